@@ -1,0 +1,54 @@
+"""Online recognition of latent risk with an evolving finite state machine.
+
+The public names load on first use, so that ``import evofsm`` itself costs next to nothing.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from evofsm.actions import IntervalActions
+    from evofsm.divergence import jensen_shannon
+    from evofsm.machine import Event, EvolvingFSM, Step, Trace
+    from evofsm.model import FSMModel
+    from evofsm.observations import Category, ObservationEncoder
+
+__version__ = "0.1.0"
+
+_HOMES = {
+    "Category": "observations",
+    "Event": "machine",
+    "EvolvingFSM": "machine",
+    "FSMModel": "model",
+    "IntervalActions": "actions",
+    "ObservationEncoder": "observations",
+    "Step": "machine",
+    "Trace": "machine",
+    "jensen_shannon": "divergence",
+}
+
+__all__ = [
+    "Category",
+    "Event",
+    "EvolvingFSM",
+    "FSMModel",
+    "IntervalActions",
+    "ObservationEncoder",
+    "Step",
+    "Trace",
+    "jensen_shannon",
+]
+
+
+def __getattr__(name: str) -> object:
+    if name not in _HOMES:
+        raise AttributeError(f"module 'evofsm' has no attribute {name!r}")
+    value = getattr(import_module(f"evofsm.{_HOMES[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

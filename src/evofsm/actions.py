@@ -1,0 +1,135 @@
+"""Turn a continuous action into one of a fixed set of intervals: the paper's Section 2.1.2."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal, overload
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Closed = Literal["left", "right"]
+Outside = Literal["error", "clip"]
+
+# Digits to which an edge is rounded, so that -2.5 + 3 * 0.3 is the edge -1.6.
+_DIGITS = 9
+
+
+@dataclass(frozen=True)
+class IntervalActions:
+    """Intervals of equal width over ``[low, high]``; the last one ends at ``high``.
+
+    Parameters
+    ----------
+    low, high : float
+        Range of the action, for an acceleration in [m/s²].
+    width : float
+        Width of an interval.
+    closed : {"left", "right"}
+        Which edge belongs to an interval: ``[a, b)`` as in the paper's experiment, or ``(a, b]``
+        as in its Section 2.1.2. The outermost edge on the open side is included as well.
+    outside : {"error", "clip"}
+        Whether a value beyond the range is refused or put into the end interval.
+
+    Examples
+    --------
+    >>> actions = IntervalActions(low=-2.5, high=2.5, width=0.3)
+    >>> actions.n_actions
+    17
+    >>> actions.encode(-2.2), actions.interval(1), actions.center(0)
+    (1, (-2.2, -1.9), -2.35)
+    >>> actions.encode([-2.5, 0.0, 2.5])
+    array([ 0,  8, 16])
+    """
+
+    low: float
+    high: float
+    width: float
+    closed: Closed = "left"
+    outside: Outside = "error"
+
+    def __post_init__(self) -> None:
+        for name in ("low", "high", "width"):
+            if not math.isfinite(getattr(self, name)):
+                raise ValueError(f"{name} is {getattr(self, name)}; it must be finite")
+        if not self.low < self.high:
+            raise ValueError(f"low is {self.low} and high is {self.high}; low must be below high")
+        if not self.width > 0.0:
+            raise ValueError(f"width is {self.width}; it must be positive")
+        if self.closed not in ("left", "right"):
+            raise ValueError(f"closed is {self.closed!r}; it must be 'left' or 'right'")
+        if self.outside not in ("error", "clip"):
+            raise ValueError(f"outside is {self.outside!r}; it must be 'error' or 'clip'")
+
+    @property
+    def n_actions(self) -> int:
+        """Number of intervals."""
+        return len(self.edges) - 1
+
+    @cached_property
+    def edges(self) -> NDArray[np.float64]:
+        """(n_actions + 1,) ndarray: where intervals meet, ``low`` and ``high`` included."""
+        count = math.ceil(round((self.high - self.low) / self.width, _DIGITS))
+        inner = np.round(self.low + np.arange(1, count) * self.width, _DIGITS)
+        edges = np.concatenate([[self.low], inner, [self.high]])
+        edges.setflags(write=False)
+        return edges
+
+    @overload
+    def encode(self, a: float) -> int: ...
+    @overload
+    def encode(self, a: ArrayLike) -> NDArray[np.int64]: ...
+    def encode(self, a: ArrayLike) -> int | NDArray[np.int64]:
+        """Index of the interval in which each value lies.
+
+        Parameters
+        ----------
+        a : float or array_like
+
+        Returns
+        -------
+        int or ndarray of int
+
+        Raises
+        ------
+        ValueError
+            If a value is NaN, or beyond the range and ``outside`` is ``"error"``.
+        """
+        values = np.asarray(a, dtype=np.float64)
+        if np.isnan(values).any():
+            raise ValueError("action is NaN; it has no interval")
+        beyond = self.beyond(values)
+        if self.outside == "error" and beyond.any():
+            raise ValueError(
+                f"action {values[beyond].flat[0]} is outside [{self.low}, {self.high}]; "
+                'widen the range, or use outside="clip" to put it into the end interval'
+            )
+        # An inner edge belongs to the interval on its closed side; the outer ones need no search.
+        inner = self.edges[1:-1]
+        index = np.searchsorted(inner, values, side="right" if self.closed == "left" else "left")
+        return int(index) if values.ndim == 0 else index.astype(np.int64)
+
+    def beyond(self, a: ArrayLike) -> NDArray[np.bool_]:
+        """Which values lie outside ``[low, high]``."""
+        values = np.asarray(a, dtype=np.float64)
+        return np.asarray((values < self.low) | (values > self.high))
+
+    def interval(self, i: int) -> tuple[float, float]:
+        """Lower and upper edge of interval ``i``."""
+        if not 0 <= i < self.n_actions:
+            raise ValueError(f"interval {i} does not exist; there are 0 to {self.n_actions - 1}")
+        return float(self.edges[i]), float(self.edges[i + 1])
+
+    def center(self, i: int) -> float:
+        """Middle of interval ``i``."""
+        lower, upper = self.interval(i)
+        return round((lower + upper) / 2.0, _DIGITS)
+
+    def label(self, i: int) -> str:
+        """Interval ``i`` as people write it, such as ``[-2.5, -2.2)``."""
+        lower, upper = self.interval(i)
+        opening = "[" if self.closed == "left" or i == 0 else "("
+        closing = "]" if self.closed == "right" or i == self.n_actions - 1 else ")"
+        return f"{opening}{lower:g}, {upper:g}{closing}"

@@ -1,0 +1,665 @@
+"""The evolving finite state machine (e-FSM): the paper's Section 2 on one screen.
+
+Observations go in one at a time. Each may found a state (`states.ets`), is recognised as a
+distribution over states (`states.spread`), and, where an action was taken after the observation
+before it, teaches that action's transition matrix (`transitions`).
+
+References
+----------
+T. Han, D. Filev, U. Ozguner, "An online evolving framework for modeling the safe autonomous
+vehicle control system via online recognition of latent risks", arXiv:1908.10823 (2019).
+"""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Sequence
+from enum import IntFlag
+from os import PathLike
+from typing import Any, NamedTuple, Self, SupportsIndex
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from evofsm import storage
+from evofsm._compile import kernel
+from evofsm.actions import IntervalActions
+from evofsm.divergence import jensen_shannon_kernel
+from evofsm.memory import (
+    NO_ACTION,
+    Learnt,
+    Memory,
+    Parameters,
+    allocate,
+    leaves,
+    open_memory,
+    resize,
+    view,
+)
+from evofsm.model import FSMModel
+from evofsm.states import ets, spread
+from evofsm.transitions import Policy, expand, forecast, identify, marginal, propagate
+
+_FIRST_CAPACITY = 8
+# Squares of larger numbers, summed over a long run, would overflow.
+_LARGEST = 1e100
+# What `_step` answers instead of an event where it did nothing.
+_FULL, _REFUSED = -1, -2
+
+
+class Event(IntFlag):
+    """What an observation did to the states."""
+
+    NONE = ets.UNCHANGED
+    MOVED = ets.MOVED
+    CREATED = ets.CREATED
+
+
+_EVENTS = (Event.NONE, Event.MOVED, Event.CREATED)
+
+
+class Step(NamedTuple):
+    """What the machine made of one observation; n states exist after it."""
+
+    state: int  #: index of the most probable state
+    belief: NDArray[np.float64]  #: (n,) distribution over states
+    event: Event  #: what happened to the states
+    predicted: NDArray[np.float64]  #: (n,) forecast made one step before; empty where none was
+    surprise: float  #: divergence of `predicted` and `belief` [bit]; NaN where none was
+
+
+class Trace(NamedTuple):
+    """What the machine made of T observations, a row each."""
+
+    state: NDArray[np.int64]  #: (T,) index of the most probable state
+    n_states: NDArray[np.int64]  #: (T,) number of states after the row
+    event: NDArray[np.int8]  #: (T,) values of `Event`
+    surprise: NDArray[np.float64]  #: (T,) [bit], NaN where nothing was predicted
+    belief: NDArray[np.float64] | None = None  #: (T, n), 0 for states not yet founded
+
+
+@kernel
+def _step(memory: Memory) -> tuple[int, int, float]:
+    """Take in the observation in ``memory.scratch``; answers event, state and surprise."""
+    parameters, now, scratch = memory.parameters, memory.learnt, memory.scratch
+    n = int(now.n_states[0])
+    if n == len(now.belief):
+        return _FULL, 0, np.nan
+    for value in scratch.observation:
+        if not abs(value) <= _LARGEST:  # also true of NaN
+            return _REFUSED, 0, np.nan
+
+    # Section 2.2.1: does the observation move a state, or found one?
+    event = ets.determine(
+        now.clusters, n, scratch.observation, parameters.radius, parameters.distance_weight
+    )
+    if event == ets.CREATED:
+        expand(now.transitions, n, parameters.prior_frequency)
+        now.founded[n] = now.clusters.count[0]
+        n += 1
+
+    # Section 2.2.2: which state is this?
+    width = parameters.spread * ets.total_variance(now.clusters)
+    state = spread.recognise(now.clusters.squared_distances, n, width, scratch.recognised)
+
+    # Section 2.3: was it foreseen, and what does it teach about the action taken before it?
+    surprise = np.nan
+    action = int(now.action[0])
+    if now.chained[0] and action != NO_ACTION:
+        forecast(now.transitions, action, n, now.belief, scratch.predicted)
+        surprise = jensen_shannon_kernel(scratch.predicted, scratch.recognised, n)
+        identify(
+            now.transitions, action, n, now.belief, scratch.recognised, parameters.learning_rate
+        )
+
+    for i in range(n):
+        now.belief[i] = scratch.recognised[i]
+    now.visits[state] += 1.0
+    now.n_states[0] = n
+    now.action[0] = NO_ACTION
+    now.chained[0] = 1.0
+    return event, state, surprise
+
+
+@kernel
+def _observe(buffer: NDArray[np.float64]) -> tuple[int, int, float]:
+    return _step(open_memory(buffer))
+
+
+@kernel
+def _learn_rows(
+    buffer: NDArray[np.float64],
+    observations: NDArray[np.float64],
+    actions: NDArray[np.int64],
+    starts: NDArray[np.bool_],
+    row: int,
+    trace: Trace,
+    beliefs: NDArray[np.float64],
+) -> int:
+    """Step through the rows from ``row`` on; answers where it stopped for want of room.
+
+    ``beliefs`` is (T, capacity), or empty where nobody wants them.
+    """
+    memory = open_memory(buffer)
+    now = memory.learnt
+    while row < len(observations):
+        if starts[row]:
+            now.chained[0] = 0.0
+        for j in range(observations.shape[1]):
+            memory.scratch.observation[j] = observations[row, j]
+        event, state, surprise = _step(memory)
+        if event == _FULL:
+            break
+        now.action[0] = actions[row]
+        n = int(now.n_states[0])
+        trace.state[row] = state
+        trace.n_states[row] = n
+        trace.event[row] = event
+        trace.surprise[row] = surprise
+        if len(beliefs) > 0:
+            for i in range(n):
+                beliefs[row, i] = now.belief[i]
+        row += 1
+    return row
+
+
+class EvolvingFSM:
+    """A finite state machine that grows its states and transitions from what it observes.
+
+    Parameters
+    ----------
+    n_actions : int
+        Number q of discrete actions; each has a transition matrix of its own.
+    radius : float
+        The paper's epsilon, in the unit of the observations: an observation that is denser
+        than every centre moves the nearest one if that is closer than this, else it founds
+        a state.
+    distance_weight : float
+        The paper's rho, how fast distance to new data lowers a centre's potential.
+    learning_rate : float
+        The paper's phi, the weight of the newest transition, in (0, 1).
+    prior_frequency : float
+        The paper's epsilon-bar, the frequency given to every transition of a new state.
+    spread : float
+        Width of recognition: the similarity to a centre is
+        ``exp(-distance^2 / (spread * total variance of all observations))``.
+
+    Notes
+    -----
+    Rows of a transition matrix are "from", columns "to": a forecast is ``belief @ P``. States
+    and actions are counted from 0 here, and from 1 (``#3``) in what people read.
+
+    Examples
+    --------
+    >>> machine = EvolvingFSM(n_actions=2, radius=0.5)
+    >>> for z in ([0.0], [0.1], [2.0], [1.0], [1.1]):
+    ...     step = machine.learn_one(z, 0)
+    >>> machine.n_states
+    2
+    >>> machine.predict(0).round(3)
+    array([0.375, 0.625])
+    """
+
+    def __init__(
+        self,
+        n_actions: int,
+        radius: float = 0.3,
+        distance_weight: float = 0.85,
+        learning_rate: float = 0.01,
+        prior_frequency: float = 1e-3,
+        spread: float = 3.0,
+    ) -> None:
+        self.n_actions = _positive_count("n_actions", n_actions)
+        self.radius = _positive("radius", radius)
+        self.distance_weight = _positive("distance_weight", distance_weight)
+        self.learning_rate = _positive("learning_rate", learning_rate)
+        self.prior_frequency = _positive("prior_frequency", prior_frequency)
+        self.spread = _positive("spread", spread)
+        if self.learning_rate >= 1.0:
+            raise ValueError(f"learning_rate is {learning_rate}; it must lie below 1")
+        self._use(self._allocate(0))
+
+    @classmethod
+    def paper(cls) -> Self:
+        """The machine of the paper's Section 3, with the settings that it leaves open recovered.
+
+        Observations are ``[gap [m], v_follower [m/s], v_leader [m/s]]``; the 17 actions are those
+        of ``IntervalActions(-2.5, 2.5, 0.3)`` [m/s²].
+
+        Examples
+        --------
+        >>> EvolvingFSM.paper()
+        EvolvingFSM(n_actions=17, radius=0.3, distance_weight=0.85, learning_rate=0.01, \
+prior_frequency=0.001, spread=3.0)
+        """
+        return cls(n_actions=17)
+
+    # -- Learning -------------------------------------------------------------------------------
+
+    def observe(self, z: ArrayLike) -> Step:
+        """Take in one observation: determine states, recognise, and learn the transition to it.
+
+        Parameters
+        ----------
+        z : (m,) array_like
+            Observation; the first one fixes m.
+
+        Returns
+        -------
+        Step
+            The present state and belief, and how well they were foreseen.
+
+        Raises
+        ------
+        TypeError
+            If ``z`` does not hold real numbers.
+        ValueError
+            If ``z`` has another length than before, or an entry is NaN, infinite or beyond
+            1e100. The machine is then as it was.
+        """
+        scratch = self._memory.scratch
+        if not (
+            type(z) is np.ndarray and z.dtype == np.float64 and z.shape == scratch.observation.shape
+        ):
+            z = self._fit(_real("observation", z, ndim=1))
+            scratch = self._memory.scratch
+        scratch.observation[:] = z
+        event, state, surprise = _observe(self._buffer)
+        if event == _REFUSED:
+            _refuse_unusable("observation", np.asarray(z))
+        if event == _FULL:
+            self._grow()
+            return self.observe(z)
+        n = self.n_states
+        predicted = scratch.predicted[: n if surprise == surprise else 0].copy()
+        return Step(state, self._memory.learnt.belief[:n].copy(), _EVENTS[event], predicted, surprise)
+
+    def act(self, i: SupportsIndex) -> None:
+        """Say which action was commanded after the latest observation.
+
+        It labels exactly one transition, the one to the next observation; a second call
+        replaces the first. Without it the next observation teaches no transition.
+
+        Parameters
+        ----------
+        i : int
+            Index of the action, from 0; `IntervalActions.encode` gives it for a number.
+
+        Raises
+        ------
+        TypeError
+            If ``i`` is not an integer.
+        ValueError
+            If there is no such action, or nothing was observed yet in this episode.
+        """
+        i = self._check_action(i)
+        if not self._memory.learnt.chained[0]:
+            raise ValueError("act before observe: this episode has no observation to act on yet")
+        self._memory.learnt.action[0] = i
+
+    def learn_one(self, z: ArrayLike, i: SupportsIndex) -> Step:
+        """Observe ``z``, then act with ``i``. See `observe` and `act`."""
+        i = self._check_action(i)
+        step = self.observe(z)
+        self._memory.learnt.action[0] = i
+        return step
+
+    def learn_many(
+        self,
+        Z: ArrayLike,
+        I: ArrayLike,  # noqa: E741 - the name stands in the public contract
+        episode_starts: Sequence[int] | NDArray[np.integer] = (),
+        *,
+        belief: bool = False,
+    ) -> Trace:
+        """Learn from many observations at once, bit for bit as `observe` and `act` would.
+
+        Parameters
+        ----------
+        Z : (T, m) array_like
+            Observations, in the order of time.
+        I : (T,) array_like of int
+            The action commanded after each observation; -1 where none was.
+        episode_starts : (E,) array_like of int
+            Rows at which an episode begins. Without row 0 the present episode goes on.
+        belief : bool
+            Whether the trace holds the belief of every row as well.
+
+        Returns
+        -------
+        Trace
+            A row for each observation.
+
+        Raises
+        ------
+        TypeError, ValueError
+            As `observe` and `act`, before any row is learnt; the message names the row.
+
+        Examples
+        --------
+        >>> machine = EvolvingFSM(n_actions=2, radius=0.5)
+        >>> machine.learn_many([[0.0], [0.1], [2.0], [1.0]], [0, 0, 0, 0]).n_states
+        array([1, 1, 1, 2])
+        """
+        observations = self._check_observations(Z)
+        actions = self._check_actions(I, len(observations))
+        starts = _starts(episode_starts, len(observations))
+        if len(observations):
+            self._fit(observations[0])
+        rows = len(observations)
+        trace = Trace(
+            np.empty(rows, np.int64),
+            np.empty(rows, np.int64),
+            np.empty(rows, np.int8),
+            np.empty(rows),
+        )
+        beliefs = np.zeros((rows if belief else 0, self._capacity))
+        row = _learn_rows(self._buffer, observations, actions, starts, 0, trace, beliefs)
+        while row < rows:
+            beliefs = np.pad(beliefs, ((0, 0), (0, self._capacity)))
+            self._grow()
+            row = _learn_rows(self._buffer, observations, actions, starts, row, trace, beliefs)
+        return trace._replace(belief=beliefs[:, : self.n_states]) if belief else trace
+
+    def start_episode(self) -> None:
+        """Begin a new episode: no transition is learnt from the last observation to the next.
+
+        Only the belief is cleared; all that was learnt stays.
+        """
+        self._memory.learnt.chained[0] = 0.0
+        self._memory.learnt.action[0] = NO_ACTION
+
+    # -- Forecasting ----------------------------------------------------------------------------
+
+    def predict(
+        self, i: SupportsIndex, horizon: int = 1, policy: Policy = "marginal"
+    ) -> NDArray[np.float64]:
+        """Forecast the state ``horizon`` steps ahead; nothing is changed by asking.
+
+        Parameters
+        ----------
+        i : int
+            Action taken now.
+        horizon : int
+            Number of steps, at least 1.
+        policy : {"marginal", "hold", "observed"}
+            Actions after the first step: each alike, as in the paper's k-step equation; ``i``
+            again; or each as often as it was used so far.
+
+        Returns
+        -------
+        (n,) ndarray
+            Distribution over states: ``belief @ P[i] @ P*^(horizon - 1)``. At the start of an
+            episode the belief is uniform; before any observation the answer is empty.
+        """
+        i = self._check_action(i)
+        return propagate(
+            self._matrices, self._memory.learnt.transitions.uses, self.belief, i, horizon, policy
+        )
+
+    # -- What it knows --------------------------------------------------------------------------
+
+    @property
+    def n_states(self) -> int:
+        """Number of states."""
+        return int(self._memory.learnt.n_states[0])
+
+    @property
+    def state_ids(self) -> NDArray[np.int64]:
+        """(n,) ndarray: identities of the states, in the order of founding."""
+        return np.arange(self.n_states)
+
+    @property
+    def centers(self) -> NDArray[np.float64]:
+        """(n, m) ndarray: the observation at the centre of each state."""
+        return self._memory.learnt.clusters.centers[:, : self.n_states].T.copy()
+
+    @property
+    def potentials(self) -> NDArray[np.float64]:
+        """(n,) ndarray: density of all observations at each centre, in (0, 1]."""
+        return self._memory.learnt.clusters.potentials[: self.n_states].copy()
+
+    @property
+    def transition_matrices(self) -> NDArray[np.float64]:
+        """(q, n, n) ndarray: for each action, probabilities from state (row) to state (column)."""
+        return self._matrices.copy()
+
+    @property
+    def origin_frequency(self) -> NDArray[np.float64]:
+        """(q, n) ndarray: the paper's F_o, the recency-weighted frequency of each row."""
+        return self._memory.learnt.transitions.origin_frequency[:, : self.n_states].copy()
+
+    @property
+    def joint_frequency(self) -> NDArray[np.float64]:
+        """(q, n, n) ndarray: the paper's F, recency-weighted frequencies of transitions."""
+        return self.origin_frequency[:, :, None] * self._matrices
+
+    @property
+    def marginal_matrix(self) -> NDArray[np.float64]:
+        """(n, n) ndarray: the paper's P*, transition probabilities if all actions are alike."""
+        return marginal(self._matrices, self._memory.learnt.transitions.uses)
+
+    @property
+    def belief(self) -> NDArray[np.float64]:
+        """(n,) ndarray: the present distribution over states, uniform as an episode starts."""
+        n = self.n_states
+        if self._memory.learnt.chained[0]:
+            return self._memory.learnt.belief[:n].copy()
+        return np.full(n, 1.0 / max(n, 1))
+
+    @property
+    def state(self) -> int | None:
+        """Index of the most probable state; None until an episode's first observation."""
+        return int(self.belief.argmax()) if self._memory.learnt.chained[0] else None
+
+    def model(
+        self,
+        *,
+        actions: IntervalActions | None = None,
+        names: Sequence[str] = (),
+        units: Sequence[str] = (),
+        dt: float | None = None,
+    ) -> FSMModel:
+        """Snapshot for analysis, which later learning does not change.
+
+        Parameters
+        ----------
+        actions : IntervalActions, optional
+            What the action indices mean.
+        names, units : sequence of str, optional
+            Names and units of the m variables.
+        dt : float, optional
+            Time between two observations [s].
+        """
+        learnt, n = self._memory.learnt, self.n_states
+        observations = int(learnt.clusters.count[0])
+        return FSMModel(
+            centers=self.centers,
+            potentials=self.potentials,
+            width=self.spread * learnt.clusters.scatter[0] / max(observations, 1),
+            transition_matrices=self.transition_matrices,
+            origin_frequency=self.origin_frequency,
+            uses=learnt.transitions.uses.copy(),
+            visits=learnt.visits[:n].copy(),
+            founded=learnt.founded[:n].copy(),
+            actions=actions,
+            names=tuple(names),
+            units=tuple(units),
+            dt=dt,
+        )
+
+    # -- Keeping it -----------------------------------------------------------------------------
+
+    def save(self, path: str | PathLike[str]) -> None:
+        """Write the machine to a file (arrays and a JSON header, nothing that can run)."""
+        # Without spare room the shapes of the arrays tell the sizes, and nothing else is stored.
+        learnt = view(resize(self._buffer, self.n_states)).learnt
+        storage.write(path, "machine", self._settings(), dict(leaves(learnt)))
+
+    @classmethod
+    def load(cls, path: str | PathLike[str]) -> Self:
+        """Read a machine that was saved; it goes on learning bit for bit as if never stopped.
+
+        Raises
+        ------
+        ValueError
+            If the file is not a machine's, or is damaged.
+        """
+        settings, arrays = storage.read(path, "machine")
+        with storage.explained(path):
+            machine = cls(**settings)
+            m, n = arrays["centers"].shape
+            buffer = allocate(m, machine.n_actions, n, machine._parameters)
+            for name, array in leaves(view(buffer).learnt):
+                if arrays[name].shape != array.shape:
+                    raise ValueError(f"{name} has shape {arrays[name].shape}, not {array.shape}")
+                array[:] = arrays[name]
+        machine._use(resize(buffer, max(_FIRST_CAPACITY, n)))
+        return machine
+
+    def copy(self) -> Self:
+        """An independent machine in the same state."""
+        twin = type(self)(**self._settings())
+        twin._use(self._buffer.copy())
+        return twin
+
+    def __copy__(self) -> Self:
+        return self.copy()
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Self:
+        return self.copy()
+
+    def __repr__(self) -> str:
+        settings = ", ".join(f"{name}={value}" for name, value in self._settings().items())
+        return f"{type(self).__name__}({settings})"
+
+    # -- Inside ---------------------------------------------------------------------------------
+
+    def _settings(self) -> dict[str, Any]:
+        return {"n_actions": self.n_actions, **self._parameters._asdict()}
+
+    @property
+    def _parameters(self) -> Parameters:
+        return Parameters(*(getattr(self, name) for name in Parameters._fields))
+
+    def _allocate(self, n_variables: int) -> NDArray[np.float64]:
+        return allocate(n_variables, self.n_actions, _FIRST_CAPACITY, self._parameters)
+
+    def _use(self, buffer: NDArray[np.float64]) -> None:
+        self._buffer = buffer
+        self._memory = view(buffer)
+
+    def _grow(self) -> None:
+        self._use(resize(self._buffer, 2 * self._capacity))
+
+    @property
+    def _capacity(self) -> int:
+        return len(self._memory.learnt.belief)
+
+    @property
+    def _matrices(self) -> NDArray[np.float64]:
+        n = self.n_states
+        return self._memory.learnt.transitions.matrices[:, :n, :n]
+
+    def _fit(self, z: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Settle the number of variables with the first observation, and hold to it after."""
+        if self.n_states == 0:
+            _refuse_unusable("observation", z)
+            self._use(self._allocate(len(z)))
+        if z.shape != self._memory.scratch.observation.shape:
+            raise ValueError(
+                f"observation has {len(z)} variables, but this machine was started with "
+                f"{len(self._memory.scratch.observation)}"
+            )
+        return z
+
+    def _check_observations(self, Z: ArrayLike) -> NDArray[np.float64]:
+        observations = np.ascontiguousarray(_real("observations", Z, ndim=2))
+        if self.n_states and len(observations):
+            self._fit(observations[0])
+        _refuse_unusable("observations", observations)
+        return observations
+
+    def _check_action(self, i: SupportsIndex) -> int:
+        try:
+            index = operator.index(i)
+        except TypeError:
+            raise TypeError(
+                f"action is {i!r}; it must be an integer index "
+                "(IntervalActions.encode turns a number into one)"
+            ) from None
+        if not 0 <= index < self.n_actions:
+            raise ValueError(f"action is {index}; this machine has actions 0 to {self.n_actions - 1}")
+        return index
+
+    def _check_actions(self, indices: ArrayLike, rows: int) -> NDArray[np.int64]:
+        actions = np.asarray(indices)
+        if actions.shape != (rows,):
+            raise ValueError(f"actions have shape {actions.shape}; {rows} observations need ({rows},)")
+        if rows and actions.dtype.kind not in "iu":
+            raise TypeError(
+                f"actions have dtype {actions.dtype}; they must be integer indices "
+                "(IntervalActions.encode turns numbers into them)"
+            )
+        wrong = np.flatnonzero((actions < NO_ACTION) | (actions >= self.n_actions))
+        if len(wrong):
+            raise ValueError(
+                f"action in row {wrong[0]} is {actions[wrong[0]]}; "
+                f"this machine has actions 0 to {self.n_actions - 1} (and -1 for none)"
+            )
+        return actions.astype(np.int64)
+
+
+def _positive(name: str, value: float) -> float:
+    if not (np.isscalar(value) and 0.0 < float(value) < float("inf")):
+        raise ValueError(f"{name} is {value!r}; it must be a positive, finite number")
+    return float(value)
+
+
+def _positive_count(name: str, value: SupportsIndex) -> int:
+    try:
+        count = operator.index(value)
+    except TypeError:
+        count = 0
+    if count < 1:
+        raise ValueError(f"{name} is {value!r}; it must be a whole number of at least 1")
+    return count
+
+
+def _real(name: str, values: ArrayLike, ndim: int) -> NDArray[np.float64]:
+    try:
+        array = np.asarray(values)
+    except ValueError:
+        raise ValueError(f"{name}: rows have different lengths") from None
+    if array.dtype.kind not in "fiub":
+        raise TypeError(
+            f"{name} has dtype {array.dtype}; it must hold real numbers "
+            "(is there a text, a None or a complex number among them?)"
+        )
+    if array.ndim != ndim or array.shape[-1] == 0:
+        wanted = "(variables,)" if ndim == 1 else "(rows, variables)"
+        raise ValueError(f"{name} has shape {array.shape}; it must be {wanted}, not empty")
+    return array.astype(np.float64)
+
+
+def _refuse_unusable(name: str, values: NDArray[np.float64]) -> None:
+    usable = np.abs(values) <= _LARGEST
+    if not usable.all():
+        place = tuple(int(k) for k in np.argwhere(~usable)[0])
+        where = f"row {place[0]}, variable {place[1]}" if len(place) > 1 else f"variable {place[0]}"
+        raise ValueError(
+            f"{name}, {where}: {values[place]} cannot be learnt; every entry must be finite "
+            f"and at most {_LARGEST:g} in size (a missing sensor value, or a division by zero?)"
+        )
+
+
+def _starts(episode_starts: ArrayLike, rows: int) -> NDArray[np.bool_]:
+    given = np.asarray(episode_starts)
+    if given.size and given.dtype.kind not in "iu":
+        raise TypeError(f"episode_starts has dtype {given.dtype}; it must hold row numbers")
+    wrong = given[(given < 0) | (given >= rows)] if given.size else given
+    if wrong.size:
+        raise ValueError(f"episode_starts names row {wrong[0]}, but there are {rows} rows")
+    starts = np.zeros(rows, np.bool_)
+    starts[given.astype(np.int64)] = True
+    return starts

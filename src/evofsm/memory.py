@@ -1,0 +1,138 @@
+"""All that a machine has learnt, in one flat buffer that a kernel takes as a single argument.
+
+Named views into the buffer make it readable; `open_memory` is the only place that knows the
+layout. There is room for ``capacity`` states, of which the first ``n_states`` are in use.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evofsm._compile import kernel
+from evofsm.states.ets import Clusters
+from evofsm.transitions import Transitions
+
+NO_ACTION = -1
+
+
+class Parameters(NamedTuple):
+    """The settings of a machine; the paper's symbols are epsilon, rho, phi, epsilon-bar."""
+
+    radius: float
+    distance_weight: float
+    learning_rate: float
+    prior_frequency: float
+    spread: float
+
+
+class Learnt(NamedTuple):
+    """What the next step needs, and what people ask of the states."""
+
+    n_states: NDArray[np.float64]  # (1,)
+    action: NDArray[np.float64]  # (1,) taken after the latest observation, or NO_ACTION
+    chained: NDArray[np.float64]  # (1,) 1 where `belief` belongs to the present episode
+    belief: NDArray[np.float64]  # (capacity,)
+    visits: NDArray[np.float64]  # (capacity,) observations in which it was the most probable
+    founded: NDArray[np.float64]  # (capacity,) number of the observation that did it, from 1
+    clusters: Clusters
+    transitions: Transitions
+
+
+class Scratch(NamedTuple):
+    """Room in which a step works; worth nothing after it."""
+
+    observation: NDArray[np.float64]  # (m,)
+    predicted: NDArray[np.float64]  # (capacity,)
+    recognised: NDArray[np.float64]  # (capacity,)
+
+
+class Memory(NamedTuple):
+    """The whole buffer."""
+
+    parameters: Parameters
+    learnt: Learnt
+    scratch: Scratch
+
+
+def _open_memory(buffer: NDArray[np.float64]) -> Memory:
+    """Views into a buffer made by `allocate`; compiled for kernels as `open_memory`."""
+    m, q, capacity = int(buffer[0]), int(buffer[1]), int(buffer[2])
+    parameters = Parameters(buffer[3], buffer[4], buffer[5], buffer[6], buffer[7])
+    counters = buffer[8:14]
+    per_variable = buffer[14 : 14 + 3 * m].reshape((3, m))
+    start = 14 + 3 * m
+    per_state = buffer[start : start + (7 + m) * capacity].reshape((7 + m, capacity))
+    start += (7 + m) * capacity
+    per_action = buffer[start : start + q * (1 + capacity)]
+    start += q * (1 + capacity)
+    matrices = buffer[start : start + q * capacity * capacity]
+    return Memory(
+        parameters,
+        Learnt(
+            counters[0:1],
+            counters[1:2],
+            counters[2:3],
+            per_state[0],
+            per_state[1],
+            per_state[2],
+            Clusters(
+                counters[3:4],
+                per_variable[0],
+                per_variable[1],
+                counters[4:5],
+                per_state[7:],
+                per_state[3],
+                per_state[4],
+            ),
+            Transitions(
+                matrices.reshape((q, capacity, capacity)),
+                per_action[q:].reshape((q, capacity)),
+                per_action[:q],
+            ),
+        ),
+        Scratch(per_variable[2], per_state[5], per_state[6]),
+    )
+
+
+open_memory = kernel(_open_memory)
+
+
+def allocate(
+    n_variables: int, n_actions: int, capacity: int, parameters: Parameters
+) -> NDArray[np.float64]:
+    """Buffer of a machine that has seen nothing."""
+    m, q = n_variables, n_actions
+    length = 14 + 3 * m + (7 + m) * capacity + q * (1 + capacity + capacity * capacity)
+    buffer = np.zeros(length)
+    buffer[:8] = (m, q, capacity, *parameters)
+    view(buffer).learnt.action[0] = NO_ACTION
+    return buffer
+
+
+def view(buffer: NDArray[np.float64]) -> Memory:
+    """Views into a buffer, for Python."""
+    return _open_memory(buffer)
+
+
+def resize(buffer: NDArray[np.float64], capacity: int) -> NDArray[np.float64]:
+    """Copy of a buffer with room for another number of states."""
+    old = view(buffer)
+    resized = allocate(int(buffer[0]), int(buffer[1]), capacity, old.parameters)
+    new = dict(leaves(view(resized).learnt))
+    for name, array in leaves(old.learnt):
+        common = tuple(slice(min(sizes)) for sizes in zip(array.shape, new[name].shape))
+        new[name][common] = array[common]
+    return resized
+
+
+def leaves(learnt: NamedTuple) -> Iterator[tuple[str, NDArray[np.float64]]]:
+    """Every array in a tuple of arrays and further such tuples, with its name."""
+    for name, value in zip(learnt._fields, learnt):
+        if isinstance(value, np.ndarray):
+            yield name, value
+        else:
+            yield from leaves(value)

@@ -1,0 +1,217 @@
+"""A frozen snapshot of a machine, with the analysis that a finite Markov chain allows."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, fields
+from os import PathLike
+from typing import Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from evofsm import storage
+from evofsm._compile import kernel
+from evofsm.actions import IntervalActions
+from evofsm.states.ets import measure_distances
+from evofsm.states.spread import recognise
+from evofsm.transitions import Policy, marginal, propagate
+
+
+@dataclass(frozen=True, eq=False)
+class FSMModel:
+    """States and transitions as they stood when the snapshot was taken.
+
+    n is the number of states, m of variables, q of actions. Arrays are read-only.
+    """
+
+    centers: NDArray[np.float64]  #: (n, m) observation at the centre of each state
+    potentials: NDArray[np.float64]  #: (n,) density of all observations at each centre
+    width: float  #: of recognition: spread times the total variance of all observations
+    transition_matrices: NDArray[np.float64]  #: (q, n, n) from state (row) to state (column)
+    origin_frequency: NDArray[np.float64]  #: (q, n) recency-weighted frequency of each row
+    uses: NDArray[np.float64]  #: (q,) transitions learnt with each action
+    visits: NDArray[np.float64]  #: (n,) observations in which a state was the most probable
+    founded: NDArray[np.float64]  #: (n,) number of the observation that founded it, from 1
+    actions: IntervalActions | None = None  #: what the action indices mean
+    names: tuple[str, ...] = ()  #: of the m variables
+    units: tuple[str, ...] = ()  #: of the m variables
+    dt: float | None = None  #: time between two observations [s]
+
+    def __post_init__(self) -> None:
+        n, m, q = self.n_states, self.n_variables, self.n_actions
+        shapes = {
+            "centers": (n, m),
+            "potentials": (n,),
+            "transition_matrices": (q, n, n),
+            "origin_frequency": (q, n),
+            "uses": (q,),
+            "visits": (n,),
+            "founded": (n,),
+        }
+        for name, shape in shapes.items():
+            array = np.array(getattr(self, name), dtype=np.float64)
+            if array.shape != shape:
+                raise ValueError(f"{name} has shape {array.shape}, not {shape}")
+            array.setflags(write=False)
+            object.__setattr__(self, name, array)
+        for name in ("names", "units"):
+            if len(getattr(self, name)) not in (0, m):
+                raise ValueError(f"{name} are {getattr(self, name)}, but there are {m} variables")
+        if self.actions is not None and self.actions.n_actions != q:
+            raise ValueError(f"actions has {self.actions.n_actions} intervals for {q} matrices")
+
+    @property
+    def n_states(self) -> int:
+        """Number n of states."""
+        return len(self.centers)
+
+    @property
+    def n_variables(self) -> int:
+        """Number m of variables in an observation."""
+        return int(np.shape(self.centers)[1])
+
+    @property
+    def n_actions(self) -> int:
+        """Number q of actions."""
+        return len(self.uses)
+
+    def recognise(self, z: ArrayLike) -> NDArray[np.float64]:
+        """Distribution over states for one observation or many; the states stay as they are.
+
+        Parameters
+        ----------
+        z : (m,) or (N, m) array_like
+
+        Returns
+        -------
+        (n,) or (N, n) ndarray
+        """
+        given = np.asarray(z, dtype=np.float64)
+        rows = np.atleast_2d(given)
+        if rows.ndim != 2 or rows.shape[1] != self.n_variables:
+            raise ValueError(f"z has shape {given.shape}; a row needs {self.n_variables} variables")
+        if not np.isfinite(rows).all():
+            raise ValueError("z holds NaN or infinity; it cannot be recognised")
+        if self.n_states == 0:
+            raise ValueError("this model has no states: its machine had observed nothing")
+        belief = np.empty((len(rows), self.n_states))
+        _recognise_rows(np.ascontiguousarray(self.centers.T), rows.copy(), self.width, belief)
+        return belief if given.ndim == 2 else belief[0]
+
+    def propagate(
+        self,
+        belief: ArrayLike,
+        action: int | None = None,
+        horizon: int = 1,
+        policy: Policy = "marginal",
+    ) -> NDArray[np.float64]:
+        """Distribution over states ``horizon`` steps after ``belief``.
+
+        Parameters
+        ----------
+        belief : (n,) array_like
+            Present distribution over states.
+        action : int, optional
+            Action of the first step; without it ``policy`` rules that step too.
+        horizon : int
+            Number of steps, at least 1.
+        policy : {"marginal", "hold", "observed"}
+            Actions after the first step: each alike (the paper's k-step equation), the first
+            one again, or each as often as it was used.
+
+        Returns
+        -------
+        (n,) ndarray
+        """
+        start = np.asarray(belief, dtype=np.float64)
+        if start.shape != (self.n_states,):
+            raise ValueError(f"belief has shape {start.shape}; the model has {self.n_states} states")
+        if action is not None and not 0 <= action < self.n_actions:
+            raise ValueError(f"action is {action}; the model has actions 0 to {self.n_actions - 1}")
+        return propagate(self.transition_matrices, self.uses, start, action, horizon, policy)
+
+    def marginal_matrix(self, policy: Policy = "marginal") -> NDArray[np.float64]:
+        """(n, n) transition probabilities, over all actions alike or as often as each was used."""
+        return marginal(self.transition_matrices, self.uses, policy)
+
+    def stationary_distribution(self, policy: Policy = "marginal") -> NDArray[np.float64]:
+        """(n,) share of time that the chain would spend in each state if it ran on for ever.
+
+        Raises
+        ------
+        ValueError
+            If the chain falls apart into sets of states that never meet, so that it has more
+            than one such distribution.
+        """
+        n = self.n_states
+        if n == 0:
+            return np.empty(0)
+        balance = np.vstack([self.marginal_matrix(policy).T - np.eye(n), np.ones(n)])
+        solution, _, rank, _ = np.linalg.lstsq(balance, np.append(np.zeros(n), 1.0))
+        if rank < n:
+            raise ValueError(
+                "the chain has states that never meet: no single stationary distribution"
+            )
+        shares: NDArray[np.float64] = np.clip(solution, 0.0, None)
+        return shares / shares.sum()
+
+    def to_dot(self, policy: Policy = "observed", least: float = 0.001) -> str:
+        """The state graph in Graphviz's DOT language.
+
+        Parameters
+        ----------
+        policy : {"observed", "marginal"}
+            How actions are weighed in the probabilities on the edges.
+        least : float
+            Edges below this probability are left out.
+        """
+        matrix = self.marginal_matrix(policy)
+        lines = ["digraph evofsm {", "  node [shape=circle];"]
+        for i, center in enumerate(self.centers):
+            values = ", ".join(f"{value:.4g}" for value in center)
+            lines.append(f'  s{i + 1} [label="#{i + 1}\\n({values})"];')
+        for i, j in np.argwhere(matrix >= least):
+            lines.append(f'  s{i + 1} -> s{j + 1} [label="{matrix[i, j]:.3f}"];')
+        return "\n".join([*lines, "}", ""])
+
+    def save(self, path: str | PathLike[str]) -> None:
+        """Write the model to a file (arrays and a JSON header, nothing that can run)."""
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        arrays = {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
+        content = {name: value for name, value in values.items() if name not in arrays}
+        content["actions"] = None if self.actions is None else asdict(self.actions)
+        storage.write(path, "model", content, arrays)
+
+    @classmethod
+    def load(cls, path: str | PathLike[str]) -> Self:
+        """Read a model that was saved.
+
+        Raises
+        ------
+        ValueError
+            If the file is not a model's, or is damaged.
+        """
+        content, arrays = storage.read(path, "model")
+        with storage.explained(path):
+            actions = content.pop("actions")
+            return cls(
+                **arrays,
+                actions=None if actions is None else IntervalActions(**actions),
+                names=tuple(content.pop("names")),
+                units=tuple(content.pop("units")),
+                **content,
+            )
+
+
+@kernel
+def _recognise_rows(
+    centers: NDArray[np.float64],
+    rows: NDArray[np.float64],
+    width: float,
+    belief: NDArray[np.float64],
+) -> None:
+    n = centers.shape[1]
+    squared_distances = np.empty(n)
+    for row in range(len(rows)):
+        measure_distances(centers, n, rows[row], squared_distances)
+        recognise(squared_distances, n, width, belief[row])

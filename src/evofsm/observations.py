@@ -1,0 +1,117 @@
+"""Put continuous and discrete variables into one observation: the paper's Section 2.1.1.
+
+States are found by Euclidean distance, so a discrete variable needs numbers in which no category
+is nearer to one than to another: one coordinate per category, which is the variable's
+``distance / sqrt(2)`` for the present category and 0 for the others. Any two categories then lie
+``distance`` apart.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True)
+class Category:
+    """A discrete variable and how far apart its categories count.
+
+    Parameters
+    ----------
+    name : str
+        Name of the variable.
+    values : sequence of str
+        All the categories it may take.
+    distance : float
+        Distance between any two of them, in the unit of the other variables. At or above a
+        machine's ``radius``, no state moves from one category to another.
+
+    Examples
+    --------
+    >>> Category("light", ("red", "green"), distance=10.0).distance
+    10.0
+    """
+
+    name: str
+    values: Sequence[str]
+    distance: float = 1.0
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "values", tuple(self.values))
+        if len(set(self.values)) < 2 or len(set(self.values)) < len(self.values):
+            raise ValueError(f"{self.name}: needs two or more different values, not {self.values}")
+        if not (math.isfinite(self.distance) and self.distance > 0.0):
+            raise ValueError(f"{self.name}: distance is {self.distance}; it must be positive")
+
+
+class ObservationEncoder:
+    """Turns named variables, continuous and discrete, into the vector a machine observes.
+
+    Parameters
+    ----------
+    *variables : str or Category
+        A name for each continuous variable, a `Category` for each discrete one, in order.
+
+    Attributes
+    ----------
+    names : tuple of str
+        Name of each entry of the vector; ``light=red`` for a category.
+
+    Examples
+    --------
+    >>> encoder = ObservationEncoder("gap", Category("light", ("red", "green")))
+    >>> encoder.names
+    ('gap', 'light=red', 'light=green')
+    >>> encoder.encode({"gap": 12.0, "light": "green"}).round(3)
+    array([12.   ,  0.   ,  0.707])
+    """
+
+    def __init__(self, *variables: str | Category) -> None:
+        if not variables:
+            raise ValueError("an observation needs at least one variable")
+        names: list[str] = []
+        for variable in variables:
+            if isinstance(variable, Category):
+                names += [f"{variable.name}={value}" for value in variable.values]
+            else:
+                names.append(variable)
+        if len(set(names)) < len(names):
+            raise ValueError(f"variables have the same name twice: {', '.join(names)}")
+        self.variables = variables
+        self.names = tuple(names)
+
+    def encode(self, values: Mapping[str, float | str]) -> NDArray[np.float64]:
+        """Vector for one observation.
+
+        Parameters
+        ----------
+        values : mapping
+            A number for each continuous variable, a category for each discrete one.
+
+        Returns
+        -------
+        (len(names),) ndarray
+
+        Raises
+        ------
+        ValueError
+            If a variable is missing, or a category unknown.
+        """
+        encoded: list[float] = []
+        for variable in self.variables:
+            name = variable.name if isinstance(variable, Category) else variable
+            if name not in values:
+                raise ValueError(f"observation lacks {name!r}; it has {', '.join(values)}")
+            value = values[name]
+            if not isinstance(variable, Category):
+                encoded.append(float(value))
+            elif value in variable.values:
+                height = variable.distance / math.sqrt(2.0)
+                encoded += [height * (value == known) for known in variable.values]
+            else:
+                raise ValueError(f"{name} is {value!r}; it may be {', '.join(variable.values)}")
+        return np.array(encoded)

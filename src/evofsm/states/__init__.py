@@ -1,0 +1,1 @@
+"""How states are determined and recognised: one rule, one file."""
