@@ -26,6 +26,7 @@ class NumpyFSM:
         self.prior_frequency = prior_frequency
         self.spread = spread
         self.count = 0
+        self.previous: NDArray[np.float64] = np.empty(0)
         self.belief: NDArray[np.float64] | None = None
         self.action: int | None = None
 
@@ -54,7 +55,9 @@ class NumpyFSM:
             matrix, frequency = self.matrices[self.action], self.frequencies[self.action]
             predicted = origin @ matrix
             middle = 0.5 * (predicted + belief)
-            surprise = 0.5 * float(_relative_entropy(predicted, middle) + _relative_entropy(belief, middle))
+            surprise = 0.5 * float(
+                _relative_entropy(predicted, middle) + _relative_entropy(belief, middle)
+            )
             gain = self.learning_rate * origin
             frequency *= 1.0 - self.learning_rate
             frequency += gain
@@ -71,7 +74,7 @@ class NumpyFSM:
         else:
             t = self.count + 1
             offset = z - self.mean
-            potential = 1.0 / (1.0 + offset @ offset + self.scatter / self.count)
+            potential = 1.0 / (1.0 + float(offset @ offset) + self.scatter / self.count)
             far = ((self.centers - self.previous) ** 2).sum(axis=1)
             self.potentials = (
                 (t - 1)

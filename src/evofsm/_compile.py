@@ -1,10 +1,11 @@
-"""How kernels are compiled: one decorator, so that every kernel is built and cached the same way."""
+"""How kernels are compiled: one decorator, so that every kernel is built and cached alike."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
-from typing import TypeVar
+from typing import TypeVar, cast
 
 import numba
 
@@ -12,13 +13,17 @@ Function = TypeVar("Function", bound=Callable[..., object])
 
 
 def kernel(function: Function) -> Function:
-    """Compile a module-level function with Numba on its first call and keep the code on disk.
+    """Compile a module-level function with Numba on its first call, and keep the code on disk.
 
-    Kernels follow NumPy's rules for division by zero. ``fastmath`` stays off: it reorders
-    sums, and then the single step and the batch would no longer agree bit for bit.
+    Kernels are inlined into each other and own no memory: they work in arrays they are given,
+    so counting references (``_nrt``) would only cost time, a fifth of a step. Division by zero
+    is NumPy's. ``fastmath`` stays off: it reorders sums, and then a single step and a batch
+    would no longer agree bit for bit.
     """
-    compiled: Function = numba.njit(cache=True, error_model="numpy", _nrt=False, forceinline=True)(function)
-    return compiled
+    compiled = numba.njit(  # type: ignore[call-overload]
+        cache=True, error_model="numpy", forceinline=True, _nrt=False
+    )(function)
+    return cast(Function, compiled)
 
 
 def _drop_stale_caches(package: Path) -> None:
@@ -36,7 +41,6 @@ def _drop_stale_caches(package: Path) -> None:
             path.unlink(missing_ok=True)
 
 
-try:
+# Not possible where the installation may not be written or another process cleans up too.
+with suppress(OSError):
     _drop_stale_caches(Path(__file__).parent)
-except OSError:  # an installation that may not be written, or another process cleaning up too
-    pass

@@ -60,7 +60,9 @@ def jensen_shannon(p: ArrayLike, q: ArrayLike) -> NDArray[np.float64] | float:
         )
     for name, distribution in (("p", p), ("q", q)):
         if not (np.isfinite(distribution).all() and (distribution >= 0.0).all()):
-            raise ValueError(f"{name} holds a negative or non-finite entry; it must be a distribution")
+            raise ValueError(
+                f"{name} holds a negative or non-finite entry; it must be a distribution"
+            )
     shape = np.broadcast_shapes(p.shape, q.shape)
     n = shape[-1]
     rows_p = np.ascontiguousarray(np.broadcast_to(p, shape)).reshape(-1, n)

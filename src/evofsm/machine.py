@@ -12,7 +12,6 @@ vehicle control system via online recognition of latent risks", arXiv:1908.10823
 
 from __future__ import annotations
 
-import operator
 from collections.abc import Sequence
 from enum import IntFlag
 from os import PathLike
@@ -27,7 +26,6 @@ from evofsm.actions import IntervalActions
 from evofsm.divergence import jensen_shannon_kernel
 from evofsm.memory import (
     NO_ACTION,
-    Learnt,
     Memory,
     Parameters,
     allocate,
@@ -39,10 +37,18 @@ from evofsm.memory import (
 from evofsm.model import FSMModel
 from evofsm.states import ets, spread
 from evofsm.transitions import Policy, expand, forecast, identify, marginal, propagate
+from evofsm.validation import (
+    LARGEST_OBSERVATION,
+    check_action,
+    check_actions,
+    check_starts,
+    positive,
+    real_array,
+    refuse_unusable,
+    whole,
+)
 
 _FIRST_CAPACITY = 8
-# Squares of larger numbers, summed over a long run, would overflow.
-_LARGEST = 1e100
 # What `_step` answers instead of an event where it did nothing.
 _FULL, _REFUSED = -1, -2
 
@@ -86,7 +92,7 @@ def _step(memory: Memory) -> tuple[int, int, float]:
     if n == len(now.belief):
         return _FULL, 0, np.nan
     for value in scratch.observation:
-        if not abs(value) <= _LARGEST:  # also true of NaN
+        if not abs(value) <= LARGEST_OBSERVATION:  # also true of NaN
             return _REFUSED, 0, np.nan
 
     # Section 2.2.1: does the observation move a state, or found one?
@@ -95,7 +101,7 @@ def _step(memory: Memory) -> tuple[int, int, float]:
     )
     if event == ets.CREATED:
         expand(now.transitions, n, parameters.prior_frequency)
-        now.founded[n] = now.clusters.count[0]
+        now.founded[n] = now.clusters.n_observations[0]
         n += 1
 
     # Section 2.2.2: which state is this?
@@ -197,7 +203,7 @@ class EvolvingFSM:
     >>> machine.n_states
     2
     >>> machine.predict(0).round(3)
-    array([0.375, 0.625])
+    array([0.48, 0.52])
     """
 
     def __init__(
@@ -209,12 +215,12 @@ class EvolvingFSM:
         prior_frequency: float = 1e-3,
         spread: float = 3.0,
     ) -> None:
-        self.n_actions = _positive_count("n_actions", n_actions)
-        self.radius = _positive("radius", radius)
-        self.distance_weight = _positive("distance_weight", distance_weight)
-        self.learning_rate = _positive("learning_rate", learning_rate)
-        self.prior_frequency = _positive("prior_frequency", prior_frequency)
-        self.spread = _positive("spread", spread)
+        self.n_actions = whole("n_actions", n_actions)
+        self.radius = positive("radius", radius)
+        self.distance_weight = positive("distance_weight", distance_weight)
+        self.learning_rate = positive("learning_rate", learning_rate)
+        self.prior_frequency = positive("prior_frequency", prior_frequency)
+        self.spread = positive("spread", spread)
         if self.learning_rate >= 1.0:
             raise ValueError(f"learning_rate is {learning_rate}; it must lie below 1")
         self._use(self._allocate(0))
@@ -261,18 +267,20 @@ prior_frequency=0.001, spread=3.0)
         if not (
             type(z) is np.ndarray and z.dtype == np.float64 and z.shape == scratch.observation.shape
         ):
-            z = self._fit(_real("observation", z, ndim=1))
+            z = self._fit(real_array("observation", z, ndim=1))
             scratch = self._memory.scratch
         scratch.observation[:] = z
         event, state, surprise = _observe(self._buffer)
         if event == _REFUSED:
-            _refuse_unusable("observation", np.asarray(z))
+            refuse_unusable("observation", np.asarray(z))
         if event == _FULL:
             self._grow()
             return self.observe(z)
         n = self.n_states
         predicted = scratch.predicted[: n if surprise == surprise else 0].copy()
-        return Step(state, self._memory.learnt.belief[:n].copy(), _EVENTS[event], predicted, surprise)
+        return Step(
+            state, self._memory.learnt.belief[:n].copy(), _EVENTS[event], predicted, surprise
+        )
 
     def act(self, i: SupportsIndex) -> None:
         """Say which action was commanded after the latest observation.
@@ -292,14 +300,14 @@ prior_frequency=0.001, spread=3.0)
         ValueError
             If there is no such action, or nothing was observed yet in this episode.
         """
-        i = self._check_action(i)
+        i = check_action(i, self.n_actions)
         if not self._memory.learnt.chained[0]:
             raise ValueError("act before observe: this episode has no observation to act on yet")
         self._memory.learnt.action[0] = i
 
     def learn_one(self, z: ArrayLike, i: SupportsIndex) -> Step:
         """Observe ``z``, then act with ``i``. See `observe` and `act`."""
-        i = self._check_action(i)
+        i = check_action(i, self.n_actions)
         step = self.observe(z)
         self._memory.learnt.action[0] = i
         return step
@@ -307,7 +315,7 @@ prior_frequency=0.001, spread=3.0)
     def learn_many(
         self,
         Z: ArrayLike,
-        I: ArrayLike,  # noqa: E741 - the name stands in the public contract
+        I: ArrayLike,
         episode_starts: Sequence[int] | NDArray[np.integer] = (),
         *,
         belief: bool = False,
@@ -342,8 +350,8 @@ prior_frequency=0.001, spread=3.0)
         array([1, 1, 1, 2])
         """
         observations = self._check_observations(Z)
-        actions = self._check_actions(I, len(observations))
-        starts = _starts(episode_starts, len(observations))
+        actions = check_actions(I, len(observations), self.n_actions)
+        starts = check_starts(episode_starts, len(observations))
         if len(observations):
             self._fit(observations[0])
         rows = len(observations)
@@ -392,7 +400,7 @@ prior_frequency=0.001, spread=3.0)
             Distribution over states: ``belief @ P[i] @ P*^(horizon - 1)``. At the start of an
             episode the belief is uniform; before any observation the answer is empty.
         """
-        i = self._check_action(i)
+        i = check_action(i, self.n_actions)
         return propagate(
             self._matrices, self._memory.learnt.transitions.uses, self.belief, i, horizon, policy
         )
@@ -472,7 +480,7 @@ prior_frequency=0.001, spread=3.0)
             Time between two observations [s].
         """
         learnt, n = self._memory.learnt, self.n_states
-        observations = int(learnt.clusters.count[0])
+        observations = int(learnt.clusters.n_observations[0])
         return FSMModel(
             centers=self.centers,
             potentials=self.potentials,
@@ -564,7 +572,7 @@ prior_frequency=0.001, spread=3.0)
     def _fit(self, z: NDArray[np.float64]) -> NDArray[np.float64]:
         """Settle the number of variables with the first observation, and hold to it after."""
         if self.n_states == 0:
-            _refuse_unusable("observation", z)
+            refuse_unusable("observation", z)
             self._use(self._allocate(len(z)))
         if z.shape != self._memory.scratch.observation.shape:
             raise ValueError(
@@ -574,92 +582,8 @@ prior_frequency=0.001, spread=3.0)
         return z
 
     def _check_observations(self, Z: ArrayLike) -> NDArray[np.float64]:
-        observations = np.ascontiguousarray(_real("observations", Z, ndim=2))
+        observations = np.ascontiguousarray(real_array("observations", Z, ndim=2))
         if self.n_states and len(observations):
             self._fit(observations[0])
-        _refuse_unusable("observations", observations)
+        refuse_unusable("observations", observations)
         return observations
-
-    def _check_action(self, i: SupportsIndex) -> int:
-        try:
-            index = operator.index(i)
-        except TypeError:
-            raise TypeError(
-                f"action is {i!r}; it must be an integer index "
-                "(IntervalActions.encode turns a number into one)"
-            ) from None
-        if not 0 <= index < self.n_actions:
-            raise ValueError(f"action is {index}; this machine has actions 0 to {self.n_actions - 1}")
-        return index
-
-    def _check_actions(self, indices: ArrayLike, rows: int) -> NDArray[np.int64]:
-        actions = np.asarray(indices)
-        if actions.shape != (rows,):
-            raise ValueError(f"actions have shape {actions.shape}; {rows} observations need ({rows},)")
-        if rows and actions.dtype.kind not in "iu":
-            raise TypeError(
-                f"actions have dtype {actions.dtype}; they must be integer indices "
-                "(IntervalActions.encode turns numbers into them)"
-            )
-        wrong = np.flatnonzero((actions < NO_ACTION) | (actions >= self.n_actions))
-        if len(wrong):
-            raise ValueError(
-                f"action in row {wrong[0]} is {actions[wrong[0]]}; "
-                f"this machine has actions 0 to {self.n_actions - 1} (and -1 for none)"
-            )
-        return actions.astype(np.int64)
-
-
-def _positive(name: str, value: float) -> float:
-    if not (np.isscalar(value) and 0.0 < float(value) < float("inf")):
-        raise ValueError(f"{name} is {value!r}; it must be a positive, finite number")
-    return float(value)
-
-
-def _positive_count(name: str, value: SupportsIndex) -> int:
-    try:
-        count = operator.index(value)
-    except TypeError:
-        count = 0
-    if count < 1:
-        raise ValueError(f"{name} is {value!r}; it must be a whole number of at least 1")
-    return count
-
-
-def _real(name: str, values: ArrayLike, ndim: int) -> NDArray[np.float64]:
-    try:
-        array = np.asarray(values)
-    except ValueError:
-        raise ValueError(f"{name}: rows have different lengths") from None
-    if array.dtype.kind not in "fiub":
-        raise TypeError(
-            f"{name} has dtype {array.dtype}; it must hold real numbers "
-            "(is there a text, a None or a complex number among them?)"
-        )
-    if array.ndim != ndim or array.shape[-1] == 0:
-        wanted = "(variables,)" if ndim == 1 else "(rows, variables)"
-        raise ValueError(f"{name} has shape {array.shape}; it must be {wanted}, not empty")
-    return array.astype(np.float64)
-
-
-def _refuse_unusable(name: str, values: NDArray[np.float64]) -> None:
-    usable = np.abs(values) <= _LARGEST
-    if not usable.all():
-        place = tuple(int(k) for k in np.argwhere(~usable)[0])
-        where = f"row {place[0]}, variable {place[1]}" if len(place) > 1 else f"variable {place[0]}"
-        raise ValueError(
-            f"{name}, {where}: {values[place]} cannot be learnt; every entry must be finite "
-            f"and at most {_LARGEST:g} in size (a missing sensor value, or a division by zero?)"
-        )
-
-
-def _starts(episode_starts: ArrayLike, rows: int) -> NDArray[np.bool_]:
-    given = np.asarray(episode_starts)
-    if given.size and given.dtype.kind not in "iu":
-        raise TypeError(f"episode_starts has dtype {given.dtype}; it must hold row numbers")
-    wrong = given[(given < 0) | (given >= rows)] if given.size else given
-    if wrong.size:
-        raise ValueError(f"episode_starts names row {wrong[0]}, but there are {rows} rows")
-    starts = np.zeros(rows, np.bool_)
-    starts[given.astype(np.int64)] = True
-    return starts

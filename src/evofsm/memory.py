@@ -124,14 +124,16 @@ def resize(buffer: NDArray[np.float64], capacity: int) -> NDArray[np.float64]:
     resized = allocate(int(buffer[0]), int(buffer[1]), capacity, old.parameters)
     new = dict(leaves(view(resized).learnt))
     for name, array in leaves(old.learnt):
-        common = tuple(slice(min(sizes)) for sizes in zip(array.shape, new[name].shape))
+        common = tuple(
+            slice(min(sizes)) for sizes in zip(array.shape, new[name].shape, strict=True)
+        )
         new[name][common] = array[common]
     return resized
 
 
 def leaves(learnt: NamedTuple) -> Iterator[tuple[str, NDArray[np.float64]]]:
     """Every array in a tuple of arrays and further such tuples, with its name."""
-    for name, value in zip(learnt._fields, learnt):
+    for name, value in zip(learnt._fields, learnt, strict=True):
         if isinstance(value, np.ndarray):
             yield name, value
         else:

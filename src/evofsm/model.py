@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass, fields
 from os import PathLike
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -125,7 +125,9 @@ class FSMModel:
         """
         start = np.asarray(belief, dtype=np.float64)
         if start.shape != (self.n_states,):
-            raise ValueError(f"belief has shape {start.shape}; the model has {self.n_states} states")
+            raise ValueError(
+                f"belief has shape {start.shape}; the model has {self.n_states} states"
+            )
         if action is not None and not 0 <= action < self.n_actions:
             raise ValueError(f"action is {action}; the model has actions 0 to {self.n_actions - 1}")
         return propagate(self.transition_matrices, self.uses, start, action, horizon, policy)
@@ -152,8 +154,8 @@ class FSMModel:
             raise ValueError(
                 "the chain has states that never meet: no single stationary distribution"
             )
-        shares: NDArray[np.float64] = np.clip(solution, 0.0, None)
-        return shares / shares.sum()
+        shares = np.clip(solution, 0.0, None)
+        return np.asarray(shares / shares.sum())
 
     def to_dot(self, policy: Policy = "observed", least: float = 0.001) -> str:
         """The state graph in Graphviz's DOT language.
@@ -193,14 +195,12 @@ class FSMModel:
         """
         content, arrays = storage.read(path, "model")
         with storage.explained(path):
-            actions = content.pop("actions")
-            return cls(
-                **arrays,
-                actions=None if actions is None else IntervalActions(**actions),
-                names=tuple(content.pop("names")),
-                units=tuple(content.pop("units")),
-                **content,
-            )
+            if content["actions"] is not None:
+                content["actions"] = IntervalActions(**content["actions"])
+            for name in ("names", "units"):
+                content[name] = tuple(content[name])
+            values: dict[str, Any] = {**content, **arrays}
+            return cls(**values)
 
 
 @kernel

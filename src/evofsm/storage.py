@@ -52,9 +52,7 @@ def kind_of(path: str | os.PathLike[str]) -> str:
     return str(_read(path)[0]["kind"])
 
 
-def read(
-    path: str | os.PathLike[str], kind: str
-) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+def read(path: str | os.PathLike[str], kind: str) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
     """Read a file of the given kind: its content and its arrays."""
     header, arrays = _read(path)
     if header["kind"] != kind:

@@ -26,7 +26,7 @@ UNCHANGED, MOVED, CREATED = 0, 1, 2
 class Clusters(NamedTuple):
     """What eTS remembers: m variables, room for ``capacity`` centres, the first ``n`` in use."""
 
-    count: NDArray[np.float64]  # (1,) observations so far
+    n_observations: NDArray[np.float64]  # (1,)
     first: NDArray[np.float64]  # (m,) z_1, the origin of `mean`
     mean: NDArray[np.float64]  # (m,) of all observations, minus `first`
     scatter: NDArray[np.float64]  # (1,) sum of squared distances to the mean
@@ -43,7 +43,7 @@ def determine(
 
     ``n`` centres are in use; where the answer is ``CREATED``, the new one stands at index ``n``.
     """
-    if clusters.count[0] == 0.0:
+    if clusters.n_observations[0] == 0.0:
         for j in range(len(z)):
             clusters.first[j] = z[j]
         _place_center(clusters, 0, z, 1.0)
@@ -68,7 +68,7 @@ def determine(
 @kernel
 def total_variance(clusters: Clusters) -> float:
     """Population variance of all observations so far, summed over the variables."""
-    return clusters.scatter[0] / clusters.count[0]
+    return float(clusters.scatter[0] / clusters.n_observations[0])
 
 
 @kernel
@@ -113,7 +113,7 @@ def _update_potentials_of_centers(clusters: Clusters, n: int, distance_weight: f
 
     It needs the distances to z_{t-1}, which are still at hand from the step before.
     """
-    t = clusters.count[0] + 1.0
+    t = clusters.n_observations[0] + 1.0
     highest = 0.0
     for i in range(n):
         potential = clusters.potentials[i]
@@ -136,9 +136,9 @@ def _place_center(clusters: Clusters, i: int, z: NDArray[np.float64], potential:
 @kernel
 def _absorb(clusters: Clusters, z: NDArray[np.float64]) -> None:
     """Add the observation to the running mean and scatter (Welford 1962)."""
-    clusters.count[0] += 1.0
+    clusters.n_observations[0] += 1.0
     for j in range(len(z)):
         offset = z[j] - clusters.first[j]
         before = offset - clusters.mean[j]
-        clusters.mean[j] += before / clusters.count[0]
+        clusters.mean[j] += before / clusters.n_observations[0]
         clusters.scatter[0] += before * (offset - clusters.mean[j])

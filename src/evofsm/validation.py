@@ -1,0 +1,109 @@
+"""Look at what users pass in, and refuse what cannot be right with the likely cause."""
+
+from __future__ import annotations
+
+import operator
+from typing import SupportsFloat, SupportsIndex
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+# Squares of larger numbers, summed over a long run, would overflow.
+LARGEST_OBSERVATION = 1e100
+
+
+def positive(name: str, value: SupportsFloat) -> float:
+    """A positive, finite number."""
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        number = float("nan")
+    if not 0.0 < number < float("inf"):
+        raise ValueError(f"{name} is {value!r}; it must be a positive, finite number")
+    return number
+
+
+def whole(name: str, value: SupportsIndex) -> int:
+    """A whole number of at least 1."""
+    try:
+        number = operator.index(value)
+    except TypeError:
+        number = 0
+    if number < 1:
+        raise ValueError(f"{name} is {value!r}; it must be a whole number of at least 1")
+    return number
+
+
+def real_array(name: str, values: ArrayLike, ndim: int) -> NDArray[np.float64]:
+    """A new array of real numbers with ``ndim`` axes, the last one not empty."""
+    try:
+        array = np.asarray(values)
+    except ValueError:
+        raise ValueError(f"{name}: rows have different lengths") from None
+    if array.dtype.kind not in "fiub":
+        raise TypeError(
+            f"{name} has dtype {array.dtype}; it must hold real numbers "
+            "(is there a text, a None or a complex number among them?)"
+        )
+    if array.ndim != ndim or array.shape[-1] == 0:
+        wanted = "(variables,)" if ndim == 1 else "(rows, variables)"
+        raise ValueError(f"{name} has shape {array.shape}; it must be {wanted}, not empty")
+    return array.astype(np.float64)
+
+
+def refuse_unusable(name: str, values: NDArray[np.float64]) -> None:
+    """Raise for the first entry that is not finite, or too large."""
+    usable = np.abs(values) <= LARGEST_OBSERVATION
+    if not usable.all():
+        place = tuple(int(k) for k in np.argwhere(~usable)[0])
+        where = f"row {place[0]}, variable {place[1]}" if len(place) > 1 else f"variable {place[0]}"
+        raise ValueError(
+            f"{name}, {where}: {values[place]} cannot be learnt; every entry must be finite "
+            f"and at most {LARGEST_OBSERVATION:g} in size (a missing sensor value?)"
+        )
+
+
+def check_action(i: SupportsIndex, n_actions: int) -> int:
+    """An index of one of the actions."""
+    try:
+        index = operator.index(i)
+    except TypeError:
+        raise TypeError(
+            f"action is {i!r}; it must be an integer index "
+            "(IntervalActions.encode turns a number into one)"
+        ) from None
+    if not 0 <= index < n_actions:
+        raise ValueError(f"action is {index}; there are actions 0 to {n_actions - 1}")
+    return index
+
+
+def check_actions(indices: ArrayLike, rows: int, n_actions: int) -> NDArray[np.int64]:
+    """An index for each row, or -1 for none."""
+    actions = np.asarray(indices)
+    if actions.shape != (rows,):
+        raise ValueError(f"actions have shape {actions.shape}; {rows} observations need ({rows},)")
+    if rows and actions.dtype.kind not in "iu":
+        raise TypeError(
+            f"actions have dtype {actions.dtype}; they must be integer indices "
+            "(IntervalActions.encode turns numbers into them)"
+        )
+    wrong = np.flatnonzero((actions < -1) | (actions >= n_actions))
+    if len(wrong):
+        raise ValueError(
+            f"action in row {wrong[0]} is {actions[wrong[0]]}; "
+            f"there are actions 0 to {n_actions - 1}, and -1 for none"
+        )
+    return actions.astype(np.int64)
+
+
+def check_starts(episode_starts: ArrayLike, rows: int) -> NDArray[np.bool_]:
+    """Mark the rows at which an episode begins."""
+    given = np.asarray(episode_starts)
+    if given.size and given.dtype.kind not in "iu":
+        raise TypeError(f"episode_starts has dtype {given.dtype}; it must hold row numbers")
+    wrong = given[(given < 0) | (given >= rows)]
+    if wrong.size:
+        raise ValueError(f"episode_starts names row {wrong[0]}, but there are {rows} rows")
+    starts = np.zeros(rows, np.bool_)
+    starts[given.astype(np.int64)] = True
+    return starts
