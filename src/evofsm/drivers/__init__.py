@@ -1,0 +1,1 @@
+"""Car-following models: each a compiled kernel, and a controller around it."""

@@ -1,0 +1,50 @@
+"""The form in which a compiled world takes a driver: a kernel and its table of parameters."""
+
+from __future__ import annotations
+
+from typing import Protocol, runtime_checkable
+
+import numba
+import numpy as np
+from numba import types
+from numpy.typing import NDArray
+
+#: ``kernel(parameters, time, gap, speed, leader_speed) -> acceleration``
+DRIVER_KERNEL = types.float64(
+    types.float64[:, ::1], types.float64, types.float64, types.float64, types.float64
+)
+
+#: Decorator for such a kernel. It has a fixed signature, and so can be passed as a value.
+driver_kernel = numba.njit([DRIVER_KERNEL], cache=True, error_model="numpy")
+
+
+class Kernel(Protocol):
+    """A compiled function from a situation to an acceleration."""
+
+    def __call__(
+        self,
+        parameters: NDArray[np.float64],
+        time: float,
+        gap: float,
+        speed: float,
+        leader_speed: float,
+        /,
+    ) -> float:
+        """Acceleration [m/s²]."""
+        ...
+
+
+@runtime_checkable
+class CompiledController(Protocol):
+    """A controller whose decisions a compiled world can take without calling Python."""
+
+    kernel: Kernel
+
+    @property
+    def parameters(self) -> NDArray[np.float64]:
+        """(rows, columns) ndarray, given to the kernel at every step."""
+        ...
+
+    def propose(self, time: float, observation: NDArray[np.float64]) -> float:
+        """As `evofsm.protocols.Controller`, with the same result as the kernel."""
+        ...

@@ -1,0 +1,1 @@
+"""How dangerous a situation is: dead ends, and the measures in use today."""

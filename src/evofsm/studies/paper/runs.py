@@ -1,0 +1,131 @@
+"""The runs: drive each case as often as asked, and show every row to one machine."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evofsm.divergence import jensen_shannon
+from evofsm.machine import EvolvingFSM
+from evofsm.model import FSMModel
+from evofsm.studies.paper.settings import Settings
+from evofsm.worlds.episode import UNITS, VARIABLES, Episode, World
+
+CASES = (1, 2, 3, 4)
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """One run of a case, and what the machine made of each row."""
+
+    name: str
+    case: int
+    round: int  #: from 1; 0 for an extra run
+    episode: Episode
+    action: NDArray[np.int64]  #: (T,) index of the action commanded after each row
+    state: NDArray[np.int64]  #: (T,) index of the most probable state
+    n_states: NDArray[np.int64]  #: (T,) number of states
+    belief: NDArray[np.float64]  #: (T, n)
+    surprise: NDArray[np.float64]  #: (T,) [bit]
+    first_surprise: float  #: of the first row, against the uniform belief and marginal matrix [bit]
+
+
+@dataclass(frozen=True, eq=False)
+class PaperStudy:
+    """The runs in the order in which they were learnt, and what follows from them."""
+
+    world: str
+    settings: Settings
+    runs: tuple[Run, ...]
+    extra_runs: tuple[Run, ...]
+    safe_at_the_end: Mapping[int, bool]  #: whether the longer runs of cases 2 and 3 stay safe
+    model: FSMModel
+    dead_end: int  #: index of the state that stands at most collisions; -1 without collisions
+
+    @property
+    def last_round(self) -> tuple[Run, ...]:
+        """The last run of each case."""
+        return self.runs[-len(CASES) :]
+
+
+def run_paper(
+    world: World,
+    name: str,
+    settings: Settings,
+    rounds: int = 20,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> PaperStudy:
+    """Drive and learn all runs.
+
+    Parameters
+    ----------
+    world : World
+        Where to drive.
+    name : str
+        What to call it.
+    settings : Settings
+        ``Settings.load()`` for the paper's.
+    rounds : int
+        How often the four cases are driven.
+    progress : callable
+        Told how many runs are done, of how many.
+    """
+    if rounds < 1:
+        raise ValueError(f"rounds is {rounds}; the cases must be driven at least once")
+    machine = EvolvingFSM(settings.actions.n_actions, **settings.machine)
+    longer = replace(settings.scenario, duration=settings.safe_until)
+    total = rounds * len(CASES) + len(settings.brake_at) + 2
+    runs: list[Run] = []
+    for round_ in range(1, rounds + 1):
+        for case in CASES:
+            episode = world.run(settings.scenario, settings.drivers[case])
+            runs.append(_learn(machine, settings, f"case {case}", case, round_, episode))
+            progress(len(runs), total)
+    extra_runs = []
+    for time in settings.brake_at:
+        leader = replace(settings.scenario.leader, brake_time=time)
+        episode = world.run(replace(settings.scenario, leader=leader), settings.drivers[1])
+        name_ = f"brake at {time:g} s"
+        extra_runs.append(_learn(machine.copy(), settings, name_, 1, 0, episode))
+        progress(len(runs) + len(extra_runs), total)
+    safe = {case: not world.run(longer, settings.drivers[case]).collided for case in (2, 3)}
+    progress(total, total)
+    at_collisions = [run.state[-1] for run in runs if run.episode.collided]
+    return PaperStudy(
+        world=name,
+        settings=settings,
+        runs=tuple(runs),
+        extra_runs=tuple(extra_runs),
+        safe_at_the_end=safe,
+        model=machine.model(
+            actions=settings.actions, names=VARIABLES, units=UNITS, dt=settings.scenario.dt
+        ),
+        dead_end=int(np.bincount(at_collisions).argmax()) if at_collisions else -1,
+    )
+
+
+def _learn(
+    machine: EvolvingFSM, settings: Settings, name: str, case: int, round_: int, episode: Episode
+) -> Run:
+    """Show a run to the machine, row by row."""
+    n = machine.n_states
+    foreseen = np.full(n, 1.0 / n) @ machine.marginal_matrix if n else np.empty(0)
+    action = settings.actions.encode(episode.accelerations)
+    trace = machine.learn_many(episode.observations, action, episode_starts=[0], belief=True)
+    assert trace.belief is not None
+    first = float(jensen_shannon(foreseen, trace.belief[0, :n])) if n else float("nan")
+    return Run(
+        name=name,
+        case=case,
+        round=round_,
+        episode=episode,
+        action=action,
+        state=trace.state,
+        n_states=trace.n_states,
+        belief=trace.belief,
+        surprise=trace.surprise,
+        first_surprise=first,
+    )

@@ -1,0 +1,85 @@
+"""What the study is told: the paper's settings, and how a file changes them."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+from evofsm.actions import IntervalActions
+from evofsm.drivers.idm import IDM, ChangingIDM
+from evofsm.protocols import Controller
+from evofsm.worlds.scenario import Leader, Scenario
+
+
+@dataclass(frozen=True)
+class Settings:
+    """All that the study can be told; the defaults stand, with comments, in ``settings.toml``."""
+
+    scenario: Scenario
+    safe_until: float
+    drivers: Mapping[int, Controller]  #: by case
+    switch_at: Mapping[int, float]  #: when the driver changes, by case
+    brake_at: tuple[float, ...]
+    decel: float  #: hardest braking of the follower [m/s²], positive
+    machine: Mapping[str, float]
+    actions: IntervalActions
+
+    @classmethod
+    def load(cls, path: Path | None = None) -> Settings:
+        """Read the paper's settings, with those of a TOML file in their place where it has any.
+
+        Raises
+        ------
+        ValueError
+            If the file is not TOML, or holds a name or a kind of value that the study does not
+            know.
+        """
+        tables = tomllib.loads(files(__package__).joinpath("settings.toml").read_text("utf-8"))
+        if path is not None:
+            try:
+                changes = tomllib.loads(path.read_text("utf-8"))
+            except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+                raise ValueError(f"{path} is not TOML: {error}") from error
+            _merge(tables, changes, str(path))
+        scenario, leader, cases = tables["scenario"], tables["leader"], tables["cases"]
+        safe_until = scenario.pop("safe_until")
+        brake = {name: leader.pop(name) for name in ("brake_speed", "brake_decel")}
+        aggressive, normal = IDM(**tables["aggressive"]), IDM(**tables["normal"])
+        to_normal, to_aggressive = cases["to_normal_at"], cases["to_aggressive_at"]
+        return cls(
+            scenario=Scenario(Leader(IDM(**leader), **brake), **scenario),
+            safe_until=safe_until,
+            drivers={
+                1: aggressive,
+                2: normal,
+                3: ChangingIDM(aggressive, normal, at=to_normal),
+                4: ChangingIDM(normal, aggressive, at=to_aggressive),
+            },
+            switch_at={3: to_normal, 4: to_aggressive},
+            brake_at=tuple(cases["brake_at"]),
+            decel=-min(aggressive.lowest, normal.lowest),
+            machine=tables["machine"],
+            actions=IntervalActions(**tables["actions"], outside="clip"),
+        )
+
+
+def _merge(known: dict[str, Any], changes: Mapping[str, Any], where: str) -> None:
+    """Put changes in the place of known values of the same kind."""
+    for name, value in changes.items():
+        if name not in known:
+            raise ValueError(f"{where}: there is no {name!r}; known are {', '.join(known)}")
+        if isinstance(known[name], dict) and isinstance(value, dict):
+            _merge(known[name], value, f"{where}, [{name}]")
+        elif isinstance(known[name], list) == isinstance(value, list) and _is_number(value):
+            known[name] = value
+        else:
+            raise ValueError(f"{where}: {name} is {value!r}; it must be like {known[name]!r}")
+
+
+def _is_number(value: Any) -> bool:
+    values = value if isinstance(value, list) else [value]
+    return all(isinstance(one, int | float) and not isinstance(one, bool) for one in values)
