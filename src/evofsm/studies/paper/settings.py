@@ -72,14 +72,22 @@ def _merge(known: dict[str, Any], changes: Mapping[str, Any], where: str) -> Non
     for name, value in changes.items():
         if name not in known:
             raise ValueError(f"{where}: there is no {name!r}; known are {', '.join(known)}")
-        if isinstance(known[name], dict) and isinstance(value, dict):
-            _merge(known[name], value, f"{where}, [{name}]")
-        elif isinstance(known[name], list) == isinstance(value, list) and _is_number(value):
-            known[name] = value
-        else:
+        if _kind(value) != _kind(known[name]):
             raise ValueError(f"{where}: {name} is {value!r}; it must be like {known[name]!r}")
+        if isinstance(value, dict):
+            _merge(known[name], value, f"{where}, [{name}]")
+        else:
+            known[name] = value
 
 
-def _is_number(value: Any) -> bool:
-    values = value if isinstance(value, list) else [value]
-    return all(isinstance(one, int | float) and not isinstance(one, bool) for one in values)
+def _kind(value: Any) -> str:
+    match value:
+        case dict():
+            return "table"
+        case str():
+            return "text"
+        case list() if all(_kind(item) == "number" for item in value):
+            return "numbers"
+        case int() | float() if not isinstance(value, bool):
+            return "number"
+    return "other"

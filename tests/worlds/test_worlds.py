@@ -1,0 +1,141 @@
+import math
+from dataclasses import replace
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+
+from evofsm.drivers.idm import IDM
+from evofsm.studies.paper import CASES, Settings
+from evofsm.worlds.kinematic import KinematicWorld
+from evofsm.worlds.scenario import Leader, Scenario
+from evofsm.worlds.sumo import SumoWorld
+
+pytest.importorskip("libsumo")
+
+SETTINGS = Settings.load()
+GOLDEN = Path(__file__).parents[1] / "golden" / "paper_four_runs.npz"
+
+
+@pytest.fixture(scope="module")
+def sumo():
+    with SumoWorld() as world:
+        yield world
+
+
+@pytest.fixture(scope="module")
+def in_both(sumo):
+    """The four cases, driven in SUMO and in closed form."""
+    return {
+        case: (
+            sumo.run(SETTINGS.scenario, SETTINGS.drivers[case]),
+            KinematicWorld().run(SETTINGS.scenario, SETTINGS.drivers[case]),
+        )
+        for case in CASES
+    }
+
+
+class Plain:
+    """A controller without a kernel."""
+
+    def __init__(self, propose):
+        self.propose = propose
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_both_worlds_agree_at_every_step(in_both, case):
+    in_sumo, in_closed_form = in_both[case]
+    assert in_sumo.observations.shape == in_closed_form.observations.shape
+    assert np.abs(in_sumo.observations - in_closed_form.observations).max() < 1e-9
+    assert np.abs(in_sumo.accelerations - in_closed_form.accelerations).max() < 1e-9
+
+
+def test_the_closed_form_drives_the_golden_runs(in_both):
+    golden = np.load(GOLDEN)["observations"]
+    driven = np.concatenate([in_both[case][1].observations for case in CASES])
+    assert np.abs(driven - golden).max() < 1e-9
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_sumo_carries_out_every_acceleration_exactly(in_both, case):
+    episode = in_both[case][0]
+    speed = episode.observations[:, 1]
+    wanted = np.maximum(0.0, speed[:-1] + episode.accelerations[:-1] * SETTINGS.scenario.dt)
+    assert np.abs(speed[1:] - wanted).max() < 1e-12
+
+
+def test_sumo_itself_reports_the_collision_at_the_last_step(tmp_path, in_both):
+    # `in_both` is asked for so that its simulation is known to this test, and closed by it.
+    report = tmp_path / "collisions.xml"
+    episode = in_both[1][0]
+    import libsumo
+
+    libsumo.close()
+    with SumoWorld(("--collision-output", str(report))) as world:
+        again = world.run(SETTINGS.scenario, SETTINGS.drivers[1])
+    assert np.array_equal(again.observations, episode.observations)
+    collisions = ElementTree.parse(report).getroot().findall("collision")
+    assert len(collisions) == 1
+    assert float(collisions[0].get("time")) == episode.time[-1]
+
+
+def test_a_second_simulation_in_the_process_is_refused():
+    with SumoWorld() as first:
+        first.run(replace(SETTINGS.scenario, duration=0.1), SETTINGS.drivers[2])
+        with pytest.raises(RuntimeError, match="another process"):
+            SumoWorld().run(SETTINGS.scenario, SETTINGS.drivers[2])
+    with SumoWorld() as after:
+        assert len(after.run(replace(SETTINGS.scenario, duration=0.1), SETTINGS.drivers[2]).time)
+
+
+def test_a_world_changes_its_step_between_runs():
+    with SumoWorld() as world:
+        for dt in (0.01, 0.1):
+            scenario = replace(SETTINGS.scenario, dt=dt, duration=2.0)
+            episode = world.run(scenario, SETTINGS.drivers[1])
+            closed_form = KinematicWorld().run(scenario, SETTINGS.drivers[1])
+            assert np.abs(episode.observations - closed_form.observations).max() < 1e-9
+
+
+def test_a_controller_in_python_drives_as_its_kernel_would():
+    driver = SETTINGS.drivers[3]
+    compiled = KinematicWorld().run(SETTINGS.scenario, driver)
+    stepped = KinematicWorld().run(SETTINGS.scenario, Plain(driver.propose))
+    assert np.array_equal(compiled.observations, stepped.observations)
+    assert np.array_equal(compiled.accelerations, stepped.accelerations)
+    assert np.array_equal(compiled.leader_accelerations, stepped.leader_accelerations)
+
+
+def test_the_run_ends_with_the_first_row_whose_gap_is_zero_or_less(in_both):
+    gap = in_both[4][1].observations[:, 0]
+    assert gap[-1] <= 0.0 < gap[-2]
+    assert in_both[4][1].collided
+    assert not in_both[2][1].collided
+    assert len(in_both[2][1].time) == 3500
+
+
+def test_the_leader_brakes_once_in_full_from_the_time_it_is_told():
+    leader = Leader(IDM(1.2, 25.0, 1.0, 1.0, 2.5), brake_decel=9.0, brake_time=0.07)
+    episode = KinematicWorld().run(Scenario(leader, initial_gap=50.0), SETTINGS.drivers[2])
+    braking = episode.leader_accelerations == -9.0
+    assert np.array_equal(braking, np.arange(len(braking)) >= 7)
+    assert (np.diff(episode.observations[8:, 2]) <= 0.0).all()
+    assert episode.observations[-1, 2] == 0.0
+
+
+def test_nobody_drives_backwards():
+    episode = KinematicWorld().run(SETTINGS.scenario, Plain(lambda time, z: -2.0))
+    assert (episode.observations[:, 1] == 0.0).all()
+
+
+@pytest.mark.parametrize("wrong", [math.nan, math.inf])
+def test_a_controller_that_proposes_no_number_is_named(wrong):
+    with pytest.raises(ValueError, match="controller proposed"):
+        KinematicWorld().run(SETTINGS.scenario, Plain(lambda time, z: wrong))
+
+
+@pytest.mark.parametrize("name", ["initial_gap", "duration", "dt"])
+def test_an_impossible_scenario_is_refused_by_name(name):
+    with pytest.raises(ValueError, match=name):
+        replace(SETTINGS.scenario, **{name: 0.0})
