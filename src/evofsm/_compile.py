@@ -32,7 +32,7 @@ def _drop_stale_caches(package: Path) -> None:
     Numba compares a cached kernel with the file it stands in only, not with the files of the
     kernels it calls, so editing one of those would silently leave the old code running.
     """
-    caches = {path: path.stat().st_mtime for path in package.rglob("__pycache__/*.nbi")}
+    caches = {path: path.stat().st_mtime for path in package.rglob("__pycache__/*.nb[ic]")}
     sources = {path.parent.parent / f"{path.name.split('.')[0]}.py" for path in caches}
     sources.add(Path(__file__))
     newest = max(path.stat().st_mtime for path in sources if path.exists())
