@@ -54,6 +54,7 @@ class IntervalActions:
         for name in ("low", "high", "width"):
             if not math.isfinite(getattr(self, name)):
                 raise ValueError(f"{name} is {getattr(self, name)}; it must be finite")
+            object.__setattr__(self, name, float(getattr(self, name)))
         if not self.low < self.high:
             raise ValueError(f"low is {self.low} and high is {self.high}; low must be below high")
         if not self.width > 0.0:
@@ -62,6 +63,11 @@ class IntervalActions:
             raise ValueError(f"closed is {self.closed!r}; it must be 'left' or 'right'")
         if self.outside not in ("error", "clip"):
             raise ValueError(f"outside is {self.outside!r}; it must be 'error' or 'clip'")
+        if not (np.diff(self.edges) > 0.0).all():
+            raise ValueError(
+                f"width is {self.width}, but edges are rounded to {_DIGITS} decimals and then "
+                "coincide; use a larger unit"
+            )
 
     @property
     def n_actions(self) -> int:

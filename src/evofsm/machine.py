@@ -91,6 +91,8 @@ def _step(memory: Memory) -> tuple[int, int, float]:
     n = int(now.n_states[0])
     if n == len(now.belief):
         return _FULL, 0, np.nan
+    if len(scratch.observation) == 0:
+        return _REFUSED, 0, np.nan
     for value in scratch.observation:
         if not abs(value) <= LARGEST_OBSERVATION:  # also true of NaN
             return _REFUSED, 0, np.nan
@@ -215,15 +217,16 @@ class EvolvingFSM:
         prior_frequency: float = 1e-3,
         spread: float = 3.0,
     ) -> None:
-        self.n_actions = whole("n_actions", n_actions)
-        self.radius = positive("radius", radius)
-        self.distance_weight = positive("distance_weight", distance_weight)
-        self.learning_rate = positive("learning_rate", learning_rate)
-        self.prior_frequency = positive("prior_frequency", prior_frequency)
-        self.spread = positive("spread", spread)
-        if self.learning_rate >= 1.0:
+        parameters = Parameters(
+            positive("radius", radius),
+            positive("distance_weight", distance_weight),
+            positive("learning_rate", learning_rate),
+            positive("prior_frequency", prior_frequency),
+            positive("spread", spread),
+        )
+        if parameters.learning_rate >= 1.0:
             raise ValueError(f"learning_rate is {learning_rate}; it must lie below 1")
-        self._use(self._allocate(0))
+        self._use(allocate(0, whole("n_actions", n_actions), _FIRST_CAPACITY, parameters))
 
     @classmethod
     def paper(cls) -> Self:
@@ -272,7 +275,7 @@ prior_frequency=0.001, spread=3.0)
         scratch.observation[:] = z
         event, state, surprise = _observe(self._buffer)
         if event == _REFUSED:
-            refuse_unusable("observation", np.asarray(z))
+            refuse_unusable("observation", real_array("observation", z, ndim=1))
         if event == _FULL:
             self._grow()
             return self.observe(z)
@@ -405,6 +408,38 @@ prior_frequency=0.001, spread=3.0)
             self._matrices, self._memory.learnt.transitions.uses, self.belief, i, horizon, policy
         )
 
+    # -- What it was told -----------------------------------------------------------------------
+
+    @property
+    def n_actions(self) -> int:
+        """Number q of actions."""
+        return len(self._memory.learnt.transitions.uses)
+
+    @property
+    def radius(self) -> float:
+        """The paper's epsilon."""
+        return self._memory.parameters.radius
+
+    @property
+    def distance_weight(self) -> float:
+        """The paper's rho."""
+        return self._memory.parameters.distance_weight
+
+    @property
+    def learning_rate(self) -> float:
+        """The paper's phi."""
+        return self._memory.parameters.learning_rate
+
+    @property
+    def prior_frequency(self) -> float:
+        """The paper's epsilon-bar."""
+        return self._memory.parameters.prior_frequency
+
+    @property
+    def spread(self) -> float:
+        """Width of recognition, in total variances of all observations."""
+        return self._memory.parameters.spread
+
     # -- What it knows --------------------------------------------------------------------------
 
     @property
@@ -517,7 +552,7 @@ prior_frequency=0.001, spread=3.0)
         with storage.explained(path):
             machine = cls(**settings)
             m, n = arrays["centers"].shape
-            buffer = allocate(m, machine.n_actions, n, machine._parameters)
+            buffer = allocate(m, machine.n_actions, n, machine._memory.parameters)
             for name, array in leaves(view(buffer).learnt):
                 if arrays[name].shape != array.shape:
                     raise ValueError(f"{name} has shape {arrays[name].shape}, not {array.shape}")
@@ -544,14 +579,7 @@ prior_frequency=0.001, spread=3.0)
     # -- Inside ---------------------------------------------------------------------------------
 
     def _settings(self) -> dict[str, Any]:
-        return {"n_actions": self.n_actions, **self._parameters._asdict()}
-
-    @property
-    def _parameters(self) -> Parameters:
-        return Parameters(*(getattr(self, name) for name in Parameters._fields))
-
-    def _allocate(self, n_variables: int) -> NDArray[np.float64]:
-        return allocate(n_variables, self.n_actions, _FIRST_CAPACITY, self._parameters)
+        return {"n_actions": self.n_actions, **self._memory.parameters._asdict()}
 
     def _use(self, buffer: NDArray[np.float64]) -> None:
         self._buffer = buffer
@@ -573,7 +601,8 @@ prior_frequency=0.001, spread=3.0)
         """Settle the number of variables with the first observation, and hold to it after."""
         if self.n_states == 0:
             refuse_unusable("observation", z)
-            self._use(self._allocate(len(z)))
+            parameters = self._memory.parameters
+            self._use(allocate(len(z), self.n_actions, _FIRST_CAPACITY, parameters))
         if z.shape != self._memory.scratch.observation.shape:
             raise ValueError(
                 f"observation has {len(z)} variables, but this machine was started with "

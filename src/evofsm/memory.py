@@ -61,7 +61,9 @@ class Memory(NamedTuple):
 def _open_memory(buffer: NDArray[np.float64]) -> Memory:
     """Views into a buffer made by `allocate`; compiled for kernels as `open_memory`."""
     m, q, capacity = int(buffer[0]), int(buffer[1]), int(buffer[2])
-    parameters = Parameters(buffer[3], buffer[4], buffer[5], buffer[6], buffer[7])
+    parameters = Parameters(
+        float(buffer[3]), float(buffer[4]), float(buffer[5]), float(buffer[6]), float(buffer[7])
+    )
     counters = buffer[8:14]
     per_variable = buffer[14 : 14 + 3 * m].reshape((3, m))
     start = 14 + 3 * m

@@ -15,6 +15,7 @@ from evofsm.actions import IntervalActions
 from evofsm.states.ets import measure_distances
 from evofsm.states.spread import recognise
 from evofsm.transitions import Policy, marginal, propagate
+from evofsm.validation import check_action, positive, refuse_unusable
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,6 +58,8 @@ class FSMModel:
         for name in ("names", "units"):
             if len(getattr(self, name)) not in (0, m):
                 raise ValueError(f"{name} are {getattr(self, name)}, but there are {m} variables")
+        if self.dt is not None:
+            object.__setattr__(self, "dt", positive("dt", self.dt))
         if self.actions is not None and self.actions.n_actions != q:
             raise ValueError(f"actions has {self.actions.n_actions} intervals for {q} matrices")
 
@@ -90,12 +93,12 @@ class FSMModel:
         rows = np.atleast_2d(given)
         if rows.ndim != 2 or rows.shape[1] != self.n_variables:
             raise ValueError(f"z has shape {given.shape}; a row needs {self.n_variables} variables")
-        if not np.isfinite(rows).all():
-            raise ValueError("z holds NaN or infinity; it cannot be recognised")
+        refuse_unusable("z", rows)
         if self.n_states == 0:
             raise ValueError("this model has no states: its machine had observed nothing")
         belief = np.empty((len(rows), self.n_states))
-        _recognise_rows(np.ascontiguousarray(self.centers.T), rows.copy(), self.width, belief)
+        centers = np.ascontiguousarray(self.centers.T)
+        _recognise_rows(centers, rows.copy(), self.width, np.empty(self.n_states), belief)
         return belief if given.ndim == 2 else belief[0]
 
     def propagate(
@@ -128,8 +131,12 @@ class FSMModel:
             raise ValueError(
                 f"belief has shape {start.shape}; the model has {self.n_states} states"
             )
-        if action is not None and not 0 <= action < self.n_actions:
-            raise ValueError(f"action is {action}; the model has actions 0 to {self.n_actions - 1}")
+        if not ((start >= 0.0).all() and abs(start.sum() - 1.0) < 1e-6):
+            raise ValueError(
+                "belief is no distribution: its entries must be 0 or more and sum to 1"
+            )
+        if action is not None:
+            action = check_action(action, self.n_actions)
         return propagate(self.transition_matrices, self.uses, start, action, horizon, policy)
 
     def marginal_matrix(self, policy: Policy = "marginal") -> NDArray[np.float64]:
@@ -208,10 +215,10 @@ def _recognise_rows(
     centers: NDArray[np.float64],
     rows: NDArray[np.float64],
     width: float,
+    squared_distances: NDArray[np.float64],
     belief: NDArray[np.float64],
 ) -> None:
-    n = centers.shape[1]
-    squared_distances = np.empty(n)
+    n = len(squared_distances)
     for row in range(len(rows)):
         measure_distances(centers, n, rows[row], squared_distances)
         recognise(squared_distances, n, width, belief[row])

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import json
 import os
-import tempfile
 import zipfile
+import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -20,6 +20,18 @@ from numpy.typing import NDArray
 
 _FORMAT = "evofsm"
 _VERSION = 1
+# What reading a damaged archive may run into (OSError: a place before its beginning;
+# RuntimeError: a flag that says it is encrypted).
+_DAMAGE = (
+    ValueError,
+    KeyError,
+    TypeError,
+    EOFError,
+    OSError,
+    RuntimeError,
+    zlib.error,
+    zipfile.BadZipFile,
+)
 
 
 def write(
@@ -34,17 +46,16 @@ def write(
     target = Path(path)
     if not target.parent.is_dir():
         raise FileNotFoundError(f"{target}: there is no folder {target.parent}")
-    with tempfile.NamedTemporaryFile(dir=target.parent, delete=False) as file:
-        temporary = Path(file.name)
-        try:
+    temporary = target.with_name(f".{target.name}.{os.getpid()}.part")
+    try:
+        with open(temporary, "wb") as file:
             np.savez_compressed(file, allow_pickle=False, header=encoded, **arrays)
             file.flush()
             os.fsync(file.fileno())
-            temporary.chmod(0o644)
-            temporary.replace(target)
-        except BaseException:
-            temporary.unlink(missing_ok=True)
-            raise
+        temporary.replace(target)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
 
 
 def kind_of(path: str | os.PathLike[str]) -> str:
@@ -63,20 +74,29 @@ def read(path: str | os.PathLike[str], kind: str) -> tuple[dict[str, Any], dict[
 def _read(path: str | os.PathLike[str]) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
     with explained(path):
         with open(path, "rb") as file:
-            if not zipfile.is_zipfile(file):
+            if file.read(4) != b"PK\x03\x04" or not zipfile.is_zipfile(file):
                 raise ValueError("it is not a ZIP archive, or was cut off")
             file.seek(0)
             with np.load(file, allow_pickle=False) as archive:
                 arrays = {name: archive[name] for name in archive.files}
-        header = json.loads(arrays.pop("header").tobytes())
-        if header["format"] != _FORMAT:
-            raise ValueError("it is another program's file")
-        if header["version"] > _VERSION:
-            raise ValueError(
-                f"its version {header['version']} is newer than this library's {_VERSION}; "
-                "a newer evofsm reads it"
-            )
+        header = _header(arrays.pop("header", None))
     return header, arrays
+
+
+def _header(encoded: Any) -> dict[str, Any]:
+    if not isinstance(encoded, np.ndarray):
+        raise ValueError("it has no header, so it is another program's file")
+    header = json.loads(encoded.tobytes())
+    if not isinstance(header, dict) or header.get("format") != _FORMAT:
+        raise ValueError("its header is another program's")
+    if header["version"] > _VERSION:
+        raise ValueError(
+            f"its version {header['version']} is newer than this library's {_VERSION}; "
+            "a newer evofsm reads it"
+        )
+    if not {"kind", "content"} <= set(header):
+        raise ValueError("its header lacks what it holds")
+    return header
 
 
 @contextmanager
@@ -84,7 +104,7 @@ def explained(path: str | os.PathLike[str]) -> Iterator[None]:
     """Turn whatever reading a damaged file runs into into one error that names the file."""
     try:
         yield
-    except OSError:
-        raise
-    except (ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
+    except _DAMAGE as error:
+        if isinstance(error, OSError) and error.filename is not None:
+            raise  # no such file, no permission: the system's own words say it best
         raise ValueError(f"{os.fspath(path)} cannot be read as an evofsm file: {error}") from error

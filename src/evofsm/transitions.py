@@ -98,6 +98,8 @@ def marginal(
     matrices: NDArray[np.float64], uses: NDArray[np.float64], policy: Policy = "marginal"
 ) -> NDArray[np.float64]:
     """Average the (q, n, n) matrices: over all actions alike, or as often as each was used."""
+    if policy not in ("marginal", "observed"):
+        raise ValueError(f"policy is {policy!r}; an average is 'marginal' or 'observed'")
     if policy == "observed" and uses.sum() > 0.0:
         mixed: NDArray[np.float64] = np.tensordot(uses / uses.sum(), matrices, axes=1)
         return mixed

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import operator
-from typing import SupportsFloat, SupportsIndex
+from typing import Any, SupportsFloat, SupportsIndex
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -15,7 +15,7 @@ LARGEST_OBSERVATION = 1e100
 def positive(name: str, value: SupportsFloat) -> float:
     """A positive, finite number."""
     try:
-        number = float(value)
+        number = float("nan") if isinstance(value, str) else float(value)
     except (TypeError, ValueError):
         number = float("nan")
     if not 0.0 < number < float("inf"):
@@ -36,10 +36,7 @@ def whole(name: str, value: SupportsIndex) -> int:
 
 def real_array(name: str, values: ArrayLike, ndim: int) -> NDArray[np.float64]:
     """A new array of real numbers with ``ndim`` axes, the last one not empty."""
-    try:
-        array = np.asarray(values)
-    except ValueError:
-        raise ValueError(f"{name}: rows have different lengths") from None
+    array = _array(name, values)
     if array.dtype.kind not in "fiub":
         raise TypeError(
             f"{name} has dtype {array.dtype}; it must hold real numbers "
@@ -51,6 +48,13 @@ def real_array(name: str, values: ArrayLike, ndim: int) -> NDArray[np.float64]:
     return array.astype(np.float64)
 
 
+def _array(name: str, values: ArrayLike) -> NDArray[Any]:
+    try:
+        return np.asarray(values)
+    except ValueError:
+        raise ValueError(f"{name}: rows have different lengths") from None
+
+
 def refuse_unusable(name: str, values: NDArray[np.float64]) -> None:
     """Raise for the first entry that is not finite, or too large."""
     usable = np.abs(values) <= LARGEST_OBSERVATION
@@ -58,7 +62,7 @@ def refuse_unusable(name: str, values: NDArray[np.float64]) -> None:
         place = tuple(int(k) for k in np.argwhere(~usable)[0])
         where = f"row {place[0]}, variable {place[1]}" if len(place) > 1 else f"variable {place[0]}"
         raise ValueError(
-            f"{name}, {where}: {values[place]} cannot be learnt; every entry must be finite "
+            f"{name}, {where}: {values[place]} cannot be used; every entry must be finite "
             f"and at most {LARGEST_OBSERVATION:g} in size (a missing sensor value?)"
         )
 
@@ -79,7 +83,7 @@ def check_action(i: SupportsIndex, n_actions: int) -> int:
 
 def check_actions(indices: ArrayLike, rows: int, n_actions: int) -> NDArray[np.int64]:
     """An index for each row, or -1 for none."""
-    actions = np.asarray(indices)
+    actions = _array("actions", indices)
     if actions.shape != (rows,):
         raise ValueError(f"actions have shape {actions.shape}; {rows} observations need ({rows},)")
     if rows and actions.dtype.kind not in "iu":
@@ -98,7 +102,7 @@ def check_actions(indices: ArrayLike, rows: int, n_actions: int) -> NDArray[np.i
 
 def check_starts(episode_starts: ArrayLike, rows: int) -> NDArray[np.bool_]:
     """Mark the rows at which an episode begins."""
-    given = np.asarray(episode_starts)
+    given = _array("episode_starts", episode_starts)
     if given.size and given.dtype.kind not in "iu":
         raise TypeError(f"episode_starts has dtype {given.dtype}; it must hold row numbers")
     wrong = given[(given < 0) | (given >= rows)]

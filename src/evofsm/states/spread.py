@@ -12,7 +12,7 @@ from evofsm.states.ets import nearest_center
 
 # Below exp(-690) a belief is taken as 0: smaller numbers are denormal and slow every sum.
 _LOWEST_EXPONENT = -690.0
-# Leaves of any positive distance nothing, and of 0 everything.
+# In place of 1 / width where that would overflow: only the nearest centres keep a belief.
 _SHARPEST = 1e300
 
 
@@ -28,7 +28,7 @@ def recognise(
     """
     nearest = nearest_center(squared_distances, n)
     smallest = squared_distances[nearest]
-    scale = 1.0 / width if width > 0.0 else _SHARPEST
+    scale = 1.0 / width if width * _SHARPEST > 1.0 else _SHARPEST
     total = 0.0
     for i in range(n):
         exponent = (smallest - squared_distances[i]) * scale

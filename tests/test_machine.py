@@ -1,0 +1,300 @@
+import copy
+
+import numpy as np
+import pytest
+
+from evofsm import Event, EvolvingFSM
+
+LEARNT = (
+    "n_states",
+    "state",
+    "centers",
+    "potentials",
+    "transition_matrices",
+    "origin_frequency",
+    "belief",
+)
+
+
+def new_machine():
+    return EvolvingFSM(n_actions=3, radius=0.01)
+
+
+def learn_in_a_loop(machine, Z, I, starts=()):
+    """What `learn_many` does, with `observe` and `act`; answers the steps."""
+    steps = []
+    for row, (z, i) in enumerate(zip(Z, I, strict=True)):
+        if row in starts:
+            machine.start_episode()
+        steps.append(machine.observe(z))
+        if i >= 0:
+            machine.act(i)
+    return steps
+
+
+def assert_same_trace(trace, steps, n_states):
+    assert trace.state.tolist() == [s.state for s in steps]
+    assert trace.n_states.tolist() == [len(s.belief) for s in steps]
+    assert trace.event.tolist() == [s.event for s in steps]
+    assert trace.surprise.tobytes() == np.array([s.surprise for s in steps]).tobytes()
+    if trace.belief is not None:
+        padded = [np.pad(s.belief, (0, n_states - len(s.belief))) for s in steps]
+        assert trace.belief.tobytes() == np.array(padded).tobytes()
+
+
+@pytest.fixture(scope="module")
+def stream(spiral):
+    """120 rows that found more than 32 states, in three episodes, some rows without action."""
+    rng = np.random.default_rng(1)
+    return spiral(120), rng.integers(-1, 3, 120), [0, 41, 90]
+
+
+# -- A batch and a loop ------------------------------------------------------------------------
+
+
+def test_a_batch_learns_bit_for_bit_what_the_loop_learns(stream, snapshot):
+    loop, batch = new_machine(), new_machine()
+    steps = learn_in_a_loop(loop, *stream)
+    trace = batch.learn_many(*stream, belief=True)
+    assert loop.n_states > 32
+    assert_same_trace(trace, steps, loop.n_states)
+    assert snapshot(batch) == snapshot(loop)
+
+
+@pytest.mark.parametrize("cuts", [[1], [41], [40, 41, 42], [7, 60, 61, 119]])
+def test_a_batch_may_be_split_anywhere(stream, snapshot, cuts):
+    Z, I, starts = stream
+    whole, split = new_machine(), new_machine()
+    expected = whole.learn_many(Z, I, starts)
+    parts = []
+    for a, b in zip([0, *cuts], [*cuts, len(Z)], strict=True):
+        parts.append(split.learn_many(Z[a:b], I[a:b], [s - a for s in starts if a <= s < b]))
+    for name in ("state", "n_states", "event", "surprise"):
+        joined = np.concatenate([getattr(part, name) for part in parts])
+        assert joined.tobytes() == getattr(expected, name).tobytes()
+    assert snapshot(split) == snapshot(whole)
+
+
+def test_loops_and_batches_may_alternate(stream, snapshot):
+    Z, I, _ = stream
+    batch, mixed = new_machine(), new_machine()
+    batch.learn_many(Z, I)
+    learn_in_a_loop(mixed, Z[:30], I[:30])
+    mixed.learn_many(Z[30:77], I[30:77])
+    learn_in_a_loop(mixed, Z[77:], I[77:])
+    assert snapshot(mixed) == snapshot(batch)
+
+
+def test_without_row_0_among_the_starts_the_present_episode_goes_on(stream):
+    Z, I, _ = stream
+    machine = new_machine()
+    machine.learn_many(Z[:20], np.zeros(20, int))
+    going_on = machine.copy().learn_many(Z[20:], I[20:])
+    beginning = machine.copy().learn_many(Z[20:], I[20:], [0])
+    assert not np.isnan(going_on.surprise[0])
+    assert np.isnan(beginning.surprise[0])
+
+
+def test_a_batch_of_no_rows_changes_nothing(grown, snapshot):
+    before = snapshot(grown)
+    trace = grown.learn_many(np.empty((0, 2)), [], belief=True)
+    assert [len(column) for column in trace] == [0, 0, 0, 0, 0]
+    assert snapshot(grown) == before
+
+
+def test_a_new_machine_still_takes_any_number_of_variables_after_a_batch_of_no_rows():
+    machine = EvolvingFSM(1)
+    machine.learn_many(np.empty((0, 2)), [])
+    assert machine.observe([1.0, 2.0, 3.0]).state == 0
+
+
+def test_beliefs_are_traced_only_when_asked_for(stream):
+    assert new_machine().learn_many(*stream).belief is None
+
+
+@pytest.mark.parametrize("order", ["C", "F"])
+@pytest.mark.parametrize("dtype", [np.float64, np.float32, np.int16])
+def test_any_real_array_is_read_and_none_is_written(dtype, order, snapshot):
+    Z = np.array([[0, 4], [9, 1], [4, 3], [5, 2]], dtype=dtype, order=order)
+    Z.setflags(write=False)
+    I = np.array([0, 1, 2, 0], dtype=np.uint8)
+    I.setflags(write=False)
+    machine, expected = new_machine(), new_machine()
+    machine.learn_many(Z, I)
+    learn_in_a_loop(expected, [list(map(float, z)) for z in Z], I.tolist())
+    assert snapshot(machine) == snapshot(expected)
+
+
+# -- Actions and episodes ----------------------------------------------------------------------
+
+
+def test_a_second_act_replaces_the_first(grown, snapshot):
+    once, twice = grown.copy(), grown.copy()
+    once.act(2)
+    twice.act(0)
+    twice.act(2)
+    assert snapshot(once) == snapshot(twice)
+
+
+def test_an_action_labels_the_next_transition_and_no_other(grown):
+    grown.act(1)
+    assert not np.isnan(grown.observe([0.3, 0.1]).surprise)
+    assert np.isnan(grown.observe([0.2, 0.1]).surprise)
+
+
+def test_only_the_matrix_of_the_action_taken_learns(grown):
+    before = grown.transition_matrices
+    grown.act(1)
+    step = grown.observe(grown.centers[0])
+    assert step.event == Event.NONE
+    changed = (grown.transition_matrices != before).any(axis=(1, 2))
+    assert changed.tolist() == [False, True, False]
+
+
+def test_an_observation_without_an_action_before_it_teaches_no_transition(grown):
+    grown.start_episode()
+    grown.observe([3.0, 1.0])
+    matrices, frequency = grown.transition_matrices, grown.origin_frequency
+    step = grown.observe([3.1, 1.0])
+    assert (step.event, step.predicted.shape) == (Event.NONE, (0,))
+    assert np.isnan(step.surprise)
+    assert grown.transition_matrices.tolist() == matrices.tolist()
+    assert grown.origin_frequency.tolist() == frequency.tolist()
+
+
+def test_a_new_episode_learns_no_transition_from_the_last_one(grown):
+    matrices = grown.transition_matrices
+    grown.act(0)
+    grown.start_episode()
+    step = grown.observe(grown.centers[0])
+    assert step.event == Event.NONE
+    assert np.isnan(step.surprise)
+    assert grown.transition_matrices.tolist() == matrices.tolist()
+
+
+def test_a_new_episode_clears_the_belief_and_nothing_else(grown):
+    n = grown.n_states
+    before = {name: getattr(grown, name) for name in LEARNT}
+    grown.start_episode()
+    assert grown.belief.tolist() == [1.0 / n] * n
+    assert grown.state is None
+    for name in set(LEARNT) - {"belief", "state"}:
+        np.testing.assert_array_equal(getattr(grown, name), before[name])
+
+
+def test_states_are_determined_from_all_episodes_alike(stream):
+    Z, I, starts = stream
+    apart = new_machine().learn_many(Z, I, starts)
+    together = new_machine().learn_many(Z, I)
+    np.testing.assert_array_equal(apart.state, together.state)
+    np.testing.assert_array_equal(apart.event, together.event)
+
+
+def test_learn_one_observes_and_then_acts(snapshot):
+    one, two = new_machine(), new_machine()
+    for z, i in (([0.0], 1), ([1.0], 2), ([0.4], 0)):
+        step = one.learn_one(z, i)
+        expected = two.observe(z)
+        two.act(i)
+        assert step.belief.tolist() == expected.belief.tolist()
+        np.testing.assert_array_equal(step.surprise, expected.surprise)
+    assert snapshot(one) == snapshot(two)
+
+
+# -- What a machine shows ----------------------------------------------------------------------
+
+
+def test_a_new_machine_knows_no_state():
+    machine = new_machine()
+    assert machine.n_states == 0
+    assert machine.state is None
+    assert machine.belief.shape == machine.state_ids.shape == (0,)
+    assert machine.transition_matrices.shape == (3, 0, 0)
+
+
+def test_the_first_observation_founds_the_first_state():
+    machine = new_machine()
+    step = machine.observe([3.0, -1.0])
+    assert (step.state, step.event, step.belief.tolist()) == (0, Event.CREATED, [1.0])
+    assert machine.centers.tolist() == [[3.0, -1.0]]
+    assert machine.potentials.tolist() == [1.0]
+    assert machine.transition_matrices.tolist() == [[[1.0]]] * 3
+    assert machine.origin_frequency.tolist() == [[1e-3]] * 3
+
+
+def test_the_state_is_the_most_probable_one(stream):
+    machine = new_machine()
+    trace = machine.learn_many(*stream, belief=True)
+    assert trace.state.tolist() == trace.belief.argmax(axis=1).tolist()
+    assert machine.state == trace.state[-1]
+    assert machine.state_ids.tolist() == list(range(machine.n_states))
+
+
+def test_a_denser_observation_moves_the_nearest_state_if_closer_than_the_radius():
+    Z = [[0.0], [0.1], [2.0], [1.0]]
+    for radius, event in ((1.5, Event.MOVED), (0.5, Event.CREATED)):
+        machine = EvolvingFSM(n_actions=1, radius=radius)
+        assert machine.learn_many(Z, [0] * 4).event.tolist() == [Event.CREATED, 0, 0, event]
+        assert machine.centers[-1].tolist() == [1.0]
+
+
+def test_a_state_at_exactly_the_radius_is_not_near_enough_to_move():
+    machine = EvolvingFSM(n_actions=1, radius=1.0)
+    assert machine.learn_many([[0.0], [0.1], [2.0], [1.0]], [0] * 4).event[-1] == Event.CREATED
+
+
+@pytest.mark.parametrize("spread", [3.0, 0.02])
+def test_belief_falls_with_distance_against_the_variance_of_all_observations(spread, spiral):
+    Z = spiral(60)
+    machine = EvolvingFSM(n_actions=1, radius=0.01, spread=spread)
+    machine.learn_many(Z, [0] * 60)
+    belief = machine.observe([7.0, 3.0]).belief
+    variance = np.vstack([Z, [7.0, 3.0]]).var(axis=0).sum()
+    squared = ((machine.centers - [7.0, 3.0]) ** 2).sum(axis=1)
+    similarity = np.exp(-squared / (spread * variance))
+    np.testing.assert_allclose(belief, similarity / similarity.sum(), rtol=1e-11)
+
+
+@pytest.mark.parametrize("name", sorted(set(LEARNT) - {"n_states", "state"} | {"joint_frequency"}))
+def test_what_a_property_gives_may_be_written_over(grown, snapshot, name):
+    before = snapshot(grown)
+    getattr(grown, name)[...] = -1.0
+    assert snapshot(grown) == before
+
+
+def test_a_step_keeps_its_arrays_when_the_machine_goes_on(grown):
+    first = grown.learn_one([0.5, 0.2], 0)
+    belief, predicted = first.belief.tolist(), first.predicted.tolist()
+    grown.learn_one([-3.0, 1.0], 1)
+    assert (first.belief.tolist(), first.predicted.tolist()) == (belief, predicted)
+
+
+@pytest.mark.parametrize("duplicate", [EvolvingFSM.copy, copy.copy, copy.deepcopy])
+def test_a_copy_goes_its_own_way(grown, snapshot, duplicate):
+    twin, before = duplicate(grown), snapshot(grown)
+    assert snapshot(twin) == before
+    twin.learn_many([[5.0, 5.0], [0.0, 0.1]], [0, 1])
+    assert snapshot(grown) == before
+    grown.learn_many([[5.0, 5.0], [0.0, 0.1]], [0, 1])
+    assert snapshot(twin) == snapshot(grown)
+
+
+def test_a_constructor_argument_is_an_attribute_of_the_same_name():
+    settings = {
+        "n_actions": 4,
+        "radius": 0.5,
+        "distance_weight": 0.7,
+        "learning_rate": 0.2,
+        "prior_frequency": 0.1,
+        "spread": 2.0,
+    }
+    machine = EvolvingFSM(**settings)
+    assert {name: getattr(machine, name) for name in settings} == settings
+    assert repr(eval(repr(machine))) == repr(machine)
+
+
+@pytest.mark.parametrize("name", ["n_actions", "radius", "spread"])
+def test_settings_cannot_change_under_a_running_machine(name):
+    machine = EvolvingFSM(n_actions=2)
+    with pytest.raises(AttributeError):
+        setattr(machine, name, 5)

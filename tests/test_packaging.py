@@ -1,0 +1,176 @@
+import email
+import importlib.util
+import json
+import os
+import subprocess
+import sys
+import zipfile
+from importlib.metadata import distribution
+from pathlib import Path
+
+import pytest
+from packaging.requirements import Requirement
+
+import evofsm
+
+ROOT = Path(__file__).parent.parent
+HEAVY = {
+    *("numba", "scipy", "libsumo", "matplotlib", "jinja2"),
+    *("polars", "pyarrow", "pandas", "typer", "rich"),
+}
+
+
+def run(*command, **options):
+    finished = subprocess.run(
+        [str(word) for word in command], capture_output=True, text=True, check=False, **options
+    )
+    assert finished.returncode == 0, finished.stdout + finished.stderr
+    return finished.stdout
+
+
+# -- Importing ---------------------------------------------------------------------------------
+
+
+def modules_after(code):
+    program = f"{code}\nimport json, sys\nprint(json.dumps(list(sys.modules)))"
+    return {name.split(".")[0] for name in json.loads(run(sys.executable, "-c", program))}
+
+
+def test_importing_the_package_loads_nothing_heavy():
+    assert not modules_after("import evofsm") & HEAVY
+
+
+def test_learning_needs_numpy_and_numba_and_nothing_else_that_is_heavy():
+    learning = "from evofsm import EvolvingFSM\nEvolvingFSM(2).observe([0.0])"
+    assert modules_after(learning) & HEAVY <= {"numba"}
+
+
+def test_importing_the_package_costs_little_more_than_importing_numpy():
+    seconds = {"numpy": [], "evofsm": []}
+    for _ in range(7):
+        for module, measured in seconds.items():
+            program = (
+                "from time import perf_counter as now\n"
+                f"start = now(); import {module}; print(now() - start)"
+            )
+            measured.append(float(run(sys.executable, "-c", program)))
+    assert min(seconds["evofsm"]) <= 1.5 * min(seconds["numpy"])
+
+
+def test_every_public_name_can_be_had_and_is_listed():
+    for name in evofsm.__all__:
+        assert getattr(evofsm, name).__name__ == name
+    assert set(evofsm.__all__) <= set(dir(evofsm))
+
+
+def test_a_name_that_is_not_there_is_named():
+    with pytest.raises(AttributeError, match="'evofsm' has no attribute 'EvolvingFMS'"):
+        _ = evofsm.EvolvingFMS
+
+
+def test_the_version_is_that_of_the_distribution():
+    assert evofsm.__version__ == distribution("evofsm").version
+
+
+# -- The wheel ---------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory):
+    """The wheel, built from the sources as a release would be."""
+    folder = tmp_path_factory.mktemp("dist")
+    command = [sys.executable, "-m", "build", "--wheel", "--outdir", folder, ROOT]
+    if importlib.util.find_spec("hatchling"):
+        command.insert(3, "--no-isolation")
+    run(*command, cwd=folder)
+    (built,) = folder.glob("*.whl")
+    return built
+
+
+def core_dependencies(wheel):
+    """Distributions that the wheel needs without any extra, and those that they need."""
+    with zipfile.ZipFile(wheel) as archive:
+        (metadata,) = (name for name in archive.namelist() if name.endswith("/METADATA"))
+        waiting = email.message_from_bytes(archive.read(metadata)).get_all("Requires-Dist")
+    found = {}
+    while waiting:
+        requirement = Requirement(waiting.pop())
+        wanted = requirement.marker is None or requirement.marker.evaluate({"extra": ""})
+        if wanted and requirement.name not in found:
+            found[requirement.name] = distribution(requirement.name)
+            waiting += found[requirement.name].requires or []
+    return found
+
+
+@pytest.fixture(scope="module")
+def fresh(wheel, tmp_path_factory):
+    """The `bin` of a new environment that holds the wheel and its core dependencies alone.
+
+    The dependencies are links to those that are installed here, so no network is needed.
+    """
+    folder = tmp_path_factory.mktemp("fresh")
+    run(sys.executable, "-m", "venv", "--without-pip", folder)
+    program = "import sysconfig; print(sysconfig.get_path('purelib'))"
+    site = Path(run(folder / "bin" / "python", "-c", program).strip())
+    for dependency in core_dependencies(wheel).values():
+        for top in {path.parts[0] for path in dependency.files if path.parts[0] != ".."}:
+            (site / top).symlink_to(dependency.locate_file(top))
+    pip = next(
+        python
+        for python in (sys.executable, sys._base_executable)
+        if subprocess.run([python, "-m", "pip", "--version"], capture_output=True).returncode == 0
+    )
+    into = ["--python", folder / "bin" / "python", "--disable-pip-version-check"]
+    run(pip, "-m", "pip", *into, "install", "--quiet", "--no-deps", "--no-index", wheel)
+    return folder / "bin"
+
+
+def test_the_core_depends_on_numpy_and_numba_alone(wheel):
+    assert core_dependencies(wheel).keys() == {"numpy", "numba", "llvmlite"}
+
+
+def test_the_wheel_holds_every_source_file_and_nothing_else(wheel):
+    with zipfile.ZipFile(wheel) as archive:
+        held = {name for name in archive.namelist() if ".dist-info/" not in name}
+        assert any(name.endswith(".dist-info/licenses/LICENSE") for name in archive.namelist())
+    sources = {
+        str(path.relative_to(ROOT / "src"))
+        for path in (ROOT / "src" / "evofsm").rglob("*")
+        if path.is_file() and "__pycache__" not in path.parts
+    }
+    assert "evofsm/py.typed" in held
+    assert held == sources
+
+
+def test_the_wheel_learns_saves_and_forecasts_with_its_core_dependencies_alone(fresh, tmp_path):
+    program = """
+import sys
+from evofsm import EvolvingFSM, FSMModel, IntervalActions
+
+actions = IntervalActions(-1.0, 1.0, 0.5)
+machine = EvolvingFSM(actions.n_actions, radius=0.5)
+for z, a in ((0.0, -1.0), (0.1, 0.0), (2.0, 0.2), (1.0, 0.9), (1.1, 1.0)):
+    machine.learn_one([z], actions.encode(a))
+machine.save("machine")
+assert EvolvingFSM.load("machine").predict(0).tolist() == machine.predict(0).tolist()
+machine.model(actions=actions).save("model")
+FSMModel.load("model").stationary_distribution()
+print(machine.n_states, sys.modules["evofsm"].__file__)
+"""
+    n_states, origin = run(fresh / "python", "-I", "-c", program, cwd=tmp_path).split()
+    assert int(n_states) == 2
+    assert Path(origin).is_relative_to(fresh.parent)
+
+
+@pytest.mark.skipif(
+    "def main" not in (ROOT / "src" / "evofsm" / "cli.py").read_text(),
+    reason="there is no command line yet",
+)
+def test_without_the_cli_extra_the_command_names_it_in_one_line(fresh):
+    environment = {**os.environ, "PYTHONPATH": ""}
+    finished = subprocess.run(
+        [fresh / "evofsm"], capture_output=True, text=True, check=False, env=environment
+    )
+    assert finished.returncode != 0
+    (line,) = (finished.stdout + finished.stderr).strip().splitlines()
+    assert "evofsm[cli]" in line

@@ -1,0 +1,312 @@
+import io
+import json
+import pickle
+import resource
+import signal
+import zipfile
+from dataclasses import fields
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from evofsm import EvolvingFSM, FSMModel, IntervalActions
+from evofsm.storage import kind_of
+
+
+def full_model(grown):
+    return grown.model(
+        actions=IntervalActions(-0.5, 1.0, 0.5, closed="right", outside="clip"),
+        names=("gap", "speed"),
+        units=("m", "m/s"),
+        dt=0.01,
+    )
+
+
+def zip_of(**members):
+    """A ZIP archive with the given members, as bytes."""
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w") as archive:
+        for name, content in members.items():
+            archive.writestr(name.replace("_npy", ".npy"), content)
+    return file.getvalue()
+
+
+def npz(header, **arrays):
+    """What the library writes, with any header and arrays, as bytes."""
+    file = io.BytesIO()
+    encoded = np.frombuffer(json.dumps(header).encode(), np.uint8)
+    np.savez(file, header=encoded, **arrays)
+    return file.getvalue()
+
+
+# -- Machines ----------------------------------------------------------------------------------
+
+
+def untouched(machine):
+    return EvolvingFSM(n_actions=3, radius=0.01)
+
+
+def in_mid_episode_with_an_action_pending(machine):
+    return machine
+
+
+def in_mid_episode_without_an_action(machine):
+    machine.observe([0.1, 0.1])
+    return machine
+
+
+def between_episodes(machine):
+    machine.start_episode()
+    return machine
+
+
+@pytest.mark.parametrize(
+    "situation",
+    [
+        untouched,
+        in_mid_episode_with_an_action_pending,
+        in_mid_episode_without_an_action,
+        between_episodes,
+    ],
+)
+def test_a_loaded_machine_goes_on_bit_for_bit(situation, grown, spiral, snapshot, tmp_path):
+    machine = situation(grown)
+    machine.save(tmp_path / "machine")
+    loaded = EvolvingFSM.load(tmp_path / "machine")
+    assert repr(loaded) == repr(machine)
+    assert snapshot(loaded) == snapshot(machine)
+    Z, I = spiral(100)[::-1], np.arange(100) % 3
+    traces = [m.learn_many(Z, I, belief=True) for m in (machine, loaded)]
+    for a, b in zip(*traces, strict=True):
+        assert a.tobytes() == b.tobytes()
+    assert snapshot(loaded) == snapshot(machine)
+
+
+def test_saving_changes_nothing_in_the_machine(grown, spiral, tmp_path):
+    twin = grown.copy()
+    grown.save(tmp_path / "machine")
+    surprise = [m.learn_many(spiral(30), [0, 1, 2] * 10).surprise for m in (grown, twin)]
+    assert surprise[0].tobytes() == surprise[1].tobytes()
+
+
+def test_a_file_says_what_it_holds(grown, tmp_path):
+    grown.save(tmp_path / "machine")
+    grown.model().save(tmp_path / "model")
+    assert kind_of(tmp_path / "machine") == "machine"
+    assert kind_of(str(tmp_path / "model")) == "model"
+
+
+# -- Models ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("make", [full_model, EvolvingFSM.model, lambda _: EvolvingFSM(2).model()])
+def test_a_loaded_model_has_every_field_of_the_saved_one(make, grown, tmp_path):
+    model = make(grown)
+    model.save(tmp_path / "model")
+    loaded = FSMModel.load(tmp_path / "model")
+    for field in fields(FSMModel):
+        value, expected = getattr(loaded, field.name), getattr(model, field.name)
+        if isinstance(expected, np.ndarray):
+            assert (value.shape, value.tobytes()) == (expected.shape, expected.tobytes())
+            assert not value.flags.writeable
+        else:
+            assert value == expected
+            assert type(value) is type(expected) or field.name == "width"
+
+
+# -- Files that are something else -------------------------------------------------------------
+
+
+def test_a_machines_file_is_no_models_and_the_reverse(grown, tmp_path):
+    path = tmp_path / "file"
+    grown.save(path)
+    with pytest.raises(ValueError, match=f"{path} holds a machine, not a model"):
+        FSMModel.load(path)
+    grown.model().save(path)
+    with pytest.raises(ValueError, match=f"{path} holds a model, not a machine"):
+        EvolvingFSM.load(path)
+
+
+HEADER = {"format": "evofsm", "version": 1, "kind": "machine", "content": {"n_actions": 1}}
+
+
+OTHERS = {
+    "empty": b"",
+    "a table": b"gap,speed\n1.0,2.0\n",
+    "a pickle": pickle.dumps({"header": 1}),
+    "an empty ZIP": zip_of(),
+    "a ZIP of a text": zip_of(readme="hello"),
+    "a ZIP of a text called header": zip_of(header="hello"),
+    "a ZIP of a text called header.npy": zip_of(header_npy="hello"),
+    "a header that is a list": npz([]),
+    "a header without entries": npz({}),
+    "another format": npz({**HEADER, "format": "other"}),
+    "a version that is no number": npz({**HEADER, "version": "new"}),
+    "no kind": npz({name: HEADER[name] for name in ("format", "version", "content")}),
+    "no content": npz({name: HEADER[name] for name in ("format", "version", "kind")}),
+}
+
+
+@pytest.mark.parametrize("which", [EvolvingFSM, FSMModel])
+@pytest.mark.parametrize("content", OTHERS.values(), ids=OTHERS.keys())
+def test_any_other_file_is_refused_by_name(which, content, tmp_path):
+    path = tmp_path / "other"
+    path.write_bytes(content)
+    with pytest.raises(ValueError, match=str(path)):
+        which.load(path)
+
+
+def test_what_a_file_without_a_kind_holds_cannot_be_told(tmp_path):
+    path = tmp_path / "other"
+    path.write_bytes(OTHERS["no kind"])
+    with pytest.raises(ValueError, match=str(path)):
+        kind_of(path)
+
+
+@pytest.mark.parametrize("content", [{}, [], {"n_actions": 0}, {"n_actions": 1, "gain": 2.0}])
+def test_a_header_that_makes_no_sense_is_refused_by_name(content, tmp_path):
+    path = tmp_path / "other"
+    path.write_bytes(npz({**HEADER, "content": content}, centers=np.zeros((1, 1))))
+    for load in (EvolvingFSM.load, FSMModel.load):
+        with pytest.raises(ValueError, match=str(path)):
+            load(path)
+
+
+def test_a_file_of_a_newer_version_asks_for_a_newer_library(tmp_path):
+    path = tmp_path / "newer"
+    path.write_bytes(npz({**HEADER, "version": 2}))
+    with pytest.raises(ValueError, match=r"version 2 is newer.*a newer evofsm reads it"):
+        EvolvingFSM.load(path)
+
+
+class Bomb:
+    def __init__(self, target):
+        self.target = target
+
+    def __reduce__(self):
+        return Path.touch, (self.target,)
+
+
+def test_a_pickle_inside_is_refused_and_never_run(grown, tmp_path):
+    path, touched = tmp_path / "machine", tmp_path / "touched"
+    grown.save(path)
+    with np.load(path) as archive:
+        arrays = dict(archive)
+    arrays["belief"] = np.array([Bomb(touched)], dtype=object)
+    with path.open("wb") as file:
+        np.savez(file, **arrays)
+    for load in (EvolvingFSM.load, FSMModel.load):
+        with pytest.raises(ValueError, match=str(path)):
+            load(path)
+    assert not touched.exists()
+
+
+@pytest.mark.parametrize("which", [EvolvingFSM, FSMModel])
+def test_a_file_that_lost_an_array_or_has_one_of_another_shape_is_refused(which, grown, tmp_path):
+    path = tmp_path / "damaged"
+    (grown if which is EvolvingFSM else grown.model()).save(path)
+    with np.load(path) as archive:
+        arrays = dict(archive)
+    for name in set(arrays) - {"header"}:
+        without = {key: value for key, value in arrays.items() if key != name}
+        for damaged in (without, {**arrays, name: np.zeros((7, 7, 7, 7))}):
+            with path.open("wb") as file:
+                np.savez(file, **damaged)
+            with pytest.raises(ValueError, match=str(path)):
+                which.load(path)
+
+
+@pytest.mark.parametrize("which", [EvolvingFSM, FSMModel])
+def test_a_file_cut_off_anywhere_is_refused(which, grown, tmp_path):
+    path = tmp_path / "cut"
+    (grown if which is EvolvingFSM else grown.model()).save(path)
+    whole = path.read_bytes()
+    for length in range(0, len(whole), 97):
+        path.write_bytes(whole[:length])
+        with pytest.raises(ValueError, match=str(path)):
+            which.load(path)
+
+
+def test_a_file_with_a_flipped_byte_is_refused_or_gives_the_same_machine(snapshot, tmp_path):
+    machine, path = EvolvingFSM(n_actions=1), tmp_path / "flipped"
+    machine.learn_many([[0.0], [2.0], [1.0]], [0, 0, 0])
+    machine.save(path)
+    expected, whole = snapshot(machine), path.read_bytes()
+    refusals = []
+    for place in range(0, len(whole), 11):
+        damaged = bytearray(whole)
+        damaged[place] ^= 0xFF
+        path.write_bytes(damaged)
+        try:
+            loaded = EvolvingFSM.load(path)
+        except ValueError as error:
+            refusals.append(str(error))
+        else:
+            assert snapshot(loaded) == expected
+    assert refusals
+    assert all(str(path) in refusal for refusal in refusals)
+
+
+# -- Saving that fails -------------------------------------------------------------------------
+
+
+def test_a_missing_folder_is_named(grown, tmp_path):
+    missing = tmp_path / "missing"
+    for item in (grown, grown.model()):
+        with pytest.raises(FileNotFoundError, match=f"no folder {missing}"):
+            item.save(missing / "file")
+
+
+def test_a_missing_file_is_named(tmp_path):
+    for load in (EvolvingFSM.load, FSMModel.load):
+        with pytest.raises(FileNotFoundError, match="missing"):
+            load(tmp_path / "missing")
+
+
+@pytest.fixture
+def full_disk():
+    """No file may grow beyond 100 bytes, which the system reports like a full disk."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+
+    def fill():
+        resource.setrlimit(resource.RLIMIT_FSIZE, (100, hard))
+
+    def free():
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+    yield fill, free
+    free()
+    signal.signal(signal.SIGXFSZ, handler)
+
+
+@pytest.mark.parametrize("old", [None, b"what was there before"])
+def test_a_save_that_fails_leaves_the_folder_as_it_was(old, grown, full_disk, tmp_path):
+    fill, free = full_disk
+    path = tmp_path / "machine"
+    if old is not None:
+        path.write_bytes(old)
+    for item in (grown, grown.model()):
+        fill()
+        try:
+            with pytest.raises(OSError, match=r"File too large"):
+                item.save(path)
+        finally:
+            free()
+        assert [p.read_bytes() for p in tmp_path.iterdir()] == ([] if old is None else [old])
+
+
+def test_saving_onto_a_folder_leaves_no_temporary_file(grown, tmp_path):
+    folder = tmp_path / "folder"
+    folder.mkdir()
+    with pytest.raises(OSError, match="folder"):
+        grown.save(folder)
+    assert list(tmp_path.iterdir()) == [folder]
+
+
+def test_saving_replaces_what_was_there(grown, snapshot, tmp_path):
+    path = tmp_path / "machine"
+    path.write_bytes(b"something longer than nothing" * 1000)
+    grown.save(str(path))
+    assert snapshot(EvolvingFSM.load(str(path))) == snapshot(grown)
