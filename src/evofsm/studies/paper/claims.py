@@ -33,33 +33,33 @@ def check_claims(study: PaperStudy) -> tuple[Claim, ...]:
 
 
 def _claims(study: PaperStudy) -> Iterator[Claim]:
-    dead_end = f"#{study.dead_end + 1}" if study.dead_end >= 0 else "none"
     counts = [int(run.n_states[-1]) for run in study.runs]
+    collisions = [run for run in study.runs if run.episode.collided]
 
-    pattern = all(run.episode.collided == _COLLIDES[run.case] for run in study.runs)
+    as_in_paper = sum(run.episode.collided == _COLLIDES[run.case] for run in study.runs)
+    safe = all(study.safe_at_the_end.values())
     yield Claim(
         "collisions_by_case",
-        "The follower collides in cases 1 and 4, and not in cases 2 and 3",
+        "Collision in cases 1 and 4, none in cases 2 and 3",
         "yes, no, no, yes",
-        ", ".join(_outcome(run) for run in study.last_round)
-        + f" (in every round: {_yes(pattern)}); at {study.settings.safe_until:g} s cases 2 and 3 "
-        + ("are still safe" if all(study.safe_at_the_end.values()) else "have collided"),
-        pattern and all(study.safe_at_the_end.values()),
+        f"{', '.join(_outcome(run) for run in study.last_round)}; so in {as_in_paper} of "
+        f"{len(study.runs)} runs; cases 2 and 3 "
+        f"{'are safe' if safe else 'have collided'} at {study.settings.safe_until:g} s",
+        as_in_paper == len(study.runs) and safe,
     )
     for time, run in zip(study.settings.brake_at, study.extra_runs, strict=True):
         state = int(run.state[_brake_row(run)])
         yield Claim(
             f"brake_at_{time:g}",
-            f"Case 1 with the leader's full brake at {time:g} s: recognised as the dead end, "
-            "and a collision",
-            "dead end, collision",
-            f"#{state + 1} at the brake, {_outcome(run)}",
+            f"Leader brakes at {time:g} s, in the dead end: collision",
+            "collision",
+            f"{_name(state)} at the brake, collision: {_outcome(run)}",
             run.episode.collided and state == study.dead_end,
         )
     yield Claim(
         "states_after_each_run",
-        "States are founded in the first four runs and then no more",
-        "0 to 7 in four runs, then none in 80",
+        "States are founded in the first four runs, then none",
+        "0 to 7 in 4 runs, 7 after 80",
         f"{', '.join(map(str, counts[:4]))} after runs 1 to 4, {counts[-1]} after {len(counts)}",
         len(set(counts[3:])) == 1 and counts == sorted(counts),
     )
@@ -70,78 +70,73 @@ def _claims(study: PaperStudy) -> Iterator[Claim]:
         str(counts[-1]),
         counts[-1] == _STATES,
     )
-    collisions = [run for run in study.runs if run.episode.collided]
     at_collisions = sorted({int(run.state[-1]) for run in collisions})
     yield Claim(
         "dead_end_state",
-        "One and the same state stands at every collision (its number tells only the order of "
-        "founding)",
+        "One and the same state at every collision, the dead end",
         "#3",
-        ", ".join(f"#{state + 1}" for state in at_collisions) or "no collision",
+        ", ".join(map(_name, at_collisions)) + " (its number is the order of founding)"
+        if collisions
+        else "no collision",
         len(at_collisions) == 1,
     )
     inside = sum(int(run.state[-1]) == study.dead_end for run in collisions)
     yield Claim(
         "dead_end_share",
-        "Share of collisions that are recognised as it",
+        "Share of collisions recognised as the dead end",
         "all",
-        f"{inside} of {len(collisions)} in {dead_end}",
+        f"{inside} of {len(collisions)}",
         0 < inside == len(collisions),
     )
-    yield _claim_of_change(
-        study,
-        3,
+    yield Claim(
         "case3_leaves_dead_end",
-        "Case 3 leaves the dead end after its driver turns normal",
-        leaves=True,
+        "Case 3 leaves the dead end when its driver turns normal",
+        "yes",
+        *_change(study, 3, leaves=True),
     )
-    yield _claim_of_change(
-        study,
-        4,
+    yield Claim(
         "case4_enters_dead_end",
-        "Case 4 comes to the dead end after its driver turns aggressive",
-        leaves=False,
+        "Case 4 comes to the dead end when its driver turns aggressive",
+        "yes",
+        *_change(study, 4, leaves=False),
     )
     largest = [float(np.nanmax(run.surprise)) for run in study.last_round]
     yield Claim(
         "jsd_max_by_case",
-        "Divergence of forecast and recognised state, but for a run's first, largest by case in "
-        "the last round",
-        f"below {LARGEST_DIVERGENCE} in all cases",
+        "Largest divergence of forecast and recognised state, but for a run's first, "
+        "in the last round",
+        f"< {LARGEST_DIVERGENCE} in all cases",
         ", ".join(f"{value:.3f}" for value in largest) + " bit",
         max(largest) < LARGEST_DIVERGENCE,
     )
 
 
-def _claim_of_change(study: PaperStudy, case: int, id_: str, text: str, leaves: bool) -> Claim:
-    """Whether the state is the dead end on one side of the driver's change, not on the other.
+def _change(study: PaperStudy, case: int, *, leaves: bool) -> tuple[str, bool]:
+    """What the driver's change did in the last round, and whether it did so in every round.
 
-    The verdict is on all runs of the case, but for the first round, in which states are founded.
+    The first round does not count: its runs still found states.
     """
+    runs = [run for run in study.runs if run.case == case]
+    runs = runs[1:] or runs
     switch = study.settings.switch_at[case]
-    trained = [run for run in study.runs if run.case == case and run.round > 1]
-    trained = trained or [study.last_round[case - 1]]
-    holds = True
-    for run in trained:
-        in_dead_end = run.state == study.dead_end
-        row = int(np.searchsorted(run.episode.time, switch))
-        at_switch = bool(in_dead_end[row])
-        changed = row + np.flatnonzero(in_dead_end[row:] != at_switch)
-        holds &= at_switch == leaves and len(changed) > 0 and in_dead_end[-1] != leaves
-        after = run.state[changed[0]] if len(changed) else run.state[-1]
-        when = run.episode.time[changed[0]] if len(changed) else float("nan")
-        measured = f"#{run.state[row] + 1} at {switch:g} s, #{after + 1} from {when:.1f} s"
-    return Claim(
-        id_, text, "yes", f"{measured} (in {len(trained)} rounds: {_yes(bool(holds))})", bool(holds)
-    )
+    as_in_paper = 0
+    for run in runs:
+        inside = run.state == study.dead_end
+        row = min(int(np.searchsorted(run.episode.time, switch)), len(inside) - 1)
+        changed = row + int(np.argmax(inside[row:] != inside[row]))  # `row` where it never does
+        as_in_paper += bool(inside[row] == leaves and inside[changed] != leaves != inside[-1])
+    text = f"{_name(run.state[row])} at {switch:g} s"
+    if changed > row:
+        text += f", {_name(run.state[changed])} from {run.episode.time[changed]:.1f} s"
+    return f"{text}; so in {as_in_paper} of {len(runs)} rounds", as_in_paper == len(runs)
+
+
+def _name(state: int) -> str:
+    return f"#{state + 1}"
 
 
 def _outcome(run: Run) -> str:
     return f"yes ({run.episode.time[-1]:.1f} s)" if run.episode.collided else "no"
-
-
-def _yes(fact: bool) -> str:
-    return "yes" if fact else "no"
 
 
 def _brake_row(run: Run) -> int:

@@ -1,0 +1,207 @@
+"""Read a table in CSV or Parquet piece by piece, and turn its columns into numbers and texts."""
+
+from __future__ import annotations
+
+import csv
+import io
+import os
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import islice
+from typing import Any, NoReturn, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evofsm.io.files import OnRead, damage_explained, ignore, open_unpacked
+from evofsm.validation import LARGEST_OBSERVATION
+
+_CSV_ROWS = 8192
+# polars decodes a whole row group for each slice of it, so small slices would only cost time.
+_PARQUET_ROWS = 65536
+
+
+@dataclass(frozen=True)
+class Piece:
+    """Some consecutive rows of a table: T values for each column that was asked for."""
+
+    path: str
+    unit: str  #: what its places count: "line" as an editor shows it, or "row" from 1
+    places: NDArray[np.int64]  #: (T,)
+    numbers: dict[str, NDArray[np.float64]]
+    texts: dict[str, NDArray[np.object_]]
+
+    def at(self, row: int) -> str:
+        """Where a row stands, for a message."""
+        return f"{self.path}, {self.unit} {self.places[row]}"
+
+
+class Table(Protocol):
+    """A table whose header is known and whose rows are still to be read."""
+
+    path: str
+    columns: tuple[str, ...]
+
+    def pieces(self, numbers: Sequence[str], texts: Sequence[str]) -> Iterator[Piece]:
+        """Read the named columns, in the order of rows."""
+        ...
+
+
+class CsvTable:
+    """A CSV file, gzipped or not, with a header; fields end at a comma, a semicolon or a tab."""
+
+    def __init__(self, path: str, on_read: OnRead = ignore) -> None:
+        self.path = path
+        self._on_read = on_read
+        with open_unpacked(path) as file, damage_explained(path), _text(file) as text:
+            line = text.readline()
+            self._separator = max(",;\t", key=line.count)
+            text.seek(0)
+            header = next(csv.reader(text, delimiter=self._separator), [])
+        self.columns = tuple(name.strip() for name in header)
+        if all(_is_number(name) for name in self.columns):
+            raise ValueError(
+                f"{path}, line 1: {line.strip()!r} is no header; the first line must name "
+                "the columns"
+            )
+
+    def pieces(self, numbers: Sequence[str], texts: Sequence[str]) -> Iterator[Piece]:
+        """Read the named columns, in the order of rows."""
+        places = {name: self._place(name) for name in (*numbers, *texts)}
+        with open_unpacked(self.path, self._on_read) as file, _text(file) as text:
+            rows = csv.reader(text, delimiter=self._separator)
+            with damage_explained(self.path, lambda: rows.line_num):
+                try:
+                    next(rows)
+                    while some := [(rows.line_num, row) for row in islice(rows, _CSV_ROWS)]:
+                        fields, lines = self._columns(some)
+                        piece = Piece(self.path, "line", lines, {}, {})
+                        for name in numbers:
+                            piece.numbers[name] = _numbers(piece, name, fields[places[name]])
+                        for name in texts:
+                            piece.texts[name] = np.array(fields[places[name]], dtype=object)
+                        yield piece
+                except csv.Error as error:
+                    raise ValueError(
+                        f"{self.path}, line {rows.line_num}: {error} (an unclosed quote?)"
+                    ) from error
+
+    def _place(self, name: str) -> int:
+        if self.columns.count(name) > 1:
+            raise ValueError(f"{self.path}, line 1: two columns are called {name!r}")
+        return self.columns.index(name)
+
+    def _columns(
+        self, some: list[tuple[int, list[str]]]
+    ) -> tuple[list[tuple[str, ...]], NDArray[np.int64]]:
+        """Fields column by column, and the line of each row; blank lines are passed over."""
+        filled = [(line, row) for line, row in some if row]
+        for line, row in filled:
+            if len(row) != len(self.columns):
+                raise ValueError(
+                    f"{self.path}, line {line}: {len(row)} fields, but the header names "
+                    f"{len(self.columns)} (was the file cut off, or does a field hold "
+                    f"{self._separator!r}?)"
+                )
+        fields = list(zip(*(row for _, row in filled), strict=True))
+        return fields or [()] * len(self.columns), np.array([line for line, _ in filled], np.int64)
+
+
+class ParquetTable:
+    """A Parquet file; read with polars because pyarrow cannot be imported beside libsumo."""
+
+    def __init__(self, path: str, on_read: OnRead = ignore) -> None:
+        try:
+            import polars
+        except ModuleNotFoundError:
+            raise ModuleNotFoundError(
+                f"{path}: Parquet needs one more package: pip install 'evofsm[tables]'"
+            ) from None
+        self.path = path
+        self._on_read = on_read
+        try:
+            self._scan = polars.scan_parquet(path, glob=False)
+            self._types = self._scan.collect_schema()
+            self._rows = int(self._scan.select(polars.len()).collect().item())
+        except polars.exceptions.PolarsError as error:
+            self._refuse(error)
+        self.columns = tuple(self._types)
+
+    def pieces(self, numbers: Sequence[str], texts: Sequence[str]) -> Iterator[Piece]:
+        """Read the named columns, in the order of rows."""
+        import polars
+
+        for name in numbers:
+            if not self._types[name].is_numeric():
+                raise ValueError(
+                    f"{self.path}: column {name!r} holds {self._types[name]}, not numbers"
+                )
+        wanted = self._scan.select(list(dict.fromkeys([*numbers, *texts])))
+        size = os.path.getsize(self.path)
+        # Not collect_batches: it reads ahead of a slow consumer without bound (polars #28569).
+        for first in range(0, self._rows, _PARQUET_ROWS):
+            try:
+                frame = wanted.slice(first, _PARQUET_ROWS).collect()
+            except polars.exceptions.PolarsError as error:
+                self._refuse(error)
+            places = np.arange(first + 1, first + len(frame) + 1)
+            piece = Piece(self.path, "row", places, {}, {})
+            for name in numbers:
+                column = frame[name].cast(polars.Float64)
+                _refuse_unusable(piece, name, column.to_numpy())
+                piece.numbers[name] = column.to_numpy()
+            for name in texts:
+                piece.texts[name] = np.array(
+                    frame[name].cast(polars.String).fill_null("").to_list(), dtype=object
+                )
+            self._on_read(size * len(frame) // self._rows)
+            yield piece
+
+    def _refuse(self, error: Exception) -> NoReturn:
+        cause = str(error).partition("\n")[0]
+        raise ValueError(
+            f"{self.path} cannot be read as Parquet (was a copy or a download interrupted?): "
+            f"{cause}"
+        ) from error
+
+
+def _text(file: Any) -> io.TextIOWrapper:
+    return io.TextIOWrapper(file, encoding="utf-8-sig", newline="")
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def _numbers(piece: Piece, name: str, fields: Sequence[str]) -> NDArray[np.float64]:
+    try:
+        values = np.fromiter(map(float, fields), np.float64, len(fields))
+    except ValueError:
+        row = next(row for row, field in enumerate(fields) if not _is_number(field))
+        raise ValueError(f"{piece.at(row)}, column {name!r}: {explain_text(fields[row])}") from None
+    _refuse_unusable(piece, name, values)
+    return values
+
+
+def _refuse_unusable(piece: Piece, name: str, values: NDArray[np.float64]) -> None:
+    usable = np.abs(values) <= LARGEST_OBSERVATION  # false of NaN
+    if not usable.all():
+        row = int(np.argmin(usable))
+        raise ValueError(
+            f"{piece.at(row)}, column {name!r}: {values[row]} cannot be learnt "
+            "(a missing or failed measurement? leave the row out: a hole in time begins a new "
+            "episode)"
+        )
+
+
+def explain_text(text: str) -> str:
+    """Why a text is not the number it should be."""
+    if not text.strip():
+        return "the field is empty (a missing measurement?)"
+    if _is_number(text.replace(",", ".")):
+        return f"{text!r} is no number (a decimal comma? write 1.5)"
+    return f"{text!r} is no number (a text, a date, or a unit behind the number?)"

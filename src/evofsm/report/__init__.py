@@ -1,0 +1,1 @@
+"""Reports: draw and print what studies and models hold; compute nothing."""

@@ -1,0 +1,313 @@
+"""Say in the terminal what was learnt; readable in 80 columns, and plain text when piped.
+
+States and actions are counted from 1 here, as people read them; in the documents for programs
+they are counted from 0, as in the code.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rich import box
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from evofsm.model import FSMModel
+from evofsm.studies import paper
+from evofsm.studies.learning import Learning, Skill, passages
+from evofsm.studies.paper import Claim
+
+_SECOND_STEPS = {
+    "marginal": "all actions alike, as in the paper",
+    "hold": "the same action, held",
+    "observed": "actions as often as they were used",
+}
+# With less of the belief, the most probable state is hardly told apart from the others.
+_UNCERTAIN = 0.5
+
+Facts = Sequence[tuple[str, str]]
+
+
+def console() -> Console:
+    """Standard output; brackets in what is printed are no markup."""
+    return Console(markup=False, highlight=False, emoji=False)
+
+
+# -- For people -----------------------------------------------------------------------------------
+
+
+def print_learning(out: Console, learning: Learning, *, action: str, lengths: str | None) -> None:
+    """Print what was read, the states, the transitions and the skill.
+
+    Parameters
+    ----------
+    out : Console
+    learning : Learning
+    action : str
+        Name of the action.
+    lengths : str, optional
+        Lengths assumed for vehicles, where they mattered.
+    """
+    model = learning.model
+    facts = [*_read_facts(learning), ("actions", _action_text(learning, action))]
+    if lengths:
+        facts.append(("vehicle lengths", f"assumed, for FCD has none: {lengths}"))
+    _print_facts(out, "What was read", facts)
+    _print_states(out, model)
+    if model.n_states > 1 and learning.certainty < _UNCERTAIN:
+        out.print(
+            f"States are hardly told apart: the most probable one has {learning.certainty:.0%} of "
+            f"the belief on average ({1 / model.n_states:.0%} is a blind guess). A smaller "
+            "--spread sharpens recognition.\n",
+            style="yellow",
+        )
+    _print_passages(out, model)
+    _print_skills(out, learning.skills)
+
+
+def print_model(out: Console, model: FSMModel, facts: Facts) -> None:
+    """Print a model: the given facts about it, its states, transitions and actions."""
+    _print_facts(out, "Model", [*facts, *_model_facts(model)])
+    _print_states(out, model)
+    _print_passages(out, model)
+    _print_actions(out, model)
+
+
+def print_claims(out: Console, claims: Sequence[Claim], context: Sequence[paper.Table]) -> None:
+    """Print the paper's claims with a verdict each, and the tables that stand beside them."""
+    table = _table("claim", "paper", "measured", "holds")
+    table.expand = True
+    for column, ratio in zip(table.columns, (2, 1, 2), strict=False):
+        column.justify, column.ratio = "left", ratio
+    for claim in claims:
+        verdict = Text("yes", "green") if claim.holds else Text("NO", "bold red")
+        table.add_row(claim.claim, claim.paper, claim.measured, verdict)
+    held = sum(claim.holds for claim in claims)
+    _print_titled(out, f"{held} of {len(claims)} claims of the paper hold", table)
+    for beside in context:
+        rows = _table(*(header.replace(" [", "\n[") for header in beside.header))
+        rows.columns[0].justify = "left"
+        for row in beside.rows:
+            rows.add_row(*row)
+        _print_titled(out, beside.title, rows)
+        out.print(f"{beside.note}\n")
+
+
+def _read_facts(learning: Learning) -> Facts:
+    facts = [
+        ("rows", f"{learning.rows:,}, one every {learning.model.dt:g} s"),
+        ("episodes", f"{learning.episodes:,}, together {_duration(learning.seconds)}"),
+        ("transitions", f"{learning.transitions:,}"),
+    ]
+    if learning.jumps:
+        facts.append(("time jumps", f"{learning.jumps:,}; each begins an episode"))
+    if learning.cuts:
+        facts.append(("pairs cut", f"{learning.cuts:,} long ones go on in an episode of their own"))
+    return facts
+
+
+def _action_text(learning: Learning, action: str) -> str:
+    actions = learning.model.actions
+    assert actions is not None
+    text = f"{actions.n_actions} intervals of {action} from {actions.low:g} to {actions.high:g}"
+    clipped = learning.clipped_below + learning.clipped_above
+    if not clipped:
+        return f"{text}; none was beyond"
+    return (
+        f"{text}; {learning.clipped_below:,} below and {learning.clipped_above:,} above "
+        f"({_percent(clipped / learning.rows)} of rows) were put into the end intervals"
+    )
+
+
+def _model_facts(model: FSMModel) -> Facts:
+    facts = [
+        ("observations", f"{model.visits.sum():,.0f}, {_step_text(model.dt)}"),
+        ("transitions", f"{model.uses.sum():,.0f}, under {model.n_actions} actions"),
+        ("states", f"{model.n_states}, of {model.n_variables} variables"),
+    ]
+    return facts
+
+
+def _step_text(dt: float | None) -> str:
+    return "the step is not known" if dt is None else f"one every {dt:g} s"
+
+
+def _print_facts(out: Console, title: str, facts: Facts) -> None:
+    table = Table.grid(padding=(0, 2))
+    for name, text in facts:
+        table.add_row(f"  {name}", text)
+    _print_titled(out, title, table)
+
+
+def _print_titled(out: Console, title: str, table: Table) -> None:
+    out.print(title, style="bold")
+    out.print(table)
+    out.print()
+
+
+def _print_states(out: Console, model: FSMModel) -> None:
+    headers = _headers(model)
+    table = _table("", *headers, "share\nof time", "stays", "first\nseen")
+    total = max(float(model.visits.sum()), 1.0)
+    stays = model.marginal_matrix("observed").diagonal()
+    columns = [_aligned(column) for column in model.centers.T]
+    for i, center in enumerate(zip(*columns, strict=True)):
+        share = _percent(float(model.visits[i]) / total)
+        table.add_row(f"#{i + 1}", *center, share, f"{stays[i]:.3f}", f"{model.founded[i]:,.0f}")
+    _print_titled(out, "States (stays: probability per step; first seen: at which row)", table)
+
+
+def _aligned(values: NDArray[np.float64]) -> list[str]:
+    """Numbers with the same number of decimals, such that the largest has four digits."""
+    largest = float(np.abs(values).max(initial=0.0))
+    decimals = max(3 - math.floor(math.log10(largest)), 0) if largest > 0.0 else 2
+    return [f"{value:.{decimals}f}" for value in values]
+
+
+def _headers(model: FSMModel) -> list[str]:
+    names = model.names or [f"variable {j + 1}" for j in range(model.n_variables)]
+    units = model.units or [""] * model.n_variables
+    headers = [name.replace("=", "=\n") for name in names]  # light=red
+    return [
+        f"{name}\n[{unit}]" if unit else name for name, unit in zip(headers, units, strict=True)
+    ]
+
+
+def _print_passages(out: Console, model: FSMModel) -> None:
+    found = passages(model)
+    if not found:
+        out.print("There are no transitions between states: there is one state only.\n")
+        return
+    table = _table(
+        "from", "to", "per step", "most likely under", "per step\nunder it", "seen about"
+    )
+    table.columns[3].justify = "left"
+    for passage in found:
+        row = [f"#{passage.origin + 1}", f"#{passage.target + 1}", f"{passage.probability:.3f}"]
+        if passage.action is not None:
+            row += [_action_name(model, passage.action), f"{passage.under_action:.3f}"]
+            row += [f"{passage.evidence:,.0f}×"]
+        table.add_row(*row)
+    _print_titled(out, f"Transitions that matter: the {len(found)} that happen most", table)
+
+
+def _print_actions(out: Console, model: FSMModel) -> None:
+    table = _table("action", "used", "share")
+    table.columns[0].justify = "left"
+    total = max(float(model.uses.sum()), 1.0)
+    for r, uses in enumerate(model.uses):
+        table.add_row(_action_name(model, r), f"{uses:,.0f}", _percent(float(uses) / total))
+    _print_titled(out, "Actions", table)
+
+
+def _action_name(model: FSMModel, r: int) -> str:
+    number = f"a({r + 1})"
+    return f"{number:6}{model.actions.label(r)}" if model.actions else number
+
+
+def _print_skills(out: Console, skills: Sequence[Skill]) -> None:
+    table = _table(
+        "ahead", "actions after the first", "forecast\n[bit]", "persistence\n[bit]", "skill"
+    )
+    table.columns[1].justify = "left"
+    for skill in skills:
+        table.add_row(
+            f"{skill.seconds:g} s",
+            "-" if skill.policy is None else _SECOND_STEPS[skill.policy],
+            f"{skill.divergence:.2g}",
+            f"{skill.persistence:.2g}",
+            _skill_text(skill.skill),
+        )
+    out.print("Forecasts against persistence", style="bold")
+    out.print(table)
+    out.print(
+        "\nMean Jensen-Shannon divergence from the belief that came; each forecast was made before "
+        "its rows were learnt. Persistence: the belief stays as it is. Skill: 1 is perfect, 0 as "
+        "good as persistence, below 0 worse."
+    )
+    if len(skills) == 1:
+        out.print("The step is too long for a separate forecast of 1 s ahead.")
+
+
+def _skill_text(skill: float) -> str:
+    if math.isnan(skill):
+        return "none"
+    return f"{skill:+.2f}" if abs(skill) < 10.0 else f"{skill:+,.0f}"
+
+
+def _table(*headers: str) -> Table:
+    table = Table(box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False, collapse_padding=True)
+    for header in headers:
+        table.add_column(header, justify="right", overflow="fold")
+    return table
+
+
+def _percent(share: float) -> str:
+    return f"{share:.1%}"
+
+
+def _duration(seconds: float) -> str:
+    if seconds < 120.0:
+        return f"{seconds:.1f} s"
+    minutes = seconds / 60.0
+    return f"{minutes:.1f} min" if minutes < 120.0 else f"{minutes / 60.0:.1f} h"
+
+
+# -- For programs ---------------------------------------------------------------------------------
+
+
+def learning_document(learning: Learning) -> dict[str, Any]:
+    """All that `print_learning` prints, for JSON; states and actions from 0."""
+    facts = {name: value for name, value in vars(learning).items() if name not in _APART}
+    skills = [{**asdict(skill), "skill": skill.skill} for skill in learning.skills]
+    return {**_without_nan({**facts, "skills": skills}), "model": model_document(learning.model)}
+
+
+_APART = ("machine", "model", "skills")
+
+
+def model_document(model: FSMModel) -> dict[str, Any]:
+    """All that `print_model` prints, for JSON; states and actions from 0."""
+    document: dict[str, Any] = {
+        "dt": model.dt,
+        "names": model.names,
+        "units": model.units,
+        "states": [
+            {
+                "state": i,
+                "center": model.centers[i].tolist(),
+                "visits": float(model.visits[i]),
+                "first_seen": int(model.founded[i]),
+            }
+            for i in range(model.n_states)
+        ],
+        "transitions": [passage._asdict() for passage in passages(model)],
+        "actions": [
+            {
+                "action": r,
+                "interval": model.actions.interval(r) if model.actions else None,
+                "uses": float(model.uses[r]),
+            }
+            for r in range(model.n_actions)
+        ],
+    }
+    return _without_nan(document)
+
+
+def _without_nan(document: dict[str, Any]) -> dict[str, Any]:
+    """The same document with None for NaN, which JSON does not know."""
+
+    def clean(value: Any) -> Any:
+        if isinstance(value, dict):
+            return _without_nan(value)
+        if isinstance(value, list | tuple):
+            return [clean(entry) for entry in value]
+        return None if isinstance(value, float) and math.isnan(value) else value
+
+    return {key: clean(value) for key, value in document.items()}

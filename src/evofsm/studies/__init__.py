@@ -1,0 +1,1 @@
+"""Studies: each makes numbers and draws nothing."""
