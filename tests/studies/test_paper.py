@@ -59,7 +59,7 @@ def test_the_measured_column_shows_what_the_notes_on_the_paper_found(study):
     assert measured["collisions_by_case"].startswith("yes (31.5 s), no, no, yes (31.7 s)")
     assert measured["states_after_each_run"].startswith("4, 4, 5, 7 after runs 1 to 4")
     assert measured["dead_end_state"] == "#4"
-    assert measured["dead_end_share"] == "40 of 40 in #4"
+    assert measured["dead_end_share"] == "40 of 40"
     assert measured["jsd_max_by_case"] == "0.051, 0.081, 0.138, 0.074 bit"
 
 
@@ -131,6 +131,20 @@ def test_a_wrong_settings_file_is_refused_by_name(tmp_path, text, message):
     with pytest.raises(ValueError, match=message) as refusal:
         changed(tmp_path, text)
     assert "changes.toml" in str(refusal.value)
+
+
+def test_one_round_in_which_states_are_still_founded_is_a_study_too():
+    study = run_paper(KinematicWorld(), "kinematic", Settings.load(), rounds=1)
+    assert [run.belief.shape[1] for run in study.runs] == [7] * 4
+    assert len(context_tables(study)) == 3
+    assert [founding.run for founding in study.foundings] == [0, 0, 0, 0, 2, 3, 3]
+
+
+def test_a_driver_whose_change_lies_beyond_the_end_changes_nothing(tmp_path):
+    short = changed(tmp_path, "[scenario]\nduration = 3.0\nsafe_until = 3.0\n")
+    holds = verdicts(run_paper(KinematicWorld(), "kinematic", short, rounds=2))
+    assert not holds["case3_leaves_dead_end"]
+    assert not holds["case4_enters_dead_end"]
 
 
 def test_no_round_is_refused():

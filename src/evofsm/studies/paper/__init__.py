@@ -3,12 +3,13 @@
 from evofsm.studies.paper.claims import Claim, check_claims
 from evofsm.studies.paper.context import Table, context_tables
 from evofsm.studies.paper.files import write_data
-from evofsm.studies.paper.runs import CASES, PaperStudy, Run, run_paper
+from evofsm.studies.paper.runs import CASES, Founding, PaperStudy, Run, run_paper
 from evofsm.studies.paper.settings import Settings
 
 __all__ = [
     "CASES",
     "Claim",
+    "Founding",
     "PaperStudy",
     "Run",
     "Settings",

@@ -73,11 +73,9 @@ def _claims(study: PaperStudy) -> Iterator[Claim]:
     at_collisions = sorted({int(run.state[-1]) for run in collisions})
     yield Claim(
         "dead_end_state",
-        "One and the same state at every collision, the dead end",
+        "One and the same state at every collision, the dead end (numbers: order of founding)",
         "#3",
-        ", ".join(map(_name, at_collisions)) + " (its number is the order of founding)"
-        if collisions
-        else "no collision",
+        ", ".join(map(_name, at_collisions)) or "no collision",
         len(at_collisions) == 1,
     )
     inside = sum(int(run.state[-1]) == study.dead_end for run in collisions)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,9 +29,17 @@ class Run:
     action: NDArray[np.int64]  #: (T,) index of the action commanded after each row
     state: NDArray[np.int64]  #: (T,) index of the most probable state
     n_states: NDArray[np.int64]  #: (T,) number of states
-    belief: NDArray[np.float64]  #: (T, n)
+    belief: NDArray[np.float64]  #: (T, n), 0 for states founded later
     surprise: NDArray[np.float64]  #: (T,) [bit]
     first_surprise: float  #: of the first row, against the uniform belief and marginal matrix [bit]
+
+
+class Founding(NamedTuple):
+    """When a state was founded."""
+
+    state: int
+    run: int  #: index of the run
+    time: float  #: in that run [s]
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,6 +53,29 @@ class PaperStudy:
     safe_at_the_end: Mapping[int, bool]  #: whether the longer runs of cases 2 and 3 stay safe
     model: FSMModel
     dead_end: int  #: index of the state that stands at most collisions; -1 without collisions
+
+    @property
+    def foundings(self) -> list[Founding]:
+        """When each state was founded, in the order of time."""
+        lengths = [len(run.state) for run in self.runs]
+        first_rows = np.cumsum([0, *lengths])
+        foundings = []
+        for state, number in enumerate(self.model.founded):
+            row = int(number) - 1
+            run = int(np.searchsorted(first_rows, row, side="right")) - 1
+            time = float(self.runs[run].episode.time[row - first_rows[run]])
+            foundings.append(Founding(state, run, time))
+        return foundings
+
+    @property
+    def changes(self) -> NDArray[np.int64]:
+        """(n, n) ndarray: how often the recognised state changed from one to another."""
+        counts = np.zeros((self.model.n_states, self.model.n_states), np.int64)
+        for run in self.runs:
+            before, after = run.state[:-1], run.state[1:]
+            changed = before != after
+            np.add.at(counts, (before[changed], after[changed]), 1)
+        return counts
 
     @property
     def last_round(self) -> tuple[Run, ...]:
@@ -97,7 +129,7 @@ def run_paper(
     return PaperStudy(
         world=name,
         settings=settings,
-        runs=tuple(runs),
+        runs=tuple(_widen(run, machine.n_states) for run in runs),
         extra_runs=tuple(extra_runs),
         safe_at_the_end=safe,
         model=machine.model(
@@ -112,11 +144,12 @@ def _learn(
 ) -> Run:
     """Show a run to the machine, row by row."""
     n = machine.n_states
-    foreseen = np.full(n, 1.0 / n) @ machine.marginal_matrix if n else np.empty(0)
+    foreseen = np.full(n, 1.0 / max(n, 1)) @ machine.marginal_matrix
     action = settings.actions.encode(episode.accelerations)
     trace = machine.learn_many(episode.observations, action, episode_starts=[0], belief=True)
     assert trace.belief is not None
-    first = float(jensen_shannon(foreseen, trace.belief[0, :n])) if n else float("nan")
+    foreseen = np.pad(foreseen, (0, machine.n_states - n))
+    first = float(jensen_shannon(foreseen, trace.belief[0])) if n else float("nan")
     return Run(
         name=name,
         case=case,
@@ -129,3 +162,8 @@ def _learn(
         surprise=trace.surprise,
         first_surprise=first,
     )
+
+
+def _widen(run: Run, n: int) -> Run:
+    """The run with a belief over all ``n`` states, those founded after it too."""
+    return replace(run, belief=np.pad(run.belief, ((0, 0), (0, n - run.belief.shape[1]))))
