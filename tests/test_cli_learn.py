@@ -172,7 +172,7 @@ def test_inspect_reads_machines_too(evofsm, tmp_path):
     machine.save(tmp_path / "machine")
     text = " ".join(evofsm("inspect", tmp_path / "machine").stdout.split())
     assert "a machine that can go on learning" in text
-    assert "radius=0.5" in text
+    assert "radius 0.5" in text
     assert "observations 5, the step is not known" in text
     assert "variable 1" in text
 

@@ -257,3 +257,9 @@ def test_numbers_of_numpy_are_saved_like_any_other(grown, tmp_path):
     actions = IntervalActions(np.float32(0.0), np.float32(grown.n_actions), np.int64(1))
     grown.model(actions=actions, dt=np.float32(0.5)).save(tmp_path / "model")
     assert FSMModel.load(tmp_path / "model").actions == actions
+
+
+def test_a_model_knows_the_settings_of_its_machine_and_keeps_them(grown, tmp_path):
+    grown.model().save(tmp_path / "model")
+    settings = FSMModel.load(tmp_path / "model").settings
+    assert repr(type(grown)(**settings)) == repr(grown)

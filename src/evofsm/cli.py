@@ -286,9 +286,8 @@ def inspect(
     from evofsm.report import terminal
 
     if storage.kind_of(file) == "machine":
-        machine = EvolvingFSM.load(file)
-        model, settings = machine.model(), repr(machine)
-        facts = [("file", f"{file}, a machine that can go on learning"), ("settings", settings)]
+        model = EvolvingFSM.load(file).model()
+        facts = [("file", f"{file}, a machine that can go on learning")]
     else:
         model = FSMModel.load(file)
         facts = [("file", file)]

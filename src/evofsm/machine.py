@@ -529,6 +529,7 @@ prior_frequency=0.001, spread=3.0)
             names=tuple(names),
             units=tuple(units),
             dt=dt,
+            settings=self._settings(),
         )
 
     # -- Keeping it -----------------------------------------------------------------------------

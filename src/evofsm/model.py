@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, fields
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, fields
 from os import PathLike
 from typing import Any, Self
 
@@ -37,6 +38,7 @@ class FSMModel:
     names: tuple[str, ...] = ()  #: of the m variables
     units: tuple[str, ...] = ()  #: of the m variables
     dt: float | None = None  #: time between two observations [s]
+    settings: Mapping[str, float] = field(default_factory=dict)  #: of the machine it is from
 
     def __post_init__(self) -> None:
         n, m, q = self.n_states, self.n_variables, self.n_actions
@@ -185,9 +187,10 @@ class FSMModel:
 
     def save(self, path: str | PathLike[str]) -> None:
         """Write the model to a file (arrays and a JSON header, nothing that can run)."""
-        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        values = {entry.name: getattr(self, entry.name) for entry in fields(self)}
         arrays = {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
         content = {name: value for name, value in values.items() if name not in arrays}
+        content["settings"] = dict(self.settings)
         content["actions"] = None if self.actions is None else asdict(self.actions)
         storage.write(path, "model", content, arrays)
 

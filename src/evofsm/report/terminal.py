@@ -126,12 +126,13 @@ def _action_text(learning: Learning, action: str) -> str:
 
 
 def _model_facts(model: FSMModel) -> Facts:
-    facts = [
+    settings = ", ".join(f"{name} {value:g}" for name, value in model.settings.items())
+    return [
         ("observations", f"{model.visits.sum():,.0f}, {_step_text(model.dt)}"),
         ("transitions", f"{model.uses.sum():,.0f}, under {model.n_actions} actions"),
         ("states", f"{model.n_states}, of {model.n_variables} variables"),
+        ("settings", settings or "not known"),
     ]
-    return facts
 
 
 def _step_text(dt: float | None) -> str:
@@ -278,6 +279,7 @@ def model_document(model: FSMModel) -> dict[str, Any]:
         "dt": model.dt,
         "names": model.names,
         "units": model.units,
+        "settings": dict(model.settings),
         "states": [
             {
                 "state": i,
