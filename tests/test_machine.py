@@ -1,4 +1,5 @@
 import copy
+import pickle
 
 import numpy as np
 import pytest
@@ -298,3 +299,13 @@ def test_settings_cannot_change_under_a_running_machine(name):
     machine = EvolvingFSM(n_actions=2)
     with pytest.raises(AttributeError):
         setattr(machine, name, 5)
+
+
+def test_a_machine_sent_to_another_process_goes_on_as_the_original(grown):
+    sent = pickle.loads(pickle.dumps(grown))
+    z = np.asarray(grown.centers[0]) + 0.25
+    for machine in (grown, sent):
+        machine.start_episode()
+        machine.learn_many([z, z + 0.5, z], [0, 1, 0])
+    assert np.array_equal(sent.transition_matrices, grown.transition_matrices)
+    assert np.array_equal(sent.belief, grown.belief)

@@ -12,6 +12,7 @@ vehicle control system via online recognition of latent risks", arXiv:1908.10823
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
 from enum import IntFlag
 from os import PathLike
@@ -563,15 +564,14 @@ prior_frequency=0.001, spread=3.0)
 
     def copy(self) -> Self:
         """An independent machine in the same state."""
-        twin = type(self)(**self._settings())
-        twin._use(self._buffer.copy())
-        return twin
+        return copy.copy(self)
 
-    def __copy__(self) -> Self:
-        return self.copy()
+    # The views belong to one buffer: a copy, or what another process gets, needs its own.
+    def __getstate__(self) -> dict[str, NDArray[np.float64]]:
+        return {"buffer": self._buffer.copy()}
 
-    def __deepcopy__(self, memo: dict[int, Any]) -> Self:
-        return self.copy()
+    def __setstate__(self, state: dict[str, NDArray[np.float64]]) -> None:
+        self._use(state["buffer"])
 
     def __repr__(self) -> str:
         settings = ", ".join(f"{name}={value}" for name, value in self._settings().items())
