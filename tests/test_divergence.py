@@ -76,8 +76,8 @@ def test_two_distributions_give_a_plain_float():
     [
         ([0.5, 0.5], [1.0], r"p has shape \(2,\) and q has shape \(1,\)"),
         (1.0, 1.0, "number of states on their last axis"),
-        ([1.5, -0.5], [0.5, 0.5], "p holds a negative"),
-        ([0.5, 0.5], [np.nan, 0.5], "q holds a negative or non-finite"),
+        ([1.5, -0.5], [0.5, 0.5], "p is no distribution"),
+        ([0.5, 0.5], [np.nan, 0.5], "q is no distribution"),
     ],
 )
 def test_what_is_no_pair_of_distributions_is_refused(p, q, words):

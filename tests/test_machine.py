@@ -309,3 +309,16 @@ def test_a_machine_sent_to_another_process_goes_on_as_the_original(grown):
         machine.learn_many([z, z + 0.5, z], [0, 1, 0])
     assert np.array_equal(sent.transition_matrices, grown.transition_matrices)
     assert np.array_equal(sent.belief, grown.belief)
+
+
+def test_the_state_is_the_nearest_also_where_beliefs_tie():
+    machine = EvolvingFSM(n_actions=1, radius=0.5, spread=1e6)
+    machine.learn_many([[0.0], [0.1], [2.0], [1.0]], [0, 0, 0, 0])
+    step = machine.observe([0.5 + 1e-12])
+    assert machine.state == step.state
+
+
+@pytest.mark.parametrize("horizon", [0, -1, 1.5, np.nan, "2"])
+def test_a_horizon_is_a_whole_number_of_steps(grown, horizon):
+    with pytest.raises(ValueError, match="horizon"):
+        grown.predict(0, horizon)

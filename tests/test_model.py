@@ -39,7 +39,7 @@ def test_a_snapshot_holds_what_the_machine_knew(grown):
         np.testing.assert_array_equal(getattr(model, name), getattr(grown, name))
     assert (model.n_states, model.n_variables, model.n_actions) == (grown.n_states, 2, 3)
     assert (model.names, model.units, model.dt) == (("x", "y"), ("m", "m/s"), 0.01)
-    np.testing.assert_array_equal(model.marginal_matrix(), grown.marginal_matrix)
+    np.testing.assert_array_equal(model.marginal_matrix, grown.marginal_matrix)
 
 
 def test_it_counts_founding_visits_and_uses(spiral):
@@ -195,7 +195,7 @@ def test_the_stationary_distribution_is_where_power_iteration_ends(n, q, seed):
     for policy in ("marginal", "observed"):
         shares = np.full(n, 1.0 / n)
         for _ in range(500):
-            shares = shares @ model.marginal_matrix(policy)
+            shares = shares @ model.averaged_matrix(policy)
         np.testing.assert_allclose(model.stationary_distribution(policy), shares, atol=1e-9)
 
 
@@ -236,7 +236,7 @@ def test_the_graph_has_a_node_per_state_and_an_edge_per_probable_transition():
 @pytest.mark.parametrize("policy", ["hold", "nonsense"])
 def test_an_average_over_actions_takes_only_policies_that_average(grown, policy):
     with pytest.raises(ValueError, match="an average is 'marginal' or 'observed'"):
-        grown.model().marginal_matrix(policy)
+        grown.model().averaged_matrix(policy)
 
 
 @pytest.mark.parametrize("belief", [[2.0, -1.0], [0.5, 0.2], [np.nan, 1.0]])

@@ -310,3 +310,34 @@ def test_saving_replaces_what_was_there(grown, snapshot, tmp_path):
     path.write_bytes(b"something longer than nothing" * 1000)
     grown.save(str(path))
     assert snapshot(EvolvingFSM.load(str(path))) == snapshot(grown)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "words"),
+    [
+        ("n_states", 1e6, "n_states is 1e"),
+        ("n_states", -3.0, "n_states is -3"),
+        ("action", 1e9, "action is 1e"),
+        ("action", 0.5, "action is 0.5"),
+        ("belief", np.nan, "belief holds NaN"),
+        ("belief", 2.0, "belief is no distribution"),
+        ("matrices", 7.0, "a row of matrices is no distribution"),
+        ("scatter", -1.0, "scatter is too small"),
+    ],
+)
+def test_numbers_that_learning_could_not_have_left_are_refused(grown, tmp_path, name, value, words):
+    grown.save(tmp_path / "machine")
+    settings, arrays = storage.read(tmp_path / "machine", "machine")
+    arrays[name].flat[0] = value
+    storage.write(tmp_path / "machine", "machine", settings, arrays)
+    with pytest.raises(ValueError, match=words):
+        EvolvingFSM.load(tmp_path / "machine")
+
+
+def test_a_model_whose_probabilities_are_none_is_refused(grown, tmp_path):
+    grown.model().save(tmp_path / "model")
+    content, arrays = storage.read(tmp_path / "model", "model")
+    arrays["transition_matrices"][0, 0, 0] = np.nan
+    storage.write(tmp_path / "model", "model", content, arrays)
+    with pytest.raises(ValueError, match="transition_matrices holds NaN"):
+        FSMModel.load(tmp_path / "model")

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from typing import Any, overload
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from evofsm._compile import kernel
+from evofsm.validation import refuse_unless_distribution
 
 # Stands in for 0 in a divisor or a logarithm whose result is multiplied by 0.
 _TINY = 1e-300
@@ -43,7 +46,11 @@ def _term(p: float, q: float) -> float:
     return more + q * math.log(max(1.0 - d, _TINY))
 
 
-def jensen_shannon(p: ArrayLike, q: ArrayLike) -> NDArray[np.float64] | float:
+@overload
+def jensen_shannon(p: Sequence[float], q: Sequence[float]) -> float: ...
+@overload
+def jensen_shannon(p: ArrayLike, q: ArrayLike) -> Any: ...
+def jensen_shannon(p: ArrayLike, q: ArrayLike) -> Any:
     """Jensen-Shannon divergence in bits (Lin 1991), between 0 (equal) and 1 (disjoint).
 
     Parameters
@@ -54,19 +61,19 @@ def jensen_shannon(p: ArrayLike, q: ArrayLike) -> NDArray[np.float64] | float:
     Returns
     -------
     float or (...) ndarray
-        Divergence [bit].
+        Divergence [bit]; a number for two single distributions.
 
     Raises
     ------
     ValueError
-        If the last axes differ in length, or an entry is negative or not finite.
+        If the last axes differ in length, or a row is no distribution.
 
     Examples
     --------
     >>> jensen_shannon([1.0, 0.0], [0.0, 1.0])
     1.0
-    >>> jensen_shannon([0.5, 0.5], [0.5, 0.5])
-    0.0
+    >>> jensen_shannon([[0.5, 0.5], [1.0, 0.0]], [0.5, 0.5]).round(3)
+    array([0.   , 0.311])
     """
     p = np.asarray(p, dtype=np.float64)
     q = np.asarray(q, dtype=np.float64)
@@ -75,11 +82,8 @@ def jensen_shannon(p: ArrayLike, q: ArrayLike) -> NDArray[np.float64] | float:
             f"p has shape {p.shape} and q has shape {q.shape}: "
             "both need the same number of states on their last axis"
         )
-    for name, distribution in (("p", p), ("q", q)):
-        if not (np.isfinite(distribution).all() and (distribution >= 0.0).all()):
-            raise ValueError(
-                f"{name} holds a negative or non-finite entry; it must be a distribution"
-            )
+    refuse_unless_distribution("p", p)
+    refuse_unless_distribution("q", q)
     shape = np.broadcast_shapes(p.shape, q.shape)
     n = shape[-1]
     rows_p = np.ascontiguousarray(np.broadcast_to(p, shape)).reshape(-1, n)

@@ -32,6 +32,7 @@ from evofsm.memory import (
     allocate,
     leaves,
     open_memory,
+    refuse_impossible,
     resize,
     view,
 )
@@ -494,7 +495,11 @@ prior_frequency=0.001, spread=3.0)
     @property
     def state(self) -> int | None:
         """Index of the most probable state; None until an episode's first observation."""
-        return int(self.belief.argmax()) if self._memory.learnt.chained[0] else None
+        now = self._memory.learnt
+        if not now.chained[0]:
+            return None
+        # By distance, as `observe` does: beliefs may tie where distances do not.
+        return int(now.clusters.squared_distances[: self.n_states].argmin())
 
     def model(
         self,
@@ -554,11 +559,14 @@ prior_frequency=0.001, spread=3.0)
         with storage.explained(path):
             machine = cls(**settings)
             m, n = arrays["centers"].shape
+            if n == 0:
+                return machine
             buffer = allocate(m, machine.n_actions, n, machine._memory.parameters)
             for name, array in leaves(view(buffer).learnt):
                 if arrays[name].shape != array.shape:
                     raise ValueError(f"{name} has shape {arrays[name].shape}, not {array.shape}")
                 array[:] = arrays[name]
+            refuse_impossible(view(buffer).learnt)
         machine._use(resize(buffer, max(_FIRST_CAPACITY, n)))
         return machine
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from evofsm._compile import kernel
 from evofsm.states.ets import Clusters
 from evofsm.transitions import Transitions
+from evofsm.validation import refuse_unless_distribution
 
 NO_ACTION = -1
 
@@ -140,3 +141,22 @@ def leaves(learnt: NamedTuple) -> Iterator[tuple[str, NDArray[np.float64]]]:
             yield name, value
         else:
             yield from leaves(value)
+
+
+def refuse_impossible(learnt: Learnt) -> None:
+    """Raise where numbers that a file gave could not have come from learning.
+
+    Kernels take counts and indices from the buffer on trust.
+    """
+    n, n_actions = len(learnt.belief), len(learnt.transitions.uses)
+    for name, array in leaves(learnt):
+        if not np.isfinite(array).all():
+            raise ValueError(f"{name} holds NaN or infinity")
+    if learnt.n_states[0] != n:
+        raise ValueError(f"n_states is {learnt.n_states[0]:g}, but there are {n} states")
+    if learnt.action[0] not in range(NO_ACTION, n_actions):
+        raise ValueError(f"action is {learnt.action[0]:g}, but there are {n_actions} actions")
+    if learnt.clusters.n_observations[0] < n or learnt.clusters.scatter[0] < 0.0:
+        raise ValueError("n_observations or scatter is too small")
+    refuse_unless_distribution("belief", learnt.belief)
+    refuse_unless_distribution("a row of matrices", learnt.transitions.matrices)

@@ -16,7 +16,13 @@ from evofsm.actions import IntervalActions
 from evofsm.states.ets import measure_distances
 from evofsm.states.spread import recognise
 from evofsm.transitions import Policy, marginal, propagate
-from evofsm.validation import check_action, positive, refuse_unusable
+from evofsm.validation import (
+    check_action,
+    positive,
+    real_array,
+    refuse_unless_distribution,
+    refuse_unusable,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,8 +61,12 @@ class FSMModel:
             array = np.array(getattr(self, name), dtype=np.float64)
             if array.shape != shape:
                 raise ValueError(f"{name} has shape {array.shape}, not {shape}")
+            if not np.isfinite(array).all():
+                raise ValueError(f"{name} holds NaN or infinity")
             array.setflags(write=False)
             object.__setattr__(self, name, array)
+        if n:
+            refuse_unless_distribution("a row of transition_matrices", self.transition_matrices)
         for name in ("names", "units"):
             if len(getattr(self, name)) not in (0, m):
                 raise ValueError(f"{name} are {getattr(self, name)}, but there are {m} variables")
@@ -91,7 +101,7 @@ class FSMModel:
         -------
         (n,) or (N, n) ndarray
         """
-        given = np.asarray(z, dtype=np.float64)
+        given = real_array("z", z, ndim=np.ndim(z))
         rows = np.atleast_2d(given)
         if rows.ndim != 2 or rows.shape[1] != self.n_variables:
             raise ValueError(f"z has shape {given.shape}; a row needs {self.n_variables} variables")
@@ -133,16 +143,24 @@ class FSMModel:
             raise ValueError(
                 f"belief has shape {start.shape}; the model has {self.n_states} states"
             )
-        if not ((start >= 0.0).all() and abs(start.sum() - 1.0) < 1e-6):
-            raise ValueError(
-                "belief is no distribution: its entries must be 0 or more and sum to 1"
-            )
+        refuse_unless_distribution("belief", start)
         if action is not None:
             action = check_action(action, self.n_actions)
         return propagate(self.transition_matrices, self.uses, start, action, horizon, policy)
 
-    def marginal_matrix(self, policy: Policy = "marginal") -> NDArray[np.float64]:
-        """(n, n) transition probabilities, over all actions alike or as often as each was used."""
+    @property
+    def marginal_matrix(self) -> NDArray[np.float64]:
+        """(n, n) ndarray: the paper's P*, transition probabilities if all actions are alike."""
+        return self.averaged_matrix("marginal")
+
+    def averaged_matrix(self, policy: Policy = "observed") -> NDArray[np.float64]:
+        """(n, n) transition probabilities, averaged over the actions.
+
+        Parameters
+        ----------
+        policy : {"observed", "marginal"}
+            Each action as often as it was used, or all alike.
+        """
         return marginal(self.transition_matrices, self.uses, policy)
 
     def stationary_distribution(self, policy: Policy = "marginal") -> NDArray[np.float64]:
@@ -157,7 +175,7 @@ class FSMModel:
         n = self.n_states
         if n == 0:
             return np.empty(0)
-        balance = np.vstack([self.marginal_matrix(policy).T - np.eye(n), np.ones(n)])
+        balance = np.vstack([self.averaged_matrix(policy).T - np.eye(n), np.ones(n)])
         solution, _, rank, _ = np.linalg.lstsq(balance, np.append(np.zeros(n), 1.0))
         if rank < n:
             raise ValueError(
@@ -176,7 +194,7 @@ class FSMModel:
         least : float
             Edges below this probability are left out.
         """
-        matrix = self.marginal_matrix(policy)
+        matrix = self.averaged_matrix(policy)
         lines = ["digraph evofsm {", "  node [shape=circle];"]
         for i, center in enumerate(self.centers):
             values = ", ".join(f"{value:.4g}" for value in center)

@@ -1,7 +1,8 @@
 """The file format of machines and models: named arrays and a JSON header, nothing that can run.
 
 A file is a ZIP of ``.npy`` members (NumPy's ``.npz``), read with pickling refused. The member
-``header`` is JSON: ``{"format", "version", "kind", "content"}``.
+``header`` is JSON: ``{"format", "version", "kind", "content"}``. A machine's file holds the
+views of its buffer, with centres by variable (m, n); a model's its fields, centres by state (n, m).
 """
 
 from __future__ import annotations
@@ -43,13 +44,14 @@ def write(
     """Write a file whole or not at all: beside its place first, then renamed into it."""
     header = {"format": _FORMAT, "version": _VERSION, "kind": kind, "content": dict(content)}
     encoded = np.frombuffer(json.dumps(header).encode(), np.uint8)
+    members: dict[str, Any] = {"header": encoded, **arrays}
     target = Path(path)
     if not target.parent.is_dir():
         raise FileNotFoundError(f"{target}: there is no folder {target.parent}")
     temporary = target.with_name(f".{target.name}.{os.getpid()}.part")
     try:
         with open(temporary, "wb") as file:
-            np.savez_compressed(file, allow_pickle=False, header=encoded, **arrays)
+            np.savez_compressed(file, **members)
             file.flush()
             os.fsync(file.fileno())
         temporary.replace(target)

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evofsm._compile import kernel
+from evofsm.validation import whole
 
 Policy = Literal["marginal", "hold", "observed"]
 
@@ -121,8 +122,7 @@ def propagate(
     """
     if policy not in get_args(Policy):
         raise ValueError(f"policy is {policy!r}; it must be one of {', '.join(get_args(Policy))}")
-    if horizon < 1:
-        raise ValueError(f"horizon is {horizon}; a forecast looks at least 1 step ahead")
+    horizon = whole("horizon", horizon)
     if action is None and policy == "hold":
         raise ValueError("policy 'hold' needs the action that is held")
     if action is not None:
@@ -130,6 +130,5 @@ def propagate(
         horizon -= 1
     if horizon > 0:
         then = matrices[action] if policy == "hold" else marginal(matrices, uses, policy)
-        for _ in range(horizon):
-            belief = belief @ then
+        belief = belief @ np.linalg.matrix_power(then, horizon)
     return belief

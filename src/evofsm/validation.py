@@ -67,6 +67,12 @@ def refuse_unusable(name: str, values: NDArray[np.float64]) -> None:
         )
 
 
+def refuse_unless_distribution(name: str, rows: NDArray[np.float64]) -> None:
+    """Raise unless every row, along the last axis, has no entry below 0 and sums to 1."""
+    if not ((rows >= 0.0).all() and (np.abs(rows.sum(axis=-1) - 1.0) < 1e-6).all()):
+        raise ValueError(f"{name} is no distribution: entries must be 0 or more and sum to 1")
+
+
 def check_action(i: SupportsIndex, n_actions: int) -> int:
     """An index of one of the actions."""
     try:

@@ -4,18 +4,21 @@ from __future__ import annotations
 
 from typing import Protocol, runtime_checkable
 
-import numba
 import numpy as np
 from numba import types
 from numpy.typing import NDArray
+
+from evofsm._compile import Function, compiled
 
 #: ``kernel(parameters, time, gap, speed, leader_speed) -> acceleration``
 DRIVER_KERNEL = types.float64(
     types.float64[:, ::1], types.float64, types.float64, types.float64, types.float64
 )
 
-#: Decorator for such a kernel. It has a fixed signature, and so can be passed as a value.
-driver_kernel = numba.njit([DRIVER_KERNEL], cache=True, error_model="numpy")
+
+def driver_kernel(function: Function) -> Function:
+    """Compile such a kernel. It has a fixed signature, and so can be passed as a value."""
+    return compiled(function, [DRIVER_KERNEL])
 
 
 class Kernel(Protocol):

@@ -217,7 +217,7 @@ def draw_graph(study: PaperStudy) -> Figure:
         2,
         gridspec_kw={"left": 0.0, "right": 1.0, "top": 0.94, "bottom": 0.05, "wspace": 0.0},
     )
-    matrix = study.model.marginal_matrix("observed")
+    matrix = study.model.averaged_matrix("observed")
     _draw_nodes(learnt, [f"stays {_percent(value)}" for value in np.diag(matrix)], study.dead_end)
     _draw_edges(learnt, matrix, study.dead_end, widest=1.6, strongest=2)
     learnt.set_title("(a) learnt: probability of the next state, per step", x=0.03)

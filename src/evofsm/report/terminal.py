@@ -156,7 +156,7 @@ def _print_states(out: Console, model: FSMModel) -> None:
     headers = _headers(model)
     table = _table("", *headers, "share\nof time", "stays", "first\nseen")
     total = max(float(model.visits.sum()), 1.0)
-    stays = model.marginal_matrix("observed").diagonal()
+    stays = model.averaged_matrix("observed").diagonal()
     columns = [_aligned(column) for column in model.centers.T]
     for i, center in enumerate(zip(*columns, strict=True)):
         share = _percent(float(model.visits[i]) / total)

@@ -145,7 +145,7 @@ def passages(model: FSMModel, most: int = 12) -> list[Passage]:
     How often an action was taken in a state is estimated from its use as a whole and the share
     of the state in its recent use.
     """
-    matrix = model.marginal_matrix("observed")
+    matrix = model.averaged_matrix("observed")
     flow = model.visits[:, None] * matrix
     np.fill_diagonal(flow, 0.0)
     recent = model.origin_frequency.sum(axis=1, keepdims=True)
