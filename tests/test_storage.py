@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from evofsm import EvolvingFSM, FSMModel, IntervalActions
+from evofsm import EvolvingFSM, FSMModel, IntervalActions, storage
 from evofsm.storage import kind_of
 
 

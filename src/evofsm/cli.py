@@ -63,7 +63,7 @@ def plain_errors(command: Callable[P, None]) -> Callable[P, None]:
         try:
             command(*args, **kwargs)
         except KeyboardInterrupt:
-            print("\nevofsm: stopped; nothing was saved", file=sys.stderr)
+            print("\nevofsm: stopped before the end", file=sys.stderr)
             raise typer.Exit(130) from None
         except BrokenPipeError:  # whoever read the output had enough
             raise

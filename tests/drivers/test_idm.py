@@ -63,3 +63,9 @@ def test_impossible_parameters_are_refused_by_name(change, word):
     values = {"accel": 1.0, "desired_speed": 25.0, "min_gap": 2.0, "time_headway": 1.0}
     with pytest.raises(ValueError, match=word):
         IDM(**{**values, "decel": 2.0, **change})
+
+
+@pytest.mark.parametrize("at", [math.nan, -1.0])
+def test_a_driver_changes_at_a_time(at):
+    with pytest.raises(ValueError, match="changes at"):
+        ChangingIDM(NORMAL, HASTY, at=at)

@@ -37,3 +37,9 @@ def test_ttc_is_gap_over_closing_speed():
     assert time_to_collision(np.array([10.0, 25.0, 20.0])) == 2.0
     rows = np.array([[10.0, 25.0, 20.0], [10.0, 20.0, 25.0]])
     assert time_to_collision(rows).tolist() == [2.0, np.inf]
+
+
+def test_measures_take_whole_numbers_and_cars_that_have_met():
+    assert time_to_collision(np.array([10, 25, 20])) == 2.0
+    assert time_to_collision(np.array([-0.5, 25.0, 20.0])) == 0.0
+    assert is_dead_end(np.array([0, 10, 10]), 4, 9)

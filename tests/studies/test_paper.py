@@ -174,3 +174,11 @@ def test_data_can_be_read_back(study, tmp_path):
     model = FSMModel.load(written / "model.evofsm")
     assert np.array_equal(model.centers, study.model.centers)
     assert model.names == ("gap", "v_follower", "v_leader")
+
+
+def test_a_leader_that_never_brakes_is_said_not_to(tmp_path):
+    late = changed(tmp_path, "[cases]\nbrake_at = [40.0]\n[leader]\nbrake_speed = 99.0\n")
+    claims = check_claims(run_paper(KinematicWorld(), "kinematic", late, rounds=1))
+    brake = next(claim for claim in claims if claim.id == "brake_at_40")
+    assert brake.measured == "the leader did not brake"
+    assert not brake.holds

@@ -19,21 +19,16 @@ GOLDEN = Path(__file__).parents[1] / "golden" / "paper_four_runs.npz"
 
 
 @pytest.fixture(scope="module")
-def sumo():
-    with SumoWorld() as world:
-        yield world
-
-
-@pytest.fixture(scope="module")
-def in_both(sumo):
+def in_both():
     """The four cases, driven in SUMO and in closed form."""
-    return {
-        case: (
-            sumo.run(SETTINGS.scenario, SETTINGS.drivers[case]),
-            KinematicWorld().run(SETTINGS.scenario, SETTINGS.drivers[case]),
-        )
-        for case in CASES
-    }
+    with SumoWorld() as sumo:
+        return {
+            case: (
+                sumo.run(SETTINGS.scenario, SETTINGS.drivers[case]),
+                KinematicWorld().run(SETTINGS.scenario, SETTINGS.drivers[case]),
+            )
+            for case in CASES
+        }
 
 
 class Plain:
@@ -66,12 +61,8 @@ def test_sumo_carries_out_every_acceleration_exactly(in_both, case):
 
 
 def test_sumo_itself_reports_the_collision_at_the_last_step(tmp_path, in_both):
-    # `in_both` is asked for so that its simulation is known to this test, and closed by it.
     report = tmp_path / "collisions.xml"
     episode = in_both[1][0]
-    import libsumo
-
-    libsumo.close()
     with SumoWorld(("--collision-output", str(report))) as world:
         again = world.run(SETTINGS.scenario, SETTINGS.drivers[1])
     assert np.array_equal(again.observations, episode.observations)
@@ -139,3 +130,68 @@ def test_a_controller_that_proposes_no_number_is_named(wrong):
 def test_an_impossible_scenario_is_refused_by_name(name):
     with pytest.raises(ValueError, match=name):
         replace(SETTINGS.scenario, **{name: 0.0})
+
+
+@pytest.mark.parametrize("dt", [0.0125, 0.0005])
+def test_a_step_that_sumos_clock_cannot_count_is_refused(dt):
+    with pytest.raises(ValueError, match="whole milliseconds"):
+        SumoWorld().run(replace(SETTINGS.scenario, dt=dt), SETTINGS.drivers[1])
+
+
+def test_a_road_that_may_be_too_short_is_refused():
+    with pytest.raises(ValueError, match="beyond the road"):
+        SumoWorld().run(replace(SETTINGS.scenario, duration=5000.0), SETTINGS.drivers[1])
+
+
+def test_a_world_closed_from_outside_starts_again():
+    import libsumo
+
+    short = replace(SETTINGS.scenario, duration=0.5)
+    with SumoWorld() as world:
+        before = world.run(short, SETTINGS.drivers[1])
+        libsumo.close()
+        after = world.run(short, SETTINGS.drivers[1])
+    assert np.array_equal(before.observations, after.observations)
+
+
+def test_a_start_that_fails_leaves_no_simulation_behind():
+    with pytest.raises(Exception, match="commandline options"):
+        SumoWorld(("--no-such-option", "1")).run(SETTINGS.scenario, SETTINGS.drivers[1])
+    with SumoWorld() as world:
+        assert world.run(replace(SETTINGS.scenario, duration=0.5), SETTINGS.drivers[1])
+
+
+def test_what_was_realised_is_what_was_commanded_until_standstill(in_both):
+    episode = in_both[3][1]
+    moving = episode.observations[1:, 1] > 0.0
+    realised, commanded = episode.realised[:-1], episode.accelerations[:-1]
+    assert np.isnan(episode.realised[-1])
+    assert np.abs(realised - commanded)[moving].max() < 1e-9
+
+
+def test_a_controller_cannot_write_into_the_record():
+    def meddle(time, observation):
+        observation[:] = 99.0
+        return 1.0
+
+    episode = KinematicWorld().run(replace(SETTINGS.scenario, duration=0.5), Plain(meddle))
+    assert episode.observations[0].tolist() == [5.0, 0.0, 0.0]
+
+
+@pytest.mark.parametrize(
+    ("change", "word"),
+    [
+        ({"brake_decel": -9.0}, "brake_decel"),
+        ({"brake_decel": math.nan}, "brake_decel"),
+        ({"brake_time": math.nan}, "brake_time"),
+        ({"brake_speed": -1.0}, "brake_speed"),
+    ],
+)
+def test_an_impossible_leader_is_refused_by_name(change, word):
+    with pytest.raises(ValueError, match=word):
+        replace(SETTINGS.scenario.leader, **change)
+
+
+def test_a_scenario_lasts_two_steps_or_more():
+    with pytest.raises(ValueError, match="two steps"):
+        replace(SETTINGS.scenario, duration=0.01)

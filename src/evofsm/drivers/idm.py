@@ -116,6 +116,10 @@ class ChangingIDM:
     then: IDM
     at: float
 
+    def __post_init__(self) -> None:
+        if not self.at >= 0.0:
+            raise ValueError(f"the driver changes at {self.at} s; it must be 0 or later")
+
     kernel: ClassVar[Kernel] = staticmethod(_idm_kernel)
 
     @cached_property

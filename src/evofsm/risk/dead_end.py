@@ -31,7 +31,7 @@ def is_dead_end(
     >>> is_dead_end(np.array([[30.0, 20.0, 20.0], [25.0, 20.0, 20.0]]), 4.0, 9.0)
     array([False,  True])
     """
-    gap, speed, leader_speed = np.moveaxis(observations, -1, 0)
+    gap, speed, leader_speed = np.moveaxis(np.asarray(observations, dtype=np.float64), -1, 0)
     stopped = gap + leader_speed**2 / (2 * leader_decel) - speed**2 / (2 * decel)
     smallest = np.minimum(gap, stopped)
     # A follower who brakes harder is nearest when the speeds meet, if both still move then.

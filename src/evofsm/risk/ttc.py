@@ -17,14 +17,16 @@ def time_to_collision(observations: NDArray[np.float64]) -> NDArray[np.float64]:
     Returns
     -------
     (...) ndarray
-        Gap over closing speed [s]; infinite where the follower is not the faster one.
+        Gap over closing speed [s]; infinite where the follower is not the faster one, 0 where
+        the cars have met.
 
     Examples
     --------
     >>> time_to_collision(np.array([[20.0, 25.0, 20.0], [2.0, 20.0, 20.0]]))
     array([ 4., inf])
     """
-    gap, speed, leader_speed = np.moveaxis(observations, -1, 0)
+    gap, speed, leader_speed = np.moveaxis(np.asarray(observations, dtype=np.float64), -1, 0)
     closing = speed - leader_speed
     ttc = np.full_like(gap, np.inf)
-    return np.asarray(np.divide(gap, closing, out=ttc, where=closing > 0.0))
+    np.divide(gap, closing, out=ttc, where=closing > 0.0)
+    return np.where(gap <= 0.0, 0.0, ttc)

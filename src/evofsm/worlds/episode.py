@@ -27,6 +27,15 @@ class Episode:
     leader_accelerations: NDArray[np.float64]  #: (T,) commanded to the leader [m/s²]
 
     @property
+    def realised(self) -> NDArray[np.float64]:
+        """(T,) ndarray: what the follower did after each row [m/s²]; NaN after the last.
+
+        It differs from what was commanded where the car came to a standstill.
+        """
+        change = np.diff(self.observations[:, 1], append=np.nan)
+        return change / np.diff(self.time, append=np.nan)
+
+    @property
     def collided(self) -> bool:
         """Whether the run ended in a collision."""
         return bool(self.observations[-1, 0] <= 0.0)
@@ -63,7 +72,7 @@ def drive(road: Road, scenario: Scenario, controller: Controller) -> Episode:
     for row, time in enumerate(times.tolist()):
         observation = observations[row]
         observation[:] = gap, _, leader_speed = road.observe()
-        acceleration = float(controller.propose(time, observation))
+        acceleration = float(controller.propose(time, observation.copy()))
         if not math.isfinite(acceleration):
             raise ValueError(f"controller proposed {acceleration} at {time:g} s, gap {gap:g} m")
         braking = braking or leader_speed >= leader.brake_speed or time >= leader.brake_time

@@ -32,6 +32,15 @@ class Leader:
     brake_speed: float = math.inf
     brake_time: float = math.inf
 
+    def __post_init__(self) -> None:
+        if not 0.0 < self.brake_decel < math.inf:
+            raise ValueError(
+                f"leader's brake_decel is {self.brake_decel}; it must be positive and finite"
+            )
+        for name in ("brake_speed", "brake_time"):
+            if not getattr(self, name) >= 0.0:
+                raise ValueError(f"leader's {name} is {getattr(self, name)}; it must be 0 or more")
+
 
 @dataclass(frozen=True)
 class Scenario:
@@ -58,6 +67,11 @@ class Scenario:
             value = getattr(self, name)
             if not 0.0 < value < math.inf:
                 raise ValueError(f"scenario's {name} is {value}; it must be positive and finite")
+        if self.duration < 2 * self.dt:
+            raise ValueError(
+                f"scenario's duration is {self.duration} and its dt {self.dt}; "
+                "it must last two steps or more"
+            )
 
     @property
     def times(self) -> NDArray[np.float64]:

@@ -11,14 +11,14 @@ import tempfile
 from collections.abc import Sequence
 from importlib import import_module
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self
 
 from evofsm.protocols import Controller
 from evofsm.worlds.episode import Episode, drive
 from evofsm.worlds.scenario import Scenario
 
-_ROAD_LENGTH = 20_000.0
+_ROAD_LENGTH = 200_000.0
+_FASTEST = 100.0
 _VEHICLE_LENGTH = 5.0
 # Where the follower's front bumper stands at first.
 _START = 10.0
@@ -27,7 +27,7 @@ _NET = f"""<net version="1.20">
     <location netOffset="0,0" convBoundary="0,0,{_ROAD_LENGTH:.2f},0"
               origBoundary="0,0,{_ROAD_LENGTH:.2f},0" projParameter="!"/>
     <edge id="road" from="begin" to="end" priority="1">
-        <lane id="road_0" index="0" speed="100" length="{_ROAD_LENGTH:.2f}"
+        <lane id="road_0" index="0" speed="{_FASTEST}" length="{_ROAD_LENGTH:.2f}"
               shape="0,0 {_ROAD_LENGTH:.2f},0"/>
     </edge>
     <junction id="begin" type="dead_end" x="0" y="0" incLanes="" intLanes="" shape="0,0 0,3.2"/>
@@ -37,8 +37,8 @@ _NET = f"""<net version="1.20">
 """
 
 _ROUTES = f"""<routes>
-    <vType id="car" length="{_VEHICLE_LENGTH}" minGap="0" maxSpeed="100" accel="100" decel="100"
-           emergencyDecel="100" speedFactor="1" speedDev="0" sigma="0"/>
+    <vType id="car" length="{_VEHICLE_LENGTH}" minGap="0" maxSpeed="{_FASTEST}" accel="100"
+           decel="100" emergencyDecel="100" speedFactor="1" speedDev="0" sigma="0"/>
     <route id="along" edges="road"/>
 </routes>
 """
@@ -71,38 +71,32 @@ class SumoWorld:
                 "the world 'sumo' needs libsumo: pip install 'evofsm[sumo]'"
             ) from error
         self._options = list(options)
-        self._folder: tempfile.TemporaryDirectory[str] | None = None
+        self._folder: tempfile.TemporaryDirectory[str] | None = None  # while a simulation is open
         self._dt = 0.0
         self._runs = 0
 
     def run(self, scenario: Scenario, controller: Controller) -> Episode:
         """Drive the scenario with ``controller`` in the follower."""
-        if self._folder is None or self._dt != scenario.dt:
+        _refuse_what_sumo_cannot_drive(scenario)
+        if self._folder is None or self._dt != scenario.dt or not self._sumo.isLoaded():
             self.close()
             self._start(scenario.dt)
         self._runs += 1
-        road = _Road(self._sumo, self._runs, scenario)
-        try:
+        with _Road(self._sumo, self._runs, scenario) as road:
             return drive(road, scenario, controller)
-        finally:
-            road.clear()
 
     def close(self) -> None:
         """End the simulation."""
         if self._folder is not None:
-            self._sumo.close()
+            if self._sumo.isLoaded():
+                self._sumo.close()
             self._folder.cleanup()
             self._folder = None
 
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.close()
 
     def _start(self, dt: float) -> None:
@@ -111,26 +105,46 @@ class SumoWorld:
                 "this process runs a SUMO simulation already, and libsumo has room for one: "
                 "close that one, or use another process"
             )
-        self._folder = tempfile.TemporaryDirectory(prefix="evofsm-sumo-")
-        folder = Path(self._folder.name)
-        (folder / "road.net.xml").write_text(_NET)
-        (folder / "road.rou.xml").write_text(_ROUTES)
-        self._sumo.start(
-            [
-                "sumo",
-                *("--net-file", str(folder / "road.net.xml")),
-                *("--route-files", str(folder / "road.rou.xml")),
-                *("--step-length", repr(dt)),
-                *("--step-method.ballistic", "true"),
-                *("--collision.action", "warn"),
-                *("--collision.mingap-factor", "0"),
-                *("--time-to-teleport", "-1"),
-                *("--no-step-log", "true"),
-                *("--no-warnings", "true"),
-                *self._options,
-            ]
+        folder = tempfile.TemporaryDirectory(prefix="evofsm-sumo-")
+        net, routes = Path(folder.name) / "road.net.xml", Path(folder.name) / "road.rou.xml"
+        net.write_text(_NET)
+        routes.write_text(_ROUTES)
+        try:
+            self._sumo.start(
+                [
+                    "sumo",
+                    *("--net-file", str(net)),
+                    *("--route-files", str(routes)),
+                    *("--step-length", repr(dt)),
+                    *("--step-method.ballistic", "true"),
+                    *("--collision.action", "warn"),
+                    *("--collision.mingap-factor", "0"),
+                    *("--time-to-teleport", "-1"),
+                    *("--no-step-log", "true"),
+                    *("--no-warnings", "true"),
+                    *self._options,
+                ]
+            )
+        except BaseException:
+            folder.cleanup()
+            raise
+        self._folder, self._dt = folder, dt
+
+
+def _refuse_what_sumo_cannot_drive(scenario: Scenario) -> None:
+    milliseconds = scenario.dt * 1000.0
+    if round(milliseconds) < 1 or abs(milliseconds - round(milliseconds)) > 1e-9:
+        raise ValueError(
+            f"dt is {scenario.dt} s, but SUMO's clock counts whole milliseconds: it would drive "
+            "another step; choose one of 0.001 s, 0.002 s, ..., or the kinematic world"
         )
-        self._dt = dt
+    # Nobody is faster than this; what the leader needs, the follower does not exceed.
+    farthest = _START + scenario.initial_gap + _FASTEST * scenario.duration
+    if farthest > _ROAD_LENGTH:
+        raise ValueError(
+            f"initial_gap {scenario.initial_gap:g} m and duration {scenario.duration:g} s may lead "
+            f"beyond the road's {_ROAD_LENGTH:g} m"
+        )
 
 
 class _Road:
@@ -164,7 +178,10 @@ class _Road:
             vehicle.setSpeed(car, max(0.0, vehicle.getSpeed(car) + wanted * self._dt))
         self._sumo.simulationStep()
 
-    def clear(self) -> None:
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
         for car in (self._follower, self._leader):
             if car in self._sumo.vehicle.getIDList():
                 self._sumo.vehicle.remove(car)

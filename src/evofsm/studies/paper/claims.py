@@ -48,13 +48,20 @@ def _claims(study: PaperStudy) -> Iterator[Claim]:
         as_in_paper == len(study.runs) and safe,
     )
     for time, run in zip(study.settings.brake_at, study.extra_runs, strict=True):
-        state = int(run.state[_brake_row(run)])
+        at_brake = _state_at_brake(study, run)
         yield Claim(
             f"brake_at_{time:g}",
             f"Leader brakes at {time:g} s, in the dead end: collision",
             "collision",
-            f"{_name(state)} at the brake, collision: {_outcome(run)}",
-            run.episode.collided and state == study.dead_end,
+            "the leader did not brake"
+            if at_brake is None
+            else f"{_name(at_brake)} at the brake; "
+            + (
+                f"collision at {run.episode.time[-1]:.1f} s, in {_name(run.state[-1])}"
+                if run.episode.collided
+                else "no collision"
+            ),
+            run.episode.collided and at_brake == study.dead_end,
         )
     yield Claim(
         "states_after_each_run",
@@ -73,7 +80,8 @@ def _claims(study: PaperStudy) -> Iterator[Claim]:
     at_collisions = sorted({int(run.state[-1]) for run in collisions})
     yield Claim(
         "dead_end_state",
-        "One and the same state at every collision, the dead end (numbers: order of founding)",
+        f"One and the same state at every collision of the {len(study.runs)} runs, the dead end "
+        "(numbers: order of founding)",
         "#3",
         ", ".join(map(_name, at_collisions)) or "no collision",
         len(at_collisions) == 1,
@@ -110,12 +118,8 @@ def _claims(study: PaperStudy) -> Iterator[Claim]:
 
 
 def _change(study: PaperStudy, case: int, *, leaves: bool) -> tuple[str, bool]:
-    """What the driver's change did in the last round, and whether it did so in every round.
-
-    The first round does not count: its runs still found states.
-    """
+    """What the driver's change did in the last round, and whether it did so in every round."""
     runs = [run for run in study.runs if run.case == case]
-    runs = runs[1:] or runs
     switch = study.settings.switch_at[case]
     as_in_paper = 0
     for run in runs:
@@ -125,7 +129,7 @@ def _change(study: PaperStudy, case: int, *, leaves: bool) -> tuple[str, bool]:
         as_in_paper += bool(inside[row] == leaves and inside[changed] != leaves != inside[-1])
     text = f"{_name(run.state[row])} at {switch:g} s"
     if changed > row:
-        text += f", {_name(run.state[changed])} from {run.episode.time[changed]:.1f} s"
+        text += f", {_name(run.state[changed])} from {run.episode.time[changed]:.2f} s"
     return f"{text}; so in {as_in_paper} of {len(runs)} rounds", as_in_paper == len(runs)
 
 
@@ -137,6 +141,7 @@ def _outcome(run: Run) -> str:
     return f"yes ({run.episode.time[-1]:.1f} s)" if run.episode.collided else "no"
 
 
-def _brake_row(run: Run) -> int:
-    """First row at which the leader brakes."""
-    return int(np.argmin(run.episode.leader_accelerations >= 0.0))
+def _state_at_brake(study: PaperStudy, run: Run) -> int | None:
+    """The state at the first row at which the leader brakes in full."""
+    braking = run.episode.leader_accelerations == -study.settings.scenario.leader.brake_decel
+    return int(run.state[np.argmax(braking)]) if braking.any() else None

@@ -106,7 +106,8 @@ def _table_of_states(study: PaperStudy) -> Table:
         "States",
         ("state", *names, "founded", "time", "dead end", "collisions"),
         tuple(rows),
-        "Founded: in which run, and when in it. Time: share of all. Dead end: share of the state's "
+        "Founded: in which run, and when in it. Time: share of all. Collisions: of the "
+        f"{len(study.runs)} runs. Dead end: share of the state's "
         f"time in which, by an oracle, the cars would collide if the leader braked with "
         f"{leader_decel:g} m/s² now and the follower with {settings.decel:g} m/s².",
     )

@@ -45,6 +45,7 @@ def _columns(number: int, run: Run) -> dict[str, Any]:
         "v_follower": v_follower,
         "v_leader": v_leader,
         "a_follower": episode.accelerations,
+        "a_follower_realised": episode.realised,
         "a_leader": episode.leader_accelerations,
         "action": run.action,
         "state": run.state,
