@@ -133,6 +133,43 @@ def test_an_interval_that_does_not_exist_is_refused(i):
             method(i)
 
 
+@pytest.mark.parametrize("i", [1.5, 1.0, "1", None])
+def test_an_index_that_is_no_integer_is_named(i):
+    actions = IntervalActions(**PAPER)
+    for method in (actions.interval, actions.center, actions.label):
+        with pytest.raises(TypeError, match=f"interval {i!r} does not exist; .*integer"):
+            method(i)
+
+
+def test_an_index_may_be_any_integer():
+    actions = IntervalActions(**PAPER)
+    for i in (np.int64(16), np.array(16)):
+        assert actions.interval(i) == (2.3, 2.5)
+        assert actions.label(i) == "[2.3, 2.5]"
+
+
+@pytest.mark.parametrize(
+    ("value", "words"),
+    [
+        ("abc", "action is 'abc'"),
+        ("0.5", "action is '0.5'"),
+        (None, "action is None"),
+        (1j, "action is 1j"),
+        (["0.5", "1"], "action has dtype <U3"),
+        ([0.0, None], "action has dtype object"),
+    ],
+)
+def test_an_action_that_is_no_number_is_named(value, words):
+    actions = IntervalActions(**PAPER)
+    for method in (actions.encode, actions.beyond):
+        with pytest.raises(TypeError, match=f"{words}; it must be a real number"):
+            method(value)
+
+
+def test_no_actions_have_no_intervals():
+    assert IntervalActions(**PAPER).encode([]).shape == (0,)
+
+
 @pytest.mark.parametrize(
     ("change", "words"),
     [

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
+import operator
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal, overload
+from typing import Literal, SupportsIndex, overload
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -26,12 +27,18 @@ class IntervalActions:
     low, high : float
         Range of the action, for an acceleration in [m/s²].
     width : float
-        Width of an interval.
+        Width of an interval, in the same unit; the last one may be narrower.
     closed : {"left", "right"}
         Which edge belongs to an interval: ``[a, b)`` as in the paper's experiment, or ``(a, b]``
         as in its Section 2.1.2. The outermost edge on the open side is included as well.
     outside : {"error", "clip"}
         Whether a value beyond the range is refused or put into the end interval.
+
+    Raises
+    ------
+    ValueError
+        If a number is not finite, ``low`` is not below ``high``, ``width`` is not positive or so
+        small that edges coincide, or ``closed`` or ``outside`` is none of its words.
 
     Examples
     --------
@@ -88,22 +95,34 @@ class IntervalActions:
     @overload
     def encode(self, a: ArrayLike) -> NDArray[np.int64]: ...
     def encode(self, a: ArrayLike) -> int | NDArray[np.int64]:
-        """Index of the interval in which each value lies.
+        """Index of the interval in which each value lies: the paper's Section 2.1.2.
 
         Parameters
         ----------
         a : float or array_like
+            Values of the action, in the unit of ``low`` and ``high``.
 
         Returns
         -------
         int or ndarray of int
+            Index from 0, in the shape of ``a``.
 
         Raises
         ------
+        TypeError
+            If ``a`` does not hold real numbers.
         ValueError
             If a value is NaN, or beyond the range and ``outside`` is ``"error"``.
+
+        Examples
+        --------
+        >>> actions = IntervalActions(low=-2.5, high=2.5, width=0.3)
+        >>> actions.encode(0.05), actions.label(8)
+        (8, '[-0.1, 0.2)')
+        >>> actions.encode([-2.2, 2.5])  # an edge opens the next interval, but for the last one
+        array([ 1, 16])
         """
-        values = np.asarray(a, dtype=np.float64)
+        values = _real_numbers(a)
         if np.isnan(values).any():
             raise ValueError("action is NaN; it has no interval")
         beyond = self.beyond(values)
@@ -118,24 +137,136 @@ class IntervalActions:
         return int(index) if values.ndim == 0 else index.astype(np.int64)
 
     def beyond(self, a: ArrayLike) -> NDArray[np.bool_]:
-        """Which values lie outside ``[low, high]``."""
-        values = np.asarray(a, dtype=np.float64)
+        """Which values lie outside ``[low, high]``.
+
+        Parameters
+        ----------
+        a : float or array_like
+            Values of the action, in the unit of ``low`` and ``high``.
+
+        Returns
+        -------
+        ndarray of bool
+            In the shape of ``a``; False for NaN.
+
+        Raises
+        ------
+        TypeError
+            If ``a`` does not hold real numbers.
+
+        Examples
+        --------
+        >>> actions = IntervalActions(low=-2.5, high=2.5, width=0.3)
+        >>> actions.beyond([-9.0, 0.0, 2.5])
+        array([ True, False, False])
+        """
+        values = _real_numbers(a)
         return np.asarray((values < self.low) | (values > self.high))
 
-    def interval(self, i: int) -> tuple[float, float]:
-        """Lower and upper edge of interval ``i``."""
-        if not 0 <= i < self.n_actions:
-            raise ValueError(f"interval {i} does not exist; there are 0 to {self.n_actions - 1}")
+    def interval(self, i: SupportsIndex) -> tuple[float, float]:
+        """Lower and upper edge of interval ``i``.
+
+        Parameters
+        ----------
+        i : int
+            Index of the interval, from 0.
+
+        Returns
+        -------
+        (float, float)
+            The edges, in the unit of ``low`` and ``high``.
+
+        Raises
+        ------
+        TypeError
+            If ``i`` is not an integer.
+        ValueError
+            If there is no such interval.
+
+        Examples
+        --------
+        >>> actions = IntervalActions(low=-2.5, high=2.5, width=0.3)
+        >>> actions.interval(0), actions.interval(16)  # the last one is cut at `high`
+        ((-2.5, -2.2), (2.3, 2.5))
+        """
+        i = self._index(i)
         return float(self.edges[i]), float(self.edges[i + 1])
 
-    def center(self, i: int) -> float:
-        """Middle of interval ``i``."""
+    def center(self, i: SupportsIndex) -> float:
+        """Middle of interval ``i``, the action that stands for all in it.
+
+        Parameters
+        ----------
+        i : int
+            Index of the interval, from 0.
+
+        Returns
+        -------
+        float
+            In the unit of ``low`` and ``high``.
+
+        Raises
+        ------
+        TypeError, ValueError
+            As `interval`.
+
+        Examples
+        --------
+        >>> actions = IntervalActions(low=-2.5, high=2.5, width=0.3)
+        >>> actions.center(actions.encode(1.0))
+        0.95
+        """
         lower, upper = self.interval(i)
         return round((lower + upper) / 2.0, _DIGITS)
 
-    def label(self, i: int) -> str:
-        """Interval ``i`` as people write it, such as ``[-2.5, -2.2)``."""
+    def label(self, i: SupportsIndex) -> str:
+        """Interval ``i`` as people write it, a bracket at each edge that belongs to it.
+
+        Parameters
+        ----------
+        i : int
+            Index of the interval, from 0.
+
+        Returns
+        -------
+        str
+            The edges in the unit of ``low`` and ``high``.
+
+        Raises
+        ------
+        TypeError, ValueError
+            As `interval`.
+
+        Examples
+        --------
+        >>> actions = IntervalActions(low=-2.5, high=2.5, width=0.3)
+        >>> actions.label(0), actions.label(16)
+        ('[-2.5, -2.2)', '[2.3, 2.5]')
+        """
+        i = self._index(i)
         lower, upper = self.interval(i)
         opening = "[" if self.closed == "left" or i == 0 else "("
         closing = "]" if self.closed == "right" or i == self.n_actions - 1 else ")"
         return f"{opening}{lower:g}, {upper:g}{closing}"
+
+    def _index(self, i: SupportsIndex) -> int:
+        try:
+            index = operator.index(i)
+        except TypeError:
+            raise TypeError(
+                f"interval {i!r} does not exist; its index must be an integer "
+                "(encode turns a number into one)"
+            ) from None
+        if not 0 <= index < self.n_actions:
+            raise ValueError(
+                f"interval {index} does not exist; there are 0 to {self.n_actions - 1}"
+            )
+        return index
+
+
+def _real_numbers(a: ArrayLike) -> NDArray[np.float64]:
+    values = np.asarray(a)
+    if values.dtype.kind not in "fiub":
+        what = f"is {a!r}" if values.ndim == 0 else f"has dtype {values.dtype}"
+        raise TypeError(f"action {what}; it must be a real number, or an array of them")
+    return values.astype(np.float64, copy=False)

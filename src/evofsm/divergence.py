@@ -53,6 +53,8 @@ def jensen_shannon(p: ArrayLike, q: ArrayLike) -> Any: ...
 def jensen_shannon(p: ArrayLike, q: ArrayLike) -> Any:
     """Jensen-Shannon divergence in bits (Lin 1991), between 0 (equal) and 1 (disjoint).
 
+    The paper's Section 3.2.2 measures by it how far a forecast was from what came.
+
     Parameters
     ----------
     p, q : (..., n) array_like

@@ -56,7 +56,19 @@ _FULL, _REFUSED = -1, -2
 
 
 class Event(IntFlag):
-    """What an observation did to the states."""
+    """What an observation did to the states (the paper's Section 2.2.1).
+
+    ``NONE`` left them as they were, ``MOVED`` put the nearest one on the observation, and
+    ``CREATED`` founded a new one there.
+
+    Examples
+    --------
+    >>> machine = EvolvingFSM(n_actions=1)
+    >>> machine.observe([0.0]).event is Event.CREATED
+    True
+    >>> Event(machine.learn_many([[0.0], [0.1]], [0, 0]).event[1])
+    <Event.NONE: 0>
+    """
 
     NONE = ets.UNCHANGED
     MOVED = ets.MOVED
@@ -67,7 +79,17 @@ _EVENTS = (Event.NONE, Event.MOVED, Event.CREATED)
 
 
 class Step(NamedTuple):
-    """What the machine made of one observation; n states exist after it."""
+    """What the machine made of one observation; n states exist after it.
+
+    Examples
+    --------
+    >>> machine = EvolvingFSM(n_actions=1)
+    >>> step = machine.learn_one([0.0], 0)
+    >>> step.state, step.event.name, len(step.predicted), step.surprise
+    (0, 'CREATED', 0, nan)
+    >>> machine.observe([0.1]).predicted
+    array([1.])
+    """
 
     state: int  #: index of the most probable state
     belief: NDArray[np.float64]  #: (n,) distribution over states
@@ -77,7 +99,17 @@ class Step(NamedTuple):
 
 
 class Trace(NamedTuple):
-    """What the machine made of T observations, a row each."""
+    """What the machine made of T observations, a row each; n states exist after the last.
+
+    Examples
+    --------
+    >>> machine = EvolvingFSM(n_actions=2, radius=0.5)
+    >>> trace = machine.learn_many([[0.0], [0.1], [2.0], [1.0]], [0, 0, 0, 0], belief=True)
+    >>> trace.state, trace.surprise.round(2)
+    (array([0, 0, 0, 1]), array([ nan, 0. , 0. , 0.31]))
+    >>> trace.belief.round(2)
+    array([[1.  , 0.  ], [1.  , 0.  ], [1.  , 0.  ], [0.37, 0.63]])
+    """
 
     state: NDArray[np.int64]  #: (T,) index of the most probable state
     n_states: NDArray[np.int64]  #: (T,) number of states after the row
@@ -194,6 +226,12 @@ class EvolvingFSM:
         Width of recognition: the similarity to a centre is
         ``exp(-distance^2 / (spread * total variance of all observations))``.
 
+    Raises
+    ------
+    ValueError
+        If ``n_actions`` is no whole number of at least 1, another setting is not positive and
+        finite, or ``learning_rate`` is 1 or more.
+
     Notes
     -----
     Rows of a transition matrix are "from", columns "to": a forecast is ``belief @ P``. States
@@ -237,6 +275,11 @@ class EvolvingFSM:
         Observations are ``[gap [m], v_follower [m/s], v_leader [m/s]]``; the 17 actions are those
         of ``IntervalActions(-2.5, 2.5, 0.3)`` [m/s²].
 
+        Returns
+        -------
+        EvolvingFSM
+            A machine that has observed nothing yet.
+
         Examples
         --------
         >>> EvolvingFSM.paper()
@@ -250,15 +293,17 @@ prior_frequency=0.001, spread=3.0)
     def observe(self, z: ArrayLike) -> Step:
         """Take in one observation: determine states, recognise, and learn the transition to it.
 
+        One step of the paper's Sections 2.2.1, 2.2.2 and 2.3.2, in that order.
+
         Parameters
         ----------
         z : (m,) array_like
-            Observation; the first one fixes m.
+            Observation, in units of your own; the first one fixes m.
 
         Returns
         -------
         Step
-            The present state and belief, and how well they were foreseen.
+            The present state and belief, and how well they were foreseen [bit].
 
         Raises
         ------
@@ -267,6 +312,14 @@ prior_frequency=0.001, spread=3.0)
         ValueError
             If ``z`` has another length than before, or an entry is NaN, infinite or beyond
             1e100. The machine is then as it was.
+
+        Examples
+        --------
+        >>> machine = EvolvingFSM(n_actions=2, radius=0.5)
+        >>> trace = machine.learn_many([[0.0], [0.1], [2.0], [1.0]], [0, 0, 0, 0])
+        >>> step = machine.observe([1.1])
+        >>> step.state, step.predicted.round(2), step.belief.round(2), round(step.surprise, 2)
+        (1, array([0.6, 0.4]), array([0.32, 0.68]), 0.06)
         """
         scratch = self._memory.scratch
         if not (
@@ -304,6 +357,15 @@ prior_frequency=0.001, spread=3.0)
             If ``i`` is not an integer.
         ValueError
             If there is no such action, or nothing was observed yet in this episode.
+
+        Examples
+        --------
+        >>> machine = EvolvingFSM(n_actions=2, radius=0.5)
+        >>> step = machine.observe([0.0])
+        >>> machine.act(1)
+        >>> step = machine.observe([0.1])
+        >>> machine.model().uses
+        array([0., 1.])
         """
         i = check_action(i, self.n_actions)
         if not self._memory.learnt.chained[0]:
@@ -311,7 +373,31 @@ prior_frequency=0.001, spread=3.0)
         self._memory.learnt.action[0] = i
 
     def learn_one(self, z: ArrayLike, i: SupportsIndex) -> Step:
-        """Observe ``z``, then act with ``i``. See `observe` and `act`."""
+        """Observe ``z``, then act with ``i``.
+
+        Parameters
+        ----------
+        z : (m,) array_like
+            Observation, as `observe` takes it.
+        i : int
+            Index of the action commanded after it, from 0, as `act` takes it.
+
+        Returns
+        -------
+        Step
+            What `observe` answers; the action shows in the next step.
+
+        Raises
+        ------
+        TypeError, ValueError
+            As `observe` and `act`. The machine is then as it was.
+
+        Examples
+        --------
+        >>> machine = EvolvingFSM(n_actions=2, radius=0.5)
+        >>> [machine.learn_one([z], 0).state for z in (0.0, 0.1, 2.0, 1.0)]
+        [0, 0, 0, 1]
+        """
         i = check_action(i, self.n_actions)
         step = self.observe(z)
         self._memory.learnt.action[0] = i
@@ -330,7 +416,7 @@ prior_frequency=0.001, spread=3.0)
         Parameters
         ----------
         Z : (T, m) array_like
-            Observations, in the order of time.
+            Observations, in the order of time and the units of `observe`.
         I : (T,) array_like of int
             The action commanded after each observation; -1 where none was.
         episode_starts : (E,) array_like of int
@@ -341,7 +427,7 @@ prior_frequency=0.001, spread=3.0)
         Returns
         -------
         Trace
-            A row for each observation.
+            A row for each observation; surprise in [bit].
 
         Raises
         ------
@@ -378,6 +464,14 @@ prior_frequency=0.001, spread=3.0)
         """Begin a new episode: no transition is learnt from the last observation to the next.
 
         Only the belief is cleared; all that was learnt stays.
+
+        Examples
+        --------
+        >>> machine = EvolvingFSM(n_actions=2, radius=0.5)
+        >>> trace = machine.learn_many([[0.0], [0.1], [2.0], [1.0]], [0, 0, 0, 0])
+        >>> machine.start_episode()
+        >>> machine.n_states, machine.state, machine.belief
+        (2, None, array([0.5, 0.5]))
         """
         self._memory.learnt.chained[0] = 0.0
         self._memory.learnt.action[0] = NO_ACTION
@@ -389,12 +483,14 @@ prior_frequency=0.001, spread=3.0)
     ) -> NDArray[np.float64]:
         """Forecast the state ``horizon`` steps ahead; nothing is changed by asking.
 
+        The forecast equations of the paper's Section 2.3.2, for one step and for k.
+
         Parameters
         ----------
         i : int
-            Action taken now.
+            Index of the action taken now, from 0.
         horizon : int
-            Number of steps, at least 1.
+            Number of steps, each as long as the time between two observations; at least 1.
         policy : {"marginal", "hold", "observed"}
             Actions after the first step: each alike, as in the paper's k-step equation; ``i``
             again; or each as often as it was used so far.
@@ -404,6 +500,22 @@ prior_frequency=0.001, spread=3.0)
         (n,) ndarray
             Distribution over states: ``belief @ P[i] @ P*^(horizon - 1)``. At the start of an
             episode the belief is uniform; before any observation the answer is empty.
+
+        Raises
+        ------
+        TypeError
+            If ``i`` is not an integer.
+        ValueError
+            If there is no such action or policy, or ``horizon`` is no whole number of at least 1.
+
+        Examples
+        --------
+        >>> machine = EvolvingFSM(n_actions=2, radius=0.5)
+        >>> trace = machine.learn_many([[0.0], [0.1], [2.0], [1.0]], [0, 0, 0, 0])
+        >>> machine.predict(0).round(3), machine.predict(1).round(3)  # 1 was never tried
+        (array([0.602, 0.398]), array([0.5, 0.5]))
+        >>> machine.predict(0, horizon=10, policy="hold").round(3)
+        array([0.686, 0.314])
         """
         i = check_action(i, self.n_actions)
         return propagate(
@@ -519,6 +631,26 @@ prior_frequency=0.001, spread=3.0)
             Names and units of the m variables.
         dt : float, optional
             Time between two observations [s].
+
+        Returns
+        -------
+        FSMModel
+            The states and transitions of now.
+
+        Raises
+        ------
+        ValueError
+            If ``actions``, ``names`` or ``units`` are of another number than the machine's, or
+            ``dt`` is not positive and finite.
+
+        Examples
+        --------
+        >>> machine = EvolvingFSM(n_actions=2, radius=0.5)
+        >>> trace = machine.learn_many([[0.0], [0.1], [2.0], [1.0]], [0, 0, 0, 0])
+        >>> model = machine.model(names=["gap"], units=["m"], dt=0.1)
+        >>> step = machine.observe([1.1])
+        >>> model.visits, machine.model().visits
+        (array([3., 1.]), array([3., 2.]))
         """
         learnt, n = self._memory.learnt, self.n_states
         observations = int(learnt.clusters.n_observations[0])
@@ -541,7 +673,30 @@ prior_frequency=0.001, spread=3.0)
     # -- Keeping it -----------------------------------------------------------------------------
 
     def save(self, path: str | PathLike[str]) -> None:
-        """Write the machine to a file (arrays and a JSON header, nothing that can run)."""
+        """Write the machine to a file (arrays and a JSON header, nothing that can run).
+
+        Parameters
+        ----------
+        path : str or path-like
+            Name of the file, used as it is; a file of that name is replaced.
+
+        Raises
+        ------
+        OSError
+            If the folder does not exist, or the file cannot be written. A file that was there
+            before is then as it was.
+
+        Examples
+        --------
+        >>> import tempfile
+        >>> from pathlib import Path
+        >>> machine = EvolvingFSM(n_actions=2, radius=0.5)
+        >>> trace = machine.learn_many([[0.0], [0.1], [2.0], [1.0]], [0, 0, 0, 0])
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     machine.save(Path(folder) / "machine.evofsm")
+        ...     EvolvingFSM.load(Path(folder) / "machine.evofsm").n_states
+        2
+        """
         # Without spare room the shapes of the arrays tell the sizes, and nothing else is stored.
         learnt = view(resize(self._buffer, self.n_states)).learnt
         storage.write(path, "machine", self._settings(), dict(leaves(learnt)))
@@ -550,10 +705,34 @@ prior_frequency=0.001, spread=3.0)
     def load(cls, path: str | PathLike[str]) -> Self:
         """Read a machine that was saved; it goes on learning bit for bit as if never stopped.
 
+        Parameters
+        ----------
+        path : str or path-like
+            Name of the file.
+
+        Returns
+        -------
+        EvolvingFSM
+            The machine as it was saved, in the middle of its episode.
+
         Raises
         ------
+        OSError
+            If there is no such file, or it may not be read.
         ValueError
             If the file is not a machine's, or is damaged.
+
+        Examples
+        --------
+        >>> import tempfile
+        >>> from pathlib import Path
+        >>> machine = EvolvingFSM(n_actions=2, radius=0.5)
+        >>> trace = machine.learn_many([[0.0], [0.1], [2.0], [1.0]], [0, 0, 0, 0])
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     machine.save(Path(folder) / "machine.evofsm")
+        ...     again = EvolvingFSM.load(Path(folder) / "machine.evofsm")
+        >>> again.observe([1.1]).surprise == machine.observe([1.1]).surprise
+        True
         """
         settings, arrays = storage.read(path, "machine")
         with storage.explained(path):
@@ -571,7 +750,22 @@ prior_frequency=0.001, spread=3.0)
         return machine
 
     def copy(self) -> Self:
-        """An independent machine in the same state."""
+        """An independent machine in the same state.
+
+        Returns
+        -------
+        EvolvingFSM
+            A machine that shares nothing with this one.
+
+        Examples
+        --------
+        >>> machine = EvolvingFSM(n_actions=2, radius=0.5)
+        >>> trace = machine.learn_many([[0.0], [0.1], [2.0], [1.0]], [0, 0, 0, 0])
+        >>> twin = machine.copy()
+        >>> step = twin.observe([-0.2])
+        >>> twin.state, machine.state
+        (0, 1)
+        """
         return copy.copy(self)
 
     # The views belong to one buffer: a copy, or what another process gets, needs its own.

@@ -29,7 +29,24 @@ from evofsm.validation import (
 class FSMModel:
     """States and transitions as they stood when the snapshot was taken.
 
-    n is the number of states, m of variables, q of actions. Arrays are read-only.
+    n is the number of states, m of variables, q of actions. Arrays are read-only. Centres are in
+    the units of the observations, distances and potentials as if all had the same unit.
+
+    Raises
+    ------
+    ValueError
+        If an array has not its shape or holds NaN or infinity, a row of a transition matrix is
+        no distribution, ``actions``, ``names`` or ``units`` are of another number than the
+        arrays say, or ``dt`` is not positive and finite.
+
+    Examples
+    --------
+    >>> from evofsm import EvolvingFSM
+    >>> machine = EvolvingFSM(n_actions=2, radius=0.5)
+    >>> trace = machine.learn_many([[0.0], [0.1], [2.0], [1.0]], [0, 0, 0, 0])
+    >>> model = machine.model(names=["gap"], units=["m"])
+    >>> model.n_states, model.visits, model.founded
+    (2, array([3., 1.]), array([1., 4.]))
     """
 
     centers: NDArray[np.float64]  #: (n, m) observation at the centre of each state
@@ -93,13 +110,33 @@ class FSMModel:
     def recognise(self, z: ArrayLike) -> NDArray[np.float64]:
         """Distribution over states for one observation or many; the states stay as they are.
 
+        The paper's Section 2.2.2, with the width that the snapshot holds.
+
         Parameters
         ----------
         z : (m,) or (N, m) array_like
+            One observation, or one per row, in the units of the machine's.
 
         Returns
         -------
         (n,) or (N, n) ndarray
+            Distribution over states, one per row where many were given.
+
+        Raises
+        ------
+        TypeError
+            If ``z`` does not hold real numbers.
+        ValueError
+            If ``z`` has not m variables, an entry is NaN, infinite or beyond 1e100, or the model
+            has no states.
+
+        Examples
+        --------
+        >>> from evofsm import EvolvingFSM
+        >>> machine = EvolvingFSM(n_actions=2, radius=0.5)
+        >>> trace = machine.learn_many([[0.0], [0.1], [2.0], [1.0]], [0, 0, 0, 0])
+        >>> machine.model().recognise([[0.0], [0.5], [1.0]]).round(3)
+        array([[0.625, 0.375], [0.5  , 0.5  ], [0.375, 0.625]])
         """
         given = real_array("z", z, ndim=np.ndim(z))
         rows = np.atleast_2d(given)
@@ -122,12 +159,14 @@ class FSMModel:
     ) -> NDArray[np.float64]:
         """Distribution over states ``horizon`` steps after ``belief``.
 
+        The forecast equations of the paper's Section 2.3.2, from any belief.
+
         Parameters
         ----------
         belief : (n,) array_like
             Present distribution over states.
         action : int, optional
-            Action of the first step; without it ``policy`` rules that step too.
+            Index of the first step's action, from 0; without it ``policy`` rules that step too.
         horizon : int
             Number of steps, at least 1.
         policy : {"marginal", "hold", "observed"}
@@ -137,6 +176,26 @@ class FSMModel:
         Returns
         -------
         (n,) ndarray
+            Distribution over states: ``belief @ P[action] @ P*^(horizon - 1)``.
+
+        Raises
+        ------
+        TypeError
+            If ``action`` is not an integer.
+        ValueError
+            If ``belief`` is no distribution over the n states, there is no such action or
+            policy, ``horizon`` is no whole number of at least 1, or ``"hold"`` has no action.
+
+        Examples
+        --------
+        >>> from evofsm import EvolvingFSM
+        >>> machine = EvolvingFSM(n_actions=2, radius=0.5)
+        >>> trace = machine.learn_many([[0.0], [0.1], [2.0], [1.0]], [0, 0, 0, 0])
+        >>> model = machine.model()
+        >>> model.propagate([1.0, 0.0], 0).round(3)
+        array([0.771, 0.229])
+        >>> model.propagate([1.0, 0.0], 0, horizon=20, policy="hold").round(3)
+        array([0.686, 0.314])
         """
         start = np.asarray(belief, dtype=np.float64)
         if start.shape != (self.n_states,):
@@ -159,18 +218,58 @@ class FSMModel:
         Parameters
         ----------
         policy : {"observed", "marginal"}
-            Each action as often as it was used, or all alike.
+            Each action as often as it was used, or all alike (the paper's P*, Section 2.3.2).
+            Where none was used yet, both are alike.
+
+        Returns
+        -------
+        (n, n) ndarray
+            From state (row) to state (column); a row sums to 1.
+
+        Raises
+        ------
+        ValueError
+            If there is no such policy.
+
+        Examples
+        --------
+        >>> from evofsm import EvolvingFSM
+        >>> machine = EvolvingFSM(n_actions=2, radius=0.5)
+        >>> trace = machine.learn_many([[0.0], [0.1], [2.0], [1.0]], [0, 0, 0, 0])
+        >>> model = machine.model()
+        >>> model.averaged_matrix("observed")[0].round(3)  # action 0 was all it saw
+        array([0.771, 0.229])
+        >>> model.averaged_matrix("marginal")[0].round(3)
+        array([0.636, 0.364])
         """
         return marginal(self.transition_matrices, self.uses, policy)
 
     def stationary_distribution(self, policy: Policy = "marginal") -> NDArray[np.float64]:
         """(n,) share of time that the chain would spend in each state if it ran on for ever.
 
+        Parameters
+        ----------
+        policy : {"marginal", "observed"}
+            How actions are weighed, as in `averaged_matrix`.
+
+        Returns
+        -------
+        (n,) ndarray
+            The distribution that ``averaged_matrix(policy)`` leaves as it is.
+
         Raises
         ------
         ValueError
-            If the chain falls apart into sets of states that never meet, so that it has more
-            than one such distribution.
+            If there is no such policy, or the chain falls apart into sets of states that never
+            meet, so that it has more than one such distribution.
+
+        Examples
+        --------
+        >>> from evofsm import EvolvingFSM
+        >>> machine = EvolvingFSM(n_actions=2, radius=0.5)
+        >>> trace = machine.learn_many([[0.0], [0.1], [2.0], [1.0]], [0, 0, 0, 0])
+        >>> machine.model().stationary_distribution("observed").round(3)
+        array([0.686, 0.314])
         """
         n = self.n_states
         if n == 0:
@@ -185,7 +284,7 @@ class FSMModel:
         return np.asarray(shares / shares.sum())
 
     def to_dot(self, policy: Policy = "observed", least: float = 0.001) -> str:
-        """The state graph in Graphviz's DOT language.
+        r"""The state graph in Graphviz's DOT language.
 
         Parameters
         ----------
@@ -193,6 +292,32 @@ class FSMModel:
             How actions are weighed in the probabilities on the edges.
         least : float
             Edges below this probability are left out.
+
+        Returns
+        -------
+        str
+            The graph; states count from 1 in it and show the values of their centres.
+
+        Raises
+        ------
+        ValueError
+            If there is no such policy.
+
+        Examples
+        --------
+        >>> from evofsm import EvolvingFSM
+        >>> machine = EvolvingFSM(n_actions=2, radius=0.5)
+        >>> trace = machine.learn_many([[0.0], [0.1], [2.0], [1.0]], [0, 0, 0, 0])
+        >>> print(machine.model().to_dot(least=0.3))
+        digraph evofsm {
+          node [shape=circle];
+          s1 [label="#1\n(0)"];
+          s2 [label="#2\n(1)"];
+          s1 -> s1 [label="0.771"];
+          s2 -> s1 [label="0.500"];
+          s2 -> s2 [label="0.500"];
+        }
+        <BLANKLINE>
         """
         matrix = self.averaged_matrix(policy)
         lines = ["digraph evofsm {", "  node [shape=circle];"]
@@ -204,7 +329,31 @@ class FSMModel:
         return "\n".join([*lines, "}", ""])
 
     def save(self, path: str | PathLike[str]) -> None:
-        """Write the model to a file (arrays and a JSON header, nothing that can run)."""
+        """Write the model to a file (arrays and a JSON header, nothing that can run).
+
+        Parameters
+        ----------
+        path : str or path-like
+            Name of the file, used as it is; a file of that name is replaced.
+
+        Raises
+        ------
+        OSError
+            If the folder does not exist, or the file cannot be written. A file that was there
+            before is then as it was.
+
+        Examples
+        --------
+        >>> import tempfile
+        >>> from pathlib import Path
+        >>> from evofsm import EvolvingFSM
+        >>> machine = EvolvingFSM(n_actions=2, radius=0.5)
+        >>> trace = machine.learn_many([[0.0], [0.1], [2.0], [1.0]], [0, 0, 0, 0])
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     machine.model(names=["gap"]).save(Path(folder) / "model.evofsm")
+        ...     FSMModel.load(Path(folder) / "model.evofsm").names
+        ('gap',)
+        """
         values = {entry.name: getattr(self, entry.name) for entry in fields(self)}
         arrays = {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
         content = {name: value for name, value in values.items() if name not in arrays}
@@ -216,10 +365,36 @@ class FSMModel:
     def load(cls, path: str | PathLike[str]) -> Self:
         """Read a model that was saved.
 
+        Parameters
+        ----------
+        path : str or path-like
+            Name of the file.
+
+        Returns
+        -------
+        FSMModel
+            The model as it was saved.
+
         Raises
         ------
+        OSError
+            If there is no such file, or it may not be read.
         ValueError
             If the file is not a model's, or is damaged.
+
+        Examples
+        --------
+        >>> import tempfile
+        >>> from pathlib import Path
+        >>> from evofsm import EvolvingFSM
+        >>> machine = EvolvingFSM(n_actions=2, radius=0.5)
+        >>> trace = machine.learn_many([[0.0], [0.1], [2.0], [1.0]], [0, 0, 0, 0])
+        >>> model = machine.model()
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     model.save(Path(folder) / "model.evofsm")
+        ...     again = FSMModel.load(Path(folder) / "model.evofsm")
+        >>> np.array_equal(again.transition_matrices, model.transition_matrices)
+        True
         """
         content, arrays = storage.read(path, "model")
         with storage.explained(path):

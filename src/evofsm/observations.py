@@ -10,7 +10,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
+from typing import SupportsFloat
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,12 +29,20 @@ class Category:
     values : sequence of str
         All the categories it may take.
     distance : float
-        Distance between any two of them, in the unit of the other variables. At or above a
-        machine's ``radius``, no state moves from one category to another.
+        Distance between any two of them, in the unit of the other variables. Above a machine's
+        ``radius``, by more than rounding, no state moves from one category to another.
+
+    Raises
+    ------
+    ValueError
+        If there are fewer than two different values, one is given twice, or ``distance`` is not
+        positive and finite.
 
     Examples
     --------
-    >>> Category("light", ("red", "green"), distance=10.0).distance
+    >>> light = Category("light", ("red", "green"), distance=10.0)
+    >>> red, green = (ObservationEncoder(light).encode({"light": value}) for value in light.values)
+    >>> round(math.dist(red, green), 9)
     10.0
     """
 
@@ -61,6 +71,11 @@ class ObservationEncoder:
     names : tuple of str
         Name of each entry of the vector; ``light=red`` for a category.
 
+    Raises
+    ------
+    ValueError
+        If there is no variable, or two entries would have the same name.
+
     Examples
     --------
     >>> encoder = ObservationEncoder("gap", Category("light", ("red", "green")))
@@ -85,21 +100,31 @@ class ObservationEncoder:
         self.names = tuple(names)
 
     def encode(self, values: Mapping[str, float | str]) -> NDArray[np.float64]:
-        """Vector for one observation.
+        """Vector for one observation: the paper's Section 2.1.1.
 
         Parameters
         ----------
         values : mapping
-            A number for each continuous variable, a category for each discrete one.
+            A number for each continuous variable, in the unit you observe it in; a category for
+            each discrete one. Others are left out.
 
         Returns
         -------
         (len(names),) ndarray
+            The numbers as they are, ``distance / sqrt(2)`` for a present category, 0 for others.
 
         Raises
         ------
+        TypeError
+            If a continuous variable is no number.
         ValueError
             If a variable is missing, or a category unknown.
+
+        Examples
+        --------
+        >>> encoder = ObservationEncoder("gap", Category("light", ("red", "green"), distance=2.0))
+        >>> encoder.encode({"light": "red", "gap": 12.0}).round(3)
+        array([12.   ,  1.414,  0.   ])
         """
         encoded: list[float] = []
         for variable in self.variables:
@@ -108,10 +133,17 @@ class ObservationEncoder:
                 raise ValueError(f"observation lacks {name!r}; it has {', '.join(values)}")
             value = values[name]
             if not isinstance(variable, Category):
-                encoded.append(float(value))
+                encoded.append(_number(name, value))
             elif value in variable.values:
                 height = variable.distance / math.sqrt(2.0)
                 encoded += [height * (value == known) for known in variable.values]
             else:
                 raise ValueError(f"{name} is {value!r}; it may be {', '.join(variable.values)}")
         return np.array(encoded)
+
+
+def _number(name: str, value: object) -> float:
+    if isinstance(value, SupportsFloat):  # a text is none, though `float` would read "1.5"
+        with suppress(TypeError, ValueError):
+            return float(value)
+    raise TypeError(f"{name} is {value!r}; it must be a number")

@@ -1,0 +1,105 @@
+"""What the package exports is documented: every method with its sections and an example."""
+
+import doctest
+import inspect
+import re
+from enum import Enum
+
+import pytest
+
+import evofsm
+
+
+def methods(cls):
+    """Public methods that our own classes define, by name: no property, nothing inherited."""
+    for base in cls.__mro__:
+        if base.__module__.partition(".")[0] == evofsm.__name__:
+            for name in vars(base):
+                method = getattr(cls, name)
+                if not (name.startswith("_") or isinstance(method, Enum)) and callable(method):
+                    yield name, method
+
+
+def sections(thing):
+    return re.findall(r"^([A-Z]\w+)\n-+$", inspect.cleandoc(thing.__doc__ or ""), re.MULTILINE)
+
+
+def missing(thing):
+    """Sections that the docstring of a class, function or method lacks, or leaves empty."""
+    wanted = {"Examples"}
+    if not inspect.isclass(thing):
+        signature = inspect.signature(thing)
+        if set(signature.parameters) - {"self"}:
+            wanted.add("Parameters")
+        if signature.return_annotation not in (None, "None"):
+            wanted.add("Returns")
+    lacks = wanted - set(sections(thing))
+    if not doctest.DocTestParser().get_examples(thing.__doc__ or ""):
+        lacks.add("Examples")
+    return lacks
+
+
+PUBLIC = {name: getattr(evofsm, name) for name in evofsm.__all__}
+DOCUMENTED = PUBLIC | {
+    f"{owner}.{name}": method
+    for owner, cls in PUBLIC.items()
+    if inspect.isclass(cls)
+    for name, method in methods(cls)
+}
+
+
+@pytest.mark.parametrize("name", DOCUMENTED)
+def test_a_public_name_has_its_sections_and_an_example(name):
+    assert not missing(DOCUMENTED[name])
+
+
+def test_the_methods_are_found_and_properties_and_what_is_inherited_are_not():
+    assert {"EvolvingFSM.predict", "EvolvingFSM.load", "FSMModel.to_dot"} <= set(DOCUMENTED)
+    assert {"ObservationEncoder.encode", "IntervalActions.label"} <= set(DOCUMENTED)
+    assert not {"EvolvingFSM.radius", "IntervalActions.edges", "Step.count"} & set(DOCUMENTED)
+    assert not {"Event.NONE", "Event.to_bytes", "Trace._replace"} & set(DOCUMENTED)
+
+
+class Bad:
+    """One line.
+
+    Examples
+    --------
+    There is none.
+    """
+
+    def bare(self, x) -> int: ...
+
+    def described(self, x) -> None:
+        """Line.
+
+        Parameters
+        ----------
+        x : int
+        """
+
+    def exemplary(self) -> int:
+        """Line.
+
+        Returns
+        -------
+        int
+
+        Examples
+        --------
+        >>> 1
+        1
+        """
+
+
+@pytest.mark.parametrize(
+    ("thing", "lacks"),
+    [
+        (Bad, {"Examples"}),
+        (Bad.bare, {"Parameters", "Returns", "Examples"}),
+        (Bad.described, {"Examples"}),
+        (Bad.exemplary, set()),
+    ],
+)
+def test_what_is_missing_is_told(thing, lacks):
+    assert missing(thing) == lacks
