@@ -11,21 +11,22 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from evofsm.actions import IntervalActions
     from evofsm.divergence import jensen_shannon
-    from evofsm.machine import Event, EvolvingFSM, Step, Trace
+    from evofsm.machine import EvolvingFSM
     from evofsm.model import FSMModel
     from evofsm.observations import Category, ObservationEncoder
+    from evofsm.step import Event, Step, Trace
 
 __version__ = "0.1.0"
 
 _HOMES = {
     "Category": "observations",
-    "Event": "machine",
+    "Event": "step",
     "EvolvingFSM": "machine",
     "FSMModel": "model",
     "IntervalActions": "actions",
     "ObservationEncoder": "observations",
-    "Step": "machine",
-    "Trace": "machine",
+    "Step": "step",
+    "Trace": "step",
     "jensen_shannon": "divergence",
 }
 

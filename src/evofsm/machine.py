@@ -1,8 +1,7 @@
-"""The evolving finite state machine (e-FSM): the paper's Section 2 on one screen.
+"""The evolving finite state machine (e-FSM): it grows from what it observes.
 
-Observations go in one at a time. Each may found a state (`states.ets`), is recognised as a
-distribution over states (`states.spread`), and, where an action was taken after the observation
-before it, teaches that action's transition matrix (`transitions`).
+What happens to an observation stands in `evofsm.step`, in the order of the paper; this is what
+people hold in their hands.
 
 References
 ----------
@@ -14,33 +13,27 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
-from enum import IntFlag
 from os import PathLike
-from typing import Any, NamedTuple, Self, SupportsIndex
+from typing import Any, Self, SupportsIndex
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from evofsm import storage
-from evofsm._compile import kernel
 from evofsm.actions import IntervalActions
-from evofsm.divergence import jensen_shannon_kernel
 from evofsm.memory import (
     NO_ACTION,
-    Memory,
     Parameters,
     allocate,
     leaves,
-    open_memory,
     refuse_impossible,
     resize,
     view,
 )
 from evofsm.model import FSMModel
-from evofsm.states import ets, spread
-from evofsm.transitions import Policy, expand, forecast, identify, marginal, propagate
+from evofsm.step import EVENTS, FULL, REFUSED, Step, Trace, learn_rows, observe
+from evofsm.transitions import Policy, marginal, propagate
 from evofsm.validation import (
-    LARGEST_OBSERVATION,
     check_action,
     check_actions,
     check_starts,
@@ -51,158 +44,6 @@ from evofsm.validation import (
 )
 
 _FIRST_CAPACITY = 8
-# What `_step` answers instead of an event where it did nothing.
-_FULL, _REFUSED = -1, -2
-
-
-class Event(IntFlag):
-    """What an observation did to the states (the paper's Section 2.2.1).
-
-    ``NONE`` left them as they were, ``MOVED`` put the nearest one on the observation, and
-    ``CREATED`` founded a new one there.
-
-    Examples
-    --------
-    >>> machine = EvolvingFSM(n_actions=1)
-    >>> machine.observe([0.0]).event is Event.CREATED
-    True
-    >>> Event(machine.learn_many([[0.0], [0.1]], [0, 0]).event[1])
-    <Event.NONE: 0>
-    """
-
-    NONE = ets.UNCHANGED
-    MOVED = ets.MOVED
-    CREATED = ets.CREATED
-
-
-_EVENTS = (Event.NONE, Event.MOVED, Event.CREATED)
-
-
-class Step(NamedTuple):
-    """What the machine made of one observation; n states exist after it.
-
-    Examples
-    --------
-    >>> machine = EvolvingFSM(n_actions=1)
-    >>> step = machine.learn_one([0.0], 0)
-    >>> step.state, step.event.name, len(step.predicted), step.surprise
-    (0, 'CREATED', 0, nan)
-    >>> machine.observe([0.1]).predicted
-    array([1.])
-    """
-
-    state: int  #: index of the most probable state
-    belief: NDArray[np.float64]  #: (n,) distribution over states
-    event: Event  #: what happened to the states
-    predicted: NDArray[np.float64]  #: (n,) forecast made one step before; empty where none was
-    surprise: float  #: divergence of `predicted` and `belief` [bit]; NaN where none was
-
-
-class Trace(NamedTuple):
-    """What the machine made of T observations, a row each; n states exist after the last.
-
-    Examples
-    --------
-    >>> machine = EvolvingFSM(n_actions=2, radius=0.5)
-    >>> trace = machine.learn_many([[0.0], [0.1], [2.0], [1.0]], [0, 0, 0, 0], belief=True)
-    >>> trace.state, trace.surprise.round(2)
-    (array([0, 0, 0, 1]), array([ nan, 0. , 0. , 0.31]))
-    >>> trace.belief.round(2)
-    array([[1.  , 0.  ], [1.  , 0.  ], [1.  , 0.  ], [0.37, 0.63]])
-    """
-
-    state: NDArray[np.int64]  #: (T,) index of the most probable state
-    n_states: NDArray[np.int64]  #: (T,) number of states after the row
-    event: NDArray[np.int8]  #: (T,) values of `Event`
-    surprise: NDArray[np.float64]  #: (T,) [bit], NaN where nothing was predicted
-    belief: NDArray[np.float64] | None = None  #: (T, n), 0 for states not yet founded
-
-
-@kernel
-def _step(memory: Memory) -> tuple[int, int, float]:
-    """Take in the observation in ``memory.scratch``; answers event, state and surprise."""
-    parameters, now, scratch = memory.parameters, memory.learnt, memory.scratch
-    n = int(now.n_states[0])
-    if n == len(now.belief):
-        return _FULL, 0, np.nan
-    if len(scratch.observation) == 0:
-        return _REFUSED, 0, np.nan
-    for value in scratch.observation:
-        if not abs(value) <= LARGEST_OBSERVATION:  # also true of NaN
-            return _REFUSED, 0, np.nan
-
-    # Section 2.2.1: does the observation move a state, or found one?
-    event = ets.determine(
-        now.clusters, n, scratch.observation, parameters.radius, parameters.distance_weight
-    )
-    if event == ets.CREATED:
-        expand(now.transitions, n, parameters.prior_frequency)
-        now.founded[n] = now.clusters.n_observations[0]
-        n += 1
-
-    # Section 2.2.2: which state is this?
-    width = parameters.spread * ets.total_variance(now.clusters)
-    state = spread.recognise(now.clusters.squared_distances, n, width, scratch.recognised)
-
-    # Section 2.3: was it foreseen, and what does it teach about the action taken before it?
-    surprise = np.nan
-    action = int(now.action[0])
-    if now.chained[0] and action != NO_ACTION:
-        forecast(now.transitions, action, n, now.belief, scratch.predicted)
-        surprise = jensen_shannon_kernel(scratch.predicted, scratch.recognised, n)
-        identify(
-            now.transitions, action, n, now.belief, scratch.recognised, parameters.learning_rate
-        )
-
-    for i in range(n):
-        now.belief[i] = scratch.recognised[i]
-    now.visits[state] += 1.0
-    now.n_states[0] = n
-    now.action[0] = NO_ACTION
-    now.chained[0] = 1.0
-    return event, state, surprise
-
-
-@kernel
-def _observe(buffer: NDArray[np.float64]) -> tuple[int, int, float]:
-    return _step(open_memory(buffer))
-
-
-@kernel
-def _learn_rows(
-    buffer: NDArray[np.float64],
-    observations: NDArray[np.float64],
-    actions: NDArray[np.int64],
-    starts: NDArray[np.bool_],
-    row: int,
-    trace: Trace,
-    beliefs: NDArray[np.float64],
-) -> int:
-    """Step through the rows from ``row`` on; answers where it stopped for want of room.
-
-    ``beliefs`` is (T, capacity), or empty where nobody wants them.
-    """
-    memory = open_memory(buffer)
-    now = memory.learnt
-    while row < len(observations):
-        if starts[row]:
-            now.chained[0] = 0.0
-        for j in range(observations.shape[1]):
-            memory.scratch.observation[j] = observations[row, j]
-        event, state, surprise = _step(memory)
-        if event == _FULL:
-            break
-        now.action[0] = actions[row]
-        n = int(now.n_states[0])
-        trace.state[row] = state
-        trace.n_states[row] = n
-        trace.event[row] = event
-        trace.surprise[row] = surprise
-        if len(beliefs) > 0:
-            for i in range(n):
-                beliefs[row, i] = now.belief[i]
-        row += 1
-    return row
 
 
 class EvolvingFSM:
@@ -328,16 +169,16 @@ prior_frequency=0.001, spread=3.0)
             z = self._fit(real_array("observation", z, ndim=1))
             scratch = self._memory.scratch
         scratch.observation[:] = z
-        event, state, surprise = _observe(self._buffer)
-        if event == _REFUSED:
+        event, state, surprise = observe(self._buffer)
+        if event == REFUSED:
             refuse_unusable("observation", real_array("observation", z, ndim=1))
-        if event == _FULL:
+        if event == FULL:
             self._grow()
             return self.observe(z)
         n = self.n_states
         predicted = scratch.predicted[: n if surprise == surprise else 0].copy()
         return Step(
-            state, self._memory.learnt.belief[:n].copy(), _EVENTS[event], predicted, surprise
+            state, self._memory.learnt.belief[:n].copy(), EVENTS[event], predicted, surprise
         )
 
     def act(self, i: SupportsIndex) -> None:
@@ -453,11 +294,11 @@ prior_frequency=0.001, spread=3.0)
             np.empty(rows),
         )
         beliefs = np.zeros((rows if belief else 0, self._capacity))
-        row = _learn_rows(self._buffer, observations, actions, starts, 0, trace, beliefs)
+        row = learn_rows(self._buffer, observations, actions, starts, 0, trace, beliefs)
         while row < rows:
             beliefs = np.pad(beliefs, ((0, 0), (0, self._capacity)))
             self._grow()
-            row = _learn_rows(self._buffer, observations, actions, starts, row, trace, beliefs)
+            row = learn_rows(self._buffer, observations, actions, starts, row, trace, beliefs)
         return trace._replace(belief=beliefs[:, : self.n_states]) if belief else trace
 
     def start_episode(self) -> None:

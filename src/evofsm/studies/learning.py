@@ -17,9 +17,10 @@ from numpy.typing import NDArray
 from evofsm.actions import IntervalActions
 from evofsm.divergence import jensen_shannon
 from evofsm.io import Chunk
-from evofsm.machine import EvolvingFSM, Trace
+from evofsm.machine import EvolvingFSM
 from evofsm.memory import NO_ACTION
 from evofsm.model import FSMModel
+from evofsm.step import Trace
 from evofsm.transitions import Policy
 
 #: How far ahead the longer forecast looks [s].
