@@ -322,3 +322,15 @@ def test_the_state_is_the_nearest_also_where_beliefs_tie():
 def test_a_horizon_is_a_whole_number_of_steps(grown, horizon):
     with pytest.raises(ValueError, match="horizon"):
         grown.predict(0, horizon)
+
+
+def test_changes_count_the_steps_of_the_recognised_state_within_episodes(grown):
+    machine = EvolvingFSM(n_actions=2, radius=0.5)
+    Z = np.random.default_rng(1).normal(size=(500, 2)) * 3.0
+    starts = [0, 100, 101, 400]
+    trace = machine.learn_many(Z, np.zeros(500, int), starts)
+    counts = np.zeros((machine.n_states, machine.n_states))
+    for row in set(range(1, 500)) - set(starts):
+        counts[trace.state[row - 1], trace.state[row]] += 1
+    assert machine.n_states > 1
+    assert np.array_equal(machine.model().changes, counts)

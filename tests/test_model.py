@@ -23,6 +23,7 @@ def chain(*matrices, uses=None):
         uses=np.ones(q) if uses is None else uses,
         visits=np.ones(n),
         founded=np.arange(1.0, n + 1),
+        changes=np.zeros((n, n)),
     )
 
 

@@ -449,10 +449,7 @@ prior_frequency=0.001, spread=3.0)
     def state(self) -> int | None:
         """Index of the most probable state; None until an episode's first observation."""
         now = self._memory.learnt
-        if not now.chained[0]:
-            return None
-        # By distance, as `observe` does: beliefs may tie where distances do not.
-        return int(now.clusters.squared_distances[: self.n_states].argmin())
+        return int(now.state[0]) if now.chained[0] else None
 
     def model(
         self,
@@ -504,6 +501,7 @@ prior_frequency=0.001, spread=3.0)
             uses=learnt.transitions.uses.copy(),
             visits=learnt.visits[:n].copy(),
             founded=learnt.founded[:n].copy(),
+            changes=learnt.changes[:n, :n].copy(),
             actions=actions,
             names=tuple(names),
             units=tuple(units),

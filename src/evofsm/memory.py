@@ -36,9 +36,11 @@ class Learnt(NamedTuple):
     n_states: NDArray[np.float64]  # (1,)
     action: NDArray[np.float64]  # (1,) taken after the latest observation, or NO_ACTION
     chained: NDArray[np.float64]  # (1,) 1 where `belief` belongs to the present episode
+    state: NDArray[np.float64]  # (1,) the most probable state at the latest observation
     belief: NDArray[np.float64]  # (capacity,)
     visits: NDArray[np.float64]  # (capacity,) observations in which it was the most probable
     founded: NDArray[np.float64]  # (capacity,) number of the observation that did it, from 1
+    changes: NDArray[np.float64]  # (capacity, capacity) steps from a state (row) to a state
     clusters: Clusters
     transitions: Transitions
 
@@ -73,15 +75,19 @@ def _open_memory(buffer: NDArray[np.float64]) -> Memory:
     per_action = buffer[start : start + q * (1 + capacity)]
     start += q * (1 + capacity)
     matrices = buffer[start : start + q * capacity * capacity]
+    start += q * capacity * capacity
+    changes = buffer[start : start + capacity * capacity]
     return Memory(
         parameters,
         Learnt(
             counters[0:1],
             counters[1:2],
             counters[2:3],
+            counters[5:6],
             per_state[0],
             per_state[1],
             per_state[2],
+            changes.reshape((capacity, capacity)),
             Clusters(
                 counters[3:4],
                 per_variable[0],
@@ -109,7 +115,7 @@ def allocate(
 ) -> NDArray[np.float64]:
     """Buffer of a machine that has seen nothing."""
     m, q = n_variables, n_actions
-    length = 14 + 3 * m + (7 + m) * capacity + q * (1 + capacity + capacity * capacity)
+    length = 14 + 3 * m + (7 + m) * capacity + q * (1 + capacity) + (q + 1) * capacity**2
     buffer = np.zeros(length)
     buffer[:8] = (m, q, capacity, *parameters)
     view(buffer).learnt.action[0] = NO_ACTION
@@ -156,6 +162,8 @@ def refuse_impossible(learnt: Learnt) -> None:
         raise ValueError(f"n_states is {learnt.n_states[0]:g}, but there are {n} states")
     if learnt.action[0] not in range(NO_ACTION, n_actions):
         raise ValueError(f"action is {learnt.action[0]:g}, but there are {n_actions} actions")
+    if learnt.state[0] not in range(n):
+        raise ValueError(f"state is {learnt.state[0]:g}, but there are {n} states")
     if learnt.clusters.n_observations[0] < n or learnt.clusters.scatter[0] < 0.0:
         raise ValueError("n_observations or scatter is too small")
     refuse_unless_distribution("belief", learnt.belief)

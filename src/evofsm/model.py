@@ -57,6 +57,7 @@ class FSMModel:
     uses: NDArray[np.float64]  #: (q,) transitions learnt with each action
     visits: NDArray[np.float64]  #: (n,) observations in which a state was the most probable
     founded: NDArray[np.float64]  #: (n,) number of the observation that founded it, from 1
+    changes: NDArray[np.float64]  #: (n, n) steps from the most probable state (row) to the next
     actions: IntervalActions | None = None  #: what the action indices mean
     names: tuple[str, ...] = ()  #: of the m variables
     units: tuple[str, ...] = ()  #: of the m variables
@@ -73,6 +74,7 @@ class FSMModel:
             "uses": (q,),
             "visits": (n,),
             "founded": (n,),
+            "changes": (n, n),
         }
         for name, shape in shapes.items():
             array = np.array(getattr(self, name), dtype=np.float64)

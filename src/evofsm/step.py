@@ -127,8 +127,11 @@ def step(memory: Memory) -> tuple[int, int, float]:
             now.transitions, action, n, now.belief, scratch.recognised, parameters.learning_rate
         )
 
+    if now.chained[0]:
+        now.changes[int(now.state[0]), state] += 1.0
     for i in range(n):
         now.belief[i] = scratch.recognised[i]
+    now.state[0] = state
     now.visits[state] += 1.0
     now.n_states[0] = n
     now.action[0] = NO_ACTION

@@ -137,7 +137,9 @@ def test_where_the_action_tells_what_comes_forecasts_beat_persistence():
     rising = int(learning.model.centers[1, 0] > 5.0)
     assert {p.target: p.action for p in found} == {rising: up, 1 - rising: down}
     assert all(p.under_action > 0.95 for p in found)
-    assert sum(p.evidence for p in found) == pytest.approx(2000, rel=0.2)
+    happened = sum(places[k] != places[k + 1] for k in range(len(Z) - 1))
+    assert sum(p.times for p in found) == pytest.approx(happened, abs=2)
+    assert sum(p.taken for p in found) == pytest.approx(2000, rel=0.2)
 
 
 @pytest.mark.parametrize(("dt", "steps"), [(0.5, 2), (0.3, 3), (0.04, 25), (1.0, 0), (5.0, 0)])

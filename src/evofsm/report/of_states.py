@@ -223,7 +223,7 @@ def draw_graph(study: PaperStudy) -> Figure:
     learnt.set_title("(a) learnt: probability of the next state, per step", x=0.03)
     _note_range(learnt, matrix)
 
-    changes = study.changes.astype(np.float64)
+    changes = study.model.changes - np.diag(np.diag(study.model.changes))
     share = study.model.visits / max(float(study.model.visits.sum()), 1.0)
     _draw_nodes(recognised, [f"{_percent(value)} of time" for value in share], study.dead_end)
     _draw_edges(recognised, changes, study.dead_end, widest=3.0, counted=True)

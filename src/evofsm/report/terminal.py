@@ -156,12 +156,12 @@ def _print_states(out: Console, model: FSMModel) -> None:
     headers = _headers(model)
     table = _table("", *headers, "share\nof time", "stays", "first\nseen")
     total = max(float(model.visits.sum()), 1.0)
-    stays = model.averaged_matrix("observed").diagonal()
+    stays = np.diag(model.changes) / np.maximum(model.changes.sum(axis=1), 1.0)
     columns = [_aligned(column) for column in model.centers.T]
     for i, center in enumerate(zip(*columns, strict=True)):
         share = _percent(float(model.visits[i]) / total)
         table.add_row(f"#{i + 1}", *center, share, f"{stays[i]:.3f}", f"{model.founded[i]:,.0f}")
-    _print_titled(out, "States (stays: probability per step; first seen: at which row)", table)
+    _print_titled(out, "States (stays: share of its steps; first seen: at which row)", table)
 
 
 def _aligned(values: NDArray[np.float64]) -> list[str]:
@@ -183,19 +183,24 @@ def _headers(model: FSMModel) -> list[str]:
 def _print_passages(out: Console, model: FSMModel) -> None:
     found = passages(model)
     if not found:
-        out.print("There are no transitions between states: there is one state only.\n")
+        out.print("The recognised state never changed.\n")
         return
-    table = _table(
-        "from", "to", "per step", "most likely under", "per step\nunder it", "seen about"
-    )
-    table.columns[3].justify = "left"
+    table = _table("from", "to", "times", "share", "learnt", "most under", "there", "tried")
+    table.columns[5].justify = "left"
     for passage in found:
-        row = [f"#{passage.origin + 1}", f"#{passage.target + 1}", f"{passage.probability:.3f}"]
+        row = [f"#{passage.origin + 1}", f"#{passage.target + 1}", f"{passage.times:,}"]
+        row += [f"{passage.share:.4f}", f"{passage.learnt:.3f}"]
         if passage.action is not None:
             row += [_action_name(model, passage.action), f"{passage.under_action:.3f}"]
-            row += [f"{passage.evidence:,.0f}×"]
+            row += [f"{passage.taken:,.0f}×"]
         table.add_row(*row)
-    _print_titled(out, f"Transitions that matter: the {len(found)} that happen most", table)
+    _print_titled(out, f"Transitions that matter: the {len(found)} most frequent", table)
+    out.print(
+        "Times and share: of the steps from that state, as recognised. Learnt: probability per "
+        "step that the matrices give; most under which action, how probable there, and about how "
+        "often that action was taken in the state. Where learnt is far above the share, beliefs "
+        "are wide.\n"
+    )
 
 
 def _print_actions(out: Console, model: FSMModel) -> None:

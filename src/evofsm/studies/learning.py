@@ -134,36 +134,39 @@ class Passage(NamedTuple):
 
     origin: int  #: state
     target: int  #: state
-    probability: float  #: per step, actions as often as they were used
-    action: int | None  #: under which it is most probable, of those tried there often enough
+    times: int  #: steps in which the recognised state went from the one to the other
+    share: float  #: of the steps from the state of origin
+    learnt: float  #: probability per step that the matrices give, actions as often as used
+    action: int | None  #: under which that is highest, of those taken there often enough
     under_action: float  #: probability per step under that action
-    evidence: float  #: about how often that action was taken in the state of origin
+    taken: float  #: about how often that action was taken in the state of origin
 
 
 def passages(model: FSMModel, most: int = 12) -> list[Passage]:
-    """The transitions between states that matter: those that happen most.
+    """The transitions between states that matter: those that were recognised most often.
 
     How often an action was taken in a state is estimated from its use as a whole and the share
     of the state in its recent use.
     """
-    matrix = model.averaged_matrix("observed")
-    flow = model.visits[:, None] * matrix
-    np.fill_diagonal(flow, 0.0)
+    counts = model.changes - np.diag(np.diag(model.changes))
+    steps = model.changes.sum(axis=1)
+    learnt = model.averaged_matrix("observed")
     recent = model.origin_frequency.sum(axis=1, keepdims=True)
     taken = model.uses[:, None] * model.origin_frequency / np.where(recent > 0.0, recent, 1.0)
     found = []
-    for place in np.argsort(-flow, axis=None, kind="stable")[:most]:
+    for place in np.argsort(-counts, axis=None, kind="stable")[:most]:
         i, j = divmod(int(place), model.n_states)
-        if flow[i, j] <= 0.0:
+        if counts[i, j] == 0.0:
             break
         tried = np.flatnonzero(taken[:, i] >= _LEAST_EVIDENCE)
         best = int(tried[model.transition_matrices[tried, i, j].argmax()]) if len(tried) else None
-        under, evidence = (
+        under, often = (
             (np.nan, np.nan)
             if best is None
             else (float(model.transition_matrices[best, i, j]), float(taken[best, i]))
         )
-        found.append(Passage(i, j, float(matrix[i, j]), best, under, evidence))
+        times, share = int(counts[i, j]), float(counts[i, j] / steps[i])
+        found.append(Passage(i, j, times, share, float(learnt[i, j]), best, under, often))
     return found
 
 

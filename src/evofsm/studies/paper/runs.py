@@ -68,16 +68,6 @@ class PaperStudy:
         return foundings
 
     @property
-    def changes(self) -> NDArray[np.int64]:
-        """(n, n) ndarray: how often the recognised state changed from one to another."""
-        counts = np.zeros((self.model.n_states, self.model.n_states), np.int64)
-        for run in self.runs:
-            before, after = run.state[:-1], run.state[1:]
-            changed = before != after
-            np.add.at(counts, (before[changed], after[changed]), 1)
-        return counts
-
-    @property
     def last_round(self) -> tuple[Run, ...]:
         """The last run of each case."""
         return self.runs[-len(CASES) :]
