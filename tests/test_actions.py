@@ -200,3 +200,10 @@ def test_encoders_with_equal_settings_are_equal_and_cannot_be_changed():
 def test_intervals_too_narrow_for_their_edges_to_be_told_apart_are_refused():
     with pytest.raises(ValueError, match="larger unit"):
         IntervalActions(0.0, 1e-10, 1e-11)
+
+
+def test_end_intervals_that_hold_what_is_beyond_say_so():
+    clipping = IntervalActions(-2.5, 2.5, 0.3, outside="clip")
+    assert [clipping.label(i) for i in (0, 1, 16)] == ["< -2.2", "[-2.2, -1.9)", "≥ 2.3"]
+    right = IntervalActions(-1.0, 1.0, 0.5, closed="right", outside="clip")
+    assert [right.label(i) for i in (0, 3)] == ["≤ -0.5", "> 0.5"]

@@ -102,7 +102,7 @@ def test_learn_saves_a_model_that_inspect_prints(evofsm, log, tmp_path):
     assert f"file {path}"[:60] in text or str(path)[:20] in text
     assert "observations 700, one every 0.1 s" in text
     assert f"states {model.n_states}, of 3 variables" in text
-    assert "a(17) [2.3, 2.5]" in text
+    assert "a(17) ≥ 2.3" in text
 
 
 def test_options_reach_the_machine_and_the_log(evofsm, tmp_path):
@@ -285,3 +285,25 @@ def test_csv_needs_no_extra(log):
         f"print(sum(len(chunk.times) for chunk in read_traces([{str(log)!r}])))"
     )
     assert result.stdout == "700\n", result.stderr
+
+
+def test_numbers_stay_whole_in_a_narrow_terminal(evofsm, log, monkeypatch):
+    def cells_of_first_state():
+        rows = evofsm("learn", log).stdout.splitlines()
+        return next(row.split() for row in rows if row.lstrip().startswith("#1 "))
+
+    wide = cells_of_first_state()
+    monkeypatch.setenv("COLUMNS", "30")
+    assert cells_of_first_state() == wide
+
+
+def test_an_out_that_is_a_folder_is_refused_before_the_work(evofsm, log, tmp_path):
+    result = evofsm("learn", log, "--out", tmp_path)
+    assert result.exit_code == 2
+    assert "is a folder" in result.stderr
+
+
+def test_the_version_is_told(evofsm):
+    result = evofsm("--version")
+    assert result.exit_code == 0
+    assert result.stdout.startswith("evofsm 0.")

@@ -222,6 +222,8 @@ class IntervalActions:
     def label(self, i: SupportsIndex) -> str:
         """Interval ``i`` as people write it, a bracket at each edge that belongs to it.
 
+        Where values beyond the range are put into the end intervals, these have one edge only.
+
         Parameters
         ----------
         i : int
@@ -242,9 +244,16 @@ class IntervalActions:
         >>> actions = IntervalActions(low=-2.5, high=2.5, width=0.3)
         >>> actions.label(0), actions.label(16)
         ('[-2.5, -2.2)', '[2.3, 2.5]')
+        >>> IntervalActions(low=-2.5, high=2.5, width=0.3, outside="clip").label(0)
+        '< -2.2'
         """
         i = self._index(i)
         lower, upper = self.interval(i)
+        if self.outside == "clip" and self.n_actions > 1:  # the end intervals hold what is beyond
+            if i == 0:
+                return f"{'<' if self.closed == 'left' else '≤'} {upper:g}"
+            if i == self.n_actions - 1:
+                return f"{'≥' if self.closed == 'left' else '>'} {lower:g}"
         opening = "[" if self.closed == "left" or i == 0 else "("
         closing = "]" if self.closed == "right" or i == self.n_actions - 1 else ")"
         return f"{opening}{lower:g}, {upper:g}{closing}"

@@ -48,11 +48,30 @@ def application() -> typer.Typer:
         rich_markup_mode=None,
         pretty_exceptions_enable=False,
     )
-    app.callback()(lambda: None)
+    app.callback()(options)
     app.command()(paper)
     app.command()(learn)
     app.command()(inspect)
     return app
+
+
+def _print_version(asked: bool) -> None:
+    if asked:
+        from evofsm import __version__
+
+        print(f"evofsm {__version__}")
+        raise typer.Exit
+
+
+def options(
+    version: Annotated[
+        bool,
+        typer.Option(
+            "--version", is_eager=True, callback=_print_version, help="Print the version and stop."
+        ),
+    ] = False,
+) -> None:
+    """Online recognition of latent risk with an evolving finite state machine."""
 
 
 def plain_errors(command: Callable[P, None]) -> Callable[P, None]:
@@ -308,6 +327,10 @@ def _check_out(out: Path | None) -> None:
         return
     if not out.parent.is_dir():
         raise FileNotFoundError(f"--out {out}: there is no folder {out.parent}")
+    if not os.access(out.parent, os.W_OK):
+        raise PermissionError(f"--out {out}: the folder {out.parent} may not be written")
+    if out.is_dir():
+        raise IsADirectoryError(f"--out {out} is a folder; name a file in it")
     if out.exists():
         try:
             storage.kind_of(out)

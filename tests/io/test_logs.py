@@ -345,3 +345,33 @@ def test_parquet_without_polars_names_what_to_install(tmp_path, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "polars", None)
     with pytest.raises(ModuleNotFoundError, match=r"pip install 'evofsm\[tables\]'"):
         read(str(path))
+
+
+def test_an_unclosed_quote_in_the_header_is_refused(tmp_path):
+    message = refusal(write(tmp_path / "a.csv", log(20_000), header='"' + HEADER))
+    assert "unclosed quote" in message
+
+
+def test_a_line_that_no_table_would_hold_is_refused_before_it_is_read_whole(tmp_path):
+    long = "x," * 600_000
+    assert "line 1: longer than" in refusal(write(tmp_path / "a.csv", [], header=long))
+    assert "line 3: longer than" in refusal(write(tmp_path / "b.csv", [*log(1), long]))
+
+
+def test_many_columns_are_not_all_named(tmp_path):
+    header = ",".join(f"column{k}" for k in range(500))
+    message = refusal(write(tmp_path / "a.csv", [], header=header))
+    assert "and 480 more" in message
+    assert len(message) < 1000
+
+
+def test_a_step_much_shorter_than_usual_begins_an_episode_too(tmp_path):
+    lines = [*log(30), *log(30, start=3.0, step=0.01)]
+    jumps = sum(chunk.jumps for chunk in read(write(tmp_path / "a.csv", lines)))
+    assert jumps == 29
+
+
+def test_files_whose_steps_differ_by_half_are_refused(tmp_path):
+    first = write(tmp_path / "a.csv", log(30))
+    other = write(tmp_path / "b.csv", log(30, step=0.149))
+    assert "a machine knows only one step" in refusal(first, other)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import gzip
 import io
 import os
@@ -68,6 +69,8 @@ def damage_explained(path: str, reached: Callable[[], int] = lambda: 0) -> Itera
             f"{path}, after line {reached()}: the gzip data ends early or is damaged "
             f"(was a copy or a download interrupted?): {error}"
         ) from error
+    except csv.Error as error:
+        raise ValueError(f"{path}, line {reached()}: {error} (an unclosed quote?)") from error
     except UnicodeDecodeError as error:
         raise ValueError(
             f"{path}, after line {reached()}: this is not text in UTF-8 "

@@ -17,6 +17,7 @@ from evofsm.io.files import OnRead, damage_explained, ignore, open_unpacked
 from evofsm.validation import LARGEST_OBSERVATION
 
 _CSV_ROWS = 8192
+_LONGEST_LINE = 1_000_000
 # polars decodes a whole row group for each slice of it, so small slices would only cost time.
 _PARQUET_ROWS = 65536
 
@@ -54,10 +55,10 @@ class CsvTable:
         self.path = path
         self._on_read = on_read
         with open_unpacked(path) as file, damage_explained(path), _text(file) as text:
-            line = text.readline()
+            line = next(_lines(path, text), "")
             self._separator = max(",;\t", key=line.count)
             text.seek(0)
-            header = next(csv.reader(text, delimiter=self._separator), [])
+            header = next(csv.reader(_lines(path, text), delimiter=self._separator), [])
         self.columns = tuple(name.strip() for name in header)
         if all(_is_number(name) for name in self.columns):
             raise ValueError(
@@ -69,22 +70,17 @@ class CsvTable:
         """Read the named columns, in the order of rows."""
         places = {name: self._place(name) for name in (*numbers, *texts)}
         with open_unpacked(self.path, self._on_read) as file, _text(file) as text:
-            rows = csv.reader(text, delimiter=self._separator)
+            rows = csv.reader(_lines(self.path, text), delimiter=self._separator)
             with damage_explained(self.path, lambda: rows.line_num):
-                try:
-                    next(rows)
-                    while some := [(rows.line_num, row) for row in islice(rows, _CSV_ROWS)]:
-                        fields, lines = self._columns(some)
-                        piece = Piece(self.path, "line", lines, {}, {})
-                        for name in numbers:
-                            piece.numbers[name] = _numbers(piece, name, fields[places[name]])
-                        for name in texts:
-                            piece.texts[name] = np.array(fields[places[name]], dtype=object)
-                        yield piece
-                except csv.Error as error:
-                    raise ValueError(
-                        f"{self.path}, line {rows.line_num}: {error} (an unclosed quote?)"
-                    ) from error
+                next(rows)
+                while some := [(rows.line_num, row) for row in islice(rows, _CSV_ROWS)]:
+                    fields, lines = self._columns(some)
+                    piece = Piece(self.path, "line", lines, {}, {})
+                    for name in numbers:
+                        piece.numbers[name] = _numbers(piece, name, fields[places[name]])
+                    for name in texts:
+                        piece.texts[name] = np.array(fields[places[name]], dtype=object)
+                    yield piece
 
     def _place(self, name: str) -> int:
         if self.columns.count(name) > 1:
@@ -169,6 +165,18 @@ def _text(file: Any) -> io.TextIOWrapper:
     return io.TextIOWrapper(file, encoding="utf-8-sig", newline="")
 
 
+def _lines(path: str, text: io.TextIOWrapper) -> Iterator[str]:
+    """The lines of a file; none is read whole that no table would hold."""
+    number = 0
+    while line := text.readline(_LONGEST_LINE):
+        number += 1
+        if len(line) == _LONGEST_LINE and not line.endswith("\n"):
+            raise ValueError(
+                f"{path}, line {number}: longer than {_LONGEST_LINE:,} characters; this is no table"
+            )
+        yield line
+
+
 def _is_number(text: str) -> bool:
     try:
         float(text)
@@ -201,7 +209,9 @@ def _refuse_unusable(piece: Piece, name: str, values: NDArray[np.float64]) -> No
 def explain_text(text: str) -> str:
     """Why a text is not the number it should be."""
     if not text.strip():
-        return "the field is empty (a missing measurement?)"
+        return (
+            "the field is empty (a missing measurement? an episode's last action may be any number)"
+        )
     if _is_number(text.replace(",", ".")):
         return f"{text!r} is no number (a decimal comma? write 1.5)"
     return f"{text!r} is no number (a text, a date, or a unit behind the number?)"

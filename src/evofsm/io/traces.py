@@ -18,8 +18,10 @@ from evofsm.observations import Category, ObservationEncoder
 
 #: Columns that tell episodes apart where nothing else was said and they exist.
 USUAL_EPISODE = ("run", "pair", "segment")
-#: Steps longer than the usual step times this are holes in time.
+#: Steps longer than the usual one times this, or as much shorter, begin a new episode.
 LONGEST_STEP = 1.5
+# Share by which the usual steps of two files may differ.
+_SAME_STEP = 0.05
 
 _ROWS_AT_ONCE = 8192
 
@@ -144,7 +146,7 @@ class _Clock:
         starts: NDArray[np.bool_],
         at: Callable[[int], str],
     ) -> NDArray[np.bool_]:
-        """Mark rows that come too late to follow the row before them in its episode."""
+        """Mark rows that come too late, or too soon, to follow the row before in its episode."""
         steps = np.diff(times, prepend=self._last)
         steps[starts] = np.nan
         self._last = times[-1]
@@ -157,12 +159,13 @@ class _Clock:
             )
         if np.isnan(self._usual) and not np.isnan(steps).all():
             self._settle(round(float(np.nanmedian(steps)), 9))
-        return np.asarray(steps > LONGEST_STEP * self._usual)
+        unusual = (steps > LONGEST_STEP * self._usual) | (steps < self._usual / LONGEST_STEP)
+        return np.asarray(unusual)
 
     def _settle(self, usual: float) -> None:
         if np.isnan(self.dt):
             self.dt, self._first_path = usual, self._path
-        if not 1.0 / LONGEST_STEP <= usual / self.dt <= LONGEST_STEP:
+        if not abs(usual / self.dt - 1.0) < _SAME_STEP:
             raise ValueError(
                 f"{self._path} has a row every {usual:g} s, but {self._first_path} has one every "
                 f"{self.dt:g} s; a machine knows only one step: resample, or learn them apart"
@@ -222,10 +225,15 @@ def _refuse_missing(
             option = {columns.action: "--action", columns.time: "--time"}.get(name)
             option = option or ("--episode" if name in (columns.episode or ()) else "--observe")
             raise ValueError(
-                f"{table.path} has no column {name!r}; it has {', '.join(table.columns)} "
+                f"{table.path} has no column {name!r}; it has {_listed(table.columns)} "
                 f"({option} names the right one"
                 f"{', and --dt stands in for a clock' if option == '--time' else ''})"
             )
+
+
+def _listed(names: Sequence[str], most: int = 20) -> str:
+    more = f" and {len(names) - most:,} more" if len(names) > most else ""
+    return ", ".join(name[:40] for name in names[:most]) + more
 
 
 def _refuse_interleaved(

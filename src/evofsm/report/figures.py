@@ -96,9 +96,8 @@ def _sketch_case(study: PaperStudy, run: Run) -> _Sketch:
         f"Result of {run.name}",
         f"Last round (run {len(study.runs) - len(study.last_round) + run.case} of "
         f"{len(study.runs)}). {tint}Vertical lines: {_named_moments(study, run)}. Action a(r) is "
-        f"the interval in which the acceleration lies, a(1) = {_interval(study, 0)} to "
-        f"a({actions.n_actions}) = {_interval(study, actions.n_actions - 1)} m/s²; what lies "
-        "beyond falls into the first or the last.",
+        f"the interval in which the acceleration lies, from a(1), {_interval(study, 0)}, to "
+        f"a({actions.n_actions}), {_interval(study, actions.n_actions - 1)} m/s².",
         "Gap, speeds, acceleration, recognised state and action over time in "
         f"{run.name}, which {_ending(run)}.",
         draw_case(study, run),

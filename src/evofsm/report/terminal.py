@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rich import box
 from rich.console import Console
+from rich.measure import Measurement
 from rich.table import Table
 from rich.text import Text
 
@@ -143,13 +144,26 @@ def _print_facts(out: Console, title: str, facts: Facts) -> None:
     table = Table.grid(padding=(0, 2))
     for name, text in facts:
         table.add_row(f"  {name}", text)
+    table.expand = True
     _print_titled(out, title, table)
 
 
 def _print_titled(out: Console, title: str, table: Table) -> None:
     out.print(title, style="bold")
-    out.print(table)
+    _print_whole(out, table)
     out.print()
+
+
+def _print_whole(out: Console, table: Table) -> None:
+    """Print a table; a line longer than the terminal is better than a number cut in two.
+
+    A table that expands is one of texts, which may be folded.
+    """
+    width = out.width
+    needed = Measurement.get(out, out.options.update(width=10_000), table).maximum
+    out.width = width if table.expand else max(width, needed)
+    out.print(table)
+    out.width = width
 
 
 def _print_states(out: Console, model: FSMModel) -> None:
@@ -231,7 +245,7 @@ def _print_skills(out: Console, skills: Sequence[Skill]) -> None:
             _skill_text(skill.skill),
         )
     out.print("Forecasts against persistence", style="bold")
-    out.print(table)
+    _print_whole(out, table)
     out.print(
         "\nMean Jensen-Shannon divergence from the belief that came; each forecast was made before "
         "its rows were learnt. Persistence: the belief stays as it is. Skill: 1 is perfect, 0 as "
