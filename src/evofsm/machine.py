@@ -31,7 +31,7 @@ from evofsm.memory import (
     view,
 )
 from evofsm.model import FSMModel
-from evofsm.step import EVENTS, FULL, REFUSED, Step, Trace, learn_rows, observe
+from evofsm.step import EVENTS, FULL, REFUSED, Step, Trace, learn_rows, observe, widen
 from evofsm.transitions import Policy, marginal, propagate
 from evofsm.validation import (
     check_action,
@@ -296,8 +296,8 @@ prior_frequency=0.001, spread=3.0)
         beliefs = np.zeros((rows if belief else 0, self._capacity))
         row = learn_rows(self._buffer, observations, actions, starts, 0, trace, beliefs)
         while row < rows:
-            beliefs = np.pad(beliefs, ((0, 0), (0, self._capacity)))
             self._grow()
+            beliefs = widen(beliefs, self._capacity)
             row = learn_rows(self._buffer, observations, actions, starts, row, trace, beliefs)
         return trace._replace(belief=beliefs[:, : self.n_states]) if belief else trace
 

@@ -91,6 +91,12 @@ class Trace(NamedTuple):
     belief: NDArray[np.float64] | None = None  #: (T, n), 0 for states not yet founded
 
 
+def widen(belief: NDArray[np.float64], n: int) -> NDArray[np.float64]:
+    """Beliefs (..., n) over n states, 0 for those founded since."""
+    missing = n - belief.shape[-1]
+    return np.pad(belief, [(0, 0)] * (belief.ndim - 1) + [(0, missing)]) if missing else belief
+
+
 @kernel
 def step(memory: Memory) -> tuple[int, int, float]:
     """Take in the observation in ``memory.scratch``; answers event, state and surprise."""

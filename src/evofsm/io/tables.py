@@ -13,6 +13,7 @@ from typing import Any, NoReturn, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from evofsm._extras import needs
 from evofsm.io.files import OnRead, damage_explained, ignore, open_unpacked
 from evofsm.validation import LARGEST_OBSERVATION
 
@@ -107,12 +108,8 @@ class ParquetTable:
     """A Parquet file; read with polars because pyarrow cannot be imported beside libsumo."""
 
     def __init__(self, path: str, on_read: OnRead = ignore) -> None:
-        try:
+        with needs("polars", "tables", f"{path}: Parquet"):
             import polars
-        except ModuleNotFoundError:
-            raise ModuleNotFoundError(
-                f"{path}: Parquet needs one more package: pip install 'evofsm[tables]'"
-            ) from None
         self.path = path
         self._on_read = on_read
         try:

@@ -2,23 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
+from evofsm._extras import needs
 from evofsm.studies.paper import PaperStudy, Run
 from evofsm.studies.paper.claims import LARGEST_DIVERGENCE
 
-try:
+with needs("matplotlib", "plot", "drawing figures"):
     from matplotlib.figure import Figure
 
     from evofsm.report.of_states import draw_graph, draw_matrices, draw_space
     from evofsm.report.over_time import draw_case, draw_divergence, draw_growth
     from evofsm.report.style import house_style, label_of, save
-except ModuleNotFoundError as error:
-    raise ModuleNotFoundError(
-        "drawing figures needs matplotlib: pip install 'evofsm[plot]'"
-    ) from error
 
 
 @dataclass(frozen=True)
@@ -67,21 +65,28 @@ def paper_figures(
     folder.mkdir(parents=True, exist_ok=True)
     drawings = []
     with house_style():
-        for sketch in _sketches(study):
+        sketches = _sketches(study)
+        for draw in sketches:
+            sketch = draw()
             paths = save(sketch.figure, folder, sketch.name)
             drawings.append(Drawing(sketch.name, sketch.title, sketch.caption, sketch.alt, paths))
-            progress(len(drawings), len(study.last_round) + 5)
+            progress(len(drawings), len(sketches))
     return drawings
 
 
-def _sketches(study: PaperStudy) -> Iterator[_Sketch]:
-    for run in study.last_round:
-        yield _sketch_case(study, run)
-    yield _sketch_divergence(study)
-    yield _sketch_growth(study)
-    yield _sketch_space(study)
-    yield _sketch_graph(study)
-    yield _sketch_matrices(study)
+def _sketches(study: PaperStudy) -> list[Callable[[], _Sketch]]:
+    """The figures, to be drawn one by one."""
+    of_the_study = (
+        _sketch_divergence,
+        _sketch_growth,
+        _sketch_space,
+        _sketch_graph,
+        _sketch_matrices,
+    )
+    return [
+        *(partial(_sketch_case, study, run) for run in study.last_round),
+        *(partial(sketch, study) for sketch in of_the_study),
+    ]
 
 
 def _sketch_case(study: PaperStudy, run: Run) -> _Sketch:

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import evofsm
+from evofsm._extras import needs
 from evofsm.drivers.idm import IDM, ChangingIDM
 from evofsm.protocols import Controller
 from evofsm.studies.paper import Claim, PaperStudy, Settings, Table
@@ -20,12 +21,8 @@ from evofsm.studies.paper import Claim, PaperStudy, Settings, Table
 if TYPE_CHECKING:
     from evofsm.report.figures import Drawing
 
-try:
+with needs("jinja2", "plot", "writing the page"):
     from jinja2 import Environment, StrictUndefined
-except ModuleNotFoundError as error:
-    raise ModuleNotFoundError(
-        "writing the page needs jinja2: pip install 'evofsm[plot]'"
-    ) from error
 
 _WORLDS = {"sumo": "SUMO", "kinematic": "the kinematic world"}
 _PACKAGES = ("numpy", "numba", "matplotlib")

@@ -20,7 +20,7 @@ from evofsm.io import Chunk
 from evofsm.machine import EvolvingFSM
 from evofsm.memory import NO_ACTION
 from evofsm.model import FSMModel
-from evofsm.step import Trace
+from evofsm.step import widen
 from evofsm.transitions import Policy
 
 #: How far ahead the longer forecast looks [s].
@@ -196,7 +196,7 @@ class _Learner:
         beliefs, surprise = self._learn_rows(chunk, indices)
 
         predicted = ~np.isnan(surprise)
-        before = np.vstack([_widened(self._last_belief, beliefs.shape[1]), beliefs[:-1]])
+        before = np.vstack([widen(self._last_belief, beliefs.shape[1]), beliefs[:-1]])
         stayed = np.asarray(jensen_shannon(before[predicted], beliefs[predicted]))
         self._one_step.add(surprise[predicted, None], stayed)
         self._last_belief = beliefs[-1]
@@ -233,27 +233,27 @@ class _Learner:
         ages = self._ages_of(chunk)
         steps = self._steps_ahead
         halts = np.flatnonzero(ages % steps == 0) if steps else np.empty(0, np.int64)
-        traces = []
+        learnt = []
         scored = []
         first = 0
         for halt in halts.tolist():
-            traces.append(self._learn_slice(chunk, indices, slice(first, halt + 1)))
+            learnt.append(self._learn_slice(chunk, indices, slice(first, halt + 1)))
             first = halt + 1
             if self._forecast is not None and ages[halt] > 0:
                 scored.append((self._forecast, self.machine.belief))
             self._forecast = None
             if indices[halt] != NO_ACTION:
                 self._forecast = self._look_ahead(int(indices[halt]), steps)
-        traces.append(self._learn_slice(chunk, indices, slice(first, len(ages))))
+        learnt.append(self._learn_slice(chunk, indices, slice(first, len(ages))))
 
         n = self.machine.n_states
         if scored:
-            forecasts = np.stack([_widened(forecast, n) for forecast, _ in scored])
-            came = np.stack([_widened(belief, n) for _, belief in scored])
+            forecasts = np.stack([widen(forecast, n) for forecast, _ in scored])
+            came = np.stack([widen(belief, n) for _, belief in scored])
             divergence = np.asarray(jensen_shannon(forecasts, came[:, None]))
             self._ahead.add(divergence[:, 1:], divergence[:, 0])
-        beliefs = np.vstack([_widened(trace.belief, n) for trace in traces])
-        return beliefs, np.concatenate([trace.surprise for trace in traces])
+        beliefs = np.vstack([widen(belief, n) for belief, _ in learnt])
+        return beliefs, np.concatenate([surprise for _, surprise in learnt])
 
     def _ages_of(self, chunk: Chunk) -> NDArray[np.int64]:
         """Rows since the beginning of each row's episode."""
@@ -264,11 +264,16 @@ class _Learner:
         self._age = int(ages[-1]) + 1
         return ages
 
-    def _learn_slice(self, chunk: Chunk, indices: NDArray[np.int64], rows: slice) -> Trace:
+    def _learn_slice(
+        self, chunk: Chunk, indices: NDArray[np.int64], rows: slice
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Beliefs and surprises of some rows."""
         starts = chunk.starts[(chunk.starts >= rows.start) & (chunk.starts < rows.stop)]
-        return self.machine.learn_many(
+        trace = self.machine.learn_many(
             chunk.observations[rows], indices[rows], starts - rows.start, belief=True
         )
+        assert trace.belief is not None  # asked for
+        return trace.belief, trace.surprise
 
     def _look_ahead(self, action: int, steps: int) -> NDArray[np.float64]:
         """(1 + policies, n) the belief as it stands, and what it is forecast to become."""
@@ -299,12 +304,3 @@ class _Score:
             )
             for policy, total in zip(policies, self._divergence, strict=True)
         )
-
-
-def _widened(beliefs: NDArray[np.float64] | None, n: int) -> NDArray[np.float64]:
-    """Beliefs over n states, 0 for states founded since."""
-    assert beliefs is not None
-    missing = n - beliefs.shape[-1]
-    return (
-        beliefs if missing == 0 else np.pad(beliefs, [(0, 0)] * (beliefs.ndim - 1) + [(0, missing)])
-    )

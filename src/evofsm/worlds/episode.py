@@ -61,6 +61,12 @@ class Road(Protocol):
         ...
 
 
+def refuse_non_number(acceleration: float, time: float, gap: float) -> None:
+    """Raise where a controller proposed NaN or infinity."""
+    if not math.isfinite(acceleration):
+        raise ValueError(f"controller proposed {acceleration} at {time:g} s, gap {gap:g} m")
+
+
 def drive(road: Road, scenario: Scenario, controller: Controller) -> Episode:
     """Drive a scenario step by step, until time is up or the cars collide."""
     leader = scenario.leader
@@ -73,8 +79,7 @@ def drive(road: Road, scenario: Scenario, controller: Controller) -> Episode:
         observation = observations[row]
         observation[:] = gap, _, leader_speed = road.observe()
         acceleration = float(controller.propose(time, observation.copy()))
-        if not math.isfinite(acceleration):
-            raise ValueError(f"controller proposed {acceleration} at {time:g} s, gap {gap:g} m")
+        refuse_non_number(acceleration, time, gap)
         braking = braking or leader_speed >= leader.brake_speed or time >= leader.brake_time
         if braking:
             leader_acceleration = -leader.brake_decel

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from evofsm.drivers.compiled import DRIVER_KERNEL, CompiledController, Kernel
 from evofsm.protocols import Controller
-from evofsm.worlds.episode import Episode, drive
+from evofsm.worlds.episode import Episode, drive, refuse_non_number
 from evofsm.worlds.scenario import Scenario
 
 
@@ -52,12 +52,7 @@ class KinematicWorld:
             record,
         )
         record = record[:rows]
-        if not np.isfinite(record[:, 3]).all():
-            row = int(np.flatnonzero(~np.isfinite(record[:, 3]))[0])
-            raise ValueError(
-                f"controller proposed {record[row, 3]} at {times[row]:g} s, "
-                f"gap {record[row, 0]:g} m"
-            )
+        refuse_non_number(record[-1, 3], times[rows - 1], record[-1, 0])  # which ended the run
         return Episode(
             times[:rows],
             np.ascontiguousarray(record[:, :3]),

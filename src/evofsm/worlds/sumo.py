@@ -13,6 +13,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, Self
 
+from evofsm._extras import needs
 from evofsm.protocols import Controller
 from evofsm.worlds.episode import Episode, drive
 from evofsm.worlds.scenario import Scenario
@@ -64,12 +65,8 @@ class SumoWorld:
     """
 
     def __init__(self, options: Sequence[str] = ()) -> None:
-        try:
+        with needs("libsumo", "sumo", "the world 'sumo'"):
             self._sumo: Any = import_module("libsumo")
-        except ModuleNotFoundError as error:
-            raise ModuleNotFoundError(
-                "the world 'sumo' needs libsumo: pip install 'evofsm[sumo]'"
-            ) from error
         self._options = list(options)
         self._folder: tempfile.TemporaryDirectory[str] | None = None  # while a simulation is open
         self._dt = 0.0

@@ -5,12 +5,12 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable
 from dataclasses import asdict
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from evofsm._extras import needs
 from evofsm.studies.paper.claims import Claim
 from evofsm.studies.paper.context import Table
 from evofsm.studies.paper.runs import PaperStudy, Run
@@ -25,7 +25,8 @@ def write_data(
         text = json.dumps([asdict(entry) for entry in entries], indent=2, ensure_ascii=False)
         (folder / f"{name}.json").write_text(text + "\n", encoding="utf-8")
     study.model.save(folder / "model.evofsm")
-    polars = _polars()
+    with needs("polars", "tables", "writing traces as Parquet"):
+        import polars
     runs = [*study.runs, *study.extra_runs]
     frames = (polars.DataFrame(_columns(number, run)) for number, run in enumerate(runs, 1))
     polars.concat(frames).write_parquet(folder / "traces.parquet")
@@ -52,12 +53,3 @@ def _columns(number: int, run: Run) -> dict[str, Any]:
         "n_states": run.n_states,
         "surprise": run.surprise,
     }
-
-
-def _polars() -> Any:
-    try:
-        return import_module("polars")
-    except ModuleNotFoundError as error:
-        raise ModuleNotFoundError(
-            "writing traces as Parquet needs polars: pip install 'evofsm[tables]'"
-        ) from error

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from evofsm.divergence import jensen_shannon
 from evofsm.machine import EvolvingFSM
 from evofsm.model import FSMModel
+from evofsm.step import widen
 from evofsm.studies.paper.settings import Settings
 from evofsm.worlds.episode import UNITS, VARIABLES, Episode, World
 
@@ -119,7 +120,7 @@ def run_paper(
     return PaperStudy(
         world=name,
         settings=settings,
-        runs=tuple(_widen(run, machine.n_states) for run in runs),
+        runs=tuple(replace(run, belief=widen(run.belief, machine.n_states)) for run in runs),
         extra_runs=tuple(extra_runs),
         safe_at_the_end=safe,
         model=machine.model(
@@ -138,7 +139,7 @@ def _learn(
     action = settings.actions.encode(episode.accelerations)
     trace = machine.learn_many(episode.observations, action, episode_starts=[0], belief=True)
     assert trace.belief is not None
-    foreseen = np.pad(foreseen, (0, machine.n_states - n))
+    foreseen = widen(foreseen, machine.n_states)
     first = float(jensen_shannon(foreseen, trace.belief[0])) if n else float("nan")
     return Run(
         name=name,
@@ -152,8 +153,3 @@ def _learn(
         surprise=trace.surprise,
         first_surprise=first,
     )
-
-
-def _widen(run: Run, n: int) -> Run:
-    """The run with a belief over all ``n`` states, those founded after it too."""
-    return replace(run, belief=np.pad(run.belief, ((0, 0), (0, n - run.belief.shape[1]))))
