@@ -7,9 +7,11 @@ import numpy as np
 import pytest
 
 from evofsm.drivers.idm import IDM
+from evofsm.protocols import Proposal
 from evofsm.studies.paper import CASES, Settings
 from evofsm.worlds.kinematic import KinematicWorld
-from evofsm.worlds.scenario import Leader, Scenario
+from evofsm.worlds.motion import REALISED
+from evofsm.worlds.scenario import Behind, Body, CutIn, Leader, Scenario, Sensors
 from evofsm.worlds.sumo import SumoWorld
 
 pytest.importorskip("libsumo")
@@ -116,14 +118,14 @@ def test_the_leader_brakes_once_in_full_from_the_time_it_is_told():
 
 
 def test_nobody_drives_backwards():
-    episode = KinematicWorld().run(SETTINGS.scenario, Plain(lambda time, z: -2.0))
+    episode = KinematicWorld().run(SETTINGS.scenario, Plain(lambda z, time: Proposal(-2.0)))
     assert (episode.observations[:, 1] == 0.0).all()
 
 
 @pytest.mark.parametrize("wrong", [math.nan, math.inf])
 def test_a_controller_that_proposes_no_number_is_named(wrong):
     with pytest.raises(ValueError, match="controller proposed"):
-        KinematicWorld().run(SETTINGS.scenario, Plain(lambda time, z: wrong))
+        KinematicWorld().run(SETTINGS.scenario, Plain(lambda z, time: Proposal(wrong)))
 
 
 @pytest.mark.parametrize("name", ["initial_gap", "duration", "dt"])
@@ -170,9 +172,9 @@ def test_what_was_realised_is_what_was_commanded_until_standstill(in_both):
 
 
 def test_a_controller_cannot_write_into_the_record():
-    def meddle(time, observation):
+    def meddle(observation, time):
         observation[:] = 99.0
-        return 1.0
+        return Proposal(1.0)
 
     episode = KinematicWorld().run(replace(SETTINGS.scenario, duration=0.5), Plain(meddle))
     assert episode.observations[0].tolist() == [5.0, 0.0, 0.0]
@@ -195,3 +197,88 @@ def test_an_impossible_leader_is_refused_by_name(change, word):
 def test_a_scenario_lasts_two_steps_or_more():
     with pytest.raises(ValueError, match="two steps"):
         replace(SETTINGS.scenario, duration=0.01)
+
+
+IDM_LEADER = IDM(1.2, 25.0, 1.0, 1.0, 2.5)
+FULL = Scenario(
+    Leader(
+        IDM_LEADER,
+        brake_decel=5.0,
+        brake_time=8.0,
+        initial_speed=12.0,
+        waves=((1.0, -2.0), (3.0, 1.5)),
+        cut_in=CutIn(5.0, gap=9.0, speed=11.0),
+    ),
+    initial_gap=20.0,
+    duration=20.0,
+    initial_speed=14.0,
+    body=Body(lowest=-6.0, highest=2.0, delay=0.2, jerk=15.0),
+    sensors=Sensors(gap_noise=0.5, speed_noise=0.3, delay=0.2, seed=3),
+    behind=Behind(IDM(1.25, 25.0, 2.0, 1.0, 2.0, lowest=-8.0), gap=15.0),
+)
+
+
+def test_both_worlds_agree_with_everything_switched_on():
+    driver = IDM(2.25, 28.0, 0.8, 0.8, 2.0, lowest=-8.0, highest=2.5)
+    closed_form = KinematicWorld().run(FULL, driver)
+    with SumoWorld() as world:
+        in_sumo = world.run(FULL, driver)
+    assert in_sumo.record.shape == closed_form.record.shape
+    assert np.abs(in_sumo.record - closed_form.record).max() < 1e-9
+    assert len(closed_form.time) > 900
+
+
+def test_a_cut_in_replaces_the_leader_at_its_time():
+    episode = KinematicWorld().run(FULL, Plain(lambda z, time: Proposal(-1.0)))
+    assert episode.observations[500, 0] == pytest.approx(9.0)
+    assert episode.observations[500, 2] == 11.0
+    assert episode.observations[499, 2] != pytest.approx(11.0, abs=0.5)
+
+
+def test_waves_then_the_brake_move_the_leader():
+    accelerations = KinematicWorld().run(FULL, SETTINGS.drivers[2]).leader_accelerations
+    assert accelerations[0] == IDM_LEADER.propose(np.array([np.inf, 12.0, 0.0])).action
+    assert (accelerations[100:300] == -2.0).all()
+    assert (accelerations[300:800] == 1.5).all()
+    assert (accelerations[800:] == -5.0).all()
+
+
+def test_a_body_is_late_limited_and_smooth():
+    scenario = replace(FULL, sensors=Sensors(), behind=None)
+    episode = KinematicWorld().run(scenario, Plain(lambda z, time: Proposal(-9.0)))
+    realised = episode.record[:, REALISED]
+    assert (realised[:20] == 0.0).all()
+    assert np.diff(realised[:100]).min() == pytest.approx(-0.15)
+    assert realised.min() == -6.0
+
+
+def test_sensors_see_late_and_with_the_noise_of_their_seed():
+    seen = []
+    look = Plain(lambda z, time: seen.append(z) or Proposal(0.0))
+    episode = KinematicWorld().run(replace(FULL, duration=5.0), look)
+    late = np.array(seen)[20:] - episode.observations[:-20]
+    assert late[:, 0].std() == pytest.approx(0.5, rel=0.2)
+    assert late[:, 1].std() == pytest.approx(0.3, rel=0.2)
+    first = seen.copy()
+    seen.clear()
+    KinematicWorld().run(replace(FULL, duration=5.0), look)
+    assert np.array_equal(first, seen)
+
+
+def test_a_car_behind_may_run_into_a_follower_who_brakes():
+    sleepy = IDM(1.25, 25.0, 2.0, 0.1, 2.0, lowest=-1.0)
+    scenario = replace(FULL, behind=Behind(sleepy, gap=4.0), sensors=Sensors())
+    episode = KinematicWorld().run(scenario, Plain(lambda z, time: Proposal(-6.0)))
+    assert episode.rear_ended
+    assert not episode.collided
+
+
+def test_a_road_that_is_over_moves_no_more():
+    with KinematicWorld().open(replace(FULL, duration=1.0)) as road:
+        road.advance(0.0, steps=1000)
+        assert road.over
+        assert road.row == 99
+        assert road.time == 0.99
+        assert math.isfinite(road.realised)
+        road.advance(1.0)
+        assert road.row == 99

@@ -9,6 +9,7 @@ from numba import types
 from numpy.typing import NDArray
 
 from evofsm._compile import Function, compiled
+from evofsm.protocols import Proposal
 
 #: ``kernel(parameters, time, gap, speed, leader_speed) -> acceleration``
 DRIVER_KERNEL = types.float64(
@@ -48,6 +49,6 @@ class CompiledController(Protocol):
         """(rows, columns) ndarray, given to the kernel at every step."""
         ...
 
-    def propose(self, time: float, observation: NDArray[np.float64]) -> float:
+    def propose(self, observation: NDArray[np.float64], time: float = 0.0) -> Proposal:
         """As `evofsm.protocols.Controller`, with the same result as the kernel."""
         ...

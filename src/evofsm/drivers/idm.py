@@ -15,10 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evofsm.drivers.compiled import Kernel, driver_kernel
+from evofsm.protocols import Proposal
 
 
 @driver_kernel
-def _idm_kernel(
+def idm_kernel(
     phases: NDArray[np.float64], time: float, gap: float, speed: float, leader_speed: float
 ) -> float:
     """The paper's IDM equations, by the last phase that has begun."""
@@ -62,9 +63,9 @@ class IDM:
 
     Examples
     --------
-    >>> IDM(1.25, 25.0, 2.0, 1.5, 2.0).propose(0.0, np.array([np.inf, 0.0, 0.0]))
+    >>> IDM(1.25, 25.0, 2.0, 1.5, 2.0).propose(np.array([np.inf, 0.0, 0.0])).action
     1.25
-    >>> IDM(1.25, 25.0, 2.0, 1.5, 2.0, lowest=-4.0).propose(0.0, np.array([5.0, 20.0, 0.0]))
+    >>> IDM(1.25, 25.0, 2.0, 1.5, 2.0, lowest=-4.0).propose(np.array([5.0, 20.0, 0.0])).action
     -4.0
     """
 
@@ -77,7 +78,7 @@ class IDM:
     lowest: float = -math.inf
     highest: float = math.inf
 
-    kernel: ClassVar[Kernel] = staticmethod(_idm_kernel)
+    kernel: ClassVar[Kernel] = staticmethod(idm_kernel)
 
     def __post_init__(self) -> None:
         for name in ("accel", "desired_speed", "decel", "exponent"):
@@ -94,39 +95,46 @@ class IDM:
         """(1, 9) ndarray: begin of the phase [s], then the arguments in order."""
         return np.array([[0.0, *astuple(self)]])
 
-    def propose(self, time: float, observation: NDArray[np.float64]) -> float:
+    def propose(self, observation: NDArray[np.float64], time: float = 0.0) -> Proposal:
         """Acceleration [m/s²] for ``[gap, v_follower, v_leader]``."""
-        return self.kernel(self.parameters, time, *observation)
+        return Proposal(self.kernel(self.parameters, time, *observation))
 
 
 @dataclass(frozen=True)
 class ChangingIDM:
-    """One driver who drives by one IDM and, from ``at`` [s] on, by another.
+    """One driver who drives by one IDM and, from given times on, by others.
+
+    Parameters
+    ----------
+    first : IDM
+    changes : tuple of (float, IDM)
+        When [s], and how it drives from then on, in the order of time.
 
     Examples
     --------
     >>> calm, hasty = IDM(1.0, 25.0, 2.0, 1.5, 2.0), IDM(2.0, 28.0, 1.0, 0.5, 2.0)
-    >>> driver = ChangingIDM(calm, hasty, at=10.0)
+    >>> driver = ChangingIDM(calm, ((10.0, hasty), (12.0, calm)))
     >>> free_road = np.array([np.inf, 0.0, 0.0])
-    >>> driver.propose(9.99, free_road), driver.propose(10.0, free_road)
-    (1.0, 2.0)
+    >>> [driver.propose(free_road, time).action for time in (9.99, 10.0, 12.0)]
+    [1.0, 2.0, 1.0]
     """
 
     first: IDM
-    then: IDM
-    at: float
+    changes: tuple[tuple[float, IDM], ...]
 
     def __post_init__(self) -> None:
-        if not self.at >= 0.0:
-            raise ValueError(f"the driver changes at {self.at} s; it must be 0 or later")
+        times = [at for at, _ in self.changes]
+        if not all(at >= 0.0 for at in times) or times != sorted(times):
+            raise ValueError(f"the driver changes at {times} s; it must be 0 or later, in order")
 
-    kernel: ClassVar[Kernel] = staticmethod(_idm_kernel)
+    kernel: ClassVar[Kernel] = staticmethod(idm_kernel)
 
     @cached_property
     def parameters(self) -> NDArray[np.float64]:
-        """(2, 9) ndarray: a row for each phase, as `IDM.parameters`."""
-        return np.array([[0.0, *astuple(self.first)], [self.at, *astuple(self.then)]])
+        """(1 + changes, 9) ndarray: a row for each phase, as `IDM.parameters`."""
+        phases = ((0.0, self.first), *self.changes)
+        return np.array([[at, *astuple(driver)] for at, driver in phases])
 
-    def propose(self, time: float, observation: NDArray[np.float64]) -> float:
-        """Acceleration [m/s²] for ``[gap, v_follower, v_leader]``."""
-        return self.kernel(self.parameters, time, *observation)
+    def propose(self, observation: NDArray[np.float64], time: float = 0.0) -> Proposal:
+        """Acceleration [m/s²] for ``[gap, v_follower, v_leader]`` at ``time`` [s]."""
+        return Proposal(self.kernel(self.parameters, time, *observation))

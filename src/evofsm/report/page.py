@@ -162,8 +162,9 @@ def _drivers(settings: Settings) -> Iterator[tuple[str, ...]]:
 
 def _phases(name: str, driver: Controller) -> Iterator[tuple[str, Controller]]:
     if isinstance(driver, ChangingIDM):
-        yield f"{name} until {driver.at:g} s", driver.first
-        yield f"{name} from {driver.at:g} s", driver.then
+        yield f"{name} at first", driver.first
+        for at, phase in driver.changes:
+            yield f"{name} from {at:g} s", phase
     else:
         yield name, driver
 

@@ -6,7 +6,7 @@ from contextlib import AbstractContextManager, nullcontext
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from evofsm.worlds.episode import World
+    from evofsm.worlds.road import World
 
 #: The worlds there are.
 WORLDS = ("sumo", "kinematic")

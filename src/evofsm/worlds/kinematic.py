@@ -1,18 +1,33 @@
-"""Two points on a line: SUMO's ballistic update in closed form, compiled.
+"""Points on a line: SUMO's ballistic update in closed form, compiled.
 
 For sweeps of many settings. SUMO is the referee: both agree within 1e-9 at every step.
 """
 
 from __future__ import annotations
 
-import numba
+import math
+from contextlib import AbstractContextManager, nullcontext
+
 import numpy as np
 from numba import types
 from numpy.typing import NDArray
 
+from evofsm._compile import compiled
 from evofsm.drivers.compiled import DRIVER_KERNEL, CompiledController, Kernel
 from evofsm.protocols import Controller
-from evofsm.worlds.episode import Episode, drive, refuse_non_number
+from evofsm.worlds.motion import (
+    GAP,
+    LEADER_SPEED,
+    PLAN,
+    SERIES,
+    SPEED,
+    TABLE,
+    Plan,
+    advance,
+    decide,
+    is_over,
+)
+from evofsm.worlds.road import Episode, Road, drive, refuse_non_number
 from evofsm.worlds.scenario import Scenario
 
 
@@ -33,111 +48,61 @@ class KinematicWorld:
     (True, 31.49)
     """
 
+    def open(self, scenario: Scenario) -> AbstractContextManager[Road]:
+        """Put the cars on a road, for use in a ``with`` statement."""
+        return nullcontext(_Road(scenario))
+
     def run(self, scenario: Scenario, controller: Controller) -> Episode:
-        """Drive the scenario with ``controller`` in the follower."""
-        if not isinstance(controller, CompiledController):
-            return drive(_Road(scenario.initial_gap, scenario.dt), scenario, controller)
-        leader = scenario.leader
-        times = scenario.times
-        record = np.empty((len(times), 5))
-        rows = _drive(
-            controller.kernel,
-            controller.parameters,
-            leader.driver.kernel,
-            leader.driver.parameters,
-            np.array([leader.brake_decel, leader.brake_speed, leader.brake_time]),
-            scenario.initial_gap,
-            scenario.dt,
-            times,
-            record,
+        """Drive the scenario with ``controller`` in the follower, asked at every step."""
+        road = _Road(scenario)
+        sees_it_all = road._noise is None and road._delay == 0
+        if isinstance(controller, CompiledController) and sees_it_all:
+            return road.run(controller)
+        return drive(road, controller)
+
+
+class _Road(Road):
+    """The road in closed form."""
+
+    def __init__(self, scenario: Scenario) -> None:
+        super().__init__(scenario)
+        behind = scenario.behind.gap if scenario.behind else math.inf
+        self._positions = np.array([0.0, scenario.initial_gap, -behind])
+
+    def advance(self, command: float, steps: int = 1) -> None:
+        self.row = advance(self._plan, self._record, self._positions, self.row, command, steps)
+
+    def run(self, controller: CompiledController) -> Episode:
+        """As `drive`, without leaving compiled code."""
+        self.row = _drive_kernel(
+            controller.kernel, controller.parameters, self._plan, self._record, self._positions
         )
-        record = record[:rows]
-        refuse_non_number(record[-1, 3], times[rows - 1], record[-1, 0])  # which ended the run
-        return Episode(
-            times[:rows],
-            np.ascontiguousarray(record[:, :3]),
-            record[:, 3].copy(),
-            record[:, 4].copy(),
+        episode = self.episode()
+        refuse_non_number(  # which ended the run
+            episode.accelerations[-1], self.time, episode.record[-1, GAP]
         )
+        return episode
 
 
-def _move(position: float, speed: float, acceleration: float, dt: float) -> tuple[float, float]:
-    """Position and speed one step later; no one drives backwards."""
-    reached = max(0.0, speed + acceleration * dt)
-    return position + 0.5 * (speed + reached) * dt, reached
-
-
-_move_kernel = numba.njit(cache=True)(_move)
-
-
-class _Road:
-    """The road as Python steps along it."""
-
-    def __init__(self, initial_gap: float, dt: float) -> None:
-        self.dt = dt
-        self.position, self.speed = 0.0, 0.0
-        self.leader_position, self.leader_speed = initial_gap, 0.0
-
-    def observe(self) -> tuple[float, float, float]:
-        return self.leader_position - self.position, self.speed, self.leader_speed
-
-    def advance(self, acceleration: float, leader_acceleration: float) -> None:
-        self.position, self.speed = _move(self.position, self.speed, acceleration, self.dt)
-        self.leader_position, self.leader_speed = _move(
-            self.leader_position, self.leader_speed, leader_acceleration, self.dt
-        )
-
-
-_SERIES = types.float64[::1]
-_TABLE = types.float64[:, ::1]
-_DRIVER = types.FunctionType(DRIVER_KERNEL)
-
-
-@numba.njit(
-    types.int64(
-        *(_DRIVER, _TABLE, _DRIVER, _TABLE, _SERIES),
-        *(types.float64, types.float64, _SERIES, _TABLE),
-    ),
-    cache=True,
-)
 def _drive(
     driver: Kernel,
     parameters: NDArray[np.float64],
-    leader_driver: Kernel,
-    leader_parameters: NDArray[np.float64],
-    brake: NDArray[np.float64],
-    initial_gap: float,
-    dt: float,
-    times: NDArray[np.float64],
+    plan: Plan,
     record: NDArray[np.float64],
+    positions: NDArray[np.float64],
 ) -> int:
-    """`evofsm.worlds.episode.drive` for compiled drivers; answers the number of rows.
+    """Ask a compiled driver at every step; answers the row in which it ended."""
+    row = 0
+    while True:
+        now = record[row]
+        command = driver(parameters, plan.times[row], now[GAP], now[SPEED], now[LEADER_SPEED])
+        if is_over(record, row) or not np.isfinite(command):
+            decide(plan, record, row, command)
+            return row
+        row = advance(plan, record, positions, row, command, 1)
 
-    A row of ``record`` holds the observation and both accelerations.
-    """
-    position, speed = 0.0, 0.0
-    leader_position, leader_speed = initial_gap, 0.0
-    braking = False
-    rows = 0
-    while rows < len(record):
-        time = times[rows]
-        gap = leader_position - position
-        acceleration = driver(parameters, time, gap, speed, leader_speed)
-        braking = braking or leader_speed >= brake[1] or time >= brake[2]
-        if braking:
-            leader_acceleration = -brake[0]
-        else:
-            leader_acceleration = leader_driver(leader_parameters, time, np.inf, leader_speed, 0.0)
-        record[rows, 0] = gap
-        record[rows, 1] = speed
-        record[rows, 2] = leader_speed
-        record[rows, 3] = acceleration
-        record[rows, 4] = leader_acceleration
-        rows += 1
-        if gap <= 0.0 or not np.isfinite(acceleration):
-            break
-        position, speed = _move_kernel(position, speed, acceleration, dt)
-        leader_position, leader_speed = _move_kernel(
-            leader_position, leader_speed, leader_acceleration, dt
-        )
-    return rows
+
+# With its signature stated it is compiled once for all drivers.
+_drive_kernel = compiled(
+    _drive, types.int64(types.FunctionType(DRIVER_KERNEL), TABLE, PLAN, TABLE, SERIES)
+)

@@ -7,22 +7,35 @@ step, the ballistic update, and no teleporting, no gap added to collisions, no r
 
 from __future__ import annotations
 
+import math
 import tempfile
 from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from importlib import import_module
 from pathlib import Path
 from typing import Any, Self
 
 from evofsm._extras import needs
 from evofsm.protocols import Controller
-from evofsm.worlds.episode import Episode, drive
+from evofsm.worlds.motion import (
+    ACCELERATION_BEHIND,
+    GAP,
+    GAP_BEHIND,
+    LEADER_ACCELERATION,
+    LEADER_SPEED,
+    REALISED,
+    SPEED,
+    SPEED_BEHIND,
+    decide,
+)
+from evofsm.worlds.road import Episode, Road, drive
 from evofsm.worlds.scenario import Scenario
 
 _ROAD_LENGTH = 200_000.0
 _FASTEST = 100.0
 _VEHICLE_LENGTH = 5.0
-# Where the follower's front bumper stands at first.
-_START = 10.0
+# Where the front bumper of the last car stands at first.
+_FIRST = 10.0
 
 _NET = f"""<net version="1.20">
     <location netOffset="0,0" convBoundary="0,0,{_ROAD_LENGTH:.2f},0"
@@ -72,15 +85,19 @@ class SumoWorld:
         self._dt = 0.0
         self._runs = 0
 
-    def run(self, scenario: Scenario, controller: Controller) -> Episode:
-        """Drive the scenario with ``controller`` in the follower."""
+    def open(self, scenario: Scenario) -> AbstractContextManager[Road]:
+        """Put the cars on a road, for use in a ``with`` statement."""
         _refuse_what_sumo_cannot_drive(scenario)
         if self._folder is None or self._dt != scenario.dt or not self._sumo.isLoaded():
             self.close()
             self._start(scenario.dt)
         self._runs += 1
-        with _Road(self._sumo, self._runs, scenario) as road:
-            return drive(road, scenario, controller)
+        return _Road(self._sumo, self._runs, scenario)
+
+    def run(self, scenario: Scenario, controller: Controller) -> Episode:
+        """Drive the scenario with ``controller`` in the follower, asked at every step."""
+        with self.open(scenario) as road:
+            return drive(road, controller)
 
     def close(self) -> None:
         """End the simulation."""
@@ -136,7 +153,7 @@ def _refuse_what_sumo_cannot_drive(scenario: Scenario) -> None:
             "another step; choose one of 0.001 s, 0.002 s, ..., or the kinematic world"
         )
     # Nobody is faster than this; what the leader needs, the follower does not exceed.
-    farthest = _START + scenario.initial_gap + _FASTEST * scenario.duration
+    farthest = _start(scenario) + scenario.initial_gap + _FASTEST * scenario.duration
     if farthest > _ROAD_LENGTH:
         raise ValueError(
             f"initial_gap {scenario.initial_gap:g} m and duration {scenario.duration:g} s may lead "
@@ -144,42 +161,75 @@ def _refuse_what_sumo_cannot_drive(scenario: Scenario) -> None:
         )
 
 
-class _Road:
-    """Two cars of their own for one run, in a simulation that goes on from run to run."""
+def _start(scenario: Scenario) -> float:
+    """Where the follower's front bumper stands at first [m], behind it what else there is."""
+    behind = scenario.behind
+    return _FIRST + (behind.gap + _VEHICLE_LENGTH if behind else 0.0)
+
+
+class _Road(Road):
+    """Cars of their own for one run, in a simulation that goes on from run to run."""
 
     def __init__(self, sumo: Any, run: int, scenario: Scenario) -> None:
+        super().__init__(scenario)
         self._sumo = sumo
-        self._dt = scenario.dt
-        self._follower, self._leader = f"follower{run}", f"leader{run}"
-        leader_start = _START + scenario.initial_gap + _VEHICLE_LENGTH
-        for car, start in ((self._leader, leader_start), (self._follower, _START)):
+        self._cars = [f"{role}{run}" for role in ("follower", "leader", "behind")]
+        start, record = _start(scenario), self._record[0]
+        starts = [start, start + scenario.initial_gap + _VEHICLE_LENGTH, _FIRST]
+        speeds = record[[SPEED, LEADER_SPEED, SPEED_BEHIND]].tolist()
+        if scenario.behind is None:
+            del self._cars[2], starts[2], speeds[2]
+        for car, position, speed in zip(self._cars, starts, speeds, strict=True):
             sumo.vehicle.add(
-                car, "along", "car", depart="now", departPos=repr(start), departSpeed="0"
+                car, "along", "car", depart="now", departPos=repr(position), departSpeed=repr(speed)
             )
             sumo.vehicle.setSpeedMode(car, 0)
-            sumo.vehicle.setSpeed(car, 0.0)
+            sumo.vehicle.setSpeed(car, speed)
         sumo.simulationStep()  # the first step only puts the cars on the road
+        self._observe()
 
-    def observe(self) -> tuple[float, float, float]:
-        vehicle = self._sumo.vehicle
-        rear = vehicle.getLanePosition(self._leader) - _VEHICLE_LENGTH
-        return (
-            rear - vehicle.getLanePosition(self._follower),
-            vehicle.getSpeed(self._follower),
-            vehicle.getSpeed(self._leader),
-        )
+    def advance(self, command: float, steps: int = 1) -> None:
+        for _ in range(steps):
+            decide(self._plan, self._record, self.row, command)
+            if self.over:
+                break
+            accelerations = self._record[self.row, [REALISED, LEADER_ACCELERATION]].tolist()
+            accelerations.append(float(self._record[self.row, ACCELERATION_BEHIND]))
+            self._move(accelerations)
+            self.row += 1
+            if self.row == self._plan.cut_in[0]:
+                self._cut_in(*self._plan.cut_in[1:].tolist())
+            self._observe()
 
-    def advance(self, acceleration: float, leader_acceleration: float) -> None:
+    def _move(self, accelerations: list[float]) -> None:
         vehicle = self._sumo.vehicle
-        for car, wanted in ((self._follower, acceleration), (self._leader, leader_acceleration)):
-            vehicle.setSpeed(car, max(0.0, vehicle.getSpeed(car) + wanted * self._dt))
+        for car, acceleration in zip(self._cars, accelerations, strict=False):
+            speed = max(0.0, vehicle.getSpeed(car) + acceleration * self.scenario.dt)
+            vehicle.setSpeed(car, speed)
         self._sumo.simulationStep()
+
+    def _cut_in(self, gap: float, speed: float) -> None:
+        vehicle = self._sumo.vehicle
+        follower, leader = self._cars[:2]
+        vehicle.moveTo(leader, "road_0", vehicle.getLanePosition(follower) + gap + _VEHICLE_LENGTH)
+        vehicle.setPreviousSpeed(leader, speed)
+        vehicle.setSpeed(leader, speed)
+
+    def _observe(self) -> None:
+        vehicle, now = self._sumo.vehicle, self._record[self.row]
+        position = [vehicle.getLanePosition(car) for car in self._cars]
+        now[GAP] = position[1] - _VEHICLE_LENGTH - position[0]
+        now[GAP_BEHIND] = math.inf
+        now[SPEED], now[LEADER_SPEED] = (vehicle.getSpeed(car) for car in self._cars[:2])
+        if self.scenario.behind is not None:
+            now[GAP_BEHIND] = position[0] - _VEHICLE_LENGTH - position[2]
+            now[SPEED_BEHIND] = vehicle.getSpeed(self._cars[2])
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *error: object) -> None:
-        for car in (self._follower, self._leader):
+        for car in self._cars:
             if car in self._sumo.vehicle.getIDList():
                 self._sumo.vehicle.remove(car)
         self._sumo.simulationStep()

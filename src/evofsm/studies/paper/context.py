@@ -12,7 +12,7 @@ from evofsm.risk.dead_end import is_dead_end
 from evofsm.risk.ttc import time_to_collision
 from evofsm.studies.paper.claims import LARGEST_DIVERGENCE
 from evofsm.studies.paper.runs import CASES, PaperStudy, Run
-from evofsm.worlds.episode import UNITS, VARIABLES
+from evofsm.worlds.road import UNITS, VARIABLES
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from evofsm.machine import EvolvingFSM
 from evofsm.model import FSMModel
 from evofsm.step import widen
 from evofsm.studies.paper.settings import Settings
-from evofsm.worlds.episode import UNITS, VARIABLES, Episode, World
+from evofsm.worlds.road import UNITS, VARIABLES, Episode, World
 
 CASES = (1, 2, 3, 4)
 

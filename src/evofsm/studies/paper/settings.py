@@ -56,8 +56,8 @@ class Settings:
             drivers={
                 1: aggressive,
                 2: normal,
-                3: ChangingIDM(aggressive, normal, at=to_normal),
-                4: ChangingIDM(normal, aggressive, at=to_aggressive),
+                3: ChangingIDM(aggressive, ((to_normal, normal),)),
+                4: ChangingIDM(normal, ((to_aggressive, aggressive),)),
             },
             switch_at={3: to_normal, 4: to_aggressive},
             brake_at=tuple(cases["brake_at"]),
