@@ -75,6 +75,13 @@ BATCH_LENGTHS = {
 }
 
 
+FAILURES = {
+    "failure beyond": ([0, 3], ValueError, "failures names row 3, but there are 3 rows"),
+    "failure before": ([-1], ValueError, "failures names row -1"),
+    "flags as failures": ([True, False, False], TypeError, "failures has dtype bool.*row"),
+}
+
+
 def cases(*tables):
     return [pytest.param(*case, id=name) for table in tables for name, case in table.items()]
 
@@ -144,6 +151,20 @@ def test_a_batch_that_cannot_be_right(machine, refuses, Z, I, starts, error, wor
 @pytest.mark.parametrize(("Z", "I", "starts", "error", "words"), cases(BATCH_LENGTHS))
 def test_a_batch_of_another_length(grown, refuses, Z, I, starts, error, words):
     refuses(grown, lambda m: m.learn_many(Z, I, starts), error, words)
+
+
+@pytest.mark.parametrize(("failures", "error", "words"), cases(FAILURES))
+def test_failures_of_a_batch_that_cannot_be_right(machine, refuses, failures, error, words):
+    refuses(machine, lambda m: m.learn_many(ROWS, [0] * 3, [], failures), error, words)
+
+
+@pytest.mark.parametrize(("z", "error", "words"), cases(OBSERVATIONS))
+def test_a_failed_observation_that_cannot_be_right(machine, refuses, z, error, words):
+    refuses(machine, lambda m: m.observe(z, failed=True), error, words)
+
+
+def test_a_failure_before_any_observation(refuses):
+    refuses(EvolvingFSM(3), EvolvingFSM.fail, ValueError, "fail before observe")
 
 
 @pytest.mark.parametrize(

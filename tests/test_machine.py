@@ -14,6 +14,9 @@ LEARNT = (
     "transition_matrices",
     "origin_frequency",
     "belief",
+    "decisions",
+    "failures",
+    "endings",
 )
 
 
@@ -334,3 +337,123 @@ def test_changes_count_the_steps_of_the_recognised_state_within_episodes(grown):
         counts[trace.state[row - 1], trace.state[row]] += 1
     assert machine.n_states > 1
     assert np.array_equal(machine.model().changes, counts)
+
+
+# -- Failure -----------------------------------------------------------------------------------
+
+
+def sharp_machine():
+    """States at 0 and 1, recognised so sharply that a belief is exactly 0 or 1."""
+    machine = EvolvingFSM(n_actions=3, radius=0.5, spread=1e-6)
+    machine.learn_many([[0.0], [0.0], [2.0], [1.0]], [-1, -1, -1, -1])
+    assert machine.centers.tolist() == [[0.0], [1.0]]
+    machine.start_episode()
+    return machine
+
+
+def test_what_led_to_failure_is_counted_by_hand():
+    machine = sharp_machine()
+    machine.learn_one([0.0], 1)
+    machine.learn_one([1.0], 2)
+    machine.learn_one([1.0], 0)
+    machine.observe([0.0], failed=True)  # action 0 in state 1 led there
+    machine.learn_one([0.0], 1)
+    machine.fail()  # action 1 in state 0 led there
+    assert machine.decisions.tolist() == [[0.0, 1.0], [2.0, 0.0], [0.0, 1.0]]
+    assert machine.failures.tolist() == [[0.0, 1.0], [1.0, 0.0], [0.0, 0.0]]
+    assert machine.endings.tolist() == [2.0, 0.0]
+    assert machine.model().uses.tolist() == [1.0, 1.0, 1.0]  # `fail` teaches no transition
+
+
+def test_a_failed_observation_is_learnt_like_any_other(grown):
+    twin = grown.copy()
+    a, b = grown.observe([0.3, 0.1], failed=True), twin.observe([0.3, 0.1])
+    for one, other in zip(a, b, strict=True):
+        np.testing.assert_array_equal(one, other)
+    twin.start_episode()
+    for name in set(LEARNT) - {"failures", "endings"}:
+        np.testing.assert_array_equal(getattr(grown, name), getattr(twin, name))
+    assert grown.failures.sum() == pytest.approx(1.0)
+    assert grown.endings.tolist() == [float(k == a.state) for k in range(grown.n_states)]
+
+
+@pytest.mark.parametrize("end", [EvolvingFSM.fail, lambda m: m.observe([0.3, 0.1], failed=True)])
+def test_after_a_failure_an_episode_begins(grown, end):
+    end(grown)
+    assert grown.state is None
+    assert grown.belief.tolist() == [1.0 / grown.n_states] * grown.n_states
+    with pytest.raises(ValueError, match="act before observe"):
+        grown.act(0)
+    with pytest.raises(ValueError, match="fail before observe: this episode"):
+        grown.fail()
+    changes = grown.model().changes.sum()
+    assert np.isnan(grown.observe([0.2, 0.1]).surprise)
+    assert grown.model().changes.sum() == changes
+
+
+def test_a_failure_without_an_action_before_it_is_counted_for_the_state_alone():
+    machine = sharp_machine()
+    machine.observe([1.0], failed=True)
+    machine.observe([1.0])
+    machine.fail()
+    assert machine.endings.tolist() == [0.0, 2.0]
+    assert not machine.decisions.any()
+
+
+def test_the_first_observation_of_all_may_fail(snapshot):
+    machine = new_machine()
+    machine.observe([1.0, 2.0], failed=True)
+    assert (machine.n_states, machine.endings.tolist()) == (1, [1.0])
+
+
+def test_failing_teaches_the_matrices_nothing(grown):
+    before = grown.transition_matrices, grown.origin_frequency, grown.centers
+    grown.act(1)
+    grown.fail()
+    after = grown.transition_matrices, grown.origin_frequency, grown.centers
+    for a, b in zip(before, after, strict=True):
+        assert a.tobytes() == b.tobytes()
+
+
+def test_counts_never_forget_where_frequencies_do():
+    machine = EvolvingFSM(n_actions=1, radius=0.5, learning_rate=0.5, spread=1e-6)
+    machine.learn_many([[0.0], [0.0], [2.0], [1.0]], [-1, -1, -1, 0], failures=[])
+    machine.observe([0.0], failed=True)
+    machine.learn_many(np.zeros((5000, 1)), [0] * 5000)
+    assert machine.origin_frequency[0, 1] == 0.0
+    assert machine.decisions[0].tolist() == [4999.0, 1.0]
+    assert machine.failures[0].tolist() == [0.0, 1.0]
+
+
+def test_decisions_sum_to_the_transitions_learnt_and_the_failures_after_them(stream):
+    machine = new_machine()
+    trace = machine.learn_many(*stream, failures=[10, 77])
+    machine.observe([0.0, 0.0])
+    machine.act(2)
+    uses = machine.model().uses
+    assert uses.sum() == (~np.isnan(trace.surprise)).sum() + (stream[1][-1] >= 0)
+    np.testing.assert_allclose(machine.decisions.sum(axis=1), uses, rtol=1e-12)
+    machine.fail()
+    np.testing.assert_allclose(machine.decisions.sum(axis=1), [*uses[:2], uses[2] + 1], rtol=1e-12)
+
+
+def test_a_batch_of_episodes_that_fail_is_the_loop_bit_for_bit(stream, snapshot):
+    Z, I, starts = stream
+    failures = [0, 40, 41, 89, 119]
+    batch, loop, split = new_machine(), new_machine(), new_machine()
+    batch.learn_many(Z, I, starts, failures)
+    for row, (z, i) in enumerate(zip(Z, I, strict=True)):
+        if row in starts:
+            loop.start_episode()
+        loop.observe(z, failed=row in failures)
+        if i >= 0 and row not in failures:
+            loop.act(i)
+    split.learn_many(Z[:41], I[:41], [0], [0, 40])
+    split.learn_many(Z[41:], I[41:], [0, 49], np.array([0, 48, 78]))
+    assert snapshot(batch) == snapshot(loop) == snapshot(split)
+
+
+def test_what_happened_to_states_may_be_combined():
+    assert [event.value for event in (Event.NONE, *Event)] == [0, 1, 2, 4, 8]
+    assert Event.CREATED in Event.CREATED | Event.MERGED
+    assert Event(12) == Event.MERGED | Event.RETIRED

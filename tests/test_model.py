@@ -36,7 +36,10 @@ STAY = [[1.0, 0.0], [0.0, 1.0]]
 
 def test_a_snapshot_holds_what_the_machine_knew(grown):
     model = grown.model(names=("x", "y"), units=("m", "m/s"), dt=0.01)
-    for name in ("centers", "potentials", "transition_matrices", "origin_frequency"):
+    for name in (
+        *("centers", "potentials", "transition_matrices", "origin_frequency"),
+        *("decisions", "failures", "endings"),
+    ):
         np.testing.assert_array_equal(getattr(model, name), getattr(grown, name))
     assert (model.n_states, model.n_variables, model.n_actions) == (grown.n_states, 2, 3)
     assert (model.names, model.units, model.dt) == (("x", "y"), ("m", "m/s"), 0.01)
@@ -88,11 +91,20 @@ def test_arrays_given_to_a_model_stay_the_givers_own():
         ({"names": ("x",)}, "names are .*2 variables"),
         ({"units": ("m", "m", "s")}, "units are .*2 variables"),
         ({"actions": ACTIONS}, "2 intervals for 1 matrices"),
+        ({"decisions": np.ones((1, 3))}, r"decisions has shape \(1, 3\), not \(1, 2\)"),
+        ({"failures": np.ones((1, 2))}, "cannot be counts"),
+        ({"endings": np.array([-1.0, 0.0])}, "cannot be counts"),
     ],
 )
 def test_parts_that_do_not_fit_each_other_are_refused(change, words):
     with pytest.raises(ValueError, match=words):
         dataclasses.replace(chain(STAY), **change)
+
+
+def test_a_model_made_without_counts_of_outcomes_has_counted_none():
+    model = chain(SWITCH, STAY)
+    assert model.decisions.tolist() == model.failures.tolist() == [[0.0, 0.0]] * 2
+    assert model.endings.tolist() == [0.0, 0.0]
 
 
 # -- Recognition -------------------------------------------------------------------------------

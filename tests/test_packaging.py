@@ -41,7 +41,8 @@ def test_importing_the_package_loads_nothing_heavy():
 
 def test_learning_needs_numpy_and_numba_and_nothing_else_that_is_heavy():
     learning = "from evofsm import EvolvingFSM\nEvolvingFSM(2).observe([0.0])"
-    assert modules_after(learning) & HEAVY <= {"numba"}
+    # Numba itself loads SciPy where it finds it.
+    assert modules_after(learning) & HEAVY <= {"numba", "scipy"}
 
 
 def test_importing_the_package_costs_little_more_than_importing_numpy():

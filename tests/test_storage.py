@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from evofsm import EvolvingFSM, FSMModel, IntervalActions, storage
+from evofsm import EvolvingFSM, FSMModel, IntervalActions, Paper, storage
 from evofsm.storage import kind_of
 
 
@@ -175,8 +175,8 @@ def test_a_header_that_makes_no_sense_is_refused_by_name(content, tmp_path):
 
 def test_a_file_of_a_newer_version_asks_for_a_newer_library(tmp_path):
     path = tmp_path / "newer"
-    path.write_bytes(npz({**HEADER, "version": 2}))
-    with pytest.raises(ValueError, match=r"version 2 is newer.*a newer evofsm reads it"):
+    path.write_bytes(npz({**HEADER, "version": 3}))
+    with pytest.raises(ValueError, match=r"version 3 is newer.*a newer evofsm reads it"):
         EvolvingFSM.load(path)
 
 
@@ -323,6 +323,9 @@ def test_saving_replaces_what_was_there(grown, snapshot, tmp_path):
         ("belief", 2.0, "belief is no distribution"),
         ("matrices", 7.0, "a row of matrices is no distribution"),
         ("scatter", -1.0, "scatter is too small"),
+        ("decisions", -1.0, "cannot be counts"),
+        ("failures", 1e9, "cannot be counts"),
+        ("endings", -1.0, "cannot be counts"),
     ],
 )
 def test_numbers_that_learning_could_not_have_left_are_refused(grown, tmp_path, name, value, words):
@@ -341,3 +344,36 @@ def test_a_model_whose_probabilities_are_none_is_refused(grown, tmp_path):
     storage.write(tmp_path / "model", "model", content, arrays)
     with pytest.raises(ValueError, match="transition_matrices holds NaN"):
         FSMModel.load(tmp_path / "model")
+
+
+# -- Files of earlier versions -----------------------------------------------------------------
+
+FILES = Path(__file__).parent / "files"
+
+
+def test_a_machine_saved_by_version_0_1_goes_on_as_if_it_had_never_been(spiral, snapshot):
+    old, new = EvolvingFSM.load(FILES / "machine-0.1.evofsm"), EvolvingFSM(3, radius=0.01)
+    new.learn_many(spiral(40)[:12], np.arange(12) % 3, [0, 9])
+    assert repr(old) == repr(new)
+    assert old.rule == Paper()
+    for name in ("decisions", "failures", "endings"):
+        counts = getattr(old, name)
+        assert (counts.shape, counts.any()) == (getattr(new, name).shape, False)
+    traces = [m.learn_many(spiral(40)[12:], [0, 1] * 14, belief=True) for m in (old, new)]
+    for a, b in zip(*traces, strict=True):
+        assert a.tobytes() == b.tobytes()
+    for name in ("centers", "potentials", "transition_matrices", "origin_frequency", "belief"):
+        assert getattr(old, name).tobytes() == getattr(new, name).tobytes()
+    assert old.decisions.sum() == pytest.approx(28.0)
+
+
+def test_a_model_saved_by_version_0_1_has_counted_no_failures():
+    model = FSMModel.load(FILES / "model-0.1.evofsm")
+    assert (model.names, model.units, model.dt) == (("gap", "speed"), ("m", "m/s"), 0.01)
+    assert model.rule == Paper()
+    assert model.decisions.shape == model.failures.shape == model.origin_frequency.shape
+    for name in ("decisions", "failures", "endings"):
+        assert not getattr(model, name).any()
+    assert model.recognise([1.0, 0.5]).sum() == pytest.approx(1.0)
+    machine = EvolvingFSM.load(FILES / "machine-0.1.evofsm")
+    assert model.recognise([1.0, 0.5]).tobytes() == machine.model().recognise([1.0, 0.5]).tobytes()

@@ -14,17 +14,22 @@ if TYPE_CHECKING:
     from evofsm.machine import EvolvingFSM
     from evofsm.model import FSMModel
     from evofsm.observations import Category, ObservationEncoder
+    from evofsm.states import Edges, FailureSplit, Novelty, Paper
     from evofsm.step import Event, Step, Trace
 
 __version__ = "0.1.0"
 
 _HOMES = {
     "Category": "observations",
+    "Edges": "states.edges",
     "Event": "step",
     "EvolvingFSM": "machine",
     "FSMModel": "model",
+    "FailureSplit": "states.failure",
     "IntervalActions": "actions",
+    "Novelty": "states.novelty",
     "ObservationEncoder": "observations",
+    "Paper": "states.ets",
     "Step": "step",
     "Trace": "step",
     "jensen_shannon": "divergence",
@@ -32,11 +37,15 @@ _HOMES = {
 
 __all__ = [
     "Category",
+    "Edges",
     "Event",
     "EvolvingFSM",
     "FSMModel",
+    "FailureSplit",
     "IntervalActions",
+    "Novelty",
     "ObservationEncoder",
+    "Paper",
     "Step",
     "Trace",
     "jensen_shannon",

@@ -31,12 +31,26 @@ from evofsm.memory import (
     view,
 )
 from evofsm.model import FSMModel
-from evofsm.step import EVENTS, FULL, REFUSED, Step, Trace, learn_rows, observe, widen
+from evofsm.states.dispatch import check_rule, describe, restore, weights, width
+from evofsm.states.ets import Paper
+from evofsm.states.rule import RuleSettings, StateRule
+from evofsm.step import (
+    EVENTS,
+    FULL,
+    REFUSED,
+    Step,
+    Trace,
+    fail,
+    learn_rows,
+    observe,
+    observe_failure,
+    widen,
+)
 from evofsm.transitions import Policy, marginal, propagate
 from evofsm.validation import (
     check_action,
     check_actions,
-    check_starts,
+    check_rows,
     positive,
     real_array,
     refuse_unusable,
@@ -44,6 +58,8 @@ from evofsm.validation import (
 )
 
 _FIRST_CAPACITY = 8
+_RADIUS, _SPREAD = 0.3, 3.0
+_SETTINGS = ("n_actions", "radius", "distance_weight", "learning_rate", "prior_frequency", "spread")
 
 
 class EvolvingFSM:
@@ -66,12 +82,18 @@ class EvolvingFSM:
     spread : float
         Width of recognition: the similarity to a centre is
         ``exp(-distance^2 / (spread * total variance of all observations))``.
+    rule : StateRule, optional
+        How states are determined, as an object: `Edges`, `Novelty`, `FailureSplit`; without it
+        the paper's rule, `Paper`. A rule may have a radius and a spread of its own, which then
+        take the place of these.
 
     Raises
     ------
+    TypeError
+        If ``rule`` is no rule (or the class of one).
     ValueError
         If ``n_actions`` is no whole number of at least 1, another setting is not positive and
-        finite, or ``learning_rate`` is 1 or more.
+        finite, ``learning_rate`` is 1 or more, or ``radius`` or ``spread`` contradicts the rule's.
 
     Notes
     -----
@@ -92,18 +114,30 @@ class EvolvingFSM:
     def __init__(
         self,
         n_actions: int,
-        radius: float = 0.3,
+        radius: float = _RADIUS,
         distance_weight: float = 0.85,
         learning_rate: float = 0.01,
         prior_frequency: float = 1e-3,
-        spread: float = 3.0,
+        spread: float = _SPREAD,
+        rule: StateRule | None = None,
     ) -> None:
+        self._rule = Paper() if rule is None else check_rule("rule", rule)
+        given = RuleSettings(
+            code=0,
+            radius=positive("radius", radius),
+            distance_weight=positive("distance_weight", distance_weight),
+            spread=positive("spread", spread),
+            failure_share=0.0,
+            failure_distance=0.0,
+            weights=np.empty(0),
+        )
+        told = self._rule._tell(given)
+        _refuse_contradiction("radius", given.radius, told.radius, _RADIUS, self._rule)
+        _refuse_contradiction("spread", given.spread, told.spread, _SPREAD, self._rule)
         parameters = Parameters(
-            positive("radius", radius),
-            positive("distance_weight", distance_weight),
             positive("learning_rate", learning_rate),
             positive("prior_frequency", prior_frequency),
-            positive("spread", spread),
+            told,
         )
         if parameters.learning_rate >= 1.0:
             raise ValueError(f"learning_rate is {learning_rate}; it must lie below 1")
@@ -131,7 +165,7 @@ prior_frequency=0.001, spread=3.0)
 
     # -- Learning -------------------------------------------------------------------------------
 
-    def observe(self, z: ArrayLike) -> Step:
+    def observe(self, z: ArrayLike, *, failed: bool = False) -> Step:
         """Take in one observation: determine states, recognise, and learn the transition to it.
 
         One step of the paper's Sections 2.2.1, 2.2.2 and 2.3.2, in that order.
@@ -140,6 +174,9 @@ prior_frequency=0.001, spread=3.0)
         ----------
         z : (m,) array_like
             Observation, in units of your own; the first one fixes m.
+        failed : bool
+            Whether the episode ended in failure with this observation. It is learnt like any
+            other; then the failure is counted, and the next observation begins an episode.
 
         Returns
         -------
@@ -169,12 +206,12 @@ prior_frequency=0.001, spread=3.0)
             z = self._fit(real_array("observation", z, ndim=1))
             scratch = self._memory.scratch
         scratch.observation[:] = z
-        event, state, surprise = observe(self._buffer)
+        event, state, surprise = (observe_failure if failed else observe)(self._buffer)
         if event == REFUSED:
             refuse_unusable("observation", real_array("observation", z, ndim=1))
         if event == FULL:
             self._grow()
-            return self.observe(z)
+            return self.observe(z, failed=failed)
         n = self.n_states
         predicted = scratch.predicted[: n if surprise == surprise else 0].copy()
         return Step(
@@ -249,6 +286,7 @@ prior_frequency=0.001, spread=3.0)
         Z: ArrayLike,
         I: ArrayLike,
         episode_starts: Sequence[int] | NDArray[np.integer] = (),
+        failures: Sequence[int] | NDArray[np.integer] = (),
         *,
         belief: bool = False,
     ) -> Trace:
@@ -262,6 +300,9 @@ prior_frequency=0.001, spread=3.0)
             The action commanded after each observation; -1 where none was.
         episode_starts : (E,) array_like of int
             Rows at which an episode begins. Without row 0 the present episode goes on.
+        failures : (K,) array_like of int
+            Rows with which an episode ended in failure, as ``observe(z, failed=True)`` tells it.
+            The action in such a row is not used, and the next row begins an episode.
         belief : bool
             Whether the trace holds the belief of every row as well.
 
@@ -283,7 +324,8 @@ prior_frequency=0.001, spread=3.0)
         """
         observations = self._check_observations(Z)
         actions = check_actions(I, len(observations), self.n_actions)
-        starts = check_starts(episode_starts, len(observations))
+        starts = check_rows("episode_starts", episode_starts, len(observations))
+        ends = check_rows("failures", failures, len(observations))
         if len(observations):
             self._fit(observations[0])
         rows = len(observations)
@@ -294,11 +336,12 @@ prior_frequency=0.001, spread=3.0)
             np.empty(rows),
         )
         beliefs = np.zeros((rows if belief else 0, self._capacity))
-        row = learn_rows(self._buffer, observations, actions, starts, 0, trace, beliefs)
+        given = observations, actions, starts, ends
+        row = learn_rows(self._buffer, *given, 0, trace, beliefs)
         while row < rows:
             self._grow()
             beliefs = widen(beliefs, self._capacity)
-            row = learn_rows(self._buffer, observations, actions, starts, row, trace, beliefs)
+            row = learn_rows(self._buffer, *given, row, trace, beliefs)
         return trace._replace(belief=beliefs[:, : self.n_states]) if belief else trace
 
     def start_episode(self) -> None:
@@ -316,6 +359,32 @@ prior_frequency=0.001, spread=3.0)
         """
         self._memory.learnt.chained[0] = 0.0
         self._memory.learnt.action[0] = NO_ACTION
+
+    def fail(self) -> None:
+        """End the episode in failure, without a further observation.
+
+        The action commanded after the latest observation led there; where none was, the failure
+        is counted for the state alone. The next observation begins a new episode.
+
+        Raises
+        ------
+        ValueError
+            If nothing was observed yet in this episode.
+
+        Examples
+        --------
+        >>> machine = EvolvingFSM(n_actions=2, radius=0.5)
+        >>> trace = machine.learn_many([[0.0], [0.1], [2.0], [1.0]], [0, 0, 0, 1])
+        >>> machine.fail()
+        >>> machine.failures.round(2), machine.endings
+        (array([[0.  , 0.  ],
+               [0.37, 0.63]]), array([0., 1.]))
+        """
+        if not self._memory.learnt.chained[0]:
+            raise ValueError("fail before observe: this episode has no observation to fail after")
+        if not fail(self._buffer):
+            self._grow()
+            fail(self._buffer)
 
     # -- Forecasting ----------------------------------------------------------------------------
 
@@ -372,13 +441,13 @@ prior_frequency=0.001, spread=3.0)
 
     @property
     def radius(self) -> float:
-        """The paper's epsilon."""
-        return self._memory.parameters.radius
+        """The paper's epsilon, or the rule's own."""
+        return self._memory.parameters.rule.radius
 
     @property
     def distance_weight(self) -> float:
         """The paper's rho."""
-        return self._memory.parameters.distance_weight
+        return self._memory.parameters.rule.distance_weight
 
     @property
     def learning_rate(self) -> float:
@@ -392,8 +461,13 @@ prior_frequency=0.001, spread=3.0)
 
     @property
     def spread(self) -> float:
-        """Width of recognition, in total variances of all observations."""
-        return self._memory.parameters.spread
+        """Width of recognition, in total variances of all observations or the rule's measure."""
+        return self._memory.parameters.rule.spread
+
+    @property
+    def rule(self) -> StateRule:
+        """How states are determined."""
+        return self._rule
 
     # -- What it knows --------------------------------------------------------------------------
 
@@ -431,6 +505,52 @@ prior_frequency=0.001, spread=3.0)
     def joint_frequency(self) -> NDArray[np.float64]:
         """(q, n, n) ndarray: the paper's F, recency-weighted frequencies of transitions."""
         return self.origin_frequency[:, :, None] * self._matrices
+
+    @property
+    def decisions(self) -> NDArray[np.float64]:
+        """(q, n) ndarray: for each action, transitions that began in each state, by belief.
+
+        Counts never forget, unlike `origin_frequency`: they are the evidence that there is.
+
+        Examples
+        --------
+        >>> machine = EvolvingFSM(n_actions=2, radius=0.5)
+        >>> trace = machine.learn_many([[0.0], [0.1], [2.0], [1.0], [1.2]], [0, 0, 0, 1, 0])
+        >>> machine.decisions.round(2)
+        array([[3.  , 0.  ],
+               [0.37, 0.63]])
+        """
+        return self._memory.learnt.outcomes.decisions[:, : self.n_states].copy()
+
+    @property
+    def failures(self) -> NDArray[np.float64]:
+        """(q, n) ndarray: those of `decisions` that led straight into failure.
+
+        Examples
+        --------
+        >>> machine = EvolvingFSM(n_actions=2, radius=0.5)
+        >>> trace = machine.learn_many([[0.0], [0.1], [2.0], [1.0]], [0, 0, 0, 1])
+        >>> step = machine.observe([1.2], failed=True)
+        >>> machine.failures.round(2)
+        array([[0.  , 0.  ],
+               [0.37, 0.63]])
+        """
+        return self._memory.learnt.outcomes.failures[:, : self.n_states].copy()
+
+    @property
+    def endings(self) -> NDArray[np.float64]:
+        """(n,) ndarray: failures whose last observation was recognised as each state.
+
+        Where failures end, a dead end may be.
+
+        Examples
+        --------
+        >>> machine = EvolvingFSM(n_actions=2, radius=0.5)
+        >>> trace = machine.learn_many([[0.0], [0.1], [2.0], [1.0]], [0, 0, 0, 1], failures=[1, 3])
+        >>> machine.endings
+        array([1., 1.])
+        """
+        return self._memory.learnt.outcomes.endings[: self.n_states].copy()
 
     @property
     def marginal_matrix(self) -> NDArray[np.float64]:
@@ -491,17 +611,20 @@ prior_frequency=0.001, spread=3.0)
         (array([3., 1.]), array([3., 2.]))
         """
         learnt, n = self._memory.learnt, self.n_states
-        observations = int(learnt.clusters.n_observations[0])
         return FSMModel(
             centers=self.centers,
             potentials=self.potentials,
-            width=self.spread * learnt.clusters.scatter[0] / max(observations, 1),
+            width=width(self._memory.parameters.rule, learnt.clusters) if n else 0.0,
             transition_matrices=self.transition_matrices,
             origin_frequency=self.origin_frequency,
             uses=learnt.transitions.uses.copy(),
             visits=learnt.visits[:n].copy(),
             founded=learnt.founded[:n].copy(),
             changes=learnt.changes[:n, :n].copy(),
+            decisions=self.decisions,
+            failures=self.failures,
+            endings=self.endings,
+            rule=self._rule,
             actions=actions,
             names=tuple(names),
             units=tuple(units),
@@ -538,7 +661,8 @@ prior_frequency=0.001, spread=3.0)
         """
         # Without spare room the shapes of the arrays tell the sizes, and nothing else is stored.
         learnt = view(resize(self._buffer, self.n_states)).learnt
-        storage.write(path, "machine", self._settings(), dict(leaves(learnt)))
+        content = {**self._settings(), "rule": describe(self._rule)}
+        storage.write(path, "machine", content, dict(leaves(learnt)))
 
     @classmethod
     def load(cls, path: str | PathLike[str]) -> Self:
@@ -573,13 +697,13 @@ prior_frequency=0.001, spread=3.0)
         >>> again.observe([1.1]).surprise == machine.observe([1.1]).surprise
         True
         """
-        settings, arrays = storage.read(path, "machine")
+        content, arrays = storage.read(path, "machine")
         with storage.explained(path):
-            machine = cls(**settings)
+            machine = cls(**{**content, "rule": restore(content["rule"])})
             m, n = arrays["centers"].shape
             if n == 0:
                 return machine
-            buffer = allocate(m, machine.n_actions, n, machine._memory.parameters)
+            buffer = allocate(m, machine.n_actions, n, machine._parameters(m))
             for name, array in leaves(view(buffer).learnt):
                 if arrays[name].shape != array.shape:
                     raise ValueError(f"{name} has shape {arrays[name].shape}, not {array.shape}")
@@ -608,20 +732,28 @@ prior_frequency=0.001, spread=3.0)
         return copy.copy(self)
 
     # The views belong to one buffer: a copy, or what another process gets, needs its own.
-    def __getstate__(self) -> dict[str, NDArray[np.float64]]:
-        return {"buffer": self._buffer.copy()}
+    def __getstate__(self) -> dict[str, Any]:
+        return {"rule": self._rule, "buffer": self._buffer.copy()}
 
-    def __setstate__(self, state: dict[str, NDArray[np.float64]]) -> None:
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self._rule = state["rule"]
         self._use(state["buffer"])
 
     def __repr__(self) -> str:
-        settings = ", ".join(f"{name}={value}" for name, value in self._settings().items())
+        shown = self._settings() | ({} if self._rule == Paper() else {"rule": self._rule})
+        settings = ", ".join(f"{name}={value}" for name, value in shown.items())
         return f"{type(self).__name__}({settings})"
 
     # -- Inside ---------------------------------------------------------------------------------
 
     def _settings(self) -> dict[str, Any]:
-        return {"n_actions": self.n_actions, **self._memory.parameters._asdict()}
+        return {name: getattr(self, name) for name in _SETTINGS}
+
+    def _parameters(self, m: int) -> Parameters:
+        """The settings, now that there are m variables."""
+        parameters = self._memory.parameters
+        told = parameters.rule._replace(weights=weights(self._rule, m))
+        return parameters._replace(rule=told)
 
     def _use(self, buffer: NDArray[np.float64]) -> None:
         self._buffer = buffer
@@ -643,7 +775,7 @@ prior_frequency=0.001, spread=3.0)
         """Settle the number of variables with the first observation, and hold to it after."""
         if self.n_states == 0:
             refuse_unusable("observation", z)
-            parameters = self._memory.parameters
+            parameters = self._parameters(len(z))
             self._use(allocate(len(z), self.n_actions, _FIRST_CAPACITY, parameters))
         if z.shape != self._memory.scratch.observation.shape:
             raise ValueError(
@@ -658,3 +790,11 @@ prior_frequency=0.001, spread=3.0)
             self._fit(observations[0])
         refuse_unusable("observations", observations)
         return observations
+
+
+def _refuse_contradiction(
+    name: str, given: float, told: float, default: float, rule: StateRule
+) -> None:
+    """Raise where a setting was given to a machine whose rule has another one of its own."""
+    if given not in (told, default):
+        raise ValueError(f"{name} is {given}, but the rule has its own: {rule}")

@@ -13,21 +13,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evofsm._compile import kernel
-from evofsm.states.ets import Clusters
-from evofsm.transitions import Transitions
-from evofsm.validation import refuse_unless_distribution
+from evofsm.states.clusters import Clusters
+from evofsm.states.rule import RuleSettings
+from evofsm.transitions import Outcomes, Transitions
+from evofsm.validation import refuse_unless_distribution, refuse_unless_outcomes
 
 NO_ACTION = -1
 
+# Room before the arrays, for sizes, `Parameters` and counters: whole cache lines, so that rows of
+# a capacity that is a multiple of 8 lie in as few lines as they can.
+_HEAD = 24
+
 
 class Parameters(NamedTuple):
-    """The settings of a machine; the paper's symbols are epsilon, rho, phi, epsilon-bar."""
+    """The settings of a machine; the paper's symbols are phi, epsilon-bar."""
 
-    radius: float
-    distance_weight: float
     learning_rate: float
     prior_frequency: float
-    spread: float
+    rule: RuleSettings
 
 
 class Learnt(NamedTuple):
@@ -43,6 +46,7 @@ class Learnt(NamedTuple):
     changes: NDArray[np.float64]  # (capacity, capacity) steps from a state (row) to a state
     clusters: Clusters
     transitions: Transitions
+    outcomes: Outcomes
 
 
 class Scratch(NamedTuple):
@@ -64,21 +68,33 @@ class Memory(NamedTuple):
 def _open_memory(buffer: NDArray[np.float64]) -> Memory:
     """Views into a buffer made by `allocate`; compiled for kernels as `open_memory`."""
     m, q, capacity = int(buffer[0]), int(buffer[1]), int(buffer[2])
-    parameters = Parameters(
-        float(buffer[3]), float(buffer[4]), float(buffer[5]), float(buffer[6]), float(buffer[7])
-    )
-    counters = buffer[8:14]
-    per_variable = buffer[14 : 14 + 3 * m].reshape((3, m))
-    start = 14 + 3 * m
-    per_state = buffer[start : start + (7 + m) * capacity].reshape((7 + m, capacity))
-    start += (7 + m) * capacity
-    per_action = buffer[start : start + q * (1 + capacity)]
-    start += q * (1 + capacity)
+    counters = buffer[11:17]
+    start = _HEAD
     matrices = buffer[start : start + q * capacity * capacity]
     start += q * capacity * capacity
     changes = buffer[start : start + capacity * capacity]
+    start += capacity * capacity
+    per_state = buffer[start : start + (8 + m) * capacity].reshape((8 + m, capacity))
+    start += (8 + m) * capacity
+    per_action = buffer[start : start + 3 * q * capacity].reshape((3, q, capacity))
+    start += 3 * q * capacity
+    uses = buffer[start : start + q]
+    start += q
+    per_variable = buffer[start : start + 5 * m].reshape((5, m))
     return Memory(
-        parameters,
+        Parameters(
+            float(buffer[3]),
+            float(buffer[4]),
+            RuleSettings(
+                float(buffer[5]),
+                float(buffer[6]),
+                float(buffer[7]),
+                float(buffer[8]),
+                float(buffer[9]),
+                float(buffer[10]),
+                per_variable[4],
+            ),
+        ),
         Learnt(
             counters[0:1],
             counters[1:2],
@@ -91,17 +107,19 @@ def _open_memory(buffer: NDArray[np.float64]) -> Memory:
             Clusters(
                 counters[3:4],
                 per_variable[0],
+                per_variable[3],
                 per_variable[1],
                 counters[4:5],
-                per_state[7:],
+                per_state[8:],
                 per_state[3],
                 per_state[4],
             ),
             Transitions(
                 matrices.reshape((q, capacity, capacity)),
-                per_action[q:].reshape((q, capacity)),
-                per_action[:q],
+                per_action[0],
+                uses,
             ),
+            Outcomes(per_action[1], per_action[2], per_state[7]),
         ),
         Scratch(per_variable[2], per_state[5], per_state[6]),
     )
@@ -115,10 +133,13 @@ def allocate(
 ) -> NDArray[np.float64]:
     """Buffer of a machine that has seen nothing."""
     m, q = n_variables, n_actions
-    length = 14 + 3 * m + (7 + m) * capacity + q * (1 + capacity) + (q + 1) * capacity**2
-    buffer = np.zeros(length)
-    buffer[:8] = (m, q, capacity, *parameters)
-    view(buffer).learnt.action[0] = NO_ACTION
+    *numbers, weights = parameters.rule
+    per_action = 1 + 3 * capacity + capacity**2
+    buffer = np.zeros(_HEAD + 5 * m + (8 + m) * capacity + q * per_action + capacity**2)
+    buffer[:11] = (m, q, capacity, parameters.learning_rate, parameters.prior_frequency, *numbers)
+    memory = view(buffer)
+    memory.parameters.rule.weights[:] = weights
+    memory.learnt.action[0] = NO_ACTION
     return buffer
 
 
@@ -166,5 +187,6 @@ def refuse_impossible(learnt: Learnt) -> None:
         raise ValueError(f"state is {learnt.state[0]:g}, but there are {n} states")
     if learnt.clusters.n_observations[0] < n or learnt.clusters.scatter[0] < 0.0:
         raise ValueError("n_observations or scatter is too small")
+    refuse_unless_outcomes(*learnt.outcomes)
     refuse_unless_distribution("belief", learnt.belief)
     refuse_unless_distribution("a row of matrices", learnt.transitions.matrices)

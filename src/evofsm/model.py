@@ -13,7 +13,10 @@ from numpy.typing import ArrayLike, NDArray
 from evofsm import storage
 from evofsm._compile import kernel
 from evofsm.actions import IntervalActions
-from evofsm.states.ets import measure_distances
+from evofsm.states.clusters import measure_distances
+from evofsm.states.dispatch import describe, restore, weights
+from evofsm.states.ets import Paper
+from evofsm.states.rule import StateRule
 from evofsm.states.spread import recognise
 from evofsm.transitions import Policy, marginal, propagate
 from evofsm.validation import (
@@ -21,8 +24,15 @@ from evofsm.validation import (
     positive,
     real_array,
     refuse_unless_distribution,
+    refuse_unless_outcomes,
     refuse_unusable,
 )
+
+_COUNTS = ("decisions", "failures", "endings")
+
+
+def _no_counts() -> NDArray[np.float64]:
+    return np.empty(0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,14 +40,16 @@ class FSMModel:
     """States and transitions as they stood when the snapshot was taken.
 
     n is the number of states, m of variables, q of actions. Arrays are read-only. Centres are in
-    the units of the observations, distances and potentials as if all had the same unit.
+    the units of the observations; distances and potentials as if all had the same unit, or are
+    those of observations divided by the rule's scales. Without counts of outcomes they are 0.
 
     Raises
     ------
     ValueError
         If an array has not its shape or holds NaN or infinity, a row of a transition matrix is
-        no distribution, ``actions``, ``names`` or ``units`` are of another number than the
-        arrays say, or ``dt`` is not positive and finite.
+        no distribution, counts are below 0 or more decisions failed than were taken,
+        ``actions``, ``names`` or ``units`` are of another number than the arrays say, or ``dt``
+        is not positive and finite.
 
     Examples
     --------
@@ -51,7 +63,7 @@ class FSMModel:
 
     centers: NDArray[np.float64]  #: (n, m) observation at the centre of each state
     potentials: NDArray[np.float64]  #: (n,) density of all observations at each centre
-    width: float  #: of recognition: spread times the total variance of all observations
+    width: float  #: of recognition: a squared distance, as the rule makes it of the spread
     transition_matrices: NDArray[np.float64]  #: (q, n, n) from state (row) to state (column)
     origin_frequency: NDArray[np.float64]  #: (q, n) recency-weighted frequency of each row
     uses: NDArray[np.float64]  #: (q,) transitions learnt with each action
@@ -63,6 +75,10 @@ class FSMModel:
     units: tuple[str, ...] = ()  #: of the m variables
     dt: float | None = None  #: time between two observations [s]
     settings: Mapping[str, float] = field(default_factory=dict)  #: of the machine it is from
+    decisions: NDArray[np.float64] = field(default_factory=_no_counts)  #: (q, n) transitions begun
+    failures: NDArray[np.float64] = field(default_factory=_no_counts)  #: (q, n) that led to failure
+    endings: NDArray[np.float64] = field(default_factory=_no_counts)  #: (n,) failures ended in it
+    rule: StateRule = field(default_factory=Paper)  #: how its machine determines states
 
     def __post_init__(self) -> None:
         n, m, q = self.n_states, self.n_variables, self.n_actions
@@ -75,15 +91,21 @@ class FSMModel:
             "visits": (n,),
             "founded": (n,),
             "changes": (n, n),
+            "decisions": (q, n),
+            "failures": (q, n),
+            "endings": (n,),
         }
         for name, shape in shapes.items():
             array = np.array(getattr(self, name), dtype=np.float64)
+            if name in _COUNTS and array.shape == (0,):
+                array = np.zeros(shape)
             if array.shape != shape:
                 raise ValueError(f"{name} has shape {array.shape}, not {shape}")
             if not np.isfinite(array).all():
                 raise ValueError(f"{name} holds NaN or infinity")
             array.setflags(write=False)
             object.__setattr__(self, name, array)
+        refuse_unless_outcomes(self.decisions, self.failures, self.endings)
         if n:
             refuse_unless_distribution("a row of transition_matrices", self.transition_matrices)
         for name in ("names", "units"):
@@ -149,7 +171,9 @@ class FSMModel:
             raise ValueError("this model has no states: its machine had observed nothing")
         belief = np.empty((len(rows), self.n_states))
         centers = np.ascontiguousarray(self.centers.T)
-        _recognise_rows(centers, rows.copy(), self.width, np.empty(self.n_states), belief)
+        distances = np.empty(self.n_states)
+        scaling = weights(self.rule, self.n_variables)
+        _recognise_rows(centers, scaling, rows.copy(), self.width, distances, belief)
         return belief if given.ndim == 2 else belief[0]
 
     def propagate(
@@ -360,6 +384,7 @@ class FSMModel:
         arrays = {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
         content = {name: value for name, value in values.items() if name not in arrays}
         content["settings"] = dict(self.settings)
+        content["rule"] = describe(self.rule)
         content["actions"] = None if self.actions is None else asdict(self.actions)
         storage.write(path, "model", content, arrays)
 
@@ -404,13 +429,17 @@ class FSMModel:
                 content["actions"] = IntervalActions(**content["actions"])
             for name in ("names", "units"):
                 content[name] = tuple(content[name])
+            content["rule"] = restore(content["rule"])
             values: dict[str, Any] = {**content, **arrays}
+            if lacking := {entry.name for entry in fields(cls)} - set(values):
+                raise ValueError(f"it lacks {', '.join(sorted(lacking))}")
             return cls(**values)
 
 
 @kernel
 def _recognise_rows(
     centers: NDArray[np.float64],
+    weights: NDArray[np.float64],
     rows: NDArray[np.float64],
     width: float,
     squared_distances: NDArray[np.float64],
@@ -418,5 +447,5 @@ def _recognise_rows(
 ) -> None:
     n = len(squared_distances)
     for row in range(len(rows)):
-        measure_distances(centers, n, rows[row], squared_distances)
+        measure_distances(centers, weights, n, rows[row], squared_distances)
         recognise(squared_distances, n, width, belief[row])

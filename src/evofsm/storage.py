@@ -3,6 +3,7 @@
 A file is a ZIP of ``.npy`` members (NumPy's ``.npz``), read with pickling refused. The member
 ``header`` is JSON: ``{"format", "version", "kind", "content"}``. A machine's file holds the
 views of its buffer, with centres by variable (m, n); a model's its fields, centres by state (n, m).
+Version 1 knew the paper's state rule only and did not count failures.
 """
 
 from __future__ import annotations
@@ -20,7 +21,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 _FORMAT = "evofsm"
-_VERSION = 1
+_VERSION = 2
+# Arrays that version 1 had not, as zeros in the shape of one that it had.
+_ADDED = {
+    "machine": {
+        "decisions": "origin_frequency",
+        "failures": "origin_frequency",
+        "endings": "visits",
+        "latest": "first",
+    },
+    "model": {
+        "decisions": "origin_frequency",
+        "failures": "origin_frequency",
+        "endings": "visits",
+    },
+}
 # What reading a damaged archive may run into (OSError: a place before its beginning;
 # RuntimeError: a flag that says it is encrypted).
 _DAMAGE = (
@@ -70,6 +85,9 @@ def read(path: str | os.PathLike[str], kind: str) -> tuple[dict[str, Any], dict[
     header, arrays = _read(path)
     if header["kind"] != kind:
         raise ValueError(f"{os.fspath(path)} holds a {header['kind']}, not a {kind}")
+    if header["version"] < _VERSION:
+        with explained(path):
+            _upgrade(header, arrays)
     return header["content"], arrays
 
 
@@ -99,6 +117,13 @@ def _header(encoded: Any) -> dict[str, Any]:
     if not {"kind", "content"} <= set(header):
         raise ValueError("its header lacks what it holds")
     return header
+
+
+def _upgrade(header: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> None:
+    """Give a file of version 1 what it lacks."""
+    header["content"]["rule"] = {"name": "paper"}
+    for name, like in _ADDED[header["kind"]].items():
+        arrays[name] = np.zeros_like(arrays[like])
 
 
 @contextmanager

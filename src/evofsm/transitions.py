@@ -34,6 +34,24 @@ class Transitions(NamedTuple):
     uses: NDArray[np.float64]  # (q,) transitions identified with each action
 
 
+class Outcomes(NamedTuple):
+    """Evidence on failure, in counts that never forget: a rare failure must not fade.
+
+    It is kept apart from `Transitions.origin_frequency`, which forgets.
+    """
+
+    decisions: NDArray[np.float64]  # (q, capacity) belief-weighted transitions from each state
+    failures: NDArray[np.float64]  # (q, capacity) those of them that led straight into failure
+    endings: NDArray[np.float64]  # (capacity,) failures whose last observation was the state
+
+
+@kernel
+def count(counts: NDArray[np.float64], belief: NDArray[np.float64], n: int) -> None:
+    """Count one event, shared out over the first ``n`` states by belief."""
+    for i in range(n):
+        counts[i] += belief[i]
+
+
 @kernel
 def expand(transitions: Transitions, n: int, prior_frequency: float) -> None:
     """Add state ``n`` to all matrices: its row and column of F are the prior frequency."""

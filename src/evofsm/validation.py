@@ -73,6 +73,14 @@ def refuse_unless_distribution(name: str, rows: NDArray[np.float64]) -> None:
         raise ValueError(f"{name} is no distribution: entries must be 0 or more and sum to 1")
 
 
+def refuse_unless_outcomes(
+    decisions: NDArray[np.float64], failures: NDArray[np.float64], endings: NDArray[np.float64]
+) -> None:
+    """Raise where they cannot be counts, or more decisions failed than were taken."""
+    if (failures < 0.0).any() or (failures > decisions).any() or (endings < 0.0).any():
+        raise ValueError("decisions, failures or endings cannot be counts")
+
+
 def check_action(i: SupportsIndex, n_actions: int) -> int:
     """An index of one of the actions."""
     try:
@@ -106,14 +114,14 @@ def check_actions(indices: ArrayLike, rows: int, n_actions: int) -> NDArray[np.i
     return actions.astype(np.int64)
 
 
-def check_starts(episode_starts: ArrayLike, rows: int) -> NDArray[np.bool_]:
-    """Mark the rows at which an episode begins."""
-    given = _array("episode_starts", episode_starts)
+def check_rows(name: str, numbers: ArrayLike, rows: int) -> NDArray[np.bool_]:
+    """Mark the rows that are named."""
+    given = _array(name, numbers)
     if given.size and given.dtype.kind not in "iu":
-        raise TypeError(f"episode_starts has dtype {given.dtype}; it must hold row numbers")
+        raise TypeError(f"{name} has dtype {given.dtype}; it must hold row numbers")
     wrong = given[(given < 0) | (given >= rows)]
     if wrong.size:
-        raise ValueError(f"episode_starts names row {wrong[0]}, but there are {rows} rows")
-    starts = np.zeros(rows, np.bool_)
-    starts[given.astype(np.int64)] = True
-    return starts
+        raise ValueError(f"{name} names row {wrong[0]}, but there are {rows} rows")
+    marked = np.zeros(rows, np.bool_)
+    marked[given.astype(np.int64)] = True
+    return marked

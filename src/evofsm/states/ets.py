@@ -1,144 +1,53 @@
-"""Determine states by evolving Takagi-Sugeno (eTS) clustering: the paper's Section 2.2.1.
+"""The paper's rule: evolving Takagi-Sugeno (eTS) clustering, Sections 2.2.1 and 2.2.2.
 
 An observation founds a state where the data seen so far is denser than at every existing
-centre. Density is the *potential*, a Cauchy kernel summed over the whole past, kept by two
-recursions: one for the present observation, one for the centres.
-
-The paper keeps running sums of z and z'z (its a_t, b_t, c_t). Those lose all digits when the
-observations lie far from zero, so this file uses the same quantity in its mean and variance
-form, with the mean kept relative to the first observation::
-
-    potential of z_t = 1 / (1 + |z_t - mean|^2 + variance),   both over z_1 .. z_{t-1}
+centre, or moves the nearest centre there. The more data vary, the wider states are recognised.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
-import numpy as np
-from numpy.typing import NDArray
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar
 
 from evofsm._compile import kernel
+from evofsm.states.clusters import CREATED, MOVED, UNCHANGED, Clusters, total_variance
+from evofsm.states.rule import RuleSettings
 
-UNCHANGED, MOVED, CREATED = 0, 1, 2
-
-
-class Clusters(NamedTuple):
-    """What eTS remembers: m variables, room for ``capacity`` centres, the first ``n`` in use."""
-
-    n_observations: NDArray[np.float64]  # (1,)
-    first: NDArray[np.float64]  # (m,) z_1, the origin of `mean`
-    mean: NDArray[np.float64]  # (m,) of all observations, minus `first`
-    scatter: NDArray[np.float64]  # (1,) sum of squared distances to the mean
-    centers: NDArray[np.float64]  # (m, capacity)
-    potentials: NDArray[np.float64]  # (capacity,)
-    squared_distances: NDArray[np.float64]  # (capacity,) from the latest observation
+CODE = 0
 
 
-@kernel
-def determine(
-    clusters: Clusters, n: int, z: NDArray[np.float64], radius: float, distance_weight: float
-) -> int:
-    """Let one observation leave the centres as they are, move one, or found one.
+@dataclass(frozen=True)
+class Paper:
+    """The paper's rule, with the machine's radius, distance_weight and spread.
 
-    ``n`` centres are in use; where the answer is ``CREATED``, the new one stands at index ``n``.
+    An observation that is denser than every centre moves the nearest one if that is closer than
+    ``radius``, else it founds a state. The width of recognition is ``spread`` times the total
+    variance of all observations.
+
+    Examples
+    --------
+    >>> from evofsm import EvolvingFSM
+    >>> machine = EvolvingFSM(n_actions=1, radius=0.5, rule=Paper())
+    >>> machine.learn_many([[0.0], [0.1], [2.0], [1.0]], [0, 0, 0, 0]).n_states
+    array([1, 1, 1, 2])
     """
-    if clusters.n_observations[0] == 0.0:
-        for j in range(len(z)):
-            clusters.first[j] = z[j]
-        _place_center(clusters, 0, z, 1.0)
-        event = CREATED
-    else:
-        potential = _potential_of_observation(clusters, z)
-        highest = _update_potentials_of_centers(clusters, n, distance_weight)
-        measure_distances(clusters.centers, n, z, clusters.squared_distances)
-        nearest = nearest_center(clusters.squared_distances, n)
-        if potential <= highest:
-            event = UNCHANGED
-        elif clusters.squared_distances[nearest] < radius * radius:
-            _place_center(clusters, nearest, z, potential)
-            event = MOVED
-        else:
-            _place_center(clusters, n, z, potential)
-            event = CREATED
-    _absorb(clusters, z)
-    return event
+
+    scales: ClassVar[Sequence[float]] = ()
+
+    def _tell(self, machine: RuleSettings) -> RuleSettings:
+        return machine._replace(code=CODE)
 
 
 @kernel
-def total_variance(clusters: Clusters) -> float:
-    """Population variance of all observations so far, summed over the variables."""
-    return float(clusters.scatter[0] / clusters.n_observations[0])
+def judge(potential: float, highest: float, squared_distance: float, radius: float) -> int:
+    """Leave the states as they are, move the nearest, or found one."""
+    if potential <= highest:
+        return UNCHANGED
+    return MOVED if squared_distance < radius * radius else CREATED
 
 
 @kernel
-def measure_distances(
-    centers: NDArray[np.float64],
-    n: int,
-    z: NDArray[np.float64],
-    squared_distances: NDArray[np.float64],
-) -> None:
-    """Squared Euclidean distance from ``z`` to each of the first ``n`` centres, (m, capacity)."""
-    for i in range(n):
-        squared_distances[i] = 0.0
-    for j in range(len(z)):
-        for i in range(n):
-            offset = z[j] - centers[j, i]
-            squared_distances[i] += offset * offset
-
-
-@kernel
-def nearest_center(squared_distances: NDArray[np.float64], n: int) -> int:
-    """Index of the smallest of the first ``n`` distances; the oldest centre wins a tie."""
-    nearest = 0
-    for i in range(1, n):
-        if squared_distances[i] < squared_distances[nearest]:
-            nearest = i
-    return nearest
-
-
-@kernel
-def _potential_of_observation(clusters: Clusters, z: NDArray[np.float64]) -> float:
-    """Equation of the potential of z_t, in its mean and variance form."""
-    squared_distance = 0.0
-    for j in range(len(z)):
-        offset = z[j] - clusters.first[j] - clusters.mean[j]
-        squared_distance += offset * offset
-    return 1.0 / (1.0 + squared_distance + total_variance(clusters))
-
-
-@kernel
-def _update_potentials_of_centers(clusters: Clusters, n: int, distance_weight: float) -> float:
-    """Recursion of the centres' potentials; returns the highest.
-
-    It needs the distances to z_{t-1}, which are still at hand from the step before.
-    """
-    t = clusters.n_observations[0] + 1.0
-    highest = 0.0
-    for i in range(n):
-        potential = clusters.potentials[i]
-        far = 1.0 + distance_weight * clusters.squared_distances[i]
-        potential = (t - 1.0) * potential / ((t - 2.0) + potential * far)
-        clusters.potentials[i] = potential
-        highest = max(highest, potential)
-    return highest
-
-
-@kernel
-def _place_center(clusters: Clusters, i: int, z: NDArray[np.float64], potential: float) -> None:
-    """Put centre ``i`` on the observation, which is then at no distance from it."""
-    for j in range(len(z)):
-        clusters.centers[j, i] = z[j]
-    clusters.potentials[i] = potential
-    clusters.squared_distances[i] = 0.0
-
-
-@kernel
-def _absorb(clusters: Clusters, z: NDArray[np.float64]) -> None:
-    """Add the observation to the running mean and scatter (Welford 1962)."""
-    clusters.n_observations[0] += 1.0
-    for j in range(len(z)):
-        offset = z[j] - clusters.first[j]
-        before = offset - clusters.mean[j]
-        clusters.mean[j] += before / clusters.n_observations[0]
-        clusters.scatter[0] += before * (offset - clusters.mean[j])
+def width(spread: float, clusters: Clusters) -> float:
+    """Width of recognition; the paper leaves its var(z*) open."""
+    return spread * total_variance(clusters)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evofsm._compile import kernel
-from evofsm.states.ets import nearest_center
+from evofsm.states.clusters import nearest_center
 
 # Below exp(-690) a belief is taken as 0: smaller numbers are denormal and slow every sum.
 _LOWEST_EXPONENT = -690.0
@@ -23,8 +23,7 @@ def recognise(
     """Write the belief over the first ``n`` states and return the most probable one.
 
     The similarity to a centre is ``exp(-distance^2 / width)``, normalised over the centres.
-    The paper leaves its var(z*) open; here the width is ``spread`` times the total variance of
-    all observations so far. Where all were equal (width 0) the nearest centres share the belief.
+    The rule says how wide that is. Where it is 0 the nearest centres share the belief.
     """
     nearest = nearest_center(squared_distances, n)
     smallest = squared_distances[nearest]

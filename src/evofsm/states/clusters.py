@@ -1,0 +1,121 @@
+"""What every state rule remembers of the observations: centres and densities (Section 2.2.1).
+
+Density is the *potential*, a Cauchy kernel summed over the whole past, kept by two recursions:
+one for the present observation, one for the centres.
+
+The paper keeps running sums of z and z'z (its a_t, b_t, c_t). Those lose all digits when the
+observations lie far from zero, so this file uses the same quantity in its mean and variance
+form, with the mean kept relative to the first observation::
+
+    potential of z_t = 1 / (1 + |z_t - mean|^2 + variance),   both over z_1 .. z_{t-1}
+
+Differences are multiplied by ``weights``, 1 / scale of each variable: 1 in the paper.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evofsm._compile import kernel
+
+# What may happen to the states.
+UNCHANGED, MOVED, CREATED = 0, 1, 2
+
+
+class Clusters(NamedTuple):
+    """What is remembered: m variables, room for ``capacity`` centres, the first ``n`` in use."""
+
+    n_observations: NDArray[np.float64]  # (1,)
+    first: NDArray[np.float64]  # (m,) z_1, the origin of `mean`
+    latest: NDArray[np.float64]  # (m,) z_t
+    mean: NDArray[np.float64]  # (m,) of all observations, minus `first`
+    scatter: NDArray[np.float64]  # (1,) sum of squared distances to the mean
+    centers: NDArray[np.float64]  # (m, capacity)
+    potentials: NDArray[np.float64]  # (capacity,)
+    squared_distances: NDArray[np.float64]  # (capacity,) from the latest observation
+
+
+@kernel
+def total_variance(clusters: Clusters) -> float:
+    """Population variance of all observations so far, summed over the variables."""
+    return float(clusters.scatter[0] / clusters.n_observations[0])
+
+
+@kernel
+def measure_distances(
+    centers: NDArray[np.float64],
+    weights: NDArray[np.float64],
+    n: int,
+    z: NDArray[np.float64],
+    squared_distances: NDArray[np.float64],
+) -> None:
+    """Squared Euclidean distance from ``z`` to each of the first ``n`` centres, (m, capacity)."""
+    for i in range(n):
+        squared_distances[i] = 0.0
+    for j in range(len(z)):
+        value, weight = z[j], weights[j]
+        for i in range(n):
+            offset = (value - centers[j, i]) * weight
+            squared_distances[i] += offset * offset
+
+
+@kernel
+def nearest_center(squared_distances: NDArray[np.float64], n: int) -> int:
+    """Index of the smallest of the first ``n`` distances; the oldest centre wins a tie."""
+    nearest = 0
+    for i in range(1, n):
+        if squared_distances[i] < squared_distances[nearest]:
+            nearest = i
+    return nearest
+
+
+@kernel
+def potential_of(clusters: Clusters, weights: NDArray[np.float64], z: NDArray[np.float64]) -> float:
+    """Density at ``z`` of the observations so far, in its mean and variance form."""
+    squared_distance = 0.0
+    for j in range(len(z)):
+        offset = (z[j] - clusters.first[j] - clusters.mean[j]) * weights[j]
+        squared_distance += offset * offset
+    return 1.0 / (1.0 + squared_distance + total_variance(clusters))
+
+
+@kernel
+def update_potentials(clusters: Clusters, n: int, distance_weight: float) -> float:
+    """Recursion of the centres' potentials; returns the highest.
+
+    It needs the distances to z_{t-1}, which are still at hand from the step before.
+    """
+    t = clusters.n_observations[0] + 1.0
+    highest = 0.0
+    for i in range(n):
+        potential = clusters.potentials[i]
+        far = 1.0 + distance_weight * clusters.squared_distances[i]
+        potential = (t - 1.0) * potential / ((t - 2.0) + potential * far)
+        clusters.potentials[i] = potential
+        highest = max(highest, potential)
+    return highest
+
+
+@kernel
+def place_center(clusters: Clusters, i: int, z: NDArray[np.float64], potential: float) -> None:
+    """Put centre ``i`` on the observation, which is then at no distance from it."""
+    for j in range(len(z)):
+        clusters.centers[j, i] = z[j]
+    clusters.potentials[i] = potential
+    clusters.squared_distances[i] = 0.0
+
+
+@kernel
+def absorb(clusters: Clusters, weights: NDArray[np.float64], z: NDArray[np.float64]) -> None:
+    """Add the observation to the running mean and scatter (Welford 1962)."""
+    clusters.n_observations[0] += 1.0
+    for j in range(len(z)):
+        clusters.latest[j] = z[j]
+        offset = z[j] - clusters.first[j]
+        before = offset - clusters.mean[j]
+        clusters.mean[j] += before / clusters.n_observations[0]
+        after = offset - clusters.mean[j]
+        clusters.scatter[0] += (before * weights[j]) * (after * weights[j])

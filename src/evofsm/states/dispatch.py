@@ -1,0 +1,124 @@
+"""Which rules there are: their names in files, and whose kernel judges an observation."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evofsm._compile import kernel
+from evofsm.states import edges, ets, novelty
+from evofsm.states.clusters import (
+    CREATED,
+    MOVED,
+    Clusters,
+    absorb,
+    measure_distances,
+    nearest_center,
+    place_center,
+    potential_of,
+    update_potentials,
+)
+from evofsm.states.edges import Edges
+from evofsm.states.ets import Paper
+from evofsm.states.failure import FailureSplit
+from evofsm.states.novelty import Novelty
+from evofsm.states.rule import RuleSettings, StateRule
+
+RULES: Mapping[str, Any] = {
+    "paper": Paper,
+    "edges": Edges,
+    "novelty": Novelty,
+    "failure": FailureSplit,
+}
+
+
+@kernel
+def determine(settings: RuleSettings, clusters: Clusters, n: int, z: NDArray[np.float64]) -> int:
+    """Let one observation leave the centres as they are, move one, or found one.
+
+    ``n`` centres are in use; where the answer is ``CREATED``, the new one stands at index ``n``.
+    """
+    if clusters.n_observations[0] == 0.0:
+        for j in range(len(z)):
+            clusters.first[j] = z[j]
+        place_center(clusters, 0, z, 1.0)
+        event = CREATED
+    else:
+        potential = potential_of(clusters, settings.weights, z)
+        highest = update_potentials(clusters, n, settings.distance_weight)
+        measure_distances(clusters.centers, settings.weights, n, z, clusters.squared_distances)
+        nearest = nearest_center(clusters.squared_distances, n)
+        squared_distance = clusters.squared_distances[nearest]
+        event = _judge(settings, clusters, n, potential, highest, squared_distance)
+        if event == MOVED:
+            place_center(clusters, nearest, z, potential)
+        elif event == CREATED:
+            place_center(clusters, n, z, potential)
+    absorb(clusters, settings.weights, z)
+    return event
+
+
+@kernel
+def _judge(
+    settings: RuleSettings,
+    clusters: Clusters,
+    n: int,
+    potential: float,
+    highest: float,
+    squared_distance: float,
+) -> int:
+    radius = settings.radius
+    if settings.code == edges.CODE:
+        return edges.judge(clusters, n, potential, highest, squared_distance, radius)
+    if settings.code == novelty.CODE:
+        return novelty.judge(squared_distance, radius)
+    return ets.judge(potential, highest, squared_distance, radius)
+
+
+@kernel
+def width(settings: RuleSettings, clusters: Clusters) -> float:
+    """Width of recognition after the latest observation."""
+    if settings.code == novelty.CODE:
+        return novelty.width(settings.spread, settings.radius)
+    return ets.width(settings.spread, clusters)
+
+
+def check_rule(name: str, rule: StateRule) -> StateRule:
+    """One of the rules, as an object."""
+    if type(rule) not in RULES.values():
+        known = ", ".join(f"{kind.__name__}(...)" for kind in RULES.values())
+        raise TypeError(f"{name} is {rule!r}; it must be an object: {known}")
+    return rule
+
+
+def weights(rule: StateRule, m: int) -> NDArray[np.float64]:
+    """1 / scale of each of m variables."""
+    scales = np.array(rule.scales or [1.0] * m)
+    if len(scales) != m:
+        raise ValueError(f"observation has {m} variables, but there are {len(scales)} in {rule}")
+    return 1.0 / scales
+
+
+def describe(rule: StateRule) -> dict[str, Any]:
+    """A rule in plain JSON: its name and its settings."""
+    name, kind = next(item for item in RULES.items() if item[1] is type(rule))
+    settings = {entry.name: getattr(rule, entry.name) for entry in fields(kind)}
+    if "base" in settings:
+        settings["base"] = describe(settings["base"])
+    return {"name": name, **settings}
+
+
+def restore(description: Mapping[str, Any]) -> StateRule:
+    """The rule that `describe` put into words."""
+    settings = dict(description)
+    name = settings.pop("name")
+    if name not in RULES:
+        raise ValueError(f"there is no state rule {name!r}, only {', '.join(RULES)}")
+    if "base" in settings:
+        settings["base"] = restore(settings["base"])
+    rule: StateRule = RULES[name](**settings)
+    return rule
