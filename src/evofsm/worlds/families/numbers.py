@@ -1,0 +1,128 @@
+"""Numbers as a file states them: one number, a range, a choice, or a relation to another."""
+
+from __future__ import annotations
+
+import math
+import operator
+from collections.abc import Mapping
+from typing import Any
+from zlib import crc32
+
+import numpy as np
+
+#: Where draws come from. What is learnt on one is scored on the other; they never meet.
+SPLITS = ("train", "test")
+
+_WANTED = "a number, a range [low, high], { one_of = [...] }, or { of = 'name of a value' }"
+
+
+def check_number(value: Any, where: str) -> None:
+    """Raise unless a value can be drawn from."""
+    match value:
+        case dict() if "of" in value:
+            _check_relation(value, where)
+        case {"one_of": [_, *_] as choices} if len(value) == 1:
+            for choice in choices:
+                check_number(choice, where)
+        case [low, high] if is_number(low) and is_number(high):
+            if not (math.isfinite(low) and math.isfinite(high)):
+                raise ValueError(f"{where} is {value}; both ends of a range must be finite")
+            if low > high:
+                raise ValueError(f"{where} is {value}; the lower end of a range comes first")
+        case _ if not is_number(value):
+            raise ValueError(f"{where} is {value!r}; it must be {_WANTED}")
+
+
+def check_unrelated(value: Any, where: str) -> None:
+    """As `check_number`, for the values that others relate to."""
+    check_number(value, where)
+    if isinstance(value, dict) and "of" in value:
+        raise ValueError(f"{where} is {value}; a value stands by itself, without 'of'")
+
+
+def check_fixed(value: Any, where: str) -> None:
+    """Raise unless it is one number."""
+    if not is_number(value):
+        raise ValueError(f"{where} is {value!r}; it must be one number")
+
+
+def is_number(value: Any) -> bool:
+    """Whether it is a number, which NaN and a boolean are not."""
+    real = isinstance(value, (int, float)) and not isinstance(value, bool)
+    return real and not math.isnan(value)
+
+
+def is_relation_or_choice(value: Mapping[str, Any]) -> bool:
+    """Whether a table stands for a number."""
+    return "of" in value or "one_of" in value
+
+
+def _check_relation(value: Mapping[str, Any], where: str) -> None:
+    for name, part in value.items():
+        if name not in ("of", "times", "plus", "least"):
+            raise ValueError(
+                f"{where}: there is no {name!r}; beside 'of' known are times, plus, least"
+            )
+        if name == "of" and not isinstance(part, str):
+            raise ValueError(f"{where}.of is {part!r}; it must be the name of a value")
+        if name != "of":
+            check_number(part, f"{where}.{name}")
+
+
+class Numbers:
+    """The numbers of one draw.
+
+    Each is drawn from a stream of its own, named by where it stands. So two families that differ
+    in one number draw the same ones everywhere else.
+
+    Parameters
+    ----------
+    values : mapping of str to value
+        What relations relate to.
+    seed, index : int
+        Of the draw, from 0.
+    split : {"train", "test"}
+
+    Examples
+    --------
+    >>> numbers = Numbers({"speed": [10.0, 20.0]}, seed=1, index=0)
+    >>> speed = numbers.draw({"of": "speed"}, "scenario.initial_speed")
+    >>> 10.0 <= speed <= 20.0
+    True
+    >>> numbers.draw({"of": "speed", "times": 2.0, "plus": 1.0}, "gap") == 2.0 * speed + 1.0
+    True
+    """
+
+    def __init__(
+        self, values: Mapping[str, Any], seed: int, index: int, split: str = "train"
+    ) -> None:
+        if split not in SPLITS:
+            raise ValueError(f"split is {split!r}; it must be one of {', '.join(SPLITS)}")
+        for name, number in (("seed", seed), ("index", index)):
+            if not 0 <= operator.index(number) < 2**32:
+                raise ValueError(f"{name} is {number}; it must be from 0 to 2**32 - 1")
+        self._values = values
+        self._key = [SPLITS.index(split), int(seed), int(index)]
+
+    def stream(self, where: str) -> np.random.Generator:
+        """The random numbers that belong to a place in the file."""
+        return np.random.default_rng([*self._key, crc32(where.encode())])
+
+    def draw(self, value: Any, where: str) -> float:
+        """One number; the same whenever the same place is asked for."""
+        match value:
+            case [low, high]:
+                return float(self.stream(where).uniform(low, high))
+            case {"one_of": choices}:
+                chosen = int(self.stream(f"{where}.one_of").integers(len(choices)))
+                return self.draw(choices[chosen], where)
+            case {"of": name}:
+                if name not in self._values:
+                    known = ", ".join(self._values) or "none"
+                    raise ValueError(f"{where} is of {name!r}; values are: {known}")
+                related = self.draw(self._values[name], f"values.{name}")
+                times = self.draw(value.get("times", 1.0), f"{where}.times")
+                plus = self.draw(value.get("plus", 0.0), f"{where}.plus")
+                least = self.draw(value.get("least", -math.inf), f"{where}.least")
+                return max(least, times * related + plus)
+        return float(value)
