@@ -9,11 +9,15 @@ from __future__ import annotations
 
 import math
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
 from importlib import import_module
 from pathlib import Path
 from typing import Any, Self
+from xml.sax.saxutils import quoteattr
+
+import numpy as np
+from numpy.typing import NDArray
 
 from evofsm._extras import needs
 from evofsm.protocols import Controller
@@ -50,12 +54,16 @@ _NET = f"""<net version="1.20">
 </net>
 """
 
-_ROUTES = f"""<routes>
-    <vType id="car" length="{_VEHICLE_LENGTH}" minGap="0" maxSpeed="{_FASTEST}" accel="100"
-           decel="100" emergencyDecel="100" speedFactor="1" speedDev="0" sigma="0"/>
+_ROUTES = """<routes>
+    {kinds}
     <route id="along" edges="road"/>
 </routes>
 """
+
+_CAR = (
+    f'minGap="0" maxSpeed="{_FASTEST}" accel="100" decel="100" emergencyDecel="100" '
+    'speedFactor="1" speedDev="0" sigma="0"'
+)
 
 
 class SumoWorld:
@@ -84,20 +92,81 @@ class SumoWorld:
         self._folder: tempfile.TemporaryDirectory[str] | None = None  # while a simulation is open
         self._dt = 0.0
         self._runs = 0
+        self._road: _Road | None = None  # the latest
+        self._kinds = {_CAR: "car"}  # attributes of each kind of car, and its id
+        self._known: set[str] = set()  # the kinds that the simulation has
 
     def open(self, scenario: Scenario) -> AbstractContextManager[Road]:
         """Put the cars on a road, for use in a ``with`` statement."""
         _refuse_what_sumo_cannot_drive(scenario)
-        if self._folder is None or self._dt != scenario.dt or not self._sumo.isLoaded():
+        goes_on = self._folder is not None and self._sumo.isLoaded()
+        if not goes_on or self._dt != scenario.dt or len(self._known) < len(self._kinds):
             self.close()
             self._start(scenario.dt)
         self._runs += 1
-        return _Road(self._sumo, self._runs, scenario)
+        self._road = _Road(self._sumo, self._runs, scenario)
+        return self._road
 
     def run(self, scenario: Scenario, controller: Controller) -> Episode:
         """Drive the scenario with ``controller`` in the follower, asked at every step."""
         with self.open(scenario) as road:
             return drive(road, controller)
+
+    def add_kind(self, attributes: Mapping[str, str]) -> str:
+        """A kind of car that SUMO can drive, known on every road opened from now on.
+
+        Parameters
+        ----------
+        attributes : mapping of str to str
+            Of SUMO's ``vType``, without ``id`` and ``length``.
+
+        Returns
+        -------
+        str
+            Its id.
+        """
+        given = " ".join(f"{name}={quoteattr(value)}" for name, value in attributes.items())
+        return self._kinds.setdefault(given, f"car{len(self._kinds)}")
+
+    def wish(
+        self, kind: str, observation: NDArray[np.float64], time: float, leader_decel: float
+    ) -> float:
+        """What SUMO itself would do with the follower, were it a car of this kind.
+
+        Parameters
+        ----------
+        kind : str
+            An id that `add_kind` gave.
+        observation : (3,) ndarray
+            Gap [m], v_follower [m/s], v_leader [m/s].
+        time : float
+            Now, on the road that was opened last [s].
+        leader_decel : float
+            How hard the follower takes the leader to be able to brake [m/s²].
+
+        Returns
+        -------
+        float
+            Acceleration over one step [m/s²].
+
+        Raises
+        ------
+        RuntimeError
+            If no road of this world is at that time.
+        """
+        road = self._road
+        if road is None or not road.is_open or road.time != time:
+            at = f"a road at {road.time:g} s" if road is not None and road.is_open else "no road"
+            raise RuntimeError(
+                f"a SUMO-driven car was asked at {time:g} s, but its SumoWorld has {at} open: "
+                "it drives only in the world that it was made with, and is told the road's time"
+            )
+        if kind not in self._known:
+            raise RuntimeError(
+                "this SUMO-driven car was made after the road was opened, and SUMO does not know "
+                "its kind yet: make it first, then open the road"
+            )
+        return road.wish(kind, observation, leader_decel)
 
     def close(self) -> None:
         """End the simulation."""
@@ -122,7 +191,11 @@ class SumoWorld:
         folder = tempfile.TemporaryDirectory(prefix="evofsm-sumo-")
         net, routes = Path(folder.name) / "road.net.xml", Path(folder.name) / "road.rou.xml"
         net.write_text(_NET)
-        routes.write_text(_ROUTES)
+        kinds = "\n    ".join(
+            f'<vType id="{kind}" length="{_VEHICLE_LENGTH}" {attributes}/>'
+            for attributes, kind in self._kinds.items()
+        )
+        routes.write_text(_ROUTES.format(kinds=kinds))
         try:
             self._sumo.start(
                 [
@@ -142,7 +215,7 @@ class SumoWorld:
         except BaseException:
             folder.cleanup()
             raise
-        self._folder, self._dt = folder, dt
+        self._folder, self._dt, self._known = folder, dt, set(self._kinds.values())
 
 
 def _refuse_what_sumo_cannot_drive(scenario: Scenario) -> None:
@@ -173,6 +246,7 @@ class _Road(Road):
     def __init__(self, sumo: Any, run: int, scenario: Scenario) -> None:
         super().__init__(scenario)
         self._sumo = sumo
+        self.is_open = True
         self._cars = [f"{role}{run}" for role in ("follower", "leader", "behind")]
         start, record = _start(scenario), self._record[0]
         starts = [start, start + scenario.initial_gap + _VEHICLE_LENGTH, _FIRST]
@@ -200,6 +274,26 @@ class _Road(Road):
             if self.row == self._plan.cut_in[0]:
                 self._cut_in(*self._plan.cut_in[1:].tolist())
             self._observe()
+
+    def wish(self, kind: str, observation: NDArray[np.float64], leader_decel: float) -> float:
+        """As `SumoWorld.wish`: SUMO's car-following model, within the bounds that SUMO puts to it.
+
+        Asked of the follower itself, which this makes a car of that kind; it obeys as before.
+        """
+        vehicle, dt = self._sumo.vehicle, self.scenario.dt
+        follower, leader = self._cars[:2]
+        if vehicle.getTypeID(follower) != kind:
+            vehicle.setType(follower, kind)
+        gap, speed, leader_speed = observation.tolist()
+        # SUMO's models take the gap without minGap; those that need all of it add it again.
+        wanted = vehicle.getFollowSpeed(
+            *(follower, speed, gap - vehicle.getMinGap(follower)),
+            *(leader_speed, leader_decel, leader),
+        )
+        fastest = min(vehicle.getAllowedSpeed(follower), speed + vehicle.getAccel(follower) * dt)
+        fastest = max(fastest, speed - vehicle.getDecel(follower) * dt)  # if above the limit
+        slowest = speed - vehicle.getEmergencyDecel(follower) * dt
+        return float((max(min(wanted, fastest), slowest) - speed) / dt)
 
     def _move(self, accelerations: list[float]) -> None:
         vehicle = self._sumo.vehicle
@@ -229,6 +323,7 @@ class _Road(Road):
         return self
 
     def __exit__(self, *error: object) -> None:
+        self.is_open = False
         for car in self._cars:
             if car in self._sumo.vehicle.getIDList():
                 self._sumo.vehicle.remove(car)
