@@ -38,9 +38,10 @@ class Revision(NamedTuple):
     proposed: float  #: acceleration that the controller wanted [m/s²]; NaN where it had none
     risk_proposed: float  #: probability of failure under the proposal; NaN where not judged
     risk_executed: float  #: the same for what is executed
-    interval: tuple[float, float]  #: 90 % credible interval of `risk_executed`
+    interval: tuple[float, float]  #: 90 % interval of `risk_executed`
     reason: str  #: in a few words
-    evidence: float  #: how many observations `risk_executed` rests on
+    evidence: float  #: number of leaders' braking manoeuvres that the risks rest on
+    advised: float  #: what the reviser would execute, whether or not it may act [m/s²]
 
 
 class Controller(Protocol):
@@ -57,6 +58,10 @@ class Controller(Protocol):
 
 class Reviser(Protocol):
     """Anything that keeps a proposal or replaces it by a better action."""
+
+    def start_episode(self) -> None:
+        """Forget what was under way."""
+        ...
 
     def revise(self, situation: Situation, proposal: Proposal) -> Revision:
         """What to execute instead of the proposal; the proposal itself where it will do."""

@@ -25,7 +25,7 @@ class Settings:
     switch_at: Mapping[int, float]  #: when the driver changes, by case
     brake_at: tuple[float, ...]
     decel: float  #: hardest braking of the follower [m/s²], positive
-    machine: Mapping[str, float]
+    machine: Mapping[str, Any]
     actions: IntervalActions
 
     @classmethod

@@ -1,0 +1,237 @@
+"""The framework's loop: observe, recognise, propose, revise, execute, learn.
+
+Whoever the controller is and wherever it drives, what it proposes is revised before it is
+executed, and what came of it is learnt before the next decision (the paper's Section 4.1).
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evofsm.actions import IntervalActions
+from evofsm.framework.reviser import Unrevised
+from evofsm.machine import EvolvingFSM
+from evofsm.protocols import Controller, Proposal, Reviser, Revision, Situation
+from evofsm.risk.outcome import LatentRisk
+from evofsm.worlds.road import Episode, World
+from evofsm.worlds.scenario import Scenario
+
+_log = logging.getLogger(__name__)
+
+
+class Decision(NamedTuple):
+    """One decision: what was seen, what was proposed, what was executed, what came of it."""
+
+    situation: Situation
+    revision: Revision
+    realised: float  #: mean acceleration until the next decision [m/s²]; NaN where none came
+
+
+@dataclass(frozen=True, eq=False)
+class Drive:
+    """One run under the framework."""
+
+    episode: Episode  #: every step, as the world has it
+    decisions: tuple[Decision, ...]
+
+    @property
+    def proposed(self) -> NDArray[np.float64]:
+        """(D,) ndarray: what the controller wanted [m/s²]."""
+        return np.array([decision.revision.proposed for decision in self.decisions])
+
+    @property
+    def executed(self) -> NDArray[np.float64]:
+        """(D,) ndarray: what was commanded [m/s²]."""
+        return np.array([decision.revision.executed for decision in self.decisions])
+
+
+class Oversight:
+    """Watches over one episode: recognises, revises and learns, wherever it is driven.
+
+    An episode begins when it is made, and is over with `end`.
+
+    Parameters
+    ----------
+    actions : IntervalActions
+    reviser : Reviser
+    machine : EvolvingFSM, optional
+    risk : LatentRisk, optional
+    learn : bool
+        Whether machine and risk learn.
+
+    Examples
+    --------
+    >>> actions = IntervalActions(low=-2.5, high=2.5, width=0.3, outside="clip")
+    >>> oversight = Oversight(actions, Unrevised(actions))
+    >>> situation = oversight.recognise(np.array([5.0, 20.0, 10.0]), time=0.0)
+    >>> oversight.revise(situation, Proposal(9.0)).executed
+    2.5
+    >>> oversight.end(np.array([-0.1, 20.0, 10.0]), failed=True)
+    """
+
+    def __init__(
+        self,
+        actions: IntervalActions,
+        reviser: Reviser,
+        *,
+        machine: EvolvingFSM | None = None,
+        risk: LatentRisk | None = None,
+        learn: bool = True,
+    ) -> None:
+        self.actions = actions
+        self.reviser = reviser
+        self.machine = machine
+        self.risk = risk
+        self.learn = learn
+        self._frozen = None if learn or machine is None else machine.model()
+        reviser.start_episode()
+        if machine is not None and learn:
+            machine.start_episode()
+
+    def recognise(self, observation: NDArray[np.float64], time: float) -> Situation:
+        """Where the vehicle is at ``time`` [s]; the machine learns the transition to it."""
+        if self.machine is None:
+            return Situation(observation, np.ones(1), None, math.nan, time)
+        if self._frozen is None:
+            step = self.machine.observe(observation)
+            return Situation(observation, step.belief, step.state, step.surprise, time)
+        if self._frozen.n_states == 0:
+            return Situation(observation, np.ones(1), None, math.nan, time)
+        belief = self._frozen.recognise(observation)
+        return Situation(observation, belief, int(belief.argmax()), math.nan, time)
+
+    def revise(self, situation: Situation, proposal: Proposal) -> Revision:
+        """What to execute; machine and risk are told of it."""
+        revision = self.reviser.revise(situation, proposal)
+        executed = revision.executed
+        if self.machine is not None and self.learn:
+            self.machine.act(self.actions.encode(executed))
+        if self.risk is not None and self.learn:
+            self.risk.learn(situation.observation, executed, situation.belief)
+        elif self.risk is not None:
+            self.risk.follow(situation.observation, executed)
+        return revision
+
+    def end(self, observation: NDArray[np.float64] | None, *, failed: bool) -> None:
+        """The episode ends with this observation, or unseen (None); perhaps in failure."""
+        if self.machine is not None and self.learn:
+            if observation is not None:
+                self.machine.observe(observation, failed=failed)
+            elif failed and self.machine.state is not None:
+                self.machine.fail()
+        if self.risk is not None:
+            self.risk.start_episode(learn=self.learn)
+
+
+def refuse_mismatch(machine: EvolvingFSM | None, actions: IntervalActions) -> None:
+    """Raise where a machine was made for another set of actions."""
+    if machine is not None and machine.n_actions != actions.n_actions:
+        raise ValueError(
+            f"the machine has {machine.n_actions} actions, but the set has "
+            f"{actions.n_actions} intervals"
+        )
+
+
+class Framework:
+    """Drives a controller under a reviser, and learns while it drives.
+
+    Parameters
+    ----------
+    controller : Controller
+        Anything that proposes. Where it raises or proposes no number, the reviser falls back.
+    actions : IntervalActions
+        The set of actions; made with ``outside="clip"``.
+    reviser : Reviser, optional
+        Without one every proposal is executed.
+    machine : EvolvingFSM, optional
+        Recognises and learns; without one nothing is recognised.
+    risk : LatentRisk, optional
+        Learns from what happens; usually the reviser's own.
+    learn : bool
+        Whether machine and risk learn while driving. It may be changed between runs.
+    interval : float
+        Time between decisions [s].
+
+    Examples
+    --------
+    >>> from evofsm.drivers.idm import IDM
+    >>> from evofsm.framework.reviser import ActionReviser
+    >>> from evofsm.worlds.kinematic import KinematicWorld
+    >>> from evofsm.worlds.scenario import Leader
+    >>> actions = IntervalActions(low=-2.5, high=2.5, width=0.3, outside="clip")
+    >>> hasty = IDM(2.25, 28.0, 0.8, 0.3, 2.0, lowest=-2.5, highest=2.5)
+    >>> leader = Leader(IDM(1.2, 25.0, 1.0, 1.0, 2.5), brake_decel=4.0, brake_time=12.0)
+    >>> scenario = Scenario(leader, initial_gap=10.0)
+    >>> Framework(hasty, actions).drive(KinematicWorld(), scenario).episode.collided
+    True
+    >>> risk = LatentRisk(lowest=-2.5)
+    >>> revised = Framework(hasty, actions, ActionReviser(risk, actions), risk=risk)
+    >>> revised.drive(KinematicWorld(), scenario).episode.collided
+    False
+    """
+
+    def __init__(
+        self,
+        controller: Controller,
+        actions: IntervalActions,
+        reviser: Reviser | None = None,
+        *,
+        machine: EvolvingFSM | None = None,
+        risk: LatentRisk | None = None,
+        learn: bool = True,
+        interval: float = 0.25,
+    ) -> None:
+        refuse_mismatch(machine, actions)
+        self.controller = controller
+        self.actions = actions
+        self.reviser = Unrevised(actions) if reviser is None else reviser
+        self.machine = machine
+        self.risk = risk
+        self.learn = learn
+        self.interval = interval
+
+    def drive(self, world: World, scenario: Scenario) -> Drive:
+        """Drive one scenario, and learn from it if `learn`.
+
+        Raises
+        ------
+        ValueError
+            If the time between decisions is no whole number of the scenario's steps.
+        """
+        steps = scenario.steps(self.interval)
+        if steps < 1 or not math.isclose(steps * scenario.dt, self.interval):
+            raise ValueError(
+                f"interval is {self.interval} s, which is no whole number of the scenario's "
+                f"steps of {scenario.dt} s"
+            )
+        oversight = Oversight(
+            self.actions, self.reviser, machine=self.machine, risk=self.risk, learn=self.learn
+        )
+        decisions: list[Decision] = []
+        with world.open(scenario) as road:
+            while not road.over:
+                before = road.observation[1]
+                situation = oversight.recognise(road.observation, road.time)
+                revision = oversight.revise(situation, self._ask(situation))
+                row = road.row
+                road.advance(revision.executed, steps)
+                elapsed = (road.row - row) * scenario.dt
+                realised = (road.observation[1] - before) / elapsed if elapsed else math.nan
+                decisions.append(Decision(situation, revision, float(realised)))
+            oversight.end(road.observation, failed=road.collided)
+            return Drive(road.episode(), tuple(decisions))
+
+    def _ask(self, situation: Situation) -> Proposal:
+        """What the controller proposes; NaN where it fails to."""
+        try:
+            proposal = self.controller.propose(situation.observation.copy(), situation.time)
+            return Proposal(float(proposal.action), tuple(proposal.candidates))
+        except Exception as error:  # whatever it is, someone has to go on driving
+            _log.warning("controller failed at %g s: %r", situation.time, error)
+            return Proposal(math.nan)

@@ -1,0 +1,323 @@
+"""The action reviser: it keeps what a controller proposes, or replaces it by something better.
+
+The module of the paper's Section 4.2, in both of its ways: to choose among the candidates that a
+controller offers, or to improve on its proposal with any action of the set. The authors' own
+sequel tests an action by predicting the states it leads to, and looks at others where those are
+not appropriate (Han, Filev, Ozguner, arXiv:2006.08092).
+"""
+
+from __future__ import annotations
+
+import math
+from enum import Enum
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evofsm.actions import IntervalActions
+from evofsm.protocols import Proposal, Revision, RiskMeasure, Situation
+from evofsm.risk.outcome import ActionJudge, Judgement
+from evofsm.validation import positive
+
+# Further decisions for which full braking is held where its effect is not known yet.
+_BRAKE_TEST = 4
+#: Executed where a controller has no usable proposal: it brakes gently [m/s²].
+GENTLE_BRAKE = -1.0
+
+
+class Mode(Enum):
+    """How far a reviser goes."""
+
+    OFF = "off"  #: proposals are executed, nothing is judged
+    SHADOW = "shadow"  #: proposals are executed, what it would have done is recorded
+    ADVISE = "advise"  #: as shadow, and the driver is told
+    ACT = "act"  #: what it decides is executed
+
+
+class Way(Enum):
+    """Where another action may come from."""
+
+    CHOOSE = "choose"  #: the candidates that the controller returns
+    IMPROVE = "improve"  #: any action of the set
+
+
+class Usable(NamedTuple):
+    """A proposal that can be executed, and what had to be done to it."""
+
+    action: float  #: [m/s²]
+    remark: str  #: empty where it is what the controller proposed
+
+
+def make_usable(proposal: Proposal, actions: IntervalActions) -> Usable:
+    """An action of the set, whatever a controller came up with.
+
+    A proposal outside the set is put at its edge; NaN or infinity becomes gentle braking.
+
+    Examples
+    --------
+    >>> actions = IntervalActions(low=-2.5, high=2.5, width=0.3)
+    >>> make_usable(Proposal(9.0), actions)
+    Usable(action=2.5, remark='proposal 9 is outside [-2.5, 2.5]')
+    >>> make_usable(Proposal(float("nan")), actions)
+    Usable(action=-1.0, remark='no usable proposal (nan): braking gently')
+    """
+    low, high = actions.low, actions.high
+    if not math.isfinite(proposal.action):
+        gentle = min(max(GENTLE_BRAKE, low), high)
+        return Usable(gentle, f"no usable proposal ({proposal.action:g}): braking gently")
+    if not low <= proposal.action <= high:
+        action = min(max(proposal.action, low), high)
+        return Usable(action, f"proposal {proposal.action:g} is outside [{low:g}, {high:g}]")
+    return Usable(float(proposal.action), "")
+
+
+class ActionReviser:
+    """Keeps a proposal whose latent risk is tolerable, and replaces any other.
+
+    By the least change: the action closest to the proposal whose risk is within the tolerance;
+    where there is none, the least risky one. While little is known of the vehicle's own brakes
+    it brakes in full for a second instead, as an RSS envelope around the risk's cautious
+    assumptions would, and so learns them. Once it has begun to revise, it keeps on until the
+    proposal is safe by a margin, so that it does not chatter.
+
+    Parameters
+    ----------
+    risk : ActionJudge
+        Usually a `LatentRisk`.
+    actions : IntervalActions
+        The set of actions. Nothing outside it is ever executed.
+    tolerance : float
+        Highest latent risk that is accepted, in (0, 1).
+    release : float
+        Share of the tolerance below which a proposal is kept again, once revising.
+    mode : Mode
+    way : Way
+
+    Examples
+    --------
+    >>> actions = IntervalActions(low=-2.5, high=2.5, width=0.3)
+    >>> from evofsm.risk.outcome import LatentRisk
+    >>> reviser = ActionReviser(LatentRisk(lowest=-2.5), actions)
+    >>> close = Situation(np.array([5.0, 20.0, 20.0]), np.ones(1), 0, 0.0, 0.0)
+    >>> revision = reviser.revise(close, Proposal(1.0))
+    >>> revision.executed, revision.risk_proposed
+    (-2.5, 1.0)
+    """
+
+    def __init__(
+        self,
+        risk: ActionJudge,
+        actions: IntervalActions,
+        *,
+        tolerance: float = 0.01,
+        release: float = 0.5,
+        mode: Mode = Mode.ACT,
+        way: Way = Way.IMPROVE,
+    ) -> None:
+        if not 0.0 < tolerance < 1.0:
+            raise ValueError(f"tolerance is {tolerance}; it is a probability, between 0 and 1")
+        if not 0.0 < release <= 1.0:
+            raise ValueError(f"release is {release}; it must lie in (0, 1]")
+        self.risk = risk
+        self.actions = actions
+        self.tolerance = tolerance
+        self.release = release
+        self.mode = mode
+        self.way = way
+        self._overridden = False
+        self.start_episode()
+
+    def start_episode(self) -> None:
+        """Nothing is under way yet."""
+        self._revising = False
+        self._brake_test = 0
+
+    def take_over(self) -> None:
+        """The driver overrides: proposals are executed until `hand_back`."""
+        self._overridden = True
+
+    def hand_back(self) -> None:
+        """The driver lets the reviser act again."""
+        self._overridden = False
+
+    def revise(self, situation: Situation, proposal: Proposal) -> Revision:
+        """What to execute instead of the proposal; the proposal itself where it will do.
+
+        Parameters
+        ----------
+        situation : Situation
+        proposal : Proposal
+            One that is no number, or outside the set, is first made usable.
+
+        Returns
+        -------
+        Revision
+        """
+        wanted, remark = make_usable(proposal, self.actions)
+        if self.mode is Mode.OFF:
+            return _unjudged(wanted, proposal, remark or "reviser is off")
+        options = self._options(wanted, proposal)
+        judged = self.risk.judge(situation, options)
+        best, reason = self._decide(options, judged)
+        does = self.mode is Mode.ACT and not self._overridden
+        executed = best if does else 0
+        if not does and best != 0:
+            who = "driver has taken over" if self._overridden else self.mode.value
+            reason = f"{who}: {reason}"
+        return Revision(
+            executed=float(options[executed]),
+            proposed=float(proposal.action),
+            risk_proposed=float(judged.risk[0]),
+            risk_executed=float(judged.risk[executed]),
+            interval=(float(judged.low[executed]), float(judged.high[executed])),
+            reason=f"{remark}; {reason}" if remark else reason,
+            evidence=judged.evidence,
+            advised=float(options[best]),
+        )
+
+    def _options(self, wanted: float, proposal: Proposal) -> NDArray[np.float64]:
+        """What could be executed, the proposal first."""
+        if self.way is Way.CHOOSE:
+            others = [a for a in proposal.candidates if self.actions.low <= a <= self.actions.high]
+        else:
+            others = nearest_values(self.actions, wanted)
+        return np.array([wanted, *others])
+
+    def _decide(self, options: NDArray[np.float64], judged: Judgement) -> tuple[int, str]:
+        """Index of the best option, and why."""
+        limit = self.tolerance * (self.release if self._revising else 1.0)
+        if self._brake_test > 0 and not self.risk.brakes.known:
+            self._brake_test -= 1
+            return int(options.argmin()), "own brakes not known yet: braking in full to learn them"
+        if judged.risk[0] <= limit:
+            self._revising = False
+            return 0, "risk is within the tolerance"
+        self._revising = True
+        why = (
+            f"could not survive a leader braking harder than {judged.critical[0]:.1f} m/s² "
+            f"(risk {judged.risk[0]:.1%})"
+        )
+        if not self.risk.brakes.known:
+            self._brake_test = _BRAKE_TEST
+            return int(options.argmin()), f"{why}; own brakes not known yet, so in full"
+        tolerable = np.flatnonzero(judged.risk <= self.tolerance)
+        if len(tolerable):
+            closest = tolerable[np.abs(options[tolerable] - options[0]).argmin()]
+            return int(closest), f"{why}; the closest that can"
+        least = np.flatnonzero(judged.risk == judged.risk.min())
+        return int(least[options[least].argmin()]), f"{why}; nothing can, the least risky"
+
+
+def nearest_values(actions: IntervalActions, wanted: float) -> list[float]:
+    """For each interval the value in it that is nearest to ``wanted``, and both limits.
+
+    Examples
+    --------
+    >>> actions = IntervalActions(low=-1.0, high=1.0, width=1.0)
+    >>> [round(value, 6) for value in nearest_values(actions, 0.5)]
+    [-0.0, 0.5, -1.0, 1.0]
+    """
+    values = []
+    for i in range(actions.n_actions):
+        lower, upper = actions.interval(i)
+        if actions.closed == "left" and i < actions.n_actions - 1:
+            upper = math.nextafter(upper, -math.inf)
+        if actions.closed == "right" and i > 0:
+            lower = math.nextafter(lower, math.inf)
+        values.append(min(max(wanted, lower), upper))
+    return [*values, actions.low, actions.high]
+
+
+class EnvelopeReviser:
+    """Brakes in full wherever a measure of danger calls for it, and else keeps the proposal.
+
+    So a classic measure becomes a reviser: time to collision an emergency brake, a safe distance
+    the proper response of RSS.
+
+    Parameters
+    ----------
+    measure : RiskMeasure
+    actions : IntervalActions
+    dt : float
+        Time between decisions [s].
+
+    Examples
+    --------
+    >>> from evofsm.risk.ttc import TimeToCollision
+    >>> actions = IntervalActions(low=-2.5, high=2.5, width=0.3)
+    >>> reviser = EnvelopeReviser(TimeToCollision(threshold=1.5), actions)
+    >>> close = Situation(np.array([5.0, 20.0, 10.0]), np.ones(1), 0, 0.0, 0.0)
+    >>> reviser.revise(close, Proposal(1.0)).executed
+    -2.5
+    """
+
+    def __init__(self, measure: RiskMeasure, actions: IntervalActions, dt: float = 0.25) -> None:
+        self.measure = measure
+        self.actions = actions
+        self.dt = positive("dt", dt)
+        self.start_episode()
+
+    def start_episode(self) -> None:
+        """What was seen before belongs to another episode."""
+        self._seen: list[NDArray[np.float64]] = []
+
+    def revise(self, situation: Situation, proposal: Proposal) -> Revision:
+        """Full braking where the measure is above 0, else the proposal."""
+        wanted, remark = make_usable(proposal, self.actions)
+        self._seen = [*self._seen[-1:], situation.observation]
+        danger = float(self.measure.score(np.array(self._seen), self.dt)[-1])
+        if danger <= 0.0:
+            return _unjudged(wanted, proposal, remark or "measure calls for nothing")
+        return _unjudged(
+            self.actions.low, proposal, remark or f"measure calls for it: {danger:.3g}"
+        )
+
+
+class Unrevised:
+    """Executes every proposal that can be executed: no reviser at all.
+
+    Parameters
+    ----------
+    actions : IntervalActions
+
+    Examples
+    --------
+    >>> actions = IntervalActions(low=-2.5, high=2.5, width=0.3)
+    >>> here = Situation(np.array([5.0, 20.0, 10.0]), np.ones(1), 0, 0.0, 0.0)
+    >>> Unrevised(actions).revise(here, Proposal(1.0)).executed
+    1.0
+    """
+
+    def __init__(self, actions: IntervalActions) -> None:
+        self.actions = actions
+
+    def start_episode(self) -> None:
+        """Nothing to forget."""
+
+    def revise(self, situation: Situation, proposal: Proposal) -> Revision:
+        """The proposal, made usable."""
+        wanted, remark = make_usable(proposal, self.actions)
+        return _unjudged(wanted, proposal, remark or "not revised")
+
+
+class AlwaysBrake(Unrevised):
+    """Brakes in full always: no one is safer, or gets less far."""
+
+    def revise(self, situation: Situation, proposal: Proposal) -> Revision:
+        """Full braking."""
+        return _unjudged(self.actions.low, proposal, "always brakes")
+
+
+def _unjudged(executed: float, proposal: Proposal, reason: str) -> Revision:
+    """A revision without a probability."""
+    return Revision(
+        executed=executed,
+        proposed=float(proposal.action),
+        risk_proposed=math.nan,
+        risk_executed=math.nan,
+        interval=(math.nan, math.nan),
+        reason=reason,
+        evidence=0.0,
+        advised=executed,
+    )

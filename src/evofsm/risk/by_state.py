@@ -1,0 +1,113 @@
+"""Latent risk of states: what is said of a state as a whole, and risk read through the belief.
+
+A situation may be judged where it is, or by the states it is recognised as: then the risk of an
+action is that at the centres of the states, weighed by the belief. The first is sharper; the
+second says what a machine's states are worth to steer by, and which of them are dead ends.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from evofsm.machine import EvolvingFSM
+from evofsm.model import FSMModel
+from evofsm.protocols import Situation
+from evofsm.risk.brakes import OwnBrakes
+from evofsm.risk.outcome import Judgement, LatentRisk
+
+# States of a smaller belief are left out.
+_LEAST_BELIEF = 1e-3
+
+
+class RiskByState:
+    """Judges actions by the states that a situation is recognised as.
+
+    Parameters
+    ----------
+    risk : LatentRisk
+        What was learnt of leaders and brakes.
+    machine : EvolvingFSM
+        Whose states they are.
+    caution : float
+        Where states disagree, so many standard deviations are added to their mean risk.
+    """
+
+    def __init__(self, risk: LatentRisk, machine: EvolvingFSM, caution: float = 1.0) -> None:
+        self.risk = risk
+        self.machine = machine
+        self.caution = caution
+
+    @property
+    def brakes(self) -> OwnBrakes:
+        """What is known of one's own brakes."""
+        return self.risk.brakes
+
+    def judge(self, situation: Situation, accelerations: ArrayLike) -> Judgement:
+        """Latent risk of each acceleration: of the states, weighed by the belief."""
+        taking_part = np.flatnonzero(situation.belief >= _LEAST_BELIEF)
+        if len(taking_part) == 0 or self.machine.n_states == 0:
+            return self.risk.judge(situation, accelerations)
+        belief = situation.belief[taking_part]
+        centers = self.machine.centers[taking_part]
+        critical = np.stack([self.risk.critical(center, accelerations) for center in centers])
+        weights = belief / belief.sum()
+        risks = self.risk.manoeuvres.harder(critical)
+        risk = weights @ risks
+        disagreement = np.sqrt(weights @ (risks - risk) ** 2)
+        cautious = np.minimum(risk + self.caution * disagreement, 1.0)
+        return self.risk.judgement(cautious, weights @ critical)
+
+
+class StateRisk(NamedTuple):
+    """How dangerous it is to be in a state."""
+
+    state: int
+    risk: float  #: latent risk if one brakes in full at once: high in a dead end
+    margin: float  #: escape margin: how much lower that is than if speed is kept
+    critical: float  #: hardest braking of a leader that is then survived [m/s²]
+    seconds: float  #: time for which the state was seen [s]
+    failures: float  #: number of failures that ended in it
+
+    @property
+    def is_dead_end(self) -> bool:
+        """Whether failure is more likely than not, whatever is done."""
+        return self.risk > 0.5
+
+
+def assess_states(model: FSMModel, risk: LatentRisk) -> list[StateRisk]:
+    """Latent risk at the centre of every state, in the order of founding.
+
+    Parameters
+    ----------
+    model : FSMModel
+        Of a machine that observes gap [m], v_follower [m/s] and v_leader [m/s].
+    risk : LatentRisk
+
+    Examples
+    --------
+    >>> machine = EvolvingFSM(n_actions=1, radius=0.5)
+    >>> trace = machine.learn_many([[50.0, 5.0, 5.0], [9.0, 20.0, 20.0]], [0, 0])
+    >>> risk = LatentRisk(lowest=-4.0)
+    >>> [state.is_dead_end for state in assess_states(machine.model(), risk)]
+    [False]
+    """
+    actions = np.array([risk.lowest, 0.0])
+    assessed = []
+    for state, center in enumerate(model.centers):
+        critical = risk.critical(center, actions)
+        braking, keeping = risk.manoeuvres.harder(critical)
+        alone: NDArray[np.float64] = np.eye(model.n_states)[state]
+        assessed.append(
+            StateRisk(
+                state,
+                float(braking),
+                float(keeping - braking),
+                float(critical[0]),
+                risk.seconds_seen(alone),
+                float(model.endings[state]),
+            )
+        )
+    return assessed

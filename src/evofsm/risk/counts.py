@@ -1,0 +1,89 @@
+"""What came within a horizon, counted: the risk of going on as one drives.
+
+The direct estimate: for each state and action, in how many cases a failure followed within h
+seconds, whatever was done after. It needs no kinematics and holds for any system, but it answers
+another question than the latent risk: not what can still be avoided, only what usually comes.
+Counts never fade, so that a rare failure is not averaged away.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from evofsm.risk.outcome import wilson_interval
+from evofsm.validation import check_action, positive, whole
+
+
+class Outcome(NamedTuple):
+    """Probability of failure within the horizon, and how well it is known."""
+
+    probability: float
+    interval: tuple[float, float]  #: 90 %
+    evidence: float  #: number of cases, weighed by the belief
+
+
+class OutcomeCounts:
+    """Counts, for each state and action, whether a failure came within the horizon.
+
+    Parameters
+    ----------
+    n_actions : int
+    horizon : float
+        Looked ahead [s].
+    dt : float
+        Time between decisions [s].
+
+    Examples
+    --------
+    >>> counts = OutcomeCounts(n_actions=1, horizon=0.5, dt=0.25)
+    >>> for _ in range(4):
+    ...     counts.learn([1.0], 0)
+    >>> counts.end_episode(failed=True)  # two of the four were followed by a failure
+    >>> counts.outcome([1.0], 0).probability
+    0.5
+    """
+
+    def __init__(self, n_actions: int, horizon: float = 5.0, dt: float = 0.25) -> None:
+        self.n_actions = whole("n_actions", n_actions)
+        self.horizon = positive("horizon", horizon)
+        self.dt = positive("dt", dt)
+        self._open: deque[tuple[NDArray[np.float64], int]] = deque()
+        self._cases = np.zeros((self.n_actions, 0))
+        self._failures = np.zeros((self.n_actions, 0))
+
+    def learn(self, belief: ArrayLike, action: int) -> None:
+        """Take in a decision: where it was taken (n,), and the index of the action."""
+        action = check_action(action, self.n_actions)
+        self._open.append((np.asarray(belief, dtype=np.float64).copy(), action))
+        if len(self._open) > round(self.horizon / self.dt):
+            self._close(failed=False)
+
+    def end_episode(self, *, failed: bool) -> None:
+        """Of an episode that ended well it is not known what would have come: that is left out."""
+        while failed and self._open:
+            self._close(failed=True)
+        self._open.clear()
+
+    def outcome(self, belief: ArrayLike, action: int) -> Outcome:
+        """Probability of failure within the horizon: the mean under Jeffreys' prior."""
+        weights = np.asarray(belief, dtype=np.float64)[: self._cases.shape[1]]
+        n, action = len(weights), check_action(action, self.n_actions)
+        cases = float(weights @ self._cases[action, :n])
+        failures = float(weights @ self._failures[action, :n])
+        probability = (failures + 0.5) / (cases + 1.0)
+        low, high = wilson_interval(np.array(probability), cases + 1.0)
+        return Outcome(probability, (float(low), float(high)), cases)
+
+    def _close(self, *, failed: bool) -> None:
+        belief, action = self._open.popleft()
+        n, missing = len(belief), len(belief) - self._cases.shape[1]
+        if missing > 0:
+            self._cases = np.pad(self._cases, ((0, 0), (0, missing)))
+            self._failures = np.pad(self._failures, ((0, 0), (0, missing)))
+        self._cases[action, :n] += belief
+        if failed:
+            self._failures[action, :n] += belief

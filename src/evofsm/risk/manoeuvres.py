@@ -1,0 +1,165 @@
+"""How hard others brake: every braking manoeuvre seen is remembered, pooled over situations.
+
+What a leader does next hardly depends on the follower, so each manoeuvre seen anywhere counts
+everywhere. The chance that the next one is harder than some deceleration is read from a kernel
+density over those remembered (Epanechnikov's kernel, Silverman's bandwidth), together with one
+manoeuvre that was only assumed, as hard as a cautious engineer would have it: with N remembered it
+weighs 1 / (N + 1), which is also the chance that the next one is harder than all before it.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from evofsm.risk.rehearsal import HARDEST
+
+# Of the recent second, in decisions or seconds; see `BrakeWatch`.
+_WINDOW = 1.0
+# A leader brakes from the first of these decelerations on, until below the second [m/s²].
+_BEGINS, _ENDS = 1.0, 0.4
+# A manoeuvre takes at least so many decisions; less may be noise.
+_SHORTEST = 3
+# A gap that changes by so much more than the speeds explain belongs to another leader [m].
+_ANOTHER_LEADER = 3.0
+# Between two points of the table of `Manoeuvres.harder` [m/s²], and its narrowest kernel.
+_GRID, _NARROWEST = 0.05, 0.1
+
+
+class Manoeuvres:
+    """The decelerations of the latest braking manoeuvres, and how likely harder ones are.
+
+    Parameters
+    ----------
+    assumed : float
+        The deceleration of the one that is only assumed [m/s²].
+    memory : int
+        How many are remembered; older ones are forgotten, so that a change shows.
+
+    Examples
+    --------
+    >>> manoeuvres = Manoeuvres(assumed=10.0)
+    >>> manoeuvres.harder([4.0, 12.0])  # nothing seen: only the assumed one counts
+    array([1., 0.])
+    >>> manoeuvres.remember(3.0, 3.5, 4.0)
+    >>> manoeuvres.harder([2.0, 3.5, 6.0, 12.0]).round(2)
+    array([1.  , 0.62, 0.25, 0.  ])
+    """
+
+    def __init__(self, assumed: float, memory: int = 500) -> None:
+        self.assumed = assumed
+        self.decels: deque[float] = deque(maxlen=memory)
+        self._tabulate()
+
+    def __len__(self) -> int:
+        return len(self.decels)
+
+    def remember(self, *decels: float) -> None:
+        """Take in manoeuvres [m/s²], the oldest first."""
+        self.decels.extend(min(decel, HARDEST) for decel in decels)
+        self._tabulate()
+
+    def harder(self, decel: ArrayLike) -> NDArray[np.float64]:
+        """Probability that the next manoeuvre is harder than these decelerations [m/s²]."""
+        return np.interp(np.asarray(decel, dtype=np.float64), self._grid, self._harder)
+
+    def seen_harder(self, decel: float) -> int:
+        """How many of those remembered were harder than ``decel`` [m/s²]."""
+        return sum(seen > decel for seen in self.decels)
+
+    def _tabulate(self) -> None:
+        self._grid = np.arange(0.0, HARDEST + _GRID, _GRID)
+        harder = (self.assumed > self._grid).astype(np.float64)
+        if self.decels:
+            seen = np.array(self.decels)
+            # Silverman's rule; where few were seen their spread says little.
+            width = max(_NARROWEST, 2.34 * seen.std() * len(seen) ** -0.2)
+            offset = np.clip((seen - self._grid[:, None]) / width, -1.0, 1.0)
+            harder += (0.5 + 0.75 * offset - 0.25 * offset**3).sum(axis=1)
+        self._harder = harder / (len(self.decels) + 1)
+
+
+class Seen(NamedTuple):
+    """One observation, as far as others' braking is concerned."""
+
+    gap: float
+    speed: float
+    leader_speed: float
+
+
+class BrakeWatch:
+    """Watches a leader's speed, and tells a manoeuvre when it has ended.
+
+    The deceleration of a manoeuvre is that of its hardest second, which neither its blurred ends
+    nor noise on the speeds change much.
+
+    Parameters
+    ----------
+    dt : float
+        Time between observations [s].
+
+    Examples
+    --------
+    >>> watch = BrakeWatch(dt=0.25)
+    >>> for speed in (20.0, 20.0, 19.0, 18.0, 17.0, 16.0, 16.0):
+    ...     decel = watch.see(50.0, speed, speed)
+    >>> watch.braking, watch.see(50.0, 16.0, 16.0)
+    (True, 4.0)
+    """
+
+    def __init__(self, dt: float) -> None:
+        self.dt = dt
+        self._window = max(_SHORTEST, round(_WINDOW / dt))
+        self.clear()
+
+    @property
+    def braking(self) -> bool:
+        """Whether the leader brakes now."""
+        return bool(self._braking)
+
+    def clear(self) -> None:
+        """Forget the leader: another comes, or an episode begins."""
+        self._recent: deque[Seen] = deque(maxlen=3)
+        self._braking: list[float] = []
+
+    def see(self, gap: float, speed: float, leader_speed: float) -> float | None:
+        """Take in an observation; answers the deceleration of a manoeuvre that ended [m/s²]."""
+        now = Seen(gap, speed, leader_speed)
+        if self._recent and self._is_another(self._recent[-1], now):
+            ended = self.end()
+            self.clear()
+            self._recent.append(now)
+            return ended
+        self._recent.append(now)
+        if len(self._recent) < 3:
+            return None
+        before = self._recent[0].leader_speed
+        decel = (before - leader_speed) / (2.0 * self.dt)
+        if self._braking:
+            self._braking.append(leader_speed)
+            if decel < _ENDS or leader_speed <= 0.0:
+                return self.end()
+        elif decel >= _BEGINS:
+            self._braking = [seen.leader_speed for seen in self._recent]
+        return None
+
+    def end(self) -> float | None:
+        """Close the manoeuvre under way, as an episode ends; answers its deceleration [m/s²]."""
+        speeds, self._braking = self._braking, []
+        while len(speeds) > 1 and speeds[-1] <= 0.0:
+            speeds.pop()  # in the interval in which it came to a standstill it did not only brake
+        if len(speeds) <= _SHORTEST:
+            return None
+        span = min(self._window, len(speeds) - 1)
+        lost = np.array(speeds[:-span]) - np.array(speeds[span:])
+        hardest = float(lost.max()) / (span * self.dt)
+        return hardest if hardest >= _BEGINS else None
+
+    def _is_another(self, before: Seen, now: Seen) -> bool:
+        expected = before.gap + 0.5 * self.dt * (
+            before.leader_speed + now.leader_speed - before.speed - now.speed
+        )
+        return abs(now.gap - expected) > _ANOTHER_LEADER

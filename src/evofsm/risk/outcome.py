@@ -1,0 +1,353 @@
+"""Latent risk: how likely failure is after an action, even if one is cautious from then on.
+
+A failure is rare and its causes are long past when it comes, so counting failures says too little
+and too late. What leads to it can be learnt from every ordinary minute: how hard leaders brake
+(`evofsm.risk.manoeuvres`), how often they begin to (by state, here), and how well one brakes
+oneself (`evofsm.risk.brakes`). An action is then *rehearsed* (`evofsm.risk.rehearsal`): it is
+taken, full braking follows, and the leader brakes. The hardest braking of the leader that still
+ends well is the critical deceleration, and the latent risk is the probability that the leader
+brakes harder than that. A situation is a dead end where even braking at once cannot lower it.
+"""
+
+from __future__ import annotations
+
+import math
+from os import PathLike
+from typing import NamedTuple, Protocol, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from evofsm import storage
+from evofsm.protocols import Situation
+from evofsm.risk.brakes import OwnBrakes
+from evofsm.risk.manoeuvres import BrakeWatch, Manoeuvres
+from evofsm.risk.rehearsal import Body, critical_decelerations
+from evofsm.validation import positive
+
+# Two-sided 90 %.
+_WIDTH = 1.645
+# Pseudo-evidence for the pooled rate of manoeuvres, against that of a state [s].
+_POOLED = 20.0
+
+
+class Judgement(NamedTuple):
+    """How dangerous some actions are; an entry for each of them.
+
+    ``risk`` is the probability that failure can no longer be avoided if the action is taken and
+    the leader begins to brake at once, with its 90 % interval from ``low`` to ``high``.
+    """
+
+    risk: NDArray[np.float64]  #: (k,)
+    low: NDArray[np.float64]  #: (k,)
+    high: NDArray[np.float64]  #: (k,)
+    critical: NDArray[np.float64]  #: (k,) hardest braking of the leader that is survived [m/s²]
+    evidence: float  #: number of manoeuvres it rests on
+
+
+class ActionJudge(Protocol):
+    """Anything that can be asked how dangerous an action is."""
+
+    @property
+    def brakes(self) -> OwnBrakes:
+        """What is known of one's own brakes."""
+        ...
+
+    def judge(self, situation: Situation, accelerations: ArrayLike, /) -> Judgement:
+        """How dangerous each acceleration [m/s²] is."""
+        ...
+
+
+class LatentRisk:
+    """Learns online what an action leads to if the leader brakes and one is cautious from then on.
+
+    Parameters
+    ----------
+    lowest : float
+        The hardest braking that can be commanded [m/s²], negative.
+    dt : float
+        Time between decisions [s].
+    leader_decel : float
+        Until enough was seen, leaders are assumed to brake so hard [m/s²].
+    own_brakes : float
+        Until it was seen, full braking is assumed to bring this share of what was commanded.
+    margin : float
+        Smallest gap that counts as no collision [m].
+
+    Examples
+    --------
+    >>> risk = LatentRisk(lowest=-2.5)
+    >>> here = Situation(np.array([30.0, 20.0, 20.0]), np.ones(1), 0, np.nan, 0.0)
+    >>> unseen = risk.judge(here, [0.0, -2.5])
+    >>> unseen.risk, unseen.evidence  # nothing was learnt: the assumptions rule
+    (array([1., 1.]), 0.0)
+    """
+
+    def __init__(
+        self,
+        lowest: float,
+        dt: float = 0.25,
+        *,
+        leader_decel: float = 10.0,
+        own_brakes: float = 0.6,
+        margin: float = 0.5,
+    ) -> None:
+        if not -math.inf < lowest < 0.0:
+            raise ValueError(f"lowest is {lowest}; the hardest braking must be negative and finite")
+        self.lowest = float(lowest)
+        self.dt = positive("dt", dt)
+        self.leader_decel = positive("leader_decel", leader_decel)
+        self.own_brakes = positive("own_brakes", own_brakes)
+        self.margin = positive("margin", margin)
+        self.manoeuvres = Manoeuvres(assumed=leader_decel)
+        self.brakes = OwnBrakes(lowest, own_brakes, dt)
+        self._watch = BrakeWatch(dt)
+        self._onsets = np.zeros(0)
+        self._exposure = np.zeros(0)
+        self._seconds = np.zeros(0)
+        self._last_command = 0.0
+
+    @classmethod
+    def told(cls, lowest: float, decel: float, leader_decel: float, dt: float = 0.25) -> Self:
+        """Told the limits instead of learning them: the best that could be learnt.
+
+        Parameters
+        ----------
+        lowest : float
+            The hardest braking that can be commanded [m/s²], negative.
+        decel, leader_decel : float
+            Hardest braking of the follower and of leaders [m/s²], positive.
+        dt : float
+            Time between decisions [s].
+        """
+        risk = cls(lowest, dt, leader_decel=leader_decel)
+        risk.brakes.trust(decel)
+        return risk
+
+    # -- Learning -------------------------------------------------------------------------------
+
+    def learn(
+        self, observation: ArrayLike, acceleration: float, belief: ArrayLike = (1.0,)
+    ) -> None:
+        """Take in an observation and the acceleration commanded after it.
+
+        Parameters
+        ----------
+        observation : (3,) array_like
+            Gap [m], speed of the follower and of the leader [m/s].
+        acceleration : float
+            Commanded [m/s²].
+        belief : (n,) array_like
+            Distribution over states, to learn where leaders begin to brake.
+        """
+        was_braking = self._watch.braking
+        self._remember(self._follow(observation, acceleration))
+        self._count(np.asarray(belief), was_braking)
+        self.brakes.see(float(np.asarray(observation)[1]), acceleration)
+
+    def follow(self, observation: ArrayLike, acceleration: float) -> None:
+        """Keep up with what happens, as `learn`, without learning from it."""
+        self._follow(observation, acceleration)
+
+    def start_episode(self, *, learn: bool = True) -> None:
+        """What comes is not a consequence of what was; a manoeuvre under way counts as it is."""
+        ended = self._watch.end()
+        if learn:
+            self._remember(ended)
+        self._watch.clear()
+        self.brakes.clear()
+        self._last_command = 0.0
+
+    def _follow(self, observation: ArrayLike, acceleration: float) -> float | None:
+        gap, speed, leader_speed = np.asarray(observation, dtype=np.float64).tolist()
+        self._last_command = acceleration
+        return self._watch.see(gap, speed, leader_speed)
+
+    def _remember(self, decel: float | None) -> None:
+        if decel is not None:
+            self.manoeuvres.remember(decel)
+
+    def _count(self, belief: NDArray[np.float64], was_braking: bool) -> None:
+        n, missing = len(belief), len(belief) - len(self._seconds)
+        if missing > 0:
+            for name in ("_onsets", "_exposure", "_seconds"):
+                setattr(self, name, np.pad(getattr(self, name), (0, missing)))
+        self._seconds[:n] += self.dt * belief
+        if not was_braking:
+            self._exposure[:n] += self.dt * belief
+            if self._watch.braking:
+                self._onsets[:n] += belief
+
+    # -- Judging --------------------------------------------------------------------------------
+
+    def judge(self, situation: Situation, accelerations: ArrayLike) -> Judgement:
+        """Latent risk of each acceleration that could be commanded now.
+
+        Parameters
+        ----------
+        situation : Situation
+        accelerations : (k,) array_like
+            To be judged [m/s²].
+
+        Returns
+        -------
+        Judgement
+        """
+        critical = self.critical(situation.observation, accelerations)
+        return self.judgement(self.manoeuvres.harder(critical), critical)
+
+    def judgement(self, risk: NDArray[np.float64], critical: NDArray[np.float64]) -> Judgement:
+        """With the interval that as many manoeuvres as were seen allow for."""
+        seen = len(self.manoeuvres)
+        low, high = wilson_interval(risk, seen + 1)
+        return Judgement(risk, low, high, critical, float(seen))
+
+    def critical(
+        self, observation: ArrayLike, accelerations: ArrayLike, onset: float = 0.0
+    ) -> NDArray[np.float64]:
+        """Hardest braking of the leader, ``onset`` [s] from now, that is survived.
+
+        Returns
+        -------
+        (k,) ndarray
+            [m/s²]; 0 where even a leader who keeps its speed is hit, `rehearsal.HARDEST` where
+            none is.
+        """
+        actions = np.ascontiguousarray(accelerations, dtype=np.float64)
+        critical = np.empty(len(actions))
+        critical_decelerations(
+            np.ascontiguousarray(observation, dtype=np.float64),
+            actions,
+            self._last_command,
+            self.body,
+            round(onset / self.dt),
+            self.dt,
+            critical,
+        )
+        return critical
+
+    def probability(
+        self,
+        observation: ArrayLike,
+        acceleration: float,
+        horizon: float,
+        belief: ArrayLike | None = None,
+    ) -> float:
+        """Probability of failure within ``horizon`` [s]: action now, then caution.
+
+        Unlike the latent risk this does not suppose that the leader brakes: it weighs by how
+        often leaders begin to, in states like this one (``belief``) or anywhere (None).
+        """
+        if self._watch.braking:
+            return float(self.manoeuvres.harder(self.critical(observation, [acceleration]))[0])
+        rate = self.onset_rate(belief)
+        delays = np.arange(0.0, horizon, self.dt)
+        begins = np.exp(-rate * delays) * -math.expm1(-rate * self.dt)
+        critical = [self.critical(observation, [acceleration], delay)[0] for delay in delays]
+        return float(begins @ self.manoeuvres.harder(critical))
+
+    def onset_rate(self, belief: ArrayLike | None = None) -> float:
+        """How often leaders begin to brake [1/s], in states like this one or anywhere."""
+        exposure = self._exposure.sum()
+        pooled = (self._onsets.sum() + 1.0) / (exposure + _POOLED)
+        if belief is None:
+            return float(pooled)
+        here = np.asarray(belief)[: len(self._onsets)]
+        n = len(here)
+        onsets, seconds = here @ self._onsets[:n], here @ self._exposure[:n]
+        return float((onsets + _POOLED * pooled) / (seconds + _POOLED))
+
+    def seconds_seen(self, belief: ArrayLike) -> float:
+        """How long states like this one were seen so far [s]: near 0 for what is new."""
+        here = np.asarray(belief)[: len(self._seconds)]
+        return float(here @ self._seconds[: len(here)])
+
+    @property
+    def body(self) -> Body:
+        """What the follower is able to do, as far as was learnt."""
+        return Body(self.brakes.decel, self.brakes.lag, self.margin)
+
+    def score(self, observations: NDArray[np.float64], dt: float) -> NDArray[np.float64]:
+        """Latent risk of braking in full now, for each row: how surely it is a dead end.
+
+        As every `RiskMeasure`; rows are judged one by one, so ``dt`` does not matter.
+        """
+        full = np.array([self.lowest])
+        critical = [self.critical(row, full)[0] for row in np.asarray(observations)]
+        return self.manoeuvres.harder(critical)
+
+    # -- Keeping it -----------------------------------------------------------------------------
+
+    def save(self, path: str | PathLike[str]) -> None:
+        """Write what was learnt to a file (arrays and a JSON header, nothing that can run).
+
+        Raises
+        ------
+        OSError
+            If the folder does not exist, or the file cannot be written. A file that was there
+            before is then as it was.
+        """
+        settings = {
+            "lowest": self.lowest,
+            "dt": self.dt,
+            "leader_decel": self.leader_decel,
+            "own_brakes": self.own_brakes,
+            "margin": self.margin,
+        }
+        storage.write(path, "risk", settings, self._learnt())
+
+    @classmethod
+    def load(cls, path: str | PathLike[str]) -> Self:
+        """Read what was learnt, between two episodes.
+
+        Raises
+        ------
+        OSError
+            If there is no such file, or it may not be read.
+        ValueError
+            If the file holds something else, or is damaged.
+
+        Examples
+        --------
+        >>> import tempfile
+        >>> from pathlib import Path
+        >>> risk = LatentRisk(lowest=-2.5)
+        >>> risk.manoeuvres.remember(4.0)
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     risk.save(Path(folder) / "risk.evofsm")
+        ...     len(LatentRisk.load(Path(folder) / "risk.evofsm").manoeuvres)
+        1
+        """
+        settings, arrays = storage.read(path, "risk")
+        with storage.explained(path):
+            risk = cls(**settings)
+            for name, array in arrays.items():
+                if array.ndim != 1 or not np.isfinite(array).all():
+                    raise ValueError(f"{name} is no series of finite numbers")
+            risk.manoeuvres.remember(*arrays["decels"].tolist())
+            risk.brakes.samples.extend(arrays["brakes"].tolist())
+            risk.brakes.lagged = arrays["lagged"].tolist()
+            risk._onsets, risk._exposure, risk._seconds = (
+                arrays[name] for name in ("onsets", "exposure", "seconds")
+            )
+        return risk
+
+    def _learnt(self) -> dict[str, NDArray[np.float64]]:
+        return {
+            "decels": np.array(self.manoeuvres.decels),
+            "brakes": np.array(self.brakes.samples),
+            "lagged": np.array(self.brakes.lagged),
+            "onsets": self._onsets,
+            "exposure": self._exposure,
+            "seconds": self._seconds,
+        }
+
+
+def wilson_interval(
+    share: NDArray[np.float64], count: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """90 % interval of a share that was counted (Wilson 1927)."""
+    spread = _WIDTH**2 / count
+    centre = (share + 0.5 * spread) / (1.0 + spread)
+    reach = np.sqrt(spread * (share * (1.0 - share) + 0.25 * spread)) / (1.0 + spread)
+    return np.maximum(centre - reach, 0.0), np.minimum(centre + reach, 1.0)
