@@ -17,6 +17,9 @@ from numpy.typing import ArrayLike, NDArray
 from evofsm.risk.outcome import wilson_interval
 from evofsm.validation import check_action, positive, whole
 
+# Cases, of the overall share of failures, that those of a state are added to.
+_LEAN = 2.0
+
 
 class Outcome(NamedTuple):
     """Probability of failure within the horizon, and how well it is known."""
@@ -69,14 +72,19 @@ class OutcomeCounts:
         self._open.clear()
 
     def outcome(self, belief: ArrayLike, action: int) -> Outcome:
-        """Probability of failure within the horizon: the mean under Jeffreys' prior."""
+        """Probability of failure within the horizon.
+
+        Where few cases are known here, it leans on the share of failures among all cases, as if
+        so many more had been seen (an empirical Bayes estimate).
+        """
         weights = np.asarray(belief, dtype=np.float64)[: self._cases.shape[1]]
         n, action = len(weights), check_action(action, self.n_actions)
+        overall = (self._failures.sum() + 0.5) / (self._cases.sum() + 1.0)
         cases = float(weights @ self._cases[action, :n])
         failures = float(weights @ self._failures[action, :n])
-        probability = (failures + 0.5) / (cases + 1.0)
-        low, high = wilson_interval(np.array(probability), cases + 1.0)
-        return Outcome(probability, (float(low), float(high)), cases)
+        probability = (failures + _LEAN * overall) / (cases + _LEAN)
+        low, high = wilson_interval(np.array(probability), cases + _LEAN)
+        return Outcome(float(probability), (float(low), float(high)), cases)
 
     def _close(self, *, failed: bool) -> None:
         belief, action = self._open.popleft()

@@ -66,9 +66,9 @@ class Manoeuvres:
         """Probability that the next manoeuvre is harder than these decelerations [m/s²]."""
         return np.interp(np.asarray(decel, dtype=np.float64), self._grid, self._harder)
 
-    def seen_harder(self, decel: float) -> int:
-        """How many of those remembered were harder than ``decel`` [m/s²]."""
-        return sum(seen > decel for seen in self.decels)
+    def exceeded_by(self, share: float) -> float:
+        """The deceleration that a share of manoeuvres exceeds [m/s²]: the inverse of `harder`."""
+        return float(self._grid[np.argmax(self._harder <= share)])
 
     def _tabulate(self) -> None:
         self._grid = np.arange(0.0, HARDEST + _GRID, _GRID)

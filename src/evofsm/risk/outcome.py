@@ -267,14 +267,18 @@ class LatentRisk:
         """What the follower is able to do, as far as was learnt."""
         return Body(self.brakes.decel, self.brakes.lag, self.margin)
 
-    def score(self, observations: NDArray[np.float64], dt: float) -> NDArray[np.float64]:
-        """Latent risk of braking in full now, for each row: how surely it is a dead end.
+    def score(
+        self, observations: NDArray[np.float64], dt: float = 0.25, tolerance: float = 0.01
+    ) -> NDArray[np.float64]:
+        """How surely each row is a dead end, as a `RiskMeasure` [m/s²].
 
-        As every `RiskMeasure`; rows are judged one by one, so ``dt`` does not matter.
+        By how much the hardest braking of a leader that is survived by braking in full now falls
+        short of the one that leaders exceed with a probability of ``tolerance``. Rows are judged
+        one by one, so ``dt`` does not matter.
         """
         full = np.array([self.lowest])
         critical = [self.critical(row, full)[0] for row in np.asarray(observations)]
-        return self.manoeuvres.harder(critical)
+        return self.manoeuvres.exceeded_by(tolerance) - np.array(critical)
 
     # -- Keeping it -----------------------------------------------------------------------------
 

@@ -78,7 +78,9 @@ def survives(
     dt: float,
 ) -> bool:
     """Whether no collision comes of ``acceleration`` now and full braking after it."""
-    gap, speed, leader_speed = observation[0] - body.margin, observation[1], observation[2]
+    # Who stands closer than the margin has not failed by that.
+    gap = observation[0] - min(body.margin, 0.5 * observation[0])
+    speed, leader_speed = observation[1], observation[2]
     caution = -body.decel
     asked = max(acceleration, caution)
     last = max(before, caution)
