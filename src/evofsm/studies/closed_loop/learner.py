@@ -1,0 +1,130 @@
+"""Our own policy, as the study teaches and tests it."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Self
+
+from evofsm.framework.loop import Drive, Framework
+from evofsm.framework.reviser import ActionReviser, Mode
+from evofsm.machine import EvolvingFSM
+from evofsm.protocols import Controller, Reviser
+from evofsm.risk.by_state import RiskByState
+from evofsm.risk.outcome import LatentRisk
+from evofsm.states import Novelty, StateRule
+from evofsm.studies.closed_loop.outcomes import Outcome, Reference, outcome, reference
+from evofsm.worlds.families import Draw, Family
+from evofsm.worlds.kinematic import KinematicWorld
+from evofsm.worlds.road import World
+
+#: The state rule for safety work: fine enough to steer by. The study compares the rules.
+SAFETY_RULE = Novelty(radius=1.0, scales=(4.0, 2.0, 2.0))
+
+_MACHINE, _RISK = "machine.evofsm", "risk.evofsm"
+
+
+@dataclass
+class Learner:
+    """A machine and the latent risk that learns beside it."""
+
+    machine: EvolvingFSM
+    risk: LatentRisk
+
+    @classmethod
+    def new(cls, family: Family, rule: StateRule | None = SAFETY_RULE) -> Self:
+        """One that has seen nothing."""
+        return cls(
+            EvolvingFSM(family.actions.n_actions, rule=rule),
+            LatentRisk(family.actions.low, family.interval),
+        )
+
+    @classmethod
+    def load(cls, folder: Path) -> Self:
+        """One that was saved."""
+        return cls(EvolvingFSM.load(folder / _MACHINE), LatentRisk.load(folder / _RISK))
+
+    def save(self, folder: Path) -> None:
+        """Write both files."""
+        folder.mkdir(parents=True, exist_ok=True)
+        self.machine.save(folder / _MACHINE)
+        self.risk.save(folder / _RISK)
+
+    def frozen(self) -> Self:
+        """A copy that goes its own way."""
+        return type(self)(self.machine, copy.deepcopy(self.risk))
+
+    def reviser(self, family: Family, tolerance: float, mode: Mode = Mode.ACT) -> ActionReviser:
+        """The action reviser that asks this risk."""
+        return ActionReviser(self.risk, family.actions, tolerance=tolerance, mode=mode)
+
+    def reviser_by_state(self, family: Family, tolerance: float) -> ActionReviser:
+        """The action reviser that asks the states."""
+        by_state = RiskByState(self.risk, self.machine)
+        return ActionReviser(by_state, family.actions, tolerance=tolerance)
+
+    def teach(
+        self,
+        family: Family,
+        draws: Iterable[Draw],
+        reviser: Reviser,
+        world: World | None = None,
+    ) -> list[Drive]:
+        """Drive and learn, each draw in turn."""
+        return [self.drive(family, draw, reviser, learn=True, world=world) for draw in draws]
+
+    def drive(
+        self,
+        family: Family,
+        draw: Draw,
+        reviser: Reviser,
+        *,
+        learn: bool,
+        world: World | None = None,
+        controller: Controller | None = None,
+    ) -> Drive:
+        """Drive one draw."""
+        framework = Framework(
+            controller or draw.controller,
+            family.actions,
+            reviser,
+            machine=self.machine,
+            risk=self.risk,
+            learn=learn,
+            interval=family.interval,
+        )
+        return framework.drive(world or KinematicWorld(), draw.scenario)
+
+
+def drive_alone(family: Family, draw: Draw, reviser: Reviser, risk: LatentRisk | None) -> Drive:
+    """Drive one draw without a machine and without learning.
+
+    What a frozen risk decides is the same, since it judges situations where they are.
+    """
+    framework = Framework(
+        draw.controller, family.actions, reviser, risk=risk, learn=False, interval=family.interval
+    )
+    return framework.drive(KinematicWorld(), draw.scenario)
+
+
+def references(family: Family, draws: Sequence[Draw], unrevised: Reviser) -> list[Reference]:
+    """How far the controller comes by itself in each draw."""
+    return [
+        reference(drive_alone(family, draw, unrevised, None), draw.scenario.leader.brake_decel)
+        for draw in draws
+    ]
+
+
+def score(
+    family: Family,
+    draws: Sequence[Draw],
+    unrevised: Sequence[Reference],
+    drives: Iterable[Drive],
+) -> list[Outcome]:
+    """Outcomes of driven draws."""
+    return [
+        outcome(drive, base, family.interval)
+        for _, base, drive in zip(draws, unrevised, drives, strict=True)
+    ]

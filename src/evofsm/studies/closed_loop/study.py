@@ -1,0 +1,358 @@
+"""The closed loop: how many collisions are prevented, and what that costs.
+
+Every policy drives the same held-out draws. Ours learns first, from draws of its own, several
+times with other seeds; tuned baselines are tuned on the same training draws. Work is split by
+policy and learning seed over the cores, and put together in the order of the tasks.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Executor, ProcessPoolExecutor
+from dataclasses import asdict, dataclass, field, replace
+from functools import partial
+from importlib.util import find_spec
+from multiprocessing import get_context
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from evofsm.framework.reviser import EnvelopeReviser, Unrevised
+from evofsm.states import Edges, FailureSplit, Novelty, StateRule
+from evofsm.studies.closed_loop.calibration import Reliability, run_calibration
+from evofsm.studies.closed_loop.cases import CaseResult, run_cases
+from evofsm.studies.closed_loop.learner import Learner, drive_alone, references, score
+from evofsm.studies.closed_loop.outcomes import Outcome, Reference, Row, summarise
+from evofsm.studies.closed_loop.policies import TUNED_MEASURES, Group, fixed_policies
+from evofsm.studies.closed_loop.separation import Separation, run_separation
+from evofsm.studies.closed_loop.shift import Check, ShiftPlan, Stream, run_shift
+from evofsm.studies.closed_loop.two_worlds import InWorld, run_two_worlds
+from evofsm.worlds.families import Draw, Family
+
+#: Collision rate at most, on so many held-out draws, for `episodes_until_safe`.
+SAFE_RATE, SAFE_EPISODES = 0.01, 200
+#: After so many training episodes the learning curve has a point.
+CHECKPOINTS = (0, 1, 2, 5, 10, 20, 50, 100, 200, 300)
+#: Tolerances of the trade-off.
+TOLERANCES = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.4)
+# Training episodes in the comparison of state rules.
+_RULE_TRAIN = 60
+#: State rules that are compared, by name.
+RULES: dict[str, StateRule | None] = {
+    "paper": None,
+    "edges": Edges(),
+    "novelty": Novelty(radius=1.0, scales=(4.0, 2.0, 2.0)),
+    "failure-split": FailureSplit(base=Novelty(radius=2.0, scales=(4.0, 2.0, 2.0))),
+}
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How much is driven."""
+
+    train: int = 300  #: training episodes
+    test: int = 1000  #: held-out episodes
+    seeds: int = 20  #: learning seeds
+    seed: int = 0  #: of everything
+    tolerance: float = 0.01
+    rule_seeds: int = 2  #: learning seeds in the comparison of state rules
+    rule_test: int = 200  #: held-out episodes in it, and in the trade-off
+    side_train: int = 100  #: training episodes of the studies beside the table
+    side_test: int = 300  #: held-out episodes of them
+    world_test: int = 50  #: episodes driven in both worlds
+    shift: ShiftPlan = field(default_factory=ShiftPlan)
+
+
+class Point(NamedTuple):
+    """A point of the learning curve."""
+
+    learning_seed: int
+    episodes: int  #: learnt from
+    collisions: int  #: of `held_out`
+    held_out: int
+    mobility: float
+    states: int
+    train_collisions: int  #: so far, while learning
+
+
+class TradeOff(NamedTuple):
+    """What a policy reaches at one setting."""
+
+    policy: str
+    setting: str
+    collision_rate: float
+    mobility: float
+
+
+@dataclass(frozen=True)
+class ClosedLoop:
+    """All that the study measured on one family."""
+
+    family: Family
+    plan: Plan
+    rows: list[Row]  #: baselines, then ours for each learning seed
+    curve: list[Point] = field(default_factory=list)
+    trade_offs: list[TradeOff] = field(default_factory=list)
+    by_rule: list[Row] = field(default_factory=list)  #: risk read through the states alone
+    separations: list[Separation] = field(default_factory=list)
+    reliabilities: list[Reliability] = field(default_factory=list)
+    cases: list[CaseResult] = field(default_factory=list)  #: of the family `paper`
+    worlds: list[InWorld] = field(default_factory=list)  #: empty without SUMO
+    streams: list[Stream] = field(default_factory=list)  #: of families that shift
+    checks: list[Check] = field(default_factory=list)
+
+    def as_dict(self) -> dict[str, Any]:
+        """All of it, for JSON."""
+        lists = {
+            name: [one.as_dict() if isinstance(one, Row) else _plain(one) for one in values]
+            for name, values in vars(self).items()
+            if isinstance(values, list)
+        }
+        return {"family": self.family.name, "plan": asdict(self.plan), **lists}
+
+
+def run_closed_loop(
+    family: Family,
+    plan: Plan,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+    workers: int | None = None,
+) -> ClosedLoop:
+    """Drive all policies.
+
+    Parameters
+    ----------
+    family : Family
+    plan : Plan
+    progress : callable
+        Told how many tasks are done, of how many.
+    workers : int, optional
+        Processes; as many as there are cores unless told.
+    """
+    names = [policy.name for policy in fixed_policies(family)]
+    tasks: list[partial[Any]] = [
+        *(partial(_test_fixed, family, plan, name) for name in names),
+        *(partial(_test_tuned, family, plan, name) for name in TUNED_MEASURES),
+        *(partial(_test_learner, family, plan, seed) for seed in range(plan.seeds)),
+        *(
+            partial(_test_rule, family, plan, rule, seed)
+            for rule in RULES
+            for seed in range(min(plan.rule_seeds, plan.seeds))
+        ),
+        partial(run_separation, family, plan.side_train, plan.side_test, plan.seed),
+        partial(run_calibration, family, plan.side_train, plan.side_test, plan.seed),
+    ]
+    if find_spec("libsumo") is not None:
+        tasks.append(
+            partial(
+                run_two_worlds,
+                *(family, plan.side_train, plan.world_test, plan.tolerance, plan.seed),
+            )
+        )
+    if family.name == "paper":
+        tasks.append(partial(run_cases, family, plan.tolerance, plan.seed))
+    if family.shifted is not None:
+        shift = replace(plan.shift, seed=plan.seed, tolerance=plan.tolerance)
+        tasks += [partial(run_shift, family, shift, seed) for seed in range(plan.seeds)]
+    found: list[Any] = []
+    for result in _run(tasks, workers or os.cpu_count() or 1):
+        found.append(result)
+        progress(len(found), len(tasks))
+    study = ClosedLoop(family, plan, [])
+    for result in found:
+        for name, values in result.items():
+            getattr(study, name).extend(values)
+    return study
+
+
+def _plain(record: Any) -> dict[str, Any]:
+    """A tuple of names, with those inside it, for JSON."""
+    return {
+        name: [_plain(one) if hasattr(one, "_asdict") else one for one in value]
+        if isinstance(value, tuple)
+        else value
+        for name, value in record._asdict().items()
+    }
+
+
+def _run(tasks: Sequence[partial[Any]], workers: int) -> Iterator[Any]:
+    """Results in the order of the tasks."""
+    if workers == 1:
+        yield from (task() for task in tasks)
+        return
+    executor: Executor
+    # Forking a process that has started threads may hang; a fresh one costs a second.
+    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as executor:
+        futures = [executor.submit(task) for task in tasks]
+        try:
+            yield from (future.result() for future in futures)
+        finally:
+            for future in futures:
+                future.cancel()
+
+
+def held_out(family: Family, plan: Plan, episodes: int) -> list[Draw]:
+    """Draws that nothing learns from."""
+    return [family.draw(plan.seed, index, split="test") for index in range(episodes)]
+
+
+def training(family: Family, plan: Plan, learning_seed: int, episodes: int) -> Iterator[Draw]:
+    """Draws to learn from, other ones for every learning seed."""
+    for index in range(episodes):
+        yield family.draw(plan.seed * 1000 + learning_seed, index, split="train")
+
+
+def _references(family: Family, draws: Sequence[Draw]) -> list[Reference]:
+    return references(family, draws, Unrevised(family.actions))
+
+
+def _test_fixed(family: Family, plan: Plan, name: str) -> dict[str, list[Any]]:
+    policy = next(policy for policy in fixed_policies(family) if policy.name == name)
+    draws = held_out(family, plan, plan.test)
+    drives = (drive_alone(family, draw, policy.make(family, draw), None) for draw in draws)
+    outcomes = score(family, draws, _references(family, draws), drives)
+    return {"rows": [summarise(family.name, name, policy.group, outcomes, family.interval)]}
+
+
+def _test_tuned(family: Family, plan: Plan, name: str) -> dict[str, list[Any]]:
+    """Of the settings without a collision in training the fastest, else the safest."""
+    measures = TUNED_MEASURES[name]
+    draws = list(training(family, plan, 0, min(plan.train, 100)))
+    base = _references(family, draws)
+    tried: list[tuple[int, float, int]] = []
+    for index, measure in enumerate(measures):
+        reviser = EnvelopeReviser(measure, family.actions, family.interval)
+        outcomes = score(
+            family, draws, base, (drive_alone(family, draw, reviser, None) for draw in draws)
+        )
+        tried.append((sum(o.collided for o in outcomes), -_mobility(outcomes), index))
+    best = measures[min(tried)[2]]
+    reviser = EnvelopeReviser(best, family.actions, family.interval)
+    tests = held_out(family, plan, plan.test)
+    drives = (drive_alone(family, draw, reviser, None) for draw in tests)
+    outcomes = score(family, tests, _references(family, tests), drives)
+    row = summarise(
+        family.name,
+        name,
+        Group.TUNED,
+        outcomes,
+        family.interval,
+        train_episodes=len(draws) * len(measures),
+    )
+    return {
+        "rows": [row],
+        "trade_offs": [
+            TradeOff(name, repr(measures[i]), collisions / len(draws), -slower)
+            for collisions, slower, i in sorted(tried, key=lambda one: one[2])
+        ],
+    }
+
+
+def _test_learner(family: Family, plan: Plan, seed: int) -> dict[str, list[Any]]:
+    """Learn with one seed; test on the way and at the end."""
+    learner = Learner.new(family)
+    reviser = learner.reviser(family, plan.tolerance)
+    checks = held_out(family, plan, min(SAFE_EPISODES, plan.test))
+    check_base = _references(family, checks)
+    checkpoints = [k for k in CHECKPOINTS if k <= plan.train]
+    curve: list[Point] = []
+    rows: list[Row] = []
+    collisions = 0
+    draws = training(family, plan, seed, plan.train)
+    for episodes in range(plan.train + 1):
+        if episodes > 0:
+            [drive] = learner.teach(family, [next(draws)], reviser)
+            collisions += drive.episode.collided
+        if episodes in checkpoints:
+            outcomes = _frozen(family, learner, plan.tolerance, checks, check_base)
+            curve.append(
+                Point(
+                    seed,
+                    episodes,
+                    sum(o.collided for o in outcomes),
+                    len(outcomes),
+                    _mobility(outcomes),
+                    learner.machine.n_states,
+                    collisions,
+                )
+            )
+        if episodes in {min(100, plan.train), plan.train}:
+            rows.append(_final_row(family, plan, learner, seed, episodes, collisions, curve))
+    trade_offs = _trade_offs(family, plan, learner) if seed == 0 else []
+    return {"rows": rows, "curve": curve, "trade_offs": trade_offs}
+
+
+def _final_row(
+    family: Family,
+    plan: Plan,
+    learner: Learner,
+    seed: int,
+    episodes: int,
+    train_collisions: int,
+    curve: Sequence[Point],
+) -> Row:
+    draws = held_out(family, plan, plan.test)
+    outcomes = _frozen(family, learner, plan.tolerance, draws, _references(family, draws))
+    safe = [point.episodes for point in curve if point.collisions <= SAFE_RATE * point.held_out]
+    return summarise(
+        family.name,
+        "evofsm",
+        Group.LEARNT,
+        outcomes,
+        family.interval,
+        learning_seed=seed,
+        train_episodes=episodes,
+        episodes_until_safe=safe[0] if safe else None,
+        train_collisions=train_collisions,
+    )
+
+
+def _trade_offs(family: Family, plan: Plan, learner: Learner) -> list[TradeOff]:
+    draws = held_out(family, plan, min(plan.rule_test, plan.test))
+    base = _references(family, draws)
+    found = []
+    for tolerance in TOLERANCES:
+        outcomes = _frozen(family, learner, tolerance, draws, base)
+        rate = sum(o.collided for o in outcomes) / len(outcomes)
+        found.append(TradeOff("evofsm", f"{tolerance:g}", rate, _mobility(outcomes)))
+    return found
+
+
+def _test_rule(family: Family, plan: Plan, rule: str, seed: int) -> dict[str, list[Any]]:
+    """Steer by the states alone: what a rule's states are worth."""
+    learner = Learner.new(family, RULES[rule])
+    by_state = learner.reviser_by_state(family, plan.tolerance)
+    episodes = min(_RULE_TRAIN, plan.train)
+    taught = learner.teach(family, training(family, plan, seed, episodes), by_state)
+    draws = held_out(family, plan, min(plan.rule_test, plan.test))
+    drives = (learner.drive(family, draw, by_state, learn=False) for draw in draws)
+    outcomes = score(family, draws, _references(family, draws), drives)
+    row = summarise(
+        family.name,
+        f"states: {rule} ({learner.machine.n_states})",
+        Group.LEARNT,
+        outcomes,
+        family.interval,
+        learning_seed=seed,
+        train_episodes=episodes,
+        train_collisions=sum(drive.episode.collided for drive in taught),
+    )
+    return {"by_rule": [row]}
+
+
+def _frozen(
+    family: Family,
+    learner: Learner,
+    tolerance: float,
+    draws: Sequence[Draw],
+    base: Sequence[Reference],
+) -> list[Outcome]:
+    """Drive held-out draws with what was learnt so far."""
+    frozen = learner.frozen()
+    reviser = frozen.reviser(family, tolerance)
+    drives = (drive_alone(family, draw, reviser, frozen.risk) for draw in draws)
+    return score(family, draws, base, drives)
+
+
+def _mobility(outcomes: Iterable[Outcome]) -> float:
+    return float(np.mean([o.mobility for o in outcomes]))

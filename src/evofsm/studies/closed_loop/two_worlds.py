@@ -1,0 +1,56 @@
+"""The same learnt model in SUMO and in closed form: it must revise the same way."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from evofsm.studies.closed_loop.learner import Learner
+from evofsm.worlds import WORLDS, open_world
+from evofsm.worlds.families import Family
+
+
+class InWorld(NamedTuple):
+    """What came of the same held-out draws in one world."""
+
+    world: str
+    episodes: int
+    collisions: int
+    mean_speed: float  #: [m/s]
+    intervention_rate: float
+
+
+def run_two_worlds(
+    family: Family, train: int, test: int, tolerance: float, seed: int = 0
+) -> dict[str, list[Any]]:
+    """Learn in closed form, then drive the same draws in every world with learning frozen."""
+    learner = Learner.new(family)
+    draws = (family.draw(seed * 1000, index) for index in range(train))
+    learner.teach(family, draws, learner.reviser(family, tolerance))
+    found = []
+    for name in WORLDS:
+        frozen = learner.frozen()
+        reviser = frozen.reviser(family, tolerance)
+        with open_world(name) as world:
+            drives = [
+                frozen.drive(
+                    family,
+                    family.draw(seed, index, split="test"),
+                    reviser,
+                    learn=False,
+                    world=world,
+                )
+                for index in range(test)
+            ]
+        changed = [drive.executed != drive.proposed for drive in drives]
+        found.append(
+            InWorld(
+                name,
+                test,
+                sum(drive.episode.collided for drive in drives),
+                float(np.mean([drive.episode.observations[:, 1].mean() for drive in drives])),
+                float(np.concatenate(changed).mean()),
+            )
+        )
+    return {"worlds": found}
