@@ -98,15 +98,27 @@ class Learner:
         return framework.drive(world or KinematicWorld(), draw.scenario)
 
 
-def drive_alone(family: Family, draw: Draw, reviser: Reviser, risk: LatentRisk | None) -> Drive:
+def drive_alone(
+    family: Family,
+    draw: Draw,
+    reviser: Reviser,
+    risk: LatentRisk | None,
+    world: World | None = None,
+    controller: Controller | None = None,
+) -> Drive:
     """Drive one draw without a machine and without learning.
 
     What a frozen risk decides is the same, since it judges situations where they are.
     """
     framework = Framework(
-        draw.controller, family.actions, reviser, risk=risk, learn=False, interval=family.interval
+        controller or draw.controller,
+        family.actions,
+        reviser,
+        risk=risk,
+        learn=False,
+        interval=family.interval,
     )
-    return framework.drive(KinematicWorld(), draw.scenario)
+    return framework.drive(world or KinematicWorld(), draw.scenario)
 
 
 def references(family: Family, draws: Sequence[Draw], unrevised: Reviser) -> list[Reference]:

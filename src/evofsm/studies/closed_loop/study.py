@@ -63,6 +63,21 @@ class Plan:
     world_test: int = 50  #: episodes driven in both worlds
     shift: ShiftPlan = field(default_factory=ShiftPlan)
 
+    def shortened(self) -> Plan:
+        """About a tenth of everything: a look, not evidence."""
+        return replace(
+            self,
+            train=min(self.train, 100),
+            test=min(self.test, 100),
+            seeds=min(self.seeds, 2),
+            rule_seeds=1,
+            rule_test=20,
+            side_train=40,
+            side_test=60,
+            world_test=5,
+            shift=replace(self.shift, before=20, after=10, held_out=20),
+        )
+
 
 class Point(NamedTuple):
     """A point of the learning curve."""

@@ -1,19 +1,15 @@
-"""The command line: reads what was asked for, calls a study, prints what it found."""
+"""`evofsm learn` and `evofsm inspect`."""
 
 from __future__ import annotations
 
-import functools
-import json
 import os
-import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
-from enum import StrEnum
-from importlib.util import find_spec
+from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, ParamSpec
+from typing import TYPE_CHECKING, Annotated
 
-# Needed once the annotations below are read; `main` says what to install where it is missing.
+from evofsm.cli.common import plain_errors, print_json, progress
+
 with suppress(ModuleNotFoundError):
     import typer
 
@@ -24,150 +20,8 @@ if TYPE_CHECKING:
     from evofsm.io import LogColumns
     from evofsm.observations import Category
 
-P = ParamSpec("P")
-
 _UNITS = {"gap": "m", "v_follower": "m/s", "v_leader": "m/s"}
 _MOST_ACTIONS = 1000
-
-
-def main() -> None:
-    """Run the command line."""
-    if find_spec("typer") is None or find_spec("rich") is None:
-        print("evofsm: the command line needs: pip install 'evofsm[cli]'", file=sys.stderr)
-        sys.exit(2)
-    application()()
-
-
-def application() -> typer.Typer:
-    """All commands."""
-    app = typer.Typer(
-        name="evofsm",
-        help="Online recognition of latent risk with an evolving finite state machine.",
-        add_completion=False,
-        no_args_is_help=True,
-        rich_markup_mode=None,
-        pretty_exceptions_enable=False,
-    )
-    app.callback()(options)
-    app.command()(paper)
-    app.command()(learn)
-    app.command()(inspect)
-    return app
-
-
-def _print_version(asked: bool) -> None:
-    if asked:
-        from evofsm import __version__
-
-        print(f"evofsm {__version__}")
-        raise typer.Exit
-
-
-def options(
-    version: Annotated[
-        bool,
-        typer.Option(
-            "--version", is_eager=True, callback=_print_version, help="Print the version and stop."
-        ),
-    ] = False,
-) -> None:
-    """Online recognition of latent risk with an evolving finite state machine."""
-
-
-def plain_errors(command: Callable[P, None]) -> Callable[P, None]:
-    """Let a command end with one clear line instead of a traceback."""
-
-    @functools.wraps(command)
-    def run(*args: P.args, **kwargs: P.kwargs) -> None:
-        try:
-            command(*args, **kwargs)
-        except KeyboardInterrupt:
-            print("\nevofsm: stopped before the end", file=sys.stderr)
-            raise typer.Exit(130) from None
-        except BrokenPipeError:  # whoever read the output had enough
-            raise
-        except (ValueError, TypeError, OSError, ModuleNotFoundError) as error:
-            print(f"evofsm: {_message(error)}", file=sys.stderr)
-            raise typer.Exit(2) from None
-
-    return run
-
-
-def _require(**extras: str) -> None:
-    """Refuse before the long work what lacks a package after it."""
-    for package, extra in extras.items():
-        if find_spec(package) is None:
-            raise ModuleNotFoundError(f"this needs {package}: pip install 'evofsm[{extra}]'")
-
-
-def _message(error: Exception) -> str:
-    if isinstance(error, OSError) and error.filename is not None and error.strerror:
-        return f"{error.filename}: {error.strerror.lower()}"
-    return str(error)
-
-
-class WorldName(StrEnum):
-    """Where to drive."""
-
-    SUMO = "sumo"
-    KINEMATIC = "kinematic"
-
-
-@plain_errors
-def paper(
-    world: Annotated[
-        WorldName, typer.Option(help="SUMO itself, or the same motion in closed form.")
-    ] = WorldName.SUMO,
-    rounds: Annotated[int, typer.Option(min=1, help="How often the four cases are driven.")] = 20,
-    out: Annotated[
-        Path, typer.Option(help="Folder for the page, figures, traces and the model.")
-    ] = Path("evofsm-paper"),
-    settings: Annotated[
-        Path | None,
-        typer.Option(
-            help="TOML file with settings to use in place of the paper's.", show_default=False
-        ),
-    ] = None,
-    as_json: Annotated[
-        bool, typer.Option("--json", help="Print the claims as JSON instead of tables.")
-    ] = False,
-) -> None:
-    """Reproduce the paper: drive its 80 runs, and hold every claim against them.
-
-    Ends with 0 if all claims hold, with 1 if any does not.
-    """
-    _require(matplotlib="plot", jinja2="plot", polars="tables")
-    from evofsm.report import terminal
-    from evofsm.report.figures import paper_figures
-    from evofsm.report.page import write_page
-    from evofsm.studies.paper import (
-        Settings,
-        check_claims,
-        context_tables,
-        run_paper,
-        write_data,
-    )
-    from evofsm.worlds import open_world
-
-    chosen = Settings.load(settings)
-    out.mkdir(parents=True, exist_ok=True)
-    with _progress() as bars, open_world(world.value) as place:
-        study = run_paper(
-            place, world.value, chosen, rounds, _counter(bars, f"Driving and learning ({world})")
-        )
-        claims, context = check_claims(study), context_tables(study)
-        write_data(study, claims, context, out)
-        drawings = paper_figures(study, out / "figures", _counter(bars, "Drawing figures"))
-        page = write_page(
-            study, claims, context, drawings, out, " ".join(["evofsm", *sys.argv[1:]])
-        )
-    if as_json:
-        print((out / "claims.json").read_text(encoding="utf-8"), end="")
-    else:
-        terminal.print_claims(terminal.console(), claims, context)
-        terminal.console().print(f"Page with all figures: {page}", soft_wrap=True)
-    if not all(claim.holds for claim in claims):
-        raise typer.Exit(1)
 
 
 @plain_errors
@@ -261,7 +115,7 @@ def learn(
         actions.n_actions, radius, distance_weight, learning_rate, prior_frequency, spread
     )
     names = columns.observe.names
-    with _progress() as bars:
+    with progress() as bars:
         learning = learn_traces(
             read_traces(files, columns, lengths, _bytes_read(bars, files)),
             machine,
@@ -276,7 +130,7 @@ def learn(
 
     if as_json:
         document = terminal.learning_document(learning)
-        _print_json({"files": files, "saved": out and str(out), **document})
+        print_json({"files": files, "saved": out and str(out), **document})
         return
     console = terminal.console()
     terminal.print_learning(
@@ -311,7 +165,7 @@ def inspect(
         model = FSMModel.load(file)
         facts = [("file", file)]
     if as_json:
-        _print_json({"file": file, **terminal.model_document(model)})
+        print_json({"file": file, **terminal.model_document(model)})
     else:
         terminal.print_model(terminal.console(), model, facts)
 
@@ -394,37 +248,7 @@ def _variable(text: str, distance: float) -> str | Category:
     return Category(name, values.split("/"), distance) if discrete else text
 
 
-# -- In the terminal ------------------------------------------------------------------------------
-
-
-@contextmanager
-def _progress() -> Iterator[Progress]:
-    """Bars on standard error; none where nobody watches."""
-    from rich.console import Console
-    from rich.progress import Progress
-
-    console = Console(stderr=True)
-    with Progress(console=console, transient=True, disable=not sys.stderr.isatty()) as bars:
-        yield bars
-
-
-def _counter(bars: Progress, text: str) -> Callable[[int, int], None]:
-    """A bar that is told how much is done, of how much."""
-    if bars.disable:
-        print(f"{text} ...", file=sys.stderr)
-    task = bars.add_task(text, total=None)
-    return lambda done, total: bars.update(task, completed=done, total=total)
-
-
 def _bytes_read(bars: Progress, files: list[str]) -> Callable[[int], None]:
     """A bar that grows with the bytes read of some files."""
     task = bars.add_task("Learning", total=sum(os.path.getsize(file) for file in files))
     return lambda count: bars.advance(task, count)
-
-
-def _print_json(document: dict[str, object]) -> None:
-    print(json.dumps(document, indent=2, allow_nan=False))
-
-
-if __name__ == "__main__":
-    main()

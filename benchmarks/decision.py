@@ -1,0 +1,84 @@
+"""What one decision costs: belief, latent risk of every action, revision, learning.
+
+Usage: python benchmarks/decision.py [--steps 1000000]
+
+The stream is what revised training episodes observed, over and over, with a machine of at least
+200 states. A decision must fit into a tenth of a 10 ms control step, in 99 of 100 cases.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evofsm.framework.loop import Oversight
+from evofsm.protocols import Proposal
+from evofsm.states import Novelty
+from evofsm.studies.closed_loop import Learner
+from evofsm.worlds.families import Family, load_family
+
+_STATES = 200
+_CONTROL_STEP = 0.010
+_PROMISED = 0.1
+
+
+def main() -> int:
+    """Measure, print, and fail where the promise is not kept."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--steps", type=int, default=1_000_000)
+    steps = parser.parse_args().steps
+    family = load_family("emergency")
+    learner = Learner.new(family, Novelty(radius=1.0, scales=(2.0, 1.0, 1.0)))
+    stream = teach(family, learner)
+    seconds = measure(family, learner, stream, steps)
+    median, p99, worst = np.quantile(seconds, [0.5, 0.99, 1.0])
+    share = p99 / _CONTROL_STEP
+    print(
+        f"one decision, {learner.machine.n_states} states, {family.actions.n_actions} actions, "
+        f"{steps} decisions: median {1e6 * median:.0f} µs, p99 {1e6 * p99:.0f} µs, "
+        f"longest {1e3 * worst:.1f} ms\n"
+        f"p99 is {share:.1%} of a 10 ms control step (promised: {_PROMISED:.0%})"
+    )
+    return int(share > _PROMISED)
+
+
+def teach(family: Family, learner: Learner) -> list[NDArray[np.float64]]:
+    """Learn until there are states enough; answers what was observed, by episode."""
+    stream = []
+    reviser = learner.reviser(family, tolerance=0.01)
+    index = 0
+    while learner.machine.n_states < _STATES:
+        [drive] = learner.teach(family, [family.draw(0, index)], reviser)
+        stream.append(np.array([decision.situation.observation for decision in drive.decisions]))
+        index += 1
+    return stream
+
+
+def measure(
+    family: Family, learner: Learner, stream: list[NDArray[np.float64]], steps: int
+) -> NDArray[np.float64]:
+    """(steps,) seconds of each decision."""
+    seconds = np.empty(steps)
+    done = 0
+    wishes = np.random.default_rng(0).uniform(family.actions.low, family.actions.high, steps)
+    reviser = learner.reviser(family, tolerance=0.01)
+    while done < steps:
+        oversight = Oversight(family.actions, reviser, machine=learner.machine, risk=learner.risk)
+        for observation in stream[done % len(stream)]:
+            begun = time.perf_counter()
+            situation = oversight.recognise(observation, 0.0)
+            oversight.revise(situation, Proposal(float(wishes[done])))
+            seconds[done] = time.perf_counter() - begun
+            done += 1
+            if done == steps:
+                break
+        oversight.end(None, failed=False)
+    return seconds
+
+
+if __name__ == "__main__":
+    sys.exit(main())

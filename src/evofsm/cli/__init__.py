@@ -1,0 +1,63 @@
+"""The command line: reads what was asked for, calls a study, prints what it found."""
+
+from __future__ import annotations
+
+import sys
+from contextlib import suppress
+from importlib.util import find_spec
+from typing import Annotated
+
+# Needed once the annotations below are read; `main` says what to install where it is missing.
+with suppress(ModuleNotFoundError):
+    import typer
+
+
+def main() -> None:
+    """Run the command line."""
+    if find_spec("typer") is None or find_spec("rich") is None:
+        print("evofsm: the command line needs: pip install 'evofsm[cli]'", file=sys.stderr)
+        sys.exit(2)
+    application()()
+
+
+def application() -> typer.Typer:
+    """All commands."""
+    from evofsm.cli.bench import bench
+    from evofsm.cli.drive import drive
+    from evofsm.cli.learn import inspect, learn
+    from evofsm.cli.paper import paper
+
+    app = typer.Typer(
+        name="evofsm",
+        help="Online recognition of latent risk with an evolving finite state machine.",
+        add_completion=False,
+        no_args_is_help=True,
+        rich_markup_mode=None,
+        pretty_exceptions_enable=False,
+    )
+    app.callback()(options)
+    app.command()(paper)
+    app.command()(learn)
+    app.command()(inspect)
+    app.command()(drive)
+    app.add_typer(bench())
+    return app
+
+
+def _print_version(asked: bool) -> None:
+    if asked:
+        from evofsm import __version__
+
+        print(f"evofsm {__version__}")
+        raise typer.Exit
+
+
+def options(
+    version: Annotated[
+        bool,
+        typer.Option(
+            "--version", is_eager=True, callback=_print_version, help="Print the version and stop."
+        ),
+    ] = False,
+) -> None:
+    """Online recognition of latent risk with an evolving finite state machine."""

@@ -1,0 +1,5 @@
+"""`python -m evofsm.cli`."""
+
+from evofsm.cli import main
+
+main()

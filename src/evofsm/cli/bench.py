@@ -1,0 +1,85 @@
+"""`evofsm bench`: the studies that hold ours against others."""
+
+from __future__ import annotations
+
+import sys
+from contextlib import suppress
+from pathlib import Path
+from typing import Annotated
+
+from evofsm.cli.common import counter, plain_errors, print_json, progress, require
+
+with suppress(ModuleNotFoundError):
+    import typer
+
+
+def bench() -> typer.Typer:
+    """The group of commands."""
+    app = typer.Typer(
+        name="bench",
+        help="Studies: ours against the baselines, on held-out scenarios.",
+        no_args_is_help=True,
+        rich_markup_mode=None,
+        pretty_exceptions_enable=False,
+    )
+    app.callback()(lambda: None)
+    app.command(name="closed-loop")(closed_loop)
+    return app
+
+
+@plain_errors
+def closed_loop(
+    family: Annotated[
+        str, typer.Option(help="Family of scenarios, or a TOML file of your own.")
+    ] = "emergency",
+    train: Annotated[int, typer.Option(min=1, help="Training episodes of a learning seed.")] = 300,
+    test: Annotated[int, typer.Option(min=1, help="Held-out episodes of every policy.")] = 1000,
+    seeds: Annotated[int, typer.Option(min=1, help="Learning seeds.")] = 20,
+    seed: Annotated[int, typer.Option(min=0, help="Of everything.")] = 0,
+    tolerance: Annotated[float, typer.Option(help="Highest latent risk that is accepted.")] = 0.01,
+    switches: Annotated[
+        str, typer.Option("--with", help="noise, delay, actuator, jerk, third_car; with commas.")
+    ] = "",
+    workers: Annotated[
+        int | None, typer.Option(min=1, help="Processes. [default: one per core]")
+    ] = None,
+    short: Annotated[
+        bool, typer.Option("--short", help="A tenth of everything: a look, not evidence.")
+    ] = False,
+    out: Annotated[
+        Path, typer.Option(help="Folder for the page, its figures and the data.")
+    ] = Path("evofsm-closed-loop"),
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print the rows of the table as JSON; write nothing.")
+    ] = False,
+) -> None:
+    """How many collisions are prevented, what that costs, and who does better.
+
+    Every policy drives the same held-out draws; ours learns first, with several seeds.
+    """
+    require(scipy="study")
+    if not as_json:
+        require(matplotlib="plot", jinja2="plot")
+    from evofsm.studies.closed_loop import Plan, run_closed_loop
+    from evofsm.worlds.families import load_family
+
+    chosen = load_family(family).with_switches([name for name in switches.split(",") if name])
+    plan = Plan(train=train, test=test, seeds=seeds, seed=seed, tolerance=tolerance)
+    if short:
+        plan = plan.shortened()
+    with progress() as bars:
+        study = run_closed_loop(chosen, plan, counter(bars, "Driving and learning"), workers)
+        if not as_json:
+            from evofsm.report.closed_loop import write_closed_loop
+
+            out.mkdir(parents=True, exist_ok=True)
+            command = " ".join(["evofsm", *sys.argv[1:]])
+            page = write_closed_loop(study, out, command, counter(bars, "Drawing figures"))
+    if as_json:
+        print_json([row.as_dict() for row in study.rows])
+        return
+    from evofsm.report import terminal
+
+    console = terminal.console()
+    terminal.print_closed_loop(console, study)
+    console.print(f"Page with all figures: {page}", soft_wrap=True)

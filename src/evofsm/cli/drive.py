@@ -1,0 +1,129 @@
+"""`evofsm drive`."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from evofsm.cli.common import WorldName, plain_errors, print_json, progress, require
+
+with suppress(ModuleNotFoundError):
+    import typer
+
+if TYPE_CHECKING:
+    from evofsm.studies.closed_loop import Learner
+    from evofsm.studies.driving import Driving, Setup
+    from evofsm.worlds.road import World
+
+
+@plain_errors
+def drive(
+    family: Annotated[
+        str,
+        typer.Argument(
+            help="Family of scenarios: emergency, paper, shift, ..., or a TOML file of your own.",
+            show_default=False,
+        ),
+    ],
+    controller: Annotated[
+        str,
+        typer.Option(
+            help="Who proposes: the family's own, aggressive, normal, acc, or sumo (SUMO's IDM)."
+        ),
+    ] = "family",
+    reviser: Annotated[
+        str,
+        typer.Option(
+            help="Who revises: least-risk (what was learnt), none, rss, aeb, or another measure."
+        ),
+    ] = "least-risk",
+    mode: Annotated[
+        str, typer.Option(help="How far least-risk goes: off, shadow, advise, act.")
+    ] = "act",
+    tolerance: Annotated[float, typer.Option(help="Highest latent risk that is accepted.")] = 0.01,
+    world: Annotated[
+        WorldName, typer.Option(help="SUMO itself, or the same motion in closed form.")
+    ] = WorldName.KINEMATIC,
+    episodes: Annotated[int, typer.Option(min=1, help="How many are driven.")] = 100,
+    seed: Annotated[int, typer.Option(min=0, help="Of the draws.")] = 0,
+    switches: Annotated[
+        str, typer.Option("--with", help="noise, delay, actuator, jerk, third_car; with commas.")
+    ] = "",
+    learn: Annotated[
+        Path | None,
+        typer.Option(
+            help="Go on learning from this folder of an earlier --out.", show_default=False
+        ),
+    ] = None,
+    frozen: Annotated[
+        Path | None,
+        typer.Option(
+            help="Drive held-out draws with what this folder holds; learn nothing.",
+            show_default=False,
+        ),
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(help="Folder for what was learnt and every decision.", show_default=False),
+    ] = None,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print the summary as one JSON document.")
+    ] = False,
+) -> None:
+    """Drive scenarios under a reviser; learn on the way.
+
+    A machine and its latent risk learn from every episode, from the first on, unless --frozen.
+    The summary compares with the controller left to itself in the same draws.
+    """
+    require(scipy="study", **({"polars": "tables"} if out else {}))
+    from evofsm.framework.reviser import Mode
+    from evofsm.report import terminal
+    from evofsm.report.driving import print_driving
+    from evofsm.studies.closed_loop import Learner
+    from evofsm.studies.driving import Setup, write_driving
+    from evofsm.worlds import open_world
+    from evofsm.worlds.families import load_family
+
+    if learn is not None and frozen is not None:
+        raise ValueError("--learn and --frozen exclude each other")
+    if mode not in (names := [one.value for one in Mode]):
+        raise ValueError(f"--mode is {mode!r}; it must be one of {', '.join(names)}")
+    chosen = load_family(family).with_switches([name for name in switches.split(",") if name])
+    setup = Setup(
+        chosen,
+        controller,
+        reviser,
+        Mode(mode),
+        tolerance,
+        episodes,
+        seed,
+        learn=frozen is None,
+    )
+    start = learn or frozen
+    learner = Learner.load(start) if start else Learner.new(chosen)
+    with open_world(world.value) as place:
+        driving = _drive(setup, learner, place)
+    if out is not None:
+        write_driving(driving, learner, out)
+    if as_json:
+        print_json({**driving.row.as_dict(), "lead_times": list(driving.lead_times)})
+        return
+    console = terminal.console()
+    print_driving(console, driving, learner, setup)
+    if out is not None:
+        console.print(f"What was learnt, and every decision: {out}", soft_wrap=True)
+
+
+def _drive(setup: Setup, learner: Learner, place: World) -> Driving:
+    """With a bar that shows the collisions so far."""
+    from evofsm.studies.driving import drive_family
+
+    with progress() as bars:
+        task = bars.add_task("Driving", total=setup.episodes)
+
+        def show(done: int, collisions: int) -> None:
+            text = f"Driving ({collisions} collisions, {collisions / done:.1%})"
+            bars.update(task, completed=done, description=text)
+
+        return drive_family(setup, learner, place, show)

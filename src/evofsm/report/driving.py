@@ -1,0 +1,96 @@
+"""Say in the terminal what came of driving."""
+
+from __future__ import annotations
+
+from statistics import median
+
+from rich import box
+from rich.console import Console
+from rich.table import Table
+
+from evofsm.studies.closed_loop import Learner
+from evofsm.studies.driving import Driving, Setup
+
+# More states than these are not listed.
+_MOST = 8
+
+
+def print_driving(out: Console, driving: Driving, learner: Learner, setup: Setup) -> None:
+    """Print collisions and their price, what was learnt, and the dead ends that were found."""
+    row = driving.row
+    facts = Table(box=None, show_header=False, pad_edge=False)
+    facts.add_column(style="bold")
+    facts.add_column()
+    for name, text in [
+        ("family", f"{row.family}, {row.episodes} {_kind(setup)} episodes"),
+        ("controller", setup.controller),
+        ("reviser", f"{setup.reviser}, {setup.mode.value}"),
+        (
+            "collisions",
+            f"{row.collisions} of {row.episodes}: {row.collision_rate:.1%} "
+            f"(95 %: {row.collision_low:.1%} to {row.collision_high:.1%})",
+        ),
+        *([("rear-ended", f"{row.rear_ends}")] if row.rear_ends else []),
+        ("mobility", f"{row.mobility:.2f} of the way that the controller makes by itself"),
+        (
+            "interventions",
+            f"{row.intervention_rate:.1%} of decisions; mean change {row.mean_change:.2f} m/s²",
+        ),
+        ("comfort", f"RMS jerk {row.jerk:.2f} m/s³"),
+        *_lead_times(driving),
+        ("learnt", _learnt(learner)),
+    ]:
+        facts.add_row(name, text)
+    out.print(facts)
+    _print_dead_ends(out, driving, learner)
+
+
+def _kind(setup: Setup) -> str:
+    return "training" if setup.learn else "held-out"
+
+
+def _lead_times(driving: Driving) -> list[tuple[str, str]]:
+    times = driving.lead_times
+    if not times:
+        return []
+    warned = sum(time > 0.0 for time in times)
+    text = f"{warned} of {len(times)} collisions had an alarm that stayed on"
+    return [("lead time", f"{text}; median {median(times):.1f} s before")]
+
+
+def _learnt(learner: Learner) -> str:
+    risk, brakes = learner.risk, learner.risk.brakes
+    own = f"{brakes.decel:.1f} m/s²" if brakes.known else "not known yet"
+    return (
+        f"{learner.machine.n_states} states; {len(risk.manoeuvres)} manoeuvres of leaders, "
+        f"1 % brake harder than {risk.manoeuvres.exceeded_by(0.01):.1f} m/s²; own brakes: {own}"
+    )
+
+
+def _print_dead_ends(out: Console, driving: Driving, learner: Learner) -> None:
+    """Those that were seen longest, and what could still be survived in them."""
+    dead_ends = sorted(
+        (state for state in driving.states if state.is_dead_end), key=lambda state: -state.seconds
+    )
+    out.print()
+    if not dead_ends:
+        out.print(f"No dead ends among the {len(driving.states)} states.")
+        return
+    out.print(f"Dead ends: {len(dead_ends)} of {len(driving.states)} states; seen longest:")
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
+    for header in (
+        *("state", "gap\n[m]", "v_follower\n[m/s]", "v_leader\n[m/s]"),
+        *("survives braking\nup to [m/s²]", "risk if\nbraking", "seen\n[s]", "failures"),
+    ):
+        table.add_column(header, justify="right")
+    centers = learner.machine.centers
+    for state in dead_ends[:_MOST]:
+        table.add_row(
+            f"#{state.state + 1}",
+            *(f"{value:.1f}" for value in centers[state.state]),
+            f"{state.critical:.1f}",
+            f"{state.risk:.0%}",
+            f"{state.seconds:.1f}",
+            f"{state.failures:g}",
+        )
+    out.print(table)

@@ -1,0 +1,156 @@
+"""The closed loop in its short form: the claims of the issue, on fewer draws."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+pytest.importorskip("scipy")
+
+from evofsm.studies.closed_loop import Learner, Plan, ShiftPlan, fixed_policies, run_closed_loop
+from evofsm.studies.closed_loop.calibration import reliability, run_calibration
+from evofsm.studies.closed_loop.cases import run_cases
+from evofsm.studies.closed_loop.outcomes import bootstrap
+from evofsm.studies.closed_loop.separation import auroc, run_separation
+from evofsm.studies.closed_loop.shift import run_shift
+from evofsm.studies.closed_loop.two_worlds import run_two_worlds
+from evofsm.worlds.families import load_family
+
+EMERGENCY = load_family("emergency")
+TINY = Plan(
+    train=10,
+    test=20,
+    seeds=2,
+    rule_seeds=1,
+    rule_test=3,
+    side_train=10,
+    side_test=10,
+    world_test=2,
+)
+
+
+@pytest.fixture(scope="module")
+def study():
+    return run_closed_loop(EMERGENCY, TINY, workers=2)
+
+
+def rows_of(study, policy):
+    return [row for row in study.rows if row.policy == policy]
+
+
+def test_the_unrevised_driver_collides_and_ours_does_not(study):
+    [unrevised] = rows_of(study, "unrevised")
+    assert unrevised.collision_rate > 0.8
+    ours = rows_of(study, "evofsm")
+    assert [row.learning_seed for row in ours] == [0, 1]
+    assert all(row.collisions == 0 and row.mobility > 0.6 for row in ours)
+    assert all(row.train_collisions == 0 for row in ours)
+
+
+def test_every_baseline_stands_in_the_table_once(study):
+    expected = {policy.name for policy in fixed_policies(EMERGENCY)}
+    assert {"unrevised", "aeb-ttc", "rss-r157", "rss-matched", "oracle"} <= expected
+    for name in expected:
+        assert len(rows_of(study, name)) == 1, name
+
+
+def test_a_row_has_the_fields_that_others_rely_on(study):
+    assert {
+        *("family", "policy", "learning_seed", "train_episodes", "episodes", "collisions"),
+        *("collision_rate", "mobility", "intervention_rate", "mean_change", "jerk"),
+        "episodes_until_safe",
+    } <= set(study.rows[0].as_dict())
+    json.dumps(study.as_dict(), allow_nan=False)
+
+
+def test_the_unrevised_driver_is_the_measure_of_mobility(study):
+    [unrevised] = rows_of(study, "unrevised")
+    assert unrevised.mobility == 1.0
+    assert unrevised.intervention_rate == 0.0
+    [always] = rows_of(study, "always-brake")
+    assert always.mobility == 0.0
+    assert always.collisions == 0
+
+
+def test_the_result_does_not_depend_on_the_number_of_workers(study):
+    small = replace(TINY, seeds=1, rule_seeds=0, test=5, train=2)
+    alone = run_closed_loop(EMERGENCY, small, workers=1)
+    together = run_closed_loop(EMERGENCY, small, workers=2)
+    assert [row.as_dict() for row in alone.rows] == [row.as_dict() for row in together.rows]
+
+
+def test_the_papers_cases_are_driven_without_a_collision_and_left_alone_where_safe():
+    by_name = {case.name: case for case in run_cases(load_family("paper"), 0.01)["cases"]}
+    assert by_name["case 1"].unrevised_collided
+    assert by_name["case 4"].unrevised_collided
+    assert not any(case.collided for case in by_name.values())
+    assert all(case.end > 59.9 for case in by_name.values())
+    assert {"brake at 11 s", "brake at 15 s"} <= set(by_name)
+    assert by_name["case 2"].changed <= 0.05
+    assert by_name["case 3"].changed_late <= 0.05
+
+
+def test_brakes_that_weaken_are_noticed_while_unchanged_constants_collide():
+    plan = ShiftPlan(before=12, after=6, held_out=25)
+    found = run_shift(load_family("shift"), plan, learning_seed=0)
+    checks = {(check.policy, check.episodes_after): check for check in found["checks"]}
+    assert checks["evofsm", 5].collisions == 0
+    assert checks["rss-unchanged", -1].collisions == 0
+    assert checks["rss-unchanged", 6].collisions > 15
+
+
+def test_the_same_model_revises_alike_in_both_worlds():
+    pytest.importorskip("libsumo")
+    sumo, kinematic = run_two_worlds(EMERGENCY, train=8, test=4, tolerance=0.01)["worlds"]
+    assert sumo.collisions == kinematic.collisions == 0
+    assert sumo.mean_speed == pytest.approx(kinematic.mean_speed, rel=1e-6)
+    assert sumo.intervention_rate == pytest.approx(kinematic.intervention_rate)
+
+
+@pytest.mark.parametrize("family", ["rare", "weak_brakes"])
+def test_dead_ends_are_told_apart(family):
+    found = run_separation(load_family(family), train=30, test=40)["separations"]
+    areas = {one.measure: one.auroc for one in found}
+    assert areas["evofsm"] > 0.98
+    assert areas["evofsm"] > areas["aeb-ttc"]
+
+
+def test_probabilities_are_better_than_the_base_rate():
+    counted, rehearsed = run_calibration(EMERGENCY, train=40, test=60)["reliabilities"]
+    for one in (counted, rehearsed):
+        assert one.brier < 0.6 * one.base_brier
+        assert sum(part.cases for part in one.bins) == one.cases
+
+
+def test_a_reliability_counts_what_it_is_told():
+    one = reliability("", [0.05, 0.05, 0.95, 0.95], [False, True, True, True])
+    assert [(part.observed, part.cases) for part in one.bins] == [(0.5, 2), (1.0, 2)]
+    assert one.failures == 3
+
+
+def test_the_area_under_the_curve():
+    truth = np.array([False, True, False, True])
+    assert auroc(np.array([0.0, 1.0, 0.0, 1.0]), truth) == 1.0
+    assert auroc(np.zeros(4), truth) == 0.5
+    assert np.isnan(auroc(np.zeros(4), np.zeros(4, bool)))
+
+
+def test_the_bootstrap_surrounds_the_mean():
+    values = np.random.default_rng(0).normal(size=200)
+    low, high = bootstrap(values)
+    assert low < values.mean() < high
+
+
+def test_what_was_learnt_is_kept(tmp_path):
+    learner = Learner.new(EMERGENCY)
+    draws = [EMERGENCY.draw(0, index) for index in range(3)]
+    learner.teach(EMERGENCY, draws, learner.reviser(EMERGENCY, 0.01))
+    learner.save(tmp_path)
+    again = Learner.load(tmp_path)
+    assert again.machine.n_states == learner.machine.n_states
+    situation = np.array([20.0, 15.0, 15.0])
+    actions = [-1.0, 0.0, 1.0]
+    assert np.array_equal(
+        again.risk.critical(situation, actions), learner.risk.critical(situation, actions)
+    )
