@@ -16,8 +16,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from evofsm._extras import needs
 from evofsm.actions import IntervalActions
-from evofsm.framework.loop import Oversight, refuse_mismatch
-from evofsm.framework.reviser import ActionReviser, Unrevised
+from evofsm.framework.loop import Oversight, own_risk, refuse_mismatch
+from evofsm.framework.reviser import Unrevised
 from evofsm.machine import EvolvingFSM
 from evofsm.protocols import Proposal, Reviser, Revision, Situation
 from evofsm.risk.outcome import LatentRisk
@@ -118,7 +118,7 @@ class RevisedActions(gymnasium.Wrapper[Any, Any, Any, Any]):
         self.observe = observe
         self.failed = failed
         self.machine = machine
-        self.risk = _own_risk(reviser) if risk is None else risk
+        self.risk = own_risk(reviser) if risk is None else risk
         self.learn = learn
         if to_acceleration is not None and to_action is not None:
             self.to_acceleration, self.to_action = to_acceleration, to_action
@@ -192,12 +192,6 @@ class RevisedActions(gymnasium.Wrapper[Any, Any, Any, Any]):
                 "numbers, or None where nothing is ahead"
             )
         return seen
-
-
-def _own_risk(reviser: Reviser) -> LatentRisk | None:
-    if isinstance(reviser, ActionReviser) and isinstance(reviser.risk, LatentRisk):
-        return reviser.risk
-    return None
 
 
 def _conversions(

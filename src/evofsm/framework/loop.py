@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -15,10 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evofsm.actions import IntervalActions
-from evofsm.framework.reviser import Unrevised
+from evofsm.framework.reviser import ActionReviser, Unrevised
 from evofsm.machine import EvolvingFSM
 from evofsm.protocols import Controller, Proposal, Reviser, Revision, Situation
 from evofsm.risk.outcome import LatentRisk
+from evofsm.validation import positive
 from evofsm.worlds.road import Episode, World
 from evofsm.worlds.scenario import Scenario
 
@@ -91,6 +93,8 @@ class Oversight:
         self.learn = learn
         self._frozen = None if learn or machine is None else machine.model()
         reviser.start_episode()
+        if risk is not None:  # of an episode that was broken off nothing follows
+            risk.start_episode(learn=False)
         if machine is not None and learn:
             machine.start_episode()
 
@@ -129,6 +133,13 @@ class Oversight:
             self.risk.start_episode(learn=self.learn)
 
 
+def own_risk(reviser: Reviser | None) -> LatentRisk | None:
+    """The latent risk that a reviser asks, if it asks one."""
+    if isinstance(reviser, ActionReviser) and isinstance(reviser.risk, LatentRisk):
+        return reviser.risk
+    return None
+
+
 def refuse_mismatch(machine: EvolvingFSM | None, actions: IntervalActions) -> None:
     """Raise where a machine was made for another set of actions."""
     if machine is not None and machine.n_actions != actions.n_actions:
@@ -152,7 +163,7 @@ class Framework:
     machine : EvolvingFSM, optional
         Recognises and learns; without one nothing is recognised.
     risk : LatentRisk, optional
-        Learns from what happens; usually the reviser's own.
+        Learns from what happens; without it the reviser's own, if it has one.
     learn : bool
         Whether machine and risk learn while driving. It may be changed between runs.
     interval : float
@@ -161,7 +172,6 @@ class Framework:
     Examples
     --------
     >>> from evofsm.drivers.idm import IDM
-    >>> from evofsm.framework.reviser import ActionReviser
     >>> from evofsm.worlds.kinematic import KinematicWorld
     >>> from evofsm.worlds.scenario import Leader
     >>> actions = IntervalActions(low=-2.5, high=2.5, width=0.3, outside="clip")
@@ -170,8 +180,7 @@ class Framework:
     >>> scenario = Scenario(leader, initial_gap=10.0)
     >>> Framework(hasty, actions).drive(KinematicWorld(), scenario).episode.collided
     True
-    >>> risk = LatentRisk(lowest=-2.5)
-    >>> revised = Framework(hasty, actions, ActionReviser(risk, actions), risk=risk)
+    >>> revised = Framework(hasty, actions, ActionReviser(LatentRisk(lowest=-2.5), actions))
     >>> revised.drive(KinematicWorld(), scenario).episode.collided
     False
     """
@@ -188,13 +197,18 @@ class Framework:
         interval: float = 0.25,
     ) -> None:
         refuse_mismatch(machine, actions)
+        self.interval = positive("interval", interval)
+        risk = own_risk(reviser) if risk is None else risk
+        if risk is not None and not math.isclose(risk.dt, interval):
+            raise ValueError(
+                f"interval is {interval} s, but the risk was made for decisions every {risk.dt} s"
+            )
         self.controller = controller
         self.actions = actions
         self.reviser = Unrevised(actions) if reviser is None else reviser
         self.machine = machine
         self.risk = risk
         self.learn = learn
-        self.interval = interval
 
     def drive(self, world: World, scenario: Scenario) -> Drive:
         """Drive one scenario, and learn from it if `learn`.
@@ -213,25 +227,42 @@ class Framework:
         oversight = Oversight(
             self.actions, self.reviser, machine=self.machine, risk=self.risk, learn=self.learn
         )
-        decisions: list[Decision] = []
+        decided: list[tuple[int, Situation, Revision]] = []
         with world.open(scenario) as road:
             while not road.over:
-                before = road.observation[1]
                 situation = oversight.recognise(road.observation, road.time)
                 revision = oversight.revise(situation, self._ask(situation))
-                row = road.row
+                decided.append((road.row, situation, revision))
                 road.advance(revision.executed, steps)
-                elapsed = (road.row - row) * scenario.dt
-                realised = (road.observation[1] - before) / elapsed if elapsed else math.nan
-                decisions.append(Decision(situation, revision, float(realised)))
             oversight.end(road.observation, failed=road.collided)
-            return Drive(road.episode(), tuple(decisions))
+            return _drive(road.episode(), decided)
 
     def _ask(self, situation: Situation) -> Proposal:
         """What the controller proposes; NaN where it fails to."""
         try:
             proposal = self.controller.propose(situation.observation.copy(), situation.time)
-            return Proposal(float(proposal.action), tuple(proposal.candidates))
+            action = float(proposal.action)
+            candidates = tuple(float(candidate) for candidate in proposal.candidates)
         except Exception as error:  # whatever it is, someone has to go on driving
             _log.warning("controller failed at %g s: %r", situation.time, error)
             return Proposal(math.nan)
+        if not math.isfinite(action):
+            _log.warning("controller proposed %g at %g s", action, situation.time)
+        elif not self.actions.low <= action <= self.actions.high:
+            _log.info("controller proposed %g at %g s, outside the set", action, situation.time)
+        return Proposal(action, candidates)
+
+
+def _drive(episode: Episode, decided: Sequence[tuple[int, Situation, Revision]]) -> Drive:
+    """With what the body did, whatever the sensors showed of it."""
+    rows = [row for row, _, _ in decided] + [len(episode.time) - 1]
+    speed, time = episode.observations[rows, 1], episode.time[rows]
+    lasted = np.diff(time)
+    realised = np.divide(np.diff(speed), lasted, np.full(len(decided), np.nan), where=lasted > 0)
+    return Drive(
+        episode,
+        tuple(
+            Decision(situation, revision, float(did))
+            for (_, situation, revision), did in zip(decided, realised, strict=True)
+        ),
+    )

@@ -111,7 +111,7 @@ class ActionReviser:
         actions: IntervalActions,
         *,
         tolerance: float = 0.01,
-        release: float = 0.5,
+        release: float = 0.9,
         mode: Mode = Mode.ACT,
         way: Way = Way.IMPROVE,
     ) -> None:
@@ -119,6 +119,11 @@ class ActionReviser:
             raise ValueError(f"tolerance is {tolerance}; it is a probability, between 0 and 1")
         if not 0.0 < release <= 1.0:
             raise ValueError(f"release is {release}; it must lie in (0, 1]")
+        if risk.brakes.lowest < actions.low:
+            raise ValueError(
+                f"the risk counts on braking down to {risk.brakes.lowest:g}, but the set of "
+                f"actions ends at {actions.low:g}"
+            )
         self.risk = risk
         self.actions = actions
         self.tolerance = tolerance
@@ -201,7 +206,9 @@ class ActionReviser:
         if not self.risk.brakes.known:
             self._brake_test = _BRAKE_TEST
             return int(options.argmin()), f"{why}; own brakes not known yet, so in full"
-        tolerable = np.flatnonzero(judged.risk <= self.tolerance)
+        within = judged.risk <= limit
+        # Once revising, what is safe by the margin; else whatever is tolerable.
+        tolerable = np.flatnonzero(within if within.any() else judged.risk <= self.tolerance)
         if len(tolerable):
             closest = tolerable[np.abs(options[tolerable] - options[0]).argmin()]
             return int(closest), f"{why}; the closest that can"

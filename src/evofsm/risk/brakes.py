@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
-from statistics import fmean, stdev
+from math import fsum, sqrt
 
 # Full braking is judged by so many of the latest decisions, and by the few latest alone, so that
 # brakes that weaken show within seconds.
@@ -18,6 +18,8 @@ _WEAKEST = 0.2
 _GENTLE, _SHORTFALL = 1.0, 0.1
 # Commands that differ by less are the same [m/s²].
 _SAME = 0.05
+# Slower than this one may stand still, and only noise moves [m/s].
+_STANDING = 1.0
 
 
 class OwnBrakes:
@@ -63,9 +65,10 @@ class OwnBrakes:
     def decel(self) -> float:
         """Full braking that can be counted on [m/s²], positive."""
         if not self.known:
-            return -self.assumed * self.lowest
-        latest = list(self.samples)[-_LATEST:]
-        counted_on = min(_lower_bound(list(self.samples)), _lower_bound(latest))
+            counted_on = -self.assumed * self.lowest
+        else:
+            samples = list(self.samples)
+            counted_on = min(_lower_bound(samples), _lower_bound(samples[-_LATEST:]))
         return max(counted_on, -_WEAKEST * self.lowest)
 
     @property
@@ -85,7 +88,8 @@ class OwnBrakes:
 
     def see(self, speed: float, command: float) -> None:
         """Take in a speed [m/s] and what is commanded after it [m/s²]."""
-        if self._speed is not None and speed > 0.5:  # nothing is learnt from standing still
+        # Nothing is learnt from standing still.
+        if self._speed is not None and min(speed, self._speed) > _STANDING:
             self._learn((speed - self._speed) / self.dt)
         self._speed = speed
         self._commands = [*self._commands[-2:], max(command, self.lowest)]
@@ -114,4 +118,6 @@ class OwnBrakes:
 
 
 def _lower_bound(samples: Sequence[float]) -> float:
-    return float(fmean(samples) - _BOUND * stdev(samples) / len(samples) ** 0.5)
+    mean = fsum(samples) / len(samples)
+    variance = fsum([(sample - mean) ** 2 for sample in samples]) / (len(samples) - 1)
+    return mean - _BOUND * sqrt(variance / len(samples))

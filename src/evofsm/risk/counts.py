@@ -15,7 +15,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from evofsm.risk.outcome import wilson_interval
-from evofsm.validation import check_action, positive, whole
+from evofsm.validation import (
+    check_action,
+    positive,
+    real_array,
+    refuse_unless_distribution,
+    whole,
+)
 
 # Cases, of the overall share of failures, that those of a state are added to.
 _LEAN = 2.0
@@ -54,6 +60,8 @@ class OutcomeCounts:
         self.n_actions = whole("n_actions", n_actions)
         self.horizon = positive("horizon", horizon)
         self.dt = positive("dt", dt)
+        if self.horizon < self.dt:
+            raise ValueError(f"horizon is {horizon} s; it must span a decision, {dt} s, or more")
         self._open: deque[tuple[NDArray[np.float64], int]] = deque()
         self._cases = np.zeros((self.n_actions, 0))
         self._failures = np.zeros((self.n_actions, 0))
@@ -61,7 +69,9 @@ class OutcomeCounts:
     def learn(self, belief: ArrayLike, action: int) -> None:
         """Take in a decision: where it was taken (n,), and the index of the action."""
         action = check_action(action, self.n_actions)
-        self._open.append((np.asarray(belief, dtype=np.float64).copy(), action))
+        states = real_array("belief", belief, 1)
+        refuse_unless_distribution("belief", states)
+        self._open.append((states, action))
         if len(self._open) > round(self.horizon / self.dt):
             self._close(failed=False)
 

@@ -16,15 +16,16 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from evofsm.risk.rehearsal import HARDEST
+from evofsm.validation import positive
 
-# Of the recent second, in decisions or seconds; see `BrakeWatch`.
-_WINDOW = 1.0
+# Of a manoeuvre the hardest second counts; it shows in the latest half, and takes at least three
+# quarters: less may be noise [s].
+_WINDOW, _RECENT, _SHORTEST = 1.0, 0.5, 0.75
 # A leader brakes from the first of these decelerations on, until below the second [m/s²].
 _BEGINS, _ENDS = 1.0, 0.4
-# A manoeuvre takes at least so many decisions; less may be noise.
-_SHORTEST = 3
-# A gap that changes by so much more than the speeds explain belongs to another leader [m].
-_ANOTHER_LEADER = 3.0
+# A gap that changes by so much more than the speeds explain belongs to another leader [m], and
+# so does a speed that changes by so much more than a car can [m/s].
+_ANOTHER_GAP, _ANOTHER_SPEED = 3.0, 1.0
 # Between two points of the table of `Manoeuvres.harder` [m/s²], and its narrowest kernel.
 _GRID, _NARROWEST = 0.05, 0.1
 
@@ -50,7 +51,7 @@ class Manoeuvres:
     """
 
     def __init__(self, assumed: float, memory: int = 500) -> None:
-        self.assumed = assumed
+        self.assumed = positive("assumed", assumed)
         self.decels: deque[float] = deque(maxlen=memory)
         self._tabulate()
 
@@ -59,7 +60,7 @@ class Manoeuvres:
 
     def remember(self, *decels: float) -> None:
         """Take in manoeuvres [m/s²], the oldest first."""
-        self.decels.extend(min(decel, HARDEST) for decel in decels)
+        self.decels.extend([min(positive("decel", decel), HARDEST) for decel in decels])
         self._tabulate()
 
     def harder(self, decel: ArrayLike) -> NDArray[np.float64]:
@@ -78,7 +79,8 @@ class Manoeuvres:
             # Silverman's rule; where few were seen their spread says little.
             width = max(_NARROWEST, 2.34 * seen.std() * len(seen) ** -0.2)
             offset = np.clip((seen - self._grid[:, None]) / width, -1.0, 1.0)
-            harder += (0.5 + 0.75 * offset - 0.25 * offset**3).sum(axis=1)
+            harder += (0.5 + offset * (0.75 - 0.25 * offset * offset)).sum(axis=1)
+        harder[self._grid >= HARDEST] = 0.0
         self._harder = harder / (len(self.decels) + 1)
 
 
@@ -111,8 +113,10 @@ class BrakeWatch:
     """
 
     def __init__(self, dt: float) -> None:
-        self.dt = dt
-        self._window = max(_SHORTEST, round(_WINDOW / dt))
+        self.dt = positive("dt", dt)
+        self._recently = max(1, round(_RECENT / dt))
+        self._shortest = max(self._recently + 1, round(_SHORTEST / dt))
+        self._window = max(self._shortest, round(_WINDOW / dt))
         self.clear()
 
     @property
@@ -122,7 +126,7 @@ class BrakeWatch:
 
     def clear(self) -> None:
         """Forget the leader: another comes, or an episode begins."""
-        self._recent: deque[Seen] = deque(maxlen=3)
+        self._recent: deque[Seen] = deque(maxlen=self._recently + 1)
         self._braking: list[float] = []
 
     def see(self, gap: float, speed: float, leader_speed: float) -> float | None:
@@ -134,10 +138,10 @@ class BrakeWatch:
             self._recent.append(now)
             return ended
         self._recent.append(now)
-        if len(self._recent) < 3:
+        if len(self._recent) <= self._recently:
             return None
         before = self._recent[0].leader_speed
-        decel = (before - leader_speed) / (2.0 * self.dt)
+        decel = (before - leader_speed) / (self._recently * self.dt)
         if self._braking:
             self._braking.append(leader_speed)
             if decel < _ENDS or leader_speed <= 0.0:
@@ -151,15 +155,17 @@ class BrakeWatch:
         speeds, self._braking = self._braking, []
         while len(speeds) > 1 and speeds[-1] <= 0.0:
             speeds.pop()  # in the interval in which it came to a standstill it did not only brake
-        if len(speeds) <= _SHORTEST:
+        if len(speeds) <= self._shortest:
             return None
         span = min(self._window, len(speeds) - 1)
         lost = np.array(speeds[:-span]) - np.array(speeds[span:])
-        hardest = float(lost.max()) / (span * self.dt)
-        return hardest if hardest >= _BEGINS else None
+        # Less than a gentle second's worth may be noise, however short.
+        return float(lost.max()) / (span * self.dt) if lost.max() >= _BEGINS * _WINDOW else None
 
     def _is_another(self, before: Seen, now: Seen) -> bool:
         expected = before.gap + 0.5 * self.dt * (
             before.leader_speed + now.leader_speed - before.speed - now.speed
         )
-        return abs(now.gap - expected) > _ANOTHER_LEADER
+        if abs(now.leader_speed - before.leader_speed) > HARDEST * self.dt + _ANOTHER_SPEED:
+            return True
+        return abs(now.gap - expected) > _ANOTHER_GAP

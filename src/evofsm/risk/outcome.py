@@ -23,7 +23,7 @@ from evofsm.protocols import Situation
 from evofsm.risk.brakes import OwnBrakes
 from evofsm.risk.manoeuvres import BrakeWatch, Manoeuvres
 from evofsm.risk.rehearsal import Body, critical_decelerations
-from evofsm.validation import positive
+from evofsm.validation import positive, real_array, refuse_unless_distribution, refuse_unusable
 
 # Two-sided 90 %.
 _WIDTH = 1.645
@@ -121,7 +121,7 @@ class LatentRisk:
             Time between decisions [s].
         """
         risk = cls(lowest, dt, leader_decel=leader_decel)
-        risk.brakes.trust(decel)
+        risk.brakes.trust(positive("decel", decel))
         return risk
 
     # -- Learning -------------------------------------------------------------------------------
@@ -139,15 +139,25 @@ class LatentRisk:
             Commanded [m/s²].
         belief : (n,) array_like
             Distribution over states, to learn where leaders begin to brake.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If one of them does not hold real, finite numbers, or has another shape, or ``belief``
+            is no distribution. What was learnt is then as it was.
         """
+        seen, command = _three_finite(observation), _finite("acceleration", [acceleration])
+        states = real_array("belief", belief, 1)
+        refuse_unless_distribution("belief", states)
         was_braking = self._watch.braking
-        self._remember(self._follow(observation, acceleration))
-        self._count(np.asarray(belief), was_braking)
-        self.brakes.see(float(np.asarray(observation)[1]), acceleration)
+        self._remember(self._follow(seen, float(command[0])))
+        self._count(states, was_braking)
+        self.brakes.see(float(seen[1]), float(command[0]))
 
     def follow(self, observation: ArrayLike, acceleration: float) -> None:
         """Keep up with what happens, as `learn`, without learning from it."""
-        self._follow(observation, acceleration)
+        command = _finite("acceleration", [acceleration])
+        self._follow(_three_finite(observation), float(command[0]))
 
     def start_episode(self, *, learn: bool = True) -> None:
         """What comes is not a consequence of what was; a manoeuvre under way counts as it is."""
@@ -158,8 +168,8 @@ class LatentRisk:
         self.brakes.clear()
         self._last_command = 0.0
 
-    def _follow(self, observation: ArrayLike, acceleration: float) -> float | None:
-        gap, speed, leader_speed = np.asarray(observation, dtype=np.float64).tolist()
+    def _follow(self, seen: NDArray[np.float64], acceleration: float) -> float | None:
+        gap, speed, leader_speed = seen.tolist()
         self._last_command = acceleration
         return self._watch.see(gap, speed, leader_speed)
 
@@ -213,10 +223,10 @@ class LatentRisk:
             [m/s²]; 0 where even a leader who keeps its speed is hit, `rehearsal.HARDEST` where
             none is.
         """
-        actions = np.ascontiguousarray(accelerations, dtype=np.float64)
+        actions = _finite("accelerations", accelerations)
         critical = np.empty(len(actions))
         critical_decelerations(
-            np.ascontiguousarray(observation, dtype=np.float64),
+            _three_finite(observation),
             actions,
             self._last_command,
             self.body,
@@ -238,8 +248,10 @@ class LatentRisk:
         Unlike the latent risk this does not suppose that the leader brakes: it weighs by how
         often leaders begin to, in states like this one (``belief``) or anywhere (None).
         """
-        if self._watch.braking:
-            return float(self.manoeuvres.harder(self.critical(observation, [acceleration]))[0])
+        positive("horizon", horizon)
+        at_once = self.critical(observation, [acceleration])
+        if self._watch.braking or at_once[0] == 0.0:  # or it fails whatever the leader does
+            return float(self.manoeuvres.harder(at_once)[0])
         rate = self.onset_rate(belief)
         delays = np.arange(0.0, horizon, self.dt)
         begins = np.exp(-rate * delays) * -math.expm1(-rate * self.dt)
@@ -328,12 +340,15 @@ class LatentRisk:
             for name, array in arrays.items():
                 if array.ndim != 1 or not np.isfinite(array).all():
                     raise ValueError(f"{name} is no series of finite numbers")
+            by_state = [arrays[name] for name in ("onsets", "exposure", "seconds")]
+            if len({len(array) for array in by_state}) > 1 or np.min(by_state, initial=0.0) < 0.0:
+                raise ValueError("onsets, exposure and seconds are no counts of the same states")
+            if len(arrays["lagged"]) != 2:
+                raise ValueError(f"lagged has {len(arrays['lagged'])} entries, not 2")
             risk.manoeuvres.remember(*arrays["decels"].tolist())
             risk.brakes.samples.extend(arrays["brakes"].tolist())
             risk.brakes.lagged = arrays["lagged"].tolist()
-            risk._onsets, risk._exposure, risk._seconds = (
-                arrays[name] for name in ("onsets", "exposure", "seconds")
-            )
+            risk._onsets, risk._exposure, risk._seconds = by_state
         return risk
 
     def _learnt(self) -> dict[str, NDArray[np.float64]]:
@@ -345,6 +360,24 @@ class LatentRisk:
             "exposure": self._exposure,
             "seconds": self._seconds,
         }
+
+
+def _three_finite(observation: ArrayLike) -> NDArray[np.float64]:
+    """Gap and speeds, as they can be judged."""
+    seen = _finite("observation", observation)
+    if len(seen) != 3:
+        raise ValueError(
+            f"observation has shape {seen.shape}; it must be (3,): gap, speed of the follower "
+            "and of the leader"
+        )
+    return seen
+
+
+def _finite(name: str, values: ArrayLike) -> NDArray[np.float64]:
+    array = real_array(name, values, 1)
+    if not np.isfinite(array).all():  # looked at more closely only where it has to be
+        refuse_unusable(name, array)
+    return array
 
 
 def wilson_interval(

@@ -78,12 +78,14 @@ def survives(
     dt: float,
 ) -> bool:
     """Whether no collision comes of ``acceleration`` now and full braking after it."""
-    # Who stands closer than the margin has not failed by that.
-    gap = observation[0] - min(body.margin, 0.5 * observation[0])
-    speed, leader_speed = observation[1], observation[2]
+    gap = observation[0] - body.margin
+    # Sensors may show a car that stands as one that rolls back.
+    speed, leader_speed = max(observation[1], 0.0), max(observation[2], 0.0)
     caution = -body.decel
     asked = max(acceleration, caution)
     last = max(before, caution)
+    if speed <= 0.0 and max(asked, last) <= 0.0:
+        return bool(observation[0] > 0.0)  # who stands, and stays, may be closer than the margin
     interval = 0
     while gap > 0.0:
         realised = body.lag * last + (1.0 - body.lag) * asked
