@@ -57,7 +57,7 @@ class Plan:
     seed: int = 0  #: of everything
     tolerance: float = 0.01
     rule_seeds: int = 2  #: learning seeds in the comparison of state rules
-    rule_test: int = 200  #: held-out episodes in it, and in the trade-off
+    rule_test: int = 100  #: held-out episodes in it, and in the trade-off
     side_train: int = 100  #: training episodes of the studies beside the table
     side_test: int = 300  #: held-out episodes of them
     world_test: int = 50  #: episodes driven in both worlds
@@ -267,8 +267,9 @@ def _test_learner(family: Family, plan: Plan, seed: int) -> dict[str, list[Any]]
     """Learn with one seed; test on the way and at the end."""
     learner = Learner.new(family)
     reviser = learner.reviser(family, plan.tolerance)
-    checks = held_out(family, plan, min(SAFE_EPISODES, plan.test))
-    check_base = _references(family, checks)
+    tests = held_out(family, plan, plan.test)
+    base = _references(family, tests)
+    checks = slice(SAFE_EPISODES)
     checkpoints = [k for k in CHECKPOINTS if k <= plan.train]
     curve: list[Point] = []
     rows: list[Row] = []
@@ -279,7 +280,7 @@ def _test_learner(family: Family, plan: Plan, seed: int) -> dict[str, list[Any]]
             [drive] = learner.teach(family, [next(draws)], reviser)
             collisions += drive.episode.collided
         if episodes in checkpoints:
-            outcomes = _frozen(family, learner, plan.tolerance, checks, check_base)
+            outcomes = _frozen(family, learner, plan.tolerance, tests[checks], base[checks])
             curve.append(
                 Point(
                     seed,
@@ -292,22 +293,21 @@ def _test_learner(family: Family, plan: Plan, seed: int) -> dict[str, list[Any]]
                 )
             )
         if episodes in {min(100, plan.train), plan.train}:
-            rows.append(_final_row(family, plan, learner, seed, episodes, collisions, curve))
-    trade_offs = _trade_offs(family, plan, learner) if seed == 0 else []
+            outcomes = _frozen(family, learner, plan.tolerance, tests, base)
+            rows.append(_final_row(family, outcomes, seed, episodes, collisions, curve))
+    few = slice(plan.rule_test)
+    trade_offs = _trade_offs(family, learner, tests[few], base[few]) if seed == 0 else []
     return {"rows": rows, "curve": curve, "trade_offs": trade_offs}
 
 
 def _final_row(
     family: Family,
-    plan: Plan,
-    learner: Learner,
+    outcomes: Sequence[Outcome],
     seed: int,
     episodes: int,
     train_collisions: int,
     curve: Sequence[Point],
 ) -> Row:
-    draws = held_out(family, plan, plan.test)
-    outcomes = _frozen(family, learner, plan.tolerance, draws, _references(family, draws))
     safe = [point.episodes for point in curve if point.collisions <= SAFE_RATE * point.held_out]
     return summarise(
         family.name,
@@ -322,9 +322,9 @@ def _final_row(
     )
 
 
-def _trade_offs(family: Family, plan: Plan, learner: Learner) -> list[TradeOff]:
-    draws = held_out(family, plan, min(plan.rule_test, plan.test))
-    base = _references(family, draws)
+def _trade_offs(
+    family: Family, learner: Learner, draws: Sequence[Draw], base: Sequence[Reference]
+) -> list[TradeOff]:
     found = []
     for tolerance in TOLERANCES:
         outcomes = _frozen(family, learner, tolerance, draws, base)
