@@ -3,10 +3,13 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: paper test check bench clean
+.PHONY: paper closed-loop test check bench clean
 
 paper: .venv/installed          ## reproduce every claim of the paper in SUMO
 	@$(BIN)/evofsm paper --out results/paper
+
+closed-loop: .venv/installed    ## does the reviser prevent collisions, at what cost? some 15 minutes
+	@$(BIN)/evofsm bench closed-loop --out results/closed-loop
 
 test: .venv/installed           ## all tests, doctests included
 	@$(BIN)/python -m pytest -q
