@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
@@ -12,33 +11,10 @@ from evofsm.studies.paper import PaperStudy, Run
 from evofsm.studies.paper.claims import LARGEST_DIVERGENCE
 
 with needs("matplotlib", "plot", "drawing figures"):
-    from matplotlib.figure import Figure
-
+    from evofsm.report.drawing import Drawing, Sketch, draw_all
     from evofsm.report.of_states import draw_graph, draw_matrices, draw_space
     from evofsm.report.over_time import draw_case, draw_divergence, draw_growth
-    from evofsm.report.style import house_style, label_of, save
-
-
-@dataclass(frozen=True)
-class Drawing:
-    """A figure in its files, and what a reader is told about it."""
-
-    name: str  #: of the files, without their ending
-    title: str
-    caption: str
-    alt: str  #: what it shows, for those who cannot see it
-    paths: Mapping[str, Path]  #: by format, ``"png"`` and ``"svg"``
-
-
-@dataclass(frozen=True)
-class _Sketch:
-    """A figure before it is in files."""
-
-    name: str
-    title: str
-    caption: str
-    alt: str
-    figure: Figure
+    from evofsm.report.style import label_of
 
 
 def paper_figures(
@@ -62,19 +38,10 @@ def paper_figures(
     list of Drawing
         In the order in which a reader wants them.
     """
-    folder.mkdir(parents=True, exist_ok=True)
-    drawings = []
-    with house_style():
-        sketches = _sketches(study)
-        for draw in sketches:
-            sketch = draw()
-            paths = save(sketch.figure, folder, sketch.name)
-            drawings.append(Drawing(sketch.name, sketch.title, sketch.caption, sketch.alt, paths))
-            progress(len(drawings), len(sketches))
-    return drawings
+    return draw_all(_sketches(study), folder, progress)
 
 
-def _sketches(study: PaperStudy) -> list[Callable[[], _Sketch]]:
+def _sketches(study: PaperStudy) -> list[Callable[[], Sketch]]:
     """The figures, to be drawn one by one."""
     of_the_study = (
         _sketch_divergence,
@@ -89,14 +56,14 @@ def _sketches(study: PaperStudy) -> list[Callable[[], _Sketch]]:
     ]
 
 
-def _sketch_case(study: PaperStudy, run: Run) -> _Sketch:
+def _sketch_case(study: PaperStudy, run: Run) -> Sketch:
     actions = study.settings.actions
     tint = (
         f"Tinted: the recognised state is the dead end, {label_of(study.dead_end)}. "
         if study.dead_end >= 0
         else ""
     )
-    return _Sketch(
+    return Sketch(
         f"case-{run.case}",
         f"Result of {run.name}",
         f"Last round (run {len(study.runs) - len(study.last_round) + run.case} of "
@@ -125,8 +92,8 @@ def _ending(run: Run) -> str:
     return f"ends in a collision at {end}" if run.episode.collided else "ends without a collision"
 
 
-def _sketch_divergence(study: PaperStudy) -> _Sketch:
-    return _Sketch(
+def _sketch_divergence(study: PaperStudy) -> Sketch:
+    return Sketch(
         "divergence",
         "Divergence of forecast and recognised state",
         "Jensen–Shannon divergence of the one-step forecast and the distribution over states "
@@ -142,9 +109,9 @@ def _sketch_divergence(study: PaperStudy) -> _Sketch:
     )
 
 
-def _sketch_growth(study: PaperStudy) -> _Sketch:
+def _sketch_growth(study: PaperStudy) -> Sketch:
     founded = study.model.n_states
-    return _Sketch(
+    return Sketch(
         "growth",
         "Growth of the number of states",
         f"{founded} states were founded in {len(study.runs)} runs. Discs are numbered by the order "
@@ -159,8 +126,8 @@ def _sketch_growth(study: PaperStudy) -> _Sketch:
     )
 
 
-def _sketch_space(study: PaperStudy) -> _Sketch:
-    return _Sketch(
+def _sketch_space(study: PaperStudy) -> Sketch:
+    return Sketch(
         "space",
         "States and trajectories in the space of observations",
         "The last round over the gap: the follower's speed above (solid), the leader's below "
@@ -174,8 +141,8 @@ def _sketch_space(study: PaperStudy) -> _Sketch:
     )
 
 
-def _sketch_graph(study: PaperStudy) -> _Sketch:
-    return _Sketch(
+def _sketch_graph(study: PaperStudy) -> Sketch:
+    return Sketch(
         "graph",
         "State graph",
         "(a) What the machine has learnt: the probability that one state follows another in the "
@@ -189,11 +156,11 @@ def _sketch_graph(study: PaperStudy) -> _Sketch:
     )
 
 
-def _sketch_matrices(study: PaperStudy) -> _Sketch:
+def _sketch_matrices(study: PaperStudy) -> Sketch:
     model = study.model
     used = int((model.uses > 0.0).sum())
     idle = [f"a({action + 1})" for action in range(model.n_actions) if not model.uses[action]]
-    return _Sketch(
+    return Sketch(
         "matrices",
         "Transition matrices by action",
         f"One matrix for each of the {used} actions that were used"

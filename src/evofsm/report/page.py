@@ -3,36 +3,19 @@
 from __future__ import annotations
 
 import math
-import platform
-from base64 import b64encode
 from collections.abc import Iterable, Iterator
-from datetime import UTC, datetime
-from importlib.metadata import PackageNotFoundError, version
-from importlib.resources import files
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
-import evofsm
-from evofsm._extras import needs
 from evofsm.drivers.idm import IDM, ChangingIDM
 from evofsm.protocols import Controller
+from evofsm.report.html import Setting, inline, versions, write_html
 from evofsm.studies.paper import Claim, PaperStudy, Settings, Table
 
 if TYPE_CHECKING:
-    from evofsm.report.figures import Drawing
-
-with needs("jinja2", "plot", "writing the page"):
-    from jinja2 import Environment, StrictUndefined
+    from evofsm.report.drawing import Drawing
 
 _WORLDS = {"sumo": "SUMO", "kinematic": "the kinematic world"}
-_PACKAGES = ("numpy", "numba", "matplotlib")
-
-
-class _Setting(NamedTuple):
-    """A line of the page's list of settings."""
-
-    name: str
-    value: str
 
 
 def write_page(
@@ -65,36 +48,24 @@ def write_page(
     """
     claims = tuple(claims)
     failing = [claim for claim in claims if not claim.holds]
-    environment = Environment(
-        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
-    source = files("evofsm.report").joinpath("templates", "paper.html.j2").read_text("utf-8")
-    text = environment.from_string(source).render(
+    return write_html(
+        folder / "index.html",
+        "paper.html.j2",
         verdict=f"{len(claims) - len(failing)} of {len(claims)} claims hold in "
         f"{_WORLDS.get(study.world, study.world)}",
         claims=claims,
         failing=failing,
         tables=tuple(context),
-        figures=[(drawing, _inline(drawing.paths["svg"])) for drawing in figures],
+        figures=[(drawing, inline(drawing.paths["svg"])) for drawing in figures],
         settings=_settings(study.settings),
         driver_header=_DRIVER_HEADER,
         drivers=list(_drivers(study.settings)),
-        versions=list(_versions(study.world)),
+        versions=list(versions(sumo=study.world == "sumo")),
         world=_WORLDS.get(study.world, study.world),
         runs=len(study.runs),
         extra_runs=len(study.extra_runs),
         command=command,
-        date=datetime.now(UTC).date().isoformat(),
     )
-    folder.mkdir(parents=True, exist_ok=True)
-    page = folder / "index.html"
-    page.write_text(text, encoding="utf-8")
-    return page
-
-
-def _inline(path: Path) -> str:
-    """A file as the address of an image that holds it."""
-    return f"data:image/svg+xml;base64,{b64encode(path.read_bytes()).decode('ascii')}"
 
 
 # -- Settings -----------------------------------------------------------------------------------
@@ -111,27 +82,27 @@ _DRIVER_HEADER = (
 )
 
 
-def _settings(settings: Settings) -> dict[str, list[_Setting]]:
+def _settings(settings: Settings) -> dict[str, list[Setting]]:
     """What was set, in groups."""
     scenario, actions, machine = settings.scenario, settings.actions, settings.machine
     leader = scenario.leader
     return {
         "Scenario": [
-            _Setting("initial gap, both at rest", f"{scenario.initial_gap:g} m"),
-            _Setting("duration", f"{scenario.duration:g} s in steps of {scenario.dt:g} s"),
-            _Setting(
+            Setting("initial gap, both at rest", f"{scenario.initial_gap:g} m"),
+            Setting("duration", f"{scenario.duration:g} s in steps of {scenario.dt:g} s"),
+            Setting(
                 "leader's full brake",
                 f"{leader.brake_decel:g} m/s² on reaching {leader.brake_speed:g} m/s",
             ),
-            _Setting(
+            Setting(
                 "extra runs of case 1: brake at",
                 ", ".join(f"{time:g} s" for time in settings.brake_at) or "none",
             ),
-            _Setting("cases 2 and 3 run on to", f"{settings.safe_until:g} s"),
+            Setting("cases 2 and 3 run on to", f"{settings.safe_until:g} s"),
         ],
         "Machine": [
-            *(_Setting(_read(name), f"{value:g}") for name, value in machine.items()),
-            _Setting(
+            *(Setting(_read(name), f"{value:g}") for name, value in machine.items()),
+            Setting(
                 "actions",
                 f"{actions.n_actions} intervals of {actions.width:g} m/s² from "
                 f"{actions.low:g} to {actions.high:g} m/s²".replace("-", "−"),
@@ -187,22 +158,3 @@ def _bounds(driver: IDM) -> str:
     if math.isinf(driver.lowest) and math.isinf(driver.highest):
         return "none"
     return f"{driver.lowest:g} to {driver.highest:g}".replace("-", "−").replace("inf", "∞")
-
-
-def _versions(world: str) -> Iterator[_Setting]:
-    """What the numbers were computed with."""
-    yield _Setting("evofsm", evofsm.__version__)
-    yield _Setting("Python", platform.python_version())
-    for name in _PACKAGES:
-        yield _Setting(name, version(name))
-    if world == "sumo":
-        yield _Setting("SUMO (libsumo)", _version_of("libsumo"))
-    yield _Setting("system", f"{platform.system()} on {platform.machine()}")
-
-
-def _version_of(package: str) -> str:
-    """A package may be on the path without having been installed by pip."""
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return "unknown"

@@ -9,7 +9,8 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import asdict
-from typing import Any
+from itertools import chain
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,9 +21,15 @@ from rich.table import Table
 from rich.text import Text
 
 from evofsm.model import FSMModel
+from evofsm.report.documents import without_nan
 from evofsm.studies import paper
 from evofsm.studies.learning import Learning, Skill, passages
 from evofsm.studies.paper import Claim
+
+if TYPE_CHECKING:
+    from evofsm.report.comparison import Line
+    from evofsm.report.losses import Loss
+    from evofsm.studies.closed_loop import ClosedLoop
 
 _SECOND_STEPS = {
     "marginal": "all actions alike, as in the paper",
@@ -92,12 +99,17 @@ def print_claims(out: Console, claims: Sequence[Claim], context: Sequence[paper.
     held = sum(claim.holds for claim in claims)
     _print_titled(out, f"{held} of {len(claims)} claims of the paper hold", table)
     for beside in context:
-        rows = _table(*(header.replace(" [", "\n[") for header in beside.header))
-        rows.columns[0].justify = "left"
-        for row in beside.rows:
-            rows.add_row(*row)
-        _print_titled(out, beside.title, rows)
-        out.print(f"{beside.note}\n")
+        _print_beside(out, beside)
+
+
+def _print_beside(out: Console, beside: paper.Table) -> None:
+    """Print a table of a study with its note."""
+    rows = _table(*(header.replace(" [", "\n[") for header in beside.header))
+    rows.columns[0].justify = "left"
+    for row in beside.rows:
+        rows.add_row(*row)
+    _print_titled(out, beside.title, rows)
+    out.print(f"{beside.note}\n")
 
 
 def _read_facts(learning: Learning) -> Facts:
@@ -261,6 +273,102 @@ def _skill_text(skill: float) -> str:
     return f"{skill:+.2f}" if abs(skill) < 10.0 else f"{skill:+,.0f}"
 
 
+# -- The closed loop ------------------------------------------------------------------------------
+
+# Of the tables beside, those that are short enough.
+_IN_THE_TERMINAL = ("shift", "separation", "cases", "worlds")
+
+
+def print_closed_loop(out: Console, study: ClosedLoop) -> None:
+    """Print the table of the closed-loop study, where ours loses, and short tables beside it."""
+    # The study needs SciPy, which those who learn from a log may lack.
+    from evofsm.report.beside import side_tables
+    from evofsm.report.comparison import answer, has_third_car, note_on_the_table, table_groups
+    from evofsm.report.losses import losses
+
+    out.print(f"Closed loop on {study.family.name}", style="bold")
+    for sentence in answer(study):
+        out.print(sentence)
+    out.print()
+    groups = table_groups(study)
+    third_car = has_third_car(study)
+    header = [row if third_car else row[:-1] for row in _POLICY_HEADER]
+    cells = {
+        group: [_policy_cells(line)[: len(header[0])] for line in lines] for group, lines in groups
+    }
+    widths = [
+        max(len(row[column]) for row in [*header, *chain(*cells.values())])
+        for column in range(len(header[0]))
+    ]
+    for names in header:
+        _print_cells(out, names, widths, "bold")
+    for group, lines in groups:
+        out.print(f"{group}", style="italic", soft_wrap=True)
+        for line, row in zip(lines, cells[group], strict=True):
+            _print_cells(out, row, widths, "bold" if line.is_ours else "")
+    out.print(
+        "\n> is ours. Change in m/s², RMS jerk in m/s³; learning: collisions while learning. "
+        f"{note_on_the_table(study)}\n"
+    )
+    _print_losses(out, losses(study))
+    for name, table in side_tables(study).items():
+        if name in _IN_THE_TERMINAL:
+            _print_beside(out, table)
+
+
+_POLICY_HEADER = (
+    ("", "collisions", "mobility", "inter-", "mean", "RMS", "until", "learn-", "rear"),
+    ("policy", "[%] (95 %)", "(95 %)", "vened", "change", "jerk", "safe", "ing", "ends"),
+)
+
+
+def _policy_cells(line: Line) -> tuple[str, ...]:
+    """A line of the table, shorter than on the page."""
+    from evofsm.report.words import NONE, count, interval, number, percent, percents
+
+    which = {"median": "median", "worst seed": "worst"}.get(line.which)
+    rates = percents(line.collision_low, line.collision_high)
+    ends = interval(line.mobility_low, line.mobility_high, lambda x: number(x, 2).lstrip("0"))
+    return (
+        f"> {line.train_episodes} ep. {which}" if line.is_ours else line.policy,
+        f"{percent(line.collision_rate, '')} {rates}".replace("100.0", "100"),
+        f"{number(line.mobility, 3)} {ends}",
+        percent(line.intervention_rate, "%").replace("100.0", "100"),
+        number(line.mean_change, 2),
+        number(line.jerk, 2),
+        "never" if math.isinf(line.until_safe) else count(line.until_safe),
+        NONE if math.isnan(line.train_collisions) else count(line.train_collisions),
+        count(line.rear_ends),
+    )
+
+
+def _print_cells(out: Console, row: Sequence[str], widths: Sequence[int], style: str) -> None:
+    """Print cells below one another: the first to the left, the others to the right."""
+    first, *others = (
+        cell.ljust(width) if column == 0 else cell.rjust(width)
+        for column, (cell, width) in enumerate(zip(row, widths, strict=True))
+    )
+    out.print(" ".join([first, *others]).rstrip(), style=style, soft_wrap=True)
+
+
+def _print_losses(out: Console, lost: Sequence[Loss]) -> None:
+    """Print where ours loses: loud things one by one, the others by their number."""
+    out.print("Where it loses", style="bold")
+    loud = [loss for loss in lost if loss.loud]
+    for loss in loud:
+        text = f"! {loss.what}: {loss.who}, {loss.theirs}, against {loss.ours} of ours"
+        out.print(text, style="bold red")
+    quiet: dict[str, list[str]] = {}
+    for loss in lost:
+        if not loss.loud:
+            quiet.setdefault(loss.what, []).append(loss.who.partition(" (")[0])
+    for what, who in quiet.items():
+        out.print(f"  {what}: {', '.join(who)}")
+    if not lost:
+        out.print("  nowhere in these tables")
+    out.print()
+
+
 def _table(*headers: str) -> Table:
     table = Table(box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False, collapse_padding=True)
     for header in headers:
@@ -286,7 +394,7 @@ def learning_document(learning: Learning) -> dict[str, Any]:
     """All that `print_learning` prints, for JSON; states and actions from 0."""
     facts = {name: value for name, value in vars(learning).items() if name not in _APART}
     skills = [{**asdict(skill), "skill": skill.skill} for skill in learning.skills]
-    return {**_without_nan({**facts, "skills": skills}), "model": model_document(learning.model)}
+    return {**without_nan({**facts, "skills": skills}), "model": model_document(learning.model)}
 
 
 _APART = ("machine", "model", "skills")
@@ -318,17 +426,4 @@ def model_document(model: FSMModel) -> dict[str, Any]:
             for r in range(model.n_actions)
         ],
     }
-    return _without_nan(document)
-
-
-def _without_nan(document: dict[str, Any]) -> dict[str, Any]:
-    """The same document with None for NaN, which JSON does not know."""
-
-    def clean(value: Any) -> Any:
-        if isinstance(value, dict):
-            return _without_nan(value)
-        if isinstance(value, list | tuple):
-            return [clean(entry) for entry in value]
-        return None if isinstance(value, float) and math.isnan(value) else value
-
-    return {key: clean(value) for key, value in document.items()}
+    return without_nan(document)

@@ -1,0 +1,67 @@
+"""What pages share: templates, figures inside the file, versions."""
+
+from __future__ import annotations
+
+import platform
+from base64 import b64encode
+from collections.abc import Iterable, Iterator
+from datetime import UTC, datetime
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import evofsm
+from evofsm._extras import needs
+
+with needs("jinja2", "plot", "writing the page"):
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+
+_PACKAGES = ("numpy", "numba", "matplotlib")
+
+
+class Setting(NamedTuple):
+    """A line of a page's list of settings."""
+
+    name: str
+    value: str
+
+
+def write_html(page: Path, template: str, **values: Any) -> Path:
+    """Fill a template in with values and the date; all of them are text, never markup."""
+    environment = Environment(
+        loader=PackageLoader("evofsm.report"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    text = environment.get_template(template).render(
+        date=datetime.now(UTC).date().isoformat(), **values
+    )
+    page.parent.mkdir(parents=True, exist_ok=True)
+    page.write_text(text, encoding="utf-8")
+    return page
+
+
+def inline(path: Path) -> str:
+    """An SVG file as the address of an image that holds it."""
+    return f"data:image/svg+xml;base64,{b64encode(path.read_bytes()).decode('ascii')}"
+
+
+def versions(more: Iterable[str] = (), *, sumo: bool = False) -> Iterator[Setting]:
+    """What the numbers were computed with."""
+    yield Setting("evofsm", evofsm.__version__)
+    yield Setting("Python", platform.python_version())
+    for name in (*_PACKAGES, *more):
+        yield Setting(name, version(name))
+    if sumo:
+        yield Setting("SUMO (libsumo)", _version_of("libsumo"))
+    yield Setting("system", f"{platform.system()} on {platform.machine()}")
+
+
+def _version_of(package: str) -> str:
+    """A package may be on the path without having been installed by pip."""
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return "unknown"

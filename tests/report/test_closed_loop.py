@@ -1,0 +1,336 @@
+"""The closed loop's page holds all that was measured, and says where ours loses."""
+
+import io
+import json
+import math
+import re
+from dataclasses import replace
+from html import unescape
+from html.parser import HTMLParser
+from pathlib import Path
+from xml.etree import ElementTree
+
+import pytest
+from rich.console import Console
+
+from evofsm.report.beside import side_tables, why_not_by_state
+from evofsm.report.closed_loop import write_closed_loop
+from evofsm.report.comparison import answer, headline, our_lines, ours
+from evofsm.report.losses import losses
+from evofsm.report.terminal import print_closed_loop
+from evofsm.report.words import percent
+from evofsm.studies.closed_loop import ClosedLoop, Group, Plan, Row, ShiftPlan
+from evofsm.studies.closed_loop.calibration import Bin, Reliability
+from evofsm.studies.closed_loop.cases import CaseResult
+from evofsm.studies.closed_loop.separation import Separation
+from evofsm.studies.closed_loop.shift import Check, Stream
+from evofsm.studies.closed_loop.study import Point, TradeOff
+from evofsm.studies.closed_loop.two_worlds import InWorld
+from evofsm.worlds.families import load_family
+
+_N = 200
+
+
+def _row(policy: str, group: str, collisions: int, mobility: float, **others: object) -> Row:
+    rate = collisions / _N
+    values: dict[str, object] = {
+        "intervention_rate": 0.311,
+        "mean_change": 1.23,
+        "jerk": 4.56,
+        "rear_ends": 0,
+        "learning_seed": None,
+        "train_episodes": 0,
+    }
+    return Row(
+        family="shift",
+        policy=policy,
+        group=group,
+        episodes=_N,
+        collisions=collisions,
+        collision_rate=rate,
+        collision_low=max(rate - 0.013, 0.0),
+        collision_high=min(rate + 0.017, 1.0),
+        mobility=mobility,
+        mobility_low=mobility - 0.004,
+        mobility_high=mobility + 0.005,
+        mean_speed=10.0,
+        **{**values, **others},
+    )
+
+
+def _learnt(seed: int, episodes: int, collisions: int, safe: int | None = 10, **others) -> Row:
+    return _row(
+        "evofsm",
+        Group.LEARNT,
+        collisions,
+        0.9 - 0.001 * seed,
+        learning_seed=seed,
+        train_episodes=episodes,
+        episodes_until_safe=safe,
+        train_collisions=7 + seed,
+        **{"intervention_rate": 0.2, "mean_change": 0.5, "jerk": 1.5, **others},
+    )
+
+
+@pytest.fixture(scope="module")
+def study() -> ClosedLoop:
+    """A win in every respect but that learning takes collisions."""
+    return ClosedLoop(
+        load_family("shift"),
+        Plan(train=100, test=_N, seeds=3, shift=ShiftPlan(before=20, after=10, held_out=50)),
+        rows=[
+            _row("unrevised", Group.BOUND, 187, 1.0, intervention_rate=0.0),
+            _row("always-brake", Group.BOUND, 0, 0.0, intervention_rate=1.0),
+            _row("rss-r157", Group.FIXED, 31, 0.87),
+            _row("rss-matched", Group.MATCHED, 1, 0.86),
+            _row("rss-tuned", Group.TUNED, 2, 0.85, train_episodes=3000),
+            *(_learnt(seed, 50, 4 + 9 * seed) for seed in range(3)),
+            *(_learnt(seed, 100, 0) for seed in range(3)),
+        ],
+        curve=[
+            Point(seed, k, 40 - 20 * (k > 0) - 20 * (k > 10), 40, 0.5 + 0.001 * k, k + seed, 7)
+            for seed in range(3)
+            for k in (0, 10, 50, 100)
+        ],
+        trade_offs=[
+            *(TradeOff("evofsm", f"{0.01 * k:g}", 0.01 * k, 0.9 + 0.01 * k) for k in range(5)),
+            *(TradeOff("rss-tuned", f"decel={k}.0", 0.1 * k, 0.8 + 0.02 * k) for k in range(5)),
+        ],
+        by_rule=[
+            _row("states: paper (12)", Group.LEARNT, 50, 0.4, learning_seed=0, train_episodes=60)
+        ],
+        separations=[
+            Separation("shift", "evofsm", Group.LEARNT, 0.987, 0.981, 0.991, 0.28, 30),
+            Separation("shift", "rss-r157", Group.FIXED, 0.954, 0.949, 0.961, 0.28, 30),
+        ],
+        reliabilities=[
+            Reliability("rehearsed: failure", (Bin(0.05, 0.04, 100),), 0.0123, 0.0456, 100, 4),
+        ],
+        cases=[CaseResult("case 1", False, 60.0, 0.433, 0.122, True)],
+        worlds=[InWorld("sumo", 5, 0, 8.123, 0.2), InWorld("kinematic", 5, 0, 8.124, 0.2)],
+        streams=[
+            Stream(policy, seed, (False,) * 20 + (True,) * 10)
+            for policy in ("rss-unchanged", "evofsm")
+            for seed in range(3)
+        ],
+        checks=[
+            Check("rss-unchanged", 0, -1, 1, 50),
+            Check("rss-unchanged", 0, 10, 45, 50),
+            Check("evofsm", 0, -1, 0, 50),
+            Check("evofsm", 0, 0, 40, 50),
+            Check("evofsm", 0, 5, 3, 50),
+        ],
+    )
+
+
+@pytest.fixture(scope="module")
+def folder(study: ClosedLoop, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("loop") / "made when missing"
+    assert write_closed_loop(study, folder, "evofsm closed-loop <&>") == folder / "index.html"
+    return folder
+
+
+@pytest.fixture(scope="module")
+def html(folder: Path) -> str:
+    return (folder / "index.html").read_text(encoding="utf-8")
+
+
+def _text(html: str) -> str:
+    body = re.sub(r"<style>.*?</style>", "", html, flags=re.DOTALL)
+    body = re.sub(r"</t[hd]>|<small>", " ", body)
+    return re.sub(r"\s+", " ", unescape(re.sub(r"<[^>]+>", "", body)))
+
+
+def _with(study: ClosedLoop, *rows: Row) -> ClosedLoop:
+    return replace(study, rows=[*study.rows, *rows])
+
+
+def _printed(study: ClosedLoop, width: int = 80) -> str:
+    out = io.StringIO()
+    print_closed_loop(Console(file=out, width=width, markup=False, highlight=False), study)
+    return out.getvalue()
+
+
+class _Reader(HTMLParser):
+    def __init__(self) -> None:
+        super().__init__()
+        self.loads: list[str] = []
+        self.links: list[str] = []
+        self.ids: list[str] = []
+        self.open: list[str] = []
+
+    def handle_starttag(self, tag, attrs):
+        given = dict(attrs)
+        (self.links if tag == "a" else self.loads).extend(
+            given[name] for name in ("src", "href", "data") if name in given
+        )
+        self.ids += [given["id"]] if "id" in given else []
+        if tag not in ("meta", "img", "br"):
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+
+def test_the_page_loads_nothing_and_its_links_lead_somewhere(html: str) -> None:
+    reader = _Reader()
+    reader.feed(html)
+    assert not reader.open
+    assert all(address.startswith("data:image/svg+xml;base64,") for address in reader.loads)
+    assert len(reader.loads) == 4
+    assert {link.removeprefix("#") for link in reader.links} <= set(reader.ids)
+    assert len(set(reader.ids)) == len(reader.ids)
+    assert not re.search(r"<script|@import|url\(|https?://", html)
+    assert "evofsm closed-loop &lt;&amp;&gt;" in html
+
+
+def test_figures_and_numbers_lie_beside_the_page(folder: Path, study: ClosedLoop) -> None:
+    for name in ("trade-off", "learning", "stream", "reliability"):
+        assert (folder / f"{name}.png").read_bytes().startswith(b"\x89PNG")
+        assert ElementTree.parse(folder / f"{name}.svg").getroot().tag.endswith("svg")
+    document = json.loads((folder / "closed-loop.json").read_text())
+    assert document["family"] == "shift"
+    assert len(document["rows"]) == len(study.rows)
+
+
+def test_every_number_of_the_table_is_there_in_its_group(html: str, study: ClosedLoop) -> None:
+    text = _text(html)
+    places = [text.index(f" {group} ", text.index("policy collisions")) for group in Group]
+    assert len(set(places)) == len(Group)
+    for row in (row for row in study.rows if row.group != Group.LEARNT):
+        line = (
+            f"{row.policy} {percent(row.collision_rate)} ({100 * row.collision_low:.1f}–"
+            f"{100 * row.collision_high:.1f}) {row.collisions} of {_N} {row.mobility:.3f} "
+            f"{row.mobility_low:.3f}–{row.mobility_high:.3f} {percent(row.intervention_rate)} "
+            f"{row.mean_change:.2f} {row.jerk:.2f} – –"
+        )
+        assert line in text
+    assert (
+        "▸ evofsm, 50 episodes median over 3 6.5 % (5.2–8.2) 13 of 200 0.899 0.895–0.904 20.0 % "
+        "0.50 1.50 10 8 of 50"
+    ) in text
+    assert "▸ evofsm, 50 episodes worst seed of 3 11.0 % (9.7–12.7) 22 of 200 0.898" in text
+    for table in side_tables(study).values():
+        assert table.title in text
+        assert table.note in text
+        for line in table.rows:
+            assert " ".join(line) in text
+    assert "rear-end" not in text
+
+
+def test_the_answer_is_computed(html: str, study: ClosedLoop) -> None:
+    sentences = answer(study)
+    assert len(sentences) == 3
+    assert all(sentence in _text(html) for sentence in (*sentences, headline(study)))
+    assert "93.5 % of 200 held-out episodes" in sentences[0]
+    assert "worst seed 0.0 %" in sentences[0]
+    assert "mobility, which is 0.899" in sentences[1]
+    assert sentences[2] == "None of 3 baselines collides as rarely."
+
+
+def test_a_win_loses_only_what_learning_costs(study: ClosedLoop, html: str) -> None:
+    assert [loss.what for loss in losses(study)] == ["collisions while learning"]
+    assert 'class="verdict"' in html
+    rows = [replace(row, train_collisions=0) for row in study.rows]
+    assert losses(replace(study, rows=rows)) == []
+
+
+@pytest.mark.parametrize("group", [Group.FIXED, Group.TUNED, Group.MATCHED])
+def test_a_baseline_that_is_better_on_both_axes_cannot_be_missed(
+    study: ClosedLoop, group: Group, tmp_path: Path
+) -> None:
+    beaten = _with(study, _row("planted", group, 0, 0.95))
+    loud = [loss for loss in losses(beaten) if loss.loud]
+    assert [(loss.who, loss.apart) for loss in loud] == [(f"planted ({group})", True)]
+    assert "1 does better" in answer(beaten)[2]
+    page = write_closed_loop(beaten, tmp_path, "x").read_text(encoding="utf-8")
+    assert 'class="verdict fails"' in page
+    text = _text(page)
+    loud_part = text[text.index("Not a win throughout") : text.index("All that it loses")]
+    assert f"planted ({group})" in loud_part
+    assert "! collisions and mobility, both: planted" in _printed(beaten)
+
+
+def test_bounds_of_the_field_are_named_but_not_loud(study: ClosedLoop) -> None:
+    found = losses(_with(study, _row("oracle", Group.BOUND, 0, 0.99)))
+    assert [(loss.who, loss.loud) for loss in found if loss.who.startswith("oracle")] == [
+        ("oracle (bounds of the field)", False)
+    ]
+
+
+def test_other_losses_are_found(study: ClosedLoop) -> None:
+    cheap = _row("cheap", Group.FIXED, 0, 0.7, jerk=0.9, mean_change=0.1, intervention_rate=0.1)
+    best, worst = study.separations[0], Bin(0.9, 0.1, 10)
+    odd = replace(
+        _with(study, cheap, _learnt(3, 100, 90, safe=None)),
+        separations=[best, best._replace(measure="better", group=Group.FIXED, auroc=0.999)],
+        reliabilities=[Reliability("odd", (worst,), 0.7, 0.09, 10, 1)],
+        checks=[study.checks[0], Check("evofsm", 0, -1, 9, 50), *study.checks[1:2]],
+        cases=[CaseResult("case 2", True, 31.5, 0.1, 0.1, False)],
+        worlds=[InWorld("sumo", 5, 1, 8.0, 0.2), InWorld("kinematic", 5, 0, 8.0, 0.2)],
+        by_rule=[
+            _row("states: lucky (9)", Group.LEARNT, 0, 0.99, learning_seed=0, train_episodes=60)
+        ],
+    )
+    found = " / ".join(f"{loss.what}: {loss.who}" for loss in losses(odd))
+    for part in (
+        "interventions, at no more collisions: cheap",
+        "mean change, at no more collisions: cheap",
+        "RMS jerk, at no more collisions: cheap",
+        "collisions of our worst seed: rss-r157",
+        "becoming safe",
+        "AUROC for the dead end: better",
+        "Brier score, odd",
+        "collisions before the shift: rss-unchanged",
+        "the paper's case 2",
+        "collisions in both worlds",
+        "risk read through states: collisions and mobility, both: states: lucky (9)",
+    ):
+        assert part in found
+    assert "see where it loses" in why_not_by_state(odd)
+    assert "this is why the default" in why_not_by_state(study)
+
+
+def test_median_and_worst_of_seeds_of_which_some_never_become_safe(study: ClosedLoop) -> None:
+    rows = [_learnt(0, 9, 1, safe=None), _learnt(1, 9, 5, safe=None), _learnt(2, 9, 3, safe=2)]
+    median, worst = our_lines(replace(study, rows=rows))
+    assert (median.collisions, worst.collisions) == (3, 5)
+    assert median.until_safe == math.inf
+    assert median.until_safe_text == "not in 9"
+    assert ours(replace(study, rows=[])) is None
+
+
+def test_a_third_car_adds_a_column(study: ClosedLoop, tmp_path: Path) -> None:
+    family = load_family("shift").with_switches(["third_car"])
+    third = replace(
+        study, family=family, rows=[replace(study.rows[0], rear_ends=17), *study.rows[5:]]
+    )
+    text = _text(write_closed_loop(third, tmp_path, "x").read_text(encoding="utf-8"))
+    assert "rear-end collisions" in text
+    assert "17 of 200" in text
+    assert "rear" in _printed(third)
+
+
+def test_what_is_missing_or_no_number_is_left_out(study: ClosedLoop, tmp_path: Path) -> None:
+    nan = math.nan
+    none = Separation("shift", "evofsm", Group.LEARNT, nan, nan, nan, 0.0, 30)
+    bare = ClosedLoop(study.family, study.plan, study.rows[:1], separations=[none])
+    page = write_closed_loop(bare, tmp_path, "x").read_text(encoding="utf-8")
+    assert not re.search(r"\bnan\b", _text(page), re.IGNORECASE)
+    assert not re.search(r"\bNone\b", _text(page))
+    assert (
+        json.loads((tmp_path / "closed-loop.json").read_text())["separations"][0]["auroc"] is None
+    )
+    assert "nan" not in _printed(bare)
+    assert "Nowhere in these tables." in _text(page)
+
+
+def test_the_terminal_needs_80_columns_and_no_colour(study: ClosedLoop) -> None:
+    text = _printed(study)
+    assert max(len(line) for line in text.splitlines()) <= 80
+    assert "\x1b" not in text
+    assert "> 100 ep. median    0.0 0.0–1.7" in text
+    for group in Group:
+        assert f"\n{group}\n" in text
+    for part in ("around the shift", "AUROC", "The paper's cases", "both worlds", "Where it loses"):
+        assert part in text
