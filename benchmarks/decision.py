@@ -49,7 +49,7 @@ def main() -> int:
 def teach(family: Family, learner: Learner) -> list[NDArray[np.float64]]:
     """Learn until there are states enough; answers what was observed, by episode."""
     stream = []
-    reviser = learner.reviser(family, tolerance=0.01)
+    reviser = learner.reviser(family, tolerance=0.02)
     index = 0
     while learner.machine.n_states < _STATES:
         [drive] = learner.teach(family, [family.draw(0, index)], reviser)
@@ -65,7 +65,7 @@ def measure(
     seconds = np.empty(steps)
     done = 0
     wishes = np.random.default_rng(0).uniform(family.actions.low, family.actions.high, steps)
-    reviser = learner.reviser(family, tolerance=0.01)
+    reviser = learner.reviser(family, tolerance=0.02)
     while done < steps:
         oversight = Oversight(family.actions, reviser, machine=learner.machine, risk=learner.risk)
         for observation in stream[done % len(stream)]:

@@ -22,7 +22,7 @@ from evofsm.risk.brakes import OwnBrakes
 from evofsm.risk.outcome import Judgement, LatentRisk
 from evofsm.risk.ttc import TimeToCollision
 
-LOW, HIGH, TOLERANCE = -2.5, 2.5, 0.01
+LOW, HIGH, TOLERANCE = -2.5, 2.5, 0.02
 ACTIONS = IntervalActions(low=LOW, high=HIGH, width=0.3)
 HERE = Situation(np.array([30.0, 20.0, 20.0]), np.ones(1), 0, 0.0, 0.0)
 CLOSE = Situation(np.array([5.0, 20.0, 20.0]), np.ones(1), 0, 0.0, 0.0)

@@ -110,7 +110,7 @@ class ActionReviser:
         risk: ActionJudge,
         actions: IntervalActions,
         *,
-        tolerance: float = 0.01,
+        tolerance: float = 0.02,
         release: float = 0.9,
         mode: Mode = Mode.ACT,
         way: Way = Way.IMPROVE,

@@ -23,6 +23,9 @@ from evofsm.validation import positive
 _WINDOW, _RECENT, _SHORTEST = 1.0, 0.5, 0.75
 # A leader brakes from the first of these decelerations on, until below the second [m/s²].
 _BEGINS, _ENDS = 1.0, 0.4
+# Where speeds are noisy both are looked at for longer: until noise is no more than this [m/s²]; and
+# a speed must have fallen by so many standard deviations of the noise more.
+_BLUR, _BLUR_HARDEST, _DOUBT = 0.4, 0.15, 3.0
 # A gap that changes by so much more than the speeds explain belongs to another leader [m], and
 # so does a speed that changes by so much more than a car can [m/s].
 _ANOTHER_GAP, _ANOTHER_SPEED = 3.0, 1.0
@@ -126,11 +129,17 @@ class BrakeWatch:
 
     def clear(self) -> None:
         """Forget the leader: another comes, or an episode begins."""
-        self._recent: deque[Seen] = deque(maxlen=self._recently + 1)
+        self._recent: deque[Seen] = deque(maxlen=4 * self._recently + 1)
         self._braking: list[float] = []
+        self._noise = 0.0
 
-    def see(self, gap: float, speed: float, leader_speed: float) -> float | None:
-        """Take in an observation; answers the deceleration of a manoeuvre that ended [m/s²]."""
+    def see(
+        self, gap: float, speed: float, leader_speed: float, noise: float = 0.0
+    ) -> float | None:
+        """Take in an observation; answers the deceleration of a manoeuvre that ended [m/s²].
+
+        ``noise`` is the standard deviation of that on the difference of two speeds [m/s].
+        """
         now = Seen(gap, speed, leader_speed)
         if self._recent and self._is_another(self._recent[-1], now):
             ended = self.end()
@@ -138,16 +147,20 @@ class BrakeWatch:
             self._recent.append(now)
             return ended
         self._recent.append(now)
-        if len(self._recent) <= self._recently:
+        self._noise = noise
+        span = min(self._long_enough(self._recently, _BLUR), 4 * self._recently)
+        if len(self._recent) <= span:
             return None
-        before = self._recent[0].leader_speed
-        decel = (before - leader_speed) / (self._recently * self.dt)
+        lost = self._recent[-1 - span].leader_speed - leader_speed
+        seconds = span * self.dt
         if self._braking:
             self._braking.append(leader_speed)
-            if decel < _ENDS or leader_speed <= 0.0:
+            if leader_speed <= 0.0:
+                self._recent.clear()  # who stands does not brake, though noise may move it
+            if lost < _ENDS * seconds or leader_speed <= 0.0:
                 return self.end()
-        elif decel >= _BEGINS:
-            self._braking = [seen.leader_speed for seen in self._recent]
+        elif lost >= _BEGINS * seconds + _DOUBT * noise:
+            self._braking = [seen.leader_speed for seen in self._recent][-1 - span :]
         return None
 
     def end(self) -> float | None:
@@ -157,10 +170,15 @@ class BrakeWatch:
             speeds.pop()  # in the interval in which it came to a standstill it did not only brake
         if len(speeds) <= self._shortest:
             return None
-        span = min(self._window, len(speeds) - 1)
+        span = min(self._long_enough(self._window, _BLUR_HARDEST), len(speeds) - 1)
         lost = np.array(speeds[:-span]) - np.array(speeds[span:])
         # Less than a gentle second's worth may be noise, however short.
-        return float(lost.max()) / (span * self.dt) if lost.max() >= _BEGINS * _WINDOW else None
+        least = _BEGINS * _WINDOW + _DOUBT * self._noise
+        return float(lost.max()) / (span * self.dt) if lost.max() >= least else None
+
+    def _long_enough(self, span: int, blur: float) -> int:
+        """So many decisions, or more if noise blurs a deceleration over them."""
+        return max(span, round(self._noise / (blur * self.dt)))
 
     def _is_another(self, before: Seen, now: Seen) -> bool:
         expected = before.gap + 0.5 * self.dt * (

@@ -20,8 +20,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from evofsm import storage
 from evofsm.protocols import Situation
-from evofsm.risk.brakes import OwnBrakes
+from evofsm.risk.brakes import OwnBrakes, Sample
 from evofsm.risk.manoeuvres import BrakeWatch, Manoeuvres
+from evofsm.risk.perception import Estimate, Perception
 from evofsm.risk.rehearsal import Body, critical_decelerations
 from evofsm.validation import positive, real_array, refuse_unless_distribution, refuse_unusable
 
@@ -29,6 +30,8 @@ from evofsm.validation import positive, real_array, refuse_unless_distribution, 
 _WIDTH = 1.645
 # Pseudo-evidence for the pooled rate of manoeuvres, against that of a state [s].
 _POOLED = 20.0
+# Where a situation is not sure, it may be worse by so many standard deviations.
+_CAUTION = 2.5
 
 
 class Judgement(NamedTuple):
@@ -101,11 +104,12 @@ class LatentRisk:
         self.margin = positive("margin", margin)
         self.manoeuvres = Manoeuvres(assumed=leader_decel)
         self.brakes = OwnBrakes(lowest, own_brakes, dt)
+        self.perception = Perception(dt)
         self._watch = BrakeWatch(dt)
         self._onsets = np.zeros(0)
         self._exposure = np.zeros(0)
         self._seconds = np.zeros(0)
-        self._last_command = 0.0
+        self._commands = (0.0, 0.0)  # the latest two
 
     @classmethod
     def told(cls, lowest: float, decel: float, leader_decel: float, dt: float = 0.25) -> Self:
@@ -150,14 +154,17 @@ class LatentRisk:
         states = real_array("belief", belief, 1)
         refuse_unless_distribution("belief", states)
         was_braking = self._watch.braking
+        estimate = self._perceive(seen, learn=True)
         self._remember(self._follow(seen, float(command[0])))
         self._count(states, was_braking)
-        self.brakes.see(float(seen[1]), float(command[0]))
+        self.brakes.see(float(seen[1]), float(command[0]), estimate.mean[1])
 
     def follow(self, observation: ArrayLike, acceleration: float) -> None:
         """Keep up with what happens, as `learn`, without learning from it."""
         command = _finite("acceleration", [acceleration])
-        self._follow(_three_finite(observation), float(command[0]))
+        seen = _three_finite(observation)
+        self._perceive(seen, learn=False)
+        self._follow(seen, float(command[0]))
 
     def start_episode(self, *, learn: bool = True) -> None:
         """What comes is not a consequence of what was; a manoeuvre under way counts as it is."""
@@ -166,12 +173,22 @@ class LatentRisk:
             self._remember(ended)
         self._watch.clear()
         self.brakes.clear()
-        self._last_command = 0.0
+        self.perception.clear()
+        self._commands = (0.0, 0.0)
+
+    def _perceive(self, seen: NDArray[np.float64], *, learn: bool) -> Estimate:
+        return self.perception.see(seen, self._expected, sure=self.brakes.known, learn=learn)
 
     def _follow(self, seen: NDArray[np.float64], acceleration: float) -> float | None:
         gap, speed, leader_speed = seen.tolist()
-        self._last_command = acceleration
-        return self._watch.see(gap, speed, leader_speed)
+        self._commands = (self._commands[1], acceleration)
+        of_change = math.sqrt(2.0) * self.perception.noise[2]
+        return self._watch.see(gap, speed, leader_speed, of_change)
+
+    @property
+    def _expected(self) -> float:
+        """What the latest command brings until the next decision, most likely [m/s²]."""
+        return self.brakes.expected(*self._commands)
 
     def _remember(self, decel: float | None) -> None:
         if decel is not None:
@@ -203,8 +220,17 @@ class LatentRisk:
         -------
         Judgement
         """
-        critical = self.critical(situation.observation, accelerations)
+        critical = self.critical(self._cautious(situation.observation), accelerations)
         return self.judgement(self.manoeuvres.harder(critical), critical)
+
+    def _cautious(self, observation: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The situation as it most likely is, but closer by what is not sure about it."""
+        here = self.perception.estimate(observation, self._expected, sure=self.brakes.known)
+        gap, speed, leader_speed = here.mean
+        # What is wrong about a speed adds up while both brake.
+        decel = self.brakes.decel
+        doubt = here.deviation((1.0, -speed / decel, leader_speed / decel))
+        return np.array([gap - _CAUTION * doubt, speed, leader_speed])
 
     def judgement(self, risk: NDArray[np.float64], critical: NDArray[np.float64]) -> Judgement:
         """With the interval that as many manoeuvres as were seen allow for."""
@@ -228,7 +254,7 @@ class LatentRisk:
         critical_decelerations(
             _three_finite(observation),
             actions,
-            self._last_command,
+            self._commands[1],
             self.body,
             round(onset / self.dt),
             self.dt,
@@ -280,7 +306,7 @@ class LatentRisk:
         return Body(self.brakes.decel, self.brakes.lag, self.margin)
 
     def score(
-        self, observations: NDArray[np.float64], dt: float = 0.25, tolerance: float = 0.01
+        self, observations: NDArray[np.float64], dt: float = 0.25, tolerance: float = 0.02
     ) -> NDArray[np.float64]:
         """How surely each row is a dead end, as a `RiskMeasure` [m/s²].
 
@@ -346,7 +372,9 @@ class LatentRisk:
             if len(arrays["lagged"]) != 2:
                 raise ValueError(f"lagged has {len(arrays['lagged'])} entries, not 2")
             risk.manoeuvres.remember(*arrays["decels"].tolist())
-            risk.brakes.samples.extend(arrays["brakes"].tolist())
+            samples = zip(arrays["brakes"].tolist(), arrays["stretches"].tolist(), strict=True)
+            risk.brakes.remember(Sample(decel, bool(begins)) for decel, begins in samples)
+            risk.perception.restore(arrays)
             risk.brakes.lagged = arrays["lagged"].tolist()
             risk._onsets, risk._exposure, risk._seconds = by_state
         return risk
@@ -354,7 +382,9 @@ class LatentRisk:
     def _learnt(self) -> dict[str, NDArray[np.float64]]:
         return {
             "decels": np.array(self.manoeuvres.decels),
-            "brakes": np.array(self.brakes.samples),
+            "brakes": np.array([sample.value for sample in self.brakes.samples]),
+            "stretches": np.array([float(sample.begins) for sample in self.brakes.samples]),
+            **self.perception.learnt(),
             "lagged": np.array(self.brakes.lagged),
             "onsets": self._onsets,
             "exposure": self._exposure,

@@ -47,7 +47,7 @@ class Setup:
     controller: str = "family"
     reviser: str = "least-risk"
     mode: Mode = Mode.ACT
-    tolerance: float = 0.01
+    tolerance: float = 0.02
     episodes: int = 100
     seed: int = 0
     learn: bool = True

@@ -28,7 +28,7 @@ class ShiftPlan:
     after: int = 60  #: and after it
     held_out: int = 200  #: episodes of each test
     seed: int = 0
-    tolerance: float = 0.01
+    tolerance: float = 0.02
 
 
 class Stream(NamedTuple):

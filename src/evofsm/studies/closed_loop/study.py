@@ -55,7 +55,7 @@ class Plan:
     test: int = 1000  #: held-out episodes
     seeds: int = 20  #: learning seeds
     seed: int = 0  #: of everything
-    tolerance: float = 0.01
+    tolerance: float = 0.02
     rule_seeds: int = 2  #: learning seeds in the comparison of state rules
     rule_test: int = 100  #: held-out episodes in it, and in the trade-off
     side_train: int = 100  #: training episodes of the studies beside the table
