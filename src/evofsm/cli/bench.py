@@ -40,6 +40,10 @@ def closed_loop(
     switches: Annotated[
         str, typer.Option("--with", help="noise, delay, actuator, jerk, third_car; with commas.")
     ] = "",
+    rule_seeds: Annotated[
+        int,
+        typer.Option(min=0, help="Learning seeds in the comparison of state rules; 0: none."),
+    ] = 2,
     workers: Annotated[
         int | None, typer.Option(min=1, help="Processes. [default: one per core]")
     ] = None,
@@ -64,7 +68,14 @@ def closed_loop(
     from evofsm.worlds.families import load_family
 
     chosen = load_family(family).with_switches([name for name in switches.split(",") if name])
-    plan = Plan(train=train, test=test, seeds=seeds, seed=seed, tolerance=tolerance)
+    plan = Plan(
+        train=train,
+        test=test,
+        seeds=seeds,
+        seed=seed,
+        tolerance=tolerance,
+        rule_seeds=rule_seeds,
+    )
     if short:
         plan = plan.shortened()
     with progress() as bars:

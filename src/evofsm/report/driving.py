@@ -79,8 +79,8 @@ def _print_dead_ends(out: Console, driving: Driving, learner: Learner) -> None:
     out.print(f"Dead ends: {len(dead_ends)} of {len(driving.states)} states; seen longest:")
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
     for header in (
-        *("state", "gap\n[m]", "v_follower\n[m/s]", "v_leader\n[m/s]"),
-        *("survives braking\nup to [m/s²]", "risk if\nbraking", "seen\n[s]", "failures"),
+        *("state", "gap\n[m]", "follower\n[m/s]", "leader\n[m/s]"),
+        *("survives\n[m/s²]", "risk if\nbraking", "escape\nmargin", "seen\n[s]", "ended\nhere"),
     ):
         table.add_column(header, justify="right")
     centers = learner.machine.centers
@@ -90,7 +90,13 @@ def _print_dead_ends(out: Console, driving: Driving, learner: Learner) -> None:
             *(f"{value:.1f}" for value in centers[state.state]),
             f"{state.critical:.1f}",
             f"{state.risk:.0%}",
+            f"{state.margin:.0%}",
             f"{state.seconds:.1f}",
             f"{state.failures:g}",
         )
     out.print(table)
+    out.print(
+        "survives: the hardest braking of a leader that braking in full now still survives; escape "
+        "margin: how much lower the risk then is than if speed is kept; ended here: collisions.",
+        style="dim",
+    )

@@ -70,7 +70,7 @@ class Plan:
             train=min(self.train, 100),
             test=min(self.test, 100),
             seeds=min(self.seeds, 2),
-            rule_seeds=1,
+            rule_seeds=min(self.rule_seeds, 1),
             rule_test=20,
             side_train=40,
             side_test=60,
