@@ -41,6 +41,7 @@ class Revision(NamedTuple):
     interval: tuple[float, float]  #: 90 % interval of `risk_executed`
     reason: str  #: in a few words
     evidence: float  #: number of leaders' braking manoeuvres that the risks rest on
+    seen: float  #: time spent in states like this one before [s]; NaN where that is not known
     advised: float  #: what the reviser would execute, whether or not it may act [m/s²]
 
 

@@ -311,3 +311,19 @@ def test_it_never_adds_risk(gap, speed, leader_speed, wanted):
     assert revision.executed <= wanted
     low, high = revision.interval
     assert low <= revision.risk_executed <= high
+
+
+def test_what_was_never_seen_is_said_to_be_so_and_what_is_known_is_not():
+    risk = LatentRisk(lowest=LOW)
+    reviser = ActionReviser(risk, ACTIONS)
+    far = Situation(np.array([200.0, 10.0, 10.0]), np.array([0.0, 1.0]), 1, math.nan, 0.0)
+    first = reviser.revise(far, Proposal(0.0))
+    assert "never seen before" in first.reason
+    assert first.seen == 0.0
+    for _ in range(8):
+        risk.learn(far.observation, 0.0, far.belief)
+    again = reviser.revise(far, Proposal(0.0))
+    assert again.reason == "risk is within the tolerance"
+    assert again.seen == 2.0
+    nobody = reviser.revise(far._replace(state=None), Proposal(0.0))
+    assert math.isnan(nobody.seen)

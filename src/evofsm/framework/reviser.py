@@ -22,6 +22,8 @@ from evofsm.validation import positive
 
 # Further decisions for which full braking is held where its effect is not known yet.
 _BRAKE_TEST = 4
+# States that were seen for a shorter time are new [s].
+_NEW = 0.5
 #: Executed where a controller has no usable proposal: it brakes gently [m/s²].
 GENTLE_BRAKE = -1.0
 
@@ -176,8 +178,9 @@ class ActionReviser:
             risk_proposed=float(judged.risk[0]),
             risk_executed=float(judged.risk[executed]),
             interval=(float(judged.low[executed]), float(judged.high[executed])),
-            reason=f"{remark}; {reason}" if remark else reason,
+            reason="; ".join(part for part in (remark, _novelty(judged), reason) if part),
             evidence=judged.evidence,
+            seen=judged.seen,
             advised=float(options[best]),
         )
 
@@ -214,6 +217,11 @@ class ActionReviser:
             return int(closest), f"{why}; the closest that can"
         least = np.flatnonzero(judged.risk == judged.risk.min())
         return int(least[options[least].argmin()]), f"{why}; nothing can, the least risky"
+
+
+def _novelty(judged: Judgement) -> str:
+    """Said of a situation that is new; whether it is dangerous is another question."""
+    return "never seen before" if judged.seen < _NEW else ""
 
 
 def nearest_values(actions: IntervalActions, wanted: float) -> list[float]:
@@ -326,5 +334,6 @@ def _unjudged(executed: float, proposal: Proposal, reason: str) -> Revision:
         interval=(math.nan, math.nan),
         reason=reason,
         evidence=0.0,
+        seen=math.nan,
         advised=executed,
     )

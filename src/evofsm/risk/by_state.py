@@ -58,7 +58,8 @@ class RiskByState:
         risk = weights @ risks
         disagreement = np.sqrt(weights @ (risks - risk) ** 2)
         cautious = np.minimum(risk + self.caution * disagreement, 1.0)
-        return self.risk.judgement(cautious, weights @ critical)
+        seen = self.risk.seconds_seen(situation.belief)
+        return self.risk.judgement(cautious, weights @ critical)._replace(seen=seen)
 
 
 class StateRisk(NamedTuple):

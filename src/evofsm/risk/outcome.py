@@ -46,6 +46,7 @@ class Judgement(NamedTuple):
     high: NDArray[np.float64]  #: (k,)
     critical: NDArray[np.float64]  #: (k,) hardest braking of the leader that is survived [m/s²]
     evidence: float  #: number of manoeuvres it rests on
+    seen: float = math.nan  #: time spent in states like this one [s]; NaN where that is not known
 
 
 class ActionJudge(Protocol):
@@ -221,7 +222,10 @@ class LatentRisk:
         Judgement
         """
         critical = self.critical(self._cautious(situation.observation), accelerations)
-        return self.judgement(self.manoeuvres.harder(critical), critical)
+        risk = self.manoeuvres.harder(critical)
+        recognised = situation.state is not None
+        seen = self.seconds_seen(situation.belief) if recognised else math.nan
+        return self.judgement(risk, critical)._replace(seen=seen)
 
     def _cautious(self, observation: NDArray[np.float64]) -> NDArray[np.float64]:
         """The situation as it most likely is, but closer by what is not sure about it."""

@@ -177,7 +177,14 @@ def _decision_columns(drives: Sequence[Drive]) -> dict[str, Any]:
         "surprise": [situation.surprise for _, situation, _, _ in decisions],
         **{
             name: [getattr(revision, name) for _, _, revision, _ in decisions]
-            for name in ("proposed", "executed", "advised", "risk_proposed", "risk_executed")
+            for name in (
+                "proposed",
+                "executed",
+                "advised",
+                "risk_proposed",
+                "risk_executed",
+                "seen",
+            )
         },
         "realised": [realised for _, _, _, realised in decisions],
         "reason": [revision.reason for _, _, revision, _ in decisions],
