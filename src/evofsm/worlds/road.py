@@ -123,6 +123,11 @@ class Road(ABC):
         return bool(self._record[self.row, GAP] <= 0.0)
 
     @property
+    def rear_ended(self) -> bool:
+        """Whether the car behind has hit the follower."""
+        return bool(self._record[self.row, GAP_BEHIND] <= 0.0)
+
+    @property
     def realised(self) -> float:
         """What the follower did in the latest step [m/s²]; NaN before the first."""
         if self.row == 0:
