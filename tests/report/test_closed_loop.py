@@ -15,13 +15,16 @@ from rich.console import Console
 
 from evofsm.report.beside import side_tables, why_not_by_state
 from evofsm.report.closed_loop import write_closed_loop
-from evofsm.report.comparison import answer, headline, our_lines, ours
-from evofsm.report.losses import losses
+from evofsm.report.comparison import answer, headline
+from evofsm.report.losses import losses_in_words
 from evofsm.report.terminal import print_closed_loop
 from evofsm.report.words import percent
 from evofsm.studies.closed_loop import ClosedLoop, Group, Plan, Row, ShiftPlan
 from evofsm.studies.closed_loop.calibration import Bin, Reliability
 from evofsm.studies.closed_loop.cases import CaseResult
+from evofsm.studies.closed_loop.comparison import chosen, front, our_lines, ours
+from evofsm.studies.closed_loop.losses import What, losses
+from evofsm.studies.closed_loop.over_seeds import along_stream
 from evofsm.studies.closed_loop.separation import Separation
 from evofsm.studies.closed_loop.shift import Check, Stream
 from evofsm.studies.closed_loop.study import Point, TradeOff
@@ -229,7 +232,9 @@ def test_the_answer_is_computed(html: str, study: ClosedLoop) -> None:
 
 
 def test_a_win_loses_only_what_learning_costs(study: ClosedLoop, html: str) -> None:
-    assert [loss.what for loss in losses(study)] == ["collisions while learning"]
+    [loss] = losses(study)
+    assert loss.what == What.LEARNING
+    assert (loss.theirs, loss.ours) == ((0, 100), (8, 100))
     assert 'class="verdict"' in html
     rows = [replace(row, train_collisions=0) for row in study.rows]
     assert losses(replace(study, rows=rows)) == []
@@ -241,7 +246,8 @@ def test_a_baseline_that_is_better_on_both_axes_cannot_be_missed(
 ) -> None:
     beaten = _with(study, _row("planted", group, 0, 0.95))
     loud = [loss for loss in losses(beaten) if loss.loud]
-    assert [(loss.who, loss.apart) for loss in loud] == [(f"planted ({group})", True)]
+    assert [(loss.who, loss.group, loss.apart) for loss in loud] == [("planted", group, True)]
+    assert (loud[0].theirs, loud[0].ours) == ((0.0, 0.95), (0.0, pytest.approx(0.899)))
     assert "1 does better" in answer(beaten)[2]
     page = write_closed_loop(beaten, tmp_path, "x").read_text(encoding="utf-8")
     assert 'class="verdict fails"' in page
@@ -253,8 +259,8 @@ def test_a_baseline_that_is_better_on_both_axes_cannot_be_missed(
 
 def test_bounds_of_the_field_are_named_but_not_loud(study: ClosedLoop) -> None:
     found = losses(_with(study, _row("oracle", Group.BOUND, 0, 0.99)))
-    assert [(loss.who, loss.loud) for loss in found if loss.who.startswith("oracle")] == [
-        ("oracle (bounds of the field)", False)
+    assert [(loss.group, loss.loud) for loss in found if loss.who == "oracle"] == [
+        (Group.BOUND, False)
     ]
 
 
@@ -272,7 +278,7 @@ def test_other_losses_are_found(study: ClosedLoop) -> None:
             _row("states: lucky (9)", Group.LEARNT, 0, 0.99, learning_seed=0, train_episodes=60)
         ],
     )
-    found = " / ".join(f"{loss.what}: {loss.who}" for loss in losses(odd))
+    found = " / ".join(f"{loss.what}: {loss.who}" for loss in losses_in_words(odd))
     for part in (
         "interventions, at no more collisions: cheap",
         "mean change, at no more collisions: cheap",
@@ -296,7 +302,6 @@ def test_median_and_worst_of_seeds_of_which_some_never_become_safe(study: Closed
     median, worst = our_lines(replace(study, rows=rows))
     assert (median.collisions, worst.collisions) == (3, 5)
     assert median.until_safe == math.inf
-    assert median.until_safe_text == "not in 9"
     assert ours(replace(study, rows=[])) is None
 
 
@@ -334,3 +339,16 @@ def test_the_terminal_needs_80_columns_and_no_colour(study: ClosedLoop) -> None:
         assert f"\n{group}\n" in text
     for part in ("around the shift", "AUROC", "The paper's cases", "both worlds", "Where it loses"):
         assert part in text
+
+
+def test_rates_along_the_stream_begin_anew_at_the_shift(study: ClosedLoop) -> None:
+    unchanged, mine = along_stream(study)
+    assert (unchanged.policy, mine.policy) == ("rss-unchanged", "evofsm")
+    assert mine.mean.tolist() == mine.low.tolist() == [0.0] * 20 + [1.0] * 10
+
+
+def test_no_setting_of_the_front_is_beaten_on_both_axes() -> None:
+    bold, good, safe = (TradeOff("x", "", r, m) for r, m in ((0.5, 0.9), (0.1, 0.8), (0.0, 0.6)))
+    beaten = TradeOff("x", "", 0.2, 0.7)
+    assert front([safe, beaten, bold, good]) == [bold, good, safe]
+    assert chosen([beaten, safe, bold]) == safe

@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from itertools import groupby
+from collections.abc import Callable
 
-import numpy as np
-
-from evofsm.report.comparison import ROUNDING, checked_on, seeds_text
-from evofsm.report.words import NONE, count, interval, number, percent, percents
+from evofsm.report.comparison import checked_on
+from evofsm.report.words import NONE, count, interval, number, percent, percents, seeds_text
 from evofsm.studies.closed_loop import ClosedLoop, Group
-from evofsm.studies.closed_loop.study import Point
+from evofsm.studies.closed_loop.comparison import states_alone
+from evofsm.studies.closed_loop.over_seeds import Spread, around_shift, learning_curve
 from evofsm.studies.paper import Table
-
-OURS = "evofsm"
 
 
 def side_tables(study: ClosedLoop) -> dict[str, Table]:
@@ -31,10 +27,9 @@ def side_tables(study: ClosedLoop) -> dict[str, Table]:
     return {name: make(study) for name, (found, make) in tables.items() if found}
 
 
-def _spread(values: Sequence[float], show: Callable[[float], str]) -> str:
+def _spread(values: Spread, show: Callable[[float], str]) -> str:
     """Median and range."""
-    low, high = show(min(values)), show(max(values))
-    middle = show(float(np.median(values)))
+    low, middle, high = map(show, values)
     return middle if low == high else f"{middle} ({low}–{high})"
 
 
@@ -43,44 +38,24 @@ def _bare_percent(share: float) -> str:
 
 
 def _table_of_learning(study: ClosedLoop) -> Table:
-    rows = []
-    ordered = sorted(study.curve, key=lambda point: point.episodes)
-    for episodes, found in groupby(ordered, key=lambda point: point.episodes):
-        points = list(found)
-        rows.append(
-            (
-                f"{episodes:,}",
-                _spread([p.collisions / p.held_out for p in points], _bare_percent),
-                _spread([p.mobility for p in points], lambda x: number(x, 3)),
-                _spread([float(p.states) for p in points], count),
-                _spread([float(p.train_collisions) for p in points], count),
-            )
+    rows = tuple(
+        (
+            f"{stage.episodes:,}",
+            _spread(stage.collision_rate, _bare_percent),
+            _spread(stage.mobility, lambda x: number(x, 3)),
+            _spread(stage.states, count),
+            _spread(stage.train_collisions, count),
         )
+        for stage in learning_curve(study)
+    )
     seeds = len({point.learning_seed for point in study.curve})
     return Table(
         "Learning: held-out tests on the way",
         ("episodes", "collisions [%]", "mobility", "states", "collided while learning"),
-        tuple(rows),
+        rows,
         f"Median and range over {seeds_text(seeds)}; {checked_on(study):,} held-out episodes each, "
         "learning frozen.",
     )
-
-
-def checks_by_time(study: ClosedLoop) -> list[tuple[int, list[float], list[float]]]:
-    """Collision rates by episodes after the shift: ours, and of the one that is not told.
-
-    The latter learns nothing: what it does at once after the shift, it does for ever.
-    """
-    rates: dict[tuple[str, int], list[float]] = {}
-    for check in study.checks:
-        key = ("" if check.policy == OURS else "other", check.episodes_after)
-        rates.setdefault(key, []).append(check.collisions / check.held_out)
-    later = [v for (who, k), values in rates.items() if who and k >= 0 for v in values]
-    return [
-        (k, own, rates.get(("other", k), []) if k < 0 else later)
-        for (who, k), own in sorted(rates.items(), key=lambda entry: entry[0][1])
-        if not who
-    ]
 
 
 def when(after: int) -> str:
@@ -98,11 +73,11 @@ def _table_of_checks(study: ClosedLoop) -> Table:
     rows = tuple(
         (
             when(after),
-            percent(float(np.median(own)), ""),
-            percent(max(own), ""),
-            percent(float(np.median(theirs)), "") if theirs else NONE,
+            percent(own.median, ""),
+            percent(own.high, ""),
+            percent(theirs.median, "") if theirs else NONE,
         )
-        for after, own, theirs in checks_by_time(study)
+        for after, own, theirs in around_shift(study)
     )
     return Table(
         "Held-out tests around the shift: collisions [%]",
@@ -187,53 +162,27 @@ def _table_of_rules(study: ClosedLoop) -> Table:
     )
 
 
-def points_beside_rules(study: ClosedLoop) -> list[Point]:
-    """Of our curve, the last test that had learnt from no more than the rules had."""
-    if not study.by_rule:
-        return []
-    most = max(row.train_episodes for row in study.by_rule)
-    points = [point for point in study.curve if point.episodes <= most]
-    last = max((point.episodes for point in points), default=0)
-    return [point for point in points if point.episodes == last]
-
-
-def median_point(points: Sequence[Point]) -> tuple[float, float]:
-    """Collision rate and mobility, each by itself."""
-    return (
-        float(np.median([point.collisions / point.held_out for point in points])),
-        float(np.median([point.mobility for point in points])),
-    )
-
-
 def why_not_by_state(study: ClosedLoop) -> str:
     """Why the default judges situations where they are, or that these rows do not say so."""
-    points = points_beside_rules(study)
-    if not points:
+    found = states_alone(study)
+    if found is None:
         return ""
-    rate, mobility = median_point(points)
-    rows = study.by_rule
-    worse = [
-        row
-        for row in rows
-        if row.collision_rate >= rate - ROUNDING and row.mobility <= mobility + ROUNDING
-    ]
-    best = min(rows, key=lambda row: (row.collision_rate, -row.mobility))
+    best, n = found.best, len(study.by_rule)
     judged = (
-        f"Judged where they are, situations lead to {percent(rate)} of collisions at mobility "
-        f"{number(mobility, 3)} after {points[0].episodes:,} episodes; read through states alone, "
-        f"the best rule, {best.policy.removeprefix('states: ')}, reaches "
+        f"Judged where they are, situations lead to {percent(found.collision_rate)} of collisions "
+        f"at mobility {number(found.mobility, 3)} after {found.episodes:,} episodes; read through "
+        f"states alone, the best rule, {best.policy.removeprefix('states: ')}, reaches "
         f"{percent(best.collision_rate)} at {number(best.mobility, 3)} after "
         f"{best.train_episodes:,}."
     )
-    if len(worse) == len(rows):
+    if found.no_better == n:
         return (
-            f"{judged} All {len(rows)} rows are no better on either axis: this is why the default "
+            f"{judged} All {n} rows are no better on either axis: this is why the default "
             "judges situations where they are, and leaves the states to recognition and forecast."
         )
-    gain = len(worse)
     return (
-        f"{judged} {gain} of {len(rows)} rows are no better on either axis, the others trade one "
-        "for the other or win: see where it loses."
+        f"{judged} {found.no_better} of {n} rows are no better on either axis, the others trade "
+        "one for the other or win: see where it loses."
     )
 
 

@@ -12,25 +12,25 @@ from typing import NamedTuple
 
 from evofsm._extras import needs
 from evofsm.report.beside import side_tables, why_not_by_state
-from evofsm.report.comparison import (
-    Line,
-    answer,
-    has_third_car,
-    headline,
-    note_on_the_table,
-    table_groups,
-)
+from evofsm.report.comparison import answer, headline, note_on_the_table
 from evofsm.report.documents import without_nan
 from evofsm.report.html import Setting, inline, versions, write_html
-from evofsm.report.losses import losses
-from evofsm.report.words import NONE, count, interval, number, percent, percents
+from evofsm.report.losses import losses_in_words
+from evofsm.report.words import NONE, count, interval, number, part, percent, percents
 from evofsm.studies.closed_loop import FIXED_MEASURES, ClosedLoop
+from evofsm.studies.closed_loop.comparison import (
+    Line,
+    chosen,
+    has_third_car,
+    settings,
+    table_groups,
+)
+from evofsm.studies.closed_loop.over_seeds import WINDOW
 from evofsm.studies.paper import Table
 
 with needs("matplotlib", "plot", "drawing figures"):
     from evofsm.report.drawing import Drawing, Sketch, draw_all
     from evofsm.report.of_policies import (
-        WINDOW,
         draw_learning,
         draw_reliability,
         draw_stream,
@@ -91,7 +91,7 @@ def write_closed_loop(
         drawing.name: (drawing, inline(drawing.paths["svg"]), place)
         for place, drawing in enumerate(drawings, 1)
     }
-    lost = losses(study)
+    lost = losses_in_words(study)
     return write_html(
         out / "index.html",
         "closed_loop.html.j2",
@@ -137,7 +137,7 @@ def _shown(line: Line, study: ClosedLoop) -> _Shown:
     cells = [
         _Cell(
             f"{percent(line.collision_rate)} ({percents(line.collision_low, line.collision_high)})",
-            f"{count(line.collisions)} of {line.episodes:,}",
+            part(line.collisions, line.episodes),
         ),
         _Cell(
             number(line.mobility, 3),
@@ -146,7 +146,7 @@ def _shown(line: Line, study: ClosedLoop) -> _Shown:
         _Cell(percent(line.intervention_rate)),
         _Cell(number(line.mean_change, 2)),
         _Cell(number(line.jerk, 2)),
-        _Cell(line.until_safe_text),
+        _Cell(_until_safe(line)),
         _Cell(
             count(line.train_collisions),
             "" if math.isnan(line.train_collisions) else f"of {line.train_episodes:,}",
@@ -161,6 +161,12 @@ def _shown(line: Line, study: ClosedLoop) -> _Shown:
     return _Shown(name, f"{line.which} {of_seeds} {line.seeds}", True, cells)
 
 
+def _until_safe(line: Line) -> str:
+    if math.isinf(line.until_safe):
+        return f"not in {line.train_episodes}"
+    return count(line.until_safe)
+
+
 def _constants(study: ClosedLoop) -> Iterator[Setting]:
     """What each baseline is made of; of the tuned ones, what tuning chose."""
     driven = {row.policy for row in study.rows}
@@ -172,11 +178,10 @@ def _constants(study: ClosedLoop) -> Iterator[Setting]:
             yield Setting(name, _short(repr(measure)))
     limits = f"own {study.family.decel:g}, leader's {study.family.leader_decel:g} m/s²"
     yield Setting("rss-matched", f"the safe distance, told the true limits: {limits}")
-    for policy in dict.fromkeys(point.policy for point in study.trade_offs):
-        points = [point for point in study.trade_offs if point.policy == policy]
+    for policy, points in settings(study).items():
         if policy in driven and policy.endswith("-tuned"):
-            best = min(points, key=lambda point: (point.collision_rate, -point.mobility))
-            yield Setting(policy, f"{_short(best.setting)}, chosen from {len(points)} settings")
+            made = _short(chosen(points).setting)
+            yield Setting(policy, f"{made}, chosen from {len(points)} settings")
 
 
 def _short(made: str) -> str:

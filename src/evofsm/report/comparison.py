@@ -1,179 +1,11 @@
-"""The table of the closed-loop study: its lines, and what they say in sentences."""
+"""What the closed-loop study says, in sentences."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
-from dataclasses import dataclass
-from itertools import groupby
-
-import numpy as np
-
-from evofsm.report.words import count, listed, number, percent
-from evofsm.studies.closed_loop import ClosedLoop, Group, Row
+from evofsm.report.words import count, listed, number, percent, seeds_text
+from evofsm.studies.closed_loop import ClosedLoop
+from evofsm.studies.closed_loop.comparison import Line, ours, standing, unrevised
 from evofsm.studies.closed_loop.study import SAFE_RATE
-
-UNREVISED = "unrevised"
-#: Numbers that are equal but for rounding.
-ROUNDING = 1e-9
-# Baselines; the rows that bound the field are none.
-_RIVALS = (Group.FIXED, Group.TUNED, Group.MATCHED)
-
-
-# -- Lines ----------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Line:
-    """A line of the table: a baseline, or ours over its learning seeds."""
-
-    policy: str
-    group: str
-    which: str  #: "median", "worst seed", or nothing for baselines
-    seeds: int  #: learning seeds
-    train_episodes: int
-    episodes: int  #: held out
-    collisions: float
-    collision_rate: float
-    collision_low: float
-    collision_high: float
-    mobility: float
-    mobility_low: float
-    mobility_high: float
-    intervention_rate: float
-    mean_change: float
-    jerk: float
-    until_safe: float  #: infinite where never reached, NaN for what does not learn
-    train_collisions: float  #: NaN for what does not learn
-    rear_ends: float
-
-    @property
-    def is_ours(self) -> bool:
-        """Whether it learnt online."""
-        return self.group == Group.LEARNT
-
-    @property
-    def name(self) -> str:
-        """As people read it."""
-        if not self.is_ours:
-            return self.policy
-        return f"{self.policy}, {self.train_episodes} episodes, {self.which}"
-
-    @property
-    def until_safe_text(self) -> str:
-        """Episodes until safe."""
-        if math.isinf(self.until_safe):
-            return f"not in {self.train_episodes}"
-        return count(self.until_safe)
-
-
-_COUNTED = ("collisions", "train_collisions", "rear_ends")
-_MEASURED = (
-    *("collision_rate", "collision_low", "collision_high"),
-    *("mobility", "mobility_low", "mobility_high"),
-    *("intervention_rate", "mean_change", "jerk"),
-)
-
-
-def table_groups(study: ClosedLoop) -> list[tuple[str, list[Line]]]:
-    """The table's lines in their groups: bounds first, ours last."""
-    lines = [_baseline(row) for row in study.rows if row.group != Group.LEARNT]
-    lines += our_lines(study)
-    groups = [(str(group), [line for line in lines if line.group == group]) for group in Group]
-    order = (Group.BOUND, Group.FIXED, Group.TUNED, Group.MATCHED, Group.LEARNT)
-    return [
-        (name, found)
-        for name, found in sorted(groups, key=lambda g: order.index(Group(g[0])))
-        if found
-    ]
-
-
-def our_lines(study: ClosedLoop) -> list[Line]:
-    """Median and worst of the learning seeds, for each number of training episodes."""
-    learnt = sorted(
-        (row for row in study.rows if row.group == Group.LEARNT), key=lambda r: r.train_episodes
-    )
-    lines = []
-    for _, rows in groupby(learnt, key=lambda row: row.train_episodes):
-        seeds = list(rows)
-        lines.append(_overseeds_text(seeds, "median"))
-        worst = max(seeds, key=lambda row: (row.collision_rate, -row.mobility))
-        lines.append(_overseeds_text([worst], "worst seed", len(seeds)))
-    return lines
-
-
-def ours(study: ClosedLoop, which: str = "median") -> Line | None:
-    """Ours after all training; None where nothing was learnt."""
-    lines = [line for line in our_lines(study) if line.which == which]
-    return lines[-1] if lines else None
-
-
-def rivals(study: ClosedLoop) -> list[Line]:
-    """The baselines, without the rows that bound the field."""
-    return [_baseline(row) for row in study.rows if row.group in _RIVALS]
-
-
-def has_third_car(study: ClosedLoop) -> bool:
-    """Whether a car drives behind, which our braking may surprise."""
-    return study.family.draw(study.plan.seed, 0).scenario.behind is not None
-
-
-def unrevised(study: ClosedLoop) -> Row | None:
-    """The row of the controller left alone."""
-    return next((row for row in study.rows if row.policy == UNREVISED), None)
-
-
-def _baseline(row: Row) -> Line:
-    values = {name: float(getattr(row, name)) for name in (*_COUNTED, *_MEASURED)}
-    values["train_collisions"] = math.nan
-    return Line(
-        **values,
-        policy=row.policy,
-        group=row.group,
-        which="",
-        seeds=0,
-        train_episodes=row.train_episodes,
-        episodes=row.episodes,
-        until_safe=math.nan,
-    )
-
-
-def _overseeds_text(rows: Sequence[Row], which: str, seeds: int | None = None) -> Line:
-    """Each column's median by itself; of one row, the row."""
-    values = {
-        name: float(np.median([getattr(row, name) for row in rows]))
-        for name in (*_COUNTED, *_MEASURED)
-    }
-    safe = [math.inf if r.episodes_until_safe is None else r.episodes_until_safe for r in rows]
-    return Line(
-        **values,
-        policy=rows[0].policy,
-        group=rows[0].group,
-        which=which,
-        seeds=seeds or len(rows),
-        train_episodes=rows[0].train_episodes,
-        episodes=rows[0].episodes,
-        until_safe=_median(safe),
-    )
-
-
-def _median(values: Sequence[float]) -> float:
-    """The median, infinite ones among them."""
-    ordered = sorted(values)
-    middle = len(ordered) // 2
-    if len(ordered) % 2:
-        return float(ordered[middle])
-    return (ordered[middle - 1] + ordered[middle]) / 2.0
-
-
-def better_on_both(line: Line, mine: Line) -> bool:
-    """No worse on either axis, and better on one."""
-    fewer = mine.collision_rate - line.collision_rate
-    further = line.mobility - mine.mobility
-    return min(fewer, further) >= -ROUNDING and max(fewer, further) > ROUNDING
-
-
-# -- Sentences -------------------------------------------------------------------------------------
 
 
 def headline(study: ClosedLoop) -> str:
@@ -212,31 +44,25 @@ def answer(study: ClosedLoop) -> list[str]:
 
 
 def _who_does_better(study: ClosedLoop, mine: Line) -> str:
-    others = rivals(study)
-    if not others:
+    found = standing(study, mine)
+    n = len(found.rivals)
+    if not n:
         return "No baseline was driven."
-    better = [line for line in others if better_on_both(line, mine)]
-    if better:
-        names = listed(f"{line.policy} ({line.group})" for line in better)
-        verb = "does" if len(better) == 1 else "do"
+    if found.better:
+        names = listed(f"{line.policy} ({line.group})" for line in found.better)
+        verb = "does" if len(found.better) == 1 else "do"
         return (
-            f"Of {len(others)} baselines {len(better)} {verb} better, colliding no more often at "
-            f"no less mobility: {names}."
+            f"Of {n} baselines {len(found.better)} {verb} better, colliding no more often at no "
+            f"less mobility: {names}."
         )
-    as_safe = [line for line in others if line.collision_rate <= mine.collision_rate + ROUNDING]
-    if not as_safe:
-        return f"None of {len(others)} baselines collides as rarely."
-    best = max(as_safe, key=lambda line: line.mobility)
+    if not found.as_safe:
+        return f"None of {n} baselines collides as rarely."
+    best = found.most_mobile
     return (
-        f"None of {len(others)} baselines is at once as safe and as mobile; of the "
-        f"{len(as_safe)} that collide as rarely the most mobile is {best.policy} "
-        f"({best.group}), with {number(best.mobility, 3)}."
+        f"None of {n} baselines is at once as safe and as mobile; of the {len(found.as_safe)} that "
+        f"collide as rarely the most mobile is {best.policy} ({best.group}), with "
+        f"{number(best.mobility, 3)}."
     )
-
-
-def seeds_text(n: int) -> str:
-    """How many learning seeds."""
-    return f"{n} learning seed{'' if n == 1 else 's'}"
 
 
 def note_on_the_table(study: ClosedLoop) -> str:

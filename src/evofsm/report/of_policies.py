@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from itertools import groupby, pairwise
+from itertools import cycle, pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,14 +13,27 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patheffects import withStroke
 from matplotlib.transforms import Bbox
-from numpy.typing import NDArray
 
-from evofsm.report.comparison import Line, ours, table_groups, unrevised
 from evofsm.report.style import DEAD_END, FIRST, FOLLOWER, INK, LEADER, SOFT, WIDTH
 from evofsm.report.words import count, percent
 from evofsm.studies.closed_loop import ClosedLoop, Group
 from evofsm.studies.closed_loop.calibration import Reliability
-from evofsm.studies.closed_loop.study import SAFE_RATE
+from evofsm.studies.closed_loop.comparison import (
+    Line,
+    front,
+    ours,
+    settings,
+    table_groups,
+    unrevised,
+)
+from evofsm.studies.closed_loop.over_seeds import (
+    OURS,
+    WINDOW,
+    Spread,
+    along_stream,
+    learning_curve,
+)
+from evofsm.studies.closed_loop.study import SAFE_RATE, TradeOff
 
 #: A group by colour and by shape, so that neither is needed.
 _LOOKS: dict[str, dict[str, Any]] = {
@@ -41,8 +54,6 @@ _DIRECTIONS = (
 )
 # Points that are closer share a label [point].
 _CLOSE = 5.0
-# Episodes of the stream that are averaged.
-WINDOW = 10
 _PERCENTS = (0, 1, 3, 10, 30, 100)
 
 
@@ -53,11 +64,12 @@ def draw_trade_off(study: ClosedLoop) -> Figure:
     """Every policy in (mobility, collisions), with intervals, and what settings trade."""
     figure = Figure(figsize=(WIDTH, 5.2))
     axes = figure.add_axes((0.085, 0.09, 0.895, 0.79))
+    mine = ours(study)
     lines = [
         line
         for _, found in table_groups(study)
         for line in found
-        if math.isfinite(line.mobility) and (not line.is_ours or line == ours(study))
+        if math.isfinite(line.mobility) and (not line.is_ours or line == mine)
     ]
     _scale_collisions(axes)
     low = _left_end(study, lines)
@@ -83,37 +95,26 @@ def _scale_collisions(axes: Axes) -> None:
 def _left_end(study: ClosedLoop, lines: Sequence[Line]) -> float:
     """Where the axis begins: what hardly moves is drawn at its edge."""
     values = [line.mobility_low for line in lines if line.mobility > 0.5]
-    values += [p.mobility for p in study.trade_offs if p.policy == "evofsm" and p.mobility > 0.5]
+    values += [p.mobility for p in study.trade_offs if p.policy == OURS and p.mobility > 0.5]
     return max(0.0, min([0.9, *values]) - 0.04)
 
 
 def _draw_settings(axes: Axes, study: ClosedLoop) -> None:
-    tuned = 0
-    for policy, found in groupby(study.trade_offs, key=lambda point: point.policy):
-        points = list(found)
-        mobility = [point.mobility for point in points]
-        rate = [100.0 * point.collision_rate for point in points]
-        if policy == "evofsm":
+    dashes = cycle(_DASHES)
+    for policy, points in settings(study).items():
+        if policy == OURS:
             look: dict[str, Any] = {"color": FOLLOWER, "linewidth": 1.6, "markersize": 3.0}
-            axes.plot(mobility, rate, marker="o", zorder=3.0, **look)
+            axes.plot(*_places(points), marker="o", zorder=3.0, **look)
         else:
-            dashes = _DASHES[tuned % len(_DASHES)]
-            tuned += 1
-            look = {"color": LEADER, "alpha": 0.8, "zorder": 2.0}
-            axes.plot(mobility, rate, linestyle="none", marker=".", markersize=2.0, **look)
-            front = _front(mobility, rate)
-            axes.plot(*front, linewidth=0.9, linestyle=dashes, marker=".", markersize=4.0, **look)
+            look = {"color": LEADER, "alpha": 0.8, "zorder": 2.0, "marker": "."}
+            axes.plot(*_places(points), linestyle="none", markersize=2.0, **look)
+            line = {"linewidth": 0.9, "linestyle": next(dashes), "markersize": 4.0}
+            axes.plot(*_places(front(points)), **line, **look)
 
 
-def _front(mobility: Sequence[float], rate: Sequence[float]) -> tuple[list[float], list[float]]:
-    """The settings that no other one beats on both axes."""
-    front: list[tuple[float, float]] = []
-    for further, collisions in sorted(
-        zip(mobility, rate, strict=True), key=lambda p: (-p[0], p[1])
-    ):
-        if not front or collisions < front[-1][1]:
-            front.append((further, collisions))
-    return [x for x, _ in front], [y for _, y in front]
+def _places(points: Iterable[TradeOff]) -> tuple[list[float], list[float]]:
+    """Mobility, and collisions in percent."""
+    return [p.mobility for p in points], [100.0 * p.collision_rate for p in points]
 
 
 def _draw_policy(axes: Axes, line: Line, left: float) -> None:
@@ -179,14 +180,14 @@ def _label_policies(axes: Axes, study: ClosedLoop, lines: Sequence[Line], left: 
                 lines[first].is_ours,
             )
         )
-    settings = [(p.mobility, 100.0 * p.collision_rate) for p in study.trade_offs]
-    own = [(p.mobility, 100.0 * p.collision_rate) for p in study.trade_offs if p.policy == "evofsm"]
-    settings += [
+    places = list(zip(*_places(study.trade_offs), strict=True))
+    own = zip(*_places(settings(study).get(OURS, ())), strict=True)
+    places += [
         (x0 + share * (x1 - x0), y0 + share * (y1 - y0))
         for (x0, y0), (x1, y1) in pairwise(own)
         for share in (0.1, 0.25, 0.5, 0.75)
     ]
-    small = axes.transData.transform(settings) * scale if settings else np.empty((0, 2))
+    small = axes.transData.transform(places) * scale if places else np.empty((0, 2))
     boxes = [Bbox.from_bounds(x - 4.0, y - 4.0, 8.0, 8.0) for x, y in drawn]
     boxes += [Bbox.from_bounds(x - 1.5, y - 1.5, 3.0, 3.0) for x, y in small]
     frame = axes.get_window_extent()
@@ -258,15 +259,15 @@ def _shared(one: Bbox, other: Bbox) -> float:
 def _explain_groups(figure: Figure, study: ClosedLoop, lines: Sequence[Line]) -> None:
     handles = {
         str(group): Line2D([], [], linestyle="none", **_LOOKS[group])
-        for group in (Group.BOUND, Group.FIXED, Group.TUNED, Group.MATCHED, Group.LEARNT)
+        for group in Group
         if any(line.group == group for line in lines)
     }
-    policies = {point.policy for point in study.trade_offs}
-    if "evofsm" in policies:
+    policies = set(settings(study))
+    if OURS in policies:
         handles["ours over its tolerance"] = Line2D(
             [], [], color=FOLLOWER, linewidth=1.6, marker="o", markersize=3.0
         )
-    if policies - {"evofsm"}:
+    if policies - {OURS}:
         handles["best of the tuned settings, in training"] = Line2D(
             [], [], color=LEADER, linewidth=0.8, linestyle=_DASHES[0], marker=".", markersize=2.5
         )
@@ -301,14 +302,12 @@ def draw_learning(study: ClosedLoop) -> Figure:
         },
     )
     collisions, mobility, states = panels
-    episodes = sorted({point.episodes for point in study.curve})
-    columns = [[p for p in study.curve if p.episodes == k] for k in episodes]
+    stages = learning_curve(study)
+    episodes = [stage.episodes for stage in stages]
     _scale_collisions(collisions)
-    _draw_band(
-        collisions, episodes, [[100 * p.collisions / p.held_out for p in c] for c in columns]
-    )
-    _draw_band(mobility, episodes, [[p.mobility for p in column] for column in columns])
-    _draw_band(states, episodes, [[float(p.states) for p in column] for column in columns])
+    _draw_band(collisions, episodes, [stage.collision_rate for stage in stages], 100.0)
+    _draw_band(mobility, episodes, [stage.mobility for stage in stages])
+    _draw_band(states, episodes, [stage.states for stage in stages])
     _draw_level(collisions, 100.0 * SAFE_RATE, f"safe: {percent(SAFE_RATE)}")
     alone = unrevised(study)
     if alone:
@@ -319,7 +318,7 @@ def draw_learning(study: ClosedLoop) -> Figure:
         )
         _draw_level(mobility, alone.mobility, "unrevised")
     mobility.set_ylabel("mobility")
-    mobility.set_ylim(*_with_margin([*(p.mobility for p in study.curve), 1.0]))
+    mobility.set_ylim(*_with_margin([1.0, *(m for stage in stages for m in stage.mobility)]))
     states.set_ylabel("states")
     states.set_ylim(bottom=0.0)
     states.set_xscale("symlog", linthresh=1.0, linscale=0.5)
@@ -331,11 +330,11 @@ def draw_learning(study: ClosedLoop) -> Figure:
     return figure
 
 
-def _draw_band(axes: Axes, x: Sequence[float], columns: Iterable[Sequence[float]]) -> None:
-    """Median and range over seeds, with the last value written beside it."""
-    values = list(columns)
-    low, high = ([edge(column) for column in values] for edge in (min, max))
-    middle = [float(np.median(column)) for column in values]
+def _draw_band(
+    axes: Axes, x: Sequence[float], values: Iterable[Spread], scale: float = 1.0
+) -> None:
+    """Median and range over seeds."""
+    low, middle, high = scale * np.array(list(values)).T
     axes.fill_between(x, low, high, color=FOLLOWER, alpha=0.2, linewidth=0.0)
     axes.plot(x, middle, color=FOLLOWER, marker="o", markersize=3.5, clip_on=False, zorder=4)
 
@@ -370,27 +369,25 @@ def draw_stream(study: ClosedLoop) -> Figure:
     axes = figure.add_axes((0.085, 0.14, 0.78, 0.77))
     before = study.plan.shift.before
     looks: dict[str, dict[str, Any]] = {
-        "evofsm": {"color": FOLLOWER, "linestyle": "-", "linewidth": 1.6},
+        OURS: {"color": FOLLOWER, "linestyle": "-", "linewidth": 1.6},
         "rss-unchanged": {"color": DEAD_END, "linestyle": (0, (4, 1.6))},
     }
     ends: list[tuple[float, str, str]] = []
-    for policy in dict.fromkeys(stream.policy for stream in study.streams):
+    streams = along_stream(study)
+    for policy, mean, low, high in streams:
         look = looks.get(policy, {"color": SOFT, "linestyle": ":"})
-        runs = np.array([s.collided for s in study.streams if s.policy == policy], dtype=float)
-        rates = 100.0 * _rolling(runs, before)
-        episode = np.arange(1, rates.shape[1] + 1)
-        low, high = np.quantile(rates, [0.1, 0.9], axis=0)
+        episode = np.arange(1, len(mean) + 1)
         for part in (slice(0, before), slice(before, None)):
             axes.fill_between(
                 episode[part],
-                low[part],
-                high[part],
+                100.0 * low[part],
+                100.0 * high[part],
                 facecolor=look["color"],
                 alpha=0.16,
                 linewidth=0.0,
             )
-            axes.plot(episode[part], rates.mean(axis=0)[part], **look)
-        ends.append((float(rates.mean(axis=0)[-1]), policy, look["color"]))
+            axes.plot(episode[part], 100.0 * mean[part], **look)
+        ends.append((100.0 * float(mean[-1]), policy, look["color"]))
     _label_ends(axes, ends)
     axes.axvline(before + 0.5, color=INK, linewidth=0.8)
     axes.annotate(
@@ -403,21 +400,10 @@ def draw_stream(study: ClosedLoop) -> Figure:
         fontsize=7.5,
     )
     axes.set_ylim(-3.0, 103.0)
-    axes.set_xlim(0.5, max(len(stream.collided) for stream in study.streams) + 0.5)
+    axes.set_xlim(0.5, max(len(stream.mean) for stream in streams) + 0.5)
     axes.set_xlabel("episode of the stream")
     axes.set_ylabel(f"collisions [%], last {WINDOW} episodes")
     return figure
-
-
-def _rolling(runs: NDArray[np.float64], before: int) -> NDArray[np.float64]:
-    """Mean over the last episodes of each run; it begins anew at the shift."""
-    parts = []
-    for part in (runs[:, :before], runs[:, before:]):
-        total = np.cumsum(np.pad(part, ((0, 0), (1, 0))), axis=1)
-        last = np.arange(1, part.shape[1] + 1)
-        first = np.maximum(last - WINDOW, 0)
-        parts.append((total[:, last] - total[:, first]) / (last - first))
-    return np.concatenate(parts, axis=1)
 
 
 def _label_ends(axes: Axes, ends: Sequence[tuple[float, str, str]]) -> None:
@@ -433,7 +419,7 @@ def _label_ends(axes: Axes, ends: Sequence[tuple[float, str, str]]) -> None:
             textcoords="offset points",
             va="center",
             fontsize=7.5,
-            fontweight="bold" if text == "evofsm" else "normal",
+            fontweight="bold" if text == OURS else "normal",
             color=color,
             annotation_clip=False,
         )

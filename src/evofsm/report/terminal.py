@@ -27,9 +27,9 @@ from evofsm.studies.learning import Learning, Skill, passages
 from evofsm.studies.paper import Claim
 
 if TYPE_CHECKING:
-    from evofsm.report.comparison import Line
-    from evofsm.report.losses import Loss
+    from evofsm.report.losses import InWords
     from evofsm.studies.closed_loop import ClosedLoop
+    from evofsm.studies.closed_loop.comparison import Line
 
 _SECOND_STEPS = {
     "marginal": "all actions alike, as in the paper",
@@ -283,8 +283,9 @@ def print_closed_loop(out: Console, study: ClosedLoop) -> None:
     """Print the table of the closed-loop study, where ours loses, and short tables beside it."""
     # The study needs SciPy, which those who learn from a log may lack.
     from evofsm.report.beside import side_tables
-    from evofsm.report.comparison import answer, has_third_car, note_on_the_table, table_groups
-    from evofsm.report.losses import losses
+    from evofsm.report.comparison import answer, note_on_the_table
+    from evofsm.report.losses import losses_in_words
+    from evofsm.studies.closed_loop.comparison import has_third_car, table_groups
 
     out.print(f"Closed loop on {study.family.name}", style="bold")
     for sentence in answer(study):
@@ -310,7 +311,7 @@ def print_closed_loop(out: Console, study: ClosedLoop) -> None:
         "\n> is ours. Change in m/s², RMS jerk in m/s³; learning: collisions while learning. "
         f"{note_on_the_table(study)}\n"
     )
-    _print_losses(out, losses(study))
+    _print_losses(out, losses_in_words(study))
     for name, table in side_tables(study).items():
         if name in _IN_THE_TERMINAL:
             _print_beside(out, table)
@@ -351,7 +352,7 @@ def _print_cells(out: Console, row: Sequence[str], widths: Sequence[int], style:
     out.print(" ".join([first, *others]).rstrip(), style=style, soft_wrap=True)
 
 
-def _print_losses(out: Console, lost: Sequence[Loss]) -> None:
+def _print_losses(out: Console, lost: Sequence[InWords]) -> None:
     """Print where ours loses: loud things one by one, the others by their number."""
     out.print("Where it loses", style="bold")
     loud = [loss for loss in lost if loss.loud]

@@ -44,3 +44,13 @@ def listed(names: Iterable[str]) -> str:
     """One, two and three."""
     *most, last = names
     return f"{', '.join(most)} and {last}" if most else last
+
+
+def seeds_text(n: int) -> str:
+    """How many learning seeds."""
+    return f"{n} learning seed{'' if n == 1 else 's'}"
+
+
+def part(number: float, whole: float) -> str:
+    """So many of so many."""
+    return f"{count(number)} of {whole:,.0f}"
