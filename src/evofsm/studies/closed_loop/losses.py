@@ -135,8 +135,9 @@ def _of_learning(study: ClosedLoop, mine: Line) -> Iterator[Loss]:
 
 
 def _after_a_shift(study: ClosedLoop) -> Iterator[Loss]:
-    last = max((check.episodes_after for check in study.checks), default=0)
-    for after, own, theirs in around_shift(study):
+    tested = list(around_shift(study))
+    last = tested[-1][0] if tested else 0
+    for after, own, theirs in tested:
         if theirs and own.median > theirs.median + ROUNDING:
             yield Loss(
                 What.SHIFT,
