@@ -23,7 +23,7 @@ from evofsm.validation import (
     whole,
 )
 
-# Cases, of the overall share of failures, that those of a state are added to.
+# Cases of a more general kind that are added to those that were seen.
 _LEAN = 2.0
 
 
@@ -84,17 +84,18 @@ class OutcomeCounts:
     def outcome(self, belief: ArrayLike, action: int) -> Outcome:
         """Probability of failure within the horizon.
 
-        Where few cases are known here, it leans on the share of failures among all cases, as if
-        so many more had been seen (an empirical Bayes estimate).
+        Where an action was rarely taken in a state it leans on the share of failures after any
+        action there, and that on the share among all cases: as if so many more had been seen (an
+        empirical Bayes estimate).
         """
         weights = np.asarray(belief, dtype=np.float64)[: self._cases.shape[1]]
         n, action = len(weights), check_action(action, self.n_actions)
-        overall = (self._failures.sum() + 0.5) / (self._cases.sum() + 1.0)
-        cases = float(weights @ self._cases[action, :n])
-        failures = float(weights @ self._failures[action, :n])
-        probability = (failures + _LEAN * overall) / (cases + _LEAN)
-        low, high = wilson_interval(np.array(probability), cases + _LEAN)
-        return Outcome(float(probability), (float(low), float(high)), cases)
+        cases, failures = self._cases[:, :n] @ weights, self._failures[:, :n] @ weights
+        anywhere = (self._failures.sum() + 0.5) / (self._cases.sum() + 1.0)
+        here = (failures.sum() + _LEAN * anywhere) / (cases.sum() + _LEAN)
+        probability = (failures[action] + _LEAN * here) / (cases[action] + _LEAN)
+        low, high = wilson_interval(np.array(probability), float(cases[action]) + _LEAN)
+        return Outcome(float(probability), (float(low), float(high)), float(cases[action]))
 
     def _close(self, *, failed: bool) -> None:
         belief, action = self._open.popleft()
