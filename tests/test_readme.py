@@ -1,6 +1,8 @@
 """What README promises; its Python runs as a doctest, `make test` is what runs this."""
 
+import json
 import re
+import statistics
 from pathlib import Path
 
 import pytest
@@ -23,3 +25,48 @@ def test_files_that_readme_and_docs_link_to_exist():
     for page in (ROOT / "README.md", *(ROOT / "docs").glob("*.md")):
         for target in re.findall(r"\]\((?!https?:)([^)#]+)\)", page.read_text()):
             assert (page.parent / target).exists(), f"{page.name} links to {target}"
+
+
+# -- The closed loop -----------------------------------------------------------------------------
+
+RESULTS = json.loads((ROOT / "docs" / "results" / "emergency.json").read_text())
+
+
+def shown(rows, pick=lambda values: values[0]):
+    """Collisions, mobility and jerk as the tables write them."""
+    rate, mobility, jerk = (
+        pick([row[name] for row in rows]) for name in ("collision_rate", "mobility", "jerk")
+    )
+    return [f"{100 * rate:.1f} %", f"{mobility:.3f}", f"{jerk:.2f}"]
+
+
+def cells_of(page):
+    text, *_ = (ROOT / page).read_text().split("\n## `shift`")  # other families have other tables
+    lines = text.splitlines()
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines if "|" in line]
+
+
+@pytest.mark.parametrize("page", ["README.md", "docs/closed-loop.md"])
+def test_the_closed_loop_table_is_what_the_study_printed(page):
+    checked = 0
+    for cells in cells_of(page):
+        name = re.match(r"`([\w-]+)`", cells[0])
+        rows = [row for row in RESULTS if name and row["policy"] == name[1]]
+        if rows and len(cells) >= 5:
+            numbers = shown(rows)
+            assert all(number in cells for number in numbers), (name[1], numbers)
+            checked += 1
+    assert checked >= 7
+
+
+def test_our_own_lines_are_the_median_and_the_worst_of_the_seeds():
+    ours = [row for row in RESULTS if row["policy"] == "evofsm" and row["train_episodes"] == 100]
+    assert len(ours) == 20
+    worst = max(ours, key=lambda row: (row["collision_rate"], -row["mobility"]))
+    lines = [cells for cells in cells_of("README.md") if "evofsm" in cells[0] and "100" in cells[0]]
+    median_line, worst_line = lines
+    assert all(number in median_line for number in shown(ours, statistics.median))
+    assert all(number in worst_line for number in shown([worst]))
+    changed = statistics.median(row["intervention_rate"] for row in ours)
+    assert f"changes {100 * changed:.1f} %" in README
+    assert sum(row["train_collisions"] for row in RESULTS) == 0  # as the text says

@@ -253,13 +253,22 @@ class LatentRisk:
             [m/s²]; 0 where even a leader who keeps its speed is hit, `rehearsal.HARDEST` where
             none is.
         """
+        return self._critical(observation, accelerations, onset, self.margin)
+
+    def _critical(
+        self,
+        observation: ArrayLike,
+        accelerations: ArrayLike,
+        onset: float = 0.0,
+        margin: float = 0.0,
+    ) -> NDArray[np.float64]:
         actions = _finite("accelerations", accelerations)
         critical = np.empty(len(actions))
         critical_decelerations(
             _three_finite(observation),
             actions,
             self._commands[1],
-            self.body,
+            self.body._replace(margin=margin),
             round(onset / self.dt),
             self.dt,
             critical,
@@ -315,11 +324,12 @@ class LatentRisk:
         """How surely each row is a dead end, as a `RiskMeasure` [m/s²].
 
         By how much the hardest braking of a leader that is survived by braking in full now falls
-        short of the one that leaders exceed with a probability of ``tolerance``. Rows are judged
-        one by one, so ``dt`` does not matter.
+        short of the one that leaders exceed with a probability of ``tolerance``. A dead end is a
+        collision, however small the gap that is left, so no margin is kept. Rows are judged one by
+        one, so ``dt`` does not matter.
         """
         full = np.array([self.lowest])
-        critical = [self.critical(row, full)[0] for row in np.asarray(observations)]
+        critical = [self._critical(row, full, margin=0.0)[0] for row in np.asarray(observations)]
         return self.manoeuvres.exceeded_by(tolerance) - np.array(critical)
 
     # -- Keeping it -----------------------------------------------------------------------------
