@@ -1,6 +1,6 @@
 """Full throttle on a highway that knows nothing of this package, with and without the reviser.
 
-    pip install highway-env
+    pip install '.[gym]' highway-env
     python examples/highway.py
 
 A policy that always commands full throttle drives in ``highway-fast-v0`` of highway-env, on three
