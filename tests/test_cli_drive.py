@@ -25,8 +25,10 @@ def test_drive_learns_saves_and_drives_frozen(tmp_path):
     row = json.loads(frozen.stdout)
     assert row["episodes"] == 5
     assert row["collisions"] == 0
-    again = evofsm("drive", "emergency", "--episodes", 2, "--learn", learnt)
-    assert again.returncode == 0
+    further = tmp_path / "further"
+    again = evofsm("drive", "emergency", "--episodes", 2, "--learn", learnt, "--out", further)
+    assert again.returncode == 0, again.stderr
+    assert json.loads((further / "summary.json").read_text())["episodes_learnt"] == 14
 
 
 def test_decisions_are_recorded_with_their_reasons(tmp_path):
@@ -65,6 +67,7 @@ def test_any_controller_is_revised(controller):
         (("emergency", "--controller", "magic"), "magic"),
         (("emergency", "--controller", "sumo"), "sumo"),
         (("emergency", "--mode", "maybe"), "maybe"),
+        (("emergency", "--mode", "shadow", "--reviser", "rss"), "rss"),
         (("emergency", "--with", "rain"), "rain"),
         (("emergency", "--frozen", "nothing-here"), "nothing-here"),
         (("emergency", "--tolerance", "2"), "tolerance"),

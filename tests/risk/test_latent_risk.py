@@ -236,7 +236,7 @@ def test_what_is_assumed_of_brakes_is_never_nothing():
 # -- How hard others brake ----------------------------------------------------------------------
 
 
-@given(st.lists(st.floats(0.5, 30.0), max_size=60), st.floats(1.0, 20.0))
+@given(st.lists(st.floats(2.5, 30.0), max_size=60), st.floats(1.0, 20.0))
 def test_harder_manoeuvres_are_less_likely(decels, assumed):
     manoeuvres = Manoeuvres(assumed)
     manoeuvres.remember(*decels)
@@ -248,6 +248,16 @@ def test_harder_manoeuvres_are_less_likely(decels, assumed):
         beyond = max(decels) + 4.0 * np.std(decels) + 0.2
         if beyond < min(assumed, HARDEST) - 0.1:
             assert manoeuvres.harder(beyond) == pytest.approx(1.0 / (len(decels) + 1))
+
+
+def test_gentle_braking_does_not_water_down_what_hard_braking_may_be():
+    manoeuvres = Manoeuvres(assumed=10.0)
+    manoeuvres.remember(*[1.5] * 400)
+    assert manoeuvres.harder(9.0) == 1.0  # nothing is known of hard braking yet
+    manoeuvres.remember(*[7.5] * 30)
+    assert manoeuvres.harder(6.0) == pytest.approx(1.0)
+    assert manoeuvres.any_harder(6.0) == pytest.approx(31.0 / 431.0)
+    assert manoeuvres.any_harder(2.0) == 1.0
 
 
 def test_old_manoeuvres_are_forgotten():
@@ -334,7 +344,7 @@ def taught():
     risk = LatentRisk(lowest=-4.0)
     for _ in range(6):
         speed = leader_speed = 20.0
-        gap, decel = 40.0, rng.uniform(2.0, 6.0)
+        gap, decel = 40.0, rng.uniform(3.0, 6.0)
         for k in range(60):
             command = 0.5 if k < 20 else -4.0
             risk.learn([gap, speed, leader_speed], command, rng.dirichlet([1.0, 1.0, 1.0]))

@@ -8,9 +8,19 @@ import pytest
 
 pytest.importorskip("scipy")
 
-from evofsm.studies.closed_loop import Learner, Plan, ShiftPlan, fixed_policies, run_closed_loop
+from evofsm.framework.reviser import Unrevised
+from evofsm.studies.closed_loop import (
+    Learner,
+    Plan,
+    ShiftPlan,
+    fixed_policies,
+    outcome,
+    reference,
+    run_closed_loop,
+)
 from evofsm.studies.closed_loop.calibration import reliability, run_calibration
 from evofsm.studies.closed_loop.cases import run_cases
+from evofsm.studies.closed_loop.learner import drive_alone
 from evofsm.studies.closed_loop.outcomes import bootstrap
 from evofsm.studies.closed_loop.separation import auroc, run_separation
 from evofsm.studies.closed_loop.shift import run_shift
@@ -140,6 +150,72 @@ def test_the_bootstrap_surrounds_the_mean():
     values = np.random.default_rng(0).normal(size=200)
     low, high = bootstrap(values)
     assert low < values.mean() < high
+
+
+def test_a_driver_who_proposes_nothing_usable_is_replaced_and_counted():
+    class Broken:
+        def propose(self, observation, time=0.0):
+            raise RuntimeError("no")
+
+    draw = EMERGENCY.draw(0, 0, split="test")
+    none = Unrevised(EMERGENCY.actions)
+    base = reference(drive_alone(EMERGENCY, draw, none, None), draw.scenario.leader.brake_decel)
+    drive = drive_alone(EMERGENCY, draw, none, None, controller=Broken())
+    found = outcome(drive, base, EMERGENCY.interval)
+    assert found.changed == found.decisions
+    assert found.change == 0.0
+
+
+def test_gentle_traffic_does_not_make_it_bold(tmp_path):
+    """Learnt among gentle waves only, then one leader stops in earnest."""
+    text = """
+about = "waves, then perhaps a stop"
+interval = 0.25
+actions = { low = -6.0, high = 2.5, width = 0.5 }
+limits = { decel = 6.0, leader_decel = 8.0 }
+scenario = { initial_gap = [2.0, 20.0], duration = 60.0, dt = 0.01 }
+body = { lowest = -6.0, highest = 2.5 }
+[leader]
+driver = "leader"
+brake_time = TIME
+brake_decel = [7.0, 8.0]
+[leader.traffic]
+fast = [15.0, 22.0]
+slow = [5.0, 12.0]
+accel = [0.8, 1.5]
+decel = [1.2, 2.4]
+cruise = [2.0, 5.0]
+pause = [1.0, 4.0]
+[follower]
+driver = "aggressive"
+[drivers.leader]
+accel = 1.2
+desired_speed = 25.0
+min_gap = 1.0
+time_headway = 1.0
+decel = 2.5
+[drivers.aggressive]
+accel = 2.25
+desired_speed = 28.0
+min_gap = 0.8
+time_headway = 0.3
+decel = 2.0
+lowest = -6.0
+highest = 2.5
+"""
+    gentle, stop = tmp_path / "gentle.toml", tmp_path / "stop.toml"
+    gentle.write_text(text.replace("TIME", "inf"))
+    stop.write_text(text.replace("TIME", "[20.0, 50.0]"))
+    waves, stops = load_family(gentle), load_family(stop)
+    learner = Learner.new(waves)
+    reviser = learner.reviser(waves, 0.02)
+    learner.teach(waves, (waves.draw(0, index) for index in range(30)), reviser)
+    assert learner.risk.manoeuvres.gentle > 60
+    drives = [
+        drive_alone(stops, stops.draw(0, index, split="test"), reviser, learner.risk)
+        for index in range(40)
+    ]
+    assert not any(drive.episode.collided for drive in drives)
 
 
 def test_what_was_learnt_is_kept(tmp_path):

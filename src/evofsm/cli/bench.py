@@ -7,7 +7,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Annotated
 
-from evofsm.cli.common import counter, plain_errors, print_json, progress, require
+from evofsm.cli.common import counter, plain_errors, print_json, progress, require, split_names
 
 with suppress(ModuleNotFoundError):
     import typer
@@ -67,7 +67,7 @@ def closed_loop(
     from evofsm.studies.closed_loop import Plan, run_closed_loop
     from evofsm.worlds.families import load_family
 
-    chosen = load_family(family).with_switches([name for name in switches.split(",") if name])
+    chosen = load_family(family).with_switches(split_names(switches))
     plan = Plan(
         train=train,
         test=test,

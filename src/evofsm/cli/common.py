@@ -83,3 +83,8 @@ def counter(bars: Progress, text: str) -> Callable[[int, int], None]:
 def print_json(document: object) -> None:
     """Print for programs."""
     print(json.dumps(document, indent=2, allow_nan=False))
+
+
+def split_names(text: str) -> list[str]:
+    """Names that were given with commas between them."""
+    return [name.strip() for name in text.split(",") if name.strip()]

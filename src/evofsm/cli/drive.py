@@ -6,7 +6,14 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from evofsm.cli.common import WorldName, plain_errors, print_json, progress, require
+from evofsm.cli.common import (
+    WorldName,
+    plain_errors,
+    print_json,
+    progress,
+    require,
+    split_names,
+)
 
 with suppress(ModuleNotFoundError):
     import typer
@@ -81,7 +88,7 @@ def drive(
     from evofsm.report import terminal
     from evofsm.report.driving import print_driving
     from evofsm.studies.closed_loop import Learner
-    from evofsm.studies.driving import Setup, write_driving
+    from evofsm.studies.driving import Setup, episodes_learnt, write_driving
     from evofsm.worlds import open_world
     from evofsm.worlds.families import load_family
 
@@ -89,7 +96,7 @@ def drive(
         raise ValueError("--learn and --frozen exclude each other")
     if mode not in (names := [one.value for one in Mode]):
         raise ValueError(f"--mode is {mode!r}; it must be one of {', '.join(names)}")
-    chosen = load_family(family).with_switches([name for name in switches.split(",") if name])
+    chosen = load_family(family).with_switches(split_names(switches))
     setup = Setup(
         chosen,
         controller,
@@ -99,13 +106,14 @@ def drive(
         episodes,
         seed,
         learn=frozen is None,
+        first=episodes_learnt(learn) if learn else 0,
     )
     start = learn or frozen
     learner = Learner.load(start) if start else Learner.new(chosen)
     with open_world(world.value) as place:
         driving = _drive(setup, learner, place)
     if out is not None:
-        write_driving(driving, learner, out)
+        write_driving(driving, learner, setup, out)
     if as_json:
         print_json({**driving.row.as_dict(), "lead_times": list(driving.lead_times)})
         return

@@ -8,7 +8,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from evofsm.cli.common import plain_errors, print_json, progress
+from evofsm.cli.common import plain_errors, print_json, progress, split_names
 
 with suppress(ModuleNotFoundError):
     import typer
@@ -224,7 +224,7 @@ def _columns(
     from evofsm.validation import positive
 
     try:
-        variables = [_variable(name, category_distance) for name in _names(observe)]
+        variables = [_variable(name, category_distance) for name in split_names(observe)]
         encoder = ObservationEncoder(*variables)
     except ValueError as error:
         raise ValueError(f"--observe {observe}: {error}") from None
@@ -232,13 +232,9 @@ def _columns(
         observe=encoder,
         action=action,
         time=time,
-        episode=None if episode is None else _names(episode),
+        episode=None if episode is None else split_names(episode),
         dt=None if dt is None else positive("--dt", dt),
     )
-
-
-def _names(text: str) -> list[str]:
-    return [name.strip() for name in text.split(",") if name.strip()]
 
 
 def _variable(text: str, distance: float) -> str | Category:

@@ -1,6 +1,6 @@
 """How hard others brake: every braking manoeuvre seen is remembered, pooled over situations.
 
-What a leader does next hardly depends on the follower, so each manoeuvre seen anywhere counts
+What a leader does next hardly depends on the follower, so each hard manoeuvre seen anywhere counts
 everywhere. The chance that the next one is harder than some deceleration is read from a kernel
 density over those remembered (Epanechnikov's kernel, Silverman's bandwidth), together with one
 manoeuvre that was only assumed, as hard as a cautious engineer would have it: with N remembered it
@@ -40,6 +40,9 @@ class Manoeuvres:
     ----------
     assumed : float
         The deceleration of the one that is only assumed [m/s²].
+    hard : float
+        Softer ones are counted, no more [m/s²]: however many were seen, they say nothing of how
+        hard the next hard one will be.
     memory : int
         How many are remembered; older ones are forgotten, so that a change shows.
 
@@ -53,8 +56,10 @@ class Manoeuvres:
     array([1.  , 0.62, 0.25, 0.  ])
     """
 
-    def __init__(self, assumed: float, memory: int = 500) -> None:
+    def __init__(self, assumed: float, hard: float = 2.5, memory: int = 500) -> None:
         self.assumed = positive("assumed", assumed)
+        self.hard = positive("hard", hard)
+        self.gentle = 0
         self.decels: deque[float] = deque(maxlen=memory)
         self._tabulate()
 
@@ -63,15 +68,24 @@ class Manoeuvres:
 
     def remember(self, *decels: float) -> None:
         """Take in manoeuvres [m/s²], the oldest first."""
-        self.decels.extend([min(positive("decel", decel), HARDEST) for decel in decels])
-        self._tabulate()
+        seen = [min(positive("decel", decel), HARDEST) for decel in decels]
+        hard = [decel for decel in seen if decel >= self.hard]
+        self.gentle += len(seen) - len(hard)
+        if hard:
+            self.decels.extend(hard)
+            self._tabulate()
 
     def harder(self, decel: ArrayLike) -> NDArray[np.float64]:
-        """Probability that the next manoeuvre is harder than these decelerations [m/s²]."""
+        """Probability that the next hard manoeuvre is harder than these decelerations [m/s²]."""
         return np.interp(np.asarray(decel, dtype=np.float64), self._grid, self._harder)
 
+    def any_harder(self, decel: ArrayLike) -> NDArray[np.float64]:
+        """Probability that the next manoeuvre, hard or gentle, is harder than these [m/s²]."""
+        share = (len(self.decels) + 1) / (len(self.decels) + 1 + self.gentle)
+        return np.where(np.asarray(decel) < self.hard, 1.0, share * self.harder(decel))
+
     def exceeded_by(self, share: float) -> float:
-        """The deceleration that a share of manoeuvres exceeds [m/s²]: the inverse of `harder`."""
+        """What a share of hard manoeuvres exceeds [m/s²]: the inverse of `harder`."""
         return float(self._grid[np.argmax(self._harder <= share)])
 
     def _tabulate(self) -> None:

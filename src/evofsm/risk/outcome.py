@@ -38,14 +38,14 @@ class Judgement(NamedTuple):
     """How dangerous some actions are; an entry for each of them.
 
     ``risk`` is the probability that failure can no longer be avoided if the action is taken and
-    the leader begins to brake at once, with its 90 % interval from ``low`` to ``high``.
+    the leader begins to brake hard at once, with its 90 % interval from ``low`` to ``high``.
     """
 
     risk: NDArray[np.float64]  #: (k,)
     low: NDArray[np.float64]  #: (k,)
     high: NDArray[np.float64]  #: (k,)
     critical: NDArray[np.float64]  #: (k,) hardest braking of the leader that is survived [m/s²]
-    evidence: float  #: number of manoeuvres it rests on
+    evidence: float  #: number of hard manoeuvres it rests on
     seen: float = math.nan  #: time spent in states like this one [s]; NaN where that is not known
 
 
@@ -77,6 +77,9 @@ class LatentRisk:
         Until it was seen, full braking is assumed to bring this share of what was commanded.
     margin : float
         Smallest gap that counts as no collision [m].
+    hard : float
+        Leaders' manoeuvres from which on it learns how hard they brake [m/s²]. Softer ones, of
+        which everyday traffic is full, must not water down the hard ones.
 
     Examples
     --------
@@ -95,6 +98,7 @@ class LatentRisk:
         leader_decel: float = 10.0,
         own_brakes: float = 0.6,
         margin: float = 0.5,
+        hard: float = 2.5,
     ) -> None:
         if not -math.inf < lowest < 0.0:
             raise ValueError(f"lowest is {lowest}; the hardest braking must be negative and finite")
@@ -103,7 +107,8 @@ class LatentRisk:
         self.leader_decel = positive("leader_decel", leader_decel)
         self.own_brakes = positive("own_brakes", own_brakes)
         self.margin = positive("margin", margin)
-        self.manoeuvres = Manoeuvres(assumed=leader_decel)
+        self.hard = positive("hard", hard)
+        self.manoeuvres = Manoeuvres(leader_decel, hard)
         self.brakes = OwnBrakes(lowest, own_brakes, dt)
         self.perception = Perception(dt)
         self._watch = BrakeWatch(dt)
@@ -290,12 +295,12 @@ class LatentRisk:
         positive("horizon", horizon)
         at_once = self.critical(observation, [acceleration])
         if self._watch.braking or at_once[0] == 0.0:  # or it fails whatever the leader does
-            return float(self.manoeuvres.harder(at_once)[0])
+            return float(self.manoeuvres.any_harder(at_once)[0])
         rate = self.onset_rate(belief)
         delays = np.arange(0.0, horizon, self.dt)
         begins = np.exp(-rate * delays) * -math.expm1(-rate * self.dt)
         critical = [self.critical(observation, [acceleration], delay)[0] for delay in delays]
-        return float(begins @ self.manoeuvres.harder(critical))
+        return float(begins @ self.manoeuvres.any_harder(critical))
 
     def onset_rate(self, belief: ArrayLike | None = None) -> float:
         """How often leaders begin to brake [1/s], in states like this one or anywhere."""
@@ -349,6 +354,7 @@ class LatentRisk:
             "leader_decel": self.leader_decel,
             "own_brakes": self.own_brakes,
             "margin": self.margin,
+            "hard": self.hard,
         }
         storage.write(path, "risk", settings, self._learnt())
 
@@ -386,6 +392,7 @@ class LatentRisk:
             if len(arrays["lagged"]) != 2:
                 raise ValueError(f"lagged has {len(arrays['lagged'])} entries, not 2")
             risk.manoeuvres.remember(*arrays["decels"].tolist())
+            risk.manoeuvres.gentle = int(arrays["gentle"][0])
             samples = zip(arrays["brakes"].tolist(), arrays["stretches"].tolist(), strict=True)
             risk.brakes.remember(Sample(decel, bool(begins)) for decel, begins in samples)
             risk.perception.restore(arrays)
@@ -396,6 +403,7 @@ class LatentRisk:
     def _learnt(self) -> dict[str, NDArray[np.float64]]:
         return {
             "decels": np.array(self.manoeuvres.decels),
+            "gentle": np.array([self.manoeuvres.gentle], dtype=np.float64),
             "brakes": np.array([sample.value for sample in self.brakes.samples]),
             "stretches": np.array([float(sample.begins) for sample in self.brakes.samples]),
             **self.perception.learnt(),

@@ -36,6 +36,7 @@ CONTROLLERS = ("family", "aggressive", "normal", "acc", "sumo")
 #: Revisers by name: none, ours, and the classic measures.
 REVISERS = ("least-risk", "none", "rss", "aeb", *FIXED_MEASURES)
 
+_SUMMARY = "summary.json"
 _ALIASES = {"rss": "rss-r157", "aeb": "aeb-ttc"}
 
 
@@ -51,6 +52,7 @@ class Setup:
     episodes: int = 100
     seed: int = 0
     learn: bool = True
+    first: int = 0  #: episodes driven before, which are not driven again
 
 
 @dataclass(frozen=True)
@@ -106,7 +108,7 @@ def drive_family(
 def draws(setup: Setup) -> Iterator[Draw]:
     """What is driven: training draws while learning, held-out ones else."""
     split = "train" if setup.learn else "test"
-    for index in range(setup.episodes):
+    for index in range(setup.first, setup.first + setup.episodes):
         yield setup.family.draw(setup.seed, index, split=split)
 
 
@@ -117,6 +119,8 @@ def make_reviser(setup: Setup, learner: Learner) -> Reviser:
         return learner.reviser(family, setup.tolerance, setup.mode)
     if setup.reviser == "none":
         return Unrevised(family.actions)
+    if setup.mode is not Mode.ACT:
+        raise ValueError(f"reviser {setup.reviser!r} can only act; modes are for least-risk")
     name = _ALIASES.get(setup.reviser, setup.reviser)
     if name not in FIXED_MEASURES:
         raise ValueError(f"there is no reviser {name!r}; there are {', '.join(REVISERS)}")
@@ -151,16 +155,23 @@ def _sumo_driver(world: World) -> Controller:
     return SumoDriver(world)
 
 
-def write_driving(driving: Driving, learner: Learner, out: Path) -> None:
+def write_driving(driving: Driving, learner: Learner, setup: Setup, out: Path) -> None:
     """Write what was learnt, the summary, and every decision as a table."""
     learner.save(out)
-    (out / "summary.json").write_text(
-        json.dumps({**driving.row.as_dict(), "lead_times": driving.lead_times}, indent=2),
-        encoding="utf-8",
-    )
+    summary = {
+        **driving.row.as_dict(),
+        "lead_times": driving.lead_times,
+        "episodes_learnt": setup.first + setup.episodes * setup.learn,
+    }
+    (out / _SUMMARY).write_text(json.dumps(summary, indent=2), encoding="utf-8")
     with needs("polars", "tables", "writing decisions as Parquet"):
         import polars
     polars.DataFrame(_decision_columns(driving.drives)).write_parquet(out / "decisions.parquet")
+
+
+def episodes_learnt(folder: Path) -> int:
+    """How many episodes what was saved in a folder has learnt from."""
+    return int(json.loads((folder / _SUMMARY).read_text("utf-8"))["episodes_learnt"])
 
 
 def _decision_columns(drives: Sequence[Drive]) -> dict[str, Any]:

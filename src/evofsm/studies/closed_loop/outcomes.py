@@ -50,16 +50,16 @@ def reference(drive: Drive, brake_decel: float) -> Reference:
 def outcome(drive: Drive, unrevised: Reference, interval: float) -> Outcome:
     """Of a run, against that of the unrevised controller in the same draw."""
     change = np.abs(drive.executed - drive.proposed)
-    change = change[np.isfinite(change)]
+    replaced = ~np.isfinite(change)  # there was no usable proposal
     jerk = np.diff([d.realised for d in drive.decisions if np.isfinite(d.realised)]) / interval
     return Outcome(
         drive.episode.collided,
         drive.episode.rear_ended,
         # Where the leader brakes at once there is no way to be kept.
         _distance(drive, unrevised.until) / unrevised.distance if unrevised.distance > 0 else 1.0,
-        int((change > _SAME).sum()),
+        int((replaced | (change > _SAME)).sum()),
         len(drive.decisions),
-        float(change.sum()),
+        float(change[~replaced].sum()),
         float((jerk**2).sum()),
         float(drive.episode.record[:, SPEED].mean()),
     )

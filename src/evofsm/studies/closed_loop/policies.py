@@ -54,6 +54,12 @@ def oracle(family: Family, draw: Draw) -> Reviser:
     return ActionReviser(risk, family.actions)
 
 
+def told_limits(family: Family, draw: Draw) -> Reviser:
+    """Ours, told the true limits of the family instead of learning them."""
+    risk = LatentRisk.told(family.actions.low, family.decel, family.leader_decel, family.interval)
+    return ActionReviser(risk, family.actions)
+
+
 def fixed_policies(family: Family) -> list[Policy]:
     """All that learn nothing, but for those that are tuned."""
     rss = ResponsibilitySensitiveSafety
@@ -63,6 +69,7 @@ def fixed_policies(family: Family) -> list[Policy]:
         Policy("oracle", Group.BOUND, oracle),
         *(envelope(name, Group.FIXED, measure) for name, measure in FIXED_MEASURES.items()),
         envelope("rss-matched", Group.MATCHED, rss.matched(family.decel, family.leader_decel)),
+        Policy("evofsm-told", Group.MATCHED, told_limits),
     ]
 
 

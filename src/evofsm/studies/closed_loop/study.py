@@ -8,12 +8,13 @@ policy and learning seed over the cores, and put together in the order of the ta
 from __future__ import annotations
 
 import os
+import signal
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import Executor, ProcessPoolExecutor
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from importlib.util import find_spec
-from multiprocessing import get_context
+from multiprocessing import active_children, get_context
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -75,7 +76,7 @@ class Plan:
             side_train=40,
             side_test=60,
             world_test=5,
-            shift=replace(self.shift, before=20, after=10, held_out=20),
+            shift=replace(self.shift, before=60, after=10, held_out=20),
         )
 
 
@@ -195,15 +196,19 @@ def _run(tasks: Sequence[partial[Any]], workers: int) -> Iterator[Any]:
     if workers == 1:
         yield from (task() for task in tasks)
         return
-    executor: Executor
-    # Forking a process that has started threads may hang; a fresh one costs a second.
-    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as executor:
-        futures = [executor.submit(task) for task in tasks]
-        try:
-            yield from (future.result() for future in futures)
-        finally:
-            for future in futures:
-                future.cancel()
+    # Forking a process that has started threads may hang; a fresh one costs a second. Workers
+    # leave an interruption to the parent, who ends them.
+    executor = ProcessPoolExecutor(
+        workers, get_context("spawn"), signal.signal, (signal.SIGINT, signal.SIG_IGN)
+    )
+    try:
+        yield from executor.map(partial.__call__, tasks)
+    except BaseException:
+        for worker in active_children():
+            worker.terminate()
+        raise
+    finally:
+        executor.shutdown(cancel_futures=True)
 
 
 def held_out(family: Family, plan: Plan, episodes: int) -> list[Draw]:
