@@ -68,5 +68,5 @@ def test_our_own_lines_are_the_median_and_the_worst_of_the_seeds():
     assert all(number in median_line for number in shown(ours, statistics.median))
     assert all(number in worst_line for number in shown([worst]))
     changed = statistics.median(row["intervention_rate"] for row in ours)
-    assert f"changes {100 * changed:.1f} %" in README
+    assert f"changing {100 * changed:.1f} %" in README
     assert sum(row["train_collisions"] for row in RESULTS) == 0  # as the text says

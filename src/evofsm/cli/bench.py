@@ -36,7 +36,9 @@ def closed_loop(
     test: Annotated[int, typer.Option(min=1, help="Held-out episodes of every policy.")] = 1000,
     seeds: Annotated[int, typer.Option(min=1, help="Learning seeds.")] = 20,
     seed: Annotated[int, typer.Option(min=0, help="Of everything.")] = 0,
-    tolerance: Annotated[float, typer.Option(help="Highest latent risk that is accepted.")] = 0.02,
+    tolerance: Annotated[
+        float, typer.Option(help="Share of leaders' hard brakes that need not be survived.")
+    ] = 0.02,
     switches: Annotated[
         str, typer.Option("--with", help="noise, delay, actuator, jerk, third_car; with commas.")
     ] = "",

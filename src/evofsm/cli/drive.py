@@ -48,7 +48,9 @@ def drive(
     mode: Annotated[
         str, typer.Option(help="How far least-risk goes: off, shadow, advise, act.")
     ] = "act",
-    tolerance: Annotated[float, typer.Option(help="Highest latent risk that is accepted.")] = 0.02,
+    tolerance: Annotated[
+        float, typer.Option(help="Share of leaders' hard brakes that need not be survived.")
+    ] = 0.02,
     world: Annotated[
         WorldName, typer.Option(help="SUMO itself, or the same motion in closed form.")
     ] = WorldName.KINEMATIC,
