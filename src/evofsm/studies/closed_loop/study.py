@@ -201,14 +201,15 @@ def _run(tasks: Sequence[partial[Any]], workers: int) -> Iterator[Any]:
     executor = ProcessPoolExecutor(
         workers, get_context("spawn"), signal.signal, (signal.SIGINT, signal.SIG_IGN)
     )
+    futures = [executor.submit(task) for task in tasks]
     try:
-        yield from executor.map(partial.__call__, tasks)
+        yield from (future.result() for future in futures)
     except BaseException:
         for worker in active_children():
             worker.terminate()
         raise
     finally:
-        executor.shutdown(cancel_futures=True)
+        executor.shutdown()
 
 
 def held_out(family: Family, plan: Plan, episodes: int) -> list[Draw]:
