@@ -52,7 +52,7 @@ def teach(family: Family, learner: Learner) -> list[NDArray[np.float64]]:
     reviser = learner.reviser(family, tolerance=0.02)
     index = 0
     while learner.machine.n_states < _STATES:
-        [drive] = learner.teach(family, [family.draw(0, index)], reviser)
+        drive = learner.drive(family, family.draw(0, index), reviser, learn=True)
         stream.append(np.array([decision.situation.observation for decision in drive.decisions]))
         index += 1
     return stream

@@ -26,6 +26,9 @@ from evofsm.worlds.scenario import Scenario
 
 _log = logging.getLogger(__name__)
 
+# Actions that differ by less are the same [m/s²].
+_SAME = 1e-9
+
 
 class Decision(NamedTuple):
     """One decision: what was seen, what was proposed, what was executed, what came of it."""
@@ -51,6 +54,12 @@ class Drive:
     def executed(self) -> NDArray[np.float64]:
         """(D,) ndarray: what was commanded [m/s²]."""
         return np.array([decision.revision.executed for decision in self.decisions])
+
+    @property
+    def changed(self) -> NDArray[np.bool_]:
+        """(D,) ndarray: where the proposal was not executed, or was none that could be."""
+        change = np.abs(self.executed - self.proposed)
+        return np.asarray(~(change <= _SAME))  # also true of NaN
 
 
 class Oversight:

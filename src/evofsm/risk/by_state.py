@@ -58,8 +58,7 @@ class RiskByState:
         risk = weights @ risks
         disagreement = np.sqrt(weights @ (risks - risk) ** 2)
         cautious = np.minimum(risk + self.caution * disagreement, 1.0)
-        seen = self.risk.seconds_seen(situation.belief)
-        return self.risk.judgement(cautious, weights @ critical)._replace(seen=seen)
+        return self.risk.judgement(situation, cautious, weights @ critical)
 
 
 class StateRisk(NamedTuple):

@@ -227,10 +227,7 @@ class LatentRisk:
         Judgement
         """
         critical = self.critical(self._cautious(situation.observation), accelerations)
-        risk = self.manoeuvres.harder(critical)
-        recognised = situation.state is not None
-        seen = self.seconds_seen(situation.belief) if recognised else math.nan
-        return self.judgement(risk, critical)._replace(seen=seen)
+        return self.judgement(situation, self.manoeuvres.harder(critical), critical)
 
     def _cautious(self, observation: NDArray[np.float64]) -> NDArray[np.float64]:
         """The situation as it most likely is, but closer by what is not sure about it."""
@@ -241,11 +238,15 @@ class LatentRisk:
         doubt = here.deviation((1.0, -speed / decel, leader_speed / decel))
         return np.array([gap - _CAUTION * doubt, speed, leader_speed])
 
-    def judgement(self, risk: NDArray[np.float64], critical: NDArray[np.float64]) -> Judgement:
+    def judgement(
+        self, situation: Situation, risk: NDArray[np.float64], critical: NDArray[np.float64]
+    ) -> Judgement:
         """With the interval that as many manoeuvres as were seen allow for."""
-        seen = len(self.manoeuvres)
-        low, high = wilson_interval(risk, seen + 1)
-        return Judgement(risk, low, high, critical, float(seen))
+        evidence = len(self.manoeuvres)
+        low, high = wilson_interval(risk, evidence + 1)
+        recognised = situation.state is not None
+        seen = self.seconds_seen(situation.belief) if recognised else math.nan
+        return Judgement(risk, low, high, critical, float(evidence), seen)
 
     def critical(
         self, observation: ArrayLike, accelerations: ArrayLike, onset: float = 0.0

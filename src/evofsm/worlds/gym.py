@@ -141,7 +141,7 @@ class CarFollowing(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
         self._which = {"split": split, "index": index}
         self._run.close()
         self._road = self._run.enter_context(self._world.open(self.draw.scenario))
-        return self._observe(self._road), self._info(self._road.episode(), 0)
+        return self._observe(self._road), self._info(self._road.episode())
 
     def step(
         self, action: ArrayLike
@@ -165,7 +165,7 @@ class CarFollowing(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
         steps = road.scenario.steps(self.family.interval)
         row = road.row
         road.advance(min(max(acceleration, actions.low), actions.high), steps)
-        info = self._info(road.episode(), row)
+        info = self._info(road.episode(first=row))
         collided = info["failed"] or info["rear_ended"]
         reward = info["distance"] - (self.collision_cost if collided else 0.0)
         return self._observe(road), reward, collided, road.over and not collided, info
@@ -174,7 +174,7 @@ class CarFollowing(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
         """Where the cars are, in one line, with ``render_mode="ansi"``."""
         if self.render_mode is None or self._road is None:
             return None
-        gap, speed, leader_speed = self._road.episode().observations[-1]
+        gap, speed, leader_speed = self._road.episode(first=self._road.row).observations[-1]
         return (
             f"{self._road.time:.2f} s: at {speed:.1f} m/s, {gap:.1f} m behind a leader at "
             f"{leader_speed:.1f} m/s"
@@ -189,16 +189,14 @@ class CarFollowing(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
     def _observe(self, road: Road) -> NDArray[np.float64]:
         return np.clip(road.observation, LOW, HIGH)
 
-    def _info(self, episode: Episode, row: int) -> dict[str, Any]:
-        """What is known at the end of an episode so far, of which the last step began at a row."""
-        gap = episode.observations[-1, 0]
-        speeds = episode.observations[row:, 1]
+    def _info(self, step: Episode) -> dict[str, Any]:
+        """What is known after a step, given its rows."""
         return {
-            "time": float(episode.time[-1]),
-            "gap": float(gap),
-            "distance": float(np.trapezoid(speeds, episode.time[row:])),
-            "failed": episode.collided,
-            "rear_ended": episode.rear_ended,
+            "time": float(step.time[-1]),
+            "gap": float(step.observations[-1, 0]),
+            "distance": float(np.trapezoid(step.observations[:, 1], step.time)),
+            "failed": step.collided,
+            "rear_ended": step.rear_ended,
             **self._which,
         }
 

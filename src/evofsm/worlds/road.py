@@ -135,10 +135,10 @@ class Road(ABC):
         now, before = self._record[self.row, SPEED], self._record[self.row - 1, SPEED]
         return float((now - before) / self.scenario.dt)
 
-    def episode(self) -> Episode:
-        """What was recorded so far."""
-        rows = self.row + 1
-        return Episode(self._plan.times[:rows], self._record[:rows].copy())
+    def episode(self, first: int = 0) -> Episode:
+        """What was recorded so far, from a row on."""
+        rows = slice(first, self.row + 1)
+        return Episode(self._plan.times[rows], self._record[rows].copy())
 
 
 class World(Protocol):

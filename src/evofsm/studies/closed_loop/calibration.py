@@ -11,11 +11,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from evofsm.framework.reviser import Unrevised
+from evofsm.framework.reviser import Unrevised, make_usable
 from evofsm.machine import EvolvingFSM
-from evofsm.protocols import Proposal
 from evofsm.risk.counts import OutcomeCounts
-from evofsm.studies.closed_loop.learner import SAFETY_RULE, Learner, drive_alone
+from evofsm.studies.closed_loop.learner import SAFETY_RULE, Learner, drive_alone, held_out, training
 from evofsm.worlds.families import Draw, Family
 from evofsm.worlds.kinematic import KinematicWorld
 
@@ -50,8 +49,7 @@ def run_calibration(family: Family, train: int, test: int, seed: int = 0) -> dic
     learner = Learner.new(family)
     counts = OutcomeCounts(family.actions.n_actions, HORIZON, family.interval)
     machine = EvolvingFSM(family.actions.n_actions, rule=SAFETY_RULE)
-    for index in range(train):
-        draw = family.draw(seed * 1000, index)
+    for draw in training(family, seed, 0, train):
         drive = learner.drive(family, draw, Unrevised(family.actions), learn=True)
         machine.start_episode()
         for decision in drive.decisions:
@@ -59,7 +57,7 @@ def run_calibration(family: Family, train: int, test: int, seed: int = 0) -> dic
             step = machine.learn_one(decision.situation.observation, action)
             counts.learn(step.belief, action)
         counts.end_episode(failed=drive.episode.collided)
-    draws = [family.draw(seed, index, split="test") for index in range(test)]
+    draws = held_out(family, seed, test)
     return {
         "reliabilities": [
             _as_driven(family, draws, machine, counts),
@@ -103,8 +101,8 @@ def _cautious(
         begin = rng.uniform(1.0, draw.scenario.duration - 1.0)
         with KinematicWorld().open(draw.scenario) as road:
             while not road.over and road.time < begin:
-                proposal: Proposal = draw.controller.propose(road.observation, road.time)
-                action = min(max(proposal.action, family.actions.low), family.actions.high)
+                proposal = draw.controller.propose(road.observation, road.time)
+                action = make_usable(proposal, family.actions).action
                 risk.follow(road.observation, action)
                 road.advance(action, steps)
             if road.over:

@@ -50,7 +50,7 @@ def _result(
     frozen = learner.frozen()
     revised = drive_alone(family, draw, frozen.reviser(family, tolerance), frozen.risk)
     alone = drive_alone(family, draw, Unrevised(family.actions), None)
-    changed = np.abs(revised.executed - revised.proposed) > 1e-9
+    changed = revised.changed
     late = np.array([decision.situation.time for decision in revised.decisions]) >= _SETTLED
     return CaseResult(
         name,

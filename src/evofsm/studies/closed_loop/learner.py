@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Self
 
 from evofsm.framework.loop import Drive, Framework
-from evofsm.framework.reviser import ActionReviser, Mode
+from evofsm.framework.reviser import ActionReviser, Mode, Unrevised
 from evofsm.machine import EvolvingFSM
 from evofsm.protocols import Controller, Reviser
 from evofsm.risk.by_state import RiskByState
@@ -70,10 +70,9 @@ class Learner:
         family: Family,
         draws: Iterable[Draw],
         reviser: Reviser,
-        world: World | None = None,
     ) -> list[Drive]:
         """Drive and learn, each draw in turn."""
-        return [self.drive(family, draw, reviser, learn=True, world=world) for draw in draws]
+        return [self.drive(family, draw, reviser, learn=True) for draw in draws]
 
     def drive(
         self,
@@ -121,22 +120,30 @@ def drive_alone(
     return framework.drive(world or KinematicWorld(), draw.scenario)
 
 
-def references(family: Family, draws: Sequence[Draw], unrevised: Reviser) -> list[Reference]:
+def held_out(family: Family, seed: int, episodes: int) -> list[Draw]:
+    """Draws that nothing learns from."""
+    return [family.draw(seed, index, split="test") for index in range(episodes)]
+
+
+def training(
+    family: Family, seed: int, learning_seed: int, episodes: int, first: int = 0
+) -> Iterator[Draw]:
+    """Draws to learn from, other ones for every learning seed."""
+    for index in range(first, first + episodes):
+        yield family.draw(seed * 1000 + learning_seed, index, split="train")
+
+
+def references(family: Family, draws: Sequence[Draw]) -> list[Reference]:
     """How far the controller comes by itself in each draw."""
+    unrevised = Unrevised(family.actions)
     return [
         reference(drive_alone(family, draw, unrevised, None), draw.scenario.leader.brake_decel)
         for draw in draws
     ]
 
 
-def score(
-    family: Family,
-    draws: Sequence[Draw],
-    unrevised: Sequence[Reference],
-    drives: Iterable[Drive],
-) -> list[Outcome]:
+def score(family: Family, unrevised: Sequence[Reference], drives: Iterable[Drive]) -> list[Outcome]:
     """Outcomes of driven draws."""
     return [
-        outcome(drive, base, family.interval)
-        for _, base, drive in zip(draws, unrevised, drives, strict=True)
+        outcome(drive, base, family.interval) for base, drive in zip(unrevised, drives, strict=True)
     ]

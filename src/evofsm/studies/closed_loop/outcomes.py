@@ -16,9 +16,6 @@ from evofsm.worlds.motion import LEADER_ACCELERATION, SPEED
 with needs("scipy", "study", "the closed-loop study"):
     from scipy.stats import binomtest
 
-# Actions that differ by less are the same [m/s²].
-_SAME = 1e-9
-
 
 class Reference(NamedTuple):
     """How far the unrevised controller came in a draw, and until when that counts."""
@@ -50,16 +47,15 @@ def reference(drive: Drive, brake_decel: float) -> Reference:
 def outcome(drive: Drive, unrevised: Reference, interval: float) -> Outcome:
     """Of a run, against that of the unrevised controller in the same draw."""
     change = np.abs(drive.executed - drive.proposed)
-    replaced = ~np.isfinite(change)  # there was no usable proposal
     jerk = np.diff([d.realised for d in drive.decisions if np.isfinite(d.realised)]) / interval
     return Outcome(
         drive.episode.collided,
         drive.episode.rear_ended,
         # Where the leader brakes at once there is no way to be kept.
         _distance(drive, unrevised.until) / unrevised.distance if unrevised.distance > 0 else 1.0,
-        int((replaced | (change > _SAME)).sum()),
+        int(drive.changed.sum()),
         len(drive.decisions),
-        float(change[~replaced].sum()),
+        float(change[np.isfinite(change)].sum()),  # else there was no usable proposal
         float((jerk**2).sum()),
         float(drive.episode.record[:, SPEED].mean()),
     )

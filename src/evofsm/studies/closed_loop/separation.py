@@ -16,7 +16,7 @@ from evofsm.framework.reviser import Mode, Unrevised
 from evofsm.protocols import RiskMeasure
 from evofsm.risk.dead_end import is_dead_end
 from evofsm.risk.rss import ResponsibilitySensitiveSafety
-from evofsm.studies.closed_loop.learner import Learner, drive_alone
+from evofsm.studies.closed_loop.learner import Learner, drive_alone, held_out, training
 from evofsm.studies.closed_loop.policies import FIXED_MEASURES, Group
 from evofsm.worlds.families import Family
 
@@ -41,7 +41,7 @@ def run_separation(family: Family, train: int, test: int, seed: int = 0) -> dict
     """Score every measure; ours has watched the training runs, without acting."""
     learner = Learner.new(family)
     watching = learner.reviser(family, 0.01, Mode.SHADOW)
-    learner.teach(family, (family.draw(seed * 1000, i) for i in range(train)), watching)
+    learner.teach(family, training(family, seed, 0, train), watching)
     measures: dict[tuple[str, str], RiskMeasure] = {
         ("evofsm", Group.LEARNT): learner.risk,
         ("rss-matched", Group.MATCHED): ResponsibilitySensitiveSafety.matched(
@@ -50,8 +50,7 @@ def run_separation(family: Family, train: int, test: int, seed: int = 0) -> dict
         **{(name, Group.FIXED): measure for name, measure in FIXED_MEASURES.items()},
     }
     seen, truth = [], []
-    for index in range(test):
-        draw = family.draw(seed, index, split="test")
+    for draw in held_out(family, seed, test):
         drive = drive_alone(family, draw, Unrevised(family.actions), None)
         rows = np.array([decision.situation.observation for decision in drive.decisions])
         seen.append(rows)

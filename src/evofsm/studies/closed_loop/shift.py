@@ -6,15 +6,14 @@ constants that were right before.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from evofsm.framework.reviser import EnvelopeReviser
 from evofsm.protocols import Reviser
 from evofsm.risk.rss import ResponsibilitySensitiveSafety
-from evofsm.studies.closed_loop.learner import Learner, drive_alone
-from evofsm.worlds.families import Draw, Family
+from evofsm.studies.closed_loop.learner import Learner, drive_alone, held_out, training
+from evofsm.worlds.families import Family
 
 #: Episodes after the shift at which what was learnt so far is tested on held-out draws.
 AFTER = (0, 1, 2, 5, 10, 20, 30)
@@ -54,10 +53,9 @@ def run_shift(family: Family, plan: ShiftPlan, learning_seed: int) -> dict[str, 
     shifted = family.shifted
     if shifted is None:
         raise ValueError(f"family {family.name!r} has no shift")
-    seed = plan.seed * 1000 + learning_seed
     stream = [
-        *(family.draw(seed, index) for index in range(plan.before)),
-        *(shifted.draw(seed, plan.before + index) for index in range(plan.after)),
+        *training(family, plan.seed, learning_seed, plan.before),
+        *training(shifted, plan.seed, learning_seed, plan.after, first=plan.before),
     ]
     constants = ResponsibilitySensitiveSafety.matched(family.decel, family.leader_decel)
     unchanged = EnvelopeReviser(constants, family.actions, family.interval)
@@ -87,7 +85,7 @@ def run_shift(family: Family, plan: ShiftPlan, learning_seed: int) -> dict[str, 
         if after in AFTER:
             checks.append(_check_frozen(learner, learning_seed, after, shifted, plan))
         now = family if after < 0 else shifted
-        [drive] = learner.teach(now, [draw], reviser)
+        drive = learner.drive(now, draw, reviser, learn=True)
         collided.append(drive.episode.collided)
     streams.append(Stream("evofsm", learning_seed, tuple(collided)))
     return {"streams": streams, "checks": checks}
@@ -110,9 +108,7 @@ def _check(
     reviser: Reviser,
     learner: Learner | None = None,
 ) -> Check:
-    draws: Sequence[Draw] = [
-        family.draw(plan.seed, index, split="test") for index in range(plan.held_out)
-    ]
+    draws = held_out(family, plan.seed, plan.held_out)
     risk = learner.risk if learner else None
     collisions = sum(drive_alone(family, draw, reviser, risk).episode.collided for draw in draws)
     return Check(policy, seed, after, collisions, len(draws))

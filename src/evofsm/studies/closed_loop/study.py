@@ -14,16 +14,26 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from importlib.util import find_spec
+from itertools import repeat
 from multiprocessing import active_children, get_context
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from evofsm.framework.reviser import EnvelopeReviser, Unrevised
+from evofsm.framework.reviser import EnvelopeReviser
+from evofsm.protocols import Reviser
+from evofsm.risk.outcome import LatentRisk
 from evofsm.states import Edges, FailureSplit, Novelty, StateRule
 from evofsm.studies.closed_loop.calibration import Reliability, run_calibration
 from evofsm.studies.closed_loop.cases import CaseResult, run_cases
-from evofsm.studies.closed_loop.learner import Learner, drive_alone, references, score
+from evofsm.studies.closed_loop.learner import (
+    Learner,
+    drive_alone,
+    held_out,
+    references,
+    score,
+    training,
+)
 from evofsm.studies.closed_loop.outcomes import Outcome, Reference, Row, summarise
 from evofsm.studies.closed_loop.policies import TUNED_MEASURES, Group, fixed_policies
 from evofsm.studies.closed_loop.separation import Separation, run_separation
@@ -212,46 +222,43 @@ def _run(tasks: Sequence[partial[Any]], workers: int) -> Iterator[Any]:
         executor.shutdown()
 
 
-def held_out(family: Family, plan: Plan, episodes: int) -> list[Draw]:
-    """Draws that nothing learns from."""
-    return [family.draw(plan.seed, index, split="test") for index in range(episodes)]
-
-
-def training(family: Family, plan: Plan, learning_seed: int, episodes: int) -> Iterator[Draw]:
-    """Draws to learn from, other ones for every learning seed."""
-    for index in range(episodes):
-        yield family.draw(plan.seed * 1000 + learning_seed, index, split="train")
-
-
-def _references(family: Family, draws: Sequence[Draw]) -> list[Reference]:
-    return references(family, draws, Unrevised(family.actions))
+def _drive_all(
+    family: Family,
+    draws: Sequence[Draw],
+    base: Sequence[Reference],
+    revisers: Iterable[Reviser],
+    risk: LatentRisk | None = None,
+) -> list[Outcome]:
+    """Drive draws without learning, each with its reviser."""
+    drives = (
+        drive_alone(family, draw, reviser, risk)
+        for draw, reviser in zip(draws, revisers, strict=False)
+    )
+    return score(family, base, drives)
 
 
 def _test_fixed(family: Family, plan: Plan, name: str) -> dict[str, list[Any]]:
     policy = next(policy for policy in fixed_policies(family) if policy.name == name)
-    draws = held_out(family, plan, plan.test)
-    drives = (drive_alone(family, draw, policy.make(family, draw), None) for draw in draws)
-    outcomes = score(family, draws, _references(family, draws), drives)
+    draws = held_out(family, plan.seed, plan.test)
+    revisers = (policy.make(family, draw) for draw in draws)
+    outcomes = _drive_all(family, draws, references(family, draws), revisers)
     return {"rows": [summarise(family.name, name, policy.group, outcomes, family.interval)]}
 
 
 def _test_tuned(family: Family, plan: Plan, name: str) -> dict[str, list[Any]]:
     """Of the settings without a collision in training the fastest, else the safest."""
     measures = TUNED_MEASURES[name]
-    draws = list(training(family, plan, 0, min(plan.train, 100)))
-    base = _references(family, draws)
+    draws = list(training(family, plan.seed, 0, min(plan.train, 100)))
+    base = references(family, draws)
     tried: list[tuple[int, float, int]] = []
     for index, measure in enumerate(measures):
         reviser = EnvelopeReviser(measure, family.actions, family.interval)
-        outcomes = score(
-            family, draws, base, (drive_alone(family, draw, reviser, None) for draw in draws)
-        )
+        outcomes = _drive_all(family, draws, base, repeat(reviser))
         tried.append((sum(o.collided for o in outcomes), -_mobility(outcomes), index))
     best = measures[min(tried)[2]]
     reviser = EnvelopeReviser(best, family.actions, family.interval)
-    tests = held_out(family, plan, plan.test)
-    drives = (drive_alone(family, draw, reviser, None) for draw in tests)
-    outcomes = score(family, tests, _references(family, tests), drives)
+    tests = held_out(family, plan.seed, plan.test)
+    outcomes = _drive_all(family, tests, references(family, tests), repeat(reviser))
     row = summarise(
         family.name,
         name,
@@ -273,17 +280,17 @@ def _test_learner(family: Family, plan: Plan, seed: int) -> dict[str, list[Any]]
     """Learn with one seed; test on the way and at the end."""
     learner = Learner.new(family)
     reviser = learner.reviser(family, plan.tolerance)
-    tests = held_out(family, plan, plan.test)
-    base = _references(family, tests)
+    tests = held_out(family, plan.seed, plan.test)
+    base = references(family, tests)
     checks = slice(SAFE_EPISODES)
     checkpoints = [k for k in CHECKPOINTS if k <= plan.train]
     curve: list[Point] = []
     rows: list[Row] = []
     collisions = 0
-    draws = training(family, plan, seed, plan.train)
+    draws = training(family, plan.seed, seed, plan.train)
     for episodes in range(plan.train + 1):
         if episodes > 0:
-            [drive] = learner.teach(family, [next(draws)], reviser)
+            drive = learner.drive(family, next(draws), reviser, learn=True)
             collisions += drive.episode.collided
         if episodes in checkpoints:
             outcomes = _frozen(family, learner, plan.tolerance, tests[checks], base[checks])
@@ -344,10 +351,10 @@ def _test_rule(family: Family, plan: Plan, rule: str, seed: int) -> dict[str, li
     learner = Learner.new(family, RULES[rule])
     by_state = learner.reviser_by_state(family, plan.tolerance)
     episodes = min(_RULE_TRAIN, plan.train)
-    taught = learner.teach(family, training(family, plan, seed, episodes), by_state)
-    draws = held_out(family, plan, min(plan.rule_test, plan.test))
+    taught = learner.teach(family, training(family, plan.seed, seed, episodes), by_state)
+    draws = held_out(family, plan.seed, min(plan.rule_test, plan.test))
     drives = (learner.drive(family, draw, by_state, learn=False) for draw in draws)
-    outcomes = score(family, draws, _references(family, draws), drives)
+    outcomes = score(family, references(family, draws), drives)
     row = summarise(
         family.name,
         f"states: {rule} ({learner.machine.n_states})",
@@ -371,8 +378,7 @@ def _frozen(
     """Drive held-out draws with what was learnt so far."""
     frozen = learner.frozen()
     reviser = frozen.reviser(family, tolerance)
-    drives = (drive_alone(family, draw, reviser, frozen.risk) for draw in draws)
-    return score(family, draws, base, drives)
+    return _drive_all(family, draws, base, repeat(reviser), frozen.risk)
 
 
 def _mobility(outcomes: Iterable[Outcome]) -> float:

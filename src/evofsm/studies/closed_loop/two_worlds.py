@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from evofsm.studies.closed_loop.learner import Learner
+from evofsm.studies.closed_loop.learner import Learner, held_out, training
 from evofsm.worlds import WORLDS, open_world
 from evofsm.worlds.families import Family
 
@@ -26,31 +26,23 @@ def run_two_worlds(
 ) -> dict[str, list[Any]]:
     """Learn in closed form, then drive the same draws in every world with learning frozen."""
     learner = Learner.new(family)
-    draws = (family.draw(seed * 1000, index) for index in range(train))
-    learner.teach(family, draws, learner.reviser(family, tolerance))
+    learner.teach(family, training(family, seed, 0, train), learner.reviser(family, tolerance))
     found = []
     for name in WORLDS:
         frozen = learner.frozen()
         reviser = frozen.reviser(family, tolerance)
         with open_world(name) as world:
             drives = [
-                frozen.drive(
-                    family,
-                    family.draw(seed, index, split="test"),
-                    reviser,
-                    learn=False,
-                    world=world,
-                )
-                for index in range(test)
+                frozen.drive(family, draw, reviser, learn=False, world=world)
+                for draw in held_out(family, seed, test)
             ]
-        changed = [drive.executed != drive.proposed for drive in drives]
         found.append(
             InWorld(
                 name,
                 test,
                 sum(drive.episode.collided for drive in drives),
                 float(np.mean([drive.episode.observations[:, 1].mean() for drive in drives])),
-                float(np.concatenate(changed).mean()),
+                float(np.concatenate([drive.changed for drive in drives]).mean()),
             )
         )
     return {"worlds": found}
