@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import operator
+from bisect import bisect_left, bisect_right
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal, SupportsIndex, overload
@@ -90,6 +91,11 @@ class IntervalActions:
         edges.setflags(write=False)
         return edges
 
+    @cached_property
+    def _inner_edges(self) -> list[float]:
+        edges: list[float] = self.edges[1:-1].tolist()
+        return edges
+
     @overload
     def encode(self, a: float) -> int: ...
     @overload
@@ -122,6 +128,9 @@ class IntervalActions:
         >>> actions.encode([-2.2, 2.5])  # an edge opens the next interval, but for the last one
         array([ 1, 16])
         """
+        if type(a) is float and self.low <= a <= self.high:  # one number, as every decision asks
+            side = bisect_right if self.closed == "left" else bisect_left
+            return side(self._inner_edges, a)
         values = _real_numbers(a)
         if np.isnan(values).any():
             raise ValueError("action is NaN; it has no interval")

@@ -9,41 +9,64 @@ from typing import Any, overload
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from evofsm._compile import kernel
+from evofsm._compile import inner_kernel, kernel
+from evofsm._elementary import logarithm
 from evofsm.validation import refuse_unless_distribution
 
 # Stands in for 0 in a divisor or a logarithm whose result is multiplied by 0.
 _TINY = 1e-300
 # The series has seven terms; below this the eighth is under half a unit in the last place.
 _SERIES_BELOW = 0.01
-_BITS_PER_NAT = 1.0 / math.log(2.0)
+_LN_2 = math.log(2.0)
 
 
-@kernel
-def jensen_shannon_kernel(p: NDArray[np.float64], q: NDArray[np.float64], n: int) -> float:
-    """Divergence in bits of the first ``n`` entries of two distributions."""
+@inner_kernel
+def jensen_shannon_kernel(
+    p: NDArray[np.float64], q: NDArray[np.float64], n: int, terms: NDArray[np.float64]
+) -> float:
+    """Divergence in bits of the first ``n`` entries of two distributions.
+
+    A state's ``p ln(p/m) + q ln(q/m)``, where m is the mean of p and q, is ``(p + q) / 2`` times
+    ``(1 + d) ln(1 + d) + (1 - d) ln(1 - d)`` with ``d = |p - q| / (p + q)``. As p nears q the
+    logarithms cancel, and ``d^2 + d^4/6 + d^6/15 + ...`` is the exact way, and the quick one.
+
+    ``terms`` is room to work in: loops that fill it, with neither branches nor sums, are compiled
+    to vector instructions.
+    """
+    beyond = 0
+    for i in range(n):
+        total = p[i] + q[i]
+        d = (p[i] - q[i]) / max(total, _TINY)
+        x = d * d
+        terms[i] = 0.5 * total * _series(x)
+        beyond += x >= _SERIES_BELOW
+    if beyond > 0:
+        for i in range(n):
+            total = p[i] + q[i]
+            divisor = max(total, _TINY)
+            d = (p[i] - q[i]) / divisor
+            less = 2.0 * min(p[i], q[i]) / divisor  # 1 - d, without rounding away its digits
+            by_logarithms = 0.5 * total * _by_logarithms(less)
+            terms[i] = terms[i] if d * d < _SERIES_BELOW else by_logarithms
     nats = 0.0
     for i in range(n):
-        nats += _term(p[i], q[i])
+        nats += terms[i]
     # Rounding may leave a hair outside [0, 1].
-    return min(max(0.5 * nats * _BITS_PER_NAT, 0.0), 1.0)
+    return min(max(0.5 * nats / _LN_2, 0.0), 1.0)
 
 
-@kernel
-def _term(p: float, q: float) -> float:
-    """One state's ``p ln(p/m) + q ln(q/m)``, where m is the mean of p and q.
+@inner_kernel
+def _series(x: float) -> float:
+    """Of ``x = d^2``, seven terms."""
+    tail = 1.0 / 45.0 + x * (1.0 / 66.0 + x * (1.0 / 91.0))
+    return x * (1.0 + x * (1.0 / 6.0 + x * (1.0 / 15.0 + x * (1.0 / 28.0 + x * tail))))
 
-    With ``d = (p - q) / (p + q)`` it is ``(p + q) (d^2/2 + d^4/12 + d^6/30 + ...)``. Close to
-    p = q the two logarithms cancel, so the series is the exact way there, and the quick one.
-    """
-    total = max(p + q, _TINY)
-    d = (p - q) / total
-    x = d * d
-    if x < _SERIES_BELOW:
-        tail = 1.0 / 90.0 + x * (1.0 / 132.0 + x * (1.0 / 182.0))
-        return total * x * (0.5 + x * (1.0 / 12.0 + x * (1.0 / 30.0 + x * (1.0 / 56.0 + x * tail))))
-    more = p * math.log(max(1.0 + d, _TINY))
-    return more + q * math.log(max(1.0 - d, _TINY))
+
+@inner_kernel
+def _by_logarithms(less: float) -> float:
+    """Of ``less = 1 - d``, which may be 0."""
+    more = 2.0 - less
+    return more * logarithm(more) + less * logarithm(max(less, _TINY))
 
 
 @overload
@@ -91,13 +114,16 @@ def jensen_shannon(p: ArrayLike, q: ArrayLike) -> Any:
     rows_p = np.ascontiguousarray(np.broadcast_to(p, shape)).reshape(-1, n)
     rows_q = np.ascontiguousarray(np.broadcast_to(q, shape)).reshape(-1, n)
     result = np.empty(len(rows_p))
-    _jensen_shannon_rows(rows_p, rows_q, result)
+    _jensen_shannon_rows(rows_p, rows_q, np.empty(n), result)
     return float(result[0]) if len(shape) == 1 else result.reshape(shape[:-1])
 
 
 @kernel
 def _jensen_shannon_rows(
-    p: NDArray[np.float64], q: NDArray[np.float64], result: NDArray[np.float64]
+    p: NDArray[np.float64],
+    q: NDArray[np.float64],
+    terms: NDArray[np.float64],
+    result: NDArray[np.float64],
 ) -> None:
     for row in range(len(result)):
-        result[row] = jensen_shannon_kernel(p[row], q[row], p.shape[1])
+        result[row] = jensen_shannon_kernel(p[row], q[row], p.shape[1], terms)

@@ -12,7 +12,7 @@ vehicle control system via online recognition of latent risks", arXiv:1908.10823
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from os import PathLike
 from typing import Any, Self, SupportsIndex
 
@@ -20,7 +20,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from evofsm import storage
+from evofsm._compile import LINE, lanes
 from evofsm.actions import IntervalActions
+from evofsm.crowding import WhenFull
 from evofsm.memory import (
     NO_ACTION,
     Parameters,
@@ -42,11 +44,11 @@ from evofsm.step import (
     Trace,
     fail,
     learn_rows,
-    observe,
-    observe_failure,
+    observer,
+    room_for,
     widen,
 )
-from evofsm.transitions import Policy, marginal, propagate
+from evofsm.transitions import NOT_OPEN, Policy, count_open, marginal, propagate
 from evofsm.validation import (
     check_action,
     check_actions,
@@ -57,9 +59,11 @@ from evofsm.validation import (
     whole,
 )
 
-_FIRST_CAPACITY = 8
+_FLOAT64 = np.dtype(np.float64)
 _RADIUS, _SPREAD = 0.3, 3.0
 _SETTINGS = ("n_actions", "radius", "distance_weight", "learning_rate", "prior_frequency", "spread")
+# What a machine does not have to be told, with what holds if it is not.
+_OPTIONS = {"max_states": None, "when_full": WhenFull.MERGE, "belief_tolerance": 0.0}
 
 
 class EvolvingFSM:
@@ -86,6 +90,17 @@ class EvolvingFSM:
         How states are determined, as an object: `Edges`, `Novelty`, `FailureSplit`; without it
         the paper's rule, `Paper`. A rule may have a radius and a spread of its own, which then
         take the place of these.
+    max_states : int, optional
+        Number of states at which another one is only founded where one is given up; without it
+        there is no limit.
+    when_full : WhenFull
+        Which one is given up: ``MERGE`` joins the two that are closest, ``RETIRE`` forgets the
+        least useful.
+    belief_tolerance : float
+        How far a belief may be from the exact one, summed over all states, in [0, 1). States
+        that are less likely get no part in the belief, and take no part in the step: with
+        hundreds of states this saves most of the time, 1e-6 for example. A jump to a state that
+        got none teaches nothing about it until it is recognised. 0 leaves nothing out.
 
     Raises
     ------
@@ -93,7 +108,8 @@ class EvolvingFSM:
         If ``rule`` is no rule (or the class of one).
     ValueError
         If ``n_actions`` is no whole number of at least 1, another setting is not positive and
-        finite, ``learning_rate`` is 1 or more, or ``radius`` or ``spread`` contradicts the rule's.
+        finite, ``learning_rate`` is 1 or more, ``radius`` or ``spread`` contradicts the rule's,
+        or ``belief_tolerance`` is not in its range.
 
     Notes
     -----
@@ -120,6 +136,9 @@ class EvolvingFSM:
         prior_frequency: float = 1e-3,
         spread: float = _SPREAD,
         rule: StateRule | None = None,
+        max_states: int | None = None,
+        when_full: WhenFull = WhenFull.MERGE,
+        belief_tolerance: float = 0.0,
     ) -> None:
         self._rule = Paper() if rule is None else check_rule("rule", rule)
         given = RuleSettings(
@@ -137,11 +156,14 @@ class EvolvingFSM:
         parameters = Parameters(
             positive("learning_rate", learning_rate),
             positive("prior_frequency", prior_frequency),
+            _tolerance(belief_tolerance),
+            np.inf if max_states is None else whole("max_states", max_states),
+            WhenFull(when_full),
             told,
         )
         if parameters.learning_rate >= 1.0:
             raise ValueError(f"learning_rate is {learning_rate}; it must lie below 1")
-        self._use(allocate(0, whole("n_actions", n_actions), _FIRST_CAPACITY, parameters))
+        self._use(allocate(0, whole("n_actions", n_actions), LINE, 0, parameters))
 
     @classmethod
     def paper(cls) -> Self:
@@ -199,24 +221,7 @@ prior_frequency=0.001, spread=3.0)
         >>> step.state, step.predicted.round(2), step.belief.round(2), round(step.surprise, 2)
         (1, array([0.6, 0.4]), array([0.32, 0.68]), 0.06)
         """
-        scratch = self._memory.scratch
-        if not (
-            type(z) is np.ndarray and z.dtype == np.float64 and z.shape == scratch.observation.shape
-        ):
-            z = self._fit(real_array("observation", z, ndim=1))
-            scratch = self._memory.scratch
-        scratch.observation[:] = z
-        event, state, surprise = (observe_failure if failed else observe)(self._buffer)
-        if event == REFUSED:
-            refuse_unusable("observation", real_array("observation", z, ndim=1))
-        if event == FULL:
-            self._grow()
-            return self.observe(z, failed=failed)
-        n = self.n_states
-        predicted = scratch.predicted[: n if surprise == surprise else 0].copy()
-        return Step(
-            state, self._memory.learnt.belief[:n].copy(), EVENTS[event], predicted, surprise
-        )
+        return self._step(z, NO_ACTION, failed)
 
     def act(self, i: SupportsIndex) -> None:
         """Say which action was commanded after the latest observation.
@@ -276,10 +281,48 @@ prior_frequency=0.001, spread=3.0)
         >>> [machine.learn_one([z], 0).state for z in (0.0, 0.1, 2.0, 1.0)]
         [0, 0, 0, 1]
         """
-        i = check_action(i, self.n_actions)
-        step = self.observe(z)
-        self._memory.learnt.action[0] = i
-        return step
+        return self._step(z, check_action(i, self.n_actions), False)
+
+    def update(self, z: NDArray[np.float64], i: int) -> float:
+        """Observe ``z``, then act with ``i``, and answer with nothing but the surprise.
+
+        The same step as `learn_one`, for those who count nanoseconds: most of the time of that
+        goes into the arrays of its answer. What they say can still be asked of the machine.
+
+        Parameters
+        ----------
+        z : (m,) ndarray
+            Observation; quickest as an array of float64.
+        i : int
+            Index of the action commanded after it, from 0.
+
+        Returns
+        -------
+        float
+            Divergence of forecast and belief [bit]; NaN where nothing was forecast.
+
+        Raises
+        ------
+        TypeError, ValueError
+            As `learn_one`. The machine is then as it was.
+
+        Examples
+        --------
+        >>> machine = EvolvingFSM(n_actions=2, radius=0.5)
+        >>> Z = np.array([[0.0], [0.1], [2.0], [1.0]])
+        >>> [round(machine.update(z, 0), 2) for z in Z]
+        [nan, 0.0, 0.0, 0.31]
+        >>> machine.state, machine.belief.round(2)
+        (1, array([0.37, 0.63]))
+        """
+        if type(i) is int and type(z) is np.ndarray and z.dtype is _FLOAT64:
+            try:
+                event, _, surprise = self._observe(self._buffer, z, i, False)
+            except TypeError:  # an array with gaps
+                event = REFUSED
+            if event >= 0:
+                return surprise
+        return self._insist(z, check_action(i, self.n_actions), False)[2]
 
     def learn_many(
         self,
@@ -428,9 +471,7 @@ prior_frequency=0.001, spread=3.0)
         array([0.686, 0.314])
         """
         i = check_action(i, self.n_actions)
-        return propagate(
-            self._matrices, self._memory.learnt.transitions.uses, self.belief, i, horizon, policy
-        )
+        return propagate(self.belief, self._matrix, self._averaged, i, horizon, policy)
 
     # -- What it was told -----------------------------------------------------------------------
 
@@ -469,7 +510,38 @@ prior_frequency=0.001, spread=3.0)
         """How states are determined."""
         return self._rule
 
+    @property
+    def max_states(self) -> int | None:
+        """Number of states from which on one is given up for another; None for no limit."""
+        most = self._memory.parameters.max_states
+        return None if most == np.inf else int(most)
+
+    @property
+    def when_full(self) -> WhenFull:
+        """Which state is given up."""
+        return WhenFull(int(self._memory.parameters.when_full))
+
+    @property
+    def belief_tolerance(self) -> float:
+        """How far a belief may be from the exact one, summed over all states."""
+        return self._memory.parameters.belief_tolerance
+
     # -- What it knows --------------------------------------------------------------------------
+
+    @property
+    def nbytes(self) -> int:
+        """Memory that holds what was learnt, with room for the next states [byte].
+
+        Examples
+        --------
+        >>> machine = EvolvingFSM(n_actions=17)
+        >>> trace = machine.learn_many([[0.0], [0.1], [2.0]], [0, 0, 1])
+        >>> once = machine.nbytes
+        >>> trace = machine.learn_many([[0.0], [0.1]], [0, 0])  # action 1 got its matrix
+        >>> machine.nbytes - once  # 8 states in a line: 8 x 8 probabilities, 3 x 8 counts
+        704
+        """
+        return self._buffer.nbytes
 
     @property
     def n_states(self) -> int:
@@ -478,8 +550,12 @@ prior_frequency=0.001, spread=3.0)
 
     @property
     def state_ids(self) -> NDArray[np.int64]:
-        """(n,) ndarray: identities of the states, in the order of founding."""
-        return np.arange(self.n_states)
+        """(n,) ndarray: identities of the states, the number of each one's founding from 0.
+
+        They equal the indices, unless states were given up (``max_states``): an index that became
+        free goes to a new state, with a new identity.
+        """
+        return self._memory.learnt.ids[: self.n_states].astype(np.int64)
 
     @property
     def centers(self) -> NDArray[np.float64]:
@@ -493,18 +569,22 @@ prior_frequency=0.001, spread=3.0)
 
     @property
     def transition_matrices(self) -> NDArray[np.float64]:
-        """(q, n, n) ndarray: for each action, probabilities from state (row) to state (column)."""
-        return self._matrices.copy()
+        """(q, n, n) ndarray: for each action, probabilities from state (row) to state (column).
+
+        An action never used has a matrix of 1 / n here; the machine holds none for it.
+        """
+        return self._of_actions(self._memory.learnt.transitions.matrices, 1.0)
 
     @property
     def origin_frequency(self) -> NDArray[np.float64]:
         """(q, n) ndarray: the paper's F_o, the recency-weighted frequency of each row."""
-        return self._memory.learnt.transitions.origin_frequency[:, : self.n_states].copy()
+        unused = self.n_states**2 * self.prior_frequency
+        return self._of_actions(self._memory.learnt.transitions.origin_frequency, unused)
 
     @property
     def joint_frequency(self) -> NDArray[np.float64]:
         """(q, n, n) ndarray: the paper's F, recency-weighted frequencies of transitions."""
-        return self.origin_frequency[:, :, None] * self._matrices
+        return self.origin_frequency[:, :, None] * self.transition_matrices
 
     @property
     def decisions(self) -> NDArray[np.float64]:
@@ -520,7 +600,7 @@ prior_frequency=0.001, spread=3.0)
         array([[3.  , 0.  ],
                [0.37, 0.63]])
         """
-        return self._memory.learnt.outcomes.decisions[:, : self.n_states].copy()
+        return self._of_actions(self._memory.learnt.outcomes.decisions, 0.0)
 
     @property
     def failures(self) -> NDArray[np.float64]:
@@ -535,7 +615,7 @@ prior_frequency=0.001, spread=3.0)
         array([[0.  , 0.  ],
                [0.37, 0.63]])
         """
-        return self._memory.learnt.outcomes.failures[:, : self.n_states].copy()
+        return self._of_actions(self._memory.learnt.outcomes.failures, 0.0)
 
     @property
     def endings(self) -> NDArray[np.float64]:
@@ -555,7 +635,7 @@ prior_frequency=0.001, spread=3.0)
     @property
     def marginal_matrix(self) -> NDArray[np.float64]:
         """(n, n) ndarray: the paper's P*, transition probabilities if all actions are alike."""
-        return marginal(self._matrices, self._memory.learnt.transitions.uses)
+        return self._averaged("marginal")
 
     @property
     def belief(self) -> NDArray[np.float64]:
@@ -660,7 +740,8 @@ prior_frequency=0.001, spread=3.0)
         2
         """
         # Without spare room the shapes of the arrays tell the sizes, and nothing else is stored.
-        learnt = view(resize(self._buffer, self.n_states)).learnt
+        open_ = count_open(self._memory.learnt.transitions)
+        learnt = view(resize(self._buffer, self.n_states, open_)).learnt
         content = {**self._settings(), "rule": describe(self._rule)}
         storage.write(path, "machine", content, dict(leaves(learnt)))
 
@@ -703,13 +784,14 @@ prior_frequency=0.001, spread=3.0)
             m, n = arrays["centers"].shape
             if n == 0:
                 return machine
-            buffer = allocate(m, machine.n_actions, n, machine._parameters(m))
+            places = len(arrays["matrices"])
+            buffer = allocate(m, machine.n_actions, n, places, machine._parameters(m))
             for name, array in leaves(view(buffer).learnt):
                 if arrays[name].shape != array.shape:
                     raise ValueError(f"{name} has shape {arrays[name].shape}, not {array.shape}")
                 array[:] = arrays[name]
             refuse_impossible(view(buffer).learnt)
-        machine._use(resize(buffer, max(_FIRST_CAPACITY, n)))
+        machine._use(resize(buffer, lanes(n), places))
         return machine
 
     def copy(self) -> Self:
@@ -747,7 +829,8 @@ prior_frequency=0.001, spread=3.0)
     # -- Inside ---------------------------------------------------------------------------------
 
     def _settings(self) -> dict[str, Any]:
-        return {name: getattr(self, name) for name in _SETTINGS}
+        given = {name: getattr(self, name) for name in (*_SETTINGS, *_OPTIONS)}
+        return {name: value for name, value in given.items() if value != _OPTIONS.get(name, ...)}
 
     def _parameters(self, m: int) -> Parameters:
         """The settings, now that there are m variables."""
@@ -758,29 +841,71 @@ prior_frequency=0.001, spread=3.0)
     def _use(self, buffer: NDArray[np.float64]) -> None:
         self._buffer = buffer
         self._memory = view(buffer)
+        self._observe: Callable[..., tuple[int, int, float]] = _not_yet
+
+    def _step(self, z: ArrayLike, action: int, failed: bool) -> Step:
+        """Observe, then act; the whole answer."""
+        event, state, surprise = self._insist(z, action, failed)
+        n, memory = self.n_states, self._memory
+        predicted = memory.scratch.predicted[: n if surprise == surprise else 0].copy()
+        return Step(state, memory.learnt.belief[:n].copy(), EVENTS[event], predicted, surprise)
+
+    def _insist(self, z: ArrayLike, action: int, failed: bool) -> tuple[int, int, float]:
+        """What the kernel answers, whatever has to be done to `z` and for room before."""
+        if type(z) is np.ndarray and z.dtype is _FLOAT64 and z.flags.c_contiguous:
+            event, state, surprise = self._observe(self._buffer, z, action, failed)
+            if event >= 0:
+                return event, state, surprise
+            if event == FULL:
+                self._grow()
+        z = self._fit(real_array("observation", z, ndim=1))
+        refuse_unusable("observation", z)
+        self._observe = observer()
+        return self._insist(z, action, failed)
 
     def _grow(self) -> None:
-        self._use(resize(self._buffer, 2 * self._capacity))
+        """Make room for what the next step may need."""
+        self._use(resize(self._buffer, *room_for(self._memory)))
 
     @property
     def _capacity(self) -> int:
         return len(self._memory.learnt.belief)
 
-    @property
-    def _matrices(self) -> NDArray[np.float64]:
-        n = self.n_states
-        return self._memory.learnt.transitions.matrices[:, :n, :n]
+    def _matrix(self, i: int) -> NDArray[np.float64]:
+        """(n, n) transition probabilities under an action."""
+        n, transitions = self.n_states, self._memory.learnt.transitions
+        if transitions.places[i] == NOT_OPEN:
+            return np.full((n, n), 1.0 / max(n, 1))
+        return transitions.matrices[int(transitions.places[i]), :n, :n]
+
+    def _averaged(self, policy: Policy) -> NDArray[np.float64]:
+        """(n, n) transition probabilities, averaged over the actions."""
+        n, transitions = self.n_states, self._memory.learnt.transitions
+        used = np.flatnonzero(transitions.places != NOT_OPEN)
+        matrices = transitions.matrices[transitions.places[used].astype(int), :n, :n]
+        return marginal(matrices, transitions.uses[used], self.n_actions, policy)
+
+    def _of_actions(self, of_places: NDArray[np.float64], unused: float) -> NDArray[np.float64]:
+        """An array with a row for each action; those never used get equal shares of ``unused``."""
+        n, places = self.n_states, self._memory.learnt.transitions.places
+        used = np.flatnonzero(places != NOT_OPEN)
+        per_state = of_places.shape[1:]
+        rows = np.full((len(places), *(n for _ in per_state)), unused / max(n, 1))
+        of_used = of_places[places[used].astype(int)]
+        rows[used] = of_used[:, :n] if of_used.ndim == 2 else of_used[:, :n, :n]
+        return rows
 
     def _fit(self, z: NDArray[np.float64]) -> NDArray[np.float64]:
         """Settle the number of variables with the first observation, and hold to it after."""
         if self.n_states == 0:
             refuse_unusable("observation", z)
             parameters = self._parameters(len(z))
-            self._use(allocate(len(z), self.n_actions, _FIRST_CAPACITY, parameters))
-        if z.shape != self._memory.scratch.observation.shape:
+            self._use(allocate(len(z), self.n_actions, LINE, 0, parameters))
+        started_with = self._memory.learnt.clusters.first
+        if z.shape != started_with.shape:
             raise ValueError(
                 f"observation has {len(z)} variables, but this machine was started with "
-                f"{len(self._memory.scratch.observation)}"
+                f"{len(started_with)}"
             )
         return z
 
@@ -790,6 +915,19 @@ prior_frequency=0.001, spread=3.0)
             self._fit(observations[0])
         refuse_unusable("observations", observations)
         return observations
+
+
+def _not_yet(*_: object) -> tuple[int, int, float]:
+    """In place of the kernel that observes, until there is something to load it for."""
+    return REFUSED, 0, np.nan
+
+
+def _tolerance(tolerance: float) -> float:
+    if tolerance == 0.0:
+        return 0.0
+    if positive("belief_tolerance", tolerance) >= 1.0:
+        raise ValueError(f"belief_tolerance is {tolerance}; it must lie below 1")
+    return float(tolerance)
 
 
 def _refuse_contradiction(

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from evofsm import storage
 from evofsm._compile import kernel
 from evofsm.actions import IntervalActions
-from evofsm.states.clusters import measure_distances
+from evofsm.states.clusters import measure_distances, nearest_center
 from evofsm.states.dispatch import describe, restore, weights
 from evofsm.states.ets import Paper
 from evofsm.states.rule import StateRule
@@ -231,7 +231,8 @@ class FSMModel:
         refuse_unless_distribution("belief", start)
         if action is not None:
             action = check_action(action, self.n_actions)
-        return propagate(self.transition_matrices, self.uses, start, action, horizon, policy)
+        matrix_of = self.transition_matrices.__getitem__
+        return propagate(start, matrix_of, self.averaged_matrix, action, horizon, policy)
 
     @property
     def marginal_matrix(self) -> NDArray[np.float64]:
@@ -268,7 +269,7 @@ class FSMModel:
         >>> model.averaged_matrix("marginal")[0].round(3)
         array([0.636, 0.364])
         """
-        return marginal(self.transition_matrices, self.uses, policy)
+        return marginal(self.transition_matrices, self.uses, self.n_actions, policy)
 
     def stationary_distribution(self, policy: Policy = "marginal") -> NDArray[np.float64]:
         """(n,) share of time that the chain would spend in each state if it ran on for ever.
@@ -448,4 +449,5 @@ def _recognise_rows(
     n = len(squared_distances)
     for row in range(len(rows)):
         measure_distances(centers, weights, n, rows[row], squared_distances)
-        recognise(squared_distances, n, width, belief[row])
+        nearest = nearest_center(squared_distances, n)
+        recognise(squared_distances, n, nearest, width, 0.0, belief[row])

@@ -8,18 +8,32 @@ state of the machine: it is counted, and the next observation begins another epi
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from enum import IntFlag
-from typing import NamedTuple
+from functools import cache
+from typing import Any, NamedTuple
 
 import numpy as np
+from numba.extending import register_jitable
 from numpy.typing import NDArray
 
-from evofsm._compile import kernel
+from evofsm import crowding
+from evofsm._compile import inner_kernel, kernel, lanes, rare_kernel
+from evofsm.crowding import MERGED, NEWCOMER, RETIRE, RETIRED, merge_closest, retire_least_useful
 from evofsm.divergence import jensen_shannon_kernel
 from evofsm.memory import NO_ACTION, Memory, open_memory
-from evofsm.states import clusters, failure, spread
+from evofsm.states import clusters, spread
+from evofsm.states.clusters import place_center, potential_of
 from evofsm.states.dispatch import determine, width
-from evofsm.transitions import count, expand, forecast, identify
+from evofsm.states.failure import splits
+from evofsm.transitions import (
+    NOT_OPEN,
+    count,
+    count_open,
+    expand,
+    forecast_and_identify,
+    place_of,
+)
 from evofsm.validation import LARGEST_OBSERVATION
 
 # What `step` answers instead of an event where it did nothing.
@@ -30,8 +44,9 @@ class Event(IntFlag):
     """What an observation did to the states (the paper's Section 2.2.1).
 
     ``NONE`` left them as they were, ``MOVED`` put the nearest one on the observation, and
-    ``CREATED`` founded a new one there. ``MERGED`` and ``RETIRED`` are kept for states that are
-    joined or given up, which nothing does yet. Events may be combined.
+    ``CREATED`` founded a new one there. Where there were ``max_states`` before, two were
+    ``MERGED`` or one was ``RETIRED`` to make room, and the new one has the index that became
+    free; ``MERGED`` alone says that none was founded, for the nearest one was close enough.
 
     Examples
     --------
@@ -46,12 +61,12 @@ class Event(IntFlag):
     NONE = clusters.UNCHANGED
     MOVED = clusters.MOVED
     CREATED = clusters.CREATED
-    MERGED = 4
-    RETIRED = 8
+    MERGED = crowding.MERGED
+    RETIRED = crowding.RETIRED
 
 
-#: Those that occur, by value: looking one up is quicker than making one.
-EVENTS = (Event.NONE, Event.MOVED, Event.CREATED)
+#: By value: looking one up is quicker than making one.
+EVENTS = tuple(Event(value) for value in range(16))
 
 
 class Step(NamedTuple):
@@ -102,130 +117,214 @@ def widen(belief: NDArray[np.float64], n: int) -> NDArray[np.float64]:
     return np.pad(belief, [(0, 0)] * (belief.ndim - 1) + [(0, missing)]) if missing else belief
 
 
-@kernel
-def step(memory: Memory, failed: bool) -> tuple[int, int, float]:
-    """Take in the observation in ``memory.scratch``; answers event, state and surprise.
+@inner_kernel
+def step(memory: Memory, z: NDArray[np.float64], failed: bool) -> tuple[int, int, float]:
+    """Take in one observation; answers event, state and surprise.
 
     Where the episode ``failed`` it ends in failure after this observation.
     """
     parameters, now, scratch = memory.parameters, memory.learnt, memory.scratch
-    n = int(now.n_states[0])
-    if n == len(now.belief):
+    if not _has_room(memory):
         return FULL, 0, np.nan
-    if len(scratch.observation) == 0:
+    if not _is_usable(memory, z):
         return REFUSED, 0, np.nan
-    for value in scratch.observation:
-        if not abs(value) <= LARGEST_OBSERVATION:  # also true of NaN
-            return REFUSED, 0, np.nan
+    n = int(now.n_states[0])
 
     # Section 2.2.1: does the observation move a state, or found one?
-    event = determine(parameters.rule, now.clusters, n, scratch.observation)
-    if failed and event == clusters.UNCHANGED:
-        event = _split(memory, n)
+    event, nearest, potential = determine(parameters.rule, now.clusters, n, z)
+    if event == clusters.UNCHANGED and failed and _splits(memory, nearest):
+        event = clusters.CREATED
     if event == clusters.CREATED:
-        _connect(memory, n)
-        n += 1
+        event, nearest = _found(memory, n, nearest, potential)
+        n = int(now.n_states[0])
 
     # Section 2.2.2: which state is this?
-    state = _recognise(memory, n)
+    _recognise(memory, n, nearest)
 
     # Section 2.3: was it foreseen, and what does it teach about the action taken before it?
     surprise = np.nan
     action = int(now.action[0])
     if now.chained[0] and action != NO_ACTION:
-        forecast(now.transitions, action, n, now.belief, scratch.predicted)
-        surprise = jensen_shannon_kernel(scratch.predicted, scratch.recognised, n)
-        identify(
-            now.transitions, action, n, now.belief, scratch.recognised, parameters.learning_rate
+        place = place_of(now.transitions, action, n, parameters.prior_frequency)
+        forecast_and_identify(
+            now.transitions,
+            place,
+            n,
+            now.belief,
+            scratch.recognised,
+            parameters.learning_rate,
+            scratch.predicted,
+            scratch.rates,
         )
-        _decide(memory, n, failed)
+        now.transitions.uses[action] += 1.0
+        surprise = jensen_shannon_kernel(
+            scratch.predicted, scratch.recognised, lanes(n), scratch.terms
+        )
+        _decide(memory, place, n, failed)
 
     if now.chained[0]:
-        now.changes[int(now.state[0]), state] += 1.0
-    for i in range(n):
+        now.changes[int(now.state[0]), nearest] += 1.0
+    for i in range(lanes(n)):
         now.belief[i] = scratch.recognised[i]
-    now.state[0] = state
-    now.visits[state] += 1.0
-    now.n_states[0] = n
+    now.state[0] = nearest
+    now.visits[nearest] += 1.0
     now.action[0] = NO_ACTION
     now.chained[0] = 1.0
     if failed:
         _end(memory)
+    return event, nearest, surprise
+
+
+@kernel
+def _observe(
+    buffer: NDArray[np.float64], z: NDArray[np.float64], action: int, failed: bool
+) -> tuple[int, int, float]:
+    """`step`, then an action (or `NO_ACTION`), with the whole machine in a single argument."""
+    memory = open_memory(buffer)
+    if not NO_ACTION <= action < len(memory.learnt.transitions.uses):
+        return REFUSED, 0, np.nan
+    event, state, surprise = step(memory, z, failed)
+    if event >= 0 and not failed:
+        memory.learnt.action[0] = action
     return event, state, surprise
 
 
-@kernel
-def observe(buffer: NDArray[np.float64]) -> tuple[int, int, float]:
-    """`step`, with the whole machine in a single argument."""
-    return step(open_memory(buffer), False)
+@cache
+def observer() -> Callable[[NDArray[np.float64], NDArray[np.float64], int, bool], Any]:
+    """The quickest way to take one step: `_observe`, for float64 arrays without gaps only.
 
-
-@kernel
-def observe_failure(buffer: NDArray[np.float64]) -> tuple[int, int, float]:
-    """`observe`, and the episode ends in failure."""
-    return step(open_memory(buffer), True)
+    For any other type of array it raises a TypeError, where Numba would compile it once more.
+    """
+    compiled: Any = _observe
+    compiled.compile("(float64[::1], float64[::1], int64, boolean)")
+    compiled.disable_compile()
+    return _observe
 
 
 @kernel
 def fail(buffer: NDArray[np.float64]) -> bool:
     """End the episode in failure, to which the pending action led from the latest observation.
 
-    Answers whether there was room for a state that this may found.
+    Answers whether there was room for what this may found.
     """
     memory = open_memory(buffer)
     now = memory.learnt
-    n = int(now.n_states[0])
-    if n == len(now.belief):
+    if not _has_room(memory):
         return False
-    if _split(memory, n) == clusters.CREATED:
-        _connect(memory, n)
-        n += 1
-        now.n_states[0] = n
-        now.state[0] = _recognise(memory, n)
+    n = int(now.n_states[0])
+    nearest = int(now.state[0])
+    if _splits(memory, nearest):
+        rule = memory.parameters.rule
+        potential = potential_of(now.clusters, rule.weights, now.clusters.latest)
+        nearest = _found(memory, n, nearest, potential)[1]
+        n = int(now.n_states[0])
+        now.state[0] = nearest
+        _recognise(memory, n, nearest)
         for i in range(n):
             now.belief[i] = memory.scratch.recognised[i]
-    if now.action[0] != NO_ACTION:
-        _decide(memory, n, True)
+    action = int(now.action[0])
+    if action != NO_ACTION:
+        place = place_of(now.transitions, action, n, memory.parameters.prior_frequency)
+        _decide(memory, place, n, True)
     _end(memory)
     return True
 
 
-@kernel
-def _split(memory: Memory, n: int) -> int:
-    """Let a failure at the latest observation found a state, where the rule does so."""
+@register_jitable
+def room_for(memory: Memory) -> tuple[int, int]:
+    """Numbers of states and of matrices with which the next step cannot lack room."""
     now = memory.learnt
-    return failure.split(
-        memory.parameters.rule, now.clusters, n, now.outcomes.endings, now.visits, now.changes
+    capacity, places = len(now.belief), len(now.transitions.matrices)
+    action = int(now.action[0])
+    if action != NO_ACTION and now.transitions.places[action] == NOT_OPEN:
+        places = max(places, count_open(now.transitions) + 1)
+    if now.n_states[0] == capacity and capacity < memory.parameters.max_states:
+        capacity = lanes(capacity + capacity // 2)
+    return capacity, places
+
+
+@inner_kernel
+def _has_room(memory: Memory) -> bool:
+    """Whether another state could be founded, and the pending action have a matrix."""
+    capacity, places = room_for(memory)
+    now = memory.learnt
+    return capacity == len(now.belief) and places == len(now.transitions.matrices)
+
+
+@inner_kernel
+def _is_usable(memory: Memory, z: NDArray[np.float64]) -> bool:
+    """Whether the observation has the machine's variables, all of them finite numbers."""
+    if len(z) == 0 or len(z) != len(memory.learnt.clusters.first):
+        return False
+    usable = True
+    for value in z:
+        usable &= abs(value) <= LARGEST_OBSERVATION  # false of NaN
+    return usable
+
+
+@inner_kernel
+def _splits(memory: Memory, nearest: int) -> bool:
+    """Whether a failure at the latest observation founds a state, amid its nearest one."""
+    now = memory.learnt
+    return splits(
+        memory.parameters.rule,
+        now.clusters.squared_distances[nearest],
+        now.visits[nearest],
+        now.changes[nearest, nearest],
+        now.outcomes.endings[nearest],
     )
 
 
-@kernel
-def _connect(memory: Memory, n: int) -> None:
-    """Give the state that was founded at index ``n`` its transitions."""
-    now = memory.learnt
-    expand(now.transitions, n, memory.parameters.prior_frequency)
-    now.founded[n] = now.clusters.n_observations[0]
+@rare_kernel
+def _found(memory: Memory, n: int, nearest: int, potential: float) -> tuple[int, int]:
+    """Found a state on the latest observation; answers what happened and the nearest state.
+
+    Where there are as many states as allowed, one of them, or the newcomer, is given up.
+    """
+    parameters, now = memory.parameters, memory.learnt
+    new, event = n, clusters.CREATED
+    if n >= parameters.max_states:
+        if parameters.when_full == RETIRE:
+            new, event = retire_least_useful(memory, n), clusters.CREATED | RETIRED
+        else:
+            new, event = merge_closest(memory, n, nearest), clusters.CREATED | MERGED
+        if new == NEWCOMER:
+            return MERGED, nearest
+    else:
+        n += 1
+    place_center(now.clusters, new, now.clusters.latest, potential)
+    expand(now.transitions, new, n, parameters.prior_frequency)
+    now.ids[new] = now.n_founded[0]
+    now.founded[new] = now.clusters.n_observations[0]
+    now.n_founded[0] += 1.0
+    now.n_states[0] = n
+    return event, new
 
 
-@kernel
-def _recognise(memory: Memory, n: int) -> int:
+@inner_kernel
+def _recognise(memory: Memory, n: int, nearest: int) -> None:
     """Recognise the latest observation, into ``scratch.recognised``."""
-    held = memory.learnt.clusters
-    wide = width(memory.parameters.rule, held)
-    return spread.recognise(held.squared_distances, n, wide, memory.scratch.recognised)
+    parameters, held = memory.parameters, memory.learnt.clusters
+    spread.recognise(
+        held.squared_distances,
+        lanes(n),
+        nearest,
+        width(parameters.rule, held),
+        parameters.belief_tolerance,
+        memory.scratch.recognised,
+    )
 
 
-@kernel
-def _decide(memory: Memory, n: int, failed: bool) -> None:
+@inner_kernel
+def _decide(memory: Memory, place: int, n: int, failed: bool) -> None:
     """Count that the pending action was taken from the belief, and whether it led to failure."""
     now = memory.learnt
-    action = int(now.action[0])
-    count(now.outcomes.decisions[action], now.belief, n)
+    count(now.outcomes.decisions[place], now.belief, n)
     if failed:
-        count(now.outcomes.failures[action], now.belief, n)
+        count(now.outcomes.failures[place], now.belief, n)
 
 
-@kernel
+@inner_kernel
 def _end(memory: Memory) -> None:
     """Count the failure where the episode was last, and clear the chain."""
     now = memory.learnt
@@ -254,9 +353,7 @@ def learn_rows(
     while row < len(observations):
         if starts[row]:
             now.chained[0] = 0.0
-        for j in range(observations.shape[1]):
-            memory.scratch.observation[j] = observations[row, j]
-        event, state, surprise = step(memory, failures[row])
+        event, state, surprise = step(memory, observations[row], failures[row])
         if event == FULL:
             break
         if not failures[row]:

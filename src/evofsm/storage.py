@@ -3,7 +3,8 @@
 A file is a ZIP of ``.npy`` members (NumPy's ``.npz``), read with pickling refused. The member
 ``header`` is JSON: ``{"format", "version", "kind", "content"}``. A machine's file holds the
 views of its buffer, with centres by variable (m, n); a model's its fields, centres by state (n, m).
-Version 1 knew the paper's state rule only and did not count failures.
+Version 1 knew the paper's state rule only and did not count failures. Version 2 held a matrix for
+every action, used or not.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 _FORMAT = "evofsm"
-_VERSION = 2
+_VERSION = 3
 # Arrays that version 1 had not, as zeros in the shape of one that it had.
 _ADDED = {
     "machine": {
@@ -120,10 +121,15 @@ def _header(encoded: Any) -> dict[str, Any]:
 
 
 def _upgrade(header: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> None:
-    """Give a file of version 1 what it lacks."""
-    header["content"]["rule"] = {"name": "paper"}
-    for name, like in _ADDED[header["kind"]].items():
-        arrays[name] = np.zeros_like(arrays[like])
+    """Give a file of an earlier version what it lacks."""
+    if header["version"] < 2:
+        header["content"]["rule"] = {"name": "paper"}
+        for name, like in _ADDED[header["kind"]].items():
+            arrays[name] = np.zeros_like(arrays[like])
+    if header["kind"] == "machine":
+        arrays["places"] = np.arange(len(arrays["uses"]), dtype=np.float64)
+        arrays["n_founded"] = arrays["n_states"]
+        arrays["ids"] = np.arange(len(arrays["visits"]), dtype=np.float64)
 
 
 @contextmanager

@@ -12,124 +12,201 @@ the other way round, with the same meaning of rows.)
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Literal, NamedTuple, get_args
 
 import numpy as np
+from numba.extending import register_jitable
 from numpy.typing import NDArray
 
-from evofsm._compile import kernel
+from evofsm._compile import inner_kernel, lanes, rare_kernel
 from evofsm.validation import whole
 
 Policy = Literal["marginal", "hold", "observed"]
 
 # A weight below this is taken as 0: smaller numbers turn denormal and slow every step.
 _LOWEST_FREQUENCY = 1e-290
+# A row with less left of it than this is rounding.
+_LEAST_KEPT = 1e-12
+#: The place of an action without a matrix.
+NOT_OPEN = -1.0
 
 
 class Transitions(NamedTuple):
-    """One row-stochastic matrix per action, the first n of ``capacity`` states in use."""
+    """One row-stochastic matrix per action, the first n of ``capacity`` states in use.
 
-    matrices: NDArray[np.float64]  # (q, capacity, capacity)
-    origin_frequency: NDArray[np.float64]  # (q, capacity)
+    An action has a place among the s matrices from its first use on. One that was never used
+    has none, and costs nothing: all its transitions are alike.
+    """
+
+    places: NDArray[np.float64]  # (q,) of each action's matrix, or NOT_OPEN
     uses: NDArray[np.float64]  # (q,) transitions identified with each action
+    matrices: NDArray[np.float64]  # (s, capacity, capacity)
+    origin_frequency: NDArray[np.float64]  # (s, capacity)
 
 
 class Outcomes(NamedTuple):
     """Evidence on failure, in counts that never forget: a rare failure must not fade.
 
-    It is kept apart from `Transitions.origin_frequency`, which forgets.
+    It is kept apart from `Transitions.origin_frequency`, which forgets. Places are the same.
     """
 
-    decisions: NDArray[np.float64]  # (q, capacity) belief-weighted transitions from each state
-    failures: NDArray[np.float64]  # (q, capacity) those of them that led straight into failure
+    decisions: NDArray[np.float64]  # (s, capacity) belief-weighted transitions from each state
+    failures: NDArray[np.float64]  # (s, capacity) those of them that led straight into failure
     endings: NDArray[np.float64]  # (capacity,) failures whose last observation was the state
 
 
-@kernel
+@inner_kernel
 def count(counts: NDArray[np.float64], belief: NDArray[np.float64], n: int) -> None:
     """Count one event, shared out over the first ``n`` states by belief."""
     for i in range(n):
         counts[i] += belief[i]
 
 
-@kernel
-def expand(transitions: Transitions, n: int, prior_frequency: float) -> None:
-    """Add state ``n`` to all matrices: its row and column of F are the prior frequency."""
-    new = n
-    for r in range(len(transitions.uses)):
-        matrix = transitions.matrices[r]
-        origin_frequency = transitions.origin_frequency[r]
-        for i in range(new):
+@register_jitable
+def count_open(transitions: Transitions) -> int:
+    """Number of actions that have a matrix."""
+    open_ = 0
+    for place in transitions.places:
+        open_ += place != NOT_OPEN
+    return open_
+
+
+@inner_kernel
+def place_of(transitions: Transitions, action: int, n: int, prior_frequency: float) -> int:
+    """Where the action's matrix is; at its first use, one of ``n`` states without evidence."""
+    if transitions.places[action] == NOT_OPEN:
+        place = count_open(transitions)
+        transitions.places[action] = place
+        for i in range(n):
+            forget_row(transitions, place, i, n, prior_frequency)
+    return int(transitions.places[action])
+
+
+@rare_kernel
+def forget_row(
+    transitions: Transitions, place: int, i: int, n: int, prior_frequency: float
+) -> None:
+    """Give a row of a matrix of ``n`` states the prior frequencies, which are all alike."""
+    for j in range(n):
+        transitions.matrices[place, i, j] = 1.0 / n
+    transitions.origin_frequency[place, i] = n * prior_frequency
+
+
+@rare_kernel
+def expand(transitions: Transitions, new: int, n: int, prior_frequency: float) -> None:
+    """Add a state to all matrices, ``n`` with it: its row and column of F are the prior frequency.
+
+    Its index ``new`` is the last, or that of a state given up, whose column is 0.
+    """
+    for place in range(len(transitions.matrices)):
+        matrix = transitions.matrices[place]
+        origin_frequency = transitions.origin_frequency[place]
+        for i in range(n):
             before = origin_frequency[i]
             origin_frequency[i] = before + prior_frequency
             kept = before / origin_frequency[i]
-            for j in range(new):
+            for j in range(n):
                 matrix[i, j] *= kept
             matrix[i, new] = prior_frequency / origin_frequency[i]
-        origin_frequency[new] = (new + 1) * prior_frequency
-        for j in range(new + 1):
-            matrix[new, j] = 1.0 / (new + 1)
+        forget_row(transitions, place, new, n, prior_frequency)
 
 
-@kernel
-def identify(
+@rare_kernel
+def merge_states(transitions: Transitions, kept: int, given: int, n: int) -> None:
+    """Add the frequencies of transitions from and to a state to those of another one."""
+    for place in range(len(transitions.matrices)):
+        matrix = transitions.matrices[place]
+        frequency = transitions.origin_frequency[place]
+        together = frequency[kept] + frequency[given]
+        share = frequency[given] / together if together > 0.0 else 0.0
+        for j in range(n):
+            matrix[kept, j] += share * (matrix[given, j] - matrix[kept, j])
+            matrix[given, j] = 0.0
+        frequency[kept], frequency[given] = together, 0.0
+        for i in range(n):
+            matrix[i, kept] += matrix[i, given]
+            matrix[i, given] = 0.0
+
+
+@rare_kernel
+def retire_state(transitions: Transitions, given: int, n: int, prior_frequency: float) -> None:
+    """Take the frequencies of transitions from and to a state away."""
+    for place in range(len(transitions.matrices)):
+        matrix = transitions.matrices[place]
+        frequency = transitions.origin_frequency[place]
+        frequency[given] = 0.0
+        for i in range(n):
+            kept = 1.0 - matrix[i, given]
+            if kept <= _LEAST_KEPT:  # nothing else is known of where it leads
+                forget_row(transitions, place, i, n, prior_frequency)
+                kept = 1.0 - matrix[i, given]
+            matrix[i, given] = 0.0
+            frequency[i] *= kept
+            for j in range(n):
+                matrix[i, j] /= kept
+
+
+@inner_kernel
+def forecast_and_identify(
     transitions: Transitions,
-    action: int,
+    place: int,
     n: int,
     origin: NDArray[np.float64],
     reached: NDArray[np.float64],
     learning_rate: float,
-) -> None:
-    """Learn one transition under ``action`` from belief ``origin`` to belief ``reached``."""
-    matrix = transitions.matrices[action]
-    origin_frequency = transitions.origin_frequency[action]
-    transitions.uses[action] += 1.0
-    for i in range(n):
-        gain = learning_rate * origin[i]
-        frequency = (1.0 - learning_rate) * origin_frequency[i] + gain
-        if frequency < _LOWEST_FREQUENCY:
-            origin_frequency[i] = 0.0
-            continue
-        origin_frequency[i] = frequency
-        rate = gain / frequency
-        for j in range(n):
-            matrix[i, j] += rate * (reached[j] - matrix[i, j])
-
-
-@kernel
-def forecast(
-    transitions: Transitions,
-    action: int,
-    n: int,
-    belief: NDArray[np.float64],
     predicted: NDArray[np.float64],
+    rates: NDArray[np.float64],
 ) -> None:
-    """One step ahead: ``belief @ P`` under ``action``."""
-    matrix = transitions.matrices[action]
-    for j in range(n):
-        predicted[j] = 0.0
+    """Forecast one step, ``origin @ P``, then learn the transition from ``origin`` to ``reached``.
+
+    Both in one pass over the matrix, which is most of what a step costs. A row whose state was
+    not believed in plays no part in either. ``rates`` is room to work in.
+    """
+    matrix = transitions.matrices[place]
+    frequencies = transitions.origin_frequency[place]
+    for i in range(lanes(n)):
+        gain = learning_rate * origin[i]
+        frequency = (1.0 - learning_rate) * frequencies[i] + gain
+        known = frequency >= _LOWEST_FREQUENCY
+        frequencies[i] = frequency if known else 0.0
+        rates[i] = gain / frequency if known else 0.0
+        predicted[i] = 0.0
     for i in range(n):
-        for j in range(n):
-            predicted[j] += belief[i] * matrix[i, j]
+        believed, rate = origin[i], rates[i]
+        if believed == 0.0:
+            continue
+        for j in range(lanes(n)):
+            probability = matrix[i, j]
+            predicted[j] += believed * probability
+            matrix[i, j] = probability + rate * (reached[j] - probability)
 
 
 def marginal(
-    matrices: NDArray[np.float64], uses: NDArray[np.float64], policy: Policy = "marginal"
+    matrices: NDArray[np.float64],
+    uses: NDArray[np.float64],
+    n_actions: int,
+    policy: Policy = "marginal",
 ) -> NDArray[np.float64]:
-    """Average the (q, n, n) matrices: over all actions alike, or as often as each was used."""
+    """Average the matrices of all actions: each alike, or as often as it was used.
+
+    Given are the (s, n, n) matrices of some actions and their (s,) uses; those of all others were
+    never used, so that they hold 1 / n.
+    """
     if policy not in ("marginal", "observed"):
         raise ValueError(f"policy is {policy!r}; an average is 'marginal' or 'observed'")
     if policy == "observed" and uses.sum() > 0.0:
         mixed: NDArray[np.float64] = np.tensordot(uses / uses.sum(), matrices, axes=1)
         return mixed
-    average: NDArray[np.float64] = matrices.mean(axis=0)
+    unused = (n_actions - len(matrices)) / max(matrices.shape[-1], 1)
+    average: NDArray[np.float64] = (matrices.sum(axis=0) + unused) / n_actions
     return average
 
 
 def propagate(
-    matrices: NDArray[np.float64],
-    uses: NDArray[np.float64],
     belief: NDArray[np.float64],
+    matrix_of: Callable[[int], NDArray[np.float64]],
+    averaged: Callable[[Policy], NDArray[np.float64]],
     action: int | None,
     horizon: int,
     policy: Policy,
@@ -144,9 +221,9 @@ def propagate(
     if action is None and policy == "hold":
         raise ValueError("policy 'hold' needs the action that is held")
     if action is not None:
-        belief = belief @ matrices[action]
+        belief = belief @ matrix_of(action)
         horizon -= 1
     if horizon > 0:
-        then = matrices[action] if policy == "hold" else marginal(matrices, uses, policy)
+        then = matrix_of(action) if action is not None and policy == "hold" else averaged(policy)
         belief = belief @ np.linalg.matrix_power(then, horizon)
     return belief

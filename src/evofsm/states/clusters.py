@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm._compile import kernel
+from evofsm._compile import inner_kernel, lanes
 
 # What may happen to the states.
 UNCHANGED, MOVED, CREATED = 0, 1, 2
@@ -38,13 +38,13 @@ class Clusters(NamedTuple):
     squared_distances: NDArray[np.float64]  # (capacity,) from the latest observation
 
 
-@kernel
+@inner_kernel
 def total_variance(clusters: Clusters) -> float:
     """Population variance of all observations so far, summed over the variables."""
     return float(clusters.scatter[0] / clusters.n_observations[0])
 
 
-@kernel
+@inner_kernel
 def measure_distances(
     centers: NDArray[np.float64],
     weights: NDArray[np.float64],
@@ -62,7 +62,7 @@ def measure_distances(
             squared_distances[i] += offset * offset
 
 
-@kernel
+@inner_kernel
 def nearest_center(squared_distances: NDArray[np.float64], n: int) -> int:
     """Index of the smallest of the first ``n`` distances; the oldest centre wins a tie."""
     nearest = 0
@@ -72,7 +72,7 @@ def nearest_center(squared_distances: NDArray[np.float64], n: int) -> int:
     return nearest
 
 
-@kernel
+@inner_kernel
 def potential_of(clusters: Clusters, weights: NDArray[np.float64], z: NDArray[np.float64]) -> float:
     """Density at ``z`` of the observations so far, in its mean and variance form."""
     squared_distance = 0.0
@@ -82,24 +82,24 @@ def potential_of(clusters: Clusters, weights: NDArray[np.float64], z: NDArray[np
     return 1.0 / (1.0 + squared_distance + total_variance(clusters))
 
 
-@kernel
+@inner_kernel
 def update_potentials(clusters: Clusters, n: int, distance_weight: float) -> float:
     """Recursion of the centres' potentials; returns the highest.
 
     It needs the distances to z_{t-1}, which are still at hand from the step before.
     """
     t = clusters.n_observations[0] + 1.0
-    highest = 0.0
-    for i in range(n):
+    for i in range(lanes(n)):
         potential = clusters.potentials[i]
         far = 1.0 + distance_weight * clusters.squared_distances[i]
-        potential = (t - 1.0) * potential / ((t - 2.0) + potential * far)
-        clusters.potentials[i] = potential
-        highest = max(highest, potential)
+        clusters.potentials[i] = (t - 1.0) * potential / ((t - 2.0) + potential * far)
+    highest = 0.0
+    for i in range(n):
+        highest = max(highest, clusters.potentials[i])
     return highest
 
 
-@kernel
+@inner_kernel
 def place_center(clusters: Clusters, i: int, z: NDArray[np.float64], potential: float) -> None:
     """Put centre ``i`` on the observation, which is then at no distance from it."""
     for j in range(len(z)):
@@ -108,7 +108,7 @@ def place_center(clusters: Clusters, i: int, z: NDArray[np.float64], potential: 
     clusters.squared_distances[i] = 0.0
 
 
-@kernel
+@inner_kernel
 def absorb(clusters: Clusters, weights: NDArray[np.float64], z: NDArray[np.float64]) -> None:
     """Add the observation to the running mean and scatter (Welford 1962)."""
     clusters.n_observations[0] += 1.0

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm._compile import kernel
+from evofsm._compile import inner_kernel, kernel, lanes
 from evofsm.states import edges, ets, novelty
 from evofsm.states.clusters import (
     CREATED,
@@ -36,33 +36,33 @@ RULES: Mapping[str, Any] = {
 }
 
 
-@kernel
-def determine(settings: RuleSettings, clusters: Clusters, n: int, z: NDArray[np.float64]) -> int:
-    """Let one observation leave the centres as they are, move one, or found one.
+@inner_kernel
+def determine(
+    settings: RuleSettings, clusters: Clusters, n: int, z: NDArray[np.float64]
+) -> tuple[int, int, float]:
+    """Judge one observation against ``n`` centres; the nearest may be moved onto it.
 
-    ``n`` centres are in use; where the answer is ``CREATED``, the new one stands at index ``n``.
+    Answers the event, the nearest centre, and the potential of the observation. Where the event
+    is ``CREATED``, whoever asked has to place the new centre.
     """
     if clusters.n_observations[0] == 0.0:
         for j in range(len(z)):
             clusters.first[j] = z[j]
-        place_center(clusters, 0, z, 1.0)
-        event = CREATED
+        event, nearest, potential = CREATED, 0, 1.0
     else:
         potential = potential_of(clusters, settings.weights, z)
         highest = update_potentials(clusters, n, settings.distance_weight)
-        measure_distances(clusters.centers, settings.weights, n, z, clusters.squared_distances)
-        nearest = nearest_center(clusters.squared_distances, n)
-        squared_distance = clusters.squared_distances[nearest]
-        event = _judge(settings, clusters, n, potential, highest, squared_distance)
+        squared_distances = clusters.squared_distances
+        measure_distances(clusters.centers, settings.weights, lanes(n), z, squared_distances)
+        nearest = nearest_center(squared_distances, n)
+        event = _judge(settings, clusters, n, potential, highest, squared_distances[nearest])
         if event == MOVED:
             place_center(clusters, nearest, z, potential)
-        elif event == CREATED:
-            place_center(clusters, n, z, potential)
     absorb(clusters, settings.weights, z)
-    return event
+    return event, nearest, potential
 
 
-@kernel
+@inner_kernel
 def _judge(
     settings: RuleSettings,
     clusters: Clusters,

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
-from evofsm._compile import kernel
+from evofsm._compile import inner_kernel
 from evofsm.states import ets
 from evofsm.states.clusters import CREATED, UNCHANGED, Clusters
 from evofsm.states.rule import RuleSettings
@@ -39,7 +39,7 @@ class Edges:
         return machine._replace(code=CODE)
 
 
-@kernel
+@inner_kernel
 def judge(
     clusters: Clusters,
     n: int,

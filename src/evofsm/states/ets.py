@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
-from evofsm._compile import kernel
+from evofsm._compile import inner_kernel
 from evofsm.states.clusters import CREATED, MOVED, UNCHANGED, Clusters, total_variance
 from evofsm.states.rule import RuleSettings
 
@@ -39,7 +39,7 @@ class Paper:
         return machine._replace(code=CODE)
 
 
-@kernel
+@inner_kernel
 def judge(potential: float, highest: float, squared_distance: float, radius: float) -> int:
     """Leave the states as they are, move the nearest, or found one."""
     if potential <= highest:
@@ -47,7 +47,7 @@ def judge(potential: float, highest: float, squared_distance: float, radius: flo
     return MOVED if squared_distance < radius * radius else CREATED
 
 
-@kernel
+@inner_kernel
 def width(spread: float, clusters: Clusters) -> float:
     """Width of recognition; the paper leaves its var(z*) open."""
     return spread * total_variance(clusters)

@@ -9,18 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-import numpy as np
-from numpy.typing import NDArray
-
-from evofsm._compile import kernel
-from evofsm.states.clusters import (
-    CREATED,
-    UNCHANGED,
-    Clusters,
-    nearest_center,
-    place_center,
-    potential_of,
-)
+from evofsm._compile import inner_kernel
 from evofsm.states.novelty import Novelty
 from evofsm.states.rule import RuleSettings, StateRule
 from evofsm.validation import positive
@@ -82,26 +71,20 @@ class FailureSplit:
         return told._replace(failure_share=self.share, failure_distance=self.distance)
 
 
-@kernel
-def split(
+@inner_kernel
+def splits(
     settings: RuleSettings,
-    clusters: Clusters,
-    n: int,
-    endings: NDArray[np.float64],
-    visits: NDArray[np.float64],
-    changes: NDArray[np.float64],
-) -> int:
-    """Judge the latest observation, at which an episode failed; found a state on it, or not.
+    squared_distance: float,
+    visits: float,
+    returns: float,
+    endings: float,
+) -> bool:
+    """Whether the latest observation, at which an episode failed, founds a state.
 
-    The potential of the new centre counts the observation itself as well: it is absorbed already.
+    Its nearest state was recognised in ``visits`` observations, ``returns`` of which followed
+    one in the same state, and ``endings`` episodes failed in it.
     """
-    nearest = nearest_center(clusters.squared_distances, n)
-    if clusters.squared_distances[nearest] <= settings.failure_distance**2:
-        return UNCHANGED
+    if squared_distance <= settings.failure_distance**2:
+        return False
     # Of all visits, those that did not come from the state itself began a stay.
-    stays = visits[nearest] - changes[nearest, nearest]
-    if endings[nearest] >= settings.failure_share * stays:
-        return UNCHANGED
-    potential = potential_of(clusters, settings.weights, clusters.latest)
-    place_center(clusters, n, clusters.latest, potential)
-    return CREATED
+    return endings < settings.failure_share * (visits - returns)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from evofsm._compile import kernel
+from evofsm._compile import inner_kernel
 from evofsm.states.clusters import CREATED, UNCHANGED
 from evofsm.states.rule import RuleSettings
 from evofsm.validation import positive
@@ -66,13 +66,13 @@ class Novelty:
         return machine._replace(code=CODE, radius=self.radius, spread=self.spread)
 
 
-@kernel
+@inner_kernel
 def judge(squared_distance: float, radius: float) -> int:
     """Found a state where the nearest centre is farther than the radius."""
     return CREATED if squared_distance > radius * radius else UNCHANGED
 
 
-@kernel
+@inner_kernel
 def width(spread: float, radius: float) -> float:
     """Width of recognition, whatever was seen."""
     return spread * radius * radius
