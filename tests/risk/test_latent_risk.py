@@ -487,6 +487,9 @@ def test_files_that_cannot_be_right_are_refused(taught, tmp_path, name, array):
         ([30.0, 20.0, 20.0], 0.0, [[1.0]], "belief"),
         ([30.0, 20.0, 20.0], 0.0, [math.nan, 1.0], "belief"),
         ([30.0, 20.0, 20.0], 0.0, [0.5, 0.1], "belief"),
+        (np.array([30.0, math.nan, 20.0]), 0.0, np.ones(1), "observation"),
+        (np.array([30.0, 20.0, 20.0]), math.inf, np.ones(1), "acceleration"),
+        (np.array([30.0, 20.0, 20.0]), 0.0, np.full(9, 0.2), "belief"),
     ],
 )
 def test_bad_input_is_named_and_changes_nothing(
@@ -501,6 +504,10 @@ def test_bad_input_is_named_and_changes_nothing(
             taught.follow(observation, acceleration)
         with pytest.raises((TypeError, ValueError), match=named):
             taught.critical(observation, [acceleration])
+        with pytest.raises((TypeError, ValueError), match=named):
+            taught.judge(
+                situation(20.0, 20.0, 20.0)._replace(observation=observation), [acceleration]
+            )
     assert snapshot(taught) == before
     for risk in (taught, after):  # nor is it confused about what is under way
         for k in range(12):

@@ -1,12 +1,13 @@
 """What is estimated from noisy observations, and what is learnt in spite of noise."""
 
 import copy
+import math
 
 import numpy as np
 import pytest
 
 from evofsm.protocols import Situation
-from evofsm.risk.brakes import OwnBrakes
+from evofsm.risk.brakes import Latest, OwnBrakes, Sample
 from evofsm.risk.manoeuvres import BrakeWatch
 from evofsm.risk.outcome import LatentRisk
 from evofsm.risk.perception import Perception
@@ -189,3 +190,56 @@ def test_a_leaders_braking_is_measured_well_in_spite_of_noise(decel):
     assert 50 <= len(told) <= 55
     assert np.median(told) == pytest.approx(decel, rel=0.1)
     assert np.quantile(told, 0.95) < 1.15 * decel
+
+
+@pytest.mark.parametrize("decimals", [1, 9])
+def test_noise_is_that_of_the_latest_residuals_and_of_no_others(decimals):
+    rng = np.random.default_rng(2)
+    speeds = np.round(20.0 + rng.normal(size=(1200, 2)), decimals)  # many sizes are equal
+    perception = Perception(DT)
+    for k, (own, leader) in enumerate(speeds):
+        perception.see([50.0, own, leader], 0.0)
+        residuals = np.abs(np.diff(speeds[: k + 1], n=2, axis=0))[-500:]
+        if len(residuals) < 20:
+            assert perception.noise[1:] == (0.0, 0.0)
+            continue
+        found = np.sort(residuals, axis=0)[len(residuals) // 2] / 0.6745 / np.sqrt(6.0)
+        assert perception.noise[1:] == pytest.approx(tuple(found), rel=1e-12)
+    kept = perception.learnt()["noise_speed"]
+    np.testing.assert_array_equal(kept, residuals[:, 0])
+    again = Perception(DT)
+    again.restore(perception.learnt())
+    assert again.noise == perception.noise
+
+
+def test_asked_twice_it_answers_the_same_and_asked_otherwise_it_does_not():
+    risk, row = taught()
+    perception = risk.perception
+    first = perception.estimate(row, 0.5)
+    assert perception.estimate(row, 0.5) == first
+    for other in (
+        perception.estimate(row + 0.1, 0.5),
+        perception.estimate(row, 0.0),
+        perception.estimate(row, 0.5, sure=False),
+    ):
+        assert other != first
+    perception.see(row, 0.5)
+    assert perception.estimate(row, 0.5) != first
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_what_brakes_bring_is_what_all_samples_in_full_precision_say(seed):
+    rng = np.random.default_rng(seed)
+    latest, given = Latest(30), []
+    for _ in range(70):
+        given.append(Sample(round(rng.normal(3.0, 0.5), seed), bool(rng.random() < 0.2)))
+        latest.add(given[-1])
+        values = [sample.value for sample in given[-30:]]
+        assert list(latest) == given[-30:]
+        mean, bound = latest.mean_and_bound(2.0) if len(values) > 1 else (values[0], values[0])
+        assert mean == math.fsum(values) / len(values)
+        if len(values) > 1:
+            stretches = max(1, sum(sample.begins for sample in given[-30:]))
+            error = np.sqrt(np.var(values, ddof=1) * stretches) / len(values)
+            few = 1.0 + 1.2 / (len(values) - 1)
+            assert bound == pytest.approx(mean - few * 2.0 * error, abs=1e-9)

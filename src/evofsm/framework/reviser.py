@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from evofsm._compile import compiled
 from evofsm.actions import IntervalActions
 from evofsm.protocols import Proposal, Revision, RiskMeasure, Situation
 from evofsm.risk.outcome import ActionJudge, Judgement
@@ -133,6 +134,7 @@ class ActionReviser:
         self.mode = mode
         self.way = way
         self._overridden = False
+        self._lowest, self._highest = _bounds(actions)
         self.start_episode()
 
     def start_episode(self) -> None:
@@ -186,11 +188,10 @@ class ActionReviser:
 
     def _options(self, wanted: float, proposal: Proposal) -> NDArray[np.float64]:
         """What could be executed, the proposal first."""
-        if self.way is Way.CHOOSE:
-            others = [a for a in proposal.candidates if self.actions.low <= a <= self.actions.high]
-        else:
-            others = nearest_values(self.actions, wanted)
-        return np.array([wanted, *others])
+        if self.way is Way.IMPROVE:
+            return np.minimum(np.maximum(wanted, self._lowest), self._highest)
+        low, high = self.actions.low, self.actions.high
+        return np.array([wanted, *(a for a in proposal.candidates if low <= a <= high)])
 
     def _decide(self, options: NDArray[np.float64], judged: Judgement) -> tuple[int, str]:
         """Index of the best option, and why."""
@@ -198,25 +199,46 @@ class ActionReviser:
         if self._brake_test > 0 and not self.risk.brakes.known:
             self._brake_test -= 1
             return int(options.argmin()), "own brakes not known yet: braking in full to learn them"
-        if judged.risk[0] <= limit:
+        risk = float(judged.risk[0])
+        if risk <= limit:
             self._revising = False
             return 0, "risk is within the tolerance"
         self._revising = True
         why = (
-            f"could not survive a leader braking harder than {judged.critical[0]:.1f} m/s² "
-            f"(risk {judged.risk[0]:.1%})"
+            f"could not survive a leader braking harder than {float(judged.critical[0]):.1f} m/s² "
+            f"(risk {risk:.1%})"
         )
         if not self.risk.brakes.known:
             self._brake_test = _BRAKE_TEST
             return int(options.argmin()), f"{why}; own brakes not known yet, so in full"
-        within = judged.risk <= limit
         # Once revising, what is safe by the margin; else whatever is tolerable.
-        tolerable = np.flatnonzero(within if within.any() else judged.risk <= self.tolerance)
-        if len(tolerable):
-            closest = tolerable[np.abs(options[tolerable] - options[0]).argmin()]
-            return int(closest), f"{why}; the closest that can"
-        least = np.flatnonzero(judged.risk == judged.risk.min())
-        return int(least[options[least].argmin()]), f"{why}; nothing can, the least risky"
+        for tolerated in (limit, self.tolerance):
+            closest = _closest_within(options, judged.risk, tolerated)
+            if closest >= 0:
+                return closest, f"{why}; the closest that can"
+        return _least_risky(options, judged.risk), f"{why}; nothing can, the least risky"
+
+
+@compiled
+def _closest_within(
+    options: NDArray[np.float64], risk: NDArray[np.float64], tolerated: float
+) -> int:
+    """Index of the tolerable option that is closest to the first; -1 where none is."""
+    best, change = -1, np.inf
+    for k in range(len(options)):
+        if risk[k] <= tolerated and abs(options[k] - options[0]) < change:
+            best, change = k, abs(options[k] - options[0])
+    return best
+
+
+@compiled
+def _least_risky(options: NDArray[np.float64], risk: NDArray[np.float64]) -> int:
+    """Index of the option of the lowest risk; of several the one that brakes hardest."""
+    best = 0
+    for k in range(len(options)):
+        if risk[k] < risk[best] or (risk[k] == risk[best] and options[k] < options[best]):
+            best = k
+    return best
 
 
 def _novelty(judged: Judgement) -> str:
@@ -233,15 +255,19 @@ def nearest_values(actions: IntervalActions, wanted: float) -> list[float]:
     >>> [round(value, 6) for value in nearest_values(actions, 0.5)]
     [-0.0, 0.5, -1.0, 1.0]
     """
-    values = []
-    for i in range(actions.n_actions):
-        lower, upper = actions.interval(i)
-        if actions.closed == "left" and i < actions.n_actions - 1:
-            upper = math.nextafter(upper, -math.inf)
-        if actions.closed == "right" and i > 0:
-            lower = math.nextafter(lower, math.inf)
-        values.append(min(max(wanted, lower), upper))
-    return [*values, actions.low, actions.high]
+    lowest, highest = _bounds(actions)
+    return [float(value) for value in np.clip(wanted, lowest, highest)[1:]]
+
+
+def _bounds(actions: IntervalActions) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Lowest and highest value of the whole set, of each interval, and of both limits alone."""
+    lowest, highest = actions.edges[:-1].copy(), actions.edges[1:].copy()
+    if actions.closed == "left":
+        highest[:-1] = np.nextafter(highest[:-1], -math.inf)
+    else:
+        lowest[1:] = np.nextafter(lowest[1:], math.inf)
+    low, high = actions.low, actions.high
+    return np.array([low, *lowest, low, high]), np.array([high, *highest, low, high])
 
 
 class EnvelopeReviser:

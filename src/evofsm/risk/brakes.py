@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Collection, Iterable
-from math import fsum, sqrt
+from collections.abc import Iterable, Iterator
+from math import sqrt
 from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evofsm._compile import compiled, kernel
 
 # Full braking is judged by so many of the latest decisions, and by no fewer than the second number;
 # that it is weaker than before shows in as few, and in no more than the third number.
@@ -30,6 +34,52 @@ class Sample(NamedTuple):
 
     value: float  #: [m/s²]
     begins: bool  #: whether a stretch of steady decisions begins with it
+
+
+class Latest:
+    """The latest samples, the oldest first, and what can be said of their mean.
+
+    Parameters
+    ----------
+    most : int
+        How many are kept.
+
+    Examples
+    --------
+    >>> latest = Latest(2)
+    >>> for value in (9.0, 2.0, 4.0):
+    ...     latest.add(Sample(value, begins=True))
+    >>> latest.mean_and_bound(errors=0.0)
+    (3.0, 3.0)
+    """
+
+    def __init__(self, most: int) -> None:
+        self._rows = np.empty((most, 2))  # value, and 1 where a stretch begins
+        self._count = 0
+
+    def __len__(self) -> int:
+        return self._count
+
+    def __iter__(self) -> Iterator[Sample]:
+        for value, begins in self._rows[: self._count].tolist():
+            yield Sample(value, bool(begins))
+
+    def add(self, sample: Sample) -> None:
+        """Take in one more; the oldest goes where there is no room."""
+        self._count = _add(self._rows, self._count, *sample)
+
+    def clear(self) -> None:
+        """Forget them."""
+        self._count = 0
+
+    def mean_and_bound(self, errors: float, latest: int | None = None) -> tuple[float, float]:
+        """Mean, and so many standard errors below it; of all, or of the ``latest``.
+
+        A decision's acceleration is a difference of two speeds, and what noise does to one it
+        undoes in the next: the mean of a stretch has the noise of its two ends only.
+        """
+        first = 0 if latest is None else self._count - latest
+        return _mean_and_bound(self._rows, first, self._count, errors)
 
 
 class OwnBrakes:
@@ -61,25 +111,15 @@ class OwnBrakes:
         self.lowest = lowest
         self.assumed = assumed
         self.dt = dt
-        self.samples: deque[Sample] = deque(maxlen=_MEMORY)
-        self._shortfalls: deque[tuple[Sample, Sample]] = deque(maxlen=_SUSPECT)
+        self.samples = Latest(_MEMORY)  #: of full braking
+        self._shortfalls = Latest(_SUSPECT)  # of any braking against what was to be expected
+        self._brought = Latest(_FEWEST)  # by the latest of it
+        #: Whether full braking was seen often and clearly enough to count on what was seen.
+        self.known = False
+        #: Full braking that can be counted on [m/s²], positive; and as it most likely is.
+        self.decel = self._likely = max(assumed, _WEAKEST) * -lowest
         self.lagged = [0.0, 0.0]  # sums of products and of squares: the lag by least squares
         self.clear()
-
-    @property
-    def known(self) -> bool:
-        """Whether full braking was seen often and clearly enough to count on what was seen."""
-        if not _FEWEST <= len(self.samples) < _MEMORY:
-            return len(self.samples) >= _FEWEST
-        return self._bound >= _CLEAR * self._mean
-
-    @property
-    def decel(self) -> float:
-        """Full braking that can be counted on [m/s²], positive."""
-        counted_on = -self.assumed * self.lowest
-        if len(self.samples) >= _FEWEST:
-            counted_on = self._bound if self.known else min(self._bound, counted_on)
-        return max(counted_on, -_WEAKEST * self.lowest)
 
     @property
     def lag(self) -> float:
@@ -93,20 +133,21 @@ class OwnBrakes:
 
     def remember(self, samples: Iterable[Sample]) -> None:
         """Take in what full braking brought, the oldest first."""
-        self.samples.extend(samples)
-        if len(self.samples) >= _FEWEST:
-            self._mean, self._bound = _mean(self.samples), _lower_bound(self.samples, _BOUND)
+        for sample in samples:
+            self.samples.add(sample)
+        if len(self.samples) < _FEWEST:
+            return
+        mean, bound = self.samples.mean_and_bound(_BOUND)
+        self.known = len(self.samples) == _MEMORY or bound >= _CLEAR * mean
+        counted_on = bound if self.known else min(bound, -self.assumed * self.lowest)
+        self.decel = max(counted_on, -_WEAKEST * self.lowest)
+        self._likely = mean if self.known else self.decel
 
     def expected(self, before: float, command: float) -> float:
         """Acceleration that a command most likely brings, after the one before it [m/s²]."""
         hardest = -self._likely
         last, asked = max(before, hardest), max(command, hardest)
         return self.lag * last + (1.0 - self.lag) * asked
-
-    @property
-    def _likely(self) -> float:
-        """Full braking as it most likely is [m/s²], positive."""
-        return self._mean if self.known else self.decel
 
     def clear(self) -> None:
         """An episode begins: what comes is not a consequence of what was."""
@@ -162,31 +203,53 @@ class OwnBrakes:
         is_braking = ruled < -_GENTLE and len(self.samples) >= _FEWEST
         if is_braking:
             brought = Sample(-realised, begins=not self._was_braking)
+            self._brought.add(brought)
             shortfall = min(-ruled, self.decel) - brought.value
-            self._shortfalls.append((brought._replace(value=shortfall), brought))
+            self._shortfalls.add(brought._replace(value=shortfall))
         self._was_braking = is_braking
-        if len(self._shortfalls) >= _FEWEST:
-            shortfalls, seen = zip(*self._shortfalls, strict=True)
-            # Without noise the latest few tell; in noise it takes more.
-            sure = max(_lower_bound(some, _SURE) for some in (shortfalls[-_FEWEST:], shortfalls))
-            if sure > _SHORTFALL:  # begin anew
-                self.samples.clear()
-                self.remember(seen[-_FEWEST:])
-                self._shortfalls.clear()
+        if is_braking and self._is_sure_to_fall_short():  # begin anew
+            self.samples.clear()
+            self.remember(self._brought)
+            self._shortfalls.clear()
+
+    def _is_sure_to_fall_short(self) -> bool:
+        """Without noise the latest few tell; in noise it takes more."""
+        if len(self._shortfalls) < _FEWEST:
+            return False
+        bounds = (self._shortfalls.mean_and_bound(_SURE, few)[1] for few in (_FEWEST, None))
+        return any(bound > _SHORTFALL for bound in bounds)
 
 
-def _mean(samples: Collection[Sample]) -> float:
-    return fsum(sample.value for sample in samples) / len(samples)
+@compiled
+def _add(rows: NDArray[np.float64], count: int, value: float, begins: bool) -> int:
+    """Add a row; answers how many there are."""
+    if count == len(rows):
+        count -= 1
+        for i in range(count):
+            rows[i, 0], rows[i, 1] = rows[i + 1, 0], rows[i + 1, 1]
+    rows[count, 0], rows[count, 1] = value, begins
+    return count + 1
 
 
-def _lower_bound(samples: Collection[Sample], errors: float) -> float:
-    """So many standard errors below the mean.
-
-    A decision's acceleration is a difference of two speeds, and what noise does to one it undoes
-    in the next: the mean of a stretch has the noise of its two ends only.
-    """
-    mean, count = _mean(samples), len(samples)
-    variance = fsum((sample.value - mean) ** 2 for sample in samples) / (count - 1)
-    stretches = max(1, sum(sample.begins for sample in samples))
+@compiled
+def _mean_and_bound(
+    rows: NDArray[np.float64], first: int, end: int, errors: float
+) -> tuple[float, float]:
+    values, count = rows[first:end, 0], end - first
+    mean = _sum(values) / count
+    variance = _sum((values - mean) ** 2) / (count - 1)
+    stretches = max(1.0, rows[first:end, 1].sum())
     few = 1.0 + 1.2 / (count - 1)  # roughly what Student's t adds: few say little of their variance
-    return mean - few * errors * sqrt(variance * stretches) / count
+    return mean, mean - few * errors * sqrt(variance * stretches) / count
+
+
+@kernel
+def _sum(values: NDArray[np.float64]) -> float:
+    """Sum in twice the precision, so that equal samples have no variance (Ogita et al. 2005)."""
+    total = rest = 0.0
+    for value in values:
+        more = total + value
+        part = more - total
+        rest += (total - (more - part)) + (value - part)
+        total = more
+    return total + rest

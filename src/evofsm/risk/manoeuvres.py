@@ -77,7 +77,8 @@ class Manoeuvres:
 
     def harder(self, decel: ArrayLike) -> NDArray[np.float64]:
         """Probability that the next hard manoeuvre is harder than these decelerations [m/s²]."""
-        return np.interp(np.asarray(decel, dtype=np.float64), self._grid, self._harder)
+        grid, harder = self.table
+        return np.asarray(np.interp(np.asarray(decel, dtype=np.float64), grid, harder))
 
     def any_harder(self, decel: ArrayLike) -> NDArray[np.float64]:
         """Probability that the next manoeuvre, hard or gentle, is harder than these [m/s²]."""
@@ -86,19 +87,21 @@ class Manoeuvres:
 
     def exceeded_by(self, share: float) -> float:
         """What a share of hard manoeuvres exceeds [m/s²]: the inverse of `harder`."""
-        return float(self._grid[np.argmax(self._harder <= share)])
+        grid, harder = self.table
+        return float(grid[np.argmax(harder <= share)])
 
     def _tabulate(self) -> None:
-        self._grid = np.arange(0.0, HARDEST + _GRID, _GRID)
-        harder = (self.assumed > self._grid).astype(np.float64)
+        grid = np.arange(0.0, HARDEST + _GRID, _GRID)
+        harder = (self.assumed > grid).astype(np.float64)
         if self.decels:
             seen = np.array(self.decels)
             # Silverman's rule; where few were seen their spread says little.
             width = max(_NARROWEST, 2.34 * seen.std() * len(seen) ** -0.2)
-            offset = np.clip((seen - self._grid[:, None]) / width, -1.0, 1.0)
+            offset = np.clip((seen - grid[:, None]) / width, -1.0, 1.0)
             harder += (0.5 + offset * (0.75 - 0.25 * offset * offset)).sum(axis=1)
-        harder[self._grid >= HARDEST] = 0.0
-        self._harder = harder / (len(self.decels) + 1)
+        harder[grid >= HARDEST] = 0.0
+        #: Decelerations [m/s²], and the chance that the next hard manoeuvre is harder.
+        self.table: NDArray[np.float64] = np.array([grid, harder / (len(self.decels) + 1)])
 
 
 class Seen(NamedTuple):

@@ -19,10 +19,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from evofsm import storage
+from evofsm._compile import compiled
 from evofsm.protocols import Situation
 from evofsm.risk.brakes import OwnBrakes, Sample
 from evofsm.risk.manoeuvres import BrakeWatch, Manoeuvres
-from evofsm.risk.perception import Estimate, Perception
+from evofsm.risk.perception import Estimate, Perception, Three
 from evofsm.risk.rehearsal import Body, critical_decelerations
 from evofsm.validation import positive, real_array, refuse_unless_distribution, refuse_unusable
 
@@ -112,9 +113,7 @@ class LatentRisk:
         self.brakes = OwnBrakes(lowest, own_brakes, dt)
         self.perception = Perception(dt)
         self._watch = BrakeWatch(dt)
-        self._onsets = np.zeros(0)
-        self._exposure = np.zeros(0)
-        self._seconds = np.zeros(0)
+        self._by_state = np.zeros((3, 0))  # onsets of braking, seconds without, all seconds
         self._commands = (0.0, 0.0)  # the latest two
 
     @classmethod
@@ -156,21 +155,22 @@ class LatentRisk:
             If one of them does not hold real, finite numbers, or has another shape, or ``belief``
             is no distribution. What was learnt is then as it was.
         """
-        seen, command = _three_finite(observation), _finite("acceleration", [acceleration])
-        states = real_array("belief", belief, 1)
-        refuse_unless_distribution("belief", states)
+        seen, command = _three_finite(observation), _one_finite("acceleration", acceleration)
+        states = _series("belief", belief)
         was_braking = self._watch.braking
-        estimate = self._perceive(seen, learn=True)
-        self._remember(self._follow(seen, float(command[0])))
         self._count(states, was_braking)
-        self.brakes.see(float(seen[1]), float(command[0]), estimate.mean[1])
+        estimate = self._perceive(seen, learn=True)
+        self._remember(self._follow(seen, command))
+        if self._watch.braking and not was_braking:
+            self._by_state[0, : len(states)] += states
+        self.brakes.see(seen[1], command, estimate.mean[1])
 
     def follow(self, observation: ArrayLike, acceleration: float) -> None:
         """Keep up with what happens, as `learn`, without learning from it."""
-        command = _finite("acceleration", [acceleration])
+        command = _one_finite("acceleration", acceleration)
         seen = _three_finite(observation)
         self._perceive(seen, learn=False)
-        self._follow(seen, float(command[0]))
+        self._follow(seen, command)
 
     def start_episode(self, *, learn: bool = True) -> None:
         """What comes is not a consequence of what was; a manoeuvre under way counts as it is."""
@@ -182,14 +182,13 @@ class LatentRisk:
         self.perception.clear()
         self._commands = (0.0, 0.0)
 
-    def _perceive(self, seen: NDArray[np.float64], *, learn: bool) -> Estimate:
+    def _perceive(self, seen: Three, *, learn: bool) -> Estimate:
         return self.perception.see(seen, self._expected, sure=self.brakes.known, learn=learn)
 
-    def _follow(self, seen: NDArray[np.float64], acceleration: float) -> float | None:
-        gap, speed, leader_speed = seen.tolist()
+    def _follow(self, seen: Three, acceleration: float) -> float | None:
         self._commands = (self._commands[1], acceleration)
         of_change = math.sqrt(2.0) * self.perception.noise[2]
-        return self._watch.see(gap, speed, leader_speed, of_change)
+        return self._watch.see(*seen, of_change)
 
     @property
     def _expected(self) -> float:
@@ -200,16 +199,13 @@ class LatentRisk:
         if decel is not None:
             self.manoeuvres.remember(decel)
 
-    def _count(self, belief: NDArray[np.float64], was_braking: bool) -> None:
-        n, missing = len(belief), len(belief) - len(self._seconds)
+    def _count(self, belief: NDArray[np.float64], braking: bool) -> None:
+        counts, missing = self._by_state, len(belief) - self._by_state.shape[1]
         if missing > 0:
-            for name in ("_onsets", "_exposure", "_seconds"):
-                setattr(self, name, np.pad(getattr(self, name), (0, missing)))
-        self._seconds[:n] += self.dt * belief
-        if not was_braking:
-            self._exposure[:n] += self.dt * belief
-            if self._watch.braking:
-                self._onsets[:n] += belief
+            counts = np.pad(counts, ((0, 0), (0, missing)))
+        if not _count(counts, belief, self.dt, braking):
+            refuse_unless_distribution("belief", belief)
+        self._by_state = counts
 
     # -- Judging --------------------------------------------------------------------------------
 
@@ -226,27 +222,37 @@ class LatentRisk:
         -------
         Judgement
         """
-        critical = self.critical(self._cautious(situation.observation), accelerations)
-        return self.judgement(situation, self.manoeuvres.harder(critical), critical)
+        here = self._cautious(situation.observation)
+        actions = _series("accelerations", accelerations)
+        judged = np.empty((4, len(actions)))
+        table, evidence = self.manoeuvres.table, float(len(self.manoeuvres))
+        if not _judge(
+            here, actions, self._commands[1], *self.body, self.dt, table, evidence, judged
+        ):
+            refuse_unusable("accelerations", actions)
+        risk, low, high, critical = judged
+        return Judgement(risk, low, high, critical, evidence, self._seen(situation))
 
-    def _cautious(self, observation: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _cautious(self, observation: ArrayLike) -> Three:
         """The situation as it most likely is, but closer by what is not sure about it."""
-        here = self.perception.estimate(observation, self._expected, sure=self.brakes.known)
+        seen = _three_finite(observation)
+        here = self.perception.estimate(seen, self._expected, sure=self.brakes.known)
         gap, speed, leader_speed = here.mean
         # What is wrong about a speed adds up while both brake.
         decel = self.brakes.decel
         doubt = here.deviation((1.0, -speed / decel, leader_speed / decel))
-        return np.array([gap - _CAUTION * doubt, speed, leader_speed])
+        return gap - _CAUTION * doubt, speed, leader_speed
 
     def judgement(
         self, situation: Situation, risk: NDArray[np.float64], critical: NDArray[np.float64]
     ) -> Judgement:
         """With the interval that as many manoeuvres as were seen allow for."""
-        evidence = len(self.manoeuvres)
-        low, high = wilson_interval(risk, evidence + 1)
-        recognised = situation.state is not None
-        seen = self.seconds_seen(situation.belief) if recognised else math.nan
-        return Judgement(risk, low, high, critical, float(evidence), seen)
+        evidence = float(len(self.manoeuvres))
+        low, high = wilson_interval(risk, evidence + 1.0)
+        return Judgement(risk, low, high, critical, evidence, self._seen(situation))
+
+    def _seen(self, situation: Situation) -> float:
+        return math.nan if situation.state is None else self.seconds_seen(situation.belief)
 
     def critical(
         self, observation: ArrayLike, accelerations: ArrayLike, onset: float = 0.0
@@ -271,7 +277,7 @@ class LatentRisk:
         actions = _finite("accelerations", accelerations)
         critical = np.empty(len(actions))
         critical_decelerations(
-            _three_finite(observation),
+            np.array(_three_finite(observation)),
             actions,
             self._commands[1],
             self.body._replace(margin=margin),
@@ -305,19 +311,18 @@ class LatentRisk:
 
     def onset_rate(self, belief: ArrayLike | None = None) -> float:
         """How often leaders begin to brake [1/s], in states like this one or anywhere."""
-        exposure = self._exposure.sum()
-        pooled = (self._onsets.sum() + 1.0) / (exposure + _POOLED)
+        onsets, exposure, _ = self._by_state
+        pooled = (onsets.sum() + 1.0) / (exposure.sum() + _POOLED)
         if belief is None:
             return float(pooled)
-        here = np.asarray(belief)[: len(self._onsets)]
+        here = np.asarray(belief)[: len(onsets)]
         n = len(here)
-        onsets, seconds = here @ self._onsets[:n], here @ self._exposure[:n]
+        onsets, seconds = here @ onsets[:n], here @ exposure[:n]
         return float((onsets + _POOLED * pooled) / (seconds + _POOLED))
 
     def seconds_seen(self, belief: ArrayLike) -> float:
         """How long states like this one were seen so far [s]: near 0 for what is new."""
-        here = np.asarray(belief)[: len(self._seconds)]
-        return float(here @ self._seconds[: len(here)])
+        return _weighed(self._by_state[2], np.asarray(belief, dtype=np.float64))
 
     @property
     def body(self) -> Body:
@@ -398,7 +403,7 @@ class LatentRisk:
             risk.brakes.remember(Sample(decel, bool(begins)) for decel, begins in samples)
             risk.perception.restore(arrays)
             risk.brakes.lagged = arrays["lagged"].tolist()
-            risk._onsets, risk._exposure, risk._seconds = by_state
+            risk._by_state = np.array(by_state)
         return risk
 
     def _learnt(self) -> dict[str, NDArray[np.float64]]:
@@ -409,35 +414,101 @@ class LatentRisk:
             "stretches": np.array([float(sample.begins) for sample in self.brakes.samples]),
             **self.perception.learnt(),
             "lagged": np.array(self.brakes.lagged),
-            "onsets": self._onsets,
-            "exposure": self._exposure,
-            "seconds": self._seconds,
+            **dict(zip(("onsets", "exposure", "seconds"), self._by_state, strict=True)),
         }
 
 
-def _three_finite(observation: ArrayLike) -> NDArray[np.float64]:
+def _three_finite(observation: ArrayLike) -> Three:
     """Gap and speeds, as they can be judged."""
-    seen = _finite("observation", observation)
+    seen = _series("observation", observation)
     if len(seen) != 3:
         raise ValueError(
             f"observation has shape {seen.shape}; it must be (3,): gap, speed of the follower "
             "and of the leader"
         )
-    return seen
+    gap, speed, leader_speed = seen.tolist()
+    if not math.isfinite(gap + speed + leader_speed):  # looked at closely only where it has to be
+        refuse_unusable("observation", seen)
+    return gap, speed, leader_speed
+
+
+def _one_finite(name: str, value: float) -> float:
+    if type(value) is float and math.isfinite(value):
+        return value
+    return float(_finite(name, [value])[0])
 
 
 def _finite(name: str, values: ArrayLike) -> NDArray[np.float64]:
-    array = real_array(name, values, 1)
-    if not np.isfinite(array).all():  # looked at more closely only where it has to be
+    array = _series(name, values)
+    if not np.isfinite(array).all():
         refuse_unusable(name, array)
     return array
 
 
+def _series(name: str, values: ArrayLike) -> NDArray[np.float64]:
+    """A new series of real numbers; what is one already is not looked at for long."""
+    if (
+        type(values) is np.ndarray
+        and values.dtype == np.float64
+        and values.ndim == 1
+        and len(values)
+    ):
+        return values.copy()
+    return real_array(name, values, 1)
+
+
+@compiled
+def _judge(
+    observation: Three,
+    accelerations: NDArray[np.float64],
+    before: float,
+    decel: float,
+    lag: float,
+    margin: float,
+    dt: float,
+    table: NDArray[np.float64],
+    evidence: float,
+    judged: NDArray[np.float64],
+) -> bool:
+    """Write risk, its interval and the critical deceleration; False if an action is no number."""
+    if not np.isfinite(accelerations).all():
+        return False
+    body, here = Body(decel, lag, margin), np.array(observation)
+    critical_decelerations(here, accelerations, before, body, 0, dt, judged[3])
+    judged[0] = np.interp(judged[3], table[0], table[1])
+    judged[1], judged[2] = wilson_interval(judged[0], evidence + 1.0)
+    return True
+
+
+@compiled
+def _count(
+    by_state: NDArray[np.float64], belief: NDArray[np.float64], dt: float, braking: bool
+) -> bool:
+    """Add the time of a decision to the states; nothing, and False, if ``belief`` is none."""
+    if not ((belief >= 0.0).all() and abs(belief.sum() - 1.0) < 1e-6):
+        return False
+    for k in range(len(belief)):
+        by_state[2, k] += dt * belief[k]
+        if not braking:
+            by_state[1, k] += dt * belief[k]
+    return True
+
+
+@compiled
+def _weighed(by_state: NDArray[np.float64], belief: NDArray[np.float64]) -> float:
+    """Mean over states; of those that were never counted it is 0."""
+    total = 0.0
+    for k in range(min(len(by_state), len(belief))):
+        total += by_state[k] * belief[k]
+    return total
+
+
+@compiled
 def wilson_interval(
     share: NDArray[np.float64], count: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """90 % interval of a share that was counted (Wilson 1927)."""
-    spread = _WIDTH**2 / count
+    spread = _WIDTH * _WIDTH / count
     centre = (share + 0.5 * spread) / (1.0 + spread)
     reach = np.sqrt(spread * (share * (1.0 - share) + 0.25 * spread)) / (1.0 + spread)
     return np.maximum(centre - reach, 0.0), np.minimum(centre + reach, 1.0)

@@ -9,14 +9,18 @@ what kinematics leave unexplained; as long as that is nothing, the estimate is t
 
 from __future__ import annotations
 
-from bisect import bisect_left, insort
-from collections import deque
 from collections.abc import Iterable
-from math import sqrt
-from typing import NamedTuple
+from math import nan, sqrt
+from typing import NamedTuple, TypeAlias, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+from evofsm._compile import compiled, kernel
+
+# Gap [m], speed of the follower and of the leader [m/s], or what is said of each of them.
+Three: TypeAlias = tuple[float, float, float]
+Matrix: TypeAlias = tuple[Three, Three, Three]
 
 # Standard deviation of what may happen within a decision: the accelerations of the leader, of
 # oneself against what is expected, and of oneself while brakes are not known [m/s²].
@@ -33,55 +37,67 @@ _STANDING = 1.0
 _ANOTHER_LEADER = 6.0
 # Median of the absolute value of a standard normal variable.
 _MEDIAN = 0.6745
+_NOTHING = (0.0, 0.0, 0.0)
+_EXACT = (_NOTHING, _NOTHING, _NOTHING)
+_NAMES = ("noise_gap", "noise_speed", "noise_leader")
 
 
 class Estimate(NamedTuple):
     """Where one is, and how sure that is."""
 
-    mean: tuple[float, float, float]  #: gap [m], speed of the follower and of the leader [m/s]
-    covariance: tuple[tuple[float, float, float], ...]  #: (3, 3)
+    mean: Three  #: gap [m], speed of the follower and of the leader [m/s]
+    covariance: Matrix
 
     def deviation(self, weights: Iterable[float]) -> float:
         """Standard deviation of a weighed sum of the three."""
-        weights = tuple(weights)
-        variance = sum(
-            a * b * entry
-            for a, row in zip(weights, self.covariance, strict=True)
-            for b, entry in zip(weights, row, strict=True)
-        )
-        return sqrt(max(variance, 0.0))
+        if self.covariance == _EXACT:
+            return 0.0
+        of_gap, of_own, of_leader = weights
+        return _deviation(self.covariance, (of_gap, of_own, of_leader))
 
 
-class Spread:
-    """Standard deviation of the latest residuals, from their median: few odd ones do not matter.
+class Spreads:
+    """Standard deviations of the latest residuals of gap, own speed and leader's speed.
+
+    From their medians: few odd ones do not matter.
 
     Examples
     --------
-    >>> spread = Spread()
-    >>> for residual in 10 * [-1.0, 0.5, 0.6745, 50.0, 0.6745]:
-    ...     spread.add(residual)
-    >>> spread.deviation
-    1.0
+    >>> spreads = Spreads()
+    >>> sizes = np.array(10 * [1.0, 0.5, 0.6745, 50.0, 0.6745])
+    >>> spreads.restore([sizes, 2.0 * sizes, sizes[:9]])
+    >>> spreads.deviations  # of the third there are few
+    (1.0, 2.0, 0.0)
     """
 
     def __init__(self) -> None:
-        self.sizes: deque[float] = deque()
-        self._sorted: list[float] = []
+        self._sizes = np.empty((3, _MEMORY))  # absolute values, in a ring
+        self._sorted = np.empty((3, _MEMORY))
+        self._added = np.zeros(3, np.int64)
 
     @property
-    def deviation(self) -> float:
+    def deviations(self) -> Three:
         """Of the residuals; 0 while there are few."""
-        if len(self.sizes) < _FEWEST:
-            return 0.0
-        return self._sorted[len(self._sorted) // 2] / _MEDIAN
+        return _deviations(self._sorted, self._added)
 
-    def add(self, residual: float) -> None:
-        """Take in one more."""
-        size = abs(residual)
-        if len(self.sizes) == _MEMORY:
-            del self._sorted[bisect_left(self._sorted, self.sizes.popleft())]
-        self.sizes.append(size)
-        insort(self._sorted, size)
+    def take_in(
+        self, before: Three, now: Three, realised: float, changes: tuple[float, float], dt: float
+    ) -> tuple[Three, tuple[float, float]]:
+        """Add what kinematics do not explain; answers the noise, and the `changes` of now."""
+        return _take_in(self._sizes, self._sorted, self._added, before, now, realised, changes, dt)
+
+    def restore(self, sizes: Iterable[NDArray[np.float64]]) -> None:
+        """Take over what `sizes` answered."""
+        for k, latest in enumerate(np.abs(given[-_MEMORY:]) for given in sizes):
+            count = self._added[k] = len(latest)
+            self._sizes[k, :count], self._sorted[k, :count] = latest, np.sort(latest)
+
+    def sizes(self) -> list[NDArray[np.float64]]:
+        """Absolute values, the oldest first."""
+        return [
+            np.roll(ring, -added)[-added:] if added > _MEMORY else ring[:added].copy()
+            for ring, added in zip(self._sizes, self._added.tolist(), strict=True)
+        ]
 
 
 class Perception:
@@ -103,20 +119,26 @@ class Perception:
 
     def __init__(self, dt: float) -> None:
         self.dt = dt
-        #: What gap, own speed and leader's speed did that kinematics do not explain.
-        self.spreads = (Spread(), Spread(), Spread())
+        #: Of what gap, own speed and leader's speed did that kinematics do not explain.
+        self.spreads = Spreads()
         #: Standard deviations of observed gap [m], own and leader's speed [m/s].
-        self.noise = (0.0, 0.0, 0.0)
+        self.noise = _NOTHING
         self.clear()
 
     def clear(self) -> None:
         """An episode begins: nothing is known of where one is; the noise is that of before."""
         self._latest: Estimate | None = None
-        self._seen: tuple[float, float, float] | None = None
-        self._changes: tuple[float, float] | None = None
+        self._asked: tuple[Three, float, bool] | None = None
+        self._seen: Three | None = None
+        self._changes = nan, nan  # of both speeds, beyond what was expected
 
     def see(
-        self, observation: ArrayLike, realised: float, *, sure: bool = True, learn: bool = True
+        self,
+        observation: ArrayLike | Three,
+        realised: float,
+        *,
+        sure: bool = True,
+        learn: bool = True,
     ) -> Estimate:
         """Take in an observation, and learn the noise from it if told to.
 
@@ -130,106 +152,226 @@ class Perception:
             Whether that is known well.
         learn : bool
         """
-        self._latest = self.estimate(observation, realised, sure=sure)
-        gap, own, leader = np.asarray(observation, dtype=np.float64).tolist()
-        if learn:
-            self._learn((gap, own, leader), realised)
-        self._seen = (gap, own, leader)
+        self._latest, now = self.estimate(observation, realised, sure=sure), _three(observation)
+        if learn and self._seen is not None:
+            self.noise, self._changes = self.spreads.take_in(
+                self._seen, now, realised, self._changes, self.dt
+            )
+        self._seen = now
+        self._asked = None
         return self._latest
 
-    def estimate(self, observation: ArrayLike, realised: float, *, sure: bool = True) -> Estimate:
+    def estimate(
+        self, observation: ArrayLike | Three, realised: float, *, sure: bool = True
+    ) -> Estimate:
         """What `see` would answer; nothing changes."""
-        gap, own, leader = np.asarray(observation, dtype=np.float64).tolist()
-        variances = [level * level for level in self.noise]
-        fresh = Estimate((gap, own, leader), _diagonal(variances))
-        if self._latest is None or not any(variances):
-            return fresh
-        mean, covariance = self._predict(self._latest, realised, _OWN if sure else _OWN_UNKNOWN)
-        for i, value in ((0, gap), (2, leader)):
-            if (value - mean[i]) ** 2 > _ANOTHER_LEADER**2 * (covariance[i][i] + variances[i]):
-                return fresh
-        for i, value in enumerate((gap, own, leader)):
-            _correct(mean, covariance, i, value, variances[i])
-        a, b, c = covariance
-        return Estimate(
-            (mean[0], max(mean[1], 0.0), max(mean[2], 0.0)),
-            ((a[0], a[1], a[2]), (b[0], b[1], b[2]), (c[0], c[1], c[2])),
-        )
-
-    def _predict(
-        self, before: Estimate, realised: float, doubt: float
-    ) -> tuple[list[float], list[list[float]]]:
-        """Where one should be now, and how sure that is."""
-        dt, (gap, own, leader) = self.dt, before.mean
-        reached = max(own + realised * dt, 0.0)
-        mean = [gap + (leader - 0.5 * (own + reached)) * dt, reached, leader]
-        (gg, gv, gu), (_, vv, vu), (_, _, uu) = before.covariance
-        # F P Fᵀ, where only the gap changes with the others.
-        to_v, to_u = gv + (vu - vv) * dt, gu + (uu - vu) * dt
-        gg += 2.0 * (gu - gv) * dt + (uu - 2.0 * vu + vv) * dt * dt
-        # An acceleration changes a speed, and the gap by half an interval of it.
-        v, u, half = (doubt * dt) ** 2, (_LEADER * dt) ** 2, 0.5 * dt
-        gg += half * half * (v + u) + _UNEVEN**2
-        to_v, to_u = to_v - half * v, to_u + half * u
-        return mean, [[gg, to_v, to_u], [to_v, vv + v, vu], [to_u, vu, uu + u]]
-
-    def _learn(self, now: tuple[float, float, float], realised: float) -> None:
-        if self._seen is None:
-            return
-        (gap, own, leader), (gap_before, own_before, leader_before) = now, self._seen
-        closing = own + own_before - leader - leader_before
-        self.spreads[0].add(gap - gap_before + 0.5 * self.dt * closing)
-        moving = min(own, own_before) > _STANDING, min(leader, leader_before) > _STANDING
-        changes = own - own_before - realised * self.dt, leader - leader_before
-        if self._changes is not None:
-            for k in (0, 1):
-                if moving[k]:
-                    self.spreads[k + 1].add(changes[k] - self._changes[k])
-        self._changes = changes
-        self._measure_noise()
-
-    def _measure_noise(self) -> None:
-        gap, *speeds = (spread.deviation for spread in self.spreads)
-        # The second difference of a noisy speed has 6 times its variance; that of a gap against
-        # the trapezoid of four noisy speeds twice its own, and some of theirs.
-        own, leader = (speed / sqrt(6.0) for speed in speeds)
-        of_speeds = 0.5 * self.dt**2 * (own**2 + leader**2)
-        gap = sqrt(max(gap**2 - of_speeds, 0.0) / 2.0)
-        levels = zip((gap, own, leader), _FINEST, strict=True)
-        gap, own, leader = (level if level >= finest else 0.0 for level, finest in levels)
-        self.noise = (gap, own, leader)
+        now = _three(observation)
+        if self.noise == _NOTHING:
+            return Estimate(now, _EXACT)
+        if self._latest is None:
+            return Estimate(now, _diagonal(self.noise))
+        if self._asked != (now, realised, sure):  # whoever judges and then learns asks twice
+            doubt = _OWN if sure else _OWN_UNKNOWN
+            filtered = _filtered(*self._latest, now, self.noise, realised, doubt, self.dt)
+            self._asked, self._answer = (now, realised, sure), Estimate(*filtered)
+        return self._answer
 
     # -- Keeping it -----------------------------------------------------------------------------
 
     def learnt(self) -> dict[str, NDArray[np.float64]]:
         """The residuals by name, for a file."""
-        names = ("noise_gap", "noise_speed", "noise_leader")
-        return {
-            name: np.array(spread.sizes) for name, spread in zip(names, self.spreads, strict=True)
-        }
+        return dict(zip(_NAMES, self.spreads.sizes(), strict=True))
 
     def restore(self, arrays: dict[str, NDArray[np.float64]]) -> None:
         """Take over what `learnt` answered."""
-        for spread, name in zip(self.spreads, self.learnt(), strict=True):
-            for size in arrays[name].tolist():
-                spread.add(size)
-        self._measure_noise()
+        self.spreads.restore([arrays[name] for name in _NAMES])
+        self.noise = _noise(self.spreads.deviations, self.dt)
+        self._asked = None
 
 
-def _diagonal(variances: list[float]) -> tuple[tuple[float, float, float], ...]:
-    gap, own, leader = variances
-    return (gap, 0.0, 0.0), (0.0, own, 0.0), (0.0, 0.0, leader)
+def _three(observation: ArrayLike | Three) -> Three:
+    if isinstance(observation, tuple):
+        return cast(Three, observation)
+    gap, own, leader = np.asarray(observation, dtype=np.float64).tolist()
+    return gap, own, leader
 
 
+# -- The filter ---------------------------------------------------------------------------------
+
+
+@compiled
+def _diagonal(deviations: Three) -> Matrix:
+    """Covariance of what is not correlated."""
+    gap, own, leader = deviations
+    return (gap * gap, 0.0, 0.0), (0.0, own * own, 0.0), (0.0, 0.0, leader * leader)
+
+
+@compiled
+def _filtered(
+    before: Three,
+    covariance: Matrix,
+    observation: Three,
+    noise: Three,
+    realised: float,
+    doubt: float,
+    dt: float,
+) -> tuple[Three, Matrix]:
+    """One step of the filter, to the next mean and covariance.
+
+    ``doubt`` is the standard deviation of the acceleration that was ``realised`` [m/s²].
+    """
+    mean, spread = _predicted(before, covariance, realised, doubt, dt)
+    variances = _diagonal(noise)
+    for i in (0, 2):
+        off, expected = observation[i] - mean[i], spread[i, i] + variances[i][i]
+        if off * off > _ANOTHER_LEADER * _ANOTHER_LEADER * expected:
+            return observation, variances
+    for i in range(3):
+        _correct(mean, spread, i, observation[i], variances[i][i])
+    return (mean[0], max(mean[1], 0.0), max(mean[2], 0.0)), (
+        (spread[0, 0], spread[0, 1], spread[0, 2]),
+        (spread[1, 0], spread[1, 1], spread[1, 2]),
+        (spread[2, 0], spread[2, 1], spread[2, 2]),
+    )
+
+
+@compiled
+def _predicted(
+    before: Three, covariance: Matrix, realised: float, doubt: float, dt: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Where one should be now, and how sure that is."""
+    gap, own, leader = before
+    reached = max(own + realised * dt, 0.0)
+    mean = np.array([gap + (leader - 0.5 * (own + reached)) * dt, reached, leader])
+    (gg, gv, gu), (_, vv, vu), (_, _, uu) = covariance
+    # F P Fᵀ, where only the gap changes with the others.
+    to_v, to_u = gv + (vu - vv) * dt, gu + (uu - vu) * dt
+    gg += 2.0 * (gu - gv) * dt + (uu - 2.0 * vu + vv) * dt * dt
+    # An acceleration changes a speed, and the gap by half an interval of it.
+    v, u, half = (doubt * dt) ** 2, (_LEADER * dt) ** 2, 0.5 * dt
+    gg += half * half * (v + u) + _UNEVEN**2
+    to_v, to_u = to_v - half * v, to_u + half * u
+    return mean, np.array([[gg, to_v, to_u], [to_v, vv + v, vu], [to_u, vu, uu + u]])
+
+
+@compiled
 def _correct(
-    mean: list[float], covariance: list[list[float]], i: int, value: float, variance: float
+    mean: NDArray[np.float64],
+    covariance: NDArray[np.float64],
+    i: int,
+    value: float,
+    variance: float,
 ) -> None:
     """Take in one observed component: a scalar Kalman update, in place."""
-    row = list(covariance[i])
+    row = covariance[i].copy()
     total = row[i] + variance
     off = (value - mean[i]) / total
     for j in range(3):
         mean[j] += row[j] * off
         gain = row[j] / total
         for k in range(3):
-            covariance[j][k] -= gain * row[k]
+            covariance[j, k] -= gain * row[k]
+
+
+@compiled
+def _deviation(covariance: Matrix, weights: Three) -> float:
+    variance = 0.0
+    for j in range(3):
+        for k in range(3):
+            variance += weights[j] * weights[k] * covariance[j][k]
+    return sqrt(max(variance, 0.0))
+
+
+# -- The noise ----------------------------------------------------------------------------------
+
+
+@compiled
+def _take_in(
+    sizes: NDArray[np.float64],
+    ordered: NDArray[np.float64],
+    added: NDArray[np.int64],
+    before: Three,
+    now: Three,
+    realised: float,
+    changes: tuple[float, float],
+    dt: float,
+) -> tuple[Three, tuple[float, float]]:
+    residuals, changes = _unexplained(before, now, realised, changes, dt)
+    _add(sizes, ordered, added, residuals)
+    return _noise(_deviations(ordered, added), dt), changes
+
+
+@compiled
+def _unexplained(
+    before: Three, now: Three, realised: float, changes: tuple[float, float], dt: float
+) -> tuple[Three, tuple[float, float]]:
+    """What the gap and both speeds did that kinematics do not explain; NaN where that is not said.
+
+    And by how much both speeds changed, beyond what was expected; ``changes`` is that of the
+    interval before.
+    """
+    (gap_before, own_before, leader_before), (gap, own, leader) = before, now
+    closing = own + own_before - leader - leader_before
+    own_change, leader_change = own - own_before - realised * dt, leader - leader_before
+    own_moves = min(own, own_before) > _STANDING
+    leader_moves = min(leader, leader_before) > _STANDING
+    residuals = (
+        gap - gap_before + 0.5 * dt * closing,
+        own_change - changes[0] if own_moves else nan,
+        leader_change - changes[1] if leader_moves else nan,
+    )
+    return residuals, (own_change, leader_change)
+
+
+@compiled
+def _noise(deviations: Three, dt: float) -> Three:
+    """Standard deviation of the noise on gap and both speeds, from that of their residuals."""
+    # The second difference of a noisy speed has 6 times its variance; that of a gap against
+    # the trapezoid of four noisy speeds twice its own, and some of theirs.
+    own, leader = deviations[1] / sqrt(6.0), deviations[2] / sqrt(6.0)
+    of_speeds = 0.5 * dt**2 * (own**2 + leader**2)
+    gap = sqrt(max(deviations[0] ** 2 - of_speeds, 0.0) / 2.0)
+    return (
+        gap if gap >= _FINEST[0] else 0.0,
+        own if own >= _FINEST[1] else 0.0,
+        leader if leader >= _FINEST[2] else 0.0,
+    )
+
+
+@compiled
+def _add(
+    sizes: NDArray[np.float64],
+    ordered: NDArray[np.float64],
+    added: NDArray[np.int64],
+    residuals: Three,
+) -> None:
+    """Put each residual's size in place of the oldest of its row; ``ordered`` stays sorted."""
+    for k in range(3):
+        if np.isnan(residuals[k]):
+            continue
+        size, place, row = abs(residuals[k]), added[k] % _MEMORY, ordered[k]
+        i = added[k]
+        if added[k] >= _MEMORY:  # the oldest leaves, and what is larger than it closes up
+            i = np.searchsorted(row, sizes[k, place])
+            while i + 1 < _MEMORY and row[i + 1] < size:
+                row[i] = row[i + 1]
+                i += 1
+        while i > 0 and row[i - 1] > size:
+            row[i] = row[i - 1]
+            i -= 1
+        row[i] = sizes[k, place] = size
+        added[k] += 1
+
+
+@kernel
+def _deviation_of(ordered: NDArray[np.float64], count: int) -> float:
+    return float(ordered[count // 2]) / _MEDIAN if count >= _FEWEST else 0.0
+
+
+@compiled
+def _deviations(ordered: NDArray[np.float64], added: NDArray[np.int64]) -> Three:
+    return (
+        _deviation_of(ordered[0], min(added[0], _MEMORY)),
+        _deviation_of(ordered[1], min(added[1], _MEMORY)),
+        _deviation_of(ordered[2], min(added[2], _MEMORY)),
+    )

@@ -95,10 +95,15 @@ def survives(
         distance, speed = _drive_on(speed, realised, dt)
         leader_distance, leader_speed = _drive_on(leader_speed, leader, dt)
         gap += leader_distance - distance
-        # Both brake until they stand: a faster leader who brakes less is never met.
-        steady = asked == caution and last == caution and interval >= onset
-        if steady and speed <= leader_speed and leader_decel <= body.decel:
-            return bool(gap > 0.0)
+        if (
+            asked == caution and last == caution and interval >= onset
+        ):  # both brake until they stand
+            if leader_decel > body.decel:  # then the gap is smallest at the end, if it shrinks
+                leader_distance = 0.5 * leader_speed * leader_speed / leader_decel
+                left = gap + leader_distance - 0.5 * speed * speed / body.decel
+                return bool(min(gap, left) > 0.0)
+            if speed <= leader_speed:  # a faster leader who brakes less is never met
+                return bool(gap > 0.0)
         last, asked = asked, caution
         interval += 1
     return False
