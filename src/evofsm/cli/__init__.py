@@ -23,6 +23,7 @@ def main() -> None:
 def application() -> typer.Typer:
     """All commands."""
     from evofsm.cli.bench import bench
+    from evofsm.cli.campaign import campaign
     from evofsm.cli.drive import drive
     from evofsm.cli.learn import inspect, learn
     from evofsm.cli.paper import paper
@@ -40,6 +41,7 @@ def application() -> typer.Typer:
     app.command()(learn)
     app.command()(inspect)
     app.command()(drive)
+    app.command()(campaign)
     app.add_typer(bench())
     return app
 

@@ -16,7 +16,9 @@ with suppress(ModuleNotFoundError):
     import typer
 
 if TYPE_CHECKING:
-    from rich.progress import Progress
+    from rich.progress import Progress, ProgressColumn, Task
+
+    from evofsm.framework.reviser import Mode
 
 P = ParamSpec("P")
 
@@ -47,6 +49,15 @@ def plain_errors(command: Callable[P, None]) -> Callable[P, None]:
     return run
 
 
+def chosen_mode(name: str) -> Mode:
+    """How far the reviser goes, by its name."""
+    from evofsm.framework.reviser import Mode
+
+    if name not in (names := [one.value for one in Mode]):
+        raise ValueError(f"--mode is {name!r}; it must be one of {', '.join(names)}")
+    return Mode(name)
+
+
 def require(**extras: str) -> None:
     """Refuse before the long work what lacks a package after it."""
     for package, extra in extras.items():
@@ -55,21 +66,40 @@ def require(**extras: str) -> None:
 
 
 def message(error: Exception) -> str:
-    """What an error says, in one line."""
+    """What an error says, in one line, and what it happened in."""
+    text = str(error)
     if isinstance(error, OSError) and error.filename is not None and error.strerror:
-        return f"{error.filename}: {error.strerror.lower()}"
-    return str(error)
+        text = f"{error.filename}: {error.strerror.lower()}"
+    return ", ".join([text, *getattr(error, "__notes__", ())])
 
 
 @contextmanager
-def progress() -> Iterator[Progress]:
-    """Bars on standard error; none where nobody watches."""
+def progress(unit: str | None = None) -> Iterator[Progress]:
+    """Bars on standard error; none where nobody watches. With a unit, with the rate as well."""
     from rich.console import Console
     from rich.progress import Progress
 
+    columns = _columns_with_rate(unit) if unit else Progress.get_default_columns()
     console = Console(stderr=True)
-    with Progress(console=console, transient=True, disable=not sys.stderr.isatty()) as bars:
+    with Progress(
+        *columns, console=console, transient=True, disable=not sys.stderr.isatty()
+    ) as bars:
         yield bars
+
+
+def _columns_with_rate(unit: str) -> tuple[ProgressColumn, ...]:
+    """How much of it is done, how many a second, and how long it will take: in 80 columns."""
+    from rich.progress import BarColumn, ProgressColumn, TextColumn, TimeRemainingColumn
+    from rich.text import Text
+
+    class Rate(ProgressColumn):
+        """Of what is done since the bar was made."""
+
+        def render(self, task: Task) -> Text:
+            return Text("" if task.speed is None else f"{task.speed:,.1f} {unit}/s")
+
+    done = TextColumn("{task.completed:,} of {task.total:,}")
+    return TextColumn("{task.description}"), BarColumn(20), done, Rate(), TimeRemainingColumn()
 
 
 def counter(bars: Progress, text: str) -> Callable[[int, int], None]:

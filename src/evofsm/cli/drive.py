@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from evofsm.cli.common import (
     WorldName,
+    chosen_mode,
     plain_errors,
     print_json,
     progress,
@@ -86,7 +87,6 @@ def drive(
     The summary compares with the controller left to itself in the same draws.
     """
     require(scipy="study", **({"polars": "tables"} if out else {}))
-    from evofsm.framework.reviser import Mode
     from evofsm.report import terminal
     from evofsm.report.driving import print_driving
     from evofsm.studies.closed_loop import Learner
@@ -96,14 +96,12 @@ def drive(
 
     if learn is not None and frozen is not None:
         raise ValueError("--learn and --frozen exclude each other")
-    if mode not in (names := [one.value for one in Mode]):
-        raise ValueError(f"--mode is {mode!r}; it must be one of {', '.join(names)}")
     chosen = load_family(family).with_switches(split_names(switches))
     setup = Setup(
         chosen,
         controller,
         reviser,
-        Mode(mode),
+        chosen_mode(mode),
         tolerance,
         episodes,
         seed,

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from statistics import median
 
 from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from evofsm.studies.closed_loop import Learner
+from evofsm.studies.closed_loop import Learner, Row
 from evofsm.studies.driving import Driving, Setup
 
 # More states than these are not listed.
@@ -17,17 +18,24 @@ _MOST = 8
 
 def print_driving(out: Console, driving: Driving, learner: Learner, setup: Setup) -> None:
     """Print collisions and their price, what was learnt, and the dead ends that were found."""
-    row = driving.row
+    print_outcome(out, driving.row, driving.lead_times, learner, setup)
+    _print_dead_ends(out, driving, learner)
+
+
+def print_outcome(
+    out: Console, row: Row, lead_times: Sequence[float], learner: Learner, setup: Setup
+) -> None:
+    """Print collisions and their price, and what was learnt."""
     facts = Table(box=None, show_header=False, pad_edge=False)
     facts.add_column(style="bold")
     facts.add_column()
     for name, text in [
-        ("family", f"{row.family}, {row.episodes} {_kind(setup)} episodes"),
+        ("family", f"{row.family}, {row.episodes:,} {_kind(setup)} episodes"),
         ("controller", setup.controller),
         ("reviser", f"{setup.reviser}, {setup.mode.value}"),
         (
             "collisions",
-            f"{row.collisions} of {row.episodes}: {row.collision_rate:.1%} "
+            f"{row.collisions:,} of {row.episodes:,}: {row.collision_rate:.1%} "
             f"(95 %: {row.collision_low:.1%} to {row.collision_high:.1%})",
         ),
         *([("rear-ended", f"{row.rear_ends}")] if row.rear_ends else []),
@@ -37,20 +45,18 @@ def print_driving(out: Console, driving: Driving, learner: Learner, setup: Setup
             f"{row.intervention_rate:.1%} of decisions; mean change {row.mean_change:.2f} m/s²",
         ),
         ("comfort", f"RMS jerk {row.jerk:.2f} m/s³"),
-        *_lead_times(driving),
+        *_lead_times(lead_times),
         ("learnt", _learnt(learner)),
     ]:
         facts.add_row(name, text)
     out.print(facts)
-    _print_dead_ends(out, driving, learner)
 
 
 def _kind(setup: Setup) -> str:
     return "training" if setup.learn else "held-out"
 
 
-def _lead_times(driving: Driving) -> list[tuple[str, str]]:
-    times = driving.lead_times
+def _lead_times(times: Sequence[float]) -> list[tuple[str, str]]:
     if not times:
         return []
     warned = sum(time > 0.0 for time in times)

@@ -22,6 +22,7 @@ from evofsm.studies.closed_loop import (
     FIXED_MEASURES,
     Learner,
     Outcome,
+    Reference,
     Row,
     outcome,
     reference,
@@ -88,21 +89,26 @@ def drive_family(
     outcomes: list[Outcome] = []
     for draw in draws(setup):
         controller = make_controller(setup, draw, world)
-        alone = drive_alone(family, draw, Unrevised(family.actions), None, world, controller)
+        unrevised = drive_unrevised(family, draw, world, controller)
         drive = learner.drive(
             family, draw, reviser, learn=setup.learn, world=world, controller=controller
         )
-        unrevised = reference(alone, draw.scenario.leader.brake_decel)
         outcomes.append(outcome(drive, unrevised, family.interval))
         drives.append(drive)
         progress(len(drives), sum(o.collided for o in outcomes))
     collided = [drive for drive in drives if drive.episode.collided]
     return Driving(
         summarise(family.name, setup.reviser, "", outcomes, family.interval),
-        tuple(lead_time(drive, setup.tolerance) for drive in collided if _is_judged(drive)),
+        tuple(lead_time(drive, setup.tolerance) for drive in collided if is_judged(drive)),
         assess_states(learner.machine.model(), learner.risk),
         drives,
     )
+
+
+def drive_unrevised(family: Family, draw: Draw, world: World, controller: Controller) -> Reference:
+    """How far the controller comes by itself."""
+    alone = drive_alone(family, draw, Unrevised(family.actions), None, world, controller)
+    return reference(alone, draw.scenario.leader.brake_decel)
 
 
 def draws(setup: Setup) -> Iterator[Draw]:
@@ -202,7 +208,7 @@ def _decision_columns(drives: Sequence[Drive]) -> dict[str, Any]:
     }
 
 
-def _is_judged(drive: Drive) -> bool:
+def is_judged(drive: Drive) -> bool:
     """Whether the reviser says how likely failure is."""
     return not math.isnan(drive.decisions[0].revision.risk_proposed)
 

@@ -1,7 +1,14 @@
 """The closed loop: whether the reviser prevents collisions, at what cost, and against whom."""
 
 from evofsm.studies.closed_loop.learner import SAFETY_RULE, Learner
-from evofsm.studies.closed_loop.outcomes import Outcome, Row, outcome, reference, summarise
+from evofsm.studies.closed_loop.outcomes import (
+    Outcome,
+    Reference,
+    Row,
+    outcome,
+    reference,
+    summarise,
+)
 from evofsm.studies.closed_loop.policies import FIXED_MEASURES, Group, fixed_policies
 from evofsm.studies.closed_loop.shift import ShiftPlan
 from evofsm.studies.closed_loop.study import ClosedLoop, Plan, run_closed_loop
@@ -14,6 +21,7 @@ __all__ = [
     "Learner",
     "Outcome",
     "Plan",
+    "Reference",
     "Row",
     "ShiftPlan",
     "fixed_policies",

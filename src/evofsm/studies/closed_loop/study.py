@@ -8,18 +8,17 @@ policy and learning seed over the cores, and put together in the order of the ta
 from __future__ import annotations
 
 import os
-import signal
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import closing
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from importlib.util import find_spec
 from itertools import repeat
-from multiprocessing import active_children, get_context
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from evofsm.fleet.executors import Here, Processes, Task, as_they_come
 from evofsm.framework.reviser import EnvelopeReviser
 from evofsm.protocols import Reviser
 from evofsm.risk.outcome import LatentRisk
@@ -180,12 +179,8 @@ def run_closed_loop(
     if family.shifted is not None:
         shift = replace(plan.shift, seed=plan.seed, tolerance=plan.tolerance)
         tasks += [partial(run_shift, family, shift, seed) for seed in range(plan.seeds)]
-    found: list[Any] = []
-    for result in _run(tasks, workers or os.cpu_count() or 1):
-        found.append(result)
-        progress(len(found), len(tasks))
     study = ClosedLoop(family, plan, [])
-    for result in found:
+    for result in _run(tasks, workers or os.cpu_count() or 1, progress):
         for name, values in result.items():
             getattr(study, name).extend(values)
     return study
@@ -201,25 +196,18 @@ def _plain(record: Any) -> dict[str, Any]:
     }
 
 
-def _run(tasks: Sequence[partial[Any]], workers: int) -> Iterator[Any]:
+def _run(
+    tasks: Sequence[partial[Any]], workers: int, progress: Callable[[int, int], None]
+) -> list[Any]:
     """Results in the order of the tasks."""
-    if workers == 1:
-        yield from (task() for task in tasks)
-        return
-    # Forking a process that has started threads may hang; a fresh one costs a second. Workers
-    # leave an interruption to the parent, who ends them.
-    executor = ProcessPoolExecutor(
-        workers, get_context("spawn"), signal.signal, (signal.SIGINT, signal.SIG_IGN)
-    )
-    futures = [executor.submit(task) for task in tasks]
-    try:
-        yield from (future.result() for future in futures)
-    except BaseException:
-        for worker in active_children():
-            worker.terminate()
-        raise
-    finally:
-        executor.shutdown()
+    named = (Task(f"{task.func.__name__}, task {k}", task) for k, task in enumerate(tasks))
+    open_executor = partial(Processes, workers) if workers > 1 else Here
+    found: dict[int, Any] = {}
+    with closing(as_they_come(named, open_executor, 2 * workers)) as arriving:
+        for results in arriving:
+            found |= results
+            progress(len(found), len(tasks))
+    return [found[k] for k in range(len(tasks))]
 
 
 def _drive_all(
