@@ -61,10 +61,20 @@ def test_caches_older_than_any_kernel_are_dropped_and_newer_ones_kept(tmp_path):
     caches = tmp_path / "room" / "__pycache__"
     caches.mkdir(parents=True)
     for module, compiled_after in (("old", -5), ("new", 5)):
-        (tmp_path / "room" / f"{module}.py").touch()
+        (tmp_path / "room" / f"{module}.py").write_text("from package._compile import kernel")
         os.utime(tmp_path / "room" / f"{module}.py", (written, written))
         cache = caches / f"{module}.kernel-3.py311.nbi"
         cache.touch()
         os.utime(cache, (written + compiled_after,) * 2)
     _compile._drop_stale_caches(tmp_path)
     assert [path.name for path in caches.iterdir()] == ["new.kernel-3.py311.nbi"]
+
+
+def test_editing_what_holds_no_kernels_keeps_the_caches(tmp_path):
+    caches = tmp_path / "__pycache__"
+    caches.mkdir()
+    (caches / "old.kernel-3.py311.nbi").touch()
+    os.utime(caches / "old.kernel-3.py311.nbi", (1000, 1000))
+    (tmp_path / "page.py").write_text("draws nothing that is compiled")
+    _compile._drop_stale_caches(tmp_path)
+    assert len(list(caches.iterdir())) == 1

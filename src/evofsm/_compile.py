@@ -125,9 +125,16 @@ def _drop_stale_caches(package: Path) -> None:
     that Numba keeps elsewhere (``NUMBA_CACHE_DIR``) are for those who set it to clear.
     """
     caches = {path: path.stat().st_mtime for path in package.rglob("__pycache__/*.nb[ic]")}
-    sources = {path.parent.parent / f"{path.name.split('.')[0]}.py" for path in caches}
-    sources.add(Path(__file__))
-    newest = max(path.stat().st_mtime for path in sources if path.exists())
+    oldest = min(caches.values(), default=math.inf)
+    edited = {path: path.stat().st_mtime for path in package.rglob("*.py")}
+    newest = max(
+        (
+            written
+            for path, written in edited.items()
+            if written > oldest and Path(__file__).stem in path.read_text("utf-8")
+        ),
+        default=-math.inf,
+    )
     for path, written in caches.items():
         if written < newest:
             path.unlink(missing_ok=True)

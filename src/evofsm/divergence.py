@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from evofsm._compile import inner_kernel, kernel
-from evofsm._elementary import logarithm
+from evofsm._elementary import fma, logarithm, total
 from evofsm.validation import refuse_unless_distribution
 
 # Stands in for 0 in a divisor or a logarithm whose result is multiplied by 0.
@@ -18,6 +18,8 @@ _TINY = 1e-300
 # The series has seven terms; below this the eighth is under half a unit in the last place.
 _SERIES_BELOW = 0.01
 _LN_2 = math.log(2.0)
+# Marks a term that the series cannot give; no term is below 0.
+_OPEN = -1.0
 
 
 @inner_kernel
@@ -33,40 +35,40 @@ def jensen_shannon_kernel(
     ``terms`` is room to work in: loops that fill it, with neither branches nor sums, are compiled
     to vector instructions.
     """
-    beyond = 0
     for i in range(n):
-        total = p[i] + q[i]
-        d = (p[i] - q[i]) / max(total, _TINY)
+        both = p[i] + q[i]
+        d = (p[i] - q[i]) / max(both, _TINY)
         x = d * d
-        terms[i] = 0.5 * total * _series(x)
-        beyond += x >= _SERIES_BELOW
-    if beyond > 0:
-        for i in range(n):
-            total = p[i] + q[i]
-            divisor = max(total, _TINY)
-            d = (p[i] - q[i]) / divisor
-            less = 2.0 * min(p[i], q[i]) / divisor  # 1 - d, without rounding away its digits
-            by_logarithms = 0.5 * total * _by_logarithms(less)
-            terms[i] = terms[i] if d * d < _SERIES_BELOW else by_logarithms
-    nats = 0.0
+        terms[i] = both * (_series(x) if x < _SERIES_BELOW else _OPEN)
+    any_open = False
     for i in range(n):
-        nats += terms[i]
+        any_open |= terms[i] < 0.0
+    if any_open:
+        _use_logarithms(p, q, n, terms)
+    nats = total(terms, n)
     # Rounding may leave a hair outside [0, 1].
-    return min(max(0.5 * nats / _LN_2, 0.0), 1.0)
+    return min(max(0.25 * nats / _LN_2, 0.0), 1.0)
 
 
 @inner_kernel
 def _series(x: float) -> float:
     """Of ``x = d^2``, seven terms."""
-    tail = 1.0 / 45.0 + x * (1.0 / 66.0 + x * (1.0 / 91.0))
-    return x * (1.0 + x * (1.0 / 6.0 + x * (1.0 / 15.0 + x * (1.0 / 28.0 + x * tail))))
+    x2 = x * x
+    last = fma(x2, 1.0 / 91.0, fma(x, 1.0 / 66.0, 1.0 / 45.0))
+    return x * fma(x2, fma(x2, last, fma(x, 1.0 / 28.0, 1.0 / 15.0)), fma(x, 1.0 / 6.0, 1.0))
 
 
 @inner_kernel
-def _by_logarithms(less: float) -> float:
-    """Of ``less = 1 - d``, which may be 0."""
-    more = 2.0 - less
-    return more * logarithm(more) + less * logarithm(max(less, _TINY))
+def _use_logarithms(
+    p: NDArray[np.float64], q: NDArray[np.float64], n: int, terms: NDArray[np.float64]
+) -> None:
+    """Fill in the terms that were left open."""
+    for i in range(n):
+        both = p[i] + q[i]
+        less = 2.0 * min(p[i], q[i]) / max(both, _TINY)  # 1 - d, with all of its digits
+        more = 2.0 - less
+        term = both * fma(more, logarithm(more), less * logarithm(max(less, _TINY)))
+        terms[i] = terms[i] if terms[i] >= 0.0 else term
 
 
 @overload

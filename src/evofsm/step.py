@@ -132,11 +132,11 @@ def step(memory: Memory, z: NDArray[np.float64], failed: bool) -> tuple[int, int
 
     # Section 2.2.1: does the observation move a state, or found one?
     event, nearest, potential = determine(parameters.rule, now.clusters, n, z)
-    if event == clusters.UNCHANGED and failed and _splits(memory, nearest):
-        event = clusters.CREATED
     if event == clusters.CREATED:
         event, nearest = _found(memory, n, nearest, potential)
-        n = int(now.n_states[0])
+    elif event == clusters.UNCHANGED and failed and _splits(memory, nearest):
+        event, nearest = _split(memory, n, nearest)
+    n = int(now.n_states[0])
 
     # Section 2.2.2: which state is this?
     _recognise(memory, n, nearest)
@@ -214,9 +214,7 @@ def fail(buffer: NDArray[np.float64]) -> bool:
     n = int(now.n_states[0])
     nearest = int(now.state[0])
     if _splits(memory, nearest):
-        rule = memory.parameters.rule
-        potential = potential_of(now.clusters, rule.weights, now.clusters.latest)
-        nearest = _found(memory, n, nearest, potential)[1]
+        nearest = _split(memory, n, nearest)[1]
         n = int(now.n_states[0])
         now.state[0] = nearest
         _recognise(memory, n, nearest)
@@ -275,6 +273,14 @@ def _splits(memory: Memory, nearest: int) -> bool:
     )
 
 
+@inner_kernel
+def _split(memory: Memory, n: int, nearest: int) -> tuple[int, int]:
+    """Found a state for a failure; the observation is absorbed and counts in its potential."""
+    held = memory.learnt.clusters
+    potential = potential_of(held, memory.parameters.rule.weights, held.latest)
+    return _found(memory, n, nearest, potential)
+
+
 @rare_kernel
 def _found(memory: Memory, n: int, nearest: int, potential: float) -> tuple[int, int]:
     """Found a state on the latest observation; answers what happened and the nearest state.
@@ -319,9 +325,9 @@ def _recognise(memory: Memory, n: int, nearest: int) -> None:
 def _decide(memory: Memory, place: int, n: int, failed: bool) -> None:
     """Count that the pending action was taken from the belief, and whether it led to failure."""
     now = memory.learnt
-    count(now.outcomes.decisions[place], now.belief, n)
+    count(now.outcomes.decisions[place], now.belief, lanes(n))
     if failed:
-        count(now.outcomes.failures[place], now.belief, n)
+        count(now.outcomes.failures[place], now.belief, lanes(n))
 
 
 @inner_kernel

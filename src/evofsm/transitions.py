@@ -20,6 +20,7 @@ from numba.extending import register_jitable
 from numpy.typing import NDArray
 
 from evofsm._compile import inner_kernel, lanes, rare_kernel
+from evofsm._elementary import fma
 from evofsm.validation import whole
 
 Policy = Literal["marginal", "hold", "observed"]
@@ -178,8 +179,8 @@ def forecast_and_identify(
             continue
         for j in range(lanes(n)):
             probability = matrix[i, j]
-            predicted[j] += believed * probability
-            matrix[i, j] = probability + rate * (reached[j] - probability)
+            predicted[j] = fma(believed, probability, predicted[j])
+            matrix[i, j] = fma(rate, reached[j] - probability, probability)
 
 
 def marginal(

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evofsm._compile import inner_kernel, lanes
+from evofsm._elementary import fma
 
 # What may happen to the states.
 UNCHANGED, MOVED, CREATED = 0, 1, 2
@@ -59,16 +60,16 @@ def measure_distances(
         value, weight = z[j], weights[j]
         for i in range(n):
             offset = (value - centers[j, i]) * weight
-            squared_distances[i] += offset * offset
+            squared_distances[i] = fma(offset, offset, squared_distances[i])
 
 
 @inner_kernel
 def nearest_center(squared_distances: NDArray[np.float64], n: int) -> int:
     """Index of the smallest of the first ``n`` distances; the oldest centre wins a tie."""
-    nearest = 0
+    nearest, smallest = 0, squared_distances[0]
     for i in range(1, n):
-        if squared_distances[i] < squared_distances[nearest]:
-            nearest = i
+        if squared_distances[i] < smallest:
+            nearest, smallest = i, squared_distances[i]
     return nearest
 
 
@@ -111,11 +112,15 @@ def place_center(clusters: Clusters, i: int, z: NDArray[np.float64], potential: 
 @inner_kernel
 def absorb(clusters: Clusters, weights: NDArray[np.float64], z: NDArray[np.float64]) -> None:
     """Add the observation to the running mean and scatter (Welford 1962)."""
-    clusters.n_observations[0] += 1.0
+    n_observations = clusters.n_observations[0] + 1.0
+    share = 1.0 / n_observations
+    added = 0.0
     for j in range(len(z)):
         clusters.latest[j] = z[j]
         offset = z[j] - clusters.first[j]
         before = offset - clusters.mean[j]
-        clusters.mean[j] += before / clusters.n_observations[0]
-        after = offset - clusters.mean[j]
-        clusters.scatter[0] += (before * weights[j]) * (after * weights[j])
+        mean = clusters.mean[j] + before * share
+        clusters.mean[j] = mean
+        added += (before * weights[j]) * ((offset - mean) * weights[j])
+    clusters.n_observations[0] = n_observations
+    clusters.scatter[0] += added

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evofsm._compile import inner_kernel
-from evofsm._elementary import exponential
+from evofsm._elementary import exponential, total
 
 # Below exp(-690) a belief is taken as 0: smaller numbers are denormal and slow every sum.
 _LOWEST_EXPONENT = -690.0
@@ -43,9 +43,6 @@ def recognise(
         exponent = (smallest - squared_distances[i]) * scale
         similarity = exponential(max(exponent, _LOWEST_EXPONENT))
         belief[i] = similarity if exponent > lowest else 0.0
-    total = 0.0
-    for i in range(n):
-        total += belief[i]
-    share = 1.0 / total
+    share = 1.0 / total(belief, n)
     for i in range(n):
         belief[i] *= share

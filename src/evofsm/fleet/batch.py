@@ -1,0 +1,378 @@
+"""Many machines at once: one for each vehicle, stepped together on all cores.
+
+Each is what `EvolvingFSM` is, bit for bit: the same step, over memory that lies in two arrays for
+all vehicles. A vehicle's part of them grows with its states and with the actions it has used, so
+that vehicles may differ, enter at different times, and be silent for a while.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numba
+import numpy as np
+from numpy.typing import ArrayLike, DTypeLike, NDArray
+
+from evofsm._compile import kernel, parallel_kernel
+from evofsm.machine import EvolvingFSM
+from evofsm.memory import NO_ACTION, Memory, lengths, matrices_of, move, open_apart
+from evofsm.step import FULL, room_for, step
+from evofsm.validation import check_actions, check_rows, real_array, refuse_unusable, whole
+
+# Room for so much more than is needed when the arrays are made anew.
+_SPARE = 1.5
+_SINGLE = np.dtype(np.float32)
+
+
+class FleetStep(NamedTuple):
+    """What the machines made of one observation each, a row for each vehicle that was observed.
+
+    Examples
+    --------
+    >>> fleet = Fleet(EvolvingFSM(n_actions=1, radius=0.5), 2)
+    >>> fleet.observe([[0.0], [7.0]], [0, 0]).n_states
+    array([1, 1])
+    """
+
+    state: NDArray[np.int64]  #: (K,) index of the most probable state
+    n_states: NDArray[np.int64]  #: (K,) number of states
+    event: NDArray[np.int8]  #: (K,) values of `Event`
+    surprise: NDArray[np.float64]  #: (K,) [bit], NaN where nothing was predicted
+
+
+class Fleet:
+    """V machines that learn side by side, each from its own vehicle.
+
+    Parameters
+    ----------
+    machine : EvolvingFSM
+        Each vehicle starts with a copy of it: its settings, and all that it has learnt.
+    n_vehicles : int
+        Number V of vehicles.
+    dtype : float64 or float32
+        Of the transition matrices, which are most of the memory; the rest is always float64.
+        In single precision a probability is off by some 1e-7 of itself a step, and machines are
+        no longer those of `EvolvingFSM` bit for bit.
+
+    Raises
+    ------
+    TypeError
+        If ``machine`` is no machine, or ``dtype`` is another one.
+    ValueError
+        If ``n_vehicles`` is no whole number of at least 1, or ``machine`` has observed nothing
+        and the first observations are refused.
+
+    Examples
+    --------
+    >>> fleet = Fleet(EvolvingFSM(n_actions=2, radius=0.5), 3)
+    >>> for z in (0.0, 0.1, 2.0, 1.0):
+    ...     step = fleet.observe([[z], [z + 1.0], [7.0]], [0, 1, 0])
+    >>> step.state, fleet.n_states
+    (array([1, 1, 0]), array([2, 2, 1]))
+    >>> alone = EvolvingFSM(n_actions=2, radius=0.5)
+    >>> trace = alone.learn_many([[0.0], [0.1], [2.0], [1.0]], [0, 0, 0, 0])
+    >>> np.array_equal(fleet[0].transition_matrices, alone.transition_matrices)
+    True
+    """
+
+    def __init__(
+        self, machine: EvolvingFSM, n_vehicles: int, dtype: DTypeLike = np.float64
+    ) -> None:
+        if not isinstance(machine, EvolvingFSM):
+            raise TypeError(f"machine is {machine!r}; it must be an EvolvingFSM")
+        if np.dtype(dtype) not in (np.dtype(np.float64), _SINGLE):
+            raise TypeError(f"dtype is {np.dtype(dtype)}; it must be float64 or float32")
+        self._machine = machine.copy()
+        self._n_vehicles = whole("n_vehicles", n_vehicles)
+        self._dtype = np.dtype(dtype)
+        self._everyone = np.arange(self._n_vehicles)
+        self._fill(machine._buffer)
+
+    def __len__(self) -> int:
+        return self._n_vehicles
+
+    def __getitem__(self, vehicle: int) -> EvolvingFSM:
+        """A copy of one vehicle's machine."""
+        at, at_matrices = self._at[range(len(self))[vehicle]]
+        machine = self._machine.copy()
+        length, of_matrices = lengths(*self._small[at : at + 4].astype(int).tolist())
+        small = self._small[at : at + length]
+        matrices = self._matrices[at_matrices : at_matrices + of_matrices]
+        machine._use(np.concatenate([small, matrices]))
+        return machine
+
+    @property
+    def n_states(self) -> NDArray[np.int64]:
+        """(V,) ndarray: number of states of each machine."""
+        found = np.empty(len(self), np.int64)
+        _count_states(self._small, self._matrices, self._at, found)
+        return found
+
+    @property
+    def nbytes(self) -> int:
+        """Memory that holds what was learnt, with room for the next states [byte]."""
+        return self._small.nbytes + self._matrices.nbytes
+
+    def observe(
+        self,
+        Z: ArrayLike,
+        A: ArrayLike | None = None,
+        *,
+        vehicles: Sequence[int] | NDArray[np.integer] | None = None,
+        episode_starts: Sequence[int] | NDArray[np.integer] = (),
+        failures: Sequence[int] | NDArray[np.integer] = (),
+    ) -> FleetStep:
+        """One observation of each vehicle, then the action commanded after it.
+
+        Parameters
+        ----------
+        Z : (K, m) array_like
+            Observations, as `EvolvingFSM.observe` takes them.
+        A : (K,) array_like of int, optional
+            Index of each vehicle's action, -1 where there was none; without it nobody acted.
+        vehicles : (K,) array_like of int, optional
+            Which vehicles were observed, each at most once; without it all, K = V. All others
+            stay as they are.
+        episode_starts : array_like of int
+            Rows whose vehicle begins an episode with this observation.
+        failures : array_like of int
+            Rows whose vehicle's episode ended in failure with this observation.
+
+        Returns
+        -------
+        FleetStep
+
+        Raises
+        ------
+        TypeError, ValueError
+            If anything cannot be used; no machine has then changed.
+
+        Examples
+        --------
+        >>> fleet = Fleet(EvolvingFSM(n_actions=2, radius=0.5), 3)
+        >>> step = fleet.observe([[0.0], [1.0]], [0, 1], vehicles=[2, 0])
+        >>> fleet.n_states
+        array([1, 0, 1])
+        """
+        rows = self._observations(Z)
+        chosen = self._everyone if vehicles is None else self._vehicles(vehicles)
+        if len(rows) != len(chosen):
+            raise ValueError(f"there are {len(rows)} observations of {len(chosen)} vehicles")
+        n_actions = self._machine.n_actions
+        if A is None:
+            actions = np.full(len(rows), NO_ACTION)
+        else:
+            actions = check_actions(A, len(rows), n_actions)
+        starts = check_rows("episode_starts", episode_starts, len(rows))
+        ends = check_rows("failures", failures, len(rows))
+        if self._small[self._at[0, 0]] == 0:  # the number of variables is not known yet
+            self._machine._fit(rows[0])
+            self._fill(self._machine._buffer)
+        answer = FleetStep(
+            np.empty(len(rows), np.int64),
+            np.empty(len(rows), np.int64),
+            np.full(len(rows), FULL, np.int8),
+            np.empty(len(rows)),
+        )
+        given = chosen, rows, actions, starts, ends
+        while _step_all(self._small, self._matrices, self._at, *given, *answer):
+            self._grow(chosen[answer.event == FULL])
+        return answer
+
+    def start_episode(self, vehicles: Sequence[int] | NDArray[np.integer] | None = None) -> None:
+        """Begin a new episode of some vehicles, or of all, as `EvolvingFSM.start_episode` does."""
+        chosen = self._everyone if vehicles is None else self._vehicles(vehicles)
+        _start_episodes(self._small, self._matrices, self._at, chosen)
+
+    # -- Inside ---------------------------------------------------------------------------------
+
+    def _fill(self, buffer: NDArray[np.float64]) -> None:
+        """Every vehicle gets a copy of one machine's buffer."""
+        small, matrices = np.split(buffer, [matrices_of(buffer)])
+        self._small = np.tile(small, len(self))
+        self._matrices = np.tile(matrices.astype(self._dtype), len(self))
+        steps = np.array([len(small), len(matrices)])
+        self._at = self._everyone[:, None] * steps
+        self._used = steps * len(self)
+
+    def _observations(self, Z: ArrayLike) -> NDArray[np.float64]:
+        if isinstance(Z, np.ndarray) and Z.dtype == np.float64 and Z.ndim == 2:
+            rows = np.ascontiguousarray(Z)
+        else:
+            rows = real_array("observations", Z, ndim=2)
+        m = int(self._small[self._at[0, 0]])
+        if m not in (0, rows.shape[1]):
+            raise ValueError(
+                f"an observation has {rows.shape[1]} variables, but these machines were started "
+                f"with {m}"
+            )
+        refuse_unusable("observations", rows)
+        return rows
+
+    def _vehicles(self, vehicles: ArrayLike) -> NDArray[np.int64]:
+        chosen = np.asarray(vehicles)
+        if chosen.ndim != 1 or (chosen.dtype.kind not in "iu" and chosen.size):
+            raise TypeError(f"vehicles are {vehicles!r}; they must be a list of whole numbers")
+        marked = check_rows("vehicles", chosen, len(self))
+        if marked.sum() != len(chosen):
+            raise ValueError("a vehicle is named twice; it can be observed once at a time")
+        return chosen.astype(np.int64)
+
+    def _grow(self, vehicles: NDArray[np.int64]) -> None:
+        """Move vehicles to where there is room for what their next step may need."""
+        sizes, needed = self._measure(vehicles)
+        if (self._used + needed.sum(axis=0) <= [len(self._small), len(self._matrices)]).all():
+            begins = self._used + np.cumsum(needed, axis=0) - needed
+            self._move(vehicles, sizes, self._small, self._matrices, begins)
+        else:  # all of them, to larger arrays and without the holes that were left behind
+            vehicles = self._everyone
+            sizes, needed = self._measure(vehicles)
+            small, matrices = (_SPARE * needed.sum(axis=0)).astype(int).tolist()
+            begins = np.cumsum(needed, axis=0) - needed
+            self._move(vehicles, sizes, np.zeros(small), np.zeros(matrices, self._dtype), begins)
+        self._used = begins[-1] + needed[-1]
+
+    def _measure(self, vehicles: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """The sizes (K, 4) of vehicles' buffers with room for the next step, and their lengths."""
+        sizes, needed = np.empty((len(vehicles), 4), np.int64), np.empty((len(vehicles), 2), int)
+        _measure_all(self._small, self._matrices, self._at, vehicles, sizes, needed)
+        return sizes, needed
+
+    def _move(
+        self,
+        vehicles: NDArray[np.int64],
+        sizes: NDArray[np.int64],
+        small: NDArray[np.float64],
+        matrices: NDArray[Any],
+        begins: NDArray[np.int64],
+    ) -> None:
+        _move_all(self._small, self._matrices, self._at, vehicles, sizes, small, matrices, begins)
+        self._small, self._matrices = small, matrices
+        self._at[vehicles] = begins
+
+
+@kernel
+def _open(small: NDArray[np.float64], matrices: NDArray[Any], at: NDArray[np.int64]) -> Memory:
+    """One vehicle's memory."""
+    return open_apart(small[at[0] :], matrices[at[1] :])
+
+
+@parallel_kernel
+def _step_all(
+    small: NDArray[np.float64],
+    matrices: NDArray[Any],
+    at: NDArray[np.int64],
+    vehicles: NDArray[np.int64],
+    observations: NDArray[np.float64],
+    actions: NDArray[np.int64],
+    starts: NDArray[np.bool_],
+    failures: NDArray[np.bool_],
+    state: NDArray[np.int64],
+    n_states: NDArray[np.int64],
+    event: NDArray[np.int8],
+    surprise: NDArray[np.float64],
+) -> int:
+    """Step those that did not step yet; answers how many could not for want of room.
+
+    Its arrays are not in tuples: Numba loses what a ``prange`` writes to an array in a tuple.
+    """
+    full = 0
+    for row in numba.prange(len(vehicles)):
+        if event[row] == FULL:
+            n_states[row], event[row], state[row], surprise[row] = _step_one(
+                small,
+                matrices,
+                at[vehicles[row]],
+                observations[row],
+                actions[row],
+                starts[row],
+                failures[row],
+            )
+            full += event[row] == FULL
+    return full
+
+
+@kernel
+def _step_one(
+    small: NDArray[np.float64],
+    matrices: NDArray[Any],
+    at: NDArray[np.int64],
+    z: NDArray[np.float64],
+    action: int,
+    starts: bool,
+    failed: bool,
+) -> tuple[int, int, int, float]:
+    memory = _open(small, matrices, at)
+    now = memory.learnt
+    if starts:
+        now.chained[0] = 0.0
+    event, state, surprise = step(memory, z, failed)
+    if event != FULL and not failed:
+        now.action[0] = action
+    return int(now.n_states[0]), event, state, surprise
+
+
+@kernel
+def _start_episodes(
+    small: NDArray[np.float64],
+    matrices: NDArray[Any],
+    at: NDArray[np.int64],
+    vehicles: NDArray[np.int64],
+) -> None:
+    for vehicle in vehicles:
+        now = _open(small, matrices, at[vehicle]).learnt
+        now.chained[0] = 0.0
+        now.action[0] = NO_ACTION
+
+
+@kernel
+def _count_states(
+    small: NDArray[np.float64],
+    matrices: NDArray[Any],
+    at: NDArray[np.int64],
+    found: NDArray[np.int64],
+) -> None:
+    for vehicle in range(len(at)):
+        found[vehicle] = int(_open(small, matrices, at[vehicle]).learnt.n_states[0])
+
+
+@kernel
+def _measure_all(
+    small: NDArray[np.float64],
+    matrices: NDArray[Any],
+    at: NDArray[np.int64],
+    vehicles: NDArray[np.int64],
+    sizes: NDArray[np.int64],
+    needed: NDArray[np.int64],
+) -> None:
+    for row in range(len(vehicles)):
+        memory = _open(small, matrices, at[vehicles[row]])
+        now = memory.learnt
+        m, q = len(now.clusters.first), len(now.transitions.uses)
+        capacity, places = room_for(memory)
+        sizes[row, 0], sizes[row, 1], sizes[row, 2], sizes[row, 3] = m, q, capacity, places
+        needed[row, 0], needed[row, 1] = lengths(m, q, capacity, places)
+
+
+@kernel
+def _move_all(
+    small: NDArray[np.float64],
+    matrices: NDArray[Any],
+    at: NDArray[np.int64],
+    vehicles: NDArray[np.int64],
+    sizes: NDArray[np.int64],
+    to_small: NDArray[np.float64],
+    to_matrices: NDArray[Any],
+    begins: NDArray[np.int64],
+) -> None:
+    for row in range(len(vehicles)):
+        source, target = at[vehicles[row]], begins[row]
+        for i in range(4):
+            to_small[target[0] + i] = sizes[row, i]
+        move(
+            small[source[0] :],
+            matrices[source[1] :],
+            to_small[target[0] :],
+            to_matrices[target[1] :],
+        )
