@@ -17,8 +17,8 @@ test: .venv/installed           ## all tests, doctests included
 check: .venv/installed          ## lint, types and the import rule
 	@$(BIN)/ruff check . && $(BIN)/ruff format --check . && $(BIN)/mypy && $(BIN)/lint-imports
 
-bench: .venv/installed          ## how fast a step is, against a plain NumPy loop; what a decision costs
-	@$(BIN)/python benchmarks/speed.py
+bench: .venv/installed          ## how fast it is, as ratios against named references; bench.json
+	@$(BIN)/python benchmarks/speed.py --json bench.json
 	@$(BIN)/python benchmarks/decision.py
 
 # pip installs into the environment from outside it, so Debian's ensurepip package is not needed.

@@ -8,7 +8,10 @@ from numpy.typing import NDArray
 
 
 class NumpyFSM:
-    """One object, one call a step, NumPy for everything; the paper's settings by default."""
+    """One object, one call a step, NumPy for everything; the paper's settings by default.
+
+    With a ``novelty_radius`` states are those of `evofsm.states.Novelty` instead of the paper's.
+    """
 
     def __init__(
         self,
@@ -18,6 +21,7 @@ class NumpyFSM:
         learning_rate: float = 0.01,
         prior_frequency: float = 1e-3,
         spread: float = 3.0,
+        novelty_radius: float | None = None,
     ) -> None:
         self.n_actions = n_actions
         self.radius = radius
@@ -25,6 +29,7 @@ class NumpyFSM:
         self.learning_rate = learning_rate
         self.prior_frequency = prior_frequency
         self.spread = spread
+        self.novelty_radius = novelty_radius
         self.count = 0
         self.previous: NDArray[np.float64] = np.empty(0)
         self.belief: NDArray[np.float64] | None = None
@@ -38,9 +43,11 @@ class NumpyFSM:
 
     def observe(self, z: NDArray[np.float64]) -> tuple[int, NDArray[np.float64], float]:
         """One observation; answers state, belief and surprise."""
-        self._determine(z)
-        distances = ((self.centers - z) ** 2).sum(axis=1)
-        width = self.spread * self.scatter / self.count
+        distances = self._determine(z)
+        if self.novelty_radius is None:
+            width = self.spread * self.scatter / self.count
+        else:
+            width = self.spread * self.novelty_radius**2
         nearest = distances.min()
         if width > 0.0:
             belief = np.exp((nearest - distances) / width)
@@ -65,12 +72,14 @@ class NumpyFSM:
         self.belief, self.action = belief, None
         return int(belief.argmax()), belief, surprise
 
-    def _determine(self, z: NDArray[np.float64]) -> None:
+    def _determine(self, z: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Move or found a state where the rule says so; answers squared distances to centres."""
         if self.count == 0:
             self.mean, self.scatter = np.zeros(len(z)), 0.0
             self.centers, self.potentials = z[None, :].copy(), np.ones(1)
             self.matrices = np.ones((self.n_actions, 1, 1))
             self.frequencies = np.full((self.n_actions, 1), self.prior_frequency)
+            distances = np.zeros(1)
         else:
             t = self.count + 1
             offset = z - self.mean
@@ -81,20 +90,27 @@ class NumpyFSM:
                 * self.potentials
                 / ((t - 2) + self.potentials * (1.0 + self.distance_weight * far))
             )
-            if potential > self.potentials.max():
-                distances = ((self.centers - z) ** 2).sum(axis=1)
+            distances = ((self.centers - z) ** 2).sum(axis=1)
+            if self.novelty_radius is not None:
+                if distances.min() > self.novelty_radius**2:
+                    distances = self._found(z, potential, distances)
+            elif potential > self.potentials.max():
                 nearest = distances.argmin()
                 if distances[nearest] < self.radius**2:
                     self.centers[nearest], self.potentials[nearest] = z, potential
+                    distances[nearest] = 0.0
                 else:
-                    self._found(z, potential)
+                    distances = self._found(z, potential, distances)
         self.count += 1
         before = z - self.mean
         self.mean = self.mean + before / self.count
         self.scatter += float(before @ (z - self.mean))
         self.previous = z
+        return distances
 
-    def _found(self, z: NDArray[np.float64], potential: float) -> None:
+    def _found(
+        self, z: NDArray[np.float64], potential: float, distances: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
         self.centers = np.vstack([self.centers, z])
         self.potentials = np.append(self.potentials, potential)
         n = len(self.centers)
@@ -102,6 +118,7 @@ class NumpyFSM:
         joint[:, :-1, :-1] = self.matrices * self.frequencies[:, :, None]
         self.frequencies = joint.sum(axis=2)
         self.matrices = joint / self.frequencies[:, :, None]
+        return np.append(distances, 0.0)
 
 
 def _relative_entropy(p: NDArray[np.float64], q: NDArray[np.float64]) -> np.float64:

@@ -1,125 +1,106 @@
-"""How fast a step is, as a ratio against a plain NumPy loop in the same run.
+"""How fast it is, as ratios against named references in the same run.
 
-Usage: python benchmarks/speed.py [--repeats 7] [--json FILE]
+Usage: python benchmarks/speed.py [--only batch_7,call_7] [--repeats 7] [--json bench.json]
+
+Prints one table and writes it as JSON. Fails where a ratio is not what the project promises, or
+is worse than in an earlier JSON by more than a margin.
 """
 
 from __future__ import annotations
 
 import argparse
+import importlib
 import json
-import statistics
 import sys
-import time
-from collections.abc import Callable
+import traceback
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
-from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
+from clusterers import db_stream, stream_k_means
+from fleets import fleet
+from single import batch, call
+from table import HEADER, Row, judged, shown, worsened
+from tolerance import cost_and_memory, many_states
+from turns import Result
 
-from evofsm.machine import EvolvingFSM
-from evofsm.studies.paper import Settings
-from evofsm.worlds.kinematic import KinematicWorld
-from reference import NumpyFSM
-
-_BATCH_ROWS = 1_000_000
-_CALL_ROWS = 50_000
-_REFERENCE_ROWS = 20_000
+_LAST = Path(__file__).with_name("last.json")
 
 
-def main() -> int:
-    """Measure, print a table, and fail where a ratio is below what the project promises."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--repeats", type=int, default=7)
-    parser.add_argument("--json", type=Path)
-    arguments = parser.parse_args()
-    results = measure(arguments.repeats)
-    print(f"{'one step, 7 states, 17 actions':<34}{'ours':>10}{'NumPy loop':>13}{'ratio':>9}")
-    for result in results:
-        print(
-            f"{result['what']:<34}{1e6 * result['ours_s']:>7.2f} µs"
-            f"{1e6 * result['reference_s']:>10.1f} µs{result['ratio']:>8.0f}x"
-            f"   (promised: {result['promised']}x)"
-        )
-    if arguments.json:
-        arguments.json.write_text(json.dumps(results, indent=2) + "\n")
-    return int(any(result["ratio"] < result["promised"] for result in results))
+def late(module: str) -> Callable[[int, bool], Result]:
+    """The `measure` of a module that is imported once it is called, and has no short sizes."""
+
+    def measure(repeats: int, short: bool) -> Result:
+        result: Result = importlib.import_module(module).measure(repeats)
+        return result
+
+    return measure
 
 
-def measure(repeats: int) -> list[dict[str, Any]]:
-    """Seconds a step, median over repeats; ours and the reference take turns."""
-    observations, actions, starts = paper_stream(_BATCH_ROWS)
-    trained = EvolvingFSM.paper()
-    trained.learn_many(observations[:14_000], actions[:14_000], starts[starts < 14_000])
-    reference = NumpyFSM(17)
-    loop(reference, observations[:14_000], actions[:14_000])
-
-    def batch() -> float:
-        return timed(lambda: trained.copy().learn_many(observations, actions, starts), _BATCH_ROWS)
-
-    def call() -> float:
-        machine = trained.copy()
-        rows, labels = observations[:_CALL_ROWS], actions[:_CALL_ROWS]
-        return timed(lambda: loop(machine, rows, labels), _CALL_ROWS)
-
-    def numpy_loop() -> float:
-        rows, labels = observations[:_REFERENCE_ROWS], actions[:_REFERENCE_ROWS]
-        return timed(lambda: loop(reference, rows, labels), _REFERENCE_ROWS)
-
-    seconds: dict[str, list[float]] = {"batch_7": [], "call_7": [], "numpy": []}
-    for _ in range(repeats):
-        seconds["batch_7"].append(batch())
-        seconds["numpy"].append(numpy_loop())
-        seconds["call_7"].append(call())
-    medians = {name: statistics.median(values) for name, values in seconds.items()}
-    names = {"batch_7": ("a million rows, learn_many", 100), "call_7": ("observe + act", 8)}
-    return [
-        {
-            "id": id_,
-            "what": what,
-            "ours_s": medians[id_],
-            "reference": "NumPy loop",
-            "reference_s": medians["numpy"],
-            "ratio": medians["numpy"] / medians[id_],
-            "promised": promised,
-        }
-        for id_, (what, promised) in names.items()
-    ]
+ROWS = {
+    "batch_7": Row(partial(batch, 7), ">=", 200.0),
+    "batch_64": Row(partial(batch, 64), ">=", 45.0),
+    "call_7": Row(partial(call, 7), ">=", 40.0),
+    "call_64": Row(partial(call, 64), ">="),
+    "fleet_1000": Row(partial(fleet, 1_000), ">=", 12.0),
+    "fleet_10000": Row(partial(fleet, 10_000), ">="),
+    "river_streamkmeans": Row(stream_k_means, ">=", 25.0),
+    "river_dbstream": Row(db_stream, ">=", 60.0),
+    "sumo_loop": Row(late("sumo_loop"), "<=", 1.25),
+    "csv_learn": Row(late("csv_learn"), "<=", 3.0),
+    "states_1024": Row(many_states, "<=", 20.0),
+}
 
 
-def paper_stream(
-    rows: int,
-) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.int64]]:
-    """The paper's four cases, over and over, until there are enough rows."""
-    settings = Settings.load()
-    world = KinematicWorld()
-    episodes = [world.run(settings.scenario, driver) for driver in settings.drivers.values()]
-    observations = np.concatenate([episode.observations for episode in episodes])
-    commanded = np.concatenate([episode.accelerations for episode in episodes])
-    lengths = [len(episode.time) for episode in episodes]
-    times = -(-rows // len(observations))
-    starts = np.cumsum([0, *(lengths * times)])
-    return (
-        np.tile(observations, (times, 1))[:rows],
-        np.tile(settings.actions.encode(commanded), times)[:rows],
-        starts[starts < rows],
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Measure, print, write; 1 where a promise is not kept or a ratio is worse than before."""
+    options = parse(arguments)
+    if options.table:
+        print(cost_and_memory(options.repeats, options.short))
+        return 0
+    last = json.loads(options.against.read_text()) if options.against.exists() else []
+    results, good = [], True
+    print(HEADER)
+    for number, id_ in enumerate(options.only, 1):
+        print(f"measuring {id_} ({number} of {len(options.only)})", file=sys.stderr, flush=True)
+        try:
+            result = judged(id_, ROWS[id_], ROWS[id_].measure(options.repeats, options.short))
+        except ImportError as error:
+            print(f"{id_:<19} not installed: {error}\n", flush=True)
+            good = False
+        except Exception:  # the other rows, which take minutes, are not to be lost
+            print(f"{id_:<19} not measured: it failed\n", flush=True)
+            traceback.print_exc()
+            good = False
+        else:
+            worse = None if options.short else worsened(result, last)
+            print(shown(result, worse), flush=True)
+            good = good and (options.short or (result["kept"] and not worse))
+            results.append(result)
+    options.json.write_text(json.dumps(results, indent=1) + "\n")
+    return int(not good)
+
+
+def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
+    parser.add_argument("--only", type=ids, default=list(ROWS), help="ids of rows, with commas")
+    parser.add_argument("--repeats", type=int, default=7, help="turns, of which the median counts")
+    parser.add_argument("--json", type=Path, default=Path("bench.json"), help="where to write")
+    parser.add_argument("--against", type=Path, default=_LAST, help="the JSON of an earlier run")
+    parser.add_argument("--short", action="store_true", help="few rows: to see whether it runs")
+    parser.add_argument("--table", action="store_true", help="cost and memory by states instead")
+    return parser.parse_args(arguments)
 
 
-def loop(
-    machine: EvolvingFSM | NumpyFSM, observations: NDArray[np.float64], actions: NDArray[np.int64]
-) -> None:
-    """Every row by a call from Python."""
-    for z, action in zip(observations, actions.tolist(), strict=True):
-        machine.observe(z)
-        machine.act(action)
-
-
-def timed(work: Callable[[], object], steps: int) -> float:
-    """Seconds a step."""
-    begin = time.perf_counter()
-    work()
-    return (time.perf_counter() - begin) / steps
+def ids(text: str) -> list[str]:
+    """The ids named, all of them known."""
+    named = text.split(",")
+    for id_ in named:
+        if id_ not in ROWS:
+            raise argparse.ArgumentTypeError(f"no row {id_!r}; there are {', '.join(ROWS)}")
+    return named
 
 
 if __name__ == "__main__":

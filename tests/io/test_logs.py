@@ -7,7 +7,7 @@ import tracemalloc
 import numpy as np
 import pytest
 
-from evofsm.io import LogColumns, read_traces
+from evofsm.io import LogColumns, read_traces, tables
 from evofsm.observations import Category, ObservationEncoder
 
 HEADER = "run,pair,segment,time,gap,v_follower,v_leader,a_follower"
@@ -133,7 +133,8 @@ def test_without_a_clock_the_step_is_given(tmp_path):
     assert chunk.dt == 0.25
 
 
-def test_chunks_go_on_where_the_one_before_ended(tmp_path):
+def test_chunks_go_on_where_the_one_before_ended(tmp_path, monkeypatch):
+    monkeypatch.setattr(tables, "_CSV_BYTES", 1 << 18)
     path = write(tmp_path / "a.csv", [*log(9000), *log(8000, "v2-v3"), *log(7000, start=2000.0)])
     chunks = read(path)
     assert len(chunks) > 2
@@ -152,7 +153,9 @@ def test_the_bytes_read_add_up_to_the_size_of_the_file(tmp_path):
     assert sum(read_so_far) == (tmp_path / "a.csv.gz").stat().st_size
 
 
-def test_memory_does_not_grow_with_the_file(tmp_path):
+def test_memory_does_not_grow_with_the_file(tmp_path, monkeypatch):
+    monkeypatch.setattr(tables, "_CSV_BYTES", 1 << 18)
+
     def peak(rows):
         path = write(tmp_path / f"{rows}.csv", log(rows))
         tracemalloc.start()
@@ -249,8 +252,10 @@ def test_time_that_stands_or_runs_backwards_is_refused(tmp_path, second):
 
 
 def test_time_that_runs_backwards_between_two_chunks_is_refused(tmp_path):
-    message = refusal(write(tmp_path / "a.csv", [*log(8192), *log(10)]))
-    assert "line 8194" in message
+    first = next(read_traces([write(tmp_path / "a.csv", log(100_000))]))
+    rows = len(first.times)
+    message = refusal(write(tmp_path / "b.csv", [*log(rows), *log(10)]))
+    assert f"line {rows + 2}" in message
 
 
 def test_interleaved_episodes_are_refused_with_the_remedy(tmp_path):
@@ -287,7 +292,9 @@ def test_a_truncated_gzip_is_refused(tmp_path, kept):
     path = tmp_path / "a.csv.gz"
     path.write_bytes(whole[: int(kept * len(whole)) if isinstance(kept, float) else kept])
     message = refusal(str(path))
-    assert re.search(r"a\.csv\.gz, after line \d+: the gzip data ends early", message)
+    reached = re.search(r"a\.csv\.gz, after line (\d+): the gzip data ends early", message)
+    share = path.stat().st_size / len(whole)
+    assert int(reached[1]) == pytest.approx(20_001 * share, rel=0.2, abs=10)
     assert "interrupted" in message
 
 

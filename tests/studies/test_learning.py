@@ -38,7 +38,7 @@ def chunks(Z, actions, starts=STARTS, dt=0.1, size=1000):
 
 
 def by_hand(Z, actions, starts=STARTS, steps=10):
-    """The same one row at a time, with divergences of forecasts and of persistence."""
+    """The same one row at a time, with divergences of forecasts and of persistence, and beliefs."""
     fsm = machine()
     one, ahead = [], []
     beliefs, looks = [], {}
@@ -60,7 +60,7 @@ def by_hand(Z, actions, starts=STARTS, steps=10):
                 looks[t] = [fsm.predict(i, steps, p) for p in ("marginal", "hold", "observed")]
         if not math.isnan(actions[t]):
             fsm.act(ACTIONS.encode(actions[t]))
-    return fsm, np.array(one), np.array(ahead)
+    return fsm, np.array(one), np.array(ahead), beliefs
 
 
 def wide(belief, n):
@@ -70,7 +70,7 @@ def wide(belief, n):
 @pytest.mark.parametrize("size", [1, 7, 10, 64, 1000])
 def test_chunks_of_any_size_learn_what_single_rows_do(trace, snapshot, size):
     learning = learn_traces(chunks(*trace, size=size), machine(), ACTIONS)
-    fsm, _, _ = by_hand(*trace)
+    fsm, *_ = by_hand(*trace)
     assert fsm.n_states > 3
     assert snapshot(learning.machine) == snapshot(fsm)
 
@@ -78,7 +78,7 @@ def test_chunks_of_any_size_learn_what_single_rows_do(trace, snapshot, size):
 @pytest.mark.parametrize("size", [1, 7, 10, 64, 1000])
 def test_skill_is_what_its_definition_says(trace, size):
     learning = learn_traces(chunks(*trace, size=size), machine(), ACTIONS)
-    _, one, ahead = by_hand(*trace)
+    _, one, ahead, _ = by_hand(*trace)
     first, *others = learning.skills
     assert first.forecasts == len(one) > 150
     assert first.divergence == pytest.approx(one[:, 0].mean())
@@ -90,6 +90,32 @@ def test_skill_is_what_its_definition_says(trace, size):
         assert skill.forecasts == len(ahead) > 10
         assert skill.persistence == pytest.approx(ahead[:, 0].mean())
         assert skill.divergence == pytest.approx(ahead[:, k].mean())
+
+
+@pytest.mark.parametrize("rows_at_once", [1, 3, 50])
+@pytest.mark.parametrize(("dt", "steps"), [(0.02, 50), (0.1, 10), (2.0, 0)])
+def test_scores_are_the_same_however_many_rows_are_learnt_at_once(
+    trace, monkeypatch, rows_at_once, dt, steps
+):
+    monkeypatch.setattr("evofsm.studies.learning._ROWS_AT_ONCE", rows_at_once)
+    learning = learn_traces(chunks(*trace, dt=dt), machine(), ACTIONS)
+    _, one, ahead, beliefs = by_hand(*trace, steps=steps or 10)
+    first, *others = learning.skills
+    assert first.forecasts == len(one)
+    assert (first.divergence, first.persistence) == pytest.approx(tuple(one.mean(axis=0)))
+    assert len(others) == (3 if steps else 0)
+    for k, skill in enumerate(others, 1):
+        assert skill.forecasts == len(ahead) > 0
+        wanted = ahead[:, k].mean(), ahead[:, 0].mean()
+        assert (skill.divergence, skill.persistence) == pytest.approx(wanted)
+    assert learning.certainty == pytest.approx(np.mean([belief.max() for belief in beliefs]))
+
+
+def test_rows_that_no_machine_takes_are_refused(trace):
+    Z, actions = trace
+    Z[130, 1] = math.nan
+    with pytest.raises(ValueError, match="row 30, variable 1: nan"):
+        learn_traces(chunks(Z, actions, size=100), machine(), ACTIONS)
 
 
 def test_counts_say_what_was_learnt(trace):

@@ -15,7 +15,8 @@ Kind = Literal["csv", "parquet", "xml"]
 #: Is told the number of bytes each time some were read from a file.
 OnRead = Callable[[int], object]
 
-_GZIP, _PARQUET, _BYTE_ORDER_MARK = b"\x1f\x8b", b"PAR1", b"\xef\xbb\xbf"
+BYTE_ORDER_MARK = b"\xef\xbb\xbf"
+_GZIP, _PARQUET = b"\x1f\x8b", b"PAR1"
 
 
 def ignore(count: int) -> None:
@@ -51,7 +52,7 @@ def open_unpacked(path: str, on_read: OnRead = ignore) -> Iterator[BinaryIO]:
 def kind_of(path: str) -> Kind:
     """What the file holds, judged by how it begins."""
     with open_unpacked(path) as file, damage_explained(path):
-        beginning = file.read(64).removeprefix(_BYTE_ORDER_MARK).lstrip()
+        beginning = file.read(64).removeprefix(BYTE_ORDER_MARK).lstrip()
     if not beginning:
         raise ValueError(f"{path} is empty")
     if beginning.startswith(_PARQUET):

@@ -5,20 +5,25 @@ from __future__ import annotations
 import csv
 import io
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from itertools import islice
-from typing import Any, NoReturn, Protocol
+from itertools import chain, islice
+from typing import Any, BinaryIO, NoReturn, Protocol, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from evofsm._extras import needs
-from evofsm.io.files import OnRead, damage_explained, ignore, open_unpacked
+from evofsm.io.files import BYTE_ORDER_MARK, OnRead, damage_explained, ignore, open_unpacked
+from evofsm.io.plain import Texts, parse_plain
 from evofsm.validation import LARGEST_OBSERVATION
 
+# At once: enough that what Python does in between hardly counts.
+_CSV_BYTES = 1 << 21
+# Rows at once of a CSV file that is not plain.
 _CSV_ROWS = 8192
 _LONGEST_LINE = 1_000_000
+_LONGEST_CHARACTER = 4  # bytes, in UTF-8
 # polars decodes a whole row group for each slice of it, so small slices would only cost time.
 _PARQUET_ROWS = 65536
 
@@ -31,7 +36,7 @@ class Piece:
     unit: str  #: what its places count: "line" as an editor shows it, or "row" from 1
     places: NDArray[np.int64]  #: (T,)
     numbers: dict[str, NDArray[np.float64]]
-    texts: dict[str, NDArray[np.object_]]
+    texts: dict[str, Texts]
 
     def at(self, row: int) -> str:
         """Where a row stands, for a message."""
@@ -50,38 +55,71 @@ class Table(Protocol):
 
 
 class CsvTable:
-    """A CSV file, gzipped or not, with a header; fields end at a comma, a semicolon or a tab."""
+    """A CSV file, gzipped or not, with a header; fields end at a comma, a semicolon or a tab.
+
+    Compiled code reads what is plain. From the first block on that is not, Python's own reader
+    does: it knows all that a CSV file may be, and what to say of one that is none.
+    """
 
     def __init__(self, path: str, on_read: OnRead = ignore) -> None:
         self.path = path
         self._on_read = on_read
-        with open_unpacked(path) as file, damage_explained(path), _text(file) as text:
-            line = next(_lines(path, text), "")
-            self._separator = max(",;\t", key=line.count)
-            text.seek(0)
-            header = next(csv.reader(_lines(path, text), delimiter=self._separator), [])
-        self.columns = tuple(name.strip() for name in header)
+        header: list[str] = []
+        with open_unpacked(path) as file, damage_explained(path):
+            lines = _lines(path, _text(file))
+            first = next(lines, "")
+            unmarked = first.removeprefix(BYTE_ORDER_MARK.decode())
+            self._separator = max(",;\t", key=unmarked.count)
+            rows = csv.reader(chain([unmarked], _kept(lines, header)), delimiter=self._separator)
+            self.columns = tuple(name.strip() for name in next(rows, []))
+            self._header_lines = rows.line_num
+            self._header_size = sum(len(line.encode()) for line in (first, *header))
         if all(_is_number(name) for name in self.columns):
             raise ValueError(
-                f"{path}, line 1: {line.strip()!r} is no header; the first line must name "
+                f"{path}, line 1: {unmarked.strip()!r} is no header; the first line must name "
                 "the columns"
             )
 
     def pieces(self, numbers: Sequence[str], texts: Sequence[str]) -> Iterator[Piece]:
         """Read the named columns, in the order of rows."""
+        numbers, texts = list(dict.fromkeys(numbers)), list(dict.fromkeys(texts))
+        places = [self._place(name) for name in numbers], [self._place(name) for name in texts]
+        reached = self._header_lines
+        with open_unpacked(self.path, self._on_read) as file:
+            file.read(self._header_size)
+            while block := _whole_lines(self.path, file, reached):
+                rows = parse_plain(block, self._separator, len(self.columns), *places)
+                if rows is None:
+                    rest = (_text(io.BytesIO(block)), _text(file))
+                    yield from self._read_carefully(rest, reached, numbers, texts)
+                    return
+                piece = Piece(self.path, "line", rows.lines + reached, {}, {})
+                for name, values in zip(numbers, rows.numbers, strict=True):
+                    _refuse_unusable(piece, name, values)
+                    piece.numbers[name] = values
+                piece.texts.update(zip(texts, rows.texts, strict=True))
+                yield piece
+                reached += rows.n_lines
+
+    def _read_carefully(
+        self,
+        parts: Iterable[io.TextIOWrapper],
+        reached: int,
+        numbers: Sequence[str],
+        texts: Sequence[str],
+    ) -> Iterator[Piece]:
+        """Read the lines of some parts, after those that were read before."""
         places = {name: self._place(name) for name in (*numbers, *texts)}
-        with open_unpacked(self.path, self._on_read) as file, _text(file) as text:
-            rows = csv.reader(_lines(self.path, text), delimiter=self._separator)
-            with damage_explained(self.path, lambda: rows.line_num):
-                next(rows)
-                while some := [(rows.line_num, row) for row in islice(rows, _CSV_ROWS)]:
-                    fields, lines = self._columns(some)
-                    piece = Piece(self.path, "line", lines, {}, {})
-                    for name in numbers:
-                        piece.numbers[name] = _numbers(piece, name, fields[places[name]])
-                    for name in texts:
-                        piece.texts[name] = np.array(fields[places[name]], dtype=object)
-                    yield piece
+        rows = csv.reader(_lines(self.path, *parts, reached=reached), delimiter=self._separator)
+        with damage_explained(self.path, lambda: reached + rows.line_num):
+            while some := [(reached + rows.line_num, row) for row in islice(rows, _CSV_ROWS)]:
+                fields, lines = self._columns(some)
+                piece = Piece(self.path, "line", lines, {}, {})
+                for name in numbers:
+                    piece.numbers[name] = _numbers(piece, name, fields[places[name]])
+                for name in texts:
+                    piece.texts[name] = Texts.of(fields[places[name]])
+                yield piece
 
     def _place(self, name: str) -> int:
         if self.columns.count(name) > 1:
@@ -137,17 +175,20 @@ class ParquetTable:
                 frame = wanted.slice(first, _PARQUET_ROWS).collect()
             except polars.exceptions.PolarsError as error:
                 self._refuse(error)
-            places = np.arange(first + 1, first + len(frame) + 1)
+            rows = len(frame)
+            places = np.arange(first + 1, first + rows + 1)
             piece = Piece(self.path, "row", places, {}, {})
             for name in numbers:
                 column = frame[name].cast(polars.Float64)
                 _refuse_unusable(piece, name, column.to_numpy())
                 piece.numbers[name] = column.to_numpy()
             for name in texts:
-                piece.texts[name] = np.array(
-                    frame[name].cast(polars.String).fill_null("").to_list(), dtype=object
+                fields = frame[name].cast(polars.String).fill_null("")
+                firsts = fields.ne_missing(fields.shift()).arg_true()
+                piece.texts[name] = Texts(
+                    fields.gather(firsts).to_list(), firsts.to_numpy().astype(np.int64), rows
                 )
-            self._on_read(size * len(frame) // self._rows)
+            self._on_read(size * rows // self._rows)
             yield piece
 
     def _refuse(self, error: Exception) -> NoReturn:
@@ -159,18 +200,44 @@ class ParquetTable:
 
 
 def _text(file: Any) -> io.TextIOWrapper:
-    return io.TextIOWrapper(file, encoding="utf-8-sig", newline="")
+    return io.TextIOWrapper(file, encoding="utf-8", newline="")
 
 
-def _lines(path: str, text: io.TextIOWrapper) -> Iterator[str]:
-    """The lines of a file; none is read whole that no table would hold."""
-    number = 0
-    while line := text.readline(_LONGEST_LINE):
-        number += 1
-        if len(line) == _LONGEST_LINE and not line.endswith("\n"):
-            raise ValueError(
-                f"{path}, line {number}: longer than {_LONGEST_LINE:,} characters; this is no table"
-            )
+def _whole_lines(path: str, file: BinaryIO, reached: int) -> bytes:
+    """The next lines of a file, the last one ended whether it is in the file or not."""
+    file = cast(io.BufferedReader, file)
+    parts: list[bytes] = []
+    missing = _CSV_BYTES
+    with damage_explained(path, lambda: reached + b"".join(parts).count(b"\n")):
+        # Not `read`: where the file is damaged, it would forget what came before.
+        while missing > 0 and (part := file.read1(missing)):
+            parts.append(part)
+            missing -= len(part)
+        if parts and not parts[-1].endswith(b"\n"):
+            parts.append(file.readline(_LONGEST_CHARACTER * _LONGEST_LINE))
+            if not parts[-1].endswith(b"\n"):
+                parts.append(b"\n")
+    return b"".join(parts)
+
+
+def _lines(path: str, *parts: io.TextIOWrapper, reached: int = 0) -> Iterator[str]:
+    """The lines of the parts of a file; none is read whole that no table would hold."""
+    number = reached
+    for text in parts:
+        while line := text.readline(_LONGEST_LINE):
+            number += 1
+            if len(line) == _LONGEST_LINE and not line.endswith("\n"):
+                raise ValueError(
+                    f"{path}, line {number}: longer than {_LONGEST_LINE:,} characters; "
+                    "this is no table"
+                )
+            yield line
+
+
+def _kept(lines: Iterator[str], into: list[str]) -> Iterator[str]:
+    """The same lines, each kept as well once it is read."""
+    for line in lines:
+        into.append(line)
         yield line
 
 

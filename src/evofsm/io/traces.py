@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
-from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -13,6 +12,7 @@ from numpy.typing import NDArray
 from evofsm.io import fcd
 from evofsm.io.fcd import VehicleLengths
 from evofsm.io.files import OnRead, ignore, kind_of
+from evofsm.io.plain import Texts
 from evofsm.io.tables import CsvTable, ParquetTable, Piece, Table
 from evofsm.observations import Category, ObservationEncoder
 
@@ -20,6 +20,8 @@ from evofsm.observations import Category, ObservationEncoder
 USUAL_EPISODE = ("run", "pair", "segment")
 #: Steps longer than the usual one times this, or as much shorter, begin a new episode.
 LONGEST_STEP = 1.5
+# Rows of a file whose steps tell the usual one.
+_FIRST_ROWS = 8192
 # Share by which the usual steps of two files may differ.
 _SAME_STEP = 0.05
 
@@ -157,8 +159,9 @@ class _Clock:
                 "an episode; it must run forward (rows not sorted by time, or several episodes "
                 "mixed? --episode names the columns that tell them apart)"
             )
-        if np.isnan(self._usual) and not np.isnan(steps).all():
-            self._settle(round(float(np.nanmedian(steps)), 9))
+        first = steps[:_FIRST_ROWS]
+        if np.isnan(self._usual) and not np.isnan(first).all():
+            self._settle(round(float(np.nanmedian(first)), 9))
         unusual = (steps > LONGEST_STEP * self._usual) | (steps < self._usual / LONGEST_STEP)
         return np.asarray(unusual)
 
@@ -185,13 +188,16 @@ def _read_log(table: Table, columns: LogColumns, clock: _Clock) -> Iterator[Chun
     _refuse_missing(table, columns, numbers, texts)
 
     rows_before = 0
-    key_before: tuple[str, ...] | None = None
+    key_before: list[str] | None = None
     for piece in table.pieces(numbers, texts):
         rows = len(piece.places)
         if rows == 0:
             continue
-        keys = list(zip(*(piece.texts[name] for name in episode), strict=True)) or [()] * rows
-        starts = np.array([key != before for before, key in pairwise([key_before, *keys])])
+        keys = [piece.texts[name] for name in episode]
+        starts = np.zeros(rows, np.bool_)
+        for key in keys:
+            starts[key.firsts] = True
+        starts[0] = key_before != _key(keys, 0)
         _refuse_interleaved(piece, episode, keys, starts)
         jumps = 0
         if clock.ticks:
@@ -210,7 +216,12 @@ def _read_log(table: Table, columns: LogColumns, clock: _Clock) -> Iterator[Chun
             dt=clock.dt,
             jumps=jumps,
         )
-        rows_before, key_before = rows_before + rows, keys[-1]
+        rows_before, key_before = rows_before + rows, _key(keys, rows - 1)
+
+
+def _key(columns: Sequence[Texts], row: int) -> list[str]:
+    """What tells the episode of a row from others."""
+    return [column.at(row) for column in columns]
 
 
 def _episode_columns(table: Table, asked: Sequence[str] | None) -> Sequence[str]:
@@ -237,13 +248,12 @@ def _listed(names: Sequence[str], most: int = 20) -> str:
 
 
 def _refuse_interleaved(
-    piece: Piece,
-    episode: Sequence[str],
-    keys: Sequence[tuple[str, ...]],
-    starts: NDArray[np.bool_],
+    piece: Piece, episode: Sequence[str], keys: Sequence[Texts], starts: NDArray[np.bool_]
 ) -> None:
-    begun = [key for key, start in zip(keys, starts, strict=True) if start]
-    if 2 * len(begun) > len(keys) and len(set(begun)) < len(begun):
+    if 2 * starts.sum() <= len(starts):
+        return
+    begun = [tuple(_key(keys, row)) for row in np.flatnonzero(starts).tolist()]
+    if len(set(begun)) < len(begun):
         raise ValueError(
             f"{piece.at(0)} and after: the episodes ({', '.join(episode)}) take turns row by row, "
             "so that hardly any row follows one of its own episode; sort the file by "
@@ -257,14 +267,14 @@ def _encode(piece: Piece, variable: str | Category) -> NDArray[np.float64]:
         return piece.numbers[variable]
     encoder = ObservationEncoder(variable)
     codes = {value: encoder.encode({variable.name: value}) for value in variable.values}
-    values = piece.texts[variable.name]
-    for row, value in enumerate(values):
+    texts = piece.texts[variable.name]
+    for row, value in zip(texts.firsts, texts.values, strict=True):
         if value not in codes:
             raise ValueError(
                 f"{piece.at(row)}, column {variable.name!r}: {value!r} is none of the values "
                 f"that --observe names: {', '.join(variable.values)}"
             )
-    return np.array([codes[value] for value in values])
+    return np.repeat([codes[value] for value in texts.values], texts.lengths, axis=0)
 
 
 # -- FCD ------------------------------------------------------------------------------------------

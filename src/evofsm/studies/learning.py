@@ -7,21 +7,24 @@ from the belief that came is measured by the Jensen-Shannon divergence.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
+from evofsm._compile import compiled, kernel
 from evofsm.actions import IntervalActions
-from evofsm.divergence import jensen_shannon
+from evofsm.divergence import jensen_shannon_kernel
 from evofsm.io import Chunk
 from evofsm.machine import EvolvingFSM
-from evofsm.memory import NO_ACTION
+from evofsm.memory import NO_ACTION, open_memory
 from evofsm.model import FSMModel
-from evofsm.step import widen
-from evofsm.transitions import Policy
+from evofsm.step import Trace, learn_rows, widen
+from evofsm.transitions import NOT_OPEN, Policy, Transitions
+from evofsm.validation import check_rows
 
 #: How far ahead the longer forecast looks [s].
 HORIZON = 1.0
@@ -30,6 +33,9 @@ HORIZON = 1.0
 _LEAST_EVIDENCE = 10.0
 
 _POLICIES: tuple[Policy, ...] = get_args(Policy)
+_HOLD, _OBSERVED = _POLICIES.index("hold"), _POLICIES.index("observed")
+# Rows whose beliefs are kept at a time.
+_ROWS_AT_ONCE = 1024
 
 
 @dataclass(frozen=True)
@@ -106,7 +112,7 @@ def learn_traces(
         )
     machine = machine.copy()
     learner = _Learner(machine, actions)
-    for chunk in chunks:
+    for chunk in _ahead(chunks):
         learner.learn(chunk)
     if learner.transitions == 0:
         raise ValueError(
@@ -170,6 +176,43 @@ def passages(model: FSMModel, most: int = 12) -> list[Passage]:
     return found
 
 
+def _ahead(chunks: Iterable[Chunk]) -> Iterator[Chunk]:
+    """The same chunks; another thread reads the next one while one is learnt."""
+    waiting = iter(chunks)
+    with ThreadPoolExecutor(1) as reader:
+        coming = reader.submit(next, waiting, None)
+        while (chunk := coming.result()) is not None:
+            coming = reader.submit(next, waiting, None)
+            yield chunk
+
+
+class _Scores(NamedTuple):
+    """Sums over all rows so far, and what the next row needs; the first axis of most is of 1."""
+
+    #: number of forecasts, divergence of persistence, then of each kind of forecast [bit]
+    one_step: NDArray[np.float64]
+    ahead: NDArray[np.float64]
+    certainty: NDArray[np.float64]
+    age: NDArray[np.int64]  # of the present episode [rows]
+    waiting: NDArray[np.bool_]  # whether the forecasts below are still to be scored
+    belief: NDArray[np.float64]  # (capacity,) in the latest row
+    forecasts: NDArray[np.float64]  # (1 + policies, capacity) persistence, then each policy's
+
+
+class _Room(NamedTuple):
+    """Room in which to learn R rows at a time; worth nothing after it."""
+
+    beliefs: NDArray[np.float64]  # (R, capacity)
+    state: NDArray[np.int64]  # (R,)
+    n_states: NDArray[np.int64]  # (R,)
+    event: NDArray[np.int8]  # (R,)
+    surprise: NDArray[np.float64]  # (R,)
+    failures: NDArray[np.bool_]  # (R,) none
+    vector: NDArray[np.float64]  # (capacity,)
+    matrix: NDArray[np.float64]  # (capacity, capacity)
+    square: NDArray[np.float64]  # (capacity, capacity)
+
+
 class _Learner:
     """Learns chunk by chunk; holds counts and sums, and of the rows only the last belief."""
 
@@ -177,38 +220,42 @@ class _Learner:
         self.machine = machine
         self.actions = actions
         self.dt = np.nan
-        self.rows = self.episodes = self.transitions = self.jumps = self.cuts = 0
+        self.rows = self.episodes = self.jumps = self.cuts = 0
         self.clipped_below = self.clipped_above = 0
-        self.seconds = self.certainty = 0.0
-        self._one_step = _Score(1)
-        self._ahead = _Score(len(_POLICIES))
-        self._forecast: NDArray[np.float64] | None = None  # persistence, then each policy's
-        self._last_belief = np.zeros(0)
+        self.seconds = 0.0
         self._last_time = np.nan
-        self._age = 0  # of the present episode [rows]
+        kinds = len(_POLICIES)
+        self._scores = _Scores(
+            one_step=np.zeros(3),
+            ahead=np.zeros(2 + kinds),
+            certainty=np.zeros(1),
+            age=np.zeros(1, np.int64),
+            waiting=np.zeros(1, np.bool_),
+            belief=np.zeros(0),
+            forecasts=np.zeros((1 + kinds, 0)),
+        )
+        self._make_room()
+
+    @property
+    def transitions(self) -> int:
+        """Number learnt."""
+        return int(self._scores.one_step[0])
+
+    @property
+    def certainty(self) -> float:
+        """Sum over all rows."""
+        return float(self._scores.certainty[0])
 
     def learn(self, chunk: Chunk) -> None:
         """Learn a chunk and score the forecasts of it."""
         self.dt = chunk.dt
-        known = ~np.isnan(chunk.actions)
-        indices = np.full(len(known), NO_ACTION)
-        indices[known] = self.actions.encode(chunk.actions[known])
-        beliefs, surprise = self._learn_rows(chunk, indices)
-
-        predicted = ~np.isnan(surprise)
-        before = np.vstack([widen(self._last_belief, beliefs.shape[1]), beliefs[:-1]])
-        stayed = np.asarray(jensen_shannon(before[predicted], beliefs[predicted]))
-        self._one_step.add(surprise[predicted, None], stayed)
-        self._last_belief = beliefs[-1]
-
+        self._learn_rows(chunk)
         steps = np.diff(chunk.times, prepend=self._last_time)
         steps[chunk.starts] = 0.0
         self._last_time = chunk.times[-1]
         self.seconds += float(steps.sum())
-        self.certainty += float(beliefs.max(axis=1).sum())
         self.rows += len(steps)
         self.episodes += len(chunk.starts)
-        self.transitions += int(predicted.sum())
         self.jumps += chunk.jumps
         self.cuts += chunk.cuts
         self.clipped_below += int((chunk.actions < self.actions.low).sum())
@@ -217,8 +264,8 @@ class _Learner:
     def skills(self) -> tuple[Skill, ...]:
         """Of all forecasts so far."""
         steps = self._steps_ahead
-        ahead = self._ahead.skills(steps, self.dt, _POLICIES) if steps else ()
-        return (*self._one_step.skills(1, self.dt, [None]), *ahead)
+        ahead = _skills(self._scores.ahead, steps, self.dt, _POLICIES) if steps else ()
+        return (*_skills(self._scores.one_step, 1, self.dt, [None]), *ahead)
 
     @property
     def _steps_ahead(self) -> int:
@@ -226,81 +273,231 @@ class _Learner:
         steps = 0 if np.isnan(self.dt) else round(HORIZON / self.dt)
         return steps if steps > 1 else 0
 
-    def _learn_rows(
-        self, chunk: Chunk, indices: NDArray[np.int64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Beliefs and surprises of all rows; halts on the way to score and to forecast."""
-        ages = self._ages_of(chunk)
-        steps = self._steps_ahead
-        halts = np.flatnonzero(ages % steps == 0) if steps else np.empty(0, np.int64)
-        learnt = []
-        scored = []
-        first = 0
-        for halt in halts.tolist():
-            learnt.append(self._learn_slice(chunk, indices, slice(first, halt + 1)))
-            first = halt + 1
-            if self._forecast is not None and ages[halt] > 0:
-                scored.append((self._forecast, self.machine.belief))
-            self._forecast = None
-            if indices[halt] != NO_ACTION:
-                self._forecast = self._look_ahead(int(indices[halt]), steps)
-        learnt.append(self._learn_slice(chunk, indices, slice(first, len(ages))))
-
-        n = self.machine.n_states
-        if scored:
-            forecasts = np.stack([widen(forecast, n) for forecast, _ in scored])
-            came = np.stack([widen(belief, n) for _, belief in scored])
-            divergence = np.asarray(jensen_shannon(forecasts, came[:, None]))
-            self._ahead.add(divergence[:, 1:], divergence[:, 0])
-        beliefs = np.vstack([widen(belief, n) for belief, _ in learnt])
-        return beliefs, np.concatenate([surprise for _, surprise in learnt])
-
-    def _ages_of(self, chunk: Chunk) -> NDArray[np.int64]:
-        """Rows since the beginning of each row's episode."""
-        rows = np.arange(len(chunk.times))
-        begun = np.full(len(rows), -self._age)  # where the present episode would have its row 0
-        begun[chunk.starts] = chunk.starts
-        ages = rows - np.maximum.accumulate(begun)
-        self._age = int(ages[-1]) + 1
-        return ages
-
-    def _learn_slice(
-        self, chunk: Chunk, indices: NDArray[np.int64], rows: slice
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Beliefs and surprises of some rows."""
-        starts = chunk.starts[(chunk.starts >= rows.start) & (chunk.starts < rows.stop)]
-        trace = self.machine.learn_many(
-            chunk.observations[rows], indices[rows], starts - rows.start, belief=True
-        )
-        assert trace.belief is not None  # asked for
-        return trace.belief, trace.surprise
-
-    def _look_ahead(self, action: int, steps: int) -> NDArray[np.float64]:
-        """(1 + policies, n) the belief as it stands, and what it is forecast to become."""
-        forecasts = (self.machine.predict(action, steps, policy) for policy in _POLICIES)
-        return np.stack([self.machine.belief, *forecasts])
-
-
-class _Score:
-    """Sums of divergences of some forecasts and of persistence, over the same rows."""
-
-    def __init__(self, kinds: int) -> None:
-        self._rows = 0
-        self._divergence = np.zeros(kinds)
-        self._persistence = 0.0
-
-    def add(self, divergence: NDArray[np.float64], persistence: NDArray[np.float64]) -> None:
-        """Take in (N, kinds) divergences of forecasts and (N,) of persistence."""
-        self._rows += len(persistence)
-        self._divergence += divergence.sum(axis=0)
-        self._persistence += float(persistence.sum())
-
-    def skills(self, steps: int, dt: float, policies: Sequence[Policy | None]) -> tuple[Skill, ...]:
-        """The means, for each kind of forecast."""
-        rows = self._rows or np.nan
-        return tuple(
-            Skill(
-                steps, steps * dt, policy, self._rows, float(total / rows), self._persistence / rows
+    def _learn_rows(self, chunk: Chunk) -> None:
+        known = ~np.isnan(chunk.actions)
+        indices = np.full(len(known), NO_ACTION)
+        indices[known] = self.actions.encode(chunk.actions[known])
+        observations = self.machine._check_observations(chunk.observations)
+        self.machine._fit(observations[0])
+        starts = check_rows("starts", chunk.starts, len(observations))
+        row = 0
+        while row < len(observations):
+            if len(self._scores.belief) < self.machine._capacity:
+                self._make_room()
+            row = _learn_and_score(
+                self.machine._buffer,
+                observations,
+                indices,
+                starts,
+                row,
+                self._steps_ahead,
+                self._scores,
+                self._room,
             )
-            for policy, total in zip(policies, self._divergence, strict=True)
+            if row < len(observations):
+                self.machine._grow()
+
+    def _make_room(self) -> None:
+        """Make room for as many states as the machine has room for."""
+        rows, capacity = _ROWS_AT_ONCE, self.machine._capacity
+        self._scores = self._scores._replace(
+            belief=widen(self._scores.belief, capacity),
+            forecasts=widen(self._scores.forecasts, capacity),
         )
+        self._room = _Room(
+            beliefs=np.zeros((rows, capacity)),
+            state=np.zeros(rows, np.int64),
+            n_states=np.zeros(rows, np.int64),
+            event=np.zeros(rows, np.int8),
+            surprise=np.zeros(rows),
+            failures=np.zeros(rows, np.bool_),
+            vector=np.zeros(capacity),
+            matrix=np.zeros((capacity, capacity)),
+            square=np.zeros((capacity, capacity)),
+        )
+
+
+def _skills(
+    sums: NDArray[np.float64], steps: int, dt: float, policies: Sequence[Policy | None]
+) -> tuple[Skill, ...]:
+    """The means, for each kind of forecast."""
+    forecasts, persistence, *totals = sums.tolist()
+    rows = forecasts or np.nan
+    return tuple(
+        Skill(steps, steps * dt, policy, int(forecasts), total / rows, persistence / rows)
+        for policy, total in zip(policies, totals, strict=True)
+    )
+
+
+# -- Kernels --------------------------------------------------------------------------------------
+
+
+def _learn_and_score_rows(
+    buffer: NDArray[np.float64],
+    observations: NDArray[np.float64],
+    actions: NDArray[np.int64],
+    starts: NDArray[np.bool_],
+    row: int,
+    steps_ahead: int,
+    scores: _Scores,
+    room: _Room,
+) -> int:
+    """Learn and score rows from ``row`` on; answers where the machine had no room.
+
+    Every ``steps_ahead`` rows of an episode it halts, to score the longer forecasts made at the
+    halt before, and to make others.
+    """
+    while row < len(observations):
+        most = min(len(observations) - row, len(room.beliefs))
+        rows, halts = _until_halt(starts[row : row + most], scores.age[0], steps_ahead)
+        these = slice(row, row + rows)
+        room.beliefs[:rows] = 0.0
+        learnt = learn_rows(
+            buffer,
+            observations[these],
+            actions[these],
+            starts[these],
+            room.failures,
+            0,
+            Trace(room.state, room.n_states, room.event, room.surprise),
+            room.beliefs,
+        )
+        _score_rows(starts[these], learnt, scores, room)
+        row += learnt
+        if learnt < rows:
+            break
+        if halts:
+            _score_ahead(room.n_states[rows - 1], scores, room)
+            if actions[row - 1] != NO_ACTION:
+                _look_ahead(buffer, actions[row - 1], steps_ahead, scores, room)
+    return row
+
+
+@kernel
+def _until_halt(starts: NDArray[np.bool_], age: int, steps_ahead: int) -> tuple[int, bool]:
+    """Number of rows up to the next halt, that one included, and whether there is one."""
+    since = age % max(steps_ahead, 1)
+    for row in range(len(starts)):
+        if starts[row]:
+            since = 0
+        if since == 0 and steps_ahead > 0:
+            return row + 1, True
+        since += 1
+        if since == steps_ahead:
+            since = 0
+    return len(starts), False
+
+
+@kernel
+def _score_rows(starts: NDArray[np.bool_], rows: int, scores: _Scores, room: _Room) -> None:
+    """Score the forecasts of one step of the rows just learnt."""
+    before = scores.belief
+    for row in range(rows):
+        n, belief = room.n_states[row], room.beliefs[row]
+        if starts[row]:
+            scores.age[0] = 0
+            scores.waiting[0] = False
+        scores.age[0] += 1
+        scores.certainty[0] += belief[room.state[row]]
+        surprise = room.surprise[row]
+        if surprise == surprise:  # a forecast was made
+            scores.one_step[0] += 1.0
+            scores.one_step[1] += jensen_shannon_kernel(before, belief, n, room.vector)
+            scores.one_step[2] += surprise
+        before = belief
+    for i in range(len(before)):
+        scores.belief[i] = before[i]
+
+
+@kernel
+def _score_ahead(n: int, scores: _Scores, room: _Room) -> None:
+    """Score the longer forecasts that wait for the latest row."""
+    if scores.waiting[0]:
+        scores.ahead[0] += 1.0
+        for kind in range(len(scores.forecasts)):
+            scores.ahead[1 + kind] += jensen_shannon_kernel(
+                scores.forecasts[kind], scores.belief, n, room.vector
+            )
+    scores.waiting[0] = False
+
+
+@kernel
+def _look_ahead(
+    buffer: NDArray[np.float64], action: int, steps: int, scores: _Scores, room: _Room
+) -> None:
+    """Forecast as `evofsm.transitions.propagate` does, under each policy."""
+    now = open_memory(buffer).learnt
+    n = int(now.n_states[0])
+    scores.waiting[0] = True
+    for forecast in scores.forecasts:
+        for i in range(len(forecast)):
+            forecast[i] = scores.belief[i]
+    for policy in range(len(scores.forecasts) - 1):
+        forecast = scores.forecasts[1 + policy]
+        room.matrix[:n, :n] = 0.0
+        _add(now.transitions, action, 1.0, n, room.matrix)
+        _advance(forecast, 1, n, room)
+        if policy != _HOLD:
+            _average(now.transitions, policy == _OBSERVED, n, room.matrix)
+        _advance(forecast, steps - 1, n, room)
+
+
+@kernel
+def _average(transitions: Transitions, observed: bool, n: int, matrix: NDArray[np.float64]) -> None:
+    """Average the matrices of all actions: each alike, or as often as it was used."""
+    total = transitions.uses.sum()
+    matrix[:n, :n] = 0.0
+    for action in range(len(transitions.uses)):
+        if observed and total > 0.0:
+            weight = transitions.uses[action] / total
+        else:
+            weight = 1.0 / len(transitions.uses)
+        _add(transitions, action, weight, n, matrix)
+
+
+@kernel
+def _add(
+    transitions: Transitions, action: int, weight: float, n: int, matrix: NDArray[np.float64]
+) -> None:
+    """Add an action's matrix, times a weight."""
+    place = int(transitions.places[action])
+    for i in range(n):
+        for j in range(n):
+            share = 1.0 / n if place == NOT_OPEN else transitions.matrices[place, i, j]
+            matrix[i, j] += weight * share
+
+
+@kernel
+def _advance(belief: NDArray[np.float64], steps: int, n: int, room: _Room) -> None:
+    """Multiply a belief by the matrix in ``room``, as often as there are steps.
+
+    The matrix is squared where this saves more than it costs.
+    """
+    while steps > 0:
+        if steps % 2 == 0 and steps > 2 * n:
+            for i in range(n):
+                _multiply(room.matrix[i], room.matrix, n, room.square[i])
+            for i in range(n):
+                for j in range(n):
+                    room.matrix[i, j] = room.square[i, j]
+            steps //= 2
+        else:
+            _multiply(belief, room.matrix, n, room.vector)
+            for i in range(n):
+                belief[i] = room.vector[i]
+            steps -= 1
+
+
+@kernel
+def _multiply(
+    vector: NDArray[np.float64], matrix: NDArray[np.float64], n: int, product: NDArray[np.float64]
+) -> None:
+    for j in range(n):
+        product[j] = 0.0
+    for i in range(n):
+        for j in range(n):
+            product[j] += vector[i] * matrix[i, j]
+
+
+# Without the lock of the interpreter, so that the next rows can be read meanwhile.
+_learn_and_score = compiled(_learn_and_score_rows, nogil=True, _nrt=False)

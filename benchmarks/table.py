@@ -1,0 +1,89 @@
+"""One row a measurement: its ratio, whether that is what was promised, and how it was before."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from typing import NamedTuple
+
+from turns import Result
+
+# Ratios of one machine differ by up to a tenth from run to run, those of a busy one by more. A
+# change that matters, such as an allocation in a step, costs more than a quarter.
+MARGIN = 0.25
+
+_FASTER, _COST = "reference_s / ours_s", "ours_s / reference_s"
+
+HEADER = f"""\
+Medians of turns, ours and the reference in turn; a step is one with forecast and divergence.
+Ratio: 'x faster' is reference / ours, more is better; 'x the cost' is ours / reference, less is.
+
+{"":<19}{"ours":>11}{"reference":>12}{"ratio":>19}{"promised":>9}        the reference
+"""
+
+
+class Row(NamedTuple):
+    """How a row is measured, in so many turns, short or in full, and what is promised of it."""
+
+    measure: Callable[[int, bool], Result]
+    better: str  # ">=": how many times as fast as the reference; "<=": how many times its cost
+    promised: float | None = None
+
+
+def judged(id_: str, row: Row, measured: Result) -> Result:
+    """What was measured as it goes into the JSON: with its ratio, and whether that was promised."""
+    ours, reference = float(measured["ours_s"]), float(measured["reference_s"])
+    faster = row.better == ">="
+    ratio = reference / ours if faster else ours / reference
+    promised = row.promised
+    kept = promised is None or (ratio >= promised if faster else ratio <= promised)
+    return {
+        "id": id_,
+        **measured,
+        "ratio": ratio,
+        "ratio_is": _FASTER if faster else _COST,
+        "promised": None if promised is None else f"{row.better} {promised:g}",
+        "kept": kept,
+        "cores": os.cpu_count(),
+    }
+
+
+def worsened(result: Result, last: list[Result]) -> str | None:
+    """How the ratio is worse than in an earlier run by more than the margin, in words.
+
+    Ratios depend on the number of cores, so a run on another number of them tells nothing.
+    """
+    for before in last:
+        if (before["id"], before["cores"]) == (result["id"], result["cores"]):
+            worse = before["ratio"] / result["ratio"]
+            if result["ratio_is"] == _COST:
+                worse = 1.0 / worse
+            if worse > 1.0 + MARGIN:
+                return f"WORSE than the {before['ratio']:.3g} of the last run by {worse - 1.0:.0%}"
+    return None
+
+
+def shown(result: Result, worse: str | None) -> str:
+    """A row of the table, and what stands beside it, no wider than 100 columns."""
+    ratio = f"{result['ratio']:.2f}" if result["ratio"] < 10.0 else f"{result['ratio']:.0f}"
+    ratio += "x faster   " if result["ratio_is"] == _FASTER else "x the cost "
+    promised = result["promised"] or ""
+    lines = [
+        f"{result['id']:<19}{duration(result['ours_s']):>11}{duration(result['reference_s']):>12}"
+        f"{ratio:>19}{promised:>9} {'' if result['kept'] else 'BROKEN':<7}{result['reference']}",
+        f"  {result['what']}",
+    ]
+    for what, seconds in result.get("beside", {}).items():
+        lines.append(f"{duration(seconds):>30}  {what}")
+    lines += [f"    {note}" for note in result.get("notes", [])]
+    if worse:
+        lines.append(f"    {worse}")
+    return "\n".join(lines) + "\n"
+
+
+def duration(seconds: float) -> str:
+    """Three digits and a unit."""
+    for unit, size in (("s ", 1.0), ("ms", 1e-3), ("µs", 1e-6)):
+        if seconds >= size:
+            return f"{seconds / size:.3g} {unit}"
+    return f"{seconds / 1e-9:.3g} ns"
