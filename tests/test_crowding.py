@@ -37,7 +37,8 @@ def test_there_are_never_more_states_and_every_array_stays_sound(when_full, seed
     assert (machine.failures <= machine.decisions + 1e-12).all()
     model = machine.model()
     assert len(set(machine.state_ids)) == machine.n_states
-    assert (model.visits >= 0).all() and (model.changes >= 0).all()
+    assert (model.visits >= 0).all()
+    assert (model.changes >= 0).all()
     if when_full is WhenFull.MERGE:  # which loses no evidence
         assert model.visits.sum() == 200
         assert machine.endings.sum() == len(failures)

@@ -13,9 +13,12 @@ import numpy as np
 from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
+from numba.np import arrayobj
 from numpy.typing import NDArray
 
-from evofsm._compile import inner_kernel
+from evofsm._compile import LINE, inner_kernel
+
+_arrays = cast(Any, arrayobj)  # Numba has no types for it
 
 _LOG2_E = 1.4426950408889634
 # ln 2 in two parts: a multiple of the first, up to 2^11 of them, is exact.
@@ -57,8 +60,79 @@ def _fused_multiply_add(_context: Any, _x: Any, _y: Any, _z: Any) -> Any:
     return types.float64(types.float64, types.float64, types.float64), generate
 
 
+# The innermost work of a step. In a loop Numba's compiler would not know that the arrays lie apart.
+@intrinsic
+def _work_on_line(
+    _context: Any,
+    matrix: Any,
+    i: Any,
+    j: Any,
+    predicted: Any,
+    reached: Any,
+    believed: Any,
+    kept: Any,
+    gain: Any,
+) -> Any:
+    def generate(context: Any, builder: Any, _: Any, arguments: Any) -> Any:
+        rows, row, column, forecasts, targets, *numbers = arguments
+        rows = _arrays.make_array(matrix)(context, builder, rows)
+        forecasts = _arrays.make_array(predicted)(context, builder, forecasts)
+        targets = _arrays.make_array(reached)(context, builder, targets)
+        begin = builder.add(builder.mul(row, builder.extract_value(rows.shape, 1)), column)
+        in_row, in_forecast = _Line(builder, rows, begin), _Line(builder, forecasts, column)
+        believed_, kept_, gain_ = (_everywhere(builder, number) for number in numbers)
+        old, target = in_row.load(), _Line(builder, targets, column).load()
+        in_forecast.store(_fma_of_lines(builder, believed_, old, in_forecast.load()))
+        in_row.store(_fma_of_lines(builder, gain_, target, builder.fmul(kept_, old)))
+        return context.get_dummy_value()
+
+    numbers = [types.float64] * 3
+    return types.void(matrix, types.intp, types.intp, predicted, reached, *numbers), generate
+
+
+_VECTOR = ir.VectorType(ir.DoubleType(), LINE)
+
+
+class _Line:
+    """So many numbers of an array that one instruction works on, in double precision."""
+
+    def __init__(self, builder: Any, array: Any, begin: Any) -> None:
+        self._builder = builder
+        kind = array.data.type.pointee
+        self._type = ir.VectorType(kind, LINE)
+        self._bytes = 8 if kind == ir.DoubleType() else 4
+        self._pointer = builder.bitcast(builder.gep(array.data, [begin]), self._type.as_pointer())
+
+    def load(self) -> Any:
+        line = self._builder.load(self._pointer, align=self._bytes)
+        return line if self._type == _VECTOR else self._builder.fpext(line, _VECTOR)
+
+    def store(self, line: Any) -> None:
+        line = line if self._type == _VECTOR else self._builder.fptrunc(line, self._type)
+        self._builder.store(line, self._pointer, align=self._bytes)
+
+
+def _everywhere(builder: Any, number: Any) -> Any:
+    """A line with the same number in every place."""
+    nothing = ir.Constant(_VECTOR, ir.Undefined)
+    first = builder.insert_element(nothing, number, ir.IntType(32)(0))
+    places = ir.Constant(ir.VectorType(ir.IntType(32), LINE), [0] * LINE)
+    return builder.shuffle_vector(first, nothing, places)
+
+
+def _fma_of_lines(builder: Any, x: Any, y: Any, z: Any) -> Any:
+    name = f"llvm.fma.v{LINE}f64"
+    function = builder.module.globals.get(name)
+    if function is None:
+        function = ir.Function(builder.module, ir.FunctionType(_VECTOR, [_VECTOR] * 3), name)
+    return builder.call(function, [x, y, z])
+
+
 #: ``x * y + z``, rounded once: one instruction in place of two, and the same one everywhere.
 fma: Callable[[float, float, float], float] = cast(Any, _fused_multiply_add)
+#: ``work_on_line(matrix, i, j, predicted, reached, believed, kept, gain)``, for a line of columns
+#: from j on: ``predicted += believed * row``, then ``row = kept * row + gain * reached``.
+work_on_line: Callable[..., None] = cast(Any, _work_on_line)
 # What a kernel sees of the others.
 _bits_of: Callable[[float], int] = cast(Any, _bits_of_float)
 _float_of: Callable[[int], float] = cast(Any, _float_of_bits)
@@ -122,3 +196,18 @@ def total(values: NDArray[np.float64], n: int) -> float:
     for i in range(whole, n):
         a += values[i]
     return (a + b) + (c + d)
+
+
+@inner_kernel
+def largest(values: NDArray[np.float64], n: int) -> float:
+    """The largest of the first ``n``, none of which is below 0, found in the same way."""
+    a = b = c = d = 0.0
+    whole = n // 4 * 4
+    for i in range(0, whole, 4):
+        a = max(a, values[i])
+        b = max(b, values[i + 1])
+        c = max(c, values[i + 2])
+        d = max(d, values[i + 3])
+    for i in range(whole, n):
+        a = max(a, values[i])
+    return max(max(a, b), max(c, d))

@@ -12,7 +12,7 @@ vehicle control system via online recognition of latent risks", arXiv:1908.10823
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from os import PathLike
 from typing import Any, Self, SupportsIndex
 
@@ -25,6 +25,7 @@ from evofsm.actions import IntervalActions
 from evofsm.crowding import WhenFull
 from evofsm.memory import (
     NO_ACTION,
+    Learnt,
     Parameters,
     allocate,
     leaves,
@@ -37,6 +38,7 @@ from evofsm.states.dispatch import check_rule, describe, restore, weights, width
 from evofsm.states.ets import Paper
 from evofsm.states.rule import RuleSettings, StateRule
 from evofsm.step import (
+    DECLINED,
     EVENTS,
     FULL,
     REFUSED,
@@ -46,6 +48,7 @@ from evofsm.step import (
     learn_rows,
     observer,
     room_for,
+    updater,
     widen,
 )
 from evofsm.transitions import NOT_OPEN, Policy, count_open, marginal, propagate
@@ -55,6 +58,7 @@ from evofsm.validation import (
     check_rows,
     positive,
     real_array,
+    real_rows,
     refuse_unusable,
     whole,
 )
@@ -126,6 +130,10 @@ class EvolvingFSM:
     >>> machine.predict(0).round(3)
     array([0.48, 0.52])
     """
+
+    # The kernels that take a step, once they are loaded.
+    _observe: Callable[..., tuple[int, int, float]]
+    _update: Callable[..., float]
 
     def __init__(
         self,
@@ -315,13 +323,14 @@ prior_frequency=0.001, spread=3.0)
         >>> machine.state, machine.belief.round(2)
         (1, array([0.37, 0.63]))
         """
-        if type(i) is int and type(z) is np.ndarray and z.dtype is _FLOAT64:
+        if type(i) is int:
             try:
-                event, _, surprise = self._observe(self._buffer, z, i, False)
-            except TypeError:  # an array with gaps
-                event = REFUSED
-            if event >= 0:
+                surprise = self._update(self._buffer, z, i)
+            except TypeError:  # not an array of float64 without gaps
+                surprise = DECLINED
+            if surprise != DECLINED:
                 return surprise
+            self._update = updater()
         return self._insist(z, check_action(i, self.n_actions), False)[2]
 
     def learn_many(
@@ -573,7 +582,8 @@ prior_frequency=0.001, spread=3.0)
 
         An action never used has a matrix of 1 / n here; the machine holds none for it.
         """
-        return self._of_actions(self._memory.learnt.transitions.matrices, 1.0)
+        transitions = self._memory.learnt.transitions
+        return self._of_actions(transitions.scales[..., None] * transitions.matrices, 1.0)
 
     @property
     def origin_frequency(self) -> NDArray[np.float64]:
@@ -740,10 +750,8 @@ prior_frequency=0.001, spread=3.0)
         2
         """
         # Without spare room the shapes of the arrays tell the sizes, and nothing else is stored.
-        open_ = count_open(self._memory.learnt.transitions)
-        learnt = view(resize(self._buffer, self.n_states, open_)).learnt
         content = {**self._settings(), "rule": describe(self._rule)}
-        storage.write(path, "machine", content, dict(leaves(learnt)))
+        storage.write(path, "machine", content, dict(leaves(self._trimmed())))
 
     @classmethod
     def load(cls, path: str | PathLike[str]) -> Self:
@@ -781,18 +789,8 @@ prior_frequency=0.001, spread=3.0)
         content, arrays = storage.read(path, "machine")
         with storage.explained(path):
             machine = cls(**{**content, "rule": restore(content["rule"])})
-            m, n = arrays["centers"].shape
-            if n == 0:
-                return machine
-            places = len(arrays["matrices"])
-            buffer = allocate(m, machine.n_actions, n, places, machine._parameters(m))
-            for name, array in leaves(view(buffer).learnt):
-                if arrays[name].shape != array.shape:
-                    raise ValueError(f"{name} has shape {arrays[name].shape}, not {array.shape}")
-                array[:] = arrays[name]
-            refuse_impossible(view(buffer).learnt)
-        machine._use(resize(buffer, lanes(n), places))
-        return machine
+            _, n = arrays["centers"].shape
+            return machine._holding(arrays) if n else machine
 
     def copy(self) -> Self:
         """An independent machine in the same state.
@@ -838,16 +836,38 @@ prior_frequency=0.001, spread=3.0)
         told = parameters.rule._replace(weights=weights(self._rule, m))
         return parameters._replace(rule=told)
 
+    def _trimmed(self) -> Learnt:
+        """A copy of all that was learnt, without spare room."""
+        open_ = count_open(self._memory.learnt.transitions)
+        return view(resize(self._buffer, self.n_states, open_)).learnt
+
+    def _holding(self, arrays: Mapping[str, NDArray[Any]]) -> Self:
+        """A machine of the same settings that has learnt these arrays, by their names."""
+        m, n = arrays["centers"].shape
+        places = len(arrays["matrices"])
+        buffer = allocate(m, self.n_actions, n, places, self._parameters(m))
+        for name, array in leaves(view(buffer).learnt):
+            if arrays[name].shape != array.shape:
+                raise ValueError(f"{name} has shape {arrays[name].shape}, not {array.shape}")
+            array[:] = arrays[name]
+        refuse_impossible(view(buffer).learnt)
+        machine = self.copy()
+        machine._use(resize(buffer, lanes(n), places))
+        return machine
+
     def _use(self, buffer: NDArray[np.float64]) -> None:
         self._buffer = buffer
         self._memory = view(buffer)
-        self._observe: Callable[..., tuple[int, int, float]] = _not_yet
+        self._observe = _cannot_observe
+        self._update = _cannot_update
 
     def _step(self, z: ArrayLike, action: int, failed: bool) -> Step:
         """Observe, then act; the whole answer."""
         event, state, surprise = self._insist(z, action, failed)
         n, memory = self.n_states, self._memory
-        predicted = memory.scratch.predicted[: n if surprise == surprise else 0].copy()
+        scratch = memory.scratch
+        forecast = scratch.forecast if self.belief_tolerance else scratch.predicted
+        predicted = forecast[: n if surprise == surprise else 0].copy()
         return Step(state, memory.learnt.belief[:n].copy(), EVENTS[event], predicted, surprise)
 
     def _insist(self, z: ArrayLike, action: int, failed: bool) -> tuple[int, int, float]:
@@ -876,14 +896,16 @@ prior_frequency=0.001, spread=3.0)
         n, transitions = self.n_states, self._memory.learnt.transitions
         if transitions.places[i] == NOT_OPEN:
             return np.full((n, n), 1.0 / max(n, 1))
-        return transitions.matrices[int(transitions.places[i]), :n, :n]
+        place = int(transitions.places[i])
+        return transitions.scales[place, :n, None] * transitions.matrices[place, :n, :n]
 
     def _averaged(self, policy: Policy) -> NDArray[np.float64]:
         """(n, n) transition probabilities, averaged over the actions."""
         n, transitions = self.n_states, self._memory.learnt.transitions
         used = np.flatnonzero(transitions.places != NOT_OPEN)
-        matrices = transitions.matrices[transitions.places[used].astype(int), :n, :n]
-        return marginal(matrices, transitions.uses[used], self.n_actions, policy)
+        places = transitions.places[used].astype(int)
+        scales, stored = transitions.scales[places, :n, None], transitions.matrices[places, :n, :n]
+        return marginal(scales * stored, transitions.uses[used], self.n_actions, policy)
 
     def _of_actions(self, of_places: NDArray[np.float64], unused: float) -> NDArray[np.float64]:
         """An array with a row for each action; those never used get equal shares of ``unused``."""
@@ -910,16 +932,20 @@ prior_frequency=0.001, spread=3.0)
         return z
 
     def _check_observations(self, Z: ArrayLike) -> NDArray[np.float64]:
-        observations = np.ascontiguousarray(real_array("observations", Z, ndim=2))
+        observations = real_rows("observations", Z)
         if self.n_states and len(observations):
             self._fit(observations[0])
         refuse_unusable("observations", observations)
         return observations
 
 
-def _not_yet(*_: object) -> tuple[int, int, float]:
-    """In place of the kernel that observes, until there is something to load it for."""
+# In place of kernels, until there is something to load them for.
+def _cannot_observe(*_: object) -> tuple[int, int, float]:
     return REFUSED, 0, np.nan
+
+
+def _cannot_update(*_: object) -> float:
+    return DECLINED
 
 
 def _tolerance(tolerance: float) -> float:

@@ -26,7 +26,7 @@ NO_ACTION = -1
 # A buffer begins with its sizes (m, q, capacity, places), `Parameters` and counters.
 _COUNTERS, _HEAD = 16, 32
 # Then, for each kind of thing there is, so many numbers; centres are further rows of states.
-_PER_STATE, _PER_PLACE, _PER_ACTION, _PER_VARIABLE = 11, 3, 2, 5
+_PER_STATE, _PER_PLACE, _PER_ACTION, _PER_VARIABLE = 13, 4, 2, 5
 # Where the centre of a state that is not there stands: too far for any belief.
 _NOWHERE = 1e150
 
@@ -67,6 +67,8 @@ class Scratch(NamedTuple):
     recognised: NDArray[np.float64]  # (capacity,)
     rates: NDArray[np.float64]  # (capacity,)
     terms: NDArray[np.float64]  # (capacity,)
+    lines: NDArray[np.float64]  # (capacity,)
+    forecast: NDArray[np.float64]  # (capacity,) all of it, where `predicted` is only a part
 
 
 class Memory(NamedTuple):
@@ -174,10 +176,18 @@ def _open_apart(buffer: NDArray[np.float64], matrices: NDArray[Any]) -> Memory:
                 of_actions[1],
                 part(matrices, 0, (places, capacity, capacity)),
                 of_places[0],
+                of_places[1],
             ),
-            Outcomes(of_places[1], of_places[2], of_states[6]),
+            Outcomes(of_places[2], of_places[3], of_states[6]),
         ),
-        Scratch(of_states[7], of_states[8], of_states[9], of_states[10]),
+        Scratch(
+            of_states[7],
+            of_states[8],
+            of_states[9],
+            of_states[10],
+            of_states[11],
+            of_states[12],
+        ),
     )
 
 
@@ -308,4 +318,5 @@ def refuse_impossible(learnt: Learnt) -> None:
         raise ValueError("places of matrices are not those that there are")
     refuse_unless_outcomes(*learnt.outcomes)
     refuse_unless_distribution("belief", learnt.belief)
-    refuse_unless_distribution("a row of matrices", learnt.transitions.matrices)
+    scales = learnt.transitions.scales
+    refuse_unless_distribution("a row of matrices", learnt.transitions.matrices * scales[..., None])

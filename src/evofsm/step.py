@@ -31,6 +31,7 @@ from evofsm.transitions import (
     count,
     count_open,
     expand,
+    forecast,
     forecast_and_identify,
     place_of,
 )
@@ -38,6 +39,8 @@ from evofsm.validation import LARGEST_OBSERVATION
 
 # What `step` answers instead of an event where it did nothing.
 FULL, REFUSED = -1, -2
+# What `_update` answers where it did nothing; no surprise is below 0.
+DECLINED = -1.0
 
 
 class Event(IntFlag):
@@ -118,10 +121,13 @@ def widen(belief: NDArray[np.float64], n: int) -> NDArray[np.float64]:
 
 
 @inner_kernel
-def step(memory: Memory, z: NDArray[np.float64], failed: bool) -> tuple[int, int, float]:
+def step(
+    memory: Memory, z: NDArray[np.float64], failed: bool, whole: bool
+) -> tuple[int, int, float]:
     """Take in one observation; answers event, state and surprise.
 
-    Where the episode ``failed`` it ends in failure after this observation.
+    Where the episode ``failed`` it ends in failure after this observation. If the ``whole``
+    forecast is wanted it stands in ``scratch``.
     """
     parameters, now, scratch = memory.parameters, memory.learnt, memory.scratch
     if not _has_room(memory):
@@ -146,20 +152,8 @@ def step(memory: Memory, z: NDArray[np.float64], failed: bool) -> tuple[int, int
     action = int(now.action[0])
     if now.chained[0] and action != NO_ACTION:
         place = place_of(now.transitions, action, n, parameters.prior_frequency)
-        forecast_and_identify(
-            now.transitions,
-            place,
-            n,
-            now.belief,
-            scratch.recognised,
-            parameters.learning_rate,
-            scratch.predicted,
-            scratch.rates,
-        )
+        surprise = _learn(memory, place, n, whole)
         now.transitions.uses[action] += 1.0
-        surprise = jensen_shannon_kernel(
-            scratch.predicted, scratch.recognised, lanes(n), scratch.terms
-        )
         _decide(memory, place, n, failed)
 
     if now.chained[0]:
@@ -175,6 +169,34 @@ def step(memory: Memory, z: NDArray[np.float64], failed: bool) -> tuple[int, int
     return event, nearest, surprise
 
 
+@inner_kernel
+def _learn(memory: Memory, place: int, n: int, whole: bool) -> float:
+    """Learn the transition from the belief to what was recognised; answers the surprise.
+
+    Where few states take part, all of the forecast is only made if asked for: a state that was
+    not reached adds half of its forecast to the divergence, whichever it is.
+    """
+    parameters, now, scratch = memory.parameters, memory.learnt, memory.scratch
+    tolerant = parameters.belief_tolerance > 0.0
+    if tolerant and whole:
+        forecast(now.transitions, place, n, now.belief, scratch.forecast)
+    predicted, reached = scratch.predicted, scratch.recognised
+    elsewhere = forecast_and_identify(
+        now.transitions,
+        place,
+        n,
+        now.belief,
+        reached,
+        parameters.learning_rate,
+        tolerant,
+        predicted,
+        scratch.rates,
+        scratch.lines,
+    )
+    divergence = jensen_shannon_kernel(predicted, reached, lanes(n), scratch.terms)
+    return min(divergence + 0.5 * elsewhere, 1.0)
+
+
 @kernel
 def _observe(
     buffer: NDArray[np.float64], z: NDArray[np.float64], action: int, failed: bool
@@ -183,22 +205,45 @@ def _observe(
     memory = open_memory(buffer)
     if not NO_ACTION <= action < len(memory.learnt.transitions.uses):
         return REFUSED, 0, np.nan
-    event, state, surprise = step(memory, z, failed)
+    event, state, surprise = step(memory, z, failed, True)
     if event >= 0 and not failed:
         memory.learnt.action[0] = action
     return event, state, surprise
 
 
+@kernel
+def _update(buffer: NDArray[np.float64], z: NDArray[np.float64], action: int) -> float:
+    """The same with fewer things to hand over: only the surprise, or `DECLINED`."""
+    memory = open_memory(buffer)
+    if not NO_ACTION <= action < len(memory.learnt.transitions.uses):
+        return DECLINED
+    event, _, surprise = step(memory, z, False, False)
+    if event < 0:
+        return DECLINED
+    memory.learnt.action[0] = action
+    return surprise
+
+
 @cache
 def observer() -> Callable[[NDArray[np.float64], NDArray[np.float64], int, bool], Any]:
-    """The quickest way to take one step: `_observe`, for float64 arrays without gaps only.
+    """`_observe`, for arrays of float64 without gaps only.
 
     For any other type of array it raises a TypeError, where Numba would compile it once more.
     """
-    compiled: Any = _observe
-    compiled.compile("(float64[::1], float64[::1], int64, boolean)")
-    compiled.disable_compile()
+    _for_plain_arrays(_observe, "(float64[::1], float64[::1], int64, boolean)")
     return _observe
+
+
+@cache
+def updater() -> Callable[[NDArray[np.float64], NDArray[np.float64], int], float]:
+    """`_update`, in the same way; the quickest call there is to take one step."""
+    _for_plain_arrays(_update, "(float64[::1], float64[::1], int64)")
+    return _update
+
+
+def _for_plain_arrays(kernel: Any, signature: str) -> None:
+    kernel.compile(signature)
+    kernel.disable_compile()
 
 
 @kernel
@@ -359,7 +404,7 @@ def learn_rows(
     while row < len(observations):
         if starts[row]:
             now.chained[0] = 0.0
-        event, state, surprise = step(memory, observations[row], failures[row])
+        event, state, surprise = step(memory, observations[row], failures[row], False)
         if event == FULL:
             break
         if not failures[row]:

@@ -128,6 +128,7 @@ def _upgrade(header: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> None:
             arrays[name] = np.zeros_like(arrays[like])
     if header["kind"] == "machine":
         arrays["places"] = np.arange(len(arrays["uses"]), dtype=np.float64)
+        arrays["scales"] = np.ones_like(arrays["origin_frequency"])
         arrays["n_founded"] = arrays["n_states"]
         arrays["ids"] = np.arange(len(arrays["visits"]), dtype=np.float64)
 

@@ -19,14 +19,18 @@ import numpy as np
 from numba.extending import register_jitable
 from numpy.typing import NDArray
 
-from evofsm._compile import inner_kernel, lanes, rare_kernel
-from evofsm._elementary import fma
+from evofsm._compile import LINE, inner_kernel, lanes, rare_kernel
+from evofsm._elementary import fma, total, work_on_line
 from evofsm.validation import whole
 
 Policy = Literal["marginal", "hold", "observed"]
 
 # A weight below this is taken as 0: smaller numbers turn denormal and slow every step.
 _LOWEST_FREQUENCY = 1e-290
+# A row with a smaller scale is multiplied out, long before it underflows.
+_SMALLEST_SCALE = 1e-30
+# A row that moves farther at once is worked on as a whole.
+_MOST_BY_SCALE = 0.5
 # A row with less left of it than this is rounding.
 _LEAST_KEPT = 1e-12
 #: The place of an action without a matrix.
@@ -38,11 +42,15 @@ class Transitions(NamedTuple):
 
     An action has a place among the s matrices from its first use on. One that was never used
     has none, and costs nothing: all its transitions are alike.
+
+    A row is kept as a scale times what is stored of it. What decays as a whole then decays by
+    its scale, without touching the row.
     """
 
     places: NDArray[np.float64]  # (q,) of each action's matrix, or NOT_OPEN
     uses: NDArray[np.float64]  # (q,) transitions identified with each action
-    matrices: NDArray[np.float64]  # (s, capacity, capacity)
+    matrices: NDArray[np.float64]  # (s, capacity, capacity) to be multiplied by `scales`
+    scales: NDArray[np.float64]  # (s, capacity)
     origin_frequency: NDArray[np.float64]  # (s, capacity)
 
 
@@ -91,7 +99,24 @@ def forget_row(
     """Give a row of a matrix of ``n`` states the prior frequencies, which are all alike."""
     for j in range(n):
         transitions.matrices[place, i, j] = 1.0 / n
+    transitions.scales[place, i] = 1.0
     transitions.origin_frequency[place, i] = n * prior_frequency
+
+
+@rare_kernel
+def multiply_out(transitions: Transitions, place: int, i: int, n: int) -> None:
+    """Store a row as it is, with a scale of 1."""
+    for j in range(lanes(n)):
+        transitions.matrices[place, i, j] *= transitions.scales[place, i]
+    transitions.scales[place, i] = 1.0
+
+
+@inner_kernel
+def fade_row(transitions: Transitions, place: int, i: int, n: int, kept: float) -> None:
+    """Multiply a row by ``kept``."""
+    transitions.scales[place, i] *= kept
+    if transitions.scales[place, i] < _SMALLEST_SCALE:
+        multiply_out(transitions, place, i, n)
 
 
 @rare_kernel
@@ -101,15 +126,13 @@ def expand(transitions: Transitions, new: int, n: int, prior_frequency: float) -
     Its index ``new`` is the last, or that of a state given up, whose column is 0.
     """
     for place in range(len(transitions.matrices)):
-        matrix = transitions.matrices[place]
+        matrix, scale = transitions.matrices[place], transitions.scales[place]
         origin_frequency = transitions.origin_frequency[place]
         for i in range(n):
             before = origin_frequency[i]
             origin_frequency[i] = before + prior_frequency
-            kept = before / origin_frequency[i]
-            for j in range(n):
-                matrix[i, j] *= kept
-            matrix[i, new] = prior_frequency / origin_frequency[i]
+            fade_row(transitions, place, i, n, before / origin_frequency[i])
+            matrix[i, new] = prior_frequency / origin_frequency[i] / scale[i]
         forget_row(transitions, place, new, n, prior_frequency)
 
 
@@ -119,6 +142,8 @@ def merge_states(transitions: Transitions, kept: int, given: int, n: int) -> Non
     for place in range(len(transitions.matrices)):
         matrix = transitions.matrices[place]
         frequency = transitions.origin_frequency[place]
+        multiply_out(transitions, place, kept, n)
+        multiply_out(transitions, place, given, n)
         together = frequency[kept] + frequency[given]
         share = frequency[given] / together if together > 0.0 else 0.0
         for j in range(n):
@@ -138,6 +163,7 @@ def retire_state(transitions: Transitions, given: int, n: int, prior_frequency: 
         frequency = transitions.origin_frequency[place]
         frequency[given] = 0.0
         for i in range(n):
+            multiply_out(transitions, place, i, n)
             kept = 1.0 - matrix[i, given]
             if kept <= _LEAST_KEPT:  # nothing else is known of where it leads
                 forget_row(transitions, place, i, n, prior_frequency)
@@ -149,22 +175,34 @@ def retire_state(transitions: Transitions, given: int, n: int, prior_frequency: 
 
 
 @inner_kernel
-def forecast_and_identify(
+def forecast(
+    transitions: Transitions,
+    place: int,
+    n: int,
+    belief: NDArray[np.float64],
+    predicted: NDArray[np.float64],
+) -> None:
+    """One step ahead: ``belief @ P``."""
+    for j in range(lanes(n)):
+        predicted[j] = 0.0
+    for i in range(n):
+        believed = belief[i] * transitions.scales[place, i]
+        if believed > 0.0:
+            for j in range(lanes(n)):
+                predicted[j] = fma(believed, transitions.matrices[place, i, j], predicted[j])
+
+
+@inner_kernel
+def _set_rates(
     transitions: Transitions,
     place: int,
     n: int,
     origin: NDArray[np.float64],
-    reached: NDArray[np.float64],
     learning_rate: float,
-    predicted: NDArray[np.float64],
     rates: NDArray[np.float64],
+    predicted: NDArray[np.float64],
 ) -> None:
-    """Forecast one step, ``origin @ P``, then learn the transition from ``origin`` to ``reached``.
-
-    Both in one pass over the matrix, which is most of what a step costs. A row whose state was
-    not believed in plays no part in either. ``rates`` is room to work in.
-    """
-    matrix = transitions.matrices[place]
+    """How far each row moves; its frequency decays and grows, and the forecast starts from 0."""
     frequencies = transitions.origin_frequency[place]
     for i in range(lanes(n)):
         gain = learning_rate * origin[i]
@@ -173,14 +211,61 @@ def forecast_and_identify(
         frequencies[i] = frequency if known else 0.0
         rates[i] = gain / frequency if known else 0.0
         predicted[i] = 0.0
+
+
+@inner_kernel
+def forecast_and_identify(
+    transitions: Transitions,
+    place: int,
+    n: int,
+    origin: NDArray[np.float64],
+    reached: NDArray[np.float64],
+    learning_rate: float,
+    by_lines: bool,
+    predicted: NDArray[np.float64],
+    rates: NDArray[np.float64],
+    lines: NDArray[np.float64],
+) -> float:
+    """Forecast one step, ``origin @ P``, then learn the transition from ``origin`` to ``reached``.
+
+    Both in one pass over the matrix, which is most of what a step costs. A row whose state was
+    not believed in plays no part in either.
+
+    ``by_lines``, where few states are reached, only the lines with their columns are touched, and
+    the others decay by the scale of their row; the forecast is then written for those columns
+    alone. Answers how much of it is missing. ``rates`` and ``lines`` are room to work in.
+    """
+    _set_rates(transitions, place, n, origin, learning_rate, rates, predicted)
+    matrix, scales = transitions.matrices[place], transitions.scales[place]
+    n_lines = _lines_above_0(reached, n, lines) if by_lines else 0
     for i in range(n):
-        believed, rate = origin[i], rates[i]
-        if believed == 0.0:
+        rate = rates[i]
+        if origin[i] == 0.0:
             continue
-        for j in range(lanes(n)):
-            probability = matrix[i, j]
-            predicted[j] = fma(believed, probability, predicted[j])
-            matrix[i, j] = fma(rate, reached[j] - probability, probability)
+        if by_lines and rate < _MOST_BY_SCALE:
+            fade_row(transitions, place, i, n, 1.0 - rate)
+            believed, gain = origin[i] * scales[i] / (1.0 - rate), rate / scales[i]
+            for k in range(n_lines):
+                work_on_line(matrix, i, int(lines[k]), predicted, reached, believed, 1.0, gain)
+        else:
+            believed, kept = origin[i] * scales[i], (1.0 - rate) * scales[i]
+            scales[i] = 1.0
+            for j in range(0, n, LINE):
+                work_on_line(matrix, i, j, predicted, reached, believed, kept, rate)
+    return max(1.0 - total(predicted, lanes(n)), 0.0) if by_lines else 0.0
+
+
+@inner_kernel
+def _lines_above_0(values: NDArray[np.float64], n: int, lines: NDArray[np.float64]) -> int:
+    """Write where the lines begin that hold anything above 0; answers how many there are."""
+    found = 0
+    for begin in range(0, n, LINE):
+        largest_there = 0.0
+        for i in range(begin, begin + LINE):
+            largest_there = max(largest_there, values[i])
+        lines[found] = begin
+        found += largest_there > 0.0
+    return found
 
 
 def marginal(

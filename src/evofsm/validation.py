@@ -48,6 +48,15 @@ def real_array(name: str, values: ArrayLike, ndim: int) -> NDArray[np.float64]:
     return array.astype(np.float64)
 
 
+def real_rows(name: str, values: ArrayLike) -> NDArray[np.float64]:
+    """Rows of real numbers, without gaps in memory: those given where they are that already."""
+    if not isinstance(values, np.ndarray) or values.dtype != np.float64:
+        return real_array(name, values, ndim=2)
+    if values.ndim != 2 or values.shape[1] == 0:
+        return real_array(name, values, ndim=2)
+    return np.ascontiguousarray(values)
+
+
 def _array(name: str, values: ArrayLike) -> NDArray[Any]:
     try:
         return np.asarray(values)
@@ -57,6 +66,11 @@ def _array(name: str, values: ArrayLike) -> NDArray[Any]:
 
 def refuse_unusable(name: str, values: NDArray[np.float64]) -> None:
     """Raise for the first entry that is not finite, or too large."""
+    if (
+        not values.size
+        or -LARGEST_OBSERVATION <= values.min() <= values.max() <= LARGEST_OBSERVATION
+    ):
+        return  # false of NaN
     usable = np.abs(values) <= LARGEST_OBSERVATION
     if not usable.all():
         place = tuple(int(k) for k in np.argwhere(~usable)[0])

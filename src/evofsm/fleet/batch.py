@@ -18,7 +18,7 @@ from evofsm._compile import kernel, parallel_kernel
 from evofsm.machine import EvolvingFSM
 from evofsm.memory import NO_ACTION, Memory, lengths, matrices_of, move, open_apart
 from evofsm.step import FULL, room_for, step
-from evofsm.validation import check_actions, check_rows, real_array, refuse_unusable, whole
+from evofsm.validation import check_actions, check_rows, real_rows, refuse_unusable, whole
 
 # Room for so much more than is needed when the arrays are made anew.
 _SPARE = 1.5
@@ -197,10 +197,7 @@ class Fleet:
         self._used = steps * len(self)
 
     def _observations(self, Z: ArrayLike) -> NDArray[np.float64]:
-        if isinstance(Z, np.ndarray) and Z.dtype == np.float64 and Z.ndim == 2:
-            rows = np.ascontiguousarray(Z)
-        else:
-            rows = real_array("observations", Z, ndim=2)
+        rows = real_rows("observations", Z)
         m = int(self._small[self._at[0, 0]])
         if m not in (0, rows.shape[1]):
             raise ValueError(
@@ -307,7 +304,7 @@ def _step_one(
     now = memory.learnt
     if starts:
         now.chained[0] = 0.0
-    event, state, surprise = step(memory, z, failed)
+    event, state, surprise = step(memory, z, failed, False)
     if event != FULL and not failed:
         now.action[0] = action
     return int(now.n_states[0]), event, state, surprise

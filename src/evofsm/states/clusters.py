@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evofsm._compile import inner_kernel, lanes
-from evofsm._elementary import fma
+from evofsm._elementary import fma, largest
 
 # What may happen to the states.
 UNCHANGED, MOVED, CREATED = 0, 1, 2
@@ -55,8 +55,9 @@ def measure_distances(
 ) -> None:
     """Squared Euclidean distance from ``z`` to each of the first ``n`` centres, (m, capacity)."""
     for i in range(n):
-        squared_distances[i] = 0.0
-    for j in range(len(z)):
+        offset = (z[0] - centers[0, i]) * weights[0]
+        squared_distances[i] = offset * offset
+    for j in range(1, len(z)):
         value, weight = z[j], weights[j]
         for i in range(n):
             offset = (value - centers[j, i]) * weight
@@ -66,10 +67,10 @@ def measure_distances(
 @inner_kernel
 def nearest_center(squared_distances: NDArray[np.float64], n: int) -> int:
     """Index of the smallest of the first ``n`` distances; the oldest centre wins a tie."""
-    nearest, smallest = 0, squared_distances[0]
+    nearest = 0
     for i in range(1, n):
-        if squared_distances[i] < smallest:
-            nearest, smallest = i, squared_distances[i]
+        if squared_distances[i] < squared_distances[nearest]:
+            nearest = i
     return nearest
 
 
@@ -94,10 +95,7 @@ def update_potentials(clusters: Clusters, n: int, distance_weight: float) -> flo
         potential = clusters.potentials[i]
         far = 1.0 + distance_weight * clusters.squared_distances[i]
         clusters.potentials[i] = (t - 1.0) * potential / ((t - 2.0) + potential * far)
-    highest = 0.0
-    for i in range(n):
-        highest = max(highest, clusters.potentials[i])
-    return highest
+    return largest(clusters.potentials, n)
 
 
 @inner_kernel

@@ -463,7 +463,10 @@ def _add(
     place = int(transitions.places[action])
     for i in range(n):
         for j in range(n):
-            share = 1.0 / n if place == NOT_OPEN else transitions.matrices[place, i, j]
+            if place == NOT_OPEN:
+                share = 1.0 / n
+            else:
+                share = transitions.scales[place, i] * transitions.matrices[place, i, j]
             matrix[i, j] += weight * share
 
 

@@ -1,0 +1,366 @@
+"""Machines that learnt apart become one: states matched, evidence added up, order of no matter."""
+
+import functools
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from evofsm import Edges, EvolvingFSM, FailureSplit, Novelty, Paper
+from evofsm.crowding import WhenFull
+from evofsm.fleet.batch import Fleet
+from evofsm.fleet.merge import merge
+from evofsm.worlds.families import load_family
+from evofsm.worlds.kinematic import KinematicWorld
+
+RULES = [
+    Novelty(1.0, (2.0, 1.0)),
+    Paper(),
+    Edges(),
+    FailureSplit(Novelty(1.0, (2.0, 1.0)), distance=0.2),
+]
+CENTRES = np.array([[0.0, 0.0], [8.0, 0.0], [0.0, 4.0], [8.0, 4.0], [16.0, 0.0], [16.0, 4.0]])
+
+
+def taught(rule, seed, rows=150, q=3, **settings):
+    """A machine that learnt from a walk of its own, with a failure on the way."""
+    random = np.random.default_rng(seed)
+    Z = np.cumsum(random.normal(size=(rows, 2)) * [0.8, 0.4], axis=0)
+    machine = EvolvingFSM(q, rule=rule, **settings)
+    machine.learn_many(Z, random.integers(-1, q, rows), [0, rows // 3], [rows // 2])
+    return machine
+
+
+def among(centres, seed, rows=300, q=2, noise=0.0, chain=None, **settings):
+    """A machine of states that are the same for all: observations are these points."""
+    random = np.random.default_rng(seed)
+    I = random.integers(0, q, rows)
+    states = np.arange(rows) % len(centres)  # all of them are found, then the chain goes on
+    if chain is None:
+        chain = np.full((q, len(centres), len(centres)), 1.0 / len(centres))
+    for t in range(len(centres), rows):
+        states[t] = random.choice(len(centres), p=chain[I[t - 1], states[t - 1]])
+    rule = Novelty(1.0, (1.0, 1.0), spread=0.1)
+    machine = EvolvingFSM(q, rule=rule, **settings)
+    machine.learn_many(centres[states] + random.normal(scale=noise, size=(rows, 2)), I)
+    machine.start_episode()
+    return machine
+
+
+def assert_alike(one, other, atol):
+    """Equal but for rounding, and for the order of states."""
+    model, expected = one.model(), other.model()
+    assert model.centers.shape == expected.centers.shape
+    a, b = np.lexsort(model.centers.T), np.lexsort(expected.centers.T)
+    for name in ("centers", "potentials", "visits", "founded", "endings"):
+        left, right = getattr(model, name)[a], getattr(expected, name)[b]
+        np.testing.assert_allclose(left, right, atol=atol, err_msg=name)
+    for name in ("origin_frequency", "decisions", "failures"):
+        left, right = getattr(model, name)[:, a], getattr(expected, name)[:, b]
+        np.testing.assert_allclose(left, right, atol=atol, err_msg=name)
+    pairs = np.ix_(range(len(model.uses)), a, a), np.ix_(range(len(model.uses)), b, b)
+    left, right = model.transition_matrices[pairs[0]], expected.transition_matrices[pairs[1]]
+    np.testing.assert_allclose(left, right, atol=atol)
+    assert (model.uses == expected.uses).all()
+
+
+seeds = st.lists(st.integers(0, 10_000), min_size=2, max_size=4, unique=True)
+
+
+@settings(max_examples=30)
+@given(st.sampled_from(RULES), seeds, st.randoms(use_true_random=False))
+def test_order_of_the_parts_does_not_matter(rule, seeds, random):
+    parts = [taught(rule, seed, rows=20 + seed % 150) for seed in seeds]
+    shuffled = random.sample(parts, len(parts))
+    one, other = merge(parts), merge(shuffled)
+    assert one._buffer.tobytes() == other._buffer.tobytes()
+
+
+@settings(max_examples=30)
+@given(st.sampled_from(RULES), seeds)
+def test_evidence_adds_up_and_rows_remain_distributions(rule, seeds):
+    parts = [taught(rule, seed, rows=20 + seed % 150) for seed in seeds]
+    merged = merge(parts)
+    model, models = merged.model(), [part.model() for part in parts]
+    assert (model.uses == sum(one.uses for one in models)).all()
+    for name in ("visits", "endings", "changes"):
+        assert getattr(model, name).sum() == sum(getattr(one, name).sum() for one in models)
+    for name in ("decisions", "failures"):
+        total = sum(getattr(one, name).sum(axis=1) for one in models)
+        np.testing.assert_allclose(getattr(model, name).sum(axis=1), total, rtol=1e-12)
+    assert (model.transition_matrices >= 0.0).all()
+    np.testing.assert_allclose(model.transition_matrices.sum(axis=-1), 1.0, atol=1e-12)
+    assert ((merged.potentials > 0.0) & (merged.potentials <= 1.0)).all()
+    rows = sum(one.visits.sum() for one in models)
+    assert ((model.founded >= 1.0) & (model.founded <= rows)).all()
+    assert max(part.n_states for part in parts) <= sum(one.n_states for one in models)
+    assert {tuple(c) for c in merged.centers} <= {tuple(c) for one in parts for c in one.centers}
+
+
+@given(st.sampled_from(RULES), st.integers(0, 10_000))
+@settings(max_examples=10)
+def test_what_has_observed_nothing_contributes_nothing(rule, seed):
+    part, nothing = taught(rule, seed), EvolvingFSM(3, rule=rule)
+    before = part.copy()
+    merged = merge([nothing, part, nothing])
+    before.start_episode()
+    assert merged._buffer.tobytes() == before._buffer.tobytes()
+    assert merge([nothing, nothing]).n_states == 0
+
+
+def test_the_parts_stay_as_they_are_and_the_merged_machine_is_its_own(snapshot):
+    parts = [taught(RULES[0], seed) for seed in range(3)]
+    before = [snapshot(part) for part in parts]
+    for machine in (merge(parts), merge(parts[:1])):
+        assert machine.state is None
+        machine.learn_one([0.0, 0.0], 0)
+        machine.learn_one([0.1, 0.0], 0)
+    assert [snapshot(part) for part in parts] == before
+
+
+def test_mean_scatter_and_potentials_are_those_of_all_the_data():
+    random = np.random.default_rng(1)
+    shards = [random.normal(size=(rows, 2)) * 3.0 + 1e4 for rows in (1, 2, 40, 100)]
+    # With distance_weight 1 the paper's recursion is exact: density over the whole past.
+    rule = Novelty(1.0, (2.0, 1.0))
+    parts = [EvolvingFSM(1, distance_weight=1.0, rule=rule) for _ in shards]
+    for part, Z in zip(parts, shards, strict=True):
+        part.learn_many(Z, np.zeros(len(Z), int))
+    merged = merge(parts)
+    Z = np.concatenate(shards)
+    now = merged._memory.learnt.clusters
+    assert now.n_observations == len(Z)
+    np.testing.assert_allclose(now.first + now.mean, Z.mean(axis=0), rtol=1e-14)
+    scaled = Z / rule.scales
+    np.testing.assert_allclose(now.scatter, ((scaled - scaled.mean(axis=0)) ** 2).sum(), rtol=1e-9)
+    merged.observe([1e4, 1e4])  # takes the latest into the potentials
+    n = len(merged.centers)
+    offsets = ((merged.centers[:, None] / rule.scales - scaled) ** 2).sum(axis=-1)
+    expected = 1.0 / (1.0 + offsets.mean(axis=1))
+    np.testing.assert_allclose(merged.potentials[:n], expected, rtol=1e-9)
+
+
+@pytest.mark.parametrize("order", ["one after another", "the last first", "in pairs"])
+def test_merging_merged_machines_is_merging_all_where_the_states_are_the_same(order):
+    parts = [among(CENTRES, seed, rows=50 + 100 * seed) for seed in range(4)]
+    match order:
+        case "one after another":
+            folded = functools.reduce(lambda a, b: merge([a, b]), parts)
+        case "the last first":
+            folded = functools.reduce(lambda a, b: merge([a, b]), parts[::-1])
+        case "in pairs":
+            folded = merge([merge(parts[:2]), merge(parts[2:])])
+    merged = merge(parts)
+    for machine in (folded, merged):  # which takes the latest, any part's, into the potentials
+        machine.observe(CENTRES[0])
+    assert_alike(folded, merged, atol=1e-9)
+
+
+def test_shards_of_a_stream_become_the_machine_of_the_whole_stream():
+    random = np.random.default_rng(5)
+    chain = random.dirichlet(np.full(len(CENTRES), 0.5), size=(2, len(CENTRES)))
+    rows, noise = 2000, 0.05
+    parts = [among(CENTRES, seed, rows, noise=noise, chain=chain) for seed in range(8)]
+    merged = merge(parts)
+    assert merged.n_states == len(CENTRES)
+    nearest = np.argmin(((merged.centers[:, None] - CENTRES) ** 2).sum(axis=-1), axis=1)
+    truth = chain[:, nearest][..., nearest]
+
+    def error(matrices):
+        return 0.5 * np.abs(matrices - truth).sum(axis=-1).mean()
+
+    order = [
+        np.argmin(((one.centers - center) ** 2).sum(axis=1))
+        for one in parts
+        for center in merged.centers
+    ]
+    order = np.reshape(order, (len(parts), -1))
+    alone = [
+        error(one.transition_matrices[:, at][..., at]) for one, at in zip(parts, order, strict=True)
+    ]
+    # Eight independent estimates of a row: nearer the truth than any by up to the root of eight.
+    assert error(merged.transition_matrices) < 0.6 * min(alone)
+
+
+def test_rows_count_by_decisions_and_a_row_of_no_decision_is_uniform():
+    there = np.array([[0.0, 0.0], [9.0, 0.0]])
+    stays = among(there, 0, rows=400, q=1, chain=np.array([np.eye(2)]))
+    goes = among(there, 1, rows=100, q=1, chain=np.array([[[0.0, 1.0], [1.0, 0.0]]]))
+    merged = merge([stays, goes])
+    weight = [
+        one.decisions[0, np.flatnonzero(one.centers[:, 0] == 9.0)[0]] for one in (stays, goes)
+    ]
+    row = merged.transition_matrices[0, np.flatnonzero(merged.centers[:, 0] == 9.0)[0]]
+    at = np.flatnonzero(merged.centers[:, 0] == 9.0)[0]
+    assert row[at] == pytest.approx(weight[0] / sum(weight), abs=0.01)
+    never = EvolvingFSM(3, rule=Novelty(1.0))
+    never.learn_many([[0.0], [0.0], [5.0]], [0, 0, -1])
+    other = EvolvingFSM(3, rule=Novelty(1.0))
+    other.learn_many([[0.0], [0.0], [9.0], [9.0]], [1, 1, -1, -1])
+    both = merge([never, other])
+    assert both.n_states == 3
+    assert both._memory.learnt.transitions.places.tolist() == [0.0, 1.0, -1.0]
+    lonely = np.flatnonzero(both.decisions[0] == 0.0)
+    assert (both.transition_matrices[0, lonely] == 1.0 / 3.0).all()
+
+
+def test_the_prior_of_many_sparse_rows_enters_once():
+    """A thousand vehicles that saw one transition each know it as well as one that saw all."""
+    one = EvolvingFSM(1, rule=Novelty(1.0, spread=0.05))
+    one.learn_many([[0.0], [3.0], [6.0], [0.0], [3.0]], [-1, -1, -1, 0, -1])
+    matrix = one.transition_matrices[0]
+    assert matrix[0].max() < 0.85  # the prior of three states: a third of a decision
+    apart = [one.copy() for _ in range(1000)]
+    merged = merge(apart)
+    into = np.flatnonzero(merged.centers[:, 0] == 3.0)[0]
+    row = merged.transition_matrices[0, np.flatnonzero(merged.centers[:, 0] == 0.0)[0]]
+    assert row[into] > 0.999
+
+
+def test_the_strongest_centre_leads_and_centres_stay_apart():
+    parts = [taught(RULES[0], seed) for seed in range(6)]
+    merged = merge(parts)
+    scaled = merged.centers / RULES[0].scales
+    distance = np.sqrt(((scaled[:, None] - scaled) ** 2).sum(axis=-1))
+    assert distance[np.triu_indices(len(scaled), 1)].min() > 1.0
+    strongest = max(parts, key=lambda part: part.model().visits.max())
+    leads = strongest.centers[strongest.model().visits.argmax()]
+    assert merged.centers[0].tolist() == leads.tolist()
+    assert merge(parts, radius=4.0).n_states < merged.n_states < merge(parts, radius=0.2).n_states
+
+
+def test_states_that_a_failure_split_stay_apart():
+    rule = FailureSplit(Novelty(2.0), distance=0.5)
+    parts = []
+    for offset in (0.0, 0.1):
+        part = EvolvingFSM(1, rule=rule)
+        part.learn_many(np.array([[0.0], [1.5], [0.0], [0.2]]) + offset, [0] * 4)
+        assert part.observe([1.5 + offset], failed=True).event.name == "CREATED"
+        parts.append(part)
+    merged = merge(parts)
+    assert merged.centers.round(1).ravel().tolist() == [0.0, 1.5]
+    assert merged.endings.tolist() == [0.0, 2.0]
+
+
+@pytest.mark.parametrize("when_full", list(WhenFull))
+def test_no_more_states_than_allowed(when_full):
+    options = {"max_states": 5, "when_full": when_full}
+    merged = merge([taught(RULES[0], seed, rows=200, **options) for seed in range(4)])
+    assert merged.n_states == 5
+    merged.learn_many(np.random.default_rng(0).normal(size=(300, 2)) * 20.0, [0] * 300)
+    assert merged.n_states == 5
+
+
+@pytest.mark.parametrize("rule", RULES)
+def test_it_is_saved_and_loaded_and_goes_on_learning(rule, tmp_path):
+    merged = merge([taught(rule, seed) for seed in range(3)])
+    merged.save(tmp_path / "merged.evofsm")
+    again = EvolvingFSM.load(tmp_path / "merged.evofsm")
+    random = np.random.default_rng(8)
+    Z, I = random.normal(size=(200, 2)) * 6.0, random.integers(0, 3, 200)
+    for machine in (merged, again):
+        trace = machine.learn_many(Z, I)
+        np.testing.assert_allclose(machine.transition_matrices.sum(axis=-1), 1.0, atol=1e-9)
+        assert np.isnan(trace.surprise[0])  # a new episode
+        assert not np.isnan(trace.surprise[1:]).any()
+    assert merged._buffer.tobytes() == again._buffer.tobytes()
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+def test_the_vehicles_of_a_fleet_become_one_machine(dtype):
+    random = np.random.default_rng(3)
+    fleet = Fleet(EvolvingFSM(2, rule=Novelty(1.0)), 20, dtype)
+    for _ in range(50):
+        fleet.observe(random.integers(0, 5, size=(20, 1)) * 2.0, random.integers(0, 2, 20))
+    merged = merge([fleet[vehicle] for vehicle in range(len(fleet))])
+    assert sorted(merged.centers.ravel().tolist()) == [0.0, 2.0, 4.0, 6.0, 8.0]
+    assert merged.model().uses.sum() == 20 * 49
+    np.testing.assert_allclose(merged.transition_matrices.sum(axis=-1), 1.0, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("machines", "error", "message"),
+    [
+        ([], ValueError, "machines is empty"),
+        ([EvolvingFSM(2), None], TypeError, "machine 1 is None"),
+        ([EvolvingFSM(2), EvolvingFSM(3)], ValueError, "n_actions of machine 1 is 3, but 2"),
+        ([EvolvingFSM(2), EvolvingFSM(2, max_states=4)], ValueError, "max_states of machine 1"),
+        (
+            [EvolvingFSM(2), EvolvingFSM(2, learning_rate=0.1)],
+            ValueError,
+            "learning_rate of machine 1 is 0.1",
+        ),
+        (
+            [EvolvingFSM(2), EvolvingFSM(2), EvolvingFSM(2, rule=Edges())],
+            ValueError,
+            "rule of machine 2 is Edges",
+        ),
+    ],
+)
+def test_machines_that_differ_are_refused(machines, error, message):
+    with pytest.raises(error, match=message):
+        merge(machines)
+
+
+def test_observations_of_other_sizes_and_impossible_radii_are_refused():
+    parts = [EvolvingFSM(2), EvolvingFSM(2), EvolvingFSM(2)]
+    parts[1].observe([0.0])
+    parts[2].observe([0.0, 1.0])
+    with pytest.raises(ValueError, match="machine 1 has 1 variables, and machine 2 has 2"):
+        merge(parts)
+    parts[0].observe([1.0])
+    with pytest.raises(ValueError, match="radius is -1"):
+        merge(parts[:2], radius=-1.0)
+
+
+# -- Held-out episodes -----------------------------------------------------------------------------
+
+
+def driven(family, seed, episodes, split):
+    """Observations and actions of episodes of a family, a row for each decision."""
+    rows = []
+    for index in range(episodes):
+        draw = family.draw(seed, index, split=split)
+        episode = KinematicWorld().run(draw.scenario, draw.controller)
+        every = round(family.interval / draw.scenario.dt)
+        rows.append(
+            (episode.observations[::every], family.actions.encode(episode.accelerations[::every]))
+        )
+    return rows
+
+
+def log_scores(machine, episodes):
+    """For each episode, the mean log density that forecasts of one step gave what was observed.
+
+    A forecast over states is taken as a mixture around their centres, as wide as recognition.
+    """
+    model, scales = machine.model(), np.array(machine.rule.scales)
+    scores = []
+    for Z, I in episodes:
+        forecasts = np.einsum("ti,tij->tj", model.recognise(Z), model.transition_matrices[I])
+        offsets = ((Z[:, None] - model.centers) / scales) ** 2
+        kernels = np.exp(-offsets.sum(axis=-1) / model.width)
+        density = (forecasts[:-1] * kernels[1:]).sum(axis=1)
+        scores.append(np.log(density + 1e-12).mean())
+    return np.array(scores)
+
+
+@pytest.mark.parametrize("name", ["emergency", "stop_and_go"])
+def test_it_forecasts_held_out_episodes_better_than_the_best_part(name):
+    family = load_family(name)
+    rule = Novelty(1.0, (2.0, 1.0, 1.0))
+    parts = []
+    for seed in range(4):
+        part = EvolvingFSM(family.actions.n_actions, rule=rule)
+        for Z, I in driven(family, 100 + seed, 6, "train"):
+            part.start_episode()
+            part.learn_many(Z, I)
+        parts.append(part)
+    held_out = driven(family, 1, 20, "test")
+    best = max((log_scores(part, held_out) for part in parts), key=np.mean)
+    gain = log_scores(merge(parts), held_out) - best
+    assert gain.mean() > 3.0 * gain.std(ddof=1) / np.sqrt(len(gain))
+    one_by_one = functools.reduce(lambda a, b: merge([a, b]), parts)
+    difference = log_scores(one_by_one, held_out) - log_scores(merge(parts), held_out)
+    assert abs(difference.mean()) < 0.1
