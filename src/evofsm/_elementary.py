@@ -199,6 +199,21 @@ def total(values: NDArray[np.float64], n: int) -> float:
 
 
 @inner_kernel
+def total_below(values: NDArray[np.float64], n: int, limit: float) -> float:
+    """Sum of those of the first ``n`` that lie below a limit."""
+    a = b = c = d = 0.0
+    whole = n // 4 * 4
+    for i in range(0, whole, 4):
+        a += values[i] if values[i] < limit else 0.0
+        b += values[i + 1] if values[i + 1] < limit else 0.0
+        c += values[i + 2] if values[i + 2] < limit else 0.0
+        d += values[i + 3] if values[i + 3] < limit else 0.0
+    for i in range(whole, n):
+        a += values[i] if values[i] < limit else 0.0
+    return (a + b) + (c + d)
+
+
+@inner_kernel
 def largest(values: NDArray[np.float64], n: int) -> float:
     """The largest of the first ``n``, none of which is below 0, found in the same way."""
     a = b = c = d = 0.0

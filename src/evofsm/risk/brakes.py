@@ -146,8 +146,8 @@ class OwnBrakes:
     def expected(self, before: float, command: float) -> float:
         """Acceleration that a command most likely brings, after the one before it [m/s²]."""
         hardest = -self._likely
-        last, asked = max(before, hardest), max(command, hardest)
-        return self.lag * last + (1.0 - self.lag) * asked
+        last, asked, lag = max(before, hardest), max(command, hardest), self.lag
+        return lag * last + (1.0 - lag) * asked
 
     def clear(self) -> None:
         """An episode begins: what comes is not a consequence of what was."""

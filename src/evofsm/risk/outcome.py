@@ -202,7 +202,7 @@ class LatentRisk:
     def _count(self, belief: NDArray[np.float64], braking: bool) -> None:
         counts, missing = self._by_state, len(belief) - self._by_state.shape[1]
         if missing > 0:
-            counts = np.pad(counts, ((0, 0), (0, missing)))
+            counts = np.concatenate([counts, np.zeros((len(counts), missing))], axis=1)
         if not _count(counts, belief, self.dt, braking):
             refuse_unless_distribution("belief", belief)
         self._by_state = counts
