@@ -30,4 +30,4 @@ bench: .venv/installed          ## how fast it is, as ratios against named refer
 	@touch $@
 
 clean:
-	rm -rf .venv results dist build .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf .venv results bench.json dist build .pytest_cache .mypy_cache .ruff_cache .hypothesis

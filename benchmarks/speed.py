@@ -2,8 +2,8 @@
 
 Usage: python benchmarks/speed.py [--only batch_7,call_7] [--repeats 7] [--json bench.json]
 
-Prints one table and writes it as JSON. Fails where a ratio is not what the project promises, or
-is worse than in an earlier JSON by more than a margin.
+Prints one table and writes it as JSON, and says which targets are missed. Fails where a row could
+not be measured, or a ratio is worse than in an earlier JSON by more than a margin.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ ROWS = {
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Measure, print, write; 1 where a promise is not kept or a ratio is worse than before."""
+    """Measure, print, write; 1 where a row failed or a ratio is worse than before."""
     options = parse(arguments)
     if options.table:
         print(cost_and_memory(options.repeats, options.short))
@@ -75,7 +75,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         else:
             worse = None if options.short else worsened(result, last)
             print(shown(result, worse), flush=True)
-            good = good and (options.short or (result["kept"] and not worse))
+            good = good and not worse
             results.append(result)
     options.json.write_text(json.dumps(results, indent=1) + "\n")
     return int(not good)

@@ -1,4 +1,4 @@
-"""One row a measurement: its ratio, whether that is what was promised, and how it was before."""
+"""One row a measurement: its ratio, whether that reaches the target, and how it was before."""
 
 from __future__ import annotations
 
@@ -18,32 +18,32 @@ HEADER = f"""\
 Medians of turns, ours and the reference in turn; a step is one with forecast and divergence.
 Ratio: 'x faster' is reference / ours, more is better; 'x the cost' is ours / reference, less is.
 
-{"":<19}{"ours":>11}{"reference":>12}{"ratio":>19}{"promised":>9}        the reference
+{"":<19}{"ours":>11}{"reference":>12}{"ratio":>19}{"target":>9}        the reference
 """
 
 
 class Row(NamedTuple):
-    """How a row is measured, in so many turns, short or in full, and what is promised of it."""
+    """How a row is measured, in so many turns, short or in full, and what it should reach."""
 
     measure: Callable[[int, bool], Result]
     better: str  # ">=": how many times as fast as the reference; "<=": how many times its cost
-    promised: float | None = None
+    target: float | None = None
 
 
 def judged(id_: str, row: Row, measured: Result) -> Result:
-    """What was measured as it goes into the JSON: with its ratio, and whether that was promised."""
+    """What was measured as it goes into the JSON: with its ratio, and whether that is enough."""
     ours, reference = float(measured["ours_s"]), float(measured["reference_s"])
     faster = row.better == ">="
     ratio = reference / ours if faster else ours / reference
-    promised = row.promised
-    kept = promised is None or (ratio >= promised if faster else ratio <= promised)
+    target = row.target
+    reached = target is None or (ratio >= target if faster else ratio <= target)
     return {
         "id": id_,
         **measured,
         "ratio": ratio,
         "ratio_is": _FASTER if faster else _COST,
-        "promised": None if promised is None else f"{row.better} {promised:g}",
-        "kept": kept,
+        "target": None if target is None else f"{row.better} {target:g}",
+        "reached": reached,
         "cores": os.cpu_count(),
     }
 
@@ -67,10 +67,10 @@ def shown(result: Result, worse: str | None) -> str:
     """A row of the table, and what stands beside it, no wider than 100 columns."""
     ratio = f"{result['ratio']:.2f}" if result["ratio"] < 10.0 else f"{result['ratio']:.0f}"
     ratio += "x faster   " if result["ratio_is"] == _FASTER else "x the cost "
-    promised = result["promised"] or ""
+    target = result["target"] or ""
     lines = [
         f"{result['id']:<19}{duration(result['ours_s']):>11}{duration(result['reference_s']):>12}"
-        f"{ratio:>19}{promised:>9} {'' if result['kept'] else 'BROKEN':<7}{result['reference']}",
+        f"{ratio:>19}{target:>9} {'' if result['reached'] else 'missed':<7}{result['reference']}",
         f"  {result['what']}",
     ]
     for what, seconds in result.get("beside", {}).items():

@@ -113,7 +113,7 @@ def test_a_lattice_has_as_many_states_as_it_says_and_its_walk_founds_no_other(n_
     assert (states[n_states - 1 :] == n_states).all()
 
 
-def test_beliefs_on_the_lattice_are_as_sure_as_promised():
+def test_beliefs_on_the_lattice_are_as_sure_as_they_should_be():
     machine = tolerance.walked(256, 17)
     spread = tolerance.perplexity(machine, tolerance.walk(256, 17, 500))
     assert 4.0 < np.median(spread) < spread.max() <= 16.0
@@ -154,7 +154,7 @@ FASTER, COST = Row(None, ">=", 10.0), Row(None, "<=", 1.25)
 
 
 @pytest.mark.parametrize(
-    ("row", "ours", "ratio", "kept"),
+    ("row", "ours", "ratio", "reached"),
     [
         (FASTER, 1.0, 10.0, True),
         (FASTER, 1.1, 10 / 1.1, False),
@@ -163,10 +163,10 @@ FASTER, COST = Row(None, ">=", 10.0), Row(None, "<=", 1.25)
         (Row(None, ">="), 20.0, 0.5, True),
     ],
 )
-def test_a_promise_is_kept_or_not(row, ours, ratio, kept):
+def test_a_target_is_reached_or_missed(row, ours, ratio, reached):
     result = judged("row", row, measured(ours, 10.0))
-    assert (result["ratio"], result["kept"]) == (pytest.approx(ratio), kept)
-    assert ("BROKEN" in shown(result, None)) is not kept
+    assert (result["ratio"], result["reached"]) == (pytest.approx(ratio), reached)
+    assert ("missed" in shown(result, None)) is not reached
 
 
 @pytest.mark.parametrize(
@@ -213,8 +213,8 @@ def harness(monkeypatch, tmp_path, capsys):
     return run
 
 
-def made_up(better, promised, ours):
-    return Row(lambda repeats, short: measured(ours, 10.0), better, promised)
+def made_up(better, target, ours):
+    return Row(lambda repeats, short: measured(ours, 10.0), better, target)
 
 
 def broken(repeats, short):
@@ -225,13 +225,13 @@ def absent(repeats, short):
     raise ModuleNotFoundError("No module named 'river'")
 
 
-def test_the_harness_writes_what_it_prints_and_fails_with_a_promise(harness):
+def test_the_harness_writes_what_it_prints_and_says_what_is_missed(harness):
     good, bad = made_up(">=", 5.0, 1.0), made_up("<=", 0.5, 6.0)
     status, out, written = harness({"good": good, "bad": bad})
-    assert status == 1
+    assert status == 0
     assert [result["id"] for result in written] == ["good", "bad"]
     assert {"id", "ours_s", "reference", "reference_s", "ratio"} <= written[0].keys()
-    assert out.count("BROKEN") == 1
+    assert out.count("missed") == 1
     assert harness({"good": good, "bad": bad}, "--only", "good")[0] == 0
 
 

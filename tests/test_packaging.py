@@ -15,7 +15,7 @@ import evofsm
 ROOT = Path(__file__).parent.parent
 HEAVY = {
     *("numba", "scipy", "libsumo", "matplotlib", "jinja2"),
-    *("polars", "pyarrow", "pandas", "typer", "rich", "gymnasium", "highway_env"),
+    *("polars", "pyarrow", "pandas", "typer", "rich", "gymnasium", "highway_env", "distributed"),
 }
 
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from evofsm.actions import IntervalActions
+    from evofsm.crowding import WhenFull
     from evofsm.divergence import jensen_shannon
     from evofsm.machine import EvolvingFSM
     from evofsm.model import FSMModel
@@ -32,6 +33,7 @@ _HOMES = {
     "Paper": "states.ets",
     "Step": "step",
     "Trace": "step",
+    "WhenFull": "crowding",
     "jensen_shannon": "divergence",
 }
 
@@ -48,6 +50,7 @@ __all__ = [
     "Paper",
     "Step",
     "Trace",
+    "WhenFull",
     "jensen_shannon",
 ]
 
