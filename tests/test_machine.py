@@ -1,10 +1,12 @@
 import copy
 import pickle
+import subprocess
+import sys
 
 import numpy as np
 import pytest
 
-from evofsm import Event, EvolvingFSM
+from evofsm import Event, EvolvingFSM, Novelty
 
 LEARNT = (
     "n_states",
@@ -457,3 +459,88 @@ def test_what_happened_to_states_may_be_combined():
     assert [event.value for event in (Event.NONE, *Event)] == [0, 1, 2, 4, 8]
     assert Event.CREATED in Event.CREATED | Event.MERGED
     assert Event(12) == Event.MERGED | Event.RETIRED
+
+
+# -- The quick call ----------------------------------------------------------------------------
+
+
+def test_update_is_learn_one_with_a_shorter_answer(grown, spiral, snapshot):
+    twin = grown.copy()
+    for row, z in enumerate(spiral(60)):
+        surprise = grown.update(z, row % 3)
+        assert (
+            np.array(surprise).tobytes() == np.array(twin.learn_one(z, row % 3).surprise).tobytes()
+        )
+    assert snapshot(grown) == snapshot(twin)
+
+
+GIVEN = {
+    "a list": lambda z: z.tolist(),
+    "single precision": lambda z: z.astype(np.float32),
+    "whole numbers": lambda z: z.astype(int),
+    "with gaps": lambda z: np.column_stack([z, z])[:, 0],
+    "read-only": lambda z: np.broadcast_to(z, z.shape),
+    "another order of bytes": lambda z: z.astype(">f8"),
+}
+
+
+@pytest.mark.parametrize("given", GIVEN.values(), ids=GIVEN.keys())
+def test_observations_of_any_kind_are_the_same_once_kernels_are_loaded(given, grown, snapshot):
+    z = np.array([2.0, 1.0])
+    machines = [grown.copy() for _ in range(4)]
+    for machine in machines:
+        machine.update(z, 0)
+    machines[0].update(z, 1)
+    machines[1].update(given(z), 1)
+    machines[2].learn_one(given(z), 1)
+    machines[3].observe(given(z))
+    machines[3].act(1)
+    assert all(snapshot(machine) == snapshot(machines[0]) for machine in machines)
+
+
+@pytest.mark.parametrize(
+    ("z", "i", "error"),
+    [
+        ([0.0, 1.0], -1, ValueError),
+        ([0.0, 1.0], 3, ValueError),
+        ([0.0, 1.0], 2**70, ValueError),
+        ([0.0, 1.0], 1.0, TypeError),
+        ([0.0, np.nan], 0, ValueError),
+        ([0.0], 0, ValueError),
+        ([[0.0, 1.0]], 0, ValueError),
+        (1.0, 0, ValueError),
+    ],
+)
+def test_update_refuses_what_learn_one_refuses_and_changes_nothing(z, i, error, grown, snapshot):
+    grown.update(np.array([2.0, 1.0]), 0)
+    before = snapshot(grown)
+    for call in (grown.update, grown.learn_one):
+        with pytest.raises(error):
+            call(np.array(z), i)
+        assert snapshot(grown) == before
+
+
+def test_a_width_beyond_all_bounds_leaves_no_belief_to_states_that_are_not_there():
+    machine = EvolvingFSM(1, rule=Novelty(radius=1e150))
+    assert machine.observe([0.0]).belief.tolist() == [1.0]
+    machine = EvolvingFSM(1, rule=Novelty(radius=1.0, spread=1e300))
+    assert machine.observe([0.0]).belief.tolist() == [1.0]
+
+
+def test_threads_may_begin_at_once():
+    program = """
+import threading, numpy as np
+from evofsm import EvolvingFSM
+failed = []
+def work():
+    try:
+        EvolvingFSM(1).update(np.zeros(1), 0)
+    except Exception as error:
+        failed.append(error)
+threads = [threading.Thread(target=work) for _ in range(4)]
+[thread.start() for thread in threads]
+[thread.join() for thread in threads]
+print(failed)
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert done.stdout == "[]\n", done.stderr

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from os import PathLike
 from typing import Any, Self, SupportsIndex
 
@@ -229,7 +230,7 @@ prior_frequency=0.001, spread=3.0)
         >>> step.state, step.predicted.round(2), step.belief.round(2), round(step.surprise, 2)
         (1, array([0.6, 0.4]), array([0.32, 0.68]), 0.06)
         """
-        return self._step(z, NO_ACTION, failed)
+        return self._step(z, NO_ACTION, bool(failed))
 
     def act(self, i: SupportsIndex) -> None:
         """Say which action was commanded after the latest observation.
@@ -323,10 +324,10 @@ prior_frequency=0.001, spread=3.0)
         >>> machine.state, machine.belief.round(2)
         (1, array([0.37, 0.63]))
         """
-        if type(i) is int:
+        if type(i) is int and type(z) is np.ndarray and z.dtype is _FLOAT64:
             try:
                 surprise = self._update(self._buffer, z, i)
-            except TypeError:  # not an array of float64 without gaps
+            except (TypeError, OverflowError):  # z has gaps or is read-only; i is beyond any index
                 surprise = DECLINED
             if surprise != DECLINED:
                 return surprise
@@ -872,8 +873,10 @@ prior_frequency=0.001, spread=3.0)
 
     def _insist(self, z: ArrayLike, action: int, failed: bool) -> tuple[int, int, float]:
         """What the kernel answers, whatever has to be done to `z` and for room before."""
-        if type(z) is np.ndarray and z.dtype is _FLOAT64 and z.flags.c_contiguous:
-            event, state, surprise = self._observe(self._buffer, z, action, failed)
+        if type(z) is np.ndarray and z.dtype is _FLOAT64:
+            event, state, surprise = REFUSED, 0, np.nan
+            with suppress(TypeError):  # it has gaps, is read-only or is no vector
+                event, state, surprise = self._observe(self._buffer, z, action, failed)
             if event >= 0:
                 return event, state, surprise
             if event == FULL:

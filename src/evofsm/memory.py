@@ -28,7 +28,7 @@ _COUNTERS, _HEAD = 16, 32
 # Then, for each kind of thing there is, so many numbers; centres are further rows of states.
 _PER_STATE, _PER_PLACE, _PER_ACTION, _PER_VARIABLE = 13, 4, 2, 5
 # Where the centre of a state that is not there stands: too far for any belief.
-_NOWHERE = 1e150
+_NOWHERE = np.inf
 
 
 class Parameters(NamedTuple):
@@ -224,7 +224,7 @@ def _blank(*sizes: int) -> NDArray[np.float64]:
 def _vacate(clusters: Clusters, n: int) -> None:
     """Put the centres from the n-th on where a state that is not there has its own."""
     clusters.centers[:, n:] = _NOWHERE
-    clusters.squared_distances[n:] = _NOWHERE**2
+    clusters.squared_distances[n:] = _NOWHERE
 
 
 def view(buffer: NDArray[np.float64]) -> Memory:
@@ -319,4 +319,6 @@ def refuse_impossible(learnt: Learnt) -> None:
     refuse_unless_outcomes(*learnt.outcomes)
     refuse_unless_distribution("belief", learnt.belief)
     scales = learnt.transitions.scales
+    if (scales <= 0.0).any():
+        raise ValueError("scales of rows are not above 0")
     refuse_unless_distribution("a row of matrices", learnt.transitions.matrices * scales[..., None])

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from enum import IntFlag
 from functools import cache
+from threading import Lock
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -41,6 +42,7 @@ from evofsm.validation import LARGEST_OBSERVATION
 FULL, REFUSED = -1, -2
 # What `_update` answers where it did nothing; no surprise is below 0.
 DECLINED = -1.0
+_COMPILING = Lock()
 
 
 class Event(IntFlag):
@@ -215,7 +217,7 @@ def _observe(
 def _update(buffer: NDArray[np.float64], z: NDArray[np.float64], action: int) -> float:
     """The same with fewer things to hand over: only the surprise, or `DECLINED`."""
     memory = open_memory(buffer)
-    if not NO_ACTION <= action < len(memory.learnt.transitions.uses):
+    if not 0 <= action < len(memory.learnt.transitions.uses):
         return DECLINED
     event, _, surprise = step(memory, z, False, False)
     if event < 0:
@@ -242,8 +244,10 @@ def updater() -> Callable[[NDArray[np.float64], NDArray[np.float64], int], float
 
 
 def _for_plain_arrays(kernel: Any, signature: str) -> None:
-    kernel.compile(signature)
-    kernel.disable_compile()
+    with _COMPILING:  # whichever thread comes first
+        if not kernel.signatures:
+            kernel.compile(signature)
+            kernel.disable_compile()
 
 
 @kernel

@@ -8,7 +8,8 @@ from typing import Any, SupportsFloat, SupportsIndex
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-# Squares of larger numbers, summed over a long run, would overflow.
+# Squares of larger numbers, summed over a long run, would overflow. Kernels hold it as a constant,
+# so that editing this file has to make them anew: `_compile` looks for its name.
 LARGEST_OBSERVATION = 1e100
 
 

@@ -112,6 +112,22 @@ def test_single_precision_is_close_and_saves_memory():
         )
 
 
+def test_a_machine_out_of_a_fleet_in_single_precision_can_be_kept(tmp_path):
+    machine = EvolvingFSM(1, learning_rate=1e-4, rule=Novelty(radius=0.5))
+    fleet = Fleet(machine, 1, dtype=np.float32)
+    for z in np.random.default_rng(0).normal(size=(20_000, 1, 1)):
+        fleet.observe(z, [0])
+    fleet[0].save(tmp_path / "machine")
+    rows = EvolvingFSM.load(tmp_path / "machine").model().transition_matrices.sum(axis=2)
+    np.testing.assert_allclose(rows, 1.0, rtol=1e-12)
+
+
+def test_nobody_may_be_seen_at_first():
+    fleet = Fleet(EvolvingFSM(Q), 2)
+    assert len(fleet.observe(np.empty((0, 1)), [], vehicles=[]).state) == 0
+    assert fleet.n_states.tolist() == [0, 0]
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [

@@ -100,6 +100,8 @@ class Fleet:
         small = self._small[at : at + length]
         matrices = self._matrices[at_matrices : at_matrices + of_matrices]
         machine._use(np.concatenate([small, matrices]))
+        if self._dtype == _SINGLE:
+            _sum_to_1(machine)
         return machine
 
     @property
@@ -166,7 +168,9 @@ class Fleet:
             actions = check_actions(A, len(rows), n_actions)
         starts = check_rows("episode_starts", episode_starts, len(rows))
         ends = check_rows("failures", failures, len(rows))
-        if self._small[self._at[0, 0]] == 0:  # the number of variables is not known yet
+        if (
+            len(rows) and self._small[self._at[0, 0]] == 0
+        ):  # the number of variables is not known yet
             self._machine._fit(rows[0])
             self._fill(self._machine._buffer)
         answer = FleetStep(
@@ -247,6 +251,13 @@ class Fleet:
         _move_all(self._small, self._matrices, self._at, vehicles, sizes, small, matrices, begins)
         self._small, self._matrices = small, matrices
         self._at[vehicles] = begins
+
+
+def _sum_to_1(machine: EvolvingFSM) -> None:
+    """Make rows distributions to the last digit again, which single precision does not keep."""
+    n, transitions = machine.n_states, machine._memory.learnt.transitions
+    sums = (transitions.scales[..., None] * transitions.matrices)[:, :n, :n].sum(axis=2)
+    transitions.scales[:, :n] /= np.where(sums > 0.0, sums, 1.0)
 
 
 @kernel

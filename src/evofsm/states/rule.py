@@ -1,4 +1,7 @@
-"""What a state rule is: frozen settings, and numbers in which it tells its kernel of them."""
+"""What a state rule is: frozen settings, and numbers in which it tells its kernel of them.
+
+(`_compile` makes kernels anew where a file that names it was edited: their order matters there.)
+"""
 
 from __future__ import annotations
 
