@@ -215,6 +215,11 @@ class Processes(ProcessPoolExecutor):
     ) -> None:
         if error is not None:
             self._lifeline[1].close()
+        if error is not None or self._broken:
+            # Python before 3.11.5 waits for ever to hand tasks to workers that are no more
+            # (python/cpython#94777): a pipe that nobody can read from tells it so.
+            inside: Any = self
+            inside._call_queue._reader.close()
         self.shutdown(cancel_futures=True)
         for end in self._lifeline:
             end.close()
