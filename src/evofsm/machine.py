@@ -548,8 +548,8 @@ prior_frequency=0.001, spread=3.0)
         >>> trace = machine.learn_many([[0.0], [0.1], [2.0]], [0, 0, 1])
         >>> once = machine.nbytes
         >>> trace = machine.learn_many([[0.0], [0.1]], [0, 0])  # action 1 got its matrix
-        >>> machine.nbytes - once  # 8 states in a line: 8 x 8 probabilities, 3 x 8 counts
-        704
+        >>> machine.nbytes - once  # 8 states in a line: 8 x 8 probabilities, 4 x 8 of rows
+        768
         """
         return self._buffer.nbytes
 
