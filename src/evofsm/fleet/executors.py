@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
 from collections import Counter
 from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import (
@@ -34,6 +35,9 @@ from evofsm._extras import needs
 _LIVES, _LIVES_IN_COMPANY = 5, 2
 # How long a scheduler may take to answer, and its workers to join it [s].
 _PATIENCE = 15
+# Python before 3.11.5 tries for ever to hand tasks to workers that are no more
+# (python/cpython#94777).
+_WAITS_FOR_THE_DEAD = sys.version_info < (3, 11, 5)
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -215,9 +219,8 @@ class Processes(ProcessPoolExecutor):
     ) -> None:
         if error is not None:
             self._lifeline[1].close()
-        if error is not None or self._broken:
-            # Python before 3.11.5 waits for ever to hand tasks to workers that are no more
-            # (python/cpython#94777): a pipe that nobody can read from tells it so.
+        if _WAITS_FOR_THE_DEAD and (error is not None or self._broken):
+            # A pipe that nobody can read from tells it so; later Pythons close it themselves.
             inside: Any = self
             inside._call_queue._reader.close()
         self.shutdown(cancel_futures=True)
