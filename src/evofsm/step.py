@@ -199,18 +199,37 @@ def _learn(memory: Memory, place: int, n: int, whole: bool) -> float:
     return min(divergence + 0.5 * elsewhere, 1.0)
 
 
+@inner_kernel
+def step_and_act(
+    memory: Memory,
+    z: NDArray[np.float64],
+    action: int,
+    starts: bool,
+    failed: bool,
+    whole: bool,
+) -> tuple[int, int, float]:
+    """`step`, in a new episode if it ``starts`` one, then an action (or `NO_ACTION`).
+
+    After a failure there is nobody to act.
+    """
+    now = memory.learnt
+    if starts:
+        now.chained[0] = 0.0
+    event, state, surprise = step(memory, z, failed, whole)
+    if event >= 0 and not failed:
+        now.action[0] = action
+    return event, state, surprise
+
+
 @kernel
 def _observe(
     buffer: NDArray[np.float64], z: NDArray[np.float64], action: int, failed: bool
 ) -> tuple[int, int, float]:
-    """`step`, then an action (or `NO_ACTION`), with the whole machine in a single argument."""
+    """`step_and_act`, with the whole machine in a single argument."""
     memory = open_memory(buffer)
     if not NO_ACTION <= action < len(memory.learnt.transitions.uses):
         return REFUSED, 0, np.nan
-    event, state, surprise = step(memory, z, failed, True)
-    if event >= 0 and not failed:
-        memory.learnt.action[0] = action
-    return event, state, surprise
+    return step_and_act(memory, z, action, False, failed, True)
 
 
 @kernel
@@ -219,11 +238,8 @@ def _update(buffer: NDArray[np.float64], z: NDArray[np.float64], action: int) ->
     memory = open_memory(buffer)
     if not 0 <= action < len(memory.learnt.transitions.uses):
         return DECLINED
-    event, _, surprise = step(memory, z, False, False)
-    if event < 0:
-        return DECLINED
-    memory.learnt.action[0] = action
-    return surprise
+    event, _, surprise = step_and_act(memory, z, action, False, False, False)
+    return surprise if event >= 0 else DECLINED
 
 
 @cache
@@ -406,13 +422,11 @@ def learn_rows(
     memory = open_memory(buffer)
     now = memory.learnt
     while row < len(observations):
-        if starts[row]:
-            now.chained[0] = 0.0
-        event, state, surprise = step(memory, observations[row], failures[row], False)
+        event, state, surprise = step_and_act(
+            memory, observations[row], actions[row], starts[row], failures[row], False
+        )
         if event == FULL:
             break
-        if not failures[row]:
-            now.action[0] = actions[row]
         n = int(now.n_states[0])
         trace.state[row] = state
         trace.n_states[row] = n

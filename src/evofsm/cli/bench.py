@@ -7,7 +7,16 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Annotated
 
-from evofsm.cli.common import counter, plain_errors, print_json, progress, require, split_names
+from evofsm.cli.common import (
+    SwitchesOption,
+    ToleranceOption,
+    counter,
+    plain_errors,
+    print_json,
+    progress,
+    require,
+    split_names,
+)
 
 with suppress(ModuleNotFoundError):
     import typer
@@ -36,12 +45,8 @@ def closed_loop(
     test: Annotated[int, typer.Option(min=1, help="Held-out episodes of every policy.")] = 1000,
     seeds: Annotated[int, typer.Option(min=1, help="Learning seeds.")] = 20,
     seed: Annotated[int, typer.Option(min=0, help="Of everything.")] = 0,
-    tolerance: Annotated[
-        float, typer.Option(help="Share of leaders' hard brakes that need not be survived.")
-    ] = 0.02,
-    switches: Annotated[
-        str, typer.Option("--with", help="noise, delay, actuator, jerk, third_car; with commas.")
-    ] = "",
+    tolerance: ToleranceOption = 0.02,
+    switches: SwitchesOption = "",
     rule_seeds: Annotated[
         int,
         typer.Option(min=0, help="Learning seeds in the comparison of state rules; 0: none."),

@@ -13,7 +13,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from evofsm.cli.common import (
+    ControllerOption,
+    FamilyArgument,
+    ModeOption,
+    ReviserOption,
+    SummaryAsJson,
+    SwitchesOption,
+    ToleranceOption,
     WorldName,
+    WorldOption,
     chosen_mode,
     plain_errors,
     print_json,
@@ -38,13 +46,7 @@ class ExecutorName(StrEnum):
 
 @plain_errors
 def campaign(
-    family: Annotated[
-        str,
-        typer.Argument(
-            help="Family of scenarios: emergency, paper, shift, ..., or a TOML file of your own.",
-            show_default=False,
-        ),
-    ],
+    family: FamilyArgument,
     episodes: Annotated[
         int, typer.Option(min=1, max=2**32, help="How many held-out draws are driven.")
     ] = 10_000,
@@ -66,31 +68,13 @@ def campaign(
             show_default=False,
         ),
     ] = None,
-    controller: Annotated[
-        str,
-        typer.Option(
-            help="Who proposes: the family's own, aggressive, normal, acc, or sumo (SUMO's IDM)."
-        ),
-    ] = "family",
-    reviser: Annotated[
-        str,
-        typer.Option(
-            help="Who revises: least-risk (what was learnt), none, rss, aeb, or another measure."
-        ),
-    ] = "least-risk",
-    mode: Annotated[
-        str, typer.Option(help="How far least-risk goes: off, shadow, advise, act.")
-    ] = "act",
-    tolerance: Annotated[
-        float, typer.Option(help="Share of leaders' hard brakes that need not be survived.")
-    ] = 0.02,
-    world: Annotated[
-        WorldName, typer.Option(help="SUMO itself, or the same motion in closed form.")
-    ] = WorldName.KINEMATIC,
+    controller: ControllerOption = "family",
+    reviser: ReviserOption = "least-risk",
+    mode: ModeOption = "act",
+    tolerance: ToleranceOption = 0.02,
+    world: WorldOption = WorldName.KINEMATIC,
     seed: Annotated[int, typer.Option(min=0, help="Of the draws.")] = 0,
-    switches: Annotated[
-        str, typer.Option("--with", help="noise, delay, actuator, jerk, third_car; with commas.")
-    ] = "",
+    switches: SwitchesOption = "",
     frozen: Annotated[
         Path | None,
         typer.Option(
@@ -101,9 +85,7 @@ def campaign(
     out: Annotated[
         Path, typer.Option(help="Folder of the campaign; what it holds is not driven again.")
     ] = Path("evofsm-campaign"),
-    as_json: Annotated[
-        bool, typer.Option("--json", help="Print the summary as one JSON document.")
-    ] = False,
+    as_json: SummaryAsJson = False,
 ) -> None:
     """Drive thousands of held-out episodes, on all cores or on a cluster.
 

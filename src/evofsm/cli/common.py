@@ -9,18 +9,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from enum import StrEnum
 from importlib.util import find_spec
-from typing import TYPE_CHECKING, ParamSpec
-
-# Needed once the annotations below are read; `main` says what to install where it is missing.
-with suppress(ModuleNotFoundError):
-    import typer
-
-if TYPE_CHECKING:
-    from rich.progress import Progress, ProgressColumn, Task
-
-    from evofsm.framework.reviser import Mode
-
-P = ParamSpec("P")
+from typing import TYPE_CHECKING, Annotated, ParamSpec
 
 
 class WorldName(StrEnum):
@@ -28,6 +17,54 @@ class WorldName(StrEnum):
 
     SUMO = "sumo"
     KINEMATIC = "kinematic"
+
+
+# Needed once annotations are read; `main` says what to install where it is missing.
+with suppress(ModuleNotFoundError):
+    import typer
+
+    # What several commands are told.
+    FamilyArgument = Annotated[
+        str,
+        typer.Argument(
+            help="Family of scenarios: emergency, paper, shift, ..., or a TOML file of your own.",
+            show_default=False,
+        ),
+    ]
+    ControllerOption = Annotated[
+        str,
+        typer.Option(
+            help="Who proposes: the family's own, aggressive, normal, acc, or sumo (SUMO's IDM)."
+        ),
+    ]
+    ReviserOption = Annotated[
+        str,
+        typer.Option(
+            help="Who revises: least-risk (what was learnt), none, rss, aeb, or another measure."
+        ),
+    ]
+    ModeOption = Annotated[
+        str, typer.Option(help="How far least-risk goes: off, shadow, advise, act.")
+    ]
+    ToleranceOption = Annotated[
+        float, typer.Option(help="Share of leaders' hard brakes that need not be survived.")
+    ]
+    WorldOption = Annotated[
+        WorldName, typer.Option(help="SUMO itself, or the same motion in closed form.")
+    ]
+    SwitchesOption = Annotated[
+        str, typer.Option("--with", help="noise, delay, actuator, jerk, third_car; with commas.")
+    ]
+    SummaryAsJson = Annotated[
+        bool, typer.Option("--json", help="Print the summary as one JSON document.")
+    ]
+
+if TYPE_CHECKING:
+    from rich.progress import Progress, ProgressColumn, Task
+
+    from evofsm.framework.reviser import Mode
+
+P = ParamSpec("P")
 
 
 def plain_errors(command: Callable[P, None]) -> Callable[P, None]:

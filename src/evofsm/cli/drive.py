@@ -7,7 +7,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from evofsm.cli.common import (
+    ControllerOption,
+    FamilyArgument,
+    ModeOption,
+    ReviserOption,
+    SummaryAsJson,
+    SwitchesOption,
+    ToleranceOption,
     WorldName,
+    WorldOption,
     chosen_mode,
     plain_errors,
     print_json,
@@ -27,39 +35,15 @@ if TYPE_CHECKING:
 
 @plain_errors
 def drive(
-    family: Annotated[
-        str,
-        typer.Argument(
-            help="Family of scenarios: emergency, paper, shift, ..., or a TOML file of your own.",
-            show_default=False,
-        ),
-    ],
-    controller: Annotated[
-        str,
-        typer.Option(
-            help="Who proposes: the family's own, aggressive, normal, acc, or sumo (SUMO's IDM)."
-        ),
-    ] = "family",
-    reviser: Annotated[
-        str,
-        typer.Option(
-            help="Who revises: least-risk (what was learnt), none, rss, aeb, or another measure."
-        ),
-    ] = "least-risk",
-    mode: Annotated[
-        str, typer.Option(help="How far least-risk goes: off, shadow, advise, act.")
-    ] = "act",
-    tolerance: Annotated[
-        float, typer.Option(help="Share of leaders' hard brakes that need not be survived.")
-    ] = 0.02,
-    world: Annotated[
-        WorldName, typer.Option(help="SUMO itself, or the same motion in closed form.")
-    ] = WorldName.KINEMATIC,
+    family: FamilyArgument,
+    controller: ControllerOption = "family",
+    reviser: ReviserOption = "least-risk",
+    mode: ModeOption = "act",
+    tolerance: ToleranceOption = 0.02,
+    world: WorldOption = WorldName.KINEMATIC,
     episodes: Annotated[int, typer.Option(min=1, help="How many are driven.")] = 100,
     seed: Annotated[int, typer.Option(min=0, help="Of the draws.")] = 0,
-    switches: Annotated[
-        str, typer.Option("--with", help="noise, delay, actuator, jerk, third_car; with commas.")
-    ] = "",
+    switches: SwitchesOption = "",
     learn: Annotated[
         Path | None,
         typer.Option(
@@ -77,9 +61,7 @@ def drive(
         Path | None,
         typer.Option(help="Folder for what was learnt and every decision.", show_default=False),
     ] = None,
-    as_json: Annotated[
-        bool, typer.Option("--json", help="Print the summary as one JSON document.")
-    ] = False,
+    as_json: SummaryAsJson = False,
 ) -> None:
     """Drive scenarios under a reviser; learn on the way.
 

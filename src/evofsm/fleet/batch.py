@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 from evofsm._compile import kernel, parallel_kernel
 from evofsm.machine import EvolvingFSM
 from evofsm.memory import NO_ACTION, Memory, lengths, matrices_of, move, open_apart
-from evofsm.step import FULL, room_for, step
+from evofsm.step import FULL, room_for, step_and_act
 from evofsm.validation import check_actions, check_rows, real_rows, refuse_unusable, whole
 
 # Room for so much more than is needed when the arrays are made anew.
@@ -161,16 +161,14 @@ class Fleet:
         chosen = self._everyone if vehicles is None else self._vehicles(vehicles)
         if len(rows) != len(chosen):
             raise ValueError(f"there are {len(rows)} observations of {len(chosen)} vehicles")
-        n_actions = self._machine.n_actions
         if A is None:
             actions = np.full(len(rows), NO_ACTION)
         else:
-            actions = check_actions(A, len(rows), n_actions)
+            actions = check_actions(A, len(rows), self._machine.n_actions)
         starts = check_rows("episode_starts", episode_starts, len(rows))
         ends = check_rows("failures", failures, len(rows))
-        if (
-            len(rows) and self._small[self._at[0, 0]] == 0
-        ):  # the number of variables is not known yet
+        # The number of variables is known from the first observation on.
+        if len(rows) and self._small[self._at[0, 0]] == 0:
             self._machine._fit(rows[0])
             self._fill(self._machine._buffer)
         answer = FleetStep(
@@ -312,13 +310,8 @@ def _step_one(
     failed: bool,
 ) -> tuple[int, int, int, float]:
     memory = _open(small, matrices, at)
-    now = memory.learnt
-    if starts:
-        now.chained[0] = 0.0
-    event, state, surprise = step(memory, z, failed, False)
-    if event != FULL and not failed:
-        now.action[0] = action
-    return int(now.n_states[0]), event, state, surprise
+    event, state, surprise = step_and_act(memory, z, action, starts, failed, False)
+    return int(memory.learnt.n_states[0]), event, state, surprise
 
 
 @kernel
