@@ -18,11 +18,11 @@ from evofsm.studies.paper import (
     Claim,
     PaperStudy,
     Settings,
-    Table,
     check_claims,
     context_tables,
     run_paper,
 )
+from evofsm.studies.table import Table
 from evofsm.worlds.kinematic import KinematicWorld
 
 _SVG = b'<svg xmlns="http://www.w3.org/2000/svg"/>'

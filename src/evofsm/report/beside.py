@@ -10,7 +10,7 @@ from evofsm.report.words import NONE, count, interval, number, percent, percents
 from evofsm.studies.closed_loop import ClosedLoop, Group
 from evofsm.studies.closed_loop.comparison import states_alone
 from evofsm.studies.closed_loop.over_seeds import Spread, around_shift, learning_curve
-from evofsm.studies.paper import Table
+from evofsm.studies.table import Table
 
 
 def side_tables(study: ClosedLoop) -> dict[str, Table]:

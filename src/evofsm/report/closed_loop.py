@@ -26,7 +26,7 @@ from evofsm.studies.closed_loop.comparison import (
     table_groups,
 )
 from evofsm.studies.closed_loop.over_seeds import WINDOW
-from evofsm.studies.paper import Table
+from evofsm.studies.table import Table
 
 with needs("matplotlib", "plot", "drawing figures"):
     from evofsm.report.drawing import Drawing, Sketch, draw_all

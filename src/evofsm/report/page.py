@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING
 from evofsm.drivers.idm import IDM, ChangingIDM
 from evofsm.protocols import Controller
 from evofsm.report.html import Setting, inline, versions, write_html
-from evofsm.studies.paper import Claim, PaperStudy, Settings, Table
+from evofsm.studies.paper import Claim, PaperStudy, Settings
+from evofsm.studies.table import Table
 
 if TYPE_CHECKING:
     from evofsm.report.drawing import Drawing

@@ -22,11 +22,12 @@ from rich.text import Text
 
 from evofsm.model import FSMModel
 from evofsm.report.documents import without_nan
-from evofsm.studies import paper
 from evofsm.studies.learning import Learning, Skill, passages
 from evofsm.studies.paper import Claim
+from evofsm.studies.table import Table as StudyTable
 
 if TYPE_CHECKING:
+    from evofsm.report.chapter import Chapter
     from evofsm.report.losses import InWords
     from evofsm.studies.closed_loop import ClosedLoop
     from evofsm.studies.closed_loop.comparison import Line
@@ -87,7 +88,7 @@ def print_model(out: Console, model: FSMModel, facts: Facts) -> None:
     _print_actions(out, model)
 
 
-def print_claims(out: Console, claims: Sequence[Claim], context: Sequence[paper.Table]) -> None:
+def print_claims(out: Console, claims: Sequence[Claim], context: Sequence[StudyTable]) -> None:
     """Print the paper's claims with a verdict each, and the tables that stand beside them."""
     table = _table("claim", "paper", "measured", "holds")
     table.expand = True
@@ -102,12 +103,12 @@ def print_claims(out: Console, claims: Sequence[Claim], context: Sequence[paper.
         _print_beside(out, beside)
 
 
-def _print_beside(out: Console, beside: paper.Table) -> None:
+def _print_beside(out: Console, beside: StudyTable) -> None:
     """Print a table of a study with its note."""
     rows = _table(*(header.replace(" [", "\n[") for header in beside.header))
     rows.columns[0].justify = "left"
-    for row in beside.rows:
-        rows.add_row(*row)
+    for place, row in enumerate(beside.rows):
+        rows.add_row(*row, style="bold" if place in beside.ours else "")
     _print_titled(out, beside.title, rows)
     out.print(f"{beside.note}\n")
 
@@ -350,6 +351,21 @@ def _print_cells(out: Console, row: Sequence[str], widths: Sequence[int], style:
         for column, (cell, width) in enumerate(zip(row, widths, strict=True))
     )
     out.print(" ".join([first, *others]).rstrip(), style=style, soft_wrap=True)
+
+
+def print_chapter(out: Console, chapter: Chapter) -> None:
+    """Print what a study found, its tables, and where it loses."""
+    out.print(chapter.title, style="bold")
+    out.print(chapter.headline)
+    for sentence in chapter.answer:
+        out.print(sentence)
+    out.print()
+    for one in chapter.tables:
+        _print_beside(out, one)
+    out.print("Where it loses", style="bold")
+    for loss in chapter.losses or ("nowhere in these tables",):
+        out.print(f"  {loss}")
+    out.print()
 
 
 def _print_losses(out: Console, lost: Sequence[InWords]) -> None:

@@ -1,7 +1,7 @@
 """The paper's Section 3: 80 runs of car following, and every claim beside what was measured."""
 
 from evofsm.studies.paper.claims import Claim, check_claims
-from evofsm.studies.paper.context import Table, context_tables
+from evofsm.studies.paper.context import context_tables
 from evofsm.studies.paper.files import write_data
 from evofsm.studies.paper.runs import CASES, Founding, PaperStudy, Run, run_paper
 from evofsm.studies.paper.settings import Settings
@@ -13,7 +13,6 @@ __all__ = [
     "PaperStudy",
     "Run",
     "Settings",
-    "Table",
     "check_claims",
     "context_tables",
     "run_paper",

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -12,17 +10,8 @@ from evofsm.risk.dead_end import is_dead_end
 from evofsm.risk.ttc import time_to_collision
 from evofsm.studies.paper.claims import LARGEST_DIVERGENCE
 from evofsm.studies.paper.runs import CASES, PaperStudy, Run
+from evofsm.studies.table import Table
 from evofsm.worlds.road import UNITS, VARIABLES
-
-
-@dataclass(frozen=True)
-class Table:
-    """Numbers that stand beside the claims, without a verdict."""
-
-    title: str
-    header: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
-    note: str = ""
 
 
 def context_tables(study: PaperStudy) -> tuple[Table, ...]:

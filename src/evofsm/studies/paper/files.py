@@ -12,8 +12,8 @@ import numpy as np
 
 from evofsm._extras import needs
 from evofsm.studies.paper.claims import Claim
-from evofsm.studies.paper.context import Table
 from evofsm.studies.paper.runs import PaperStudy, Run
+from evofsm.studies.table import Table
 
 
 def write_data(

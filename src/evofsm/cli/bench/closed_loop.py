@@ -1,4 +1,4 @@
-"""`evofsm bench`: the studies that hold ours against others."""
+"""`evofsm bench closed-loop`: how many collisions are prevented, and what that costs."""
 
 from __future__ import annotations
 
@@ -20,20 +20,6 @@ from evofsm.cli.common import (
 
 with suppress(ModuleNotFoundError):
     import typer
-
-
-def bench() -> typer.Typer:
-    """The group of commands."""
-    app = typer.Typer(
-        name="bench",
-        help="Studies: ours against the baselines, on held-out scenarios.",
-        no_args_is_help=True,
-        rich_markup_mode=None,
-        pretty_exceptions_enable=False,
-    )
-    app.callback()(lambda: None)
-    app.command(name="closed-loop")(closed_loop)
-    return app
 
 
 @plain_errors

@@ -1,0 +1,16 @@
+"""Numbers in rows, as text: what studies hand to reports."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows under a header; the first column names the row."""
+
+    title: str
+    header: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    note: str = ""
+    ours: tuple[int, ...] = ()  #: rows that are ours, to be set off
