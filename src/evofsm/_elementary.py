@@ -73,21 +73,58 @@ def _work_on_line(
     kept: Any,
     gain: Any,
 ) -> Any:
+    numbers = [types.float64] * 3
+    return (
+        types.void(matrix, types.intp, types.intp, predicted, reached, *numbers),
+        _work_on_rows(matrix, predicted, reached),
+    )
+
+
+@intrinsic
+def _work_on_two_lines(
+    _context: Any,
+    matrix: Any,
+    i: Any,
+    j: Any,
+    predicted: Any,
+    reached: Any,
+    believed: Any,
+    kept: Any,
+    gain: Any,
+    believed_next: Any,
+    kept_next: Any,
+    gain_next: Any,
+) -> Any:
+    numbers = [types.float64] * 6
+    return (
+        types.void(matrix, types.intp, types.intp, predicted, reached, *numbers),
+        _work_on_rows(matrix, predicted, reached),
+    )
+
+
+def _work_on_rows(matrix: Any, predicted: Any, reached: Any) -> Any:
+    """Generate the work on as many rows below one another as there are numbers for."""
+
     def generate(context: Any, builder: Any, _: Any, arguments: Any) -> Any:
         rows, row, column, forecasts, targets, *numbers = arguments
         rows = _arrays.make_array(matrix)(context, builder, rows)
         forecasts = _arrays.make_array(predicted)(context, builder, forecasts)
         targets = _arrays.make_array(reached)(context, builder, targets)
-        begin = builder.add(builder.mul(row, builder.extract_value(rows.shape, 1)), column)
-        in_row, in_forecast = _Line(builder, rows, begin), _Line(builder, forecasts, column)
-        believed_, kept_, gain_ = (_everywhere(builder, number) for number in numbers)
-        old, target = in_row.load(), _Line(builder, targets, column).load()
-        in_forecast.store(_fma_of_lines(builder, believed_, old, in_forecast.load()))
-        in_row.store(_fma_of_lines(builder, gain_, target, builder.fmul(kept_, old)))
+        length = builder.extract_value(rows.shape, 1)
+        begin = builder.add(builder.mul(row, length), column)
+        in_forecast = _Line(builder, forecasts, column)
+        forecast, target = in_forecast.load(), _Line(builder, targets, column).load()
+        for place in range(0, len(numbers), 3):
+            believed, kept, gain = (_everywhere(builder, x) for x in numbers[place : place + 3])
+            in_row = _Line(builder, rows, begin)
+            old = in_row.load()
+            forecast = _fma_of_lines(builder, believed, old, forecast)
+            in_row.store(_fma_of_lines(builder, gain, target, builder.fmul(kept, old)))
+            begin = builder.add(begin, length)
+        in_forecast.store(forecast)
         return context.get_dummy_value()
 
-    numbers = [types.float64] * 3
-    return types.void(matrix, types.intp, types.intp, predicted, reached, *numbers), generate
+    return generate
 
 
 _VECTOR = ir.VectorType(ir.DoubleType(), LINE)
@@ -133,6 +170,8 @@ fma: Callable[[float, float, float], float] = cast(Any, _fused_multiply_add)
 #: ``work_on_line(matrix, i, j, predicted, reached, believed, kept, gain)``, for a line of columns
 #: from j on: ``predicted += believed * row``, then ``row = kept * row + gain * reached``.
 work_on_line: Callable[..., None] = cast(Any, _work_on_line)
+#: The same for two rows, i and the next one, with three numbers for each: a sum is loaded once.
+work_on_two_lines: Callable[..., None] = cast(Any, _work_on_two_lines)
 # What a kernel sees of the others.
 _bits_of: Callable[[float], int] = cast(Any, _bits_of_float)
 _float_of: Callable[[int], float] = cast(Any, _float_of_bits)

@@ -20,7 +20,7 @@ from numba.extending import register_jitable
 from numpy.typing import NDArray
 
 from evofsm._compile import LINE, inner_kernel, lanes, rare_kernel
-from evofsm._elementary import fma, total, work_on_line
+from evofsm._elementary import fma, total, work_on_line, work_on_two_lines
 from evofsm.validation import whole
 
 Policy = Literal["marginal", "hold", "observed"]
@@ -236,23 +236,86 @@ def forecast_and_identify(
     alone. Answers how much of it is missing. ``rates`` and ``lines`` are room to work in.
     """
     _set_rates(transitions, place, n, origin, learning_rate, rates, predicted)
+    if by_lines:
+        n_lines = _lines_above_0(reached, n, lines)
+        for i in range(n):
+            if origin[i] == 0.0:
+                continue
+            if rates[i] < _MOST_BY_SCALE:
+                _by_lines(
+                    transitions, place, i, n, origin, reached, rates, predicted, lines, n_lines
+                )
+            else:
+                _whole_row(transitions, place, i, n, origin, reached, rates, predicted)
+        return max(1.0 - total(predicted, lanes(n)), 0.0)
+    for i in range(0, n - 1, 2):
+        _two_rows(transitions, place, i, n, origin, reached, rates, predicted)
+    if n % 2 == 1:
+        _whole_row(transitions, place, n - 1, n, origin, reached, rates, predicted)
+    return 0.0
+
+
+@inner_kernel
+def _whole_row(
+    transitions: Transitions,
+    place: int,
+    i: int,
+    n: int,
+    origin: NDArray[np.float64],
+    reached: NDArray[np.float64],
+    rates: NDArray[np.float64],
+    predicted: NDArray[np.float64],
+) -> None:
+    matrix, scale = transitions.matrices[place], transitions.scales[place, i]
+    transitions.scales[place, i] = 1.0
+    believed, kept = origin[i] * scale, (1.0 - rates[i]) * scale
+    for j in range(0, n, LINE):
+        work_on_line(matrix, i, j, predicted, reached, believed, kept, rates[i])
+
+
+@inner_kernel
+def _two_rows(
+    transitions: Transitions,
+    place: int,
+    i: int,
+    n: int,
+    origin: NDArray[np.float64],
+    reached: NDArray[np.float64],
+    rates: NDArray[np.float64],
+    predicted: NDArray[np.float64],
+) -> None:
+    """`_whole_row` for i and the next one, in a fifth less time."""
     matrix, scales = transitions.matrices[place], transitions.scales[place]
-    n_lines = _lines_above_0(reached, n, lines) if by_lines else 0
-    for i in range(n):
-        rate = rates[i]
-        if origin[i] == 0.0:
-            continue
-        if by_lines and rate < _MOST_BY_SCALE:
-            fade_row(transitions, place, i, n, 1.0 - rate)
-            believed, gain = origin[i] * scales[i] / (1.0 - rate), rate / scales[i]
-            for k in range(n_lines):
-                work_on_line(matrix, i, int(lines[k]), predicted, reached, believed, 1.0, gain)
-        else:
-            believed, kept = origin[i] * scales[i], (1.0 - rate) * scales[i]
-            scales[i] = 1.0
-            for j in range(0, n, LINE):
-                work_on_line(matrix, i, j, predicted, reached, believed, kept, rate)
-    return max(1.0 - total(predicted, lanes(n)), 0.0) if by_lines else 0.0
+    gain, believed, kept = rates[i], origin[i] * scales[i], (1.0 - rates[i]) * scales[i]
+    k = i + 1
+    gain_k, believed_k, kept_k = rates[k], origin[k] * scales[k], (1.0 - rates[k]) * scales[k]
+    scales[i] = scales[k] = 1.0
+    for j in range(0, n, LINE):
+        work_on_two_lines(
+            matrix, i, j, predicted, reached, believed, kept, gain, believed_k, kept_k, gain_k
+        )
+
+
+@inner_kernel
+def _by_lines(
+    transitions: Transitions,
+    place: int,
+    i: int,
+    n: int,
+    origin: NDArray[np.float64],
+    reached: NDArray[np.float64],
+    rates: NDArray[np.float64],
+    predicted: NDArray[np.float64],
+    lines: NDArray[np.float64],
+    n_lines: int,
+) -> None:
+    """A row of which only some lines are touched."""
+    matrix, rate = transitions.matrices[place], rates[i]
+    fade_row(transitions, place, i, n, 1.0 - rate)
+    scale = transitions.scales[place, i]
+    believed, gain = origin[i] * scale / (1.0 - rate), rate / scale
+    for k in range(n_lines):
+        work_on_line(matrix, i, int(lines[k]), predicted, reached, believed, 1.0, gain)
 
 
 @inner_kernel
