@@ -383,7 +383,7 @@ def test_dangerous_and_never_seen_are_told_apart(taught):
 
 def test_frozen_it_still_knows_what_was_commanded_last():
     risk = LatentRisk.told(-4.0, 4.0, 8.0)
-    risk.brakes.lagged = [0.8, 1.0]
+    risk.brakes.set_lagged(0.8, 1.0)
     here, chances = situation(30.0, 20.0, 20.0), []
     for command in (-4.0, 2.0):
         risk.follow([30.0, 20.0, 20.0], command)

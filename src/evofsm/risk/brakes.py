@@ -118,14 +118,14 @@ class OwnBrakes:
         self.known = False
         #: Full braking that can be counted on [m/s²], positive; and as it most likely is.
         self.decel = self._likely = max(assumed, _WEAKEST) * -lowest
-        self.lagged = [0.0, 0.0]  # sums of products and of squares: the lag by least squares
+        self.set_lagged(0.0, 0.0)
         self.clear()
 
-    @property
-    def lag(self) -> float:
-        """Share of an interval in which the command before still rules, in [0, 1]."""
-        products, squares = self.lagged
-        return float(min(max(products / squares, 0.0), 1.0)) if squares > 0.0 else 0.0
+    def set_lagged(self, products: float, squares: float) -> None:
+        """Tell the lag by least squares, from sums of products and of squares."""
+        self.lagged = products, squares
+        #: Share of an interval in which the command before still rules, in [0, 1].
+        self.lag = min(max(products / squares, 0.0), 1.0) if squares > 0.0 else 0.0
 
     def trust(self, decel: float) -> None:
         """Take full braking as known [m/s²], positive."""
@@ -180,8 +180,9 @@ class OwnBrakes:
     def _learn(self, realised: float, estimated: float, now: float) -> None:
         if self.known and len(self._commands) >= 2:
             last, asked = (max(command, -self._likely) for command in self._commands[-2:])
-            self.lagged[0] += (estimated - asked) * (last - asked)
-            self.lagged[1] += (last - asked) ** 2
+            products, squares = self.lagged
+            change = last - asked
+            self.set_lagged(products + (estimated - asked) * change, squares + change * change)
         # However late commands take effect, it was one of the latest three that ruled.
         ruled = max(self._commands) if len(self._commands) == 3 else 0.0
         self._learn_full(max(ruled, now), realised)
@@ -216,8 +217,8 @@ class OwnBrakes:
         """Without noise the latest few tell; in noise it takes more."""
         if len(self._shortfalls) < _FEWEST:
             return False
-        bounds = (self._shortfalls.mean_and_bound(_SURE, few)[1] for few in (_FEWEST, None))
-        return any(bound > _SHORTFALL for bound in bounds)
+        _, of_few = self._shortfalls.mean_and_bound(_SURE, _FEWEST)
+        return of_few > _SHORTFALL or self._shortfalls.mean_and_bound(_SURE)[1] > _SHORTFALL
 
 
 @compiled

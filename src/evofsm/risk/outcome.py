@@ -402,7 +402,7 @@ class LatentRisk:
             samples = zip(arrays["brakes"].tolist(), arrays["stretches"].tolist(), strict=True)
             risk.brakes.remember(Sample(decel, bool(begins)) for decel, begins in samples)
             risk.perception.restore(arrays)
-            risk.brakes.lagged = arrays["lagged"].tolist()
+            risk.brakes.set_lagged(*arrays["lagged"].tolist())
             risk._by_state = np.array(by_state)
         return risk
 
@@ -446,14 +446,15 @@ def _finite(name: str, values: ArrayLike) -> NDArray[np.float64]:
 
 
 def _series(name: str, values: ArrayLike) -> NDArray[np.float64]:
-    """A new series of real numbers; what is one already is not looked at for long."""
+    """Real numbers in a row; what is that already is not looked at for long, nor copied."""
     if (
         type(values) is np.ndarray
         and values.dtype == np.float64
         and values.ndim == 1
         and len(values)
+        and values.flags.carray  # a read-only one would be compiled for
     ):
-        return values.copy()
+        return values
     return real_array(name, values, 1)
 
 
