@@ -6,22 +6,20 @@ can from now on, and still collide. Every decision of unrevised held-out runs is
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm._extras import needs
 from evofsm.framework.reviser import Mode, Unrevised
 from evofsm.protocols import RiskMeasure
 from evofsm.risk.dead_end import is_dead_end
 from evofsm.risk.rss import ResponsibilitySensitiveSafety
 from evofsm.studies.closed_loop.learner import Learner, drive_alone, held_out, training
 from evofsm.studies.closed_loop.policies import FIXED_MEASURES, Group
+from evofsm.studies.scores import auroc, bootstrap
 from evofsm.worlds.families import Family
-
-with needs("scipy", "study", "the area under a ROC curve"):
-    from scipy.stats import rankdata
 
 
 class Separation(NamedTuple):
@@ -59,41 +57,16 @@ def run_separation(family: Family, train: int, test: int, seed: int = 0) -> dict
     separations = []
     for (name, group), measure in measures.items():
         scores = [measure.score(rows, family.interval) for rows in seen]
-        low, high = _bootstrap(scores, truth)
+        low, high = bootstrap(partial(_over, scores, truth), test)
         area = auroc(np.concatenate(scores), np.concatenate(truth))
         separations.append(Separation(family.name, name, group, area, low, high, share, test))
     return {"separations": separations}
 
 
-def auroc(score: NDArray[np.float64], truth: NDArray[np.bool_]) -> float:
-    """Probability that a positive case scores above a negative one, ties counting half.
-
-    Examples
-    --------
-    >>> auroc(np.array([0.1, 0.4, 0.4, 0.8]), np.array([False, False, True, True]))
-    0.875
-    """
-    positive = int(truth.sum())
-    negative = len(truth) - positive
-    if positive == 0 or negative == 0:
-        return float("nan")
-    above = rankdata(score)[truth].sum() - positive * (positive + 1) / 2
-    return float(above / (positive * negative))
-
-
-def _bootstrap(
-    scores: list[NDArray[np.float64]], truth: list[NDArray[np.bool_]], rounds: int = 200
-) -> tuple[float, float]:
-    """95 % interval, by resampling episodes."""
-    rng = np.random.default_rng(0)
-    areas = []
-    for _ in range(rounds):
-        chosen = rng.integers(len(scores), size=len(scores))
-        areas.append(
-            auroc(
-                np.concatenate([scores[i] for i in chosen]),
-                np.concatenate([truth[i] for i in chosen]),
-            )
-        )
-    low, high = np.nanquantile(areas, [0.025, 0.975])
-    return float(low), float(high)
+def _over(
+    scores: list[NDArray[np.float64]], truth: list[NDArray[np.bool_]], chosen: NDArray[np.intp]
+) -> float:
+    """Area over some episodes."""
+    return auroc(
+        np.concatenate([scores[i] for i in chosen]), np.concatenate([truth[i] for i in chosen])
+    )
