@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -70,8 +70,13 @@ class PaperStudy:
 
     @property
     def last_round(self) -> tuple[Run, ...]:
-        """The last run of each case."""
-        return self.runs[-len(CASES) :]
+        """The last run of each case, in the order of the cases."""
+        return tuple(sorted(self.runs[-len(CASES) :], key=lambda run: run.case))
+
+
+def as_it_is(number: int, episode: Episode) -> NDArray[np.float64]:
+    """What the paper's machine observes of a run: what truly happened."""
+    return episode.observations
 
 
 def run_paper(
@@ -80,6 +85,10 @@ def run_paper(
     settings: Settings,
     rounds: int = 20,
     progress: Callable[[int, int], None] = lambda done, total: None,
+    *,
+    order: Sequence[int] = CASES,
+    observe: Callable[[int, Episode], NDArray[np.float64]] = as_it_is,
+    beliefs: bool = True,
 ) -> PaperStudy:
     """Drive and learn all runs.
 
@@ -95,24 +104,36 @@ def run_paper(
         How often the four cases are driven.
     progress : callable
         Told how many runs are done, of how many.
+    order : sequence of int
+        In which the cases are driven in each round.
+    observe : callable
+        What the machine observes of a run, (T, 3): told how many runs came before, and the run.
+    beliefs : bool
+        Whether to keep every belief. The claims do without, and with hundreds of states they take
+        gigabytes; `Run.belief` then has no columns, and `Run.first_surprise` is NaN.
     """
     if rounds < 1:
         raise ValueError(f"rounds is {rounds}; the cases must be driven at least once")
+    if sorted(order) != list(CASES):
+        raise ValueError(f"order is {list(order)}; it must hold each of the cases once")
     machine = EvolvingFSM(settings.actions.n_actions, **settings.machine)
     longer = replace(settings.scenario, duration=settings.safe_until)
     total = rounds * len(CASES) + len(settings.brake_at) + 2
     runs: list[Run] = []
     for round_ in range(1, rounds + 1):
-        for case in CASES:
+        for case in order:
             episode = world.run(settings.scenario, settings.drivers[case])
-            runs.append(_learn(machine, settings, f"case {case}", case, round_, episode))
+            seen = observe(len(runs), episode)
+            name_ = f"case {case}"
+            runs.append(_learn(machine, settings, name_, case, round_, episode, seen, beliefs))
             progress(len(runs), total)
-    extra_runs = []
+    extra_runs: list[Run] = []
     for time in settings.brake_at:
         leader = replace(settings.scenario.leader, brake_time=time)
         episode = world.run(replace(settings.scenario, leader=leader), settings.drivers[1])
         name_ = f"brake at {time:g} s"
-        extra_runs.append(_learn(machine.copy(), settings, name_, 1, 0, episode))
+        seen = observe(len(runs) + len(extra_runs), episode)
+        extra_runs.append(_learn(machine.copy(), settings, name_, 1, 0, episode, seen, beliefs))
         progress(len(runs) + len(extra_runs), total)
     safe = {case: not world.run(longer, settings.drivers[case]).collided for case in (2, 3)}
     progress(total, total)
@@ -120,7 +141,7 @@ def run_paper(
     return PaperStudy(
         world=name,
         settings=settings,
-        runs=tuple(replace(run, belief=widen(run.belief, machine.n_states)) for run in runs),
+        runs=tuple(_widened(run, machine.n_states) for run in runs) if beliefs else tuple(runs),
         extra_runs=tuple(extra_runs),
         safe_at_the_end=safe,
         model=machine.model(
@@ -130,17 +151,29 @@ def run_paper(
     )
 
 
+def _widened(run: Run, n: int) -> Run:
+    """The same run with beliefs over all the states there are in the end."""
+    return replace(run, belief=widen(run.belief, n))
+
+
 def _learn(
-    machine: EvolvingFSM, settings: Settings, name: str, case: int, round_: int, episode: Episode
+    machine: EvolvingFSM,
+    settings: Settings,
+    name: str,
+    case: int,
+    round_: int,
+    episode: Episode,
+    seen: NDArray[np.float64],
+    beliefs: bool,
 ) -> Run:
     """Show a run to the machine, row by row."""
-    n = machine.n_states
-    foreseen = np.full(n, 1.0 / max(n, 1)) @ machine.marginal_matrix
+    foreseen = _first_forecast(machine) if beliefs else np.empty(0)
     action = settings.actions.encode(episode.accelerations)
-    trace = machine.learn_many(episode.observations, action, episode_starts=[0], belief=True)
-    assert trace.belief is not None
-    foreseen = widen(foreseen, machine.n_states)
-    first = float(jensen_shannon(foreseen, trace.belief[0])) if n else float("nan")
+    trace = machine.learn_many(seen, action, episode_starts=[0], belief=beliefs)
+    belief = np.empty((len(action), 0)) if trace.belief is None else trace.belief
+    first = float("nan")
+    if len(foreseen):
+        first = float(jensen_shannon(widen(foreseen, machine.n_states), belief[0]))
     return Run(
         name=name,
         case=case,
@@ -149,7 +182,13 @@ def _learn(
         action=action,
         state=trace.state,
         n_states=trace.n_states,
-        belief=trace.belief,
+        belief=belief,
         surprise=trace.surprise,
         first_surprise=first,
     )
+
+
+def _first_forecast(machine: EvolvingFSM) -> NDArray[np.float64]:
+    """Of a run's first row: the uniform belief through the marginal matrix; (n,)."""
+    n = machine.n_states
+    return np.full(n, 1.0 / max(n, 1)) @ machine.marginal_matrix

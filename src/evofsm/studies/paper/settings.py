@@ -38,13 +38,38 @@ class Settings:
             If the file is not TOML, or holds a name or a kind of value that the study does not
             know.
         """
+        if path is None:
+            return cls.with_changes({})
+        try:
+            changes = tomllib.loads(path.read_text("utf-8"))
+        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+            raise ValueError(f"{path} is not TOML: {error}") from error
+        return cls.with_changes(changes, str(path))
+
+    @classmethod
+    def with_changes(cls, changes: Mapping[str, Any], where: str = "changes") -> Settings:
+        """The paper's settings with others in the place of some.
+
+        Parameters
+        ----------
+        changes : mapping
+            Tables of ``settings.toml``, with what is changed in them.
+        where : str
+            What they are called in error messages.
+
+        Raises
+        ------
+        ValueError
+            If there is a name or a kind of value that the study does not know.
+
+        Examples
+        --------
+        >>> settings = Settings.with_changes({"leader": {"brake_decel": 6.0}})
+        >>> settings.scenario.leader.brake_decel, settings.scenario.initial_gap
+        (6.0, 5.0)
+        """
         tables = tomllib.loads(files(__package__).joinpath("settings.toml").read_text("utf-8"))
-        if path is not None:
-            try:
-                changes = tomllib.loads(path.read_text("utf-8"))
-            except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-                raise ValueError(f"{path} is not TOML: {error}") from error
-            _merge(tables, changes, str(path))
+        _merge(tables, changes, where)
         scenario, leader, cases = tables["scenario"], tables["leader"], tables["cases"]
         safe_until = scenario.pop("safe_until")
         brake = {name: leader.pop(name) for name in ("brake_speed", "brake_decel")}
