@@ -1,0 +1,67 @@
+"""`evofsm bench real`: what was learnt on some real drives, judged on others."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from evofsm.cli.bench.common import Progress, finish
+from evofsm.cli.common import counter, plain_errors, progress, require
+
+if TYPE_CHECKING:
+    from evofsm.report.chapter import Chapter
+
+with suppress(ModuleNotFoundError):
+    import typer
+
+
+@plain_errors
+def real(
+    data: Annotated[
+        Path,
+        typer.Option(
+            help="Folder of runs, a CSV file each (gzipped or not): pair, segment, time, gap, "
+            "v_follower, v_leader, a_follower. See docs/real-data.md.",
+            show_default=False,
+        ),
+    ],
+    folds: Annotated[
+        int, typer.Option(min=2, help="Each run is judged by what the other folds taught.")
+    ] = 5,
+    seed: Annotated[int, typer.Option(min=0, help="Of the folds and the intervals.")] = 0,
+    workers: Annotated[
+        int | None, typer.Option(min=1, help="Processes. [default: one per core]")
+    ] = None,
+    short: Annotated[bool, typer.Option("--short", help="Ten runs: a look, not evidence.")] = False,
+    out: Annotated[
+        Path, typer.Option(help="Folder for the page, its figures and the data.")
+    ] = Path("evofsm-real"),
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print the rows of the table as JSON; write nothing.")
+    ] = False,
+) -> None:
+    """Whether what was learnt on some real drives foretells danger in others.
+
+    Events are a time to collision below 3, 2 and 1.5 s, and braking harder than 3 m/s², within 1,
+    2 and 5 s. Ours learns on the runs of all folds but one, and is judged on that one, beside
+    the classic measures. Checksums in MANIFEST.csv or SHA256SUMS are held against the files.
+    """
+    require(scipy="study")
+    if not as_json:
+        require(matplotlib="plot", jinja2="plot")
+    from evofsm.studies.real import Plan, read_folder, run_real
+
+    plan = Plan(folds=folds, seed=seed)
+    if short:
+        plan = plan.shortened()
+    cases, verified = read_folder(data, plan)
+    with progress() as bars:
+        study = run_real(cases, plan, verified, counter(bars, "Learning and judging"), workers)
+
+    def make_chapter(folder: Path, command: str, drawn: Progress) -> Chapter:
+        from evofsm.report.real import real_chapter
+
+        return real_chapter(study, folder, command, drawn)
+
+    finish(study.as_rows(), make_chapter, out, as_json=as_json, packages=("scipy",))

@@ -1,0 +1,109 @@
+"""Columns of a CSV file by name or by place, missing values as NaN."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evofsm.io.files import damage_explained, open_unpacked
+
+_ROWS_AT_ONCE = 8192
+#: How layouts write that a value is missing.
+MISSING = frozenset({"", ".", "nan", "na", "null"})
+
+
+def name_of(path: Path) -> str:
+    """Name of a recording: the file's, without its endings.
+
+    Examples
+    --------
+    >>> name_of(Path("data/run_7.csv.gz"))
+    'run_7'
+    """
+    return path.name.removesuffix(".gz").rsplit(".", 1)[0]
+
+
+def header_and_rows(path: Path) -> Iterator[list[str]]:
+    """Rows of a CSV file, gzipped or not, as texts; the header is the first of them."""
+    with open_unpacked(str(path)) as file:
+        rows = csv.reader(io.TextIOWrapper(file, "utf-8-sig", newline=""), skipinitialspace=True)
+        with damage_explained(str(path), lambda: rows.line_num):
+            yield from rows
+
+
+def places(path: Path, header: Sequence[str], names: Sequence[Sequence[str]]) -> list[int]:
+    """Where columns stand, each under one of several names; upper and lower case are alike.
+
+    Raises
+    ------
+    ValueError
+        Naming the file and the column that is not there.
+    """
+    known = {name.strip().lower(): place for place, name in enumerate(header)}
+    found = []
+    for options in names:
+        place = next((known[name.lower()] for name in options if name.lower() in known), None)
+        if place is None:
+            raise ValueError(
+                f"{path} has no column {options[0]!r}; it has {', '.join(header[:12])} "
+                "(a file of another layout?)"
+            )
+        found.append(place)
+    return found
+
+
+def numbers(
+    path: Path, rows: Iterator[list[str]], columns: Sequence[int], first_line: int = 2
+) -> NDArray[np.float64]:
+    """The named columns of the rows that are left, one row each; NaN where a value is missing.
+
+    Parameters
+    ----------
+    path : Path
+        For messages.
+    rows : iterator of list of str
+    columns : sequence of int
+        Their places.
+    first_line : int
+        Line of the first of the rows, for messages.
+
+    Returns
+    -------
+    (rows, columns) ndarray
+
+    Raises
+    ------
+    ValueError
+        Naming file, line and column of what is no number.
+    """
+    parts: list[NDArray[np.float64]] = []
+    block: list[list[float]] = []
+    for line, row in enumerate(rows, first_line):
+        if not row:
+            continue
+        block.append([_number(path, line, row, place) for place in columns])
+        if len(block) == _ROWS_AT_ONCE:
+            parts.append(np.array(block))
+            block = []
+    if block:
+        parts.append(np.array(block))
+    if not parts:
+        raise ValueError(f"{path} has a header but no rows")
+    return np.concatenate(parts)
+
+
+def _number(path: Path, line: int, row: list[str], place: int) -> float:
+    text = row[place].strip() if place < len(row) else ""
+    try:
+        return float(text)
+    except ValueError:
+        if text.lower() in MISSING:
+            return np.nan
+        raise ValueError(
+            f"{path}, line {line}, column {place + 1}: {text!r} is no number"
+        ) from None

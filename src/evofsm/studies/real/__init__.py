@@ -1,0 +1,25 @@
+"""Real data: whether risk that was learnt on some runs foretells what came in others."""
+
+from evofsm.studies.real.moments import Kind, Moment
+from evofsm.studies.real.study import (
+    FEWEST_EVENTS,
+    Plan,
+    RealStudy,
+    Row,
+    read_folder,
+    run_real,
+)
+from evofsm.studies.real.targets import TARGETS, Target
+
+__all__ = [
+    "FEWEST_EVENTS",
+    "TARGETS",
+    "Kind",
+    "Moment",
+    "Plan",
+    "RealStudy",
+    "Row",
+    "Target",
+    "read_folder",
+    "run_real",
+]
