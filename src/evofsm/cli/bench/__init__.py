@@ -5,6 +5,10 @@ from __future__ import annotations
 from contextlib import suppress
 
 from evofsm.cli.bench.closed_loop import closed_loop
+from evofsm.cli.bench.detection import detection
+from evofsm.cli.bench.prediction import prediction
+from evofsm.cli.bench.real import real
+from evofsm.cli.bench.sensitivity import sensitivity
 
 with suppress(ModuleNotFoundError):
     import typer
@@ -21,4 +25,8 @@ def bench() -> typer.Typer:
     )
     app.callback()(lambda: None)
     app.command(name="closed-loop")(closed_loop)
+    app.command(name="detection")(detection)
+    app.command(name="prediction")(prediction)
+    app.command(name="sensitivity")(sensitivity)
+    app.command(name="real")(real)
     return app
