@@ -10,7 +10,7 @@ import os
 import signal
 import sys
 from collections import Counter
-from collections.abc import Callable, Generator, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import (
     FIRST_COMPLETED,
     BrokenExecutor,
@@ -20,7 +20,8 @@ from concurrent.futures import (
     ProcessPoolExecutor,
     wait,
 )
-from contextlib import AbstractContextManager, contextmanager, suppress
+from contextlib import AbstractContextManager, closing, contextmanager, suppress
+from functools import partial
 from importlib import import_module
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
@@ -114,6 +115,39 @@ def as_they_come(
                         waiting.suspects.discard(index)
                 if results:
                     yield results
+
+
+def in_order(
+    tasks: Sequence[partial[R]],
+    workers: int | None = None,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> list[R]:
+    """Results of all tasks, in the order of the tasks.
+
+    Parameters
+    ----------
+    tasks : sequence of functools.partial
+    workers : int, optional
+        Processes of this computer, one per core if not told; with 1 the tasks are run in this
+        very process.
+    progress : callable
+        Told how many are done, of how many.
+
+    Examples
+    --------
+    >>> from functools import partial
+    >>> in_order([partial(pow, x, 2) for x in range(4)], workers=1)
+    [0, 1, 4, 9]
+    """
+    workers = workers or os.cpu_count() or 1
+    named = (Task(f"{task.func.__name__}, task {k}", task) for k, task in enumerate(tasks))
+    open_executor = partial(Processes, workers) if workers > 1 else Here
+    found: dict[int, R] = {}
+    with closing(as_they_come(named, open_executor, 2 * workers)) as arriving:
+        for results in arriving:
+            found |= results
+            progress(len(found), len(tasks))
+    return [found[k] for k in range(len(tasks))]
 
 
 class _Waiting(Generic[R]):

@@ -40,7 +40,7 @@ def prediction(
     ] = False,
 ) -> None:
     """How well the state 0.01 to 5 s ahead is forecast, against persistence and a batch fit."""
-    require(scipy="study", deeptime="study")
+    require(scipy="study", deeptime="dev")
     if not as_json:
         require(matplotlib="plot", jinja2="plot")
     from evofsm.studies.prediction import Plan, log_sources, run_prediction

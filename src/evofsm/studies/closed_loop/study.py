@@ -7,9 +7,7 @@ policy and learning seed over the cores, and put together in the order of the ta
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterable, Sequence
-from contextlib import closing
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from importlib.util import find_spec
@@ -18,7 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from evofsm.fleet.executors import Here, Processes, Task, as_they_come
+from evofsm.fleet.executors import in_order
 from evofsm.framework.reviser import EnvelopeReviser
 from evofsm.protocols import Reviser
 from evofsm.risk.outcome import LatentRisk
@@ -180,7 +178,7 @@ def run_closed_loop(
         shift = replace(plan.shift, seed=plan.seed, tolerance=plan.tolerance)
         tasks += [partial(run_shift, family, shift, seed) for seed in range(plan.seeds)]
     study = ClosedLoop(family, plan, [])
-    for result in _run(tasks, workers or os.cpu_count() or 1, progress):
+    for result in in_order(tasks, workers, progress):
         for name, values in result.items():
             getattr(study, name).extend(values)
     return study
@@ -194,20 +192,6 @@ def _plain(record: Any) -> dict[str, Any]:
         else value
         for name, value in record._asdict().items()
     }
-
-
-def _run(
-    tasks: Sequence[partial[Any]], workers: int, progress: Callable[[int, int], None]
-) -> list[Any]:
-    """Results in the order of the tasks."""
-    named = (Task(f"{task.func.__name__}, task {k}", task) for k, task in enumerate(tasks))
-    open_executor = partial(Processes, workers) if workers > 1 else Here
-    found: dict[int, Any] = {}
-    with closing(as_they_come(named, open_executor, 2 * workers)) as arriving:
-        for results in arriving:
-            found |= results
-            progress(len(found), len(tasks))
-    return [found[k] for k in range(len(tasks))]
 
 
 def _drive_all(

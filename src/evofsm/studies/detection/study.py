@@ -7,15 +7,13 @@ and learning seed over the cores, and put together in the order of the tasks.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Sequence
-from contextlib import closing
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import islice, product
 from typing import Any, NamedTuple
 
-from evofsm.fleet.executors import Here, Processes, Task, as_they_come
+from evofsm.fleet.executors import in_order
 from evofsm.risk.rss import ResponsibilitySensitiveSafety
 from evofsm.studies.closed_loop.policies import Group
 from evofsm.studies.detection.measures import (
@@ -112,7 +110,7 @@ def run_detection(
             partial(_judge_cell, decel, leader_decel, chosen)
             for decel, leader_decel in product(chosen.grid, chosen.grid_leader)
         ]
-    found = _run(tasks, workers or os.cpu_count() or 1, progress)
+    found = in_order(tasks, workers, progress)
     by_name = dict(zip(longest, found, strict=False))
     judged = [one for name in families for one in by_name[name]]
     areas = [area for result in found if isinstance(result, _Areas) for area in result.areas]
@@ -140,20 +138,6 @@ class _Areas(NamedTuple):
 
 class _Cell(NamedTuple):
     rows: list[Row]
-
-
-def _run(
-    tasks: Sequence[partial[Any]], workers: int, progress: Callable[[int, int], None]
-) -> list[Any]:
-    """Results in the order of the tasks."""
-    named = (Task(f"{task.func.__name__}{task.args[:1]}", task) for task in tasks)
-    open_executor = partial(Processes, workers) if workers > 1 else Here
-    found: dict[int, Any] = {}
-    with closing(as_they_come(named, open_executor, 2 * workers)) as arriving:
-        for results in arriving:
-            found |= results
-            progress(len(found), len(tasks))
-    return [found[k] for k in range(len(tasks))]
 
 
 def _judge_world(name: str, plan: Plan) -> list[Judged]:

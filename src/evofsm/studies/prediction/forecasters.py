@@ -167,7 +167,7 @@ def batch(taught: Taught, lags: Sequence[int]) -> list[Forecaster]:
     Its rows are those of its counts, sliding over all training rows; a state that is never left,
     nor seen again after that time, stays as it is.
     """
-    with needs("deeptime", "study", "the batch-fitted Markov model"):
+    with needs("deeptime", "dev", "the batch-fitted Markov model"):
         from deeptime.markov import TransitionCountEstimator
     n = taught.model.n_states
     paths = [beliefs.argmax(axis=1) for beliefs in taught.beliefs()]

@@ -8,15 +8,13 @@ ones. Logs are split by run into parts, and each part is held out once.
 
 from __future__ import annotations
 
-import os
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from typing import Any, NamedTuple
 
-from evofsm.fleet.executors import Here, Processes, Task, as_they_come
+from evofsm.fleet.executors import in_order
 from evofsm.studies.prediction.forecasters import (
     REFERENCES,
     Method,
@@ -156,7 +154,7 @@ def run_prediction(
         ablated += [partial(_ablated_logs, plan, one) for one in few]
     # The longest first, so that no core is left waiting for them at the end.
     tasks = [*real, *ablated, *driven]
-    found = _run_all(tasks, workers or os.cpu_count() or 1, progress)
+    found = in_order(tasks, workers, progress)
     of_ablation = found[len(real) : len(real) + len(ablated)]
     of_rows = found[len(real) + len(ablated) :] + found[: len(real)]
     return Prediction(plan, list(_rows(plan, of_rows)), list(_rows(plan, of_ablation)), logs)
@@ -186,22 +184,6 @@ def _rows(plan: Plan, found: Sequence[Sequence[_Scored]]) -> Iterator[Row]:
             plan.seed,
             plan.rounds,
         )
-
-
-def _run_all(
-    tasks: Sequence[partial[list[_Scored]]],
-    workers: int,
-    progress: Callable[[int, int], None],
-) -> list[list[_Scored]]:
-    """Results in the order of the tasks."""
-    named = (Task(f"{task.func.__name__}, task {k}", task) for k, task in enumerate(tasks))
-    open_executor = partial(Processes, workers) if workers > 1 else Here
-    found: dict[int, list[_Scored]] = {}
-    with closing(as_they_come(named, open_executor, 2 * workers)) as arriving:
-        for results in arriving:
-            found |= results
-            progress(len(found), len(tasks))
-    return [found[k] for k in range(len(tasks))]
 
 
 # -- Tasks ----------------------------------------------------------------------------------------

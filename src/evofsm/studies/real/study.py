@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterable, Sequence
-from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -13,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.fleet.executors import Here, Processes, Task, as_they_come
+from evofsm.fleet.executors import in_order
 from evofsm.io.datasets import Layout, find_checksums, read_episodes
 from evofsm.studies.real.cases import INTERVAL, QUESTIONS, Case, Question, case_of
 from evofsm.studies.real.measures import (
@@ -206,7 +204,7 @@ def run_real(
     }
     states: dict[str, list[int]] = {}
     shares: list[StateShare] = []
-    results = _run([task for _, task in tasks], workers or os.cpu_count() or 1, progress)
+    results = in_order([task for _, task in tasks], workers, progress)
     for (fold, _), learnt in zip(tasks, results, strict=True):
         places = [k for k, case in enumerate(cases) if folds[case.run] == fold]
         for name, found in learnt.scores.items():
@@ -258,20 +256,6 @@ def _parted(
     """Those to learn from, and those to judge."""
     held_out = [case for case in cases if folds[case.run] == fold]
     return [case for case in cases if folds[case.run] != fold], held_out
-
-
-def _run(
-    tasks: Sequence[Callable[[], Learnt]], workers: int, progress: Callable[[int, int], None]
-) -> list[Learnt]:
-    """Results in the order of the tasks."""
-    named = (Task(f"fold {k // len(_LEARNERS) + 1}, learner {k}", t) for k, t in enumerate(tasks))
-    open_executor = partial(Processes, workers) if workers > 1 else Here
-    found: dict[int, Learnt] = {}
-    with closing(as_they_come(named, open_executor, 2 * workers)) as arriving:
-        for results in arriving:
-            found |= results
-            progress(len(found), len(tasks))
-    return [found[k] for k in range(len(tasks))]
 
 
 def _rows(

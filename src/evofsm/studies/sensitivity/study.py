@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, NamedTuple
 
-from evofsm.fleet.executors import Here, Processes, Task, as_they_come
+from evofsm.fleet.executors import in_order
 from evofsm.studies.paper import Claim, check_claims
 from evofsm.studies.sensitivity.designs import Design, Trial, filling, maps, sweeps
 from evofsm.studies.sensitivity.parameters import PARAMETERS, Parameter
@@ -119,23 +117,22 @@ def run_sensitivity(
     Sensitivity
         Rows in the order of the designs.
     """
-    processes = workers or os.cpu_count() or 1
     trials = list(_trials(plan))
     searched = [one for one in PARAMETERS if one.is_number]
     total = len(trials) + 2 * plan.halvings * len(searched)
 
     chunks = [trials[at : at + _TOGETHER] for at in range(0, len(trials), _TOGETHER)]
-    found = _in_order(
+    found = in_order(
         [partial(_try_all, chunk, plan.rounds) for chunk in chunks],
-        processes,
-        lambda done: progress(min(done * _TOGETHER, len(trials)), total),
+        workers,
+        lambda done, _: progress(min(done * _TOGETHER, len(trials)), total),
     )
     rows: list[Row] = [row for chunk in found for row in chunk]
     by_sweep = {one.name: _sweep(rows, one) for one in searched}
-    edges = _in_order(
+    edges = in_order(
         [partial(_reach, one, by_sweep[one.name], plan) for one in searched],
-        processes,
-        lambda done: progress(len(trials) + done * 2 * plan.halvings, total),
+        workers,
+        lambda done, _: progress(len(trials) + done * 2 * plan.halvings, total),
     )
     for _, more in edges:
         rows += more
@@ -209,17 +206,3 @@ def _value(one: Parameter, row: Row) -> float:
 
 def _broken(row: Row) -> tuple[str, ...]:
     return tuple(claim for claim, holds in row.verdicts.items() if not holds)
-
-
-def _in_order(
-    tasks: Sequence[partial[Any]], workers: int, progress: Callable[[int], None]
-) -> list[Any]:
-    """Results in the order of the tasks."""
-    named = (Task(f"{task.func.__name__}, task {k}", task) for k, task in enumerate(tasks))
-    open_executor = partial(Processes, workers) if workers > 1 else Here
-    found: dict[int, Any] = {}
-    with closing(as_they_come(named, open_executor, 2 * workers)) as arriving:
-        for results in arriving:
-            found |= results
-            progress(len(found))
-    return [found[k] for k in range(len(tasks))]
