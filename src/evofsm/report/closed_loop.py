@@ -86,7 +86,7 @@ def write_closed_loop(
     out.mkdir(parents=True, exist_ok=True)
     text = json.dumps(without_nan(study.as_dict()), allow_nan=False, indent=1)
     (out / "closed-loop.json").write_text(f"{text}\n", encoding="utf-8")
-    drawings = draw_all(_sketches(study), out, progress)
+    drawings = draw_all(closed_loop_sketches(study), out, progress)
     figures = {
         drawing.name: (drawing, inline(drawing.paths["svg"]), place)
         for place, drawing in enumerate(drawings, 1)
@@ -161,6 +161,23 @@ def _shown(line: Line, study: ClosedLoop) -> _Shown:
     return _Shown(name, f"{line.which} {of_seeds} {line.seeds}", True, cells)
 
 
+def policy_table(study: ClosedLoop) -> Table:
+    """All policies, as a plain table."""
+    lines = [_shown(line, study) for _, found in table_groups(study) for line in found]
+    return Table(
+        "All policies",
+        tuple(_header(study)),
+        tuple(
+            (
+                f"{line.name}, {line.which}" if line.which else line.name,
+                *(cell.value for cell in line.cells),
+            )
+            for line in lines
+        ),
+        ours=tuple(place for place, line in enumerate(lines) if line.ours),
+    )
+
+
 def _until_safe(line: Line) -> str:
     if math.isinf(line.until_safe):
         return f"not in {line.train_episodes}"
@@ -192,8 +209,8 @@ def _short(made: str) -> str:
 # -- Figures --------------------------------------------------------------------------------------
 
 
-def _sketches(study: ClosedLoop) -> list[Callable[[], Sketch]]:
-    """The figures that apply."""
+def closed_loop_sketches(study: ClosedLoop) -> list[Callable[[], Sketch]]:
+    """The figures that apply, to be drawn."""
     drawn = [
         (study.rows, _sketch_trade_off),
         (study.curve, _sketch_learning),
