@@ -24,7 +24,7 @@ from evofsm.validation import refuse_unless_distribution, refuse_unless_outcomes
 NO_ACTION = -1
 
 # A buffer begins with its sizes (m, q, capacity, places), `Parameters` and counters.
-_COUNTERS, _HEAD = 16, 32
+_COUNTERS, _HEAD = 20, 32
 # Then, for each kind of thing there is, so many numbers; centres are further rows of states.
 _PER_STATE, _PER_PLACE, _PER_ACTION, _PER_VARIABLE = 13, 4, 2, 5
 # Where the centre of a state that is not there stands: too far for any belief.
@@ -147,6 +147,7 @@ def _open_apart(buffer: NDArray[np.float64], matrices: NDArray[Any]) -> Memory:
                 float(buffer[12]),
                 float(buffer[13]),
                 float(buffer[14]),
+                float(buffer[15]),
                 of_variables[4],
             ),
         ),
@@ -201,7 +202,7 @@ def allocate(
     buffer = _blank(n_variables, n_actions, capacity, places)
     *numbers, rule = parameters
     *rule_numbers, weights = rule
-    buffer[4:15] = (*numbers, *rule_numbers)
+    buffer[4:16] = (*numbers, *rule_numbers)
     memory = view(buffer)
     memory.parameters.rule.weights[:] = weights
     memory.learnt.action[0] = NO_ACTION

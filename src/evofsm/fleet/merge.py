@@ -154,6 +154,11 @@ def _refuse_unlike(machines: Iterable[EvolvingFSM]) -> list[EvolvingFSM]:
                     f"{name} of machine {number} is {given!r}, but {expected!r} of machine 0; "
                     "machines to merge must have the same settings"
                 )
+    if np.isfinite(parts[0]._memory.parameters.rule.memory):
+        raise ValueError(
+            f"machines with {parts[0].rule} cannot be merged: what each still remembers depends on "
+            "when it saw it"
+        )
     return parts
 
 

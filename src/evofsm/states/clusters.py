@@ -85,12 +85,12 @@ def potential_of(clusters: Clusters, weights: NDArray[np.float64], z: NDArray[np
 
 
 @inner_kernel
-def update_potentials(clusters: Clusters, n: int, distance_weight: float) -> float:
+def update_potentials(clusters: Clusters, n: int, distance_weight: float, memory: float) -> float:
     """Recursion of the centres' potentials; returns the highest.
 
     It needs the distances to z_{t-1}, which are still at hand from the step before.
     """
-    t = clusters.n_observations[0] + 1.0
+    t = min(clusters.n_observations[0], memory) + 1.0
     for i in range(lanes(n)):
         potential = clusters.potentials[i]
         far = 1.0 + distance_weight * clusters.squared_distances[i]
@@ -108,10 +108,16 @@ def place_center(clusters: Clusters, i: int, z: NDArray[np.float64], potential: 
 
 
 @inner_kernel
-def absorb(clusters: Clusters, weights: NDArray[np.float64], z: NDArray[np.float64]) -> None:
-    """Add the observation to the running mean and scatter (Welford 1962)."""
+def absorb(
+    clusters: Clusters, weights: NDArray[np.float64], z: NDArray[np.float64], memory: float
+) -> None:
+    """Add the observation to the running mean and scatter (Welford 1962).
+
+    Beyond ``memory`` observations both are exponentially weighted (West 1979): each new one takes
+    the place of a share of all before it.
+    """
     n_observations = clusters.n_observations[0] + 1.0
-    share = 1.0 / n_observations
+    share = 1.0 / min(n_observations, memory)
     added = 0.0
     for j in range(len(z)):
         clusters.latest[j] = z[j]
@@ -120,5 +126,9 @@ def absorb(clusters: Clusters, weights: NDArray[np.float64], z: NDArray[np.float
         mean = clusters.mean[j] + before * share
         clusters.mean[j] = mean
         added += (before * weights[j]) * ((offset - mean) * weights[j])
+    if n_observations > memory:  # the scatter is always the variance times their number
+        grown = n_observations / (n_observations - 1.0)
+        clusters.scatter[0] *= (1.0 - share) * grown
+        added *= share * n_observations
     clusters.n_observations[0] = n_observations
     clusters.scatter[0] += added

@@ -51,14 +51,14 @@ def determine(
         event, nearest, potential = CREATED, 0, 1.0
     else:
         potential = potential_of(clusters, settings.weights, z)
-        highest = update_potentials(clusters, n, settings.distance_weight)
+        highest = update_potentials(clusters, n, settings.distance_weight, settings.memory)
         squared_distances = clusters.squared_distances
         measure_distances(clusters.centers, settings.weights, lanes(n), z, squared_distances)
         nearest = nearest_center(squared_distances, n)
         event = _judge(settings, clusters, n, potential, highest, squared_distances[nearest])
         if event == MOVED:
             place_center(clusters, nearest, z, potential)
-    absorb(clusters, settings.weights, z)
+    absorb(clusters, settings.weights, z, settings.memory)
     return event, nearest, potential
 
 
@@ -104,9 +104,10 @@ def weights(rule: StateRule, m: int) -> NDArray[np.float64]:
 
 
 def describe(rule: StateRule) -> dict[str, Any]:
-    """A rule in plain JSON: its name and its settings."""
+    """A rule in plain JSON: its name and its settings, but for those that are None."""
     name, kind = next(item for item in RULES.items() if item[1] is type(rule))
-    settings = {entry.name: getattr(rule, entry.name) for entry in fields(kind)}
+    given = {entry.name: getattr(rule, entry.name) for entry in fields(kind)}
+    settings = {name: value for name, value in given.items() if value is not None}
     if "base" in settings:
         settings["base"] = describe(settings["base"])
     return {"name": name, **settings}

@@ -6,6 +6,7 @@ so a rare corner never gets a state. Here it gets one where it lies farther out 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
@@ -25,6 +26,11 @@ class Edges:
     An observation also founds a state where its potential lies below every centre's and it is
     farther than ``radius`` from every centre.
 
+    Parameters
+    ----------
+    memory : int, optional
+        Number of observations after which older ones fade, as `Paper` has it.
+
     Examples
     --------
     >>> from evofsm import EvolvingFSM
@@ -33,10 +39,14 @@ class Edges:
     array([1, 1, 2, 3])
     """
 
+    memory: int | None = None
     scales: ClassVar[Sequence[float]] = ()
 
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "memory", ets.check_memory(self.memory))
+
     def _tell(self, machine: RuleSettings) -> RuleSettings:
-        return machine._replace(code=CODE)
+        return machine._replace(code=CODE, memory=self.memory or math.inf)
 
 
 @inner_kernel

@@ -6,6 +6,7 @@ centre, or moves the nearest centre there. The more data vary, the wider states 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
@@ -13,6 +14,7 @@ from typing import ClassVar
 from evofsm._compile import inner_kernel
 from evofsm.states.clusters import CREATED, MOVED, UNCHANGED, Clusters, total_variance
 from evofsm.states.rule import RuleSettings
+from evofsm.validation import whole
 
 CODE = 0
 
@@ -25,6 +27,18 @@ class Paper:
     ``radius``, else it founds a state. The width of recognition is ``spread`` times the total
     variance of all observations.
 
+    Parameters
+    ----------
+    memory : int, optional
+        Number of observations after which older ones fade, so that densities and variances are
+        those of the recent past: for regimes that change. Without it, as in the paper, all count
+        alike, and the more were seen the less a new one changes.
+
+    Raises
+    ------
+    ValueError
+        If ``memory`` is no whole number of at least 2.
+
     Examples
     --------
     >>> from evofsm import EvolvingFSM
@@ -33,10 +47,21 @@ class Paper:
     array([1, 1, 1, 2])
     """
 
+    memory: int | None = None
     scales: ClassVar[Sequence[float]] = ()
 
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "memory", check_memory(self.memory))
+
     def _tell(self, machine: RuleSettings) -> RuleSettings:
-        return machine._replace(code=CODE)
+        return machine._replace(code=CODE, memory=self.memory or math.inf)
+
+
+def check_memory(memory: int | None) -> int | None:
+    """A number of observations that are remembered; None for all of them."""
+    if memory is not None and (memory := whole("memory", memory)) < 2:
+        raise ValueError("memory is 1; of one observation nothing can be said to vary")
+    return memory
 
 
 @inner_kernel

@@ -21,6 +21,7 @@ class RuleSettings(NamedTuple):
     spread: float  #: width of recognition, in the rule's own measure
     failure_share: float  #: a failure founds a state where fewer stays ended so; 0: none does
     failure_distance: float  #: and only farther than this from the nearest centre
+    memory: float  #: number of observations after which older ones fade; infinity: never
     weights: NDArray[np.float64]  #: (m,) 1 / scale of each variable, where m is known
 
 
