@@ -1,8 +1,15 @@
+import hashlib
 import io
 import json
+import os
 import pickle
 import resource
 import signal
+import stat
+import subprocess
+import sys
+import tracemalloc
+import warnings
 import zipfile
 from dataclasses import fields
 from pathlib import Path
@@ -17,8 +24,10 @@ from evofsm import (
     IntervalActions,
     Novelty,
     Paper,
+    __version__,
     storage,
 )
+from evofsm.risk.outcome import LatentRisk
 from evofsm.storage import kind_of
 
 
@@ -183,8 +192,8 @@ def test_a_header_that_makes_no_sense_is_refused_by_name(content, tmp_path):
 
 def test_a_file_of_a_newer_version_asks_for_a_newer_library(tmp_path):
     path = tmp_path / "newer"
-    path.write_bytes(npz({**HEADER, "version": 4}))
-    with pytest.raises(ValueError, match=r"version 4 is newer.*a newer evofsm reads it"):
+    path.write_bytes(npz({**HEADER, "version": 5}))
+    with pytest.raises(ValueError, match=r"version 5 is newer.*a newer evofsm reads it"):
         EvolvingFSM.load(path)
 
 
@@ -242,7 +251,7 @@ def test_a_file_with_a_flipped_byte_is_refused_or_gives_the_same_machine(snapsho
     machine.save(path)
     expected, whole = snapshot(machine), path.read_bytes()
     refusals = []
-    for place in range(0, len(whole), 11):
+    for place in range(0, len(whole), 41):
         damaged = bytearray(whole)
         damaged[place] ^= 0xFF
         path.write_bytes(damaged)
@@ -406,3 +415,284 @@ def test_a_model_saved_by_version_0_1_has_counted_no_failures():
     assert model.recognise([1.0, 0.5]).sum() == pytest.approx(1.0)
     machine = EvolvingFSM.load(FILES / "machine-0.1.evofsm")
     assert model.recognise([1.0, 0.5]).tobytes() == machine.model().recognise([1.0, 0.5]).tobytes()
+
+
+def test_a_machine_of_format_3_goes_on_as_if_it_had_never_been(spiral):
+    rule = FailureSplit(Novelty(radius=2.0, scales=(1.0, 2.0)), distance=0.1)
+    new = EvolvingFSM(4, rule=rule, max_states=12, belief_tolerance=1e-9)
+    new.learn_many(spiral(40)[:24], np.arange(24) % 3, [0, 9], failures=[15])
+    old = EvolvingFSM.load(FILES / "machine-format-3.evofsm")
+    assert repr(old) == repr(new)
+    assert_go_on_alike(old, new, spiral(40)[24:], [0, 1, 2, 3] * 4)
+
+
+def test_a_model_of_format_3_is_read():
+    model = FSMModel.load(FILES / "model-format-3.evofsm")
+    machine = EvolvingFSM.load(FILES / "machine-format-3.evofsm")
+    assert model.actions == IntervalActions(-0.5, 1.5, 0.5, outside="clip")
+    np.testing.assert_array_equal(model.transition_matrices, machine.transition_matrices)
+
+
+def test_a_risk_of_format_3_is_read():
+    risk = LatentRisk.load(FILES / "risk-format-3.evofsm")
+    assert (len(risk.manoeuvres), len(risk.brakes.samples)) == (3, 80)
+    assert risk.brakes.decel == pytest.approx(2.25)
+
+
+def test_files_of_earlier_versions_have_no_checksum_and_say_nothing_of_their_origin():
+    header = storage.describe(FILES / "machine-format-3.evofsm")
+    assert (header.version, header.library, header.provenance) == (3, None, {})
+
+
+# -- What a file says of itself ------------------------------------------------------------------
+
+
+def test_a_file_says_who_wrote_it_and_what_it_learnt_from(grown, tmp_path):
+    provenance = {"files": [{"name": "drive.csv", "bytes": 12}], "rows": 40}
+    for item, kind in ((grown, "machine"), (grown.model(), "model")):
+        item.save(tmp_path / kind, provenance)
+        header = storage.describe(tmp_path / kind)
+        assert (header.kind, header.version) == (kind, 4)
+        assert header.library == __version__
+        assert header.provenance == provenance
+
+
+def test_the_same_machine_gives_the_same_file(grown, tmp_path):
+    grown.save(tmp_path / "a")
+    EvolvingFSM.load(tmp_path / "a").save(tmp_path / "b")
+    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
+
+
+def test_the_checksum_is_taken_as_the_documentation_says(grown, tmp_path):
+    grown.save(tmp_path / "machine")
+    with np.load(tmp_path / "machine") as archive:
+        arrays = dict(archive)
+    header = json.loads(arrays.pop("header").tobytes())
+    told = header.pop("sha256")
+
+    def line(value):
+        return json.dumps(value, sort_keys=True, separators=(",", ":")).encode() + b"\n"
+
+    digest = hashlib.sha256(line(header))
+    for name, array in sorted(arrays.items()):
+        digest.update(line([name, array.dtype.str, array.shape]) + array.tobytes())
+    assert digest.hexdigest() == told
+
+
+def test_an_open_file_will_do_in_place_of_a_name(grown, snapshot):
+    file = io.BytesIO()
+    grown.save(file)
+    assert snapshot(EvolvingFSM.load(io.BytesIO(file.getvalue()))) == snapshot(grown)
+
+
+# -- Files that are damaged, or made to do harm ----------------------------------------------------
+
+
+@pytest.fixture
+def members(grown, tmp_path):
+    """What is in a machine's file, as bytes by name."""
+    grown.save(tmp_path / "whole")
+    with zipfile.ZipFile(tmp_path / "whole") as archive:
+        return {name: archive.read(name) for name in archive.namelist()}
+
+
+def packed(members, method=zipfile.ZIP_DEFLATED):
+    """An archive in which all checksums of the ZIP are right."""
+    file = io.BytesIO()
+    with warnings.catch_warnings(), zipfile.ZipFile(file, "w", method) as archive:
+        warnings.simplefilter("ignore")  # that a name is there twice
+        for name, content in members:
+            archive.writestr(name, content)
+    return file.getvalue()
+
+
+def array(values, shape=None):
+    """An array's member, which may claim another shape."""
+    file = io.BytesIO()
+    told = {"descr": values.dtype.str, "fortran_order": False, "shape": shape or values.shape}
+    np.lib.format.write_array_header_1_0(file, told)
+    return file.getvalue() + values.tobytes()
+
+
+def changed(members, **others):
+    return packed({**members, **{f"{name}.npy": data for name, data in others.items()}}.items())
+
+
+def flipped(data, place):
+    place %= len(data)
+    return data[:place] + bytes([data[place] ^ 1]) + data[place + 1 :]
+
+
+def lying(data, size):
+    """A file whose directory claims another size of its last member, packed and unpacked."""
+    where = data.rindex(b"PK\x01\x02")
+    sizes = (size // 1000).to_bytes(4, "little") + size.to_bytes(4, "little")
+    return data[: where + 20] + sizes + data[where + 28 :]
+
+
+def encrypted(data):
+    for mark, place in ((b"PK\x03\x04", 6), (b"PK\x01\x02", 8)):
+        where = data.rindex(mark) + place
+        data = data[:where] + bytes([data[where] | 1]) + data[where + 1 :]
+    return data
+
+
+HARMFUL = {
+    "cut off": (lambda m: packed(m.items())[:-1], "was cut off"),
+    "something behind it": (lambda m: packed(m.items()) + b"x", "was cut off"),
+    "something before it": (lambda m: b"x" + packed(m.items()), "not a ZIP archive"),
+    "a number changed": (
+        lambda m: changed(m, belief=flipped(m["belief.npy"], -1)),
+        "SHA-256 is another",
+    ),
+    "a setting changed": (
+        lambda m: changed(m, header=m["header.npy"].replace(b'"radius": 0.01', b'"radius": 0.02')),
+        "SHA-256 is another",
+    ),
+    "an origin changed": (
+        lambda m: changed(m, header=m["header.npy"].replace(b"{}", b"[]")),
+        "the provenance in its header",
+    ),
+    "arrays swapped": (
+        lambda m: changed(m, visits=m["founded.npy"], founded=m["visits.npy"]),
+        "SHA-256 is another",
+    ),
+    "an array lost": (lambda m: packed(list(m.items())[:-1]), "it lacks"),
+    "an array more": (lambda m: changed(m, more=array(np.zeros(3))), "it has more, which no"),
+    "an array twice": (lambda m: packed([*m.items(), *m.items()]), "two arrays called header"),
+    "a shape of its own": (
+        lambda m: changed(m, visits=array(np.zeros(3))),
+        r"visits has shape \(3,\), not \(\d+,\)",
+    ),
+    "too many dimensions": (
+        lambda m: changed(m, visits=array(np.zeros((3, 1)))),
+        r"visits has shape \(3, 1\)",
+    ),
+    "other actions": (lambda m: changed(m, uses=array(np.zeros(4))), r"uses has shape \(4,\)"),
+    "a shape that does not fit": (
+        lambda m: changed(m, visits=array(np.zeros(3), (1 << 40,))),
+        "does not fit",
+    ),
+    "a size that does not fit": (lambda m: lying(packed(m.items()), 1 << 30), "too many|overlap"),
+    "objects": (
+        lambda m: changed(m, visits=m["visits.npy"].replace(b"<f8", b"|O ")),
+        "of type",
+    ),
+    "texts": (lambda m: changed(m, visits=array(np.array(["a"]))), "of type"),
+    "a header that is evaluated": (
+        lambda m: changed(m, visits=m["visits.npy"].replace(b"False", b"exit()")),
+        "does not begin as an array",
+    ),
+    "a folder": (lambda m: packed([*m.items(), ("a/b.npy", b"")]), "'a/b.npy', which is no"),
+    "a way out": (lambda m: packed([*m.items(), ("../b.npy", b"")]), "'../b.npy', which is no"),
+    "a root": (lambda m: packed([*m.items(), ("/b.npy", b"")]), "'/b.npy', which is no"),
+    "a text": (lambda m: packed([*m.items(), ("readme", b"")]), "'readme', which is no"),
+    "encrypted": (lambda m: encrypted(packed(m.items())), "is encrypted"),
+    "packed otherwise": (lambda m: packed(m.items(), zipfile.ZIP_LZMA), "packed in a way"),
+    "many members": (
+        lambda m: packed((f"a{k}.npy", b"") for k in range(200)),
+        "200 arrays; there are no more than",
+    ),
+    "a header without end": (
+        lambda m: changed(m, header=array(np.full(1 << 25, 32, np.uint8))),
+        "far too long",
+    ),
+    "a header nested without end": (
+        lambda m: changed(m, header=array(np.full(100_000, ord("["), np.uint8))),
+        "recursion|nested",
+    ),
+}
+
+
+@pytest.mark.parametrize(("damage", "words"), HARMFUL.values(), ids=HARMFUL.keys())
+def test_what_was_damaged_or_made_to_do_harm_is_refused_and_told(damage, words, members, tmp_path):
+    path = tmp_path / "harmful"
+    path.write_bytes(damage(members))
+    tracemalloc.start()
+    try:
+        with pytest.raises(ValueError, match=words) as raised:
+            EvolvingFSM.load(path)
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert str(path) in str(raised.value)
+    assert peak < 4 << 20
+
+
+def test_a_file_of_the_greatest_size_is_refused_before_there_is_room_for_it(tmp_path):
+    """Zeros pack so well that 5 GiB of them are a small file; here it only claims them."""
+    path = tmp_path / "bomb"
+    data = packed([("header.npy", array(np.zeros(0, np.uint8))), ("a.npy", bytes(10_000_000))])
+    path.write_bytes(lying(data, 1 << 31))
+    with pytest.raises(ValueError, match=r"claims [\d,]+ bytes|overlap"):
+        EvolvingFSM.load(path)
+
+
+def test_a_kind_that_is_not_known_is_refused(members, tmp_path):
+    path = tmp_path / "odd"
+    path.write_bytes(changed(members, header=m_header(members, b'"machine"', b'"engine!"')))
+    with pytest.raises(ValueError, match="it holds a 'engine!'"):
+        storage.kind_of(path)
+
+
+def m_header(members, old, new):
+    assert old in members["header.npy"]
+    return members["header.npy"].replace(old, new)
+
+
+def test_actions_without_end_are_refused_before_there_is_room_for_them(grown, tmp_path):
+    full_model(grown).save(tmp_path / "model")
+    content, arrays = storage.read(tmp_path / "model", "model")
+    content["actions"]["width"] = 1e-12
+    storage.write(tmp_path / "model", "model", content, arrays)
+    with pytest.raises(ValueError, match="more than 3 intervals"):
+        FSMModel.load(tmp_path / "model")
+
+
+def test_what_could_not_be_read_again_is_not_written(grown, tmp_path):
+    grown.save(tmp_path / "machine")
+    content, arrays = storage.read(tmp_path / "machine", "machine")
+    for wrong, words in (
+        ({"more": np.zeros(1)}, "more, which no machine has"),
+        ({"visits": np.zeros(1)}, "shape"),
+        ({"visits": arrays["visits"].astype(object)}, "cannot be kept"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            storage.write(tmp_path / "new", "machine", content, {**arrays, **wrong})
+    assert not (tmp_path / "new").exists()
+
+
+# -- On the disk -----------------------------------------------------------------------------------
+
+
+def test_a_file_and_its_name_are_on_the_disk_when_saving_returns(grown, tmp_path, monkeypatch):
+    flushed = []
+
+    def fsync(descriptor):
+        flushed.append(stat.S_ISDIR(os.fstat(descriptor).st_mode))
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    grown.save(tmp_path / "machine")
+    assert flushed == [False, True]
+
+
+def test_an_error_in_saving_names_the_file(grown, full_disk, tmp_path):
+    fill, free = full_disk
+    fill()
+    try:
+        with pytest.raises(OSError, match="File too large") as raised:
+            grown.save(tmp_path / "machine")
+    finally:
+        free()
+    assert raised.value.filename == str(tmp_path / "machine")
+
+
+def test_what_a_killed_process_left_behind_is_swept(tmp_path):
+    ended = subprocess.Popen([sys.executable, "-c", ""])
+    ended.wait()
+    left = tmp_path / f".machine.{ended.pid}.part"
+    others = [tmp_path / f".machine.{os.getpid()}.part", tmp_path / f".other.{ended.pid}.part"]
+    for path in (left, *others):
+        path.touch()
+    storage.sweep(tmp_path / "machine")
+    assert sorted(tmp_path.iterdir()) == sorted(others)

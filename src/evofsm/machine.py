@@ -14,7 +14,6 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from os import PathLike
 from typing import Any, Self, SupportsIndex
 
 import numpy as np
@@ -24,6 +23,7 @@ from evofsm import storage
 from evofsm._compile import LINE, lanes
 from evofsm.actions import IntervalActions
 from evofsm.crowding import WhenFull
+from evofsm.divergence import jensen_shannon
 from evofsm.memory import (
     NO_ACTION,
     Learnt,
@@ -34,7 +34,8 @@ from evofsm.memory import (
     resize,
     view,
 )
-from evofsm.model import FSMModel
+from evofsm.model import FSMModel, recognise_rows
+from evofsm.observations import Missing
 from evofsm.states.dispatch import check_rule, describe, restore, weights, width
 from evofsm.states.ets import Paper
 from evofsm.states.rule import RuleSettings, StateRule
@@ -43,6 +44,7 @@ from evofsm.step import (
     EVENTS,
     FULL,
     REFUSED,
+    Event,
     Step,
     Trace,
     fail,
@@ -157,6 +159,7 @@ class EvolvingFSM:
             spread=positive("spread", spread),
             failure_share=0.0,
             failure_distance=0.0,
+            memory=np.inf,
             weights=np.empty(0),
         )
         told = self._rule._tell(given)
@@ -196,7 +199,9 @@ prior_frequency=0.001, spread=3.0)
 
     # -- Learning -------------------------------------------------------------------------------
 
-    def observe(self, z: ArrayLike, *, failed: bool = False) -> Step:
+    def observe(
+        self, z: ArrayLike, *, failed: bool = False, missing: Missing = Missing.REJECT
+    ) -> Step:
         """Take in one observation: determine states, recognise, and learn the transition to it.
 
         One step of the paper's Sections 2.2.1, 2.2.2 and 2.3.2, in that order.
@@ -208,6 +213,10 @@ prior_frequency=0.001, spread=3.0)
         failed : bool
             Whether the episode ended in failure with this observation. It is learnt like any
             other; then the failure is counted, and the next observation begins an episode.
+        missing : Missing
+            What to do where entries are NaN, which says that they were not observed. Such an
+            observation is recognised and no more: no state moves, no transition to it is learnt,
+            and `Step.missing` tells the variables.
 
         Returns
         -------
@@ -220,7 +229,8 @@ prior_frequency=0.001, spread=3.0)
             If ``z`` does not hold real numbers.
         ValueError
             If ``z`` has another length than before, or an entry is NaN, infinite or beyond
-            1e100. The machine is then as it was.
+            1e100; if NaN is allowed, and there is nothing yet to recognise it by. The machine is
+            then as it was.
 
         Examples
         --------
@@ -230,6 +240,11 @@ prior_frequency=0.001, spread=3.0)
         >>> step.state, step.predicted.round(2), step.belief.round(2), round(step.surprise, 2)
         (1, array([0.6, 0.4]), array([0.32, 0.68]), 0.06)
         """
+        if missing is not Missing.REJECT:
+            given = real_array("observation", z, ndim=1)
+            absent = np.isnan(given)
+            if absent.any():
+                return self._observe_partly(given, absent, missing, failed=bool(failed))
         return self._step(z, NO_ACTION, bool(failed))
 
     def act(self, i: SupportsIndex) -> None:
@@ -725,13 +740,15 @@ prior_frequency=0.001, spread=3.0)
 
     # -- Keeping it -----------------------------------------------------------------------------
 
-    def save(self, path: str | PathLike[str]) -> None:
+    def save(self, path: storage.Place, provenance: Mapping[str, Any] | None = None) -> None:
         """Write the machine to a file (arrays and a JSON header, nothing that can run).
 
         Parameters
         ----------
-        path : str or path-like
+        path : str, path-like or binary file
             Name of the file, used as it is; a file of that name is replaced.
+        provenance : mapping, optional
+            What it learnt from, for JSON; `evofsm inspect` shows it.
 
         Raises
         ------
@@ -752,15 +769,15 @@ prior_frequency=0.001, spread=3.0)
         """
         # Without spare room the shapes of the arrays tell the sizes, and nothing else is stored.
         content = {**self._settings(), "rule": describe(self._rule)}
-        storage.write(path, "machine", content, dict(leaves(self._trimmed())))
+        storage.write(path, "machine", content, dict(leaves(self._trimmed())), provenance)
 
     @classmethod
-    def load(cls, path: str | PathLike[str]) -> Self:
+    def load(cls, path: storage.Place) -> Self:
         """Read a machine that was saved; it goes on learning bit for bit as if never stopped.
 
         Parameters
         ----------
-        path : str or path-like
+        path : str, path-like or binary file
             Name of the file.
 
         Returns
@@ -773,7 +790,7 @@ prior_frequency=0.001, spread=3.0)
         OSError
             If there is no such file, or it may not be read.
         ValueError
-            If the file is not a machine's, or is damaged.
+            If the file is not a machine's, is damaged, or of a newer version.
 
         Examples
         --------
@@ -870,6 +887,42 @@ prior_frequency=0.001, spread=3.0)
         forecast = scratch.forecast if self.belief_tolerance else scratch.predicted
         predicted = forecast[: n if surprise == surprise else 0].copy()
         return Step(state, memory.learnt.belief[:n].copy(), EVENTS[event], predicted, surprise)
+
+    def _observe_partly(
+        self,
+        z: NDArray[np.float64],
+        absent: NDArray[np.bool_],
+        missing: Missing,
+        *,
+        failed: bool,
+    ) -> Step:
+        """Recognise what some variables are missing of; only the belief changes."""
+        now, n = self._memory.learnt, self.n_states
+        gone = tuple(np.flatnonzero(absent).tolist())
+        if n == 0:
+            raise ValueError(f"variables {gone} of a machine's first observation are missing")
+        if missing is Missing.HOLD and not now.chained[0]:
+            raise ValueError(f"variables {gone} are missing, and nothing to hold since the start")
+        filled = np.where(absent, now.clusters.latest, self._fit(z))
+        refuse_unusable("observation", filled)
+        action = int(now.action[0])
+        predicted = self.predict(action) if now.chained[0] and action != NO_ACTION else np.empty(0)
+        if missing is Missing.PARTIAL and absent.all():
+            belief = predicted if len(predicted) else self.belief
+        else:
+            rule = self._memory.parameters.rule
+            counted = rule.weights * ~absent if missing is Missing.PARTIAL else rule.weights
+            held, belief = now.clusters, np.empty(n)
+            centers, distances = np.ascontiguousarray(held.centers[:, :n]), np.empty(n)
+            rows = filled[None], width(rule, held)
+            recognise_rows(centers, counted, *rows, distances, belief[None])
+        now.belief[:n], now.state[0] = belief, belief.argmax()
+        now.chained[0], now.action[0] = 1.0, NO_ACTION
+        state = int(now.state[0])
+        if failed:
+            self.fail()
+        surprise = jensen_shannon(predicted, belief) if len(predicted) else np.nan
+        return Step(state, belief, Event.NONE, predicted, surprise, gone)
 
     def _insist(self, z: ArrayLike, action: int, failed: bool) -> tuple[int, int, float]:
         """What the kernel answers, whatever has to be done to `z` and for room before."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields
-from os import PathLike
 from typing import Any, Self
 
 import numpy as np
@@ -131,6 +130,10 @@ class FSMModel:
         """Number q of actions."""
         return len(self.uses)
 
+    def __deepcopy__(self, memo: Any) -> Self:
+        """Itself: nothing in it ever changes."""
+        return self
+
     def recognise(self, z: ArrayLike) -> NDArray[np.float64]:
         """Distribution over states for one observation or many; the states stay as they are.
 
@@ -173,7 +176,7 @@ class FSMModel:
         centers = np.ascontiguousarray(self.centers.T)
         distances = np.empty(self.n_states)
         scaling = weights(self.rule, self.n_variables)
-        _recognise_rows(centers, scaling, rows.copy(), self.width, distances, belief)
+        recognise_rows(centers, scaling, rows.copy(), self.width, distances, belief)
         return belief if given.ndim == 2 else belief[0]
 
     def propagate(
@@ -355,13 +358,15 @@ class FSMModel:
             lines.append(f'  s{i + 1} -> s{j + 1} [label="{matrix[i, j]:.3f}"];')
         return "\n".join([*lines, "}", ""])
 
-    def save(self, path: str | PathLike[str]) -> None:
+    def save(self, path: storage.Place, provenance: Mapping[str, Any] | None = None) -> None:
         """Write the model to a file (arrays and a JSON header, nothing that can run).
 
         Parameters
         ----------
-        path : str or path-like
+        path : str, path-like or binary file
             Name of the file, used as it is; a file of that name is replaced.
+        provenance : mapping, optional
+            What it learnt from, for JSON; `evofsm inspect` shows it.
 
         Raises
         ------
@@ -387,15 +392,15 @@ class FSMModel:
         content["settings"] = dict(self.settings)
         content["rule"] = describe(self.rule)
         content["actions"] = None if self.actions is None else asdict(self.actions)
-        storage.write(path, "model", content, arrays)
+        storage.write(path, "model", content, arrays, provenance)
 
     @classmethod
-    def load(cls, path: str | PathLike[str]) -> Self:
+    def load(cls, path: storage.Place) -> Self:
         """Read a model that was saved.
 
         Parameters
         ----------
-        path : str or path-like
+        path : str, path-like or binary file
             Name of the file.
 
         Returns
@@ -408,7 +413,7 @@ class FSMModel:
         OSError
             If there is no such file, or it may not be read.
         ValueError
-            If the file is not a model's, or is damaged.
+            If the file is not a model's, is damaged, or of a newer version.
 
         Examples
         --------
@@ -427,7 +432,7 @@ class FSMModel:
         content, arrays = storage.read(path, "model")
         with storage.explained(path):
             if content["actions"] is not None:
-                content["actions"] = IntervalActions(**content["actions"])
+                content["actions"] = _actions(content["actions"], len(arrays["uses"]))
             for name in ("names", "units"):
                 content[name] = tuple(content[name])
             content["rule"] = restore(content["rule"])
@@ -437,8 +442,15 @@ class FSMModel:
             return cls(**values)
 
 
+def _actions(settings: Mapping[str, Any], q: int) -> IntervalActions:
+    """A set of actions from a file, of as many intervals as there are matrices."""
+    if (settings["high"] - settings["low"]) > (q + 1) * settings["width"]:
+        raise ValueError(f"actions has more than {q} intervals, for {q} matrices")
+    return IntervalActions(**settings)
+
+
 @kernel
-def _recognise_rows(
+def recognise_rows(
     centers: NDArray[np.float64],
     weights: NDArray[np.float64],
     rows: NDArray[np.float64],
@@ -446,6 +458,7 @@ def _recognise_rows(
     squared_distances: NDArray[np.float64],
     belief: NDArray[np.float64],
 ) -> None:
+    """Write the belief (N, n) of each row, given centres (m, n) and 1 / scale of each variable."""
     n = len(squared_distances)
     for row in range(len(rows)):
         measure_distances(centers, weights, n, rows[row], squared_distances)

@@ -12,10 +12,24 @@ import math
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from enum import Enum
 from typing import SupportsFloat
 
 import numpy as np
 from numpy.typing import NDArray
+
+
+class Missing(Enum):
+    """What is done where some variables were not observed; they hold NaN.
+
+    ``REJECT`` is an error, ``HOLD`` takes the value of the observation before, and ``PARTIAL``
+    recognises from the variables that are there. Whichever it is, an incomplete observation moves
+    no state and teaches no transition to it.
+    """
+
+    REJECT = "reject"
+    HOLD = "hold"
+    PARTIAL = "partial"
 
 
 @dataclass(frozen=True)

@@ -93,6 +93,7 @@ class Step(NamedTuple):
     event: Event  #: what happened to the states
     predicted: NDArray[np.float64]  #: (n,) forecast made one step before; empty where none was
     surprise: float  #: divergence of `predicted` and `belief` [bit]; NaN where none was
+    missing: tuple[int, ...] = ()  #: variables that were not observed, so that nothing was learnt
 
 
 class Trace(NamedTuple):

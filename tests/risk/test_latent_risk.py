@@ -477,7 +477,7 @@ def test_files_that_cannot_be_right_are_refused(taught, tmp_path, name, array):
 @pytest.mark.parametrize(
     ("observation", "acceleration", "belief", "named"),
     [
-        ([math.nan, 20.0, 20.0], 0.0, [1.0], "observation"),
+        ([-math.inf, 20.0, 20.0], 0.0, [1.0], "observation"),
         ([30.0, math.inf, -math.inf], 0.0, [1.0], "observation"),
         ([30.0, 20.0], 0.0, [1.0], "observation"),
         ([[30.0, 20.0, 20.0]], 0.0, [1.0], "observation"),
@@ -487,7 +487,7 @@ def test_files_that_cannot_be_right_are_refused(taught, tmp_path, name, array):
         ([30.0, 20.0, 20.0], 0.0, [[1.0]], "belief"),
         ([30.0, 20.0, 20.0], 0.0, [math.nan, 1.0], "belief"),
         ([30.0, 20.0, 20.0], 0.0, [0.5, 0.1], "belief"),
-        (np.array([30.0, math.nan, 20.0]), 0.0, np.ones(1), "observation"),
+        (np.array([30.0, math.inf, 20.0]), 0.0, np.ones(1), "observation"),
         (np.array([30.0, 20.0, 20.0]), math.inf, np.ones(1), "acceleration"),
         (np.array([30.0, 20.0, 20.0]), 0.0, np.full(9, 0.2), "belief"),
     ],
@@ -635,3 +635,15 @@ def test_counts_refuse_what_they_cannot_count():
         counts.learn([1.0], 1)
     counts.end_episode(failed=True)
     assert counts.outcome([1.0], 0).evidence == 0.0
+
+
+def test_what_was_saved_doubts_the_brakes_as_before(tmp_path):
+    risk = LatentRisk(lowest=-4.0)
+    drive(risk.brakes, 4.0)
+    for k in range(3):  # weaker than they were, but not yet for sure
+        risk.learn([80.0, 20.0 - 0.5 * k, 20.0], -4.0)
+    risk.save(tmp_path / "risk")
+    again = LatentRisk.load(tmp_path / "risk")
+    for name, latest in risk.brakes.doubts.items():
+        assert list(again.brakes.doubts[name]) == list(latest)
+    assert any(len(latest) for latest in risk.brakes.doubts.values())

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -28,6 +28,8 @@ with suppress(ModuleNotFoundError):
     import typer
 
 if TYPE_CHECKING:
+    from evofsm.checkpoint import Checkpoint
+    from evofsm.framework.audit import AuditLog
     from evofsm.studies.closed_loop import Learner
     from evofsm.studies.driving import Driving, Setup
     from evofsm.worlds.road import World
@@ -61,14 +63,38 @@ def drive(
         Path | None,
         typer.Option(help="Folder for what was learnt and every decision.", show_default=False),
     ] = None,
+    checkpoint: Annotated[
+        Path | None,
+        typer.Option(
+            help="Keep what came of the episodes so far in this file; where it exists, go on "
+            "from it.",
+            show_default=False,
+        ),
+    ] = None,
+    every: Annotated[
+        str, typer.Option(help="Time between two checkpoints: 10s, 5m; 0s for every episode.")
+    ] = "60s",
+    audit: Annotated[
+        Path | None,
+        typer.Option(
+            help="Append to this log what the reviser changed or warned of, to be verified and "
+            "replayed by evofsm audit.",
+            show_default=False,
+        ),
+    ] = None,
     as_json: SummaryAsJson = False,
 ) -> None:
     """Drive scenarios under a reviser; learn on the way.
 
     A machine and its latent risk learn from every episode, from the first on, unless --frozen.
     The summary compares with the controller left to itself in the same draws.
+
+    With --checkpoint, the same command goes on where it was stopped, whatever stopped it, and comes
+    to the same result; with more --episodes, it goes on to these.
     """
     require(scipy="study", **({"polars": "tables"} if out else {}))
+    from evofsm.checkpoint import Checkpoint, duration, result_kept
+    from evofsm.framework.audit import AuditLog
     from evofsm.report import terminal
     from evofsm.report.driving import print_driving
     from evofsm.studies.closed_loop import Learner
@@ -78,6 +104,7 @@ def drive(
 
     if learn is not None and frozen is not None:
         raise ValueError("--learn and --frozen exclude each other")
+    interval = duration(every)
     chosen = load_family(family).with_switches(split_names(switches))
     setup = Setup(
         chosen,
@@ -92,10 +119,16 @@ def drive(
     )
     start = learn or frozen
     learner = Learner.load(start) if start else Learner.new(chosen)
-    with open_world(world.value) as place:
-        driving = _drive(setup, learner, place)
     if out is not None:
-        write_driving(driving, learner, setup, out)
+        out.mkdir(parents=True, exist_ok=True)
+    keeper = None
+    if checkpoint is not None:
+        keeper = Checkpoint(checkpoint, setup.settings(world.value, learner), interval)
+    with AuditLog(audit) if audit else nullcontext() as log, open_world(world.value) as place:
+        driving = _drive(setup, learner, place, keeper, log)
+    if out is not None:
+        with result_kept(keeper):
+            write_driving(driving, learner, setup, out)
     if as_json:
         print_json({**driving.row.as_dict(), "lead_times": list(driving.lead_times)})
         return
@@ -103,9 +136,17 @@ def drive(
     print_driving(console, driving, learner, setup)
     if out is not None:
         console.print(f"What was learnt, and every decision: {out}", soft_wrap=True)
+    if log is not None:
+        console.print(f"Head of {audit}, to be kept elsewhere: {log.head}", soft_wrap=True)
 
 
-def _drive(setup: Setup, learner: Learner, place: World) -> Driving:
+def _drive(
+    setup: Setup,
+    learner: Learner,
+    place: World,
+    checkpoint: Checkpoint | None,
+    audit: AuditLog | None,
+) -> Driving:
     """With a bar that shows the collisions so far."""
     from evofsm.studies.driving import drive_family
 
@@ -116,4 +157,4 @@ def _drive(setup: Setup, learner: Learner, place: World) -> Driving:
             text = f"Driving ({collisions} collisions, {collisions / done:.1%})"
             bars.update(task, completed=done, description=text)
 
-        return drive_family(setup, learner, place, show)
+        return drive_family(setup, learner, place, show, checkpoint, audit)

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any, cast
 
 from evofsm.cli.common import plain_errors, print_json, progress, split_names
 
@@ -17,11 +17,18 @@ if TYPE_CHECKING:
     from rich.progress import Progress
 
     from evofsm.actions import IntervalActions
-    from evofsm.io import LogColumns
+    from evofsm.checkpoint import Checkpoint
+    from evofsm.io import Chunk, LogColumns, VehicleLengths
     from evofsm.observations import Category
+    from evofsm.storage import Header
 
 _UNITS = {"gap": "m", "v_follower": "m/s", "v_leader": "m/s"}
 _MOST_ACTIONS = 1000
+# What does not change what is learnt; files are told apart by what is in them.
+_NO_SETTINGS = ("files", "out", "checkpoint", "every", "as_json")
+# What there may be of in a provenance, and how many files of it are named.
+_AMOUNTS = ("files", "rows", "episodes", "transitions")
+_MOST_FILES = 3
 
 
 @plain_errors
@@ -89,6 +96,16 @@ def learn(
     out: Annotated[
         Path | None, typer.Option(help="File to save the model to.", show_default=False)
     ] = None,
+    checkpoint: Annotated[
+        Path | None,
+        typer.Option(
+            help="Keep what was learnt so far in this file; where it exists, go on from it.",
+            show_default=False,
+        ),
+    ] = None,
+    every: Annotated[
+        str, typer.Option(help="Time between two checkpoints: 10s, 5m; 0s for as often as it can.")
+    ] = "60s",
     as_json: Annotated[
         bool, typer.Option("--json", help="Print one JSON document; counts from 0.")
     ] = False,
@@ -102,12 +119,19 @@ def learn(
     leader beyond the end of the lane is not seen). A pair is observed by gap (bumper to bumper),
     v_follower and v_leader; its action a_follower is what the follower did until the next time
     step. SUMO rounds to 2 decimals unless told --precision 6.
+
+    With --checkpoint, the same command goes on where it was stopped, whatever stopped it, and comes
+    to the same result. The file is kept at the end: run again, the command prints it at once.
     """
+    # Whatever it is told, a new option too, is a setting that a checkpoint goes by.
+    settings = {name: value for name, value in locals().items() if name not in _NO_SETTINGS}
+    from evofsm.checkpoint import Checkpoint, duration, fingerprints, result_kept
     from evofsm.io import VehicleLengths, read_traces
     from evofsm.machine import EvolvingFSM
     from evofsm.studies.learning import learn_traces
 
     _check_out(out)
+    interval = duration(every)
     actions = _actions(action_range)
     columns = _columns(observe, action, time, episode, dt, category_distance)
     lengths = VehicleLengths.parse(vehicle_length or [])
@@ -115,27 +139,42 @@ def learn(
         actions.n_actions, radius, distance_weight, learning_rate, prior_frequency, spread
     )
     names = columns.observe.names
+    known = fingerprints(files)
+    keeper = None
+    if checkpoint is not None:
+        _check_apart(checkpoint, out, files)
+        keeper = Checkpoint(checkpoint, {**settings, "files": known}, interval)
     with progress() as bars:
         learning = learn_traces(
-            read_traces(files, columns, lengths, _bytes_read(bars, files)),
+            _noting(
+                read_traces(files, columns, lengths, _bytes_read(bars, files)), lengths, keeper
+            ),
             machine,
             actions,
             names,
             [_UNITS.get(name, "") for name in names],
+            keeper,
         )
+    provenance = {
+        "files": known,
+        "rows": learning.rows,
+        "episodes": learning.episodes,
+        "transitions": learning.transitions,
+        "action": action,
+    }
     if out is not None:
-        learning.model.save(out)
+        with result_kept(keeper):
+            learning.model.save(out, provenance)
 
     from evofsm.report import terminal
 
     if as_json:
         document = terminal.learning_document(learning)
+        document["model"]["provenance"] = provenance
         print_json({"files": files, "saved": out and str(out), **document})
         return
     console = terminal.console()
-    terminal.print_learning(
-        console, learning, action=action, lengths=str(lengths) if lengths.seen else None
-    )
+    terminal.print_learning(console, learning, action=action, lengths=_assumed(lengths, keeper))
     console.print()
     if out is None:
         console.print("Nothing was saved; --out MODEL keeps the model.", soft_wrap=True)
@@ -158,16 +197,39 @@ def inspect(
     from evofsm.model import FSMModel
     from evofsm.report import terminal
 
-    if storage.kind_of(file) == "machine":
+    header = storage.describe(file)
+    if header.kind == "machine":
         model = EvolvingFSM.load(file).model()
         facts = [("file", f"{file}, a machine that can go on learning")]
     else:
         model = FSMModel.load(file)
         facts = [("file", file)]
     if as_json:
-        print_json({"file": file, **terminal.model_document(model)})
+        document = terminal.model_document(model)
+        print_json({"file": file, **document, "provenance": header.provenance})
     else:
+        facts += [("written by", _writer(header)), *_learnt_from(header.provenance)]
         terminal.print_model(terminal.console(), model, facts)
+
+
+def _writer(header: Header) -> str:
+    library = "an evofsm" if header.library is None else f"evofsm {header.library}"
+    checked = "its SHA-256 is right" if header.version >= 4 else "without a SHA-256 yet"
+    return f"{library}, file format {header.version}; {checked}"
+
+
+def _learnt_from(provenance: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """What a file says of where it comes from, line by line."""
+    facts = []
+    for name, value in provenance.items():
+        if name == "files":
+            shown = [f"{file['name']} ({file['bytes']:,} bytes)" for file in value[:_MOST_FILES]]
+            more = len(value) - _MOST_FILES
+            text = ", ".join(shown) + (f" and {more:,} more" if more > 0 else "")
+        else:
+            text = f"{value:,}" if isinstance(value, int) else str(value)
+        facts.append((f"learnt from {name}" if name in _AMOUNTS else name, text))
+    return facts
 
 
 # -- What was asked for ---------------------------------------------------------------------------
@@ -192,6 +254,29 @@ def _check_out(out: Path | None) -> None:
             raise ValueError(
                 f"--out {out}: exists and is no file of evofsm; it was left alone"
             ) from None
+
+
+def _check_apart(checkpoint: Path, out: Path | None, files: list[str]) -> None:
+    """Refuse a checkpoint that would take the place of something else."""
+    others = [*files, *([str(out)] if out is not None else [])]
+    if str(checkpoint.resolve()) in {str(Path(other).resolve()) for other in others}:
+        raise ValueError(f"--checkpoint {checkpoint} is named twice; give it a file of its own")
+
+
+def _noting(
+    chunks: Iterator[Chunk], lengths: VehicleLengths, keeper: Checkpoint | None
+) -> Iterator[Chunk]:
+    """The same chunks; at their end, what was assumed in reading them is noted."""
+    yield from chunks
+    if keeper is not None:
+        keeper.notes["lengths"] = _assumed(lengths, None)
+
+
+def _assumed(lengths: VehicleLengths, keeper: Checkpoint | None) -> str | None:
+    """Lengths of vehicles that mattered, in this run or in the one that read the files."""
+    if keeper is not None and "lengths" in keeper.notes:
+        return cast("str | None", keeper.notes["lengths"])
+    return str(lengths) if lengths.seen else None
 
 
 def _actions(text: str) -> IntervalActions:

@@ -21,9 +21,9 @@ from pathlib import Path
 from typing import Any, BinaryIO, Self
 from zlib import crc32
 
+from evofsm.checkpoint import differences
+
 _SEAL = b',"crc":"'
-# So many settings that differ are named in an error.
-_NAMED = 4
 
 Record = Mapping[str, Any]
 
@@ -138,17 +138,11 @@ class Journal:
         return good
 
     def _check(self, begun_with: Record, header: Record) -> None:
-        before, now = _flat(begun_with["settings"]), _flat(header["settings"])
-        differing = [
-            f"{name} was {_shown(before.get(name))} and is now {_shown(now.get(name))}"
-            for name in now | before
-            if json.dumps(before.get(name)) != json.dumps(now.get(name))  # NaN equals NaN here
-        ]
+        differing = differences(begun_with["settings"], header["settings"])
         if differing:
-            more = f" and {len(differing) - _NAMED} more" if len(differing) > _NAMED else ""
             raise ValueError(
-                f"{self.path} was begun with other settings: {', '.join(differing[:_NAMED])}{more}"
-                "; run it with those, or name another folder"
+                f"{self.path} was begun with other settings: {differing}; run it with those, or "
+                "name another folder"
             )
 
 
@@ -164,22 +158,6 @@ def _record(line: bytes) -> dict[str, Any] | None:
         return None
     record = json.loads(text + b"}")
     return record if isinstance(record, dict) else None
-
-
-def _flat(value: Any, name: str = "") -> dict[str, Any]:
-    """Settings within settings, by names with dots."""
-    if not isinstance(value, dict | list):
-        return {name: value}
-    items = value.items() if isinstance(value, dict) else enumerate(value)
-    found: dict[str, Any] = {}
-    for inner, one in items:
-        found |= _flat(one, f"{name}.{inner}" if name else str(inner))
-    return found
-
-
-def _shown(value: Any) -> str:
-    text = json.dumps(value)
-    return text if len(text) <= 24 else f"{text[:20]} ..."
 
 
 @contextmanager

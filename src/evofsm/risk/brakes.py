@@ -121,6 +121,11 @@ class OwnBrakes:
         self.set_lagged(0.0, 0.0)
         self.clear()
 
+    @property
+    def doubts(self) -> dict[str, Latest]:
+        """What may yet show that the brakes have weakened, by name."""
+        return {"brought": self._brought, "shortfalls": self._shortfalls}
+
     def set_lagged(self, products: float, squares: float) -> None:
         """Tell the lag by least squares, from sums of products and of squares."""
         self.lagged = products, squares

@@ -47,6 +47,11 @@ class RiskByState:
 
     def judge(self, situation: Situation, accelerations: ArrayLike) -> Judgement:
         """Latent risk of each acceleration: of the states, weighed by the belief."""
+        states, known = len(situation.belief), self.machine.n_states
+        if states > max(known, 1):
+            raise ValueError(
+                f"belief is over {states} states, but the machine has {known} (is it another one?)"
+            )
         taking_part = np.flatnonzero(situation.belief >= _LEAST_BELIEF)
         if len(taking_part) == 0 or self.machine.n_states == 0:
             return self.risk.judge(situation, accelerations)

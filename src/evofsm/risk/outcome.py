@@ -12,8 +12,8 @@ brakes harder than that. A situation is a dead end where even braking at once ca
 from __future__ import annotations
 
 import math
-from os import PathLike
-from typing import NamedTuple, Protocol, Self
+from collections.abc import Mapping
+from typing import Any, NamedTuple, Protocol, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -23,7 +23,7 @@ from evofsm._compile import compiled
 from evofsm.protocols import Situation
 from evofsm.risk.brakes import OwnBrakes, Sample
 from evofsm.risk.manoeuvres import BrakeWatch, Manoeuvres
-from evofsm.risk.perception import Estimate, Perception, Three
+from evofsm.risk.perception import Estimate, Perception, Three, is_whole
 from evofsm.risk.rehearsal import Body, critical_decelerations
 from evofsm.validation import positive, real_array, refuse_unless_distribution, refuse_unusable
 
@@ -143,7 +143,8 @@ class LatentRisk:
         Parameters
         ----------
         observation : (3,) array_like
-            Gap [m], speed of the follower and of the leader [m/s].
+            Gap [m], speed of the follower and of the leader [m/s]; NaN where it was not seen.
+            Then nothing is learnt, and what is under way is not gone on with.
         acceleration : float
             Commanded [m/s²].
         belief : (n,) array_like
@@ -155,8 +156,12 @@ class LatentRisk:
             If one of them does not hold real, finite numbers, or has another shape, or ``belief``
             is no distribution. What was learnt is then as it was.
         """
-        seen, command = _three_finite(observation), _one_finite("acceleration", acceleration)
+        seen = _three_finite(observation, whole=False)
+        command = _one_finite("acceleration", acceleration)
         states = _series("belief", belief)
+        if not is_whole(seen):
+            self.follow(observation, acceleration)
+            return
         was_braking = self._watch.braking
         self._count(states, was_braking)
         estimate = self._perceive(seen, learn=True)
@@ -168,9 +173,14 @@ class LatentRisk:
     def follow(self, observation: ArrayLike, acceleration: float) -> None:
         """Keep up with what happens, as `learn`, without learning from it."""
         command = _one_finite("acceleration", acceleration)
-        seen = _three_finite(observation)
+        seen = _three_finite(observation, whole=False)
         self._perceive(seen, learn=False)
-        self._follow(seen, command)
+        if is_whole(seen):
+            self._follow(seen, command)
+        else:
+            self._watch.clear()
+            self.brakes.clear()
+            self._commands = (self._commands[1], command)
 
     def start_episode(self, *, learn: bool = True) -> None:
         """What comes is not a consequence of what was; a manoeuvre under way counts as it is."""
@@ -212,6 +222,9 @@ class LatentRisk:
     def judge(self, situation: Situation, accelerations: ArrayLike) -> Judgement:
         """Latent risk of each acceleration that could be commanded now.
 
+        What was not seen (NaN) is estimated from what was seen before; the less sure that is, the
+        higher the risk. Where nothing was seen before either, every risk is 1.
+
         Parameters
         ----------
         situation : Situation
@@ -224,6 +237,8 @@ class LatentRisk:
         """
         here = self._cautious(situation.observation)
         actions = _series("accelerations", accelerations)
+        if not is_whole(here):
+            return self._blind(situation, _finite("accelerations", actions))
         judged = np.empty((4, len(actions)))
         table, evidence = self.manoeuvres.table, float(len(self.manoeuvres))
         if not _judge(
@@ -235,13 +250,19 @@ class LatentRisk:
 
     def _cautious(self, observation: ArrayLike) -> Three:
         """The situation as it most likely is, but closer by what is not sure about it."""
-        seen = _three_finite(observation)
+        seen = _three_finite(observation, whole=False)
         here = self.perception.estimate(seen, self._expected, sure=self.brakes.known)
         gap, speed, leader_speed = here.mean
         # What is wrong about a speed adds up while both brake.
         decel = self.brakes.decel
         doubt = here.deviation((1.0, -speed / decel, leader_speed / decel))
         return gap - _CAUTION * doubt, speed, leader_speed
+
+    def _blind(self, situation: Situation, actions: NDArray[np.float64]) -> Judgement:
+        """Where one is was not seen, nor can it be told: nothing can be survived for sure."""
+        sure, none = np.ones(len(actions)), np.zeros(len(actions))
+        evidence = float(len(self.manoeuvres))
+        return Judgement(sure, none, sure, none, evidence, self._seen(situation))
 
     def judgement(
         self, situation: Situation, risk: NDArray[np.float64], critical: NDArray[np.float64]
@@ -345,8 +366,14 @@ class LatentRisk:
 
     # -- Keeping it -----------------------------------------------------------------------------
 
-    def save(self, path: str | PathLike[str]) -> None:
+    def save(self, path: storage.Place, provenance: Mapping[str, Any] | None = None) -> None:
         """Write what was learnt to a file (arrays and a JSON header, nothing that can run).
+
+        Parameters
+        ----------
+        path : path-like, or file open for writing bytes
+        provenance : mapping, optional
+            What it learnt from, for people; kept in the file.
 
         Raises
         ------
@@ -362,10 +389,10 @@ class LatentRisk:
             "margin": self.margin,
             "hard": self.hard,
         }
-        storage.write(path, "risk", settings, self._learnt())
+        storage.write(path, "risk", settings, self._learnt(), provenance)
 
     @classmethod
-    def load(cls, path: str | PathLike[str]) -> Self:
+    def load(cls, path: storage.Place) -> Self:
         """Read what was learnt, between two episodes.
 
         Raises
@@ -404,6 +431,10 @@ class LatentRisk:
             risk.perception.restore(arrays)
             risk.brakes.set_lagged(*arrays["lagged"].tolist())
             risk._by_state = np.array(by_state)
+            for name, latest in risk.brakes.doubts.items():
+                pairs = arrays.get(f"doubts_{name}", np.empty(0)).reshape(-1, 2)  # new in format 4
+                for value, begins in pairs.tolist():
+                    latest.add(Sample(value, bool(begins)))
         return risk
 
     def _learnt(self) -> dict[str, NDArray[np.float64]]:
@@ -414,12 +445,16 @@ class LatentRisk:
             "stretches": np.array([float(sample.begins) for sample in self.brakes.samples]),
             **self.perception.learnt(),
             "lagged": np.array(self.brakes.lagged),
+            **{
+                f"doubts_{name}": np.array(list(latest), dtype=np.float64).reshape(-1)
+                for name, latest in self.brakes.doubts.items()
+            },
             **dict(zip(("onsets", "exposure", "seconds"), self._by_state, strict=True)),
         }
 
 
-def _three_finite(observation: ArrayLike) -> Three:
-    """Gap and speeds, as they can be judged."""
+def _three_finite(observation: ArrayLike, *, whole: bool = True) -> Three:
+    """Gap and speeds, as they can be judged; unless they must be ``whole``, NaN where not seen."""
     seen = _series("observation", observation)
     if len(seen) != 3:
         raise ValueError(
@@ -428,7 +463,7 @@ def _three_finite(observation: ArrayLike) -> Three:
         )
     gap, speed, leader_speed = seen.tolist()
     if not math.isfinite(gap + speed + leader_speed):  # looked at closely only where it has to be
-        refuse_unusable("observation", seen)
+        refuse_unusable("observation", seen if whole else seen[~np.isnan(seen)])
     return gap, speed, leader_speed
 
 

@@ -2,22 +2,31 @@
 
 from __future__ import annotations
 
+import hashlib
+import io
 import json
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Self, get_type_hints
 
 import numpy as np
+from numpy.typing import NDArray
 
+from evofsm import storage
 from evofsm._extras import needs
+from evofsm.checkpoint import Checkpoint, Kept
 from evofsm.drivers.acc import AdaptiveCruise
 from evofsm.drivers.idm import IDM
-from evofsm.framework.loop import Drive
+from evofsm.framework.audit import AuditLog
+from evofsm.framework.loop import Drive, Framework
 from evofsm.framework.reviser import EnvelopeReviser, Mode, Unrevised
+from evofsm.machine import EvolvingFSM
 from evofsm.protocols import Controller, Reviser
 from evofsm.risk.by_state import StateRisk, assess_states
+from evofsm.risk.outcome import LatentRisk
 from evofsm.studies.closed_loop import (
     FIXED_MEASURES,
     Learner,
@@ -55,6 +64,34 @@ class Setup:
     learn: bool = True
     first: int = 0  #: episodes driven before, which are not driven again
 
+    def settings(self, world: str, learner: Learner) -> dict[str, Any]:
+        """All that an episode depends on, for JSON; not how many there are.
+
+        Parameters
+        ----------
+        world : str
+            Where is driven.
+        learner : Learner
+            With what was learnt before.
+        """
+        machine, risk = _files(learner)
+        return {
+            "family": {
+                "name": self.family.name,
+                "tables": self.family.tables,
+                "added": self.family.added,
+            },
+            "controller": self.controller,
+            "reviser": self.reviser,
+            "mode": self.mode.value,
+            "tolerance": self.tolerance,
+            "seed": self.seed,
+            "learn": self.learn,
+            "first": self.first,
+            "world": world,
+            "learnt": hashlib.sha256(machine + risk).hexdigest(),
+        }
+
 
 @dataclass(frozen=True)
 class Driving:
@@ -63,7 +100,7 @@ class Driving:
     row: Row
     lead_times: tuple[float, ...]  #: from the last alarm that stayed on to the collision [s]
     states: list[StateRisk]
-    drives: list[Drive]
+    decisions: Mapping[str, Sequence[Any]]  #: columns of the table of all decisions
 
 
 def drive_family(
@@ -71,6 +108,8 @@ def drive_family(
     learner: Learner,
     world: World,
     progress: Callable[[int, int], None] = lambda done, collisions: None,
+    checkpoint: Checkpoint | None = None,
+    audit: AuditLog | None = None,
 ) -> Driving:
     """Drive the episodes in turn.
 
@@ -82,26 +121,46 @@ def drive_family(
     world : World
     progress : callable
         Told how many episodes are done, and how many ended in a collision.
+    checkpoint : Checkpoint, optional
+        Keeps, between two episodes, all that came of those before. Where its file exists, it is
+        gone on from, and ``learner`` learns what it had learnt. The result is the same, bit for
+        bit; there may be more episodes than before.
+    audit : AuditLog, optional
+        Writes down what is decided; also in episodes that are driven again after a stop.
+
+    Raises
+    ------
+    ValueError
+        If the checkpoint is of other work, or of more episodes.
     """
     family = setup.family
+    done = Driven.resumed(setup, learner, checkpoint)
     reviser = make_reviser(setup, learner)
-    drives: list[Drive] = []
-    outcomes: list[Outcome] = []
-    for draw in draws(setup):
+    for draw in draws(setup, len(done.outcomes)):
         controller = make_controller(setup, draw, world)
         unrevised = drive_unrevised(family, draw, world, controller)
-        drive = learner.drive(
-            family, draw, reviser, learn=setup.learn, world=world, controller=controller
+        framework = Framework(
+            controller,
+            family.actions,
+            reviser,
+            machine=learner.machine,
+            risk=learner.risk,
+            learn=setup.learn,
+            interval=family.interval,
+            audit=audit,
         )
-        outcomes.append(outcome(drive, unrevised, family.interval))
-        drives.append(drive)
-        progress(len(drives), sum(o.collided for o in outcomes))
-    collided = [drive for drive in drives if drive.episode.collided]
+        drive = framework.drive(world, draw.scenario)
+        done.add(drive, outcome(drive, unrevised, family.interval), setup.tolerance)
+        if checkpoint is not None:
+            checkpoint.offer(partial(done.keep, learner))
+        progress(len(done.outcomes), sum(o.collided for o in done.outcomes))
+    if checkpoint is not None:
+        checkpoint.keep(done.keep(learner, finished=True))
     return Driving(
-        summarise(family.name, setup.reviser, "", outcomes, family.interval),
-        tuple(lead_time(drive, setup.tolerance) for drive in collided if is_judged(drive)),
+        summarise(family.name, setup.reviser, "", done.outcomes, family.interval),
+        tuple(done.lead_times),
         assess_states(learner.machine.model(), learner.risk),
-        drives,
+        done.decisions,
     )
 
 
@@ -111,10 +170,10 @@ def drive_unrevised(family: Family, draw: Draw, world: World, controller: Contro
     return reference(alone, draw.scenario.leader.brake_decel)
 
 
-def draws(setup: Setup) -> Iterator[Draw]:
-    """What is driven: training draws while learning, held-out ones else."""
+def draws(setup: Setup, done: int = 0) -> Iterator[Draw]:
+    """What is driven: training draws while learning, held-out ones else; but those done."""
     split = "train" if setup.learn else "test"
-    for index in range(setup.first, setup.first + setup.episodes):
+    for index in range(setup.first + done, setup.first + setup.episodes):
         yield setup.family.draw(setup.seed, index, split=split)
 
 
@@ -162,17 +221,25 @@ def _sumo_driver(world: World) -> Controller:
 
 
 def write_driving(driving: Driving, learner: Learner, setup: Setup, out: Path) -> None:
-    """Write what was learnt, the summary, and every decision as a table."""
-    learner.save(out)
+    """Write what was learnt, every decision as a table, and the summary; each whole or not at all.
+
+    Raises
+    ------
+    OSError
+        If one of them cannot be written; those before it are, and it is as it was.
+    """
+    with needs("polars", "tables", "writing decisions as Parquet"):
+        import polars
+    learner.save(out, {"drove": setup.settings})
+    with storage.replacing(out / "decisions.parquet") as file:
+        polars.DataFrame(driving.decisions).write_parquet(file)
     summary = {
         **driving.row.as_dict(),
         "lead_times": driving.lead_times,
         "episodes_learnt": setup.first + setup.episodes * setup.learn,
     }
-    (out / _SUMMARY).write_text(json.dumps(summary, indent=2), encoding="utf-8")
-    with needs("polars", "tables", "writing decisions as Parquet"):
-        import polars
-    polars.DataFrame(_decision_columns(driving.drives)).write_parquet(out / "decisions.parquet")
+    with storage.replacing(out / _SUMMARY) as file:
+        file.write(json.dumps(summary, indent=2).encode())
 
 
 def episodes_learnt(folder: Path) -> int:
@@ -180,32 +247,120 @@ def episodes_learnt(folder: Path) -> int:
     return int(json.loads((folder / _SUMMARY).read_text("utf-8"))["episodes_learnt"])
 
 
-def _decision_columns(drives: Sequence[Drive]) -> dict[str, Any]:
-    """A row for each decision, episodes one after another."""
-    decisions = [
-        (episode, *decision) for episode, drive in enumerate(drives) for decision in drive.decisions
-    ]
-    seen = np.array([situation.observation for _, situation, _, _ in decisions])
-    return {
-        "episode": [episode for episode, _, _, _ in decisions],
-        "time": [situation.time for _, situation, _, _ in decisions],
-        **{name: seen[:, column] for column, name in enumerate(VARIABLES)},
-        "state": [situation.state for _, situation, _, _ in decisions],
-        "surprise": [situation.surprise for _, situation, _, _ in decisions],
-        **{
-            name: [getattr(revision, name) for _, _, revision, _ in decisions]
-            for name in (
-                "proposed",
-                "executed",
-                "advised",
-                "risk_proposed",
-                "risk_executed",
-                "seen",
+# -- What has been driven so far ------------------------------------------------------------------
+
+_WHOLE = ("episode", "state")
+_OF_REVISION = ("proposed", "executed", "advised", "risk_proposed", "risk_executed", "seen")
+_COLUMNS = ("episode", "time", *VARIABLES, "state", "surprise", *_OF_REVISION, "realised", "reason")
+# Where there is no state.
+_NONE = -1
+
+
+class Driven:
+    """Outcomes of the episodes so far, and the columns of the table of their decisions."""
+
+    def __init__(self) -> None:
+        self.outcomes: list[Outcome] = []
+        self.lead_times: list[float] = []
+        self.decisions: dict[str, list[Any]] = {name: [] for name in _COLUMNS}
+
+    def add(self, drive: Drive, came_of_it: Outcome, tolerance: float) -> None:
+        """Take in the next episode."""
+        for situation, revision, realised in drive.decisions:
+            row = (
+                len(self.outcomes),
+                situation.time,
+                *situation.observation.tolist(),
+                situation.state,
+                situation.surprise,
+                *(getattr(revision, name) for name in _OF_REVISION),
+                realised,
+                revision.reason,
             )
-        },
-        "realised": [realised for _, _, _, realised in decisions],
-        "reason": [revision.reason for _, _, revision, _ in decisions],
-    }
+            for name, value in zip(_COLUMNS, row, strict=True):
+                self.decisions[name].append(value)
+        self.outcomes.append(came_of_it)
+        if drive.episode.collided and is_judged(drive):
+            self.lead_times.append(lead_time(drive, tolerance))
+
+    @classmethod
+    def resumed(cls, setup: Setup, learner: Learner, checkpoint: Checkpoint | None) -> Self:
+        """What was driven before, if anything was; the learner is then as it was after it."""
+        done = cls()
+        if checkpoint is None:
+            return done
+        kept = checkpoint.begin(done.keep(learner))
+        with storage.explained(checkpoint.path):
+            done._restore(kept.arrays)
+            _teach(learner, kept.arrays)
+        if len(done.outcomes) > setup.episodes:
+            raise ValueError(
+                f"{checkpoint.path} has driven {len(done.outcomes)} episodes, more than "
+                f"{setup.episodes}"
+            )
+        return done
+
+    def keep(self, learner: Learner, finished: bool = False) -> Kept:
+        """All of it and what was learnt, for a checkpoint."""
+        machine, risk = _files(learner)
+        columns = {f"decided_{name}": _column(name, self.decisions[name]) for name in _COLUMNS}
+        return Kept(
+            {"episodes": len(self.outcomes)},
+            {
+                "machine": np.frombuffer(machine, np.uint8),
+                "risk": np.frombuffer(risk, np.uint8),
+                "outcomes": np.array(self.outcomes, np.float64).reshape(-1, len(Outcome._fields)),
+                "lead_times": np.array(self.lead_times, np.float64),
+                **columns,
+            },
+            finished,
+        )
+
+    def _restore(self, arrays: Mapping[str, NDArray[Any]]) -> None:
+        kinds = get_type_hints(Outcome).values()
+        for row in arrays["outcomes"].tolist():
+            self.outcomes.append(Outcome(*(kind(v) for kind, v in zip(kinds, row, strict=True))))
+        self.lead_times = arrays["lead_times"].tolist()
+        for name in _COLUMNS:
+            self.decisions[name] = _values(name, arrays[f"decided_{name}"])
+        if len({len(column) for column in self.decisions.values()}) != 1:
+            raise ValueError("columns of decisions are of different lengths")
+
+
+def _column(name: str, values: Sequence[Any]) -> NDArray[Any]:
+    """A column of decisions as an array; texts as JSON."""
+    if name == "reason":
+        return np.frombuffer(json.dumps(values).encode(), np.uint8)
+    if name in _WHOLE:
+        return np.array([_NONE if value is None else value for value in values], np.int64)
+    return np.array(values, np.float64)
+
+
+def _values(name: str, column: NDArray[Any]) -> list[Any]:
+    """The column that `_column` made an array of."""
+    if name == "reason":
+        return [str(reason) for reason in json.loads(column.tobytes())]
+    if name in _WHOLE:
+        return [None if value == _NONE else value for value in column.tolist()]
+    values: list[float] = column.tolist()
+    return values
+
+
+def _files(learner: Learner) -> tuple[bytes, bytes]:
+    """The files of its machine and of its risk."""
+    machine, risk = io.BytesIO(), io.BytesIO()
+    learner.machine.save(machine)
+    learner.risk.save(risk)
+    return machine.getvalue(), risk.getvalue()
+
+
+def _teach(learner: Learner, arrays: Mapping[str, NDArray[Any]]) -> None:
+    """Let it have learnt what `Driven.keep` kept."""
+    learner.machine = EvolvingFSM.load(io.BytesIO(arrays["machine"].tobytes()))
+    learner.risk = LatentRisk.load(io.BytesIO(arrays["risk"].tobytes()))
+
+
+# -- One episode ----------------------------------------------------------------------------------
 
 
 def is_judged(drive: Drive) -> bool:

@@ -7,16 +7,20 @@ from the belief that came is measured by the Jensen-Shannon divergence.
 
 from __future__ import annotations
 
+import io
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from itertools import islice
 from typing import NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
+from evofsm import storage
 from evofsm._compile import compiled, kernel
 from evofsm.actions import IntervalActions
+from evofsm.checkpoint import Checkpoint, Kept
 from evofsm.divergence import jensen_shannon_kernel
 from evofsm.io import Chunk
 from evofsm.machine import EvolvingFSM
@@ -34,6 +38,8 @@ _LEAST_EVIDENCE = 10.0
 
 _POLICIES: tuple[Policy, ...] = get_args(Policy)
 _HOLD, _OBSERVED = _POLICIES.index("hold"), _POLICIES.index("observed")
+# What a learner counts.
+_COUNTS = ("chunks", "rows", "episodes", "jumps", "cuts", "clipped_below", "clipped_above")
 # Rows whose beliefs are kept at a time.
 _ROWS_AT_ONCE = 1024
 
@@ -82,6 +88,9 @@ def learn_traces(
     actions: IntervalActions,
     names: Sequence[str] = (),
     units: Sequence[str] = (),
+    checkpoint: Checkpoint | None = None,
+    *,
+    live: bool = False,
 ) -> Learning:
     """Learn all chunks in their order, each row once.
 
@@ -95,6 +104,14 @@ def learn_traces(
         Turns actions into indices; made with ``outside="clip"`` it takes any action.
     names, units : sequence of str, optional
         Of the variables, for the model.
+    checkpoint : Checkpoint, optional
+        Keeps what was learnt between two chunks. Where its file exists, what was learnt before is
+        gone on with: as many of the chunks, which must be the same, are passed over; none is read
+        where all were learnt. The result is the same, bit for bit.
+    live : bool
+        Whether chunks come as things happen, so that none comes again. Then none is passed over:
+        what was learnt before is gone on with, and what came after the latest checkpoint and
+        before a stop is lost; `Learning.rows` counts what is not.
 
     Returns
     -------
@@ -103,17 +120,17 @@ def learn_traces(
     Raises
     ------
     ValueError
-        If no row follows another in any episode, so that there is no transition to learn.
+        If no row follows another in any episode, so that there is no transition to learn, or the
+        checkpoint is of other work, or the chunks are others than it knows.
     """
     if actions.n_actions != machine.n_actions:
         raise ValueError(
             f"the machine has {machine.n_actions} actions, but there are "
             f"{actions.n_actions} intervals"
         )
-    machine = machine.copy()
-    learner = _Learner(machine, actions)
-    for chunk in _ahead(chunks):
-        learner.learn(chunk)
+    learner = _Learner(machine.copy(), actions)
+    _learn_all(chunks, learner, checkpoint, live)
+    machine = learner.machine
     if learner.transitions == 0:
         raise ValueError(
             "no transition could be learnt: no row with an action is followed by another row of "
@@ -133,6 +150,38 @@ def learn_traces(
         certainty=learner.certainty / learner.rows,
         skills=learner.skills(),
     )
+
+
+def _learn_all(
+    chunks: Iterable[Chunk], learner: _Learner, checkpoint: Checkpoint | None, live: bool
+) -> None:
+    """Learn what was not learnt before, and keep it."""
+    if checkpoint is None:
+        for chunk in _ahead(chunks):
+            learner.learn(chunk)
+        return
+    kept = checkpoint.begin(learner.keep())
+    with storage.explained(checkpoint.path):
+        learner.restore(kept)
+    if kept.finished and not live:
+        return
+    coming = _ahead(chunks)
+    if not live:
+        _pass_over(coming, learner, checkpoint)
+    for chunk in coming:
+        learner.learn(chunk)
+        checkpoint.offer(learner.keep)
+    checkpoint.keep(learner.keep(finished=True))
+
+
+def _pass_over(coming: Iterator[Chunk], learner: _Learner, checkpoint: Checkpoint) -> None:
+    """Leave out the chunks that were learnt before."""
+    rows = sum(len(chunk.times) for chunk in islice(coming, learner.chunks))
+    if rows != learner.rows:
+        raise ValueError(
+            f"{checkpoint.path} has learnt {learner.rows:,} rows, where there are {rows:,} now; "
+            "the files were changed, or are read in other pieces: delete it to begin anew"
+        )
 
 
 class Passage(NamedTuple):
@@ -220,7 +269,7 @@ class _Learner:
         self.machine = machine
         self.actions = actions
         self.dt = np.nan
-        self.rows = self.episodes = self.jumps = self.cuts = 0
+        self.rows = self.episodes = self.jumps = self.cuts = self.chunks = 0
         self.clipped_below = self.clipped_above = 0
         self.seconds = 0.0
         self._last_time = np.nan
@@ -254,6 +303,7 @@ class _Learner:
         steps[chunk.starts] = 0.0
         self._last_time = chunk.times[-1]
         self.seconds += float(steps.sum())
+        self.chunks += 1
         self.rows += len(steps)
         self.episodes += len(chunk.starts)
         self.jumps += chunk.jumps
@@ -266,6 +316,47 @@ class _Learner:
         steps = self._steps_ahead
         ahead = _skills(self._scores.ahead, steps, self.dt, _POLICIES) if steps else ()
         return (*_skills(self._scores.one_step, 1, self.dt, [None]), *ahead)
+
+    def keep(self, finished: bool = False) -> Kept:
+        """All of it, for a checkpoint."""
+        machine = io.BytesIO()
+        self.machine.save(machine)
+        n = self.machine.n_states
+        return Kept(
+            {name: getattr(self, name) for name in _COUNTS},
+            {
+                "machine": np.frombuffer(machine.getvalue(), np.uint8),
+                "clock": np.array([self.dt, self.seconds, self._last_time]),
+                **self._scores._replace(
+                    belief=self._scores.belief[:n], forecasts=self._scores.forecasts[:, :n]
+                )._asdict(),
+            },
+            finished,
+        )
+
+    def restore(self, kept: Kept) -> None:
+        """Take over what `keep` answered."""
+        arrays = kept.arrays
+        self.machine = type(self.machine).load(io.BytesIO(arrays["machine"].tobytes()))
+        if self.machine.n_actions != self.actions.n_actions:
+            raise ValueError(f"its machine has {self.machine.n_actions} actions")
+        scores = _Scores(*(np.array(arrays[name]) for name in _Scores._fields))
+        for name in _COUNTS:
+            setattr(self, name, int(kept.content[name]))
+        self.dt, self.seconds, self._last_time = arrays["clock"].tolist()
+        n, kinds = self.machine.n_states, len(_POLICIES)
+        for name, shape in (
+            ("one_step", (3,)),
+            ("ahead", (2 + kinds,)),
+            ("belief", (n,)),
+            ("forecasts", (1 + kinds, n)),
+            *((name, (1,)) for name in ("certainty", "age", "waiting")),
+        ):
+            now, old = getattr(scores, name), getattr(self._scores, name)
+            if now.shape != shape or now.dtype != old.dtype:
+                raise ValueError(f"{name} has shape {now.shape} of {now.dtype}, not {shape}")
+        self._scores = scores
+        self._make_room()
 
     @property
     def _steps_ahead(self) -> int:

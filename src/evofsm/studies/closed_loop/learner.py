@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 from evofsm.framework.loop import Drive, Framework
 from evofsm.framework.reviser import ActionReviser, Mode, Unrevised
@@ -48,11 +48,11 @@ class Learner:
         """One that was saved."""
         return cls(EvolvingFSM.load(folder / _MACHINE), LatentRisk.load(folder / _RISK))
 
-    def save(self, folder: Path) -> None:
-        """Write both files."""
+    def save(self, folder: Path, provenance: Mapping[str, Any] | None = None) -> None:
+        """Write both files, with what they learnt from."""
         folder.mkdir(parents=True, exist_ok=True)
-        self.machine.save(folder / _MACHINE)
-        self.risk.save(folder / _RISK)
+        self.machine.save(folder / _MACHINE, provenance)
+        self.risk.save(folder / _RISK, provenance)
 
     def frozen(self) -> Self:
         """A copy that goes its own way."""

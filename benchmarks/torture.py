@@ -1,0 +1,461 @@
+"""What kill -9, a full disk and damaged files do to what was learnt: nothing, it is hoped.
+
+``make torture`` runs it, prints what was found and ends with 1 where there is anything but zeros.
+Needs Linux or macOS: it forks a process that is warm, so that a kill costs no more than the work.
+"""
+
+from __future__ import annotations
+
+import argparse
+import io
+import json
+import logging
+import os
+import resource
+import signal
+import sys
+import tempfile
+import time
+import tracemalloc
+import zipfile
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from evofsm import EvolvingFSM, FSMModel, IntervalActions, storage
+from evofsm.checkpoint import Checkpoint, fingerprints
+from evofsm.io import read_traces
+from evofsm.risk.outcome import LatentRisk
+from evofsm.studies.closed_loop import Learner
+from evofsm.studies.driving import Setup, drive_family
+from evofsm.studies.learning import learn_traces
+from evofsm.worlds.families import load_family
+from evofsm.worlds.kinematic import KinematicWorld
+
+#: What must not happen, in the order in which it is printed.
+WRONG = (
+    "broken files",
+    "results that differ",
+    "loaded silently",
+    "crashes",
+    "over-allocations",
+    "left behind",
+)
+_REFUSED, _CRASHED = 3, 4
+
+#: One way of damaging what is in a file.
+Way = Callable[[bytes, np.random.Generator], bytes]
+# A damaged file may take so much more memory than the whole one: a share, and bytes.
+_MORE, _SPARE = 2.0, 1 << 20
+
+
+# -- Work that is stopped ------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Work:
+    """Something that learns, with a checkpoint wherever it can have one."""
+
+    name: str
+    run: Callable[[Path], bytes]  #: from the path of a checkpoint to all that came of it
+    expected: bytes  #: what came of it when nothing stopped it
+    seconds: float  #: that it took then
+
+
+def works(folder: Path) -> list[Work]:
+    """Learning from files, and driving, each run once before to be warm."""
+    logs = [_write_log(folder / f"log{k}.csv", seed=k) for k in range(8)]
+    found = []
+    for name, run in (("learn", lambda path: _learn(logs, path)), ("drive", _drive)):
+        run(folder / f"{name}.warm")
+        began = time.perf_counter()
+        expected = run(folder / f"{name}.whole")
+        found.append(Work(name, run, expected, time.perf_counter() - began))
+    return found
+
+
+def _write_log(path: Path, seed: int, rows: int = 250) -> str:
+    random = np.random.default_rng(seed)
+    lines = ["time,gap,v_follower,v_leader,a_follower"]
+    gap, speed, leader_speed = 30.0, 20.0, 20.0
+    for k in range(rows):
+        action = float(random.normal())
+        lines.append(f"{k / 10},{gap:.4f},{speed:.4f},{leader_speed:.4f},{action:.4f}")
+        gap = max(1.0, gap + 0.1 * (leader_speed - speed))
+        speed = max(0.0, speed + 0.5 * action)
+        leader_speed = max(0.0, leader_speed + 0.5 * float(random.normal()))
+    path.write_text("\n".join([*lines, ""]))
+    return str(path)
+
+
+def _learn(logs: Sequence[str], path: Path) -> bytes:
+    actions = IntervalActions(-2.5, 2.5, 1.0, outside="clip")
+    machine = EvolvingFSM(actions.n_actions)
+    checkpoint = Checkpoint(path, {"files": fingerprints(logs)}, every=0.0)
+    learning = learn_traces(read_traces(logs), machine, actions, checkpoint=checkpoint)
+    numbers = [value for name, value in vars(learning).items() if name not in ("machine", "model")]
+    return _saved(learning.machine) + repr(numbers).encode()
+
+
+def _drive(path: Path) -> bytes:
+    setup = Setup(load_family("emergency"), episodes=4)
+    learner = Learner.new(setup.family)
+    checkpoint = Checkpoint(path, setup.settings("kinematic", learner), every=0.0)
+    driving = drive_family(setup, learner, KinematicWorld(), checkpoint=checkpoint)
+    told = json.dumps([driving.row.as_dict(), driving.lead_times, dict(driving.decisions)])
+    return _saved(learner.machine) + _saved(learner.risk) + told.encode()
+
+
+def _saved(learnt: Any) -> bytes:
+    file = io.BytesIO()
+    learnt.save(file)
+    return file.getvalue()
+
+
+def _fork(work: Work, checkpoint: Path, result: Path, room: int | None) -> int:
+    """Do the work in another process, with so much room for a file; answers its number."""
+    if (child := os.fork()) > 0:
+        return child
+    code = _CRASHED
+    try:
+        logging.disable()  # that a checkpoint could not be written is what is tried here
+        if room is not None:
+            signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+            resource.setrlimit(resource.RLIMIT_FSIZE, (room, resource.RLIM_INFINITY))
+        came = work.run(checkpoint)
+        if room is not None:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY,) * 2)
+        result.write_bytes(came)
+        code = 0
+    except OSError:
+        code = _REFUSED
+    finally:
+        os._exit(code)
+
+
+def _is_broken(checkpoint: Path) -> bool:
+    if not checkpoint.exists():
+        return False  # it was stopped before there was anything to keep
+    try:
+        storage.read(checkpoint, "checkpoint")
+    except (ValueError, OSError):
+        return True
+    return False
+
+
+def kill(work: Work, times: int, folder: Path, random: np.random.Generator) -> Counter[str]:
+    """Kill it at random moments, and start it again until it ends; then begin anew."""
+    found: Counter[str] = Counter()
+    while found["kills"] < times:
+        with tempfile.TemporaryDirectory(dir=folder) as name:
+            checkpoint, result = Path(name) / "checkpoint", Path(name) / "result"
+            while not result.exists() and not found["crashes"]:
+                child = _fork(work, checkpoint, result, None)
+                if found["kills"] < times:
+                    time.sleep(random.uniform(0.0, 0.5 * work.seconds))
+                    os.kill(child, signal.SIGKILL)
+                _, status = os.waitpid(child, 0)
+                found["kills"] += os.WIFSIGNALED(status)
+                found["crashes"] += os.WIFEXITED(status) and os.WEXITSTATUS(status) != 0
+                found["broken files"] += _is_broken(checkpoint)
+                if os.WIFSIGNALED(status) and result.exists():
+                    result.unlink()  # perhaps half of it
+            if found["crashes"]:
+                return found
+            found["results"] += 1
+            found["results that differ"] += result.read_bytes() != work.expected
+            found["left behind"] += len(list(Path(name).glob(".*.part")))
+    return found
+
+
+def fill(work: Work, times: int, folder: Path, random: np.random.Generator) -> Counter[str]:
+    """Let the disk be full at some size of a checkpoint, then make room and go on."""
+    found: Counter[str] = Counter()
+    with tempfile.TemporaryDirectory(dir=folder) as name:
+        work.run(whole := Path(name) / "whole")
+        size = whole.stat().st_size
+    for _ in range(times):
+        with tempfile.TemporaryDirectory(dir=folder) as name:
+            checkpoint, result = Path(name) / "checkpoint", Path(name) / "result"
+            for room in (int(random.integers(1, size)), None):
+                result.unlink(missing_ok=True)
+                _, status = os.waitpid(_fork(work, checkpoint, result, room), 0)
+                code = os.WEXITSTATUS(status) if os.WIFEXITED(status) else _CRASHED
+                # Without room for the first one it says so before it begins.
+                refused = code == _REFUSED and room is not None and not checkpoint.exists()
+                found["refused at once"] += refused
+                found["crashes"] += code != 0 and not refused
+                found["broken files"] += _is_broken(checkpoint)
+                if code == 0:
+                    found["results"] += 1
+                    found["results that differ"] += result.read_bytes() != work.expected
+            found["left behind"] += len(list(Path(name).glob(".*.part")))
+        found["full disks"] += 1
+    return found
+
+
+# -- Files that are damaged -----------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Sample:
+    """A file, and what is in it once it was loaded and saved again."""
+
+    name: str
+    data: bytes
+    load: Callable[[Path], bytes]
+    has_checksum: bool  #: whether it is of version 4 or later
+
+
+def _load_checkpoint(path: Path) -> bytes:
+    content, arrays = storage.read(path, "checkpoint")
+    kept = {name: (a.dtype.str, a.shape, a.tobytes().hex()) for name, a in sorted(arrays.items())}
+    return json.dumps([content, kept], sort_keys=True).encode()
+
+
+_LOADS: dict[str, Callable[[Path], bytes]] = {
+    "machine": lambda path: _saved(EvolvingFSM.load(path)),
+    "model": lambda path: _saved(FSMModel.load(path)),
+    "risk": lambda path: _saved(LatentRisk.load(path)),
+    "checkpoint": _load_checkpoint,
+}
+
+
+def samples(folder: Path) -> list[Sample]:
+    """One of each kind of this version, and those of earlier ones that the tests hold."""
+    paths = sorted((Path(__file__).parents[1] / "tests" / "files").glob("*.evofsm"))
+    machine = EvolvingFSM(3, radius=0.5)
+    random = np.random.default_rng(0)
+    machine.learn_many(random.normal(size=(60, 2)).cumsum(axis=0), np.arange(60) % 3)
+    risk = LatentRisk(lowest=-2.5)
+    for decel in (3.0, 4.0, 6.0):
+        risk.manoeuvres.remember(decel)
+    machine.save(folder / "new.machine", {"files": ["a.csv"]})
+    machine.model(names=("x", "y")).save(folder / "new.model")
+    risk.save(folder / "new.risk")
+    _drive(folder / "new.checkpoint")
+    paths += [folder / f"new.{kind}" for kind in _LOADS]
+    return [
+        Sample(path.name, path.read_bytes(), _LOADS[header.kind], header.version >= 4)
+        for path in paths
+        for header in [storage.describe(path)]
+    ]
+
+
+def damaged(sample: Sample, random: np.random.Generator) -> bytes:
+    """The file with one thing wrong."""
+    ways: list[Way] = [*_ROUGH, *(_FINE if sample.has_checksum else ())]
+    while (data := ways[random.integers(len(ways))](sample.data, random)) == sample.data:
+        pass
+    return data
+
+
+def _flip(data: bytes, random: np.random.Generator) -> bytes:
+    """A few bits."""
+    flipped = bytearray(data)
+    for place in random.integers(len(data), size=random.integers(1, 9)):
+        flipped[place] ^= 1 << int(random.integers(8))
+    return bytes(flipped)
+
+
+def _cut(data: bytes, random: np.random.Generator) -> bytes:
+    return data[: random.integers(len(data))]
+
+
+def _parts(data: bytes, random: np.random.Generator) -> list[bytes]:
+    """Cut at four places."""
+    a, b, c, d = np.sort(random.integers(len(data) + 1, size=4)).tolist()
+    return [data[:a], data[a:b], data[b:c], data[c:d], data[d:]]
+
+
+def _swap(data: bytes, random: np.random.Generator) -> bytes:
+    first, second, third, fourth, fifth = _parts(data, random)
+    return first + fourth + third + second + fifth
+
+
+def _repeat(data: bytes, random: np.random.Generator) -> bytes:
+    first, second, third, *rest = _parts(data, random)
+    return first + second + third + second + b"".join(rest)
+
+
+def _drop(data: bytes, random: np.random.Generator) -> bytes:
+    first, _, *rest = _parts(data, random)
+    return first + b"".join(rest)
+
+
+def _blank(data: bytes, random: np.random.Generator) -> bytes:
+    """A stretch that was never written, or with something else in it."""
+    first, second, *rest = _parts(data, random)
+    filling = bytes(len(second)) if random.random() < 0.5 else random.bytes(len(second))
+    return first + filling + b"".join(rest)
+
+
+_ROUGH = (_flip, _flip, _cut, _swap, _repeat, _drop, _blank)
+
+
+def _members(data: bytes) -> dict[str, bytes]:
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        return {name: archive.read(name) for name in archive.namelist()}
+
+
+def _packed(members: Iterator[tuple[str, bytes]] | Any) -> bytes:
+    """An archive whose own checksums are right, whatever it holds."""
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, content in members:
+            archive.writestr(zipfile.ZipInfo(name), content, zipfile.ZIP_DEFLATED)
+    return file.getvalue()
+
+
+def _change_member(data: bytes, random: np.random.Generator) -> bytes:
+    members = _members(data)
+    name = random.choice(list(members))
+    members[name] = _flip(members[name], random)
+    return _packed(members.items())
+
+
+def _swap_members(data: bytes, random: np.random.Generator) -> bytes:
+    members = _members(data)
+    a, b = random.choice(list(members), 2, replace=False)
+    members[a], members[b] = members[b], members[a]
+    return _packed(members.items())
+
+
+def _lose_member(data: bytes, random: np.random.Generator) -> bytes:
+    members = _members(data)
+    del members[random.choice(list(members))]
+    return _packed(members.items())
+
+
+def _rename_member(data: bytes, random: np.random.Generator) -> bytes:
+    members = _members(data)
+    old = str(random.choice(list(members)))
+    names = ("../up.npy", "/etc/passwd.npy", "other.npy", "a/b.npy", "", old.upper(), old[:-4])
+    new = names[random.integers(len(names))]
+    return _packed((new if name == old else name, content) for name, content in members.items())
+
+
+def _claim(data: bytes, random: np.random.Generator) -> bytes:
+    """A shape that is far too large, in the array, in the archive's directory, or in both."""
+    members = _members(data)
+    name = str(random.choice(list(members)))
+    beginning, shape, rest = members[name].partition(b"'shape': (")
+    if random.random() < 0.7:
+        at = rest.index(b")")
+        more = b"%d," % random.integers(1 << 20, 1 << 60)
+        padding = rest[at:].split(b"\n")[0]
+        changed = more + rest[:at] + padding[: len(padding) - len(more)]
+        rest = changed + rest[len(changed) :] if len(padding) > len(more) + 3 else more + rest
+        members[name] = beginning + shape + rest
+    packed = bytearray(_packed(members.items()))
+    if random.random() < 0.7:
+        where = packed.rindex(b"PK\x01\x02", 0, packed.rindex(name.encode()))
+        size = int(random.integers(1 << 20, 1 << 32)).to_bytes(4, "little")
+        packed[where + 24 : where + 28] = size
+        if random.random() < 0.5:
+            packed[where + 20 : where + 24] = size
+    return bytes(packed)
+
+
+def _change_header(data: bytes, random: np.random.Generator) -> bytes:
+    members = _members(data)
+    text = members["header.npy"]
+    begin = text.index(b"\n") + 1
+    header = json.loads(text[begin:])
+    name = random.choice(list(header))
+    others: tuple[Any, ...] = (None, -1, 2, 3, 10**9, "x", [], {}, {"n_actions": 10**12}, 1e308)
+    header[name] = others[random.integers(len(others))]
+    file = io.BytesIO()
+    np.save(file, np.frombuffer(json.dumps(header).encode(), np.uint8))
+    members["header.npy"] = file.getvalue()
+    return _packed(members.items())
+
+
+_FINE = (_change_member, _swap_members, _lose_member, _rename_member, _claim, _change_header)
+
+
+def damage(times: int, folder: Path, random: np.random.Generator) -> Counter[str]:
+    """Load damaged files; each must be refused by name, or hold what the whole one does."""
+    found: Counter[str] = Counter()
+    kinds = samples(folder)
+    path = folder / "damaged"
+    tracemalloc.start()
+    whole = []
+    for sample in kinds:
+        path.write_bytes(sample.data)
+        sample.load(path)  # once before, so that nothing is counted that is made only once
+        before = _in_use()
+        whole.append((sample, sample.load(path), _peak() - before))
+    for turn in range(times):
+        sample, expected, needed = whole[turn % len(whole)]
+        path.write_bytes(damaged(sample, random))
+        found["damaged files"] += 1
+        before = _in_use()
+        try:
+            came = sample.load(path)
+        except ValueError as error:
+            found["refused"] += 1
+            found["crashes"] += str(path) not in str(error)
+        except Exception as error:
+            print(f"{sample.name}: {error!r}", file=sys.stderr)
+            found["crashes"] += 1
+        else:
+            found["the same"] += came == expected
+            found["loaded silently"] += came != expected
+        found["over-allocations"] += _peak() - before > _MORE * needed + _SPARE
+    tracemalloc.stop()
+    return found
+
+
+def _in_use() -> int:
+    """Memory that is in use now [bytes]; the peak is counted from here on."""
+    tracemalloc.reset_peak()
+    return tracemalloc.get_traced_memory()[0]
+
+
+def _peak() -> int:
+    return tracemalloc.get_traced_memory()[1]
+
+
+# -- All of it ------------------------------------------------------------------------------------
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Answers 1 where anything was wrong."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--short", action="store_true", help="20 kills, 4 full disks, 200 files")
+    parser.add_argument("--seed", type=int, default=0)
+    asked = parser.parse_args(arguments)
+    kills, disks, files = (20, 4, 200) if asked.short else (500, 100, 10_000)
+    random = np.random.default_rng(asked.seed)
+    total: Counter[str] = Counter()
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        learn, drive = works(folder)
+        for work in (learn, drive):
+            print(f"{work.name}, not stopped: {work.seconds:.2f} s", flush=True)
+        for title, run in (
+            ("killed while learning", partial(kill, learn, kills * 3 // 4)),
+            ("killed while driving", partial(kill, drive, kills // 4)),
+            ("disk full while learning", partial(fill, learn, disks * 3 // 4)),
+            ("disk full while driving", partial(fill, drive, disks // 4)),
+            ("damaged files", partial(damage, files)),
+        ):
+            began = time.perf_counter()
+            found = run(folder, random)
+            counts = ", ".join(f"{count:,} {what}" for what, count in found.items() if count)
+            print(f"{title:<25} {time.perf_counter() - began:6.1f} s  {counts}", flush=True)
+            total += found
+    print()
+    for what in WRONG:
+        print(f"{what:<25} {total[what]:6,}")
+    return int(any(total[what] for what in WRONG))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
