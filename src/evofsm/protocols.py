@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from enum import IntFlag
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -21,6 +22,17 @@ class Proposal(NamedTuple):
     candidates: tuple[float, ...] = ()  #: others it could do as well [m/s²]
 
 
+class Intake(IntFlag):
+    """What was wrong with an observation, and so what was done about it."""
+
+    WHOLE = 0  #: nothing
+    PARTIAL = 1  #: variables are missing: recognised by the others, and not learnt from
+    HELD = 2  #: the same, but recognised by the values of before
+    GAP = 4  #: it came long after the one before: no transition is learnt to it
+    REPEATED = 8  #: as old as the one before: nothing new is known, or learnt
+    LATE = 16  #: older than the one before: left out
+
+
 class Situation(NamedTuple):
     """Where the vehicle is, as it was observed and as the machine recognised it."""
 
@@ -29,6 +41,7 @@ class Situation(NamedTuple):
     state: int | None  #: index of the most probable state; None where there is none yet
     surprise: float  #: divergence of forecast and belief [bit]; NaN where nothing was forecast
     time: float  #: [s]
+    intake: Intake = Intake.WHOLE  #: whether the observation was whole and in time
 
 
 class Revision(NamedTuple):

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from copy import deepcopy
-from typing import Any, Protocol, SupportsFloat
+from typing import TYPE_CHECKING, Any, Protocol, SupportsFloat
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -21,6 +21,9 @@ from evofsm.framework.reviser import Unrevised
 from evofsm.machine import EvolvingFSM
 from evofsm.protocols import Proposal, Reviser, Revision, Situation
 from evofsm.risk.outcome import LatentRisk
+
+if TYPE_CHECKING:
+    from evofsm.framework.audit import AuditLog
 
 with needs("gymnasium", "gym", "a wrapper for Gymnasium"):
     import gymnasium
@@ -69,6 +72,8 @@ class RevisedActions(gymnasium.Wrapper[Any, Any, Any, Any]):
         is taken for that.
     to_action : callable, optional
         From an acceleration [m/s²] to an action of ``env``.
+    audit : AuditLog, optional
+        Writes down what is decided while something is ahead.
 
     Raises
     ------
@@ -111,6 +116,7 @@ class RevisedActions(gymnasium.Wrapper[Any, Any, Any, Any]):
         learn: bool = True,
         to_acceleration: Callable[[Any], float] | None = None,
         to_action: Callable[[float], Any] | None = None,
+        audit: AuditLog | None = None,
     ) -> None:
         super().__init__(env)
         refuse_mismatch(machine, reviser.actions)
@@ -120,6 +126,7 @@ class RevisedActions(gymnasium.Wrapper[Any, Any, Any, Any]):
         self.machine = machine
         self.risk = own_risk(reviser) if risk is None else risk
         self.learn = learn
+        self.audit = audit
         if to_acceleration is not None and to_action is not None:
             self.to_acceleration, self.to_action = to_acceleration, to_action
         elif to_acceleration is None and to_action is None:
@@ -171,6 +178,7 @@ class RevisedActions(gymnasium.Wrapper[Any, Any, Any, Any]):
                 machine=self.machine,
                 risk=self.risk,
                 learn=self.learn,
+                audit=self.audit,
             )
         time = math.nan if self.risk is None else self._steps * self.risk.dt
         situation = self._oversight.recognise(self._seen, time)

@@ -10,21 +10,29 @@ import logging
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from evofsm.actions import IntervalActions
 from evofsm.framework.reviser import ActionReviser, Unrevised
+from evofsm.framework.senses import Senses
 from evofsm.machine import EvolvingFSM
-from evofsm.protocols import Controller, Proposal, Reviser, Revision, Situation
+from evofsm.observations import Missing
+from evofsm.protocols import Controller, Intake, Proposal, Reviser, Revision, Situation
 from evofsm.risk.outcome import LatentRisk
 from evofsm.validation import positive
 from evofsm.worlds.road import Episode, World
 from evofsm.worlds.scenario import Scenario
 
+if TYPE_CHECKING:
+    from evofsm.framework.audit import AuditLog
+
 _log = logging.getLogger(__name__)
+
+# Observations that bring nothing new, and such as lack something.
+_STALE, _INCOMPLETE = Intake.REPEATED | Intake.LATE, Intake.PARTIAL | Intake.HELD
 
 # Actions that differ by less are the same [m/s²].
 _SAME = 1e-9
@@ -75,6 +83,12 @@ class Oversight:
     risk : LatentRisk, optional
     learn : bool
         Whether machine and risk learn.
+    missing : Missing
+        What to do where a variable was not observed (NaN).
+    interval : float, optional
+        Time between observations [s]; one that comes later begins an episode anew.
+    audit : AuditLog, optional
+        Writes down what is decided.
 
     Examples
     --------
@@ -94,37 +108,76 @@ class Oversight:
         machine: EvolvingFSM | None = None,
         risk: LatentRisk | None = None,
         learn: bool = True,
+        missing: Missing = Missing.PARTIAL,
+        interval: float | None = None,
+        audit: AuditLog | None = None,
     ) -> None:
         self.actions = actions
         self.reviser = reviser
         self.machine = machine
         self.risk = risk
         self.learn = learn
+        self.senses = Senses(missing, interval)
+        self.audit = audit
+        self._latest: Situation | None = None
         self._frozen = None if learn or machine is None else machine.model()
         reviser.start_episode()
         if risk is not None:  # of an episode that was broken off nothing follows
             risk.start_episode(learn=False)
         if machine is not None and learn:
             machine.start_episode()
+        if audit is not None:
+            audit.begin(self)
 
     def recognise(self, observation: NDArray[np.float64], time: float) -> Situation:
-        """Where the vehicle is at ``time`` [s]; the machine learns the transition to it."""
-        if self.machine is None:
-            return Situation(observation, np.ones(1), None, math.nan, time)
+        """Where the vehicle is at ``time`` [s]; the machine learns the transition to it.
+
+        NaN says that a variable was not observed. An observation that is no newer than the one
+        before changes nothing: the situation is still that one.
+        """
+        intake = self.senses.take(observation, time)
+        if intake & _STALE and self._latest is not None:
+            situation = self._latest._replace(intake=intake)
+        else:
+            if intake & Intake.GAP:
+                self._begin_anew()
+            situation = self._latest = self._recognised(observation, time, intake)
+        if self.audit is not None:
+            self.audit.seen(observation, time)
+        return situation
+
+    def _begin_anew(self) -> None:
+        """What comes after a hole in time does not follow from what was before it."""
+        if self.risk is not None:
+            self.risk.start_episode(learn=self.learn)
+        if self.machine is not None and self.learn:
+            self.machine.start_episode()
+
+    def _recognised(
+        self, observation: NDArray[np.float64], time: float, intake: Intake
+    ) -> Situation:
+        nothing = Situation(observation, np.ones(1), None, math.nan, time, intake)
+        if self.machine is None or (self.machine.n_states == 0 and intake & _INCOMPLETE):
+            return nothing
         if self._frozen is None:
-            step = self.machine.observe(observation)
-            return Situation(observation, step.belief, step.state, step.surprise, time)
-        if self._frozen.n_states == 0:
-            return Situation(observation, np.ones(1), None, math.nan, time)
-        belief = self._frozen.recognise(observation)
-        return Situation(observation, belief, int(belief.argmax()), math.nan, time)
+            policy = Missing.PARTIAL if self.machine.state is None else self.senses.missing
+            step = self.machine.observe(observation, missing=policy)
+            return Situation(observation, step.belief, step.state, step.surprise, time, intake)
+        if self._frozen.n_states == 0 or np.isnan(self.senses.held).any():
+            return nothing
+        belief = self._frozen.recognise(self.senses.held)
+        return Situation(observation, belief, int(belief.argmax()), math.nan, time, intake)
 
     def revise(self, situation: Situation, proposal: Proposal) -> Revision:
         """What to execute; machine and risk are told of it."""
         revision = self.reviser.revise(situation, proposal)
+        if self.audit is not None:
+            self.audit.decided(situation, proposal, revision)
         executed = revision.executed
-        if self.machine is not None and self.learn:
+        if self.machine is not None and self.learn and self.machine.state is not None:
             self.machine.act(self.actions.encode(executed))
+        if situation.intake & _STALE:  # it was learnt from before
+            return revision
         if self.risk is not None and self.learn:
             self.risk.learn(situation.observation, executed, situation.belief)
         elif self.risk is not None:
@@ -140,6 +193,8 @@ class Oversight:
                 self.machine.fail()
         if self.risk is not None:
             self.risk.start_episode(learn=self.learn)
+        if self.audit is not None:
+            self.audit.ended(observation, failed=failed)
 
 
 def own_risk(reviser: Reviser | None) -> LatentRisk | None:
@@ -177,6 +232,10 @@ class Framework:
         Whether machine and risk learn while driving. It may be changed between runs.
     interval : float
         Time between decisions [s].
+    missing : Missing
+        What to do where a variable was not observed (NaN). Controllers are given its latest value.
+    audit : AuditLog, optional
+        Writes down what is decided.
 
     Examples
     --------
@@ -204,6 +263,8 @@ class Framework:
         risk: LatentRisk | None = None,
         learn: bool = True,
         interval: float = 0.25,
+        missing: Missing = Missing.PARTIAL,
+        audit: AuditLog | None = None,
     ) -> None:
         refuse_mismatch(machine, actions)
         self.interval = positive("interval", interval)
@@ -218,6 +279,8 @@ class Framework:
         self.machine = machine
         self.risk = risk
         self.learn = learn
+        self.missing = missing
+        self.audit = audit
 
     def drive(self, world: World, scenario: Scenario) -> Drive:
         """Drive one scenario, and learn from it if `learn`.
@@ -234,22 +297,29 @@ class Framework:
                 f"steps of {scenario.dt} s"
             )
         oversight = Oversight(
-            self.actions, self.reviser, machine=self.machine, risk=self.risk, learn=self.learn
+            self.actions,
+            self.reviser,
+            machine=self.machine,
+            risk=self.risk,
+            learn=self.learn,
+            missing=self.missing,
+            interval=self.interval,
+            audit=self.audit,
         )
         decided: list[tuple[int, Situation, Revision]] = []
         with world.open(scenario) as road:
             while not road.over:
                 situation = oversight.recognise(road.observation, road.time)
-                revision = oversight.revise(situation, self._ask(situation))
+                revision = oversight.revise(situation, self._ask(situation, oversight.senses.held))
                 decided.append((road.row, situation, revision))
                 road.advance(revision.executed, steps)
             oversight.end(road.observation, failed=road.collided)
             return _drive(road.episode(), decided)
 
-    def _ask(self, situation: Situation) -> Proposal:
-        """What the controller proposes; NaN where it fails to."""
+    def _ask(self, situation: Situation, held: NDArray[np.float64]) -> Proposal:
+        """What the controller proposes, seeing what was ``held``; NaN where it fails to."""
         try:
-            proposal = self.controller.propose(situation.observation.copy(), situation.time)
+            proposal = self.controller.propose(held.copy(), situation.time)
             action = float(proposal.action)
             candidates = tuple(float(candidate) for candidate in proposal.candidates)
         except Exception as error:  # whatever it is, someone has to go on driving

@@ -17,9 +17,10 @@ from numpy.typing import NDArray
 
 from evofsm._compile import compiled
 from evofsm.actions import IntervalActions
-from evofsm.protocols import Proposal, Revision, RiskMeasure, Situation
+from evofsm.protocols import Intake, Proposal, Revision, RiskMeasure, Situation
 from evofsm.risk.outcome import ActionJudge, Judgement
 from evofsm.validation import positive
+from evofsm.worlds.road import VARIABLES
 
 # Further decisions for which full braking is held where its effect is not known yet.
 _BRAKE_TEST = 4
@@ -142,6 +143,11 @@ class ActionReviser:
         self._revising = False
         self._brake_test = 0
 
+    @property
+    def overridden(self) -> bool:
+        """Whether the driver has taken over."""
+        return self._overridden
+
     def take_over(self) -> None:
         """The driver overrides: proposals are executed until `hand_back`."""
         self._overridden = True
@@ -180,7 +186,9 @@ class ActionReviser:
             risk_proposed=float(judged.risk[0]),
             risk_executed=float(judged.risk[executed]),
             interval=(float(judged.low[executed]), float(judged.high[executed])),
-            reason="; ".join(part for part in (remark, _novelty(judged), reason) if part),
+            reason="; ".join(
+                part for part in (remark, _unseen(situation), _novelty(judged), reason) if part
+            ),
             evidence=judged.evidence,
             seen=judged.seen,
             advised=float(options[best]),
@@ -239,6 +247,21 @@ def _least_risky(options: NDArray[np.float64], risk: NDArray[np.float64]) -> int
         if risk[k] < risk[best] or (risk[k] == risk[best] and options[k] < options[best]):
             best = k
     return best
+
+
+def _unseen(situation: Situation) -> str:
+    """Said of a situation that was not seen whole, or not in time."""
+    if not situation.intake:
+        return ""
+    missing = [
+        name
+        for name, value in zip(VARIABLES, situation.observation, strict=False)
+        if math.isnan(value)
+    ]
+    if missing:
+        return f"not seen: {', '.join(missing)}"
+    stale = Intake.REPEATED | Intake.LATE
+    return "nothing new was seen" if situation.intake & stale else ""
 
 
 def _novelty(judged: Judgement) -> str:
@@ -306,8 +329,10 @@ class EnvelopeReviser:
     def revise(self, situation: Situation, proposal: Proposal) -> Revision:
         """Full braking where the measure is above 0, else the proposal."""
         wanted, remark = make_usable(proposal, self.actions)
-        self._seen = [*self._seen[-1:], situation.observation]
+        self._seen = [*self._seen[-1:], situation.observation.copy()]
         danger = float(self.measure.score(np.array(self._seen), self.dt)[-1])
+        if math.isnan(danger):
+            return _unjudged(self.actions.low, proposal, _unseen(situation) or "danger unknown")
         if danger <= 0.0:
             return _unjudged(wanted, proposal, remark or "measure calls for nothing")
         return _unjudged(

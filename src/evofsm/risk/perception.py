@@ -10,7 +10,7 @@ what kinematics leave unexplained; as long as that is nothing, the estimate is t
 from __future__ import annotations
 
 from collections.abc import Iterable
-from math import nan, sqrt
+from math import isnan, nan, sqrt
 from typing import NamedTuple, TypeAlias, cast
 
 import numpy as np
@@ -145,28 +145,34 @@ class Perception:
         Parameters
         ----------
         observation : (3,) array_like
-            Gap [m], speed of the follower and of the leader [m/s].
+            Gap [m], speed of the follower and of the leader [m/s]; NaN where it was not seen,
+            which is then estimated from what was seen before, and teaches nothing of the noise.
         realised : float
             Acceleration of the follower since the observation before, as expected [m/s²].
         sure : bool
             Whether that is known well.
         learn : bool
         """
-        self._latest, now = self.estimate(observation, realised, sure=sure), _three(observation)
-        if learn and self._seen is not None:
-            self.noise, self._changes = self.spreads.take_in(
-                self._seen, now, realised, self._changes, self.dt
-            )
-        self._seen = now
+        estimate, now = self.estimate(observation, realised, sure=sure), _three(observation)
+        if not is_whole(now):
+            self._seen, self._changes = None, (nan, nan)
+        else:
+            if learn and self._seen is not None:
+                self.noise, self._changes = self.spreads.take_in(
+                    self._seen, now, realised, self._changes, self.dt
+                )
+            self._seen = now
         self._asked = None
-        return self._latest
+        if is_whole(estimate.mean):
+            self._latest = estimate
+        return estimate
 
     def estimate(
         self, observation: ArrayLike | Three, realised: float, *, sure: bool = True
     ) -> Estimate:
-        """What `see` would answer; nothing changes."""
+        """What `see` would answer; nothing changes. NaN stays where nothing was seen before."""
         now = _three(observation)
-        if self.noise == _NOTHING:
+        if self.noise == _NOTHING and is_whole(now):
             return Estimate(now, _EXACT)
         if self._latest is None:
             return Estimate(now, _diagonal(self.noise))
@@ -187,6 +193,12 @@ class Perception:
         self.spreads.restore([arrays[name] for name in _NAMES])
         self.noise = _noise(self.spreads.deviations, self.dt)
         self._asked = None
+
+
+def is_whole(observation: Three) -> bool:
+    """Whether all three are there."""
+    gap, own, leader = observation
+    return not isnan(gap + own + leader)
 
 
 def _three(observation: ArrayLike | Three) -> Three:
@@ -216,17 +228,20 @@ def _filtered(
     doubt: float,
     dt: float,
 ) -> tuple[Three, Matrix]:
-    """One step of the filter, to the next mean and covariance.
+    """One step of the filter, to the next mean and covariance, by what was seen (not NaN).
 
     ``doubt`` is the standard deviation of the acceleration that was ``realised`` [m/s²].
     """
     mean, spread = _predicted(before, covariance, realised, doubt, dt)
     variances = _diagonal(noise)
+    whole = not np.isnan(observation[0] + observation[1] + observation[2])
     for i in (0, 2):
         off, expected = observation[i] - mean[i], spread[i, i] + variances[i][i]
-        if off * off > _ANOTHER_LEADER * _ANOTHER_LEADER * expected:
+        if whole and off * off > _ANOTHER_LEADER * _ANOTHER_LEADER * expected:
             return observation, variances
     for i in range(3):
+        if np.isnan(observation[i]):
+            continue
         _correct(mean, spread, i, observation[i], variances[i][i])
     return (mean[0], max(mean[1], 0.0), max(mean[2], 0.0)), (
         (spread[0, 0], spread[0, 1], spread[0, 2]),

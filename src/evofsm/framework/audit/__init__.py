@@ -1,0 +1,21 @@
+"""The audit log of a reviser: written while driving, verified and replayed afterwards.
+
+`chain` is the file, and knows nothing of driving; `participants` writes down who drives; `log` is
+what writes while driving; `replay` is the audit.
+"""
+
+from evofsm.framework.audit.chain import Fault, Finding, Head, Sync
+from evofsm.framework.audit.log import AuditLog
+from evofsm.framework.audit.replay import Audit, Difference, Replay, audit
+
+__all__ = [
+    "Audit",
+    "AuditLog",
+    "Difference",
+    "Fault",
+    "Finding",
+    "Head",
+    "Replay",
+    "Sync",
+    "audit",
+]
