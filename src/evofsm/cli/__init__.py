@@ -22,9 +22,12 @@ def main() -> None:
 
 def application() -> typer.Typer:
     """All commands."""
+    from evofsm.cli.audit import audit
     from evofsm.cli.bench import bench
     from evofsm.cli.campaign import campaign
+    from evofsm.cli.check import check
     from evofsm.cli.drive import drive
+    from evofsm.cli.evidence import evidence
     from evofsm.cli.learn import inspect, learn
     from evofsm.cli.paper import paper
 
@@ -42,7 +45,10 @@ def application() -> typer.Typer:
     app.command()(inspect)
     app.command()(drive)
     app.command()(campaign)
+    app.command()(audit)
+    app.command()(check)
     app.add_typer(bench())
+    app.command()(evidence)
     return app
 
 

@@ -31,6 +31,15 @@ ACTION = "a_follower"
 TIME = "timestep_time"
 
 _BYTES_AT_ONCE = 1 << 16
+# Those that the parser knows itself; for any other it would ask Python's codecs.
+_ENCODINGS = ("utf-8", "us-ascii", "iso-8859-1", "utf-16")
+# What SUMO writes stays far below these, which bound what a file can make of memory: bytes of a tag
+# or a comment, tags within tags, characters of a name, vehicles at one time, types remembered.
+_LONGEST_TAG = 1_000_000
+_DEEPEST = 16
+_LONGEST_NAME = 256
+_MOST_VEHICLES = 250_000
+_MOST_TYPES = 1000
 # Rows that pairs on the road may have waiting before all are handed on, each of 32 bytes. It
 # bounds memory, at the price of one transition for each pair cut.
 _MOST_WAITING = 1_000_000
@@ -80,7 +89,8 @@ class VehicleLengths:
     def of(self, kind: str) -> float:
         """Length of a vehicle of the given type [m]."""
         kind = kind.partition("@")[0]  # a vehicle changed on its own has the type `car@id`
-        self.seen.add(kind)
+        if len(self.seen) < _MOST_TYPES or kind in self.by_type:
+            self.seen.add(kind)
         return self.by_type.get(kind, self.default)
 
     def refuse_unknown(self) -> None:
@@ -154,9 +164,10 @@ def pair_episodes(timesteps: Iterable[Timestep], lengths: VehicleLengths) -> Ite
 def _episode(rows: array[float], was_cut: bool = False) -> Episode:
     table = np.array(rows).reshape(-1, 4)
     times, speeds = table[:, 0], table[:, 2]
-    return Episode(
-        times, table[:, 1:], np.append(np.diff(speeds) / np.diff(times), np.nan), was_cut
-    )
+    with np.errstate(over="ignore"):
+        actions = np.append(np.diff(speeds) / np.diff(times), np.nan)
+    actions[np.isinf(actions)] = np.nan  # beyond any number: none is known
+    return Episode(times, table[:, 1:], actions, was_cut)
 
 
 def checked(path: str, timesteps: Iterable[Timestep]) -> Iterator[Timestep]:
@@ -200,12 +211,17 @@ class _XmlReader:
     def __init__(self, path: str, parser: expat.XMLParserType) -> None:
         self._path = path
         self._parser = parser
+        self._fed = 0
+        self._depth = 0
         self._root = ""
         self._lanes_seen = False
         self._present: Timestep | None = None
         self._finished: list[Timestep] = []
         parser.StartElementHandler = self._start
         parser.EndElementHandler = self._end
+        parser.XmlDeclHandler = self._refuse_encoding
+        # Entities could grow without end, or be read from elsewhere.
+        parser.StartDoctypeDeclHandler = self._refuse_doctype
 
     def feed(self, data: bytes, last: bool = False) -> list[Timestep]:
         """Parse more of the file; answers the timesteps that ended in it."""
@@ -216,26 +232,52 @@ class _XmlReader:
                 f"{self._path}, line {error.lineno}: this is not whole XML: "
                 f"{expat.ErrorString(error.code)} (was SUMO or a copy interrupted?)"
             ) from error
+        self._fed += len(data)
+        if self._fed - self._parser.CurrentByteIndex > _LONGEST_TAG:
+            raise ValueError(
+                f"{self._place}: a tag or comment of more than {_LONGEST_TAG:,} bytes begins here; "
+                "SUMO writes none"
+            )
         finished, self._finished = self._finished, []
         return finished
 
+    def _refuse_encoding(self, version: str, encoding: str | None, standalone: int) -> None:
+        if encoding is not None and encoding.lower() not in _ENCODINGS:
+            raise ValueError(
+                f"{self._path}, line 1: the encoding is {encoding[:40]!r}; SUMO writes UTF-8 (was "
+                "the file changed?)"
+            )
+
+    def _refuse_doctype(self, name: str, *_: object) -> None:
+        raise ValueError(
+            f"{self._place}: there is a <!DOCTYPE {name[:40]}>; SUMO writes none, and entities are "
+            "not read (is this another program's file?)"
+        )
+
     def _start(self, name: str, attributes: dict[str, str]) -> None:
+        self._depth += 1
+        if self._depth > _DEEPEST:
+            raise ValueError(
+                f"{self._place}: more than {_DEEPEST} tags within each other; SUMO writes no more "
+                "than a few"
+            )
         if name == "vehicle" and self._present is not None:
             vehicle = self._vehicle(attributes)
             if vehicle is not None:
-                self._present.vehicles.append(vehicle)
+                _add(self._present, vehicle)
         elif name == "timestep":
             self._present = Timestep(
                 _number(self._place, "time", attributes.get("time")), self._place, []
             )
         elif not self._root and name != "fcd-export":
             raise ValueError(
-                f"{self._path} is XML but not SUMO's FCD output: it begins with <{name}> "
+                f"{self._path} is XML but not SUMO's FCD output: it begins with <{name[:40]}> "
                 "instead of <fcd-export> (written with another option than --fcd-output?)"
             )
         self._root = self._root or name
 
     def _end(self, name: str) -> None:
+        self._depth -= 1
         if name == "timestep" and self._present is not None:
             self._finished.append(self._present)
             self._present = None
@@ -286,7 +328,7 @@ def table_timesteps(table: Table) -> Iterator[Timestep]:
                     yield present
                 present = Timestep(time, piece.at(row), [])
             if lane:  # persons, empty timesteps and vehicles off the road have none
-                present.vehicles.append(_vehicle(piece.at(row), name, lane, *rest))
+                _add(present, _vehicle(piece.at(row), name, lane, *rest))
     if present is not None:
         yield present
 
@@ -299,9 +341,24 @@ def _vehicle(
 ) -> Vehicle:
     if name is None:
         raise _lacks(place, "id")
+    for text in (name, lane, kind):
+        if len(text) > _LONGEST_NAME:
+            raise ValueError(
+                f"{place}: an id, a lane or a type of {len(text):,} characters; it must be at most "
+                f"{_LONGEST_NAME} long"
+            )
     return Vehicle(
         lane, _number(place, "pos", position), name, kind, _number(place, "speed", speed)
     )
+
+
+def _add(timestep: Timestep, vehicle: Vehicle) -> None:
+    timestep.vehicles.append(vehicle)
+    if len(timestep.vehicles) > _MOST_VEHICLES:
+        raise ValueError(
+            f"{timestep.place}: more than {_MOST_VEHICLES:,} vehicles at one time (rows not sorted "
+            "by time, or the clock of a coarse step?)"
+        )
 
 
 def _number(place: str, name: str, text: str | None) -> float:
@@ -312,7 +369,7 @@ def _number(place: str, name: str, text: str | None) -> float:
     except ValueError:
         cause = explain_text(text)
         if name == "time" and ":" in text:
-            cause = f"{text!r} is no number (written with --human-readable-time?)"
+            cause = f"{text[:40]!r} is no number (written with --human-readable-time?)"
         raise ValueError(f"{place}, {name}: {cause}") from None
     if not abs(number) <= LARGEST_OBSERVATION:
         raise ValueError(f"{place}, {name}: {number} cannot be learnt; it must be finite")

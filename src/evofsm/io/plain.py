@@ -92,14 +92,17 @@ def parse_plain(
     numbers, texts : sequence of int
         Columns to read as numbers and as texts, each at most once, counted from 0.
     """
-    capacity = len(block) // (2 * n_columns) + 1  # a field takes no less than two bytes
+    data = np.frombuffer(block, np.uint8)
+    # Compiled code does not look where an array ends, so there has to be room for every row: one a
+    # line, each of whose fields takes a byte at least, and one that turns out to have too few.
+    capacity = min(int(np.count_nonzero(data == _NEWLINE)), len(block) // n_columns + 1)
     lines = np.empty(capacity, np.int64)
     values = np.empty((len(numbers), capacity))
     doubts = np.empty((len(numbers) * capacity, 4), np.int64)
     changes = np.empty((len(texts), capacity, 3), np.int64)
     counts = np.zeros(len(texts), np.int64)
     n_lines, rows, n_doubts, is_ascii = _parse_rows(
-        np.frombuffer(block, np.uint8),
+        data,
         ord(separator),
         _slots(n_columns, numbers),
         _slots(n_columns, texts),

@@ -7,8 +7,8 @@ import io
 import os
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from itertools import chain, islice
-from typing import Any, BinaryIO, NoReturn, Protocol, cast
+from itertools import chain
+from typing import Any, BinaryIO, NoReturn, Protocol, Self, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,9 +20,12 @@ from evofsm.validation import LARGEST_OBSERVATION
 
 # At once: enough that what Python does in between hardly counts.
 _CSV_BYTES = 1 << 21
-# Rows at once of a CSV file that is not plain.
+# Rows at once of a CSV file that is not plain, and characters in which so many may end sooner.
 _CSV_ROWS = 8192
+_CSV_CHARACTERS = 1 << 22
 _LONGEST_LINE = 1_000_000
+# Characters of a row, which a quoted field may carry on over many lines.
+_LONGEST_ROW = _LONGEST_LINE
 _LONGEST_CHARACTER = 4  # bytes, in UTF-8
 # polars decodes a whole row group for each slice of it, so small slices would only cost time.
 _PARQUET_ROWS = 65536
@@ -70,14 +73,15 @@ class CsvTable:
             first = next(lines, "")
             unmarked = first.removeprefix(BYTE_ORDER_MARK.decode())
             self._separator = max(",;\t", key=unmarked.count)
-            rows = csv.reader(chain([unmarked], _kept(lines, header)), delimiter=self._separator)
+            of_row = _LinesOfRow(path, chain([unmarked], _kept(lines, header)))
+            rows = csv.reader(of_row, delimiter=self._separator)
             self.columns = tuple(name.strip() for name in next(rows, []))
             self._header_lines = rows.line_num
             self._header_size = sum(len(line.encode()) for line in (first, *header))
         if all(_is_number(name) for name in self.columns):
             raise ValueError(
-                f"{path}, line 1: {unmarked.strip()!r} is no header; the first line must name "
-                "the columns"
+                f"{path}, line 1: {unmarked.strip()[:200]!r} is no header; the first line must "
+                "name the columns"
             )
 
     def pieces(self, numbers: Sequence[str], texts: Sequence[str]) -> Iterator[Piece]:
@@ -110,11 +114,12 @@ class CsvTable:
     ) -> Iterator[Piece]:
         """Read the lines of some parts, after those that were read before."""
         places = {name: self._place(name) for name in (*numbers, *texts)}
-        rows = csv.reader(_lines(self.path, *parts, reached=reached), delimiter=self._separator)
-        with damage_explained(self.path, lambda: reached + rows.line_num):
-            while some := [(reached + rows.line_num, row) for row in islice(rows, _CSV_ROWS)]:
-                fields, lines = self._columns(some)
-                piece = Piece(self.path, "line", lines, {}, {})
+        lines = _LinesOfRow(self.path, _lines(self.path, *parts, reached=reached), reached)
+        rows = csv.reader(lines, delimiter=self._separator)
+        with damage_explained(self.path, lambda: lines.number):
+            while some := lines.some(rows):
+                fields, places_of_rows = self._columns(some)
+                piece = Piece(self.path, "line", places_of_rows, {}, {})
                 for name in numbers:
                     piece.numbers[name] = _numbers(piece, name, fields[places[name]])
                 for name in texts:
@@ -154,7 +159,8 @@ class ParquetTable:
             self._scan = polars.scan_parquet(path, glob=False)
             self._types = self._scan.collect_schema()
             self._rows = int(self._scan.select(polars.len()).collect().item())
-        except polars.exceptions.PolarsError as error:
+        # A panic is what polars makes of some damaged files; it is no Exception.
+        except (polars.exceptions.PolarsError, polars.exceptions.PanicException) as error:
             self._refuse(error)
         self.columns = tuple(self._types)
 
@@ -173,7 +179,7 @@ class ParquetTable:
         for first in range(0, self._rows, _PARQUET_ROWS):
             try:
                 frame = wanted.slice(first, _PARQUET_ROWS).collect()
-            except polars.exceptions.PolarsError as error:
+            except (polars.exceptions.PolarsError, polars.exceptions.PanicException) as error:
                 self._refuse(error)
             rows = len(frame)
             places = np.arange(first + 1, first + rows + 1)
@@ -191,8 +197,8 @@ class ParquetTable:
             self._on_read(size * rows // self._rows)
             yield piece
 
-    def _refuse(self, error: Exception) -> NoReturn:
-        cause = str(error).partition("\n")[0]
+    def _refuse(self, error: BaseException) -> NoReturn:
+        cause = str(error).partition("\n")[0][:300]
         raise ValueError(
             f"{self.path} cannot be read as Parquet (was a copy or a download interrupted?): "
             f"{cause}"
@@ -232,6 +238,42 @@ def _lines(path: str, *parts: io.TextIOWrapper, reached: int = 0) -> Iterator[st
                     "this is no table"
                 )
             yield line
+
+
+class _LinesOfRow:
+    """Lines for a csv reader, which sees no end to a row whose quotes go on opening."""
+
+    def __init__(self, path: str, lines: Iterator[str], reached: int = 0) -> None:
+        self._path = path
+        self._lines = lines
+        self._size = 0  # of the row that is being read
+        self.number = reached  #: of the latest line
+
+    def __iter__(self) -> Self:
+        return self
+
+    def __next__(self) -> str:
+        line = next(self._lines)
+        self.number += 1
+        self._size += len(line)
+        if self._size > _LONGEST_ROW:
+            raise ValueError(
+                f"{self._path}, line {self.number}: a row of more than {_LONGEST_ROW:,} characters "
+                "(an unclosed quote?)"
+            )
+        return line
+
+    def some(self, rows: Iterator[list[str]]) -> list[tuple[int, list[str]]]:
+        """The next rows that a reader makes of these lines, each with its last line."""
+        found: list[tuple[int, list[str]]] = []
+        size = 0
+        for row in rows:
+            found.append((self.number, row))
+            size += self._size
+            self._size = 0
+            if len(found) == _CSV_ROWS or size > _CSV_CHARACTERS:
+                break
+        return found
 
 
 def _kept(lines: Iterator[str], into: list[str]) -> Iterator[str]:
@@ -277,5 +319,5 @@ def explain_text(text: str) -> str:
             "the field is empty (a missing measurement? an episode's last action may be any number)"
         )
     if _is_number(text.replace(",", ".")):
-        return f"{text!r} is no number (a decimal comma? write 1.5)"
-    return f"{text!r} is no number (a text, a date, or a unit behind the number?)"
+        return f"{text[:40]!r} is no number (a decimal comma? write 1.5)"
+    return f"{text[:40]!r} is no number (a text, a date, or a unit behind the number?)"

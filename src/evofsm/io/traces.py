@@ -166,6 +166,11 @@ class _Clock:
         return np.asarray(unusual)
 
     def _settle(self, usual: float) -> None:
+        if usual <= 0.0:
+            raise ValueError(
+                f"{self._path}: a row follows the one before within less than a nanosecond; the "
+                "time must be in seconds"
+            )
         if np.isnan(self.dt):
             self.dt, self._first_path = usual, self._path
         if not abs(usual / self.dt - 1.0) < _SAME_STEP:
@@ -271,7 +276,7 @@ def _encode(piece: Piece, variable: str | Category) -> NDArray[np.float64]:
     for row, value in zip(texts.firsts, texts.values, strict=True):
         if value not in codes:
             raise ValueError(
-                f"{piece.at(row)}, column {variable.name!r}: {value!r} is none of the values "
+                f"{piece.at(row)}, column {variable.name!r}: {value[:40]!r} is none of the values "
                 f"that --observe names: {', '.join(variable.values)}"
             )
     return np.repeat([codes[value] for value in texts.values], texts.lengths, axis=0)
