@@ -2,8 +2,9 @@
 
 PYTHON ?= python3
 BIN := .venv/bin
+INSTALL = $(PYTHON) -m pip --python $(BIN)/python --disable-pip-version-check install --quiet
 
-.PHONY: paper closed-loop test check bench clean
+.PHONY: paper closed-loop evidence test check bench fuzz torture soak lock lowest supply clean
 
 paper: .venv/installed          ## reproduce every claim of the paper in SUMO
 	@$(BIN)/evofsm paper --out results/paper
@@ -21,13 +22,49 @@ bench: .venv/installed          ## how fast it is, as ratios against named refer
 	@$(BIN)/python benchmarks/speed.py --json bench.json
 	@$(BIN)/python benchmarks/decision.py
 
+evidence: .venv/installed       ## all studies in short, on one page; DATA=folder adds real drives
+	@$(BIN)/evofsm evidence --out results/evidence $(if $(DATA),--data $(DATA))
+
+soak: .venv/installed           ## do the numbers hold for a thousand million steps? some 15 minutes
+	@$(BIN)/python benchmarks/soak.py
+
+lock: .venv/installed           ## pin what development needs anew, with hashes
+	@$(BIN)/uv pip compile --quiet --universal --generate-hashes --extra dev --upgrade \
+	    --python-version 3.11 --no-annotate --custom-compile-command 'make lock' \
+	    pyproject.toml --output-file requirements.lock
+
+LOWEST := .venv-lowest/bin/python
+lowest: .venv/installed         ## test the core with the lowest versions that are allowed
+	@$(BIN)/uv venv --quiet --allow-existing --python $(BIN)/python .venv-lowest
+	@$(BIN)/uv pip install --quiet --python $(LOWEST) --resolution lowest-direct \
+	    --editable '.[tables,study]' pytest hypothesis
+	@$(LOWEST) -m pytest -q -p no:cacheprovider tests/states tests/fleet/test_batch.py \
+	    tests/test_golden.py tests/test_machine.py tests/test_model.py tests/test_transitions.py
+
+supply: .venv/installed         ## known holes in what is pinned, and a bill of materials: sbom.json
+	@$(BIN)/uv tool run pip-audit --disable-pip --require-hashes --requirement requirements.lock
+	@$(BIN)/uv tool run --from cyclonedx-bom cyclonedx-py requirements requirements.lock -o sbom.json
+
+torture: .venv/installed        ## kill -9, full disks, damaged files: is anything lost or wrong?
+	@$(BIN)/python benchmarks/torture.py
+
+SECONDS ?= 60
+fuzz: .venv/installed           ## hostile files into every reader, SECONDS=60 each; findings stay in /tmp
+	@$(BIN)/python tests/fuzz/fuzz.py --seconds $(SECONDS)
+
 # pip installs into the environment from outside it, so Debian's ensurepip package is not needed.
-.venv/installed: pyproject.toml
+# `make UNLOCKED=1` takes the newest versions that pyproject.toml allows, whatever was pinned.
+.venv/installed: pyproject.toml requirements.lock
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "evofsm needs Python 3.11 or newer; this is " + sys.version.split()[0] + ". Name another one: make PYTHON=python3.12")'
 	@test -x $(BIN)/python || $(PYTHON) -m venv --without-pip .venv
 	@echo "Installing evofsm and its tools into .venv (a minute or two) ..."
-	@$(PYTHON) -m pip --python $(BIN)/python --disable-pip-version-check install --quiet --editable '.[dev]'
+ifdef UNLOCKED
+	@$(INSTALL) --editable '.[dev]'
+else
+	@$(INSTALL) --require-hashes --requirement requirements.lock
+	@$(INSTALL) --no-deps --no-build-isolation --editable .
+endif
 	@touch $@
 
 clean:
-	rm -rf .venv results bench.json dist build .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf .venv .venv-lowest sbom.json results bench.json dist build .pytest_cache .mypy_cache .ruff_cache .hypothesis
