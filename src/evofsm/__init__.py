@@ -12,9 +12,10 @@ if TYPE_CHECKING:
     from evofsm.actions import IntervalActions
     from evofsm.crowding import WhenFull
     from evofsm.divergence import jensen_shannon
+    from evofsm.forecast import Forecasts
     from evofsm.machine import EvolvingFSM
     from evofsm.model import FSMModel
-    from evofsm.observations import Category, ObservationEncoder
+    from evofsm.observations import Category, Missing, ObservationEncoder
     from evofsm.states import Edges, FailureSplit, Novelty, Paper
     from evofsm.step import Event, Step, Trace
 
@@ -27,7 +28,9 @@ _HOMES = {
     "EvolvingFSM": "machine",
     "FSMModel": "model",
     "FailureSplit": "states.failure",
+    "Forecasts": "forecast",
     "IntervalActions": "actions",
+    "Missing": "observations",
     "Novelty": "states.novelty",
     "ObservationEncoder": "observations",
     "Paper": "states.ets",
@@ -44,7 +47,9 @@ __all__ = [
     "EvolvingFSM",
     "FSMModel",
     "FailureSplit",
+    "Forecasts",
     "IntervalActions",
+    "Missing",
     "Novelty",
     "ObservationEncoder",
     "Paper",

@@ -25,6 +25,14 @@ class Missing(Enum):
     ``REJECT`` is an error, ``HOLD`` takes the value of the observation before, and ``PARTIAL``
     recognises from the variables that are there. Whichever it is, an incomplete observation moves
     no state and teaches no transition to it.
+
+    Examples
+    --------
+    >>> from evofsm import EvolvingFSM, Missing
+    >>> machine = EvolvingFSM(n_actions=1, radius=0.5)
+    >>> step = machine.observe([1.0, 2.0])
+    >>> machine.observe([float("nan"), 2.5], missing=Missing.PARTIAL).missing
+    (0,)
     """
 
     REJECT = "reject"

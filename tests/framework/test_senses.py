@@ -203,6 +203,14 @@ def test_the_reviser_keeps_its_promise_with_a_gap_sensor_that_fails_half_the_tim
     assert not drive.episode.collided
 
 
+def test_an_episode_may_end_unseen():
+    watch = oversight()
+    watch.recognise(np.array([5.0, 10.0, 0.0]), 0.0)
+    before = watch.machine.endings.sum()
+    watch.end(np.array([NAN, 10.0, 0.0]), failed=True)
+    assert watch.machine.endings.sum() == before + 1
+
+
 # -- Time ---------------------------------------------------------------------------------------
 
 

@@ -5,6 +5,7 @@ from functools import partial
 import numpy as np
 import pytest
 
+from evofsm.fleet.executors import in_order
 from evofsm.studies.paper import CASES, Settings, check_claims, run_paper
 from evofsm.studies.sensitivity import (
     PARAMETERS,
@@ -24,7 +25,7 @@ from evofsm.studies.sensitivity import (
 from evofsm.studies.sensitivity.designs import NEAR, filling, maps, sweeps
 from evofsm.studies.sensitivity.parameters import parameter
 from evofsm.studies.sensitivity.setting import SCALES, SPEED_NOISE, Remembering, Row, study_of
-from evofsm.studies.sensitivity.study import _in_order, _reach, _try_all
+from evofsm.studies.sensitivity.study import _reach, _try_all
 from evofsm.worlds.kinematic import KinematicWorld
 
 TINY = Plan(settings=8, levels=3, side=2, halvings=1, rounds=1)
@@ -281,7 +282,7 @@ def test_rows_are_plain_json_with_a_verdict_for_each_claim(tiny):
 def test_the_same_rows_come_out_of_one_process_and_of_two():
     trials = list(filling(Design.ALL, 6, seed=0))
     tasks = [partial(_try_all, trials[:3], 1), partial(_try_all, trials[3:], 1)]
-    one, two = (_in_order(tasks, workers, lambda done: None) for workers in (1, 2))
+    one, two = (in_order(tasks, workers) for workers in (1, 2))
     assert one == two
     assert [row.setting for rows in one for row in rows] == [trial.setting for trial in trials]
 

@@ -187,8 +187,10 @@ class Oversight:
     def end(self, observation: NDArray[np.float64] | None, *, failed: bool) -> None:
         """The episode ends with this observation, or unseen (None); perhaps in failure."""
         if self.machine is not None and self.learn:
-            if observation is not None:
-                self.machine.observe(observation, failed=failed)
+            if observation is not None and (
+                self.machine.n_states or not np.isnan(observation).any()
+            ):
+                self.machine.observe(observation, failed=failed, missing=Missing.PARTIAL)
             elif failed and self.machine.state is not None:
                 self.machine.fail()
         if self.risk is not None:

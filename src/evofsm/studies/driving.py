@@ -230,7 +230,8 @@ def write_driving(driving: Driving, learner: Learner, setup: Setup, out: Path) -
     """
     with needs("polars", "tables", "writing decisions as Parquet"):
         import polars
-    learner.save(out, {"drove": setup.settings})
+    drove = {"family": setup.family.name, "seed": setup.seed, "first": setup.first}
+    learner.save(out, {**drove, "episodes": setup.episodes, "reviser": setup.reviser})
     with storage.replacing(out / "decisions.parquet") as file:
         polars.DataFrame(driving.decisions).write_parquet(file)
     summary = {
