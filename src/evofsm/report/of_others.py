@@ -32,6 +32,7 @@ def paper_chapter(study: PaperStudy, folder: Path, command: str, progress: Progr
             (claim.claim, claim.paper, claim.measured, "yes" if claim.holds else "no")
             for claim in claims
         ),
+        in_words=True,
     )
     return Chapter(
         id="paper",
@@ -43,7 +44,7 @@ def paper_chapter(study: PaperStudy, folder: Path, command: str, progress: Progr
         answer=(f"{len(study.runs)} runs in {study.world}, {study.model.n_states} states.",),
         losses=tuple(f"{claim.claim}: {claim.measured}" for claim in failing),
         tables=(table, *context_tables(study)),
-        figures=tuple(paper_figures(study, folder, progress)),
+        figures=tuple(paper_figures(study, folder, progress)[:1]),  # its own page has all
         plan=(Setting("runs", str(len(study.runs))), Setting("world", study.world)),
         command=command,
     )

@@ -14,3 +14,4 @@ class Table:
     rows: tuple[tuple[str, ...], ...]
     note: str = ""
     ours: tuple[int, ...] = ()  #: rows that are ours, to be set off
+    in_words: bool = False  #: whether the cells are words, which may be broken into lines

@@ -67,7 +67,7 @@ class Plan:
             seeds=min(self.seeds, 2),
             fine_seeds=min(self.fine_seeds, 1),
             parts=min(self.parts, 2),
-            runs=4,
+            runs=12,
             ablation=self.ablation[-1:],
             rounds=min(self.rounds, 200),
         )
