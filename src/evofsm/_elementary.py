@@ -165,6 +165,22 @@ def _fma_of_lines(builder: Any, x: Any, y: Any, z: Any) -> Any:
     return builder.call(function, [x, y, z])
 
 
+@intrinsic
+def _fetch_ahead(_context: Any, array: Any, i: Any) -> Any:
+    def generate(context: Any, builder: Any, _: Any, arguments: Any) -> Any:
+        values, place = arguments
+        pointer = builder.gep(_arrays.make_array(array)(context, builder, values).data, [place])
+        byte, number = ir.IntType(8).as_pointer(), ir.IntType(32)
+        kind = ir.FunctionType(ir.VoidType(), [byte, number, number, number])
+        name = "llvm.prefetch.p0i8"
+        function = builder.module.globals.get(name) or ir.Function(builder.module, kind, name)
+        to_write, soon, data = number(1), number(3), number(1)
+        builder.call(function, [builder.bitcast(pointer, byte), to_write, soon, data])
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp), generate
+
+
 #: ``x * y + z``, rounded once: one instruction in place of two, and the same one everywhere.
 fma: Callable[[float, float, float], float] = cast(Any, _fused_multiply_add)
 #: ``work_on_line(matrix, i, j, predicted, reached, believed, kept, gain)``, for a line of columns
@@ -172,6 +188,8 @@ fma: Callable[[float, float, float], float] = cast(Any, _fused_multiply_add)
 work_on_line: Callable[..., None] = cast(Any, _work_on_line)
 #: The same for two rows, i and the next one, with three numbers for each: a sum is loaded once.
 work_on_two_lines: Callable[..., None] = cast(Any, _work_on_two_lines)
+#: ``fetch_ahead(array, i)``: have the line that holds an element brought near, for a later step.
+fetch_ahead: Callable[[NDArray[Any], int], None] = cast(Any, _fetch_ahead)
 # What a kernel sees of the others.
 _bits_of: Callable[[float], int] = cast(Any, _bits_of_float)
 _float_of: Callable[[int], float] = cast(Any, _float_of_bits)

@@ -14,14 +14,18 @@ import numba
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
-from evofsm._compile import kernel, parallel_kernel
+from evofsm._compile import LINE, inner_kernel, kernel, parallel_kernel
+from evofsm._elementary import fetch_ahead
 from evofsm.machine import EvolvingFSM
 from evofsm.memory import NO_ACTION, Memory, lengths, matrices_of, move, open_apart
 from evofsm.step import FULL, room_for, step_and_act
+from evofsm.transitions import NOT_OPEN
 from evofsm.validation import check_actions, check_rows, real_rows, refuse_unusable, whole
 
 # Room for so much more than is needed when the arrays are made anew.
 _SPARE = 1.5
+# Lines of a vehicle that are fetched while others are stepped: all of one with eight states.
+_LINES_AHEAD = 28
 _SINGLE = np.dtype(np.float32)
 
 
@@ -285,6 +289,9 @@ def _step_all(
     """
     full = 0
     for row in numba.prange(len(vehicles)):
+        if row + 2 < len(vehicles):  # a vehicle's memory is far away until it is asked for
+            _fetch_states(small, at[vehicles[row + 2]])
+            _fetch_matrix(small, matrices, at[vehicles[row + 1]])
         if event[row] == FULL:
             n_states[row], event[row], state[row], surprise[row] = _step_one(
                 small,
@@ -297,6 +304,33 @@ def _step_all(
             )
             full += event[row] == FULL
     return full
+
+
+@inner_kernel
+def _fetch_states(small: NDArray[np.float64], at: NDArray[np.int64]) -> None:
+    """Have a vehicle's states brought near, while others are stepped.
+
+    How many it has is not asked: that would be waiting for what is far away.
+    """
+    for line in range(_LINES_AHEAD):
+        fetch_ahead(small, at[0] + line * LINE)
+
+
+@inner_kernel
+def _fetch_matrix(
+    small: NDArray[np.float64], matrices: NDArray[Any], at: NDArray[np.int64]
+) -> None:
+    """The same of the matrix that its latest action is about."""
+    now = _open(small, matrices, at).learnt
+    action = int(now.action[0])
+    if action == NO_ACTION or now.transitions.places[action] == NOT_OPEN:
+        return
+    held, place, capacity = now.transitions, int(now.transitions.places[action]), len(now.belief)
+    for of_places in (held.scales, held.origin_frequency, now.outcomes.decisions):
+        fetch_ahead(of_places, place * capacity)
+    size = capacity * capacity
+    for i in range(0, min(size, _LINES_AHEAD * LINE), LINE):
+        fetch_ahead(held.matrices, place * size + i)
 
 
 @kernel
