@@ -136,10 +136,10 @@ class Oversight:
         before changes nothing: the situation is still that one.
         """
         intake = self.senses.take(observation, time)
-        if intake & _STALE and self._latest is not None:
+        if intake and intake & _STALE and self._latest is not None:
             situation = self._latest._replace(intake=intake)
         else:
-            if intake & Intake.GAP:
+            if intake and intake & Intake.GAP:
                 self._begin_anew()
             situation = self._latest = self._recognised(observation, time, intake)
         if self.audit is not None:
@@ -157,10 +157,13 @@ class Oversight:
         self, observation: NDArray[np.float64], time: float, intake: Intake
     ) -> Situation:
         nothing = Situation(observation, np.ones(1), None, math.nan, time, intake)
-        if self.machine is None or (self.machine.n_states == 0 and intake & _INCOMPLETE):
+        incomplete = bool(intake) and bool(intake & _INCOMPLETE)
+        if self.machine is None or (incomplete and self.machine.n_states == 0):
             return nothing
         if self._frozen is None:
-            policy = Missing.PARTIAL if self.machine.state is None else self.senses.missing
+            policy = Missing.REJECT
+            if incomplete:
+                policy = self.senses.missing if self.machine.state is not None else Missing.PARTIAL
             step = self.machine.observe(observation, missing=policy)
             return Situation(observation, step.belief, step.state, step.surprise, time, intake)
         if self._frozen.n_states == 0 or np.isnan(self.senses.held).any():
@@ -176,7 +179,7 @@ class Oversight:
         executed = revision.executed
         if self.machine is not None and self.learn and self.machine.state is not None:
             self.machine.act(self.actions.encode(executed))
-        if situation.intake & _STALE:  # it was learnt from before
+        if situation.intake and situation.intake & _STALE:  # it was learnt from before
             return revision
         if self.risk is not None and self.learn:
             self.risk.learn(situation.observation, executed, situation.belief)
