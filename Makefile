@@ -37,7 +37,7 @@ LOWEST := .venv-lowest/bin/python
 lowest: .venv/installed         ## test the core with the lowest versions that are allowed
 	@$(BIN)/uv venv --quiet --allow-existing --python $(BIN)/python .venv-lowest
 	@$(BIN)/uv pip install --quiet --python $(LOWEST) --resolution lowest-direct \
-	    --editable '.[tables,study]' pytest hypothesis
+	    --editable '.[tables,study]' 'pytest>=8.3' 'hypothesis>=6.100'
 	@$(LOWEST) -m pytest -q -p no:cacheprovider tests/states tests/fleet/test_batch.py \
 	    tests/test_golden.py tests/test_machine.py tests/test_model.py tests/test_transitions.py
 
