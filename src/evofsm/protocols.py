@@ -33,6 +33,10 @@ class Intake(IntFlag):
     LATE = 16  #: older than the one before: left out
 
 
+#: Observations that bring nothing new, and such as lack something.
+STALE, INCOMPLETE = Intake.REPEATED | Intake.LATE, Intake.PARTIAL | Intake.HELD
+
+
 class Situation(NamedTuple):
     """Where the vehicle is, as it was observed and as the machine recognised it."""
 

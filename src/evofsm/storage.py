@@ -217,6 +217,26 @@ def _pack(file: BinaryIO, members: Mapping[str, NDArray[Any]]) -> None:
                 write_array(member, array, version=(1, 0), allow_pickle=False)
 
 
+def only_writer(file: BinaryIO, path: str | os.PathLike[str], otherwise: str) -> None:
+    """Lock a file against other processes, where the system can; it is unlocked as it is closed.
+
+    Raises
+    ------
+    ValueError
+        If another process has locked it; says what to do ``otherwise``.
+    """
+    with suppress(ModuleNotFoundError):  # Windows
+        import fcntl
+
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise ValueError(
+                f"{os.fspath(path)} is being written by another process; wait for its end, or "
+                f"{otherwise}"
+            ) from None
+
+
 @contextmanager
 def replacing(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
     """A file that takes its place once it is whole and on the disk.

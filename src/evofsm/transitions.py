@@ -284,7 +284,7 @@ def _two_rows(
     rates: NDArray[np.float64],
     predicted: NDArray[np.float64],
 ) -> None:
-    """`_whole_row` for i and the next one, in a fifth less time."""
+    """`_whole_row` for i and the next one: what both read and add to is loaded once."""
     matrix, scales = transitions.matrices[place], transitions.scales[place]
     gain, believed, kept = rates[i], origin[i] * scales[i], (1.0 - rates[i]) * scales[i]
     k = i + 1

@@ -7,8 +7,9 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
+from evofsm.cli.bench.common import Progress, WorkersOption
 from evofsm.cli.common import WorldName, WorldOption, counter, plain_errors, progress, require
 
 with suppress(ModuleNotFoundError):
@@ -16,9 +17,6 @@ with suppress(ModuleNotFoundError):
 
 if TYPE_CHECKING:
     from evofsm.report.chapter import Chapter
-
-Progress = Callable[[int, int], None]
-Maker = Callable[[Path, Progress], "Chapter"]
 
 
 @plain_errors
@@ -33,9 +31,7 @@ def evidence(
     ] = None,
     world: WorldOption = WorldName.SUMO,
     seed: Annotated[int, typer.Option(min=0, help="Of every study.")] = 0,
-    workers: Annotated[
-        int | None, typer.Option(min=1, help="Processes. [default: one per core]")
-    ] = None,
+    workers: WorkersOption = None,
     out: Annotated[Path, typer.Option(help="Folder for the page and its figures.")] = Path(
         "evofsm-evidence"
     ),
@@ -44,25 +40,18 @@ def evidence(
 
     The page names the command of each study's long form.
     """
-    require(scipy="study", matplotlib="plot", jinja2="plot")
+    require(scipy="study", deeptime="dev", matplotlib="plot", jinja2="plot")
     from evofsm.report import terminal
     from evofsm.report.chapter import write_chapters
 
-    makers: dict[str, Maker] = {
-        "paper": _paper(world),
-        "closed loop": _closed_loop(seed, workers),
-        "detection": _detection(seed, workers),
-        "prediction": _prediction(data, seed, workers),
-        "sensitivity": _sensitivity(seed, workers),
-    }
-    if data is not None:
-        makers["real"] = _real(data, seed, workers)
     out.mkdir(parents=True, exist_ok=True)
     chapters = []
     with progress() as bars:
-        for name, make in makers.items():
+        for name, study in _studies(data, world, seed, workers).items():
             begun = time.monotonic()
-            chapters.append(make(out / name.replace(" ", "-"), counter(bars, f"Study: {name}")))
+            found = study.run(counter(bars, f"Study: {name}"))
+            folder = out / name.replace(" ", "-")
+            chapters.append(study.tell(found, folder, study.command, _silent))
             print(f"{name}: {time.monotonic() - begun:.0f} s", file=sys.stderr)
     page = write_chapters(
         out / "index.html",
@@ -80,77 +69,64 @@ def evidence(
     console.print(f"\nPage with all tables and figures: {page}", soft_wrap=True)
 
 
-def _paper(world: WorldName) -> Maker:
-    def make(folder: Path, done: Progress) -> Chapter:
-        from evofsm.report.of_others import paper_chapter
-        from evofsm.studies.paper import Settings, run_paper
-        from evofsm.worlds import open_world
+class _Study(NamedTuple):
+    """How a study is made, and told."""
 
+    run: Callable[[Progress], Any]
+    tell: Callable[[Any, Path, str, Progress], Chapter]
+    command: str  #: of the long form
+
+
+def _studies(
+    data: Path | None, world: WorldName, seed: int, workers: int | None
+) -> dict[str, _Study]:
+    """All studies in their short form, by name."""
+    from evofsm.report.detection import detection_chapter
+    from evofsm.report.of_others import closed_loop_chapter, paper_chapter
+    from evofsm.report.prediction import prediction_chapter
+    from evofsm.report.real import real_chapter
+    from evofsm.report.sensitivity import sensitivity_chapter
+    from evofsm.studies import closed_loop, detection, paper, prediction, real, sensitivity
+    from evofsm.worlds import open_world
+    from evofsm.worlds.families import load_family
+
+    def run_paper(done: Progress) -> paper.PaperStudy:
         with open_world(world.value) as place:
-            study = run_paper(place, world.value, Settings.load(None), 20, done)
-        return paper_chapter(study, folder, "evofsm paper", _silent)
+            return paper.run_paper(place, world.value, paper.Settings.load(None), 20, done)
 
-    return make
+    def run_closed_loop(done: Progress) -> closed_loop.ClosedLoop:
+        plan = closed_loop.Plan(seed=seed).shortened()
+        return closed_loop.run_closed_loop(load_family("emergency"), plan, done, workers)
 
+    def run_detection(done: Progress) -> detection.Detection:
+        plan = detection.Plan(seed=seed).shortened()
+        return detection.run_detection(detection.FAMILIES, plan, done, workers)
 
-def _closed_loop(seed: int, workers: int | None) -> Maker:
-    def make(folder: Path, done: Progress) -> Chapter:
-        from evofsm.report.of_others import closed_loop_chapter
-        from evofsm.studies.closed_loop import Plan, run_closed_loop
-        from evofsm.worlds.families import load_family
+    def run_prediction(done: Progress) -> prediction.Prediction:
+        logs = prediction.log_sources(data) if data is not None else ()
+        return prediction.run_prediction(
+            prediction.Plan(seed=seed).shortened(), logs, done, workers
+        )
 
-        plan = Plan(seed=seed).shortened()
-        study = run_closed_loop(load_family("emergency"), plan, done, workers)
-        return closed_loop_chapter(study, folder, "evofsm bench closed-loop", _silent)
+    def run_sensitivity(done: Progress) -> sensitivity.Sensitivity:
+        return sensitivity.run_sensitivity(sensitivity.Plan(seed=seed).shortened(), done, workers)
 
-    return make
+    studies = {
+        "paper": _Study(run_paper, paper_chapter, "evofsm paper"),
+        "closed loop": _Study(run_closed_loop, closed_loop_chapter, "evofsm bench closed-loop"),
+        "detection": _Study(run_detection, detection_chapter, "evofsm bench detection"),
+        "prediction": _Study(run_prediction, prediction_chapter, "evofsm bench prediction"),
+        "sensitivity": _Study(run_sensitivity, sensitivity_chapter, "evofsm bench sensitivity"),
+    }
+    if data is not None:
 
+        def run_real(done: Progress) -> real.RealStudy:
+            plan = real.Plan(seed=seed).shortened()
+            cases, verified = real.read_folder(data, plan)
+            return real.run_real(cases, plan, verified, done, workers)
 
-def _detection(seed: int, workers: int | None) -> Maker:
-    def make(folder: Path, done: Progress) -> Chapter:
-        from evofsm.report.detection import detection_chapter
-        from evofsm.studies.detection import FAMILIES, Plan, run_detection
-
-        study = run_detection(FAMILIES, Plan(seed=seed).shortened(), done, workers)
-        return detection_chapter(study, folder, "evofsm bench detection", _silent)
-
-    return make
-
-
-def _prediction(data: Path | None, seed: int, workers: int | None) -> Maker:
-    def make(folder: Path, done: Progress) -> Chapter:
-        from evofsm.report.prediction import prediction_chapter
-        from evofsm.studies.prediction import Plan, log_sources, run_prediction
-
-        logs = log_sources(data) if data is not None else ()
-        study = run_prediction(Plan(seed=seed).shortened(), logs, done, workers)
-        return prediction_chapter(study, folder, "evofsm bench prediction", _silent)
-
-    return make
-
-
-def _sensitivity(seed: int, workers: int | None) -> Maker:
-    def make(folder: Path, done: Progress) -> Chapter:
-        from evofsm.report.sensitivity import sensitivity_chapter
-        from evofsm.studies.sensitivity import Plan, run_sensitivity
-
-        study = run_sensitivity(Plan(seed=seed).shortened(), done, workers)
-        return sensitivity_chapter(study, folder, "evofsm bench sensitivity", _silent)
-
-    return make
-
-
-def _real(data: Path, seed: int, workers: int | None) -> Maker:
-    def make(folder: Path, done: Progress) -> Chapter:
-        from evofsm.report.real import real_chapter
-        from evofsm.studies.real import Plan, read_folder, run_real
-
-        plan = Plan(seed=seed).shortened()
-        cases, verified = read_folder(data, plan)
-        study = run_real(cases, plan, verified, done, workers)
-        return real_chapter(study, folder, f"evofsm bench real --data {data}", _silent)
-
-    return make
+        studies["real"] = _Study(run_real, real_chapter, f"evofsm bench real --data {data}")
+    return studies
 
 
 def _silent(done: int, total: int) -> None:

@@ -16,11 +16,12 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO, Self
 from zlib import crc32
 
+from evofsm import storage
 from evofsm.checkpoint import differences
 
 _SEAL = b',"crc":"'
@@ -62,7 +63,7 @@ class Journal:
         self.records: dict[int, Record] = {}
         self._file: BinaryIO = open(path, "a+b", buffering=0)  # noqa: SIM115
         try:
-            self._lock()
+            storage.only_writer(self._file, self.path, "name another folder")
             header = _line({"settings": settings})
             good = self._read(header)
             self._file.truncate(good)
@@ -98,18 +99,6 @@ class Journal:
             while data:  # a disk that gets full takes a part of it first
                 data = data[self._file.write(data) :]
             os.fsync(self._file.fileno())
-
-    def _lock(self) -> None:
-        with suppress(ModuleNotFoundError):  # Windows
-            import fcntl
-
-            try:
-                fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                raise ValueError(
-                    f"{self.path} is being written by another process; wait for its end, or name "
-                    "another folder"
-                ) from None
 
     def _read(self, header: bytes) -> int:
         """Read what is there, and say up to where it is good; without an episode, nothing is."""

@@ -20,7 +20,16 @@ from evofsm.framework.reviser import ActionReviser, Unrevised
 from evofsm.framework.senses import Senses
 from evofsm.machine import EvolvingFSM
 from evofsm.observations import Missing
-from evofsm.protocols import Controller, Intake, Proposal, Reviser, Revision, Situation
+from evofsm.protocols import (
+    INCOMPLETE,
+    STALE,
+    Controller,
+    Intake,
+    Proposal,
+    Reviser,
+    Revision,
+    Situation,
+)
 from evofsm.risk.outcome import LatentRisk
 from evofsm.validation import positive
 from evofsm.worlds.road import Episode, World
@@ -31,8 +40,6 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 
-# Observations that bring nothing new, and such as lack something.
-_STALE, _INCOMPLETE = Intake.REPEATED | Intake.LATE, Intake.PARTIAL | Intake.HELD
 
 # Actions that differ by less are the same [m/s²].
 _SAME = 1e-9
@@ -136,7 +143,7 @@ class Oversight:
         before changes nothing: the situation is still that one.
         """
         intake = self.senses.take(observation, time)
-        if intake and intake & _STALE and self._latest is not None:
+        if intake and intake & STALE and self._latest is not None:
             situation = self._latest._replace(intake=intake)
         else:
             if intake and intake & Intake.GAP:
@@ -157,7 +164,7 @@ class Oversight:
         self, observation: NDArray[np.float64], time: float, intake: Intake
     ) -> Situation:
         nothing = Situation(observation, np.ones(1), None, math.nan, time, intake)
-        incomplete = bool(intake) and bool(intake & _INCOMPLETE)
+        incomplete = bool(intake) and bool(intake & INCOMPLETE)
         if self.machine is None or (incomplete and self.machine.n_states == 0):
             return nothing
         if self._frozen is None:
@@ -179,7 +186,7 @@ class Oversight:
         executed = revision.executed
         if self.machine is not None and self.learn and self.machine.state is not None:
             self.machine.act(self.actions.encode(executed))
-        if situation.intake and situation.intake & _STALE:  # it was learnt from before
+        if situation.intake and situation.intake & STALE:  # it was learnt from before
             return revision
         if self.risk is not None and self.learn:
             self.risk.learn(situation.observation, executed, situation.belief)

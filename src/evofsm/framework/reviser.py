@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from evofsm._compile import compiled
 from evofsm.actions import IntervalActions
-from evofsm.protocols import Intake, Proposal, Revision, RiskMeasure, Situation
+from evofsm.protocols import STALE, Proposal, Revision, RiskMeasure, Situation
 from evofsm.risk.outcome import ActionJudge, Judgement
 from evofsm.validation import positive
 from evofsm.worlds.road import VARIABLES
@@ -260,8 +260,7 @@ def _unseen(situation: Situation) -> str:
     ]
     if missing:
         return f"not seen: {', '.join(missing)}"
-    stale = Intake.REPEATED | Intake.LATE
-    return "nothing new was seen" if situation.intake & stale else ""
+    return "nothing new was seen" if situation.intake & STALE else ""
 
 
 def _novelty(judged: Judgement) -> str:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import csv
 import hashlib
+import io
 import json
 import pickle
 from collections.abc import Callable
@@ -17,11 +18,10 @@ from dataclasses import dataclass, replace
 from functools import cache, lru_cache, partial
 from importlib.metadata import version
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from threading import Lock
 from typing import Any
 
-from evofsm import __version__
+from evofsm.checkpoint import versions
 from evofsm.fleet.campaign import Batch, run_campaign
 from evofsm.fleet.journal import Journal, Record, room_needed
 from evofsm.protocols import Reviser
@@ -60,18 +60,8 @@ class Campaign:
     @property
     def settings(self) -> dict[str, Any]:
         """All that an episode depends on, for JSON; not how many there are."""
-        setup = self.setup
         return {
-            "family": {
-                "name": setup.family.name,
-                "tables": setup.family.tables,
-                "added": setup.family.added,
-            },
-            "controller": setup.controller,
-            "reviser": setup.reviser,
-            "mode": setup.mode.value,
-            "tolerance": setup.tolerance,
-            "seed": setup.seed,
+            **self.setup.told,
             "world": self.world,
             "learnt": _digest(self.risk),
             "versions": _versions(self.world),
@@ -135,15 +125,14 @@ def _write(result: Result, records: list[Record], out: Path) -> None:
 
 def _digest(risk: LatentRisk) -> str:
     """Of all that was learnt: of what saving it writes."""
-    with TemporaryDirectory() as folder:
-        risk.save(path := Path(folder) / "risk")
-        return hashlib.sha256(path.read_bytes()).hexdigest()
+    file = io.BytesIO()
+    risk.save(file)
+    return hashlib.sha256(file.getvalue()).hexdigest()
 
 
 def _versions(world: str) -> dict[str, str]:
     """Of everything that may change a digit."""
-    packages = ["numpy", "numba", *(["libsumo"] if world == "sumo" else [])]
-    return {"evofsm": __version__, **{package: version(package) for package in packages}}
+    return {**versions(), **({"libsumo": version("libsumo")} if world == "sumo" else {})}
 
 
 # -- In a worker ----------------------------------------------------------------------------------

@@ -21,7 +21,7 @@ from evofsm.checkpoint import Checkpoint, Kept
 from evofsm.drivers.acc import AdaptiveCruise
 from evofsm.drivers.idm import IDM
 from evofsm.framework.audit import AuditLog
-from evofsm.framework.loop import Drive, Framework
+from evofsm.framework.loop import Drive
 from evofsm.framework.reviser import EnvelopeReviser, Mode, Unrevised
 from evofsm.machine import EvolvingFSM
 from evofsm.protocols import Controller, Reviser
@@ -64,6 +64,22 @@ class Setup:
     learn: bool = True
     first: int = 0  #: episodes driven before, which are not driven again
 
+    @property
+    def told(self) -> dict[str, Any]:
+        """Who drives what and how, for JSON."""
+        return {
+            "family": {
+                "name": self.family.name,
+                "tables": self.family.tables,
+                "added": self.family.added,
+            },
+            "controller": self.controller,
+            "reviser": self.reviser,
+            "mode": self.mode.value,
+            "tolerance": self.tolerance,
+            "seed": self.seed,
+        }
+
     def settings(self, world: str, learner: Learner) -> dict[str, Any]:
         """All that an episode depends on, for JSON; not how many there are.
 
@@ -76,16 +92,7 @@ class Setup:
         """
         machine, risk = _files(learner)
         return {
-            "family": {
-                "name": self.family.name,
-                "tables": self.family.tables,
-                "added": self.family.added,
-            },
-            "controller": self.controller,
-            "reviser": self.reviser,
-            "mode": self.mode.value,
-            "tolerance": self.tolerance,
-            "seed": self.seed,
+            **self.told,
             "learn": self.learn,
             "first": self.first,
             "world": world,
@@ -139,17 +146,15 @@ def drive_family(
     for draw in draws(setup, len(done.outcomes)):
         controller = make_controller(setup, draw, world)
         unrevised = drive_unrevised(family, draw, world, controller)
-        framework = Framework(
-            controller,
-            family.actions,
+        drive = learner.drive(
+            family,
+            draw,
             reviser,
-            machine=learner.machine,
-            risk=learner.risk,
             learn=setup.learn,
-            interval=family.interval,
+            world=world,
+            controller=controller,
             audit=audit,
         )
-        drive = framework.drive(world, draw.scenario)
         done.add(drive, outcome(drive, unrevised, family.interval), setup.tolerance)
         if checkpoint is not None:
             checkpoint.offer(partial(done.keep, learner))

@@ -7,6 +7,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Annotated
 
+from evofsm.cli.bench.common import PageFolder, WorkersOption
 from evofsm.cli.common import (
     SwitchesOption,
     ToleranceOption,
@@ -37,15 +38,11 @@ def closed_loop(
         int,
         typer.Option(min=0, help="Learning seeds in the comparison of state rules; 0: none."),
     ] = 2,
-    workers: Annotated[
-        int | None, typer.Option(min=1, help="Processes. [default: one per core]")
-    ] = None,
+    workers: WorkersOption = None,
     short: Annotated[
         bool, typer.Option("--short", help="A tenth of everything: a look, not evidence.")
     ] = False,
-    out: Annotated[
-        Path, typer.Option(help="Folder for the page, its figures and the data.")
-    ] = Path("evofsm-closed-loop"),
+    out: PageFolder = Path("evofsm-closed-loop"),
     as_json: Annotated[
         bool, typer.Option("--json", help="Print the rows of the table as JSON; write nothing.")
     ] = False,

@@ -5,10 +5,22 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from evofsm.cli.common import counter, print_json, progress
+
+with suppress(ModuleNotFoundError):
+    import typer
+
+    # What all of them are told.
+    WorkersOption = Annotated[
+        int | None, typer.Option(min=1, help="Processes. [default: one per core]")
+    ]
+    PageFolder = Annotated[
+        Path, typer.Option(help="Folder for the page, its figures and the data.")
+    ]
 
 if TYPE_CHECKING:
     from evofsm.report.chapter import Chapter

@@ -6,7 +6,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from evofsm.cli.bench.common import Progress, finish
+from evofsm.cli.bench.common import PageFolder, Progress, WorkersOption, finish
 from evofsm.cli.common import counter, plain_errors, progress, require, split_names
 
 if TYPE_CHECKING:
@@ -30,15 +30,11 @@ def detection(
     grid: Annotated[
         bool, typer.Option(help="Also over brakes that nobody was told of, own and leader's.")
     ] = True,
-    workers: Annotated[
-        int | None, typer.Option(min=1, help="Processes. [default: one per core]")
-    ] = None,
+    workers: WorkersOption = None,
     short: Annotated[
         bool, typer.Option("--short", help="A tenth of everything: a look, not evidence.")
     ] = False,
-    out: Annotated[
-        Path, typer.Option(help="Folder for the page, its figures and the data.")
-    ] = Path("evofsm-detection"),
+    out: PageFolder = Path("evofsm-detection"),
     as_json: Annotated[
         bool, typer.Option("--json", help="Print all rows as JSON; write nothing.")
     ] = False,

@@ -6,7 +6,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from evofsm.cli.bench.common import Progress, finish
+from evofsm.cli.bench.common import PageFolder, Progress, WorkersOption, finish
 from evofsm.cli.common import counter, plain_errors, progress, require
 
 if TYPE_CHECKING:
@@ -26,15 +26,11 @@ def prediction(
     test: Annotated[int, typer.Option(min=2, help="Held-out episodes of each family.")] = 100,
     seeds: Annotated[int, typer.Option(min=1, help="Learning seeds.")] = 20,
     seed: Annotated[int, typer.Option(min=0, help="Of everything.")] = 0,
-    workers: Annotated[
-        int | None, typer.Option(min=1, help="Processes. [default: one per core]")
-    ] = None,
+    workers: WorkersOption = None,
     short: Annotated[
         bool, typer.Option("--short", help="A tenth of everything: a look, not evidence.")
     ] = False,
-    out: Annotated[
-        Path, typer.Option(help="Folder for the page, its figures and the data.")
-    ] = Path("evofsm-prediction"),
+    out: PageFolder = Path("evofsm-prediction"),
     as_json: Annotated[
         bool, typer.Option("--json", help="Print the rows of the tables as JSON; write nothing.")
     ] = False,

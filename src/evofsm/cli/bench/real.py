@@ -6,7 +6,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from evofsm.cli.bench.common import Progress, finish
+from evofsm.cli.bench.common import PageFolder, Progress, WorkersOption, finish
 from evofsm.cli.common import counter, plain_errors, progress, require
 
 if TYPE_CHECKING:
@@ -30,13 +30,9 @@ def real(
         int, typer.Option(min=2, help="Each run is judged by what the other folds taught.")
     ] = 5,
     seed: Annotated[int, typer.Option(min=0, help="Of the folds and the intervals.")] = 0,
-    workers: Annotated[
-        int | None, typer.Option(min=1, help="Processes. [default: one per core]")
-    ] = None,
+    workers: WorkersOption = None,
     short: Annotated[bool, typer.Option("--short", help="Ten runs: a look, not evidence.")] = False,
-    out: Annotated[
-        Path, typer.Option(help="Folder for the page, its figures and the data.")
-    ] = Path("evofsm-real"),
+    out: PageFolder = Path("evofsm-real"),
     as_json: Annotated[
         bool, typer.Option("--json", help="Print the rows of the table as JSON; write nothing.")
     ] = False,

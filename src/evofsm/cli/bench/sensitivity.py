@@ -6,7 +6,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from evofsm.cli.bench.common import Progress, finish
+from evofsm.cli.bench.common import PageFolder, Progress, WorkersOption, finish
 from evofsm.cli.common import counter, plain_errors, progress, require
 
 if TYPE_CHECKING:
@@ -25,15 +25,11 @@ def sensitivity(
         ),
     ] = 2000,
     seed: Annotated[int, typer.Option(min=0, help="Of the draws and of the noise.")] = 0,
-    workers: Annotated[
-        int | None, typer.Option(min=1, help="Processes. [default: one per core]")
-    ] = None,
+    workers: WorkersOption = None,
     short: Annotated[
         bool, typer.Option("--short", help="A twentieth of everything: a look, not evidence.")
     ] = False,
-    out: Annotated[
-        Path, typer.Option(help="Folder for the page, its figures and the data.")
-    ] = Path("evofsm-sensitivity"),
+    out: PageFolder = Path("evofsm-sensitivity"),
     as_json: Annotated[
         bool, typer.Option("--json", help="Print a row for each setting as JSON; write nothing.")
     ] = False,

@@ -25,6 +25,8 @@ from itertools import islice
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple, Self
 
+from evofsm import storage
+
 _log = logging.getLogger(__name__)
 
 _SEAL = b',"hash":"'
@@ -411,7 +413,7 @@ class ChainedFile:
         self.path = path
         self._file: BinaryIO = open(path, "a+b", buffering=0)  # noqa: SIM115
         try:
-            self._lock()
+            storage.only_writer(self._file, self.path, "name another file")
             chain = verify(path)
             if chain.finding is not None:
                 raise ValueError(
@@ -471,15 +473,3 @@ class ChainedFile:
             start = file.read(len(_OPENING))
         if not chain.size and not _OPENING.startswith(start):
             raise ValueError(f"{self.path} is no audit log; it was left alone")
-
-    def _lock(self) -> None:
-        with suppress(ModuleNotFoundError):  # Windows
-            import fcntl
-
-            try:
-                fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                raise ValueError(
-                    f"{self.path} is being written by another process; wait for its end, or name "
-                    "another file"
-                ) from None

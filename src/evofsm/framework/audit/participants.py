@@ -13,8 +13,7 @@ import platform
 from collections.abc import Mapping
 from dataclasses import asdict
 from hashlib import sha256
-from pathlib import Path
-from tempfile import TemporaryDirectory
+from io import BytesIO
 from typing import Any, NamedTuple, Protocol, TypeVar
 
 import numba
@@ -127,14 +126,13 @@ def learnt(machine: EvolvingFSM | None, risk: LatentRisk | None) -> dict[str, fl
 
 
 class _Saved(Protocol):
-    def save(self, path: Path) -> None: ...
+    def save(self, path: BytesIO) -> None: ...
 
 
 def _file(saved: _Saved) -> dict[str, str]:
-    with TemporaryDirectory() as folder:
-        path = Path(folder) / "saved.evofsm"
-        saved.save(path)
-        data = path.read_bytes()
+    file = BytesIO()
+    saved.save(file)
+    data = file.getvalue()
     return {"file": base64.b64encode(data).decode(), "sha256": sha256(data).hexdigest()}
 
 
@@ -199,10 +197,7 @@ def _restored(kind: type[_Kept], kept: Mapping[str, Any] | None) -> _Kept | None
     data = base64.b64decode(kept["file"], validate=True)
     if sha256(data).hexdigest() != kept["sha256"]:
         raise ValueError(f"the {kind.__name__} in it has not the SHA-256 that is said")
-    with TemporaryDirectory() as folder:
-        path = Path(folder) / "saved.evofsm"
-        path.write_bytes(data)
-        return kind.load(path)
+    return kind.load(BytesIO(data))
 
 
 def _restored_reviser(

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
+from evofsm.framework.audit import AuditLog
 from evofsm.framework.loop import Drive, Framework
 from evofsm.framework.reviser import ActionReviser, Mode, Unrevised
 from evofsm.machine import EvolvingFSM
@@ -85,6 +86,7 @@ class Learner:
         learn: bool,
         world: World | None = None,
         controller: Controller | None = None,
+        audit: AuditLog | None = None,
     ) -> Drive:
         """Drive one draw."""
         framework = Framework(
@@ -95,6 +97,7 @@ class Learner:
             risk=self.risk,
             learn=learn,
             interval=family.interval,
+            audit=audit,
         )
         return framework.drive(world or KinematicWorld(), draw.scenario)
 
