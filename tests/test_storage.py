@@ -192,8 +192,8 @@ def test_a_header_that_makes_no_sense_is_refused_by_name(content, tmp_path):
 
 def test_a_file_of_a_newer_version_asks_for_a_newer_library(tmp_path):
     path = tmp_path / "newer"
-    path.write_bytes(npz({**HEADER, "version": 5}))
-    with pytest.raises(ValueError, match=r"version 5 is newer.*a newer evofsm reads it"):
+    path.write_bytes(npz({**HEADER, "version": 6}))
+    with pytest.raises(ValueError, match=r"version 6 is newer.*a newer evofsm reads it"):
         EvolvingFSM.load(path)
 
 
@@ -433,6 +433,19 @@ def test_a_model_of_format_3_is_read():
     np.testing.assert_array_equal(model.transition_matrices, machine.transition_matrices)
 
 
+def test_a_machine_of_format_4_goes_on_and_counts_episodes_from_then_on(spiral):
+    rule = FailureSplit(Novelty(radius=2.0, scales=(1.0, 2.0)), distance=0.1)
+    new = EvolvingFSM(4, rule=rule, max_states=12, belief_tolerance=1e-9)
+    new.learn_many(spiral(40)[:24], np.arange(24) % 3, [0, 9], failures=[15])
+    old = EvolvingFSM.load(FILES / "machine-format-4.evofsm")
+    assert repr(old) == repr(new)
+    assert not old.episodes.any()
+    assert not FSMModel.load(FILES / "model-format-4.evofsm").tried.any()
+    assert_go_on_alike(old, new, spiral(40)[24:], [0, 1, 2, 3] * 4)
+    old.fail()
+    assert 0 < old.failed_soon.sum() == old.episodes.sum() <= old.n_states
+
+
 def test_a_risk_of_format_3_is_read():
     risk = LatentRisk.load(FILES / "risk-format-3.evofsm")
     assert (len(risk.manoeuvres), len(risk.brakes.samples)) == (3, 80)
@@ -452,7 +465,7 @@ def test_a_file_says_who_wrote_it_and_what_it_learnt_from(grown, tmp_path):
     for item, kind in ((grown, "machine"), (grown.model(), "model")):
         item.save(tmp_path / kind, provenance)
         header = storage.describe(tmp_path / kind)
-        assert (header.kind, header.version) == (kind, 4)
+        assert (header.kind, header.version) == (kind, 5)
         assert header.library == __version__
         assert header.provenance == provenance
 

@@ -12,9 +12,11 @@ if TYPE_CHECKING:
     from evofsm.actions import IntervalActions
     from evofsm.crowding import WhenFull
     from evofsm.divergence import jensen_shannon
+    from evofsm.explanation import Explanation
     from evofsm.forecast import Forecasts
     from evofsm.machine import EvolvingFSM
     from evofsm.model import FSMModel
+    from evofsm.naming import Labels
     from evofsm.observations import Category, Missing, ObservationEncoder
     from evofsm.states import Edges, FailureSplit, Novelty, Paper
     from evofsm.step import Event, Step, Trace
@@ -26,10 +28,12 @@ _HOMES = {
     "Edges": "states.edges",
     "Event": "step",
     "EvolvingFSM": "machine",
+    "Explanation": "explanation",
     "FSMModel": "model",
     "FailureSplit": "states.failure",
     "Forecasts": "forecast",
     "IntervalActions": "actions",
+    "Labels": "naming",
     "Missing": "observations",
     "Novelty": "states.novelty",
     "ObservationEncoder": "observations",
@@ -45,10 +49,12 @@ __all__ = [
     "Edges",
     "Event",
     "EvolvingFSM",
+    "Explanation",
     "FSMModel",
     "FailureSplit",
     "Forecasts",
     "IntervalActions",
+    "Labels",
     "Missing",
     "Novelty",
     "ObservationEncoder",

@@ -10,7 +10,7 @@ from enum import IntEnum
 from evofsm._compile import rare_kernel
 from evofsm.memory import Memory
 from evofsm.states.clusters import measure_distances
-from evofsm.transitions import merge_states, retire_state
+from evofsm.transitions import Outcomes, merge_episodes, merge_states, retire_state
 
 # What may happen besides what `evofsm.states.clusters` knows.
 MERGED, RETIRED = 4, 8
@@ -89,10 +89,7 @@ def _merge(memory: Memory, kept: int, given: int, n: int) -> None:
         now.changes[kept, i] += now.changes[given, i]
     for i in range(n):
         now.changes[i, kept] += now.changes[i, given]
-    for place in range(len(now.outcomes.decisions)):
-        now.outcomes.decisions[place, kept] += now.outcomes.decisions[place, given]
-        now.outcomes.failures[place, kept] += now.outcomes.failures[place, given]
-    now.outcomes.endings[kept] += now.outcomes.endings[given]
+    _merge_outcomes(now.outcomes, kept, given)
     now.visits[kept] += now.visits[given]
     now.belief[kept] += now.belief[given]
     if now.state[0] == given:
@@ -105,6 +102,19 @@ def _merge(memory: Memory, kept: int, given: int, n: int) -> None:
         clusters.latest,
         clusters.squared_distances,
     )
+
+
+@rare_kernel
+def _merge_outcomes(outcomes: Outcomes, kept: int, given: int) -> None:
+    began = outcomes.began[0]
+    for place in range(len(outcomes.decisions)):
+        outcomes.decisions[place, kept] += outcomes.decisions[place, given]
+        outcomes.failures[place, kept] += outcomes.failures[place, given]
+        tried, latest = outcomes.tried[place], outcomes.latest_try[place]
+        merge_episodes(tried, outcomes.failed_after[place], latest, kept, given, began)
+    episodes, latest_visit = outcomes.episodes, outcomes.latest_visit
+    merge_episodes(episodes, outcomes.failed_soon, latest_visit, kept, given, began)
+    outcomes.endings[kept] += outcomes.endings[given]
 
 
 @rare_kernel
@@ -136,9 +146,22 @@ def _clear(memory: Memory, given: int, n: int) -> None:
     for i in range(n):
         now.changes[given, i] = 0.0
         now.changes[i, given] = 0.0
-    for place in range(len(now.outcomes.decisions)):
-        now.outcomes.decisions[place, given] = 0.0
-        now.outcomes.failures[place, given] = 0.0
-    now.outcomes.endings[given] = 0.0
+    outcomes = now.outcomes
+    for of_places in (
+        outcomes.decisions,
+        outcomes.failures,
+        outcomes.tried,
+        outcomes.failed_after,
+        outcomes.latest_try,
+    ):
+        for place in range(len(of_places)):
+            of_places[place, given] = 0.0
+    for of_states in (
+        outcomes.endings,
+        outcomes.episodes,
+        outcomes.failed_soon,
+        outcomes.latest_visit,
+    ):
+        of_states[given] = 0.0
     now.visits[given] = 0.0
     now.belief[given] = 0.0

@@ -24,6 +24,7 @@ from evofsm._compile import LINE, lanes
 from evofsm.actions import IntervalActions
 from evofsm.crowding import WhenFull
 from evofsm.divergence import jensen_shannon
+from evofsm.explanation import Explanation, explain, nothing_known
 from evofsm.memory import (
     NO_ACTION,
     Learnt,
@@ -35,6 +36,7 @@ from evofsm.memory import (
     view,
 )
 from evofsm.model import FSMModel, recognise_rows
+from evofsm.naming import Labels
 from evofsm.observations import Missing
 from evofsm.states.dispatch import check_rule, describe, restore, weights, width
 from evofsm.states.ets import Paper
@@ -70,7 +72,12 @@ _FLOAT64 = np.dtype(np.float64)
 _RADIUS, _SPREAD = 0.3, 3.0
 _SETTINGS = ("n_actions", "radius", "distance_weight", "learning_rate", "prior_frequency", "spread")
 # What a machine does not have to be told, with what holds if it is not.
-_OPTIONS = {"max_states": None, "when_full": WhenFull.MERGE, "belief_tolerance": 0.0}
+_OPTIONS = {
+    "max_states": None,
+    "when_full": WhenFull.MERGE,
+    "belief_tolerance": 0.0,
+    "failure_horizon": None,
+}
 
 
 class EvolvingFSM:
@@ -108,6 +115,10 @@ class EvolvingFSM:
         that are less likely get no part in the belief, and take no part in the step: with
         hundreds of states this saves most of the time, 1e-6 for example. A jump to a state that
         got none teaches nothing about it until it is recognised. 0 leaves nothing out.
+    failure_horizon : int, optional
+        A failure so many observations later, or sooner, came soon after a state: it is counted
+        among what came of being there (`failed_soon`). Without it every failure later in the same
+        episode is.
 
     Raises
     ------
@@ -116,7 +127,8 @@ class EvolvingFSM:
     ValueError
         If ``n_actions`` is no whole number of at least 1, another setting is not positive and
         finite, ``learning_rate`` is 1 or more, ``radius`` or ``spread`` contradicts the rule's,
-        or ``belief_tolerance`` is not in its range.
+        ``belief_tolerance`` is not in its range, or ``failure_horizon`` is no whole number of at
+        least 1.
 
     Notes
     -----
@@ -150,6 +162,7 @@ class EvolvingFSM:
         max_states: int | None = None,
         when_full: WhenFull = WhenFull.MERGE,
         belief_tolerance: float = 0.0,
+        failure_horizon: int | None = None,
     ) -> None:
         self._rule = Paper() if rule is None else check_rule("rule", rule)
         given = RuleSettings(
@@ -171,6 +184,7 @@ class EvolvingFSM:
             _tolerance(belief_tolerance),
             np.inf if max_states is None else whole("max_states", max_states),
             WhenFull(when_full),
+            np.inf if failure_horizon is None else whole("failure_horizon", failure_horizon),
             told,
         )
         if parameters.learning_rate >= 1.0:
@@ -200,7 +214,12 @@ prior_frequency=0.001, spread=3.0)
     # -- Learning -------------------------------------------------------------------------------
 
     def observe(
-        self, z: ArrayLike, *, failed: bool = False, missing: Missing = Missing.REJECT
+        self,
+        z: ArrayLike,
+        *,
+        failed: bool = False,
+        missing: Missing = Missing.REJECT,
+        explained: Labels | None = None,
     ) -> Step:
         """Take in one observation: determine states, recognise, and learn the transition to it.
 
@@ -217,6 +236,9 @@ prior_frequency=0.001, spread=3.0)
             What to do where entries are NaN, which says that they were not observed. Such an
             observation is recognised and no more: no state moves, no transition to it is learnt,
             and `Step.missing` tells the variables.
+        explained : Labels, optional
+            What the numbers mean: with it `Step.explanation` says what was learnt of the state so
+            far, as `explain` does.
 
         Returns
         -------
@@ -240,12 +262,12 @@ prior_frequency=0.001, spread=3.0)
         >>> step.state, step.predicted.round(2), step.belief.round(2), round(step.surprise, 2)
         (1, array([0.6, 0.4]), array([0.32, 0.68]), 0.06)
         """
-        if missing is not Missing.REJECT:
-            given = real_array("observation", z, ndim=1)
-            absent = np.isnan(given)
-            if absent.any():
-                return self._observe_partly(given, absent, missing, failed=bool(failed))
-        return self._step(z, NO_ACTION, bool(failed))
+        if missing is Missing.REJECT and explained is None:
+            return self._step(z, NO_ACTION, bool(failed))
+        step = self._observe_any(z, bool(failed), missing)
+        if explained is None:
+            return step
+        return step._replace(explanation=explain(self, step.belief, None, explained).text)
 
     def act(self, i: SupportsIndex) -> None:
         """Say which action was commanded after the latest observation.
@@ -498,6 +520,46 @@ prior_frequency=0.001, spread=3.0)
         i = check_action(i, self.n_actions)
         return propagate(self.belief, self._matrix, self._averaged, i, horizon, policy)
 
+    def explain(
+        self, action: SupportsIndex | None = None, labels: Labels | None = None
+    ) -> Explanation:
+        """What experience says of the present situation; nothing is changed by asking.
+
+        Parameters
+        ----------
+        action : int, optional
+            Index of an action, from 0: what came of taking it there.
+        labels : Labels, optional
+            What the numbers mean, for words.
+
+        Returns
+        -------
+        Explanation
+            As `FSMModel.explain` gives it.
+
+        Raises
+        ------
+        TypeError
+            If ``action`` is not an integer.
+        ValueError
+            If there is no such action.
+
+        Examples
+        --------
+        >>> from evofsm import Labels
+        >>> machine = EvolvingFSM(n_actions=2, radius=0.5)
+        >>> trace = machine.learn_many([[0.0], [0.1], [2.0], [1.0]], [0, 1, 0, 0], [0, 2], [3])
+        >>> step = machine.observe([0.9])
+        >>> print(machine.explain(0, Labels(names=("gap",), units=("m",))))
+        #2: gap 0.9 m (belief 63 %, next #1 37 %). 1 episode came here (2 observations);
+        1 of 1 (at least 27 %) failed later on; a(1) was never tried here. Mostly reached from #1:
+        1 of 1 times.
+        """
+        index = None if action is None else check_action(action, self.n_actions)
+        if self.state is None:
+            return nothing_known("Nothing was observed yet in this episode.")
+        return explain(self, self.belief, index, Labels() if labels is None else labels)
+
     # -- What it was told -----------------------------------------------------------------------
 
     @property
@@ -551,6 +613,12 @@ prior_frequency=0.001, spread=3.0)
         """How far a belief may be from the exact one, summed over all states."""
         return self._memory.parameters.belief_tolerance
 
+    @property
+    def failure_horizon(self) -> int | None:
+        """Observations after which a failure no longer counts as soon; None for no limit."""
+        most = self._memory.parameters.failure_horizon
+        return None if most == np.inf else int(most)
+
     # -- What it knows --------------------------------------------------------------------------
 
     @property
@@ -563,8 +631,8 @@ prior_frequency=0.001, spread=3.0)
         >>> trace = machine.learn_many([[0.0], [0.1], [2.0]], [0, 0, 1])
         >>> once = machine.nbytes
         >>> trace = machine.learn_many([[0.0], [0.1]], [0, 0])  # action 1 got its matrix
-        >>> machine.nbytes - once  # 8 states in a line: 8 x 8 probabilities, 4 x 8 of rows
-        768
+        >>> machine.nbytes - once  # 8 states in a line: 8 x 8 probabilities, 7 x 8 of rows
+        960
         """
         return self._buffer.nbytes
 
@@ -613,6 +681,16 @@ prior_frequency=0.001, spread=3.0)
         return self.origin_frequency[:, :, None] * self.transition_matrices
 
     @property
+    def visits(self) -> NDArray[np.float64]:
+        """(n,) ndarray: observations in which each state was the most probable."""
+        return self._memory.learnt.visits[: self.n_states].copy()
+
+    @property
+    def changes(self) -> NDArray[np.float64]:
+        """(n, n) ndarray: steps from the most probable state (row) to the next one (column)."""
+        return self._memory.learnt.changes[: self.n_states, : self.n_states].copy()
+
+    @property
     def decisions(self) -> NDArray[np.float64]:
         """(q, n) ndarray: for each action, transitions that began in each state, by belief.
 
@@ -657,6 +735,46 @@ prior_frequency=0.001, spread=3.0)
         array([1., 1.])
         """
         return self._memory.learnt.outcomes.endings[: self.n_states].copy()
+
+    @property
+    def episodes(self) -> NDArray[np.float64]:
+        """(n,) ndarray: episodes that came to each state, without the one that is going on.
+
+        Examples
+        --------
+        >>> machine = EvolvingFSM(n_actions=2, radius=0.5)
+        >>> trace = machine.learn_many([[0.0], [0.1], [2.0], [1.0]], [0, 0, 0, 1], [0, 2], [3])
+        >>> machine.episodes, machine.failed_soon
+        (array([2., 1.]), array([1., 1.]))
+        """
+        outcomes, n = self._memory.learnt.outcomes, self.n_states
+        return outcomes.episodes[:n] - self._under_way(outcomes.latest_visit[:n])
+
+    @property
+    def failed_soon(self) -> NDArray[np.float64]:
+        """(n,) ndarray: those of `episodes` that failed within the horizon of being there."""
+        return self._memory.learnt.outcomes.failed_soon[: self.n_states].copy()
+
+    @property
+    def tried(self) -> NDArray[np.float64]:
+        """(q, n) ndarray: episodes that took each action in each state, without the present one.
+
+        Examples
+        --------
+        >>> machine = EvolvingFSM(n_actions=2, radius=0.5)
+        >>> trace = machine.learn_many([[0.0], [0.1], [2.0], [1.0]], [0, 1, 0, 0], [0, 2], [3])
+        >>> machine.tried, machine.failed_after
+        (array([[2., 0.],
+               [0., 0.]]), array([[1., 0.],
+               [0., 0.]]))
+        """
+        outcomes = self._memory.learnt.outcomes
+        return self._of_actions(outcomes.tried - self._under_way(outcomes.latest_try), 0.0)
+
+    @property
+    def failed_after(self) -> NDArray[np.float64]:
+        """(q, n) ndarray: those of `tried` that failed within the horizon of doing so."""
+        return self._of_actions(self._memory.learnt.outcomes.failed_after, 0.0)
 
     @property
     def marginal_matrix(self) -> NDArray[np.float64]:
@@ -724,12 +842,16 @@ prior_frequency=0.001, spread=3.0)
             transition_matrices=self.transition_matrices,
             origin_frequency=self.origin_frequency,
             uses=learnt.transitions.uses.copy(),
-            visits=learnt.visits[:n].copy(),
+            visits=self.visits,
             founded=learnt.founded[:n].copy(),
-            changes=learnt.changes[:n, :n].copy(),
+            changes=self.changes,
             decisions=self.decisions,
             failures=self.failures,
             endings=self.endings,
+            episodes=self.episodes,
+            failed_soon=self.failed_soon,
+            tried=self.tried,
+            failed_after=self.failed_after,
             rule=self._rule,
             actions=actions,
             names=tuple(names),
@@ -879,6 +1001,15 @@ prior_frequency=0.001, spread=3.0)
         self._observe = _cannot_observe
         self._update = _cannot_update
 
+    def _observe_any(self, z: ArrayLike, failed: bool, missing: Missing) -> Step:
+        """Observe, whole or in part."""
+        if missing is not Missing.REJECT:
+            given = real_array("observation", z, ndim=1)
+            absent = np.isnan(given)
+            if absent.any():
+                return self._observe_partly(given, absent, missing, failed=failed)
+        return self._step(z, NO_ACTION, failed)
+
     def _step(self, z: ArrayLike, action: int, failed: bool) -> Step:
         """Observe, then act; the whole answer."""
         event, state, surprise = self._insist(z, action, failed)
@@ -916,6 +1047,8 @@ prior_frequency=0.001, spread=3.0)
             centers, distances = np.ascontiguousarray(held.centers[:, :n]), np.empty(n)
             rows = filled[None], width(rule, held)
             recognise_rows(centers, counted, *rows, distances, belief[None])
+        if not now.chained[0]:
+            now.outcomes.began[0] = now.clusters.n_observations[0] + 1.0
         now.belief[:n], now.state[0] = belief, belief.argmax()
         now.chained[0], now.action[0] = 1.0, NO_ACTION
         state = int(now.state[0])
@@ -972,6 +1105,11 @@ prior_frequency=0.001, spread=3.0)
         of_used = of_places[places[used].astype(int)]
         rows[used] = of_used[:, :n] if of_used.ndim == 2 else of_used[:, :n, :n]
         return rows
+
+    def _under_way(self, latest: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Whether what was done ``latest`` belongs to an episode that is going on."""
+        now = self._memory.learnt
+        return np.asarray((latest >= now.outcomes.began[0]) & (now.chained[0] > 0.0))
 
     def _fit(self, z: NDArray[np.float64]) -> NDArray[np.float64]:
         """Settle the number of variables with the first observation, and hold to it after."""

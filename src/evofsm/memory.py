@@ -19,16 +19,22 @@ from evofsm._compile import LINE, inner_kernel, kernel, lanes, part
 from evofsm.states.clusters import Clusters
 from evofsm.states.rule import RuleSettings
 from evofsm.transitions import NOT_OPEN, Outcomes, Transitions
-from evofsm.validation import refuse_unless_distribution, refuse_unless_outcomes
+from evofsm.validation import refuse_unless_counts, refuse_unless_distribution
 
 NO_ACTION = -1
 
 # A buffer begins with its sizes (m, q, capacity, places), `Parameters` and counters.
 _COUNTERS, _HEAD = 20, 32
 # Then, for each kind of thing there is, so many numbers; centres are further rows of states.
-_PER_STATE, _PER_PLACE, _PER_ACTION, _PER_VARIABLE = 13, 4, 2, 5
+_PER_STATE, _PER_PLACE, _PER_ACTION, _PER_VARIABLE = 16, 7, 2, 5
 # Where the centre of a state that is not there stands: too far for any belief.
 _NOWHERE = np.inf
+# Outcomes that belong together: cases, failures among them, and another count.
+_COUNTED = (
+    ("decisions", "failures", "endings"),
+    ("episodes", "failed_soon", "latest_visit"),
+    ("tried", "failed_after", "latest_try"),
+)
 
 
 class Parameters(NamedTuple):
@@ -39,6 +45,7 @@ class Parameters(NamedTuple):
     belief_tolerance: float
     max_states: float  #: infinity for no limit
     when_full: float  #: a value of `evofsm.crowding.WhenFull`
+    failure_horizon: float  #: observations; infinity for all of an episode
     rule: RuleSettings
 
 
@@ -128,7 +135,7 @@ def _open_apart(buffer: NDArray[np.float64], matrices: NDArray[Any]) -> Memory:
     """Views into a buffer whose matrices are somewhere else; for kernels `open_apart`."""
     m, q, capacity, places = _sizes(buffer)
     begin = _sections(m, q, capacity, places)
-    counters = part(buffer, _COUNTERS, (7, 1))
+    counters = part(buffer, _COUNTERS, (8, 1))
     of_states = part(buffer, begin.of_states, (_PER_STATE + m, capacity))
     of_places = part(buffer, begin.of_places, (_PER_PLACE, places, capacity))
     of_actions = part(buffer, begin.of_actions, (_PER_ACTION, q))
@@ -140,14 +147,15 @@ def _open_apart(buffer: NDArray[np.float64], matrices: NDArray[Any]) -> Memory:
             float(buffer[6]),
             float(buffer[7]),
             float(buffer[8]),
+            float(buffer[9]),
             RuleSettings(
-                float(buffer[9]),
                 float(buffer[10]),
                 float(buffer[11]),
                 float(buffer[12]),
                 float(buffer[13]),
                 float(buffer[14]),
                 float(buffer[15]),
+                float(buffer[16]),
                 of_variables[4],
             ),
         ),
@@ -179,15 +187,26 @@ def _open_apart(buffer: NDArray[np.float64], matrices: NDArray[Any]) -> Memory:
                 of_places[0],
                 of_places[1],
             ),
-            Outcomes(of_places[2], of_places[3], of_states[6]),
+            Outcomes(
+                of_places[2],
+                of_places[3],
+                of_states[6],
+                counters[7],
+                of_states[7],
+                of_states[8],
+                of_states[9],
+                of_places[4],
+                of_places[5],
+                of_places[6],
+            ),
         ),
         Scratch(
-            of_states[7],
-            of_states[8],
-            of_states[9],
             of_states[10],
             of_states[11],
             of_states[12],
+            of_states[13],
+            of_states[14],
+            of_states[15],
         ),
     )
 
@@ -202,7 +221,7 @@ def allocate(
     buffer = _blank(n_variables, n_actions, capacity, places)
     *numbers, rule = parameters
     *rule_numbers, weights = rule
-    buffer[4:16] = (*numbers, *rule_numbers)
+    buffer[4:17] = (*numbers, *rule_numbers)
     memory = view(buffer)
     memory.parameters.rule.weights[:] = weights
     memory.learnt.action[0] = NO_ACTION
@@ -317,7 +336,9 @@ def refuse_impossible(learnt: Learnt) -> None:
     open_ = learnt.transitions.places[learnt.transitions.places != NOT_OPEN]
     if sorted(open_) != list(range(len(learnt.transitions.matrices))):
         raise ValueError("places of matrices are not those that there are")
-    refuse_unless_outcomes(*learnt.outcomes)
+    for names in _COUNTED:
+        counts = [getattr(learnt.outcomes, name) for name in names]
+        refuse_unless_counts(f"{names[0]}, {names[1]} or {names[2]}", *counts)
     refuse_unless_distribution("belief", learnt.belief)
     scales = learnt.transitions.scales
     if (scales <= 0.0).any():

@@ -12,6 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 from evofsm import storage
 from evofsm._compile import kernel
 from evofsm.actions import IntervalActions
+from evofsm.explanation import Explanation, explain
+from evofsm.naming import Labels
 from evofsm.states.clusters import measure_distances, nearest_center
 from evofsm.states.dispatch import describe, restore, weights
 from evofsm.states.ets import Paper
@@ -20,14 +22,23 @@ from evofsm.states.spread import recognise
 from evofsm.transitions import Policy, marginal, propagate
 from evofsm.validation import (
     check_action,
+    check_state,
     positive,
     real_array,
+    refuse_unless_counts,
     refuse_unless_distribution,
-    refuse_unless_outcomes,
     refuse_unusable,
 )
 
-_COUNTS = ("decisions", "failures", "endings")
+_COUNTS = (
+    "decisions",
+    "failures",
+    "endings",
+    "episodes",
+    "failed_soon",
+    "tried",
+    "failed_after",
+)
 
 
 def _no_counts() -> NDArray[np.float64]:
@@ -40,7 +51,10 @@ class FSMModel:
 
     n is the number of states, m of variables, q of actions. Arrays are read-only. Centres are in
     the units of the observations; distances and potentials as if all had the same unit, or are
-    those of observations divided by the rule's scales. Without counts of outcomes they are 0.
+    those of observations divided by the rule's scales. Without counts of outcomes they are 0. An
+    episode failed *soon* after it was in a state if no more than ``failure_horizon`` observations
+    lay between, of ``settings``; where that is not set, if it failed at all. The episode that was
+    going on when the snapshot was taken is not counted.
 
     Raises
     ------
@@ -77,6 +91,12 @@ class FSMModel:
     decisions: NDArray[np.float64] = field(default_factory=_no_counts)  #: (q, n) transitions begun
     failures: NDArray[np.float64] = field(default_factory=_no_counts)  #: (q, n) that led to failure
     endings: NDArray[np.float64] = field(default_factory=_no_counts)  #: (n,) failures ended in it
+    episodes: NDArray[np.float64] = field(default_factory=_no_counts)  #: (n,) that came to it
+    #: (n,) of these, those that failed soon after they were there
+    failed_soon: NDArray[np.float64] = field(default_factory=_no_counts)
+    tried: NDArray[np.float64] = field(default_factory=_no_counts)  #: (q, n) episodes that did it
+    #: (q, n) of these, those that failed soon after they did
+    failed_after: NDArray[np.float64] = field(default_factory=_no_counts)
     rule: StateRule = field(default_factory=Paper)  #: how its machine determines states
 
     def __post_init__(self) -> None:
@@ -93,6 +113,10 @@ class FSMModel:
             "decisions": (q, n),
             "failures": (q, n),
             "endings": (n,),
+            "episodes": (n,),
+            "failed_soon": (n,),
+            "tried": (q, n),
+            "failed_after": (q, n),
         }
         for name, shape in shapes.items():
             array = np.array(getattr(self, name), dtype=np.float64)
@@ -104,7 +128,13 @@ class FSMModel:
                 raise ValueError(f"{name} holds NaN or infinity")
             array.setflags(write=False)
             object.__setattr__(self, name, array)
-        refuse_unless_outcomes(self.decisions, self.failures, self.endings)
+        refuse_unless_counts(
+            "decisions, failures or endings", self.decisions, self.failures, self.endings
+        )
+        refuse_unless_counts(
+            "episodes or failed_soon", self.episodes, self.failed_soon, self.visits
+        )
+        refuse_unless_counts("tried or failed_after", self.tried, self.failed_after, self.uses)
         if n:
             refuse_unless_distribution("a row of transition_matrices", self.transition_matrices)
         for name in ("names", "units"):
@@ -129,6 +159,17 @@ class FSMModel:
     def n_actions(self) -> int:
         """Number q of actions."""
         return len(self.uses)
+
+    @property
+    def failure_horizon(self) -> int | None:
+        """Observations after which a failure no longer counted as soon; None for no limit."""
+        horizon = self.settings.get("failure_horizon")
+        return None if horizon is None else int(horizon)
+
+    @property
+    def labels(self) -> Labels:
+        """What its numbers mean."""
+        return Labels(self.actions, self.names, self.units, self.dt)
 
     def __deepcopy__(self, memo: Any) -> Self:
         """Itself: nothing in it ever changes."""
@@ -226,16 +267,68 @@ class FSMModel:
         >>> model.propagate([1.0, 0.0], 0, horizon=20, policy="hold").round(3)
         array([0.686, 0.314])
         """
-        start = np.asarray(belief, dtype=np.float64)
-        if start.shape != (self.n_states,):
-            raise ValueError(
-                f"belief has shape {start.shape}; the model has {self.n_states} states"
-            )
-        refuse_unless_distribution("belief", start)
+        start = self._belief(belief)
         if action is not None:
             action = check_action(action, self.n_actions)
         matrix_of = self.transition_matrices.__getitem__
         return propagate(start, matrix_of, self.averaged_matrix, action, horizon, policy)
+
+    def explain(self, situation: int | ArrayLike, action: int | None = None) -> Explanation:
+        """What experience says of a situation: where it lies, and what came of being there.
+
+        All of it was counted, once for each episode; see `evofsm.explanation`.
+
+        Parameters
+        ----------
+        situation : int or (n,) array_like
+            A state, or a distribution over states, of which the most probable one is explained.
+        action : int, optional
+            Index of an action, from 0: what came of taking it there.
+
+        Returns
+        -------
+        Explanation
+            Its text is a sentence or two; its fields hold the numbers.
+
+        Raises
+        ------
+        TypeError
+            If ``action`` or a state is not an integer.
+        ValueError
+            If there is no such state or action, or a belief is no distribution over the states.
+
+        Examples
+        --------
+        >>> from evofsm import EvolvingFSM
+        >>> machine = EvolvingFSM(n_actions=2, radius=0.5)
+        >>> Z, I = [[0.0], [0.1], [2.0], [1.0]], [0, 1, 0, 0]
+        >>> trace = machine.learn_many(Z, I, episode_starts=[0, 2], failures=[3])
+        >>> model = machine.model(names=["gap"], units=["m"], dt=0.1)
+        >>> print(model.explain(0))
+        #1: gap 0 m. 2 episodes came here (3 observations); 1 of 2 (12 to 88 %) failed later on.
+        >>> print(model.explain([0.2, 0.8], action=1))
+        #2: gap 1 m (belief 80 %, next #1 20 %). 1 episode came here (1 observation);
+        1 of 1 (at least 27 %) failed later on; a(2) was never tried here. Mostly reached from #1:
+        1 of 1 times.
+        """
+        if action is not None:
+            action = check_action(action, self.n_actions)
+        if np.ndim(situation) == 0:
+            belief = np.eye(self.n_states)[check_state(situation, self.n_states)]
+        else:
+            belief = self._belief(situation)
+        return explain(self, belief, action, self.labels)
+
+    def _belief(self, belief: ArrayLike) -> NDArray[np.float64]:
+        """Refuse what is no distribution over the states."""
+        given = np.asarray(belief, dtype=np.float64)
+        if given.shape != (self.n_states,):
+            raise ValueError(
+                f"belief has shape {given.shape}; the model has {self.n_states} states"
+            )
+        if self.n_states:
+            refuse_unless_distribution("belief", given)
+        return given
 
     @property
     def marginal_matrix(self) -> NDArray[np.float64]:

@@ -60,6 +60,7 @@ class Revision(NamedTuple):
     evidence: float  #: number of leaders' braking manoeuvres that the risks rest on
     seen: float  #: time spent in states like this one before [s]; NaN where that is not known
     advised: float  #: what the reviser would execute, whether or not it may act [m/s²]
+    explanation: str = ""  #: what a machine's experience says of it, where that was asked for
 
 
 class Controller(Protocol):

@@ -30,6 +30,8 @@ from evofsm.states.failure import splits
 from evofsm.transitions import (
     NOT_OPEN,
     count,
+    count_episode,
+    count_failure,
     count_open,
     expand,
     forecast,
@@ -94,6 +96,7 @@ class Step(NamedTuple):
     predicted: NDArray[np.float64]  #: (n,) forecast made one step before; empty where none was
     surprise: float  #: divergence of `predicted` and `belief` [bit]; NaN where none was
     missing: tuple[int, ...] = ()  #: variables that were not observed, so that nothing was learnt
+    explanation: str = ""  #: what experience says of the state, where that was asked for
 
 
 class Trace(NamedTuple):
@@ -138,6 +141,8 @@ def step(
     if not _is_usable(memory, z):
         return REFUSED, 0, np.nan
     n = int(now.n_states[0])
+    if not now.chained[0]:
+        now.outcomes.began[0] = now.clusters.n_observations[0] + 1.0
 
     # Section 2.2.1: does the observation move a state, or found one?
     event, nearest, potential = determine(parameters.rule, now.clusters, n, z)
@@ -165,6 +170,7 @@ def step(
         now.belief[i] = scratch.recognised[i]
     now.state[0] = nearest
     now.visits[nearest] += 1.0
+    _come_to(memory, nearest)
     now.action[0] = NO_ACTION
     now.chained[0] = 1.0
     if failed:
@@ -284,6 +290,7 @@ def fail(buffer: NDArray[np.float64]) -> bool:
         n = int(now.n_states[0])
         now.state[0] = nearest
         _recognise(memory, n, nearest)
+        _come_to(memory, nearest)
         for i in range(n):
             now.belief[i] = memory.scratch.recognised[i]
     action = int(now.action[0])
@@ -390,17 +397,37 @@ def _recognise(memory: Memory, n: int, nearest: int) -> None:
 @inner_kernel
 def _decide(memory: Memory, place: int, n: int, failed: bool) -> None:
     """Count that the pending action was taken from the belief, and whether it led to failure."""
-    now = memory.learnt
-    count(now.outcomes.decisions[place], now.belief, lanes(n))
+    now, outcomes = memory.learnt, memory.learnt.outcomes
+    count(outcomes.decisions[place], now.belief, lanes(n))
     if failed:
-        count(now.outcomes.failures[place], now.belief, lanes(n))
+        count(outcomes.failures[place], now.belief, lanes(n))
+    count_episode(
+        outcomes.tried[place],
+        outcomes.latest_try[place],
+        int(now.state[0]),
+        outcomes.began[0],
+        now.clusters.n_observations[0],
+    )
+
+
+@inner_kernel
+def _come_to(memory: Memory, state: int) -> None:
+    """Count that the present episode is in a state."""
+    outcomes, now = memory.learnt.outcomes, memory.learnt.clusters.n_observations[0]
+    count_episode(outcomes.episodes, outcomes.latest_visit, state, outcomes.began[0], now)
 
 
 @inner_kernel
 def _end(memory: Memory) -> None:
-    """Count the failure where the episode was last, and clear the chain."""
+    """Count the failure where the episode was last and what it did before; clear the chain."""
     now = memory.learnt
     now.outcomes.endings[int(now.state[0])] += 1.0
+    count_failure(
+        now.outcomes,
+        int(now.n_states[0]),
+        now.clusters.n_observations[0],
+        memory.parameters.failure_horizon,
+    )
     now.action[0] = NO_ACTION
     now.chained[0] = 0.0
 

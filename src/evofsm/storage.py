@@ -6,7 +6,8 @@ machine's file holds the views of its buffer, with centres by variable (m, n); a
 centres by state (n, m).
 
 Version 1 knew the paper's state rule only and did not count failures. Version 2 held a matrix for
-every action, used or not. Version 3 had neither a checksum nor a provenance.
+every action, used or not. Version 3 had neither a checksum nor a provenance. Version 4 did not
+count episodes.
 
 Whatever a file claims is looked at before anything is made room for: first how its archive is
 built, then the headers of all arrays, and only then what they hold.
@@ -38,7 +39,7 @@ from evofsm import __version__
 Place: TypeAlias = str | os.PathLike[str] | BinaryIO
 
 _FORMAT = "evofsm"
-_VERSION = 4
+_VERSION = 5
 _HEADER = "header"
 #: No file holds more, unpacked [bytes].
 LARGEST = 1 << 32
@@ -56,19 +57,23 @@ _Shape: TypeAlias = tuple[int | str, ...]
 _SHAPES: dict[str, dict[str, _Shape] | None] = {
     "machine": {
         **dict.fromkeys(("n_states", "n_founded", "action", "chained", "state"), (1,)),
-        **dict.fromkeys(("n_observations", "scatter"), (1,)),
+        **dict.fromkeys(("n_observations", "scatter", "began"), (1,)),
         **dict.fromkeys(("belief", "ids", "visits", "founded", "endings"), ("n",)),
         **dict.fromkeys(("potentials", "squared_distances"), ("n",)),
+        **dict.fromkeys(("episodes", "failed_soon", "latest_visit"), ("n",)),
         **dict.fromkeys(("first", "latest", "mean"), ("m",)),
         **dict.fromkeys(("places", "uses"), ("q",)),
         **dict.fromkeys(("scales", "origin_frequency", "decisions", "failures"), ("places", "n")),
+        **dict.fromkeys(("tried", "failed_after", "latest_try"), ("places", "n")),
         "changes": ("n", "n"),
         "centers": ("m", "n"),
         "matrices": ("places", "n", "n"),
     },
     "model": {
         **dict.fromkeys(("potentials", "visits", "founded", "endings"), ("n",)),
+        **dict.fromkeys(("episodes", "failed_soon"), ("n",)),
         **dict.fromkeys(("origin_frequency", "decisions", "failures"), ("q", "n")),
+        **dict.fromkeys(("tried", "failed_after"), ("q", "n")),
         "uses": ("q",),
         "changes": ("n", "n"),
         "centers": ("n", "m"),
@@ -93,23 +98,21 @@ _SINCE = {
     "machine": {
         **dict.fromkeys(("decisions", "failures", "endings", "latest"), 2),
         **dict.fromkeys(("places", "scales", "n_founded", "ids"), 3),
-    },
-    "model": dict.fromkeys(("decisions", "failures", "endings"), 2),
-    "risk": dict.fromkeys(("doubts_brought", "doubts_shortfalls"), 4),
-}
-# Arrays that version 1 had not, as zeros in the shape of one that it had.
-_ADDED = {
-    "machine": {
-        "decisions": "origin_frequency",
-        "failures": "origin_frequency",
-        "endings": "visits",
-        "latest": "first",
+        **dict.fromkeys(("began", "episodes", "failed_soon", "latest_visit"), 5),
+        **dict.fromkeys(("tried", "failed_after", "latest_try"), 5),
     },
     "model": {
-        "decisions": "origin_frequency",
-        "failures": "origin_frequency",
-        "endings": "visits",
+        **dict.fromkeys(("decisions", "failures", "endings"), 2),
+        **dict.fromkeys(("episodes", "failed_soon", "tried", "failed_after"), 5),
     },
+    "risk": dict.fromkeys(("doubts_brought", "doubts_shortfalls"), 4),
+}
+# Counts that earlier versions had not, and an array of the same shape: in these they are zeros.
+_ADDED = {
+    **dict.fromkeys(("decisions", "failures", "tried", "failed_after"), "origin_frequency"),
+    **dict.fromkeys(("endings", "episodes", "failed_soon", "latest_visit"), "visits"),
+    "latest_try": "origin_frequency",
+    "latest": "first",
 }
 # Of an error that quotes a damaged file so many letters are told.
 _MOST_SAID = 300
@@ -552,13 +555,16 @@ def _upgrade(header: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> None:
     """Give a file of an earlier version what it lacks."""
     if header["version"] < 2:
         header["content"]["rule"] = {"name": "paper"}
-        for name, like in _ADDED[header["kind"]].items():
-            arrays[name] = np.zeros_like(arrays[like])
+    for name, since in _SINCE.get(header["kind"], {}).items():
+        if header["version"] < since and name in _ADDED:
+            arrays[name] = np.zeros_like(arrays[_ADDED[name]])
     if header["version"] < 3 and header["kind"] == "machine":
         arrays["places"] = np.arange(len(arrays["uses"]), dtype=np.float64)
         arrays["scales"] = np.ones_like(arrays["origin_frequency"])
         arrays["n_founded"] = arrays["n_states"]
         arrays["ids"] = np.arange(len(arrays["visits"]), dtype=np.float64)
+    if header["version"] < 5 and header["kind"] == "machine":  # counts begin with the next one
+        arrays["began"] = arrays["n_observations"] + 1.0
 
 
 # -- Errors ---------------------------------------------------------------------------------------

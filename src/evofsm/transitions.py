@@ -57,12 +57,21 @@ class Transitions(NamedTuple):
 class Outcomes(NamedTuple):
     """Evidence on failure, in counts that never forget: a rare failure must not fade.
 
-    It is kept apart from `Transitions.origin_frequency`, which forgets. Places are the same.
+    It is kept apart from `Transitions.origin_frequency`, which forgets. Places are the same. What
+    came of an episode is counted once for each state it came to, and each action it took there:
+    observations of one episode are no independent evidence.
     """
 
     decisions: NDArray[np.float64]  # (s, capacity) belief-weighted transitions from each state
     failures: NDArray[np.float64]  # (s, capacity) those of them that led straight into failure
     endings: NDArray[np.float64]  # (capacity,) failures whose last observation was the state
+    began: NDArray[np.float64]  # (1,) number of the present episode's first observation
+    episodes: NDArray[np.float64]  # (capacity,) that came to the state
+    failed_soon: NDArray[np.float64]  # (capacity,) those that failed soon after they were there
+    latest_visit: NDArray[np.float64]  # (capacity,) number of the latest observation there
+    tried: NDArray[np.float64]  # (s, capacity) episodes that took the action in the state
+    failed_after: NDArray[np.float64]  # (s, capacity) those that failed soon after they did
+    latest_try: NDArray[np.float64]  # (s, capacity) number of the observation that followed it
 
 
 @inner_kernel
@@ -70,6 +79,43 @@ def count(counts: NDArray[np.float64], belief: NDArray[np.float64], n: int) -> N
     """Count one event, shared out over the first ``n`` states by belief."""
     for i in range(n):
         counts[i] += belief[i]
+
+
+@inner_kernel
+def count_episode(
+    episodes: NDArray[np.float64], latest: NDArray[np.float64], i: int, began: float, now: float
+) -> None:
+    """Count that the present episode, which ``began`` then, is at ``i`` ``now``; once for each."""
+    if latest[i] < began:
+        episodes[i] += 1.0
+    latest[i] = now
+
+
+@rare_kernel
+def count_failure(outcomes: Outcomes, n: int, now: float, horizon: float) -> None:
+    """The present episode failed ``now``: so did all that it did within the horizon before."""
+    since = max(outcomes.began[0], now - horizon)
+    for i in range(n):
+        outcomes.failed_soon[i] += outcomes.latest_visit[i] >= since
+    for place in range(len(outcomes.tried)):
+        for i in range(n):
+            outcomes.failed_after[place, i] += outcomes.latest_try[place, i] >= since
+
+
+@rare_kernel
+def merge_episodes(
+    episodes: NDArray[np.float64],
+    failed: NDArray[np.float64],
+    latest: NDArray[np.float64],
+    kept: int,
+    given: int,
+    began: float,
+) -> None:
+    """Add up the episodes of two states; of those before it is not known who came to both."""
+    both = latest[kept] >= began and latest[given] >= began
+    episodes[kept] += episodes[given] - both
+    failed[kept] += failed[given]
+    latest[kept] = max(latest[kept], latest[given])
 
 
 @register_jitable

@@ -88,12 +88,15 @@ def refuse_unless_distribution(name: str, rows: NDArray[np.float64]) -> None:
         raise ValueError(f"{name} is no distribution: entries must be 0 or more and sum to 1")
 
 
-def refuse_unless_outcomes(
-    decisions: NDArray[np.float64], failures: NDArray[np.float64], endings: NDArray[np.float64]
+def refuse_unless_counts(
+    name: str,
+    cases: NDArray[np.float64],
+    failures: NDArray[np.float64],
+    others: NDArray[np.float64],
 ) -> None:
-    """Raise where they cannot be counts, or more decisions failed than were taken."""
-    if (failures < 0.0).any() or (failures > decisions).any() or (endings < 0.0).any():
-        raise ValueError("decisions, failures or endings cannot be counts")
+    """Raise where they cannot be counts, or there are more failures than cases."""
+    if (failures < 0.0).any() or (failures > cases).any() or (others < 0.0).any():
+        raise ValueError(f"{name} cannot be counts")
 
 
 def check_action(i: SupportsIndex, n_actions: int) -> int:
@@ -107,6 +110,17 @@ def check_action(i: SupportsIndex, n_actions: int) -> int:
         ) from None
     if not 0 <= index < n_actions:
         raise ValueError(f"action is {index}; there are actions 0 to {n_actions - 1}")
+    return index
+
+
+def check_state(state: Any, n_states: int) -> int:
+    """An index of one of the states."""
+    try:
+        index = operator.index(state)
+    except TypeError:
+        raise TypeError(f"state is {state!r}; it must be an integer index, from 0") from None
+    if not 0 <= index < n_states:
+        raise ValueError(f"state is {index}; there are {n_states} states, from 0")
     return index
 
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from evofsm.naming import name_state, name_states
 from evofsm.report.chapter import write_chapters
-from evofsm.report.naming import name_state, name_states
 from evofsm.report.real import losses, real_chapter
 from evofsm.studies.real import TARGETS, Kind, Moment, Plan, RealStudy, Row
 from evofsm.studies.real.cases import HORIZONS

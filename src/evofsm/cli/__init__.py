@@ -28,6 +28,7 @@ def application() -> typer.Typer:
     from evofsm.cli.check import check
     from evofsm.cli.drive import drive
     from evofsm.cli.evidence import evidence
+    from evofsm.cli.explain import explain
     from evofsm.cli.learn import inspect, learn
     from evofsm.cli.paper import paper
 
@@ -43,6 +44,7 @@ def application() -> typer.Typer:
     app.command()(paper)
     app.command()(learn)
     app.command()(inspect)
+    app.command()(explain)
     app.command()(drive)
     app.command()(campaign)
     app.command()(audit)

@@ -63,6 +63,8 @@ if TYPE_CHECKING:
     from rich.progress import Progress, ProgressColumn, Task
 
     from evofsm.framework.reviser import Mode
+    from evofsm.model import FSMModel
+    from evofsm.storage import Header
 
 P = ParamSpec("P")
 
@@ -93,6 +95,29 @@ def chosen_mode(name: str) -> Mode:
     if name not in (names := [one.value for one in Mode]):
         raise ValueError(f"--mode is {name!r}; it must be one of {', '.join(names)}")
     return Mode(name)
+
+
+def load_model(file: str) -> tuple[FSMModel, Header]:
+    """The model in a file, or of the machine in it, and what the file says of itself.
+
+    A machine that drove a family of scenarios is labelled as that family is.
+    """
+    from evofsm import storage
+    from evofsm.machine import EvolvingFSM
+    from evofsm.model import FSMModel
+    from evofsm.naming import UNITS, VARIABLES
+    from evofsm.worlds.families import load_family
+    from evofsm.worlds.families.family import FAMILIES
+
+    header = storage.describe(file)
+    if header.kind != "machine":
+        return FSMModel.load(file), header
+    machine = EvolvingFSM.load(file)
+    if (name := header.provenance.get("family")) not in FAMILIES:
+        return machine.model(), header
+    family = load_family(name)
+    model = machine.model(actions=family.actions, names=VARIABLES, units=UNITS, dt=family.interval)
+    return model, header
 
 
 def require(**extras: str) -> None:

@@ -8,7 +8,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, cast
 
-from evofsm.cli.common import plain_errors, print_json, progress, split_names
+from evofsm.cli.common import load_model, plain_errors, print_json, progress, split_names
 
 with suppress(ModuleNotFoundError):
     import typer
@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from evofsm.observations import Category
     from evofsm.storage import Header
 
-_UNITS = {"gap": "m", "v_follower": "m/s", "v_leader": "m/s"}
 _MOST_ACTIONS = 1000
 # What does not change what is learnt; files are told apart by what is in them.
 _NO_SETTINGS = ("files", "out", "checkpoint", "every", "as_json")
@@ -128,6 +127,7 @@ def learn(
     from evofsm.checkpoint import Checkpoint, duration, fingerprints, result_kept
     from evofsm.io import VehicleLengths, read_traces
     from evofsm.machine import EvolvingFSM
+    from evofsm.naming import UNITS, VARIABLES
     from evofsm.studies.learning import learn_traces
 
     _check_out(out)
@@ -152,7 +152,7 @@ def learn(
             machine,
             actions,
             names,
-            [_UNITS.get(name, "") for name in names],
+            [dict(zip(VARIABLES, UNITS, strict=True)).get(name, "") for name in names],
             keeper,
         )
     provenance = {
@@ -192,18 +192,11 @@ def inspect(
     ] = False,
 ) -> None:
     """Print a saved model: its states, the transitions that matter, the actions."""
-    from evofsm import storage
-    from evofsm.machine import EvolvingFSM
-    from evofsm.model import FSMModel
     from evofsm.report import terminal
 
-    header = storage.describe(file)
-    if header.kind == "machine":
-        model = EvolvingFSM.load(file).model()
-        facts = [("file", f"{file}, a machine that can go on learning")]
-    else:
-        model = FSMModel.load(file)
-        facts = [("file", file)]
+    model, header = load_model(file)
+    goes_on = ", a machine that can go on learning" if header.kind == "machine" else ""
+    facts = [("file", f"{file}{goes_on}")]
     if as_json:
         document = terminal.model_document(model)
         print_json({"file": file, **document, "provenance": header.provenance})

@@ -25,7 +25,7 @@ from evofsm.validation import check_actions, check_rows, real_rows, refuse_unusa
 # Room for so much more than is needed when the arrays are made anew.
 _SPARE = 1.5
 # Lines of a vehicle that are fetched while others are stepped: all of one with eight states.
-_LINES_AHEAD = 28
+_LINES_AHEAD = 31
 _SINGLE = np.dtype(np.float32)
 
 
@@ -326,7 +326,14 @@ def _fetch_matrix(
     if action == NO_ACTION or now.transitions.places[action] == NOT_OPEN:
         return
     held, place, capacity = now.transitions, int(now.transitions.places[action]), len(now.belief)
-    for of_places in (held.scales, held.origin_frequency, now.outcomes.decisions):
+    counted = now.outcomes
+    for of_places in (
+        held.scales,
+        held.origin_frequency,
+        counted.decisions,
+        counted.tried,
+        counted.latest_try,
+    ):
         fetch_ahead(of_places, place * capacity)
     size = capacity * capacity
     for i in range(0, min(size, _LINES_AHEAD * LINE), LINE):

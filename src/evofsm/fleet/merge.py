@@ -93,7 +93,8 @@ def merge(machines: Sequence[EvolvingFSM], *, radius: float | None = None) -> Ev
 
     *Further*: mean and scatter are pooled exactly [1]_. A centre's potential is what the recursion
     would have made of it, had it seen the data of all other parts since; ``founded`` is one more
-    than the observations that were made before, in the parts that founded it.
+    than the observations that were made before, in the parts that founded it. An episode that came
+    to two states of one part that are joined is counted twice.
 
     References
     ----------
@@ -230,20 +231,32 @@ def _no_episode(n: int) -> dict[str, NDArray[Any]]:
         "chained": np.zeros(1),
         "state": np.zeros(1),
         "belief": np.full(n, 1.0 / n),
+        "began": np.zeros(1),
+        "latest_visit": np.zeros(n),
     }
 
 
 def _states(learnt: Sequence[Learnt], match: _Match) -> dict[str, NDArray[Any]]:
-    visits, endings, founded = np.zeros(match.n), np.zeros(match.n), np.ones(match.n)
+    visits, endings, episodes, failed_soon = np.zeros((4, match.n))
+    founded = np.ones(match.n)
     changes = np.zeros((match.n, match.n))
     for part, group in zip(learnt, match.groups, strict=True):
         np.add.at(visits, group, part.visits)
         np.add.at(endings, group, part.outcomes.endings)
+        np.add.at(episodes, group, part.outcomes.episodes)
+        np.add.at(failed_soon, group, part.outcomes.failed_soon)
         np.add.at(changes, (group[:, None], group), part.changes)
         earliest = np.full(match.n, np.inf)
         np.minimum.at(earliest, group, part.founded)
         founded += np.where(np.isfinite(earliest), earliest - 1.0, 0.0)
-    return {"visits": visits, "endings": endings, "founded": founded, "changes": changes}
+    return {
+        "visits": visits,
+        "endings": endings,
+        "episodes": episodes,
+        "failed_soon": failed_soon,
+        "founded": founded,
+        "changes": changes,
+    }
 
 
 def _densities(
@@ -299,7 +312,7 @@ def _transitions(
     places = np.where(is_open, np.cumsum(is_open) - 1.0, NOT_OPEN)
     open_ = int(is_open.sum())
     joint = np.zeros((open_, n, n))
-    decisions, failures, frequencies = np.zeros((3, open_, n))
+    decisions, failures, tried, failed_after, frequencies = np.zeros((5, open_, n))
     for part, group in zip(learnt, match.groups, strict=True):
         shares, weight = _evidence(part, parameters)
         counts = part.outcomes.decisions
@@ -308,6 +321,8 @@ def _transitions(
         rows = (place[:, None], group)
         np.add.at(decisions, rows, counts)
         np.add.at(failures, rows, part.outcomes.failures)
+        np.add.at(tried, rows, part.outcomes.tried)
+        np.add.at(failed_after, rows, part.outcomes.failed_after)
         np.add.at(frequencies, rows, counts * weight)
 
     known = joint.sum(axis=-1)
@@ -326,6 +341,9 @@ def _transitions(
         "origin_frequency": together,
         "decisions": decisions,
         "failures": failures,
+        "tried": tried,
+        "failed_after": failed_after,
+        "latest_try": np.zeros((open_, n)),
     }
 
 

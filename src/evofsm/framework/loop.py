@@ -10,15 +10,18 @@ import logging
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from enum import Enum
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from evofsm.actions import IntervalActions
-from evofsm.framework.reviser import ActionReviser, Unrevised
+from evofsm.explanation import explain
+from evofsm.framework.reviser import ActionReviser, Unrevised, speaks
 from evofsm.framework.senses import Senses
 from evofsm.machine import EvolvingFSM
+from evofsm.naming import UNITS, VARIABLES, Labels
 from evofsm.observations import Missing
 from evofsm.protocols import (
     INCOMPLETE,
@@ -43,6 +46,14 @@ _log = logging.getLogger(__name__)
 
 # Actions that differ by less are the same [m/s²].
 _SAME = 1e-9
+
+
+class Explain(Enum):
+    """Of which decisions the machine's experience is told (`Revision.explanation`)."""
+
+    NONE = "none"
+    SPOKEN = "spoken"  #: of those that change a proposal or warn
+    ALL = "all"
 
 
 class Decision(NamedTuple):
@@ -96,6 +107,9 @@ class Oversight:
         Time between observations [s]; one that comes later begins an episode anew.
     audit : AuditLog, optional
         Writes down what is decided.
+    explaining : Explain, optional
+        Of which decisions the machine's experience is told; without it of none, and with an audit
+        log of those that speak.
 
     Examples
     --------
@@ -118,6 +132,7 @@ class Oversight:
         missing: Missing = Missing.PARTIAL,
         interval: float | None = None,
         audit: AuditLog | None = None,
+        explaining: Explain | None = None,
     ) -> None:
         self.actions = actions
         self.reviser = reviser
@@ -126,6 +141,8 @@ class Oversight:
         self.learn = learn
         self.senses = Senses(missing, interval)
         self.audit = audit
+        self.explaining = explaining or (Explain.NONE if audit is None else Explain.SPOKEN)
+        self._labels = Labels(actions, VARIABLES, UNITS, interval)
         self._latest: Situation | None = None
         self._frozen = None if learn or machine is None else machine.model()
         reviser.start_episode()
@@ -181,6 +198,8 @@ class Oversight:
     def revise(self, situation: Situation, proposal: Proposal) -> Revision:
         """What to execute; machine and risk are told of it."""
         revision = self.reviser.revise(situation, proposal)
+        if self.explaining is not Explain.NONE:
+            revision = self._explained(situation, revision)
         if self.audit is not None:
             self.audit.decided(situation, proposal, revision)
         executed = revision.executed
@@ -193,6 +212,17 @@ class Oversight:
         elif self.risk is not None:
             self.risk.follow(situation.observation, executed)
         return revision
+
+    def _explained(self, situation: Situation, revision: Revision) -> Revision:
+        """With what the machine has seen come of what is executed."""
+        if self.machine is None or situation.state is None:
+            return revision
+        if self.explaining is Explain.SPOKEN and not speaks(self.reviser, revision):
+            return revision
+        known = self.machine if self._frozen is None else self._frozen
+        action = int(self.actions.encode(revision.executed))
+        text = explain(known, situation.belief, action, self._labels).text
+        return revision._replace(explanation=text)
 
     def end(self, observation: NDArray[np.float64] | None, *, failed: bool) -> None:
         """The episode ends with this observation, or unseen (None); perhaps in failure."""
@@ -248,6 +278,9 @@ class Framework:
         What to do where a variable was not observed (NaN). Controllers are given its latest value.
     audit : AuditLog, optional
         Writes down what is decided.
+    explaining : Explain, optional
+        Of which decisions the machine's experience is told; without it of none, and with an audit
+        log of those that speak.
 
     Examples
     --------
@@ -277,6 +310,7 @@ class Framework:
         interval: float = 0.25,
         missing: Missing = Missing.PARTIAL,
         audit: AuditLog | None = None,
+        explaining: Explain | None = None,
     ) -> None:
         refuse_mismatch(machine, actions)
         self.interval = positive("interval", interval)
@@ -293,6 +327,7 @@ class Framework:
         self.learn = learn
         self.missing = missing
         self.audit = audit
+        self.explaining = explaining
 
     def drive(self, world: World, scenario: Scenario) -> Drive:
         """Drive one scenario, and learn from it if `learn`.
@@ -317,6 +352,7 @@ class Framework:
             missing=self.missing,
             interval=self.interval,
             audit=self.audit,
+            explaining=self.explaining,
         )
         decided: list[tuple[int, Situation, Revision]] = []
         with world.open(scenario) as road:

@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 
 from evofsm._compile import compiled
 from evofsm.actions import IntervalActions
-from evofsm.protocols import STALE, Proposal, Revision, RiskMeasure, Situation
+from evofsm.naming import VARIABLES
+from evofsm.protocols import STALE, Proposal, Reviser, Revision, RiskMeasure, Situation
 from evofsm.risk.outcome import ActionJudge, Judgement
 from evofsm.validation import positive
-from evofsm.worlds.road import VARIABLES
 
 # Further decisions for which full braking is held where its effect is not known yet.
 _BRAKE_TEST = 4
@@ -266,6 +266,14 @@ def _unseen(situation: Situation) -> str:
 def _novelty(judged: Judgement) -> str:
     """Said of a situation that is new; whether it is dangerous is another question."""
     return "never seen before" if judged.seen < _NEW else ""
+
+
+def speaks(reviser: Reviser, revision: Revision) -> bool:
+    """Whether a decision changed something, would have, or raised an alarm."""
+    proposed = revision.proposed
+    if revision.executed != proposed or revision.advised != proposed:  # NaN differs
+        return True
+    return isinstance(reviser, ActionReviser) and revision.risk_proposed > reviser.tolerance
 
 
 def nearest_values(actions: IntervalActions, wanted: float) -> list[float]:

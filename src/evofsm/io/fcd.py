@@ -24,8 +24,7 @@ from evofsm.io.files import OnRead, damage_explained, open_unpacked
 from evofsm.io.tables import Table, explain_text
 from evofsm.validation import LARGEST_OBSERVATION, positive
 
-#: What a pair is observed by, and the action: what the follower did until the next timestep.
-VARIABLES = ("gap", "v_follower", "v_leader")
+#: The action of a pair of vehicles: what the follower did until the next timestep.
 ACTION = "a_follower"
 #: The column by which an FCD table is known.
 TIME = "timestep_time"

@@ -14,6 +14,7 @@ from evofsm.io.fcd import VehicleLengths
 from evofsm.io.files import OnRead, ignore, kind_of
 from evofsm.io.plain import Texts
 from evofsm.io.tables import CsvTable, ParquetTable, Piece, Table
+from evofsm.naming import VARIABLES
 from evofsm.observations import Category, ObservationEncoder
 
 #: Columns that tell episodes apart where nothing else was said and they exist.
@@ -60,7 +61,7 @@ class LogColumns:
         Time from a row to the next [s], for a log without a clock.
     """
 
-    observe: ObservationEncoder = field(default_factory=lambda: ObservationEncoder(*fcd.VARIABLES))
+    observe: ObservationEncoder = field(default_factory=lambda: ObservationEncoder(*VARIABLES))
     action: str = fcd.ACTION
     time: str = "time"
     episode: Sequence[str] | None = None
@@ -310,17 +311,17 @@ def _read_fcd(
 
 
 def _fcd_variables(path: str, columns: LogColumns) -> list[int]:
-    asked = [f"--observe {name}" for name in columns.observe.names if name not in fcd.VARIABLES]
+    asked = [f"--observe {name}" for name in columns.observe.names if name not in VARIABLES]
     asked += [f"--action {columns.action}"] if columns.action != fcd.ACTION else []
     asked += ["--episode"] if columns.episode is not None else []
     asked += ["--dt"] if columns.dt is not None else []
     if asked:
         raise ValueError(
             f"{path} is FCD output of SUMO, with a clock and episodes of its own; it gives "
-            f"{', '.join(fcd.VARIABLES)} and the action {fcd.ACTION}, and cannot be read with "
+            f"{', '.join(VARIABLES)} and the action {fcd.ACTION}, and cannot be read with "
             f"{', '.join(asked)}"
         )
-    return [fcd.VARIABLES.index(name) for name in columns.observe.names]
+    return [VARIABLES.index(name) for name in columns.observe.names]
 
 
 def _join(

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evofsm._extras import needs
+from evofsm.naming import name_states
 from evofsm.report.html import Setting
-from evofsm.report.naming import name_states
 from evofsm.report.words import NONE, count, interval, listed, number, percent
 from evofsm.studies.real import TARGETS, Kind, Moment, RealStudy, Row, Target
 from evofsm.studies.real.cases import HORIZONS, INTERVAL

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from evofsm.risk.outcome import wilson_interval
+from evofsm.proportions import wilson_interval
 from evofsm.validation import (
     check_action,
     positive,

@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from evofsm import storage
 from evofsm._compile import compiled
+from evofsm.proportions import wilson_interval
 from evofsm.protocols import Situation
 from evofsm.risk.brakes import OwnBrakes, Sample
 from evofsm.risk.manoeuvres import BrakeWatch, Manoeuvres
@@ -27,8 +28,6 @@ from evofsm.risk.perception import Estimate, Perception, Three, is_whole
 from evofsm.risk.rehearsal import Body, critical_decelerations
 from evofsm.validation import positive, real_array, refuse_unless_distribution, refuse_unusable
 
-# Two-sided 90 %.
-_WIDTH = 1.645
 # Pseudo-evidence for the pooled rate of manoeuvres, against that of a state [s].
 _POOLED = 20.0
 # Where a situation is not sure, it may be worse by so many standard deviations.
@@ -537,14 +536,3 @@ def _weighed(by_state: NDArray[np.float64], belief: NDArray[np.float64]) -> floa
     for k in range(min(len(by_state), len(belief))):
         total += by_state[k] * belief[k]
     return total
-
-
-@compiled
-def wilson_interval(
-    share: NDArray[np.float64], count: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """90 % interval of a share that was counted (Wilson 1927)."""
-    spread = _WIDTH * _WIDTH / count
-    centre = (share + 0.5 * spread) / (1.0 + spread)
-    reach = np.sqrt(spread * (share * (1.0 - share) + 0.25 * spread)) / (1.0 + spread)
-    return np.maximum(centre - reach, 0.0), np.minimum(centre + reach, 1.0)

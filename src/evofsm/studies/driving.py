@@ -24,6 +24,7 @@ from evofsm.framework.audit import AuditLog
 from evofsm.framework.loop import Drive
 from evofsm.framework.reviser import EnvelopeReviser, Mode, Unrevised
 from evofsm.machine import EvolvingFSM
+from evofsm.naming import VARIABLES
 from evofsm.protocols import Controller, Reviser
 from evofsm.risk.by_state import StateRisk, assess_states
 from evofsm.risk.outcome import LatentRisk
@@ -39,7 +40,7 @@ from evofsm.studies.closed_loop import (
 )
 from evofsm.studies.closed_loop.learner import drive_alone
 from evofsm.worlds.families import Draw, Family
-from evofsm.worlds.road import VARIABLES, World
+from evofsm.worlds.road import World
 
 #: Controllers by name; ``family`` is the family's own.
 CONTROLLERS = ("family", "aggressive", "normal", "acc", "sumo")

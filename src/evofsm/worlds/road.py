@@ -26,10 +26,6 @@ from evofsm.worlds.motion import (
 )
 from evofsm.worlds.scenario import Scenario
 
-#: The columns of an observation, and their units.
-VARIABLES = ("gap", "v_follower", "v_leader")
-UNITS = ("m", "m/s", "m/s")
-
 
 @dataclass(frozen=True, eq=False)
 class Episode:

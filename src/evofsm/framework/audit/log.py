@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 
 from evofsm.framework.audit.chain import ABOUT, ChainedFile, Head, Sync, records
 from evofsm.framework.audit.participants import Participants, describe, learnt, settings
-from evofsm.framework.reviser import ActionReviser
+from evofsm.framework.reviser import speaks
 from evofsm.protocols import Proposal, Reviser, Revision, Situation
 
 if TYPE_CHECKING:
@@ -42,7 +42,9 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 
-VERSION = 1
+VERSION = 2
+# The version from which on a decision holds what was not in it from the first.
+SINCE = {"explanation": 2}
 # So many states of a belief are written, the most probable first.
 _STATES = 3
 
@@ -83,6 +85,7 @@ class AuditLog:
     >>> from evofsm.actions import IntervalActions
     >>> from evofsm.framework.audit import audit
     >>> from evofsm.framework.loop import Oversight
+    >>> from evofsm.framework.reviser import ActionReviser
     >>> from evofsm.risk.outcome import LatentRisk
     >>> actions = IntervalActions(low=-2.5, high=2.5, width=0.3, outside="clip")
     >>> risk = LatentRisk(actions.low)
@@ -283,14 +286,6 @@ class AuditLog:
 # -- What is written ------------------------------------------------------------------------------
 
 
-def speaks(reviser: Reviser, revision: Revision) -> bool:
-    """Whether a decision changed something, would have, or raised an alarm."""
-    proposed = revision.proposed
-    if revision.executed != proposed or revision.advised != proposed:  # NaN differs
-        return True
-    return isinstance(reviser, ActionReviser) and revision.risk_proposed > reviser.tolerance
-
-
 def told(situation: Situation, proposal: Proposal, revision: Revision) -> dict[str, Any]:
     """A decision, as it is written, but for what came in."""
     likely = np.argsort(-situation.belief, kind="stable")[:_STATES].tolist()
@@ -300,6 +295,7 @@ def told(situation: Situation, proposal: Proposal, revision: Revision) -> dict[s
         "candidates": _candidates(proposal),
         "evidence": float(revision.evidence),
         "executed": float(revision.executed),
+        "explanation": revision.explanation,
         "intake": int(situation.intake),
         "interval": [float(bound) for bound in revision.interval],
         "proposed": float(proposal.action),

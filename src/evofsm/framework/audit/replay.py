@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evofsm.framework.audit.chain import Chain, Head, Record, canonical, number, records, verify
-from evofsm.framework.audit.log import VERSION, speaks, told
+from evofsm.framework.audit.log import SINCE, VERSION, told
 from evofsm.framework.audit.participants import (
     CannotBeReplayedError,
     Participants,
@@ -27,7 +27,8 @@ from evofsm.framework.audit.participants import (
     restore,
     set_again,
 )
-from evofsm.framework.loop import Oversight
+from evofsm.framework.loop import Explain, Oversight
+from evofsm.framework.reviser import speaks
 from evofsm.observations import Missing
 from evofsm.protocols import Proposal, Revision, Situation
 
@@ -173,6 +174,7 @@ class _Player:
     _who: Participants | None = None
     _oversight: Oversight | None = None
     _is_known: bool = True
+    _version: int = VERSION
 
     def play(self, record: Record) -> Difference | None:
         """What differs; None where it comes out as it was recorded."""
@@ -206,6 +208,7 @@ class _Player:
                     raise ValueError(f"there is no kind {kind!r}")
 
     def _start(self, content: Mapping[str, Any]) -> None:
+        self._version = content["version"]
         now = made_by()
         for name, then in content["made_by"].items():
             if then != now.get(name):
@@ -232,6 +235,7 @@ class _Player:
             learn=content["learn"],
             missing=Missing(content["missing"]),
             interval=content["interval"],
+            explaining=Explain.SPOKEN,
         )
 
     def _overseer(self) -> Oversight:
@@ -258,7 +262,9 @@ class _Player:
     def _decision(self, content: Mapping[str, Any]) -> None:
         proposal = _proposal(content["proposed"], content["candidates"])
         situation, revision = self._decide(content["time"], content["observation"], proposal)
-        fields = _differing(content, told(situation, proposal, revision))
+        again = told(situation, proposal, revision)
+        recorded = {name: again[name] for name in again if SINCE.get(name, 1) <= self._version}
+        fields = _differing(content, recorded)
         if fields:
             raise _DiffersError(f"the decision at {situation.time:g} s comes out otherwise", fields)
         if not speaks(self._present().reviser, revision):

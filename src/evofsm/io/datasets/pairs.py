@@ -9,8 +9,9 @@ import numpy as np
 
 from evofsm.io.datasets.columns import name_of
 from evofsm.io.datasets.episodes import Episode, cut
-from evofsm.io.fcd import ACTION, VARIABLES
+from evofsm.io.fcd import ACTION
 from evofsm.io.tables import CsvTable, Piece
+from evofsm.naming import VARIABLES
 
 _NUMBERS = ("time", *VARIABLES, ACTION)
 _LABELS = ("pair", "segment")

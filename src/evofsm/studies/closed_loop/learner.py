@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from evofsm.framework.audit import AuditLog
-from evofsm.framework.loop import Drive, Framework
+from evofsm.framework.loop import Drive, Explain, Framework
 from evofsm.framework.reviser import ActionReviser, Mode, Unrevised
 from evofsm.machine import EvolvingFSM
 from evofsm.protocols import Controller, Reviser
@@ -26,6 +26,8 @@ SAFETY_RULE = Novelty(radius=1.0, scales=(4.0, 2.0, 2.0))
 
 # With hundreds of states this makes a step several times as quick.
 _BELIEF_TOLERANCE = 1e-6
+# What its explanations call soon [s].
+_SOON = 5.0
 _MACHINE, _RISK = "machine.evofsm", "risk.evofsm"
 
 
@@ -40,7 +42,12 @@ class Learner:
     def new(cls, family: Family, rule: StateRule | None = SAFETY_RULE) -> Self:
         """One that has seen nothing."""
         return cls(
-            EvolvingFSM(family.actions.n_actions, rule=rule, belief_tolerance=_BELIEF_TOLERANCE),
+            EvolvingFSM(
+                family.actions.n_actions,
+                rule=rule,
+                belief_tolerance=_BELIEF_TOLERANCE,
+                failure_horizon=round(_SOON / family.interval),
+            ),
             LatentRisk(family.actions.low, family.interval),
         )
 
@@ -87,6 +94,7 @@ class Learner:
         world: World | None = None,
         controller: Controller | None = None,
         audit: AuditLog | None = None,
+        explaining: Explain | None = None,
     ) -> Drive:
         """Drive one draw."""
         framework = Framework(
@@ -98,6 +106,7 @@ class Learner:
             learn=learn,
             interval=family.interval,
             audit=audit,
+            explaining=explaining,
         )
         return framework.drive(world or KinematicWorld(), draw.scenario)
 

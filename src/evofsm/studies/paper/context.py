@@ -6,12 +6,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evofsm.divergence import jensen_shannon
+from evofsm.naming import UNITS, VARIABLES
 from evofsm.risk.dead_end import is_dead_end
 from evofsm.risk.ttc import time_to_collision
 from evofsm.studies.paper.claims import LARGEST_DIVERGENCE
 from evofsm.studies.paper.runs import CASES, PaperStudy, Run
 from evofsm.studies.table import Table
-from evofsm.worlds.road import UNITS, VARIABLES
 
 
 def context_tables(study: PaperStudy) -> tuple[Table, ...]:

@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 from evofsm.divergence import jensen_shannon
 from evofsm.machine import EvolvingFSM
 from evofsm.model import FSMModel
+from evofsm.naming import UNITS, VARIABLES
 from evofsm.step import widen
 from evofsm.studies.paper.settings import Settings
-from evofsm.worlds.road import UNITS, VARIABLES, Episode, World
+from evofsm.worlds.road import Episode, World
 
 CASES = (1, 2, 3, 4)
 

@@ -14,10 +14,11 @@ from numpy.typing import NDArray
 
 from evofsm.actions import IntervalActions
 from evofsm.io import read_traces
-from evofsm.io.fcd import ACTION, VARIABLES
+from evofsm.io.fcd import ACTION
 from evofsm.io.files import ignore, kind_of
 from evofsm.io.tables import CsvTable, ParquetTable
 from evofsm.memory import NO_ACTION
+from evofsm.naming import VARIABLES
 from evofsm.studies.closed_loop.learner import held_out, training
 from evofsm.worlds.families import Draw, Family, load_family
 from evofsm.worlds.kinematic import KinematicWorld

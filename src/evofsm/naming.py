@@ -1,14 +1,19 @@
-"""States in words: where a centre lies, with its numbers and units."""
+"""Places in words: where a centre lies, with its numbers and units."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import groupby
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from evofsm.actions import IntervalActions
 from evofsm.validation import real_array
+
+#: What is observed of car following, and its units.
+VARIABLES, UNITS = ("gap", "v_follower", "v_leader"), ("m", "m/s", "m/s")
 
 # Up to these a gap [m] and a speed [m/s] are called so.
 _GAPS = ((2.0, "nearly touching"), (15.0, "close"), (40.0, "at a distance"))
@@ -19,6 +24,94 @@ _FAST = "fast"
 _EQUAL = 0.5
 # With so many decimals at most two states are told apart by their numbers.
 _MOST_DECIMALS = 3
+
+
+class Labels(NamedTuple):
+    """What the numbers of a machine mean: for words and pictures, it learns without.
+
+    Examples
+    --------
+    >>> Labels(names=("gap", "speed"), units=("m", "m/s")).place([9.21, 4.0])
+    'gap 9.21 m, speed 4 m/s'
+    """
+
+    actions: IntervalActions | None = None  #: what the action indices mean
+    names: tuple[str, ...] = ()  #: of the variables
+    units: tuple[str, ...] = ()  #: of the variables
+    dt: float | None = None  #: time between two observations [s]
+
+    def place(self, center: ArrayLike) -> str:
+        """Where a centre lies: in words where it is car following, else variable by variable.
+
+        Parameters
+        ----------
+        center : (m,) array_like
+            In the units of the observations.
+
+        Returns
+        -------
+        str
+
+        Examples
+        --------
+        >>> Labels(names=VARIABLES, units=UNITS).place([9.2, 4.1, 3.0])
+        'close (9 m), slow (4 m/s), closing at 1 m/s'
+        >>> Labels().place([9.2, 4.1])
+        '(9.2, 4.1)'
+        """
+        if self.names == VARIABLES:
+            return name_state(center)
+        values = [f"{value:.3g}" for value in np.asarray(center, np.float64).tolist()]
+        if not self.names:
+            return f"({', '.join(values)})"
+        units = self.units or ("",) * len(values)
+        named = zip(self.names, values, units, strict=True)
+        return ", ".join(" ".join(part for part in one if part) for one in named)
+
+    def action(self, index: int) -> str:
+        """An action with its interval, where that is known.
+
+        Parameters
+        ----------
+        index : int
+            From 0.
+
+        Returns
+        -------
+        str
+
+        Examples
+        --------
+        >>> actions = IntervalActions(low=-2.5, high=2.5, width=0.3)
+        >>> Labels(actions, VARIABLES).action(16), Labels().action(16)
+        ('a(17) [2.3, 2.5] m/s²', 'a(17)')
+        """
+        name = f"a({index + 1})"
+        if self.actions is None:
+            return name
+        unit = " m/s²" if self.names == VARIABLES else ""
+        return f"{name} {self.actions.label(index)}{unit}"
+
+    def duration(self, observations: int) -> str:
+        """How long so many observations last.
+
+        Parameters
+        ----------
+        observations : int
+
+        Returns
+        -------
+        str
+            In seconds where the time between two is known, else their number.
+
+        Examples
+        --------
+        >>> Labels(dt=0.25).duration(20), Labels().duration(20)
+        ('5 s', '20 observations')
+        """
+        if self.dt is None:
+            return f"{observations:,} observation{'s' * (observations != 1)}"
+        return f"{observations * self.dt:.4g} s"
 
 
 def name_state(center: ArrayLike, decimals: int = 0) -> str:
@@ -54,8 +147,8 @@ def name_state(center: ArrayLike, decimals: int = 0) -> str:
         raise ValueError(f"center has {len(where)} variables; a name needs gap and both speeds")
     gap, speed, leader = where.tolist()
     parts = [
-        f"{_word(gap, _GAPS, _FAR)} ({gap:.{decimals}f} m)",
-        f"{_word(speed, _SPEEDS, _FAST)} ({speed:.{decimals}f} m/s)",
+        f"{_word(gap, _GAPS, _FAR)} ({_plain(gap, decimals)} m)",
+        f"{_word(speed, _SPEEDS, _FAST)} ({_plain(speed, decimals)} m/s)",
         _change(speed - leader, decimals),
     ]
     return ", ".join(parts)
@@ -110,6 +203,11 @@ def _alike(names: Sequence[str]) -> list[list[int]]:
 
 def _word(value: float, bands: Sequence[tuple[float, str]], beyond: str) -> str:
     return next((word for most, word in bands if value <= most), beyond)
+
+
+def _plain(value: float, decimals: int) -> str:
+    """Rounded, without a minus before a zero."""
+    return f"{round(value, decimals) + 0.0:.{decimals}f}"
 
 
 def _change(closing: float, decimals: int) -> str:

@@ -1,0 +1,96 @@
+"""`evofsm explain`."""
+
+from __future__ import annotations
+
+import textwrap
+from contextlib import suppress
+from typing import TYPE_CHECKING, Annotated, Any
+
+from evofsm.cli.common import load_model, plain_errors, print_json
+
+with suppress(ModuleNotFoundError):
+    import typer
+
+if TYPE_CHECKING:
+    from evofsm.explanation import Explanation, Tally
+    from evofsm.model import FSMModel
+
+_WIDTH = 80
+
+
+@plain_errors
+def explain(
+    file: Annotated[
+        str, typer.Argument(help="A model or a machine that was saved.", show_default=False)
+    ],
+    state: Annotated[
+        int | None,
+        typer.Option(help="Number of a state, from 1; without it all.", show_default=False),
+    ] = None,
+    observation: Annotated[
+        str | None,
+        typer.Option(
+            help="An observation, its values with commas between them: which state it is, and what "
+            "is known of it.",
+            show_default=False,
+        ),
+    ] = None,
+    action: Annotated[
+        int | None,
+        typer.Option(help="Number of an action, from 1: what came of it.", show_default=False),
+    ] = None,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print one JSON document; counts from 0.")
+    ] = False,
+) -> None:
+    """Say what was learnt of a situation: where it lies, how often it was seen, what came of it.
+
+    All numbers were counted, once for each episode that came to a state; intervals are of 90 %.
+    That one action ended better than another does not say that it was the reason.
+    """
+    if state is not None and observation is not None:
+        raise ValueError("--state and --observation exclude each other")
+    model, _ = load_model(file)
+    asked = _index("--action", action, model.n_actions)
+    one = _index("--state", state, model.n_states)
+    if observation is not None:
+        found = [model.explain(model.recognise(_values(observation)), asked)]
+    else:
+        states = range(model.n_states) if one is None else [one]
+        found = [model.explain(each, asked) for each in states]
+    if as_json:
+        print_json({"file": file, "situations": [_document(model, each) for each in found]})
+        return
+    for each in found:
+        print(textwrap.fill(each.text, _WIDTH, subsequent_indent="   "))
+
+
+def _index(option: str, number: int | None, count: int) -> int | None:
+    """From what people count from 1."""
+    if number is not None and not 1 <= number <= count:
+        raise ValueError(f"{option} is {number}; there are 1 to {count}")
+    return None if number is None else number - 1
+
+
+def _values(text: str) -> list[float]:
+    try:
+        return [float(value) for value in text.split(",")]
+    except ValueError:
+        raise ValueError(f"--observation is {text!r}; write numbers, such as 9,24,24") from None
+
+
+def _document(model: FSMModel, found: Explanation) -> dict[str, Any]:
+    center = None if found.state is None else model.centers[found.state].tolist()
+    return {
+        **found._asdict(),
+        "center": center,
+        "here": _tally(found.here),
+        "action": _tally(found.action),
+        "after_better": _tally(found.after_better),
+    }
+
+
+def _tally(tally: Tally | None) -> dict[str, Any] | None:
+    if tally is None:
+        return None
+    return {**tally._asdict(), "interval": list(tally.interval)}

@@ -1,0 +1,212 @@
+"""What is counted of episodes, and what is said of it."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from evofsm import EvolvingFSM, FSMModel, IntervalActions, Labels, Missing, Novelty, WhenFull
+from evofsm.explanation import Tally
+from evofsm.fleet.batch import Fleet
+from evofsm.fleet.merge import merge
+from evofsm.naming import UNITS, VARIABLES
+
+COUNTS = ("episodes", "failed_soon", "tried", "failed_after")
+
+
+def drives(seed, rows=60, places=4):
+    """Rows over a few places, cut into episodes of which some fail."""
+    rng = np.random.default_rng(seed)
+    Z = rng.integers(0, places, size=(rows, 1)) * 10.0
+    I = rng.integers(-1, 3, size=rows)
+    starts = np.flatnonzero(rng.random(rows) < 0.1)
+    failures = np.flatnonzero(rng.random(rows) < 0.1)
+    return Z, I, starts, failures
+
+
+def by_hand(states, I, starts, failures, horizon, n):
+    """The same counts, episode by episode, as their definitions have them."""
+    cut = sorted({0, *starts.tolist(), *(failures + 1).tolist(), len(states)})
+    counts = {"episodes": np.zeros(n), "failed_soon": np.zeros(n)}
+    counts |= {"tried": np.zeros((3, n)), "failed_after": np.zeros((3, n))}
+    for begin, end in pairwise(cut):
+        failed = end - 1 in failures
+        if end == len(states) and not failed:
+            continue  # it is going on
+        for state in set(states[begin:end]):
+            counts["episodes"][state] += 1
+            soon = [end - 1 - row <= horizon for row in range(begin, end) if states[row] == state]
+            counts["failed_soon"][state] += failed and any(soon)
+        taken = {(I[row], states[row], row) for row in range(begin, end - 1) if I[row] >= 0}
+        for action, state in {(a, s) for a, s, _ in taken}:
+            counts["tried"][action, state] += 1
+            followed = [row + 1 for a, s, row in taken if (a, s) == (action, state)]
+            soon = [end - 1 - row <= horizon for row in followed]
+            counts["failed_after"][action, state] += failed and any(soon)
+    return counts
+
+
+@settings(max_examples=60)
+@given(seed=st.integers(0, 10_000), horizon=st.sampled_from([1, 3, 8, None]))
+def test_an_episode_counts_once_for_each_state_and_action(seed, horizon):
+    Z, I, starts, failures = drives(seed)
+    machine = EvolvingFSM(3, rule=Novelty(radius=1.0), failure_horizon=horizon)
+    states = machine.learn_many(Z, I, starts, failures).state
+    limit = np.inf if horizon is None else horizon
+    told = by_hand(states.tolist(), I, starts, failures, limit, machine.n_states)
+    for name in COUNTS:
+        np.testing.assert_array_equal(getattr(machine, name), told[name], err_msg=name)
+        np.testing.assert_array_equal(getattr(machine.model(), name), told[name], err_msg=name)
+
+
+@settings(max_examples=20)
+@given(seed=st.integers(0, 10_000), when_full=st.sampled_from(WhenFull))
+def test_counts_stay_counts_where_states_are_given_up(seed, when_full):
+    Z, I, starts, failures = drives(seed, places=12)
+    machine = EvolvingFSM(3, rule=Novelty(radius=1.0), max_states=4, when_full=when_full)
+    machine.learn_many(Z, I, starts, failures)
+    for cases, failed in (("episodes", "failed_soon"), ("tried", "failed_after")):
+        assert (getattr(machine, failed) >= 0.0).all()
+        assert (getattr(machine, failed) <= getattr(machine, cases)).all()
+    assert machine.episodes.max() <= len(starts) + len(failures) + 1
+
+
+def test_an_episode_that_begins_unseen_is_no_part_of_the_one_before():
+    machine = EvolvingFSM(1, rule=Novelty(radius=1.0))
+    machine.learn_many([[0.0, 0.0], [9.0, 9.0]], [0, 0])
+    machine.start_episode()
+    machine.observe([9.0, np.nan], missing=Missing.PARTIAL)
+    machine.fail()
+    assert machine.episodes.tolist() == [1.0, 1.0]
+    assert machine.failed_soon.tolist() == [0.0, 0.0]
+
+
+def test_a_fleet_counts_as_its_machines_would():
+    machine = EvolvingFSM(3, rule=Novelty(radius=1.0), failure_horizon=3)
+    fleet, alone = Fleet(machine, 2), [machine.copy(), machine.copy()]
+    given_ = [drives(seed) for seed in (1, 2)]
+    for row in range(60):
+        starts = [k for k, (_, _, s, _) in enumerate(given_) if row in s]
+        failed = [k for k, (_, _, _, f) in enumerate(given_) if row in f]
+        Z, I = [g[0][row] for g in given_], [g[1][row] for g in given_]
+        fleet.observe(Z, I, episode_starts=starts, failures=failed)
+    for k, one in enumerate(alone):
+        one.learn_many(*given_[k])
+        for name in COUNTS:
+            np.testing.assert_array_equal(getattr(fleet[k], name), getattr(one, name))
+
+
+def test_merging_adds_episodes_up():
+    parts = [EvolvingFSM(3, rule=Novelty(radius=1.0)) for _ in range(3)]
+    for seed, part in enumerate(parts):
+        part.learn_many(*drives(seed))
+        part.start_episode()
+    merged = merge(parts)
+    for name in COUNTS:
+        assert getattr(merged, name).sum() == sum(getattr(p, name).sum() for p in parts)
+    order = np.argsort(merged.centers[:, 0])
+    first = parts[0].episodes[np.argsort(parts[0].centers[:, 0])]
+    assert (merged.episodes[order][: len(first)] >= first).all()
+
+
+def test_counts_survive_a_file(tmp_path):
+    machine = EvolvingFSM(3, rule=Novelty(radius=1.0), failure_horizon=4)
+    Z, I, starts, failures = drives(3)
+    machine.learn_many(Z[:37], I[:37], starts[starts < 37], failures[failures < 37])
+    machine.save(tmp_path / "machine")
+    machine.model(names=["place"]).save(tmp_path / "model")
+    again, model = EvolvingFSM.load(tmp_path / "machine"), FSMModel.load(tmp_path / "model")
+    assert model.explain(0, 1) == machine.model(names=["place"]).explain(0, 1)
+    for one in (machine, again):
+        one.learn_many(Z[37:], I[37:])
+        one.fail()
+    assert again.failure_horizon == 4
+    for name in COUNTS:
+        np.testing.assert_array_equal(getattr(again, name), getattr(machine, name))
+
+
+# -- What is said ----------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def crash():
+    """Ten episodes from a far place to a close one; after throttle there eight of nine fail."""
+    actions = IntervalActions(-2.0, 2.0, 2.0, outside="clip")
+    machine = EvolvingFSM(2, rule=Novelty(radius=5.0), failure_horizon=2)
+    far, close = [60.0, 20.0, 20.0], [5.0, 20.0, 20.0]
+    for episode in range(12):
+        machine.start_episode()
+        machine.learn_one(far, 1)
+        machine.learn_one(close, 0 if episode < 3 else 1)
+        machine.observe(close, failed=episode > 3)
+    return machine, Labels(actions, VARIABLES, UNITS, 0.5)
+
+
+def test_an_explanation_tells_where_how_often_what_came_of_it_and_what_was_better(crash):
+    machine, labels = crash
+    model = machine.model(
+        actions=labels.actions, names=labels.names, units=labels.units, dt=labels.dt
+    )
+    found = model.explain(1, action=1)
+    assert str(found) == (
+        "#2: close (5 m), at medium speed (20 m/s), at equal speeds. "
+        "12 episodes came here (24 observations); 8 of 12 (43 to 84 %) failed within 1 s, "
+        "and 8 of 9 (62 to 97 %) after a(2) ≥ 0 m/s². "
+        "Least after a(1) < 0 m/s²: 0 of 3 (at most 47 %). Mostly reached from #1: 12 of 12 times."
+    )
+    assert (found.here, found.action, found.after_better) == (
+        Tally(8, 12),
+        Tally(8, 9),
+        Tally(0, 3),
+    )
+    assert (found.state, found.visits, found.reached_from, found.better) == (1, 24, 0, 0)
+
+
+def test_the_step_tells_the_same_as_the_machine(crash):
+    machine, labels = crash
+    machine.start_episode()
+    step = machine.observe([5.0, 20.0, 20.0], explained=labels)
+    assert step.explanation == machine.explain(labels=labels).text
+    assert step.explanation.startswith("#2: close (5 m)")
+    assert machine.observe([5.0, 20.0, 20.0]).explanation == ""
+
+
+def test_what_is_new_is_said_to_be(crash):
+    machine, labels = crash
+    machine.start_episode()
+    assert machine.explain().text == "Nothing was observed yet in this episode."
+    machine.observe([200.0, 5.0, 5.0])
+    found = machine.explain(labels=labels)
+    assert "Never seen before." in found.text
+    assert found.here == Tally(0, 0)
+    machine.observe([200.0, 5.0, 5.0])
+    assert (
+        "No earlier episode that was counted came here (2 observations)." in machine.explain().text
+    )
+    assert EvolvingFSM(1).model().explain([]).text == "Nothing was learnt yet."
+
+
+def test_asking_changes_nothing(crash, snapshot):
+    machine, labels = crash
+    machine.observe([5.0, 20.0, 20.0])
+    before = snapshot(machine)
+    machine.explain(0, labels)
+    machine.model().explain(0)
+    assert snapshot(machine) == before
+
+
+@pytest.mark.parametrize(
+    ("situation", "action", "error", "says"),
+    [
+        (2, None, ValueError, "state is 2; there are 2 states"),
+        (0.5, None, TypeError, "state is 0.5"),
+        ([1.0], None, ValueError, "the model has 2 states"),
+        ([0.5, 0.9], None, ValueError, "belief"),
+        (0, 2, ValueError, "action is 2"),
+    ],
+)
+def test_what_cannot_be_explained_is_refused(crash, situation, action, error, says):
+    with pytest.raises(error, match=says):
+        crash[0].model().explain(situation, action)
