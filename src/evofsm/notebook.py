@@ -195,14 +195,39 @@ def _columns(model: FSMModel, shown: Sequence[int]) -> list[_Column]:
     return columns
 
 
+def variable_label(model: FSMModel, variable: int) -> str:
+    """Name and unit of a variable, as far as they are known.
+
+    Parameters
+    ----------
+    model : FSMModel
+    variable : int
+        Its index, from 0.
+
+    Returns
+    -------
+    str
+
+    Examples
+    --------
+    >>> from evofsm import EvolvingFSM
+    >>> machine = EvolvingFSM(n_actions=1)
+    >>> step = machine.observe([4.0, 10.0])
+    >>> variable_label(machine.model(), 1)
+    'variable 1'
+    >>> variable_label(machine.model(names=["gap", "speed"], units=["m", "m/s"]), 1)
+    'speed [m/s]'
+    """
+    name = model.names[variable] if model.names else f"variable {variable}"
+    unit = model.units[variable] if model.units else ""
+    return f"{name} [{unit}]" if unit else name
+
+
 def _variables(model: FSMModel) -> list[str]:
-    """Heads of the columns of the centres, with units where they are known."""
+    """Heads of the columns of the centres."""
     m = model.n_variables
-    names = model.names or [f"variable {j}" for j in range(m)]
-    units = [f" [{unit}]" if unit else "" for unit in model.units or [""] * m]
-    heads = [f"{name}{unit}" for name, unit in zip(names, units, strict=True)]
+    heads = [variable_label(model, j) for j in range(min(m, _MOST_VARIABLES))]
     if m > _MOST_VARIABLES:
-        heads = heads[:_MOST_VARIABLES]
         heads[-1] += f" (and {m - _MOST_VARIABLES} more)"
     return heads
 
