@@ -352,7 +352,8 @@ def _plot_beliefs(
         _explain(ax)
     name_rows(ax, n, dead_ends)
     ax.set_ylabel("state")
-    ax.figure.colorbar(mesh, ax=ax, label="belief", pad=0.1 if dead_ends else 0.05)
+    # Below, for the words beside the rows stand to the right.
+    ax.figure.colorbar(mesh, ax=ax, label="belief", location="bottom", aspect=40)
 
 
 # -- Of a drive -------------------------------------------------------------------------------
@@ -529,7 +530,7 @@ def _given_or_new(ax: Axes | None) -> Axes:
         return ax
     from matplotlib import pyplot  # late: whoever gives axes needs none of it
 
-    return pyplot.subplots()[1]
+    return pyplot.subplots(layout="constrained")[1]
 
 
 def _refuse_unknown(model: FSMModel, dead_ends: Collection[int]) -> None:
