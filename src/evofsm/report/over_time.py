@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 
+from evofsm.report.axes import name_rows
 from evofsm.report.style import (
     DEAD_END,
     FIRST,
@@ -21,6 +22,8 @@ from evofsm.report.style import (
     MOST_DISCS,
     SOFT,
     WIDTH,
+    dead_ends_of,
+    draw_collision,
     draw_state,
     label_of,
     stretches,
@@ -28,8 +31,6 @@ from evofsm.report.style import (
 from evofsm.studies.paper import CASES, Founding, PaperStudy, Run
 from evofsm.studies.paper.claims import LARGEST_DIVERGENCE
 
-# Beyond so many states or actions not every one of them gets a tick.
-_MOST_TICKS = 12
 # Height of a line of text [point], and width of a letter [inch].
 _ROW = 10.0
 _LETTER = 0.062
@@ -107,18 +108,7 @@ def _draw_gap(axes: Axes, run: Run) -> None:
     axes.plot(episode.time, gap, color=INK)
     axes.set_ylim(0.0, 1.08 * gap.max())
     if episode.collided:
-        axes.plot(
-            [episode.time[-1]],
-            [0.0],
-            linestyle="none",
-            marker="X",
-            markersize=8,
-            color=INK,
-            markeredgecolor="white",
-            markeredgewidth=0.7,
-            clip_on=False,
-            zorder=6,
-        )
+        draw_collision(axes, float(episode.time[-1]), 0.0)
     axes.set_ylabel("gap [m]")
 
 
@@ -144,29 +134,9 @@ def _draw_acceleration(axes: Axes, study: PaperStudy, run: Run) -> None:
 
 
 def _draw_states(axes: Axes, study: PaperStudy, run: Run) -> None:
-    n = study.model.n_states
     axes.step(run.episode.time, run.state + 1, where="post", color=INK)
-    axes.set_ylim(0.4, n + 0.6)
-    if n <= _MOST_TICKS:
-        axes.set_yticks(range(1, n + 1), [label_of(i) for i in range(n)])
-    else:
-        axes.yaxis.set_major_locator(MaxNLocator(8, integer=True))
+    name_rows(axes, study.model.n_states, dead_ends_of(study.dead_end))
     axes.set_ylabel("recognised\nstate")
-    if study.dead_end >= 0:
-        row = study.dead_end + 1
-        axes.axhspan(row - 0.5, row + 0.5, color=DEAD_END, alpha=0.18, linewidth=0.0, zorder=0.5)
-        axes.annotate(
-            "dead end",
-            (1.0, row),
-            xycoords=("axes fraction", "data"),
-            xytext=(4, 0),
-            textcoords="offset points",
-            va="center",
-            fontsize=7.0,
-            fontweight="bold",
-            color=DEAD_END,
-            annotation_clip=False,
-        )
 
 
 def _draw_actions(axes: Axes, study: PaperStudy, run: Run) -> None:
@@ -414,7 +384,7 @@ def _draw_foundings(axes: Axes, study: PaperStudy, runs: int) -> None:
     numbered = study.model.n_states <= MOST_DISCS
     for count, founding in enumerate(study.foundings, 1):
         x, state = _position(study, founding), founding.state
-        draw_state(axes, x, count, state, study.dead_end, size=9.0, numbered=numbered)
+        draw_state(axes, x, count, state, 9.0, dead_end=state == study.dead_end, numbered=numbered)
         if numbered:
             axes.annotate(
                 f"{founding.time:.1f} s",

@@ -10,6 +10,7 @@ from typing import Any
 import matplotlib.style
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.colors import to_hex, to_rgb
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
@@ -27,6 +28,14 @@ DEAD_END = "#D55E00"
 FIRST = "#CC79A7"
 #: Dashes of the leader's lines; the follower's are solid.
 LEADER_DASHES = (0, (4, 1.6))
+
+#: How a collision is marked.
+COLLISION: Mapping[str, Any] = {
+    "marker": "X",
+    "markersize": 8,
+    "markeredgecolor": "white",
+    "markeredgewidth": 0.7,
+}
 
 #: Beyond so many states they are drawn as dots, without numbers.
 MOST_DISCS = 20
@@ -89,23 +98,50 @@ def label_of(state: int) -> str:
     return f"#{state + 1}"
 
 
+def points(size: float) -> float:
+    """A size of type that is ``size`` points in this style, in the style that holds [point]."""
+    return size * float(matplotlib.rcParams["font.size"]) / float(_SETTINGS["font.size"])
+
+
+def ink(share: float = 1.0) -> str:
+    """The colour of type in the style that holds, of which a share is left on its ground."""
+    pairs = zip(
+        to_rgb(matplotlib.rcParams["text.color"]),
+        to_rgb(matplotlib.rcParams["axes.facecolor"]),
+        strict=True,
+    )
+    red, green, blue = (share * type_ + (1.0 - share) * ground for type_, ground in pairs)
+    return to_hex((red, green, blue))
+
+
+def dead_ends_of(dead_end: int) -> tuple[int, ...]:
+    """The dead end of a study that has at most one, as those to mark; -1 stands for none."""
+    return (dead_end,) if dead_end >= 0 else ()
+
+
 def draw_state(
-    axes: Axes, x: float, y: float, state: int, dead_end: int, size: float, numbered: bool = True
+    axes: Axes,
+    x: float,
+    y: float,
+    state: int,
+    size: float,
+    *,
+    dead_end: bool = False,
+    numbered: bool = True,
 ) -> None:
-    """Draw a state: a disc, or a filled hexagon for the dead end; the latter is always numbered."""
-    is_dead_end = state == dead_end
-    numbered = numbered or is_dead_end
+    """Draw a state: a disc, or a filled hexagon for a dead end; the latter is always numbered."""
+    numbered = numbered or dead_end
     axes.plot(
         [x],
         [y],
         linestyle="none",
-        marker="h" if is_dead_end else "o",
-        markersize=(1.18 if is_dead_end else 1.0) * (size if numbered else 0.35 * size),
-        markerfacecolor=DEAD_END if is_dead_end else "white",
-        markeredgecolor=DEAD_END if is_dead_end else INK,
+        marker="h" if dead_end else "o",
+        markersize=(1.18 if dead_end else 1.0) * (size if numbered else 0.35 * size),
+        markerfacecolor=DEAD_END if dead_end else "white",
+        markeredgecolor=DEAD_END if dead_end else INK,
         markeredgewidth=0.8,
         clip_on=False,
-        zorder=5.5 if is_dead_end else 5.0,
+        zorder=5.5 if dead_end else 5.0,
     )
     if numbered:
         axes.annotate(
@@ -115,10 +151,15 @@ def draw_state(
             va="center_baseline",
             fontsize=min(0.72 * size, 8.5),
             fontweight="bold",
-            color="white" if is_dead_end else INK,
+            color="white" if dead_end else INK,
             zorder=6,
             annotation_clip=False,
         )
+
+
+def draw_collision(axes: Axes, x: float, y: float) -> None:
+    """Mark where a run ended in a collision."""
+    axes.plot([x], [y], linestyle="none", color=INK, clip_on=False, zorder=7, **COLLISION)
 
 
 def stretches(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:

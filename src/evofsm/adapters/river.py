@@ -1,0 +1,217 @@
+"""A clusterer of River: one observation at a time, as a dictionary of features."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Hashable, Mapping, Sequence
+from typing import Any, SupportsFloat
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evofsm._extras import needs
+from evofsm.crowding import WhenFull
+from evofsm.machine import EvolvingFSM
+from evofsm.observations import Missing
+from evofsm.states.rule import StateRule
+
+with needs("River", "river", "a clusterer of River"):
+    from river import base
+
+# A clusterer acts on nothing: there is one action, and it is always taken.
+_ACTION = 0
+
+
+class RiverClusterer(base.Clusterer):
+    """The states of an `EvolvingFSM` as the clusters of a River clusterer.
+
+    It observes features of fixed names, whatever their order. One that is absent, None or NaN was
+    *not observed*, which is not to say that it is 0: such an observation is recognised by the
+    features that are there, founds and moves no state, and teaches no transition. A feature that
+    is not among those observed is left out.
+
+    Parameters
+    ----------
+    features : sequence of hashable, optional
+        Names of the features that are observed. Without them, those of the first observation
+        that holds any; name them where it may lack some.
+    radius, distance_weight, learning_rate, prior_frequency, spread : float
+        As `EvolvingFSM` takes them; ``radius`` in the unit of the features, which all count
+        alike: scale them first.
+    rule : StateRule, optional
+        How states are determined.
+    max_states : int, optional
+        Number of states at which another one is only founded where one is given up.
+    when_full : WhenFull
+        Which one is given up. Its number goes to the new state.
+    belief_tolerance : float
+        How far a belief may be from the exact one.
+
+    Attributes
+    ----------
+    machine : EvolvingFSM
+        With one action: ``machine.predict(0)`` forecasts the next state, and
+        ``machine.start_episode()`` says that the next observation does not follow from the last.
+
+    Raises
+    ------
+    TypeError, ValueError
+        As `EvolvingFSM`, and where ``features`` are empty or named twice.
+
+    Examples
+    --------
+    >>> from river import stream
+    >>> clusterer = RiverClusterer(radius=0.5)
+    >>> for x, _ in stream.iter_array([[0.0], [0.1], [2.0], [1.0]], feature_names=["gap"]):
+    ...     clusterer.learn_one(x)
+    >>> clusterer.predict_one({"gap": 0.2}), clusterer.predict_one({"gap": 1.8})
+    (0, 1)
+    >>> {state: round(p, 2) for state, p in clusterer.predict_proba_one({"gap": 0.5}).items()}
+    {0: 0.5, 1: 0.5}
+    """
+
+    def __init__(
+        self,
+        features: Sequence[Hashable] | None = None,
+        radius: float = 0.3,
+        distance_weight: float = 0.85,
+        learning_rate: float = 0.01,
+        prior_frequency: float = 1e-3,
+        spread: float = 3.0,
+        rule: StateRule | None = None,
+        max_states: int | None = None,
+        when_full: WhenFull = WhenFull.MERGE,
+        belief_tolerance: float = 0.0,
+    ) -> None:
+        if features is not None and not 0 < len(set(features)) == len(features):
+            raise ValueError(f"features are {features}; they must be different names, at least one")
+        self.features = features
+        self.radius = radius
+        self.distance_weight = distance_weight
+        self.learning_rate = learning_rate
+        self.prior_frequency = prior_frequency
+        self.spread = spread
+        self.rule = rule
+        self.max_states = max_states
+        self.when_full = when_full
+        self.belief_tolerance = belief_tolerance
+        settings = {name: value for name, value in self._get_params().items() if name != "features"}
+        self.machine = EvolvingFSM(n_actions=1, **settings)
+        self._observed = () if features is None else tuple(features)
+
+    def learn_one(self, x: Mapping[Hashable, Any]) -> None:
+        """Observe, as the machine's ``learn_one`` does.
+
+        Until every feature was observed once, all at the same time, there is no state to recognise
+        by the others: what is incomplete is passed over.
+
+        Parameters
+        ----------
+        x : mapping
+            A number for each feature; what is absent, None or NaN was not observed.
+
+        Raises
+        ------
+        TypeError
+            If a feature is no number.
+        ValueError
+            If a feature is infinite, or beyond 1e100.
+
+        Examples
+        --------
+        >>> clusterer = RiverClusterer(features=("gap", "speed"))
+        >>> clusterer.learn_one({"gap": 3.0})  # nothing to recognise it by
+        >>> clusterer.learn_one({"speed": 9.0, "gap": 3.0, "colour": "red"})
+        >>> clusterer.machine.centers
+        array([[3., 9.]])
+        """
+        if not self._observed:  # sorted, so that the order of the first does not matter either
+            self._observed = tuple(sorted(x, key=str))
+        if not self._observed:
+            return
+        z = self._vector(x)
+        if not np.isnan(z).any():
+            self.machine.learn_one(z, _ACTION)
+        elif self.machine.n_states:
+            self.machine.observe(z, missing=Missing.PARTIAL)
+            self.machine.act(_ACTION)
+
+    def predict_one(self, x: Mapping[Hashable, Any]) -> int:
+        """Number of the most probable state, from 0; nothing is changed by asking.
+
+        Parameters
+        ----------
+        x : mapping
+            As `learn_one` takes it.
+
+        Returns
+        -------
+        int
+            Index of a state of the machine; 0 before anything was learnt.
+
+        Raises
+        ------
+        TypeError, ValueError
+            As `learn_one`.
+
+        Examples
+        --------
+        >>> RiverClusterer().predict_one({"gap": 3.0})
+        0
+        """
+        belief = self._recognise(x)
+        return int(belief.argmax()) if len(belief) else 0
+
+    def predict_proba_one(self, x: Mapping[Hashable, Any]) -> dict[int, float]:
+        """Distribution over states: how much an observation belongs to each.
+
+        Parameters
+        ----------
+        x : mapping
+            As `learn_one` takes it.
+
+        Returns
+        -------
+        dict
+            A probability for each state; empty before anything was learnt.
+
+        Raises
+        ------
+        TypeError, ValueError
+            As `learn_one`.
+
+        Examples
+        --------
+        >>> clusterer = RiverClusterer()
+        >>> clusterer.learn_one({"gap": 3.0})
+        >>> clusterer.predict_proba_one({"gap": 4.0})
+        {0: 1.0}
+        """
+        return dict(enumerate(self._recognise(x).tolist()))
+
+    def _recognise(self, x: Mapping[Hashable, Any]) -> NDArray[np.float64]:
+        """(n,) belief, as `learn_one` would have it, but for what that would teach."""
+        if self.machine.n_states == 0:
+            return np.empty(0)
+        z = self._vector(x)
+        if np.isnan(z).any():  # a machine learns nothing from these, but its belief changes
+            return self.machine.copy().observe(z, missing=Missing.PARTIAL).belief
+        return self.machine.model().recognise(z)
+
+    def _vector(self, x: Mapping[Hashable, Any]) -> NDArray[np.float64]:
+        """The features in their order, NaN for those that were not observed."""
+        return np.array([_number(name, x.get(name)) for name in self._observed])
+
+
+def _number(name: Hashable, value: object) -> float:
+    if value is None:
+        return math.nan
+    if not isinstance(value, SupportsFloat):
+        raise TypeError(
+            f"feature {name!r} is {value!r}; it must be a number "
+            "(river.preprocessing.OneHotEncoder makes numbers of categories)"
+        )
+    number = float(value)
+    if math.isinf(number):
+        raise ValueError(f"feature {name!r} is {number}; it must be finite (None: not observed)")
+    return number

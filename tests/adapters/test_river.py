@@ -1,0 +1,159 @@
+"""What River expects of a clusterer holds, and the clusters are the machine's states."""
+
+import math
+import pickle
+import sys
+from importlib import import_module
+from inspect import signature
+
+import numpy as np
+import pytest
+from river import checks, datasets, preprocessing, stream
+from river.checks import common
+
+from evofsm import EvolvingFSM, Missing, Novelty, WhenFull
+from evofsm.adapters.river import RiverClusterer
+
+# River's own list runs these only on models it has a data set for, and has none for clusterers.
+_ON_DATA = [
+    common.check_learn_one,
+    common.check_pickling,
+    common.check_shuffle_features_no_impact,
+    common.check_emerging_features,
+    common.check_disappearing_features,
+    common.check_radically_disappearing_features,
+    common.check_no_state_aliasing_with_input,
+    common.check_clone_is_independent,
+    common.check_bounded_memory_growth,
+]
+
+
+def walk(rows=120, variables=3):
+    return np.random.default_rng(5).normal(size=(rows, variables)).cumsum(axis=0)
+
+
+def as_features(Z, names=("a", "b", "c")):
+    return [x for x, _ in stream.iter_array(Z, feature_names=list(names))]
+
+
+def test_rivers_checks_pass():
+    checks.check_estimator(RiverClusterer())
+    checks.check_estimator(RiverClusterer(("a", "b"), rule=Novelty(1.0), max_states=6))
+
+
+@pytest.mark.parametrize("check", _ON_DATA, ids=lambda check: check.__name__)
+def test_rivers_checks_on_data_pass_as_well(check):
+    check(RiverClusterer(), list(datasets.Phishing().take(150)))
+
+
+def test_settings_have_the_names_and_defaults_of_the_machine():
+    of_machine = dict(signature(EvolvingFSM).parameters)
+    of_clusterer = dict(signature(RiverClusterer).parameters)
+    del of_machine["n_actions"], of_clusterer["features"]
+    assert {name: each.default for name, each in of_clusterer.items()} == {
+        name: each.default for name, each in of_machine.items()
+    }
+    told = RiverClusterer(radius=0.7, max_states=4, when_full=WhenFull.RETIRE).machine
+    assert (told.radius, told.max_states, told.when_full) == (0.7, 4, WhenFull.RETIRE)
+
+
+@pytest.mark.parametrize("settings", [{"radius": 0.5}, {"rule": Novelty(1.5)}])
+def test_it_learns_what_the_machine_learns(settings):
+    Z = walk()
+    machine = EvolvingFSM(1, **settings)
+    trace = machine.learn_many(Z, np.zeros(len(Z), np.int64), belief=True)
+    clusterer = RiverClusterer(**settings)
+    learnt = []
+    for x in as_features(Z):
+        clusterer.learn_one(x)
+        learnt.append(clusterer.predict_one(x))
+    assert trace.n_states[-1] > 2
+    assert learnt == trace.state.tolist()
+    assert np.array_equal(clusterer.machine.transition_matrices, machine.transition_matrices)
+    of_last = list(clusterer.predict_proba_one(as_features(Z)[-1]).values())
+    assert np.allclose(of_last, trace.belief[-1], atol=1e-12)
+
+
+def test_the_order_of_features_matters_never_not_even_in_the_first_observation():
+    straight, turned = RiverClusterer(), RiverClusterer()
+    for x in as_features(walk()):
+        straight.learn_one(x)
+        turned.learn_one(dict(reversed(x.items())))
+    assert pickle.dumps(straight.machine) == pickle.dumps(turned.machine)
+
+
+@pytest.mark.parametrize("absent", [{}, {"b": None}, {"b": math.nan}])
+def test_what_is_absent_was_not_observed(absent):
+    Z = walk()
+    machine = EvolvingFSM(1)
+    machine.learn_many(Z, np.zeros(len(Z), np.int64))
+    clusterer = RiverClusterer()
+    for x in as_features(Z):
+        clusterer.learn_one(x)
+    step = machine.observe([0.5, np.nan, -1.0], missing=Missing.PARTIAL)
+    x = {"a": 0.5, "c": -1.0, **absent}
+    before = pickle.dumps(clusterer)
+    assert np.array_equal(list(clusterer.predict_proba_one(x).values()), step.belief)
+    assert clusterer.predict_one(x) == step.state
+    assert pickle.dumps(clusterer) == before
+    clusterer.learn_one(x)
+    assert np.array_equal(clusterer.machine.centers, machine.centers)
+    # A transition from it is learnt again, under the one action there is.
+    machine.act(0)
+    machine.observe(Z[0])
+    clusterer.learn_one(as_features(Z[:1])[0])
+    assert np.array_equal(clusterer.machine.transition_matrices, machine.transition_matrices)
+
+
+def test_features_that_are_named_wait_for_a_whole_observation_and_others_are_left_out():
+    clusterer = RiverClusterer(features=("speed", "gap"))
+    clusterer.learn_one({})
+    clusterer.learn_one({"gap": 2.0})
+    assert clusterer.predict_one({"gap": 2.0}) == 0
+    assert clusterer.predict_proba_one({"gap": 2.0}) == {}
+    clusterer.learn_one({"noise": 1.0, "gap": 2.0, "speed": 3.0})
+    assert clusterer.machine.centers.tolist() == [[3.0, 2.0]]
+
+
+def test_nothing_at_all_is_no_first_observation():
+    clusterer = RiverClusterer()
+    clusterer.learn_one({})
+    clusterer.learn_one({"a": 1.0})
+    assert clusterer.machine.centers.tolist() == [[1.0]]
+
+
+@pytest.mark.parametrize(
+    ("x", "error", "words"),
+    [
+        ({"a": "red"}, TypeError, "feature 'a' is 'red'.*OneHotEncoder"),
+        ({"a": math.inf}, ValueError, "feature 'a' is inf.*finite"),
+    ],
+)
+def test_what_is_no_number_is_named(x, error, words):
+    clusterer = RiverClusterer(features=("a",))
+    with pytest.raises(error, match=words):
+        clusterer.learn_one(x)
+    assert clusterer.machine.n_states == 0
+
+
+@pytest.mark.parametrize("features", [(), ("a", "a")])
+def test_features_are_different_names(features):
+    with pytest.raises(ValueError, match="must be different names, at least one"):
+        RiverClusterer(features=features)
+
+
+def test_it_ends_a_pipeline():
+    pipeline = preprocessing.StandardScaler() | RiverClusterer()
+    for x in as_features(walk()):
+        pipeline.learn_one(x)
+    assert pipeline["RiverClusterer"].machine.n_states > 1
+    assert pipeline.predict_one(x) in range(pipeline["RiverClusterer"].machine.n_states)
+
+
+@pytest.mark.parametrize("library", ["river", "sklearn"])
+def test_a_missing_library_is_named(library, monkeypatch):
+    for name in (library, f"{library}.base"):
+        monkeypatch.setitem(sys.modules, name, None)
+    monkeypatch.delitem(sys.modules, f"evofsm.adapters.{library}", raising=False)
+    with pytest.raises(ModuleNotFoundError, match=rf"pip install 'evofsm\[{library}\]'"):
+        import_module(f"evofsm.adapters.{library}")

@@ -1,0 +1,114 @@
+"""What scikit-learn expects of a clusterer holds, and the clusters are the machine's states."""
+
+from inspect import signature
+
+import numpy as np
+import polars
+import pytest
+from sklearn.base import clone
+from sklearn.exceptions import NotFittedError
+from sklearn.pipeline import make_pipeline
+from sklearn.preprocessing import StandardScaler
+from sklearn.utils.estimator_checks import parametrize_with_checks
+
+from evofsm import Edges, EvolvingFSM, Novelty, WhenFull
+from evofsm.adapters.sklearn import EvolvingClusterer
+
+# docs/river-and-scikit-learn.md lists it as well.
+_EXCEPTIONS = {
+    "check_clustering": "the paper's rule founds states towards the mean of all data: clusters "
+    "around it get none of their own",
+}
+
+
+def _exceptions(estimator):
+    return _EXCEPTIONS if estimator.rule is None else {}
+
+
+def walk(rows=120, variables=3):
+    return np.random.default_rng(5).normal(size=(rows, variables)).cumsum(axis=0)
+
+
+@parametrize_with_checks(
+    [EvolvingClusterer(), EvolvingClusterer(rule=Edges()), EvolvingClusterer(rule=Novelty(1.0))],
+    expected_failed_checks=_exceptions,
+    xfail_strict=True,
+)
+def test_scikit_learns_checks_pass(estimator, check):
+    check(estimator)
+
+
+def test_settings_have_the_names_and_defaults_of_the_machine():
+    of_machine = dict(signature(EvolvingFSM).parameters)
+    of_clusterer = dict(signature(EvolvingClusterer).parameters)
+    del of_machine["n_actions"]
+    assert of_clusterer.keys() == of_machine.keys()
+    for name, setting in of_clusterer.items():
+        assert setting.default in (None, of_machine[name].default)
+    told = EvolvingClusterer(radius=0.7, max_states=4, when_full=WhenFull.RETIRE).fit([[0.0]])
+    machine = told.machine_
+    assert (machine.radius, machine.max_states, machine.when_full) == (0.7, 4, WhenFull.RETIRE)
+    assert EvolvingClusterer().fit([[0.0]]).machine_.when_full == of_machine["when_full"].default
+
+
+@pytest.mark.parametrize("settings", [{"radius": 0.5}, {"rule": Novelty(1.5)}])
+def test_labels_are_the_states_that_the_machine_recognised(settings):
+    Z = walk()
+    machine = EvolvingFSM(1, **settings)
+    trace = machine.learn_many(Z, np.zeros(len(Z), np.int64))
+    clusterer = EvolvingClusterer(**settings)
+    assert trace.n_states[-1] > 2
+    assert np.array_equal(clusterer.fit_predict(Z), trace.state)
+    assert np.array_equal(clusterer.cluster_centers_, machine.centers)
+    assert np.array_equal(clusterer.predict_proba(Z), machine.model().recognise(Z))
+    assert np.array_equal(clusterer.machine_.transition_matrices, machine.transition_matrices)
+
+
+def test_batches_learn_what_the_whole_does_and_fit_starts_anew():
+    Z = walk()
+    whole = EvolvingClusterer().fit(Z)
+    parts = EvolvingClusterer()
+    labels = [parts.partial_fit(batch).labels_ for batch in np.array_split(Z, 7)]
+    assert np.array_equal(np.concatenate(labels), whole.labels_)
+    assert np.array_equal(parts.machine_.transition_matrices, whole.machine_.transition_matrices)
+    assert np.array_equal(parts.fit(Z).cluster_centers_, whole.cluster_centers_)
+
+
+def test_asking_changes_nothing():
+    clusterer = EvolvingClusterer().fit(walk())
+    twin = clusterer.machine_.copy()
+    clusterer.predict(walk(5)), clusterer.predict_proba(walk(5))
+    assert clusterer.machine_.observe(walk(1)[0]).surprise == twin.observe(walk(1)[0]).surprise
+
+
+def test_nothing_can_be_asked_before_anything_was_learnt():
+    with pytest.raises(NotFittedError):
+        EvolvingClusterer().predict(walk(5))
+    assert not hasattr(EvolvingClusterer(), "cluster_centers_")
+
+
+def test_a_clone_has_the_settings_and_nothing_else():
+    clusterer = EvolvingClusterer(spread=1.0, rule=Novelty(2.0)).fit(walk())
+    twin = clone(clusterer)
+    assert twin.get_params() == clusterer.get_params()
+    assert not hasattr(twin, "machine_")
+
+
+def test_settings_that_cannot_be_are_refused_when_it_learns():
+    clusterer = EvolvingClusterer().set_params(radius=-1.0)
+    with pytest.raises(ValueError, match=r"radius is -1\.0; it must be a positive"):
+        clusterer.fit(walk())
+
+
+def test_names_of_columns_are_kept_and_held_to():
+    frame = polars.DataFrame(walk(), schema=["gap", "speed", "leader"])
+    clusterer = EvolvingClusterer().fit(frame)
+    assert clusterer.feature_names_in_.tolist() == ["gap", "speed", "leader"]
+    with pytest.raises(ValueError, match="feature names should match"):
+        clusterer.predict(frame.rename({"gap": "distance"}))
+
+
+def test_it_ends_a_pipeline():
+    pipeline = make_pipeline(StandardScaler(), EvolvingClusterer(rule=Novelty(1.0)))
+    labels = pipeline.fit_predict(walk())
+    assert set(labels) == set(range(pipeline[-1].machine_.n_states))
