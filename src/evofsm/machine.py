@@ -37,6 +37,7 @@ from evofsm.memory import (
 )
 from evofsm.model import FSMModel, recognise_rows
 from evofsm.naming import Labels
+from evofsm.notebook import machine_html
 from evofsm.observations import Missing
 from evofsm.states.dispatch import check_rule, describe, restore, weights, width
 from evofsm.states.ets import Paper
@@ -563,6 +564,12 @@ prior_frequency=0.001, spread=3.0)
     # -- What it was told -----------------------------------------------------------------------
 
     @property
+    def settings(self) -> dict[str, Any]:
+        """Its settings by name, but for the rule; those that were left as they are, left out."""
+        given = {name: getattr(self, name) for name in (*_SETTINGS, *_OPTIONS)}
+        return {name: value for name, value in given.items() if value != _OPTIONS.get(name, ...)}
+
+    @property
     def n_actions(self) -> int:
         """Number q of actions."""
         return len(self._memory.learnt.transitions.uses)
@@ -640,6 +647,11 @@ prior_frequency=0.001, spread=3.0)
     def n_states(self) -> int:
         """Number of states."""
         return int(self._memory.learnt.n_states[0])
+
+    @property
+    def n_variables(self) -> int:
+        """Number m of variables in an observation; 0 before the first."""
+        return len(self._memory.learnt.clusters.first)
 
     @property
     def state_ids(self) -> NDArray[np.int64]:
@@ -857,7 +869,7 @@ prior_frequency=0.001, spread=3.0)
             names=tuple(names),
             units=tuple(units),
             dt=dt,
-            settings=self._settings(),
+            settings=self.settings,
         )
 
     # -- Keeping it -----------------------------------------------------------------------------
@@ -890,7 +902,7 @@ prior_frequency=0.001, spread=3.0)
         2
         """
         # Without spare room the shapes of the arrays tell the sizes, and nothing else is stored.
-        content = {**self._settings(), "rule": describe(self._rule)}
+        content = {**self.settings, "rule": describe(self._rule)}
         storage.write(path, "machine", content, dict(leaves(self._trimmed())), provenance)
 
     @classmethod
@@ -959,16 +971,15 @@ prior_frequency=0.001, spread=3.0)
         self._rule = state["rule"]
         self._use(state["buffer"])
 
+    def _repr_html_(self) -> str:
+        return machine_html(self)
+
     def __repr__(self) -> str:
-        shown = self._settings() | ({} if self._rule == Paper() else {"rule": self._rule})
+        shown = self.settings | ({} if self._rule == Paper() else {"rule": self._rule})
         settings = ", ".join(f"{name}={value}" for name, value in shown.items())
         return f"{type(self).__name__}({settings})"
 
     # -- Inside ---------------------------------------------------------------------------------
-
-    def _settings(self) -> dict[str, Any]:
-        given = {name: getattr(self, name) for name in (*_SETTINGS, *_OPTIONS)}
-        return {name: value for name, value in given.items() if value != _OPTIONS.get(name, ...)}
 
     def _parameters(self, m: int) -> Parameters:
         """The settings, now that there are m variables."""

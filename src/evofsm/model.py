@@ -14,6 +14,7 @@ from evofsm._compile import kernel
 from evofsm.actions import IntervalActions
 from evofsm.explanation import Explanation, explain
 from evofsm.naming import Labels
+from evofsm.notebook import model_html
 from evofsm.states.clusters import measure_distances, nearest_center
 from evofsm.states.dispatch import describe, restore, weights
 from evofsm.states.ets import Paper
@@ -170,6 +171,9 @@ class FSMModel:
     def labels(self) -> Labels:
         """What its numbers mean."""
         return Labels(self.actions, self.names, self.units, self.dt)
+
+    def _repr_html_(self) -> str:
+        return model_html(self)
 
     def __deepcopy__(self, memo: Any) -> Self:
         """Itself: nothing in it ever changes."""

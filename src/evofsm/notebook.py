@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Sequence
 from html import escape
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from evofsm.machine import EvolvingFSM
     from evofsm.model import FSMModel
     from evofsm.step import Step
+
+    _Known: TypeAlias = EvolvingFSM | FSMModel
 
 # More rows than these are summed up in one.
 _MOST_STATES = 12
@@ -67,14 +69,13 @@ def machine_html(machine: EvolvingFSM) -> str:
     >>> "2 states, 2 actions, now in #2" in machine_html(machine)
     True
     """
-    model = machine.model()
     now = "no episode has begun" if machine.state is None else f"now in {_name(machine.state)}"
-    shown = _most(model.visits, machine.state)
-    columns = _columns(model, shown)
+    shown = _most(machine.visits, machine.state)
+    columns = _columns(machine, shown)
     if machine.state is not None:
         columns.append(_shares("belief", machine.belief, shown))
-    head = _head(machine, [*_counts(model), now], _settings(model))
-    return _html(head, shown, model.n_states, columns)
+    head = _head(machine, [*_counts(machine), now], _settings(machine))
+    return _html(head, shown, machine.n_states, columns)
 
 
 def model_html(model: FSMModel) -> str:
@@ -133,14 +134,15 @@ def step_html(step: Step) -> str:
     columns = [_shares("belief", step.belief, shown)]
     if len(step.predicted):
         columns.append(_shares("forecast", step.predicted, shown))
-    head = _head(step, [_name(step.state), _happened(step), surprise], _unseen(step.missing))
+    details = _unseen(step.missing) or step.explanation
+    head = _head(step, [_name(step.state), _happened(step), surprise], details)
     return _html(head, shown, len(step.belief), columns)
 
 
 # -- What is said -----------------------------------------------------------------------------
 
 
-def _counts(model: FSMModel) -> Iterable[str]:
+def _counts(model: _Known) -> Iterable[str]:
     yield _some(model.n_states, "state")
     yield _some(model.n_actions, "action")
 
@@ -149,7 +151,7 @@ def _some(number: int, thing: str) -> str:
     return f"{number:,} {thing}{'' if number == 1 else 's'}"
 
 
-def _settings(model: FSMModel) -> str:
+def _settings(model: _Known) -> str:
     told = [
         f"{name} {getattr(value, 'name', value)}"  # a member of an enumeration by its name
         for name, value in model.settings.items()
@@ -181,7 +183,7 @@ def _most(weights: NDArray[np.float64], present: int | None = None) -> list[int]
     return sorted(heaviest[:_MOST_STATES])
 
 
-def _columns(model: FSMModel, shown: Sequence[int]) -> list[_Column]:
+def _columns(model: _Known, shown: Sequence[int]) -> list[_Column]:
     """Where the states lie, and how often each was seen."""
     columns = [
         _Column(head, [_value(model.centers[state, j]) for state in shown], "")
@@ -190,17 +192,21 @@ def _columns(model: FSMModel, shown: Sequence[int]) -> list[_Column]:
     columns.append(_numbers("visits", model.visits, shown))
     visits = float(model.visits.sum())
     columns.append(_shares("share", model.visits / max(visits, 1.0), shown, barred=False))
+    if model.episodes.any():
+        columns.append(_numbers("episodes", model.episodes, shown))
+    if model.failed_soon.any():
+        columns.append(_numbers("failed soon", model.failed_soon, shown))
     if model.endings.any():
         columns.append(_numbers("failures ended here", model.endings, shown))
     return columns
 
 
-def variable_label(model: FSMModel, variable: int) -> str:
+def variable_label(model: _Known, variable: int) -> str:
     """Name and unit of a variable, as far as they are known.
 
     Parameters
     ----------
-    model : FSMModel
+    model : EvolvingFSM or FSMModel
     variable : int
         Its index, from 0.
 
@@ -213,17 +219,18 @@ def variable_label(model: FSMModel, variable: int) -> str:
     >>> from evofsm import EvolvingFSM
     >>> machine = EvolvingFSM(n_actions=1)
     >>> step = machine.observe([4.0, 10.0])
-    >>> variable_label(machine.model(), 1)
+    >>> variable_label(machine, 1)
     'variable 1'
     >>> variable_label(machine.model(names=["gap", "speed"], units=["m", "m/s"]), 1)
     'speed [m/s]'
     """
-    name = model.names[variable] if model.names else f"variable {variable}"
-    unit = model.units[variable] if model.units else ""
+    names, units = getattr(model, "names", ()), getattr(model, "units", ())
+    name = names[variable] if names else f"variable {variable}"
+    unit = units[variable] if units else ""
     return f"{name} [{unit}]" if unit else name
 
 
-def _variables(model: FSMModel) -> list[str]:
+def _variables(model: _Known) -> list[str]:
     """Heads of the columns of the centres."""
     m = model.n_variables
     heads = [variable_label(model, j) for j in range(min(m, _MOST_VARIABLES))]

@@ -23,6 +23,7 @@ from evofsm._compile import inner_kernel, kernel, lanes, rare_kernel
 from evofsm.crowding import MERGED, NEWCOMER, RETIRE, RETIRED, merge_closest, retire_least_useful
 from evofsm.divergence import jensen_shannon_kernel
 from evofsm.memory import NO_ACTION, Memory, open_memory
+from evofsm.notebook import step_html
 from evofsm.states import clusters, spread
 from evofsm.states.clusters import place_center, potential_of
 from evofsm.states.dispatch import determine, width
@@ -97,6 +98,9 @@ class Step(NamedTuple):
     surprise: float  #: divergence of `predicted` and `belief` [bit]; NaN where none was
     missing: tuple[int, ...] = ()  #: variables that were not observed, so that nothing was learnt
     explanation: str = ""  #: what experience says of the state, where that was asked for
+
+    def _repr_html_(self) -> str:
+        return step_html(self)
 
 
 class Trace(NamedTuple):

@@ -146,7 +146,7 @@ def _refuse_unlike(machines: Iterable[EvolvingFSM]) -> list[EvolvingFSM]:
             f"machine {one} has {m} variables, and machine {other} has {other_m}; "
             "machines to merge must have observed the same"
         )
-    settings = [part._settings() | {"rule": part.rule} for part in parts]
+    settings = [part.settings | {"rule": part.rule} for part in parts]
     for number, its in enumerate(settings):
         for name in sorted(its.keys() | settings[0].keys()):
             given, expected = getattr(parts[number], name), getattr(parts[0], name)
