@@ -1,7 +1,7 @@
 """A learnt machine as a graph or a Markov decision process, in the formats of others' tools.
 
-DOT is Graphviz's language, Mermaid is what GitHub draws within a page, GraphML is read by yEd, Gephi
-and networkx, and PRISM's language by the model checkers PRISM and Storm. All count states and
+DOT is Graphviz's language, Mermaid is what GitHub draws within a page, GraphML is read by yEd,
+Gephi and networkx, and PRISM's language by the model checkers PRISM and Storm. All count states and
 actions from 1, as people read them.
 
 Every number that was learnt stands beside the evidence for it: a probability may come from one
