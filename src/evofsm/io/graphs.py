@@ -462,12 +462,14 @@ def _header(model: FSMModel, evidence: float, least: float, unknown: int) -> lis
         f"A machine of {model.n_states} states and {model.n_actions} actions, learnt by evofsm.",
         "s=0 is failure, s=i the state #i. Comments say how many decisions a command rests on, how",
         "many of them failed, and how often a change was seen after whatever action: seen 0 is the",
-        "prior alone. A belief over several states divides a decision between them.",
+        "prior alone, or what states share. A belief over several states divides a decision.",
         "",
-        f"Left out: {(~tried).sum():,} pairs of state and action never tried; {few.sum():,} tried",
-        f"less than {evidence:g} times ({lost:.2%} of all decisions); transitions below {least:g}.",
+        f"Left out: {(~tried).sum():,} pairs of state and action that were never tried, and",
+        f"{few.sum():,} that rest on fewer than {evidence:g} decisions ({lost:.2%} of all).",
         f"States left without any action, absorbing and labelled unknown: {unknown}.",
     ]
+    if least > 0.0:
+        told.append(f"Transitions below {least:g} are left out as well.")
     if model.dt is not None:
         told.append(f"A step is {model.dt:g} s.")
     if model.actions is not None:

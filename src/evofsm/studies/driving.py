@@ -117,6 +117,7 @@ def drive_family(
     progress: Callable[[int, int], None] = lambda done, collisions: None,
     checkpoint: Checkpoint | None = None,
     audit: AuditLog | None = None,
+    record: Callable[[Drive], None] = lambda drive: None,
 ) -> Driving:
     """Drive the episodes in turn.
 
@@ -134,6 +135,8 @@ def drive_family(
         bit; there may be more episodes than before.
     audit : AuditLog, optional
         Writes down what is decided; also in episodes that are driven again after a stop.
+    record : callable
+        Given each episode that is driven here, none of those before a stop.
 
     Raises
     ------
@@ -155,6 +158,7 @@ def drive_family(
             controller=controller,
             audit=audit,
         )
+        record(drive)
         done.add(drive, outcome(drive, unrevised, family.interval), setup.tolerance)
         if checkpoint is not None:
             checkpoint.offer(partial(done.keep, learner))
