@@ -259,9 +259,13 @@ def episodes_learnt(folder: Path) -> int:
 
 # -- What has been driven so far ------------------------------------------------------------------
 
-_WHOLE = ("episode", "state")
-_OF_REVISION = ("proposed", "executed", "advised", "risk_proposed", "risk_executed", "seen")
-_COLUMNS = ("episode", "time", *VARIABLES, "state", "surprise", *_OF_REVISION, "realised", "reason")
+_WHOLE = ("episode", "intake", "state", "n_states")
+_OF_REVISION = ("proposed", "executed", "advised", "risk_proposed", "risk_executed")
+_EVIDENCE = ("risk_low", "risk_high", "evidence", "seen")
+_COLUMNS = (
+    *("episode", "time", *VARIABLES, "intake", "state", "n_states", "surprise"),
+    *(*_OF_REVISION, *_EVIDENCE, "realised", "reason"),
+)
 # Where there is no state.
 _NONE = -1
 
@@ -281,9 +285,14 @@ class Driven:
                 len(self.outcomes),
                 situation.time,
                 *situation.observation.tolist(),
+                int(situation.intake),
                 situation.state,
+                0 if situation.state is None else len(situation.belief),
                 situation.surprise,
                 *(getattr(revision, name) for name in _OF_REVISION),
+                *revision.interval,
+                revision.evidence,
+                revision.seen,
                 realised,
                 revision.reason,
             )
