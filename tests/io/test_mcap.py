@@ -129,6 +129,8 @@ def test_another_reader_finds_every_channel_in_the_order_of_time(run, log):
     times = [time for time, _ in found["/decision"]]
     assert times == sorted(set(times))
     start = {m["episode"]: t for t, m in found["/event"] if m["kind"] == "episode started"}
+    end = {m["episode"]: t for t, m in found["/event"] if m["kind"] == "episode ended"}
+    assert [start[k + 1] - end[k] for k in (0, 1)] == [10**9, 10**9]
     assert times[-1] - start[2] == round(drives[2].decisions[-1].situation.time * 1e9)
 
 
