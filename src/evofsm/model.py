@@ -410,51 +410,6 @@ class FSMModel:
         shares = np.clip(solution, 0.0, None)
         return np.asarray(shares / shares.sum())
 
-    def to_dot(self, policy: Policy = "observed", least: float = 0.001) -> str:
-        r"""The state graph in Graphviz's DOT language.
-
-        Parameters
-        ----------
-        policy : {"observed", "marginal"}
-            How actions are weighed in the probabilities on the edges.
-        least : float
-            Edges below this probability are left out.
-
-        Returns
-        -------
-        str
-            The graph; states count from 1 in it and show the values of their centres.
-
-        Raises
-        ------
-        ValueError
-            If there is no such policy.
-
-        Examples
-        --------
-        >>> from evofsm import EvolvingFSM
-        >>> machine = EvolvingFSM(n_actions=2, radius=0.5)
-        >>> trace = machine.learn_many([[0.0], [0.1], [2.0], [1.0]], [0, 0, 0, 0])
-        >>> print(machine.model().to_dot(least=0.3))
-        digraph evofsm {
-          node [shape=circle];
-          s1 [label="#1\n(0)"];
-          s2 [label="#2\n(1)"];
-          s1 -> s1 [label="0.771"];
-          s2 -> s1 [label="0.500"];
-          s2 -> s2 [label="0.500"];
-        }
-        <BLANKLINE>
-        """
-        matrix = self.averaged_matrix(policy)
-        lines = ["digraph evofsm {", "  node [shape=circle];"]
-        for i, center in enumerate(self.centers):
-            values = ", ".join(f"{value:.4g}" for value in center)
-            lines.append(f'  s{i + 1} [label="#{i + 1}\\n({values})"];')
-        for i, j in np.argwhere(matrix >= least):
-            lines.append(f'  s{i + 1} -> s{j + 1} [label="{matrix[i, j]:.3f}"];')
-        return "\n".join([*lines, "}", ""])
-
     def save(self, path: storage.Place, provenance: Mapping[str, Any] | None = None) -> None:
         """Write the model to a file (arrays and a JSON header, nothing that can run).
 

@@ -29,6 +29,7 @@ def application() -> typer.Typer:
     from evofsm.cli.drive import drive
     from evofsm.cli.evidence import evidence
     from evofsm.cli.explain import explain
+    from evofsm.cli.export import export
     from evofsm.cli.learn import inspect, learn
     from evofsm.cli.paper import paper
 
@@ -47,6 +48,7 @@ def application() -> typer.Typer:
     app.command()(explain)
     app.command()(drive)
     app.command()(campaign)
+    app.command()(export)
     app.command()(audit)
     app.command()(check)
     app.add_typer(bench())

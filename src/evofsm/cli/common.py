@@ -9,7 +9,11 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from enum import StrEnum
 from importlib.util import find_spec
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, ParamSpec
+
+# What folders of results hold, in the order in which it is looked for.
+_MODELS = ("machine.evofsm", "model.evofsm")
 
 
 class WorldName(StrEnum):
@@ -97,27 +101,46 @@ def chosen_mode(name: str) -> Mode:
     return Mode(name)
 
 
-def load_model(file: str) -> tuple[FSMModel, Header]:
-    """The model in a file, or of the machine in it, and what the file says of itself.
+def load_model(place: Path) -> tuple[FSMModel, Header | None]:
+    """A model from wherever one was left, and what its file says of itself, if there is one.
 
-    A machine that drove a family of scenarios is labelled as that family is.
+    From a file, from a folder of results, or from a log of runs. A machine that drove a family of
+    scenarios is labelled as that family is.
     """
     from evofsm import storage
-    from evofsm.machine import EvolvingFSM
     from evofsm.model import FSMModel
-    from evofsm.naming import UNITS, VARIABLES
+
+    if place.is_dir():
+        within = next((place / name for name in _MODELS if (place / name).exists()), None)
+        if within is None:
+            raise FileNotFoundError(f"{place}: there is neither {' nor '.join(_MODELS)} in it")
+        return load_model(within)
+    if place.suffix == ".mcap":
+        return _model_of_log(place), None
+    header = storage.describe(place)
+    return (_labelled(place, header) if header.kind == "machine" else FSMModel.load(place)), header
+
+
+def _labelled(place: Path, header: Header) -> FSMModel:
+    """The model of a machine, with the words of the family that it drove."""
+    from evofsm.machine import EvolvingFSM
     from evofsm.worlds.families import load_family
     from evofsm.worlds.families.family import FAMILIES
 
-    header = storage.describe(file)
-    if header.kind != "machine":
-        return FSMModel.load(file), header
-    machine = EvolvingFSM.load(file)
+    machine = EvolvingFSM.load(place)
     if (name := header.provenance.get("family")) not in FAMILIES:
-        return machine.model(), header
-    family = load_family(name)
-    model = machine.model(actions=family.actions, names=VARIABLES, units=UNITS, dt=family.interval)
-    return model, header
+        return machine.model()
+    return machine.model(**load_family(name).labels._asdict())
+
+
+def _model_of_log(place: Path) -> FSMModel:
+    require(mcap="mcap")
+    from evofsm.io.mcap import read_run
+
+    model = read_run(place).model
+    if model is None:
+        raise ValueError(f"{place}: no model is attached to this log")
+    return model
 
 
 def require(**extras: str) -> None:

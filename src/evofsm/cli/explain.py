@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import textwrap
 from contextlib import suppress
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from evofsm.cli.common import load_model, plain_errors, print_json
@@ -21,7 +22,11 @@ _WIDTH = 80
 @plain_errors
 def explain(
     file: Annotated[
-        str, typer.Argument(help="A model or a machine that was saved.", show_default=False)
+        Path,
+        typer.Argument(
+            help="A machine or a model that was saved, or a folder of evofsm drive --out.",
+            show_default=False,
+        ),
     ],
     state: Annotated[
         int | None,
@@ -59,7 +64,7 @@ def explain(
         states = range(model.n_states) if one is None else [one]
         found = [model.explain(each, asked) for each in states]
     if as_json:
-        print_json({"file": file, "situations": [_document(model, each) for each in found]})
+        print_json({"file": str(file), "situations": [_document(model, each) for each in found]})
         return
     for each in found:
         print(textwrap.fill(each.text, _WIDTH, subsequent_indent="   "))

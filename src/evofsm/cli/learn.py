@@ -185,7 +185,11 @@ def learn(
 @plain_errors
 def inspect(
     file: Annotated[
-        str, typer.Argument(help="A model or a machine that was saved.", show_default=False)
+        Path,
+        typer.Argument(
+            help="A machine or a model that was saved, or a folder of evofsm drive --out.",
+            show_default=False,
+        ),
     ],
     as_json: Annotated[
         bool, typer.Option("--json", help="Print one JSON document; counts from 0.")
@@ -195,14 +199,16 @@ def inspect(
     from evofsm.report import terminal
 
     model, header = load_model(file)
-    goes_on = ", a machine that can go on learning" if header.kind == "machine" else ""
-    facts = [("file", f"{file}{goes_on}")]
+    provenance = {} if header is None else header.provenance
     if as_json:
         document = terminal.model_document(model)
-        print_json({"file": file, **document, "provenance": header.provenance})
-    else:
-        facts += [("written by", _writer(header)), *_learnt_from(header.provenance)]
-        terminal.print_model(terminal.console(), model, facts)
+        print_json({"file": str(file), **document, "provenance": provenance})
+        return
+    facts = [("file", str(file))]
+    if header is not None:
+        goes_on = ", a machine that can go on learning" if header.kind == "machine" else ""
+        facts = [("file", f"{file}{goes_on}"), ("written by", _writer(header))]
+    terminal.print_model(terminal.console(), model, [*facts, *_learnt_from(provenance)])
 
 
 def _writer(header: Header) -> str:

@@ -21,7 +21,7 @@ from evofsm.checkpoint import Checkpoint, Kept
 from evofsm.drivers.acc import AdaptiveCruise
 from evofsm.drivers.idm import IDM
 from evofsm.framework.audit import AuditLog
-from evofsm.framework.loop import Drive
+from evofsm.framework.loop import Drive, Explain
 from evofsm.framework.reviser import EnvelopeReviser, Mode, Unrevised
 from evofsm.machine import EvolvingFSM
 from evofsm.naming import VARIABLES
@@ -118,6 +118,7 @@ def drive_family(
     progress: Callable[[int, int], None] = lambda done, collisions: None,
     checkpoint: Checkpoint | None = None,
     audit: AuditLog | None = None,
+    record: Callable[[Drive], None] | None = None,
 ) -> Driving:
     """Drive the episodes in turn.
 
@@ -135,6 +136,9 @@ def drive_family(
         bit; there may be more episodes than before.
     audit : AuditLog, optional
         Writes down what is decided; also in episodes that are driven again after a stop.
+    record : callable, optional
+        Given each episode that is driven here, none of those before a stop; every decision is then
+        explained.
 
     Raises
     ------
@@ -155,7 +159,10 @@ def drive_family(
             world=world,
             controller=controller,
             audit=audit,
+            explaining=None if record is None else Explain.ALL,
         )
+        if record is not None:
+            record(drive)
         done.add(drive, outcome(drive, unrevised, family.interval), setup.tolerance)
         if checkpoint is not None:
             checkpoint.offer(partial(done.keep, learner))
@@ -256,9 +263,13 @@ def episodes_learnt(folder: Path) -> int:
 
 # -- What has been driven so far ------------------------------------------------------------------
 
-_WHOLE = ("episode", "state")
-_OF_REVISION = ("proposed", "executed", "advised", "risk_proposed", "risk_executed", "seen")
-_COLUMNS = ("episode", "time", *VARIABLES, "state", "surprise", *_OF_REVISION, "realised", "reason")
+_WHOLE = ("episode", "intake", "state", "n_states")
+_OF_REVISION = ("proposed", "executed", "advised", "risk_proposed", "risk_executed")
+_EVIDENCE = ("risk_low", "risk_high", "evidence", "seen")
+_COLUMNS = (
+    *("episode", "time", *VARIABLES, "intake", "state", "n_states", "surprise"),
+    *(*_OF_REVISION, *_EVIDENCE, "realised", "reason"),
+)
 # Where there is no state.
 _NONE = -1
 
@@ -278,9 +289,14 @@ class Driven:
                 len(self.outcomes),
                 situation.time,
                 *situation.observation.tolist(),
+                int(situation.intake),
                 situation.state,
+                0 if situation.state is None else len(situation.belief),
                 situation.surprise,
                 *(getattr(revision, name) for name in _OF_REVISION),
+                *revision.interval,
+                revision.evidence,
+                revision.seen,
                 realised,
                 revision.reason,
             )

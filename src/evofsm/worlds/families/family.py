@@ -13,6 +13,7 @@ from typing import Any, NamedTuple, TypeVar
 
 from evofsm.actions import IntervalActions
 from evofsm.drivers.idm import IDM, ChangingIDM
+from evofsm.naming import UNITS, VARIABLES, Labels
 from evofsm.worlds.families.numbers import Numbers
 from evofsm.worlds.families.tables import LAYOUT, NEEDED, SWITCH_LAYOUT, Table, merge, parse
 from evofsm.worlds.scenario import Behind, Body, CutIn, Leader, Scenario, Sensors
@@ -90,6 +91,11 @@ class Family:
     def interval(self) -> float:
         """Time between decisions [s]."""
         return float(self.tables["interval"])
+
+    @property
+    def labels(self) -> Labels:
+        """What the numbers of a machine mean that drove it."""
+        return Labels(self.actions, VARIABLES, UNITS, self.interval)
 
     @property
     def decel(self) -> float:
