@@ -48,7 +48,7 @@ _NET = """<net version="1.20">
 </net>
 """
 
-# Cars that wait do not look ahead, so that none is put on the road later than it should be.
+# Limits so wide that SUMO bends nothing that was recorded.
 _TYPE = (
     '    <vType id={name} color={color} length="{length}" minGap="0" maxSpeed="100" '
     'accel="100" decel="100" emergencyDecel="100"/>'
