@@ -96,6 +96,7 @@ def detection_chapter(
         figures=tuple(draw_all(_sketches(study), folder, progress)),
         plan=tuple(_plan(study)),
         command=command,
+        packages=("scipy",),
     )
 
 

@@ -68,6 +68,7 @@ def prediction_chapter(
         figures=tuple(draw_all([partial(_sketch_skills, study)], folder, progress)),
         plan=tuple(_plan(study)),
         command=command,
+        packages=("scipy", "deeptime"),
     )
 
 

@@ -140,6 +140,7 @@ def sensitivity_chapter(
         figures=tuple(draw_all(sketches, folder, progress)),
         plan=tuple(_plan(study)),
         command=command,
+        packages=("scipy",),
     )
 
 
