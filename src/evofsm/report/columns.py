@@ -7,7 +7,7 @@ import sys
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from io import TextIOBase
-from itertools import zip_longest
+from itertools import chain, zip_longest
 from textwrap import wrap
 from typing import IO, NamedTuple, cast
 
@@ -144,19 +144,17 @@ def print_columns(
         What stands above a row, by row.
     """
     styles, headings = styles or {}, headings or {}
-    names = [_lines(row[0], out.width // 2) for row in rows]
-    cells = [[name, *map(_lines, row[1:])] for name, row in zip(names, rows, strict=True)]
-    widest = [
-        max((_width(row[column]) for row in cells), default=0) for column in range(len(header))
-    ]
-    heads = [
-        _header_lines(name, max(wide, _HEADER_WIDTH))
-        for name, wide in zip(header, widest, strict=True)
-    ]
-    widths = [max(wide, _width(head)) for wide, head in zip(widest, heads, strict=True)]
-    depth = max(map(len, heads))
-    heads = [[*[""] * (depth - len(head)), *head] for head in heads]
-    for number, part in enumerate(_parts(widths, out.width)):
+    cells = [[cell.split("\n") for cell in row] for row in rows]
+    heads, widths = _header_over(header, cells)
+    parts = list(_parts(widths, out.width))
+    if len(parts) > 1:  # names that are folded leave room for more columns
+        cells = [
+            [_folded(row[0], out.width // 2), *cell[1:]]
+            for row, cell in zip(rows, cells, strict=True)
+        ]
+        heads, widths = _header_over(header, cells)
+        parts = list(_parts(widths, out.width))
+    for number, part in enumerate(parts):
         if number:
             out.print()
         _print_rows(out, heads, cells, part, widths, left, styles, headings)
@@ -239,20 +237,27 @@ def _shared(wanted: Sequence[int], room: int) -> list[int]:
     return [given[column] for column in range(len(wanted))]
 
 
-def _header_lines(name: str, width: int) -> list[str]:
-    """Words of a header below one another, and its unit below them."""
-    lines = name.replace(" [", "\n[").split("\n")
-    return [part for line in lines for part in _folded(line, width)]
-
-
-def _lines(text: str, width: int | None = None) -> list[str]:
-    lines = text.split("\n")
-    return lines if width is None else [part for line in lines for part in _folded(line, width)]
+def _header_over(header: Sequence[str], rows: Sequence[_Cells]) -> tuple[_Cells, list[int]]:
+    """The header in lines, its words and units below one another; and the columns' widths."""
+    widths, heads = [], []
+    for column, name in enumerate(header):
+        widest = max((_width(row[column]) for row in rows), default=0)
+        room = max(widest, _HEADER_WIDTH)
+        lines = name.replace(" [", "\n[").split("\n")
+        head = [part for line in lines for part in _folded(line, room)]
+        heads.append(head)
+        widths.append(max(widest, _width(head)))
+    depth = max(map(len, heads))
+    return [[*[""] * (depth - len(head)), *head] for head in heads], widths
 
 
 def _folded(text: str, width: int) -> list[str]:
     """Lines no longer than a width, but for words that are longer by themselves."""
-    return wrap(text, width, break_long_words=False, break_on_hyphens=False) or [""]
+    lines = (
+        wrap(line, width, break_long_words=False, break_on_hyphens=False)
+        for line in text.split("\n")
+    )
+    return [*chain.from_iterable(lines)] or [""]
 
 
 def _width(lines: Sequence[str]) -> int:

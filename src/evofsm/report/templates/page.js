@@ -72,10 +72,11 @@
     <div class="stage" tabindex="0" autofocus><img draggable="false"></div>`;
   const [title, stage, image] = ["h2", ".stage", "img"].map((name) => dialog.querySelector(name));
   const pointers = new Map();
-  let scale, x, y; // of the image, 1 where all of it is seen, and where its corner lies
+  let [scale, x, y] = [1, 0, 0]; // of the image, 1 where all of it is seen; where its corner lies
 
   /** Put the image where it belongs: centred where there is room, else without a gap at an edge. */
   const place = () => {
+    if (!image.naturalWidth) return; // not there yet
     const { clientWidth: width, clientHeight: height } = stage;
     const fit = Math.min(width / image.naturalWidth, height / image.naturalHeight);
     const [w, h] = [image.naturalWidth * fit * scale, image.naturalHeight * fit * scale];
