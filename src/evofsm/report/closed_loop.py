@@ -113,8 +113,8 @@ def _table_of_losses(lost: Sequence[InWords]) -> Table | None:
 def _header(study: ClosedLoop) -> list[str]:
     header = [
         "policy",
-        "collisions (95 %)",
-        "mobility (95 %)",
+        "collisions (95\N{NO-BREAK SPACE}%)",
+        "mobility (95\N{NO-BREAK SPACE}%)",
         "interventions",
         "mean change [m/s²]",
         "RMS jerk [m/s³]",
