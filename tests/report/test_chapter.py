@@ -77,6 +77,19 @@ def test_what_fails_is_in_the_answer_and_losses_may_be_a_table(chapter, tmp_path
     assert re.search(r'<tr class="fails"><th scope="row"><span data-mark>✗ </span>cost', page.html)
 
 
+def test_only_what_had_to_hold_is_said_to_hold(chapter, tmp_path, read_page):
+    for fails, kind in ((None, "verdict"), ((), "verdict holds"), (("x",), "verdict fails")):
+        page = read_page(page_of(tmp_path, replace(chapter, fails=fails)))
+        assert f'<div class="{kind}">' in page.verdict
+
+
+def test_minus_signs_are_set_before_numbers_and_not_in_names(chapter, tmp_path):
+    table = Table("T", ("who", "skill"), (("rss-r157", "-1.5--0.5"), ("aeb", "4e-03")))
+    page = page_of(tmp_path, replace(chapter, tables=(table,)))
+    for cell in ("rss-r157", "<td>−1.5-−0.5</td>", "<td>4e-03</td>"):
+        assert cell in page
+
+
 def test_cells_may_have_a_second_line(chapter, tmp_path):
     table = Table("T", ("who", "rate"), (("rss", "3 %\n3 of <100>"),))
     page = page_of(tmp_path, replace(chapter, tables=(table,)))

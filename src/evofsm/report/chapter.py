@@ -50,7 +50,8 @@ class Chapter:
     figures: tuple[Drawing, ...]
     plan: tuple[Setting, ...]  #: seeds and sizes
     command: str  #: what makes these numbers
-    fails: tuple[str, ...] = ()  #: what must not be missed: it makes the answer a warning
+    #: What must not be missed, which makes the answer a warning; None where nothing had to hold.
+    fails: tuple[str, ...] | None = None
     losses_table: Table | None = None  #: all losses, where sentences would be too many
     sections: tuple[Section, ...] = ()  #: what is told where the chapter has a page to itself
     packages: tuple[str, ...] = ()  #: whose versions matter beside the usual ones
@@ -76,7 +77,7 @@ class Chapter:
             "title": self.title,
             "headline": self.headline,
             "answer": list(self.answer),
-            "fails": list(self.fails),
+            "fails": list(self.fails or ()),
             "losses": list(self.losses),
             "tables": tables,
             "plan": {line.name: line.value for line in self.plan},

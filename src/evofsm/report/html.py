@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import platform
+import re
 from base64 import b64encode
 from collections.abc import Iterable, Iterator
 from datetime import UTC, datetime
@@ -35,12 +36,18 @@ def write_html(page: Path, **values: Any) -> Path:
         trim_blocks=True,
         lstrip_blocks=True,
     )
+    environment.filters["minus"] = _with_minus_signs
     text = environment.get_template("page.html.j2").render(
         date=datetime.now(UTC).date().isoformat(), version=evofsm.__version__, **values
     )
     page.parent.mkdir(parents=True, exist_ok=True)
     page.write_text(text, encoding="utf-8")
     return page
+
+
+def _with_minus_signs(text: str) -> str:
+    """Hyphens before numbers as minus signs; those within words stay."""
+    return re.sub(r"(?<![\w.])-(?=[\d.])", "−", text)
 
 
 def inline(path: Path) -> str:
