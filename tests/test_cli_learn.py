@@ -289,12 +289,16 @@ def test_csv_needs_no_extra(log):
 
 def test_numbers_stay_whole_in_a_narrow_terminal(evofsm, log, monkeypatch):
     def cells_of_first_state():
-        rows = evofsm("learn", log).stdout.splitlines()
-        return next(row.split() for row in rows if row.lstrip().startswith("#1 "))
+        text = evofsm("learn", log).stdout.partition("\nStates")[2].partition("\nTransitions")[0]
+        rows = [row.split() for row in text.splitlines() if row.startswith("#1 ")]
+        return [cell for name, *cells in rows for cell in cells], len(rows)
 
-    wide = cells_of_first_state()
+    wide, parts = cells_of_first_state()
+    assert (len(wide), parts) == (6, 1)
     monkeypatch.setenv("COLUMNS", "30")
-    assert cells_of_first_state() == wide
+    narrow, parts = cells_of_first_state()
+    assert narrow == wide
+    assert parts > 1
 
 
 def test_an_out_that_is_a_folder_is_refused_before_the_work(evofsm, log, tmp_path):

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from evofsm.framework.audit.chain import Chain
     from evofsm.framework.audit.replay import Contents, Field
 
-_WIDTH, _LABEL = 80, 10
+_LABEL = 10
 # So many fields that differ are shown, and so much of each.
 _FIELDS, _LETTERS = 5, 40
 
@@ -77,12 +77,9 @@ def _print(found: Audit, *, head_given: bool) -> None:
         _say("head", str(chain.head))
     if found.is_good and not head_given:
         print()
-        print(
-            textwrap.fill(
-                "Keep the head where the log is not. Without it (--head) neither an end that is "
-                "cut off nor a log that is written anew can be told.",
-                _WIDTH,
-            )
+        _fill(
+            "Keep the head where the log is not. Without it (--head) neither an end that is "
+            "cut off nor a log that is written anew can be told."
         )
 
 
@@ -135,13 +132,17 @@ def _count(count: int, one: str, many: str = "") -> str:
 
 
 def _say(label: str, text: str) -> None:
+    _fill(text, f"  {label}".ljust(_LABEL), " " * _LABEL)
+
+
+def _fill(text: str, first: str = "", others: str = "") -> None:
+    """Print a text as wide as the terminal is."""
+    from evofsm.report.terminal import console
+
+    width = max(console().width, 3 * _LABEL)
     print(
         textwrap.fill(
-            text,
-            _WIDTH,
-            initial_indent=f"  {label}".ljust(_LABEL),
-            subsequent_indent=" " * _LABEL,
-            break_on_hyphens=False,
+            text, width, initial_indent=first, subsequent_indent=others, break_on_hyphens=False
         )
     )
 

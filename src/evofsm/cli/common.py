@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-import json
+import shlex
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -197,7 +197,14 @@ def counter(bars: Progress, text: str) -> Callable[[int, int], None]:
 
 def print_json(document: object) -> None:
     """Print for programs."""
-    print(json.dumps(document, indent=2, allow_nan=False))
+    from evofsm.report.documents import to_json
+
+    print(to_json(document))
+
+
+def command_line() -> str:
+    """What was typed."""
+    return shlex.join(["evofsm", *sys.argv[1:]])
 
 
 def split_names(text: str) -> list[str]:

@@ -108,7 +108,7 @@ def drive(
     from evofsm.checkpoint import Checkpoint, duration, result_kept
     from evofsm.framework.audit import AuditLog
     from evofsm.report import terminal
-    from evofsm.report.driving import print_driving
+    from evofsm.report.driving import driving_document, print_driving
     from evofsm.studies.closed_loop import Learner
     from evofsm.studies.driving import Setup, episodes_learnt, write_driving
     from evofsm.worlds import open_world
@@ -152,7 +152,7 @@ def drive(
         with result_kept(keeper):
             write_driving(driving, learner, setup, out)
     if as_json:
-        print_json({**driving.row.as_dict(), "lead_times": list(driving.lead_times)})
+        print_json(driving_document(driving))
         return
     console = terminal.console()
     print_driving(console, driving, learner, setup)

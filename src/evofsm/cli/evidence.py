@@ -10,7 +10,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 from evofsm.cli.bench.common import Progress, WorkersOption
-from evofsm.cli.common import WorldName, WorldOption, counter, plain_errors, progress, require
+from evofsm.cli.common import (
+    WorldName,
+    WorldOption,
+    command_line,
+    counter,
+    plain_errors,
+    print_json,
+    progress,
+    require,
+)
 
 with suppress(ModuleNotFoundError):
     import typer
@@ -35,6 +44,9 @@ def evidence(
     out: Annotated[Path, typer.Option(help="Folder for the page and its figures.")] = Path(
         "evofsm-evidence"
     ),
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print what was found as JSON instead of a summary.")
+    ] = False,
 ) -> None:
     """All studies in their short form, on one page: what holds, and where it loses.
 
@@ -60,13 +72,14 @@ def evidence(
         about="Each study asks one question, says what came of it in a line, and shows the numbers "
         "that this rests on. These are the short forms, which fit a coffee break: the command "
         "beside each study makes the long one. What goes against us is gathered at the end.",
-        command=" ".join(["evofsm", *sys.argv[1:]]),
-        packages=("scipy",),
+        command=command_line(),
     )
+    if as_json:
+        print_json({"page": str(page), "chapters": [chapter.as_dict() for chapter in chapters]})
+        return
     console = terminal.console()
-    for chapter in chapters:
-        console.print(f"{chapter.title}\n  {chapter.headline}", soft_wrap=True)
-    console.print(f"\nPage with all tables and figures: {page}", soft_wrap=True)
+    terminal.print_headlines(console, chapters)
+    console.print(f"Page with all tables and figures: {page}", soft_wrap=True)
 
 
 class _Study(NamedTuple):
@@ -81,8 +94,9 @@ def _studies(
     data: Path | None, world: WorldName, seed: int, workers: int | None
 ) -> dict[str, _Study]:
     """All studies in their short form, by name."""
+    from evofsm.report.closed_loop import closed_loop_chapter
     from evofsm.report.detection import detection_chapter
-    from evofsm.report.of_others import closed_loop_chapter, paper_chapter
+    from evofsm.report.paper import paper_chapter
     from evofsm.report.prediction import prediction_chapter
     from evofsm.report.real import real_chapter
     from evofsm.report.sensitivity import sensitivity_chapter

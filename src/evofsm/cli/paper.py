@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
-import sys
 from contextlib import suppress
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
 
-from evofsm.cli.common import WorldName, counter, plain_errors, progress, require
+from evofsm.cli.common import (
+    WorldName,
+    command_line,
+    counter,
+    plain_errors,
+    print_json,
+    progress,
+    require,
+)
 
 with suppress(ModuleNotFoundError):
     import typer
@@ -38,8 +46,8 @@ def paper(
     """
     require(matplotlib="plot", jinja2="plot", polars="tables")
     from evofsm.report import terminal
-    from evofsm.report.figures import paper_figures
-    from evofsm.report.page import write_page
+    from evofsm.report.chapter import write_chapters
+    from evofsm.report.paper import paper_chapter
     from evofsm.studies.paper import (
         Settings,
         check_claims,
@@ -57,14 +65,19 @@ def paper(
         )
         claims, context = check_claims(study), context_tables(study)
         write_data(study, claims, context, out)
-        drawings = paper_figures(study, out / "figures", counter(bars, "Drawing figures"))
-        page = write_page(
-            study, claims, context, drawings, out, " ".join(["evofsm", *sys.argv[1:]])
+        chapter = paper_chapter(
+            study,
+            out / "figures",
+            command_line(),
+            counter(bars, "Drawing figures"),
+            claims=claims,
         )
+    page = write_chapters(out / "index.html", [chapter], command=command_line())
     if as_json:
-        print((out / "claims.json").read_text(encoding="utf-8"), end="")
+        print_json([asdict(claim) for claim in claims])
     else:
-        terminal.print_claims(terminal.console(), claims, context)
-        terminal.console().print(f"Page with all figures: {page}", soft_wrap=True)
+        console = terminal.console()
+        terminal.print_claims(console, claims, context)
+        console.print(f"Page with all figures: {page}", soft_wrap=True)
     if not all(claim.holds for claim in claims):
         raise typer.Exit(1)

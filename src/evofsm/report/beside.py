@@ -115,7 +115,7 @@ def _table_of_separation(study: ClosedLoop) -> Table:
     )
     rows = tuple(
         (
-            f"▸ {one.measure}" if one.group == Group.LEARNT else one.measure,
+            one.measure,
             one.group,
             number(one.auroc, 3),
             interval(one.low, one.high, lambda x: number(x, 3)),
@@ -130,6 +130,7 @@ def _table_of_separation(study: ClosedLoop) -> Table:
         f"Truth: the oracle's dead end ({percent(first.dead_end_share)} of decisions in "
         f"{first.episodes:,} unrevised held-out episodes). 0.5 is chance, 1 perfect. Intervals by "
         "bootstrap over episodes.",
+        ours=tuple(place for place, one in enumerate(ordered) if one.group == Group.LEARNT),
     )
 
 

@@ -6,13 +6,34 @@ it loses. Each study makes its own; the page, and the terminal, show them all al
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import count
 from pathlib import Path
+from typing import Any, NamedTuple
 
 from evofsm.report.drawing import Drawing
 from evofsm.report.html import Setting, inline, versions, write_html
 from evofsm.studies.table import Table
+
+
+class Source(NamedTuple):
+    """Where something is written."""
+
+    text: str  #: who wrote what, when
+    name: str  #: of the address, such as ``"arXiv:1908.10823"``
+    address: str
+
+
+@dataclass(frozen=True)
+class Section:
+    """More about a study, under a title of its own."""
+
+    id: str  #: in addresses
+    title: str
+    text: str = ""
+    tables: tuple[Table, ...] = ()
+    figures: tuple[Drawing, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -29,16 +50,48 @@ class Chapter:
     figures: tuple[Drawing, ...]
     plan: tuple[Setting, ...]  #: seeds and sizes
     command: str  #: what makes these numbers
+    #: What must not be missed, which makes the answer a warning; None where nothing had to hold.
+    fails: tuple[str, ...] | None = None
+    losses_table: Table | None = None  #: all losses, where sentences would be too many
+    sections: tuple[Section, ...] = ()  #: what is told where the chapter has a page to itself
+    packages: tuple[str, ...] = ()  #: whose versions matter beside the usual ones
+    sources: tuple[Source, ...] = ()
+
+    @property
+    def n_losses(self) -> int:
+        """How many rows go against us."""
+        return len(self.losses_table.rows if self.losses_table else self.losses)
+
+    def as_dict(self) -> dict[str, Any]:
+        """What it says, for JSON: all but its figures and further sections."""
+        tables = [
+            {
+                "title": one.title,
+                "header": list(one.header),
+                "rows": [list(row) for row in one.rows],
+            }
+            for one in self.tables
+        ]
+        return {
+            "id": self.id,
+            "title": self.title,
+            "headline": self.headline,
+            "answer": list(self.answer),
+            "fails": list(self.fails or ()),
+            "losses": list(self.losses),
+            "tables": tables,
+            "plan": {line.name: line.value for line in self.plan},
+            "command": self.command,
+        }
 
 
 def write_chapters(
     page: Path,
     chapters: Sequence[Chapter],
     *,
-    title: str,
-    about: str,
+    title: str = "",
+    about: str = "",
     command: str,
-    packages: Sequence[str] = (),
 ) -> Path:
     """Write a page that holds all it shows.
 
@@ -47,28 +100,86 @@ def write_chapters(
     page : Path
         The file; its folder is made if it is not there.
     chapters : sequence of Chapter
-        In the order in which they stand.
+        In the order in which they stand. One that is alone is told with all its sections.
     title, about : str
-        Of the page.
+        Of a page of many chapters; one that is alone has its own.
     command : str
         What was typed to get it.
-    packages : sequence of str
-        Whose versions are told beside the usual ones.
 
     Returns
     -------
     Path
         The page.
     """
+    alone = len(chapters) == 1
+    shown = list(_shown(chapters))
     return write_html(
         page,
-        "chapters.html.j2",
-        title=title,
+        title=chapters[0].title if alone else title,
         about=about,
-        chapters=[
-            (chapter, [(one, inline(one.paths["svg"])) for one in chapter.figures])
-            for chapter in chapters
-        ],
-        versions=list(versions(packages)),
+        shown=shown,
+        summary=_summary(chapters),
+        contents=list(_contents(shown)),
+        versions=list(versions(dict.fromkeys(p for one in chapters for p in one.packages))),
+        sources=list(dict.fromkeys(source for one in chapters for source in one.sources)),
         command=command,
     )
+
+
+# -- What the template shows ----------------------------------------------------------------------
+
+
+class _Figure(NamedTuple):
+    number: int
+    drawing: Drawing
+    address: str
+
+
+class _Part(NamedTuple):
+    id: str
+    title: str
+    text: str
+    tables: list[tuple[str, Table]]
+    figures: list[_Figure]
+
+
+class _Shown(NamedTuple):
+    chapter: Chapter
+    parts: list[_Part]
+    plan: list[Setting]
+
+
+def _shown(chapters: Sequence[Chapter]) -> Iterator[_Shown]:
+    """The chapters with figures and tables numbered through the page."""
+    figures, tables = count(1), count(1)
+    for chapter in chapters:
+        numbers = Section("numbers", "The numbers", "", chapter.tables, chapter.figures)
+        sections = [numbers, *(chapter.sections if len(chapters) == 1 else ())]
+        parts = [
+            _Part(
+                section.id,
+                section.title,
+                section.text,
+                [(f"table-{next(tables)}", table) for table in section.tables],
+                [_Figure(next(figures), one, inline(one.paths["svg"])) for one in section.figures],
+            )
+            for section in sections
+        ]
+        yield _Shown(chapter, parts, [Setting("command", chapter.command), *chapter.plan])
+
+
+def _contents(shown: Sequence[_Shown]) -> Iterator[Setting]:
+    """Places on the page, and what they are called."""
+    if len(shown) == 1:
+        yield from (Setting(part.id, part.title) for part in shown[0].parts)
+    else:
+        for one in shown:
+            yield Setting(one.chapter.id, one.chapter.id.replace("-", " ").capitalize())
+    yield Setting("loses", "Where it loses")
+    yield Setting("reproduce", "Reproduce it")
+
+
+def _summary(chapters: Sequence[Chapter]) -> Table:
+    failing = tuple(place for place, chapter in enumerate(chapters) if chapter.fails)
+    rows = tuple((chapter.title, chapter.headline) for chapter in chapters)
+    return Table("In a line each", ("question", "answer"), rows, in_words=True, failing=failing)

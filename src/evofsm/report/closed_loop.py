@@ -1,21 +1,19 @@
-"""The closed-loop study on one page: its table, its figures, and where it loses."""
+"""The closed-loop study as a chapter: its table, its figures, and where it loses."""
 
 from __future__ import annotations
 
-import json
 import math
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
 
 from evofsm._extras import needs
 from evofsm.report.beside import side_tables, why_not_by_state
+from evofsm.report.chapter import Chapter, Section
 from evofsm.report.comparison import answer, headline, note_on_the_table
-from evofsm.report.documents import without_nan
-from evofsm.report.html import Setting, inline, versions, write_html
-from evofsm.report.losses import losses_in_words
+from evofsm.report.html import Setting
+from evofsm.report.losses import InWords, losses_in_words
 from evofsm.report.words import NONE, count, interval, number, part, percent, percents
 from evofsm.studies.closed_loop import FIXED_MEASURES, ClosedLoop
 from evofsm.studies.closed_loop.comparison import (
@@ -38,81 +36,74 @@ with needs("matplotlib", "plot", "drawing figures"):
     )
 
 
-class _Cell(NamedTuple):
-    value: str
-    beside: str = ""  # smaller, below it
-
-
-class _Shown(NamedTuple):
-    """A line of the table, in words."""
-
-    name: str
-    which: str
-    ours: bool
-    cells: list[_Cell]
-
-
-class _Section(NamedTuple):
-    id: str
-    title: str
-    text: str
-    figures: list[tuple[Drawing, str, int]]
-    table: Table | None
-
-
-def write_closed_loop(
+def closed_loop_chapter(
     study: ClosedLoop,
-    out: Path,
+    folder: Path,
     command: str,
     progress: Callable[[int, int], None] = lambda done, total: None,
-) -> Path:
-    """Write ``closed-loop.json``, the figures, and ``index.html``, which needs nothing beside it.
+) -> Chapter:
+    """Draw the figures of the study and say what it found.
 
     Parameters
     ----------
     study : ClosedLoop
-    out : Path
-        Folder; made if it is not there.
+    folder : Path
+        Where the figures are put.
     command : str
         What was typed to get it.
     progress : callable
         Told how many figures are done, of how many.
-
-    Returns
-    -------
-    Path
-        The page.
     """
-    out.mkdir(parents=True, exist_ok=True)
-    text = json.dumps(without_nan(study.as_dict()), allow_nan=False, indent=1)
-    (out / "closed-loop.json").write_text(f"{text}\n", encoding="utf-8")
-    drawings = draw_all(closed_loop_sketches(study), out, progress)
-    figures = {
-        drawing.name: (drawing, inline(drawing.paths["svg"]), place)
-        for place, drawing in enumerate(drawings, 1)
-    }
+    figures = {one.name: one for one in draw_all(closed_loop_sketches(study), folder, progress)}
     lost = losses_in_words(study)
-    return write_html(
-        out / "index.html",
-        "closed_loop.html.j2",
-        family=study.family.name,
-        about=study.family.about,
-        tolerance=percent(study.plan.tolerance),
+    return Chapter(
+        id="closed-loop",
+        title="Does latent risk, learnt online, prevent collisions, at what cost, and against "
+        "whom?",
+        about=_about(study),
         headline=headline(study),
-        answer=answer(study),
-        losses=lost,
-        loud=[loss for loss in lost if loss.loud],
-        header=_header(study),
-        groups=[
-            (name, [_shown(line, study) for line in lines]) for name, lines in table_groups(study)
-        ],
-        note=note_on_the_table(study),
-        constants=list(_constants(study)),
-        trade_off=[figures[name] for name in ("trade-off",) if name in figures],
-        sections=list(_sections(study, figures)),
-        plan=list(_plan(study)),
-        versions=list(versions(("scipy",), sumo=bool(study.worlds))),
+        answer=tuple(answer(study)),
+        fails=tuple(_in_a_line(loss) for loss in lost if loss.loud),
+        losses=tuple(map(_in_a_line, lost)),
+        losses_table=_table_of_losses(lost),
+        tables=(policy_table(study), _table_of_names(study)),
+        figures=tuple(figures[name] for name in ("trade-off",) if name in figures),
+        sections=tuple(_sections(study, figures)),
+        plan=tuple(_plan(study)),
         command=command,
+        packages=("scipy", *(("libsumo",) if study.worlds else ())),
+    )
+
+
+def _about(study: ClosedLoop) -> str:
+    return (
+        "A controller proposes an action at every decision; a reviser may execute a more careful "
+        "one. Ours asks how probable a failure still is if this action is taken now and caution "
+        "follows, and it has learnt that answer from driving alone. It accepts a risk of "
+        f"{percent(study.plan.tolerance)}. Held against it stand fixed constants from the "
+        "literature and from regulation, measures that were tuned on the same training scenarios, "
+        f"and one that was told the true limits. Family {study.family.name}: {study.family.about}"
+    )
+
+
+def _in_a_line(loss: InWords) -> str:
+    return f"{loss.what}: {loss.who}, {loss.theirs}, against {loss.ours} of ours"
+
+
+def _table_of_losses(lost: Sequence[InWords]) -> Table | None:
+    if not lost:
+        return None
+    apart = {None: NONE, True: "apart", False: "overlap"}
+    return Table(
+        "Every row and measure in which ours loses",
+        ("in what", "to whom", "theirs", "ours", "95 % intervals"),
+        tuple((one.what, one.who, one.theirs, one.ours, apart[one.apart]) for one in lost),
+        "Found by comparing all numbers on this page with those of evofsm after all training "
+        "(median over seeds unless said): every baseline that is better on both axes, that "
+        "collides less, or that pays less while colliding no more often, every measure that tells "
+        "dead ends apart better, and every test that it fails. ✗ marks what matters most.",
+        in_words=True,
+        failing=tuple(place for place, one in enumerate(lost) if one.loud),
     )
 
 
@@ -122,8 +113,8 @@ def write_closed_loop(
 def _header(study: ClosedLoop) -> list[str]:
     header = [
         "policy",
-        "collisions (95 %)",
-        "mobility (95 %)",
+        "collisions (95\N{NO-BREAK SPACE}%)",
+        "mobility (95\N{NO-BREAK SPACE}%)",
         "interventions",
         "mean change [m/s²]",
         "RMS jerk [m/s³]",
@@ -133,49 +124,47 @@ def _header(study: ClosedLoop) -> list[str]:
     return [*header, "rear-end collisions"] if has_third_car(study) else header
 
 
-def _shown(line: Line, study: ClosedLoop) -> _Shown:
-    cells = [
-        _Cell(
-            f"{percent(line.collision_rate)} ({percents(line.collision_low, line.collision_high)})",
-            part(line.collisions, line.episodes),
-        ),
-        _Cell(
-            number(line.mobility, 3),
-            interval(line.mobility_low, line.mobility_high, lambda x: number(x, 3)),
-        ),
-        _Cell(percent(line.intervention_rate)),
-        _Cell(number(line.mean_change, 2)),
-        _Cell(number(line.jerk, 2)),
-        _Cell(_until_safe(line)),
-        _Cell(
-            count(line.train_collisions),
-            "" if math.isnan(line.train_collisions) else f"of {line.train_episodes:,}",
-        ),
-    ]
-    if has_third_car(study):
-        cells.append(_Cell(count(line.rear_ends), f"of {line.episodes:,}"))
-    if not line.is_ours:
-        return _Shown(line.policy, "", False, cells)
-    name = f"{line.policy}, {line.train_episodes:,} episodes"
-    of_seeds = "of" if line.which == "worst seed" else "over"
-    return _Shown(name, f"{line.which} {of_seeds} {line.seeds}", True, cells)
-
-
 def policy_table(study: ClosedLoop) -> Table:
-    """All policies, as a plain table."""
-    lines = [_shown(line, study) for _, found in table_groups(study) for line in found]
+    """All policies: the value, and below it what it was counted in or its interval."""
+    lines = [line for _, found in table_groups(study) for line in found]
+    third_car = has_third_car(study)
     return Table(
         "All policies",
         tuple(_header(study)),
-        tuple(
-            (
-                f"{line.name}, {line.which}" if line.which else line.name,
-                *(cell.value for cell in line.cells),
-            )
-            for line in lines
-        ),
-        ours=tuple(place for place, line in enumerate(lines) if line.ours),
+        tuple((_name(line), *_cells(line, third_car)) for line in lines),
+        note_on_the_table(study),
+        ours=tuple(place for place, line in enumerate(lines) if line.is_ours),
     )
+
+
+def _name(line: Line) -> str:
+    """The policy, and below it what it was told."""
+    if not line.is_ours:
+        return f"{line.policy}\n{line.group}"
+    of_seeds = "of" if line.which == "worst seed" else "over"
+    return (
+        f"{line.policy}, {line.train_episodes:,} episodes\n"
+        f"{line.group}, {line.which} {of_seeds} {line.seeds}"
+    )
+
+
+def _cells(line: Line, third_car: bool) -> Iterator[str]:
+    yield (
+        f"{percent(line.collision_rate)} ({percents(line.collision_low, line.collision_high)})\n"
+        f"{part(line.collisions, line.episodes)}"
+    )
+    ends = interval(line.mobility_low, line.mobility_high, lambda x: number(x, 3))
+    yield f"{number(line.mobility, 3)}\n{ends}"
+    yield percent(line.intervention_rate)
+    yield number(line.mean_change, 2)
+    yield number(line.jerk, 2)
+    yield _until_safe(line)
+    if math.isnan(line.train_collisions):
+        yield NONE
+    else:
+        yield f"{count(line.train_collisions)}\nof {line.train_episodes:,}"
+    if third_car:
+        yield f"{count(line.rear_ends)}\nof {line.episodes:,}"
 
 
 def _until_safe(line: Line) -> str:
@@ -184,21 +173,26 @@ def _until_safe(line: Line) -> str:
     return count(line.until_safe)
 
 
-def _constants(study: ClosedLoop) -> Iterator[Setting]:
+def _table_of_names(study: ClosedLoop) -> Table:
+    rows = tuple(_made_of(study))
+    return Table("What the names stand for", ("policy", "made of"), rows, in_words=True)
+
+
+def _made_of(study: ClosedLoop) -> Iterator[tuple[str, str]]:
     """What each baseline is made of; of the tuned ones, what tuning chose."""
     driven = {row.policy for row in study.rows}
-    yield Setting("unrevised", "the family's controller, left alone")
-    yield Setting("always-brake", "hardest braking at every decision")
-    yield Setting("oracle", "our reviser, told how hard this very leader brakes, and the brakes")
+    yield ("unrevised", "the family's controller, left alone")
+    yield ("always-brake", "hardest braking at every decision")
+    yield ("oracle", "our reviser, told how hard this very leader brakes, and the brakes")
     for name, measure in FIXED_MEASURES.items():
         if name in driven:
-            yield Setting(name, _short(repr(measure)))
+            yield (name, _short(repr(measure)))
     limits = f"own {study.family.decel:g}, leader's {study.family.leader_decel:g} m/s²"
-    yield Setting("rss-matched", f"the safe distance, told the true limits: {limits}")
+    yield ("rss-matched", f"the safe distance, told the true limits: {limits}")
     for policy, points in settings(study).items():
         if policy in driven and policy.endswith("-tuned"):
             made = _short(chosen(points).setting)
-            yield Setting(policy, f"{made}, chosen from {len(points)} settings")
+            yield (policy, f"{made}, chosen from {len(points)} settings")
 
 
 def _short(made: str) -> str:
@@ -286,15 +280,14 @@ _TITLES = {
 }
 
 
-def _sections(
-    study: ClosedLoop, figures: dict[str, tuple[Drawing, str, int]]
-) -> Iterator[_Section]:
+def _sections(study: ClosedLoop, figures: dict[str, Drawing]) -> Iterator[Section]:
     tables = side_tables(study)
     for name, (title, figure) in _TITLES.items():
-        shown = [figures[figure]] if figure in figures else []
-        if shown or name in tables:
+        table = (tables[name],) if name in tables else ()
+        shown = (figures[figure],) if figure in figures else ()
+        if shown or table:
             text = why_not_by_state(study) if name == "states" else ""
-            yield _Section(name, title, text, shown, tables.get(name))
+            yield Section(name, title, text, table, shown)
 
 
 def _plan(study: ClosedLoop) -> Iterator[Setting]:

@@ -91,11 +91,13 @@ def detection_chapter(
         about=_about(study),
         headline=headline,
         answer=tuple(_answer(study)),
+        fails=tuple(map(_missed, (claim for claim in asked if not claim.met))),
         losses=tuple(losses(study)),
         tables=tuple(_tables(study, asked)),
         figures=tuple(draw_all(_sketches(study), folder, progress)),
         plan=tuple(_plan(study)),
         command=command,
+        packages=("scipy",),
     )
 
 
@@ -148,6 +150,10 @@ def claims(study: Detection) -> Iterator[Claim]:
             yield _at_least(what, row.auroc, paper.auroc + _ASKED_MARGIN)
 
 
+def _missed(claim: Claim) -> str:
+    return f"{claim.claim}: {claim.measured}, where {claim.asked} was asked."
+
+
 def _at_least(what: str, measured: float, least: float) -> Claim:
     return Claim(what, f"≥ {number(least, 4)}", number(measured, 4), measured >= least)
 
@@ -191,7 +197,7 @@ def losses(study: Detection) -> Iterator[str]:
     """What goes against ours, the most important first."""
     for claim in claims(study):
         if not claim.met:
-            yield f"Target missed. {claim.claim}: {claim.measured}, where {claim.asked} was asked."
+            yield f"Target missed. {_missed(claim)}"
     for target in Target:
         yield from _beaten(study, target)
     yield from _later(study)
@@ -327,6 +333,7 @@ def _tables(study: Detection, asked: Sequence[Claim]) -> Iterator[Table]:
             tuple(
                 (one.claim, one.asked, one.measured, "yes" if one.met else "no") for one in asked
             ),
+            failing=tuple(place for place, one in enumerate(asked) if not one.met),
         )
     for target in Target:
         yield _areas_by_family(study, target)

@@ -1,19 +1,29 @@
-"""Numbers for programs: what JSON knows, and nothing else."""
+"""Documents for programs: what JSON knows, and nothing else."""
 
 from __future__ import annotations
 
+import json
 import math
 from typing import Any
 
 
-def without_nan(document: dict[str, Any]) -> dict[str, Any]:
-    """The same document with None for NaN and the infinite, which JSON does not know."""
+def to_json(document: Any) -> str:
+    """A document as JSON, with null for NaN and the infinite, which JSON does not know.
 
-    def clean(value: Any) -> Any:
-        if isinstance(value, dict):
-            return without_nan(value)
-        if isinstance(value, list | tuple):
-            return [clean(entry) for entry in value]
-        return None if isinstance(value, float) and not math.isfinite(value) else value
+    >>> print(to_json({"lead": [1.5, float("inf")]}))
+    {
+      "lead": [
+        1.5,
+        null
+      ]
+    }
+    """
+    return json.dumps(_known(document), allow_nan=False, ensure_ascii=False, indent=2)
 
-    return {key: clean(value) for key, value in document.items()}
+
+def _known(document: Any) -> Any:
+    if isinstance(document, dict):
+        return {key: _known(value) for key, value in document.items()}
+    if isinstance(document, list | tuple):
+        return [_known(value) for value in document]
+    return None if isinstance(document, float) and not math.isfinite(document) else document

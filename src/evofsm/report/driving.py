@@ -1,19 +1,23 @@
-"""Say in the terminal what came of driving."""
+"""Say what came of driving, in the terminal and to programs."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from statistics import median
+from typing import Any
 
-from rich import box
 from rich.console import Console
-from rich.table import Table
 
+from evofsm.report.columns import print_columns, print_facts
 from evofsm.studies.closed_loop import Learner, Row
 from evofsm.studies.driving import Driving, Setup
 
 # More states than these are not listed.
 _MOST = 8
+_DEAD_END_HEADER = (
+    *("state", "gap [m]", "follower [m/s]", "leader [m/s]", "survives [m/s²]"),
+    *("risk if\nbraking", "escape\nmargin", "seen [s]", "ended\nhere"),
+)
 
 
 def print_driving(out: Console, driving: Driving, learner: Learner, setup: Setup) -> None:
@@ -26,10 +30,7 @@ def print_outcome(
     out: Console, row: Row, lead_times: Sequence[float], learner: Learner, setup: Setup
 ) -> None:
     """Print collisions and their price, and what was learnt."""
-    facts = Table(box=None, show_header=False, pad_edge=False)
-    facts.add_column(style="bold")
-    facts.add_column()
-    for name, text in [
+    facts = [
         ("family", f"{row.family}, {row.episodes:,} {_kind(setup)} episodes"),
         ("controller", setup.controller),
         ("reviser", f"{setup.reviser}, {setup.mode.value}"),
@@ -47,9 +48,8 @@ def print_outcome(
         ("comfort", f"RMS jerk {row.jerk:.2f} m/s³"),
         *_lead_times(lead_times),
         ("learnt", _learnt(learner)),
-    ]:
-        facts.add_row(name, text)
-    out.print(facts)
+    ]
+    print_facts(out, "What came of driving", facts)
 
 
 def _kind(setup: Setup) -> str:
@@ -78,20 +78,13 @@ def _print_dead_ends(out: Console, driving: Driving, learner: Learner) -> None:
     dead_ends = sorted(
         (state for state in driving.states if state.is_dead_end), key=lambda state: -state.seconds
     )
-    out.print()
     if not dead_ends:
         out.print(f"No dead ends among the {len(driving.states)} states.")
         return
     out.print(f"Dead ends: {len(dead_ends)} of {len(driving.states)} states; seen longest:")
-    table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
-    for header in (
-        *("state", "gap\n[m]", "follower\n[m/s]", "leader\n[m/s]"),
-        *("survives\n[m/s²]", "risk if\nbraking", "escape\nmargin", "seen\n[s]", "ended\nhere"),
-    ):
-        table.add_column(header, justify="right")
     centers = learner.machine.centers
-    for state in dead_ends[:_MOST]:
-        table.add_row(
+    rows = [
+        (
             f"#{state.state + 1}",
             *(f"{value:.1f}" for value in centers[state.state]),
             f"{state.critical:.1f}",
@@ -100,9 +93,18 @@ def _print_dead_ends(out: Console, driving: Driving, learner: Learner) -> None:
             f"{state.seconds:.1f}",
             f"{state.failures:g}",
         )
-    out.print(table)
+        for state in dead_ends[:_MOST]
+    ]
+    print_columns(out, _DEAD_END_HEADER, rows)
     out.print(
-        "survives: the hardest braking of a leader that braking in full now still survives; escape "
-        "margin: how much lower the risk then is than if speed is kept; ended here: collisions.",
+        "\nsurvives: the hardest braking of a leader that braking in full now still survives; "
+        "escape margin: how much lower the risk then is than if speed is kept; ended here: "
+        "collisions.",
         style="dim",
     )
+
+
+def driving_document(driving: Driving) -> dict[str, Any]:
+    """All that `print_driving` prints, for JSON; states from 0."""
+    states = [{**state._asdict(), "is_dead_end": state.is_dead_end} for state in driving.states]
+    return {**driving.row.as_dict(), "lead_times": list(driving.lead_times), "states": states}

@@ -1,8 +1,9 @@
-"""What pages share: templates, figures inside the file, versions."""
+"""What pages share: the template, figures inside the file, versions."""
 
 from __future__ import annotations
 
 import platform
+import re
 from base64 import b64encode
 from collections.abc import Iterable, Iterator
 from datetime import UTC, datetime
@@ -26,8 +27,8 @@ class Setting(NamedTuple):
     value: str
 
 
-def write_html(page: Path, template: str, **values: Any) -> Path:
-    """Fill a template in with values and the date; all of them are text, never markup."""
+def write_html(page: Path, **values: Any) -> Path:
+    """Fill the template in with values and the date; all of them are text, never markup."""
     environment = Environment(
         loader=PackageLoader("evofsm.report"),
         autoescape=True,
@@ -35,12 +36,18 @@ def write_html(page: Path, template: str, **values: Any) -> Path:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    text = environment.get_template(template).render(
-        date=datetime.now(UTC).date().isoformat(), **values
+    environment.filters["minus"] = _with_minus_signs
+    text = environment.get_template("page.html.j2").render(
+        date=datetime.now(UTC).date().isoformat(), version=evofsm.__version__, **values
     )
     page.parent.mkdir(parents=True, exist_ok=True)
     page.write_text(text, encoding="utf-8")
     return page
+
+
+def _with_minus_signs(text: str) -> str:
+    """Hyphens before numbers as minus signs; those within words stay."""
+    return re.sub(r"(?<![\w.])-(?=[\d.])", "−", text)
 
 
 def inline(path: Path) -> str:
@@ -48,14 +55,12 @@ def inline(path: Path) -> str:
     return f"data:image/svg+xml;base64,{b64encode(path.read_bytes()).decode('ascii')}"
 
 
-def versions(more: Iterable[str] = (), *, sumo: bool = False) -> Iterator[Setting]:
-    """What the numbers were computed with."""
+def versions(more: Iterable[str] = ()) -> Iterator[Setting]:
+    """What the numbers were computed with: the usual packages, and more."""
     yield Setting("evofsm", evofsm.__version__)
     yield Setting("Python", platform.python_version())
     for name in (*_PACKAGES, *more):
-        yield Setting(name, version(name))
-    if sumo:
-        yield Setting("SUMO (libsumo)", _version_of("libsumo"))
+        yield Setting("SUMO (libsumo)" if name == "libsumo" else name, _version_of(name))
     yield Setting("system", f"{platform.system()} on {platform.machine()}")
 
 

@@ -68,6 +68,7 @@ def prediction_chapter(
         figures=tuple(draw_all([partial(_sketch_skills, study)], folder, progress)),
         plan=tuple(_plan(study)),
         command=command,
+        packages=("scipy", "deeptime"),
     )
 
 
@@ -82,7 +83,7 @@ def _about(study: Prediction) -> str:
         "the same rows. A skill is 1 for a perfect forecast and 0 for one as good as persistence, "
         "the belief that stays as it is. Divergence is Jensen and Shannon's; the log score is that "
         "of the belief that came, and its skill counts what is above the entropy of that belief, "
-        "which nobody gets below. `evofsm-paper` is the paper's machine, whose states are few and "
+        "which nobody gets below. evofsm-paper is the paper's machine, whose states are few and "
         "wide: its divergences are small, and so are persistence's in these states, which it is "
         "compared with. `batch` is deeptime's count of transitions between the most probable "
         "states at the lag of the horizon, over all training rows at once; `blend` is persistence "
@@ -289,7 +290,7 @@ def _tables_of_ablation(study: Prediction) -> Iterator[Table]:
             ),
             note=(
                 "Skill against persistence in the same states, by divergence and by log score; one "
-                f"learning seed, or one part of {study.plan.ablation_runs} runs at most. `evofsm` "
+                f"learning seed, or one part of {study.plan.ablation_runs} runs at most. evofsm "
                 "has evidence 0.3 and moved 0.003."
             ),
             ours=(list(Variant).index(Variant.ACTIONS),),

@@ -99,6 +99,7 @@ def real_chapter(
         figures=tuple(draw_all(sketches, folder, progress)),
         plan=tuple(_plan(study)),
         command=command,
+        packages=("scipy",),
     )
 
 

@@ -140,6 +140,7 @@ def sensitivity_chapter(
         figures=tuple(draw_all(sketches, folder, progress)),
         plan=tuple(_plan(study)),
         command=command,
+        packages=("scipy",),
     )
 
 
@@ -155,7 +156,7 @@ def _about(study: Sensitivity) -> str:
     gap, speed, _ = SCALES
     return (
         f"The paper's {len(study.claims)} claims were checked with {len(study.rows):,} settings, "
-        "each time on all 80 runs and by the checks of `evofsm paper`, in the closed-form world. "
+        "each time on all 80 runs and by the checks of evofsm paper, in the closed-form world. "
         "Sweeps move one parameter away from the recovered setting, maps two. Latin hypercubes "
         "fill all that the paper leaves open, everything at once, and the numbers within "
         f"±{100 * NEAR:g} % of the recovered ones. A share is one of this space, as stated here: "

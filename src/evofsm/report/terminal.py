@@ -9,22 +9,25 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import asdict
-from itertools import chain
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rich import box
 from rich.console import Console
-from rich.measure import Measurement
-from rich.table import Table
-from rich.text import Text
+from rich.padding import Padding
 
 from evofsm.model import FSMModel
-from evofsm.report.documents import without_nan
+from evofsm.report.columns import (
+    Facts,
+    print_columns,
+    print_facts,
+    print_table,
+    print_words,
+)
+from evofsm.report.columns import console as console
 from evofsm.studies.learning import Learning, Skill, passages
 from evofsm.studies.paper import Claim
-from evofsm.studies.table import Table as StudyTable
+from evofsm.studies.table import Table
 
 if TYPE_CHECKING:
     from evofsm.report.chapter import Chapter
@@ -39,14 +42,6 @@ _SECOND_STEPS = {
 }
 # With less of the belief, the most probable state is hardly told apart from the others.
 _UNCERTAIN = 0.5
-
-Facts = Sequence[tuple[str, str]]
-
-
-def console() -> Console:
-    """Standard output; brackets in what is printed are no markup."""
-    return Console(markup=False, highlight=False, emoji=False)
-
 
 # -- For people -----------------------------------------------------------------------------------
 
@@ -67,7 +62,7 @@ def print_learning(out: Console, learning: Learning, *, action: str, lengths: st
     facts = [*_read_facts(learning), ("actions", _action_text(learning, action))]
     if lengths:
         facts.append(("vehicle lengths", f"assumed, for FCD has none: {lengths}"))
-    _print_facts(out, "What was read", facts)
+    print_facts(out, "What was read", facts)
     _print_states(out, model)
     if model.n_states > 1 and learning.certainty < _UNCERTAIN:
         out.print(
@@ -82,35 +77,30 @@ def print_learning(out: Console, learning: Learning, *, action: str, lengths: st
 
 def print_model(out: Console, model: FSMModel, facts: Facts) -> None:
     """Print a model: the given facts about it, its states, transitions and actions."""
-    _print_facts(out, "Model", [*facts, *_model_facts(model)])
+    print_facts(out, "Model", [*facts, *_model_facts(model)])
     _print_states(out, model)
     _print_passages(out, model)
     _print_actions(out, model)
 
 
-def print_claims(out: Console, claims: Sequence[Claim], context: Sequence[StudyTable]) -> None:
+def print_claims(out: Console, claims: Sequence[Claim], context: Sequence[Table]) -> None:
     """Print the paper's claims with a verdict each, and the tables that stand beside them."""
-    table = _table("claim", "paper", "measured", "holds")
-    table.expand = True
-    for column, ratio in zip(table.columns, (2, 1, 2), strict=False):
-        column.justify, column.ratio = "left", ratio
-    for claim in claims:
-        verdict = Text("yes", "green") if claim.holds else Text("NO", "bold red")
-        table.add_row(claim.claim, claim.paper, claim.measured, verdict)
     held = sum(claim.holds for claim in claims)
-    _print_titled(out, f"{held} of {len(claims)} claims of the paper hold", table)
+    out.print(f"{held} of {len(claims)} claims of the paper hold", style="bold")
+    rows = [
+        (claim.claim, claim.paper, claim.measured, "yes" if claim.holds else "NO")
+        for claim in claims
+    ]
+    failing = [place for place, claim in enumerate(claims) if not claim.holds]
+    print_words(
+        out,
+        ("claim", "paper", "measured", "holds"),
+        rows,
+        styles=dict.fromkeys(failing, "bold red"),
+    )
+    out.print()
     for beside in context:
-        _print_beside(out, beside)
-
-
-def _print_beside(out: Console, beside: StudyTable) -> None:
-    """Print a table of a study with its note."""
-    rows = _table(*(header.replace(" [", "\n[") for header in beside.header))
-    rows.columns[0].justify = "left"
-    for place, row in enumerate(beside.rows):
-        rows.add_row(*row, style="bold" if place in beside.ours else "")
-    _print_titled(out, beside.title, rows)
-    out.print(f"{beside.note}\n")
+        print_table(out, beside)
 
 
 def _read_facts(learning: Learning) -> Facts:
@@ -153,42 +143,23 @@ def _step_text(dt: float | None) -> str:
     return "the step is not known" if dt is None else f"one every {dt:g} s"
 
 
-def _print_facts(out: Console, title: str, facts: Facts) -> None:
-    table = Table.grid(padding=(0, 2))
-    for name, text in facts:
-        table.add_row(f"  {name}", text)
-    table.expand = True
-    _print_titled(out, title, table)
-
-
-def _print_titled(out: Console, title: str, table: Table) -> None:
-    out.print(title, style="bold")
-    _print_whole(out, table)
-    out.print()
-
-
-def _print_whole(out: Console, table: Table) -> None:
-    """Print a table; a line longer than the terminal is better than a number cut in two.
-
-    A table that expands is one of texts, which may be folded.
-    """
-    width = out.width
-    needed = Measurement.get(out, out.options.update(width=10_000), table).maximum
-    out.width = width if table.expand else max(width, needed)
-    out.print(table)
-    out.width = width
-
-
 def _print_states(out: Console, model: FSMModel) -> None:
-    headers = _headers(model)
-    table = _table("", *headers, "share\nof time", "stays", "first\nseen")
     total = max(float(model.visits.sum()), 1.0)
     stays = np.diag(model.changes) / np.maximum(model.changes.sum(axis=1), 1.0)
-    columns = [_aligned(column) for column in model.centers.T]
-    for i, center in enumerate(zip(*columns, strict=True)):
-        share = _percent(float(model.visits[i]) / total)
-        table.add_row(f"#{i + 1}", *center, share, f"{stays[i]:.3f}", f"{model.founded[i]:,.0f}")
-    _print_titled(out, "States (stays: share of its steps; first seen: at which row)", table)
+    centers = zip(*(_aligned(column) for column in model.centers.T), strict=True)
+    rows = [
+        (
+            f"#{i + 1}",
+            *center,
+            _percent(float(model.visits[i]) / total),
+            f"{stays[i]:.3f}",
+            f"{model.founded[i]:,.0f}",
+        )
+        for i, center in enumerate(centers)
+    ]
+    out.print("States (stays: share of its steps; first seen: at which row)", style="bold")
+    print_columns(out, ("", *_headers(model), "share\nof time", "stays", "first\nseen"), rows)
+    out.print()
 
 
 def _aligned(values: NDArray[np.float64]) -> list[str]:
@@ -212,16 +183,20 @@ def _print_passages(out: Console, model: FSMModel) -> None:
     if not found:
         out.print("The recognised state never changed.\n")
         return
-    table = _table("from", "to", "times", "share", "learnt", "most under", "there", "tried")
-    table.columns[5].justify = "left"
+    rows = []
     for passage in found:
-        row = [f"#{passage.origin + 1}", f"#{passage.target + 1}", f"{passage.times:,}"]
+        row = [f"#{passage.origin + 1} → #{passage.target + 1}", f"{passage.times:,}"]
         row += [f"{passage.share:.4f}", f"{passage.learnt:.3f}"]
-        if passage.action is not None:
+        if passage.action is None:
+            row += ["", "", ""]
+        else:
             row += [_action_name(model, passage.action), f"{passage.under_action:.3f}"]
             row += [f"{passage.taken:,.0f}×"]
-        table.add_row(*row)
-    _print_titled(out, f"Transitions that matter: the {len(found)} most frequent", table)
+        rows.append(row)
+    out.print(f"Transitions that matter: the {len(found)} most frequent", style="bold")
+    header = ("from → to", "times", "share", "learnt", "most under", "there", "tried")
+    print_columns(out, header, rows, left=(0, 4))
+    out.print()
     out.print(
         "Times and share: of the steps from that state, as recognised. Learnt: probability per "
         "step that the matrices give; most under which action, how probable there, and about how "
@@ -231,12 +206,14 @@ def _print_passages(out: Console, model: FSMModel) -> None:
 
 
 def _print_actions(out: Console, model: FSMModel) -> None:
-    table = _table("action", "used", "share")
-    table.columns[0].justify = "left"
     total = max(float(model.uses.sum()), 1.0)
-    for r, uses in enumerate(model.uses):
-        table.add_row(_action_name(model, r), f"{uses:,.0f}", _percent(float(uses) / total))
-    _print_titled(out, "Actions", table)
+    rows = [
+        (_action_name(model, r), f"{uses:,.0f}", _percent(float(uses) / total))
+        for r, uses in enumerate(model.uses)
+    ]
+    out.print("Actions", style="bold")
+    print_columns(out, ("action", "used", "share"), rows)
+    out.print()
 
 
 def _action_name(model: FSMModel, r: int) -> str:
@@ -245,20 +222,19 @@ def _action_name(model: FSMModel, r: int) -> str:
 
 
 def _print_skills(out: Console, skills: Sequence[Skill]) -> None:
-    table = _table(
-        "ahead", "actions after the first", "forecast\n[bit]", "persistence\n[bit]", "skill"
-    )
-    table.columns[1].justify = "left"
-    for skill in skills:
-        table.add_row(
+    rows = [
+        (
             f"{skill.seconds:g} s",
             "-" if skill.policy is None else _SECOND_STEPS[skill.policy],
             f"{skill.divergence:.2g}",
             f"{skill.persistence:.2g}",
             _skill_text(skill.skill),
         )
+        for skill in skills
+    ]
     out.print("Forecasts against persistence", style="bold")
-    _print_whole(out, table)
+    header = ("ahead", "actions after the first", "forecast [bit]", "persistence [bit]", "skill")
+    print_columns(out, header, rows, left=(0, 1))
     out.print(
         "\nMean Jensen-Shannon divergence from the belief that came; each forecast was made before "
         "its rows were learnt. Persistence: the belief stays as it is. Skill: 1 is perfect, 0 as "
@@ -292,22 +268,16 @@ def print_closed_loop(out: Console, study: ClosedLoop) -> None:
     for sentence in answer(study):
         out.print(sentence)
     out.print()
-    groups = table_groups(study)
-    third_car = has_third_car(study)
-    header = [row if third_car else row[:-1] for row in _POLICY_HEADER]
-    cells = {
-        group: [_policy_cells(line)[: len(header[0])] for line in lines] for group, lines in groups
-    }
-    widths = [
-        max(len(row[column]) for row in [*header, *chain(*cells.values())])
-        for column in range(len(header[0]))
-    ]
-    for names in header:
-        _print_cells(out, names, widths, "bold")
-    for group, lines in groups:
-        out.print(f"{group}", style="italic", soft_wrap=True)
-        for line, row in zip(lines, cells[group], strict=True):
-            _print_cells(out, row, widths, "bold" if line.is_ours else "")
+    columns = len(_POLICY_HEADER) - (not has_third_car(study))
+    cells: list[tuple[str, ...]] = []
+    styles, headings = {}, {}
+    for group, lines in table_groups(study):
+        headings[len(cells)] = group
+        for line in lines:
+            if line.is_ours:
+                styles[len(cells)] = "bold"
+            cells.append(_policy_cells(line)[:columns])
+    print_columns(out, _POLICY_HEADER[:columns], cells, styles=styles, headings=headings)
     out.print(
         "\n> is ours. Change in m/s², RMS jerk in m/s³; learning: collisions while learning. "
         f"{note_on_the_table(study)}\n"
@@ -315,12 +285,19 @@ def print_closed_loop(out: Console, study: ClosedLoop) -> None:
     _print_losses(out, losses_in_words(study))
     for name, table in side_tables(study).items():
         if name in _IN_THE_TERMINAL:
-            _print_beside(out, table)
+            print_table(out, table)
 
 
 _POLICY_HEADER = (
-    ("", "collisions", "mobility", "inter-", "mean", "RMS", "until", "learn-", "rear"),
-    ("policy", "[%] (95 %)", "(95 %)", "vened", "change", "jerk", "safe", "ing", "ends"),
+    "policy",
+    "collisions\n[%] (95 %)",
+    "mobility\n(95 %)",
+    "inter-\nvened",
+    "mean\nchange",
+    "RMS\njerk",
+    "until\nsafe",
+    "learn-\ning",
+    "rear\nends",
 )
 
 
@@ -344,15 +321,6 @@ def _policy_cells(line: Line) -> tuple[str, ...]:
     )
 
 
-def _print_cells(out: Console, row: Sequence[str], widths: Sequence[int], style: str) -> None:
-    """Print cells below one another: the first to the left, the others to the right."""
-    first, *others = (
-        cell.ljust(width) if column == 0 else cell.rjust(width)
-        for column, (cell, width) in enumerate(zip(row, widths, strict=True))
-    )
-    out.print(" ".join([first, *others]).rstrip(), style=style, soft_wrap=True)
-
-
 def print_chapter(out: Console, chapter: Chapter) -> None:
     """Print what a study found, its tables, and where it loses."""
     out.print(chapter.title, style="bold")
@@ -361,11 +329,23 @@ def print_chapter(out: Console, chapter: Chapter) -> None:
         out.print(sentence)
     out.print()
     for one in chapter.tables:
-        _print_beside(out, one)
+        print_table(out, one)
     out.print("Where it loses", style="bold")
     for loss in chapter.losses or ("nowhere in these tables",):
-        out.print(f"  {loss}")
+        _print_indented(out, loss)
     out.print()
+
+
+def print_headlines(out: Console, chapters: Sequence[Chapter]) -> None:
+    """Print of each study what it asks, and the answer in a line."""
+    for chapter in chapters:
+        out.print(chapter.title, style="bold")
+        _print_indented(out, chapter.headline, "bold red" if chapter.fails else "")
+    out.print()
+
+
+def _print_indented(out: Console, text: str, style: str = "") -> None:
+    out.print(Padding(text, (0, 0, 0, 2)), style=style)
 
 
 def _print_losses(out: Console, lost: Sequence[InWords]) -> None:
@@ -380,17 +360,10 @@ def _print_losses(out: Console, lost: Sequence[InWords]) -> None:
         if not loss.loud:
             quiet.setdefault(loss.what, []).append(loss.who.partition(" (")[0])
     for what, who in quiet.items():
-        out.print(f"  {what}: {', '.join(who)}")
+        _print_indented(out, f"{what}: {', '.join(who)}")
     if not lost:
         out.print("  nowhere in these tables")
     out.print()
-
-
-def _table(*headers: str) -> Table:
-    table = Table(box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False, collapse_padding=True)
-    for header in headers:
-        table.add_column(header, justify="right", overflow="fold")
-    return table
 
 
 def _percent(share: float) -> str:
@@ -411,7 +384,7 @@ def learning_document(learning: Learning) -> dict[str, Any]:
     """All that `print_learning` prints, for JSON; states and actions from 0."""
     facts = {name: value for name, value in vars(learning).items() if name not in _APART}
     skills = [{**asdict(skill), "skill": skill.skill} for skill in learning.skills]
-    return {**without_nan({**facts, "skills": skills}), "model": model_document(learning.model)}
+    return {**facts, "skills": skills, "model": model_document(learning.model)}
 
 
 _APART = ("machine", "model", "skills")
@@ -419,7 +392,7 @@ _APART = ("machine", "model", "skills")
 
 def model_document(model: FSMModel) -> dict[str, Any]:
     """All that `print_model` prints, for JSON; states and actions from 0."""
-    document: dict[str, Any] = {
+    return {
         "dt": model.dt,
         "names": model.names,
         "units": model.units,
@@ -443,4 +416,3 @@ def model_document(model: FSMModel) -> dict[str, Any]:
             for r in range(model.n_actions)
         ],
     }
-    return without_nan(document)

@@ -7,7 +7,10 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Table:
-    """Rows under a header; the first column names the row."""
+    """Rows under a header; the first column names the row.
+
+    A cell may have several lines: what follows the first stands beside it, smaller.
+    """
 
     title: str
     header: tuple[str, ...]
@@ -15,3 +18,4 @@ class Table:
     note: str = ""
     ours: tuple[int, ...] = ()  #: rows that are ours, to be set off
     in_words: bool = False  #: whether the cells are words, which may be broken into lines
+    failing: tuple[int, ...] = ()  #: rows that say that something does not hold

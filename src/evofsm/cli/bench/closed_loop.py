@@ -2,22 +2,25 @@
 
 from __future__ import annotations
 
-import sys
 from contextlib import suppress
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
-from evofsm.cli.bench.common import PageFolder, WorkersOption
+from evofsm.cli.bench.common import PageFolder, Progress, WorkersOption, finish
 from evofsm.cli.common import (
     SwitchesOption,
     ToleranceOption,
     counter,
     plain_errors,
-    print_json,
     progress,
     require,
     split_names,
 )
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from evofsm.report.chapter import Chapter
 
 with suppress(ModuleNotFoundError):
     import typer
@@ -70,17 +73,16 @@ def closed_loop(
         plan = plan.shortened()
     with progress() as bars:
         study = run_closed_loop(chosen, plan, counter(bars, "Driving and learning"), workers)
-        if not as_json:
-            from evofsm.report.closed_loop import write_closed_loop
 
-            out.mkdir(parents=True, exist_ok=True)
-            command = " ".join(["evofsm", *sys.argv[1:]])
-            page = write_closed_loop(study, out, command, counter(bars, "Drawing figures"))
-    if as_json:
-        print_json([row.as_dict() for row in study.rows])
-        return
-    from evofsm.report import terminal
+    def make_chapter(folder: Path, command: str, drawn: Progress) -> Chapter:
+        from evofsm.report.closed_loop import closed_loop_chapter
 
-    console = terminal.console()
-    terminal.print_closed_loop(console, study)
-    console.print(f"Page with all figures: {page}", soft_wrap=True)
+        return closed_loop_chapter(study, folder, command, drawn)
+
+    def say(console: Console) -> None:
+        from evofsm.report.terminal import print_closed_loop
+
+        print_closed_loop(console, study)
+
+    rows = [row.as_dict() for row in study.rows]
+    finish(rows, make_chapter, out, as_json=as_json, document=study.as_dict(), say=say)

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import json
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from evofsm.cli.common import counter, print_json, progress
+from evofsm.cli.common import command_line, counter, print_json, progress
 
 with suppress(ModuleNotFoundError):
     import typer
@@ -23,6 +21,8 @@ with suppress(ModuleNotFoundError):
     ]
 
 if TYPE_CHECKING:
+    from rich.console import Console
+
     from evofsm.report.chapter import Chapter
 
 Progress = Callable[[int, int], None]
@@ -34,7 +34,8 @@ def finish(
     out: Path,
     *,
     as_json: bool,
-    packages: Sequence[str] = (),
+    document: object = None,
+    say: Callable[[Console], None] | None = None,
 ) -> None:
     """Print the rows as JSON, or write the page with its figures and print what it says.
 
@@ -48,32 +49,27 @@ def finish(
         Folder of the page.
     as_json : bool
         Print the rows and write nothing.
-    packages : sequence of str
-        Whose versions the page tells beside the usual ones.
+    document : object, optional
+        Written beside the page in place of the rows.
+    say : callable, optional
+        Prints the study in the terminal in place of the chapter.
     """
-    from evofsm.report.documents import without_nan
-
-    documents = [without_nan(dict(row)) for row in rows]
     if as_json:
-        print_json(documents)
+        print_json(rows)
         return
     from evofsm.report import terminal
     from evofsm.report.chapter import write_chapters
+    from evofsm.report.documents import to_json
 
     out.mkdir(parents=True, exist_ok=True)
-    command = " ".join(["evofsm", *sys.argv[1:]])
     with progress() as bars:
-        chapter = make_chapter(out, command, counter(bars, "Drawing figures"))
-    data = json.dumps(documents, allow_nan=False, indent=1)
+        chapter = make_chapter(out, command_line(), counter(bars, "Drawing figures"))
+    data = to_json(rows if document is None else document)
     (out / f"{chapter.id}.json").write_text(f"{data}\n", encoding="utf-8")
-    page = write_chapters(
-        out / "index.html",
-        [chapter],
-        title=chapter.title,
-        about="",
-        command=command,
-        packages=packages,
-    )
+    page = write_chapters(out / "index.html", [chapter], command=command_line())
     console = terminal.console()
-    terminal.print_chapter(console, chapter)
+    if say is None:
+        terminal.print_chapter(console, chapter)
+    else:
+        say(console)
     console.print(f"Page with all figures: {page}", soft_wrap=True)

@@ -61,4 +61,4 @@ def detection(
         return detection_chapter(study, folder, command, drawn)
 
     rows = [row.as_dict() for row in (*study.rows, *study.grid)]
-    finish(rows, make_chapter, out, as_json=as_json, packages=("scipy",))
+    finish(rows, make_chapter, out, as_json=as_json)

@@ -53,4 +53,4 @@ def prediction(
 
         return prediction_chapter(study, folder, command, drawn)
 
-    finish(study.as_dicts(), make_chapter, out, as_json=as_json, packages=("scipy", "deeptime"))
+    finish(study.as_dicts(), make_chapter, out, as_json=as_json)

@@ -60,4 +60,4 @@ def real(
 
         return real_chapter(study, folder, command, drawn)
 
-    finish(study.as_rows(), make_chapter, out, as_json=as_json, packages=("scipy",))
+    finish(study.as_rows(), make_chapter, out, as_json=as_json)

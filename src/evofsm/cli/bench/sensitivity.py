@@ -55,4 +55,4 @@ def sensitivity(
 
         return sensitivity_chapter(study, folder, command, drawn)
 
-    finish(study.as_dicts(), make_chapter, out, as_json=as_json, packages=("scipy",))
+    finish(study.as_dicts(), make_chapter, out, as_json=as_json)
