@@ -170,7 +170,8 @@ def _learn(
     """Show a run to the machine, row by row."""
     foreseen = _first_forecast(machine) if beliefs else np.empty(0)
     action = settings.actions.encode(episode.accelerations)
-    trace = machine.learn_many(seen, action, episode_starts=[0], belief=beliefs)
+    ends = [len(seen) - 1] if episode.collided else []
+    trace = machine.learn_many(seen, action, [0], ends, belief=beliefs)
     belief = np.empty((len(action), 0)) if trace.belief is None else trace.belief
     first = float("nan")
     if len(foreseen):
