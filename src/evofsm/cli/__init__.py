@@ -30,6 +30,7 @@ def application() -> typer.Typer:
     from evofsm.cli.evidence import evidence
     from evofsm.cli.learn import inspect, learn
     from evofsm.cli.paper import paper
+    from evofsm.cli.watch import watch
 
     app = typer.Typer(
         name="evofsm",
@@ -44,6 +45,7 @@ def application() -> typer.Typer:
     app.command()(learn)
     app.command()(inspect)
     app.command()(drive)
+    app.command()(watch)
     app.command()(campaign)
     app.command()(audit)
     app.command()(check)

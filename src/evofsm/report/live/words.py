@@ -1,0 +1,172 @@
+"""The story of a run in plain sentences: when danger began, why, and what was done about it."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+from evofsm.studies.watching import Danger, Frame, Start, Story
+
+# Changes of speed that are smaller are "at the same speed" [m/s], and softer accelerations none.
+_EQUAL, _HARDLY = 0.5, 0.3
+
+
+class Told(NamedTuple):
+    """A story as it is read."""
+
+    status: str  #: ``safe``, ``danger``, ``dead end``, ``collision`` or ``ended``
+    headline: str
+    when: str
+    why: str
+    done: str
+    others: str  #: what time to collision and time headway would have said
+    outcome: str
+
+
+def tell(frame: Frame, start: Start) -> Told:
+    """What has happened up to a frame.
+
+    Parameters
+    ----------
+    frame : Frame
+    start : Start
+        Of its run.
+    """
+    story = frame.story
+    status = _status(frame)
+    if story.danger is None:
+        return Told(
+            status,
+            _HEADLINES[status],
+            "No danger so far.",
+            "Whatever the leader does, full braking would still avoid a collision.",
+            "Nothing had to be done: every wish of the driver was carried out.",
+            _others(story, start),
+            _outcome(story, frame),
+        )
+    return Told(
+        status,
+        _HEADLINES[status],
+        _when(story, story.danger),
+        _why(story.danger),
+        _done(story.danger, frame),
+        _others(story, start),
+        _outcome(story, frame),
+    )
+
+
+_HEADLINES = {
+    "safe": "Safe",
+    "danger": "Danger",
+    "averted": "Danger, held off",
+    "dead end": "Dead end: too late to brake",
+    "collision": "Collision",
+    "ended": "The run has ended safely",
+}
+
+
+def _status(frame: Frame) -> str:
+    story = frame.story
+    if frame.collided:
+        return "collision"
+    if frame.over:
+        return "ended"
+    if not story.in_danger or story.danger is None:
+        return "safe"
+    if not math.isnan(story.danger.dead_end):
+        return "dead end"
+    return "averted" if frame.revising else "danger"
+
+
+def _when(story: Story, danger: Danger) -> str:
+    text = f"Danger began at {danger.since:.1f} s"
+    if danger.since > story.first:
+        text += f" (and before, at {story.first:.1f} s)"
+    if not story.in_danger:
+        return f"{text}; it was over at {danger.last:.1f} s."
+    if not math.isnan(danger.dead_end):
+        return (
+            f"{text}. Since {danger.dead_end:.1f} s not even full braking would help: a dead end."
+        )
+    return f"{text}."
+
+
+def _why(danger: Danger) -> str:
+    """Where the cars were, and what could not be survived there."""
+    where = f"{danger.gap:.1f} m behind the leader at {danger.speed:.0f} m/s"
+    if danger.closing > _EQUAL:
+        where += f", {danger.closing:.1f} m/s faster than it"
+    elif danger.closing < -_EQUAL:
+        where += f", {-danger.closing:.1f} m/s slower than it"
+    else:
+        where += ", as fast as it"
+    return (
+        f"{where[0].upper()}{where[1:]}, the driver wanted to {_wish(danger.proposed)}. "
+        "After that, full braking could no longer avoid a collision if the leader braked harder "
+        f"than {danger.critical:.1f} m/s² – and leaders brake by up to {danger.brakes_to:.1f} m/s²."
+    )
+
+
+def _done(danger: Danger, frame: Frame) -> str:
+    share = f"{danger.revised} of {danger.decisions} decisions since then"
+    instead = f"to {_wish(danger.advised)} instead of {_wishing(danger.proposed)}"
+    if danger.revised == 0:
+        if frame.revising:
+            return "The reviser is on; it has changed nothing yet."
+        return f"Nothing: the reviser is off. It would have begun at once, {instead}."
+    if not frame.revising:
+        return f"The reviser changed {share}, but now it is off."
+    hardest = ""
+    if danger.hardest < -_HARDLY:
+        hardest = f"; at its hardest it braked by {-danger.hardest:.1f} m/s²"
+    return f"The reviser stepped in, at first {instead}; it changed {share}{hardest}."
+
+
+def _wish(acceleration: float) -> str:
+    if acceleration > _HARDLY:
+        return f"accelerate by {acceleration:.1f} m/s²"
+    if acceleration < -_HARDLY:
+        return f"brake by {-acceleration:.1f} m/s²"
+    return f"keep its speed ({acceleration:+.1f} m/s²)"
+
+
+def _wishing(acceleration: float) -> str:
+    if acceleration > _HARDLY:
+        return f"accelerating by {acceleration:.1f} m/s²"
+    if acceleration < -_HARDLY:
+        return f"braking by only {-acceleration:.1f} m/s²"
+    return f"keeping its speed ({acceleration:+.1f} m/s²)"
+
+
+def _others(story: Story, start: Start) -> str:
+    """When the classic measures noticed, against the first danger."""
+    measure = f"Time to collision (alarm below {start.ttc_threshold:g} s)"
+    if math.isnan(story.time_to_collision):
+        return f"{measure} has not noticed anything."
+    text = f"{measure} noticed at {story.time_to_collision:.1f} s"
+    earlier = story.time_to_collision - story.first
+    if earlier > 0.0:
+        return f"{text}, {earlier:.1f} s after the danger began."
+    return f"{text}."
+
+
+def _outcome(story: Story, frame: Frame) -> str:
+    parts = []
+    if not math.isnan(story.leader_brakes):
+        parts.append(
+            f"The leader braked by {story.leader_decel:.1f} m/s² at {story.leader_brakes:.1f} s."
+        )
+    if not math.isnan(story.collision):
+        parts.append(f"Collision at {story.collision:.1f} s, {story.impact:.1f} m/s too fast.")
+    elif not math.isnan(story.ended):
+        parts.append(f"No collision: {_rest(frame)}.")
+    if math.isfinite(story.alone) and not frame.collided and frame.time > 0.0:
+        verb = "would have hit" if frame.time >= story.alone else "will hit"
+        parts.append(f"Left alone, this driver {verb} the leader at {story.alone:.1f} s.")
+    return " ".join(parts)
+
+
+def _rest(frame: Frame) -> str:
+    if frame.v_follower == 0.0:
+        return f"stopped {frame.gap:.1f} m behind the leader"
+    return f"{frame.gap:.1f} m behind the leader at the end"
