@@ -44,8 +44,11 @@ def watch(
     reviser: ReviserOption = "least-risk",
     tolerance: ToleranceOption = 0.02,
     learn_first: Annotated[
-        int, typer.Option(min=0, help="Episodes to learn from before; 0 to watch it from empty.")
+        int, typer.Option(min=0, help="Episodes to learn from before it is watched.")
     ] = 60,
+    fresh: Annotated[
+        bool, typer.Option("--fresh", help="Learn nothing before: watch it grow from empty.")
+    ] = False,
     learn: Annotated[
         Path | None,
         typer.Option(
@@ -73,6 +76,8 @@ def watch(
     from evofsm.studies.watching import SPEEDS, Player, Watching
     from evofsm.worlds.families import load_family
 
+    if fresh and learn is not None:
+        raise ValueError("--fresh and --learn exclude each other")
     if speed not in SPEEDS:
         raise ValueError(f"--speed is {speed:g}; it must be one of {_list(SPEEDS)}")
     watching = Watching(
@@ -80,7 +85,7 @@ def watch(
     )
     if case > len(watching.cases):
         raise ValueError(f"--case is {case}; {what} has 1 to {len(watching.cases)}")
-    learner, learnt = _learner(watching, learn, learn_first)
+    learner, learnt = _learner(watching, learn, 0 if fresh else learn_first)
 
     @contextmanager
     def session() -> Iterator[Session]:

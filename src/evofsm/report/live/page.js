@@ -86,7 +86,8 @@ function showStory() {
   at("status").dataset.status = frame.told.status;
   write("headline", frame.told.headline);
   for (const part of ["when", "why", "done", "others", "outcome"]) write(part, frame.told[part]);
-  write("explanation", run.decision.explanation);
+  const decision = run.decision;
+  write("explanation", `${decision.here}; ${decision.explanation}`);
 }
 
 /** Only what is new, so that screen readers say only that. */

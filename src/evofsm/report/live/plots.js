@@ -21,7 +21,7 @@ function panels(start) {
     },
     {
       title: "Classic warnings", about: "seconds; they warn below their dotted line",
-      low: 0, high: 6, ticks: [0, 2, 4, 6], show: plain,
+      low: 0, high: 6, ticks: [0, 2, 4, 6], show: (value) => (value === 6 ? "≥ 6" : plain(value)),
       lines: [
         { label: "time to collision", ink: leader, width: 2, dash: [8, 3], value: (f) => f.time_to_collision ?? Infinity },
         { label: "time headway", ink: third, width: 2, dash: [2, 2], value: (f) => f.time_headway ?? Infinity },
@@ -153,15 +153,31 @@ function drawHeading(pen, panel, y, width, isNarrow) {
 
 /** Shade when there was danger, and hatch when not even full braking would have helped. */
 function drawDanger(pen, frames, run, x, box) {
-  frames.forEach((frame, k) => {
-    if (!frame.danger) return;
-    const from = x(frame.time), to = x(k + 1 < frames.length ? frames[k + 1].time : run.shown);
+  const end = (k) => (k + 1 < frames.length ? frames[k + 1].time : run.shown);
+  const shade = (holds, fill) => {
+    let from = -1;
+    frames.forEach((frame, k) => {
+      if (holds(frame) && from < 0) from = k;
+      if (from >= 0 && (!holds(frame) || k + 1 === frames.length)) {
+        fill(x(frames[from].time), x(holds(frame) ? end(k) : frame.time));
+        from = -1;
+      }
+    });
+  };
+  shade((frame) => frame.danger, (from, to) => {
     pen.fillStyle = colour.wash;
-    pen.fillRect(from, box.top, to - from + 0.4, box.bottom - box.top);
-    if (frame.danger.dead_end === null) return;
-    for (let at = Math.ceil(from / 7) * 7; at < to; at += 7) {
-      line(pen, at, box.bottom, at, box.bottom - 5, { ink: colour.danger, width: 2 });
+    pen.fillRect(from, box.top, to - from, box.bottom - box.top);
+  });
+  shade((frame) => frame.danger && frame.danger.dead_end !== null, (from, to) => {
+    pen.save();
+    pen.beginPath();
+    pen.rect(from, box.top, to - from, box.bottom - box.top);
+    pen.clip();
+    const tall = box.bottom - box.top;
+    for (let at = from - tall; at < to; at += 9) {
+      line(pen, at, box.bottom, at + tall, box.top, { ink: colour.wash, width: 2 });
     }
+    pen.restore();
   });
 }
 

@@ -16,7 +16,7 @@ export function drawRoad(canvas, run) {
   view += (needed - view) * 0.06;
   const scale = width / view;
   const front = (behind + length + 6) * scale; // where the follower's front bumper is
-  const lane = { top: height * 0.43, bottom: height * 0.83 };
+  const lane = { top: 46, bottom: height - 24 };
   const middle = (lane.top + lane.bottom) / 2;
 
   pen.fillStyle = colour.asphalt;
@@ -37,25 +37,26 @@ export function drawRoad(canvas, run) {
   const tail = front + motion.gap * scale; // the leader's rear bumper
   car(front, colour.follower, motion.a_follower < BRAKES);
   car(tail + length * scale, colour.leader, motion.a_leader < BRAKES);
-  drawGap(pen, front, tail, middle, motion.gap);
+  drawGap(pen, front, tail, middle, lane.top, motion.gap);
 
-  const small = width < 560;
-  const left = label("Follower", motion.v_follower, motion.a_follower, small);
-  const right = label("Leader", motion.v_leader, motion.a_leader, small);
-  const size = small ? 11.5 : 13;
-  text(pen, left, 8, lane.top - (small ? 30 : 16), { size, bold: true, ink: colour.follower });
-  const x = small ? 8 : Math.max(tail + length * scale, pen.measureText(left).width + 40 + pen.measureText(right).width);
-  text(pen, right, Math.min(x, width - 8), lane.top - (small ? 12 : 16), {
-    size, bold: true, align: small ? "left" : "right", ink: colour.leader,
+  const isNarrow = width < 560;
+  const left = label("Follower", motion.v_follower, motion.a_follower, isNarrow);
+  const right = label("Leader", motion.v_leader, motion.a_leader, isNarrow);
+  const size = isNarrow ? 11.5 : 13.5;
+  text(pen, left, 10, 14, { size, bold: true, ink: colour.follower });
+  // Over its car, but clear of the other label.
+  const clear = 10 + pen.measureText(left).width + 30 + pen.measureText(right).width;
+  text(pen, right, Math.min(width - 10, Math.max(clear, tail + length * scale)), 14, {
+    size, bold: true, align: "right", ink: colour.leader,
   });
   const frame = run.frame;
   if (frame.collided) drawCollision(pen, front, middle, carHeight);
   canvas.setAttribute("aria-label", `${left}. ${right}. Gap ${Math.max(0, motion.gap).toFixed(1)} metres.`);
 }
 
-function label(who, speed, acceleration, small) {
+function label(who, speed, acceleration, isNarrow) {
   const does = acceleration < BRAKES ? " – braking" : "";
-  const kmh = small ? "" : ` (${(speed * 3.6).toFixed(0)} km/h)`;
+  const kmh = isNarrow ? "" : ` (${(speed * 3.6).toFixed(0)} km/h)`;
   return `${who} ${speed.toFixed(1)} m/s${kmh}${does}`;
 }
 
@@ -83,20 +84,14 @@ function drawCar(pen, front, middle, length, height, ink, brakes) {
   }
 }
 
-function drawGap(pen, from, to, y, gap) {
-  const room = to - from;
-  if (room > 6) {
+function drawGap(pen, from, to, y, top, gap) {
+  if (to - from > 6) {
     line(pen, from + 2, y, to - 2, y, { ink: colour.paint, width: 1.5 });
     for (const x of [from + 2, to - 2]) line(pen, x, y - 5, x, y + 5, { ink: colour.paint, width: 1.5 });
   }
-  const words = `gap ${Math.max(0, gap).toFixed(1)} m`;
-  pen.font = "600 12px system-ui";
-  const wide = pen.measureText(words).width;
-  const inside = room > wide + 14;
-  text(pen, words, (from + to) / 2, inside ? y - 11 : y - 36, {
-    bold: true, align: "center", ink: inside ? "#ffffff" : colour.ink,
-  });
-  if (!inside) line(pen, (from + to) / 2, y - 29, (from + to) / 2, y - 8, { ink: colour.soft });
+  const middle = (from + to) / 2;
+  line(pen, middle, top - 7, middle, y, { ink: colour.soft });
+  text(pen, `gap ${Math.max(0, gap).toFixed(1)} m`, middle, top - 14, { size: 12.5, bold: true, align: "center" });
 }
 
 function drawScale(pen, position, front, scale, width, top, height) {
@@ -106,7 +101,7 @@ function drawScale(pen, position, front, scale, width, top, height) {
     const x = front + (at - position) * scale;
     if (x > width) break;
     line(pen, x, top, x, top + 5, { ink: colour.soft });
-    if (at >= 0) text(pen, `${at} m`, x, (top + height) / 2 + 3, { size: 11, align: "center", ink: colour.soft });
+    if (at >= 0) text(pen, `${at} m`, x, (top + height) / 2 + 2, { size: 11, align: "center", ink: colour.soft });
   }
 }
 

@@ -13,6 +13,7 @@ import hmac
 import json
 import logging
 import secrets
+import socket
 import threading
 from collections import deque
 from http import HTTPStatus
@@ -39,6 +40,8 @@ with needs("websockets", "watch", "the live page"):
 _HOST = "127.0.0.1"
 # Who is more messages behind is shown everything anew; a run keeps so many frames.
 _MOST_WAITING, _MOST_FRAMES, _MOST_CLIENTS = 64, 20_000, 200
+# Under way to a client [bytes].
+_MOST_SENT = 1 << 17
 # A command is short [bytes].
 _LONGEST_COMMAND = 512
 _WELCOME = {
@@ -207,6 +210,9 @@ class LivePage:
         if len(self._clients) >= _MOST_CLIENTS:
             await connection.close(_TOO_MANY, "too many look on already")
             return
+        # The system must not take in more than a little for one who does not read.
+        wire = connection.transport.get_extra_info("socket")
+        wire.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _MOST_SENT)
         client = _Client(connection, self._shown)
         self._clients.add(client)
         feeding = asyncio.create_task(client.feed())
@@ -351,8 +357,8 @@ class _Client:
 
 
 def _port_of(server: Server) -> int:
-    (socket,) = server.sockets
-    return int(socket.getsockname()[1])
+    (listening,) = server.sockets
+    return int(listening.getsockname()[1])
 
 
 def _refusal(status: HTTPStatus, text: str) -> Response:

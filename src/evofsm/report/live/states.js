@@ -2,7 +2,7 @@
 
 import { colour, fresh, hexagon, line, text } from "./paint.js";
 
-const MOST_BARS = 5, FEW = 45;
+const MOST_BARS = 4, FEW = 80;
 const EDGE = { left: 36, right: 14, top: 14, bottom: 34 };
 
 export function drawBelief(list, run) {
@@ -19,7 +19,7 @@ export function drawBelief(list, run) {
     item.querySelector(".bar").style.width = `${100 * share}%`;
     item.querySelector(".share").textContent = `${Math.round(100 * share)} %`;
     const name = known ? known.name : "new";
-    const words = `${known && known.is_dead_end ? "⬢ dead end " : ""}#${state + 1} ${name}`;
+    const words = `#${state + 1} ${known && known.is_dead_end ? "⬢ dead end: " : ""}${name}`;
     item.querySelector(".name").textContent = words;
     item.title = words;
   });
@@ -55,7 +55,7 @@ export function drawMap(canvas, run) {
   drawTrail(pen, run, where, graph);
   const most = Math.max(...graph.states.map((state) => state.visits), 1);
   for (const state of graph.states) {
-    drawState(pen, state, where(state.state), 5 + 6 * Math.sqrt(state.visits / most), graph.states.length <= FEW, false);
+    drawState(pen, state, where(state.state), 4 + 6 * Math.sqrt(state.visits / most), graph.states.length <= FEW, false);
   }
   const present = graph.states[decision.state];
   if (present) drawState(pen, present, where(present.state), 11, true, true);
@@ -126,7 +126,7 @@ function drawState(pen, state, [x, y], radius, isNumbered, isPresent) {
   pen.lineWidth = isPresent ? 2 : 1.2;
   pen.fill();
   pen.stroke();
-  if (isNumbered && radius > 5.5) {
+  if (isNumbered && radius > 5) {
     const ink = state.is_dead_end || isPresent ? colour.panel : colour.ink;
     text(pen, `${state.state + 1}`, x, y + 0.5, { size: isPresent ? 11 : 9, bold: true, align: "center", ink });
   }

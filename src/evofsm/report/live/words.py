@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from typing import NamedTuple
 
 from evofsm.studies.watching import Danger, Frame, Start, Story
@@ -14,7 +15,7 @@ _EQUAL, _HARDLY = 0.5, 0.3
 class Told(NamedTuple):
     """A story as it is read."""
 
-    status: str  #: ``safe``, ``danger``, ``dead end``, ``collision`` or ``ended``
+    status: str  #: ``safe``, ``averted``, ``danger``, ``dead end``, ``collision`` or ``ended``
     headline: str
     when: str
     why: str
@@ -32,40 +33,41 @@ def tell(frame: Frame, start: Start) -> Told:
     start : Start
         Of its run.
     """
-    story = frame.story
-    status = _status(frame)
-    if story.danger is None:
-        return Told(
-            status,
-            _HEADLINES[status],
-            "No danger so far.",
-            "Whatever the leader does, full braking would still avoid a collision.",
-            "Nothing had to be done: every wish of the driver was carried out.",
-            _others(story, start),
-            _outcome(story, frame),
-        )
-    return Told(
+    story, danger = frame.story, frame.story.danger
+    status = _status(frame, start)
+    told = Told(
         status,
         _HEADLINES[status],
-        _when(story, story.danger),
-        _why(story.danger),
-        _done(story.danger, frame),
+        "No danger so far." if danger is None else _when(story, danger),
+        _no_danger(frame) if danger is None else _why(danger),
+        _NOTHING if danger is None else _done(danger, frame),
         _others(story, start),
         _outcome(story, frame),
     )
+    return Told(*(_UNIT.sub("\u00a0", text) for text in told))
 
 
+_NOTHING = "Nothing had to be done: every wish of the driver was carried out."
+# A number and its unit stay on one line.
+_UNIT = re.compile(r"(?<=\d) (?=(?:s|m|m/s|m/s²)\b)")
 _HEADLINES = {
     "safe": "Safe",
     "danger": "Danger",
     "averted": "Danger, held off",
-    "dead end": "Dead end: too late to brake",
+    "dead end": "Dead end: too late",
     "collision": "Collision",
-    "ended": "The run has ended safely",
+    "ended": "No collision",
 }
 
 
-def _status(frame: Frame) -> str:
+def _no_danger(frame: Frame) -> str:
+    return (
+        f"If the leader braked as hard as leaders do (up to {frame.brakes_to:.1f} m/s²), full "
+        "braking would still avoid a collision."
+    )
+
+
+def _status(frame: Frame, start: Start) -> str:
     story = frame.story
     if frame.collided:
         return "collision"
@@ -75,7 +77,8 @@ def _status(frame: Frame) -> str:
         return "safe"
     if not math.isnan(story.danger.dead_end):
         return "dead end"
-    return "averted" if frame.revising else "danger"
+    is_held_off = frame.executed_risk.risk <= start.tolerance
+    return "averted" if frame.revising and is_held_off else "danger"
 
 
 def _when(story: Story, danger: Danger) -> str:

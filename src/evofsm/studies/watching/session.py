@@ -30,7 +30,7 @@ from evofsm.worlds.motion import GAP, GAP_BEHIND, LEADER_ACCELERATION, LEADER_SP
 from evofsm.worlds.road import World
 
 #: The state rule for looking on: coarse enough that each state can be told from the others.
-WATCHED_RULE = Novelty(radius=3.0, scales=(4.0, 2.0, 2.0))
+WATCHED_RULE = Novelty(radius=2.0, scales=(4.0, 2.0, 2.0))
 
 # What the page draws of a car; worlds need no length [m].
 _CAR_LENGTH = 5.0
