@@ -1,10 +1,10 @@
 // The page: what comes from the run is shown, what is asked for is sent.
 
 import { readColours } from "./paint.js";
-import { drawPlots, span, timeAt } from "./plots.js";
+import { drawPlots, placeOf, span, timeAt } from "./plots.js";
 import { drawRoad } from "./road.js";
 import { Run } from "./run.js";
-import { drawBelief, drawMap } from "./states.js";
+import { drawBelief, drawMap, placeHere } from "./states.js";
 
 const at = (id) => document.getElementById(id);
 const run = new Run();
@@ -172,22 +172,34 @@ new ResizeObserver(() => { changed = true; }).observe(document.body);
 
 // -- Every frame of the screen ----------------------------------------------------------------------
 
+// The road is drawn anew for each; the rest, where nothing but a mark moves, with each decision.
+
 let changed = true;
 let before = performance.now();
+let drawn = null;
 function draw(now) {
   const time = run.shown;
   run.play(Math.min(0.25, (now - before) / 1000));
   before = now;
   if (run.latest && (changed || run.shown !== time)) {
-    changed = false;
+    if (changed || run.frame !== drawn) {
+      drawPlots(plots, run);
+      drawBelief(at("belief"), run);
+      drawMap(at("map-canvas"), run);
+      showStory();
+    }
+    [changed, drawn] = [false, run.frame];
     drawRoad(at("road-canvas"), run);
-    drawPlots(plots, run);
-    drawBelief(at("belief"), run);
-    drawMap(at("map-canvas"), run);
-    showStory();
     showMode();
+    put("playhead", placeOf(plots, run, run.shown), 0);
+    if (placeHere(run)) put("here", ...placeHere(run));
   }
   requestAnimationFrame(draw);
+}
+
+function put(id, x, y) {
+  at(id).hidden = false;
+  at(id).style.transform = `translate(${x}px, ${y}px)`;
 }
 
 setTheme(dark.matches);

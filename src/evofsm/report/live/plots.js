@@ -11,7 +11,7 @@ function panels(start) {
   const { follower, leader, danger, third, soft } = colour;
   return [
     {
-      title: "Risk", about: "chance that it is too late to brake, if the leader brakes now",
+      title: "Risk", about: "chance to collide if the leader brakes now",
       low: 0, high: 1, ticks: [0, 0.5, 1], show: percent,
       lines: [
         { label: "driver's wish", ink: danger, width: 2.5, dash: [], value: (f) => f.proposed_risk.risk, band: (f) => f.proposed_risk },
@@ -54,11 +54,15 @@ export function timeAt(canvas, run, x) {
   return ((x - LEFT) / (canvas.clientWidth - LEFT - RIGHT)) * span(run);
 }
 
+export function placeOf(canvas, run, time) {
+  return LEFT + (time / span(run)) * (canvas.clientWidth - LEFT - RIGHT);
+}
+
 export function drawPlots(canvas, run) {
   const { pen, width, height } = fresh(canvas);
   if (!run.latest) return;
   const most = span(run);
-  const x = (time) => LEFT + (time / most) * (width - LEFT - RIGHT);
+  const x = (time) => placeOf(canvas, run, time);
   const visible = run.frames.slice(0, run.index(run.shown + 1e-6) + 1);
   const marks = marksOf(run.frame);
   const top = 4 + 16 * place(pen, marks, x, width), bottom = height - 32;
@@ -71,7 +75,7 @@ export function drawPlots(canvas, run) {
       const inside = Math.max(panel.low, Math.min(panel.high, value));
       return box.bottom - ((inside - panel.low) / (panel.high - panel.low)) * (box.bottom - box.top);
     };
-    drawDanger(pen, visible, run, x, box);
+    drawDanger(pen, visible, x, box);
     drawFrame(pen, panel, box, y, x, most, width);
     drawHeading(pen, panel, box.top - heading, width, heading > 20);
     for (const one of panel.lines) if (one.band) drawBand(pen, visible, one.band, x, y);
@@ -79,7 +83,6 @@ export function drawPlots(canvas, run) {
   });
   drawTimes(pen, x, most, bottom);
   drawMarks(pen, marks, x, top, bottom);
-  line(pen, x(run.shown), top, x(run.shown), bottom, { ink: colour.ink, width: 1.5 });
 }
 
 function marksOf(frame) {
@@ -152,14 +155,13 @@ function drawHeading(pen, panel, y, width, isNarrow) {
 }
 
 /** Shade when there was danger, and hatch when not even full braking would have helped. */
-function drawDanger(pen, frames, run, x, box) {
-  const end = (k) => (k + 1 < frames.length ? frames[k + 1].time : run.shown);
+function drawDanger(pen, frames, x, box) {
   const shade = (holds, fill) => {
     let from = -1;
     frames.forEach((frame, k) => {
       if (holds(frame) && from < 0) from = k;
       if (from >= 0 && (!holds(frame) || k + 1 === frames.length)) {
-        fill(x(frames[from].time), x(holds(frame) ? end(k) : frame.time));
+        fill(x(frames[from].time), x(frame.time));
         from = -1;
       }
     });

@@ -55,7 +55,8 @@ export function drawRoad(canvas, run) {
 }
 
 function label(who, speed, acceleration, isNarrow) {
-  const does = acceleration < BRAKES ? " – braking" : "";
+  const moves = acceleration < BRAKES ? " – braking" : "";
+  const does = speed < 0.05 ? " – stands" : moves;
   const kmh = isNarrow ? "" : ` (${(speed * 3.6).toFixed(0)} km/h)`;
   return `${who} ${speed.toFixed(1)} m/s${kmh}${does}`;
 }

@@ -35,17 +35,31 @@ function bar() {
   return item;
 }
 
-export function drawMap(canvas, run) {
-  const { pen, width, height } = fresh(canvas);
-  const graph = run.graph, decision = run.decision, motion = run.motion;
-  if (!graph || !decision) return;
-  const gaps = graph.states.map((state) => state.center[0]);
-  const speeds = graph.states.map((state) => state.center[1]);
-  const farthest = Math.max(20, motion.gap, ...gaps), fastest = Math.max(10, motion.v_follower, ...speeds) * 1.05;
-  const right = width - EDGE.right, bottom = height - EDGE.bottom;
-  // The root of the gap: what is close together is told apart where it matters.
+/** Where a gap and a speed lie on the map. The root of the gap: where cars are close, it matters. */
+function scales(canvas, run) {
+  const centers = run.graph.states.map((state) => state.center);
+  const frames = run.frames; // so that the map stands still while the car moves on it
+  const farthest = Math.max(20, ...frames.map((frame) => frame.gap), ...centers.map((center) => center[0]));
+  const fastest = 1.05 * Math.max(10, ...frames.map((frame) => frame.v_follower), ...centers.map((center) => center[1]));
+  const right = canvas.clientWidth - EDGE.right, bottom = canvas.clientHeight - EDGE.bottom;
   const x = (gap) => EDGE.left + Math.sqrt(Math.max(0, gap) / farthest) * (right - EDGE.left);
   const y = (speed) => bottom - (speed / fastest) * (bottom - EDGE.top);
+  return { x, y, farthest, fastest };
+}
+
+let latest = null; // the scales of the map as it was drawn
+
+/** Where the car is now on the map. */
+export function placeHere(run) {
+  return latest && [latest.x(run.motion.gap), latest.y(run.motion.v_follower)];
+}
+
+export function drawMap(canvas, run) {
+  const { pen, width, height } = fresh(canvas);
+  const graph = run.graph, decision = run.decision;
+  if (!graph || !decision) return;
+  latest = scales(canvas, run);
+  const { x, y, farthest, fastest } = latest;
   drawAxes(pen, x, y, farthest, fastest, width, height);
 
   const where = (state) => [x(graph.states[state].center[0]), y(graph.states[state].center[1])];
@@ -59,7 +73,6 @@ export function drawMap(canvas, run) {
   }
   const present = graph.states[decision.state];
   if (present) drawState(pen, present, where(present.state), 11, true, true);
-  drawHere(pen, x(motion.gap), y(motion.v_follower));
   canvas.setAttribute("aria-label", present
     ? `${graph.states.length} states; now in number ${present.state + 1}: ${present.name}`
     : `${graph.states.length} states`);
@@ -130,9 +143,4 @@ function drawState(pen, state, [x, y], radius, isNumbered, isPresent) {
     const ink = state.is_dead_end || isPresent ? colour.panel : colour.ink;
     text(pen, `${state.state + 1}`, x, y + 0.5, { size: isPresent ? 11 : 9, bold: true, align: "center", ink });
   }
-}
-
-function drawHere(pen, x, y) {
-  line(pen, x - 6, y, x + 6, y, { ink: colour.ink, width: 2 });
-  line(pen, x, y - 6, x, y + 6, { ink: colour.ink, width: 2 });
 }

@@ -89,7 +89,8 @@ def _when(story: Story, danger: Danger) -> str:
         return f"{text}; it was over at {danger.last:.1f} s."
     if not math.isnan(danger.dead_end):
         return (
-            f"{text}. Since {danger.dead_end:.1f} s not even full braking would help: a dead end."
+            f"{text}. From {danger.dead_end:.1f} s on it was a dead end: if the leader braked, even "
+            "full braking would come too late."
         )
     return f"{text}."
 
