@@ -28,6 +28,7 @@ def application() -> typer.Typer:
     from evofsm.cli.check import check
     from evofsm.cli.drive import drive
     from evofsm.cli.evidence import evidence
+    from evofsm.cli.export import export
     from evofsm.cli.learn import inspect, learn
     from evofsm.cli.paper import paper
     from evofsm.cli.watch import watch
@@ -47,6 +48,7 @@ def application() -> typer.Typer:
     app.command()(drive)
     app.command()(watch)
     app.command()(campaign)
+    app.command()(export)
     app.command()(audit)
     app.command()(check)
     app.add_typer(bench())

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from contextlib import nullcontext, suppress
+from contextlib import AbstractContextManager, nullcontext, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -30,6 +30,7 @@ with suppress(ModuleNotFoundError):
 if TYPE_CHECKING:
     from evofsm.checkpoint import Checkpoint
     from evofsm.framework.audit import AuditLog
+    from evofsm.io.mcap import RunWriter
     from evofsm.studies.closed_loop import Learner
     from evofsm.studies.driving import Driving, Setup
     from evofsm.worlds.road import World
@@ -82,6 +83,13 @@ def drive(
             show_default=False,
         ),
     ] = None,
+    mcap: Annotated[
+        Path | None,
+        typer.Option(
+            help="Write every episode to this log, for Foxglove and evofsm export.",
+            show_default=False,
+        ),
+    ] = None,
     as_json: SummaryAsJson = False,
 ) -> None:
     """Drive scenarios under a reviser; learn on the way.
@@ -92,7 +100,11 @@ def drive(
     With --checkpoint, the same command goes on where it was stopped, whatever stopped it, and comes
     to the same result; with more --episodes, it goes on to these.
     """
-    require(scipy="study", **({"polars": "tables"} if out else {}))
+    require(
+        scipy="study",
+        **({"polars": "tables"} if out else {}),
+        **({"mcap": "mcap"} if mcap else {}),
+    )
     from evofsm.checkpoint import Checkpoint, duration, result_kept
     from evofsm.framework.audit import AuditLog
     from evofsm.report import terminal
@@ -101,9 +113,14 @@ def drive(
     from evofsm.studies.driving import Setup, episodes_learnt, write_driving
     from evofsm.worlds import open_world
     from evofsm.worlds.families import load_family
+    from evofsm.worlds.road import UNITS, VARIABLES
 
     if learn is not None and frozen is not None:
         raise ValueError("--learn and --frozen exclude each other")
+    if mcap is not None and checkpoint is not None:
+        raise ValueError(
+            "--mcap and --checkpoint exclude each other: a log holds what one run has driven"
+        )
     interval = duration(every)
     chosen = load_family(family).with_switches(split_names(switches))
     setup = Setup(
@@ -124,8 +141,18 @@ def drive(
     keeper = None
     if checkpoint is not None:
         keeper = Checkpoint(checkpoint, setup.settings(world.value, learner), interval)
-    with AuditLog(audit) if audit else nullcontext() as log, open_world(world.value) as place:
-        driving = _drive(setup, learner, place, keeper, log)
+    with (
+        AuditLog(audit) if audit else nullcontext() as log,
+        open_world(world.value) as place,
+        _recording(mcap, setup, world.value) as run,
+    ):
+        driving = _drive(setup, learner, place, keeper, log, run)
+        if run is not None:
+            run.attach(
+                learner.machine.model(
+                    actions=chosen.actions, names=VARIABLES, units=UNITS, dt=chosen.interval
+                )
+            )
     if out is not None:
         with result_kept(keeper):
             write_driving(driving, learner, setup, out)
@@ -136,6 +163,8 @@ def drive(
     print_driving(console, driving, learner, setup)
     if out is not None:
         console.print(f"What was learnt, and every decision: {out}", soft_wrap=True)
+    if mcap is not None:
+        console.print(f"Every episode, for Foxglove: {mcap}", soft_wrap=True)
     if log is not None:
         console.print(f"Head of {audit}, to be kept elsewhere: {log.head}", soft_wrap=True)
 
@@ -146,6 +175,7 @@ def _drive(
     place: World,
     checkpoint: Checkpoint | None,
     audit: AuditLog | None,
+    run: RunWriter | None,
 ) -> Driving:
     """With a bar that shows the collisions so far."""
     from evofsm.studies.driving import drive_family
@@ -157,4 +187,17 @@ def _drive(
             text = f"Driving ({collisions} collisions, {collisions / done:.1%})"
             bars.update(task, completed=done, description=text)
 
-        return drive_family(setup, learner, place, show, checkpoint, audit)
+        record = (lambda drive: None) if run is None else run.add
+        return drive_family(setup, learner, place, show, checkpoint, audit, record)
+
+
+def _recording(
+    path: Path | None, setup: Setup, world: str
+) -> AbstractContextManager[RunWriter | None]:
+    """A log of the run, where one is asked for."""
+    if path is None:
+        return nullcontext()
+    from evofsm.io.mcap import recording
+
+    told = {**setup.told, "family": setup.family.name, "learn": setup.learn, "first": setup.first}
+    return recording(path, {**told, "episodes": setup.episodes, "world": world})

@@ -117,6 +117,7 @@ def drive_family(
     progress: Callable[[int, int], None] = lambda done, collisions: None,
     checkpoint: Checkpoint | None = None,
     audit: AuditLog | None = None,
+    record: Callable[[Drive], None] = lambda drive: None,
 ) -> Driving:
     """Drive the episodes in turn.
 
@@ -134,6 +135,8 @@ def drive_family(
         bit; there may be more episodes than before.
     audit : AuditLog, optional
         Writes down what is decided; also in episodes that are driven again after a stop.
+    record : callable
+        Given each episode that is driven here, none of those before a stop.
 
     Raises
     ------
@@ -155,6 +158,7 @@ def drive_family(
             controller=controller,
             audit=audit,
         )
+        record(drive)
         done.add(drive, outcome(drive, unrevised, family.interval), setup.tolerance)
         if checkpoint is not None:
             checkpoint.offer(partial(done.keep, learner))
@@ -255,9 +259,13 @@ def episodes_learnt(folder: Path) -> int:
 
 # -- What has been driven so far ------------------------------------------------------------------
 
-_WHOLE = ("episode", "state")
-_OF_REVISION = ("proposed", "executed", "advised", "risk_proposed", "risk_executed", "seen")
-_COLUMNS = ("episode", "time", *VARIABLES, "state", "surprise", *_OF_REVISION, "realised", "reason")
+_WHOLE = ("episode", "intake", "state", "n_states")
+_OF_REVISION = ("proposed", "executed", "advised", "risk_proposed", "risk_executed")
+_EVIDENCE = ("risk_low", "risk_high", "evidence", "seen")
+_COLUMNS = (
+    *("episode", "time", *VARIABLES, "intake", "state", "n_states", "surprise"),
+    *(*_OF_REVISION, *_EVIDENCE, "realised", "reason"),
+)
 # Where there is no state.
 _NONE = -1
 
@@ -277,9 +285,14 @@ class Driven:
                 len(self.outcomes),
                 situation.time,
                 *situation.observation.tolist(),
+                int(situation.intake),
                 situation.state,
+                0 if situation.state is None else len(situation.belief),
                 situation.surprise,
                 *(getattr(revision, name) for name in _OF_REVISION),
+                *revision.interval,
+                revision.evidence,
+                revision.seen,
                 realised,
                 revision.reason,
             )

@@ -1,0 +1,555 @@
+"""Runs as MCAP, the log format of robotics, which Foxglove opens: a channel for each question.
+
+What was seen (``/observation``), where that is (``/belief``), how dangerous (``/risk``), and what
+was done about it (``/decision``); beside them ``/event``, and ``/log`` for Foxglove's log panel.
+The messages are JSON with schemas that name every unit. Episodes follow each other on one axis of
+time.
+
+What is not known is left out of a message: JSON has no NaN, and the schemas that Foxglove takes
+have one type for each field, so no null.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+import os
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any, BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evofsm import __version__, storage
+from evofsm._extras import needs
+from evofsm.framework.loop import Decision, Drive
+from evofsm.model import FSMModel
+from evofsm.protocols import Intake
+from evofsm.risk.headway import time_headway
+from evofsm.risk.ttc import time_to_collision
+from evofsm.worlds.road import VARIABLES
+
+with needs("mcap", "mcap", "reading and writing MCAP"):
+    from mcap.records import Attachment, Channel, Message, Metadata
+    from mcap.stream_reader import StreamReader
+    from mcap.writer import Writer
+
+#: The attachment that holds the model, and the record that says what was driven.
+MODEL, METADATA = "model.evofsm", "evofsm"
+_FORMAT = "1"
+# Time from the end of an episode to the start of the next [ns].
+_PAUSE = 1_000_000_000
+# Levels of foxglove.Log.
+_INFO, _WARNING, _ERROR = 2, 3, 4
+_SAME = 1e-9
+# Where there is no state.
+_NONE = -1
+
+
+def _of(kind: str, description: str) -> dict[str, Any]:
+    return {"type": kind, "description": description}
+
+
+_ACCELERATION = "[m/s²]; left out where there is none"
+_CHANNELS: dict[str, dict[str, dict[str, Any]]] = {
+    "/observation": {
+        "time": _of("number", "since the start of the episode [s]"),
+        "gap": _of("number", "from bumper to bumper, as observed [m]; left out where missing"),
+        "v_follower": _of("number", "speed of the follower [m/s]; left out where missing"),
+        "v_leader": _of("number", "speed of the leader [m/s]; left out where missing"),
+        "intake": _of(
+            "integer",
+            "what was wrong: a sum of "
+            + ", ".join(f"{flag.value} {flag.name}" for flag in Intake if flag.name),
+        ),
+    },
+    "/belief": {
+        "state": _of("integer", "the most probable one, from 0; left out where none is known"),
+        "belief": {
+            **_of("array", "probability of each state, from 0"),
+            "items": _of("number", "probability"),
+        },
+        "surprise": _of("number", "divergence of forecast and belief [bit]; left out at first"),
+        "n_states": _of("integer", "how many states there were"),
+    },
+    "/risk": {
+        "proposed": _of("number", "probability of failure under the proposal"),
+        "executed": _of("number", "the same for what is executed"),
+        "low": _of("number", "lower end of its 90 % interval"),
+        "high": _of("number", "upper end of its 90 % interval"),
+        "evidence": _of("number", "braking manoeuvres of leaders that it rests on"),
+        "seen": _of("number", "time spent in states like this one before [s]"),
+        "time_to_collision": _of("number", "[s]; left out where the gap does not close"),
+        "time_headway": _of("number", "[s]; left out where the follower stands"),
+    },
+    "/decision": {
+        "proposed": _of("number", f"what the controller wanted {_ACCELERATION}"),
+        "executed": _of("number", "what was commanded [m/s²]"),
+        "advised": _of("number", "what the reviser would have executed [m/s²]"),
+        "realised": _of("number", f"what the body did until the next decision {_ACCELERATION}"),
+        "reason": _of("string", "why, in a few words"),
+        "explanation": _of("string", "why, in detail; empty where nothing was said"),
+    },
+    "/event": {
+        "kind": _of("string", "episode started, collision, rear-end collision or episode ended"),
+        "episode": _of("integer", "number of the episode, from 0"),
+        "time": _of("number", "since the start of the episode [s]"),
+        "gap": _of("number", "from bumper to bumper, as it truly was [m]"),
+        "v_follower": _of("number", "speed of the follower [m/s]"),
+        "v_leader": _of("number", "speed of the leader [m/s]"),
+    },
+    # As Foxglove knows it, which is by its name.
+    "/log": {
+        "timestamp": {
+            **_of("object", "when"),
+            "properties": {"sec": {"type": "integer"}, "nsec": {"type": "integer"}},
+        },
+        "level": {
+            "description": "how grave",
+            "oneOf": [
+                {"title": name, "const": level}
+                for level, name in enumerate(
+                    ("UNKNOWN", "DEBUG", "INFO", "WARNING", "ERROR", "FATAL")
+                )
+            ],
+        },
+        "message": _of("string", "what happened"),
+        "name": _of("string", "who says so"),
+        "file": _of("string", "empty"),
+        "line": _of("integer", "0"),
+    },
+}
+_SCHEMA_NAMES = {"/log": "foxglove.Log"}
+# The columns of an episode, by channel and field; those in common are told apart.
+_RENAMED = {
+    ("/risk", "proposed"): "risk_proposed",
+    ("/risk", "executed"): "risk_executed",
+    ("/risk", "low"): "risk_low",
+    ("/risk", "high"): "risk_high",
+}
+_OF_DECISIONS = ("/observation", "/belief", "/risk", "/decision")
+_TEXTS, _WHOLE = ("reason", "explanation"), ("intake", "state", "n_states")
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedEpisode:
+    """An episode as a log holds it: D decisions over n states."""
+
+    #: By name, a row for each decision: ``time`` [s], ``gap`` [m], ``v_follower``, ``v_leader``
+    #: [m/s], ``intake``, ``state`` (-1 for none), ``belief`` (D, n), ``surprise`` [bit],
+    #: ``n_states``, ``risk_proposed``, ``risk_executed``, ``risk_low``, ``risk_high``,
+    #: ``evidence``, ``seen`` [s], ``time_to_collision``, ``time_headway`` [s], ``proposed``,
+    #: ``executed``, ``advised``, ``realised`` [m/s²], ``reason``, ``explanation``.
+    columns: Mapping[str, NDArray[Any]]
+    collided: bool  #: with the leader
+    rear_ended: bool  #: by the car behind
+    end_time: float  #: [s]
+    end: NDArray[np.float64]  #: (3,) gap [m], v_follower, v_leader [m/s] at the end
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """What a log holds."""
+
+    about: Mapping[str, str]  #: what was driven, by whom, with which library
+    model: FSMModel | None  #: as it was after the last episode
+    episodes: tuple[RecordedEpisode, ...]
+
+
+# -- Writing --------------------------------------------------------------------------------------
+
+
+def write_run(
+    path: str | os.PathLike[str],
+    drives: Iterable[Drive],
+    *,
+    model: FSMModel | None = None,
+    about: Mapping[str, Any] | None = None,
+) -> None:
+    """Write drives as a log, one after the other; the file appears once it is whole.
+
+    Parameters
+    ----------
+    path : str or path-like
+        A file of that name is replaced.
+    drives : iterable of Drive
+        Taken one by one, so they need not all be kept at once.
+    model : FSMModel, optional
+        What was learnt, to be attached.
+    about : mapping, optional
+        What was driven: family, controller, reviser and so on. What is no text becomes JSON.
+
+    Raises
+    ------
+    OSError
+        If it cannot be written; what was there before is then as it was.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> from evofsm import IntervalActions
+    >>> from evofsm.drivers.idm import IDM
+    >>> from evofsm.framework.loop import Framework
+    >>> from evofsm.worlds.kinematic import KinematicWorld
+    >>> from evofsm.worlds.scenario import Leader, Scenario
+    >>> actions = IntervalActions(low=-2.5, high=2.5, width=0.3, outside="clip")
+    >>> hasty = IDM(2.25, 28.0, 0.8, 0.3, 2.0, lowest=-2.5, highest=2.5)
+    >>> leader = Leader(IDM(1.2, 25.0, 1.0, 1.0, 2.5), brake_decel=4.0, brake_time=12.0)
+    >>> drive = Framework(hasty, actions).drive(KinematicWorld(), Scenario(leader, 10.0))
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     write_run(Path(folder) / "run.mcap", [drive], about={"controller": "hasty"})
+    ...     run = read_run(Path(folder) / "run.mcap")
+    >>> run.about["controller"], run.episodes[0].collided
+    ('hasty', True)
+    >>> bool((run.episodes[0].columns["executed"] == drive.executed).all())
+    True
+    """
+    with recording(path, about) as log:
+        for drive in drives:
+            log.add(drive)
+        if model is not None:
+            log.attach(model)
+
+
+@contextmanager
+def recording(
+    path: str | os.PathLike[str], about: Mapping[str, Any] | None = None
+) -> Iterator[RunWriter]:
+    """A log that grows episode by episode; the file appears at the end, if all went well.
+
+    Parameters
+    ----------
+    path, about
+        As in `write_run`.
+
+    Yields
+    ------
+    RunWriter
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     with recording(Path(folder) / "run.mcap", {"family": "emergency"}) as log:
+    ...         pass  # log.add(drive), and log.attach(model) at the end
+    ...     read_run(Path(folder) / "run.mcap").about["family"]
+    'emergency'
+    """
+    with storage.replacing(path) as file:
+        log = RunWriter(file, about or {})
+        yield log
+        log.finish()
+
+
+class RunWriter:
+    """Writes episode after episode; `recording` opens one. It keeps only part of an episode.
+
+    Parameters
+    ----------
+    file : binary file
+        Open for writing.
+    about : mapping
+        As in `write_run`.
+    """
+
+    def __init__(self, file: BinaryIO, about: Mapping[str, Any]) -> None:
+        self._episodes = 0
+        self._begin = 0  # of the episode, on the axis of time [ns]
+        self._mcap = Writer(file, enable_data_crcs=True)
+        self._mcap.start(profile="", library=f"evofsm {__version__}")
+        self._channels = {topic: self._channel(topic) for topic in _CHANNELS}
+        told = {"library": f"evofsm {__version__}", **about, "format": _FORMAT}
+        self._mcap.add_metadata(METADATA, {name: _text(value) for name, value in told.items()})
+
+    def _channel(self, topic: str) -> int:
+        name = _SCHEMA_NAMES.get(topic, f"evofsm.{topic[1:].capitalize()}")
+        schema = {"title": name, "type": "object", "properties": _CHANNELS[topic]}
+        number = self._mcap.register_schema(name, "jsonschema", json.dumps(schema).encode())
+        return self._mcap.register_channel(topic, "json", number)
+
+    def add(self, drive: Drive) -> None:
+        """Write the next episode.
+
+        Parameters
+        ----------
+        drive : Drive
+        """
+        episode = drive.episode
+        start, end = float(episode.time[0]), float(episode.time[-1])
+        self._event("episode started", start, episode.observations[0])
+        for number, (decision, changed) in enumerate(
+            zip(drive.decisions, drive.changed.tolist(), strict=True)
+        ):
+            time = decision.situation.time
+            for topic, message in _messages(decision):
+                self._send(topic, time, message, number)
+            if changed or abs(decision.revision.advised - decision.revision.executed) > _SAME:
+                self._log(_WARNING if changed else _INFO, time, _said(decision))
+        for happened, kind in (
+            (episode.collided, "collision"),
+            (episode.rear_ended, "rear-end collision"),
+        ):
+            if happened:
+                self._event(kind, end, episode.observations[-1])
+                self._log(_ERROR, end, kind)
+        self._event("episode ended", end, episode.observations[-1])
+        self._begin += _nanoseconds(end) + _PAUSE
+        self._episodes += 1
+
+    def attach(self, model: FSMModel) -> None:
+        """Attach what was learnt.
+
+        Parameters
+        ----------
+        model : FSMModel
+        """
+        file = io.BytesIO()
+        model.save(file)
+        self._mcap.add_attachment(0, self._begin, MODEL, "application/zip", file.getvalue())
+
+    def finish(self) -> None:
+        """Write the index, which ends the log."""
+        self._mcap.finish()  # type: ignore[no-untyped-call]
+
+    def _event(self, kind: str, time: float, observation: NDArray[np.float64]) -> None:
+        where = dict(zip(VARIABLES, observation.tolist(), strict=True))
+        about = {"kind": kind, "episode": self._episodes, "time": time, **where}
+        self._send("/event", time, about, 0)
+
+    def _log(self, level: int, time: float, message: str) -> None:
+        sec, nsec = divmod(self._begin + _nanoseconds(time), 1_000_000_000)
+        about = {"timestamp": {"sec": sec, "nsec": nsec}, "level": level, "message": message}
+        self._send("/log", time, {**about, "name": "evofsm", "file": "", "line": 0}, 0)
+
+    def _send(self, topic: str, time: float, message: Mapping[str, Any], number: int) -> None:
+        known = {name: value for name, value in message.items() if _is_known(value)}
+        at = self._begin + _nanoseconds(time)
+        encoded = json.dumps(known, ensure_ascii=False, allow_nan=False).encode()
+        self._mcap.add_message(self._channels[topic], at, encoded, at, number)
+
+
+def _messages(decision: Decision) -> Iterator[tuple[str, dict[str, Any]]]:
+    """What a decision says on each channel."""
+    situation, revision = decision.situation, decision.revision
+    observation = dict(zip(VARIABLES, situation.observation.tolist(), strict=True))
+    yield "/observation", {"time": situation.time, **observation, "intake": int(situation.intake)}
+    belief = [] if situation.state is None else situation.belief.tolist()
+    yield (
+        "/belief",
+        {
+            "state": situation.state,
+            "belief": belief,
+            "surprise": situation.surprise,
+            "n_states": len(belief),
+        },
+    )
+    yield (
+        "/risk",
+        {
+            "proposed": revision.risk_proposed,
+            "executed": revision.risk_executed,
+            "low": revision.interval[0],
+            "high": revision.interval[1],
+            "evidence": revision.evidence,
+            "seen": revision.seen,
+            "time_to_collision": float(time_to_collision(situation.observation)),
+            "time_headway": float(time_headway(situation.observation)),
+        },
+    )
+    yield (
+        "/decision",
+        {
+            "proposed": revision.proposed,
+            "executed": revision.executed,
+            "advised": revision.advised,
+            "realised": decision.realised,
+            "reason": revision.reason,
+            "explanation": getattr(decision, "explanation", ""),
+        },
+    )
+
+
+def _said(decision: Decision) -> str:
+    """A decision that was changed, or would have been, in a line."""
+    revision = decision.revision
+    kept = abs(revision.executed - revision.proposed) <= _SAME
+    what = f"would advise {revision.advised:+.2f}" if kept else f"executed {revision.executed:+.2f}"
+    return f"proposed {revision.proposed:+.2f}, {what} m/s²: {revision.reason}"
+
+
+def _is_known(value: Any) -> bool:
+    return value is not None and not (isinstance(value, float) and not math.isfinite(value))
+
+
+def _text(value: Any) -> str:
+    return value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
+
+
+def _nanoseconds(seconds: float) -> int:
+    return round(seconds * 1e9)
+
+
+# -- Reading --------------------------------------------------------------------------------------
+
+
+def read_run(path: str | os.PathLike[str]) -> Run:
+    """Read a log that `write_run` or `RunWriter` wrote, all of it checked.
+
+    Parameters
+    ----------
+    path : str or path-like
+
+    Returns
+    -------
+    Run
+        Everything the drives' decisions held. What was left out is NaN, no state is -1, and states
+        that there were not yet have belief 0.
+
+    Raises
+    ------
+    OSError
+        If there is no such file, or it may not be read.
+    ValueError
+        If it is no MCAP file, holds no run of evofsm, or is damaged; the message says which.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     write_run(Path(folder) / "run.mcap", [], about={"seed": 3})
+    ...     read_run(Path(folder) / "run.mcap").about["seed"]
+    '3'
+    """
+    with open(path, "rb") as file, _explained(path):
+        size = file.seek(0, os.SEEK_END)
+        file.seek(0)
+        return _read(StreamReader(file, validate_crcs=True, record_size_limit=size))
+
+
+def _read(reader: StreamReader) -> Run:
+    """The run, in one pass over all records."""
+    about: dict[str, str] | None = None
+    model: FSMModel | None = None
+    topics: dict[int, str] = {}
+    episodes = _Episodes()
+    for record in reader.records:
+        if isinstance(record, Metadata) and record.name == METADATA:
+            about = dict(record.metadata)
+            _refuse_other_formats(about)
+        elif isinstance(record, Attachment) and record.name == MODEL:
+            model = FSMModel.load(io.BytesIO(record.data))
+        elif isinstance(record, Channel):
+            topics[record.id] = record.topic
+        elif isinstance(record, Message) and about is not None:
+            episodes.take(topics[record.channel_id], record.data)
+    if about is None:
+        raise ValueError("it holds no run of evofsm")
+    return Run(about, model, episodes.finished())
+
+
+def _refuse_other_formats(about: Mapping[str, str]) -> None:
+    if (version := about.get("format")) != _FORMAT:
+        raise ValueError(f"its format is {version!r}, and this library reads {_FORMAT!r}")
+
+
+class _Episodes:
+    """Puts messages together to episodes."""
+
+    def __init__(self) -> None:
+        self._whole: list[RecordedEpisode] = []
+        self._events: list[str] = []
+        self._messages: dict[str, list[dict[str, Any]]] = {}  # of the one under way, by topic
+
+    def take(self, topic: str, encoded: bytes) -> None:
+        """The next message."""
+        if topic in self._messages:
+            self._messages[topic].append(json.loads(encoded))
+        elif topic in _OF_DECISIONS:
+            raise ValueError("a decision is outside of every episode")
+        elif topic == "/event":
+            self._happened(json.loads(encoded))
+
+    def _happened(self, event: Mapping[str, Any]) -> None:
+        if (event["kind"] == "episode started") == bool(self._messages):
+            raise ValueError("an episode has no end, or no beginning")
+        if event["kind"] == "episode started":
+            self._messages, self._events = {topic: [] for topic in _OF_DECISIONS}, []
+        elif event["kind"] == "episode ended":
+            self._whole.append(_episode(self._messages, self._events, event))
+            self._messages = {}
+        else:
+            self._events.append(event["kind"])
+
+    def finished(self) -> tuple[RecordedEpisode, ...]:
+        """All of them."""
+        if self._messages:
+            raise ValueError("it ends within an episode")
+        return tuple(self._whole)
+
+
+def _episode(
+    messages: Mapping[str, list[dict[str, Any]]], events: list[str], end: Mapping[str, Any]
+) -> RecordedEpisode:
+    """An episode from its messages."""
+    counts = {topic: len(of_topic) for topic, of_topic in messages.items()}
+    if len(set(counts.values())) != 1:
+        raise ValueError(f"its channels hold different numbers of decisions: {counts}")
+    columns = {
+        _RENAMED.get((topic, name), name): _column(name, messages[topic])
+        for topic in _OF_DECISIONS
+        for name in _CHANNELS[topic]
+    }
+    _restore_infinities(columns)
+    where = np.array([end[name] for name in VARIABLES], np.float64)
+    for array in (where, *columns.values()):
+        array.setflags(write=False)
+    return RecordedEpisode(
+        columns=columns,
+        collided="collision" in events,
+        rear_ended="rear-end collision" in events,
+        end_time=float(end["time"]),
+        end=where,
+    )
+
+
+def _column(name: str, messages: list[dict[str, Any]]) -> NDArray[Any]:
+    """A field of all messages, in their order."""
+    if name == "belief":
+        rows = [message[name] for message in messages]
+        beliefs = np.zeros((len(rows), max(map(len, rows), default=0)))
+        for row, belief in zip(beliefs, rows, strict=True):
+            row[: len(belief)] = belief
+        return beliefs
+    if name in _TEXTS:
+        return np.array([str(message[name]) for message in messages], dtype=object)
+    if name in _WHOLE:
+        return np.array([message.get(name, _NONE) for message in messages], np.int64)
+    return np.array([message.get(name, math.nan) for message in messages], np.float64)
+
+
+def _restore_infinities(columns: dict[str, NDArray[Any]]) -> None:
+    """Times that were left out are infinite where all that they follow from is known."""
+    seen = np.isfinite([columns[name] for name in VARIABLES]).all(axis=0)
+    for name in ("time_to_collision", "time_headway"):
+        columns[name][np.isnan(columns[name]) & seen] = math.inf
+
+
+@contextmanager
+def _explained(path: str | os.PathLike[str]) -> Iterator[None]:
+    """Turn whatever reading a damaged file runs into into one error that names the file."""
+    try:
+        yield
+    except OSError:
+        raise
+    except Exception as error:  # of the MCAP reader, of what unpacks for it, or ours
+        why = str(error)[:300] or type(error).__name__
+        raise ValueError(
+            f"{os.fspath(path)} cannot be read as a run in MCAP (damaged, cut off, or not written "
+            f"by evofsm?): {why}"
+        ) from error

@@ -1,0 +1,234 @@
+"""Graphs and processes, read back by others' tools, or by a reader written from PRISM's manual."""
+
+import re
+
+import numpy as np
+import pytest
+
+from evofsm import EvolvingFSM, IntervalActions
+from evofsm.io.graphs import to_dot, to_graphml, to_mermaid, to_prism
+
+ODD = 'v "\\#1;<b>&`x`{|}'
+
+
+@pytest.fixture(scope="module")
+def model():
+    """Of a walk between places that fails at its end, where one action leads more often."""
+    rng = np.random.default_rng(3)
+    machine = EvolvingFSM(n_actions=3, radius=0.05)
+    actions = rng.integers(0, 3, 400)
+    place, rows, failures, starts = 0.0, [], [], [0]
+    for row, action in enumerate(actions):
+        place = float(np.clip(place + 0.6 * (action - 0.8) + 0.1 * rng.normal(), 0.0, 6.0))
+        rows.append([place, 2.0 * place])
+        if place > 5.0:
+            failures.append(row)
+            starts.append(row + 1)
+            place = 0.0
+    starts = [start for start in starts if start < len(rows)]
+    machine.learn_many(rows, actions, starts, failures=failures)
+    assert machine.n_states >= 4
+    assert len(failures) >= 4
+    named = IntervalActions(-1.5, 1.5, 1.0)
+    return machine.model(actions=named, names=["gap", ODD], units=["m", "m/s"], dt=0.25)
+
+
+def drawn(model, least=0.0, evidence=0.0):
+    matrix = model.averaged_matrix("observed")
+    return {(i, j) for i, j in np.argwhere((matrix > least) & (model.changes >= evidence)).tolist()}
+
+
+# -- Graphs ---------------------------------------------------------------------------------------
+
+
+def test_graphviz_draws_every_state_and_every_edge_that_was_asked_for(model):
+    pygraphviz = pytest.importorskip("pygraphviz")
+    graph = pygraphviz.AGraph(string=to_dot(model, least=0.0, evidence=1.0))
+    assert set(graph.nodes()) == {f"s{i + 1}" for i in range(model.n_states)}
+    assert {(int(a[1:]) - 1, int(b[1:]) - 1) for a, b in graph.edges()} == drawn(model, 0.0, 1.0)
+    picture = graph.draw(format="svg", prog="dot").decode()
+    assert picture.count('class="node"') == model.n_states
+    assert ODD.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;").replace(
+        '"', "&quot;"
+    ) in picture.replace("&#45;", "-")
+
+
+def test_a_dead_end_is_marked_by_its_shape_and_in_words(model):
+    pygraphviz = pytest.importorskip("pygraphviz")
+    ended = {f"s{i + 1}" for i in np.flatnonzero(model.endings)}
+    graph = pygraphviz.AGraph(string=to_dot(model))
+    assert {n for n in graph.nodes() if n.attr["shape"] == "hexagon"} == ended
+    for name in ended:
+        assert "of all" in graph.get_node(name).attr["label"]
+    told = pygraphviz.AGraph(string=to_dot(model, dead_ends=[1]))
+    assert [n for n in told.nodes() if "dead end" in n.attr["label"]] == ["s2"]
+    assert [n for n in told.nodes() if n.attr["shape"] == "hexagon"] == ["s2"]
+
+
+def test_what_was_never_seen_is_dashed_and_loops_can_be_left_out(model):
+    pygraphviz = pytest.importorskip("pygraphviz")
+    graph = pygraphviz.AGraph(string=to_dot(model, least=0.0, evidence=0.0, self_loops=False))
+    assert len(graph.edges()) == model.n_states * (model.n_states - 1)
+    for edge in graph.edges():
+        seen = model.changes[int(edge[0][1:]) - 1, int(edge[1][1:]) - 1]
+        assert (edge.attr["style"] == "dashed") == (seen == 0)
+        assert edge.attr["label"].endswith(f"({seen:,.0f})")
+
+
+def test_mermaid_has_the_same_nodes_and_edges_in_its_own_syntax(model):
+    first, *lines, style = to_mermaid(model, least=0.0, evidence=0.0).splitlines()
+    assert first == "flowchart LR"
+    assert style.startswith("  classDef marked ")
+    node = re.compile(r'  s(\d+)(\(\["[^"]*"\]\)|\{\{"[^"]*"\}\}:::marked)')
+    edge = re.compile(r'  s(\d+) (-->|-\.->)\|"(\d\.\d+) \(([\d,]+)\)"\| s(\d+)')
+    nodes = [found for line in lines if (found := node.fullmatch(line))]
+    edges = [found for line in lines if (found := edge.fullmatch(line))]
+    assert len(nodes) + len(edges) == len(lines)
+    assert len(nodes) == model.n_states
+    assert {(int(e[1]) - 1, int(e[5]) - 1) for e in edges} == drawn(model)
+    assert all((e[2] == "-.->") == (e[4] == "0") for e in edges)
+    label = re.search(r'"([^"]*)"', lines[0])[1].replace("<br/>", "\n")
+    assert ODD in re.sub(r"#(\d+);", lambda code: chr(int(code[1])), label)
+
+
+def test_networkx_reads_graphml_with_types(model):
+    networkx = pytest.importorskip("networkx")
+    graph = networkx.parse_graphml(to_graphml(model))
+    matrix = model.averaged_matrix("observed")
+    for i in range(model.n_states):
+        node = graph.nodes[f"s{i + 1}"]
+        assert (node["visits"], node["failures"]) == (model.visits[i], model.endings[i])
+        assert (node["center.gap"], node[f"center.{ODD}"]) == tuple(model.centers[i])
+        assert node["dead_end"] is bool(model.endings[i])
+        for j in range(model.n_states):
+            edge = graph.edges[f"s{i + 1}", f"s{j + 1}"]
+            assert (edge["probability"], edge["changes"]) == (matrix[i, j], model.changes[i, j])
+
+
+def test_a_model_without_states_or_names_is_drawn_too():
+    empty = EvolvingFSM(n_actions=1, radius=0.5).model()
+    assert to_dot(empty).count("->") == 0
+    assert "s1" not in to_mermaid(empty)
+    assert "<node" not in to_graphml(empty)
+
+
+@pytest.mark.parametrize("write", [to_dot, to_mermaid, to_graphml])
+def test_what_cannot_be_drawn_is_refused(model, write):
+    with pytest.raises(ValueError, match="least is 2"):
+        write(model, least=2)
+    with pytest.raises(ValueError, match=r"\[99\].*states, from 0"):
+        write(model, dead_ends=[0, 99])
+    with pytest.raises(ValueError, match="policy"):
+        write(model, "sometimes")
+
+
+# -- PRISM ----------------------------------------------------------------------------------------
+
+NAME = r"[A-Za-z_][A-Za-z0-9_]*"
+
+
+def parsed(text):
+    """An MDP of one module and one variable, as the manual has it: initial state, commands, labels.
+
+    Comments end at the end of a line; a command is ``[action] guard -> p:(s'=j) + ...;``.
+    """
+    text = re.sub(r"//[^\n]*", "", text)
+    kind, module = re.match(rf"\s*(mdp)\s+module\s+({NAME})\s", text).groups()
+    assert (kind, module) == ("mdp", "evofsm")
+    low, high, first = re.search(r"s\s*:\s*\[(\d+)\.\.(\d+)\]\s*init\s+(\d+);", text).groups()
+    body = text[text.index(";") + 1 : text.index("endmodule")]
+    commands = {}
+    for command in body.split(";")[:-1]:
+        action, state, updates = re.fullmatch(
+            rf"\s*\[({NAME})\]\s*s=(\d+)\s*->(.*)", command, re.DOTALL
+        ).groups()
+        row = np.zeros(int(high) + 1)
+        for update in updates.split("+"):
+            probability, target = re.fullmatch(
+                r"\s*([0-9.]+)\s*:\s*\(s'=(\d+)\)\s*", update
+            ).groups()
+            assert int(low) <= int(target) <= int(high)
+            assert row[int(target)] == 0.0
+            row[int(target)] = float(probability)
+        assert (int(state), action) not in commands
+        commands[int(state), action] = row
+    rest = text[text.index("endmodule") + len("endmodule") :]
+    labels = dict(re.findall(rf'label "({NAME})" = ([^;]+);', rest))
+    assert not re.sub(rf'label "{NAME}" = [^;]+;', "", rest).strip()
+    return int(first), commands, labels
+
+
+def reached(commands, steps, choose):
+    """Probability to have reached s=0 from each state within some steps."""
+    n = max(state for state, _ in commands) + 1
+    value = np.eye(n)[0]
+    for _ in range(steps):
+        value = np.array(
+            [choose([row @ value for (s, _), row in commands.items() if s == k]) for k in range(n)]
+        )
+    return value
+
+
+def computed(model, steps, choose, evidence=1.0):
+    """The same, from the model."""
+    value = np.zeros(model.n_states)
+    for _ in range(steps):
+        share = model.failures / np.maximum(model.decisions, 1e-300)
+        each = share + (1.0 - share) * (model.transition_matrices @ value)
+        value = np.array(
+            [choose(each[model.decisions[:, s] >= evidence, s]) for s in range(model.n_states)]
+        )
+    return value
+
+
+def test_commands_are_distributions_and_stand_for_what_was_tried(model):
+    first, commands, labels = parsed(to_prism(model, evidence=2.0))
+    assert first == 1 + np.argmin(model.founded)
+    for row in commands.values():
+        assert row.sum() == pytest.approx(1.0, abs=1e-14)
+    tried = {(s + 1, f"a{a + 1}") for a, s in np.argwhere(model.decisions >= 2.0).tolist()}
+    assert {key for key in commands if key[1][1:].isdigit()} == tried
+    assert labels["failed"] == "s=0"
+    assert labels["state_2"] == "s=2"
+    for state in range(model.n_states + 1):  # PRISM refuses a state without a command
+        assert any(s == state for s, _ in commands)
+
+
+@pytest.mark.parametrize("choose", [np.max, np.mean])
+def test_failure_is_as_probable_as_the_model_says(model, choose):
+    _, commands, _ = parsed(to_prism(model))
+    wanted = computed(model, 30, choose)
+    assert 0.05 < wanted[0] < 0.999
+    np.testing.assert_allclose(reached(commands, 30, choose)[1:], wanted, atol=1e-10)
+
+
+def test_states_without_evidence_are_absorbing_and_say_so(model):
+    few = float(np.sort(model.decisions.max(axis=0))[1])
+    text = to_prism(model, evidence=few)
+    _, commands, labels = parsed(text)
+    lost = int(np.argmin(model.decisions.max(axis=0))) + 1
+    assert labels["unknown"] == f"s={lost}"
+    assert commands[lost, "unknown"][lost] == 1.0
+    assert "labelled unknown: 1." in text
+
+
+def test_rare_transitions_can_be_left_out_but_failure_never_is(model):
+    _, commands, _ = parsed(to_prism(model, least=0.5))
+    for (state, action), row in commands.items():
+        if action[1:].isdigit():
+            a, s = int(action[1:]) - 1, state - 1
+            assert row[0] == pytest.approx(model.failures[a, s] / model.decisions[a, s], abs=1e-11)
+            assert np.count_nonzero(row[1:]) <= 2
+            assert row.sum() == pytest.approx(1.0, abs=1e-14)
+
+
+def test_comments_tell_the_evidence_and_what_actions_mean(model):
+    text = to_prism(model)
+    assert "//   a1: [-1.5, -0.5)" in text
+    assert re.search(r"\[a1\] s=\d+ -> // [\d.]+ decisions; a1 was used", text)
+    assert f"seen {model.changes.max():g}" in text
+
+
+def test_a_process_needs_decisions():
+    with pytest.raises(ValueError, match="counted no decisions"):
+        to_prism(EvolvingFSM(n_actions=1, radius=0.5).model())
