@@ -7,6 +7,7 @@ from itertools import pairwise
 
 import pytest
 
+from evofsm.framework.reviser import Mode
 from evofsm.studies.closed_loop import Learner
 from evofsm.studies.watching import (
     Player,
@@ -132,6 +133,56 @@ def test_what_was_saved_is_gone_on_from(tmp_path):
     loaded = Learner.load(tmp_path)
     session = opened(learner=loaded)
     assert len(session.graph().states) == loaded.machine.n_states > 3
+
+
+# -- A recording ----------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def recorded(tmp_path):
+    """A log of two episodes, revised and not, and its drives."""
+    pytest.importorskip("mcap")
+    from evofsm.io.mcap import write_run
+
+    learner, family = learnt(), PAPER.family
+    drives = [
+        learner.drive(family, family.draw(0, 0), learner.reviser(family, 0.02, mode), learn=True)
+        for mode in (Mode.ACT, Mode.SHADOW)
+    ]
+    path = tmp_path / "run.mcap"
+    write_run(path, drives, model=learner.machine.model(), about={"family": "paper"})
+    return path, drives
+
+
+def test_a_recording_shows_what_was_decided(recorded):
+    from evofsm.studies.watching.recording import Recording
+
+    path, drives = recorded
+    recording = Recording(path)
+    for case, drive_ in enumerate(drives):
+        recording.restart(case)
+        frames = drive(recording)
+        assert [frame.executed for frame in frames[:-1]] == drive_.executed.tolist()
+        assert frames[-1].collided == drive_.episode.collided == bool(case)
+        assert frames[-1].time == drive_.episode.time[-1]
+        risks = [decision.revision.risk_proposed for decision in drive_.decisions]
+        assert frames[-1].story.first == next(
+            frame.time for frame, risk in zip(frames, risks, strict=False) if risk > 0.02
+        )
+        assert frames[-1].story.leader_brakes == pytest.approx(29.75, abs=0.3)
+        assert math.isnan(frames[-1].story.danger.dead_end)  # which the log does not hold
+    assert [state.is_dead_end for state in recording.graph().states].count(True) == 1
+    with pytest.raises(ValueError, match="there are 1 to 2"):
+        recording.restart(2)
+
+
+def test_no_recording_is_made_of_something_else(tmp_path):
+    pytest.importorskip("mcap")
+    from evofsm.studies.watching.recording import Recording
+
+    (tmp_path / "no.mcap").write_bytes(b"junk")
+    with pytest.raises(ValueError, match=r"no\.mcap"):
+        Recording(tmp_path / "no.mcap")
 
 
 # -- The clock ------------------------------------------------------------------------------------

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -24,7 +24,7 @@ with suppress(ModuleNotFoundError):
 
 if TYPE_CHECKING:
     from evofsm.studies.closed_loop import Learner
-    from evofsm.studies.watching import Session, Watching
+    from evofsm.studies.watching import Session, Watched, Watching
 
 
 @plain_errors
@@ -32,8 +32,9 @@ def watch(
     what: Annotated[
         str,
         typer.Argument(
-            metavar="FAMILY",
-            help="Family of scenarios: paper, emergency, ..., or a TOML file of your own.",
+            metavar="FAMILY|FILE",
+            help="Family of scenarios: paper, emergency, ..., or a TOML file of your own; or a run "
+            "that drive --mcap recorded, to be replayed.",
         ),
     ] = "paper",
     case: Annotated[
@@ -65,7 +66,7 @@ def watch(
         bool, typer.Option("--no-browser", help="Print the address; open nothing.")
     ] = False,
 ) -> None:
-    """Watch a run in the browser while it is driven, and act on it.
+    """Watch a run in the browser while it is driven, and act on it; or one that was recorded.
 
     The page shows the cars, what the machine believes, latent risk beside time to collision, and
     what was done about it. It answers on this computer only, under the address that is printed.
@@ -80,27 +81,57 @@ def watch(
         raise ValueError("--fresh and --learn exclude each other")
     if speed not in SPEEDS:
         raise ValueError(f"--speed is {speed:g}; it must be one of {_list(SPEEDS)}")
-    watching = Watching(
-        load_family(what), world.value, case - 1, controller, reviser, tolerance, seed
-    )
-    if case > len(watching.cases):
-        raise ValueError(f"--case is {case}; {what} has 1 to {len(watching.cases)}")
-    learner, learnt = _learner(watching, learn, 0 if fresh else learn_first)
+    is_recorded = what.endswith(".mcap")
+    if is_recorded:
+        opened = _recording(what, case)
+    else:
+        watching = Watching(
+            load_family(what), world.value, case - 1, controller, reviser, tolerance, seed
+        )
+        opened = _session(watching, learn, 0 if fresh else learn_first)
+    with (
+        LivePage(port, live=not is_recorded) as page,
+        Player(opened, page, paused=paused, speed=speed) as player,
+    ):
+        page.player = player
+        _show(page.address, no_browser)
+        with suppress(KeyboardInterrupt):
+            threading.Event().wait()
+    print("\nevofsm: the page is closed")
+
+
+Opening = Callable[[], "AbstractContextManager[Watched]"]
+
+
+def _recording(path: str, case: int) -> Opening:
+    """A run that was recorded, read before the page is opened."""
+    require(mcap="mcap")
+    from evofsm.studies.watching.recording import Recording
+
+    recording = Recording(path)
+    recording.restart(case - 1)
+    return lambda: recording
+
+
+def _session(watching: Watching, learn: Path | None, learn_first: int) -> Opening:
+    """A session in a world of its own, once something was learnt."""
+    cases = len(watching.cases)
+    if watching.case >= cases:
+        raise ValueError(f"--case is {watching.case + 1}; {watching.family.name} has 1 to {cases}")
+    learner, learnt = _learner(watching, learn, learn_first)
 
     @contextmanager
     def session() -> Iterator[Session]:
         from evofsm.studies.watching import Session
         from evofsm.worlds import open_world
 
-        with open_world(world.value) as place, Session(watching, learner, place, learnt) as opened:
+        with (
+            open_world(watching.world) as world,
+            Session(watching, learner, world, learnt) as opened,
+        ):
             yield opened
 
-    with LivePage(port) as page, Player(session, page, paused=paused, speed=speed) as player:
-        page.player = player
-        _show(page.address, no_browser)
-        with suppress(KeyboardInterrupt):
-            threading.Event().wait()
-    print("\nevofsm: the page is closed")
+    return session
 
 
 def _learner(watching: Watching, folder: Path | None, episodes: int) -> tuple[Learner, int]:

@@ -46,6 +46,7 @@ const send = (what, value) => {
 
 function showStart(start) {
   at("about").textContent = `${start.cases[start.case] ?? ""} · ${start.about}`;
+  at("of-cases").textContent = start.live ? "Case" : "Episode";
   at("case").replaceChildren(...start.cases.map((name, k) => new Option(name, k, false, k === start.case)));
   at("speed").replaceChildren(...start.speeds.map((speed) => new Option(`${speed} ×`, speed)));
   for (const element of document.querySelectorAll("[data-live]")) element.hidden = !start.live;
@@ -53,7 +54,7 @@ function showStart(start) {
 }
 
 function learnt(start) {
-  if (!start.live) return "Recorded: what it had learnt by then.";
+  if (!start.live) return "Recorded: the states as they were at its end. ⬢ a collision ended there, + the car now, blue: its way.";
   const before = start.learnt ? `It had learnt from ${start.learnt} episodes before this run` : "It began from empty";
   return `${before}, and goes on learning. ⬢ dead end, + the car now, blue: its way.`;
 }
@@ -128,7 +129,7 @@ function back(count) {
 /** On in the past; at its end, and where the run waits, it drives one decision. */
 function on(count) {
   if (!run.isLive) run.stepBy(count);
-  else if (run.start.live || run.clock.paused) send("step");
+  else send("step");
 }
 
 function faster(by) {

@@ -184,12 +184,20 @@ function drawDanger(pen, frames, x, box) {
 }
 
 function drawBand(pen, frames, band, x, y) {
-  const judged = frames.filter((frame) => band(frame).risk !== null);
   pen.fillStyle = colour.band;
-  pen.beginPath();
-  for (const frame of judged) pen.lineTo(x(frame.time), y(band(frame).high));
-  for (const frame of judged.reverse()) pen.lineTo(x(frame.time), y(band(frame).low));
-  pen.fill();
+  let stretch = [];
+  const fill = () => {
+    pen.beginPath();
+    for (const frame of stretch) pen.lineTo(x(frame.time), y(band(frame).high));
+    for (const frame of stretch.reverse()) pen.lineTo(x(frame.time), y(band(frame).low));
+    pen.fill();
+    stretch = [];
+  };
+  for (const frame of frames) {
+    if (band(frame).high === null) fill();
+    else stretch.push(frame);
+  }
+  fill();
 }
 
 function drawLine(pen, frames, one, x, y) {

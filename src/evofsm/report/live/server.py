@@ -250,7 +250,7 @@ class LivePage:
                 self.player.revise(on)
             case ("restart", None):
                 self.player.restart()
-            case ("case", float(case)) if self._live and case in range(len(self._start.cases)):
+            case ("case", float(case)) if case in range(len(self._start.cases)):
                 self.player.restart(int(case))
             case _:
                 raise ValueError(f"no such command: {command.name}")

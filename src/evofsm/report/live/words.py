@@ -61,9 +61,11 @@ _HEADLINES = {
 
 
 def _no_danger(frame: Frame) -> str:
+    if math.isnan(frame.brakes_to):  # which recordings do not hold
+        return "No wish of the driver was judged to be too risky."
     return (
-        f"If the leader braked as hard as leaders do (up to {frame.brakes_to:.1f} m/s²), full "
-        "braking would still avoid a collision."
+        f"If the leader braked as hard as must be expected (up to {frame.brakes_to:.1f} m/s²), "
+        "full braking would still avoid a collision."
     )
 
 
@@ -89,8 +91,8 @@ def _when(story: Story, danger: Danger) -> str:
         return f"{text}; it was over at {danger.last:.1f} s."
     if not math.isnan(danger.dead_end):
         return (
-            f"{text}. From {danger.dead_end:.1f} s on it was a dead end: if the leader braked, even "
-            "full braking would come too late."
+            f"{text}. From {danger.dead_end:.1f} s on it was a dead end: if the leader braked, "
+            "even full braking would come too late."
         )
     return f"{text}."
 
@@ -104,10 +106,13 @@ def _why(danger: Danger) -> str:
         where += f", {-danger.closing:.1f} m/s slower than it"
     else:
         where += ", as fast as it"
+    wanted = f"{where[0].upper()}{where[1:]}, the driver wanted to {_wish(danger.proposed)}"
+    if math.isnan(danger.critical):  # which recordings do not hold
+        return f"{wanted}: a risk of {danger.risk:.0%}."
     return (
-        f"{where[0].upper()}{where[1:]}, the driver wanted to {_wish(danger.proposed)}. "
-        "After that, full braking could no longer avoid a collision if the leader braked harder "
-        f"than {danger.critical:.1f} m/s² – and leaders brake by up to {danger.brakes_to:.1f} m/s²."
+        f"{wanted}. After that, full braking could no longer avoid a collision if the leader "
+        f"braked harder than {danger.critical:.1f} m/s² – and leaders must be expected to brake "
+        f"by up to {danger.brakes_to:.1f} m/s²."
     )
 
 

@@ -8,22 +8,30 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import Self
 
-import numpy as np
-from numpy.typing import NDArray
-
 from evofsm.actions import IntervalActions
 from evofsm.framework.loop import Oversight
 from evofsm.framework.reviser import Unrevised, make_usable
 from evofsm.machine import EvolvingFSM
 from evofsm.protocols import Proposal, Reviser, Revision, Situation
-from evofsm.risk.headway import TimeHeadway, time_headway
+from evofsm.risk.headway import time_headway
 from evofsm.risk.outcome import Judgement, LatentRisk
-from evofsm.risk.ttc import TimeToCollision, time_to_collision
+from evofsm.risk.ttc import time_to_collision
 from evofsm.states import Novelty
 from evofsm.studies.closed_loop import Learner
 from evofsm.studies.closed_loop.learner import drive_alone
 from evofsm.studies.driving import Setup, make_controller, make_reviser
-from evofsm.studies.watching.shown import Frame, Graph, Judged, Start, graph_of
+from evofsm.studies.watching.shown import (
+    CAR_LENGTH,
+    HEADWAY,
+    TTC,
+    UNJUDGED,
+    Frame,
+    Graph,
+    Judged,
+    Start,
+    graph_of,
+    most_believed,
+)
 from evofsm.studies.watching.story import Chronicle
 from evofsm.worlds.families import Draw, Family
 from evofsm.worlds.motion import GAP, GAP_BEHIND, LEADER_ACCELERATION, LEADER_SPEED, SPEED
@@ -32,17 +40,10 @@ from evofsm.worlds.road import World
 #: The state rule for looking on: coarse enough that each state can be told from the others.
 WATCHED_RULE = Novelty(radius=2.0, scales=(4.0, 2.0, 2.0))
 
-# What the page draws of a car; worlds need no length [m].
-_CAR_LENGTH = 5.0
-# So many states of a belief are shown, and none that is less probable.
-_MOST_BELIEVED, _LEAST_BELIEF = 12, 0.002
 # So many draws can be chosen among where a family has no cases.
 _DRAWS = 12
-# The classic measures that are shown beside, with their thresholds.
-_TTC, _HEADWAY = TimeToCollision(), TimeHeadway()
 # After a leader's full brake there is nothing left to see once all have stood for so long [s].
 _STANDING = 3.0
-_UNJUDGED = Judged(math.nan, math.nan, math.nan)
 
 
 @dataclass(frozen=True)
@@ -133,6 +134,7 @@ class Switchable:
 
     Examples
     --------
+    >>> import numpy as np
     >>> from evofsm.framework.reviser import AlwaysBrake
     >>> actions = IntervalActions(low=-2.5, high=2.5, width=0.3)
     >>> reviser = Switchable(AlwaysBrake(actions), actions, LatentRisk(lowest=-2.5), on=False)
@@ -238,7 +240,7 @@ class Session:
             interval=family.interval,
         )
         self._chronicle = Chronicle(
-            watching.tolerance, (_TTC.threshold, _HEADWAY.threshold), self._alone(draw)
+            watching.tolerance, (TTC.threshold, HEADWAY.threshold), self._alone(draw)
         )
         self._number, self._row, self._position = 0, 0, 0.0
         self._state: int | None = None
@@ -295,9 +297,9 @@ class Session:
             interval=family.interval,
             duration=draw.scenario.duration,
             actions=(family.actions.low, family.actions.high),
-            car_length=_CAR_LENGTH,
-            ttc_threshold=_TTC.threshold,
-            headway_threshold=_HEADWAY.threshold,
+            car_length=CAR_LENGTH,
+            ttc_threshold=TTC.threshold,
+            headway_threshold=HEADWAY.threshold,
             learnt=self.learnt,
         )
 
@@ -322,7 +324,7 @@ class Session:
         assert judged is not None
         wanted, does, braking = range(3)
         frame = self._seen()._replace(
-            belief=_most_believed(situation.belief),
+            belief=most_believed(situation.belief),
             state=situation.state,
             event=self._event(situation.state, machine.n_states > known),
             surprise=situation.surprise,
@@ -375,8 +377,8 @@ class Session:
             event="",
             n_states=self.learner.machine.n_states,
             surprise=math.nan,
-            proposed_risk=_UNJUDGED,
-            executed_risk=_UNJUDGED,
+            proposed_risk=UNJUDGED,
+            executed_risk=UNJUDGED,
             braking_risk=math.nan,
             critical=math.nan,
             brakes_to=self.learner.risk.manoeuvres.exceeded_by(self.watching.tolerance),
@@ -401,8 +403,3 @@ def explain(machine: EvolvingFSM, situation: Situation, revision: Revision) -> s
 
 def _judged(judged: Judgement, option: int) -> Judged:
     return Judged(float(judged.risk[option]), float(judged.low[option]), float(judged.high[option]))
-
-
-def _most_believed(belief: NDArray[np.float64]) -> tuple[tuple[int, float], ...]:
-    most = np.argsort(-belief, kind="stable")[:_MOST_BELIEVED].tolist()
-    return tuple((k, float(belief[k])) for k in most if belief[k] >= _LEAST_BELIEF)

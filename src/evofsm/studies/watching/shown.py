@@ -2,17 +2,28 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from evofsm.model import FSMModel
 from evofsm.risk.by_state import assess_states
+from evofsm.risk.headway import TimeHeadway
 from evofsm.risk.outcome import LatentRisk
+from evofsm.risk.ttc import TimeToCollision
 
 if TYPE_CHECKING:
     from evofsm.studies.watching.story import Story
 
+#: What is drawn of a car; worlds need no length [m].
+CAR_LENGTH = 5.0
+#: The classic measures that are shown beside, with their thresholds.
+TTC, HEADWAY = TimeToCollision(), TimeHeadway()
+
+# So many states of a belief are shown, and none that is less probable.
+_MOST_BELIEVED, _LEAST_BELIEF = 12, 0.002
 # Of each state so many ways out are shown, and none that is rarer.
 _MOST_WAYS, _LEAST_SHARE = 3, 0.02
 
@@ -23,6 +34,10 @@ class Judged(NamedTuple):
     risk: float
     low: float
     high: float
+
+
+#: Where nothing is judged.
+UNJUDGED = Judged(math.nan, math.nan, math.nan)
 
 
 class Start(NamedTuple):
@@ -141,10 +156,11 @@ def graph_of(model: FSMModel, risk: LatentRisk, number: int = 0) -> Graph:
         )
         for one in assess_states(model, risk)
     )
-    return Graph(number, states, tuple(_usual_ways(model)))
+    return Graph(number, states, tuple(usual_ways(model)))
 
 
-def _usual_ways(model: FSMModel) -> list[Transition]:
+def usual_ways(model: FSMModel) -> list[Transition]:
+    """How one state follows another, of each state the most usual ways."""
     changes = model.changes * ~np.eye(model.n_states, dtype=bool)
     ways = []
     for origin, row in enumerate(changes):
@@ -155,3 +171,9 @@ def _usual_ways(model: FSMModel) -> list[Transition]:
             if shares[target] >= _LEAST_SHARE:
                 ways.append(Transition(origin, target, float(shares[target])))
     return ways
+
+
+def most_believed(belief: NDArray[np.float64]) -> tuple[tuple[int, float], ...]:
+    """The most probable states, and how probable they are."""
+    most = np.argsort(-belief, kind="stable")[:_MOST_BELIEVED].tolist()
+    return tuple((k, float(belief[k])) for k in most if belief[k] >= _LEAST_BELIEF)

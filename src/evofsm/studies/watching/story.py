@@ -23,6 +23,7 @@ class Danger(NamedTuple):
     gap: float  #: then [m]
     speed: float  #: the follower's, then [m/s]
     closing: float  #: the follower's speed less the leader's, then [m/s]
+    risk: float  #: of what the driver then wanted
     critical: float  #: hardest braking of the leader that was then survived [m/s²]
     brakes_to: float  #: how hard leaders were then known to brake [m/s²]
     proposed: float  #: what the driver then wanted [m/s²]
@@ -121,6 +122,7 @@ def _began(frame: Frame) -> Danger:
         gap=gap,
         speed=speed,
         closing=speed - leader_speed,
+        risk=frame.proposed_risk.risk,
         critical=frame.critical,
         brakes_to=frame.brakes_to,
         proposed=frame.proposed,
@@ -131,7 +133,7 @@ def _began(frame: Frame) -> Danger:
 def _went_on(danger: Danger, frame: Frame, is_tolerable: bool) -> Danger:
     revised = abs(frame.executed - frame.proposed) > _SAME
     dead_end = danger.dead_end
-    if frame.braking_risk <= _DEAD_END:
+    if not frame.braking_risk > _DEAD_END:  # or it is not known
         dead_end = math.nan
     elif math.isnan(dead_end):
         dead_end = frame.time
