@@ -280,17 +280,25 @@ def test_speed_is_kept():
     assert len(told.of("saw")) < 60  # and not as fast as it goes
 
 
-def test_a_run_that_breaks_off_says_why():
-    told = Told()
-
+def test_what_cannot_be_opened_raises_and_a_run_that_breaks_off_says_why():
     @contextmanager
-    def broken():
+    def no_road():
         raise ValueError("no road")
         yield
 
-    with Player(broken, told):
+    with pytest.raises(ValueError, match="no road"), Player(no_road, Told()):
+        pass
+
+    @contextmanager
+    def short_road():
+        with opened() as session:
+            session.step = lambda: 1 / 0
+            yield session
+
+    told = Told()
+    with Player(short_road, told, speed=math.inf):
         told.wait(lambda told: told.of("failed"))
-    assert told.of("failed") == ["ValueError: no road"]
+    assert told.of("failed") == ["ZeroDivisionError: division by zero"]
 
 
 def test_it_ends_at_once_when_closed():

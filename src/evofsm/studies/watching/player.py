@@ -79,7 +79,8 @@ class Audience(Protocol):
 class Player:
     """Plays what is watched at a pace, and does as it is told while it plays.
 
-    What it is told is carried out before the next decision; telling never waits.
+    What it is told is carried out before the next decision; telling never waits. What cannot be
+    opened raises its error where the player is entered.
 
     Parameters
     ----------
@@ -112,6 +113,8 @@ class Player:
         self._told = threading.Condition()
         self._orders: dict[str, Callable[[Watched], None]] = {}  # the latest of each kind
         self._closed = False
+        self._opened = threading.Event()
+        self._refused: Exception | None = None  # why it could not be opened
         self._thread = threading.Thread(target=self._play, name="evofsm-player", daemon=True)
 
     # -- Told from any thread ---------------------------------------------------------------------
@@ -174,6 +177,10 @@ class Player:
 
     def __enter__(self) -> Self:
         self._thread.start()
+        self._opened.wait()
+        if self._refused is not None:
+            self._thread.join()
+            raise self._refused
         return self
 
     def __exit__(self, *error: object) -> None:
@@ -186,9 +193,14 @@ class Player:
         try:
             with self._watched() as watched:
                 self._begin(watched)
+                self._opened.set()
                 while self._is_due(watched):
                     self._show(watched, watched.step())
-        except Exception as error:  # whoever looks on must learn why nothing moves any more
+        except Exception as error:
+            if not self._opened.is_set():
+                self._refused = error
+                self._opened.set()
+            # Whoever looks on must learn why nothing moves any more.
             self._audience.failed(f"{type(error).__name__}: {error}")
 
     def _begin(self, watched: Watched) -> None:
