@@ -129,7 +129,7 @@ def test_switched_on_the_reviser_prevents_the_collision_that_happens_with_it_off
     assert "Collision at 31.4" in text(page, "outcome")
     assert began[0] in text(page, "when")
     assert "the reviser is off" in text(page, "done")
-    assert re.search(r"noticed at 30\.\d.s, 2\d\.\d.s after", text(page, "others"))
+    assert re.search(r"did at 30\.\d.s, 2\d\.\d.s after", text(page, "others"))
 
     page.locator("#reviser").click()
     page.locator("#pause").click()  # again

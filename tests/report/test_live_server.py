@@ -91,11 +91,9 @@ def test_the_page_and_all_that_it_needs_are_served_under_its_address(page):
         assert body
 
 
-@pytest.mark.parametrize("path", ["/", "/wrong/", "/wrong/page.js", "/%00/", "//", "/ä/".encode()])
+@pytest.mark.parametrize("path", ["/", "/wrong/", "/wrong/page.js", "/%00/", "//", "/socket"])
 def test_without_the_token_nothing_is_served(page, path):
-    path = path if isinstance(path, str) else path.decode("latin-1")
-    with suppress(UnicodeEncodeError):
-        assert get(page, path)[0] == 403
+    assert get(page, path)[0] == 403
 
 
 def test_files_beside_the_page_are_not_served(page):
@@ -233,6 +231,7 @@ def test_junk_on_the_wire_is_survived(page):
     for junk in (
         b"\x16\x03\x01\x02\x00\x01" * 50,  # as if it were TLS
         b"GET / HTTP/1.1\r\n" + b"A: b\r\n" * 500,
+        b"GET /\xff/ HTTP/1.1\r\n\r\n",
         b"POST / HTTP/1.1\r\nContent-Length: 9\r\n\r\n",
         b"\x00" * 100_000,
         request.encode(),  # and then nothing

@@ -11,12 +11,14 @@ from typing import TYPE_CHECKING, Annotated
 from evofsm.cli.common import (
     ControllerOption,
     ReviserOption,
+    SwitchesOption,
     ToleranceOption,
     WorldName,
     WorldOption,
     plain_errors,
     progress,
     require,
+    split_names,
 )
 
 with suppress(ModuleNotFoundError):
@@ -44,6 +46,7 @@ def watch(
     controller: ControllerOption = "family",
     reviser: ReviserOption = "least-risk",
     tolerance: ToleranceOption = 0.02,
+    switches: SwitchesOption = "",
     learn_first: Annotated[
         int, typer.Option(min=0, help="Episodes to learn from before it is watched.")
     ] = 60,
@@ -85,9 +88,8 @@ def watch(
     if is_recorded:
         opened = _recording(what, case)
     else:
-        watching = Watching(
-            load_family(what), world.value, case - 1, controller, reviser, tolerance, seed
-        )
+        family = load_family(what).with_switches(split_names(switches))
+        watching = Watching(family, world.value, case - 1, controller, reviser, tolerance, seed)
         opened = _session(watching, learn, 0 if fresh else learn_first)
     with (
         LivePage(port, live=not is_recorded) as page,

@@ -89,6 +89,7 @@ function marksOf(frame) {
   const story = frame.story;
   return [
     { at: story.first, label: "▲ danger began", ink: colour.danger },
+    { at: story.time_headway, label: "time headway warns", ink: colour.third },
     { at: story.dead_end, label: "⬢ dead end", ink: colour.danger },
     { at: story.leader_brakes, label: "leader brakes", ink: colour.ink },
     { at: story.time_to_collision, label: "time to collision warns", ink: colour.leader },
@@ -102,6 +103,7 @@ function place(pen, marks, x, width) {
   const rows = [];
   for (const mark of marks) {
     const wide = pen.measureText(mark.label).width + 12;
+    mark.wide = wide;
     mark.right = x(mark.at) + wide > width;
     const [from, to] = mark.right ? [x(mark.at) - wide, x(mark.at)] : [x(mark.at), x(mark.at) + wide];
     mark.row = rows.findIndex((taken) => taken.every(([a, b]) => to < a || from > b));
@@ -112,10 +114,15 @@ function place(pen, marks, x, width) {
 }
 
 function drawMarks(pen, marks, x, top, bottom) {
+  const y = (mark) => 10 + 16 * mark.row;
   for (const mark of marks) {
-    const y = 10 + 16 * mark.row;
-    line(pen, x(mark.at), y - 7, x(mark.at), bottom, { ink: mark.ink, width: 1.2, dash: [3, 3] });
-    text(pen, mark.label, x(mark.at) + (mark.right ? -4 : 4), y, {
+    line(pen, x(mark.at), y(mark) - 7, x(mark.at), bottom, { ink: mark.ink, width: 1.2, dash: [3, 3] });
+  }
+  for (const mark of marks) {
+    pen.fillStyle = colour.panel;
+    const wide = mark.wide - 7;
+    pen.fillRect(x(mark.at) + (mark.right ? -wide - 2 : 2), y(mark) - 7, wide, 14);
+    text(pen, mark.label, x(mark.at) + (mark.right ? -4 : 4), y(mark), {
       size: 11, bold: true, ink: mark.ink, align: mark.right ? "right" : "left",
     });
   }

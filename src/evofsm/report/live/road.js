@@ -32,7 +32,7 @@ export function drawRoad(canvas, run) {
   const carHeight = (lane.bottom - lane.top) * 0.52;
   const car = (x, ink, brakes) => drawCar(pen, x, middle, length * scale, carHeight, ink, brakes);
   if (motion.gap_behind !== null) {
-    car(front - (length + motion.gap_behind) * scale, colour.soft, false);
+    car(front - (length + motion.gap_behind) * scale, colour.line, false);
   }
   const tail = front + motion.gap * scale; // the leader's rear bumper
   car(front, colour.follower, motion.a_follower < BRAKES);
@@ -51,6 +51,7 @@ export function drawRoad(canvas, run) {
   });
   const frame = run.frame;
   if (frame.collided) drawCollision(pen, front, middle, carHeight);
+  if (frame.rear_ended) drawCollision(pen, front - length * scale, middle, carHeight);
   canvas.setAttribute("aria-label", `${left}. ${right}. Gap ${Math.max(0, motion.gap).toFixed(1)} metres.`);
 }
 
@@ -92,7 +93,8 @@ function drawGap(pen, from, to, y, top, gap) {
   }
   const middle = (from + to) / 2;
   line(pen, middle, top - 7, middle, y, { ink: colour.soft });
-  text(pen, `gap ${Math.max(0, gap).toFixed(1)} m`, middle, top - 14, { size: 12.5, bold: true, align: "center" });
+  const words = gap > 0 ? `gap ${gap.toFixed(1)} m` : "collision";
+  text(pen, words, middle, top - 14, { size: 12.5, bold: true, align: "center", ink: gap > 0 ? colour.ink : colour.danger });
 }
 
 function drawScale(pen, position, front, scale, width, top, height) {
@@ -119,5 +121,5 @@ function drawCollision(pen, x, y, size) {
   pen.lineWidth = 2;
   pen.fill();
   pen.stroke();
-  text(pen, "Collision", x, y, { size: 12, bold: true, align: "center", ink: "#5a1200" });
+  text(pen, "✕", x, y + 1, { size: 18, bold: true, align: "center", ink: "#8a1c00" });
 }

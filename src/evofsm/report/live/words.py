@@ -69,9 +69,14 @@ def _no_danger(frame: Frame) -> str:
     )
 
 
+def _seconds(time: float) -> str:
+    """A time, rounded as the page does it: 14.25 s becomes 14.3 s."""
+    return f"{math.floor(10.0 * time + 0.5) / 10.0:.1f} s"
+
+
 def _status(frame: Frame, start: Start) -> str:
     story = frame.story
-    if frame.collided:
+    if frame.collided or frame.rear_ended:
         return "collision"
     if frame.over:
         return "ended"
@@ -84,14 +89,14 @@ def _status(frame: Frame, start: Start) -> str:
 
 
 def _when(story: Story, danger: Danger) -> str:
-    text = f"Danger began at {danger.since:.1f} s"
+    text = f"Danger began at {_seconds(danger.since)}"
     if danger.since > story.first:
-        text += f" (and before, at {story.first:.1f} s)"
+        text += f" (and before, at {_seconds(story.first)})"
     if not story.in_danger:
-        return f"{text}; it was over at {danger.last:.1f} s."
+        return f"{text}; it was over at {_seconds(danger.last)}."
     if not math.isnan(danger.dead_end):
         return (
-            f"{text}. From {danger.dead_end:.1f} s on it was a dead end: if the leader braked, "
+            f"{text}. From {_seconds(danger.dead_end)} on it was a dead end: if the leader braked, "
             "even full braking would come too late."
         )
     return f"{text}."
@@ -121,7 +126,7 @@ def _done(danger: Danger, frame: Frame) -> str:
     instead = f"to {_wish(danger.advised)} instead of {_wishing(danger.proposed)}"
     if danger.revised == 0:
         if frame.revising:
-            return "The reviser is on; it has changed nothing yet."
+            return "The reviser has changed nothing yet."
         return f"Nothing: the reviser is off. It would have begun at once, {instead}."
     if not frame.revising:
         return f"The reviser changed {share}, but now it is off."
@@ -149,29 +154,38 @@ def _wishing(acceleration: float) -> str:
 
 def _others(story: Story, start: Start) -> str:
     """When the classic measures noticed, against the first danger."""
-    measure = f"Time to collision (alarm below {start.ttc_threshold:g} s)"
-    if math.isnan(story.time_to_collision):
-        return f"{measure} has not noticed anything."
-    text = f"{measure} noticed at {story.time_to_collision:.1f} s"
-    earlier = story.time_to_collision - story.first
-    if earlier > 0.0:
-        return f"{text}, {earlier:.1f} s after the danger began."
-    return f"{text}."
+    collision = _noticed(story.time_to_collision, story.first)
+    headway = _noticed(story.time_headway, story.first)
+    return (
+        f"Time to collision (below {start.ttc_threshold:g} s) {collision}; "
+        f"time headway (below {start.headway_threshold:g} s) {headway}."
+    )
+
+
+def _noticed(at: float, danger: float) -> str:
+    if math.isnan(at):
+        return "has not noticed anything"
+    late = at - danger
+    if math.isnan(late) or late == 0.0:
+        return f"did at {_seconds(at)}"
+    side = "after danger began" if late > 0.0 else "before"
+    return f"did at {_seconds(at)}, {_seconds(abs(late))} {side}"
 
 
 def _outcome(story: Story, frame: Frame) -> str:
     parts = []
     if not math.isnan(story.leader_brakes):
-        parts.append(
-            f"The leader braked by {story.leader_decel:.1f} m/s² at {story.leader_brakes:.1f} s."
-        )
+        when = _seconds(story.leader_brakes)
+        parts.append(f"The leader braked by {story.leader_decel:.1f} m/s² at {when}.")
     if not math.isnan(story.collision):
-        parts.append(f"Collision at {story.collision:.1f} s, {story.impact:.1f} m/s too fast.")
+        parts.append(f"Collision at {_seconds(story.collision)}, {story.impact:.1f} m/s too fast.")
+    elif frame.rear_ended:
+        parts.append(f"The car behind ran into the follower at {_seconds(frame.time)}.")
     elif not math.isnan(story.ended):
         parts.append(f"No collision: {_rest(frame)}.")
     if math.isfinite(story.alone) and not frame.collided and frame.time > 0.0:
         verb = "would have hit" if frame.time >= story.alone else "will hit"
-        parts.append(f"Left alone, this driver {verb} the leader at {story.alone:.1f} s.")
+        parts.append(f"Left alone, this driver {verb} the leader at {_seconds(story.alone)}.")
     return " ".join(parts)
 
 

@@ -115,7 +115,9 @@ class Recording:
         if number < decisions:
             frame = frame._replace(**_decided(self._episode.columns, number))
         else:
-            frame = frame._replace(over=True, collided=self._episode.collided)
+            frame = frame._replace(
+                over=True, collided=self._episode.collided, rear_ended=self._episode.rear_ended
+            )
         self._number += 1
         return frame._replace(story=self._chronicle.tell(frame))
 
@@ -189,6 +191,7 @@ class Recording:
             explanation="",
             revising=self.revising,
             collided=False,
+            rear_ended=False,
             over=False,
             story=self._chronicle.story,
         )

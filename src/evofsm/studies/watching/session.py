@@ -345,7 +345,9 @@ class Session:
         self._over = True
         self._oversight.end(self._road.observation, failed=self._road.collided)
         self.learnt += 1
-        return self._seen()._replace(over=True, collided=self._road.collided)
+        return self._seen()._replace(
+            over=True, collided=self._road.collided, rear_ended=self._road.rear_ended
+        )
 
     def _event(self, state: int | None, created: bool) -> str:
         if created:
@@ -391,6 +393,7 @@ class Session:
             explanation="",
             revising=self.revising,
             collided=False,
+            rear_ended=False,
             over=False,
             story=self._chronicle.story,
         )

@@ -94,7 +94,8 @@ class Frame(NamedTuple):
     reason: str  #: the reviser's
     explanation: str  #: the machine's
     revising: bool  #: whether the reviser may act
-    collided: bool
+    collided: bool  #: with the leader
+    rear_ended: bool  #: by the car behind
     over: bool  #: whether the run ended here
     story: Story  #: what has happened so far
 
