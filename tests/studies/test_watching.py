@@ -62,6 +62,7 @@ def test_switched_on_in_time_it_still_prevents_it_and_switched_off_it_says_what_
     assert all(frame.executed == frame.proposed for frame in off)
     assert any(frame.advised < frame.executed - 0.5 for frame in off)
     assert any(frame.executed < frame.proposed - 0.5 for frame in frames[20:-1])
+    assert frames[-1].story.danger.since < 5.0 <= frames[-1].story.danger.stepped_in
 
 
 def test_danger_shows_long_before_time_to_collision_notices_and_is_told_from_when_it_began():

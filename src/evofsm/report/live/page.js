@@ -184,7 +184,7 @@ function draw(now) {
   before = now;
   if (run.latest && (changed || run.shown !== time)) {
     if (changed || run.frame !== drawn) {
-      drawPlots(plots, run);
+      at("playhead").style.top = `${drawPlots(plots, run)}px`;
       drawBelief(at("belief"), run);
       drawMap(at("map-canvas"), run);
       showStory();

@@ -58,9 +58,10 @@ export function placeOf(canvas, run, time) {
   return LEFT + (time / span(run)) * (canvas.clientWidth - LEFT - RIGHT);
 }
 
+/** Draw all panels; answers where they begin, below the marks' labels. */
 export function drawPlots(canvas, run) {
   const { pen, width, height } = fresh(canvas);
-  if (!run.latest) return;
+  if (!run.latest) return 0;
   const most = span(run);
   const x = (time) => placeOf(canvas, run, time);
   const visible = run.frames.slice(0, run.index(run.shown + 1e-6) + 1);
@@ -83,6 +84,7 @@ export function drawPlots(canvas, run) {
   });
   drawTimes(pen, x, most, bottom);
   drawMarks(pen, marks, x, top, bottom);
+  return top;
 }
 
 function marksOf(frame) {

@@ -122,18 +122,20 @@ def _why(danger: Danger) -> str:
 
 
 def _done(danger: Danger, frame: Frame) -> str:
-    share = f"{danger.revised} of {danger.decisions} decisions since then"
-    instead = f"to {_wish(danger.advised)} instead of {_wishing(danger.proposed)}"
+    share = f"{danger.revised} of {danger.decisions} decisions in danger"
     if danger.revised == 0:
         if frame.revising:
             return "The reviser has changed nothing yet."
+        instead = f"to {_wish(danger.advised)} instead of {_wishing(danger.proposed)}"
         return f"Nothing: the reviser is off. It would have begun at once, {instead}."
     if not frame.revising:
         return f"The reviser changed {share}, but now it is off."
     hardest = ""
     if danger.hardest < -_HARDLY:
         hardest = f"; at its hardest it braked by {-danger.hardest:.1f} m/s²"
-    return f"The reviser stepped in, at first {instead}; it changed {share}{hardest}."
+    instead = f"to {_wish(danger.instead)} instead of {_wishing(danger.wished)}"
+    when = _seconds(danger.stepped_in)
+    return f"The reviser stepped in at {when}, at first {instead}; it changed {share}{hardest}."
 
 
 def _wish(acceleration: float) -> str:
@@ -184,7 +186,7 @@ def _outcome(story: Story, frame: Frame) -> str:
     elif not math.isnan(story.ended):
         parts.append(f"No collision: {_rest(frame)}.")
     if math.isfinite(story.alone) and not frame.collided and frame.time > 0.0:
-        verb = "would have hit" if frame.time >= story.alone else "will hit"
+        verb = "would have hit" if frame.time >= story.alone else "would hit"
         parts.append(f"Left alone, this driver {verb} the leader at {_seconds(story.alone)}.")
     return " ".join(parts)
 

@@ -28,6 +28,9 @@ class Danger(NamedTuple):
     brakes_to: float  #: how hard leaders were then known to brake [m/s²]
     proposed: float  #: what the driver then wanted [m/s²]
     advised: float  #: what the reviser then found better [m/s²]
+    stepped_in: float = math.nan  #: when the reviser first changed something in it [s]
+    wished: float = math.nan  #: what the driver wanted then [m/s²]
+    instead: float = math.nan  #: and what was executed [m/s²]
     revised: int = 0  #: decisions in it that the reviser changed
     decisions: int = 0  #: decisions in it
     hardest: float = math.inf  #: lowest acceleration that the reviser put through in it [m/s²]
@@ -132,6 +135,10 @@ def _began(frame: Frame) -> Danger:
 
 def _went_on(danger: Danger, frame: Frame, is_tolerable: bool) -> Danger:
     revised = abs(frame.executed - frame.proposed) > _SAME
+    if revised and danger.revised == 0:
+        danger = danger._replace(
+            stepped_in=frame.time, wished=frame.proposed, instead=frame.executed
+        )
     dead_end = danger.dead_end
     if not frame.braking_risk > _DEAD_END:  # or it is not known
         dead_end = math.nan
