@@ -4,10 +4,13 @@ PYTHON ?= python3
 BIN := .venv/bin
 INSTALL = $(PYTHON) -m pip --python $(BIN)/python --disable-pip-version-check install --quiet
 
-.PHONY: paper closed-loop evidence test check bench fuzz torture soak lock lowest supply clean
+.PHONY: paper watch closed-loop evidence test check bench fuzz torture soak lock lowest supply clean
 
 paper: .venv/installed          ## reproduce every claim of the paper in SUMO
 	@$(BIN)/evofsm paper --out results/paper
+
+watch: .venv/installed          ## look on while it drives case 1 of the paper, in the browser
+	@$(BIN)/evofsm watch paper --case 1 --world sumo
 
 closed-loop: .venv/installed    ## does the reviser prevent collisions, at what cost? some 15 minutes
 	@$(BIN)/evofsm bench closed-loop --out results/closed-loop

@@ -32,6 +32,7 @@ def application() -> typer.Typer:
     from evofsm.cli.export import export
     from evofsm.cli.learn import inspect, learn
     from evofsm.cli.paper import paper
+    from evofsm.cli.watch import watch
 
     app = typer.Typer(
         name="evofsm",
@@ -47,6 +48,7 @@ def application() -> typer.Typer:
     app.command()(inspect)
     app.command()(explain)
     app.command()(drive)
+    app.command()(watch)
     app.command()(campaign)
     app.command()(export)
     app.command()(audit)

@@ -1,0 +1,208 @@
+// The page: what comes from the run is shown, what is asked for is sent.
+
+import { readColours } from "./paint.js";
+import { drawPlots, placeOf, span, timeAt } from "./plots.js";
+import { drawRoad } from "./road.js";
+import { Run } from "./run.js";
+import { drawBelief, drawMap, placeHere } from "./states.js";
+
+const at = (id) => document.getElementById(id);
+const run = new Run();
+let socket = null;
+
+// -- The run, as it comes ---------------------------------------------------------------------------
+
+function connect() {
+  socket = new WebSocket(new URL("socket", location.href.replace(/^http/, "ws")));
+  socket.onmessage = (event) => take(JSON.parse(event.data));
+  socket.onopen = () => { at("lost").hidden = true; };
+  socket.onclose = (event) => {
+    complain(`The connection to evofsm is lost${event.reason ? ` (${event.reason})` : ""}. Trying again ...`);
+    at("mode").textContent = "lost";
+    setTimeout(connect, 1500);
+  };
+}
+
+function take(message) {
+  if (message.kind === "whole") message.parts.forEach(take);
+  else if (message.kind === "failed") complain(`The run broke off: ${message.text}`);
+  else run.take(message);
+  if (message.kind === "start") showStart(message);
+  if (message.kind === "clock") showControls();
+  changed = true;
+}
+
+function complain(words) {
+  at("lost").textContent = words;
+  at("lost").hidden = false;
+}
+
+const send = (what, value) => {
+  if (socket.readyState !== WebSocket.OPEN) return;
+  socket.send(JSON.stringify(value === undefined ? { do: what } : { do: what, value }));
+};
+
+// -- What is shown as words and controls ------------------------------------------------------------
+
+function showStart(start) {
+  at("about").textContent = `${start.cases[start.case] ?? ""} · ${start.about}`;
+  at("of-cases").textContent = start.live ? "Case" : "Episode";
+  at("case").replaceChildren(...start.cases.map((name, k) => new Option(name, k, false, k === start.case)));
+  at("speed").replaceChildren(...start.speeds.map((speed) => new Option(`${speed} ×`, speed)));
+  for (const element of document.querySelectorAll("[data-live]")) element.hidden = !start.live;
+  at("learnt").textContent = learnt(start);
+}
+
+function learnt(start) {
+  if (!start.live) return "Recorded: the states as they were at its end. ⬢ a collision ended there, + the car now, blue: its way.";
+  const before = start.learnt ? `It had learnt from ${start.learnt} episodes before this run` : "It began from empty";
+  return `${before}, and goes on learning. ⬢ dead end, + the car now, blue: its way.`;
+}
+
+function showControls() {
+  const { clock } = run;
+  at("pause").textContent = clock.over ? "Again" : clock.paused ? "Go on" : "Pause";
+  at("reviser").setAttribute("aria-checked", clock.revising);
+  at("reviser-state").textContent = clock.revising ? "on" : "off";
+  at("speed").value = clock.speed ?? "";
+}
+
+function showMode() {
+  at("live").hidden = run.isLive;
+  const recorded = run.start && !run.start.live ? "recorded" : "live";
+  const mode = !run.isLive ? "past" : run.clock.over ? "ended" : run.clock.paused ? "paused" : recorded;
+  if (socket.readyState === WebSocket.OPEN) at("mode").textContent = mode;
+  at("time").textContent = `${run.shown.toFixed(1)} s`;
+  const scrub = at("scrub");
+  scrub.max = span(run);
+  scrub.value = run.shown;
+  scrub.setAttribute("aria-valuetext", `${run.shown.toFixed(1)} seconds`);
+}
+
+let told = null;
+function showStory() {
+  const frame = run.frame;
+  if (!frame || frame === told) return;
+  told = frame;
+  at("status").dataset.status = frame.told.status;
+  write("headline", frame.told.headline);
+  for (const part of ["when", "why", "done", "others", "outcome"]) write(part, frame.told[part]);
+  const decision = run.decision;
+  write("explanation", `${decision.here}; ${decision.explanation}`);
+}
+
+/** Only what is new, so that screen readers say only that. */
+function write(id, words) {
+  if (at(id).textContent !== words) at(id).textContent = words;
+}
+
+// -- What is asked for ------------------------------------------------------------------------------
+
+const actions = {
+  pause: () => (run.clock.over ? send("restart") : send("pause", !run.clock.paused)),
+  step: () => send("step"),
+  reviser: () => send("revise", !run.clock.revising),
+  restart: () => send("restart"),
+  live: () => run.goLive(),
+  theme: () => setTheme(!document.documentElement.classList.contains("dark")),
+  help: () => at("helping").showModal(),
+};
+for (const [id, action] of Object.entries(actions)) {
+  at(id).addEventListener("click", () => { action(); changed = true; });
+}
+at("speed").addEventListener("change", () => send("speed", Number(at("speed").value)));
+at("case").addEventListener("change", () => send("case", Number(at("case").value)));
+at("scrub").addEventListener("input", () => { run.see(Number(at("scrub").value)); changed = true; });
+
+const plots = at("plots-canvas");
+const drag = (event) => {
+  run.see(timeAt(plots, run, event.offsetX));
+  changed = true;
+};
+plots.addEventListener("pointerdown", drag);
+plots.addEventListener("pointermove", (event) => { if (event.buttons) drag(event); });
+
+function back(count) {
+  run.stepBy(-count);
+}
+
+/** On in the past; at its end, and where the run waits, it drives one decision. */
+function on(count) {
+  if (!run.isLive) run.stepBy(count);
+  else send("step");
+}
+
+function faster(by) {
+  const speeds = run.start.speeds;
+  const wanted = speeds[speeds.indexOf(run.clock.speed) + by];
+  if (wanted) send("speed", wanted);
+}
+
+const keys = {
+  " ": actions.pause,
+  ArrowLeft: (event) => back(event.shiftKey ? 10 : 1),
+  ArrowRight: (event) => on(event.shiftKey ? 10 : 1),
+  Home: () => run.see(0),
+  End: actions.live, l: actions.live,
+  "+": () => faster(1), "=": () => faster(1), ArrowUp: () => faster(1),
+  "-": () => faster(-1), ArrowDown: () => faster(-1),
+  r: () => { if (run.start.live) actions.reviser(); },
+  n: actions.restart, t: actions.theme, "?": actions.help,
+};
+document.addEventListener("keydown", (event) => {
+  const { target, key } = event;
+  if (!run.start || at("helping").open || event.ctrlKey || event.metaKey || event.altKey) return;
+  if (target.tagName === "SELECT" || (target.tagName === "BUTTON" && key === " ")) return;
+  const action = keys[key] ?? keys[key.toLowerCase()];
+  if (!action) return;
+  event.preventDefault();
+  action(event);
+  changed = true;
+});
+
+// -- Looks ------------------------------------------------------------------------------------------
+
+const dark = matchMedia("(prefers-color-scheme: dark)");
+function setTheme(isDark) {
+  document.documentElement.classList.toggle("dark", isDark);
+  readColours();
+  changed = true;
+}
+dark.addEventListener("change", () => setTheme(dark.matches));
+new ResizeObserver(() => { changed = true; }).observe(document.body);
+
+// -- Every frame of the screen ----------------------------------------------------------------------
+
+// The road is drawn anew for each; the rest, where nothing but a mark moves, with each decision.
+
+let changed = true;
+let before = performance.now();
+let drawn = null;
+function draw(now) {
+  const time = run.shown;
+  run.play(Math.min(0.25, (now - before) / 1000));
+  before = now;
+  if (run.latest && (changed || run.shown !== time)) {
+    if (changed || run.frame !== drawn) {
+      at("playhead").style.top = `${drawPlots(plots, run)}px`;
+      drawBelief(at("belief"), run);
+      drawMap(at("map-canvas"), run);
+      showStory();
+    }
+    [changed, drawn] = [false, run.frame];
+    drawRoad(at("road-canvas"), run);
+    showMode();
+    put("playhead", placeOf(plots, run, run.shown), 0);
+    if (placeHere(run)) put("here", ...placeHere(run));
+  }
+  requestAnimationFrame(draw);
+}
+
+function put(id, x, y) {
+  at(id).hidden = false;
+  at(id).style.transform = `translate(${x}px, ${y}px)`;
+}
+
+setTheme(dark.matches);
+connect();
+requestAnimationFrame(draw);
