@@ -88,7 +88,8 @@ function showStory() {
   write("headline", frame.told.headline);
   for (const part of ["when", "why", "done", "others", "outcome"]) write(part, frame.told[part]);
   const decision = run.decision;
-  write("explanation", `${decision.here}; ${decision.explanation}`);
+  write("decision", `${decision.here}; ${decision.reason}`);
+  write("experience", decision.explanation || "nothing yet");
 }
 
 /** Only what is new, so that screen readers say only that. */

@@ -7,8 +7,8 @@ import math
 from collections.abc import Iterable
 from typing import Any
 
+from evofsm.naming import name_state, name_states
 from evofsm.report.live.words import tell
-from evofsm.report.naming import name_state, name_states
 from evofsm.studies.watching import SPEEDS, Clock, Frame, Graph, Start
 
 # What is not worth sending of a number.

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from evofsm.io.mcap import RecordedEpisode, Run, read_run
 from evofsm.model import FSMModel
+from evofsm.naming import VARIABLES
 from evofsm.studies.watching.shown import (
     CAR_LENGTH,
     HEADWAY,
@@ -26,7 +27,6 @@ from evofsm.studies.watching.shown import (
     usual_ways,
 )
 from evofsm.studies.watching.story import Chronicle
-from evofsm.worlds.road import VARIABLES
 
 # What is accepted where a log does not say.
 _TOLERANCE = 0.02
@@ -217,7 +217,7 @@ def _decided(columns: Any, number: int) -> dict[str, Any]:
         "executed_risk": executed,
         **{name: float(columns[name][number]) for name in ("proposed", "executed", "advised")},
         "reason": reason,
-        "explanation": str(columns["explanation"][number]) or reason,
+        "explanation": str(columns["explanation"][number]),
     }
 
 

@@ -9,9 +9,8 @@ from dataclasses import dataclass
 from typing import Self
 
 from evofsm.actions import IntervalActions
-from evofsm.framework.loop import Oversight
+from evofsm.framework.loop import Explain, Oversight
 from evofsm.framework.reviser import Unrevised, make_usable
-from evofsm.machine import EvolvingFSM
 from evofsm.protocols import Proposal, Reviser, Revision, Situation
 from evofsm.risk.headway import time_headway
 from evofsm.risk.outcome import Judgement, LatentRisk
@@ -238,6 +237,7 @@ class Session:
             machine=self.learner.machine,
             risk=self.learner.risk,
             interval=family.interval,
+            explaining=Explain.ALL,
         )
         self._chronicle = Chronicle(
             watching.tolerance, (TTC.threshold, HEADWAY.threshold), self._alone(draw)
@@ -336,7 +336,7 @@ class Session:
             executed=revision.executed,
             advised=revision.advised,
             reason=revision.reason,
-            explanation=explain(machine, situation, revision),
+            explanation=revision.explanation,
         )
         self._state = situation.state
         return frame
@@ -397,11 +397,6 @@ class Session:
             over=False,
             story=self._chronicle.story,
         )
-
-
-def explain(machine: EvolvingFSM, situation: Situation, revision: Revision) -> str:
-    """What the machine says of a situation, and why it was decided so."""
-    return revision.reason
 
 
 def _judged(judged: Judgement, option: int) -> Judged:

@@ -92,7 +92,7 @@ class Frame(NamedTuple):
     executed: float  #: [m/s²]
     advised: float  #: what the reviser would execute, on or off [m/s²]
     reason: str  #: the reviser's
-    explanation: str  #: the machine's
+    explanation: str  #: what the machine has seen of such situations
     revising: bool  #: whether the reviser may act
     collided: bool  #: with the leader
     rear_ended: bool  #: by the car behind
