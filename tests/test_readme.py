@@ -70,3 +70,14 @@ def test_our_own_lines_are_the_median_and_the_worst_of_the_seeds():
     changed = statistics.median(row["intervention_rate"] for row in ours)
     assert f"changing {100 * changed:.1f} %" in README
     assert sum(row["train_collisions"] for row in RESULTS) == 0  # as the text says
+
+
+def test_the_evidence_page_has_the_numbers_of_the_study():
+    page = (ROOT / "docs" / "evidence.md").read_text()
+    ours = [row for row in RESULTS if row["policy"] == "evofsm" and row["train_episodes"] == 100]
+    assert all(row["collision_rate"][0] == 0.0 for row in ours)
+    assert f"each of {len(ours)} learning seeds" in page
+    median = statistics.median(row["mobility"][0] for row in ours)
+    changed = statistics.median(row["intervention_rate"] for row in ours)
+    assert f"a mobility of {median:.3f}" in page
+    assert f"changes {100 * changed:.1f} % of the decisions" in page
