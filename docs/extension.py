@@ -244,7 +244,9 @@ def _open_rooms(app: Sphinx, docname: str, source: list[str]) -> None:
     for word, write in (("room", _chapter), ("list", _listed)):
 
         def modules(line: re.Match[str], write: Callable[[str], str] = write) -> str:
-            return "\n".join(write(module) for room in line[1].split() for module in modules_in(room))
+            return "\n".join(
+                write(module) for room in line[1].split() for module in modules_in(room)
+            )
 
         source[0] = re.sub(rf"^\.\. {word}:: (.*)$", modules, source[0], flags=re.MULTILINE)
 

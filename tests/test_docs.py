@@ -10,7 +10,6 @@ import re
 import shlex
 import subprocess
 import sys
-from functools import cache
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import NamedTuple
@@ -161,3 +160,108 @@ def test_commands_that_are_not_run_would_be_understood():
                 assert given <= options | {"--help"}, f"{name_of(page)}: {command}"
                 looked_at += 1
     assert looked_at > 50
+
+
+# -- The site -------------------------------------------------------------------------------------
+
+
+class Page(HTMLParser):
+    """What a page of HTML can be linked to by, where it leads, and what it loads."""
+
+    def __init__(self, path):
+        super().__init__()
+        self.anchors, self.links, self.loaded = set(), [], []
+        self.feed(path.read_text())
+
+    def handle_starttag(self, tag, attributes):
+        attributes = dict(attributes)
+        self.anchors |= {attributes[name] for name in ("id", "name") if attributes.get(name)}
+        leads = tag == "link" and attributes.get("rel") in {"index", "search", "next", "prev"}
+        if "href" in attributes and (tag == "a" or leads):
+            self.links.append(attributes["href"])
+        else:
+            self.loaded += [attributes[name] for name in ("src", "href") if attributes.get(name)]
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory):
+    """All pages of the site, built with warnings as errors."""
+    folder = tmp_path_factory.mktemp("site")
+    build = (sys.executable, "-m", "sphinx", "-W", "--keep-going", "-n", "-q", DOCS, folder)
+    environment = {**os.environ, "PYTHONPATH": ""}
+    done = subprocess.run(build, capture_output=True, text=True, check=False, env=environment)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return folder, {path: Page(path) for path in folder.rglob("*.html")}
+
+
+def is_elsewhere(address):
+    return urlsplit(address).scheme != "" or address.startswith("//")
+
+
+def test_every_link_of_the_site_leads_somewhere(site):
+    _, pages = site
+    looked_at = 0
+    for path, page in pages.items():
+        for link in page.links:
+            parts = urlsplit(link)
+            if is_elsewhere(link):
+                assert parts.scheme == "https", f"{path}: {link}"
+                continue
+            target = (path.parent / unquote(parts.path)).resolve() if parts.path else path
+            assert target.exists(), f"{path}: {link}"
+            if parts.fragment and target in pages:
+                assert unquote(parts.fragment) in pages[target].anchors, f"{path}: {link}"
+            looked_at += 1
+    assert looked_at > 1000
+
+
+def test_the_site_loads_nothing_from_elsewhere(site):
+    folder, pages = site
+    for path, page in pages.items():
+        assert not [one for one in page.loaded if is_elsewhere(one)], path
+    for style in folder.rglob("*.css"):
+        assert not re.search(r"(url\(|@import )['\"]?(https?:)?//", style.read_text()), style
+
+
+def test_formulas_are_there_without_a_script(site):
+    folder, _ = site
+    text = (folder / "equations" / "states.html").read_text()
+    assert len(re.findall(r'<math [^>]*display="block"', text)) == 4
+    assert "\\frac" not in text
+
+
+def test_a_line_of_code_is_where_its_link_leads(site):
+    folder, pages = site
+    links = pages[folder / "equations" / "states.html"].links
+    found = {int(one.rpartition("L-")[2]) for one in links if "states/ets.html#" in one}
+    source = (ROOT / "src/evofsm/states/ets.py").read_text().splitlines()
+    there = [source[line - 1].strip().partition("(")[0] for line in sorted(found)]
+    assert there == ["def judge", "return MOVED if squared_distance < radius * radius else CREATED"]
+
+
+def test_every_public_module_is_in_the_reference(site):
+    folder, _ = site
+    reference = "".join(path.read_text() for path in (folder / "reference").glob("*.html"))
+    for file in (ROOT / "src" / "evofsm").rglob("*.py"):
+        parts = file.relative_to(ROOT / "src").with_suffix("").parts
+        if not any(part.startswith("_") for part in parts):
+            name = ".".join(parts)
+            assert f'id="module-{name}"' in reference or f">{name}<" in reference, name
+
+
+def slug(heading):
+    """The anchor that GitHub gives a heading."""
+    words = re.sub(r"[^\w\- ]", "", re.sub(r"[`*]|\]\(.*?\)", "", heading).lower())
+    return words.strip().replace(" ", "-")
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
+def test_links_between_files_lead_somewhere(page):
+    text = FENCE.sub("", page.read_text())
+    for target in re.findall(r"\]\((?!https?:)([^)\s]+)\)", text):
+        path, _, anchor = target.partition("#")
+        file = (page.parent / path).resolve() if path else page
+        assert file.exists(), f"{name_of(page)} links to {target}"
+        if anchor and file.suffix == ".md":
+            headings = re.findall(r"^#+ (.*)$", FENCE.sub("", file.read_text()), re.MULTILINE)
+            assert anchor in {slug(heading) for heading in headings}, target
