@@ -24,7 +24,7 @@ myst_heading_anchors = 3
 # The reference.
 default_role = "py:obj"
 autodoc_member_order = "bysource"
-autodoc_typehints = "signature"
+autodoc_typehints = "none"  # `extension` writes them as they stand in the source
 autodoc_inherit_docstrings = False
 python_maximum_signature_line_length = 88
 napoleon_google_docstring = False

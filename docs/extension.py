@@ -329,10 +329,19 @@ def _name_in_full(app: Sphinx, doctree: nodes.document) -> None:
         module = pending.get("py:module") or ""
         target = pending["reftarget"].lstrip("~.")
         meaning = meaning_of(target, module, pending.get("py:class") or "")
+        if meaning is None and target.partition(".")[0] in imports_of("evofsm"):
+            meaning = meaning_of(target, "evofsm")
         if meaning is not None and meaning.startswith("evofsm"):
             pending["reftarget"] = meaning
         elif not target.startswith("evofsm."):  # of another package, a parameter, a command
             pending.replace_self(pending.children)
+
+
+def _trim(app: Sphinx, doctree: nodes.document) -> None:
+    """Blocks end with their last line; doctests need an empty one, readers do not."""
+    for block in doctree.findall(nodes.literal_block):
+        text = block.astext().rstrip()
+        block.rawsource, block.children = text, [nodes.Text(text)]
 
 
 def _lead_to_source(
@@ -361,5 +370,6 @@ def setup(app: Sphinx) -> dict[str, bool]:
     app.connect("autodoc-skip-member", _skip_kernels)
     app.connect("autodoc-process-signature", _as_written)
     app.connect("doctree-read", _name_in_full)
+    app.connect("doctree-read", _trim)
     app.connect("missing-reference", _lead_to_source)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -226,7 +226,7 @@ def test_the_site_loads_nothing_from_elsewhere(site):
 def test_formulas_are_there_without_a_script(site):
     folder, _ = site
     text = (folder / "equations" / "states.html").read_text()
-    assert len(re.findall(r'<math [^>]*display="block"', text)) == 4
+    assert len(re.findall(r'<math [^>]*display="block"', text)) == 5
     assert "\\frac" not in text
 
 

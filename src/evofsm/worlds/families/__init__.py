@@ -16,7 +16,8 @@ as well. All are SI units.
 ``[scenario]``      as `evofsm.worlds.scenario.Scenario`, and likewise ``[body]``, ``[sensors]``
 ``[leader]``        as `Leader`; ``driver`` names one of the drivers. ``waves`` holds pairs of a
                     time and an acceleration, ``[leader.traffic]`` makes such waves between a
-                    ``fast`` and a ``slow`` speed, and ``[leader.cut_in]`` puts another car in its place
+                    ``fast`` and a ``slow`` speed, and ``[leader.cut_in]`` puts another car in its
+                    place
 ``[follower]``      ``driver`` names one of the drivers, ``changes`` others from given times on;
                     ``[follower.lapses]``: a ``count`` of lapses, each from a ``start`` on for a
                     ``duration``, in which another ``driver`` drives
