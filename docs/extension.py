@@ -132,8 +132,18 @@ class Line(SphinxRole):
         here = nodes.inline(classes=["place"])
         here += nodes.Text(f" {module.rpartition('.')[2]}.py:{line}")
         link = _link_to(self.env.current_document.docname, self.env.app, module, line)
-        link += [nodes.literal(text=shown), here]
+        link += [_breakable(shown), here]
         return [link], []
+
+
+def _breakable(name: str) -> nodes.literal:
+    """A name that may go on in the next line after an underscore."""
+    literal = nodes.literal("", "")
+    first, *others = name.split("_")
+    literal += nodes.Text(first)
+    for part in others:
+        literal += [nodes.Text("_"), nodes.raw("", "<wbr>", format="html"), nodes.Text(part)]
+    return literal
 
 
 def _link_to(docname: str, app: Sphinx, module: str, line: int) -> nodes.reference:
@@ -249,6 +259,16 @@ def _open_rooms(app: Sphinx, docname: str, source: list[str]) -> None:
             )
 
         source[0] = re.sub(rf"^\.\. {word}:: (.*)$", modules, source[0], flags=re.MULTILINE)
+
+
+def _list_methods(app: Sphinx, domain: str, kind: str, content: nodes.Element) -> None:
+    """The contents of a page name its modules; those of the machine's, its methods as well.
+
+    Every page carries the contents of all: with every method of every class they would be slow.
+    """
+    for signature in content.parent.findall(addnodes.desc_signature):
+        if signature.get("module") not in {"evofsm.machine", "evofsm.model"}:
+            signature["_toc_name"] = ""
 
 
 def _skip_kernels(
@@ -367,6 +387,7 @@ def setup(app: Sphinx) -> dict[str, bool]:
     app.connect("doctree-read", _link_files)
     app.connect("doctree-resolved", _link_signatures)
     app.connect("build-finished", _write_sources)
+    app.connect("object-description-transform", _list_methods)
     app.connect("autodoc-skip-member", _skip_kernels)
     app.connect("autodoc-process-signature", _as_written)
     app.connect("doctree-read", _name_in_full)
