@@ -9,6 +9,7 @@ import ast
 import inspect
 import re
 from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -192,25 +193,43 @@ def _link_files(app: Sphinx, doctree: nodes.document) -> None:
             pending.replace_self(link)
 
 
-def _write_sources(app: Sphinx, error: Exception | None) -> None:
-    """A page for every file of the package, each line with an anchor, and one of the examples.
+def _coloured(file: Path) -> str:
+    """A file's source in HTML, each line with an anchor."""
+    formatter = HtmlFormatter(lineanchors="L", linenos="inline", anchorlinenos=True)
+    return highlight(file.read_text("utf-8"), PythonLexer(), formatter)
 
-    Not by Sphinx's way for further pages: each would carry the whole table of contents.
+
+class Sources:
+    """Writes a page for every file of the package, and one of the examples.
+
+    Not by Sphinx's way for further pages, as each would carry the whole table of contents; and in
+    another process, while Sphinx reads.
     """
-    if error is not None or app.builder.format != "html":
-        return
-    numbered = HtmlFormatter(lineanchors="L", linenos="inline", anchorlinenos=True)
-    for file in sorted(SOURCE.rglob("*.py")):
-        inside = file.relative_to(SOURCE)
-        module = ".".join(inside.with_suffix("").parts).removesuffix(".__init__")
-        body = highlight(file.read_text("utf-8"), PythonLexer(), numbered)
-        _write_page(app, page_of(module), inside.as_posix(), body)
-    examples = "".join(
-        f'<h2 id="{file.name}">{file.name}</h2>'
-        + highlight(file.read_text("utf-8"), PythonLexer(), HtmlFormatter())
-        for file in sorted((ROOT / "examples").glob("*.py"))
-    )
-    _write_page(app, page_of("examples"), "Examples", examples)
+
+    def __init__(self) -> None:
+        self.files = sorted(SOURCE.rglob("*.py"))
+
+    def begin(self, app: Sphinx) -> None:
+        """Start to colour the files."""
+        self.executor = ProcessPoolExecutor(1)
+        self.coloured = self.executor.map(_coloured, self.files, chunksize=20)
+
+    def write(self, app: Sphinx, error: Exception | None) -> None:
+        """Write what is coloured."""
+        with self.executor:
+            if error is not None or app.builder.format != "html":
+                self.executor.shutdown(cancel_futures=True)
+                return
+            for file, body in zip(self.files, self.coloured, strict=True):
+                inside = file.relative_to(SOURCE)
+                module = ".".join(inside.with_suffix("").parts).removesuffix(".__init__")
+                _write_page(app, page_of(module), inside.as_posix(), body)
+        examples = "".join(
+            f'<h2 id="{file.name}">{file.name}</h2>'
+            + highlight(file.read_text("utf-8"), PythonLexer(), HtmlFormatter())
+            for file in sorted((ROOT / "examples").glob("*.py"))
+        )
+        _write_page(app, page_of("examples"), "Examples", examples)
 
 
 def _write_page(app: Sphinx, name: str, title: str, body: str) -> None:
@@ -381,12 +400,14 @@ def _lead_to_source(
 
 def setup(app: Sphinx) -> dict[str, bool]:
     """Register all of it."""
+    sources = Sources()
     app.add_html_math_renderer("mathml", (_inline_math, None), (_display_math, None))
     app.add_role("line", Line())
     app.connect("source-read", _open_rooms)
     app.connect("doctree-read", _link_files)
     app.connect("doctree-resolved", _link_signatures)
-    app.connect("build-finished", _write_sources)
+    app.connect("builder-inited", sources.begin)
+    app.connect("build-finished", sources.write)
     app.connect("object-description-transform", _list_methods)
     app.connect("autodoc-skip-member", _skip_kernels)
     app.connect("autodoc-process-signature", _as_written)
