@@ -4,7 +4,8 @@ PYTHON ?= python3
 BIN := .venv/bin
 INSTALL = $(PYTHON) -m pip --python $(BIN)/python --disable-pip-version-check install --quiet
 
-.PHONY: paper watch closed-loop evidence test check bench fuzz torture soak lock lowest supply clean
+.PHONY: paper watch closed-loop evidence docs test check bench fuzz torture soak lock lowest supply \
+    clean
 
 paper: .venv/installed          ## reproduce every claim of the paper in SUMO
 	@$(BIN)/evofsm paper --out results/paper
@@ -16,7 +17,7 @@ closed-loop: .venv/installed    ## does the reviser prevent collisions, at what 
 	@$(BIN)/evofsm bench closed-loop --out results/closed-loop
 
 test: .venv/installed           ## all tests, doctests included
-	@$(BIN)/python -m pytest -q
+	@$(BIN)/python -m pytest -q -n auto --maxprocesses 4 --dist worksteal
 
 check: .venv/installed          ## lint, types and the import rule
 	@$(BIN)/ruff check . && $(BIN)/ruff format --check . && $(BIN)/mypy && $(BIN)/lint-imports
@@ -27,6 +28,9 @@ bench: .venv/installed          ## how fast it is, as ratios against named refer
 
 evidence: .venv/installed       ## all studies in short, on one page; DATA=folder adds real drives
 	@$(BIN)/evofsm evidence --out results/evidence $(if $(DATA),--data $(DATA))
+
+docs: .venv/installed           ## the documentation's site: results/docs/index.html
+	@$(BIN)/python -m sphinx -W --keep-going -n -q docs results/docs
 
 soak: .venv/installed           ## do the numbers hold for a thousand million steps? some 15 minutes
 	@$(BIN)/python benchmarks/soak.py

@@ -1,0 +1,270 @@
+"""The documentation: its pages are run, its links and its site hold.
+
+Tutorials and how-to pages are run as a reader would, block after block in a folder of their own.
+All others are doctests. A block that is not run says why, in a comment before it.
+"""
+
+import doctest
+import os
+import re
+import shlex
+import subprocess
+import sys
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import NamedTuple
+from urllib.parse import unquote, urlsplit
+
+import pytest
+import typer.testing
+
+from evofsm import cli
+
+ROOT = Path(__file__).parents[1]
+DOCS = ROOT / "docs"
+RUN = sorted([*DOCS.glob("tutorials/*.md"), *DOCS.glob("how-to/*.md")])
+PAGES = [*sorted(ROOT.glob("*.md")), *sorted(DOCS.rglob("*.md"))]
+FLAGS = doctest.NORMALIZE_WHITESPACE
+
+
+def name_of(page):
+    return str(page.relative_to(ROOT))
+
+
+# -- Blocks of code -------------------------------------------------------------------------------
+
+
+class Block(NamedTuple):
+    kind: str  # its language
+    text: str
+    line: int
+    file: str | None  # under which name it is kept, if it is the content of a file
+    reason: str | None  # why it is not run, if it is not
+
+
+FENCE = re.compile(
+    r"(?:^<!-- not run: (?P<reason>(?:(?!-->).)+) -->\n+)?"
+    r"^```(?P<kind>[^\n`]*)\n(?P<text>.*?)^```$",
+    re.MULTILINE | re.DOTALL,
+)
+
+
+def blocks(page):
+    text = page.read_text()
+    whole = re.search(r"^<!-- blocks that are not run: (.+?) -->$", text, re.M | re.S)
+    for found in FENCE.finditer(text):
+        kind, code, file = found["kind"].strip(), found["text"], None
+        if kind.startswith("{code-block}"):
+            kind = kind.split()[1]
+            if caption := re.match(r":caption: (\S+)\n\n?", code):
+                file, code = caption[1], code[caption.end() :]
+        line = text.count("\n", 0, found.start("text"))
+        reason = found["reason"] or (whole[1] if whole and ">>>" not in code else None)
+        yield Block(kind, code, line, file, reason)
+
+
+def commands(block):
+    """Each command of a console block, with what is shown to come of it."""
+    for part in re.split(r"^\$ ", block.text, flags=re.MULTILINE)[1:]:
+        command, _, shown = part.replace("\\\n", "").partition("\n")
+        yield re.sub(r"\s+# .*", "", command), shown
+
+
+def forget_written_since(before):
+    """Modules in the present folder; another process would import them anew."""
+    for name in set(sys.modules) - before:
+        file = getattr(sys.modules[name], "__file__", None)
+        if file and Path(file).resolve().is_relative_to(Path.cwd()):
+            del sys.modules[name]
+
+
+def run_command(command):
+    """What a command prints, and how it ends; ours without the start of another process."""
+    words = shlex.split(command)
+    if words[0] == "evofsm":
+        before = set(sys.modules)
+        done = typer.testing.CliRunner().invoke(cli.application(), words[1:])
+        forget_written_since(before)
+        return done.output, done.exit_code
+    if words[0] == "python":
+        words[0] = sys.executable
+    done = subprocess.run(words, capture_output=True, text=True, check=False)
+    return done.stdout + done.stderr, done.returncode
+
+
+def as_printed(shown, got):
+    return doctest.OutputChecker().check_output(shown, got, FLAGS | doctest.ELLIPSIS)
+
+
+@pytest.fixture
+def reader(tmp_path, monkeypatch):
+    """Someone in an empty folder, with a terminal of 80 columns."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "80")
+    monkeypatch.setattr(sys, "path", [str(tmp_path), *sys.path])
+    before = set(sys.modules)
+    yield
+    forget_written_since(before)
+
+
+@pytest.mark.parametrize("page", RUN, ids=name_of)
+def test_a_page_does_what_it_shows(page, reader):
+    names, parser = {}, doctest.DocTestParser()
+    for block in blocks(page):
+        if block.reason is not None:
+            continue
+        if block.file is not None:
+            Path(block.file).write_text(block.text)
+        elif block.kind == "console":
+            for command, shown in commands(block):
+                got, status = run_command(command)
+                where = f"{name_of(page)}, line {block.line}: {command}\n{got}"
+                assert as_printed(shown, got) if shown else status == 0, where
+        elif block.kind == "pycon":
+            test = parser.get_doctest(block.text, names, page.name, str(page), block.line)
+            written = []
+            runner = doctest.DocTestRunner(optionflags=FLAGS)
+            runner.run(test, out=written.append, clear_globs=False)
+            names = test.globs
+            assert not runner.failures, "".join(written)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
+def test_every_block_is_run_or_says_why_not(page):
+    for block in blocks(page):
+        runs = page in RUN and (block.kind in {"console", "pycon"} or block.file)
+        runs = runs or (page not in RUN and ">>>" in block.text)
+        is_code = block.kind in {"python", "pycon", "console", "toml", "sh", "bash"}
+        where = f"{name_of(page)}, line {block.line}"
+        assert bool(runs) or block.reason is not None or not is_code, where
+
+
+def test_commands_that_are_not_run_would_be_understood():
+    """Every command and option that a page names is there."""
+    group = typer.main.get_command(cli.application())
+    looked_at = 0
+    for page in PAGES:
+        for block in blocks(page):
+            for command, _ in commands(block) if block.kind == "console" else ():
+                words = shlex.split(command.split("|")[0])
+                if words[0] != "evofsm":
+                    continue
+                known = group
+                for word in words[1:]:
+                    if not hasattr(known, "commands") or word.startswith("-"):
+                        break
+                    assert word in known.commands, f"{name_of(page)}: {command}"
+                    known = known.commands[word]
+                options = {o for p in known.params for o in (*p.opts, *p.secondary_opts)}
+                given = {w.partition("=")[0] for w in words[1:] if re.match(r"--?[a-z]", w)}
+                assert given <= options | {"--help"}, f"{name_of(page)}: {command}"
+                looked_at += 1
+    assert looked_at > 50
+
+
+# -- The site -------------------------------------------------------------------------------------
+
+
+class Page(HTMLParser):
+    """What a page of HTML can be linked to by, where it leads, and what it loads."""
+
+    def __init__(self, path):
+        super().__init__()
+        self.anchors, self.links, self.loaded = set(), [], []
+        self.feed(path.read_text())
+
+    def handle_starttag(self, tag, attributes):
+        attributes = dict(attributes)
+        self.anchors |= {attributes[name] for name in ("id", "name") if attributes.get(name)}
+        leads = tag == "link" and attributes.get("rel") in {"index", "search", "next", "prev"}
+        if "href" in attributes and (tag == "a" or leads):
+            self.links.append(attributes["href"])
+        else:
+            self.loaded += [attributes[name] for name in ("src", "href") if attributes.get(name)]
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory):
+    """All pages of the site, built with warnings as errors."""
+    folder = tmp_path_factory.mktemp("site")
+    build = (sys.executable, "-m", "sphinx", "-W", "--keep-going", "-n", "-q", DOCS, folder)
+    environment = {**os.environ, "PYTHONPATH": ""}
+    done = subprocess.run(build, capture_output=True, text=True, check=False, env=environment)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return folder, {path: Page(path) for path in folder.rglob("*.html")}
+
+
+def is_elsewhere(address):
+    return urlsplit(address).scheme != "" or address.startswith("//")
+
+
+def test_every_link_of_the_site_leads_somewhere(site):
+    _, pages = site
+    looked_at = 0
+    for path, page in pages.items():
+        for link in page.links:
+            parts = urlsplit(link)
+            if is_elsewhere(link):
+                assert parts.scheme == "https", f"{path}: {link}"
+                continue
+            target = (path.parent / unquote(parts.path)).resolve() if parts.path else path
+            assert target.exists(), f"{path}: {link}"
+            if parts.fragment and target in pages:
+                assert unquote(parts.fragment) in pages[target].anchors, f"{path}: {link}"
+            looked_at += 1
+    assert looked_at > 1000
+
+
+def test_the_site_loads_nothing_from_elsewhere(site):
+    folder, pages = site
+    for path, page in pages.items():
+        assert not [one for one in page.loaded if is_elsewhere(one)], path
+    for style in folder.rglob("*.css"):
+        assert not re.search(r"(url\(|@import )['\"]?(https?:)?//", style.read_text()), style
+
+
+def test_formulas_are_there_without_a_script(site):
+    folder, _ = site
+    text = (folder / "equations" / "states.html").read_text()
+    assert len(re.findall(r'<math [^>]*display="block"', text)) == 5
+    assert "\\frac" not in text
+
+
+def test_a_line_of_code_is_where_its_link_leads(site):
+    folder, pages = site
+    links = pages[folder / "equations" / "states.html"].links
+    found = {int(one.rpartition("L-")[2]) for one in links if "states/ets.html#" in one}
+    source = (ROOT / "src/evofsm/states/ets.py").read_text().splitlines()
+    there = [source[line - 1].strip().partition("(")[0] for line in sorted(found)]
+    assert there == ["def judge", "return MOVED if squared_distance < radius * radius else CREATED"]
+
+
+def test_every_public_module_is_in_the_reference(site):
+    folder, _ = site
+    reference = "".join(path.read_text() for path in (folder / "reference").glob("*.html"))
+    for file in (ROOT / "src" / "evofsm").rglob("*.py"):
+        parts = file.relative_to(ROOT / "src").with_suffix("").parts
+        if not any(part.startswith("_") for part in parts):
+            described, listed = (
+                f'id="module-{".".join(parts)}"',
+                f"source/{'/'.join(parts)}.html#L-1",
+            )
+            assert described in reference or listed in reference, file
+
+
+def slug(heading):
+    """The anchor that GitHub gives a heading."""
+    words = re.sub(r"[^\w\- ]", "", re.sub(r"[`*]|\]\(.*?\)", "", heading).lower())
+    return words.strip().replace(" ", "-")
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
+def test_links_between_files_lead_somewhere(page):
+    text = FENCE.sub("", page.read_text())
+    for target in re.findall(r"\]\((?!https?:)([^)\s]+)\)", text):
+        path, _, anchor = target.partition("#")
+        file = (page.parent / path).resolve() if path else page
+        assert file.exists(), f"{name_of(page)} links to {target}"
+        if anchor and file.suffix == ".md":
+            headings = re.findall(r"^#+ (.*)$", FENCE.sub("", file.read_text()), re.MULTILINE)
+            assert anchor in {slug(heading) for heading in headings}, target
