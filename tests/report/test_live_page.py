@@ -119,7 +119,7 @@ def test_switched_on_the_reviser_prevents_the_collision_that_happens_with_it_off
     shows(page, "headline", "No collision")
     began = re.search(r"Danger began at (\d+\.\d)", text(page, "when"))
     assert began
-    assert "would have hit the leader" in text(page, "outcome")
+    assert "would have hit the leader" in text(page, "alone")
     assert "The reviser stepped in" in text(page, "done")
 
     page.keyboard.press("r")

@@ -45,7 +45,7 @@ const send = (what, value) => {
 // -- What is shown as words and controls ------------------------------------------------------------
 
 function showStart(start) {
-  at("about").textContent = `${start.cases[start.case] ?? ""} · ${start.about}`;
+  at("about").textContent = `Here ${start.cases[start.case] ?? start.family}: ${start.about}`;
   at("of-cases").textContent = start.live ? "Case" : "Episode";
   at("case").replaceChildren(...start.cases.map((name, k) => new Option(name, k, false, k === start.case)));
   at("speed").replaceChildren(...start.speeds.map((speed) => new Option(`${speed} ×`, speed)));
@@ -62,6 +62,7 @@ function learnt(start) {
 function showControls() {
   const { clock } = run;
   at("pause").textContent = clock.over ? "Again" : clock.paused ? "Go on" : "Pause";
+  at("restart").hidden = clock.over; // which "Again" does then
   at("reviser").setAttribute("aria-checked", clock.revising);
   at("reviser-state").textContent = clock.revising ? "on" : "off";
   at("speed").value = clock.speed ?? "";
@@ -86,7 +87,7 @@ function showStory() {
   told = frame;
   at("status").dataset.status = frame.told.status;
   write("headline", frame.told.headline);
-  for (const part of ["when", "why", "done", "others", "outcome"]) write(part, frame.told[part]);
+  for (const part of ["when", "why", "done", "others", "outcome", "alone"]) write(part, frame.told[part]);
   const decision = run.decision;
   write("decision", `${decision.here}; ${decision.reason}`);
   write("experience", decision.explanation || "nothing yet");

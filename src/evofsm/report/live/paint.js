@@ -22,10 +22,14 @@ export function fresh(canvas) {
   return { pen, width, height };
 }
 
-export function text(pen, words, x, y, { size = 12, align = "left", bold = false, ink = colour.ink } = {}) {
+export function text(pen, words, x, y, { size = 12, align = "left", bold = false, grounded = false, ink = colour.ink } = {}) {
   pen.font = `${bold ? "600 " : ""}${size}px system-ui, "Segoe UI", Roboto, "DejaVu Sans", sans-serif`;
   pen.textAlign = align;
   pen.textBaseline = "middle";
+  if (grounded) {
+    pen.fillStyle = colour.panel;
+    pen.fillRect(x - 2, y - size / 2 - 1, pen.measureText(words).width + 4, size + 2);
+  }
   pen.fillStyle = ink;
   pen.fillText(words, x, y);
 }

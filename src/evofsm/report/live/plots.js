@@ -77,13 +77,16 @@ export function drawPlots(canvas, run) {
       return box.bottom - ((inside - panel.low) / (panel.high - panel.low)) * (box.bottom - box.top);
     };
     drawDanger(pen, visible, x, box);
-    drawFrame(pen, panel, box, y, x, most, width);
-    drawHeading(pen, panel, box.top - heading, width, heading > 20);
+    drawFrame(pen, panel, box, y, width);
     for (const one of panel.lines) if (one.band) drawBand(pen, visible, one.band, x, y);
     for (const one of panel.lines) drawLine(pen, visible, one, x, y);
   });
   drawTimes(pen, x, most, bottom);
   drawMarks(pen, marks, x, top, bottom);
+  // Words come last, on ground of their own, so that no mark strikes them through.
+  all.forEach((panel, number) => {
+    drawHeading(pen, panel, top + number * each, width, heading > 20);
+  });
   return top;
 }
 
@@ -130,7 +133,7 @@ function drawMarks(pen, marks, x, top, bottom) {
   }
 }
 
-function drawFrame(pen, panel, box, y, x, most, width) {
+function drawFrame(pen, panel, box, y, width) {
   for (const tick of panel.ticks) {
     line(pen, LEFT, y(tick), width - RIGHT, y(tick), { ink: colour.grid });
     text(pen, panel.show(tick), LEFT - 5, y(tick), { size: 11, align: "right", ink: colour.soft });
@@ -145,7 +148,7 @@ function drawFrame(pen, panel, box, y, x, most, width) {
 }
 
 function drawHeading(pen, panel, y, width, isNarrow) {
-  text(pen, panel.title, LEFT, y + 9, { bold: true });
+  text(pen, panel.title, LEFT, y + 9, { bold: true, grounded: true });
   const from = LEFT + pen.measureText(panel.title).width + 7;
   let x = isNarrow ? LEFT : width - RIGHT;
   pen.font = "11px system-ui";
@@ -154,11 +157,11 @@ function drawHeading(pen, panel, y, width, isNarrow) {
   const room = (isNarrow ? width - RIGHT : x) - from;
   let about = panel.about;
   if (pen.measureText(about).width > room) about = about.split(/[;,]/)[0];
-  if (pen.measureText(about).width <= room) text(pen, about, from, y + 9, { size: 11, ink: colour.soft });
+  if (pen.measureText(about).width <= room) text(pen, about, from, y + 9, { size: 11, ink: colour.soft, grounded: true });
   const level = isNarrow ? y + 23 : y + 9;
   panel.lines.forEach((one, k) => {
+    text(pen, one.label, x + 26, level, { size: 11, grounded: true });
     line(pen, x, level, x + 22, level, { ink: one.ink, width: one.width, dash: one.dash });
-    text(pen, one.label, x + 26, level, { size: 11 });
     x += widths[k];
   });
 }
@@ -175,11 +178,15 @@ function drawDanger(pen, frames, x, box) {
       }
     });
   };
-  shade((frame) => frame.danger, (from, to) => {
+  // It is known only later that danger was over; the shade ends where it was.
+  const lasted = new Map();
+  for (const { danger } of frames) if (danger) lasted.set(danger.since, danger.last);
+  const isDangerous = ({ danger, time }) => danger && time <= lasted.get(danger.since);
+  shade(isDangerous, (from, to) => {
     pen.fillStyle = colour.wash;
     pen.fillRect(from, box.top, to - from, box.bottom - box.top);
   });
-  shade((frame) => frame.danger && frame.danger.dead_end !== null, (from, to) => {
+  shade((frame) => isDangerous(frame) && frame.danger.dead_end !== null, (from, to) => {
     pen.save();
     pen.beginPath();
     pen.rect(from, box.top, to - from, box.bottom - box.top);

@@ -22,6 +22,7 @@ class Told(NamedTuple):
     done: str
     others: str  #: what time to collision and time headway would have said
     outcome: str
+    alone: str  #: what the driver would have come to by itself
 
 
 def tell(frame: Frame, start: Start) -> Told:
@@ -43,6 +44,7 @@ def tell(frame: Frame, start: Start) -> Told:
         _NOTHING if danger is None else _done(danger, frame),
         _others(story, start),
         _outcome(story, frame),
+        _alone(story, frame),
     )
     return Told(*(_UNIT.sub("\u00a0", text) for text in told))
 
@@ -70,8 +72,12 @@ def _no_danger(frame: Frame) -> str:
 
 
 def _seconds(time: float) -> str:
+    return f"{_tenths(time):.1f} s"
+
+
+def _tenths(time: float) -> float:
     """A time, rounded as the page does it: 14.25 s becomes 14.3 s."""
-    return f"{math.floor(10.0 * time + 0.5) / 10.0:.1f} s"
+    return math.nan if math.isnan(time) else math.floor(10.0 * time + 0.5) / 10.0
 
 
 def _status(frame: Frame, start: Start) -> str:
@@ -115,9 +121,9 @@ def _why(danger: Danger) -> str:
     if math.isnan(danger.critical):  # which recordings do not hold
         return f"{wanted}: a risk of {danger.risk:.0%}."
     return (
-        f"{wanted}. After that, full braking could no longer avoid a collision if the leader "
-        f"braked harder than {danger.critical:.1f} m/s² – and leaders must be expected to brake "
-        f"by up to {danger.brakes_to:.1f} m/s²."
+        f"{wanted}. After that, not even braking in full (by {danger.decel:.1f} m/s²) would avoid "
+        f"a collision if the leader braked harder than {danger.critical:.1f} m/s² – and leaders "
+        f"must be expected to brake by up to {danger.brakes_to:.1f} m/s²."
     )
 
 
@@ -135,7 +141,13 @@ def _done(danger: Danger, frame: Frame) -> str:
         hardest = f"; at its hardest it braked by {-danger.hardest:.1f} m/s²"
     instead = f"to {_wish(danger.instead)} instead of {_wishing(danger.wished)}"
     when = _seconds(danger.stepped_in)
-    return f"The reviser stepped in at {when}, at first {instead}; it changed {share}{hardest}."
+    if danger.off < danger.stepped_in:
+        when += ", as it was switched on"
+    mean = danger.change / danger.revised
+    return (
+        f"The reviser stepped in at {when}, at first {instead}. It changed {share}, by "
+        f"{mean:.1f} m/s² on average{hardest}."
+    )
 
 
 def _wish(acceleration: float) -> str:
@@ -143,7 +155,7 @@ def _wish(acceleration: float) -> str:
         return f"accelerate by {acceleration:.1f} m/s²"
     if acceleration < -_HARDLY:
         return f"brake by {-acceleration:.1f} m/s²"
-    return f"keep its speed ({acceleration:+.1f} m/s²)"
+    return f"hardly change its speed ({acceleration:+.1f} m/s²)"
 
 
 def _wishing(acceleration: float) -> str:
@@ -151,7 +163,7 @@ def _wishing(acceleration: float) -> str:
         return f"accelerating by {acceleration:.1f} m/s²"
     if acceleration < -_HARDLY:
         return f"braking by only {-acceleration:.1f} m/s²"
-    return f"keeping its speed ({acceleration:+.1f} m/s²)"
+    return f"hardly changing its speed ({acceleration:+.1f} m/s²)"
 
 
 def _others(story: Story, start: Start) -> str:
@@ -167,7 +179,7 @@ def _others(story: Story, start: Start) -> str:
 def _noticed(at: float, danger: float) -> str:
     if math.isnan(at):
         return "has not noticed anything"
-    late = at - danger
+    late = _tenths(at) - _tenths(danger)
     if math.isnan(late) or late == 0.0:
         return f"did at {_seconds(at)}"
     side = "after danger began" if late > 0.0 else "before"
@@ -185,10 +197,14 @@ def _outcome(story: Story, frame: Frame) -> str:
         parts.append(f"The car behind ran into the follower at {_seconds(frame.time)}.")
     elif not math.isnan(story.ended):
         parts.append(f"No collision: {_rest(frame)}.")
-    if math.isfinite(story.alone) and not frame.collided and frame.time > 0.0:
-        verb = "would have hit" if frame.time >= story.alone else "would hit"
-        parts.append(f"Left alone, this driver {verb} the leader at {_seconds(story.alone)}.")
     return " ".join(parts)
+
+
+def _alone(story: Story, frame: Frame) -> str:
+    if not math.isfinite(story.alone) or frame.collided or frame.time == 0.0:
+        return ""
+    verb = "would have hit" if frame.time >= story.alone else "would hit"
+    return f"This driver {verb} the leader at {_seconds(story.alone)}."
 
 
 def _rest(frame: Frame) -> str:

@@ -181,6 +181,7 @@ class Recording:
             executed_risk=UNJUDGED,
             braking_risk=math.nan,
             critical=math.nan,
+            decel=math.nan,
             brakes_to=math.nan,
             time_to_collision=float(columns["time_to_collision"][last]),
             time_headway=float(columns["time_headway"][last]),

@@ -383,6 +383,7 @@ class Session:
             executed_risk=UNJUDGED,
             braking_risk=math.nan,
             critical=math.nan,
+            decel=self.learner.risk.brakes.decel,
             brakes_to=self.learner.risk.manoeuvres.exceeded_by(self.watching.tolerance),
             time_to_collision=float(time_to_collision(observation)),
             time_headway=float(time_headway(observation)),

@@ -85,6 +85,7 @@ class Frame(NamedTuple):
     executed_risk: Judged  #: of what is executed
     braking_risk: float  #: of full braking at once: high in a dead end
     critical: float  #: hardest braking of the leader that is survived if the driver has its way
+    decel: float  #: of the follower if it brakes in full, as far as is known [m/s²]
     brakes_to: float  #: all but a tolerated share of leaders' hard brakes are softer [m/s²]
     time_to_collision: float  #: [s]; infinite where the gap does not close
     time_headway: float  #: [s]

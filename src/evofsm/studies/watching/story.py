@@ -26,12 +26,15 @@ class Danger(NamedTuple):
     risk: float  #: of what the driver then wanted
     critical: float  #: hardest braking of the leader that was then survived [m/s²]
     brakes_to: float  #: how hard leaders were then known to brake [m/s²]
+    decel: float  #: how hard the follower was then known to brake in full [m/s²]
     proposed: float  #: what the driver then wanted [m/s²]
     advised: float  #: what the reviser then found better [m/s²]
     stepped_in: float = math.nan  #: when the reviser first changed something in it [s]
     wished: float = math.nan  #: what the driver wanted then [m/s²]
     instead: float = math.nan  #: and what was executed [m/s²]
     revised: int = 0  #: decisions in it that the reviser changed
+    change: float = 0.0  #: by how much, all of them together [m/s²]
+    off: float = math.nan  #: time of the latest decision in it with the reviser off [s]
     decisions: int = 0  #: decisions in it
     hardest: float = math.inf  #: lowest acceleration that the reviser put through in it [m/s²]
     dead_end: float = math.nan  #: since when full braking was too late as well [s]
@@ -128,6 +131,7 @@ def _began(frame: Frame) -> Danger:
         risk=frame.proposed_risk.risk,
         critical=frame.critical,
         brakes_to=frame.brakes_to,
+        decel=frame.decel,
         proposed=frame.proposed,
         advised=frame.advised,
     )
@@ -147,6 +151,8 @@ def _went_on(danger: Danger, frame: Frame, is_tolerable: bool) -> Danger:
     return danger._replace(
         decisions=danger.decisions + 1,
         revised=danger.revised + revised,
+        change=danger.change + (abs(frame.executed - frame.proposed) if revised else 0.0),
+        off=danger.off if frame.revising else frame.time,
         hardest=min(danger.hardest, frame.executed) if revised else danger.hardest,
         dead_end=dead_end,
         last=danger.last if is_tolerable else frame.time,
