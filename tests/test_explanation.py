@@ -7,7 +7,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from evofsm import EvolvingFSM, FSMModel, IntervalActions, Labels, Missing, Novelty, WhenFull
+from evofsm import (
+    EvolvingFSM,
+    FailureSplit,
+    FSMModel,
+    IntervalActions,
+    Labels,
+    Missing,
+    Novelty,
+    WhenFull,
+)
 from evofsm.explanation import Tally
 from evofsm.fleet.batch import Fleet
 from evofsm.fleet.merge import merge
@@ -83,6 +92,58 @@ def test_an_episode_that_begins_unseen_is_no_part_of_the_one_before():
     assert machine.failed_soon.tolist() == [0.0, 0.0]
 
 
+def test_a_failure_straight_after_an_action_is_counted_however_the_episode_began():
+    machine = EvolvingFSM(2, rule=Novelty(radius=1.0))
+    machine.learn_many([[0.0, 0.0], [9.0, 9.0]], [0, 0])
+    machine.start_episode()
+    machine.observe([9.0, np.nan], missing=Missing.PARTIAL)
+    machine.act(1)
+    machine.fail()
+    assert machine.tried[1].sum() == machine.failed_after[1].sum() == 1.0
+
+
+def test_what_was_not_seen_whole_splits_no_state():
+    rule = FailureSplit(Novelty(radius=2.0), distance=0.5)
+    machine = EvolvingFSM(1, rule=rule)
+    machine.learn_many([[0.0, 0.0], [9.0, 9.0], [9.0, 8.0]], [0, 0, 0])
+    machine.start_episode()
+    machine.observe([0.0, np.nan], missing=Missing.PARTIAL)
+    machine.fail()
+    assert machine.n_states == 2
+    assert machine.endings.tolist() == [1.0, 0.0]
+
+
+def test_time_goes_on_while_nothing_is_seen():
+    machine = EvolvingFSM(1, rule=Novelty(radius=1.0), failure_horizon=2)
+    machine.observe([0.0])
+    for _ in range(50):
+        machine.observe([np.nan], missing=Missing.PARTIAL)
+    machine.fail()
+    assert (machine.episodes.tolist(), machine.failed_soon.tolist()) == ([1.0], [0.0])
+
+
+def test_where_states_were_joined_there_is_no_interval():
+    machine = EvolvingFSM(1, rule=Novelty(radius=1.0), max_states=2)
+    for episode in range(6):
+        machine.start_episode()
+        machine.learn_many([[0.0], [4.0]], [0, 0])
+        if episode:
+            machine.fail()
+    machine.start_episode()
+    machine.observe([50.0])  # the two of before are joined
+    machine.start_episode()
+    model = machine.model()
+    (joined,) = np.flatnonzero(model.joined)
+    text = model.explain(int(joined)).text
+    assert "States were joined here, so an episode may count twice." in text
+    assert "%" not in text
+    one, other = EvolvingFSM(1, rule=Novelty(radius=1.0)), EvolvingFSM(1, rule=Novelty(radius=1.0))
+    one.learn_many([[0.0], [1.5]], [0, 0])
+    other.learn_many([[0.7]], [0])
+    assert merge([one, other], radius=2.0).joined.tolist() == [1.0]
+    assert not merge([one, other.copy()], radius=0.1).joined.any()
+
+
 def test_a_fleet_counts_as_its_machines_would():
     machine = EvolvingFSM(3, rule=Novelty(radius=1.0), failure_horizon=3)
     fleet, alone = Fleet(machine, 2), [machine.copy(), machine.copy()]
@@ -154,7 +215,8 @@ def test_an_explanation_tells_where_how_often_what_came_of_it_and_what_was_bette
         "#2: close (5 m), at medium speed (20 m/s), at equal speeds. "
         "12 episodes came here (24 observations); 8 of 12 (43 to 84 %) failed within 1 s, "
         "and 8 of 9 (62 to 97 %) after a(2) ≥ 0 m/s². "
-        "Least after a(1) < 0 m/s²: 0 of 3 (at most 47 %). Mostly reached from #1: 12 of 12 times."
+        "Better after a(1) < 0 m/s²: 0 of 3 (at most 47 %). "
+        "Most often reached from #1: 12 of 12 times."
     )
     assert (found.here, found.action, found.after_better) == (
         Tally(8, 12),
@@ -179,7 +241,7 @@ def test_what_is_new_is_said_to_be(crash):
     assert machine.explain().text == "Nothing was observed yet in this episode."
     machine.observe([200.0, 5.0, 5.0])
     found = machine.explain(labels=labels)
-    assert "Never seen before." in found.text
+    assert "Never seen but in one observation." in found.text
     assert found.here == Tally(0, 0)
     machine.observe([200.0, 5.0, 5.0])
     assert (

@@ -114,6 +114,7 @@ def _merge_outcomes(outcomes: Outcomes, kept: int, given: int) -> None:
         merge_episodes(tried, outcomes.failed_after[place], latest, kept, given, began)
     episodes, latest_visit = outcomes.episodes, outcomes.latest_visit
     merge_episodes(episodes, outcomes.failed_soon, latest_visit, kept, given, began)
+    outcomes.joined[kept] = 1.0
     outcomes.endings[kept] += outcomes.endings[given]
 
 
@@ -161,6 +162,7 @@ def _clear(memory: Memory, given: int, n: int) -> None:
         outcomes.episodes,
         outcomes.failed_soon,
         outcomes.latest_visit,
+        outcomes.joined,
     ):
         of_states[given] = 0.0
     now.visits[given] = 0.0

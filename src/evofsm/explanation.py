@@ -7,6 +7,7 @@ action ended better than another does not say that it was the reason.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -37,6 +38,8 @@ class Experience(Protocol):
     @property
     def failed_soon(self) -> NDArray[np.float64]: ...  # noqa: D102
     @property
+    def joined(self) -> NDArray[np.float64]: ...  # noqa: D102
+    @property
     def tried(self) -> NDArray[np.float64]: ...  # noqa: D102
     @property
     def failed_after(self) -> NDArray[np.float64]: ...  # noqa: D102
@@ -49,12 +52,13 @@ class Tally(NamedTuple):
     --------
     >>> print(Tally(3, 12))
     3 of 12 (10 to 49 %)
-    >>> print(Tally(0, 40), "|", Tally(7, 7), "|", Tally(0, 0))
-    0 of 40 (at most 6 %) | 7 of 7 (at least 72 %) | none
+    >>> print(Tally(0, 40), "|", Tally(7, 7), "|", Tally(7, 7, is_exact=False))
+    0 of 40 (at most 6 %) | 7 of 7 (at least 72 %) | 7 of 7
     """
 
     failed: int
     episodes: int
+    is_exact: bool = True  #: False where an episode may count twice
 
     @property
     def share(self) -> float:
@@ -70,8 +74,8 @@ class Tally(NamedTuple):
         return float(low[0]), float(high[0])
 
     def __str__(self) -> str:
-        if not self.episodes:
-            return "none"
+        if not (self.episodes and self.is_exact):
+            return f"{self.failed:,} of {self.episodes:,}"
         low, high = (f"{100.0 * bound:.0f}" for bound in self.interval)
         within = f"{low} to {high} %"
         if self.failed == 0:
@@ -104,7 +108,8 @@ class Explanation(NamedTuple):
     here: Tally  #: of the episodes that came to it
     reached_from: int | None  #: index of the state that most changes to it came from
     action: Tally | None  #: of those that took the action there; None where none was asked for
-    better: int | None  #: index of the action there of whose episodes the smallest share failed
+    #: index of the action whose interval ends lowest, of those after which a smaller share failed
+    better: int | None
     after_better: Tally | None  #: of those that took it
 
     def __str__(self) -> str:
@@ -118,14 +123,16 @@ def explain(
     if not len(belief):
         return nothing_known("Nothing was learnt yet.")
     state = int(belief.argmax())
-    here = Tally(int(known.failed_soon[state]), int(known.episodes[state]))
+    is_exact = not known.joined[state]
+    here = Tally(int(known.failed_soon[state]), int(known.episodes[state]), is_exact)
     visits = int(known.visits[state])
-    tried, failed_after = known.tried[:, state], known.failed_after[:, state]
-    asked = None if action is None else Tally(int(failed_after[action]), int(tried[action]))
-    better = _best(tried, failed_after, here if asked is None or not asked.episodes else asked)
-    after_better = None
-    if better is not None:
-        after_better = Tally(int(failed_after[better]), int(tried[better]))
+    after = [
+        Tally(int(failed), int(tried), is_exact)
+        for failed, tried in zip(known.failed_after[:, state], known.tried[:, state], strict=True)
+    ]
+    asked = None if action is None else after[action]
+    better = _best(after, here if asked is None or not asked.episodes else asked)
+    after_better = None if better is None else after[better]
     came_from = _came_from(known.changes, state)
 
     horizon = known.failure_horizon
@@ -133,7 +140,8 @@ def explain(
     sentences = [
         _of_place(known, belief, state, labels),
         _of_episodes(here, visits, soon, asked, "" if action is None else labels.action(action)),
-        "" if better is None else f"Least after {labels.action(better)}: {after_better}",
+        "" if better is None else f"Better after {labels.action(better)}: {after_better}",
+        "" if is_exact else "States were joined here, so an episode may count twice",
         _of_origin(known.changes, state, came_from),
     ]
     return Explanation(
@@ -154,12 +162,13 @@ def nothing_known(text: str) -> Explanation:
     return Explanation(text, None, 0.0, 0, Tally(0, 0), None, None, None, None)
 
 
-def _best(tried: NDArray[np.float64], failed: NDArray[np.float64], than: Tally) -> int | None:
+def _best(after: Sequence[Tally], than: Tally) -> int | None:
     """The action with the lowest upper end of its interval, if fewer of its episodes failed."""
-    candidates = [
-        (Tally(int(failed[i]), int(tried[i])), int(i)) for i in np.flatnonzero(tried > 0.0)
+    better = [
+        (tally.interval[1], action)
+        for action, tally in enumerate(after)
+        if tally.episodes and tally.share < than.share
     ]
-    better = [(tally.interval[1], i) for tally, i in candidates if tally.share < than.share]
     return min(better)[1] if better else None
 
 
@@ -185,15 +194,15 @@ def _of_place(known: Experience, belief: NDArray[np.float64], state: int, labels
 
 def _of_episodes(here: Tally, visits: int, soon: str, asked: Tally | None, action: str) -> str:
     if visits <= 1 and not here.episodes:
-        return "Never seen before"
-    observations = _count(visits, "observation")
+        return "Never seen but in one observation"
+    observations = f" ({_count(visits, 'observation')})" if visits else ""
     if not here.episodes:
-        return f"No earlier episode that was counted came here ({observations})"
-    text = f"{_count(here.episodes, 'episode')} came here ({observations}); {here} failed {soon}"
+        return f"No earlier episode that was counted came here{observations}"
+    text = f"{_count(here.episodes, 'episode')} came here{observations}; {here} failed {soon}"
     if asked is None:
         return text
     if not asked.episodes:
-        return f"{text}; {action} was never tried here"
+        return f"{text}; none of them is known to have tried {action} here"
     return f"{text}, and {asked} after {action}"
 
 
@@ -202,7 +211,7 @@ def _of_origin(changes: NDArray[np.float64], state: int, came_from: int | None) 
         return ""
     arrivals = changes[:, state].sum() - changes[state, state]
     most = changes[came_from, state]
-    return f"Mostly reached from #{came_from + 1}: {most:,.0f} of {arrivals:,.0f} times"
+    return f"Most often reached from #{came_from + 1}: {most:,.0f} of {arrivals:,.0f} times"
 
 
 def _count(number: int, noun: str) -> str:

@@ -553,8 +553,8 @@ prior_frequency=0.001, spread=3.0)
         >>> step = machine.observe([0.9])
         >>> print(machine.explain(0, Labels(names=("gap",), units=("m",))))
         #2: gap 0.9 m (belief 63 %, next #1 37 %). 1 episode came here (2 observations);
-        1 of 1 (at least 27 %) failed later on; a(1) was never tried here. Mostly reached from #1:
-        1 of 1 times.
+        1 of 1 (at least 27 %) failed later on; none of them is known to have tried a(1) here.
+        Most often reached from #1: 1 of 1 times.
         """
         index = None if action is None else check_action(action, self.n_actions)
         if self.state is None:
@@ -768,6 +768,11 @@ prior_frequency=0.001, spread=3.0)
         return self._memory.learnt.outcomes.failed_soon[: self.n_states].copy()
 
     @property
+    def joined(self) -> NDArray[np.float64]:
+        """(n,) ndarray: 1 where two states were joined, so that an episode may count twice."""
+        return self._memory.learnt.outcomes.joined[: self.n_states].copy()
+
+    @property
     def tried(self) -> NDArray[np.float64]:
         """(q, n) ndarray: episodes that took each action in each state, without the present one.
 
@@ -862,6 +867,7 @@ prior_frequency=0.001, spread=3.0)
             endings=self.endings,
             episodes=self.episodes,
             failed_soon=self.failed_soon,
+            joined=self.joined,
             tried=self.tried,
             failed_after=self.failed_after,
             rule=self._rule,
@@ -1058,8 +1064,9 @@ prior_frequency=0.001, spread=3.0)
             centers, distances = np.ascontiguousarray(held.centers[:, :n]), np.empty(n)
             rows = filled[None], width(rule, held)
             recognise_rows(centers, counted, *rows, distances, belief[None])
+        now.outcomes.clock[0] += 1.0
         if not now.chained[0]:
-            now.outcomes.began[0] = now.clusters.n_observations[0] + 1.0
+            now.outcomes.began[0] = now.outcomes.clock[0]
         now.belief[:n], now.state[0] = belief, belief.argmax()
         now.chained[0], now.action[0] = 1.0, NO_ACTION
         state = int(now.state[0])

@@ -26,7 +26,7 @@ NO_ACTION = -1
 # A buffer begins with its sizes (m, q, capacity, places), `Parameters` and counters.
 _COUNTERS, _HEAD = 20, 32
 # Then, for each kind of thing there is, so many numbers; centres are further rows of states.
-_PER_STATE, _PER_PLACE, _PER_ACTION, _PER_VARIABLE = 16, 7, 2, 5
+_PER_STATE, _PER_PLACE, _PER_ACTION, _PER_VARIABLE = 17, 7, 2, 5
 # Where the centre of a state that is not there stands: too far for any belief.
 _NOWHERE = np.inf
 # Outcomes that belong together: cases, failures among them, and another count.
@@ -135,7 +135,7 @@ def _open_apart(buffer: NDArray[np.float64], matrices: NDArray[Any]) -> Memory:
     """Views into a buffer whose matrices are somewhere else; for kernels `open_apart`."""
     m, q, capacity, places = _sizes(buffer)
     begin = _sections(m, q, capacity, places)
-    counters = part(buffer, _COUNTERS, (8, 1))
+    counters = part(buffer, _COUNTERS, (9, 1))
     of_states = part(buffer, begin.of_states, (_PER_STATE + m, capacity))
     of_places = part(buffer, begin.of_places, (_PER_PLACE, places, capacity))
     of_actions = part(buffer, begin.of_actions, (_PER_ACTION, q))
@@ -192,21 +192,23 @@ def _open_apart(buffer: NDArray[np.float64], matrices: NDArray[Any]) -> Memory:
                 of_places[3],
                 of_states[6],
                 counters[7],
+                counters[8],
                 of_states[7],
                 of_states[8],
                 of_states[9],
+                of_states[10],
                 of_places[4],
                 of_places[5],
                 of_places[6],
             ),
         ),
         Scratch(
-            of_states[10],
             of_states[11],
             of_states[12],
             of_states[13],
             of_states[14],
             of_states[15],
+            of_states[16],
         ),
     )
 

@@ -37,6 +37,7 @@ _COUNTS = (
     "endings",
     "episodes",
     "failed_soon",
+    "joined",
     "tried",
     "failed_after",
 )
@@ -95,6 +96,8 @@ class FSMModel:
     episodes: NDArray[np.float64] = field(default_factory=_no_counts)  #: (n,) that came to it
     #: (n,) of these, those that failed soon after they were there
     failed_soon: NDArray[np.float64] = field(default_factory=_no_counts)
+    #: (n,) 1 where two states were joined, so that an episode may count twice
+    joined: NDArray[np.float64] = field(default_factory=_no_counts)
     tried: NDArray[np.float64] = field(default_factory=_no_counts)  #: (q, n) episodes that did it
     #: (q, n) of these, those that failed soon after they did
     failed_after: NDArray[np.float64] = field(default_factory=_no_counts)
@@ -116,6 +119,7 @@ class FSMModel:
             "endings": (n,),
             "episodes": (n,),
             "failed_soon": (n,),
+            "joined": (n,),
             "tried": (q, n),
             "failed_after": (q, n),
         }
@@ -133,7 +137,7 @@ class FSMModel:
             "decisions, failures or endings", self.decisions, self.failures, self.endings
         )
         refuse_unless_counts(
-            "episodes or failed_soon", self.episodes, self.failed_soon, self.visits
+            "episodes or failed_soon", self.episodes, self.failed_soon, self.joined
         )
         refuse_unless_counts("tried or failed_after", self.tried, self.failed_after, self.uses)
         if n:
@@ -312,8 +316,8 @@ class FSMModel:
         #1: gap 0 m. 2 episodes came here (3 observations); 1 of 2 (12 to 88 %) failed later on.
         >>> print(model.explain([0.2, 0.8], action=1))
         #2: gap 1 m (belief 80 %, next #1 20 %). 1 episode came here (1 observation);
-        1 of 1 (at least 27 %) failed later on; a(2) was never tried here. Mostly reached from #1:
-        1 of 1 times.
+        1 of 1 (at least 27 %) failed later on; none of them is known to have tried a(2) here.
+        Most often reached from #1: 1 of 1 times.
         """
         if action is not None:
             action = check_action(action, self.n_actions)

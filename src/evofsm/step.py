@@ -31,13 +31,15 @@ from evofsm.states.failure import splits
 from evofsm.transitions import (
     NOT_OPEN,
     count,
-    count_episode,
     count_failure,
     count_open,
+    count_try,
+    count_visit,
     expand,
     forecast,
     forecast_and_identify,
     place_of,
+    tick,
 )
 from evofsm.validation import LARGEST_OBSERVATION
 
@@ -145,8 +147,7 @@ def step(
     if not _is_usable(memory, z):
         return REFUSED, 0, np.nan
     n = int(now.n_states[0])
-    if not now.chained[0]:
-        now.outcomes.began[0] = now.clusters.n_observations[0] + 1.0
+    tick(now.outcomes, not now.chained[0])
 
     # Section 2.2.1: does the observation move a state, or found one?
     event, nearest, potential = determine(parameters.rule, now.clusters, n, z)
@@ -174,7 +175,7 @@ def step(
         now.belief[i] = scratch.recognised[i]
     now.state[0] = nearest
     now.visits[nearest] += 1.0
-    _come_to(memory, nearest)
+    count_visit(now.outcomes, nearest)
     now.action[0] = NO_ACTION
     now.chained[0] = 1.0
     if failed:
@@ -289,12 +290,13 @@ def fail(buffer: NDArray[np.float64]) -> bool:
         return False
     n = int(now.n_states[0])
     nearest = int(now.state[0])
-    if _splits(memory, nearest):
+    is_whole = now.outcomes.latest_visit[nearest] == now.outcomes.clock[0]
+    if is_whole and _splits(memory, nearest):
         nearest = _split(memory, n, nearest)[1]
         n = int(now.n_states[0])
         now.state[0] = nearest
         _recognise(memory, n, nearest)
-        _come_to(memory, nearest)
+        count_visit(now.outcomes, nearest)
         for i in range(n):
             now.belief[i] = memory.scratch.recognised[i]
     action = int(now.action[0])
@@ -405,20 +407,7 @@ def _decide(memory: Memory, place: int, n: int, failed: bool) -> None:
     count(outcomes.decisions[place], now.belief, lanes(n))
     if failed:
         count(outcomes.failures[place], now.belief, lanes(n))
-    count_episode(
-        outcomes.tried[place],
-        outcomes.latest_try[place],
-        int(now.state[0]),
-        outcomes.began[0],
-        now.clusters.n_observations[0],
-    )
-
-
-@inner_kernel
-def _come_to(memory: Memory, state: int) -> None:
-    """Count that the present episode is in a state."""
-    outcomes, now = memory.learnt.outcomes, memory.learnt.clusters.n_observations[0]
-    count_episode(outcomes.episodes, outcomes.latest_visit, state, outcomes.began[0], now)
+    count_try(outcomes, place, int(now.state[0]))
 
 
 @inner_kernel
@@ -426,12 +415,7 @@ def _end(memory: Memory) -> None:
     """Count the failure where the episode was last and what it did before; clear the chain."""
     now = memory.learnt
     now.outcomes.endings[int(now.state[0])] += 1.0
-    count_failure(
-        now.outcomes,
-        int(now.n_states[0]),
-        now.clusters.n_observations[0],
-        memory.parameters.failure_horizon,
-    )
+    count_failure(now.outcomes, int(now.n_states[0]), memory.parameters.failure_horizon)
     now.action[0] = NO_ACTION
     now.chained[0] = 0.0
 

@@ -57,10 +57,10 @@ _Shape: TypeAlias = tuple[int | str, ...]
 _SHAPES: dict[str, dict[str, _Shape] | None] = {
     "machine": {
         **dict.fromkeys(("n_states", "n_founded", "action", "chained", "state"), (1,)),
-        **dict.fromkeys(("n_observations", "scatter", "began"), (1,)),
+        **dict.fromkeys(("n_observations", "scatter", "clock", "began"), (1,)),
         **dict.fromkeys(("belief", "ids", "visits", "founded", "endings"), ("n",)),
         **dict.fromkeys(("potentials", "squared_distances"), ("n",)),
-        **dict.fromkeys(("episodes", "failed_soon", "latest_visit"), ("n",)),
+        **dict.fromkeys(("episodes", "failed_soon", "latest_visit", "joined"), ("n",)),
         **dict.fromkeys(("first", "latest", "mean"), ("m",)),
         **dict.fromkeys(("places", "uses"), ("q",)),
         **dict.fromkeys(("scales", "origin_frequency", "decisions", "failures"), ("places", "n")),
@@ -71,7 +71,7 @@ _SHAPES: dict[str, dict[str, _Shape] | None] = {
     },
     "model": {
         **dict.fromkeys(("potentials", "visits", "founded", "endings"), ("n",)),
-        **dict.fromkeys(("episodes", "failed_soon"), ("n",)),
+        **dict.fromkeys(("episodes", "failed_soon", "joined"), ("n",)),
         **dict.fromkeys(("origin_frequency", "decisions", "failures"), ("q", "n")),
         **dict.fromkeys(("tried", "failed_after"), ("q", "n")),
         "uses": ("q",),
@@ -98,19 +98,19 @@ _SINCE = {
     "machine": {
         **dict.fromkeys(("decisions", "failures", "endings", "latest"), 2),
         **dict.fromkeys(("places", "scales", "n_founded", "ids"), 3),
-        **dict.fromkeys(("began", "episodes", "failed_soon", "latest_visit"), 5),
+        **dict.fromkeys(("clock", "began", "episodes", "failed_soon", "latest_visit", "joined"), 5),
         **dict.fromkeys(("tried", "failed_after", "latest_try"), 5),
     },
     "model": {
         **dict.fromkeys(("decisions", "failures", "endings"), 2),
-        **dict.fromkeys(("episodes", "failed_soon", "tried", "failed_after"), 5),
+        **dict.fromkeys(("episodes", "failed_soon", "joined", "tried", "failed_after"), 5),
     },
     "risk": dict.fromkeys(("doubts_brought", "doubts_shortfalls"), 4),
 }
 # Counts that earlier versions had not, and an array of the same shape: in these they are zeros.
 _ADDED = {
     **dict.fromkeys(("decisions", "failures", "tried", "failed_after"), "origin_frequency"),
-    **dict.fromkeys(("endings", "episodes", "failed_soon", "latest_visit"), "visits"),
+    **dict.fromkeys(("endings", "episodes", "failed_soon", "latest_visit", "joined"), "visits"),
     "latest_try": "origin_frequency",
     "latest": "first",
 }
@@ -563,8 +563,8 @@ def _upgrade(header: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> None:
         arrays["scales"] = np.ones_like(arrays["origin_frequency"])
         arrays["n_founded"] = arrays["n_states"]
         arrays["ids"] = np.arange(len(arrays["visits"]), dtype=np.float64)
-    if header["version"] < 5 and header["kind"] == "machine":  # counts begin with the next one
-        arrays["began"] = arrays["n_observations"] + 1.0
+    if header["version"] < 5 and header["kind"] == "machine":  # episodes count from here on
+        arrays["clock"] = arrays["began"] = arrays["n_observations"]
 
 
 # -- Errors ---------------------------------------------------------------------------------------

@@ -65,13 +65,15 @@ class Outcomes(NamedTuple):
     decisions: NDArray[np.float64]  # (s, capacity) belief-weighted transitions from each state
     failures: NDArray[np.float64]  # (s, capacity) those of them that led straight into failure
     endings: NDArray[np.float64]  # (capacity,) failures whose last observation was the state
-    began: NDArray[np.float64]  # (1,) number of the present episode's first observation
+    clock: NDArray[np.float64]  # (1,) observations so far, with those that lacked something
+    began: NDArray[np.float64]  # (1,) the clock at the present episode's first observation
     episodes: NDArray[np.float64]  # (capacity,) that came to the state
     failed_soon: NDArray[np.float64]  # (capacity,) those that failed soon after they were there
-    latest_visit: NDArray[np.float64]  # (capacity,) number of the latest observation there
+    latest_visit: NDArray[np.float64]  # (capacity,) the clock at the latest observation there
+    joined: NDArray[np.float64]  # (capacity,) 1 where an episode may count twice, of two states
     tried: NDArray[np.float64]  # (s, capacity) episodes that took the action in the state
     failed_after: NDArray[np.float64]  # (s, capacity) those that failed soon after they did
-    latest_try: NDArray[np.float64]  # (s, capacity) number of the observation that followed it
+    latest_try: NDArray[np.float64]  # (s, capacity) the clock at the observation that followed
 
 
 @inner_kernel
@@ -82,19 +84,33 @@ def count(counts: NDArray[np.float64], belief: NDArray[np.float64], n: int) -> N
 
 
 @inner_kernel
-def count_episode(
-    episodes: NDArray[np.float64], latest: NDArray[np.float64], i: int, began: float, now: float
-) -> None:
-    """Count that the present episode, which ``began`` then, is at ``i`` ``now``; once for each."""
-    if latest[i] < began:
-        episodes[i] += 1.0
-    latest[i] = now
+def tick(outcomes: Outcomes, begins: bool) -> None:
+    """Count an observation, with which an episode may begin."""
+    outcomes.clock[0] += 1.0
+    if begins:
+        outcomes.began[0] = outcomes.clock[0]
+
+
+@inner_kernel
+def count_visit(outcomes: Outcomes, state: int) -> None:
+    """Count that the present episode is in a state; once for each episode."""
+    if outcomes.latest_visit[state] < outcomes.began[0]:
+        outcomes.episodes[state] += 1.0
+    outcomes.latest_visit[state] = outcomes.clock[0]
+
+
+@inner_kernel
+def count_try(outcomes: Outcomes, place: int, state: int) -> None:
+    """Count that the present episode took an action in a state; once for each episode."""
+    if outcomes.latest_try[place, state] < outcomes.began[0]:
+        outcomes.tried[place, state] += 1.0
+    outcomes.latest_try[place, state] = outcomes.clock[0]
 
 
 @rare_kernel
-def count_failure(outcomes: Outcomes, n: int, now: float, horizon: float) -> None:
-    """The present episode failed ``now``: so did all that it did within the horizon before."""
-    since = max(outcomes.began[0], now - horizon)
+def count_failure(outcomes: Outcomes, n: int, horizon: float) -> None:
+    """The present episode failed: so did all that it did within the horizon before."""
+    since = max(outcomes.began[0], outcomes.clock[0] - horizon)
     for i in range(n):
         outcomes.failed_soon[i] += outcomes.latest_visit[i] >= since
     for place in range(len(outcomes.tried)):

@@ -6,7 +6,7 @@ import pytest
 
 from evofsm import EvolvingFSM, IntervalActions
 from evofsm.drivers.idm import IDM
-from evofsm.framework.loop import Decision, Drive, Framework
+from evofsm.framework.loop import Decision, Drive, Explain, Framework
 from evofsm.framework.reviser import ActionReviser, Mode
 from evofsm.naming import VARIABLES
 from evofsm.protocols import Intake
@@ -36,7 +36,7 @@ def run():
     drives = []
     for mode in (Mode.SHADOW, Mode.ACT, Mode.ACT):
         reviser = ActionReviser(risk, ACTIONS, mode=mode)
-        framework = Framework(HASTY, ACTIONS, reviser, machine=machine)
+        framework = Framework(HASTY, ACTIONS, reviser, machine=machine, explaining=Explain.ALL)
         drives.append(framework.drive(KinematicWorld(), Scenario(LEADER, 8.0, duration=14.0)))
     assert [drive.episode.collided for drive in drives] == [True, False, False]
     names = {"names": VARIABLES, "units": ("m", "m/s", "m/s")}
@@ -97,7 +97,7 @@ def test_the_log_holds_what_the_drives_held(run, log):
             "advised": [r.advised for r in revisions],
             "realised": [decision.realised for decision in drive.decisions],
             "reason": [r.reason for r in revisions],
-            "explanation": [getattr(d, "explanation", "") for d in drive.decisions],
+            "explanation": [r.explanation for r in revisions],
         }
         assert set(columns) == {*wanted, "belief"}
         for name, values in wanted.items():
@@ -111,6 +111,30 @@ def test_the_log_holds_what_the_drives_held(run, log):
         np.testing.assert_array_equal(episode.end, drive.episode.observations[-1])
         with pytest.raises(ValueError, match="read-only"):
             columns["gap"][0] = 0.0
+
+
+def test_explanations_are_in_it(run, log):
+    told = [text for episode in read_run(log).episodes for text in episode.columns["explanation"]]
+    assert all(str(text).startswith("#") for text in told)
+    assert any("failed later on" in str(text) for text in told)
+
+
+def test_a_log_that_begins_with_its_messages_is_not_read_as_empty(log, tmp_path):
+    with open(log, "rb") as file, open(tmp_path / "other.mcap", "wb") as rewritten:
+        reader, writer = make_reader(file), Writer(rewritten, use_chunking=False)
+        writer.start()
+        channels = {}
+        for schema, channel, message in reader.iter_messages():
+            if channel.topic not in channels:
+                known = writer.register_schema(schema.name, schema.encoding, schema.data)
+                channels[channel.topic] = writer.register_channel(channel.topic, "json", known)
+            times = message.log_time, message.publish_time
+            writer.add_message(channels[channel.topic], times[0], message.data, times[1])
+        for metadata in reader.iter_metadata():
+            writer.add_metadata(metadata.name, metadata.metadata)
+        writer.finish()
+    with pytest.raises(ValueError, match="messages come before what it is about"):
+        read_run(tmp_path / "other.mcap")
 
 
 def test_another_reader_finds_every_channel_in_the_order_of_time(run, log):

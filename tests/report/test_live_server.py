@@ -145,6 +145,20 @@ def test_a_port_that_is_taken_is_said(page):
 # -- What is shown, and done ----------------------------------------------------------------------
 
 
+def test_a_port_that_cannot_be_is_said_too():
+    with pytest.raises(OverflowError, match="port"), LivePage(70_000):
+        pass
+
+
+def test_who_connects_and_says_nothing_does_not_hold_up_the_end():
+    with LivePage() as page:
+        silent = socket.create_connection(("127.0.0.1", page.port), timeout=5)
+        time.sleep(0.1)
+        began = time.monotonic()
+    assert time.monotonic() - began < 4.0
+    silent.close()
+
+
 def test_who_comes_late_is_shown_all_of_it(page):
     with looking_on(page) as first:
         for number in range(3):
@@ -232,6 +246,8 @@ def test_junk_on_the_wire_is_survived(page):
         b"\x16\x03\x01\x02\x00\x01" * 50,  # as if it were TLS
         b"GET / HTTP/1.1\r\n" + b"A: b\r\n" * 500,
         b"GET /\xff/ HTTP/1.1\r\n\r\n",
+        f"GET /{'x' * 5000}/ HTTP/1.1\r\nHost: 127.0.0.1:{page.port}\r\n\r\n".encode(),
+        f"GET /\xff/ HTTP/1.1\r\nHost: 127.0.0.1:{page.port}\r\n\r\n".encode("latin-1"),
         b"POST / HTTP/1.1\r\nContent-Length: 9\r\n\r\n",
         b"\x00" * 100_000,
         request.encode(),  # and then nothing

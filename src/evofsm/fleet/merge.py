@@ -231,13 +231,14 @@ def _no_episode(n: int) -> dict[str, NDArray[Any]]:
         "chained": np.zeros(1),
         "state": np.zeros(1),
         "belief": np.full(n, 1.0 / n),
+        "clock": np.zeros(1),
         "began": np.zeros(1),
         "latest_visit": np.zeros(n),
     }
 
 
 def _states(learnt: Sequence[Learnt], match: _Match) -> dict[str, NDArray[Any]]:
-    visits, endings, episodes, failed_soon = np.zeros((4, match.n))
+    visits, endings, episodes, failed_soon, joined = np.zeros((5, match.n))
     founded = np.ones(match.n)
     changes = np.zeros((match.n, match.n))
     for part, group in zip(learnt, match.groups, strict=True):
@@ -245,6 +246,8 @@ def _states(learnt: Sequence[Learnt], match: _Match) -> dict[str, NDArray[Any]]:
         np.add.at(endings, group, part.outcomes.endings)
         np.add.at(episodes, group, part.outcomes.episodes)
         np.add.at(failed_soon, group, part.outcomes.failed_soon)
+        of_part = np.bincount(group, minlength=match.n) > 1
+        np.maximum.at(joined, group, np.maximum(part.outcomes.joined, of_part[group]))
         np.add.at(changes, (group[:, None], group), part.changes)
         earliest = np.full(match.n, np.inf)
         np.minimum.at(earliest, group, part.founded)
@@ -254,6 +257,7 @@ def _states(learnt: Sequence[Learnt], match: _Match) -> dict[str, NDArray[Any]]:
         "endings": endings,
         "episodes": episodes,
         "failed_soon": failed_soon,
+        "joined": joined,
         "founded": founded,
         "changes": changes,
     }

@@ -289,9 +289,10 @@ def _graph(
 ) -> tuple[list[_Node], list[_Edge]]:
     """What all graphs show."""
     _refuse_no_probability(least)
-    if beyond := [state for state in dead_ends or () if not 0 <= state < model.n_states]:
+    ended = np.flatnonzero(model.endings) if dead_ends is None else dead_ends
+    marked = frozenset(int(state) for state in ended)
+    if beyond := sorted(state for state in marked if not 0 <= state < model.n_states):
         raise ValueError(f"dead_ends names {beyond}; the model has {model.n_states} states, from 0")
-    marked = np.flatnonzero(model.endings) if dead_ends is None else dead_ends
     names, units = _variables(model)
     nodes = [
         _Node(

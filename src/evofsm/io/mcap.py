@@ -446,7 +446,9 @@ def _read(reader: StreamReader) -> Run:
             model = FSMModel.load(io.BytesIO(record.data))
         elif isinstance(record, Channel):
             topics[record.id] = record.topic
-        elif isinstance(record, Message) and about is not None:
+        elif isinstance(record, Message):
+            if about is None and topics[record.channel_id] in _CHANNELS:
+                raise ValueError("its messages come before what it is about; was it rewritten?")
             episodes.take(topics[record.channel_id], record.data)
     if about is None:
         raise ValueError("it holds no run of evofsm")

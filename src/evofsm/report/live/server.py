@@ -84,7 +84,7 @@ class LivePage:
         self._clients: set[_Client] = set()
         self._start: Start | None = None
         self._ready = threading.Event()
-        self._error: OSError | None = None
+        self._error: Exception | None = None
         self._thread = threading.Thread(target=self._serve, name="evofsm-live-page", daemon=True)
         self._files = {name: files(__package__).joinpath(name).read_bytes() for name in _WELCOME}
 
@@ -169,12 +169,12 @@ class LivePage:
                 compression=None,
                 max_size=_LONGEST_COMMAND,
                 max_queue=4,
-                open_timeout=10,
+                open_timeout=2,
                 close_timeout=1,
                 server_header=None,
                 logger=_log,
             )
-        except OSError as error:
+        except Exception as error:  # a port that is taken, or none at all
             self._error = error
             self._ready.set()
             return

@@ -41,7 +41,7 @@ def tell(frame: Frame, start: Start) -> Told:
         _HEADLINES[status],
         "No danger so far." if danger is None else _when(story, danger),
         _no_danger(frame) if danger is None else _why(danger),
-        _NOTHING if danger is None else _done(danger, frame),
+        _quiet(story) if danger is None else _done(danger, frame),
         _others(story, start),
         _outcome(story, frame),
         _alone(story, frame),
@@ -49,7 +49,6 @@ def tell(frame: Frame, start: Start) -> Told:
     return Told(*(_UNIT.sub("\u00a0", text) for text in told))
 
 
-_NOTHING = "Nothing had to be done: every wish of the driver was carried out."
 # A number and its unit stay on one line.
 _UNIT = re.compile(r"(?<=\d) (?=(?:s|m|m/s|m/s²)\b)")
 _HEADLINES = {
@@ -60,6 +59,14 @@ _HEADLINES = {
     "collision": "Collision",
     "ended": "No collision",
 }
+
+
+def _quiet(story: Story) -> str:
+    """What was done where latent risk saw no danger; classic measures may have."""
+    if story.revised == 0:
+        return "Nothing had to be done: every wish of the driver was carried out."
+    plural = "decision" if story.revised == 1 else "decisions"
+    return f"The reviser changed {story.revised} {plural}, though latent risk saw no danger."
 
 
 def _no_danger(frame: Frame) -> str:
@@ -144,9 +151,11 @@ def _done(danger: Danger, frame: Frame) -> str:
     if danger.off < danger.stepped_in:
         when += ", as it was switched on"
     mean = danger.change / danger.revised
+    others = frame.story.revised - danger.revised
+    elsewhere = f" It changed {others} more outside of this danger." if others else ""
     return (
         f"The reviser stepped in at {when}, at first {instead}. It changed {share}, by "
-        f"{mean:.1f} m/s² on average{hardest}."
+        f"{mean:.1f} m/s² on average{hardest}.{elsewhere}"
     )
 
 
@@ -190,7 +199,7 @@ def _outcome(story: Story, frame: Frame) -> str:
     parts = []
     if not math.isnan(story.leader_brakes):
         when = _seconds(story.leader_brakes)
-        parts.append(f"The leader braked by {story.leader_decel:.1f} m/s² at {when}.")
+        parts.append(f"The leader braked from {when} on, by up to {story.leader_decel:.1f} m/s².")
     if not math.isnan(story.collision):
         parts.append(f"Collision at {_seconds(story.collision)}, {story.impact:.1f} m/s too fast.")
     elif frame.rear_ended:

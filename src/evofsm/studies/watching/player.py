@@ -170,6 +170,7 @@ class Player:
 
     def _tell(self, kind: str, order: Callable[[Watched], None]) -> None:
         with self._told:
+            self._orders.pop(kind, None)  # what was told last comes last
             self._orders[kind] = order
             self._told.notify()
 

@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 from evofsm.io.mcap import RecordedEpisode, Run, read_run
 from evofsm.model import FSMModel
 from evofsm.naming import VARIABLES
+from evofsm.risk.headway import time_headway
+from evofsm.risk.ttc import time_to_collision
 from evofsm.studies.watching.shown import (
     CAR_LENGTH,
     HEADWAY,
@@ -159,7 +161,8 @@ class Recording:
     def _moved(self, number: int) -> Frame:
         """Where the cars are; the rest is as in a frame in which nothing is decided."""
         columns, cars = self._episode.columns, self._cars
-        gap, speed, leader_speed = cars["observed"][number].tolist()
+        observed = cars["observed"][number]
+        gap, speed, leader_speed = observed.tolist()
         last = min(number, len(columns["time"]) - 1)
         return Frame(
             number=number,
@@ -183,8 +186,8 @@ class Recording:
             critical=math.nan,
             decel=math.nan,
             brakes_to=math.nan,
-            time_to_collision=float(columns["time_to_collision"][last]),
-            time_headway=float(columns["time_headway"][last]),
+            time_to_collision=float(time_to_collision(observed)),
+            time_headway=float(time_headway(observed)),
             proposed=math.nan,
             executed=math.nan,
             advised=math.nan,

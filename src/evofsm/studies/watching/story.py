@@ -50,7 +50,8 @@ class Story(NamedTuple):
     time_to_collision: float = math.nan  #: when it first fell below its threshold [s]
     time_headway: float = math.nan  #: the same of time headway [s]
     leader_brakes: float = math.nan  #: when the leader first braked hard [s]
-    leader_decel: float = math.nan  #: how hard [m/s²]
+    leader_decel: float = math.nan  #: how hard it has braked since, at most [m/s²]
+    revised: int = 0  #: decisions that the reviser changed, in danger or not
     alone: float = math.nan  #: when the driver left alone collides [s]; infinite if it does not
     collision: float = math.nan  #: [s]
     impact: float = math.nan  #: speed at which the cars met [m/s]
@@ -80,6 +81,7 @@ class Chronicle:
     def tell(self, frame: Frame) -> Story:
         """The story with one more frame."""
         story = self._warnings(frame, self._leader(frame, self.story))
+        story = story._replace(revised=story.revised + _is_revised(frame))
         if frame.over:
             story = story._replace(ended=frame.time)
             if frame.collided:
@@ -137,8 +139,12 @@ def _began(frame: Frame) -> Danger:
     )
 
 
+def _is_revised(frame: Frame) -> bool:
+    return abs(frame.executed - frame.proposed) > _SAME
+
+
 def _went_on(danger: Danger, frame: Frame, is_tolerable: bool) -> Danger:
-    revised = abs(frame.executed - frame.proposed) > _SAME
+    revised = _is_revised(frame)
     if revised and danger.revised == 0:
         danger = danger._replace(
             stepped_in=frame.time, wished=frame.proposed, instead=frame.executed
