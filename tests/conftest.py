@@ -21,6 +21,21 @@ def spiral():
     return make
 
 
+@pytest.fixture(scope="session")
+def compiled():
+    """All that a watched run needs is compiled, for tests that wait for some seconds only."""
+    from evofsm.studies.watching import Session, Watching, learn_first, watched_learner
+    from evofsm.worlds.families import load_family
+    from evofsm.worlds.kinematic import KinematicWorld
+
+    watching = Watching(load_family("paper"))
+    learner = watched_learner(watching.family)
+    learn_first(watching, learner, 2)
+    with Session(watching, learner, KinematicWorld()) as session:
+        while not session.step().over:
+            session.graph()
+
+
 @pytest.fixture
 def snapshot(tmp_path):
     """Everything a machine holds, byte for byte: what it would write to a file."""

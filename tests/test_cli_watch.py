@@ -5,6 +5,8 @@ from urllib.request import urlopen
 
 import pytest
 
+pytestmark = pytest.mark.usefixtures("compiled")
+
 pytest.importorskip("websockets")
 
 

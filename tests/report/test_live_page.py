@@ -22,9 +22,12 @@ PAPER = Watching(load_family("paper"))
 NAMES = ("chromium", "chromium-browser", "google-chrome")
 CHROMIUM = next((path for path in map(shutil.which, NAMES) if path), None)
 
-pytestmark = pytest.mark.skipif(
-    CHROMIUM is None, reason=f"none of {', '.join(NAMES)} is installed to look at the page with"
-)
+pytestmark = [
+    pytest.mark.skipif(
+        CHROMIUM is None, reason=f"none of {', '.join(NAMES)} is installed to look at the page with"
+    ),
+    pytest.mark.usefixtures("compiled"),
+]
 
 
 @pytest.fixture(scope="module")

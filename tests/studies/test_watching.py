@@ -19,6 +19,8 @@ from evofsm.studies.watching import (
 from evofsm.worlds.families import load_family
 from evofsm.worlds.kinematic import KinematicWorld
 
+pytestmark = pytest.mark.usefixtures("compiled")
+
 PAPER = Watching(load_family("paper"))
 
 
