@@ -1,10 +1,13 @@
 """Pages as readers and browsers meet them."""
 
 import re
+import shutil
 from html import unescape
 from html.parser import HTMLParser
 
 import pytest
+
+BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 
 
 class Page(HTMLParser):
@@ -66,3 +69,17 @@ class Page(HTMLParser):
 def read_page():
     """Reads a file, or markup, as a `Page`."""
     return lambda page: Page(page if isinstance(page, str) else page.read_text(encoding="utf-8"))
+
+
+@pytest.fixture(scope="module")  # while one is open, no other loop can run in this thread
+def browser():
+    """Chromium, if one is installed."""
+    playwright = pytest.importorskip("playwright.sync_api")
+    found = next((path for path in map(shutil.which, BROWSERS) if path), None)
+    if found is None:
+        pytest.skip(f"none of {', '.join(BROWSERS)} is installed to look at pages with")
+    flags = ["--no-sandbox", "--disable-quic", "--no-first-run", "--disable-background-networking"]
+    with playwright.sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=found, args=[*flags, "--disable-gpu"])
+        yield browser
+        browser.close()

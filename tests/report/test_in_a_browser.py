@@ -1,6 +1,5 @@
 """Pages in Chromium: tables sort, figures open large, nothing is loaded, nothing goes wrong."""
 
-import shutil
 from contextlib import closing
 
 import pytest
@@ -9,13 +8,6 @@ from evofsm.report.chapter import Chapter, write_chapters
 from evofsm.report.drawing import Drawing
 from evofsm.report.html import Setting
 from evofsm.studies.table import Table
-
-playwright = pytest.importorskip("playwright.sync_api")
-BROWSER = next(
-    filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None
-)
-if BROWSER is None:
-    pytest.skip("no Chromium is installed", allow_module_level=True)
 
 SVG = '<svg xmlns="http://www.w3.org/2000/svg" width="{}" height="200"><path d="M0 0h90"/></svg>'
 # Where the image of the dialog lies.
@@ -58,23 +50,6 @@ def address(tmp_path_factory):
         command="evofsm bench made",
     )
     return write_chapters(folder / "index.html", [chapter], command="x").as_uri()
-
-
-@pytest.fixture(scope="module")
-def browser():
-    with (
-        playwright.sync_playwright() as started,
-        closing(
-            started.chromium.launch(
-                executable_path=BROWSER,
-                args=[
-                    *("--no-sandbox", "--disable-quic", "--no-first-run"),
-                    "--disable-background-networking",
-                ],
-            )
-        ) as opened,
-    ):
-        yield opened
 
 
 @pytest.fixture

@@ -2,7 +2,6 @@
 
 import math
 import re
-import shutil
 import time
 from contextlib import contextmanager
 
@@ -19,24 +18,8 @@ from evofsm.worlds.families import load_family
 from evofsm.worlds.kinematic import KinematicWorld
 
 PAPER = Watching(load_family("paper"))
-NAMES = ("chromium", "chromium-browser", "google-chrome")
-CHROMIUM = next((path for path in map(shutil.which, NAMES) if path), None)
 
-pytestmark = [
-    pytest.mark.skipif(
-        CHROMIUM is None, reason=f"none of {', '.join(NAMES)} is installed to look at the page with"
-    ),
-    pytest.mark.usefixtures("compiled"),
-]
-
-
-@pytest.fixture(scope="module")
-def browser():
-    flags = ["--no-sandbox", "--disable-quic", "--no-first-run", "--disable-background-networking"]
-    with playwright.sync_playwright() as driver:
-        browser = driver.chromium.launch(executable_path=CHROMIUM, args=[*flags, "--disable-gpu"])
-        yield browser
-        browser.close()
+pytestmark = pytest.mark.usefixtures("compiled")
 
 
 @pytest.fixture
