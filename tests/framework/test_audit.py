@@ -530,6 +530,7 @@ FORGERIES = {
     "risk": ("decision", 5, with_ulp("risk_proposed")),
     "reason": ("decision", 2, with_other("reason", "the driver wished it")),
     "state": ("decision", 4, with_other("state", 99)),
+    "explanation": ("decision", 4, with_other("explanation", "all was well here")),
     "learnt": ("end", 0, lambda content: content["learnt"].update(manoeuvres=99)),
     "failed": ("end", 0, with_other("failed", True)),
     "no such kind": ("end", 0, with_other("kind", "nonsense")),
@@ -552,6 +553,26 @@ def test_a_forgery_behind_a_chain_that_was_made_anew_is_found_by_replaying(drive
     else:
         assert result.replay.difference.record == number
     assert audit(tmp_path / "forged", replay=False).is_good
+
+
+def test_a_decision_is_written_with_what_the_machine_had_seen_of_its_situation(driven):
+    told = [one for one in contents(driven) if one["kind"] == "decision"]
+    assert all(one["explanation"].startswith(f"#{one['state'] + 1}: ") for one in told)
+    assert "No earlier episode that was counted came here" in told[0]["explanation"]
+    assert any("episode came here" in one["explanation"] for one in told)
+
+
+def test_a_log_from_before_there_were_explanations_is_replayed_without(driven, tmp_path):
+    head, lines = Head(0, NOTHING), []
+    for line in driven.read_bytes().splitlines(keepends=True):
+        content = unseal(line).content
+        content.pop("explanation", None)
+        line, head = seal(content | ({"version": 1} if "version" in content else {}), head)
+        lines.append(line)
+    (tmp_path / "old").write_bytes(b"".join(lines))
+    result = audit(tmp_path / "old")
+    assert result.is_good
+    assert result.replay.decisions == audit(driven).replay.decisions
 
 
 def test_a_decision_that_was_hidden_is_found_by_replaying(driven, tmp_path):
