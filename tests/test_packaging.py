@@ -14,7 +14,17 @@ import evofsm
 
 ROOT = Path(__file__).parent.parent
 HEAVY = {
-    *("numba", "scipy", "libsumo", "matplotlib", "jinja2"),
+    *(
+        "numba",
+        "scipy",
+        "libsumo",
+        "matplotlib",
+        "jinja2",
+        "river",
+        "sklearn",
+        "mcap",
+        "websockets",
+    ),
     *("polars", "pyarrow", "pandas", "typer", "rich", "gymnasium", "highway_env", "distributed"),
 }
 
