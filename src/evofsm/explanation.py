@@ -108,7 +108,7 @@ class Explanation(NamedTuple):
     here: Tally  #: of the episodes that came to it
     reached_from: int | None  #: index of the state that most changes to it came from
     action: Tally | None  #: of those that took the action there; None where none was asked for
-    #: index of the action whose interval ends lowest, of those after which a smaller share failed
+    #: index of the action after which a smaller share failed and whose interval ends lowest
     better: int | None
     after_better: Tally | None  #: of those that took it
 
@@ -163,11 +163,11 @@ def nothing_known(text: str) -> Explanation:
 
 
 def _best(after: Sequence[Tally], than: Tally) -> int | None:
-    """The action with the lowest upper end of its interval, if fewer of its episodes failed."""
+    """The action whose interval ends lowest, if that is lower and a smaller share failed."""
     better = [
         (tally.interval[1], action)
         for action, tally in enumerate(after)
-        if tally.episodes and tally.share < than.share
+        if tally.share < than.share and tally.interval[1] < than.interval[1]
     ]
     return min(better)[1] if better else None
 
