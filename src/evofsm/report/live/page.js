@@ -45,7 +45,7 @@ const send = (what, value) => {
 // -- What is shown as words and controls ------------------------------------------------------------
 
 function showStart(start) {
-  at("about").textContent = `Here ${start.cases[start.case] ?? start.family}: ${start.about}`;
+  at("about").textContent = `Here ${start.cases[start.case] ?? "a run"} of “${start.family}”: ${start.about}`;
   at("of-cases").textContent = start.live ? "Case" : "Episode";
   at("case").replaceChildren(...start.cases.map((name, k) => new Option(name, k, false, k === start.case)));
   at("speed").replaceChildren(...start.speeds.map((speed) => new Option(`${speed} ×`, speed)));

@@ -109,8 +109,8 @@ def _when(story: Story, danger: Danger) -> str:
         return f"{text}; it was over at {_seconds(danger.last)}."
     if not math.isnan(danger.dead_end):
         return (
-            f"{text}. From {_seconds(danger.dead_end)} on it was a dead end: if the leader braked, "
-            "even full braking would come too late."
+            f"{text}, in what the driver wanted. From {_seconds(danger.dead_end)} on it was a dead "
+            "end: if the leader braked, even braking in full at once would come too late."
         )
     return f"{text}."
 
@@ -164,7 +164,7 @@ def _wish(acceleration: float) -> str:
         return f"accelerate by {acceleration:.1f} m/s²"
     if acceleration < -_HARDLY:
         return f"brake by {-acceleration:.1f} m/s²"
-    return f"hardly change its speed ({acceleration:+.1f} m/s²)"
+    return f"keep about its speed ({acceleration:+.1f} m/s²)"
 
 
 def _wishing(acceleration: float) -> str:
@@ -172,7 +172,7 @@ def _wishing(acceleration: float) -> str:
         return f"accelerating by {acceleration:.1f} m/s²"
     if acceleration < -_HARDLY:
         return f"braking by only {-acceleration:.1f} m/s²"
-    return f"hardly changing its speed ({acceleration:+.1f} m/s²)"
+    return f"keeping about its speed ({acceleration:+.1f} m/s²)"
 
 
 def _others(story: Story, start: Start) -> str:
