@@ -133,7 +133,9 @@ def explain(
     asked = None if action is None else after[action]
     better = _best(after, here if asked is None or not asked.episodes else asked)
     after_better = None if better is None else after[better]
-    came_from = _came_from(known.changes, state)
+    arrivals = known.changes[:, state]
+    arrivals = np.where(np.arange(len(arrivals)) == state, 0.0, arrivals)
+    came_from = int(arrivals.argmax()) if arrivals.any() else None
 
     horizon = known.failure_horizon
     soon = "later on" if horizon is None else f"within {labels.duration(horizon)}"
@@ -142,7 +144,7 @@ def explain(
         _of_episodes(here, visits, soon, asked, "" if action is None else labels.action(action)),
         "" if better is None else f"Better after {labels.action(better)}: {after_better}",
         "" if is_exact else "States were joined here, so an episode may count twice",
-        _of_origin(known.changes, state, came_from),
+        _of_origin(arrivals, came_from),
     ]
     return Explanation(
         " ".join(f"{sentence}." for sentence in sentences if sentence),
@@ -170,12 +172,6 @@ def _best(after: Sequence[Tally], than: Tally) -> int | None:
         if tally.share < than.share and tally.interval[1] < than.interval[1]
     ]
     return min(better)[1] if better else None
-
-
-def _came_from(changes: NDArray[np.float64], state: int) -> int | None:
-    arrivals = changes[:, state].copy()
-    arrivals[state] = 0.0
-    return int(arrivals.argmax()) if arrivals.any() else None
 
 
 # -- In words -------------------------------------------------------------------------------------
@@ -206,12 +202,11 @@ def _of_episodes(here: Tally, visits: int, soon: str, asked: Tally | None, actio
     return f"{text}, and {asked} after {action}"
 
 
-def _of_origin(changes: NDArray[np.float64], state: int, came_from: int | None) -> str:
+def _of_origin(arrivals: NDArray[np.float64], came_from: int | None) -> str:
     if came_from is None:
         return ""
-    arrivals = changes[:, state].sum() - changes[state, state]
-    most = changes[came_from, state]
-    return f"Most often reached from #{came_from + 1}: {most:,.0f} of {arrivals:,.0f} times"
+    most, all_ = arrivals[came_from], arrivals.sum()
+    return f"Most often reached from #{came_from + 1}: {most:,.0f} of {all_:,.0f} times"
 
 
 def _count(number: int, noun: str) -> str:

@@ -82,13 +82,13 @@ class StateRisk(NamedTuple):
         return self.risk > 0.5
 
 
-def assess_states(model: FSMModel, risk: LatentRisk) -> list[StateRisk]:
+def assess_states(known: EvolvingFSM | FSMModel, risk: LatentRisk) -> list[StateRisk]:
     """Latent risk at the centre of every state, in the order of founding.
 
     Parameters
     ----------
-    model : FSMModel
-        Of a machine that observes gap [m], v_follower [m/s] and v_leader [m/s].
+    known : EvolvingFSM or FSMModel
+        A machine, or the model of one, that observes gap [m], v_follower [m/s] and v_leader [m/s].
     risk : LatentRisk
 
     Examples
@@ -96,15 +96,15 @@ def assess_states(model: FSMModel, risk: LatentRisk) -> list[StateRisk]:
     >>> machine = EvolvingFSM(n_actions=1, radius=0.5)
     >>> trace = machine.learn_many([[50.0, 5.0, 5.0], [9.0, 20.0, 20.0]], [0, 0])
     >>> risk = LatentRisk(lowest=-4.0)
-    >>> [state.is_dead_end for state in assess_states(machine.model(), risk)]
+    >>> [state.is_dead_end for state in assess_states(machine, risk)]
     [False]
     """
     actions = np.array([risk.lowest, 0.0])
-    assessed = []
-    for state, center in enumerate(model.centers):
+    assessed, endings = [], known.endings
+    for state, center in enumerate(known.centers):
         critical = risk.critical(center, actions)
         braking, keeping = risk.manoeuvres.harder(critical)
-        alone: NDArray[np.float64] = np.eye(model.n_states)[state]
+        alone: NDArray[np.float64] = np.eye(known.n_states)[state]
         assessed.append(
             StateRisk(
                 state,
@@ -112,7 +112,7 @@ def assess_states(model: FSMModel, risk: LatentRisk) -> list[StateRisk]:
                 float(keeping - braking),
                 float(critical[0]),
                 risk.seconds_seen(alone),
-                float(model.endings[state]),
+                float(endings[state]),
             )
         )
     return assessed

@@ -172,7 +172,7 @@ def drive_family(
     return Driving(
         summarise(family.name, setup.reviser, "", done.outcomes, family.interval),
         tuple(done.lead_times),
-        assess_states(learner.machine.model(), learner.risk),
+        assess_states(learner.machine, learner.risk),
         done.decisions,
     )
 

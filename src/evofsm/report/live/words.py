@@ -139,14 +139,14 @@ def _done(danger: Danger, frame: Frame) -> str:
     if danger.revised == 0:
         if frame.revising:
             return "The reviser has changed nothing yet."
-        instead = f"to {_wish(danger.advised)} instead of {_wishing(danger.proposed)}"
+        instead = _instead(danger.advised, danger.proposed)
         return f"Nothing: the reviser is off. It would have begun at once, {instead}."
     if not frame.revising:
         return f"The reviser changed {share}, but now it is off."
     hardest = ""
     if danger.hardest < -_HARDLY:
         hardest = f"; at its hardest it braked by {-danger.hardest:.1f} m/s²"
-    instead = f"to {_wish(danger.instead)} instead of {_wishing(danger.wished)}"
+    instead = _instead(danger.instead, danger.wished)
     when = _seconds(danger.stepped_in)
     if danger.off < danger.stepped_in:
         when += ", as it was switched on"
@@ -159,20 +159,19 @@ def _done(danger: Danger, frame: Frame) -> str:
     )
 
 
-def _wish(acceleration: float) -> str:
+def _wish(
+    acceleration: float, faster: str = "accelerate by", slower: str = "brake by", kept: str = "keep"
+) -> str:
     if acceleration > _HARDLY:
-        return f"accelerate by {acceleration:.1f} m/s²"
+        return f"{faster} {acceleration:.1f} m/s²"
     if acceleration < -_HARDLY:
-        return f"brake by {-acceleration:.1f} m/s²"
-    return f"keep about its speed ({acceleration:+.1f} m/s²)"
+        return f"{slower} {-acceleration:.1f} m/s²"
+    return f"{kept} about its speed ({acceleration:+.1f} m/s²)"
 
 
-def _wishing(acceleration: float) -> str:
-    if acceleration > _HARDLY:
-        return f"accelerating by {acceleration:.1f} m/s²"
-    if acceleration < -_HARDLY:
-        return f"braking by only {-acceleration:.1f} m/s²"
-    return f"keeping about its speed ({acceleration:+.1f} m/s²)"
+def _instead(better: float, wished: float) -> str:
+    wishing = _wish(wished, "accelerating by", "braking by only", "keeping")
+    return f"to {_wish(better)} instead of {wishing}"
 
 
 def _others(story: Story, start: Start) -> str:

@@ -19,7 +19,6 @@ from evofsm.studies.watching.shown import (
     CAR_LENGTH,
     HEADWAY,
     TTC,
-    UNJUDGED,
     Frame,
     Graph,
     Judged,
@@ -175,28 +174,10 @@ class Recording:
             x_follower=float(cars["x_follower"][number]),
             gap_behind=math.inf,
             observation=(gap, speed, leader_speed),
-            belief=(),
-            state=None,
-            event="",
             n_states=int(columns["n_states"][last]),
-            surprise=math.nan,
-            proposed_risk=UNJUDGED,
-            executed_risk=UNJUDGED,
-            braking_risk=math.nan,
-            critical=math.nan,
-            decel=math.nan,
-            brakes_to=math.nan,
             time_to_collision=float(time_to_collision(observed)),
             time_headway=float(time_headway(observed)),
-            proposed=math.nan,
-            executed=math.nan,
-            advised=math.nan,
-            reason="",
-            explanation="",
             revising=self.revising,
-            collided=False,
-            rear_ended=False,
-            over=False,
             story=self._chronicle.story,
         )
 
@@ -211,7 +192,6 @@ def _decided(columns: Any, number: int) -> dict[str, Any]:
     # The log has the interval of what was executed only.
     is_kept = proposed == executed.risk
     unknown = Judged(proposed, math.nan, math.nan)
-    reason = str(columns["reason"][number])
     return {
         "belief": most_believed(columns["belief"][number]),
         "state": None if state == _NONE else state,
@@ -220,7 +200,7 @@ def _decided(columns: Any, number: int) -> dict[str, Any]:
         "proposed_risk": executed if is_kept else unknown,
         "executed_risk": executed,
         **{name: float(columns[name][number]) for name in ("proposed", "executed", "advised")},
-        "reason": reason,
+        "reason": str(columns["reason"][number]),
         "explanation": str(columns["explanation"][number]),
     }
 

@@ -23,7 +23,6 @@ from evofsm.studies.watching.shown import (
     CAR_LENGTH,
     HEADWAY,
     TTC,
-    UNJUDGED,
     Frame,
     Graph,
     Judged,
@@ -271,7 +270,7 @@ class Session:
 
     def graph(self) -> Graph:
         """The states found so far."""
-        return graph_of(self.learner.machine.model(), self.learner.risk, self._number)
+        return graph_of(self.learner.machine, self.learner.risk, self._number)
 
     def close(self) -> None:
         """Leave the road."""
@@ -374,28 +373,12 @@ class Session:
             x_follower=self._position,
             gap_behind=float(now[GAP_BEHIND]),
             observation=tuple(observation.tolist()),
-            belief=(),
-            state=None,
-            event="",
             n_states=self.learner.machine.n_states,
-            surprise=math.nan,
-            proposed_risk=UNJUDGED,
-            executed_risk=UNJUDGED,
-            braking_risk=math.nan,
-            critical=math.nan,
             decel=self.learner.risk.brakes.decel,
             brakes_to=self.learner.risk.manoeuvres.exceeded_by(self.watching.tolerance),
             time_to_collision=float(time_to_collision(observation)),
             time_headway=float(time_headway(observation)),
-            proposed=math.nan,
-            executed=math.nan,
-            advised=math.nan,
-            reason="",
-            explanation="",
             revising=self.revising,
-            collided=False,
-            rear_ended=False,
-            over=False,
             story=self._chronicle.story,
         )
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from evofsm.machine import EvolvingFSM
 from evofsm.model import FSMModel
 from evofsm.risk.by_state import assess_states
 from evofsm.risk.headway import TimeHeadway
@@ -76,29 +77,32 @@ class Frame(NamedTuple):
     x_follower: float  #: front bumper, from where it started [m]
     gap_behind: float  #: to the car behind [m]; infinite where there is none
     observation: tuple[float, ...]  #: gap, v_follower, v_leader, as they were seen
-    belief: tuple[tuple[int, float], ...]  #: the most probable states, and how probable they are
-    state: int | None  #: the most probable one
-    event: str  #: ``created``, ``moved``, or nothing
     n_states: int
-    surprise: float  #: [bit]
-    proposed_risk: Judged  #: of what the driver wants
-    executed_risk: Judged  #: of what is executed
-    braking_risk: float  #: of full braking at once: high in a dead end
-    critical: float  #: hardest braking of the leader that is survived if the driver has its way
-    decel: float  #: of the follower if it brakes in full, as far as is known [m/s²]
-    brakes_to: float  #: all but a tolerated share of leaders' hard brakes are softer [m/s²]
     time_to_collision: float  #: [s]; infinite where the gap does not close
     time_headway: float  #: [s]
-    proposed: float  #: [m/s²]
-    executed: float  #: [m/s²]
-    advised: float  #: what the reviser would execute, on or off [m/s²]
-    reason: str  #: the reviser's
-    explanation: str  #: what the machine has seen of such situations
     revising: bool  #: whether the reviser may act
-    collided: bool  #: with the leader
-    rear_ended: bool  #: by the car behind
-    over: bool  #: whether the run ended here
     story: Story  #: what has happened so far
+    decel: float = math.nan  #: of the follower if it brakes in full, as far as is known [m/s²]
+    #: all but a tolerated share of leaders' hard brakes are softer [m/s²]
+    brakes_to: float = math.nan
+    #: the most probable states, and how probable they are
+    belief: tuple[tuple[int, float], ...] = ()
+    state: int | None = None  #: the most probable one
+    event: str = ""  #: ``created``, ``moved``, or nothing
+    surprise: float = math.nan  #: [bit]
+    proposed_risk: Judged = UNJUDGED  #: of what the driver wants
+    executed_risk: Judged = UNJUDGED  #: of what is executed
+    braking_risk: float = math.nan  #: of full braking at once: high in a dead end
+    #: hardest braking of the leader that is survived if the driver has its way [m/s²]
+    critical: float = math.nan
+    proposed: float = math.nan  #: [m/s²]
+    executed: float = math.nan  #: [m/s²]
+    advised: float = math.nan  #: what the reviser would execute, on or off [m/s²]
+    reason: str = ""  #: the reviser's
+    explanation: str = ""  #: what the machine has seen of such situations
+    collided: bool = False  #: with the leader
+    rear_ended: bool = False  #: by the car behind
+    over: bool = False  #: whether the run ended here
 
 
 class StateShown(NamedTuple):
@@ -128,12 +132,12 @@ class Graph(NamedTuple):
     transitions: tuple[Transition, ...]
 
 
-def graph_of(model: FSMModel, risk: LatentRisk, number: int = 0) -> Graph:
-    """The states of a model, and their usual ways out.
+def graph_of(known: EvolvingFSM | FSMModel, risk: LatentRisk, number: int = 0) -> Graph:
+    """The states of a machine or a model, and their usual ways out.
 
     Parameters
     ----------
-    model : FSMModel
+    known : EvolvingFSM or FSMModel
     risk : LatentRisk
         Says which states are dead ends.
     number : int
@@ -144,26 +148,27 @@ def graph_of(model: FSMModel, risk: LatentRisk, number: int = 0) -> Graph:
     >>> from evofsm import EvolvingFSM
     >>> machine = EvolvingFSM(n_actions=1, radius=0.5)
     >>> trace = machine.learn_many([[50.0, 5.0, 5.0], [9.0, 20.0, 20.0]], [0, 0])
-    >>> graph_of(machine.model(), LatentRisk(lowest=-4.0)).transitions
+    >>> graph_of(machine, LatentRisk(lowest=-4.0)).transitions
     ()
     """
+    centers, visits = known.centers, known.visits
     states = tuple(
         StateShown(
             one.state,
-            tuple(model.centers[one.state].tolist()),
-            float(model.visits[one.state]),
+            tuple(centers[one.state].tolist()),
+            float(visits[one.state]),
             one.risk,
             one.is_dead_end,
             one.failures,
         )
-        for one in assess_states(model, risk)
+        for one in assess_states(known, risk)
     )
-    return Graph(number, states, tuple(usual_ways(model)))
+    return Graph(number, states, tuple(usual_ways(known)))
 
 
-def usual_ways(model: FSMModel) -> list[Transition]:
+def usual_ways(known: EvolvingFSM | FSMModel) -> list[Transition]:
     """How one state follows another, of each state the most usual ways."""
-    changes = model.changes * ~np.eye(model.n_states, dtype=bool)
+    changes = known.changes * ~np.eye(known.n_states, dtype=bool)
     ways = []
     for origin, row in enumerate(changes):
         if not row.any():
