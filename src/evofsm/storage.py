@@ -240,6 +240,14 @@ def only_writer(file: BinaryIO, path: str | os.PathLike[str], otherwise: str) ->
             ) from None
 
 
+def let_others_write(file: BinaryIO) -> None:
+    """Undo `only_writer`, also where a child of this process still has the file open."""
+    with suppress(ModuleNotFoundError):  # Windows
+        import fcntl
+
+        fcntl.flock(file, fcntl.LOCK_UN)
+
+
 @contextmanager
 def replacing(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
     """A file that takes its place once it is whole and on the disk.

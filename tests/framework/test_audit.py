@@ -1,9 +1,13 @@
 """The audit log: what is tampered with is found where it was, and what is replayed is the same."""
 
 import errno
+import inspect
 import json
 import logging
 import math
+import os
+import sys
+from contextlib import contextmanager, suppress
 from hashlib import sha256
 
 import numpy as np
@@ -14,7 +18,7 @@ from hypothesis import strategies as st
 from evofsm import EvolvingFSM, Novelty
 from evofsm.actions import IntervalActions
 from evofsm.drivers.idm import IDM
-from evofsm.framework.audit import AuditLog, Fault, Head, Sync, audit
+from evofsm.framework.audit import AuditLog, Fault, Head, Sync, audit, chain
 from evofsm.framework.audit.chain import NOTHING, ChainedFile, canonical, seal, unseal, verify
 from evofsm.framework.audit.participants import Participants, describe, restore
 from evofsm.framework.loop import Framework, Oversight
@@ -533,10 +537,29 @@ FORGERIES = {
     "explanation": ("decision", 4, with_other("explanation", "all was well here")),
     "learnt": ("end", 0, lambda content: content["learnt"].update(manoeuvres=99)),
     "failed": ("end", 0, with_other("failed", True)),
-    "no such kind": ("end", 0, with_other("kind", "nonsense")),
     "no number": ("decision", 1, with_other("observation", ["x", 1.0, 2.0])),
     "settings": ("start", 0, lambda content: content["reviser"]["settings"].update(tolerance=0.5)),
     "machine": ("start", 0, lambda content: content["machine"].update(file="AAAA")),
+    "what was never learnt": ("end", 0, lambda content: content["learnt"].update(wisdom=1.0)),
+    "an action's name": ("start", 0, lambda content: content["actions"].pop("closed")),
+    "a reviser's name": ("start", 0, lambda content: content["reviser"].update(more=1)),
+}
+
+# A forger may write any of these on top of forged decisions, and chain it all anew.
+MISFITS = {
+    **{f"version {one!r}": ("start", with_other("version", one)) for one in (0, -7, 0.5, False)},
+    "version 'two'": ("start", with_other("version", "2")),
+    "an explanation in version 1": ("start", with_other("version", 1)),
+    "no version": ("start", lambda content: content.pop("version")),
+    "another kind": ("end", with_other("kind", "nonsense")),
+    "no explanation in version 2": ("decision", lambda content: content.pop("explanation")),
+    "what nobody writes": ("decision", with_other("comment", "all was well")),
+    "a flag that is none": ("end", with_other("failed", 0)),
+    "a file with more in it": ("start", lambda content: content["machine"].update(more=1)),
+    "another episode": ("begin", with_other("episode", 7)),
+    "no time": ("decision", with_other("clock", "yesterday")),
+    "a time before clocks": ("decision", with_other("clock", "0001-01-01T00:00:00+00:00")),
+    "another time zone": ("decision", with_other("clock", "2026-03-01T00:00:00+01:00")),
 }
 
 
@@ -562,17 +585,70 @@ def test_a_decision_is_written_with_what_the_machine_had_seen_of_its_situation(d
     assert any("episode came here" in one["explanation"] for one in told)
 
 
-def test_a_log_from_before_there_were_explanations_is_replayed_without(driven, tmp_path):
+@pytest.mark.parametrize("name", MISFITS)
+def test_what_no_log_holds_is_a_forgery(driven, tmp_path, name):
+    kind, change = MISFITS[name]
+    number = forge(driven, tmp_path / "forged", kind, 0, change)
+    result = audit(tmp_path / "forged", replay=False)
+    if name == "an explanation in version 1":  # it stands in the first decision
+        number = 1 + next(k for k, one in enumerate(contents(driven)) if one["kind"] == "decision")
+    assert result.misfit.record == number
+    assert not result.is_good
+    assert audit(tmp_path / "forged").replay is None
+
+
+def test_a_name_given_twice_is_found_behind_its_own_hash(driven, tmp_path):
+    """Some readers take the first of them, others the last."""
+    lines = driven.read_bytes().splitlines(keepends=True)
+    text = lines[-1].rpartition(b',"hash":"')[0]
+    twice = text.replace(b'"failed":false', b'"failed":true,"failed":false')
+    assert twice != text
+    lines[-1] = twice + b',"hash":"' + sha256(twice).hexdigest().encode() + b'"}\n'
+    (tmp_path / "forged").write_bytes(b"".join(lines))
+    finding = verify(tmp_path / "forged").finding
+    assert (finding.fault, finding.record) == (Fault.ALTERED, len(lines))
+    assert "not written as records are" in finding.explanation
+
+
+def as_version_1(driven, target, change=lambda content: None):
+    """The log as it was written before decisions were explained."""
     head, lines = Head(0, NOTHING), []
     for line in driven.read_bytes().splitlines(keepends=True):
         content = unseal(line).content
         content.pop("explanation", None)
-        line, head = seal(content | ({"version": 1} if "version" in content else {}), head)
+        content |= {"version": 1} if "version" in content else {}
+        change(content)
+        line, head = seal(content, head)
         lines.append(line)
-    (tmp_path / "old").write_bytes(b"".join(lines))
-    result = audit(tmp_path / "old")
+    target.write_bytes(b"".join(lines))
+
+
+def test_a_log_from_before_there_were_explanations_is_replayed_without(driven, tmp_path):
+    as_version_1(driven, tmp_path / "old")
+    result, now = audit(tmp_path / "old"), audit(driven)
     assert result.is_good
-    assert result.replay.decisions == audit(driven).replay.decisions
+    assert result.replay.decisions == now.replay.decisions
+    assert f"{now.contents.spoke} decisions are compared without" in result.remarks[0]
+    assert not now.remarks
+
+
+def test_decisions_that_are_forged_in_an_old_log_are_found(driven, tmp_path):
+    def change(content):
+        if content["kind"] == "decision":
+            content["executed"] = 1.25
+
+    as_version_1(driven, tmp_path / "old", change)
+    assert audit(tmp_path / "old").replay.difference.fields[0].name == "executed"
+
+
+def test_a_clock_that_goes_back_is_said(driven, tmp_path):
+    """It may have been set, so that it is no proof of anything."""
+    forge(driven, tmp_path / "log", "decision", 3, with_other("clock", "2001-01-01T00:00:00+00:00"))
+    result = audit(tmp_path / "log")
+    assert result.is_good
+    assert "the clock goes back" in result.remarks[0]
+    forge(driven, tmp_path / "log", "end", 1, with_other("clock", "9001-01-01T00:00:00+00:00"))
+    assert "ahead of this computer" in audit(tmp_path / "log").remarks[0]
 
 
 def test_a_decision_that_was_hidden_is_found_by_replaying(driven, tmp_path):
@@ -687,6 +763,189 @@ def test_a_part_of_a_record_is_taken_back_where_the_disk_is_full(tmp_path):
         file.append({"kind": "note", "text": "x" * 200})
     file.close()
     assert (tmp_path / "log").read_bytes() == kept
+
+
+# -- Interrupts, forks, and readers meanwhile -----------------------------------------------------
+
+
+class CtrlCError(KeyboardInterrupt):
+    """Ctrl-C at a place of one's choice."""
+
+
+@contextmanager
+def interrupt(functions, at):
+    """Ctrl-C before line ``at`` of those that run in some functions, or as one of them returns."""
+    codes, left = {inspect.unwrap(function).__code__ for function in functions}, at
+
+    def trace(frame, event, argument):
+        nonlocal left
+        if frame.f_code not in codes:
+            return None
+        if event in ("line", "return"):
+            left -= 1
+            if left == -1:
+                raise CtrlCError
+        return trace
+
+    before = sys.gettrace()
+    sys.settrace(trace)
+    try:
+        yield
+    finally:
+        sys.settrace(before)
+
+
+def interrupted_everywhere(functions, run, every=1):
+    """Run it until nothing interrupts it any more: where something did."""
+    for at in range(0, 1000, every):
+        try:
+            with interrupt(functions, at):
+                run(at)
+        except CtrlCError:
+            yield at
+        else:
+            return
+
+
+def test_an_interrupt_while_a_record_is_written_breaks_no_chain(tmp_path):
+    path = tmp_path / "log"
+    with ChainedFile(path) as file:
+        file.append({"kind": "note"})
+        functions = (ChainedFile.append, ChainedFile.settle)
+        for at in interrupted_everywhere(functions, lambda at: file.append({"value": at})):
+            assert verify(path).finding is None
+            if at % 2:
+                with suppress(CtrlCError), interrupt(functions, at):  # and again
+                    file.append({"kind": "another"})
+            file.append({"kind": "after", "value": at})
+            assert verify(path, file.head).finding is None
+            assert verify(path).head == file.head
+    assert at > 10
+    assert verify(path, file.head).finding is None
+
+
+def brief(log):
+    """An episode of two decisions, of which one speaks."""
+    risk = LatentRisk(ACTIONS.low)
+    oversight = Oversight(ACTIONS, ActionReviser(risk, ACTIONS), risk=risk, audit=log)
+    for step in range(2):
+        seen = np.array([60.0 - 40.0 * step, 15.0, 8.0])
+        oversight.revise(oversight.recognise(seen, 0.25 * step), Proposal(0.0))
+    oversight.end(np.array([5.0, 15.0, 8.0]), failed=False)
+
+
+def test_an_interrupt_while_a_log_is_written_costs_that_episode_only(tmp_path, monkeypatch):
+    monkeypatch.setattr(ChainedFile, "sync", lambda file: None)  # which takes its time
+    path, functions = tmp_path / "log", (AuditLog._write, ChainedFile.append)
+    with AuditLog(path) as log:
+        times = len([*interrupted_everywhere(functions, lambda at: brief(log), every=4)])
+        brief(log)
+    result = audit(path, log.head)
+    assert result.is_good
+    assert result.contents.episodes > times / 2 > 4
+
+
+def test_an_episode_that_goes_on_after_an_interrupt_is_not_written_any_more(tmp_path, caplog):
+    path, risk = tmp_path / "log", LatentRisk(ACTIONS.low)
+    with AuditLog(path) as log:
+        oversight = Oversight(ACTIONS, ActionReviser(risk, ACTIONS), risk=risk, audit=log)
+        for step in range(6):
+            seen = np.array([30.0 - 4.0 * step, 15.0, 8.0])
+            situation = oversight.recognise(seen, 0.25 * step)
+            with suppress(CtrlCError):
+                functions = (ChainedFile.sync,) if step == 3 else ()
+                with interrupt(functions, 0):
+                    oversight.revise(situation, Proposal(1.0))
+        oversight.end(np.array([9.0, 15.0, 8.0]), failed=False)
+        brief(log)
+    assert [one.message for one in caplog.records if "was interrupted" in one.message]
+    result = audit(path, log.head)
+    assert result.is_good
+    assert result.contents.episodes == 2
+
+
+def in_a_child(do):
+    """Do it in a process that inherits everything: whether it raised nothing."""
+    child = os.fork()
+    if child == 0:
+        code = 1
+        try:
+            do()
+            code = 0
+        finally:
+            os._exit(code)
+    return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="nothing can fork here")
+@pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
+def test_a_child_that_inherits_a_log_leaves_it_to_its_parent(tmp_path):
+    path = tmp_path / "log"
+    log = AuditLog(path, most_quiet=50)
+    oversight = Oversight(ACTIONS, Unrevised(ACTIONS), audit=log)
+
+    def decide(time):
+        situation = oversight.recognise(np.array([50.0, 9.0, 9.0]), time)
+        oversight.revise(situation, Proposal(0.5))
+
+    def drive_on():
+        decide(1.0)
+        with pytest.raises(OSError, match="belongs to the process"):
+            oversight.end(None, failed=False)
+        with pytest.raises(OSError, match="belongs to the process"):
+            log.close()
+
+    decide(0.0)
+    assert in_a_child(log.close)
+    assert in_a_child(drive_on)
+    assert kinds(path) == ["start", "begin"]
+    decide(1.0)
+    oversight.end(None, failed=False)
+    log.close()
+    result = audit(path, log.head)
+    assert result.is_good
+    assert result.replay.decisions == 2
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="nothing can fork here")
+@pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
+def test_a_child_that_lives_on_does_not_keep_a_log_that_its_parent_closed(tmp_path):
+    reading, writing = os.pipe()
+    file = ChainedFile(tmp_path / "log")
+    child = os.fork()
+    if child == 0:
+        os.read(reading, 1)
+        os._exit(0)
+    try:
+        file.close()
+        ChainedFile(tmp_path / "log").close()
+    finally:
+        os.write(writing, b".")
+        os.waitpid(child, 0)
+        os.close(reading)
+        os.close(writing)
+
+
+def test_of_a_log_that_grows_what_was_there_at_first_is_read(tmp_path, monkeypatch):
+    path = tmp_path / "log"
+    with ChainedFile(path) as file:
+        for _ in range(3):
+            file.append({"kind": "note"})
+        size = path.stat().st_size
+        reading = chain.lines(path)
+        first = next(reading)
+        file.append({"kind": "note", "text": "x" * 100_000})
+        assert len(first + b"".join(reading)) == size
+        unseal = chain.unseal
+
+        def slowly(line):
+            file.append({"kind": "note"})
+            return unseal(line)
+
+        monkeypatch.setattr(chain, "unseal", slowly)
+        found = verify(path)
+    assert found.finding is None
+    assert (found.head.number, found.half_written) == (4, 0)
 
 
 # -- Gymnasium ------------------------------------------------------------------------------------

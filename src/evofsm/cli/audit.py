@@ -40,7 +40,8 @@ def audit(
 ) -> None:
     """Verify an audit log, and replay it.
 
-    Finds the first record that was altered, removed, moved, repeated or inserted; then tells the
+    Finds the first record that was altered, removed, moved, repeated or inserted, or that no log of
+    its version holds; then tells the
     machine and the risk that the log began with what was observed and proposed, and compares each
     decision to the last bit. Ends with 0 if all is well, 1 if the log was tampered with or a
     decision comes out otherwise, and 2 if it cannot be read.
@@ -65,14 +66,22 @@ def _print(found: Audit, *, head_given: bool) -> None:
     chain, contents = found.chain, found.contents
     _say("chain", _of_chain(chain))
     if chain.half_written:
-        _say("", f"its last line is half written ({chain.half_written} bytes), as by a crash")
+        _say(
+            "",
+            f"its last line is half written ({chain.half_written} bytes): as by a crash, or it is "
+            "being written now",
+        )
+    if found.misfit is not None:
+        _say("form", f"FORGED at record {found.misfit.record}: {found.misfit.explanation}")
     _say("holds", _of_contents(contents) + ("" if chain.finding is None else ", so far"))
     if found.replay is not None:
-        _print_replay(found.replay)
-    elif chain.finding is None:
+        _print_replay(found.replay, contents.decisions)
+    elif chain.finding is None and found.misfit is None:
         _say("replay", "not done")
     else:
         _say("replay", "not done, since the log was tampered with")
+    for remark in found.remarks:
+        _say("note", remark)
     if chain.finding is None:
         _say("head", str(chain.head))
     if found.is_good and not head_given:
@@ -102,7 +111,7 @@ def _of_contents(contents: Contents) -> str:
     return ", ".join(parts)
 
 
-def _print_replay(replay: Replay) -> None:
+def _print_replay(replay: Replay, decisions: int) -> None:
     difference = replay.difference
     good = f"{_count(replay.decisions, 'decision')} as recorded, to the last bit"
     if difference is None:
@@ -114,6 +123,8 @@ def _print_replay(replay: Replay) -> None:
         _say("", f"before it {good}")
     for why in dict.fromkeys(replay.not_replayed):
         _say("", f"{_count(replay.not_replayed.count(why), 'session')} not replayed: {why}")
+    if difference is None and replay.decisions < decisions:
+        _say("", f"{_count(decisions - replay.decisions, 'decision')} compared with nothing")
     if difference is not None and replay.other_makers:
         then = ", ".join(f"{one.name} {one.recorded}" for one in replay.other_makers)
         _say("", f"it was recorded with {then}: floats may differ there")
@@ -158,6 +169,8 @@ def _document(found: Audit) -> dict[str, Any]:
         "head": str(chain.head),
         "half_written": chain.half_written,
         "finding": finding,
+        "misfit": found.misfit and found.misfit._asdict(),
+        "remarks": list(found.remarks),
         "contents": found.contents._asdict(),
         "replay": replay and _of_replay(replay),
     }

@@ -1,10 +1,11 @@
 """The audit log of a reviser: written while driving, verified and replayed afterwards.
 
-`chain` is the file, and knows nothing of driving; `participants` writes down who drives; `log` is
-what writes while driving; `replay` is the audit.
+`chain` is the file, and knows nothing of driving; `form` is what its records hold; `participants`
+writes down who drives; `log` is what writes while driving; `replay` is the audit.
 """
 
 from evofsm.framework.audit.chain import Fault, Finding, Head, Sync
+from evofsm.framework.audit.form import Misfit
 from evofsm.framework.audit.log import AuditLog
 from evofsm.framework.audit.replay import Audit, Difference, Replay, audit
 
@@ -15,6 +16,7 @@ __all__ = [
     "Fault",
     "Finding",
     "Head",
+    "Misfit",
     "Replay",
     "Sync",
     "audit",

@@ -13,6 +13,7 @@ hash of the last record, where someone has kept it elsewhere.
 
 from __future__ import annotations
 
+import errno
 import json
 import logging
 import math
@@ -154,19 +155,28 @@ def seal(content: Mapping[str, Any], after: Head) -> tuple[bytes, Head]:
 
 
 def unseal(line: bytes) -> Record | None:
-    """The record that a line holds; None where it is not what was written."""
-    text, _, end = line.rpartition(_SEAL)
-    digest = sha256(text).hexdigest()
-    if end != digest.encode() + _END:
+    """The record that a line holds; None where it is not as `seal` writes it."""
+    text, digest = _sealed(line)
+    if text is None:
         return None
     try:
         content = json.loads(text + b"}", parse_constant=_refuse)
+        # Of the ways to write it, names given twice among them, only one is `seal`'s.
+        if canonical(content).encode()[:-1] != text:
+            return None
         place, previous = content.pop("number"), content.pop("previous")
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
         return None
     if type(place) is not int or not isinstance(previous, str):
         return None
     return Record(place, previous, digest, content)
+
+
+def _sealed(line: bytes) -> tuple[bytes | None, str]:
+    """What the hash of a line is of, and the hash; None where it is of something else."""
+    text, _, end = line.rpartition(_SEAL)
+    digest = sha256(text).hexdigest()
+    return (text if end == digest.encode() + _END else None), digest
 
 
 def _refuse(constant: str) -> float:
@@ -208,7 +218,7 @@ class Chain(NamedTuple):
 
 
 def lines(path: Path) -> Iterator[bytes]:
-    """The lines of a log, the last perhaps without an end.
+    """The lines of a log, the last perhaps without an end; of one that grows, those there are now.
 
     Raises
     ------
@@ -216,9 +226,11 @@ def lines(path: Path) -> Iterator[bytes]:
         If one is longer than any record.
     """
     with open(path, "rb") as file:
-        for line in iter(lambda: file.readline(_LONGEST), b""):
+        left = os.fstat(file.fileno()).st_size
+        while line := file.readline(min(_LONGEST, left)):
             if len(line) == _LONGEST:
                 raise ValueError(f"{path} has a line of more than {_LONGEST >> 20} MiB")
+            left -= len(line)
             yield line
 
 
@@ -299,11 +311,14 @@ class _Line(NamedTuple):
     number: int | None
     previous: str
     digest: str
+    is_sealed: bool = True  # whether it has the hash of what it says
 
     @classmethod
     def of(cls, line: bytes) -> Self:
         record = unseal(line)
-        return cls(None, "", "") if record is None else cls(*record[:3])
+        if record is None:
+            return cls(None, "", "", _sealed(line)[0] is not None)
+        return cls(*record[:3])
 
 
 def _diagnosis(path: Path, at: int) -> Finding:
@@ -315,7 +330,7 @@ def _diagnosis(path: Path, at: int) -> Finding:
     here = seen[at - 1]
     following = seen[at] if at < len(seen) else _Line(None, "", "")
     if here.number is None:
-        return _unreadable(at, before, following)
+        return _unreadable(at, before, here, following)
     if here.previous == before.digest:
         return _altered(at, f"it says that it is record {here.number}")
     if here.number == at:
@@ -331,9 +346,11 @@ def _diagnosis(path: Path, at: int) -> Finding:
     return Finding(Fault.MISSING, at, at, text)
 
 
-def _unreadable(at: int, before: _Line, following: _Line) -> Finding:
+def _unreadable(at: int, before: _Line, here: _Line, following: _Line) -> Finding:
     if (following.number, following.previous) == (at, before.digest):
         return _inserted(at)
+    if here.is_sealed:
+        return _altered(at, "it is not written as records are (a name given twice, perhaps)")
     return _altered(at, "it has not the hash of what it says")
 
 
@@ -398,6 +415,12 @@ class ChainedFile:
         If it was tampered with, is no log, or is being written by another process. It is then
         left as it is.
 
+    Notes
+    -----
+    Only the process that opened it writes: in a child of it `append` is refused, and `close` lets
+    the parent keep the file. What interrupts `append` leaves a record that is whole, a part of
+    one, or none; the next `append` or `close` finds out which, and takes a part back.
+
     Examples
     --------
     >>> from tempfile import TemporaryDirectory
@@ -412,6 +435,8 @@ class ChainedFile:
     def __init__(self, path: Path) -> None:
         self.path = path
         self._file: BinaryIO = open(path, "a+b", buffering=0)  # noqa: SIM115
+        self._owner = os.getpid()
+        self._under_way: tuple[bytes, Head] | None = None  # what is being written: line, head
         try:
             storage.only_writer(self._file, self.path, "name another file")
             chain = verify(path)
@@ -420,8 +445,6 @@ class ChainedFile:
                     f"{path} was tampered with, and is left as it is: {chain.finding.explanation}; "
                     "name another file"
                 )
-            #: The last record.
-            self.head = chain.head
             #: What was cut off from a half-written end [byte].
             self.cut_off = chain.half_written
             if self.cut_off:
@@ -429,10 +452,20 @@ class ChainedFile:
                 _log.warning("%s: %d bytes of a half-written record cut off", path, self.cut_off)
                 self._file.truncate(chain.size)
                 self.sync()
-            self._size = chain.size
+            self._written = chain.head, chain.size
         except BaseException:
             self._file.close()
             raise
+
+    @property
+    def head(self) -> Head:
+        """The last record."""
+        return self._written[0]
+
+    @property
+    def is_ours(self) -> bool:
+        """Whether this process opened it, and no parent of it."""
+        return os.getpid() == self._owner
 
     def append(self, content: Mapping[str, Any]) -> None:
         """Add a record; only `sync` forces it onto the disk.
@@ -440,18 +473,48 @@ class ChainedFile:
         Raises
         ------
         OSError
-            If it cannot be written. The records before it are kept.
+            If it cannot be written, or another process opened it. The records before it are kept.
         """
+        if not self.is_ours:
+            raise PermissionError(
+                errno.EPERM,
+                "the log belongs to the process that opened it; a child of that needs its own",
+                str(self.path),
+            )
+        self.settle()
         line, head = seal(content, self.head)
+        self._under_way = line, head
         try:
             data = line
             while data:  # a disk that gets full takes a part of it first
                 data = data[self._file.write(data) :]
         except OSError:
             with suppress(OSError):
-                self._file.truncate(self._size)
+                self.settle()
             raise
-        self.head, self._size = head, self._size + len(line)
+        self._written = head, self._written[1] + len(line)
+        self._under_way = None
+
+    def settle(self) -> None:
+        """See to a record whose `append` was interrupted: one that is whole stays.
+
+        A part of one is taken back, which no reader took for a record.
+
+        Raises
+        ------
+        OSError
+            If it cannot be.
+        """
+        if self._under_way is None:
+            return
+        (line, head), (_, size) = self._under_way, self._written
+        self._file.seek(size)
+        there = self._file.read()
+        if there == line:
+            self._written = head, size + len(line)
+        elif there:
+            self._file.truncate(size)
+        self._under_way = None
 
     def sync(self) -> None:
         """Force what was appended onto the disk."""
@@ -459,7 +522,14 @@ class ChainedFile:
 
     def close(self) -> None:
         """Let others have the file."""
-        self._file.close()
+        if self._file.closed:
+            return
+        try:
+            if self.is_ours:
+                self.settle()
+                storage.let_others_write(self._file)
+        finally:
+            self._file.close()
 
     def __enter__(self) -> Self:
         return self

@@ -24,15 +24,17 @@ them.
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from datetime import UTC, datetime
+from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from evofsm.framework.audit.chain import ABOUT, ChainedFile, Head, Sync, records
+from evofsm.framework.audit.form import VERSION
 from evofsm.framework.audit.participants import Participants, describe, learnt, settings
 from evofsm.framework.reviser import speaks
 from evofsm.protocols import Proposal, Reviser, Revision, Situation
@@ -42,11 +44,39 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 
-VERSION = 2
-# The version from which on a decision holds what was not in it from the first.
-SINCE = {"explanation": 2}
 # So many states of a belief are written, the most probable first.
 _STATES = 3
+
+_P = ParamSpec("_P")
+
+
+def _whole(
+    method: Callable[Concatenate[AuditLog, _P], None],
+) -> Callable[Concatenate[AuditLog, _P], None]:
+    """What is interrupted half-way leaves a hole; what follows in the episode is not written then.
+
+    Replayed without what is missing it would come out otherwise, as if someone had forged it.
+    """
+
+    @wraps(method)
+    def told(self: AuditLog, *args: _P.args, **kwargs: _P.kwargs) -> None:
+        if self._broken_off:
+            return
+        try:
+            method(self, *args, **kwargs)
+        except OSError:
+            raise  # it was written as far as could be
+        except BaseException:
+            self._broken_off = True
+            _log.error(
+                "the audit log %s was interrupted at record %s: nothing more is written of this "
+                "episode; it goes on with the next",
+                self.path,
+                self.head.number,
+            )
+            raise
+
+    return told
 
 
 class AuditLog:
@@ -77,7 +107,9 @@ class AuditLog:
     Notes
     -----
     Between the episodes of a log anything may teach machine or risk: they are written anew then.
-    During one nothing else may.
+    During one nothing else may. An interrupt (Ctrl-C) while something is written breaks the
+    episode off in the log, which goes on with the next one. Where a process forks, the log stays
+    with the parent: a child that has something to write fails as if the disk did.
 
     Examples
     --------
@@ -114,6 +146,7 @@ class AuditLog:
         self._before: list[list[Any]] = []
         self._seen: list[Any] = []  # what a proposal is waited for
         self._failure: OSError | None = None
+        self._broken_off = False  # the present episode, by an interrupt
 
     @property
     def path(self) -> Path:
@@ -134,8 +167,9 @@ class AuditLog:
             If something could not be written, now or before.
         """
         try:
-            self._flush()
-            self._force()
+            if self._file.is_ours:  # what is held back is the parent's to write
+                self._flush()
+                self._force()
         finally:
             self._file.close()
         self._raise()
@@ -151,8 +185,11 @@ class AuditLog:
     def begin(self, oversight: Oversight) -> None:
         """An episode begins."""
         self._raise()
+        was_broken_off, self._broken_off = self._broken_off, True  # until it has begun
         self._flush()  # of one that was broken off
         self._seen = []
+        if was_broken_off:
+            self._begin_anew()
         who = Participants(oversight.actions, oversight.reviser, oversight.machine, oversight.risk)
         if not self._know(who):
             self._write(
@@ -173,13 +210,16 @@ class AuditLog:
             }
         )
         self._force()
+        self._broken_off = False
         self._raise()
 
+    @_whole
     def seen(self, observation: NDArray[np.float64], time: float) -> None:
         """An observation came in, at ``time`` [s]."""
         self._keep_seen()
         self._seen = [float(time), _floats(observation)]
 
+    @_whole
     def decided(self, situation: Situation, proposal: Proposal, revision: Revision) -> None:
         """A decision was made. When this returns it is written down, if it said something."""
         if self._who is None:
@@ -197,6 +237,7 @@ class AuditLog:
         if len(self._before) >= self.most_quiet:
             self._flush()
 
+    @_whole
     def ended(self, observation: NDArray[np.float64] | None, *, failed: bool) -> None:
         """The episode ended.
 
@@ -222,6 +263,15 @@ class AuditLog:
         self._raise()
 
     # -- Writing ----------------------------------------------------------------------------------
+
+    def _begin_anew(self) -> None:
+        """After an interrupt the file alone knows what was written."""
+        self._who = None
+        try:
+            self._file.settle()
+            self._episodes = _count_episodes(self.path, self._file.head)
+        except OSError as error:
+            self._fail(error)
 
     def _know(self, who: Participants) -> bool:
         """Whether they are those of the latest episode, and as it left them."""

@@ -185,7 +185,20 @@ def restore(described: Mapping[str, Any]) -> Participants:
     actions = IntervalActions(**described["actions"])
     machine = _restored(EvolvingFSM, described["machine"])
     risk = _restored(LatentRisk, described["risk"])
-    return Participants(actions, _restored_reviser(reviser, actions, machine, risk), machine, risk)
+    again = _restored_reviser(reviser, actions, machine, risk)
+    who = Participants(actions, again, machine, risk)
+    if _names(described["actions"]) != _names(asdict(actions)) or (
+        _names(reviser) != _names(_reviser(who))
+    ):
+        raise ValueError("the actions or the reviser are described by other names than are written")
+    return who
+
+
+def _names(described: Any) -> Any:
+    """Without what they stand for."""
+    if not isinstance(described, Mapping):
+        return None
+    return {name: _names(value) for name, value in described.items()}
 
 
 _Kept = TypeVar("_Kept", EvolvingFSM, LatentRisk)

@@ -18,7 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evofsm.framework.audit.chain import Chain, Head, Record, canonical, number, records, verify
-from evofsm.framework.audit.log import SINCE, VERSION, told
+from evofsm.framework.audit.form import SINCE, VERSION, Form, Misfit
+from evofsm.framework.audit.log import told
 from evofsm.framework.audit.participants import (
     CannotBeReplayedError,
     Participants,
@@ -86,20 +87,23 @@ class Audit(NamedTuple):
     chain: Chain
     contents: Contents  #: of the records that are unbroken
     replay: Replay | None  #: None where it was not asked for, or the log was tampered with
+    misfit: Misfit | None = None  #: the first of them that no log of its version holds
+    remarks: tuple[str, ...] = ()  #: what nothing was compared with
 
     @property
     def is_good(self) -> bool:
         """Whether nothing was tampered with, and nothing came out otherwise."""
         replayed = self.replay is None or self.replay.difference is None
-        return self.chain.finding is None and replayed
+        return self.chain.finding is None and self.misfit is None and replayed
 
 
 def audit(path: Path, kept: Head | None = None, *, replay: bool = True) -> Audit:
-    """Verify the chain of a log, and replay it where it is whole.
+    """Verify the chain of a log and the form of its records, and replay it where they are whole.
 
     Parameters
     ----------
     path : Path
+        One that is being written is audited up to where it is now.
     kept : Head, optional
         A head that was kept elsewhere.
     replay : bool
@@ -119,21 +123,26 @@ def audit(path: Path, kept: Head | None = None, *, replay: bool = True) -> Audit
     if chain.head.number == 0 and chain.finding is None:
         raise ValueError(f"{path} is no audit log, or no record of it was finished")
     count = chain.head.number or 0
-    contents = _contents(path, count)
-    again = _replay(path, count) if replay and chain.finding is None else None
-    return Audit(chain, contents, again)
+    contents, form = _survey(path, count)
+    is_whole = chain.finding is None and form.misfit is None
+    again = _replay(path, count) if replay and is_whole else None
+    return Audit(chain, contents, again, form.misfit, form.remarks())
 
 
-def _contents(path: Path, count: int) -> Contents:
+def _survey(path: Path, count: int) -> tuple[Contents, Form]:
     kinds: Counter[str] = Counter()
+    form = Form()
     silent = 0
     for record in records(path, count):
         _refuse_newer(path, record)
+        form.check(record)
         kinds[str(record.content.get("kind"))] += 1
         before = record.content.get("before", ())
         silent += len(before) if isinstance(before, list) else 0
     decisions = silent + kinds["decision"]
-    return Contents(kinds["start"], kinds["begin"], decisions, kinds["decision"], kinds["settings"])
+    spoke = kinds["decision"]
+    held = Contents(kinds["start"], kinds["begin"], decisions, spoke, kinds["settings"])
+    return held, form
 
 
 def _refuse_newer(path: Path, record: Record) -> None:
@@ -285,7 +294,10 @@ class _Player:
         seen = None if observation is None else _observation(observation)
         oversight.end(seen, failed=content["failed"])
         self._oversight = None
-        fields = _differing(content["learnt"], learnt(oversight.machine, oversight.risk))
+        recorded, again = content["learnt"], learnt(oversight.machine, oversight.risk)
+        if unknown := sorted(recorded.keys() - again.keys()):
+            raise _DiffersError(f"nothing is learnt that is called {unknown[0]!r}")
+        fields = _differing(recorded, again)
         if fields:
             raise _DiffersError("something else was learnt until its end", fields)
 
@@ -300,8 +312,8 @@ def _proposal(action: Any, candidates: Sequence[Any] = ()) -> Proposal:
 
 def _differing(recorded: Mapping[str, Any], replayed: Mapping[str, Any]) -> list[Field]:
     """What is not the same to the last bit."""
-    both = ((name, canonical(recorded[name]), canonical(replayed[name])) for name in replayed)
-    return [Field(*one) for one in both if one[1] != one[2]]
+    both = (Field(name, canonical(recorded[name]), canonical(replayed[name])) for name in replayed)
+    return [one for one in both if one.recorded != one.replayed]
 
 
 def _said(error: Exception) -> str:
