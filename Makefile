@@ -52,7 +52,7 @@ supply: .venv/installed         ## known holes in what is pinned, and a bill of 
 	@$(BIN)/uv tool run pip-audit --disable-pip --require-hashes --requirement requirements.lock
 	@$(BIN)/uv tool run --from cyclonedx-bom cyclonedx-py requirements requirements.lock -o sbom.json
 
-torture: .venv/installed        ## kill -9, full disks, damaged files: is anything lost or wrong?
+torture: .venv/installed        ## kill -9, full disks, damaged files, forged logs: is anything lost or wrong?
 	@$(BIN)/python benchmarks/torture.py
 
 SECONDS ?= 60

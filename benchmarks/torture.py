@@ -27,6 +27,7 @@ from typing import Any
 
 import numpy as np
 
+import torture_audit
 from evofsm import EvolvingFSM, FSMModel, IntervalActions, storage
 from evofsm.checkpoint import Checkpoint, fingerprints
 from evofsm.io import read_traces
@@ -45,6 +46,7 @@ WRONG = (
     "crashes",
     "over-allocations",
     "left behind",
+    *torture_audit.WRONG,
 )
 _REFUSED, _CRASHED = 3, 4
 
@@ -432,6 +434,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=0)
     asked = parser.parse_args(arguments)
     kills, disks, files = (20, 4, 200) if asked.short else (500, 100, 10_000)
+    reading = 1.0 if asked.short else 20.0  # [s]
     random = np.random.default_rng(asked.seed)
     total: Counter[str] = Counter()
     with tempfile.TemporaryDirectory() as name:
@@ -445,6 +448,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
             ("disk full while learning", partial(fill, learn, disks * 3 // 4)),
             ("disk full while driving", partial(fill, drive, disks // 4)),
             ("damaged files", partial(damage, files)),
+            ("logs interrupted", partial(torture_audit.interrupt, every=30 if asked.short else 1)),
+            ("logs forged", torture_audit.forge),
+            ("logs read meanwhile", partial(torture_audit.read_meanwhile, seconds=reading)),
         ):
             began = time.perf_counter()
             found = run(folder, random)
