@@ -1,13 +1,17 @@
+import json
 import signal
 import subprocess
 import sys
+from urllib.parse import urlsplit
 from urllib.request import urlopen
 
 import pytest
 
-pytestmark = pytest.mark.usefixtures("compiled")
-
 pytest.importorskip("websockets")
+
+from websockets.sync.client import connect
+
+pytestmark = pytest.mark.usefixtures("compiled")
 
 
 def watch(*arguments):
@@ -27,6 +31,25 @@ def test_it_prints_an_address_that_answers_and_ends_with_control_c():
     assert process.returncode == 0
     assert rest == "\nevofsm: the page is closed\n"
     assert errors == ""
+
+
+def test_paused_shows_the_first_frame():
+    with watch("paper", "--fresh", "--no-browser", "--paused") as process:
+        process.stdout.readline()
+        address = urlsplit(process.stdout.readline().strip())
+        socket = f"ws://{address.netloc}{address.path}socket"
+        with connect(socket, origin=f"http://{address.netloc}", proxy=None) as client:
+            shown = []
+            while "frame" not in {part["kind"] for part in shown}:
+                message = json.loads(client.recv(timeout=30))
+                shown += message.get("parts", [message])
+        process.send_signal(signal.SIGINT)
+        process.communicate(timeout=20)
+    assert process.returncode == 0
+    (frame,) = [part for part in shown if part["kind"] == "frame"]
+    (*_, clock) = [part for part in shown if part["kind"] == "clock"]
+    assert frame["number"] == 0
+    assert clock["paused"]
 
 
 @pytest.mark.parametrize(

@@ -197,6 +197,19 @@ def test_numbers_that_are_none_are_sent_as_null():
     assert message["told"]["status"] == "safe"
 
 
+def test_a_run_waits_for_the_first_who_looks_on():
+    with (
+        LivePage() as page,
+        Player(session, page, speed=math.inf, awaits=True) as player,
+    ):
+        page.player = player
+        assert get(page, f"/{page.token}/")[0] == 200  # who loads the page only sees nothing yet
+        assert not page._shown._frames
+        with looking_on(page) as client:
+            assert told(client, "frame")["number"] == 0
+            assert told(client, "frame")["number"] == 1
+
+
 # -- Who looks on cannot harm it ------------------------------------------------------------------
 
 _JUNK = [
@@ -204,6 +217,8 @@ _JUNK = [
     "[]",
     "{",
     '{"do": "explode"}',
+    '{"do": "\\ud800"}',  # half a character, which no reason can hold
+    '{"do": "\\ud83d\\ude00"}',
     '{"do": "speed", "value": 3.21}',
     '{"do": "speed", "value": NaN}',
     '{"do": "case", "value": 1e400}',

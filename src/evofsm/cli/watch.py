@@ -61,7 +61,9 @@ def watch(
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Of the draws.")] = 0,
     speed: Annotated[float, typer.Option(help="At first, as a multiple of real time.")] = 1.0,
-    paused: Annotated[bool, typer.Option("--paused", help="Wait at first.")] = False,
+    paused: Annotated[
+        bool, typer.Option("--paused", help="Show the first frame, and wait.")
+    ] = False,
     port: Annotated[
         int, typer.Option(min=0, max=65535, help="Of the page; 0 for any that is free.")
     ] = 0,
@@ -72,8 +74,8 @@ def watch(
     """Watch a run in the browser while it is driven, and act on it; or one that was recorded.
 
     The page shows the cars, what the machine believes, latent risk beside time to collision, and
-    what was done about it. It answers on this computer only, under the address that is printed.
-    Ctrl-C ends it.
+    what was done about it. It answers on this computer only, under the address that is printed,
+    and the run begins as the page is first opened. Ctrl-C ends it.
     """
     require(websockets="watch", scipy="study")
     from evofsm.report.live import LivePage
@@ -93,9 +95,12 @@ def watch(
         opened = _session(watching, learn, 0 if fresh else learn_first)
     with (
         LivePage(port, live=not is_recorded) as page,
-        Player(opened, page, paused=paused, speed=speed) as player,
+        # Whoever comes to a run that waits finds its first frame.
+        Player(opened, page, paused=paused, speed=speed, awaits=not paused) as player,
     ):
         page.player = player
+        if paused:
+            player.step()
         _show(page.address, no_browser)
         with suppress(KeyboardInterrupt):
             threading.Event().wait()

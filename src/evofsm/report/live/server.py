@@ -215,6 +215,8 @@ class LivePage:
         wire.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _MOST_SENT)
         client = _Client(connection, self._shown)
         self._clients.add(client)
+        if self.player is not None:
+            self.player.attend()
         feeding = asyncio.create_task(client.feed())
         try:
             await self._obey_all(connection)
@@ -281,7 +283,10 @@ class Command(NamedTuple):
         """
         try:
             match json.loads(text):
-                case {"do": str(name), **rest} if len(rest) <= 1 and len(name) <= 20:
+                # Whatever is no command is told its name, which may hold no half of a character.
+                case {"do": str(name), **rest} if (
+                    len(rest) <= 1 and len(name) <= 20 and name.isascii()
+                ):
                     match rest.get("value"):
                         case bool() | None as value:
                             return cls(name, value)

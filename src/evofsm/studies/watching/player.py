@@ -92,6 +92,8 @@ class Player:
         Whether it waits at first.
     speed : float
         Multiple of real time; infinite for as fast as it goes.
+    awaits : bool
+        Whether it plays nothing before `attend`, as long as no one looks on.
     """
 
     def __init__(
@@ -101,9 +103,11 @@ class Player:
         *,
         paused: bool = False,
         speed: float = 1.0,
+        awaits: bool = False,
     ) -> None:
         self._watched = watched
         self._audience = audience
+        self._awaits = awaits
         self._paused = paused
         self._speed = _checked(speed)
         self._over = False
@@ -118,6 +122,15 @@ class Player:
         self._thread = threading.Thread(target=self._play, name="evofsm-player", daemon=True)
 
     # -- Told from any thread ---------------------------------------------------------------------
+
+    def attend(self) -> None:
+        """Someone looks on: play, if that was waited for."""
+        if self._awaits:
+
+            def order(watched: Watched) -> None:
+                self._awaits, self._due = False, time.monotonic()
+
+            self._tell("attend", order)
 
     def pause(self, paused: bool) -> None:
         """Wait, or go on."""
@@ -230,7 +243,7 @@ class Player:
 
     def _wait(self) -> float:
         """Time until the next frame [s]; infinite where none comes by itself."""
-        if self._over:
+        if self._over or self._awaits:
             return math.inf
         if self._paused:
             return 0.0 if self._steps else math.inf
