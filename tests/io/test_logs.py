@@ -7,7 +7,7 @@ import tracemalloc
 import numpy as np
 import pytest
 
-from evofsm.io import LogColumns, read_traces, tables
+from evofsm.io import LogColumns, blocks, read_traces, tables
 from evofsm.observations import Category, ObservationEncoder
 
 HEADER = "run,pair,segment,time,gap,v_follower,v_leader,a_follower"
@@ -86,7 +86,7 @@ def test_what_spreadsheets_do_to_a_csv_changes_nothing(tmp_path, change):
 
 def test_parquet_reads_as_csv_does(tmp_path):
     polars = pytest.importorskip("polars")
-    path = write(tmp_path / "a.csv", [*log(30), *log(40, "v2-v3"), *log(5, start=99.0)])
+    path = write(tmp_path / "a.csv", [*log(30), *log(40, "v2-v3"), *log(5, "v3-v4")])
     polars.read_csv(path).write_parquet(tmp_path / "a.parquet", row_group_size=16)
     (csv,), (parquet,) = read(path), read(str(tmp_path / "a.parquet"))
     for field in ("observations", "actions", "times", "starts"):
@@ -135,7 +135,7 @@ def test_without_a_clock_the_step_is_given(tmp_path):
 
 def test_chunks_go_on_where_the_one_before_ended(tmp_path, monkeypatch):
     monkeypatch.setattr(tables, "_CSV_BYTES", 1 << 18)
-    path = write(tmp_path / "a.csv", [*log(9000), *log(8000, "v2-v3"), *log(7000, start=2000.0)])
+    path = write(tmp_path / "a.csv", [*log(9000), *log(8000, "v2-v3"), *log(7000, "v3-v4")])
     chunks = read(path)
     assert len(chunks) > 2
     starts, before = [], 0
@@ -264,6 +264,59 @@ def test_interleaved_episodes_are_refused_with_the_remedy(tmp_path):
     message = refusal(write(tmp_path / "a.csv", lines))
     assert "take turns" in message
     assert "sort the file by run, pair, segment and then by time" in message
+
+
+def test_episodes_that_come_back_in_blocks_are_refused_with_their_number(tmp_path):
+    """Each block would be an episode of its own, and no row would look wrong."""
+    lines = [
+        row
+        for begin in range(0, 80, 10)
+        for pair in ("v1", "v2")
+        for row in log(10, pair, start=begin / 10)
+    ]
+    message = refusal(write(tmp_path / "a.csv", lines))
+    assert "a.csv, line 22: the episode r, v1, 0 (run, pair, segment) comes back" in message
+    assert "up to line 161, 2 episodes take turns in 16 blocks" in message
+    assert "sort the file by run, pair, segment and then by time" in message
+    key = [(one.split(",")[1], float(one.split(",")[3])) for one in lines]
+    sorted_lines = [line for _, line in sorted(zip(key, lines, strict=True))]
+    (chunk,) = read(write(tmp_path / "b.csv", sorted_lines))
+    assert chunk.starts.tolist() == [0, 80]
+
+
+def test_an_episode_that_comes_back_in_a_later_chunk_is_refused(tmp_path):
+    long = log(100_000, "v2")
+    message = refusal(write(tmp_path / "a.csv", [*log(5), *long, *log(5, start=9.0)]))
+    assert "a.csv, line 100007: the episode r, v1-v2, 0" in message
+
+
+def test_each_file_has_episodes_of_its_own(tmp_path):
+    paths = [write(tmp_path / name, log(5)) for name in ("a.csv", "b.csv")]
+    assert len(read(*paths)) == 2
+
+
+def test_of_very_many_episodes_the_first_are_kept_in_mind(tmp_path, monkeypatch):
+    monkeypatch.setattr(blocks, "_MOST_EPISODES", 2)
+    lines = [row for pair in "abcdc" for row in log(3, pair)]
+    assert read(write(tmp_path / "a.csv", lines))[0].starts.tolist() == [0, 3, 6, 9, 12]
+    assert "comes back" in refusal(write(tmp_path / "b.csv", [*lines, *log(3, "b")]))
+
+
+def test_of_a_file_that_grows_what_was_there_at_first_is_read(tmp_path, caplog):
+    path = tmp_path / "a.csv"
+    write(path, log(100))
+    whole = path.read_bytes()
+    path.write_bytes(whole[:-4])  # its last line is being written
+    more = [whole[-4:], "\n".join([*log(50, start=10.0), ""]).encode()]
+
+    def grow(count):
+        with open(path, "ab") as file:
+            file.write(more.pop(0) if len(more) > 1 else more[0])
+
+    chunks = list(read_traces([str(path)], on_read=grow))
+    assert sum(len(chunk.times) for chunk in chunks) == 100
+    assert (chunks[-1].actions == -0.25).all()
+    assert "a.csv grew by" in caplog.text
 
 
 def test_files_with_different_steps_are_refused(tmp_path):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import gzip
 import io
+import logging
 import os
 import zlib
 from collections.abc import Callable, Iterator
@@ -17,6 +18,9 @@ OnRead = Callable[[int], object]
 
 BYTE_ORDER_MARK = b"\xef\xbb\xbf"
 _GZIP, _PARQUET = b"\x1f\x8b", b"PAR1"
+_NEWLINE = ord("\n")
+
+_log = logging.getLogger(__name__)
 
 
 def ignore(count: int) -> None:
@@ -24,29 +28,66 @@ def ignore(count: int) -> None:
 
 
 class _WatchedFile(io.FileIO):
+    """A file as it was when it was opened, to the end of what was its last line then."""
+
     def __init__(self, path: str, on_read: OnRead) -> None:
         super().__init__(path)
         self._on_read = on_read
+        self._size = self._left = os.fstat(self.fileno()).st_size
+        self._ends_line = True  # whether what was read last does
+        self.has_lines = True
 
     def readinto(self, buffer: bytearray | memoryview, /) -> int:  # type: ignore[override]
-        count = super().readinto(buffer)
+        wanted = memoryview(buffer).cast("B")
+        if self._left > 0:
+            count = super().readinto(wanted[: self._left])
+            self._left -= count
+        else:
+            count = self._rest_of_line(wanted)
+        if count:
+            self._ends_line = wanted[count - 1] == _NEWLINE
         self._on_read(count)
         return count
+
+    def _rest_of_line(self, buffer: memoryview) -> int:
+        """What came since to a line that was being written."""
+        if self._ends_line or not self.has_lines:
+            return 0
+        count = super().readinto(buffer)
+        end = bytes(buffer[:count]).find(b"\n") + 1
+        return end or count
+
+    @property
+    def growth(self) -> int:
+        """By how much it has grown since [byte]."""
+        return max(os.fstat(self.fileno()).st_size - self._size, 0)
 
 
 @contextmanager
 def open_unpacked(path: str, on_read: OnRead = ignore) -> Iterator[BinaryIO]:
-    """Open a file for reading bytes; one that is gzipped is unpacked on the way."""
+    """Open a file for reading bytes; one that is gzipped is unpacked on the way.
+
+    Of one that grows meanwhile no more is read than was there at first, and its last line; where
+    someone is told what is read, that is logged as a warning.
+    """
     if os.path.isdir(path):
         raise IsADirectoryError(f"{path} is a folder; name the files in it")
     if os.path.exists(path) and not os.path.isfile(path):
         raise ValueError(f"{path} is a pipe or a device; write it to a file first")
-    with io.BufferedReader(_WatchedFile(path, on_read)) as file:
+    watched = _WatchedFile(path, on_read)
+    with io.BufferedReader(watched) as file:
         if file.peek(2).startswith(_GZIP):
+            watched.has_lines = False
             with gzip.GzipFile(fileobj=file) as unpacked:
                 yield cast(BinaryIO, unpacked)
         else:
             yield file
+        if on_read is not ignore and watched.growth:
+            _log.warning(
+                "%s grew by %s bytes while it was read; rows that came meanwhile are left out",
+                path,
+                f"{watched.growth:,}",
+            )
 
 
 def kind_of(path: str) -> Kind:
@@ -68,7 +109,7 @@ def damage_explained(path: str, reached: Callable[[], int] = lambda: 0) -> Itera
     except (EOFError, zlib.error, gzip.BadGzipFile) as error:
         raise ValueError(
             f"{path}, after line {reached()}: the gzip data ends early or is damaged "
-            f"(was a copy or a download interrupted?): {error}"
+            f"(was a copy or a download interrupted, or is it still being written?): {error}"
         ) from error
     except csv.Error as error:
         raise ValueError(f"{path}, line {reached()}: {error} (an unclosed quote?)") from error

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evofsm.io import fcd
+from evofsm.io.blocks import Blocks
 from evofsm.io.fcd import VehicleLengths
 from evofsm.io.files import OnRead, ignore, kind_of
 from evofsm.io.plain import Texts
@@ -56,7 +57,7 @@ class LogColumns:
         Column of the time [s]; not read if ``dt`` is given.
     episode : sequence of str, optional
         An episode begins where one of these columns changes, and in each file; without it,
-        those of run, pair and segment that exist.
+        those of run, pair and segment that exist. The rows of an episode stand together.
     dt : float, optional
         Time from a row to the next [s], for a log without a clock.
     """
@@ -95,7 +96,13 @@ def read_traces(
     Raises
     ------
     ValueError
-        If a file is not what it should be; the message names file, line and likely cause.
+        If a file is not what it should be; the message names file, line and likely cause. So
+        where an episode comes back after another one, of the first 262,144 episodes of a file.
+
+    Notes
+    -----
+    A file that grows meanwhile is read up to where it was as it was opened, and to the end of that
+    line; a warning is logged.
     """
     columns = columns or LogColumns()
     lengths = lengths or VehicleLengths()
@@ -195,6 +202,7 @@ def _read_log(table: Table, columns: LogColumns, clock: _Clock) -> Iterator[Chun
 
     rows_before = 0
     key_before: list[str] | None = None
+    blocks = Blocks(episode)
     for piece in table.pieces(numbers, texts):
         rows = len(piece.places)
         if rows == 0:
@@ -204,7 +212,7 @@ def _read_log(table: Table, columns: LogColumns, clock: _Clock) -> Iterator[Chun
         for key in keys:
             starts[key.firsts] = True
         starts[0] = key_before != _key(keys, 0)
-        _refuse_interleaved(piece, episode, keys, starts)
+        blocks.see(piece, keys, starts)
         jumps = 0
         if clock.ticks:
             times = piece.numbers[columns.time]
@@ -251,20 +259,6 @@ def _refuse_missing(
 def _listed(names: Sequence[str], most: int = 20) -> str:
     more = f" and {len(names) - most:,} more" if len(names) > most else ""
     return ", ".join(name[:40] for name in names[:most]) + more
-
-
-def _refuse_interleaved(
-    piece: Piece, episode: Sequence[str], keys: Sequence[Texts], starts: NDArray[np.bool_]
-) -> None:
-    if 2 * starts.sum() <= len(starts):
-        return
-    begun = [tuple(_key(keys, row)) for row in np.flatnonzero(starts).tolist()]
-    if len(set(begun)) < len(begun):
-        raise ValueError(
-            f"{piece.at(0)} and after: the episodes ({', '.join(episode)}) take turns row by row, "
-            "so that hardly any row follows one of its own episode; sort the file by "
-            f"{', '.join(episode)} and then by time"
-        )
 
 
 def _encode(piece: Piece, variable: str | Category) -> NDArray[np.float64]:

@@ -132,14 +132,17 @@ class Form:
     def _check(self, record: Record) -> None:
         content = record.content
         kind = content.get("kind")
-        held = _KINDS.get(kind) if isinstance(kind, str) else None
-        if held is None:
-            raise ValueError(f"there is no kind {kind!r}")
+        if not isinstance(kind, str) or kind not in _KINDS:
+            raise ValueError(f"there is no kind {str(kind)[:40]!r}")
         if kind == "start":
             self._version = _version(content.get("version"))
         elif not self._version:
             raise ValueError("it comes before anyone takes part")
-        held = {name: of for name, of in held.items() if SINCE.get(name, 1) <= self._version}
+        held = {
+            name: types
+            for name, types in _KINDS[kind].items()
+            if SINCE.get(name, 1) <= self._version
+        }
         what = f"a record of kind {kind!r} in version {self._version}"
         _refuse_others(content, {**_ALWAYS, **held}, what)
         for name in _WITHIN.keys() & content.keys():

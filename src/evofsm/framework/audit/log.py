@@ -59,21 +59,20 @@ def _whole(
     """
 
     @wraps(method)
-    def told(self: AuditLog, *args: _P.args, **kwargs: _P.kwargs) -> None:
-        if self._broken_off:
+    def told(log: AuditLog, /, *args: _P.args, **kwargs: _P.kwargs) -> None:
+        if log._broken_off:
             return
         try:
-            method(self, *args, **kwargs)
-        except OSError:
-            raise  # it was written as far as could be
+            method(log, *args, **kwargs)
         except BaseException:
-            self._broken_off = True
-            _log.error(
-                "the audit log %s was interrupted at record %s: nothing more is written of this "
-                "episode; it goes on with the next",
-                self.path,
-                self.head.number,
-            )
+            if log._failure is None:  # else it ends there anyway, which was said
+                log._broken_off = True
+                _log.error(
+                    "the audit log %s was interrupted at record %s: nothing more is written of "
+                    "this episode; it goes on with the next",
+                    log.path,
+                    log.head.number,
+                )
             raise
 
     return told
