@@ -368,3 +368,4 @@ def test_a_little_torture_harms_nothing():
     assert result.returncode == 0, result.stdout + result.stderr
     assert "15 kills" in result.stdout
     assert "200 damaged files" in result.stdout
+    assert "36 forged logs" in result.stdout
