@@ -1,12 +1,14 @@
 """The chapter on real data, made of a study that nobody measured."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from evofsm.naming import name_state, name_states
 from evofsm.report.chapter import write_chapters
 from evofsm.report.real import losses, real_chapter
-from evofsm.studies.real import TARGETS, Kind, Moment, Plan, RealStudy, Row
+from evofsm.studies.real import TARGETS, Drives, Kind, Moment, Plan, RealStudy, Row
 from evofsm.studies.real.cases import HORIZONS
 from evofsm.studies.real.measures import MEASURES, StateShare
 from evofsm.studies.real.moments import Warned
@@ -127,6 +129,22 @@ def test_without_enough_events_nothing_is_claimed(tmp_path):
     assert chapter.headline == "Too few events in these runs to compare anything."
     assert chapter.losses == ()
     assert [figure.name for figure in chapter.figures] == ["real-moments"]
+
+
+def test_it_says_who_taught_what_is_judged(tmp_path):
+    folds = make({})
+    assert "by what was learnt on the runs of the other 4 of 5 folds" in _said(folds, tmp_path)
+    other = _said(replace(folds, taught_by=Drives(42, 16.1)), tmp_path)
+    assert "All are judged by what 42 runs of another folder (16.1 h) taught;" in other
+    assert "learnt on 42 runs of another folder, 16.1 h" in other
+    assert "fold " not in other
+    assert "folds" not in other
+
+
+def _said(study, folder):
+    chapter = real_chapter(study, folder, "evofsm bench")
+    plan = "; ".join(f"{one.name} {one.value}" for one in chapter.plan)
+    return " ".join([chapter.about, plan, *(table.note for table in chapter.tables)])
 
 
 # -- States in words ------------------------------------------------------------------------------

@@ -1,5 +1,6 @@
 """Real data: what is asked, what is learnt, and how it is judged, on small made-up drives."""
 
+import json
 import shutil
 
 import numpy as np
@@ -11,7 +12,7 @@ from evofsm.risk.counts import OutcomeCounts
 from evofsm.states import Novelty
 from evofsm.studies.real import TARGETS, Kind, Plan, read_folder, run_real
 from evofsm.studies.real.cases import HORIZONS, Question, case_of, recent_acceleration
-from evofsm.studies.real.measures import MEASURES, ComingByState, approach
+from evofsm.studies.real.measures import MEASURES, ComingByState, approach, learn_logistic
 from evofsm.studies.real.moments import alarm_threshold, lead_before, leads, telling_moments
 from evofsm.studies.real.study import fold_of_runs
 from evofsm.studies.real.targets import coming, onsets
@@ -42,9 +43,9 @@ def drive(seed, seconds=60.0):
     return np.array(rows)
 
 
-def write_runs(folder, runs=4):
+def write_runs(folder, runs=range(4)):
     folder.mkdir(exist_ok=True)
-    for run in range(runs):
+    for run in runs:
         lines = ["run,pair,segment,time,gap,v_follower,v_leader,a_follower"]
         for pair in range(2):
             rows = drive(10 * run + pair)
@@ -297,3 +298,108 @@ def test_what_a_run_shows_does_not_teach_how_it_is_judged(cases, study):
 
 def test_the_same_seed_gives_the_same_numbers_with_any_number_of_workers(cases, study):
     assert repr(run_real(cases, TINY, workers=2).rows) == repr(study.rows)
+
+
+# -- Learnt on one folder, judged on another ------------------------------------------------------
+
+
+def turned(cases):
+    """The same drives, in which whatever came did not, and the other way round."""
+    return [
+        case._replace(answers={q: a._replace(came=~a.came) for q, a in case.answers.items()})
+        for case in cases
+    ]
+
+
+def area(study, measure, question=BRAKING):
+    return next(row.auroc for row in study.of(*question) if row.measure == measure)
+
+
+@pytest.fixture(scope="module")
+def others(tmp_path_factory):
+    """Runs of another folder."""
+    folder = write_runs(tmp_path_factory.mktemp("others"), range(4, 6))
+    return read_folder(folder, TINY, dealt=False)[0]
+
+
+@pytest.fixture(scope="module")
+def apart(cases, others):
+    return run_real(cases, TINY, workers=1, training=others)
+
+
+def test_all_of_one_folder_is_judged_by_all_that_the_other_taught(cases, others, apart):
+    assert apart.runs == tuple(f"made_{k}" for k in range(4))
+    assert apart.episodes == len(cases)
+    assert apart.taught_by.runs == 2
+    assert apart.taught_by.hours == pytest.approx(
+        0.2 / 3600.0 * sum(len(case.times) for case in others)
+    )
+    scores = [one[BRAKING] for one in learn_logistic(others, cases).scores["logistic"]]
+    answers = [case.answers[BRAKING] for case in cases]
+    score = np.concatenate([s[a.known] for s, a in zip(scores, answers, strict=True)])
+    came = np.concatenate([a.came[a.known] for a in answers])
+    assert area(apart, "logistic") == pytest.approx(auroc(score, came))
+
+
+def test_what_is_judged_teaches_nothing(cases, others, apart):
+    again = run_real(turned(cases), TINY, workers=1, training=others)
+    assert again.shares == apart.shares
+    assert again.states == apart.states
+    # What ranked moments well ranks them as badly once the truth is turned: it learnt none of it.
+    for measure in ("logistic", "evofsm-approach", "evofsm-states"):
+        assert area(again, measure) == pytest.approx(1.0 - area(apart, measure))
+
+
+def test_what_teaches_is_the_other_folder(cases, others, apart):
+    again = run_real(cases, TINY, workers=1, training=turned(others))
+    assert area(again, "ttc") == area(apart, "ttc")
+    assert area(apart, "evofsm-approach") > 0.8
+    assert area(again, "evofsm-approach") < 0.2
+
+
+def test_a_recording_that_is_in_both_folders_is_refused_by_any_name(cases, others):
+    renamed = cases[3]._replace(run="other_name")
+    with pytest.raises(ValueError, match="made_1, v1-v2 is judged and learnt from .as other_name"):
+        run_real(cases, TINY, workers=1, training=[*others, renamed])
+
+
+def test_one_run_is_enough_to_be_judged_or_to_teach(tmp_path):
+    one = write_runs(tmp_path / "one", [0])
+    assert {case.run for case in read_folder(one, TINY, dealt=False)[0]} == {"made_0"}
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(ValueError, match=r"empty holds no runs \(\*\.csv"):
+        read_folder(tmp_path / "empty", TINY, dealt=False)
+
+
+# -- The command ----------------------------------------------------------------------------------
+
+
+def bench_real(*arguments):
+    pytest.importorskip("typer")
+    from typer.testing import CliRunner
+
+    from evofsm.cli import application
+
+    return CliRunner().invoke(application(), ["bench", "real", *map(str, arguments)])
+
+
+def test_the_command_learns_on_one_folder_and_judges_on_the_other(tmp_path):
+    teaching, judged = write_runs(tmp_path / "a", [4]), write_runs(tmp_path / "b", [0])
+    found = bench_real("--train", teaching, "--data", judged, "--workers", 1, "--json")
+    assert found.exit_code == 0, found.stderr
+    assert {row["runs"] for row in json.loads(found.stdout)} == {1}
+
+
+def test_the_command_names_the_folder_that_is_wrong(tmp_path):
+    runs = write_runs(tmp_path / "runs", [0])
+    missing, strange = tmp_path / "missing", tmp_path / "strange"
+    strange.mkdir()
+    (strange / "x.csv").write_text("when,distance\n0,1\n", encoding="utf-8")
+    for folder, said in (
+        (missing, "missing: there is no such folder"),
+        (strange, "x.csv has no column 'time'; it has when, distance"),
+        (runs, "made_0, v0-v1 is judged and learnt from"),
+    ):
+        found = bench_real("--train", folder, "--data", runs, "--json")
+        assert found.exit_code == 2
+        assert said in found.stderr.replace("\n", " ")

@@ -110,14 +110,22 @@ def _about(study: RealStudy) -> str:
     return (
         f"{len(study.runs)} runs of real car-following, {study.hours:.1f} h, "
         f"{study.episodes} episodes of leader and follower, a decision every {INTERVAL:g} s. "
-        f"Each run is judged once, by what was learnt on the runs of the other "
-        f"{study.plan.folds - 1} of {study.plan.folds} folds; what came within "
+        f"{_taught(study)}; what came within "
         f"{listed(f'{horizon:g}' for horizon in HORIZONS)} s is the truth. Decisions at 5 m/s or "
         "slower, decisions at which the event is under way already, and those whose outcome the "
         "end of an episode hides are left out. Runs of one day may share cars and drivers, and "
         "pairs of one run do: intervals (95 %) draw whole runs, and are still too narrow for "
         "that. Nobody commanded anything that could be seen, so only watching is possible: full "
         f"braking is never observed, and {-LOWEST:g} m/s² is assumed to be commandable."
+    )
+
+
+def _taught(study: RealStudy) -> str:
+    if (by := study.taught_by) is not None:
+        return f"All are judged by what {by.runs} runs of another folder ({by.hours:.1f} h) taught"
+    return (
+        "Each run is judged once, by what was learnt on the runs of the other "
+        f"{study.plan.folds - 1} of {study.plan.folds} folds"
     )
 
 
@@ -261,7 +269,8 @@ def _tables(study: RealStudy) -> Iterable[Table]:
     )
     named = [one for one in study.shares if one.seconds >= _LEAST_SECONDS][:_MOST_STATES]
     if named:
-        yield _table_states(named)
+        first = "the runs outside the first fold"
+        yield _table_states(named, "the other folder" if study.taught_by else first)
 
 
 def _table_areas(study: RealStudy, target: Target, ours: tuple[int, ...]) -> Table:
@@ -331,7 +340,7 @@ def _table_warned(study: RealStudy, ours: tuple[int, ...]) -> Table:
     )
 
 
-def _table_states(states: Sequence[StateShare]) -> Table:
+def _table_states(states: Sequence[StateShare], taught_by: str) -> Table:
     names = name_states([one.center for one in states])
     return Table(
         f"The states after which {_TARGETS[SHOWN_QUESTION.target].title} most often came within "
@@ -341,19 +350,24 @@ def _table_states(states: Sequence[StateShare]) -> Table:
             (name, count(round(one.seconds)), percent(one.share))
             for name, one in zip(names, states, strict=True)
         ),
-        "Of evofsm-states, as the runs outside the first fold taught it: states in which "
-        f"{_LEAST_SECONDS:g} s or more were spent.",
+        f"Of evofsm-states, as {taught_by} taught it: states in which {_LEAST_SECONDS:g} s or "
+        "more were spent.",
     )
 
 
 def _plan(study: RealStudy) -> Iterable[Setting]:
     yield Setting("runs", f"{len(study.runs)}, {study.hours:.1f} h")
     yield Setting("checksums held against a list", f"{study.verified} files")
-    yield Setting("folds", f"{study.plan.folds}, by run, seed {study.plan.seed}")
+    if (by := study.taught_by) is not None:
+        yield Setting("learnt on", f"{by.runs} runs of another folder, {by.hours:.1f} h")
+        yield Setting("seed", f"{study.plan.seed}")
+    else:
+        yield Setting("folds", f"{study.plan.folds}, by run, seed {study.plan.seed}")
     yield Setting("bootstrap", f"{study.plan.rounds} draws of whole runs")
     yield Setting("decisions", f"every {INTERVAL:g} s")
     for name, (fewest, most) in study.states.items():
-        yield Setting(f"states of {name}", f"{fewest} to {most} by fold")
+        counts = f"{fewest} to {most} by fold" if study.taught_by is None else f"{fewest}"
+        yield Setting(f"states of {name}", counts)
 
 
 # -- Figures --------------------------------------------------------------------------------------

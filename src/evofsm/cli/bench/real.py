@@ -26,8 +26,17 @@ def real(
             show_default=False,
         ),
     ],
+    train: Annotated[
+        Path | None,
+        typer.Option(
+            help="Another folder of runs: all that is learnt from, and all of --data is judged. "
+            "Without it the runs of --data are dealt to folds.",
+            show_default=False,
+        ),
+    ] = None,
     folds: Annotated[
-        int, typer.Option(min=2, help="Each run is judged by what the other folds taught.")
+        int,
+        typer.Option(min=2, help="Each run is judged by what the other folds taught (no --train)."),
     ] = 5,
     seed: Annotated[int, typer.Option(min=0, help="Of the folds and the intervals.")] = 0,
     workers: WorkersOption = None,
@@ -40,8 +49,8 @@ def real(
     """Whether what was learnt on some real drives foretells danger in others.
 
     Events are a time to collision below 3, 2 and 1.5 s, and braking harder than 3 m/s², within 1,
-    2 and 5 s. Ours learns on the runs of all folds but one, and is judged on that one, beside
-    the classic measures. Checksums in MANIFEST.csv or SHA256SUMS are held against the files.
+    2 and 5 s. Ours learns on the runs of all folds but one, and is judged on that one, or learns on
+    --train and is judged on --data, beside the classic measures. Checksums in MANIFEST.csv or SHA256SUMS are held against the files.
     """
     require(scipy="study")
     if not as_json:
@@ -51,9 +60,11 @@ def real(
     plan = Plan(folds=folds, seed=seed)
     if short:
         plan = plan.shortened()
-    cases, verified = read_folder(data, plan)
+    training, verified = (None, 0) if train is None else read_folder(train, plan, dealt=False)
+    cases, held = read_folder(data, plan, dealt=train is None)
     with progress() as bars:
-        study = run_real(cases, plan, verified, counter(bars, "Learning and judging"), workers)
+        done = counter(bars, "Learning and judging")
+        study = run_real(cases, plan, verified + held, done, workers, training)
 
     def make_chapter(folder: Path, command: str, drawn: Progress) -> Chapter:
         from evofsm.report.real import real_chapter

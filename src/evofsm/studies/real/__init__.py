@@ -3,6 +3,7 @@
 from evofsm.studies.real.moments import Kind, Moment
 from evofsm.studies.real.study import (
     FEWEST_EVENTS,
+    Drives,
     Plan,
     RealStudy,
     Row,
@@ -14,6 +15,7 @@ from evofsm.studies.real.targets import TARGETS, Target
 __all__ = [
     "FEWEST_EVENTS",
     "TARGETS",
+    "Drives",
     "Kind",
     "Moment",
     "Plan",

@@ -1,4 +1,7 @@
-"""The study: cross-validation over runs, so that every run is judged once by what others taught."""
+"""The study: every run is judged once, by what other runs taught.
+
+The others are those of the other folds, or those of another folder.
+"""
 
 from __future__ import annotations
 
@@ -84,6 +87,13 @@ class Row(NamedTuple):
     enough: bool  #: events, in enough runs, for a comparison to mean something
 
 
+class Drives(NamedTuple):
+    """How much was driven."""
+
+    runs: int
+    hours: float
+
+
 @dataclass(frozen=True)
 class RealStudy:
     """All that was measured."""
@@ -96,8 +106,9 @@ class RealStudy:
     rows: list[Row]
     warned: list[Warned]
     states: dict[str, tuple[int, int]]  #: fewest and most states of a fold, by measure
-    shares: list[StateShare]  #: the most dangerous states of gap and speeds, of the first fold
+    shares: list[StateShare]  #: the most dangerous states of gap and speeds, as first learnt
     moments: list[Moment]
+    taught_by: Drives | None = None  #: of another folder; None where folds taught each other
 
     def as_rows(self) -> list[dict[str, Any]]:
         """Every row as plain values."""
@@ -108,7 +119,7 @@ class RealStudy:
         return [row for row in self.rows if (row.target, row.horizon) == (target, horizon)]
 
 
-def read_folder(folder: Path, plan: Plan) -> tuple[list[Case], int]:
+def read_folder(folder: Path, plan: Plan, *, dealt: bool = True) -> tuple[list[Case], int]:
     """Decisions of all runs in a folder, and how many files were held against a checksum.
 
     Parameters
@@ -118,14 +129,18 @@ def read_folder(folder: Path, plan: Plan) -> tuple[list[Case], int]:
         a run; lists of checksums and of segments in capital letters are no runs.
     plan : Plan
         Tells how many runs at most.
+    dealt : bool
+        Whether its runs will be dealt to folds, each of which needs one.
 
     Raises
     ------
+    NotADirectoryError
+        If there is no such folder.
     ValueError
-        If there are fewer runs than folds, or a file is not what it should be.
+        If there is no run, or fewer than folds, or a file is not what it should be.
     """
     if not folder.is_dir():
-        raise NotADirectoryError(f"--data {folder}: there is no such folder")
+        raise NotADirectoryError(f"{folder}: there is no such folder")
     paths = sorted(
         path
         for path in folder.iterdir()
@@ -135,7 +150,9 @@ def read_folder(folder: Path, plan: Plan) -> tuple[list[Case], int]:
         rng = np.random.default_rng(plan.seed)
         chosen = rng.choice(len(paths), size=plan.most_runs, replace=False)
         paths = [paths[k] for k in sorted(chosen.tolist())]
-    if len(paths) < plan.folds:
+    if not paths:
+        raise ValueError(f"{folder} holds no runs (*.csv, *.csv.gz)")
+    if dealt and len(paths) < plan.folds:
         raise ValueError(
             f"{folder} holds {len(paths)} runs (*.csv, *.csv.gz); {plan.folds} folds need as many"
         )
@@ -166,6 +183,7 @@ def run_real(
     verified: int = 0,
     progress: Callable[[int, int], None] = lambda done, total: None,
     workers: int | None = None,
+    training: Sequence[Case] | None = None,
 ) -> RealStudy:
     """Learn on some runs and judge on others, until every run was judged once.
 
@@ -179,6 +197,9 @@ def run_real(
         Told how many tasks are done, of how many.
     workers : int, optional
         Processes; as many as there are cores unless told. Results do not depend on it.
+    training : sequence of Case, optional
+        All that is learnt from, and all of ``cases`` are judged by it. Without it the runs of
+        ``cases`` are dealt to folds, and each fold is judged by what the others taught.
 
     Returns
     -------
@@ -187,15 +208,14 @@ def run_real(
     Raises
     ------
     ValueError
-        If there are fewer runs than folds, or than 2.
+        If there are fewer runs than folds, or than 2; if a recording is in ``cases`` and in
+        ``training``.
     """
     runs = tuple(sorted({case.run for case in cases}))
-    if not 2 <= plan.folds <= len(runs):
-        raise ValueError(f"{len(runs)} runs cannot be dealt to {plan.folds} folds")
-    folds = fold_of_runs(runs, plan.folds, plan.seed)
+    parts = _folds(cases, runs, plan) if training is None else [_apart(training, cases)]
     tasks = [
-        (fold, partial(learner, *_parted(cases, folds, fold)))
-        for fold in range(plan.folds)
+        (part, partial(learner, part.training, [cases[k] for k in part.judged]))
+        for part in parts
         for learner in _LEARNERS
     ]
     scores: dict[str, list[dict[Question, NDArray[np.float64]]]] = {
@@ -205,15 +225,14 @@ def run_real(
     states: dict[str, list[int]] = {}
     shares: list[StateShare] = []
     results = in_order([task for _, task in tasks], workers, progress)
-    for (fold, _), learnt in zip(tasks, results, strict=True):
-        places = [k for k, case in enumerate(cases) if folds[case.run] == fold]
+    for (part, _), learnt in zip(tasks, results, strict=True):
         for name, found in learnt.scores.items():
             every = scores.setdefault(name, [{} for _ in cases])
-            for k, one in zip(places, found, strict=True):
+            for k, one in zip(part.judged, found, strict=True):
                 every[k] = one
             if learnt.states:
                 states.setdefault(name, []).append(learnt.states)
-            if fold == 0 and name == "evofsm-states":
+            if part is parts[0] and name == "evofsm-states":
                 shares = list(learnt.shares)
     asked = {
         (name, question): [one[question] for one in scores[name]]
@@ -225,7 +244,7 @@ def run_real(
         runs,
         verified,
         len(cases),
-        sum(len(case.times) for case in cases) * INTERVAL / 3600.0,
+        _hours(cases),
         [row for question in QUESTIONS for row in _rows(cases, runs, question, asked, plan)],
         [
             _warned(cases, asked, target, measure.name)
@@ -240,7 +259,14 @@ def run_real(
             asked[SHOWN, SHOWN_QUESTION],
             asked[REFERENCE, SHOWN_QUESTION],
         ),
+        None
+        if training is None
+        else Drives(len({case.run for case in training}), _hours(training)),
     )
+
+
+def _hours(cases: Iterable[Case]) -> float:
+    return sum(len(case.times) for case in cases) * INTERVAL / 3600.0
 
 
 _LEARNERS: tuple[Callable[[Sequence[Case], Sequence[Case]], Learnt], ...] = (
@@ -250,12 +276,37 @@ _LEARNERS: tuple[Callable[[Sequence[Case], Sequence[Case]], Learnt], ...] = (
 )
 
 
-def _parted(
-    cases: Sequence[Case], folds: dict[str, int], fold: int
-) -> tuple[list[Case], list[Case]]:
-    """Those to learn from, and those to judge."""
-    held_out = [case for case in cases if folds[case.run] == fold]
-    return [case for case in cases if folds[case.run] != fold], held_out
+class _Part(NamedTuple):
+    """What is learnt from, and the places of the cases that are judged by it."""
+
+    training: list[Case]
+    judged: list[int]
+
+
+def _folds(cases: Sequence[Case], runs: Sequence[str], plan: Plan) -> list[_Part]:
+    """Each fold judged by what the others taught."""
+    if not 2 <= plan.folds <= len(runs):
+        raise ValueError(f"{len(runs)} runs cannot be dealt to {plan.folds} folds")
+    folds = fold_of_runs(runs, plan.folds, plan.seed)
+    return [
+        _Part(
+            [case for case in cases if folds[case.run] != fold],
+            [k for k, case in enumerate(cases) if folds[case.run] == fold],
+        )
+        for fold in range(plan.folds)
+    ]
+
+
+def _apart(training: Sequence[Case], cases: Sequence[Case]) -> _Part:
+    """All judged by what other recordings taught."""
+    taught = {case.observations.tobytes(): case for case in training}
+    for case in cases:
+        if (same := taught.get(case.observations.tobytes())) is not None:
+            raise ValueError(
+                f"{case.run}, {case.pair} is judged and learnt from (as {same.run}, {same.pair}): "
+                "what is judged must not be among what teaches"
+            )
+    return _Part(list(training), list(range(len(cases))))
 
 
 def _rows(
