@@ -83,6 +83,21 @@ def test_only_what_had_to_hold_is_said_to_hold(chapter, tmp_path, read_page):
         assert f'<div class="{kind}">' in page.verdict
 
 
+def test_marks_of_the_summary_say_whether_what_was_asked_holds(chapter, tmp_path, capsys):
+    chapters = [
+        replace(chapter, id=name, title=name, fails=fails)
+        for name, fails in (("good", ()), ("bad", ("x",)), ("open", None))
+    ]
+    text = page_of(tmp_path, *chapters)
+    assert re.search(r'<tr class="holds"><th scope="row"><span data-mark>✓ </span>good', text)
+    assert re.search(r'<tr class="fails"><th scope="row"><span data-mark>✗ </span>bad', text)
+    assert '<tr><th scope="row">open' in text
+    terminal.print_headlines(terminal.console(), chapters)
+    lines = capsys.readouterr().out.split("\n")
+    marks = ["✓", "✗", ""]
+    assert lines[1:6:2] == [f"  {mark} {chapter.headline}".replace("   ", "  ") for mark in marks]
+
+
 def test_minus_signs_are_set_before_numbers_and_not_in_names(chapter, tmp_path):
     table = Table("T", ("who", "skill"), (("rss-r157", "-1.5--0.5"), ("aeb", "4e-03")))
     page = page_of(tmp_path, replace(chapter, tables=(table,)))

@@ -14,7 +14,7 @@ from rich.console import Console
 from evofsm.report.beside import side_tables, why_not_by_state
 from evofsm.report.chapter import write_chapters
 from evofsm.report.closed_loop import closed_loop_chapter
-from evofsm.report.comparison import answer, headline
+from evofsm.report.comparison import answer, headline, what_was_asked
 from evofsm.report.documents import to_json
 from evofsm.report.losses import losses_in_words
 from evofsm.report.terminal import print_closed_loop
@@ -222,22 +222,63 @@ def test_a_baseline_that_is_better_on_both_axes_cannot_be_missed(
     study: ClosedLoop, group: Group, page_of
 ) -> None:
     beaten = _with(study, _row("planted", group, 0, 0.95))
-    loud = [loss for loss in losses(beaten) if loss.loud]
-    assert [(loss.who, loss.group, loss.apart) for loss in loud] == [("planted", group, True)]
-    assert (loud[0].theirs, loud[0].ours) == ((0.0, 0.95), (0.0, pytest.approx(0.899)))
+    (found,) = (loss for loss in losses(beaten) if loss.what == What.BOTH)
+    assert (found.who, found.group, found.apart) == ("planted", group, True)
+    assert (found.theirs, found.ours) == ((0.0, 0.95), (0.0, pytest.approx(0.899)))
     assert "1 does better" in answer(beaten)[2]
     page = page_of(beaten)
-    assert 'class="verdict fails"' in page.verdict
     assert f"planted ({group})" in page.verdict
-    assert page.html.count('<tr class="fails">') == 1
-    assert "! collisions and mobility, both: planted" in _printed(beaten)
+    # That none with fixed constants does was asked for; a cross says that it does not hold.
+    asked = group == Group.FIXED
+    assert f'class="verdict {"fails" if asked else "holds"}"' in page.verdict
+    assert page.html.count('<tr class="fails">') == 2 * asked
+    assert ("! collisions and mobility, both: planted" in _printed(beaten)) == asked
 
 
-def test_bounds_of_the_field_are_named_but_not_loud(study: ClosedLoop) -> None:
-    found = losses(_with(study, _row("oracle", Group.BOUND, 0, 0.99)))
-    assert [(loss.group, loss.loud) for loss in found if loss.who == "oracle"] == [
-        (Group.BOUND, False)
+@pytest.mark.parametrize(
+    ("policy", "group"), [("oracle", Group.BOUND), ("evofsm-told", Group.MATCHED)]
+)
+def test_our_own_reviser_that_was_told_is_no_rival(
+    study: ClosedLoop, policy: str, group: Group, page_of
+) -> None:
+    told = _with(study, _row(policy, group, 0, 0.99))
+    assert losses(told) == losses(study)
+    assert answer(told) == answer(study)
+    text = page_of(told).text
+    assert f"No rival, but our own reviser with nothing to learn: {policy} 0.0 % at 0.990." in text
+
+
+def test_marks_follow_what_was_asked(study: ClosedLoop, page_of) -> None:
+    asked = {one.claim: one for one in what_was_asked(study)}
+    assert all(one.met for one in asked.values())
+    assert asked["Collisions, worst seed"].asked == "≤ 2.0 %"
+    assert not any("Mobility" in claim for claim in asked)  # that was asked of emergency
+    odd = replace(
+        study,
+        rows=[*study.rows[:-1], _learnt(2, 100, 9, safe=None)],
+        cases=[CaseResult("case 2", True, 31.5, 0.1, 0.1, False)],
+        worlds=[InWorld("sumo", 5, 1, 8.0, 0.2), InWorld("kinematic", 5, 0, 8.0, 0.2)],
+    )
+    missed = [f"{one.claim}: {one.measured}" for one in what_was_asked(odd) if not one.met]
+    assert missed == [
+        "Collisions, worst seed: 4.5 %",
+        "Learning seeds that never come to 1.0 % of collisions: 1 of 3",
+        "Collisions in the paper's cases, revised: case 2",
+        "Collisions in sumo and kinematic: 1 and 0",
     ]
+    emergency = replace(odd, family=load_family("emergency"))
+    met = {one.claim: one.met for one in what_was_asked(emergency)}
+    assert met["Mobility, median over seeds"]
+    assert met["Collisions, median over seeds"]
+    assert 'class="verdict fails"' in page_of(odd).verdict
+
+
+def test_it_must_have_recovered_some_time_after_a_shift(study: ClosedLoop) -> None:
+    late = [Check("evofsm", 0, 30, 2, 50), Check("rss-unchanged", 0, 0, 1, 50)]
+    slow = replace(study, checks=late)
+    (missed,) = (one for one in what_was_asked(slow) if not one.met)
+    assert (missed.claim[:34], missed.measured) == ("Collisions 30 episodes after the s", "4.0 %")
+    assert [loss.what for loss in losses(slow) if loss.loud] == [What.SHIFT]
 
 
 def test_other_losses_are_found(study: ClosedLoop) -> None:
@@ -266,10 +307,10 @@ def test_other_losses_are_found(study: ClosedLoop) -> None:
         "collisions before the shift: rss-unchanged",
         "the paper's case 2",
         "collisions in both worlds",
-        "risk read through states: collisions and mobility, both: states: lucky (9)",
     ):
         assert part in found
-    assert "see where it loses" in why_not_by_state(odd)
+    assert "see the table" in why_not_by_state(odd)
+    assert "lucky" not in found  # our own reading by states is no rival
     assert "this is why the default" in why_not_by_state(study)
 
 

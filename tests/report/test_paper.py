@@ -8,10 +8,11 @@ from dataclasses import replace
 import pytest
 
 import evofsm
+from evofsm.divergence import jensen_shannon
 from evofsm.report import paper
 from evofsm.report.chapter import write_chapters
 from evofsm.report.drawing import Drawing
-from evofsm.report.paper import paper_chapter
+from evofsm.report.paper import losses, paper_chapter
 from evofsm.studies.paper import Claim, Settings, check_claims, context_tables, run_paper
 from evofsm.worlds.kinematic import KinematicWorld
 
@@ -112,6 +113,26 @@ def test_all_holds_is_said_on_top_and_a_failing_claim_cannot_be_missed(page, stu
     assert "quite the contrary" in read.verdict
     assert read.text.count("✗ ") == 1
     assert read.html.count('<tr class="fails">') == 1
+    assert "quite the contrary" not in "".join(losses(study))
+
+
+def test_whoever_forecasts_better_is_where_it_loses(page, study):
+    lost = list(losses(study))
+    assert lost[0].startswith("persistence is the better forecast")
+    mine = max(run.surprise[1:].max() for run in study.last_round[:1])
+    assert f"in case 1 {_still(study.last_round[0]):.1e} against {mine:.1e} bit" in lost[0]
+    text = page(study).text
+    assert all(loss in text for loss in lost)
+    assert f"{len(lost)} rows go against us" in text
+
+    # Where the machine foresees everything nobody is better.
+    runs = tuple(replace(run, surprise=0.0 * run.surprise) for run in study.runs)
+    assert list(losses(replace(study, runs=runs))) == []
+
+
+def _still(run):
+    """Largest divergence of a belief from the one before it."""
+    return jensen_shannon(run.belief[:-1], run.belief[1:]).max()
 
 
 def test_what_is_told_is_text_and_never_markup(page, study):

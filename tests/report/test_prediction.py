@@ -74,7 +74,7 @@ def test_skills_that_are_far_below_are_not_spelt_out(chapter):
 
 
 def test_tables_have_a_row_for_each_source_and_horizon_and_variant(chapter):
-    skills, scores, ablation = chapter.tables
+    skills, scores, ablation, _asked = chapter.tables
     assert len(skills.rows) == len(scores.rows) == 6
     assert [line[0] for line in ablation.rows] == [str(v) for v in Variant]
     assert ablation.rows[ablation.ours[0]][0] == str(Variant.ACTIONS)
@@ -88,5 +88,8 @@ def test_what_goes_against_us_is_said(tmp_path):
     assert "Below 0.5 s" in lost
 
 
-def test_where_all_is_won_only_the_caveat_is_left(chapter):
-    assert len(chapter.losses) == 1
+def test_where_all_is_won_nothing_is_lost_and_all_that_was_asked_holds(chapter, tmp_path):
+    assert (chapter.losses, chapter.fails) == ((), ())
+    assert "how useful a forecast is depends on how fine the states are" in chapter.about
+    lost = prediction_chapter(study(EVOFSM=-0.2), tmp_path, "x").fails
+    assert any("by divergence: in 0 of 4 cases" in failure for failure in lost)

@@ -183,7 +183,7 @@ def why_not_by_state(study: ClosedLoop) -> str:
         )
     return (
         f"{judged} {found.no_better} of {n} rows are no better on either axis, the others trade "
-        "one for the other or win: see where it loses."
+        "one for the other or win: see the table."
     )
 
 

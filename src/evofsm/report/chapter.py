@@ -50,7 +50,7 @@ class Chapter:
     figures: tuple[Drawing, ...]
     plan: tuple[Setting, ...]  #: seeds and sizes
     command: str  #: what makes these numbers
-    #: What must not be missed, which makes the answer a warning; None where nothing had to hold.
+    #: What was asked for and does not hold; None where nothing was asked, or could be judged.
     fails: tuple[str, ...] | None = None
     losses_table: Table | None = None  #: all losses, where sentences would be too many
     sections: tuple[Section, ...] = ()  #: what is told where the chapter has a page to itself
@@ -61,6 +61,13 @@ class Chapter:
     def n_losses(self) -> int:
         """How many rows go against us."""
         return len(self.losses_table.rows if self.losses_table else self.losses)
+
+    @property
+    def mark(self) -> str:
+        """Whether all that was asked for holds, as a sign; empty where nothing was judged."""
+        if self.fails is None:
+            return ""
+        return "✗" if self.fails else "✓"
 
     def as_dict(self) -> dict[str, Any]:
         """What it says, for JSON: all but its figures and further sections."""
@@ -180,6 +187,14 @@ def _contents(shown: Sequence[_Shown]) -> Iterator[Setting]:
 
 
 def _summary(chapters: Sequence[Chapter]) -> Table:
-    failing = tuple(place for place, chapter in enumerate(chapters) if chapter.fails)
-    rows = tuple((chapter.title, chapter.headline) for chapter in chapters)
-    return Table("In a line each", ("question", "answer"), rows, in_words=True, failing=failing)
+    marks = [chapter.mark for chapter in chapters]
+    return Table(
+        "In a line each",
+        ("question", "answer"),
+        tuple((chapter.title, chapter.headline) for chapter in chapters),
+        "✓: all that was asked for holds. ✗: some of it does not; the study's part says what. "
+        "Without a mark nothing could be judged.",
+        in_words=True,
+        failing=tuple(place for place, mark in enumerate(marks) if mark == "✗"),
+        holding=tuple(place for place, mark in enumerate(marks) if mark == "✓"),
+    )

@@ -9,18 +9,21 @@ from functools import partial
 from pathlib import Path
 
 from evofsm._extras import needs
+from evofsm.report.asked import failures, tables_of_asked
 from evofsm.report.beside import side_tables, why_not_by_state
 from evofsm.report.chapter import Chapter, Section
-from evofsm.report.comparison import answer, headline, note_on_the_table
+from evofsm.report.comparison import answer, headline, note_on_the_table, what_was_asked
 from evofsm.report.html import Setting
 from evofsm.report.losses import InWords, losses_in_words
-from evofsm.report.words import NONE, count, interval, number, part, percent, percents
+from evofsm.report.words import NONE, count, interval, listed, number, part, percent, percents
 from evofsm.studies.closed_loop import FIXED_MEASURES, ClosedLoop
 from evofsm.studies.closed_loop.comparison import (
     Line,
     chosen,
     has_third_car,
+    ours,
     settings,
+    standing,
     table_groups,
 )
 from evofsm.studies.closed_loop.over_seeds import WINDOW
@@ -63,10 +66,10 @@ def closed_loop_chapter(
         about=_about(study),
         headline=headline(study),
         answer=tuple(answer(study)),
-        fails=tuple(_in_a_line(loss) for loss in lost if loss.loud),
+        fails=failures(asked := what_was_asked(study)),
         losses=tuple(map(_in_a_line, lost)),
-        losses_table=_table_of_losses(lost),
-        tables=(policy_table(study), _table_of_names(study)),
+        losses_table=_table_of_losses(study, lost),
+        tables=(policy_table(study), *tables_of_asked(asked), _table_of_names(study)),
         figures=tuple(figures[name] for name in ("trade-off",) if name in figures),
         sections=tuple(_sections(study, figures)),
         plan=tuple(_plan(study)),
@@ -90,7 +93,7 @@ def _in_a_line(loss: InWords) -> str:
     return f"{loss.what}: {loss.who}, {loss.theirs}, against {loss.ours} of ours"
 
 
-def _table_of_losses(lost: Sequence[InWords]) -> Table | None:
+def _table_of_losses(study: ClosedLoop, lost: Sequence[InWords]) -> Table | None:
     if not lost:
         return None
     apart = {None: NONE, True: "apart", False: "overlap"}
@@ -101,10 +104,24 @@ def _table_of_losses(lost: Sequence[InWords]) -> Table | None:
         "Found by comparing all numbers on this page with those of evofsm after all training "
         "(median over seeds unless said): every baseline that is better on both axes, that "
         "collides less, or that pays less while colliding no more often, every measure that tells "
-        "dead ends apart better, and every test that it fails. ✗ marks what matters most.",
+        "dead ends apart better, and every test that it fails. ✗ marks what breaks something that "
+        f"was asked for.{_told(study)}",
         in_words=True,
         failing=tuple(place for place, one in enumerate(lost) if one.loud),
     )
+
+
+def _told(study: ClosedLoop) -> str:
+    """Our own reviser where it did not have to learn, which is no rival."""
+    mine = ours(study)
+    found = standing(study, mine).told if mine else []
+    if not found:
+        return ""
+    each = listed(
+        f"{line.policy} {percent(line.collision_rate)} at {number(line.mobility, 3)}"
+        for line in found
+    )
+    return f" No rival, but our own reviser with nothing to learn: {each}."
 
 
 # -- The table ------------------------------------------------------------------------------------

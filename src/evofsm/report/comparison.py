@@ -2,10 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
+from evofsm.report.asked import Asked
 from evofsm.report.words import count, listed, number, percent, seeds_text
-from evofsm.studies.closed_loop import ClosedLoop
+from evofsm.studies.closed_loop import ClosedLoop, Group
 from evofsm.studies.closed_loop.comparison import Line, ours, standing, unrevised
+from evofsm.studies.closed_loop.losses import RECOVERED_AFTER, never_safe
+from evofsm.studies.closed_loop.over_seeds import around_shift
 from evofsm.studies.closed_loop.study import SAFE_RATE
+
+# What was asked of one family; of all, that its tolerance is kept.
+_FAMILY_ASKED, _MOST_COLLISIONS, _LEAST_MOBILITY = "emergency", 0.005, 0.8
 
 
 def headline(study: ClosedLoop) -> str:
@@ -89,3 +97,71 @@ def note_on_the_table(study: ClosedLoop) -> str:
 def checked_on(study: ClosedLoop) -> int:
     """Held-out episodes of a test on the way."""
     return study.curve[0].held_out if study.curve else 0
+
+
+def what_was_asked(study: ClosedLoop) -> list[Asked]:
+    """What had to hold, as far as it was driven here."""
+    return [*_asked_of_the_table(study), *_asked_beside(study)]
+
+
+def _asked_of_the_table(study: ClosedLoop) -> Iterator[Asked]:
+    mine, worst = ours(study), ours(study, "worst seed")
+    if mine is None or worst is None:
+        return
+    rates = [("worst seed", worst, study.plan.tolerance)]
+    if study.family.name == _FAMILY_ASKED:
+        rates.insert(0, ("median over seeds", mine, _MOST_COLLISIONS))
+        yield Asked(
+            "Mobility, median over seeds",
+            f"≥ {_LEAST_MOBILITY:g}",
+            number(mine.mobility, 3),
+            mine.mobility >= _LEAST_MOBILITY,
+        )
+    for which, line, most in rates:
+        yield Asked(
+            f"Collisions, {which}",
+            f"≤ {percent(most)}",
+            percent(line.collision_rate),
+            line.collision_rate <= most,
+        )
+    fixed = [line for line in standing(study, mine).better if line.group == Group.FIXED]
+    yield Asked(
+        "Fixed constants with no more collisions at no less mobility",
+        "none",
+        listed(line.policy for line in fixed) if fixed else "none",
+        not fixed,
+    )
+    never = never_safe(study, mine)
+    yield Asked(
+        f"Learning seeds that never come to {percent(SAFE_RATE)} of collisions",
+        "none",
+        f"{never} of {mine.seeds}" if never else "none",
+        not never,
+    )
+
+
+def _asked_beside(study: ClosedLoop) -> Iterator[Asked]:
+    tested = {one.after: one for one in around_shift(study)}
+    if (then := tested.get(RECOVERED_AFTER)) is not None:
+        yield Asked(
+            f"Collisions {RECOVERED_AFTER} episodes after the shift, median over seeds",
+            f"≤ {percent(SAFE_RATE)}",
+            percent(then.ours.median),
+            then.ours.median <= SAFE_RATE,
+        )
+    if study.cases:
+        collided = [case.name for case in study.cases if case.collided]
+        yield Asked(
+            "Collisions in the paper's cases, revised",
+            "none",
+            listed(collided) if collided else "none",
+            not collided,
+        )
+    if study.worlds:
+        counts = [one.collisions for one in study.worlds]
+        yield Asked(
+            f"Collisions in {listed(one.world for one in study.worlds)}",
+            "equal",
+            listed(map(str, counts)),
+            len(set(counts)) == 1,
+        )

@@ -7,11 +7,12 @@ from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from itertools import product
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from evofsm._extras import needs
+from evofsm.report.asked import Asked, failures, tables_of_asked
 from evofsm.report.chapter import Chapter
 from evofsm.report.html import Setting
 from evofsm.report.words import NONE, interval, listed, number, percent, seeds_text
@@ -53,15 +54,6 @@ _CLOSEST = 1e-4
 _ASKED_LEAD, _ASKED_MARGIN = 5.0, 0.2
 
 
-class Claim(NamedTuple):
-    """What was asked for, and what came out."""
-
-    claim: str
-    asked: str
-    measured: str
-    met: bool
-
-
 def detection_chapter(
     study: Detection,
     folder: Path,
@@ -91,7 +83,7 @@ def detection_chapter(
         about=_about(study),
         headline=headline,
         answer=tuple(_answer(study)),
-        fails=tuple(map(_missed, (claim for claim in asked if not claim.met))),
+        fails=failures(asked),
         losses=tuple(losses(study)),
         tables=tuple(_tables(study, asked)),
         figures=tuple(draw_all(_sketches(study), folder, progress)),
@@ -118,7 +110,7 @@ def _about(study: Detection) -> str:
 # -- What was asked for ---------------------------------------------------------------------------
 
 
-def claims(study: Detection) -> Iterator[Claim]:
+def claims(study: Detection) -> Iterator[Asked]:
     """The targets that were set before, as far as their worlds were judged."""
     table = _by_key(study)
 
@@ -136,7 +128,7 @@ def claims(study: Detection) -> Iterator[Claim]:
         row, other = of("paper", _OURS, target), of("paper", "ttc", target)
         if row and other and row.lead_median_1 is not None and other.lead_median_1 is not None:
             longer = row.lead_median_1 - other.lead_median_1
-            yield Claim(
+            yield Asked(
                 f"Lead time on paper beyond TTC's, {_WHAT[target]}",
                 f"≥ {_ASKED_LEAD:g} s",
                 f"{longer:.1f} s",
@@ -150,12 +142,8 @@ def claims(study: Detection) -> Iterator[Claim]:
             yield _at_least(what, row.auroc, paper.auroc + _ASKED_MARGIN)
 
 
-def _missed(claim: Claim) -> str:
-    return f"{claim.claim}: {claim.measured}, where {claim.asked} was asked."
-
-
-def _at_least(what: str, measured: float, least: float) -> Claim:
-    return Claim(what, f"≥ {number(least, 4)}", number(measured, 4), measured >= least)
+def _at_least(what: str, measured: float, least: float) -> Asked:
+    return Asked(what, f"≥ {number(least, 4)}", number(measured, 4), measured >= least)
 
 
 def _by_key(study: Detection) -> dict[tuple[str, str, str], Row]:
@@ -185,8 +173,22 @@ def _answer(study: Detection) -> Iterator[str]:
         )
 
 
+def _is_rival(measure: str) -> bool:
+    """Whether it is no other reading of ours; the default itself is among those compared."""
+    return measure == _OURS or measure not in list(Ours)
+
+
+def _among(study: Detection, family: str, target: Target) -> list[Row]:
+    """Ours and its rivals in one world."""
+    return [
+        row
+        for row in study.rows
+        if (row.family, row.target) == (family, target) and _is_rival(row.measure)
+    ]
+
+
 def _best(study: Detection, family: str, target: Target) -> Row:
-    rows = [row for row in study.rows if (row.family, row.target) == (family, target)]
+    rows = _among(study, family, target)
     return max(rows, key=lambda row: (np.nan_to_num(row.auroc), row.measure == _OURS))
 
 
@@ -194,17 +196,12 @@ def _best(study: Detection, family: str, target: Target) -> Row:
 
 
 def losses(study: Detection) -> Iterator[str]:
-    """What goes against ours, the most important first."""
-    for claim in claims(study):
-        if not claim.met:
-            yield f"Target missed. {_missed(claim)}"
+    """Where a rival does better than ours, the most important first."""
     for target in Target:
         yield from _beaten(study, target)
     yield from _later(study)
     yield from _called(study)
     yield from _in_grid(study)
-    yield from _by_actions(study)
-    yield from _by_seed(study)
     yield from _states_alone(study)
 
 
@@ -225,12 +222,11 @@ def _later(study: Detection) -> Iterator[str]:
     for target in Target:
         found = []
         for family in study.families:
-            rows = [r for r in study.rows if (r.family, r.target) == (family, target)]
-            told = [r for r in rows if r.lead_median_1 is not None]
-            mine = next((r for r in told if r.measure == _OURS), None)
+            rows = [r for r in _among(study, family, target) if r.lead_median_1 is not None]
+            mine = next((r for r in rows if r.measure == _OURS), None)
             if mine is None or mine.lead_median_1 is None:
                 continue
-            first = max(told, key=lambda r: r.lead_median_1 or 0.0)
+            first = max(rows, key=lambda r: r.lead_median_1 or 0.0)
             if (first.lead_median_1 or 0.0) > (mine.lead_median_1 or 0.0) + 0.25:
                 found.append(
                     f"{family} ({first.measure} {number(first.lead_median_1 or 0.0, 1)} s, in "
@@ -258,7 +254,7 @@ def _called(study: Detection) -> Iterator[str]:
 
 def _in_grid(study: Detection) -> Iterator[str]:
     """The world of the grid in which ours tells worst, where another one tells better."""
-    cells = [row for row in study.grid if math.isfinite(row.auroc)]
+    cells = [r for r in study.grid if math.isfinite(r.auroc) and _is_rival(r.measure)]
     mine = [row for row in cells if row.measure == _OURS]
     if not mine:
         return
@@ -276,31 +272,19 @@ def _in_grid(study: Detection) -> Iterator[str]:
         )
 
 
-def _by_actions(study: Detection) -> Iterator[str]:
-    table = _by_key(study)
-    row = table.get(("rare", Ours.PAPER_ACTIONS, Target.DEAD_END))
-    mine = table.get(("rare", _OURS, Target.DEAD_END))
-    if row and mine:
-        yield (
-            f"Counted by state and action, the paper's rule reaches {row.auroc:.3f} on rare (ours "
-            f"{mine.auroc:.3f}): the driver's own hard braking gives the danger away, late. "
-            f"Precision shows the difference: AUPRC {row.auprc:.3f} against {mine.auprc:.3f}."
-        )
-
-
-def _by_seed(study: Detection) -> Iterator[str]:
+def _margin_by_seed(study: Detection) -> str:
     """The margin over the paper's preset is not the same with every learning seed."""
     table = _by_key(study)
     paper = table.get(("rare", Ours.PAPER, Target.DEAD_END))
     states = table.get(("rare", Ours.STATES, Target.DEAD_END))
-    if paper and states and paper.auroc_seeds and states.auroc_seeds:
-        pairs = list(zip(states.auroc_seeds, paper.auroc_seeds, strict=True))
-        clear = sum(mine >= other + _ASKED_MARGIN for mine, other in pairs)
-        yield (
-            f"On rare the paper's preset depends on what it happened to watch: AUROC "
-            f"{_spread(paper)} with other learning seeds ({Ours.STATES} {_spread(states)}); the "
-            f"margin of {_ASKED_MARGIN:g} holds with {clear} of {len(pairs)} of them."
-        )
+    if not (paper and states and paper.auroc_seeds and states.auroc_seeds):
+        return ""
+    pairs = list(zip(states.auroc_seeds, paper.auroc_seeds, strict=True))
+    clear = sum(mine >= other + _ASKED_MARGIN for mine, other in pairs)
+    return (
+        f" On rare {Ours.STATES} is better than {Ours.PAPER} by the margin of {_ASKED_MARGIN:g} "
+        f"with {clear} of {len(pairs)} of them."
+    )
 
 
 def _spread(row: Row) -> str:
@@ -325,16 +309,8 @@ def _states_alone(study: Detection) -> Iterator[str]:
 # -- Tables ---------------------------------------------------------------------------------------
 
 
-def _tables(study: Detection, asked: Sequence[Claim]) -> Iterator[Table]:
-    if asked:
-        yield Table(
-            "What was asked for",
-            ("target", "asked", "measured", "met"),
-            tuple(
-                (one.claim, one.asked, one.measured, "yes" if one.met else "no") for one in asked
-            ),
-            failing=tuple(place for place, one in enumerate(asked) if not one.met),
-        )
+def _tables(study: Detection, asked: Sequence[Asked]) -> Iterator[Table]:
+    yield from tables_of_asked(asked)
     for target in Target:
         yield _areas_by_family(study, target)
     yield from _seeds_table(study)
@@ -375,7 +351,8 @@ def _seeds_table(study: Detection) -> Iterator[Table]:
             f"AUROC over {study.plan.seeds - 1} other learning seeds, dead end",
             ("world", *map(_short_name, columns)),
             tuple(rows),
-            "From the lowest to the highest; on fewer held-out episodes than above.",
+            "From the lowest to the highest; on fewer held-out episodes than above."
+            f"{_margin_by_seed(study)}",
         )
 
 

@@ -20,7 +20,7 @@ class InWords(NamedTuple):
     theirs: str
     ours: str
     apart: bool | None  #: whether 95 % intervals do not meet; None where there are none
-    loud: bool  #: a baseline that is better on both axes, or a failure
+    loud: bool  #: whether it breaks what was asked for
 
 
 def losses_in_words(study: ClosedLoop) -> list[InWords]:
@@ -41,8 +41,6 @@ def _in_words(loss: Loss) -> InWords:
             what, who, ours = f"collisions {when(int(about))}", loss.who, f"{ours} (median)"
         case What.BRIER:
             what, who = f"{what}, {about}", "always the base rate"
-        case What.STATES:
-            who, ours = f"{loss.who}, seed {about}", f"{ours} (judged where they are)"
         case What.CASE_COLLIDES:
             what, who, theirs = f"the paper's {about}", "no collision", "the run's end"
         case What.CASE_CHANGED:
@@ -79,7 +77,6 @@ _SHOWN: dict[What, Callable[..., str]] = {
     What.SHIFT: percent,
     What.AUROC: _area,
     What.BRIER: lambda x: number(x, 4),
-    What.STATES: lambda rate, mobility: f"{percent(rate)} at {number(mobility, 3)}",
     What.CASE_COLLIDES: lambda end: f"collides at {end:.1f} s",
     What.CASE_CHANGED: lambda share, late: (
         f"{percent(share)} of decisions changed ({percent(late)} late)"

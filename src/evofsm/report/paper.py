@@ -6,12 +6,23 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
+import numpy as np
+
 from evofsm.drivers.idm import IDM, ChangingIDM
 from evofsm.protocols import Controller
 from evofsm.report.chapter import Chapter, Section, Source
 from evofsm.report.figures import paper_figures
 from evofsm.report.html import Setting
-from evofsm.studies.paper import Claim, PaperStudy, Settings, check_claims, context_tables
+from evofsm.studies.paper import (
+    CASES,
+    OURS,
+    Claim,
+    PaperStudy,
+    Settings,
+    check_claims,
+    context_tables,
+    divergences,
+)
 from evofsm.studies.table import Table
 
 _WORLDS = {"sumo": "SUMO", "kinematic": "the kinematic world"}
@@ -64,7 +75,7 @@ def paper_chapter(
         headline=f"{len(claims) - len(failing)} of {len(claims)} claims hold in {world}",
         answer=(f"{study.model.n_states} states were founded in {len(study.runs)} runs.",),
         fails=tuple(_failure(claims[place]) for place in failing),
-        losses=tuple(_failure(claims[place]) for place in failing),
+        losses=tuple(losses(study)),
         tables=(_table_of_claims(claims, failing), *context_tables(study)),
         figures=(first,),
         sections=(
@@ -89,6 +100,26 @@ def paper_chapter(
 
 def _failure(claim: Claim) -> str:
     return f"{claim.claim}: {claim.measured} (paper: {claim.paper})"
+
+
+def losses(study: PaperStudy) -> Iterator[str]:
+    """Every simple forecast that comes closer than the machine's, with the numbers."""
+    found = {
+        who: {
+            **{f"in case {k}": float(one.max()) for k, one in zip(CASES, by_case, strict=True)},
+            "on average": float(np.concatenate(by_case).mean()),
+        }
+        for who, by_case in divergences(study).items()
+    }
+    mine = found.pop(OURS)
+    for who, theirs in found.items():
+        better = [where for where, value in theirs.items() if value < mine[where]]
+        if better:
+            cases = "; ".join(f"{w} {theirs[w]:.1e} against {mine[w]:.1e} bit" for w in better)
+            yield (
+                f"{who} is the better forecast of the next belief (largest divergence in a case "
+                f"of the last round, or mean of all): {cases}."
+            )
 
 
 def _table_of_claims(claims: Sequence[Claim], failing: tuple[int, ...]) -> Table:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from evofsm._extras import needs
+from evofsm.report.asked import Asked, failures, tables_of_asked
 from evofsm.report.chapter import Chapter
 from evofsm.report.html import Setting
 from evofsm.report.words import NONE, interval, listed, number
@@ -64,7 +65,13 @@ def prediction_chapter(
         headline=_headline(study),
         answer=tuple(_answer(study)),
         losses=tuple(_losses(study)),
-        tables=(_table_of_skills(study), _table_of_scores(study), *_tables_of_ablation(study)),
+        fails=failures(asked := list(_what_was_asked(study))),
+        tables=(
+            _table_of_skills(study),
+            _table_of_scores(study),
+            *_tables_of_ablation(study),
+            *tables_of_asked(asked),
+        ),
         figures=tuple(draw_all([partial(_sketch_skills, study)], folder, progress)),
         plan=tuple(_plan(study)),
         command=command,
@@ -88,7 +95,9 @@ def _about(study: Prediction) -> str:
         "compared with. `batch` is deeptime's count of transitions between the most probable "
         "states at the lag of the horizon, over all training rows at once; `blend` is persistence "
         "with the best share of the mean belief. Horizons of 0.01 and 0.1 s in simulation are of "
-        "machines that observe every 0.01 s, longer ones every 0.25 s."
+        "machines that observe every 0.01 s, longer ones every 0.25 s. What is forecast are "
+        "beliefs in our own states, not accelerations or gaps: how useful a forecast is depends on "
+        "how fine the states are, and finer ones are harder to foresee."
     )
 
 
@@ -109,6 +118,18 @@ def _headline(study: Prediction) -> str:
     )
 
 
+def _what_was_asked(study: Prediction) -> Iterator[Asked]:
+    rows = _asked(study, Method.EVOFSM)
+    for what, name in (("divergence", "low"), ("log score", "log_low")):
+        clear = sum(getattr(row, name) > 0.0 for row in rows)
+        yield Asked(
+            f"Better than persistence from 0.5 to 5 s ahead, by {what}",
+            "whole interval above 0 in every case",
+            f"in {clear} of {len(rows)} cases",
+            clear == len(rows),
+        )
+
+
 def _answer(study: Prediction) -> Iterator[str]:
     for source in study.sources:
         rows = [row for row in study.of(source, Method.EVOFSM) if row.horizon >= _ASKED]
@@ -123,7 +144,7 @@ def _answer(study: Prediction) -> Iterator[str]:
 
 
 def _losses(study: Prediction) -> Iterator[str]:
-    """What goes against us, the most important first."""
+    """Where a reference does better, or as well, the most important first."""
     ours = [row for row in study.rows if row.method == Method.EVOFSM]
     by_key = {(row.source, row.horizon, row.method): row for row in study.rows}
     for row in ours:
@@ -152,10 +173,6 @@ def _losses(study: Prediction) -> Iterator[str]:
     if unsteady:
         named = [f"{_where(row)} {_skill(row.worst)}" for row in unsteady]
         yield f"Negative for the worst learning seed or part of the runs: {listed(named)}."
-    yield (
-        "What is forecast are beliefs in our own states, not accelerations or gaps: how useful a "
-        "forecast is depends on how fine the states are, and finer ones are harder to foresee."
-    )
 
 
 def _where(row: Row) -> str:

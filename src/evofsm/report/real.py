@@ -35,6 +35,7 @@ with needs("matplotlib", "plot", "drawing figures"):
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
 
+    from evofsm.report.asked import Asked, failures, tables_of_asked
     from evofsm.report.chapter import Chapter
     from evofsm.report.drawing import Sketch, draw_all
     from evofsm.report.style import (
@@ -95,7 +96,8 @@ def real_chapter(
         headline=_headline(study),
         answer=tuple(_answer(study)),
         losses=tuple(losses(study)),
-        tables=tuple(_tables(study)),
+        fails=failures(asked := list(_what_was_asked(study))),
+        tables=(*_tables(study), *tables_of_asked(asked)),
         figures=tuple(draw_all(sketches, folder, progress)),
         plan=tuple(_plan(study)),
         command=command,
@@ -140,6 +142,18 @@ def _headline(study: RealStudy) -> str:
         f"{SHOWN} ranks moments better than time to collision in {len(clear)} of {len(mine)} "
         f"questions, worse in {len(worse)}; in the others intervals of the difference hold 0."
     )
+
+
+def _what_was_asked(study: RealStudy) -> Iterable[Asked]:
+    mine = [row for row in _comparable(study) if row.measure == SHOWN]
+    if mine:
+        clear = sum(row.over_ttc_low > 0.0 for row in mine)
+        yield Asked(
+            f"{SHOWN} ranks moments better than time to collision",
+            "clearly (interval above 0) in every question",
+            f"in {clear} of {len(mine)} questions",
+            clear == len(mine),
+        )
 
 
 def _answer(study: RealStudy) -> Iterable[str]:

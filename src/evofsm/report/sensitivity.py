@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from evofsm._extras import needs
+from evofsm.report.asked import Asked, failures, tables_of_asked
 from evofsm.report.chapter import Chapter
 from evofsm.report.html import Setting
 from evofsm.report.words import NONE, count, listed, number, percent
@@ -132,10 +133,12 @@ def sensitivity_chapter(
         headline=_headline(study),
         answer=tuple(_answer(study)),
         losses=tuple(_losses(study)),
+        fails=failures(asked := list(_what_was_asked(study))),
         tables=(
             _table_of_claims(study),
             _table_of_harm(study),
             _table_of_parameters(study),
+            *tables_of_asked(asked),
         ),
         figures=tuple(draw_all(sketches, folder, progress)),
         plan=tuple(_plan(study)),
@@ -175,6 +178,19 @@ def _interval(share: Share) -> str:
 
 def _ids(study: Sensitivity) -> list[str]:
     return [claim.id for claim in study.claims]
+
+
+def _what_was_asked(study: Sensitivity) -> Iterator[Asked]:
+    for space in (_OPEN, _NEAR):
+        share = space.share(study)
+        yield Asked(
+            f"All {len(study.claims)} claims hold together over {space.name}"
+            if space is _OPEN
+            else f"All {len(study.claims)} claims hold together {space.name}",
+            f"in most settings (more than {100 * _SELDOM:g} %)",
+            f"in {percent(share.value)} of {share.tried:,} ({_interval(share)})",
+            share.value > _SELDOM,
+        )
 
 
 def _headline(study: Sensitivity) -> str:

@@ -259,8 +259,9 @@ _IN_THE_TERMINAL = ("shift", "separation", "cases", "worlds")
 def print_closed_loop(out: Console, study: ClosedLoop) -> None:
     """Print the table of the closed-loop study, where ours loses, and short tables beside it."""
     # The study needs SciPy, which those who learn from a log may lack.
+    from evofsm.report.asked import tables_of_asked
     from evofsm.report.beside import side_tables
-    from evofsm.report.comparison import answer, note_on_the_table
+    from evofsm.report.comparison import answer, note_on_the_table, what_was_asked
     from evofsm.report.losses import losses_in_words
     from evofsm.studies.closed_loop.comparison import has_third_car, table_groups
 
@@ -282,6 +283,8 @@ def print_closed_loop(out: Console, study: ClosedLoop) -> None:
         "\n> is ours. Change in m/s², RMS jerk in m/s³; learning: collisions while learning. "
         f"{note_on_the_table(study)}\n"
     )
+    for table in tables_of_asked(what_was_asked(study)):
+        print_table(out, table)
     _print_losses(out, losses_in_words(study))
     for name, table in side_tables(study).items():
         if name in _IN_THE_TERMINAL:
@@ -340,7 +343,8 @@ def print_headlines(out: Console, chapters: Sequence[Chapter]) -> None:
     """Print of each study what it asks, and the answer in a line."""
     for chapter in chapters:
         out.print(chapter.title, style="bold")
-        _print_indented(out, chapter.headline, "bold red" if chapter.fails else "")
+        text = f"{chapter.mark} {chapter.headline}".strip()
+        _print_indented(out, text, "bold red" if chapter.fails else "")
     out.print()
 
 

@@ -18,4 +18,5 @@ class Table:
     note: str = ""
     ours: tuple[int, ...] = ()  #: rows that are ours, to be set off
     in_words: bool = False  #: whether the cells are words, which may be broken into lines
-    failing: tuple[int, ...] = ()  #: rows that say that something does not hold
+    failing: tuple[int, ...] = ()  #: rows of which something that was asked for does not hold
+    holding: tuple[int, ...] = ()  #: rows of which all that was asked for holds, if that is marked

@@ -50,7 +50,8 @@ def real(
 
     Events are a time to collision below 3, 2 and 1.5 s, and braking harder than 3 m/s², within 1,
     2 and 5 s. Ours learns on the runs of all folds but one, and is judged on that one, or learns on
-    --train and is judged on --data, beside the classic measures. Checksums in MANIFEST.csv or SHA256SUMS are held against the files.
+    --train and is judged on --data, beside the classic measures. Checksums in MANIFEST.csv or
+    SHA256SUMS are held against the files.
     """
     require(scipy="study")
     if not as_json:

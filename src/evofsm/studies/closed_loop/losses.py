@@ -10,16 +10,17 @@ from typing import NamedTuple
 from evofsm.studies.closed_loop.comparison import (
     ROUNDING,
     Line,
-    better_on_both,
     has_third_car,
     ours,
     standing,
-    states_alone,
     table_groups,
 )
 from evofsm.studies.closed_loop.over_seeds import around_shift
 from evofsm.studies.closed_loop.policies import Group
-from evofsm.studies.closed_loop.study import ClosedLoop
+from evofsm.studies.closed_loop.study import SAFE_RATE, ClosedLoop
+
+#: So many episodes after a shift collisions must be as rare as where it is safe.
+RECOVERED_AFTER = 30
 
 
 class What(StrEnum):
@@ -37,7 +38,6 @@ class What(StrEnum):
     SHIFT = "collisions around the shift"  #: rate
     AUROC = "AUROC for the dead end"  #: area, low, high
     BRIER = "Brier score"  #: score
-    STATES = "risk read through states: collisions and mobility, both"  #: rate, mobility
     CASE_COLLIDES = "collision in a case of the paper"  #: the run's end [s]
     CASE_CHANGED = "changes in a case of the paper"  #: share of decisions, of late ones
     WORLDS = "collisions in both worlds"  #: number, episodes
@@ -52,8 +52,8 @@ class Loss(NamedTuple):
     theirs: tuple[float, ...]  #: empty where there are no numbers
     ours: tuple[float, ...]
     apart: bool | None = None  #: whether 95 % intervals do not meet; None where there are none
-    loud: bool = False  #: a baseline that is better on both axes, or a failure
-    about: str | int = ""  #: which seed, test, probability, case or other world
+    loud: bool = False  #: whether it breaks what was asked for
+    about: str | int = ""  #: which test, probability, case or other world
 
 
 def losses(study: ClosedLoop) -> list[Loss]:
@@ -63,7 +63,6 @@ def losses(study: ClosedLoop) -> list[Loss]:
         *_after_a_shift(study),
         *_in_separation(study),
         *_in_calibration(study),
-        *_to_state_rules(study),
         *_in_cases(study),
         *_between_worlds(study),
     ]
@@ -74,8 +73,8 @@ def _in_the_table(study: ClosedLoop) -> Iterator[Loss]:
     if mine is None or worst is None:
         return
     found = standing(study, mine)
-    for line in [*found.better, *(one for one in found.bounds if better_on_both(one, mine))]:
-        yield _on_axes(What.BOTH, line, mine, loud=line.group != Group.BOUND)
+    for line in found.better:
+        yield _on_axes(What.BOTH, line, mine, loud=line.group == Group.FIXED)
     for line in found.rivals:
         if line in found.better:
             continue
@@ -122,21 +121,24 @@ def _of_learning(study: ClosedLoop, mine: Line) -> Iterator[Loss]:
     if mine.train_collisions > 0.0:
         own = (mine.train_collisions, mine.train_episodes)
         yield Loss(What.LEARNING, "", "", (0.0, mine.train_episodes), own)
-    never = sum(
-        row.group == Group.LEARNT
-        and row.train_episodes == mine.train_episodes
-        and row.episodes_until_safe is None
-        for row in study.rows
-    )
-    if never:
+    if never := never_safe(study, mine):
         yield Loss(
             What.BECOMING_SAFE, "", "", (), (never, mine.seeds, mine.train_episodes), loud=True
         )
 
 
+def never_safe(study: ClosedLoop, mine: Line) -> int:
+    """How many learning seeds of all training were never as safe as is asked."""
+    return sum(
+        row.group == Group.LEARNT
+        and row.train_episodes == mine.train_episodes
+        and row.episodes_until_safe is None
+        for row in study.rows
+    )
+
+
 def _after_a_shift(study: ClosedLoop) -> Iterator[Loss]:
     tested = list(around_shift(study))
-    last = tested[-1][0] if tested else 0
     for after, own, theirs in tested:
         if theirs and own.median > theirs.median + ROUNDING:
             yield Loss(
@@ -145,7 +147,7 @@ def _after_a_shift(study: ClosedLoop) -> Iterator[Loss]:
                 "",
                 (theirs.median,),
                 (own.median,),
-                loud=after == last,
+                loud=after >= RECOVERED_AFTER and own.median > SAFE_RATE,
                 about=after,
             )
 
@@ -168,15 +170,6 @@ def _in_calibration(study: ClosedLoop) -> Iterator[Loss]:
     for one in study.reliabilities:
         if one.brier >= one.base_brier:
             yield Loss(What.BRIER, "", "", (one.base_brier,), (one.brier,), about=one.what)
-
-
-def _to_state_rules(study: ClosedLoop) -> Iterator[Loss]:
-    mine = states_alone(study)
-    if mine is None:
-        return
-    for row in mine.better:
-        theirs, own = ((one.collision_rate, one.mobility) for one in (row, mine))
-        yield Loss(What.STATES, row.policy, row.group, theirs, own, about=row.learning_seed or 0)
 
 
 def _in_cases(study: ClosedLoop) -> Iterator[Loss]:

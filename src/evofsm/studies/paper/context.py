@@ -22,17 +22,27 @@ def context_tables(study: PaperStudy) -> tuple[Table, ...]:
     return tuple(tables)
 
 
-def _table_of_forecasts(study: PaperStudy) -> Table:
-    """What simple forecasts reach in the paper's own test."""
+#: Whose forecasts are judged beside the simple ones.
+OURS = "e-FSM"
+
+
+def divergences(study: PaperStudy) -> dict[str, list[NDArray[np.float64]]]:
+    """Of every forecast of the last round [bit], by case: ours, and what simple ones reach."""
     beliefs = np.concatenate([run.belief for run in study.last_round])
     constant = beliefs.mean(axis=0)
     uniform = np.full_like(constant, 1.0 / len(constant))
-    last_round = {
-        "e-FSM": [run.surprise[1:] for run in study.last_round],
+    return {
+        OURS: [run.surprise[1:] for run in study.last_round],
         "persistence": [_divergence(run, run.belief[:-1]) for run in study.last_round],
         "constant": [_divergence(run, constant) for run in study.last_round],
         "uniform": [_divergence(run, uniform) for run in study.last_round],
     }
+
+
+def _table_of_forecasts(study: PaperStudy) -> Table:
+    """What simple forecasts reach in the paper's own test."""
+    beliefs = np.concatenate([run.belief for run in study.last_round])
+    last_round = divergences(study)
     passing = [
         name
         for name, by_case in last_round.items()
@@ -60,7 +70,7 @@ def _table_of_forecasts(study: PaperStudy) -> Table:
         f"{', '.join(passing)}. With {study.settings.scenario.dt:g} s from step to step so "
         "little changes that this test says little about the transitions. Beliefs are wide: the "
         f"most probable state has {beliefs.max(axis=1).mean():.0%} on average, where a blind "
-        f"guess has {uniform[0]:.0%}, so the rows of a matrix come out much alike.",
+        f"guess has {1.0 / beliefs.shape[1]:.0%}, so the rows of a matrix come out much alike.",
     )
 
 
