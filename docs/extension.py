@@ -19,7 +19,6 @@ from docutils.utils.math.latex2mathml import tex2mathml
 from pygments import highlight
 from pygments.formatters import HtmlFormatter
 from pygments.lexers import PythonLexer
-from pygments.lexers.special import TextLexer
 from sphinx import addnodes
 from sphinx.application import Sphinx
 from sphinx.util import logging
@@ -404,7 +403,6 @@ def setup(app: Sphinx) -> dict[str, bool]:
     sources = Sources()
     app.add_html_math_renderer("mathml", (_inline_math, None), (_display_math, None))
     app.add_role("line", Line())
-    app.add_lexer("mermaid", TextLexer)  # drawn where the pages are read on GitHub
     app.connect("source-read", _open_rooms)
     app.connect("doctree-read", _link_files)
     app.connect("doctree-resolved", _link_signatures)

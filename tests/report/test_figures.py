@@ -14,6 +14,7 @@ from evofsm.report.figures import Drawing, paper_figures
 from evofsm.report.of_states import draw_graph, draw_matrices, draw_space
 from evofsm.report.over_time import draw_case, draw_divergence, draw_growth
 from evofsm.report.style import house_style
+from evofsm.risk.dead_end import is_dead_end
 from evofsm.studies.paper import PaperStudy, Settings, run_paper
 from evofsm.worlds.kinematic import KinematicWorld
 
@@ -71,8 +72,10 @@ def test_every_figure_says_what_it_shows(drawings: list[Drawing]) -> None:
         assert drawing.title
         assert drawing.caption.endswith(".")
         assert drawing.alt.endswith(".")
-    assert "collision" in drawings[0].caption
-    assert "collision" not in drawings[1].caption
+    assert "collision (solid" in drawings[0].caption
+    assert "collision (solid" not in drawings[1].caption
+    assert "Tinted: a dead end, by an oracle" in drawings[0].caption
+    assert "Tinted" not in drawings[1].caption
 
 
 def test_the_same_study_gives_the_same_files(
@@ -126,7 +129,7 @@ def test_a_case_shows_its_moments_its_states_and_its_collision(study: PaperStudy
         assert any(text.startswith("leader brakes, ") for text in texts[case])
         assert any(text.startswith("collision, ") for text in texts[case]) == (case in (1, 4))
         assert {f"#{state}" for state in range(1, 8)} <= set(texts[case])
-        assert "dead end" in texts[case]
+        assert "collisions" in texts[case]
         assert all(np.allclose(axes.get_xlim(), (0.0, 35.0)) for axes in figures[case].axes)
 
 
@@ -228,7 +231,25 @@ def test_any_study_can_be_drawn(settings: str, n_states: int | None, tmp_path: P
         for figure in figures:
             figure.savefig(tmp_path / "figure.png", dpi=40)
             assert (tmp_path / "figure.png").stat().st_size > 2_000
-    assert any("dead end" in text for text in _texts(figures[0])) == (study.dead_end >= 0)
+    assert any("collisions" in text for text in _texts(figures[0])) == (study.dead_end >= 0)
+    assert any("dead end: if the leader braked" in text for text in _texts(figures[0])) == (
+        study.settings.scenario.leader.brake_decel > study.settings.decel
+    )
+
+
+def test_a_dead_end_is_tinted_as_long_as_a_brake_could_not_be_survived(study: PaperStudy) -> None:
+    """Not as long as one state is recognised, which would look like a warning withdrawn."""
+    lasted = []
+    for run in study.last_round:
+        axes = draw_case(study, run).axes[0]
+        to_time = axes.transData.inverted()
+        boxes = [patch.get_window_extent() for patch in axes.patches]
+        found = [to_time.transform([(box.x0, 0.0), (box.x1, 0.0)])[:, 0] for box in boxes]
+        times = run.episode.time[is_dead_end(run.episode.observations, 4.0, 9.0)]
+        expected = [[times[0], times[-1]]] if len(times) else []  # one stretch in these cases
+        np.testing.assert_allclose(found, expected, atol=0.05)
+        lasted.append(bool(len(times)))
+    assert lasted == [True, False, True, True]
 
 
 def test_a_model_without_transitions_can_be_drawn(study: PaperStudy) -> None:

@@ -160,6 +160,25 @@ def test_states_and_help_are_shown_and_the_theme_changes(seen):
     shows(page, "about", "case 4")
 
 
+@pytest.mark.parametrize(("width", "height"), [(1280, 720), (1366, 768), (1100, 800)])
+def test_the_longest_story_is_shown_to_its_end(seen, width, height):
+    """No column hides words below its edge, whether the reviser acts or not."""
+    page = seen(width, height, speed=math.inf)
+    shows(page, "headline", "No collision")
+    story = page.locator("#story")
+    hidden = "one => one.scrollHeight - one.clientHeight"
+    assert story.evaluate(hidden) <= 0
+    page.keyboard.press("r")
+    shows(page, "reviser-state", "off")
+    page.keyboard.press("n")
+    shows(page, "headline", "Collision")
+    assert story.evaluate(hidden) <= 0
+    for _ in range(5):
+        page.keyboard.press("Shift+ArrowLeft")
+    shows(page, "headline", "Dead end, if the leader brakes hard now")
+    assert story.evaluate(hidden) <= 0
+
+
 def test_on_a_phone_nothing_is_wider_than_the_screen(seen):
     page = seen(390, 844, speed=math.inf)
     shows(page, "headline", "No collision")

@@ -359,9 +359,7 @@ def test_what_teaches_is_the_other_folder(cases, others, apart):
 
 def test_a_recording_that_is_in_both_folders_is_refused_by_any_name(cases, others):
     renamed = cases[3]._replace(run="other_name")
-    with pytest.raises(
-        ValueError, match=r"made_1, v1-v2 is judged and learnt from \(as other"
-    ):
+    with pytest.raises(ValueError, match=r"made_1, v1-v2 is judged and learnt from \(as other"):
         run_real(cases, TINY, workers=1, training=[*others, renamed])
 
 

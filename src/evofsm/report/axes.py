@@ -732,7 +732,7 @@ def name_states(axis: Axis, n: int, dead_ends: Collection[int], shown: bool = Tr
             label.set_fontweight("bold")
 
 
-def name_rows(axes: Axes, n: int, dead_ends: Collection[int]) -> None:
+def name_rows(axes: Axes, n: int, dead_ends: Collection[int], called: str = "dead end") -> None:
     """Give each state a row, from 1 upward; those of dead ends are tinted, and called so."""
     axes.set_ylim(0.4, n + 0.6)
     if n <= _MOST_TICKS:
@@ -743,7 +743,7 @@ def name_rows(axes: Axes, n: int, dead_ends: Collection[int]) -> None:
         row = state + 1
         axes.axhspan(row - 0.5, row + 0.5, color=DEAD_END, alpha=0.18, linewidth=0.0, zorder=0.5)
         axes.annotate(
-            "dead end",
+            called,
             (1.0, row),
             xycoords=("axes fraction", "data"),
             xytext=(4, 0),

@@ -96,14 +96,14 @@ def detection_chapter(
 def _about(study: Detection) -> str:
     return (
         "Nobody acts here. Each decision of unrevised episodes is a case, and every measure scores "
-        "it from what was seen until then. Two things may come: a dead end (by an oracle: both "
-        "cars brake as hard as they truly can from now on, and still collide), and a collision "
-        f"within {HORIZON:g} s, going on as driven. Ours has watched {study.plan.train} other "
-        "episodes without acting and was told nothing; on dead ends it is nearly perfect because "
-        "the oracle is kinematics with the true brakes, and ours the same kinematics with brakes "
-        "that it learnt: what is shown is that they can be learnt by watching. An alarm holds for "
-        "1 s after it was raised, and is false if the target does not hold within 5 s; thresholds "
-        "are chosen on draws of their own."
+        "it from what was seen until then. Two things may come: a dead end (by an oracle: if "
+        "both cars braked as hard as they truly can from now on, they would collide), and a "
+        f"collision within {HORIZON:g} s, going on as driven. Ours has watched {study.plan.train} "
+        "other episodes without acting and was told nothing; on dead ends it is nearly perfect "
+        "because the oracle is kinematics with the true brakes, and ours the same kinematics with "
+        "brakes that it learnt: what is shown is that they can be learnt by watching. An alarm "
+        "holds for 1 s after it was raised, and is false if the target does not hold within 5 s; "
+        "thresholds are chosen on draws of their own."
     )
 
 

@@ -97,7 +97,8 @@ def _print_dead_ends(out: Console, driving: Driving, learner: Learner) -> None:
     ]
     print_columns(out, _DEAD_END_HEADER, rows)
     out.print(
-        "\nsurvives: the hardest braking of a leader that braking in full now still survives; "
+        "\nDead end: if the leader braked hard now, braking in full would most likely be too late. "
+        "survives: the hardest braking of a leader that braking in full now still survives; "
         "escape margin: how much lower the risk then is than if speed is kept; ended here: "
         "collisions.",
         style="dim",

@@ -13,7 +13,7 @@ from evofsm.studies.paper.claims import LARGEST_DIVERGENCE
 with needs("matplotlib", "plot", "drawing figures"):
     from evofsm.report.drawing import Drawing, Sketch, draw_all
     from evofsm.report.of_states import draw_graph, draw_matrices, draw_space
-    from evofsm.report.over_time import draw_case, draw_divergence, draw_growth
+    from evofsm.report.over_time import draw_case, draw_divergence, draw_growth, in_dead_end
     from evofsm.report.style import label_of
 
 
@@ -59,10 +59,13 @@ def _sketches(study: PaperStudy) -> list[Callable[[], Sketch]]:
 def _sketch_case(study: PaperStudy, run: Run) -> Sketch:
     actions = study.settings.actions
     tint = (
-        f"Tinted: the recognised state is the dead end, {label_of(study.dead_end)}. "
-        if study.dead_end >= 0
+        "Tinted: a dead end, by an oracle who knows how both can brake, as long as it lasts; until "
+        "the leader brakes it can still be left, as in case 3. "
+        if in_dead_end(study, run).any()
         else ""
     )
+    if study.dead_end >= 0:
+        tint += f"{label_of(study.dead_end)} is the state in which collisions happen. "
     return Sketch(
         f"case-{run.case}",
         f"Result of {run.name}",

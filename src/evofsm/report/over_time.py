@@ -10,6 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
+from numpy.typing import NDArray
 
 from evofsm.report.axes import name_rows
 from evofsm.report.style import (
@@ -25,15 +26,16 @@ from evofsm.report.style import (
     dead_ends_of,
     draw_collision,
     draw_state,
-    label_of,
     stretches,
 )
+from evofsm.risk.dead_end import is_dead_end
 from evofsm.studies.paper import CASES, Founding, PaperStudy, Run
 from evofsm.studies.paper.claims import LARGEST_DIVERGENCE
 
 # Height of a line of text [point], and width of a letter [inch].
 _ROW = 10.0
 _LETTER = 0.062
+_VEIL = 0.09
 
 
 class _Moment(NamedTuple):
@@ -74,12 +76,12 @@ def draw_case(study: PaperStudy, run: Run) -> Figure:
     action.set_xlim(0.0, study.settings.scenario.duration)
     moments = _moments(study, run)
     for axes in panels:
-        _shade_dead_end(axes, study, run)
+        _shade(axes, run, in_dead_end(study, run))
         _draw_moments(axes, moments)
     _label_moments(gap, moments)
     figure.align_ylabels(panels)
     figure.text(0.105, 0.985, title_of(study, run), va="top", fontsize=9.0, fontweight="bold")
-    if study.dead_end >= 0:
+    if in_dead_end(study, run).any():
         _explain_shade(figure, study)
     return figure
 
@@ -95,10 +97,13 @@ def title_of(study: PaperStudy, run: Run) -> str:
 
 
 def _explain_shade(figure: Figure, study: PaperStudy) -> None:
-    patch = Patch(facecolor=DEAD_END, alpha=0.18, linewidth=0.0)
-    text = f"recognised as the dead end, {label_of(study.dead_end)}"
+    patch = Patch(facecolor=DEAD_END, alpha=2.0 * _VEIL, linewidth=0.0)
+    text = (
+        f"dead end: if the leader braked now ({study.settings.scenario.leader.brake_decel:g} "
+        f"m/s²),\neven full braking ({study.settings.decel:g} m/s²) would be too late"
+    )
     figure.legend(
-        [patch], [text], loc="upper right", bbox_to_anchor=(0.915, 0.992), handlelength=1.6
+        [patch], [text], loc="upper right", bbox_to_anchor=(0.99, 0.995), handlelength=1.6
     )
 
 
@@ -135,7 +140,7 @@ def _draw_acceleration(axes: Axes, study: PaperStudy, run: Run) -> None:
 
 def _draw_states(axes: Axes, study: PaperStudy, run: Run) -> None:
     axes.step(run.episode.time, run.state + 1, where="post", color=INK)
-    name_rows(axes, study.model.n_states, dead_ends_of(study.dead_end))
+    name_rows(axes, study.model.n_states, dead_ends_of(study.dead_end), called="collisions")
     axes.set_ylabel("recognised\nstate")
 
 
@@ -149,14 +154,20 @@ def _draw_actions(axes: Axes, study: PaperStudy, run: Run) -> None:
     axes.set_ylabel("follower's\naction")
 
 
-def _shade_dead_end(axes: Axes, study: PaperStudy, run: Run) -> None:
-    """Tint the time that a run spends in the dead end."""
-    for first, last in stretches(run.state == study.dead_end):
+def in_dead_end(study: PaperStudy, run: Run) -> NDArray[np.bool_]:
+    """Whether, by the oracle, a full brake of the leader could not be survived, at each row."""
+    leader = study.settings.scenario.leader
+    return is_dead_end(run.episode.observations, study.settings.decel, leader.brake_decel)
+
+
+def _shade(axes: Axes, run: Run, rows: NDArray[np.bool_]) -> None:
+    """Tint the time of some rows of a run."""
+    for first, last in stretches(rows):
         axes.axvspan(
             run.episode.time[first],
             run.episode.time[last],
             color=DEAD_END,
-            alpha=0.09,
+            alpha=_VEIL,
             linewidth=0.0,
             zorder=0.4,
         )

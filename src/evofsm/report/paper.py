@@ -67,11 +67,11 @@ def paper_chapter(
         "by itself: dense observations found states, each new observation is recognised as a "
         "distribution over them, and for every action a matrix of transition probabilities is "
         "learnt, step by step. Among the states there may be a dead end, the one in which "
-        "collisions come: recognised early, it is a warning. This is the car-following experiment "
-        f"of the paper once more, {len(study.runs)} runs of four cases in {world}, with each claim "
-        "of its Section 3 beside what was measured. States are numbered from #1 in the order of "
-        "founding, actions from a(1) by their intervals; a claim is tested on all runs unless it "
-        "says otherwise.",
+        "collisions come if the leader brakes hard: recognised early, it is a warning. This is the "
+        f"car-following experiment of the paper once more, {len(study.runs)} runs of four cases in "
+        f"{world}, with each claim of its Section 3 beside what was measured. States are numbered "
+        "from #1 in the order of founding, actions from a(1) by their intervals; a claim is tested "
+        "on all runs unless it says otherwise.",
         headline=f"{len(claims) - len(failing)} of {len(claims)} claims hold in {world}",
         answer=(f"{study.model.n_states} states were founded in {len(study.runs)} runs.",),
         fails=tuple(_failure(claims[place]) for place in failing),

@@ -1,1 +1,1 @@
-"""How dangerous a situation is: dead ends, and the measures in use today."""
+"""How dangerous a situation is: dead ends if the leader brakes, and measures in use today."""

@@ -70,7 +70,7 @@ class StateRisk(NamedTuple):
     """How dangerous it is to be in a state."""
 
     state: int
-    risk: float  #: latent risk if one brakes in full at once: high in a dead end
+    risk: float  #: latent risk if one brakes in full at once, with the leader: high in a dead end
     margin: float  #: escape margin: how much lower that is than if speed is kept
     critical: float  #: hardest braking of a leader that is then survived [m/s²]
     seconds: float  #: time for which the state was seen [s]
@@ -78,7 +78,7 @@ class StateRisk(NamedTuple):
 
     @property
     def is_dead_end(self) -> bool:
-        """Whether failure is more likely than not, whatever is done."""
+        """Whether a hard brake of the leader now is more likely than not to end in failure."""
         return self.risk > 0.5
 
 

@@ -6,7 +6,8 @@ and too late. What leads to it can be learnt from every ordinary minute: how har
 oneself (`evofsm.risk.brakes`). An action is then *rehearsed* (`evofsm.risk.rehearsal`): it is
 taken, full braking follows, and the leader brakes. The hardest braking of the leader that still
 ends well is the critical deceleration, and the latent risk is the probability that the leader
-brakes harder than that. A situation is a dead end where even braking at once cannot lower it.
+brakes harder than that. A situation is a dead end where, if the leader braked hard now, even
+braking in full at once would be too late; while the leader does not, it can still be left.
 """
 
 from __future__ import annotations
@@ -352,7 +353,7 @@ class LatentRisk:
     def score(
         self, observations: NDArray[np.float64], dt: float = 0.25, tolerance: float = 0.02
     ) -> NDArray[np.float64]:
-        """How surely each row is a dead end, as a `RiskMeasure` [m/s²].
+        """How surely each row is a dead end if the leader brakes now, as a `RiskMeasure` [m/s²].
 
         By how much the hardest braking of a leader that is survived by braking in full now falls
         short of the one that leaders exceed with a probability of ``tolerance``. A dead end is a

@@ -55,7 +55,7 @@ _HEADLINES = {
     "safe": "Safe",
     "danger": "Danger",
     "averted": "Danger, held off",
-    "dead end": "Dead end: too late",
+    "dead end": "Dead end, if the leader brakes hard now",
     "collision": "Collision",
     "ended": "No collision",
 }
@@ -110,7 +110,7 @@ def _when(story: Story, danger: Danger) -> str:
     if not math.isnan(danger.dead_end):
         return (
             f"{text}, in what the driver wanted. From {_seconds(danger.dead_end)} on it was a dead "
-            "end: if the leader braked, even braking in full at once would come too late."
+            "end: if the leader braked hard, even braking in full at once would come too late."
         )
     return f"{text}."
 

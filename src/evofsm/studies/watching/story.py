@@ -10,7 +10,7 @@ if TYPE_CHECKING:
 
 # Danger is over once the driver's wishes were tolerable for so long [s].
 _CALM = 2.0
-# Full braking that is as likely as not to be too late: a dead end.
+# A dead end: if the leader braked hard now, full braking would as likely as not be too late.
 _DEAD_END = 0.5
 # Actions that differ by less are the same, and softer braking is no full brake [m/s²].
 _SAME, _LEADER_BRAKES = 0.05, -2.5
