@@ -118,7 +118,7 @@ def test_all_holds_is_said_on_top_and_a_failing_claim_cannot_be_missed(page, stu
 
 def test_whoever_forecasts_better_is_where_it_loses(page, study):
     lost = list(losses(study))
-    assert lost[0].startswith("persistence is the better forecast")
+    assert lost[0].startswith("Persistence is the better forecast")
     mine = max(run.surprise[1:].max() for run in study.last_round[:1])
     assert f"in case 1 {_still(study.last_round[0]):.1e} against {mine:.1e} bit" in lost[0]
     text = page(study).text

@@ -102,6 +102,13 @@ def _failure(claim: Claim) -> str:
     return f"{claim.claim}: {claim.measured} (paper: {claim.paper})"
 
 
+_IN_WORDS = {
+    "persistence": "Persistence",
+    "constant": "A constant",
+    "uniform": "The uniform distribution",
+}
+
+
 def losses(study: PaperStudy) -> Iterator[str]:
     """Every simple forecast that comes closer than the machine's, with the numbers."""
     found = {
@@ -117,8 +124,8 @@ def losses(study: PaperStudy) -> Iterator[str]:
         if better:
             cases = "; ".join(f"{w} {theirs[w]:.1e} against {mine[w]:.1e} bit" for w in better)
             yield (
-                f"{who} is the better forecast of the next belief (largest divergence in a case "
-                f"of the last round, or mean of all): {cases}."
+                f"{_IN_WORDS.get(who, who)} is the better forecast of the next belief (largest "
+                f"divergence in a case of the last round, or mean of all): {cases}."
             )
 
 
