@@ -10,7 +10,7 @@ from evofsm import EvolvingFSM
 from evofsm.actions import IntervalActions
 from evofsm.drivers.idm import IDM
 from evofsm.framework.loop import Framework, Oversight
-from evofsm.framework.reviser import ActionReviser, AlwaysBrake, Mode, Unrevised
+from evofsm.framework.reviser import ActionReviser, AlwaysBrake, Mode, Unrevised, speaks
 from evofsm.protocols import Proposal
 from evofsm.risk.outcome import LatentRisk
 from evofsm.worlds.kinematic import KinematicWorld
@@ -195,6 +195,87 @@ def test_machine_and_risk_are_told_what_was_executed(learn, monkeypatch):
     assert deaf == []
     assert acted == ([0] * len(told.decisions) if learn else [])
     assert (told.executed == -2.5).all()
+
+
+# -- Shadow mode beside ordinary driving ----------------------------------------------------------
+
+
+def ordinary_driving(seed, minutes=2.0):
+    """A log at 10 Hz: a driver close behind a leader who brakes gently now and then.
+
+    Gap and speeds as recorded, and the driver's own acceleration, which a recorder smooths over
+    the latest second.
+    """
+    rng = np.random.default_rng(seed)
+    rows = round(600 * minutes)
+    braking = rng.uniform(0.0, rows, size=6)
+    leader, speed, gap, log = 15.0, 15.0, 13.0, []
+    for k in range(rows):
+        log.append((gap, speed, leader))
+        brakes = any(start <= k < start + 30 for start in braking)
+        push = -2.0 if brakes else 0.5 * (15.0 - leader)
+        wish = 0.3 * (gap - 4.0 - 0.6 * speed) + 0.8 * (leader - speed)
+        before = leader, speed
+        leader = max(leader + 0.1 * push, 0.0)
+        speed = max(speed + 0.1 * min(max(wish, -3.0), 1.5), 0.0)
+        gap += 0.05 * (leader + before[0] - speed - before[1])
+    seen = np.array(log)
+    did = np.diff(seen[:, 1], append=seen[-1, 1]) / 0.1
+    return seen, np.convolve(did, np.ones(10) / 10.0)[: len(did)]
+
+
+def shadowed(risk, mode=Mode.SHADOW, drives=2):
+    """What a reviser says beside it, of every row."""
+    reviser = ActionReviser(risk, IntervalActions(-8.0, 8.0, 0.5, outside="clip"), mode=mode)
+    said = []
+    for seed in range(drives):
+        oversight = Oversight(reviser.actions, reviser, risk=risk, interval=0.1)
+        for k, (row, did) in enumerate(zip(*ordinary_driving(seed), strict=True)):
+            situation = oversight.recognise(row, 0.1 * k)
+            said.append(oversight.revise(situation, Proposal(float(did))))
+        oversight.end(None, failed=False)
+    return reviser, said
+
+
+def test_ordinary_driving_raises_few_alarms_and_none_that_speaks_of_braking_not_done():
+    told = LatentRisk.told(-8.0, decel=7.0, leader_decel=8.0, dt=0.1)
+    unlearnt = LatentRisk(-8.0, dt=0.1)
+    for risk, least, most in ((told, 0.0, 0.05), (unlearnt, 0.05, 1.0)):
+        reviser, said = shadowed(risk)
+        alarms = [revision for revision in said if speaks(reviser, revision)]
+        assert least * len(said) <= len(alarms) <= most * len(said)
+        assert not [revision.reason for revision in alarms if "in full" in revision.reason]
+    assert unlearnt.brakes.decel == pytest.approx(0.6 * 8.0)  # no harder braking was shown
+
+
+@pytest.mark.parametrize("mode", [Mode.SHADOW, Mode.ADVISE, Mode.OFF])
+def test_brakes_that_were_told_stay_as_told_beside_a_driver(mode):
+    risk = LatentRisk.told(-8.0, decel=7.0, leader_decel=8.0, dt=0.1)
+    shadowed(risk, mode)
+    assert risk.brakes.known
+    assert risk.brakes.decel == pytest.approx(7.0)
+
+
+def test_a_driver_who_brakes_hard_shows_what_the_brakes_can_do(tmp_path):
+    risk = LatentRisk(-8.0, dt=0.1)
+    reviser = ActionReviser(risk, IntervalActions(-8.0, 2.0, 0.5), mode=Mode.SHADOW)
+
+    def braked(*decels):
+        oversight, speed, time = Oversight(reviser.actions, reviser, risk=risk), 25.0, 0.0
+        for decel in np.repeat((0.0, *decels, 0.0), 20):
+            situation = oversight.recognise(np.array([60.0, speed, speed]), time)
+            oversight.revise(situation, Proposal(-decel))
+            speed, time = max(speed - 0.1 * decel, 0.0), time + 0.1
+        oversight.end(None, failed=False)
+        return risk.brakes.decel
+
+    assert braked(3.0) == pytest.approx(4.8)  # what was never shown stays as assumed
+    assert braked(6.0) == pytest.approx(6.0)
+    assert braked(2.0) == pytest.approx(6.0)
+    risk.save(tmp_path / "risk.evofsm")
+    assert LatentRisk.load(tmp_path / "risk.evofsm").brakes.decel == pytest.approx(6.0)
+    reviser.mode = Mode.ACT
+    assert braked(7.0) == pytest.approx(6.0)  # its own braking is told from what it commands
 
 
 # -- Learning, and not learning -----------------------------------------------------------------

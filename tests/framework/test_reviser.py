@@ -206,6 +206,52 @@ def test_a_driver_takes_over_and_hands_back():
     assert reviser.revise(HERE, Proposal(2.0)).executed <= -1.0
 
 
+def not_acting(judge, **others):
+    """Revisers whose decisions are not executed."""
+    for mode in (Mode.SHADOW, Mode.ADVISE):
+        yield ActionReviser(judge, ACTIONS, mode=mode, **others)
+    driven = ActionReviser(judge, ACTIONS, **others)
+    driven.take_over()
+    yield driven
+
+
+def test_where_nothing_is_executed_brakes_are_not_tested():
+    danger = True
+    judge = Told(lambda a: 0.5 if danger and a > -1.0 else 0.0, known=False)
+    for reviser in not_acting(judge):
+        danger = True
+        first = reviser.revise(HERE, Proposal(1.0))
+        assert LOW < first.advised <= -1.0  # the least change, and no test in full
+        assert "in full" not in first.reason
+        assert "1.5 m/s² assumed" in first.reason
+        danger = False
+        again = reviser.revise(HERE, Proposal(1.0))
+        assert again.advised == 1.0
+        assert again.reason == "risk is within the tolerance"
+
+
+def test_a_test_of_the_brakes_ends_where_the_driver_takes_over():
+    danger = True
+    reviser = ActionReviser(
+        Told(lambda a: 0.5 if danger and a > -1.0 else 0.0, known=False), ACTIONS
+    )
+    assert "in full" in reviser.revise(HERE, Proposal(1.0)).reason
+    danger = False
+    reviser.take_over()
+    assert reviser.revise(HERE, Proposal(1.0)).advised == 1.0
+    reviser.hand_back()
+    assert reviser.revise(HERE, Proposal(1.0)).executed == 1.0
+
+
+@pytest.mark.parametrize("wanted", [-0.3, 0.0, 0.02, 1.0])
+def test_where_nothing_is_executed_no_braking_is_asked_of_a_car_that_stands(wanted):
+    standing = Situation(np.array([0.4, 0.02, 0.0]), np.ones(1), 0, 0.0, 0.0)
+    for reviser in not_acting(Told(lambda a: 1.0 if a > -9.0 else 0.0)):
+        assert reviser.revise(standing, Proposal(wanted)).advised >= min(wanted, 0.0)
+        moving = standing._replace(observation=np.array([0.4, 0.5, 0.0]))
+        assert reviser.revise(moving, Proposal(wanted)).advised == LOW
+
+
 # -- Hysteresis ---------------------------------------------------------------------------------
 
 

@@ -208,7 +208,9 @@ class Oversight:
         if situation.intake and situation.intake & STALE:  # it was learnt from before
             return revision
         if self.risk is not None and self.learn:
-            self.risk.learn(situation.observation, executed, situation.belief)
+            watched = isinstance(self.reviser, ActionReviser) and not self.reviser.acts
+            take_in = self.risk.watch if watched else self.risk.learn
+            take_in(situation.observation, executed, situation.belief)
         elif self.risk is not None:
             self.risk.follow(situation.observation, executed)
         return revision

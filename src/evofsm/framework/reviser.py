@@ -26,6 +26,8 @@ from evofsm.validation import positive
 _BRAKE_TEST = 4
 # States that were seen for a shorter time are new [s].
 _NEW = 0.5
+# Slower than this a car stands, though a sensor may show that it moves [m/s].
+_STANDS = 0.1
 #: Executed where a controller has no usable proposal: it brakes gently [m/s²].
 GENTLE_BRAKE = -1.0
 
@@ -84,6 +86,9 @@ class ActionReviser:
     it brakes in full for a second instead, as an RSS envelope around the risk's cautious
     assumptions would, and so learns them. Once it has begun to revise, it keeps on until the
     proposal is safe by a margin, so that it does not chatter.
+
+    Where nothing of what it decides is executed (any mode but `Mode.ACT`, or the driver has taken
+    over), there is no such test of the brakes, and no braking is asked of a car that stands.
 
     Parameters
     ----------
@@ -148,6 +153,11 @@ class ActionReviser:
         """Whether the driver has taken over."""
         return self._overridden
 
+    @property
+    def acts(self) -> bool:
+        """Whether what it decides is executed."""
+        return self.mode is Mode.ACT and not self._overridden
+
     def take_over(self) -> None:
         """The driver overrides: proposals are executed until `hand_back`."""
         self._overridden = True
@@ -170,14 +180,17 @@ class ActionReviser:
         Revision
         """
         wanted, remark = make_usable(proposal, self.actions)
+        if not self.acts:
+            self._brake_test = 0
         if self.mode is Mode.OFF:
             return _unjudged(wanted, proposal, remark or "reviser is off")
         options = self._options(wanted, proposal)
+        if not self.acts and self.way is Way.IMPROVE and situation.observation[1] < _STANDS:
+            options = np.maximum(options, min(wanted, 0.0))  # to stay is enough
         judged = self.risk.judge(situation, options)
         best, reason = self._decide(options, judged)
-        does = self.mode is Mode.ACT and not self._overridden
-        executed = best if does else 0
-        if not does and best != 0:
+        executed = best if self.acts else 0
+        if not self.acts and best != 0:
             who = "driver has taken over" if self._overridden else self.mode.value
             reason = f"{who}: {reason}"
         return Revision(
@@ -217,8 +230,10 @@ class ActionReviser:
             f"(risk {risk:.1%})"
         )
         if not self.risk.brakes.known:
-            self._brake_test = _BRAKE_TEST
-            return int(options.argmin()), f"{why}; own brakes not known yet, so in full"
+            if self.acts:
+                self._brake_test = _BRAKE_TEST
+                return int(options.argmin()), f"{why}; own brakes not known yet, so in full"
+            why = f"{why}; own brakes not known yet, {self.risk.brakes.decel:.1f} m/s² assumed"
         # Once revising, what is safe by the margin; else whatever is tolerable.
         for tolerated in (limit, self.tolerance):
             closest = _closest_within(options, judged.risk, tolerated)

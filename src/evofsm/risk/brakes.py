@@ -148,6 +148,17 @@ class OwnBrakes:
         self.decel = max(counted_on, -_WEAKEST * self.lowest)
         self._likely = mean if self.known else self.decel
 
+    def show(self, decel: float) -> None:
+        """Take in that the car braked so hard [m/s²], whatever was commanded.
+
+        So hard it can brake, which is believed in until full braking is known; that it can brake
+        no harder is not shown by it.
+        """
+        share = min(decel / -self.lowest, 1.0)
+        if share > self.assumed and len(self.samples) < _FEWEST:
+            self.assumed = share
+            self.decel = self._likely = max(share, _WEAKEST) * -self.lowest
+
     def expected(self, before: float, command: float) -> float:
         """Acceleration that a command most likely brings, after the one before it [m/s²]."""
         hardest = -self._likely
@@ -161,7 +172,14 @@ class OwnBrakes:
         self._commands: list[float] = []
         self._was_full = self._was_braking = False
 
-    def see(self, speed: float, command: float, estimate: float | None = None) -> None:
+    def see(
+        self,
+        speed: float,
+        command: float,
+        estimate: float | None = None,
+        *,
+        watched: bool = False,
+    ) -> None:
         """Take in a speed, and what is commanded after it.
 
         Parameters
@@ -173,16 +191,20 @@ class OwnBrakes:
         estimate : float, optional
             The speed as it most likely is [m/s], if it was observed with noise. Commands answer
             to noise, so that the lag must not be told from it.
+        watched : bool
+            Whether someone else drives, whose proposal may be no command to the brakes but what
+            the car does anyway. Then ordinary braking does not show that they weakened.
         """
         asked = max(command, self.lowest)
         # Nothing is learnt from standing still.
         if self._speed is not None and min(speed, self._speed) > _STANDING:
-            self._learn((speed - self._speed) / self.dt, (speed - self._estimate) / self.dt, asked)
+            realised, estimated = (speed - self._speed), (speed - self._estimate)
+            self._learn(realised / self.dt, estimated / self.dt, asked, watched=watched)
         self._speed = speed
         self._estimate = speed if estimate is None else estimate
         self._commands = [*self._commands[-2:], asked]
 
-    def _learn(self, realised: float, estimated: float, now: float) -> None:
+    def _learn(self, realised: float, estimated: float, now: float, *, watched: bool) -> None:
         if self.known and len(self._commands) >= 2:
             last, asked = (max(command, -self._likely) for command in self._commands[-2:])
             products, squares = self.lagged
@@ -191,7 +213,10 @@ class OwnBrakes:
         # However late commands take effect, it was one of the latest three that ruled.
         ruled = max(self._commands) if len(self._commands) == 3 else 0.0
         self._learn_full(max(ruled, now), realised)
-        self._learn_shortfall(ruled, realised)
+        if watched:
+            self._was_braking = False
+        else:
+            self._learn_shortfall(ruled, realised)
 
     def _learn_full(self, ruled: float, realised: float) -> None:
         """Braking in full shows what it brings.

@@ -113,6 +113,8 @@ class LatentRisk:
         self.brakes = OwnBrakes(lowest, own_brakes, dt)
         self.perception = Perception(dt)
         self._watch = BrakeWatch(dt)
+        self._own_watch = BrakeWatch(dt)  # of the car itself, where someone else drives it
+        self._watched = False  # the latest decision
         self._by_state = np.zeros((3, 0))  # onsets of braking, seconds without, all seconds
         self._commands = (0.0, 0.0)  # the latest two
 
@@ -156,6 +158,30 @@ class LatentRisk:
             If one of them does not hold real, finite numbers, or has another shape, or ``belief``
             is no distribution. What was learnt is then as it was.
         """
+        self._learn(observation, acceleration, belief, watched=False)
+
+    def watch(
+        self, observation: ArrayLike, acceleration: float, belief: ArrayLike = (1.0,)
+    ) -> None:
+        """Learn as `learn` does, where someone else drives, as in shadow mode.
+
+        The ``acceleration`` may then be no command but what the car does anyway. Hard braking
+        shows what its brakes can do; ordinary braking does not show what they cannot.
+
+        Examples
+        --------
+        >>> risk = LatentRisk(lowest=-8.0)
+        >>> before = risk.brakes.decel
+        >>> for speed in (20.0, 20.0, 18.5, 17.0, 15.5, 14.0, 14.0, 14.0, 14.0):
+        ...     risk.watch([40.0, speed, speed], -6.0)
+        >>> before, risk.brakes.decel
+        (4.8, 6.0)
+        """
+        self._learn(observation, acceleration, belief, watched=True)
+
+    def _learn(
+        self, observation: ArrayLike, acceleration: float, belief: ArrayLike, *, watched: bool
+    ) -> None:
         seen = _three_finite(observation, whole=False)
         command = _one_finite("acceleration", acceleration)
         states = _series("belief", belief)
@@ -168,12 +194,18 @@ class LatentRisk:
         self._remember(self._follow(seen, command))
         if self._watch.braking and not was_braking:
             self._by_state[0, : len(states)] += states
-        self.brakes.see(seen[1], command, estimate.mean[1])
+        self.brakes.see(seen[1], command, estimate.mean[1], watched=watched)
+        if watched:
+            if not self._watched:
+                self._own_watch.clear()
+            self._show(self._own_watch.see(0.0, seen[1], seen[1], self._of_change(1)))
+        self._watched = watched
 
     def follow(self, observation: ArrayLike, acceleration: float) -> None:
         """Keep up with what happens, as `learn`, without learning from it."""
         command = _one_finite("acceleration", acceleration)
         seen = _three_finite(observation, whole=False)
+        self._watched = False
         self._perceive(seen, learn=False)
         if is_whole(seen):
             self._follow(seen, command)
@@ -184,10 +216,12 @@ class LatentRisk:
 
     def start_episode(self, *, learn: bool = True) -> None:
         """What comes is not a consequence of what was; a manoeuvre under way counts as it is."""
-        ended = self._watch.end()
+        ended, shown = self._watch.end(), self._own_watch.end()
         if learn:
             self._remember(ended)
+            self._show(shown)
         self._watch.clear()
+        self._own_watch.clear()
         self.brakes.clear()
         self.perception.clear()
         self._commands = (0.0, 0.0)
@@ -197,8 +231,11 @@ class LatentRisk:
 
     def _follow(self, seen: Three, acceleration: float) -> float | None:
         self._commands = (self._commands[1], acceleration)
-        of_change = math.sqrt(2.0) * self.perception.noise[2]
-        return self._watch.see(*seen, of_change)
+        return self._watch.see(*seen, self._of_change(2))
+
+    def _of_change(self, variable: int) -> float:
+        """Standard deviation of the noise on a difference of two of its values."""
+        return math.sqrt(2.0) * self.perception.noise[variable]
 
     @property
     def _expected(self) -> float:
@@ -208,6 +245,10 @@ class LatentRisk:
     def _remember(self, decel: float | None) -> None:
         if decel is not None:
             self.manoeuvres.remember(decel)
+
+    def _show(self, decel: float | None) -> None:
+        if decel is not None:
+            self.brakes.show(decel)
 
     def _count(self, belief: NDArray[np.float64], braking: bool) -> None:
         counts, missing = self._by_state, len(belief) - self._by_state.shape[1]
@@ -385,7 +426,7 @@ class LatentRisk:
             "lowest": self.lowest,
             "dt": self.dt,
             "leader_decel": self.leader_decel,
-            "own_brakes": self.own_brakes,
+            "own_brakes": self.brakes.assumed,
             "margin": self.margin,
             "hard": self.hard,
         }
