@@ -10,11 +10,14 @@ weighs 1 / (N + 1), which is also the chance that the next one is harder than al
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Iterable, Sequence
+from itertools import zip_longest
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from evofsm.risk.leaders import LeaderBrakes
 from evofsm.risk.rehearsal import HARDEST
 from evofsm.validation import positive
 
@@ -75,6 +78,30 @@ class Manoeuvres:
             self.decels.extend(hard)
             self._tabulate()
 
+    def begin_with(self, leaders: LeaderBrakes) -> None:
+        """Take in a table of others' manoeuvres as if they had been seen.
+
+        Raises
+        ------
+        ValueError
+            If some that are hard here were not counted there.
+        """
+        if leaders.hard > self.hard:
+            raise ValueError(
+                f"leaders counts from {leaders.hard:g} m/s² on, but hard is {self.hard:g}; a "
+                "table that begins no higher is needed"
+            )
+        self.remember(*leaders.decels)
+        self.gentle += leaders.gentle
+
+    def merge(self, others: Sequence[Manoeuvres]) -> None:
+        """Take in what others saw, who call the same hard; of too many the latest of each."""
+        self.gentle += sum(other.gentle for other in others)
+        every = latest_of_each([*(other.decels for other in others), self.decels])
+        self.decels.clear()
+        self.decels.extend(every)
+        self._tabulate()
+
     def harder(self, decel: ArrayLike) -> NDArray[np.float64]:
         """Probability that the next hard manoeuvre is harder than these decelerations [m/s²]."""
         grid, harder = self.table
@@ -102,6 +129,18 @@ class Manoeuvres:
         harder[grid >= HARDEST] = 0.0
         #: Decelerations [m/s²], and the chance that the next hard manoeuvre is harder.
         self.table: NDArray[np.float64] = np.array([grid, harder / (len(self.decels) + 1)])
+
+
+def latest_of_each(series: Iterable[Iterable[float]]) -> list[float]:
+    """Values of several series, so that the latest of each come last.
+
+    Examples
+    --------
+    >>> latest_of_each([[1.0, 2.0, 3.0], [30.0]])
+    [1.0, 2.0, 30.0, 3.0]
+    """
+    columns = zip_longest(*(reversed(list(values)) for values in series))
+    return [value for column in columns for value in column if value is not None][::-1]
 
 
 class Seen(NamedTuple):

@@ -13,7 +13,7 @@ braking in full at once would be too late; while the leader does not, it can sti
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple, Protocol, Self
 
 import numpy as np
@@ -24,6 +24,7 @@ from evofsm._compile import compiled
 from evofsm.proportions import wilson_interval
 from evofsm.protocols import Situation
 from evofsm.risk.brakes import OwnBrakes, Sample
+from evofsm.risk.leaders import LeaderBrakes
 from evofsm.risk.manoeuvres import BrakeWatch, Manoeuvres
 from evofsm.risk.perception import Estimate, Perception, Three, is_whole
 from evofsm.risk.rehearsal import Body, critical_decelerations
@@ -81,6 +82,9 @@ class LatentRisk:
     hard : float
         Leaders' manoeuvres from which on it learns how hard they brake [m/s²]. Softer ones, of
         which everyday traffic is full, must not water down the hard ones.
+    leaders : LeaderBrakes, optional
+        Leaders' brakes to begin with, as if they had been seen; `leaders.REAL_DRIVES` are those
+        of public drives. Without them it begins with the assumption alone.
 
     Examples
     --------
@@ -100,6 +104,7 @@ class LatentRisk:
         own_brakes: float = 0.6,
         margin: float = 0.5,
         hard: float = 2.5,
+        leaders: LeaderBrakes | None = None,
     ) -> None:
         if not -math.inf < lowest < 0.0:
             raise ValueError(f"lowest is {lowest}; the hardest braking must be negative and finite")
@@ -110,6 +115,8 @@ class LatentRisk:
         self.margin = positive("margin", margin)
         self.hard = positive("hard", hard)
         self.manoeuvres = Manoeuvres(leader_decel, hard)
+        if leaders is not None:
+            self.manoeuvres.begin_with(leaders)
         self.brakes = OwnBrakes(lowest, own_brakes, dt)
         self.perception = Perception(dt)
         self._watch = BrakeWatch(dt)
@@ -119,7 +126,15 @@ class LatentRisk:
         self._commands = (0.0, 0.0)  # the latest two
 
     @classmethod
-    def told(cls, lowest: float, decel: float, leader_decel: float, dt: float = 0.25) -> Self:
+    def told(
+        cls,
+        lowest: float,
+        decel: float,
+        leader_decel: float,
+        dt: float = 0.25,
+        *,
+        leaders: LeaderBrakes | None = None,
+    ) -> Self:
         """Told the limits instead of learning them: the best that could be learnt.
 
         Parameters
@@ -130,8 +145,10 @@ class LatentRisk:
             Hardest braking of the follower and of leaders [m/s²], positive.
         dt : float
             Time between decisions [s].
+        leaders : LeaderBrakes, optional
+            What leaders' brakes are like, so that not each is taken to be the hardest.
         """
-        risk = cls(lowest, dt, leader_decel=leader_decel)
+        risk = cls(lowest, dt, leader_decel=leader_decel, leaders=leaders)
         risk.brakes.trust(positive("decel", decel))
         return risk
 
@@ -257,6 +274,71 @@ class LatentRisk:
         if not _count(counts, belief, self.dt, braking):
             refuse_unless_distribution("belief", belief)
         self._by_state = counts
+
+    # -- Sharing --------------------------------------------------------------------------------
+
+    def merge(
+        self, others: Iterable[LatentRisk], *, same_states: bool = False, brakes: bool = False
+    ) -> None:
+        """Take in what others saw of their leaders, as if it had been seen here.
+
+        They must have learnt apart: what two of them began with in common counts twice, a table of
+        `leaders` too, which only this one may begin with. They stay as they are.
+
+        Parameters
+        ----------
+        others : iterable of LatentRisk
+            Leaders' manoeuvres and the noise of the sensors add up; where there are more than are
+            remembered, the latest of each stay. Where leaders begin to brake adds up if no states
+            are told apart, or if they are the same.
+        same_states : bool
+            Whether all of them learnt by the states of one machine.
+        brakes : bool
+            Whether all of them are cars with the same brakes, so that those add up as well.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If one is no `LatentRisk`, is this one, or was made for another time between decisions,
+            another ``hard`` or, for the brakes, another ``lowest``. Nothing is then changed.
+
+        Examples
+        --------
+        >>> mine, yours = LatentRisk(lowest=-2.5), LatentRisk(lowest=-4.0)
+        >>> mine.manoeuvres.remember(3.0, 4.0)
+        >>> yours.manoeuvres.remember(3.5)
+        >>> mine.merge([yours])
+        >>> sorted(mine.manoeuvres.decels)
+        [3.0, 3.5, 4.0]
+        """
+        given = list(others)
+        alike = ("dt", "hard", "lowest") if brakes else ("dt", "hard")
+        for other in given:
+            self._refuse_unlike(other, alike)
+        every = [*given, self]
+        self.manoeuvres.merge([other.manoeuvres for other in given])
+        self.perception.merge([other.perception for other in given])
+        if same_states or max(one._by_state.shape[1] for one in every) <= 1:
+            states = max(one._by_state.shape[1] for one in every)
+            self._by_state = sum(
+                (
+                    np.pad(one._by_state, ((0, 0), (0, states - one._by_state.shape[1])))
+                    for one in every
+                ),
+                start=np.zeros((3, states)),
+            )
+        if brakes:
+            self.brakes.merge([other.brakes for other in given])
+
+    def _refuse_unlike(self, other: object, alike: Iterable[str]) -> None:
+        if not isinstance(other, LatentRisk):
+            raise TypeError(f"only a LatentRisk can be merged, not {type(other).__name__}")
+        if other is self:
+            raise ValueError("a risk cannot be merged with itself: what it saw would count twice")
+        for name in alike:
+            mine, its = getattr(self, name), getattr(other, name)
+            if mine != its:
+                raise ValueError(f"{name} is {mine:g} here and {its:g} there; it must be the same")
 
     # -- Judging --------------------------------------------------------------------------------
 

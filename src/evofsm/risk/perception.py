@@ -9,7 +9,7 @@ what kinematics leave unexplained; as long as that is nothing, the estimate is t
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from math import isnan, nan, sqrt
 from typing import NamedTuple, TypeAlias, cast
 
@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from evofsm._compile import compiled, kernel
+from evofsm.risk.manoeuvres import latest_of_each
 
 # Gap [m], speed of the follower and of the leader [m/s], or what is said of each of them.
 Three: TypeAlias = tuple[float, float, float]
@@ -187,6 +188,12 @@ class Perception:
     def learnt(self) -> dict[str, NDArray[np.float64]]:
         """The residuals by name, for a file."""
         return dict(zip(_NAMES, self.spreads.sizes(), strict=True))
+
+    def merge(self, others: Sequence[Perception]) -> None:
+        """Take in what others' sensors left unexplained; of too many the latest of each."""
+        every = zip(*(one.spreads.sizes() for one in (*others, self)), strict=True)
+        merged = [np.array(latest_of_each(sizes)) for sizes in every]
+        self.restore(dict(zip(_NAMES, merged, strict=True)))
 
     def restore(self, arrays: dict[str, NDArray[np.float64]]) -> None:
         """Take over what `learnt` answered."""

@@ -6,6 +6,7 @@ from contextlib import suppress
 
 from evofsm.cli.bench.closed_loop import closed_loop
 from evofsm.cli.bench.detection import detection
+from evofsm.cli.bench.leaders import leaders
 from evofsm.cli.bench.prediction import prediction
 from evofsm.cli.bench.real import real
 from evofsm.cli.bench.sensitivity import sensitivity
@@ -29,4 +30,5 @@ def bench() -> typer.Typer:
     app.command(name="prediction")(prediction)
     app.command(name="sensitivity")(sensitivity)
     app.command(name="real")(real)
+    app.command(name="leaders")(leaders)
     return app
