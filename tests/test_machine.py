@@ -521,9 +521,9 @@ def test_update_refuses_what_learn_one_refuses_and_changes_nothing(z, i, error, 
 
 
 def test_a_width_beyond_all_bounds_leaves_no_belief_to_states_that_are_not_there():
-    machine = EvolvingFSM(1, rule=Novelty(radius=1e150))
+    machine = EvolvingFSM(1, rule=Novelty(radius=1e100, spread=1e100))
     assert machine.observe([0.0]).belief.tolist() == [1.0]
-    machine = EvolvingFSM(1, rule=Novelty(radius=1.0, spread=1e300))
+    machine = EvolvingFSM(1, rule=Novelty(radius=1e100))
     assert machine.observe([0.0]).belief.tolist() == [1.0]
 
 

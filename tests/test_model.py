@@ -1,4 +1,5 @@
 import dataclasses
+import math
 
 import numpy as np
 import pytest
@@ -91,8 +92,10 @@ def test_arrays_given_to_a_model_stay_the_givers_own():
         ({"units": ("m", "m", "s")}, "units are .*2 variables"),
         ({"actions": ACTIONS}, "2 intervals for 1 matrices"),
         ({"decisions": np.ones((1, 3))}, r"decisions has shape \(1, 3\), not \(1, 2\)"),
-        ({"failures": np.ones((1, 2))}, "cannot be counts"),
-        ({"endings": np.array([-1.0, 0.0])}, "cannot be counts"),
+        ({"failures": np.ones((1, 2))}, "failures cannot be more than decisions"),
+        ({"endings": np.array([-1.0, 0.0])}, "endings of -1 cannot be right"),
+        ({"width": math.nan}, "width of nan cannot be right"),
+        ({"potentials": np.array([np.nan, 1.0])}, "potentials of nan cannot be right"),
     ],
 )
 def test_parts_that_do_not_fit_each_other_are_refused(change, words):

@@ -6,8 +6,8 @@ import pickle
 import resource
 import signal
 import stat
-import subprocess
 import sys
+import threading
 import tracemalloc
 import warnings
 import zipfile
@@ -24,10 +24,13 @@ from evofsm import (
     IntervalActions,
     Novelty,
     Paper,
+    WhenFull,
     __version__,
+    ranges,
     storage,
 )
 from evofsm.risk.outcome import LatentRisk
+from evofsm.risk.rehearsal import HARDEST
 from evofsm.storage import kind_of
 
 
@@ -38,6 +41,25 @@ def full_model(grown):
         units=("m", "m/s"),
         dt=0.01,
     )
+
+
+@pytest.fixture
+def forged(monkeypatch):
+    """Change arrays (their first number) or settings of a file; its checksum is then right."""
+
+    def forge(path, changes):
+        kind = storage.kind_of(path)
+        content, arrays = storage.read(path, kind)
+        for name, value in changes.items():
+            if name in arrays:
+                arrays[name].flat[0] = value
+            else:
+                content[name] = value
+        with monkeypatch.context() as patched:
+            patched.setattr(ranges, "refuse_others", lambda *_: None)
+            storage.write(path, kind, content, arrays)
+
+    return forge
 
 
 def zip_of(**members):
@@ -333,34 +355,162 @@ def test_saving_replaces_what_was_there(grown, snapshot, tmp_path):
     ("name", "value", "words"),
     [
         ("n_states", 1e6, "n_states is 1e"),
-        ("n_states", -3.0, "n_states is -3"),
+        ("n_states", -3.0, "n_states of -3"),
+        ("n_states", 0.5, "n_states holds a fraction"),
         ("action", 1e9, "action is 1e"),
-        ("action", 0.5, "action is 0.5"),
-        ("belief", np.nan, "belief holds NaN"),
-        ("belief", 2.0, "belief is no distribution"),
+        ("action", 0.5, "action holds a fraction"),
+        ("belief", np.nan, "belief of nan"),
+        ("belief", 0.5, "belief is no distribution"),
         ("matrices", 7.0, "a row of matrices is no distribution"),
-        ("scatter", -1.0, "scatter is too small"),
-        ("decisions", -1.0, "cannot be counts"),
-        ("failures", 1e9, "cannot be counts"),
-        ("endings", -1.0, "cannot be counts"),
+        ("scatter", -1.0, "scatter of -1"),
+        ("centers", 1e308, r"centers of 1e\+308"),
+        ("visits", -1.0, "visits of -1"),
+        ("decisions", -1.0, "decisions of -1"),
+        ("failures", 1e9, "failures cannot be more than decisions"),
+        ("endings", -1.0, "endings of -1"),
     ],
 )
-def test_numbers_that_learning_could_not_have_left_are_refused(grown, tmp_path, name, value, words):
+def test_numbers_that_learning_could_not_have_left_are_refused(
+    grown, forged, tmp_path, name, value, words
+):
     grown.save(tmp_path / "machine")
-    settings, arrays = storage.read(tmp_path / "machine", "machine")
-    arrays[name].flat[0] = value
-    storage.write(tmp_path / "machine", "machine", settings, arrays)
+    forged(tmp_path / "machine", {name: value})
     with pytest.raises(ValueError, match=words):
         EvolvingFSM.load(tmp_path / "machine")
 
 
-def test_a_model_whose_probabilities_are_none_is_refused(grown, tmp_path):
-    grown.model().save(tmp_path / "model")
-    content, arrays = storage.read(tmp_path / "model", "model")
-    arrays["transition_matrices"][0, 0, 0] = np.nan
-    storage.write(tmp_path / "model", "model", content, arrays)
-    with pytest.raises(ValueError, match="transition_matrices holds NaN"):
+@pytest.mark.parametrize(
+    ("name", "value", "words"),
+    [
+        ("transition_matrices", np.nan, "transition_matrices of nan"),
+        ("visits", -1.0, "visits of -1"),
+        ("centers", -1e308, r"centers of -1e\+308"),
+        ("width", np.nan, "width of nan"),
+        ("width", -1.0, "width of -1"),
+        ("dt", 1e308, r"dt of 1e\+308"),
+        ("settings", {"spread": 1e308}, r"settings.spread of 1e\+308"),
+        ("settings", {"failure_horizon": 0.5}, "settings.failure_horizon of 0.5"),
+        ("actions", {"low": -1e308, "high": 0.0, "width": 1e308}, "actions.low of -1e"),
+    ],
+)
+def test_a_model_that_no_learning_could_have_left_is_refused(
+    grown, forged, tmp_path, name, value, words
+):
+    full_model(grown).save(tmp_path / "model")
+    forged(tmp_path / "model", {name: value})
+    with pytest.raises(ValueError, match=words):
         FSMModel.load(tmp_path / "model")
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "words"),
+    [
+        ("radius", 1e308, r"radius of 1e\+308"),
+        ("max_states", 0.5, "max_states of 0.5"),
+        ("learning_rate", 1.0, "learning_rate of 1"),
+        ("spread", "wide", "spread is 'wide'; it must be a number"),
+        ("radius", True, "radius is True; it must be a number"),
+        ("rule", {"name": "novelty", "scales": [1e308, 1.0]}, r"rule.scales of 1e\+308"),
+        (
+            "rule",
+            {"name": "failure", "base": {"name": "novelty", "spread": 1e308}},
+            r"rule.base.spread of 1e\+308",
+        ),
+    ],
+)
+def test_settings_that_no_machine_can_have_are_refused(grown, forged, tmp_path, name, value, words):
+    grown.save(tmp_path / "machine")
+    forged(tmp_path / "machine", {name: value})
+    with pytest.raises(ValueError, match=words):
+        EvolvingFSM.load(tmp_path / "machine")
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "words"),
+    [
+        ("gentle", -5.0, "gentle of -5"),
+        ("gentle", 0.5, "gentle holds a fraction"),
+        ("brakes", 100.0, "brakes of 100"),
+        ("doubts_brought", 100.0, "doubts_brought of 100"),
+        ("decels", 100.0, "decels of 100"),
+        ("decels", np.nan, "decels of nan"),
+        ("stretches", -1.0, "stretches of -1"),
+        ("lowest", 1.0, "lowest of 1"),
+        ("lowest", -1e308, r"lowest of -1e\+308"),
+        ("dt", 0.0, "dt of 0"),
+    ],
+)
+def test_a_risk_that_no_drive_could_have_left_is_refused(forged, tmp_path, name, value, words):
+    risk = LatentRisk(lowest=-2.5)
+    risk.manoeuvres.remember(4.0)
+    for step in range(12):
+        risk.learn([30.0, 30.0 - 0.625 * step, 20.0], -2.5)
+    risk.save(tmp_path / "risk")
+    forged(tmp_path / "risk", {name: value})
+    with pytest.raises(ValueError, match=words):
+        LatentRisk.load(tmp_path / "risk")
+
+
+def test_every_array_of_every_kind_has_its_range():
+    for kind, shapes in storage._SHAPES.items():
+        settings = {"dt": 0.25}
+        for name in shapes or ():
+            with pytest.raises(ValueError, match=f"{name} of nan"):
+                ranges.refuse_others(kind, settings, {name: np.array([np.nan])})
+
+
+def test_the_hardest_braking_is_the_same_for_leaders_and_in_files():
+    assert ranges.hardest_seen(np.inf) == HARDEST
+
+
+@pytest.mark.parametrize("kind", ["machine", "model", "risk"])
+def test_what_could_not_be_read_is_not_written_either(kind, grown, forged, tmp_path):
+    whole = {"machine": grown, "model": grown.model(), "risk": LatentRisk(lowest=-2.5)}[kind]
+    name = "seconds" if kind == "risk" else "visits"
+    whole.save(tmp_path / "kept")
+    content, arrays = storage.read(tmp_path / "kept", kind)
+    before = (tmp_path / "kept").read_bytes()
+    arrays[name] = np.full_like(arrays[name], -1.0)
+    content = {**content, **({"dt": -1.0} if kind == "risk" else {})}
+    with pytest.raises(ValueError, match="of -1"):
+        storage.write(tmp_path / "kept", kind, content, arrays)
+    assert (tmp_path / "kept").read_bytes() == before
+
+
+def test_numbers_of_every_size_are_kept_and_read_again(snapshot, tmp_path):
+    """What can be learnt can be kept: whatever the observations, the rule, and who is given up."""
+    random = np.random.default_rng(0)
+    sizes = (0.0, 5e-324, 1e-200, 1e-9, 1.0, 1e9, 1e100)
+    machines = [
+        EvolvingFSM(2, max_states=3, rule=Novelty(1.0, (1e-20, 1e20))),
+        EvolvingFSM(2, max_states=3, when_full=WhenFull.RETIRE, rule=Novelty(2.0)),
+        EvolvingFSM(2, radius=1e-9, distance_weight=1e50, prior_frequency=1e50),
+        EvolvingFSM(2, radius=1e100, spread=1e100, prior_frequency=1e-300),
+        EvolvingFSM(2, rule=Paper(memory=2), belief_tolerance=1e-3, learning_rate=0.999),
+        EvolvingFSM(2, rule=FailureSplit(Novelty(2.0), distance=1e-3), failure_horizon=2),
+    ]
+    for machine in machines:
+        for _ in range(2):
+            Z = random.choice(sizes, (60, 2)) * random.uniform(-1.0, 1.0, (60, 2))
+            machine.learn_many(Z, random.integers(-1, 2, 60), [7, 31], failures=[6, 59])
+            machine.save(tmp_path / "machine")
+            assert snapshot(EvolvingFSM.load(tmp_path / "machine")) == snapshot(machine)
+            machine.model().save(tmp_path / "model")
+            FSMModel.load(tmp_path / "model")
+
+
+def test_a_risk_that_saw_jumps_and_odd_numbers_is_kept_and_read_again(tmp_path):
+    random = np.random.default_rng(0)
+    odd = (0.0, 1e-9, 1.0, 30.0, 200.0, 1e9, 1e100, np.nan)
+    for dt in (0.01, 0.25, 10.0):
+        risk = LatentRisk(lowest=-2.5, dt=dt)
+        for turn in range(300):
+            risk.learn(random.choice(odd, 3), random.choice([-2.5, 1.0, -1e100, 1e100]))
+            if turn % 100 == 0:
+                risk.start_episode()
+        risk.save(tmp_path / "risk")
+        LatentRisk.load(tmp_path / "risk").save(tmp_path / "again")
+        assert (tmp_path / "again").read_bytes() == (tmp_path / "risk").read_bytes()
 
 
 # -- Files of earlier versions -----------------------------------------------------------------
@@ -700,12 +850,174 @@ def test_an_error_in_saving_names_the_file(grown, full_disk, tmp_path):
     assert raised.value.filename == str(tmp_path / "machine")
 
 
-def test_what_a_killed_process_left_behind_is_swept(tmp_path):
-    ended = subprocess.Popen([sys.executable, "-c", ""])
-    ended.wait()
-    left = tmp_path / f".machine.{ended.pid}.part"
-    others = [tmp_path / f".machine.{os.getpid()}.part", tmp_path / f".other.{ended.pid}.part"]
-    for path in (left, *others):
-        path.touch()
-    storage.sweep(tmp_path / "machine")
-    assert sorted(tmp_path.iterdir()) == sorted(others)
+def test_what_a_killed_process_left_behind_is_swept_and_what_is_being_written_is_not(tmp_path):
+    path = tmp_path / "machine"
+    left = tmp_path / ".machine.0123456789abcdef.part"
+    others = [tmp_path / ".machine.7.part", tmp_path / ".other.0123456789abcdef.part"]
+    for one in (left, *others):
+        one.touch()
+    with storage.replacing(path) as file:
+        written = Path(file.name)
+        storage.sweep(path)
+        assert sorted(tmp_path.iterdir()) == sorted([written, *others])
+        file.write(b"whole")
+    assert sorted(tmp_path.iterdir()) == sorted([path, *others])
+
+
+def test_what_was_swept_before_it_was_locked_is_begun_anew(tmp_path, monkeypatch):
+    fcntl = pytest.importorskip("fcntl")
+    lock, swept = fcntl.flock, []
+
+    def sweep_first(file, how):
+        if how == fcntl.LOCK_EX and not swept:
+            swept.append(file.name)
+            storage.sweep(tmp_path / "machine")
+        lock(file, how)
+
+    monkeypatch.setattr(fcntl, "flock", sweep_first)
+    with storage.replacing(tmp_path / "machine") as file:
+        file.write(b"whole")
+    assert swept
+    assert [path.name for path in tmp_path.iterdir()] == ["machine"]
+
+
+# -- Several writers, and what stands in the way ---------------------------------------------------
+
+
+def test_two_who_write_one_path_do_not_meet(grown, tmp_path):
+    with storage.replacing(tmp_path / "file") as one, storage.replacing(tmp_path / "file") as two:
+        one.write(b"one, which ends last")
+        two.write(b"two")
+    assert [path.read_bytes() for path in tmp_path.iterdir()] == [b"one, which ends last"]
+
+
+def test_threads_that_save_to_one_path_leave_it_whole_at_every_moment(grown, tmp_path):
+    grown.save(tmp_path / "machine")
+    done = []
+
+    def save():
+        for _ in range(15):
+            grown.save(tmp_path / "machine")
+        done.append(True)
+
+    threads = [threading.Thread(target=save) for _ in range(2)]
+    for thread in threads:
+        thread.start()
+    while any(thread.is_alive() for thread in threads):
+        storage.read(tmp_path / "machine", "machine")
+    assert done == [True, True]
+    assert [path.name for path in tmp_path.iterdir()] == ["machine"]
+
+
+@pytest.mark.parametrize("mode", [0o600, 0o640, 0o444])
+def test_a_file_keeps_its_mode(mode, grown, tmp_path):
+    grown.save(tmp_path / "machine")
+    (tmp_path / "machine").chmod(mode)
+    grown.save(tmp_path / "machine")
+    assert stat.S_IMODE((tmp_path / "machine").stat().st_mode) == mode
+
+
+def test_a_new_file_has_the_mode_of_any_other(grown, tmp_path):
+    grown.save(tmp_path / "machine")
+    (tmp_path / "other").touch()
+    assert (tmp_path / "machine").stat().st_mode == (tmp_path / "other").stat().st_mode
+
+
+def test_a_link_stays_and_what_it_leads_to_is_replaced(grown, tmp_path):
+    (tmp_path / "far").mkdir()
+    link, target = tmp_path / "link", tmp_path / "far" / "machine"
+    link.symlink_to(target)
+    for _ in range(2):  # where there is nothing yet, and where there is
+        grown.save(link)
+        assert link.is_symlink()
+        assert not target.is_symlink()
+        assert storage.kind_of(target) == "machine"
+    assert sorted(tmp_path.rglob("*")) == sorted([link, target, target.parent])
+
+
+def test_what_is_no_file_is_left_alone(grown, tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "device").symlink_to("/dev/null")
+    for name in ("pipe", "device"):
+        with pytest.raises(OSError, match=f"{name} is a device, a pipe"):
+            grown.save(tmp_path / name)
+    with pytest.raises(OSError, match="is a folder"):
+        grown.save(tmp_path)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["device", "pipe"]
+    assert stat.S_ISCHR(os.stat("/dev/null").st_mode)
+
+
+def test_what_cannot_be_read_again_takes_no_place(grown, tmp_path, monkeypatch):
+    path = tmp_path / "machine"
+    grown.save(path)
+    before, pack = path.read_bytes(), storage._pack
+
+    def pack_badly(file, members):
+        pack(file, members)
+        file.seek(100)
+        file.write(b"x")
+
+    monkeypatch.setattr(storage, "_pack", pack_badly)
+    with pytest.raises(OSError, match=f"{path} was left as it was"):
+        grown.save(path)
+    assert [one.read_bytes() for one in tmp_path.iterdir()] == [before]
+
+
+# Where it comes as an archive is made or closed, Python says that it could not be closed once more.
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+def test_an_interrupt_anywhere_in_a_save_is_an_interrupt_and_leaves_a_whole_file(tmp_path):
+    machine, path = EvolvingFSM(n_actions=1), tmp_path / "machine"
+    machine.learn_many([[0.0], [2.0]], [0, 0])
+    machine.save(path)
+
+    def stop_at(line):
+        """Save, interrupted at a line; answers whether it came so far."""
+        lines = 0
+
+        def trace(frame, event, _):
+            nonlocal lines
+            if not frame.f_code.co_filename.endswith(("storage.py", "zipfile.py", "__init__.py")):
+                return None
+            lines += event == "line"
+            if lines == line and event == "line":
+                sys.settrace(None)
+                raise KeyboardInterrupt
+            return trace
+
+        before = sys.gettrace()
+        sys.settrace(trace)
+        try:
+            machine.save(path)
+        except KeyboardInterrupt:
+            return True
+        finally:
+            sys.settrace(before)
+        return False
+
+    line = 1
+    while stop_at(line):
+        line += 97
+        assert [one.name for one in tmp_path.iterdir()] == ["machine"]
+        EvolvingFSM.load(path)
+    assert line > 1000
+
+
+def test_a_disk_that_is_full_as_one_interrupts_is_told_as_such(grown, full_disk, tmp_path):
+    fill, free = full_disk
+    try:
+        raise KeyboardInterrupt
+    except KeyboardInterrupt:  # who saves on Ctrl-C
+        fill()
+        try:
+            with pytest.raises(OSError, match="File too large"):
+                grown.save(tmp_path / "machine")
+        finally:
+            free()
+
+
+@pytest.mark.parametrize("provenance", ["drive 7", ["drive 7"], 7])
+def test_a_provenance_that_is_no_mapping_is_named(provenance, grown, tmp_path):
+    for item in (grown, grown.model(), LatentRisk(lowest=-2.5)):
+        with pytest.raises(TypeError, match=r"provenance is .*; it must be a mapping"):
+            item.save(tmp_path / "file", provenance)
+    assert not list(tmp_path.iterdir())

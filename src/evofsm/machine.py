@@ -19,7 +19,7 @@ from typing import Any, Self, SupportsIndex
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from evofsm import storage
+from evofsm import ranges, storage
 from evofsm._compile import LINE, lanes
 from evofsm.actions import IntervalActions
 from evofsm.crowding import WhenFull
@@ -126,10 +126,10 @@ class EvolvingFSM:
     TypeError
         If ``rule`` is no rule (or the class of one).
     ValueError
-        If ``n_actions`` is no whole number of at least 1, another setting is not positive and
-        finite, ``learning_rate`` is 1 or more, ``radius`` or ``spread`` contradicts the rule's,
-        ``belief_tolerance`` is not in its range, or ``failure_horizon`` is no whole number of at
-        least 1.
+        If ``n_actions`` is no whole number of at least 1, another setting is not positive, or
+        beyond what can be computed with (`evofsm.ranges`), ``learning_rate`` is 1 or more,
+        ``radius`` or ``spread`` contradicts the rule's, ``belief_tolerance`` is not in its range,
+        or ``failure_horizon`` is no whole number of at least 1.
 
     Notes
     -----
@@ -191,6 +191,7 @@ class EvolvingFSM:
         if parameters.learning_rate >= 1.0:
             raise ValueError(f"learning_rate is {learning_rate}; it must lie below 1")
         self._use(allocate(0, whole("n_actions", n_actions), LINE, 0, parameters))
+        ranges.refuse_others("machine", self._content)
 
     @classmethod
     def paper(cls) -> Self:
@@ -908,8 +909,7 @@ prior_frequency=0.001, spread=3.0)
         2
         """
         # Without spare room the shapes of the arrays tell the sizes, and nothing else is stored.
-        content = {**self.settings, "rule": describe(self._rule)}
-        storage.write(path, "machine", content, dict(leaves(self._trimmed())), provenance)
+        storage.write(path, "machine", self._content, dict(leaves(self._trimmed())), provenance)
 
     @classmethod
     def load(cls, path: storage.Place) -> Self:
@@ -968,6 +968,11 @@ prior_frequency=0.001, spread=3.0)
         (0, 1)
         """
         return copy.copy(self)
+
+    @property
+    def _content(self) -> dict[str, Any]:
+        """The settings, for JSON."""
+        return {**self.settings, "rule": describe(self._rule)}
 
     # The views belong to one buffer: a copy, or what another process gets, needs its own.
     def __getstate__(self) -> dict[str, Any]:

@@ -19,7 +19,7 @@ from evofsm._compile import LINE, inner_kernel, kernel, lanes, part
 from evofsm.states.clusters import Clusters
 from evofsm.states.rule import RuleSettings
 from evofsm.transitions import NOT_OPEN, Outcomes, Transitions
-from evofsm.validation import refuse_unless_counts, refuse_unless_distribution
+from evofsm.validation import refuse_more_failures, refuse_unless_distribution
 
 NO_ACTION = -1
 
@@ -29,12 +29,6 @@ _COUNTERS, _HEAD = 20, 32
 _PER_STATE, _PER_PLACE, _PER_ACTION, _PER_VARIABLE = 17, 7, 2, 5
 # Where the centre of a state that is not there stands: too far for any belief.
 _NOWHERE = np.inf
-# Outcomes that belong together: cases, failures among them, and another count.
-_COUNTED = (
-    ("decisions", "failures", "endings"),
-    ("episodes", "failed_soon", "latest_visit"),
-    ("tried", "failed_after", "latest_try"),
-)
 
 
 class Parameters(NamedTuple):
@@ -319,30 +313,23 @@ def leaves(learnt: NamedTuple) -> Iterator[tuple[str, NDArray[np.float64]]]:
 
 
 def refuse_impossible(learnt: Learnt) -> None:
-    """Raise where numbers that a file gave could not have come from learning.
+    """Raise where numbers that a file gave contradict each other; `ranges` has what each may be.
 
     Kernels take counts and indices from the buffer on trust.
     """
     n, n_actions = len(learnt.belief), len(learnt.transitions.uses)
-    for name, array in leaves(learnt):
-        if not np.isfinite(array).all():
-            raise ValueError(f"{name} holds NaN or infinity")
     if learnt.n_states[0] != n:
         raise ValueError(f"n_states is {learnt.n_states[0]:g}, but there are {n} states")
     if learnt.action[0] not in range(NO_ACTION, n_actions):
         raise ValueError(f"action is {learnt.action[0]:g}, but there are {n_actions} actions")
     if learnt.state[0] not in range(n):
         raise ValueError(f"state is {learnt.state[0]:g}, but there are {n} states")
-    if learnt.clusters.n_observations[0] < n or learnt.clusters.scatter[0] < 0.0:
-        raise ValueError("n_observations or scatter is too small")
+    if learnt.clusters.n_observations[0] < n:
+        raise ValueError(f"n_observations is too small for {n} states")
     open_ = learnt.transitions.places[learnt.transitions.places != NOT_OPEN]
     if sorted(open_) != list(range(len(learnt.transitions.matrices))):
         raise ValueError("places of matrices are not those that there are")
-    for names in _COUNTED:
-        counts = [getattr(learnt.outcomes, name) for name in names]
-        refuse_unless_counts(f"{names[0]}, {names[1]} or {names[2]}", *counts)
+    refuse_more_failures(learnt.outcomes)
     refuse_unless_distribution("belief", learnt.belief)
     scales = learnt.transitions.scales
-    if (scales <= 0.0).any():
-        raise ValueError("scales of rows are not above 0")
     refuse_unless_distribution("a row of matrices", learnt.transitions.matrices * scales[..., None])

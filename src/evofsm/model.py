@@ -9,7 +9,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from evofsm import storage
+from evofsm import ranges, storage
 from evofsm._compile import kernel
 from evofsm.actions import IntervalActions
 from evofsm.explanation import Explanation, explain
@@ -26,7 +26,7 @@ from evofsm.validation import (
     check_state,
     positive,
     real_array,
-    refuse_unless_counts,
+    refuse_more_failures,
     refuse_unless_distribution,
     refuse_unusable,
 )
@@ -61,8 +61,9 @@ class FSMModel:
     Raises
     ------
     ValueError
-        If an array has not its shape or holds NaN or infinity, a row of a transition matrix is
-        no distribution, counts are below 0 or more decisions failed than were taken,
+        If an array has not its shape, a number is none that learning can leave, such as NaN or
+        a count below 0 (`evofsm.ranges`), a row of a transition matrix is no distribution, more
+        decisions failed than were taken,
         ``actions``, ``names`` or ``units`` are of another number than the arrays say, or ``dt``
         is not positive and finite.
 
@@ -129,17 +130,10 @@ class FSMModel:
                 array = np.zeros(shape)
             if array.shape != shape:
                 raise ValueError(f"{name} has shape {array.shape}, not {shape}")
-            if not np.isfinite(array).all():
-                raise ValueError(f"{name} holds NaN or infinity")
             array.setflags(write=False)
             object.__setattr__(self, name, array)
-        refuse_unless_counts(
-            "decisions, failures or endings", self.decisions, self.failures, self.endings
-        )
-        refuse_unless_counts(
-            "episodes or failed_soon", self.episodes, self.failed_soon, self.joined
-        )
-        refuse_unless_counts("tried or failed_after", self.tried, self.failed_after, self.uses)
+        ranges.refuse_others("model", self._content, {name: getattr(self, name) for name in shapes})
+        refuse_more_failures(self)
         if n:
             refuse_unless_distribution("a row of transition_matrices", self.transition_matrices)
         for name in ("names", "units"):
@@ -327,6 +321,19 @@ class FSMModel:
             belief = self._belief(situation)
         return explain(self, belief, action, self.labels)
 
+    @property
+    def _content(self) -> dict[str, Any]:
+        """All but the arrays, for JSON."""
+        return {
+            "width": self.width,
+            "actions": None if self.actions is None else asdict(self.actions),
+            "names": self.names,
+            "units": self.units,
+            "dt": self.dt,
+            "settings": dict(self.settings),
+            "rule": describe(self.rule),
+        }
+
     def _belief(self, belief: ArrayLike) -> NDArray[np.float64]:
         """Refuse what is no distribution over the states."""
         given = np.asarray(belief, dtype=np.float64)
@@ -442,13 +449,9 @@ class FSMModel:
         ...     FSMModel.load(Path(folder) / "model.evofsm").names
         ('gap',)
         """
-        values = {entry.name: getattr(self, entry.name) for entry in fields(self)}
-        arrays = {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
-        content = {name: value for name, value in values.items() if name not in arrays}
-        content["settings"] = dict(self.settings)
-        content["rule"] = describe(self.rule)
-        content["actions"] = None if self.actions is None else asdict(self.actions)
-        storage.write(path, "model", content, arrays, provenance)
+        names = [entry.name for entry in fields(self) if entry.name not in self._content]
+        arrays = {name: getattr(self, name) for name in names}
+        storage.write(path, "model", self._content, arrays, provenance)
 
     @classmethod
     def load(cls, path: storage.Place) -> Self:

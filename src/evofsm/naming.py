@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from itertools import groupby
 from typing import NamedTuple
@@ -22,8 +23,24 @@ _SPEEDS = ((0.5, "standing"), (8.0, "slow"), (20.0, "at medium speed"))
 _FAST = "fast"
 # Speeds that differ by less are called equal [m/s].
 _EQUAL = 0.5
+# What a terminal obeys, or cannot print: control characters but for tab and newline, ends of lines
+# and directions of Unicode, halves of characters.
+_UNPRINTABLE = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
 # With so many decimals at most two states are told apart by their numbers.
 _MOST_DECIMALS = 3
+
+
+def visible(text: str) -> str:
+    r"""A text, from wherever it came, in which no character tells a terminal what to do.
+
+    Each such one is shown as JSON would write it.
+
+    Examples
+    --------
+    >>> visible("gap \x1b[2J")
+    'gap \\u001b[2J'
+    """
+    return _UNPRINTABLE.sub(lambda found: f"\\u{ord(found[0]):04x}", text)
 
 
 class Labels(NamedTuple):

@@ -20,11 +20,15 @@ import json
 import math
 import os
 import re
+import secrets
+import stat
 import struct
+import time
 import zipfile
 import zlib
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
+from functools import partial
 from io import BufferedIOBase
 from pathlib import Path
 from typing import IO, Any, BinaryIO, NamedTuple, TypeAlias, cast
@@ -33,7 +37,7 @@ import numpy as np
 from numpy.lib.format import write_array
 from numpy.typing import NDArray
 
-from evofsm import __version__
+from evofsm import __version__, ranges
 
 #: A file by its name, or one that is open.
 Place: TypeAlias = str | os.PathLike[str] | BinaryIO
@@ -48,6 +52,8 @@ _LARGEST_HEADER, _MOST_MEMBERS, _LARGEST_DIRECTORY = 1 << 24, 128, 1 << 16
 _DENSEST = 1032
 _AT_ONCE = 1 << 20
 _BEGINNING = b"PK\x03\x04"  # of a ZIP
+# Where nothing can be locked, what is as old as this is no longer written [s].
+_OLD = 86400.0
 # Booleans, bytes, integers and numbers; no objects, which could run.
 _TYPES = ("|b1", "|u1", "<i8", "<f8")
 
@@ -153,7 +159,7 @@ def write(
     arrays: Mapping[str, NDArray[Any]],
     provenance: Mapping[str, Any] | None = None,
 ) -> None:
-    """Write a file whole or not at all: beside its place first, then renamed into it.
+    """Write a file whole or not at all: beside its place first, read again, then renamed into it.
 
     When this returns, file and name are on the disk.
 
@@ -173,9 +179,13 @@ def write(
     ------
     OSError
         If it cannot be written. What was there before is then as it was.
+    TypeError
+        If ``provenance`` is no mapping, or JSON has no words for it.
     ValueError
         If it could not be read again.
     """
+    if not isinstance(provenance, Mapping | None):
+        raise TypeError(f"provenance is {provenance!r}; it must be a mapping of names to values")
     plain = {name: _plain(name, array) for name, array in arrays.items()}
     header = {
         "format": _FORMAT,
@@ -187,16 +197,23 @@ def write(
     }
     header = json.loads(json.dumps(header))  # as it will be read: a tuple is a list there
     _refuse_unfit(kind, header["content"], _VERSION, {n: a.shape for n, a in plain.items()})
+    ranges.refuse_others(kind, header["content"], plain)
     header["sha256"] = _sha256(header, plain)
     encoded = np.frombuffer(json.dumps(header).encode(), np.uint8)
     if encoded.nbytes > _LARGEST_HEADER or sum(a.nbytes for a in plain.values()) > LARGEST:
         raise ValueError(f"{kind} is too large for a file: more than {LARGEST:,} bytes")
     members = {_HEADER: encoded, **plain}
-    if isinstance(place, str | os.PathLike):
-        with replacing(place) as file:
-            _pack(file, members)
-    else:
+    if not isinstance(place, str | os.PathLike):
         _pack(place, members)
+        return
+    with replacing(place) as file:
+        _pack(file, members)
+        try:
+            read(file, kind)
+        except ValueError as error:
+            raise OSError(
+                f"{os.fspath(place)} was left as it was: what was written cannot be read: {error}"
+            ) from error
 
 
 def _plain(name: str, array: NDArray[Any]) -> NDArray[Any]:
@@ -210,7 +227,8 @@ def _plain(name: str, array: NDArray[Any]) -> NDArray[Any]:
 
 def _pack(file: BinaryIO, members: Mapping[str, NDArray[Any]]) -> None:
     # Numbers hardly get smaller by trying harder, and a checkpoint should cost little.
-    with zipfile.ZipFile(file, "w", compresslevel=1) as archive:
+    archive = zipfile.ZipFile(file, "w", compresslevel=1)
+    try:
         for name, array in members.items():
             # A file within a file is packed already.
             within = array.dtype == np.uint8 and array[:4].tobytes() == _BEGINNING
@@ -218,6 +236,9 @@ def _pack(file: BinaryIO, members: Mapping[str, NDArray[Any]]) -> None:
             # By its name, not as a file: those have a date, and the same should give the same.
             with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
                 write_array(member, array, version=(1, 0), allow_pickle=False)
+        archive.close()
+    finally:
+        archive.fp = None  # closing half of one would raise an error in place of an interrupt
 
 
 def only_writer(file: BinaryIO, path: str | os.PathLike[str], otherwise: str) -> None:
@@ -250,28 +271,35 @@ def let_others_write(file: BinaryIO) -> None:
 
 @contextmanager
 def replacing(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
-    """A file that takes its place once it is whole and on the disk.
+    """A file, open for writing and reading, that takes its place once it is whole and on the disk.
+
+    Whoever else writes the same path has a file of its own until then: the last one to end stays. A
+    link is followed, and the mode of a file that was there is kept.
 
     Raises
     ------
     OSError
-        If it cannot be written; it names the file. What was there before is then as it was.
+        If it cannot be written, or something else than a file is there; it names the file. What was
+        there before is then as it was.
     """
-    target = Path(path)
-    if not target.parent.is_dir():
-        raise FileNotFoundError(f"{target}: there is no folder {target.parent}")
-    temporary = target.with_name(f".{target.name}.{os.getpid()}.part")
+    begun: list[Path] = []
     try:
-        with open(temporary, "wb") as file:
+        target, mode = _place_of(path)
+        with _begin(target, mode, begun) as file:
             yield file
             file.flush()
             os.fsync(file.fileno())
-        temporary.replace(target)
+            if mode is not None:
+                os.chmod(begun[-1], mode)
+            if os.name == "nt":  # where an open file cannot be renamed
+                file.close()
+            os.replace(begun[-1], target)
     except BaseException as error:
-        if isinstance(error, OSError):
-            error.filename, error.filename2 = str(target), None
-        with suppress(OSError):
-            temporary.unlink(missing_ok=True)
+        if isinstance(error, OSError) and error.errno is not None:
+            error.filename, error.filename2 = os.fspath(path), None
+        for temporary in begun:
+            with suppress(OSError):
+                temporary.unlink(missing_ok=True)
         raise
     # Not all systems can flush a folder; the file is whole, if not under its name, without it.
     with suppress(OSError):
@@ -282,26 +310,61 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
             os.close(folder)
 
 
+def _place_of(path: str | os.PathLike[str]) -> tuple[Path, int | None]:
+    """Where a file is once links are followed, and its mode; None where there is none yet."""
+    given = Path(path)
+    if not given.parent.is_dir():
+        raise FileNotFoundError(f"{given}: there is no folder {given.parent}")
+    target = Path(os.path.realpath(given))
+    try:
+        mode = os.stat(given).st_mode
+    except FileNotFoundError:
+        return target, None
+    if not stat.S_ISREG(mode):
+        what = "a folder" if stat.S_ISDIR(mode) else "a device, a pipe or a socket"
+        raise OSError(f"{given} is {what}, which no file may take the place of")
+    return target, stat.S_IMODE(mode)
+
+
+def _begin(target: Path, mode: int | None, begun: list[Path]) -> BinaryIO:
+    """Open a file of a random name beside another one, and lock it as long as it is open.
+
+    Its name is added to those ``begun`` first, so that whatever happens it is known.
+    """
+    opener = partial(os.open, mode=0o666 if mode is None else 0o600)
+    while True:
+        begun.append(target.with_name(f".{target.name}.{secrets.token_hex(8)}.part"))
+        file = open(begun[-1], "x+b", opener=opener)  # noqa: SIM115
+        with suppress(ModuleNotFoundError, OSError):  # Windows; places without locks
+            import fcntl
+
+            fcntl.flock(file, fcntl.LOCK_EX)
+        if begun[-1].exists():  # else it was swept before it was locked
+            return file
+        file.close()
+
+
 def sweep(path: str | os.PathLike[str]) -> None:
     """Remove what processes that were killed while they wrote a file have left beside it."""
-    target = Path(path)
-    pattern = re.compile(rf"\.{re.escape(target.name)}\.(\d+)\.part")
+    target = Path(os.path.realpath(path))
+    pattern = re.compile(rf"\.{re.escape(target.name)}\.[0-9a-f]{{16}}\.part")
     for beside in target.parent.iterdir():
-        found = pattern.fullmatch(beside.name)
-        if found and not _is_running(int(found[1])):
-            with suppress(OSError):
-                beside.unlink(missing_ok=True)
+        if pattern.fullmatch(beside.name):
+            with suppress(OSError), open(beside, "r+b") as file:
+                if _is_left(file):
+                    beside.unlink()
 
 
-def _is_running(process: int) -> bool:
-    if os.name == "nt":  # where asking would end it
-        return True
+def _is_left(file: BinaryIO) -> bool:
+    """Whether nobody writes a file any more: it can be locked, or is old where nothing can."""
     try:
-        os.kill(process, 0)
-    except (ProcessLookupError, OverflowError):
+        import fcntl
+
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
         return False
-    except PermissionError:
-        pass
+    except (ModuleNotFoundError, OSError):
+        return time.time() - os.fstat(file.fileno()).st_mtime > _OLD
     return True
 
 
@@ -347,6 +410,7 @@ def read(place: Place, kind: str) -> tuple[dict[str, Any], dict[str, NDArray[Any
             arrays = archive.arrays()
             if header["version"] < _VERSION:
                 _upgrade(header, arrays)
+            ranges.refuse_others(kind, header["content"], arrays)
     return header["content"], arrays
 
 

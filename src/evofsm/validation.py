@@ -11,6 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 # Squares of larger numbers, summed over a long run, would overflow. Kernels hold it as a constant,
 # so that editing this file has to make them anew: `_compile` looks for its name.
 LARGEST_OBSERVATION = 1e100
+# Cases, and failures among them.
+_OUTCOMES = (("decisions", "failures"), ("episodes", "failed_soon"), ("tried", "failed_after"))
 
 
 def positive(name: str, value: SupportsFloat) -> float:
@@ -88,15 +90,11 @@ def refuse_unless_distribution(name: str, rows: NDArray[np.float64]) -> None:
         raise ValueError(f"{name} is no distribution: entries must be 0 or more and sum to 1")
 
 
-def refuse_unless_counts(
-    name: str,
-    cases: NDArray[np.float64],
-    failures: NDArray[np.float64],
-    others: NDArray[np.float64],
-) -> None:
-    """Raise where they cannot be counts, or there are more failures than cases."""
-    if (failures < 0.0).any() or (failures > cases).any() or (others < 0.0).any():
-        raise ValueError(f"{name} cannot be counts")
+def refuse_more_failures(learnt: Any) -> None:
+    """Raise where there are more failures than cases, in what has the outcomes by name."""
+    for cases, failures in _OUTCOMES:
+        if (getattr(learnt, failures) > getattr(learnt, cases)).any():
+            raise ValueError(f"{failures} cannot be more than {cases}")
 
 
 def check_action(i: SupportsIndex, n_actions: int) -> int:

@@ -7,7 +7,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from evofsm.cli.common import plain_errors, print_json
+from evofsm.cli.common import plain_errors, print_json, say
 
 with suppress(ModuleNotFoundError):
     import typer
@@ -53,7 +53,7 @@ def audit(
     if as_json:
         print_json({"file": str(file), **_document(found)})
     else:
-        print(file)
+        say(file)
         _print(found, head_given=head is not None)
     if not found.is_good:
         raise typer.Exit(1)
@@ -151,7 +151,7 @@ def _fill(text: str, first: str = "", others: str = "") -> None:
     from evofsm.report.terminal import console
 
     width = max(console().width, 3 * _LABEL)
-    print(
+    say(
         textwrap.fill(
             text, width, initial_indent=first, subsequent_indent=others, break_on_hyphens=False
         )

@@ -12,6 +12,8 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, ParamSpec
 
+from evofsm.naming import visible
+
 # What folders of results hold, in the order in which it is looked for.
 _MODELS = ("machine.evofsm", "model.evofsm")
 
@@ -86,7 +88,7 @@ def plain_errors(command: Callable[P, None]) -> Callable[P, None]:
         except BrokenPipeError:  # whoever read the output had enough
             raise
         except (ValueError, TypeError, OSError, ModuleNotFoundError) as error:
-            print(f"evofsm: {message(error)}", file=sys.stderr)
+            print(f"evofsm: {visible(message(error))}", file=sys.stderr)
             raise typer.Exit(2) from None
 
     return run
@@ -193,6 +195,11 @@ def counter(bars: Progress, text: str) -> Callable[[int, int], None]:
         print(f"{text} ...", file=sys.stderr)
     task = bars.add_task(text, total=None)
     return lambda done, total: bars.update(task, completed=done, total=total)
+
+
+def say(text: object) -> None:
+    """Print what may hold texts from files."""
+    print(visible(str(text)))
 
 
 def print_json(document: object) -> None:

@@ -7,7 +7,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from evofsm.cli.common import load_model, plain_errors, print_json
+from evofsm.cli.common import load_model, plain_errors, print_json, say
 
 with suppress(ModuleNotFoundError):
     import typer
@@ -67,7 +67,7 @@ def explain(
         print_json({"file": str(file), "situations": [_document(model, each) for each in found]})
         return
     for each in found:
-        print(textwrap.fill(each.text, _WIDTH, subsequent_indent="   "))
+        say(textwrap.fill(each.text, _WIDTH, subsequent_indent="   "))
 
 
 def _index(option: str, number: int | None, count: int) -> int | None:

@@ -8,7 +8,8 @@ from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from evofsm.cli.common import load_model, plain_errors, require
+from evofsm.cli.common import load_model, plain_errors, require, say
+from evofsm.naming import visible
 
 with suppress(ModuleNotFoundError):
     import typer
@@ -18,6 +19,9 @@ if TYPE_CHECKING:
 
 # Beside the machine, in folders of results.
 _RISK = "risk.evofsm"
+# How files of evofsm and logs of runs begin.
+_LEARNT = (b"PK\x03\x04", b"\x89MCAP")
+_LONGEST_MARK = 5
 # Whoever draws a picture wants no more edges than were seen.
 _PICTURE_LEAST, _PICTURE_EVIDENCE = 0.001, 1.0
 
@@ -88,14 +92,25 @@ def export(
         return
     if policy not in ("observed", "marginal"):
         raise ValueError(f"--policy is {policy!r}; it must be observed or marginal")
+    _refuse_learnt(out)
     text = _written(file, to, policy, least, evidence, loops)
     if out is None:
-        sys.stdout.write(text)
+        sys.stdout.write(visible(text))
         return
     from evofsm import storage
 
     with storage.replacing(out) as place:
-        place.write(text.encode())
+        place.write(visible(text).encode())
+
+
+def _refuse_learnt(out: Path | None) -> None:
+    """Raise where a graph would take the place of what cannot be had again."""
+    if out is not None and out.is_file():
+        with out.open("rb") as file:
+            if file.read(_LONGEST_MARK).startswith(_LEARNT):
+                raise ValueError(
+                    f"--out {out}: what was learnt or driven is kept there; it was left alone"
+                )
 
 
 def _written(
@@ -145,4 +160,4 @@ def _export_replay(file: Path, out: Path | None, episode: int) -> None:
     episodes = read_run(file).episodes
     if episode > len(episodes):
         raise ValueError(f"--episode is {episode}; {file} holds {len(episodes)}")
-    print(f"Open it: sumo-gui {write_replay(out, episodes[episode - 1])}")
+    say(f"Open it: sumo-gui {write_replay(out, episodes[episode - 1])}")

@@ -9,12 +9,14 @@ from functools import partial
 from io import TextIOBase
 from itertools import chain, zip_longest
 from textwrap import wrap
-from typing import IO, NamedTuple, cast
+from typing import IO, Any, NamedTuple, cast
 
 from rich.cells import cell_len
 from rich.console import Console
 from rich.padding import Padding
+from rich.text import Text
 
+from evofsm.naming import visible
 from evofsm.studies.table import Table
 
 # Narrower than this, words do not stand beside one another.
@@ -31,7 +33,14 @@ def console() -> Console:
     It is as wide as the terminal or as ``COLUMNS`` says, 80 in a pipe; colours only in a terminal
     and never with ``NO_COLOR``.
     """
-    return Console(file=cast("IO[str]", _Trimmed()), markup=False, highlight=False, emoji=False)
+    return _Console(file=cast("IO[str]", _Trimmed()), markup=False, highlight=False, emoji=False)
+
+
+class _Console(Console):
+    """Obeys what the program says, and nothing that stands in a text from a file."""
+
+    def render_str(self, text: str, **styles: Any) -> Text:  # type: ignore[override]
+        return super().render_str(visible(text), **styles)
 
 
 class _Trimmed(TextIOBase):

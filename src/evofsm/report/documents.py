@@ -6,6 +6,8 @@ import json
 import math
 from typing import Any
 
+from evofsm.naming import visible
+
 
 def to_json(document: Any) -> str:
     """A document as JSON, with null for NaN and the infinite, which JSON does not know.
@@ -18,7 +20,7 @@ def to_json(document: Any) -> str:
       ]
     }
     """
-    return json.dumps(_known(document), allow_nan=False, ensure_ascii=False, indent=2)
+    return visible(json.dumps(_known(document), allow_nan=False, ensure_ascii=False, indent=2))
 
 
 def _known(document: Any) -> Any:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evofsm._compile import compiled, kernel
+from evofsm.ranges import hardest_seen
 
 # Full braking is judged by so many of the latest decisions, and by no fewer than the second number;
 # that it is weaker than before shows in as few, and in no more than the third number.
@@ -111,6 +112,7 @@ class OwnBrakes:
         self.lowest = lowest
         self.assumed = assumed
         self.dt = dt
+        self._most_change = hardest_seen(dt) * dt  # of a speed within a decision [m/s]
         self.samples = Latest(_MEMORY)  #: of full braking
         self._shortfalls = Latest(_SUSPECT)  # of any braking against what was to be expected
         self._brought = Latest(_FEWEST)  # by the latest of it
@@ -206,8 +208,12 @@ class OwnBrakes:
             the car does anyway. Then ordinary braking does not show that they weakened.
         """
         asked = max(command, self.lowest)
-        # Nothing is learnt from standing still.
-        if self._speed is not None and min(speed, self._speed) > _STANDING:
+        # Nothing is learnt from standing still, nor from a sensor's jump.
+        if (
+            self._speed is not None
+            and min(speed, self._speed) > _STANDING
+            and abs(speed - self._speed) <= self._most_change
+        ):
             realised, estimated = (speed - self._speed), (speed - self._estimate)
             self._learn(realised / self.dt, estimated / self.dt, asked, watched=watched)
         self._speed = speed

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple, Protocol, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from evofsm import storage
+from evofsm import ranges, storage
 from evofsm._compile import compiled
 from evofsm.proportions import wilson_interval
 from evofsm.protocols import Situation
@@ -28,7 +28,13 @@ from evofsm.risk.leaders import LeaderBrakes
 from evofsm.risk.manoeuvres import BrakeWatch, Manoeuvres
 from evofsm.risk.perception import Estimate, Perception, Three, is_whole
 from evofsm.risk.rehearsal import Body, critical_decelerations
-from evofsm.validation import positive, real_array, refuse_unless_distribution, refuse_unusable
+from evofsm.validation import (
+    LARGEST_OBSERVATION,
+    positive,
+    real_array,
+    refuse_unless_distribution,
+    refuse_unusable,
+)
 
 # Pseudo-evidence for the pooled rate of manoeuvres, against that of a state [s].
 _POOLED = 20.0
@@ -114,6 +120,7 @@ class LatentRisk:
         self.own_brakes = positive("own_brakes", own_brakes)
         self.margin = positive("margin", margin)
         self.hard = positive("hard", hard)
+        ranges.refuse_others("risk", self._settings)
         self.manoeuvres = Manoeuvres(leader_decel, hard)
         if leaders is not None:
             self.manoeuvres.begin_with(leaders)
@@ -504,14 +511,7 @@ class LatentRisk:
             If the folder does not exist, or the file cannot be written. A file that was there
             before is then as it was.
         """
-        settings = {
-            "lowest": self.lowest,
-            "dt": self.dt,
-            "leader_decel": self.leader_decel,
-            "own_brakes": self.brakes.assumed,
-            "margin": self.margin,
-            "hard": self.hard,
-        }
+        settings = {**self._settings, "own_brakes": self.brakes.assumed}
         storage.write(path, "risk", settings, self._learnt(), provenance)
 
     @classmethod
@@ -539,26 +539,23 @@ class LatentRisk:
         settings, arrays = storage.read(path, "risk")
         with storage.explained(path):
             risk = cls(**settings)
-            for name, array in arrays.items():
-                if array.ndim != 1 or not np.isfinite(array).all():
-                    raise ValueError(f"{name} is no series of finite numbers")
-            by_state = [arrays[name] for name in ("onsets", "exposure", "seconds")]
-            if len({len(array) for array in by_state}) > 1 or np.min(by_state, initial=0.0) < 0.0:
-                raise ValueError("onsets, exposure and seconds are no counts of the same states")
-            if len(arrays["lagged"]) != 2:
-                raise ValueError(f"lagged has {len(arrays['lagged'])} entries, not 2")
             risk.manoeuvres.remember(*arrays["decels"].tolist())
             risk.manoeuvres.gentle = int(arrays["gentle"][0])
             samples = zip(arrays["brakes"].tolist(), arrays["stretches"].tolist(), strict=True)
             risk.brakes.remember(Sample(decel, bool(begins)) for decel, begins in samples)
             risk.perception.restore(arrays)
             risk.brakes.set_lagged(*arrays["lagged"].tolist())
-            risk._by_state = np.array(by_state)
+            risk._by_state = np.array([arrays[name] for name in ("onsets", "exposure", "seconds")])
             for name, latest in risk.brakes.doubts.items():
                 pairs = arrays.get(f"doubts_{name}", np.empty(0)).reshape(-1, 2)  # new in format 4
                 for value, begins in pairs.tolist():
                     latest.add(Sample(value, bool(begins)))
         return risk
+
+    @property
+    def _settings(self) -> dict[str, float]:
+        names = ("lowest", "dt", "leader_decel", "own_brakes", "margin", "hard")
+        return {name: getattr(self, name) for name in names}
 
     def _learnt(self) -> dict[str, NDArray[np.float64]]:
         return {
@@ -591,9 +588,11 @@ def _three_finite(observation: ArrayLike, *, whole: bool = True) -> Three:
 
 
 def _one_finite(name: str, value: float) -> float:
-    if type(value) is float and math.isfinite(value):
+    if type(value) is float and abs(value) <= LARGEST_OBSERVATION:  # false of NaN
         return value
-    return float(_finite(name, [value])[0])
+    given = _series(name, [value])
+    refuse_unusable(name, given)
+    return float(given[0])
 
 
 def _finite(name: str, values: ArrayLike) -> NDArray[np.float64]:
