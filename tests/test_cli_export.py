@@ -9,6 +9,7 @@ pytest.importorskip("mcap")
 
 from typer.testing import CliRunner
 
+from evofsm import EvolvingFSM
 from evofsm.cli import application
 from evofsm.io.mcap import read_run
 
@@ -117,3 +118,24 @@ def test_what_cannot_be_exported_is_refused_in_one_line(driven, arguments, word)
     assert result.exit_code == 2
     assert word in result.stderr
     assert len(result.stderr.splitlines()) == 1
+
+
+def test_no_text_from_a_file_tells_the_terminal_what_to_do(tmp_path):
+    machine = EvolvingFSM(n_actions=1, radius=0.5)
+    machine.learn_many([[0.0], [0.1], [2.0], [1.0]], [0, 0, 0, 0], failures=[3])
+    evil = "\x1b[2Jgap\x9b31m\r\u202e"
+    model = machine.model(names=[evil], units=[evil], dt=0.1)
+    model.save(tmp_path / "model", {evil: evil, "files": [{"name": evil, "bytes": 1}]})
+    (tmp_path / "text").write_text("x")
+    printed = [
+        *(("inspect", tmp_path / "model"), ("inspect", tmp_path / "model", "--json")),
+        *(("explain", tmp_path / "model"), ("explain", tmp_path / "model", "--json")),
+        *(("export", tmp_path / "model", "--to", to) for to in ("dot", "mermaid", "graphml")),
+        ("inspect", tmp_path / evil),
+    ]
+    for arguments in printed:
+        result = evofsm(*arguments)
+        told = result.stdout + result.stderr
+        assert "gap" in told
+        assert not set(told) & set("\x1b\x9b\r\u202e"), arguments
+    assert json.loads(evofsm("inspect", tmp_path / "model", "--json").stdout)["provenance"][evil]

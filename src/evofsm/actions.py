@@ -17,6 +17,8 @@ Outside = Literal["error", "clip"]
 
 # Digits to which an edge is rounded, so that -2.5 + 3 * 0.3 is the edge -1.6.
 _DIGITS = 9
+# More would be a mistake, and take all the memory there is.
+_MOST = 100_000
 
 
 @dataclass(frozen=True)
@@ -39,7 +41,7 @@ class IntervalActions:
     ------
     ValueError
         If a number is not finite, ``low`` is not below ``high``, ``width`` is not positive or so
-        small that edges coincide, or ``closed`` or ``outside`` is none of its words.
+        small that edges coincide or there are more than 100,000, or ``closed`` or ``outside`` is none of its words.
 
     Examples
     --------
@@ -67,6 +69,8 @@ class IntervalActions:
             raise ValueError(f"low is {self.low} and high is {self.high}; low must be below high")
         if not self.width > 0.0:
             raise ValueError(f"width is {self.width}; it must be positive")
+        if not (self.high - self.low) / self.width <= _MOST:
+            raise ValueError(f"width is {self.width}: more than {_MOST:,} intervals; make it wider")
         if self.closed not in ("left", "right"):
             raise ValueError(f"closed is {self.closed!r}; it must be 'left' or 'right'")
         if self.outside not in ("error", "clip"):

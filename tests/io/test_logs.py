@@ -399,6 +399,21 @@ def test_parquet_with_holes_texts_or_half_a_file_is_refused(tmp_path):
     assert "cannot be read as Parquet" in refusal(str(path))
 
 
+@pytest.mark.parametrize(
+    "name", ["~x.parquet", "~/x.parquet", "http://host/x.parquet", "s3://bucket/x", "file://x"]
+)
+def test_a_name_that_looks_like_an_address_is_a_file_like_any_other(name, tmp_path, monkeypatch):
+    polars = pytest.importorskip("polars")
+    monkeypatch.chdir(tmp_path)
+    table = polars.read_csv(write(tmp_path / "a.csv", log(10)))
+    place = tmp_path / name
+    place.parent.mkdir(parents=True, exist_ok=True)
+    with place.open("wb") as file:
+        table.write_parquet(file)
+    (chunk,) = read(name)
+    assert len(chunk.times) == 10
+
+
 def test_parquet_without_polars_names_what_to_install(tmp_path, monkeypatch):
     path = tmp_path / "a.parquet"
     path.write_bytes(b"PAR1" + bytes(100))

@@ -1,5 +1,6 @@
 import json
 import math
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -19,9 +20,9 @@ from evofsm.worlds.scenario import Leader, Scenario
 pytest.importorskip("mcap")
 
 from mcap.reader import make_reader
-from mcap.writer import Writer
+from mcap.writer import CompressionType, Writer
 
-from evofsm.io.mcap import RunWriter, read_run, recording, write_run
+from evofsm.io.mcap import RunWriter, _column, read_run, recording, write_run
 
 ACTIONS = IntervalActions(low=-4.0, high=2.5, width=0.5, outside="clip")
 HASTY = IDM(2.25, 28.0, 0.8, 0.3, 2.0, lowest=-4.0, highest=2.5)
@@ -298,3 +299,33 @@ def test_a_file_that_is_not_there_keeps_its_own_error(tmp_path):
         read_run(tmp_path / "none.mcap")
     with pytest.raises(FileNotFoundError, match="there is no folder"):
         write_run(tmp_path / "no" / "run.mcap", [])
+
+
+@pytest.mark.parametrize("packing", [CompressionType.ZSTD, CompressionType.LZ4])
+@pytest.mark.parametrize(("chunks", "size"), [(1, 1 << 28), (40, 1 << 23)])
+def test_a_small_log_that_unpacks_to_hundreds_of_megabytes_is_refused(
+    packing, chunks, size, tmp_path
+):
+    path = tmp_path / "bomb.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file, chunk_size=size // 2, compression=packing)
+        writer.start()
+        channel = writer.register_channel("/other", "json", writer.register_schema("x", "", b""))
+        for number in range(chunks):
+            writer.add_message(channel, number, bytes(size), number)
+        writer.finish()
+    small = path.stat().st_size
+    tracemalloc.start()
+    try:
+        with pytest.raises(ValueError, match=r"bomb\.mcap.*unpacks to more than was ever packed"):
+            read_run(path)
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert peak < (96 << 20) + 8 * small
+
+
+def test_beliefs_that_are_far_too_many_are_refused():
+    rows = [{"belief": [0.0] * 20_000}, *({"belief": []} for _ in range(10_000))]
+    with pytest.raises(ValueError, match="10,001 beliefs in 20,000 states"):
+        _column("belief", rows)

@@ -462,6 +462,12 @@ duration = 5.0
         ("[follower]", "[follower]\nlapses = 3", r"follower\.lapses is 3; it must be a table"),
         ("[values]", "[values]\none_of = 3.0", "the name of a relation"),
         ("about", "= about", "is not TOML"),
+        ("about", "deep = " + 10_000 * "[" + "\nabout", "is not TOML"),
+        ("about", "long = " + 10_000 * "1" + "\nabout", "is not TOML"),
+        ("about", "#" + (1 << 20) * "x" + "\nabout", "more than 1,048,576 bytes"),
+        ("interval = 0.5", f"interval = {10**400}", "interval is 10.* it must be one number"),
+        ("[10.0, 20.0]", "{ one_of = [{ of = 'speed' }] }", "a value stands by itself"),
+        ("width = 0.5", "width = 1e-11", "more than 100,000 intervals"),
     ],
 )
 def test_a_file_with_a_mistake_is_refused_by_file_and_key(own, before, after, message):
@@ -483,6 +489,20 @@ def test_a_follower_that_brakes_harder_than_the_limits_say_is_refused(own):
         ("[variant]\nname = 'one'", "variant is .* it must be a table"),
         ("[shift]\nactions.low = -1.0", r"no 'shift\.actions'"),
         ("[shift.body]\nlowest = 3.0\nhighest = 2.0", "body: body's bounds"),
+        ("[[variant]]\n" * 10_001, "more than 10,000 variants"),
+        ("[[variant]]\nscenario.duration = 1e12", "no more than 2,000,000 steps"),
+        ("[[variant]]\nscenario.dt = 1e-300", "no more than 2,000,000 steps"),
+        ("[[variant]]\nbody.delay = 1e12", "body's delay is .* no more than 2,000,000"),
+        ("[[variant]]\nsensors.delay = 1e12", "sensors' delay is .* no more than 2,000,000"),
+        (
+            "[leader.traffic]\nfast = 9\nslow = 8\naccel = 1e99\ndecel = 1e99\n"
+            "cruise = 1e-9\npause = 1e-9",
+            "leader.traffic has more than 10,000 waves",
+        ),
+        (
+            "[follower.lapses]\ncount = 1e12\ndriver = 'me'\nstart = 1.0\nduration = 1.0",
+            "whole numbers up to 10,000",
+        ),
         ("[follower.lapses]\ncount = 1.5\ndriver = 'me'\nstart = 1.0", "it must be whole numbers"),
         ("[follower.lapses]\ncount = 1\ndriver = 'me'\nduration = 1.0", "lapses.start is missing"),
     ],

@@ -17,7 +17,7 @@ import math
 import os
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -33,9 +33,11 @@ from evofsm.risk.headway import time_headway
 from evofsm.risk.ttc import time_to_collision
 
 with needs("mcap", "mcap", "reading and writing MCAP"):
-    from mcap.records import Attachment, Channel, Message, Metadata
-    from mcap.stream_reader import StreamReader
+    from lz4.frame import LZ4FrameDecompressor
+    from mcap.records import Attachment, Channel, Chunk, McapRecord, Message, Metadata
+    from mcap.stream_reader import StreamReader, breakup_chunk
     from mcap.writer import Writer
+    from zstandard import ZstdDecompressor
 
 #: The attachment that holds the model, and the record that says what was driven.
 MODEL, METADATA = "model.evofsm", "evofsm"
@@ -47,6 +49,9 @@ _INFO, _WARNING, _ERROR = 2, 3, 4
 _SAME = 1e-9
 # Where there is no state.
 _NONE = -1
+# No chunk is larger than this, unpacked, nor all of them together than so many times the file and
+# one chunk more [bytes]; and no episode's beliefs are more numbers than the last.
+_LARGEST_CHUNK, _DENSEST, _MOST_BELIEFS = 1 << 24, 1000, 1 << 27
 
 
 def _of(kind: str, description: str) -> dict[str, Any]:
@@ -429,16 +434,45 @@ def read_run(path: str | os.PathLike[str]) -> Run:
     with open(path, "rb") as file, _explained(path):
         size = file.seek(0, os.SEEK_END)
         file.seek(0)
-        return _read(StreamReader(file, validate_crcs=True, record_size_limit=size))
+        reader = StreamReader(file, emit_chunks=True, validate_crcs=True, record_size_limit=size)
+        return _read(_unpacked(reader, size))
 
 
-def _read(reader: StreamReader) -> Run:
+def _unpacked(reader: StreamReader, size: int) -> Iterator[McapRecord]:
+    """All records, those in chunks among them, of a file of so many bytes."""
+    room = _DENSEST * size + _LARGEST_CHUNK
+    for record in reader.records:
+        if not isinstance(record, Chunk):
+            yield record
+            continue
+        data = _unpacked_chunk(record)
+        room -= len(data)
+        if len(data) > _LARGEST_CHUNK or room < 0:
+            raise ValueError(f"it unpacks to more than was ever packed in {size:,} bytes")
+        yield from breakup_chunk(replace(record, compression="", data=data), validate_crc=True)
+
+
+def _unpacked_chunk(chunk: Chunk) -> bytes:
+    """What is in a chunk, or at least the beginning of what is too large."""
+    most = _LARGEST_CHUNK + 1
+    if chunk.compression == "zstd":
+        unpacker = ZstdDecompressor(max_window_size=_LARGEST_CHUNK)
+        with unpacker.stream_reader(chunk.data) as stream:
+            return bytes(stream.read(most))
+    if chunk.compression == "lz4":
+        return bytes(LZ4FrameDecompressor().decompress(chunk.data, max_length=most))
+    if chunk.compression:
+        raise ValueError(f"its chunks are packed as {chunk.compression!r}, which is not known")
+    return chunk.data
+
+
+def _read(records: Iterable[McapRecord]) -> Run:
     """The run, in one pass over all records."""
     about: dict[str, str] | None = None
     model: FSMModel | None = None
     topics: dict[int, str] = {}
     episodes = _Episodes()
-    for record in reader.records:
+    for record in records:
         if isinstance(record, Metadata) and record.name == METADATA:
             about = dict(record.metadata)
             _refuse_other_formats(about)
@@ -524,7 +558,10 @@ def _column(name: str, messages: list[dict[str, Any]]) -> NDArray[Any]:
     """A field of all messages, in their order."""
     if name == "belief":
         rows = [message[name] for message in messages]
-        beliefs = np.zeros((len(rows), max(map(len, rows), default=0)))
+        longest = max(map(len, rows), default=0)
+        if len(rows) * longest > _MOST_BELIEFS:
+            raise ValueError(f"an episode of {len(rows):,} beliefs in {longest:,} states")
+        beliefs = np.zeros((len(rows), longest))
         for row, belief in zip(beliefs, rows, strict=True):
             row[: len(belief)] = belief
         return beliefs

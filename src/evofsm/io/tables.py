@@ -156,7 +156,8 @@ class ParquetTable:
         self.path = path
         self._on_read = on_read
         try:
-            self._scan = polars.scan_parquet(path, glob=False)
+            # polars takes other paths for addresses on the network, or of somebody's home.
+            self._scan = polars.scan_parquet(os.path.abspath(path), glob=False)
             self._types = self._scan.collect_schema()
             self._rows = int(self._scan.select(polars.len()).collect().item())
         # A panic is what polars makes of some damaged files; it is no Exception.

@@ -29,7 +29,8 @@ def write_data(
         import polars
     runs = [*study.runs, *study.extra_runs]
     frames = (polars.DataFrame(_columns(number, run)) for number, run in enumerate(runs, 1))
-    polars.concat(frames).write_parquet(folder / "traces.parquet")
+    # polars takes other paths for addresses on the network, or of somebody's home.
+    polars.concat(frames).write_parquet(folder.absolute() / "traces.parquet")
 
 
 def _columns(number: int, run: Run) -> dict[str, Any]:

@@ -15,7 +15,15 @@ from evofsm.actions import IntervalActions
 from evofsm.drivers.idm import IDM, ChangingIDM
 from evofsm.naming import UNITS, VARIABLES, Labels
 from evofsm.worlds.families.numbers import Numbers
-from evofsm.worlds.families.tables import LAYOUT, NEEDED, SWITCH_LAYOUT, Table, merge, parse
+from evofsm.worlds.families.tables import (
+    LAYOUT,
+    LONGEST,
+    NEEDED,
+    SWITCH_LAYOUT,
+    Table,
+    merge,
+    parse,
+)
 from evofsm.worlds.scenario import Behind, Body, CutIn, Leader, Scenario, Sensors
 
 #: The families that come with the package.
@@ -30,6 +38,8 @@ _SWITCHES = parse(
 #: What can be switched on in any family.
 SWITCHES = tuple(_SWITCHES)
 
+# More variants, lapses or waves of traffic are a mistake, and would never end.
+_MOST = 10_000
 # Numbers that are equal but for rounding.
 _ROUNDING = 1e-9
 
@@ -267,7 +277,8 @@ def load_family(name: str | PathLike[str]) -> Family:
                 f"there is no family {source!r}; there are {', '.join(FAMILIES)}, or name a TOML "
                 "file that exists"
             )
-        text = path.read_bytes()
+        with path.open("rb") as file:
+            text = file.read(LONGEST + 1)
     tables = parse(text, source, LAYOUT)
     for needed in NEEDED:
         if needed not in tables:
@@ -284,6 +295,8 @@ def _try_out(family: Family) -> None:
             raise ValueError(f"{family.source}: limits.{limit} is missing, or not positive")
     if not family.interval > 0.0:
         raise ValueError(f"{family.source}: interval is {family.interval}; it must be positive")
+    if len(family.variants) > _MOST:
+        raise ValueError(f"{family.source}: more than {_MOST:,} variants")
     variants = range(len(family.variants)) if family.variants else [None]
     for one, variant in itertools.product((family, family.shifted), variants):
         if one is not None:
@@ -367,13 +380,17 @@ class _Builder:
                 time, speed = time + hold, wanted
             if time >= duration:
                 break
+            if k == _MOST:
+                raise ValueError(f"leader.traffic has more than {_MOST:,} waves in {duration:g} s")
         return tuple(waves)
 
     def _lapses(self, table: Table) -> list[tuple[float, float]]:
         """Begin and end of each lapse, in order; those that meet are one."""
         count = self._one("follower.lapses.count")
-        if count != round(count) or count < 0:
-            raise ValueError(f"follower.lapses.count is {count:g}; it must be whole numbers")
+        if not 0 <= count <= _MOST or count != round(count):
+            raise ValueError(
+                f"follower.lapses.count is {count:g}; it must be whole numbers up to {_MOST:,}"
+            )
         for name in ("start", "duration"):
             if name not in table:
                 raise ValueError(f"follower.lapses.{name} is missing")

@@ -13,6 +13,8 @@ import numpy as np
 #: Where draws come from. What is learnt on one is scored on the other; they never meet.
 SPLITS = ("train", "test")
 
+# Larger numbers are a mistake, or infinite.
+_LARGEST = 1e100
 _WANTED = "a number, a range [low, high], { one_of = [...] }, or { of = 'name of a value' }"
 
 
@@ -36,8 +38,11 @@ def check_number(value: Any, where: str) -> None:
 def check_unrelated(value: Any, where: str) -> None:
     """As `check_number`, for the values that others relate to."""
     check_number(value, where)
-    if isinstance(value, dict) and "of" in value:
-        raise ValueError(f"{where} is {value}; a value stands by itself, without 'of'")
+    if isinstance(value, dict):
+        if "of" in value:
+            raise ValueError(f"{where} is {value}; a value stands by itself, without 'of'")
+        for choice in value["one_of"]:
+            check_unrelated(choice, where)
 
 
 def check_fixed(value: Any, where: str) -> None:
@@ -47,9 +52,9 @@ def check_fixed(value: Any, where: str) -> None:
 
 
 def is_number(value: Any) -> bool:
-    """Whether it is a number, which NaN and a boolean are not."""
+    """Whether it is a number, which NaN, a boolean and what no float can hold are not."""
     real = isinstance(value, (int, float)) and not isinstance(value, bool)
-    return real and not math.isnan(value)
+    return real and (abs(value) <= _LARGEST or abs(value) == math.inf)
 
 
 def is_relation_or_choice(value: Mapping[str, Any]) -> bool:

@@ -49,6 +49,8 @@ def _check_pairs(second: Check) -> Check:
     return check
 
 
+#: No family needs a longer file [bytes].
+LONGEST = 1 << 20
 _ANY = "*"  # stands for names that the file chooses
 
 #: What may be put over another table: by a variant, a shift, a switch.
@@ -98,9 +100,11 @@ SWITCH_LAYOUT: Table = {_ANY: CHANGES}
 
 def parse(text: bytes, source: str, layout: Table) -> Table:
     """Read a file's text, and refuse what the layout does not know."""
+    if len(text) > LONGEST:
+        raise ValueError(f"{source} has more than {LONGEST:,} bytes; this is no family")
     try:
         tables = tomllib.loads(text.decode("utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except (ValueError, RecursionError) as error:  # TOMLDecodeError and others are ValueErrors
         raise ValueError(f"{source} is not TOML: {error}") from error
     _check(tables, layout, source, "")
     return tables
