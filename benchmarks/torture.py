@@ -15,11 +15,13 @@ import resource
 import signal
 import sys
 import tempfile
+import threading
 import time
 import tracemalloc
 import zipfile
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -41,6 +43,7 @@ from evofsm.worlds.kinematic import KinematicWorld
 #: What must not happen, in the order in which it is printed.
 WRONG = (
     "broken files",
+    "refused loads",
     "results that differ",
     "loaded silently",
     "crashes",
@@ -199,6 +202,69 @@ def fill(work: Work, times: int, folder: Path, random: np.random.Generator) -> C
             found["left behind"] += len(list(Path(name).glob(".*.part")))
         found["full disks"] += 1
     return found
+
+
+# -- Several that write the same file ------------------------------------------------------------
+
+
+def share(apart: bool, times: int, folder: Path, random: np.random.Generator) -> Counter[str]:
+    """Load a file again and again that two threads, or two processes apart, save all the while."""
+    found: Counter[str] = Counter()
+    machines = []
+    for rows in (60, 600):  # of two sizes
+        machine = EvolvingFSM(3, radius=0.5)
+        machine.learn_many(random.normal(size=(rows, 2)).cumsum(axis=0), np.arange(rows) % 3)
+        machines.append(machine)
+    with tempfile.TemporaryDirectory(dir=folder) as name:
+        path, done = Path(name) / "machine", threading.Event()
+        machines[0].save(path)
+        kind = _Child if apart else _Thread
+        writers = [kind(partial(_save_until, done, machine, path)) for machine in machines]
+        while found["loads"] < times:
+            found["loads"] += 1
+            try:
+                storage.read(path, "machine")
+            except (OSError, ValueError):
+                found["refused loads"] += 1
+        done.set()
+        found["crashes"] += sum(writer.has_crashed() for writer in writers)
+        storage.sweep(path)
+        found["left behind"] += len(list(Path(name).glob(".*.part")))
+    return found
+
+
+def _save_until(done: threading.Event, machine: EvolvingFSM, path: Path) -> None:
+    while not done.is_set():
+        machine.save(path)
+
+
+class _Thread:
+    """Works beside all others until it is told to end."""
+
+    def __init__(self, work: Callable[[], None]) -> None:
+        self._pool = ThreadPoolExecutor(1)
+        self._work = self._pool.submit(work)
+
+    def has_crashed(self) -> bool:
+        """Whether it ended in an error."""
+        return self._work.exception() is not None
+
+
+class _Child:
+    """Another process, which works until it is killed."""
+
+    def __init__(self, work: Callable[[], None]) -> None:
+        self._number = os.fork()
+        if self._number == 0:
+            try:
+                work()
+            finally:
+                os._exit(_CRASHED)
+
+    def has_crashed(self) -> bool:
+        """Whether it ended before it was killed."""
+        os.kill(self._number, signal.SIGKILL)
+        return os.WIFEXITED(os.waitpid(self._number, 0)[1])
 
 
 # -- Files that are damaged -----------------------------------------------------------------------
@@ -430,10 +496,10 @@ def _peak() -> int:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Answers 1 where anything was wrong."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--short", action="store_true", help="20 kills, 4 full disks, 200 files")
+    parser.add_argument("--short", action="store_true", help="20 kills, 4 full disks, 300 files")
     parser.add_argument("--seed", type=int, default=0)
     asked = parser.parse_args(arguments)
-    kills, disks, files = (20, 4, 200) if asked.short else (500, 100, 10_000)
+    kills, disks, loads, files = (20, 4, 100, 200) if asked.short else (500, 100, 5000, 10_000)
     reading = 1.0 if asked.short else 20.0  # [s]
     random = np.random.default_rng(asked.seed)
     total: Counter[str] = Counter()
@@ -447,6 +513,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             ("killed while driving", partial(kill, drive, kills // 4)),
             ("disk full while learning", partial(fill, learn, disks * 3 // 4)),
             ("disk full while driving", partial(fill, drive, disks // 4)),
+            ("two threads on one file", partial(share, False, loads)),
+            ("two processes on one file", partial(share, True, loads)),
             ("damaged files", partial(damage, files)),
             ("logs interrupted", partial(torture_audit.interrupt, every=30 if asked.short else 1)),
             ("logs forged", torture_audit.forge),

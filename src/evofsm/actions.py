@@ -41,7 +41,8 @@ class IntervalActions:
     ------
     ValueError
         If a number is not finite, ``low`` is not below ``high``, ``width`` is not positive or so
-        small that edges coincide or there are more than 100,000, or ``closed`` or ``outside`` is none of its words.
+        small that edges coincide or there are more than 100,000, or ``closed`` or ``outside`` is
+        none of its words.
 
     Examples
     --------

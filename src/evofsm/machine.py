@@ -127,7 +127,7 @@ class EvolvingFSM:
         If ``rule`` is no rule (or the class of one).
     ValueError
         If ``n_actions`` is no whole number of at least 1, another setting is not positive, or
-        beyond what can be computed with (`evofsm.ranges`), ``learning_rate`` is 1 or more,
+        beyond what can be computed with (``evofsm.ranges``), ``learning_rate`` is 1 or more,
         ``radius`` or ``spread`` contradicts the rule's, ``belief_tolerance`` is not in its range,
         or ``failure_horizon`` is no whole number of at least 1.
 

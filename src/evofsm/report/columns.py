@@ -39,7 +39,7 @@ def console() -> Console:
 class _Console(Console):
     """Obeys what the program says, and nothing that stands in a text from a file."""
 
-    def render_str(self, text: str, **styles: Any) -> Text:  # type: ignore[override]
+    def render_str(self, text: str, **styles: Any) -> Text:
         return super().render_str(visible(text), **styles)
 
 
