@@ -8,6 +8,7 @@ pytest.importorskip("typer")
 
 from typer.testing import CliRunner
 
+from evofsm import EvolvingFSM
 from evofsm.cli import application
 from evofsm.framework.reviser import Unrevised
 from evofsm.studies.closed_loop import Learner
@@ -67,3 +68,17 @@ def test_what_is_not_there_is_refused_in_one_line(saved, arguments, says):
     assert answer.exit_code == 2
     assert says in answer.stderr
     assert len(answer.stderr.splitlines()) == 1
+
+
+def test_a_far_observation_is_never_seen_and_silence_about_failures_is_said(tmp_path):
+    machine = EvolvingFSM(1)
+    machine.learn_many([[0.0], [5.0]] * 20, [0] * 40, range(0, 40, 2))
+    machine.save(tmp_path / "machine")
+    answer = run(tmp_path / "machine", "--observation", "500")
+    assert "tells nothing of failures: none was ever told" in answer.stdout
+    assert "Never seen" in answer.stdout
+    told = run(tmp_path / "machine", "--observation", "500", "--json").stdout
+    assert json.loads(told)["situations"][0]["never_seen"] is True
+    machine.tell_of_failures()
+    machine.save(tmp_path / "machine")
+    assert "tells nothing of failures" not in run(tmp_path / "machine").stdout

@@ -4,10 +4,12 @@ import json
 import math
 import subprocess
 import sys
+import tomllib
+from pathlib import Path
 
 import pytest
 
-from evofsm import EvolvingFSM, FSMModel
+from evofsm import Edges, EvolvingFSM, FailureSplit, FSMModel, Novelty, Paper
 
 pytest.importorskip("typer")
 pytest.importorskip("rich")
@@ -262,7 +264,43 @@ def test_without_the_extra_one_line_says_what_to_install(missing):
         f"import sys; sys.modules[{missing!r}] = None\nfrom evofsm.cli import main\nmain()"
     )
     assert result.returncode == 2
-    assert result.stderr == "evofsm: the command line needs: pip install 'evofsm[cli]'\n"
+    assert result.stderr == (
+        "evofsm: the command line needs typer and rich: pip install '.[cli]' in a clone of evofsm\n"
+    )
+
+
+def test_without_the_command_line_all_that_a_command_needs_is_named_at_once():
+    result = python(
+        "import sys; sys.modules['typer'] = None; sys.argv = ['evofsm', 'paper']\n"
+        "from evofsm.cli import main\nmain()"
+    )
+    assert "pip install '.[cli,plot,sumo,tables]'" in result.stderr
+
+
+def test_all_that_lacks_is_named_at_once(monkeypatch):
+    from evofsm.cli import common
+
+    monkeypatch.setattr(common, "find_spec", lambda name: None)
+    with pytest.raises(ModuleNotFoundError, match="needs scipy and libsumo") as caught:
+        common.require(scipy="study", **common.of_world(common.WorldName.SUMO))
+    assert "pip install '.[cli,study,sumo]'" in str(caught.value)
+
+
+def test_extras_of_commands_exist():
+    from evofsm._extras import OF_COMMANDS
+
+    project = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text())["project"]
+    assert {one for extras in OF_COMMANDS.values() for one in extras} <= set(
+        project["optional-dependencies"]
+    )
+
+
+def test_python_m_evofsm_is_the_command():
+    run = subprocess.run(
+        [sys.executable, "-m", "evofsm", "--version"], capture_output=True, text=True
+    )
+    assert run.returncode == 0, run.stderr
+    assert run.stdout.startswith("evofsm 0.")
 
 
 def test_help_loads_neither_numba_nor_polars():
@@ -311,3 +349,127 @@ def test_the_version_is_told(evofsm):
     result = evofsm("--version")
     assert result.exit_code == 0
     assert result.stdout.startswith("evofsm 0.")
+
+
+# -- What a log tells, and how ---------------------------------------------------------------------
+
+
+@pytest.fixture
+def crashes(tmp_path):
+    """Four drives, of which two end in a collision that lasts for some rows."""
+    path = tmp_path / "crashes.csv"
+    rows = ["pair,time,gap,v_follower,v_leader,a_follower,hit"]
+    for pair in range(4):
+        for k in range(60):
+            gap = 5.0 - 0.1 * k if pair % 2 else 5.0 + math.sin(k)
+            rows.append(f"{pair},{k / 10:.1f},{gap:.2f},{15 + k % 3},15,0.1,{int(gap <= 0.0)}")
+    path.write_text("\n".join([*rows, ""]))
+    return path
+
+
+def test_failures_are_learnt_from_a_column_or_a_comparison(evofsm, crashes, tmp_path):
+    path = tmp_path / "model"
+    documents = [
+        json.loads(evofsm("learn", crashes, "--failed", told, "--json", "--out", path).stdout)
+        for told in ("hit", "gap<=0")
+    ]
+    assert [one["failures"] for one in documents] == [2, 2]
+    assert [one["noted"]["after_failure"] for one in documents] == [18, 18]
+    assert documents[1]["model"]["provenance"]["failed"] == "gap<=0"
+    assert FSMModel.load(path).failed_soon.max() == 2.0
+    text = " ".join(evofsm("learn", crashes, "--failed", "hit").stdout.split())
+    assert "failures 2 episodes ended with hit; 18 rows after them" in text
+    assert "failures 2 episodes ended in one" in " ".join(evofsm("inspect", path).stdout.split())
+    assert "2 of 3" in " ".join(evofsm("explain", path, "--state", "1").stdout.split())
+
+
+def test_a_log_that_tells_nothing_of_failures_is_said_to(evofsm, crashes, tmp_path):
+    path = tmp_path / "model"
+    learnt = evofsm("learn", crashes, "--out", path)
+    assert "failures not told; --failed" in " ".join(learnt.stdout.split())
+    text = " ".join(evofsm("explain", path).stdout.split())
+    assert "tells nothing of failures" in text
+    assert "0 of" not in text
+    safe = tmp_path / "safe"
+    assert evofsm("learn", crashes, "--failed", "gap<-9", "--out", safe).exit_code == 0
+    text = " ".join(evofsm("explain", safe).stdout.split())
+    assert "tells nothing of failures" not in text
+    assert "0 of 3 (at most 48 %) failed later on" in text
+
+
+def test_failures_survive_a_stop_and_another_condition_is_other_work(evofsm, crashes, tmp_path):
+    whole, kept = tmp_path / "whole", tmp_path / "kept"
+    command = ("learn", crashes, crashes, "--failed", "hit", "--every", "0s")
+    assert evofsm(*command, "--out", whole).exit_code == 0
+    assert evofsm(*command, "--checkpoint", kept).exit_code == 0
+    again = evofsm(*command, "--checkpoint", kept, "--out", tmp_path / "again")
+    assert "4 episodes ended with hit; 36 rows" in " ".join(again.stdout.split())
+    assert (tmp_path / "again").read_bytes() == whole.read_bytes()
+    other = evofsm("learn", crashes, crashes, "--failed", "gap<=0", "--checkpoint", kept)
+    assert 'failed was "hit" and is now "gap<=0"' in failure(other)
+
+
+def test_units_and_missing_leaders_are_said_in_the_summary(evofsm, tmp_path):
+    path = tmp_path / "log.csv"
+    rows = [f"p,{100 * k},{'' if k == 9 else 20},54,54,0.1" for k in range(30)]
+    header = "pair,time,gap,v_follower,v_leader,a_follower"
+    path.write_text("\n".join([header, *rows, ""]))
+    assert "no leader? --no-leader end" in failure(evofsm("learn", path))
+    told = evofsm(
+        *("learn", path, "--no-leader", "end", "--unit", "v=km/h", "--unit", "time=ms"),
+        *("--out", tmp_path / "model"),
+    )
+    text = " ".join(told.stdout.split())
+    assert "no leader in 1 rows, left out" in text
+    assert "converted v_follower from km/h, v_leader from km/h, time from ms" in text
+    assert "rows 29, one every 0.1 s" in text
+    assert told.stderr == ""
+    assert FSMModel.load(tmp_path / "model").centers[0].tolist() == pytest.approx([20, 15, 15])
+    warned = evofsm("learn", path, "--no-leader", "end")
+    assert "a row every 100 s: is the time in ms? --unit time=ms converts it" in warned.stderr
+
+
+@pytest.mark.parametrize(
+    ("options", "rule"),
+    [
+        ([], Paper()),
+        (["--rule", "edges"], Edges()),
+        (["--rule", "novelty"], Novelty(1.0, (4.0, 2.0, 2.0))),
+        (
+            ["--rule", "novelty", "--radius", "2", "--spread", "0.5", "--scale", "gap=8"],
+            Novelty(2.0, (8.0, 2.0, 2.0), 0.5),
+        ),
+        (["--rule", "failure", "--failed", "hit"], FailureSplit(Novelty(1.0, (4.0, 2.0, 2.0)))),
+    ],
+)
+def test_another_rule_is_told_by_its_name(evofsm, crashes, tmp_path, options, rule):
+    assert evofsm("learn", crashes, *options, "--out", tmp_path / "model").exit_code == 0
+    assert FSMModel.load(tmp_path / "model").rule == rule
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--failed", "gap<"], "--failed is 'gap<'"),
+        (["--failed", "crash"], "no column 'crash'"),
+        (["--unit", "v=warp"], "--unit is 'v=warp'"),
+        (["--scale", "gap=4"], "--scale is for --rule novelty or failure, not paper"),
+        (["--rule", "novelty", "--scale", "speed=4"], "--scale names 'speed'; observed are gap"),
+        (["--rule", "novelty", "--scale", "gap=0"], "--scale is 'gap=0'; write COLUMN=NUMBER"),
+        (["--rule", "novelty", "--observe", "gap,hit"], "difference that counts as 1 in 'hit'"),
+        (["--rule", "failure"], "--failed has to tell"),
+        (["--max-states", "0"], "max_states is 0"),
+    ],
+)
+def test_wrong_words_on_rules_failures_and_units_end_with_one_line(
+    evofsm, crashes, options, message
+):
+    assert message in failure(evofsm("learn", crashes, *options))
+
+
+def test_novelty_counts_as_the_closed_loop_does():
+    pytest.importorskip("scipy")
+    from evofsm.cli.learn import _SCALES
+    from evofsm.studies.closed_loop.learner import SAFETY_RULE
+
+    assert tuple(SAFETY_RULE.scales) == _SCALES

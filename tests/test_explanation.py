@@ -1,6 +1,7 @@
 """What is counted of episodes, and what is said of it."""
 
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -213,9 +214,9 @@ def test_an_explanation_tells_where_how_often_what_came_of_it_and_what_was_bette
     found = model.explain(1, action=1)
     assert str(found) == (
         "#2: close (5 m), at medium speed (20 m/s), at equal speeds. "
-        "12 episodes came here (24 observations); 8 of 12 (43 to 84 %) failed within 1 s, "
-        "and 8 of 9 (62 to 97 %) after a(2) ≥ 0 m/s². "
-        "Better after a(1) < 0 m/s²: 0 of 3 (at most 47 %). "
+        "12 episodes came here (24 observations); 8 of 12 (43 to 85 %) failed within 1 s, "
+        "and 8 of 9 (62 to 98 %) after a(2) ≥ 0 m/s². "
+        "Better after a(1) < 0 m/s²: 0 of 3 (at most 48 %). "
         "Most often reached from #1: 12 of 12 times."
     )
     assert (found.here, found.action, found.after_better) == (
@@ -272,3 +273,106 @@ def test_asking_changes_nothing(crash, snapshot):
 def test_what_cannot_be_explained_is_refused(crash, situation, action, error, says):
     with pytest.raises(error, match=says):
         crash[0].model().explain(situation, action)
+
+
+# -- Failures that nobody told of ------------------------------------------------------------------
+
+
+def untold():
+    machine = EvolvingFSM(1, rule=Novelty(radius=1.0))
+    for _ in range(3):
+        machine.start_episode()
+        machine.learn_many([[0.0], [5.0]], [0, 0])
+    machine.start_episode()
+    return machine
+
+
+def test_without_a_word_of_failures_none_are_said_to_be_rare():
+    found = untold().model().explain(0, action=0)
+    assert "how many failed is not known, for no failure was ever told" in found.text
+    assert "3 of which took a(1)" in found.text
+    assert "0 of 3" not in found.text
+    assert np.isnan(found.here.share)
+    assert found.here.interval == (0.0, 1.0)
+    assert found.better is None
+
+
+@pytest.mark.parametrize(
+    "tell",
+    [
+        lambda machine: machine.tell_of_failures(),
+        lambda machine: machine.observe([0.0], failed=False),
+        lambda machine: machine.learn_many([[0.0]], [0], failures=[]),
+    ],
+)
+def test_failures_that_were_told_and_never_happened_are_counted_as_none(tell, tmp_path):
+    machine = untold()
+    assert not machine.failures_told
+    tell(machine)
+    assert "0 of 3 (at most 48 %) failed later on" in machine.model().explain(0).text
+    machine.save(tmp_path / "machine")
+    machine.model().save(tmp_path / "model")
+    assert EvolvingFSM.load(tmp_path / "machine").failures_told
+    assert FSMModel.load(tmp_path / "model").failures_told
+    assert machine.copy().failures_told
+    assert Fleet(machine, 2)[1].failures_told
+    assert not merge([machine, untold()]).failures_told
+    assert merge([machine, machine.copy()]).failures_told
+
+
+def test_one_failure_tells_of_failures_and_old_files_know_of_none():
+    machine = untold()
+    machine.observe([0.0])
+    machine.fail()
+    assert machine.failures_told
+    fleet = Fleet(untold(), 2)
+    fleet.observe([[0.0]], vehicles=[1], failures=[])
+    assert [fleet[k].failures_told for k in range(2)] == [False, True]
+    files = Path(__file__).parent / "files"
+    assert not FSMModel.load(files / "model-format-3.evofsm").failures_told
+
+
+# -- What was never seen ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("rule", "seen", "never"),
+    [
+        (Novelty(radius=1.0, spread=9.0), 5.9, 6.1),  # its radius
+        (FailureSplit(Novelty(radius=2.0)), 6.9, 7.1),
+        (None, 9.2, 9.4),  # the width of recognition: 3 times the variance
+    ],
+)
+def test_what_lies_far_from_every_state_was_never_seen_whatever_the_belief(rule, seen, never):
+    machine = EvolvingFSM(1, rule=rule)
+    machine.learn_many([[0.0], [5.0]] * 20, [0] * 40, range(0, 40, 2), failures=[])
+    model = machine.model()
+    near, far = model.explain(observation=[seen]), model.explain(observation=[never])
+    assert not near.never_seen
+    assert "came here" in near.text
+    assert far.never_seen
+    assert far.text.startswith("Never seen, as far as the states tell")
+    assert (far.here, far.visits, far.action) == (Tally(0, 0), 0, None)
+    assert far.state == model.recognise([never]).argmax()
+
+
+def test_the_machine_says_so_of_what_founds_no_state():
+    machine = EvolvingFSM(1, radius=0.5)
+    machine.learn_many([[0.0], [0.1], [-0.1]] * 20, [0] * 60)
+    step = machine.observe([3.0], explained=Labels())
+    assert step.belief[step.state] > 0.9
+    assert "Never seen" in step.explanation
+    assert machine.explain().never_seen
+    machine.observe([np.nan], missing=Missing.PARTIAL)
+    assert not machine.explain().never_seen  # nothing is known of it
+
+
+def test_either_a_situation_or_an_observation_is_explained():
+    model = untold().model()
+    for wrong in ({}, {"situation": 0, "observation": [0.0]}):
+        with pytest.raises(ValueError, match="either a situation or an observation"):
+            model.explain(**wrong)
+    with pytest.raises(ValueError, match="z has shape"):
+        model.explain(observation=[0.0, 1.0])
+    with pytest.raises(ValueError, match="2 observations; one"):
+        model.explain(observation=[[0.0], [1.0]])

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from evofsm import Event, EvolvingFSM, FSMModel, IntervalActions
+from evofsm import Event, EvolvingFSM, FSMModel, IntervalActions, Missing, Novelty
 
 ACTIONS = IntervalActions(low=-1.0, high=1.0, width=1.0)
 
@@ -258,3 +258,21 @@ def test_a_model_knows_the_settings_of_its_machine_and_keeps_them(grown, tmp_pat
     grown.model().save(tmp_path / "model")
     settings = FSMModel.load(tmp_path / "model").settings
     assert repr(type(grown)(**settings)) == repr(grown)
+
+
+def test_models_and_steps_are_shown_in_a_line():
+    machine = EvolvingFSM(n_actions=2, rule=Novelty(radius=0.001))
+    machine.learn_many(np.arange(500.0)[:, None], np.zeros(500, int))
+    model = machine.model(names=["gap"])
+    assert (
+        str(model)
+        == repr(model)
+        == (
+            "FSMModel(500 states of gap, 2 actions, 500 observations, "
+            "Novelty(radius=0.001, scales=(), spread=1.0))"
+        )
+    )
+    step = machine.observe([3.2])
+    assert repr(step) == "Step(state=500, belief=1 of 501 states, event=CREATED, surprise=nan)"
+    step = machine.observe([np.nan], missing=Missing.PARTIAL)
+    assert repr(step).endswith("event=NONE, surprise=nan, missing=(0,))")

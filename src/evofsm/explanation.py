@@ -3,6 +3,16 @@
 Nothing is estimated here: all of it was counted, once for each episode that came to a state, or
 took an action there. So an explanation is true of what was seen, whatever comes next; that one
 action ended better than another does not say that it was the reason.
+
+Where nobody ever told of failures, none can be counted, and that is said instead of a share.
+
+Beliefs are normalised: one that lies far from every state still belongs to the nearest of them. So
+an observation that is farther from the nearest centre than a state reaches is *never seen*, and
+nothing that was counted is told of it. How far a state reaches is the rule's
+(`evofsm.states.dispatch.reach`): the radius beyond which `Novelty` would make a new state; with the
+paper's rule, which makes none of what is rare, the distance at which the similarity has fallen to
+1/e, the root of the width of recognition. With that rule the states may have passed over something
+rare that was seen, hence "as far as the states tell".
 """
 
 from __future__ import annotations
@@ -14,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evofsm.naming import Labels
-from evofsm.proportions import wilson_interval
+from evofsm.proportions import bounds_text, wilson_interval
 
 # A belief above this is not worth a word.
 _SURE = 0.995
@@ -27,6 +37,8 @@ class Experience(Protocol):
     def n_states(self) -> int: ...  # noqa: D102
     @property
     def failure_horizon(self) -> int | None: ...  # noqa: D102
+    @property
+    def failures_told(self) -> bool: ...  # noqa: D102
     @property
     def centers(self) -> NDArray[np.float64]: ...  # noqa: D102
     @property
@@ -53,36 +65,51 @@ class Tally(NamedTuple):
     >>> print(Tally(3, 12))
     3 of 12 (10 to 49 %)
     >>> print(Tally(0, 40), "|", Tally(7, 7), "|", Tally(7, 7, is_exact=False))
-    0 of 40 (at most 6 %) | 7 of 7 (at least 72 %) | 7 of 7
+    0 of 40 (at most 7 %) | 7 of 7 (at least 72 %) | 7 of 7
+    >>> Tally(0, 40, is_told=False).share
+    nan
     """
 
     failed: int
     episodes: int
     is_exact: bool = True  #: False where an episode may count twice
+    is_told: bool = True  #: False where nobody told of failures, so that `failed` is 0
 
     @property
     def share(self) -> float:
-        """Of the episodes, those that failed; NaN without any."""
-        return self.failed / self.episodes if self.episodes else np.nan
+        """Of the episodes, those that failed; NaN without any, or where it is not known."""
+        return self.failed / self.episodes if self.episodes and self.is_told else np.nan
 
     @property
     def interval(self) -> tuple[float, float]:
-        """Of the share, 90 % (Wilson 1927); from 0 to 1 without any."""
-        if not self.episodes:
+        """Of the share, 90 % (Wilson 1927); from 0 to 1 without any, or where it is not known."""
+        if not (self.episodes and self.is_told):
             return 0.0, 1.0
         low, high = wilson_interval(np.array([self.share]), float(self.episodes))
         return float(low[0]), float(high[0])
 
     def __str__(self) -> str:
+        if not self.is_told:
+            return f"an unknown number of {self.episodes:,}"
         if not (self.episodes and self.is_exact):
             return f"{self.failed:,} of {self.episodes:,}"
-        low, high = (f"{100.0 * bound:.0f}" for bound in self.interval)
-        within = f"{low} to {high} %"
-        if self.failed == 0:
-            within = f"at most {high} %"
-        elif self.failed == self.episodes:
-            within = f"at least {low} %"
-        return f"{self.failed:,} of {self.episodes:,} ({within})"
+        low, high = self.interval
+        low = low if self.failed else 0.0
+        high = high if self.failed < self.episodes else 1.0
+        return f"{self.failed:,} of {self.episodes:,} ({bounds_text(low, high)})"
+
+
+class Nearest(NamedTuple):
+    """The state that an observation is nearest to, in the scales of the rule."""
+
+    state: int  #: its index
+    distance: float  #: from its centre
+    reach: float  #: how far from a centre an observation still belongs to the state
+
+    @property
+    def is_beyond(self) -> bool:
+        """Whether no state reaches as far as the observation."""
+        return self.distance > self.reach
 
 
 class Explanation(NamedTuple):
@@ -111,23 +138,34 @@ class Explanation(NamedTuple):
     #: index of the action after which a smaller share failed and whose interval ends lowest
     better: int | None
     after_better: Tally | None  #: of those that took it
+    #: whether no state reaches as far: then `state` is the nearest, and nothing is told of it
+    never_seen: bool = False
 
     def __str__(self) -> str:
         return self.text
 
 
 def explain(
-    known: Experience, belief: NDArray[np.float64], action: int | None, labels: Labels
+    known: Experience,
+    belief: NDArray[np.float64],
+    action: int | None,
+    labels: Labels,
+    nearest: Nearest | None = None,
 ) -> Explanation:
-    """What experience says of a situation that is recognised as ``belief`` (n,)."""
+    """What experience says of a situation that is recognised as ``belief`` (n,).
+
+    Where the observation is known, ``nearest`` says how far it is from what was learnt.
+    """
     if not len(belief):
         return nothing_known("Nothing was learnt yet.")
+    if nearest is not None and nearest.is_beyond:
+        return _never_seen(known, belief, nearest, labels)
     state = int(belief.argmax())
-    is_exact = not known.joined[state]
-    here = Tally(int(known.failed_soon[state]), int(known.episodes[state]), is_exact)
+    is_exact, is_told = not known.joined[state], known.failures_told
+    here = Tally(int(known.failed_soon[state]), int(known.episodes[state]), is_exact, is_told)
     visits = int(known.visits[state])
     after = [
-        Tally(int(failed), int(tried), is_exact)
+        Tally(int(failed), int(tried), is_exact, is_told)
         for failed, tried in zip(known.failed_after[:, state], known.tried[:, state], strict=True)
     ]
     asked = None if action is None else after[action]
@@ -164,6 +202,19 @@ def nothing_known(text: str) -> Explanation:
     return Explanation(text, None, 0.0, 0, Tally(0, 0), None, None, None, None)
 
 
+def _never_seen(
+    known: Experience, belief: NDArray[np.float64], nearest: Nearest, labels: Labels
+) -> Explanation:
+    state, none = nearest.state, Tally(0, 0, is_told=known.failures_told)
+    place = labels.place(known.centers[state])
+    place = place if place.startswith("(") else f"({place})"
+    text = (
+        f"Never seen, as far as the states tell: {nearest.distance:.3g} from the nearest, "
+        f"#{state + 1} {place}, where a state reaches {nearest.reach:.3g}."
+    )
+    return Explanation(text, state, float(belief[state]), 0, none, None, None, None, None, True)
+
+
 def _best(after: Sequence[Tally], than: Tally) -> int | None:
     """The action whose interval ends lowest, if that is lower and a smaller share failed."""
     better = [
@@ -194,7 +245,11 @@ def _of_episodes(here: Tally, visits: int, soon: str, asked: Tally | None, actio
     observations = f" ({_count(visits, 'observation')})" if visits else ""
     if not here.episodes:
         return f"No earlier episode that was counted came here{observations}"
-    text = f"{_count(here.episodes, 'episode')} came here{observations}; {here} failed {soon}"
+    came = f"{_count(here.episodes, 'episode')} came here{observations}"
+    if not here.is_told:
+        took = "" if asked is None else f", {asked.episodes:,} of which took {action}"
+        return f"{came}{took}; how many failed is not known, for no failure was ever told"
+    text = f"{came}; {here} failed {soon}"
     if asked is None:
         return text
     if not asked.episodes:

@@ -24,22 +24,24 @@ from evofsm._compile import LINE, lanes
 from evofsm.actions import IntervalActions
 from evofsm.crowding import WhenFull
 from evofsm.divergence import jensen_shannon
-from evofsm.explanation import Explanation, explain, nothing_known
+from evofsm.explanation import Explanation, Nearest, explain, nothing_known
 from evofsm.memory import (
     NO_ACTION,
     Learnt,
     Parameters,
     allocate,
+    failures_told,
     leaves,
     refuse_impossible,
     resize,
+    tell_of_failures,
     view,
 )
 from evofsm.model import FSMModel, recognise_rows
 from evofsm.naming import Labels
 from evofsm.notebook import machine_html
 from evofsm.observations import Missing
-from evofsm.states.dispatch import check_rule, describe, restore, weights, width
+from evofsm.states.dispatch import check_rule, describe, reach, restore, weights, width
 from evofsm.states.ets import Paper
 from evofsm.states.rule import RuleSettings, StateRule
 from evofsm.step import (
@@ -65,6 +67,7 @@ from evofsm.validation import (
     positive,
     real_array,
     real_rows,
+    refuse_unless_told,
     refuse_unusable,
     whole,
 )
@@ -219,7 +222,7 @@ prior_frequency=0.001, spread=3.0)
         self,
         z: ArrayLike,
         *,
-        failed: bool = False,
+        failed: bool | None = None,
         missing: Missing = Missing.REJECT,
         explained: Labels | None = None,
     ) -> Step:
@@ -231,9 +234,10 @@ prior_frequency=0.001, spread=3.0)
         ----------
         z : (m,) array_like
             Observation, in units of your own; the first one fixes m.
-        failed : bool
+        failed : bool, optional
             Whether the episode ended in failure with this observation. It is learnt like any
-            other; then the failure is counted, and the next observation begins an episode.
+            other; then the failure is counted, and the next observation begins an episode. Without
+            it nothing is said of failures: see `failures_told`.
         missing : Missing
             What to do where entries are NaN, which says that they were not observed. Such an
             observation is recognised and no more: no state moves, no transition to it is learnt,
@@ -264,12 +268,15 @@ prior_frequency=0.001, spread=3.0)
         >>> step.state, step.predicted.round(2), step.belief.round(2), round(step.surprise, 2)
         (1, array([0.6, 0.4]), array([0.32, 0.68]), 0.06)
         """
-        if missing is Missing.REJECT and explained is None:
-            return self._step(z, NO_ACTION, bool(failed))
+        if missing is Missing.REJECT and explained is None and failed is None:
+            return self._step(z, NO_ACTION, False)
         step = self._observe_any(z, bool(failed), missing)
+        if failed is not None:
+            tell_of_failures(self._buffer)
         if explained is None:
             return step
-        return step._replace(explanation=explain(self, step.belief, None, explained).text)
+        text = explain(self, step.belief, None, explained, self._nearest(step.state)).text
+        return step._replace(explanation=text)
 
     def act(self, i: SupportsIndex) -> None:
         """Say which action was commanded after the latest observation.
@@ -378,7 +385,7 @@ prior_frequency=0.001, spread=3.0)
         Z: ArrayLike,
         I: ArrayLike,
         episode_starts: Sequence[int] | NDArray[np.integer] = (),
-        failures: Sequence[int] | NDArray[np.integer] = (),
+        failures: Sequence[int] | NDArray[np.integer] | None = None,
         *,
         belief: bool = False,
     ) -> Trace:
@@ -392,9 +399,10 @@ prior_frequency=0.001, spread=3.0)
             The action commanded after each observation; -1 where none was.
         episode_starts : (E,) array_like of int
             Rows at which an episode begins. Without row 0 the present episode goes on.
-        failures : (K,) array_like of int
+        failures : (K,) array_like of int, optional
             Rows with which an episode ended in failure, as ``observe(z, failed=True)`` tells it.
-            The action in such a row is not used, and the next row begins an episode.
+            The action in such a row is not used, and the next row begins an episode. An empty one
+            tells that there was none; without it nothing is said of failures.
         belief : bool
             Whether the trace holds the belief of every row as well.
 
@@ -417,9 +425,11 @@ prior_frequency=0.001, spread=3.0)
         observations = self._check_observations(Z)
         actions = check_actions(I, len(observations), self.n_actions)
         starts = check_rows("episode_starts", episode_starts, len(observations))
-        ends = check_rows("failures", failures, len(observations))
+        ends = check_rows("failures", () if failures is None else failures, len(observations))
         if len(observations):
             self._fit(observations[0])
+        if failures is not None:
+            tell_of_failures(self._buffer)
         rows = len(observations)
         trace = Trace(
             np.empty(rows, np.int64),
@@ -477,6 +487,26 @@ prior_frequency=0.001, spread=3.0)
         if not fail(self._buffer):
             self._grow()
             fail(self._buffer)
+        tell_of_failures(self._buffer)
+
+    def tell_of_failures(self) -> None:
+        """Say that failures are told: an episode that ends without one is known to have had none.
+
+        The same is said by `observe` with ``failed=False`` and by `learn_many` with
+        ``failures=[]``. Where nobody says so, and no failure was ever told, `explain` does not take
+        the silence for safety.
+
+        Examples
+        --------
+        >>> machine = EvolvingFSM(n_actions=1)
+        >>> trace = machine.learn_many([[0.0], [0.1]], [0, 0])
+        >>> machine.failures_told
+        False
+        >>> machine.tell_of_failures()
+        >>> machine.failures_told
+        True
+        """
+        tell_of_failures(self._buffer)
 
     # -- Forecasting ----------------------------------------------------------------------------
 
@@ -554,13 +584,14 @@ prior_frequency=0.001, spread=3.0)
         >>> step = machine.observe([0.9])
         >>> print(machine.explain(0, Labels(names=("gap",), units=("m",))))
         #2: gap 0.9 m (belief 63 %, next #1 37 %). 1 episode came here (2 observations);
-        1 of 1 (at least 27 %) failed later on; none of them is known to have tried a(1) here.
+        1 of 1 (at least 26 %) failed later on; none of them is known to have tried a(1) here.
         Most often reached from #1: 1 of 1 times.
         """
         index = None if action is None else check_action(action, self.n_actions)
         if self.state is None:
             return nothing_known("Nothing was observed yet in this episode.")
-        return explain(self, self.belief, index, Labels() if labels is None else labels)
+        labels, nearest = Labels() if labels is None else labels, self._nearest(self.state)
+        return explain(self, self.belief, index, labels, nearest)
 
     # -- What it was told -----------------------------------------------------------------------
 
@@ -769,6 +800,11 @@ prior_frequency=0.001, spread=3.0)
         return self._memory.learnt.outcomes.failed_soon[: self.n_states].copy()
 
     @property
+    def failures_told(self) -> bool:
+        """Whether anybody told of failures: of one, or that there was none."""
+        return failures_told(self._buffer) or bool(self.endings.any())
+
+    @property
     def joined(self) -> NDArray[np.float64]:
         """(n,) ndarray: 1 where two states were joined, so that an episode may count twice."""
         return self._memory.learnt.outcomes.joined[: self.n_states].copy()
@@ -871,6 +907,7 @@ prior_frequency=0.001, spread=3.0)
             joined=self.joined,
             tried=self.tried,
             failed_after=self.failed_after,
+            failures_told=self.failures_told,
             rule=self._rule,
             actions=actions,
             names=tuple(names),
@@ -946,9 +983,13 @@ prior_frequency=0.001, spread=3.0)
         """
         content, arrays = storage.read(path, "machine")
         with storage.explained(path):
+            refuse_unless_told(told := content.pop("failures_told", False))
             machine = cls(**{**content, "rule": restore(content["rule"])})
             _, n = arrays["centers"].shape
-            return machine._holding(arrays) if n else machine
+            machine = machine._holding(arrays) if n else machine
+        if told:
+            tell_of_failures(machine._buffer)
+        return machine
 
     def copy(self) -> Self:
         """An independent machine in the same state.
@@ -971,8 +1012,9 @@ prior_frequency=0.001, spread=3.0)
 
     @property
     def _content(self) -> dict[str, Any]:
-        """The settings, for JSON."""
-        return {**self.settings, "rule": describe(self._rule)}
+        """The settings, and whether failures were told, for JSON."""
+        told = {"failures_told": True} if self.failures_told else {}
+        return {**self.settings, "rule": describe(self._rule), **told}
 
     # The views belong to one buffer: a copy, or what another process gets, needs its own.
     def __getstate__(self) -> dict[str, Any]:
@@ -1022,6 +1064,14 @@ prior_frequency=0.001, spread=3.0)
         self._memory = view(buffer)
         self._observe = _cannot_observe
         self._update = _cannot_update
+
+    def _nearest(self, state: int | None) -> Nearest | None:
+        """How far the latest observation is from its state, if it was seen whole."""
+        now = self._memory.learnt
+        if state is None or now.outcomes.latest_visit[state] != now.outcomes.clock[0]:
+            return None
+        beyond = reach(self._rule, width(self._memory.parameters.rule, now.clusters))
+        return Nearest(state, float(np.sqrt(now.clusters.squared_distances[state])), beyond)
 
     def _observe_any(self, z: ArrayLike, failed: bool, missing: Missing) -> Step:
         """Observe, whole or in part."""

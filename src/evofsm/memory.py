@@ -23,8 +23,9 @@ from evofsm.validation import refuse_more_failures, refuse_unless_distribution
 
 NO_ACTION = -1
 
-# A buffer begins with its sizes (m, q, capacity, places), `Parameters` and counters.
-_COUNTERS, _HEAD = 20, 32
+# A buffer begins with its sizes (m, q, capacity, places), `Parameters`, whether anybody told of
+# failures, and counters.
+_FAILURES_TOLD, _COUNTERS, _HEAD = 17, 20, 32
 # Then, for each kind of thing there is, so many numbers; centres are further rows of states.
 _PER_STATE, _PER_PLACE, _PER_ACTION, _PER_VARIABLE = 17, 7, 2, 5
 # Where the centre of a state that is not there stands: too far for any belief.
@@ -301,6 +302,16 @@ def _copy_rows(
     for row in range(rows):
         for i in range(n):
             target[target_start + row * target_stride + i] = source[start + row * stride + i]
+
+
+def failures_told(buffer: NDArray[np.float64]) -> bool:
+    """Whether anybody told of failures: of one, or that there was none."""
+    return bool(buffer[_FAILURES_TOLD])
+
+
+def tell_of_failures(buffer: NDArray[np.float64], at: int | NDArray[np.int64] = 0) -> None:
+    """Note that failures are told, of the machines whose memories begin ``at`` a place."""
+    buffer[at + _FAILURES_TOLD] = 1.0
 
 
 def leaves(learnt: NamedTuple) -> Iterator[tuple[str, NDArray[np.float64]]]:

@@ -12,11 +12,11 @@ from numpy.typing import ArrayLike, NDArray
 from evofsm import ranges, storage
 from evofsm._compile import kernel
 from evofsm.actions import IntervalActions
-from evofsm.explanation import Explanation, explain
+from evofsm.explanation import Explanation, Nearest, explain
 from evofsm.naming import Labels
 from evofsm.notebook import model_html
 from evofsm.states.clusters import measure_distances, nearest_center
-from evofsm.states.dispatch import describe, restore, weights
+from evofsm.states.dispatch import describe, reach, restore, weights
 from evofsm.states.ets import Paper
 from evofsm.states.rule import StateRule
 from evofsm.states.spread import recognise
@@ -28,6 +28,7 @@ from evofsm.validation import (
     real_array,
     refuse_more_failures,
     refuse_unless_distribution,
+    refuse_unless_told,
     refuse_unusable,
 )
 
@@ -47,7 +48,7 @@ def _no_counts() -> NDArray[np.float64]:
     return np.empty(0)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class FSMModel:
     """States and transitions as they stood when the snapshot was taken.
 
@@ -73,6 +74,8 @@ class FSMModel:
     >>> machine = EvolvingFSM(n_actions=2, radius=0.5)
     >>> trace = machine.learn_many([[0.0], [0.1], [2.0], [1.0]], [0, 0, 0, 0])
     >>> model = machine.model(names=["gap"], units=["m"])
+    >>> model
+    FSMModel(2 states of gap, 2 actions, 4 observations, Paper(memory=None))
     >>> model.n_states, model.visits, model.founded
     (2, array([3., 1.]), array([1., 4.]))
     """
@@ -103,6 +106,8 @@ class FSMModel:
     #: (q, n) of these, those that failed soon after they did
     failed_after: NDArray[np.float64] = field(default_factory=_no_counts)
     rule: StateRule = field(default_factory=Paper)  #: how its machine determines states
+    #: whether anybody told of failures; where not, episodes without one are not known to be safe
+    failures_told: bool = False
 
     def __post_init__(self) -> None:
         n, m, q = self.n_states, self.n_variables, self.n_actions
@@ -134,6 +139,9 @@ class FSMModel:
             object.__setattr__(self, name, array)
         ranges.refuse_others("model", self._content, {name: getattr(self, name) for name in shapes})
         refuse_more_failures(self)
+        counted = self.failures, self.endings, self.failed_soon
+        told = bool(self.failures_told) or any(counts.any() for counts in counted)
+        object.__setattr__(self, "failures_told", told)
         if n:
             refuse_unless_distribution("a row of transition_matrices", self.transition_matrices)
         for name in ("names", "units"):
@@ -169,6 +177,13 @@ class FSMModel:
     def labels(self) -> Labels:
         """What its numbers mean."""
         return Labels(self.actions, self.names, self.units, self.dt)
+
+    def __repr__(self) -> str:
+        variables = ", ".join(self.names) or f"{self.n_variables} variables"
+        return (
+            f"{type(self).__name__}({self.n_states} states of {variables}, "
+            f"{self.n_actions} actions, {self.visits.sum():.0f} observations, {self.rule})"
+        )
 
     def _repr_html_(self) -> str:
         return model_html(self)
@@ -208,13 +223,7 @@ class FSMModel:
         >>> machine.model().recognise([[0.0], [0.5], [1.0]]).round(3)
         array([[0.625, 0.375], [0.5  , 0.5  ], [0.375, 0.625]])
         """
-        given = real_array("z", z, ndim=np.ndim(z))
-        rows = np.atleast_2d(given)
-        if rows.ndim != 2 or rows.shape[1] != self.n_variables:
-            raise ValueError(f"z has shape {given.shape}; a row needs {self.n_variables} variables")
-        refuse_unusable("z", rows)
-        if self.n_states == 0:
-            raise ValueError("this model has no states: its machine had observed nothing")
+        given, rows = self._observations(z)
         belief = np.empty((len(rows), self.n_states))
         centers = np.ascontiguousarray(self.centers.T)
         distances = np.empty(self.n_states)
@@ -275,17 +284,60 @@ class FSMModel:
         matrix_of = self.transition_matrices.__getitem__
         return propagate(start, matrix_of, self.averaged_matrix, action, horizon, policy)
 
-    def explain(self, situation: int | ArrayLike, action: int | None = None) -> Explanation:
+    def nearest(self, z: ArrayLike) -> Nearest:
+        """Which state an observation is nearest to, how far that is, and how far a state reaches.
+
+        Parameters
+        ----------
+        z : (m,) array_like
+            Observation, as `recognise` takes it.
+
+        Returns
+        -------
+        Nearest
+            Distances are those of observations divided by the rule's scales.
+
+        Raises
+        ------
+        TypeError, ValueError
+            As `recognise`.
+
+        Examples
+        --------
+        >>> from evofsm import EvolvingFSM, Novelty
+        >>> machine = EvolvingFSM(n_actions=1, rule=Novelty(radius=1.0, scales=(2.0,)))
+        >>> trace = machine.learn_many([[0.0], [1.9], [4.0]], [0, 0, 0])
+        >>> machine.model().nearest([9.0])
+        Nearest(state=1, distance=2.5, reach=1.0)
+        """
+        _, rows = self._observations(z)
+        if len(rows) != 1:
+            raise ValueError(f"z holds {len(rows)} observations; one is asked for")
+        offsets = (self.centers - rows[0]) * weights(self.rule, self.n_variables)
+        distances = np.sqrt(np.square(offsets).sum(axis=1))
+        state = int(distances.argmin())
+        return Nearest(state, float(distances[state]), reach(self.rule, self.width))
+
+    def explain(
+        self,
+        situation: int | ArrayLike | None = None,
+        action: int | None = None,
+        *,
+        observation: ArrayLike | None = None,
+    ) -> Explanation:
         """What experience says of a situation: where it lies, and what came of being there.
 
         All of it was counted, once for each episode; see `evofsm.explanation`.
 
         Parameters
         ----------
-        situation : int or (n,) array_like
+        situation : int or (n,) array_like, optional
             A state, or a distribution over states, of which the most probable one is explained.
         action : int, optional
             Index of an action, from 0: what came of taking it there.
+        observation : (m,) array_like, optional
+            What was observed, in place of a situation: it is recognised, unless it is farther
+            from every state than a state reaches, and so was never seen.
 
         Returns
         -------
@@ -297,7 +349,8 @@ class FSMModel:
         TypeError
             If ``action`` or a state is not an integer.
         ValueError
-            If there is no such state or action, or a belief is no distribution over the states.
+            If there is no such state or action, a belief is no distribution over the states, or
+            not one of ``situation`` and ``observation`` is given.
 
         Examples
         --------
@@ -310,11 +363,20 @@ class FSMModel:
         #1: gap 0 m. 2 episodes came here (3 observations); 1 of 2 (12 to 88 %) failed later on.
         >>> print(model.explain([0.2, 0.8], action=1))
         #2: gap 1 m (belief 80 %, next #1 20 %). 1 episode came here (1 observation);
-        1 of 1 (at least 27 %) failed later on; none of them is known to have tried a(2) here.
+        1 of 1 (at least 26 %) failed later on; none of them is known to have tried a(2) here.
         Most often reached from #1: 1 of 1 times.
+        >>> print(model.explain(observation=[30.0]))
+        Never seen, as far as the states tell: 29 from the nearest, #2 (gap 1 m), where a state
+        reaches 1.4.
         """
         if action is not None:
             action = check_action(action, self.n_actions)
+        if (situation is None) == (observation is None):
+            raise ValueError("give either a situation or an observation")
+        if situation is None:
+            assert observation is not None
+            nearest, belief = self.nearest(observation), self.recognise(observation)
+            return explain(self, np.ravel(belief), action, self.labels, nearest)
         if np.ndim(situation) == 0:
             belief = np.eye(self.n_states)[check_state(situation, self.n_states)]
         else:
@@ -332,7 +394,19 @@ class FSMModel:
             "dt": self.dt,
             "settings": dict(self.settings),
             "rule": describe(self.rule),
+            "failures_told": self.failures_told,
         }
+
+    def _observations(self, z: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """One observation or many, as given and row by row; refused where it is none."""
+        given = real_array("z", z, ndim=np.ndim(z))
+        rows = np.atleast_2d(given)
+        if rows.ndim != 2 or rows.shape[1] != self.n_variables:
+            raise ValueError(f"z has shape {given.shape}; a row needs {self.n_variables} variables")
+        refuse_unusable("z", rows)
+        if self.n_states == 0:
+            raise ValueError("this model has no states: its machine had observed nothing")
+        return given, rows
 
     def _belief(self, belief: ArrayLike) -> NDArray[np.float64]:
         """Refuse what is no distribution over the states."""
@@ -495,6 +569,7 @@ class FSMModel:
             for name in ("names", "units"):
                 content[name] = tuple(content[name])
             content["rule"] = restore(content["rule"])
+            refuse_unless_told(content.setdefault("failures_told", False))
             values: dict[str, Any] = {**content, **arrays}
             if lacking := {entry.name for entry in fields(cls)} - set(values):
                 raise ValueError(f"it lacks {', '.join(sorted(lacking))}")

@@ -8,6 +8,7 @@ state of the machine: it is counted, and the next observation begins another epi
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from enum import IntFlag
 from functools import cache
@@ -89,7 +90,9 @@ class Step(NamedTuple):
     >>> step = machine.learn_one([0.0], 0)
     >>> step.state, step.event.name, len(step.predicted), step.surprise
     (0, 'CREATED', 0, nan)
-    >>> machine.observe([0.1]).predicted
+    >>> machine.observe([0.1])
+    Step(state=0, belief=1 of 1 states, event=NONE, surprise=0)
+    >>> machine.belief
     array([1.])
     """
 
@@ -100,6 +103,15 @@ class Step(NamedTuple):
     surprise: float  #: divergence of `predicted` and `belief` [bit]; NaN where none was
     missing: tuple[int, ...] = ()  #: variables that were not observed, so that nothing was learnt
     explanation: str = ""  #: what experience says of the state, where that was asked for
+
+    def __repr__(self) -> str:
+        belief = float(self.belief[self.state]) if len(self.belief) else math.nan
+        missing = f", missing={self.missing}" if self.missing else ""
+        return (
+            f"{type(self).__name__}(state={self.state}, belief={belief:.3g} of "
+            f"{len(self.belief)} states, event={self.event.name}, surprise={self.surprise:.3g}"
+            f"{missing})"
+        )
 
     def _repr_html_(self) -> str:
         return step_html(self)

@@ -152,3 +152,9 @@ def check_rows(name: str, numbers: ArrayLike, rows: int) -> NDArray[np.bool_]:
     marked = np.zeros(rows, np.bool_)
     marked[given.astype(np.int64)] = True
     return marked
+
+
+def refuse_unless_told(told: object) -> None:
+    """Raise where a file says neither yes nor no."""
+    if not isinstance(told, bool):
+        raise ValueError(f"failures_told is {told!r}; it must be true or false")

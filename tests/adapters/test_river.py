@@ -156,5 +156,5 @@ def test_a_missing_library_is_named(library, monkeypatch):
     for name in (library, f"{library}.base"):
         monkeypatch.setitem(sys.modules, name, None)
     monkeypatch.delitem(sys.modules, f"evofsm.adapters.{library}", raising=False)
-    with pytest.raises(ModuleNotFoundError, match=rf"pip install 'evofsm\[{library}\]'"):
+    with pytest.raises(ModuleNotFoundError, match=rf"pip install '.\[{library}\]'"):
         import_module(f"evofsm.adapters.{library}")

@@ -114,7 +114,7 @@ except ModuleNotFoundError as error:
     print(error)
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert "pip install 'evofsm[plot]'" in done.stdout
+    assert "pip install '.[plot]'" in done.stdout
 
 
 def test_a_case_shows_its_moments_its_states_and_its_collision(study: PaperStudy) -> None:

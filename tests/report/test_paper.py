@@ -167,4 +167,4 @@ except ModuleNotFoundError as error:
     print(error)
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert "pip install 'evofsm[plot]'" in done.stdout
+    assert "pip install '.[plot]'" in done.stdout

@@ -217,4 +217,4 @@ def test_sumo_drives_the_same():
 def test_without_gymnasium_the_extra_is_named(module):
     program = f"import sys; sys.modules['gymnasium'] = None; import {module}"
     finished = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
-    assert finished.stderr.rstrip().endswith("pip install 'evofsm[gym]'")
+    assert finished.stderr.rstrip().endswith("pip install '.[gym]' in a clone of evofsm")

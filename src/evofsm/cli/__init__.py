@@ -7,6 +7,8 @@ from contextlib import suppress
 from importlib.util import find_spec
 from typing import Annotated
 
+from evofsm._extras import install_for
+
 # Needed once the annotations below are read; `main` says what to install where it is missing.
 with suppress(ModuleNotFoundError):
     import typer
@@ -15,7 +17,9 @@ with suppress(ModuleNotFoundError):
 def main() -> None:
     """Run the command line."""
     if find_spec("typer") is None or find_spec("rich") is None:
-        print("evofsm: the command line needs: pip install 'evofsm[cli]'", file=sys.stderr)
+        command = next((word for word in sys.argv[1:] if not word.startswith("-")), None)
+        needed = install_for(command)
+        print(f"evofsm: the command line needs typer and rich: {needed}", file=sys.stderr)
         sys.exit(2)
     application()()
 

@@ -23,6 +23,7 @@ from evofsm.cli.common import (
     WorldName,
     WorldOption,
     chosen_mode,
+    of_world,
     plain_errors,
     print_json,
     progress,
@@ -92,7 +93,8 @@ def campaign(
     Each episode is written to the folder as it comes. After an interruption the same command goes
     on where it stopped; the result is the same whoever drives, and whatever happened to them.
     """
-    require(scipy="study", **({"distributed": "cluster"} if executor == "dask" else {}))
+    workers_too = {"distributed": "cluster"} if executor == "dask" else {}
+    require(scipy="study", **of_world(world), **workers_too)
     from evofsm.report import terminal
     from evofsm.report.driving import print_outcome
     from evofsm.studies.campaign import Campaign

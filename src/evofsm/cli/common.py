@@ -12,6 +12,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, ParamSpec
 
+from evofsm._extras import install
 from evofsm.naming import visible
 
 # What folders of results hold, in the order in which it is looked for.
@@ -145,11 +146,20 @@ def _model_of_log(place: Path) -> FSMModel:
     return model
 
 
+#: What a page with figures needs, and the extra that brings it.
+PAGE = {"matplotlib": "plot", "jinja2": "plot"}
+
+
+def of_world(world: WorldName) -> dict[str, str]:
+    """What a world needs, and the extra that brings it."""
+    return {"libsumo": "sumo"} if world is WorldName.SUMO else {}
+
+
 def require(**extras: str) -> None:
-    """Refuse before the long work what lacks a package after it."""
-    for package, extra in extras.items():
-        if find_spec(package) is None:
-            raise ModuleNotFoundError(f"this needs {package}: pip install 'evofsm[{extra}]'")
+    """Refuse before the long work what lacks a package after it: all at once."""
+    if lacking := [package for package in extras if find_spec(package) is None]:
+        all_extras = install(*dict.fromkeys(["cli", *extras.values()]))
+        raise ModuleNotFoundError(f"this needs {' and '.join(lacking)}: {all_extras}")
 
 
 def message(error: Exception) -> str:

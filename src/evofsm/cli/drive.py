@@ -17,6 +17,7 @@ from evofsm.cli.common import (
     WorldName,
     WorldOption,
     chosen_mode,
+    of_world,
     plain_errors,
     print_json,
     progress,
@@ -102,6 +103,7 @@ def drive(
     """
     require(
         scipy="study",
+        **of_world(world),
         **({"polars": "tables"} if out else {}),
         **({"mcap": "mcap"} if mcap else {}),
     )

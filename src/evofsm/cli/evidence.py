@@ -11,10 +11,12 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 from evofsm.cli.bench.common import Progress, WorkersOption
 from evofsm.cli.common import (
+    PAGE,
     WorldName,
     WorldOption,
     command_line,
     counter,
+    of_world,
     plain_errors,
     print_json,
     progress,
@@ -52,7 +54,7 @@ def evidence(
 
     The page names the command of each study's long form.
     """
-    require(scipy="study", deeptime="dev", matplotlib="plot", jinja2="plot")
+    require(scipy="study", deeptime="dev", **PAGE, **of_world(world))
     from evofsm.report import terminal
     from evofsm.report.chapter import write_chapters
 

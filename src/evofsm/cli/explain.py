@@ -17,6 +17,10 @@ if TYPE_CHECKING:
     from evofsm.model import FSMModel
 
 _WIDTH = 80
+_UNTOLD = (
+    "What was learnt tells nothing of failures: none was ever told. From a log, evofsm learn "
+    "--failed COLUMN or --failed 'gap<=0' tells of them."
+)
 
 
 @plain_errors
@@ -59,13 +63,15 @@ def explain(
     asked = _index("--action", action, model.n_actions)
     one = _index("--state", state, model.n_states)
     if observation is not None:
-        found = [model.explain(model.recognise(_values(observation)), asked)]
+        found = [model.explain(action=asked, observation=_values(observation))]
     else:
         states = range(model.n_states) if one is None else [one]
         found = [model.explain(each, asked) for each in states]
     if as_json:
         print_json({"file": str(file), "situations": [_document(model, each) for each in found]})
         return
+    if not model.failures_told:
+        print(textwrap.fill(_UNTOLD, _WIDTH))
     for each in found:
         say(textwrap.fill(each.text, _WIDTH, subsequent_indent="   "))
 

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import os
+import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
+from dataclasses import asdict, replace
+from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, cast
 
@@ -18,11 +21,31 @@ if TYPE_CHECKING:
 
     from evofsm.actions import IntervalActions
     from evofsm.checkpoint import Checkpoint
-    from evofsm.io import Chunk, LogColumns, VehicleLengths
+    from evofsm.io import Chunk, LogColumns, Noted, VehicleLengths
     from evofsm.observations import Category
     from evofsm.storage import Header
+    from evofsm.studies.learning import Learning
+
+
+class RuleName(StrEnum):
+    """How states are made."""
+
+    PAPER = "paper"
+    EDGES = "edges"
+    NOVELTY = "novelty"
+    FAILURE = "failure"
+
+
+class NoLeader(StrEnum):
+    """What to do where there is no leader."""
+
+    REFUSE = "refuse"
+    END = "end"
+
 
 _MOST_ACTIONS = 1000
+# For novelty, of a gap [m] and of speeds [m/s]: as the closed loop has them.
+_SCALES = (4.0, 2.0, 2.0)
 # What does not change what is learnt; files are told apart by what is in them.
 _NO_SETTINGS = ("files", "out", "checkpoint", "every", "as_json")
 # What there may be of in a provenance, and how many files of it are named.
@@ -70,6 +93,30 @@ def learn(
             help="Seconds from a row to the next, for a log without a clock.", show_default=False
         ),
     ] = None,
+    failed: Annotated[
+        str | None,
+        typer.Option(
+            help="What tells of failures: a column of truth values (0 and 1, true and false), or a "
+            "comparison such as 'gap<=0'. The row with which it becomes true ends the episode in "
+            "failure; rows in which it stays so are left out. Compared after --unit.",
+            show_default=False,
+        ),
+    ] = None,
+    unit: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Unit of a column, or of all read that begin so: v=km/h, time=ms. May be "
+            "repeated. Learnt are s, m, m/s, m/s².",
+            show_default=False,
+        ),
+    ] = None,
+    no_leader: Annotated[
+        NoLeader,
+        typer.Option(
+            help="A row in which an observed number is missing (empty, NaN, infinite), as where "
+            "there is no leader: refuse the log, or end the episode there and leave the row out."
+        ),
+    ] = NoLeader.REFUSE,
     vehicle_length: Annotated[
         list[str] | None,
         typer.Option(
@@ -81,7 +128,40 @@ def learn(
     category_distance: Annotated[
         float, typer.Option(help="How far apart the values of a discrete column count.")
     ] = 1.0,
-    radius: Annotated[float, typer.Option(help="The paper's ε, which parts states.")] = 0.3,
+    rule: Annotated[
+        RuleName,
+        typer.Option(
+            help="How states are made. The paper's is the default, for the paper specifies it and "
+            "earlier results were learnt with it; edges: with states at edges too; novelty: one "
+            "wherever nothing like it was seen, recommended for logs (docs/logs.md says why); "
+            "failure: as novelty, and at failures (--failed)."
+        ),
+    ] = RuleName.PAPER,
+    radius: Annotated[
+        float | None,
+        typer.Option(
+            help="The paper's ε, which parts states; of novelty, in --scale. [default: 0.3; of "
+            "novelty and failure 1.0]",
+            show_default=False,
+        ),
+    ] = None,
+    scale: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Novelty and failure: the difference that counts as 1, by the column, such as "
+            "gap=4. May be repeated. [default: gap=4, v_follower=2, v_leader=2; of a discrete "
+            "column 1]",
+            show_default=False,
+        ),
+    ] = None,
+    max_states: Annotated[
+        int | None,
+        typer.Option(
+            help="Where there are so many states, two are merged for each new one. [default: no "
+            "limit]",
+            show_default=False,
+        ),
+    ] = None,
     distance_weight: Annotated[
         float, typer.Option(help="The paper's ρ, how fast distance lowers potential.")
     ] = 0.85,
@@ -91,7 +171,14 @@ def learn(
     prior_frequency: Annotated[
         float, typer.Option(help="The paper's ε̄, the frequency of transitions never seen.")
     ] = 1e-3,
-    spread: Annotated[float, typer.Option(help="Width of recognition; smaller is sharper.")] = 3.0,
+    spread: Annotated[
+        float | None,
+        typer.Option(
+            help="Width of recognition; smaller is sharper. [default: 3.0; of novelty and failure "
+            "1.0]",
+            show_default=False,
+        ),
+    ] = None,
     out: Annotated[
         Path | None, typer.Option(help="File to save the model to.", show_default=False)
     ] = None,
@@ -119,13 +206,17 @@ def learn(
     v_follower and v_leader; its action a_follower is what the follower did until the next time
     step. SUMO rounds to 2 decimals unless told --precision 6.
 
+    The time may be seconds, or dates of ISO 8601. Without --failed a log tells nothing of failures,
+    and evofsm explain says so.
+
     With --checkpoint, the same command goes on where it was stopped, whatever stopped it, and comes
     to the same result. The file is kept at the end: run again, the command prints it at once.
     """
     # Whatever it is told, a new option too, is a setting that a checkpoint goes by.
     settings = {name: value for name, value in locals().items() if name not in _NO_SETTINGS}
     from evofsm.checkpoint import Checkpoint, duration, fingerprints, result_kept
-    from evofsm.io import VehicleLengths, read_traces
+    from evofsm.io import Condition, Noted, VehicleLengths, read_traces
+    from evofsm.io.units import parse_units
     from evofsm.machine import EvolvingFSM
     from evofsm.naming import UNITS, VARIABLES
     from evofsm.studies.learning import learn_traces
@@ -133,10 +224,22 @@ def learn(
     _check_out(out)
     interval = duration(every)
     actions = _actions(action_range)
-    columns = _columns(observe, action, time, episode, dt, category_distance)
-    lengths = VehicleLengths.parse(vehicle_length or [])
+    columns = replace(
+        _columns(observe, action, time, episode, dt, category_distance),
+        failed=None if failed is None else Condition.parse(failed),
+        units=parse_units(unit or []),
+        leader_may_lack=no_leader is NoLeader.END,
+    )
+    lengths, noted = VehicleLengths.parse(vehicle_length or []), Noted()
+    if rule is RuleName.FAILURE and failed is None:
+        raise ValueError("--rule failure makes states at failures; --failed has to tell of them")
     machine = EvolvingFSM(
-        actions.n_actions, radius, distance_weight, learning_rate, prior_frequency, spread
+        actions.n_actions,
+        distance_weight=distance_weight,
+        learning_rate=learning_rate,
+        prior_frequency=prior_frequency,
+        max_states=max_states,
+        **_rule(rule, radius, spread, scale, columns),
     )
     names = columns.observe.names
     known = fingerprints(files)
@@ -147,7 +250,10 @@ def learn(
     with progress() as bars:
         learning = learn_traces(
             _noting(
-                read_traces(files, columns, lengths, _bytes_read(bars, files)), lengths, keeper
+                read_traces(files, columns, lengths, _bytes_read(bars, files), noted),
+                lengths,
+                noted,
+                keeper,
             ),
             machine,
             actions,
@@ -161,7 +267,14 @@ def learn(
         "episodes": learning.episodes,
         "transitions": learning.transitions,
         "action": action,
+        **({} if failed is None else {"failed": failed, "failures": learning.failures}),
+        **({} if unit is None else {"units converted": ", ".join(unit)}),
     }
+    if keeper is not None and "noted" in keeper.notes:  # in the run that read the files
+        noted = Noted(**keeper.notes["noted"])
+    warnings = noted.warnings(time)
+    for warning in warnings:
+        print(f"evofsm: warning: {warning}", file=sys.stderr)
     if out is not None:
         with result_kept(keeper):
             learning.model.save(out, provenance)
@@ -171,10 +284,17 @@ def learn(
     if as_json:
         document = terminal.learning_document(learning)
         document["model"]["provenance"] = provenance
-        print_json({"files": files, "saved": out and str(out), **document})
+        apart = {"noted": asdict(noted), "warnings": warnings}
+        print_json({"files": files, "saved": out and str(out), **document, **apart})
         return
     console = terminal.console()
-    terminal.print_learning(console, learning, action=action, lengths=_assumed(lengths, keeper))
+    terminal.print_learning(
+        console,
+        learning,
+        action=action,
+        lengths=_assumed(lengths, keeper),
+        further=_read_otherwise(noted, failed, learning),
+    )
     console.print()
     if out is None:
         console.print("Nothing was saved; --out MODEL keeps the model.", soft_wrap=True)
@@ -263,12 +383,33 @@ def _check_apart(checkpoint: Path, out: Path | None, files: list[str]) -> None:
 
 
 def _noting(
-    chunks: Iterator[Chunk], lengths: VehicleLengths, keeper: Checkpoint | None
+    chunks: Iterator[Chunk], lengths: VehicleLengths, noted: Noted, keeper: Checkpoint | None
 ) -> Iterator[Chunk]:
-    """The same chunks; at their end, what was assumed in reading them is noted."""
+    """The same chunks; at their end, what was assumed and noticed in reading them is noted."""
     yield from chunks
     if keeper is not None:
         keeper.notes["lengths"] = _assumed(lengths, None)
+        keeper.notes["noted"] = asdict(noted)
+
+
+def _read_otherwise(
+    noted: Noted, failed: str | None, learning: Learning
+) -> Iterator[tuple[str, str]]:
+    """What was not learnt as it stands in the files, line by line."""
+    if failed is None:
+        yield "failures", "not told; --failed COLUMN or --failed 'gap<=0' tells of them"
+    else:
+        left_out = f"; {noted.after_failure:,} rows after them, still so, were left out"
+        yield (
+            "failures",
+            f"{learning.failures:,} episodes ended with {failed}"
+            + (left_out if noted.after_failure else ""),
+        )
+    if noted.leaderless:
+        yield "no leader", f"in {noted.leaderless:,} rows, left out; there an episode ends"
+    if noted.units:
+        given = (f"{name} from {one}" for name, one in noted.units.items())
+        yield "converted", f"{', '.join(given)} to units of the SI"
 
 
 def _assumed(lengths: VehicleLengths, keeper: Checkpoint | None) -> str | None:
@@ -319,6 +460,50 @@ def _columns(
         episode=None if episode is None else split_names(episode),
         dt=None if dt is None else positive("--dt", dt),
     )
+
+
+def _rule(
+    name: RuleName,
+    radius: float | None,
+    spread: float | None,
+    scale: list[str] | None,
+    columns: LogColumns,
+) -> dict[str, Any]:
+    """What a machine is told of its rule, and the settings that it shares with it."""
+    from evofsm.states import Edges, FailureSplit, Novelty
+
+    shared = {"radius": radius, "spread": spread}
+    given = {name: value for name, value in shared.items() if value is not None}
+    if name in (RuleName.PAPER, RuleName.EDGES):
+        if scale:
+            raise ValueError(f"--scale is for --rule novelty or failure, not {name.value}")
+        return given | ({"rule": Edges()} if name is RuleName.EDGES else {})
+    rule = Novelty(scales=_scales(scale or [], columns, name), **given)
+    return {"rule": FailureSplit(rule) if name is RuleName.FAILURE else rule}
+
+
+def _scales(texts: list[str], columns: LogColumns, rule: RuleName) -> list[float]:
+    """The difference that counts as 1, for each number that is observed."""
+    from evofsm.naming import VARIABLES
+    from evofsm.validation import positive
+
+    told = {}
+    for text in texts:
+        column, _, number = text.rpartition("=")
+        try:
+            told[column] = positive("it", float(number))
+        except ValueError:
+            raise ValueError(f"--scale is {text!r}; write COLUMN=NUMBER, such as gap=4") from None
+    single = [one for one in columns.observe.variables if isinstance(one, str)]
+    if unknown := [column for column in told if column not in single]:
+        raise ValueError(f"--scale names {unknown[0]!r}; observed are {', '.join(single)}")
+    told = dict(zip(VARIABLES, _SCALES, strict=True)) | told
+    if lacking := [column for column in single if column not in told]:
+        raise ValueError(
+            f"--rule {rule.value} has to know the difference that counts as 1 in {lacking[0]!r}: "
+            f"--scale {lacking[0]}=2 (4 m of a gap and 2 m/s of a speed are usual)"
+        )
+    return [told.get(name, 1.0) for name in columns.observe.names]
 
 
 def _variable(text: str, distance: float) -> str | Category:

@@ -8,9 +8,11 @@ from pathlib import Path
 from typing import Annotated
 
 from evofsm.cli.common import (
+    PAGE,
     WorldName,
     command_line,
     counter,
+    of_world,
     plain_errors,
     print_json,
     progress,
@@ -44,7 +46,7 @@ def paper(
 
     Ends with 0 if all claims hold, with 1 if any does not.
     """
-    require(matplotlib="plot", jinja2="plot", polars="tables")
+    require(polars="tables", **PAGE, **of_world(world))
     from evofsm.report import terminal
     from evofsm.report.chapter import write_chapters
     from evofsm.report.paper import paper_chapter

@@ -15,6 +15,7 @@ from evofsm.cli.common import (
     ToleranceOption,
     WorldName,
     WorldOption,
+    of_world,
     plain_errors,
     progress,
     require,
@@ -77,7 +78,8 @@ def watch(
     what was done about it. It answers on this computer only, under the address that is printed,
     and the run begins as the page is first opened. Ctrl-C ends it.
     """
-    require(websockets="watch", scipy="study")
+    recorded = {"mcap": "mcap"} if what.endswith(".mcap") else of_world(world)
+    require(websockets="watch", scipy="study", **recorded)
     from evofsm.report.live import LivePage
     from evofsm.studies.watching import SPEEDS, Player, Watching
     from evofsm.worlds.families import load_family

@@ -17,7 +17,15 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 from evofsm._compile import LINE, inner_kernel, kernel, parallel_kernel
 from evofsm._elementary import fetch_ahead
 from evofsm.machine import EvolvingFSM
-from evofsm.memory import NO_ACTION, Memory, lengths, matrices_of, move, open_apart
+from evofsm.memory import (
+    NO_ACTION,
+    Memory,
+    lengths,
+    matrices_of,
+    move,
+    open_apart,
+    tell_of_failures,
+)
 from evofsm.step import FULL, room_for, step_and_act
 from evofsm.transitions import NOT_OPEN
 from evofsm.validation import check_actions, check_rows, real_rows, refuse_unusable, whole
@@ -127,7 +135,7 @@ class Fleet:
         *,
         vehicles: Sequence[int] | NDArray[np.integer] | None = None,
         episode_starts: Sequence[int] | NDArray[np.integer] = (),
-        failures: Sequence[int] | NDArray[np.integer] = (),
+        failures: Sequence[int] | NDArray[np.integer] | None = None,
     ) -> FleetStep:
         """One observation of each vehicle, then the action commanded after it.
 
@@ -142,8 +150,9 @@ class Fleet:
             stay as they are.
         episode_starts : array_like of int
             Rows whose vehicle begins an episode with this observation.
-        failures : array_like of int
-            Rows whose vehicle's episode ended in failure with this observation.
+        failures : array_like of int, optional
+            Rows whose vehicle's episode ended in failure with this observation; an empty one tells
+            that none did.
 
         Returns
         -------
@@ -170,11 +179,13 @@ class Fleet:
         else:
             actions = check_actions(A, len(rows), self._machine.n_actions)
         starts = check_rows("episode_starts", episode_starts, len(rows))
-        ends = check_rows("failures", failures, len(rows))
+        ends = check_rows("failures", () if failures is None else failures, len(rows))
         # The number of variables is known from the first observation on.
         if len(rows) and self._small[self._at[0, 0]] == 0:
             self._machine._fit(rows[0])
             self._fill(self._machine._buffer)
+        if failures is not None:
+            tell_of_failures(self._small, self._at[chosen, 0])
         answer = FleetStep(
             np.empty(len(rows), np.int64),
             np.empty(len(rows), np.int64),

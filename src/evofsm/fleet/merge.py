@@ -121,7 +121,7 @@ def merge(machines: Sequence[EvolvingFSM], *, radius: float | None = None) -> Ev
     within = parameters.rule.radius if radius is None else positive("radius", radius)
     learnt = sorted((part._trimmed() for part in experienced), key=_content)
     match = _match(learnt, parameters, within)
-    return experienced[0]._holding(
+    merged = experienced[0]._holding(
         {
             **_no_episode(match.n),
             **_states(learnt, match),
@@ -129,6 +129,9 @@ def merge(machines: Sequence[EvolvingFSM], *, radius: float | None = None) -> Ev
             **_transitions(learnt, match, parameters),
         }
     )
+    if all(part.failures_told for part in experienced):
+        merged.tell_of_failures()
+    return merged
 
 
 def _refuse_unlike(machines: Iterable[EvolvingFSM]) -> list[EvolvingFSM]:

@@ -221,9 +221,12 @@ class Oversight:
             return revision
         if self.explaining is Explain.SPOKEN and not speaks(self.reviser, revision):
             return revision
-        known = self.machine if self._frozen is None else self._frozen
         action = int(self.actions.encode(revision.executed))
-        text = explain(known, situation.belief, action, self._labels).text
+        if self._frozen is None:
+            text = self.machine.explain(action, self._labels).text
+        else:
+            nearest = self._frozen.nearest(self.senses.held)
+            text = explain(self._frozen, situation.belief, action, self._labels, nearest).text
         return revision._replace(explanation=text)
 
     def end(self, observation: NDArray[np.float64] | None, *, failed: bool) -> None:
@@ -235,6 +238,7 @@ class Oversight:
                 self.machine.observe(observation, failed=failed, missing=Missing.PARTIAL)
             elif failed and self.machine.state is not None:
                 self.machine.fail()
+            self.machine.tell_of_failures()
         if self.risk is not None:
             self.risk.start_episode(learn=self.learn)
         if self.audit is not None:

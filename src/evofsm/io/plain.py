@@ -8,7 +8,8 @@ asked has to look at it more carefully.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import math
+from collections.abc import Container, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise, repeat
 from typing import NamedTuple, Self
@@ -34,6 +35,8 @@ _POWERS = 10.0 ** np.arange(23)
 # A quotient of 60 bits and a power of ten up to this lies so far from the middle between two
 # floats, if not right on it, that twice the precision of a float is enough to round it.
 _MOST_DECIMALS = 19
+# What stands in a field where there is no number.
+_NOTHING = ("", "na", "n/a", "null", "none")
 # Cuts a float into two halves whose products are exact (Veltkamp).
 _SPLITTER = float((1 << 27) + 1)
 
@@ -76,8 +79,19 @@ class PlainRows(NamedTuple):
     texts: list[Texts]  #: of each column asked for as texts
 
 
+def number_or_gap(field: str | bytes) -> float:
+    """The number in a field; NaN where it says that there is none."""
+    text = field.decode() if isinstance(field, bytes) else field
+    return math.nan if text.strip().lower() in _NOTHING else float(field)
+
+
 def parse_plain(
-    block: bytes, separator: str, n_columns: int, numbers: Sequence[int], texts: Sequence[int]
+    block: bytes,
+    separator: str,
+    n_columns: int,
+    numbers: Sequence[int],
+    texts: Sequence[int],
+    gaps: Container[int] = (),
 ) -> PlainRows | None:
     """Parse whole lines of CSV, or answer None where they are not plain.
 
@@ -91,6 +105,8 @@ def parse_plain(
         Fields that every line has to have; blank lines are passed over.
     numbers, texts : sequence of int
         Columns to read as numbers and as texts, each at most once, counted from 0.
+    gaps : container of int
+        Those of the numbers that may be missing, as an empty field.
     """
     data = np.frombuffer(block, np.uint8)
     # Compiled code does not look where an array ends, so there has to be room for every row: one a
@@ -118,7 +134,8 @@ def parse_plain(
         if not is_ascii:
             block.decode()
         for slot, row, first, last in doubts[:n_doubts].tolist():
-            values[slot, row] = float(block[first:last])
+            read = number_or_gap if numbers[slot] in gaps else float
+            values[slot, row] = read(block[first:last])
     except ValueError:  # no UTF-8, or no number
         return None
     columns = []

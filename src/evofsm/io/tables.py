@@ -5,7 +5,8 @@ from __future__ import annotations
 import csv
 import io
 import os
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import chain
 from typing import Any, BinaryIO, NoReturn, Protocol, Self, cast
@@ -14,8 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evofsm._extras import needs
+from evofsm.io.dates import looks_like_a_date, microseconds
 from evofsm.io.files import BYTE_ORDER_MARK, OnRead, damage_explained, ignore, open_unpacked
-from evofsm.io.plain import Texts, parse_plain
+from evofsm.io.plain import Texts, number_or_gap, parse_plain
 from evofsm.validation import LARGEST_OBSERVATION
 
 # At once: enough that what Python does in between hardly counts.
@@ -52,8 +54,22 @@ class Table(Protocol):
     path: str
     columns: tuple[str, ...]
 
-    def pieces(self, numbers: Sequence[str], texts: Sequence[str]) -> Iterator[Piece]:
-        """Read the named columns, in the order of rows."""
+    def pieces(
+        self,
+        numbers: Sequence[str],
+        texts: Sequence[str],
+        dates: Sequence[str] = (),
+        gaps: Sequence[str] = (),
+    ) -> Iterator[Piece]:
+        """Read the named columns, in the order of rows.
+
+        Of the numbers those in ``gaps`` may be missing: NaN, or what whoever asked has to refuse.
+        ``dates`` come as numbers, of microseconds.
+        """
+        ...
+
+    def holds_dates(self, name: str) -> bool:
+        """Whether a column holds times of ISO 8601 in place of numbers, as its first row says."""
         ...
 
 
@@ -84,22 +100,47 @@ class CsvTable:
                 "name the columns"
             )
 
-    def pieces(self, numbers: Sequence[str], texts: Sequence[str]) -> Iterator[Piece]:
+    def holds_dates(self, name: str) -> bool:
+        """Whether the first row has a time of ISO 8601 there; what else it has is not judged."""
+        with open_unpacked(self.path) as file, suppress(ValueError, EOFError, OSError, csv.Error):
+            file.read(self._header_size)
+            lines = _lines(self.path, _text(file), reached=self._header_lines)
+            row = next(csv.reader(lines, delimiter=self._separator), [])
+            return len(row) == len(self.columns) and looks_like_a_date(row[self._place(name)])
+        return False
+
+    def pieces(
+        self,
+        numbers: Sequence[str],
+        texts: Sequence[str],
+        dates: Sequence[str] = (),
+        gaps: Sequence[str] = (),
+    ) -> Iterator[Piece]:
         """Read the named columns, in the order of rows."""
-        numbers, texts = list(dict.fromkeys(numbers)), list(dict.fromkeys(texts))
+        numbers, texts = list(dict.fromkeys(numbers)), list(dict.fromkeys([*texts, *dates]))
+        for piece in self._pieces(numbers, texts, gaps):
+            for name in dates:
+                piece.numbers[name] = _microseconds(piece, name)
+            yield piece
+
+    def _pieces(
+        self, numbers: Sequence[str], texts: Sequence[str], gaps: Sequence[str]
+    ) -> Iterator[Piece]:
         places = [self._place(name) for name in numbers], [self._place(name) for name in texts]
+        may_lack = {self._place(name) for name in gaps}
         reached = self._header_lines
         with open_unpacked(self.path, self._on_read) as file:
             file.read(self._header_size)
             while block := _whole_lines(self.path, file, reached):
-                rows = parse_plain(block, self._separator, len(self.columns), *places)
+                rows = parse_plain(block, self._separator, len(self.columns), *places, may_lack)
                 if rows is None:
                     rest = (_text(io.BytesIO(block)), _text(file))
-                    yield from self._read_carefully(rest, reached, numbers, texts)
+                    yield from self._read_carefully(rest, reached, numbers, texts, gaps)
                     return
                 piece = Piece(self.path, "line", rows.lines + reached, {}, {})
                 for name, values in zip(numbers, rows.numbers, strict=True):
-                    _refuse_unusable(piece, name, values)
+                    if name not in gaps:
+                        refuse_unusable(piece, name, values)
                     piece.numbers[name] = values
                 piece.texts.update(zip(texts, rows.texts, strict=True))
                 yield piece
@@ -111,6 +152,7 @@ class CsvTable:
         reached: int,
         numbers: Sequence[str],
         texts: Sequence[str],
+        gaps: Sequence[str],
     ) -> Iterator[Piece]:
         """Read the lines of some parts, after those that were read before."""
         places = {name: self._place(name) for name in (*numbers, *texts)}
@@ -121,7 +163,7 @@ class CsvTable:
                 fields, places_of_rows = self._columns(some)
                 piece = Piece(self.path, "line", places_of_rows, {}, {})
                 for name in numbers:
-                    piece.numbers[name] = _numbers(piece, name, fields[places[name]])
+                    piece.numbers[name] = _numbers(piece, name, fields[places[name]], name in gaps)
                 for name in texts:
                     piece.texts[name] = Texts.of(fields[places[name]])
                 yield piece
@@ -165,7 +207,22 @@ class ParquetTable:
             self._refuse(error)
         self.columns = tuple(self._types)
 
-    def pieces(self, numbers: Sequence[str], texts: Sequence[str]) -> Iterator[Piece]:
+    def holds_dates(self, name: str) -> bool:
+        """Whether its type says so, or the first of its texts."""
+        import polars
+
+        kind = self._types[name]
+        if kind == polars.String and self._rows:
+            return looks_like_a_date(str(self._scan.select(name).head(1).collect().item() or ""))
+        return isinstance(kind, polars.Datetime)
+
+    def pieces(
+        self,
+        numbers: Sequence[str],
+        texts: Sequence[str],
+        dates: Sequence[str] = (),
+        gaps: Sequence[str] = (),
+    ) -> Iterator[Piece]:
         """Read the named columns, in the order of rows."""
         import polars
 
@@ -174,7 +231,8 @@ class ParquetTable:
                 raise ValueError(
                     f"{self.path}: column {name!r} holds {self._types[name]}, not numbers"
                 )
-        wanted = self._scan.select(list(dict.fromkeys([*numbers, *texts])))
+        texts = [*texts, *(name for name in dates if self._types[name] == polars.String)]
+        wanted = self._scan.select(list(dict.fromkeys([*numbers, *texts, *dates])))
         size = os.path.getsize(self.path)
         # Not collect_batches: it reads ahead of a slow consumer without bound (polars #28569).
         for first in range(0, self._rows, _PARQUET_ROWS):
@@ -186,15 +244,23 @@ class ParquetTable:
             places = np.arange(first + 1, first + rows + 1)
             piece = Piece(self.path, "row", places, {}, {})
             for name in numbers:
-                column = frame[name].cast(polars.Float64)
-                _refuse_unusable(piece, name, column.to_numpy())
-                piece.numbers[name] = column.to_numpy()
+                values = frame[name].cast(polars.Float64).to_numpy()
+                if name not in gaps:
+                    refuse_unusable(piece, name, values)
+                piece.numbers[name] = values
             for name in texts:
                 fields = frame[name].cast(polars.String).fill_null("")
                 firsts = fields.ne_missing(fields.shift()).arg_true()
                 piece.texts[name] = Texts(
                     fields.gather(firsts).to_list(), firsts.to_numpy().astype(np.int64), rows
                 )
+            for name in dates:
+                if name in piece.texts:
+                    piece.numbers[name] = _microseconds(piece, name)
+                else:
+                    ticks = frame[name].dt.epoch("us").cast(polars.Float64).to_numpy()
+                    refuse_unusable(piece, name, ticks)
+                    piece.numbers[name] = ticks
             self._on_read(size * rows // self._rows)
             yield piece
 
@@ -284,25 +350,50 @@ def _kept(lines: Iterator[str], into: list[str]) -> Iterator[str]:
         yield line
 
 
-def _is_number(text: str) -> bool:
+def _is_date(text: str) -> bool:
     try:
-        float(text)
+        microseconds([text])
     except ValueError:
         return False
     return True
 
 
-def _numbers(piece: Piece, name: str, fields: Sequence[str]) -> NDArray[np.float64]:
+def _is_number(text: str, read: Callable[[str], float] = float) -> bool:
     try:
-        values = np.fromiter(map(float, fields), np.float64, len(fields))
+        read(text)
     except ValueError:
-        row = next(row for row, field in enumerate(fields) if not _is_number(field))
+        return False
+    return True
+
+
+def _numbers(piece: Piece, name: str, fields: Sequence[str], may_lack: bool) -> NDArray[np.float64]:
+    read = number_or_gap if may_lack else float
+    try:
+        values = np.fromiter(map(read, fields), np.float64, len(fields))
+    except ValueError:
+        row = next(row for row, field in enumerate(fields) if not _is_number(field, read))
         raise ValueError(f"{piece.at(row)}, column {name!r}: {explain_text(fields[row])}") from None
-    _refuse_unusable(piece, name, values)
+    if not may_lack:
+        refuse_unusable(piece, name, values)
     return values
 
 
-def _refuse_unusable(piece: Piece, name: str, values: NDArray[np.float64]) -> None:
+def _microseconds(piece: Piece, name: str) -> NDArray[np.float64]:
+    """Dates of a column of texts."""
+    texts = piece.texts[name]
+    try:
+        return np.repeat(microseconds(texts.values), texts.lengths)
+    except ValueError as error:
+        is_date = [_is_date(text) for text in texts.values]
+        row = 0 if all(is_date) else int(texts.firsts[is_date.index(False)])
+        raise ValueError(
+            f"{piece.at(row)}, column {name!r}: {error}; the first row has a date, so all must "
+            "have one in ISO 8601, such as 2026-03-14T09:26:53.5+01:00"
+        ) from None
+
+
+def refuse_unusable(piece: Piece, name: str, values: NDArray[np.float64]) -> None:
+    """Raise where a number cannot be learnt; NaN is none."""
     usable = np.abs(values) <= LARGEST_OBSERVATION  # false of NaN
     if not usable.all():
         row = int(np.argmin(usable))
@@ -317,7 +408,8 @@ def explain_text(text: str) -> str:
     """Why a text is not the number it should be."""
     if not text.strip():
         return (
-            "the field is empty (a missing measurement? an episode's last action may be any number)"
+            "the field is empty (a missing measurement, or no leader? --no-leader end leaves such "
+            "rows out; an episode's last action may be any number)"
         )
     if _is_number(text.replace(",", ".")):
         return f"{text[:40]!r} is no number (a decimal comma? write 1.5)"

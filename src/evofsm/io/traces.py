@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -11,10 +12,12 @@ from numpy.typing import NDArray
 
 from evofsm.io import fcd
 from evofsm.io.blocks import Blocks
+from evofsm.io.conditions import Condition
 from evofsm.io.fcd import VehicleLengths
 from evofsm.io.files import OnRead, ignore, kind_of
 from evofsm.io.plain import Texts
-from evofsm.io.tables import CsvTable, ParquetTable, Piece, Table
+from evofsm.io.tables import CsvTable, ParquetTable, Piece, Table, refuse_unusable
+from evofsm.io.units import KNOWN, of_columns
 from evofsm.naming import VARIABLES
 from evofsm.observations import Category, ObservationEncoder
 
@@ -24,6 +27,10 @@ USUAL_EPISODE = ("run", "pair", "segment")
 LONGEST_STEP = 1.5
 # Rows of a file whose steps tell the usual one.
 _FIRST_ROWS = 8192
+# Speeds [m/s] and usual steps [s] beyond these are most likely in another unit.
+_FASTEST, _LONGEST_STEP = 60.0, 10.0
+_SPEED = re.compile(r"v([_0-9]|$)|.*(speed|velocity)", re.IGNORECASE)
+_MICROSECOND = 1e-6
 # Share by which the usual steps of two files may differ.
 _SAME_STEP = 0.05
 
@@ -41,6 +48,47 @@ class Chunk(NamedTuple):
     dt: float  #: usual time from a row to the next [s]; NaN while no two rows belong together
     jumps: int = 0  #: episodes that begin because of a hole in time
     cuts: int = 0  #: episodes that end because too many pairs were on the road to wait for
+    #: (K,) rows with which an episode ended in failure; None where nothing tells of failures
+    failures: NDArray[np.int64] | None = None
+
+
+@dataclass
+class Noted:
+    """What was noticed while traces were read, for people."""
+
+    units: dict[str, str] = field(default_factory=dict)  #: that columns were converted from
+    leaderless: int = 0  #: rows without a leader, left out
+    after_failure: int = 0  #: rows left out because the failure before them still held
+    unplaced: int = 0  #: failures in rows without a leader, which belong to no episode
+    fastest: dict[str, float] = field(default_factory=dict)  #: by variable, beyond belief [m/s]
+    longest_step: float = 0.0  #: the usual one, beyond belief [s]
+
+    def see(self, chunk: Chunk, names: Sequence[str]) -> None:
+        """Look for speeds and steps that are beyond belief."""
+        for name, values in zip(names, chunk.observations.T, strict=True):
+            if _SPEED.match(name) and (fastest := float(np.abs(values).max())) > _FASTEST:
+                self.fastest[name] = max(fastest, self.fastest.get(name, 0.0))
+        if chunk.dt > _LONGEST_STEP:
+            self.longest_step = max(chunk.dt, self.longest_step)
+
+    def warnings(self, time: str = "time") -> list[str]:
+        """What is most likely a mistake, and what would mend it."""
+        found = [
+            f"{name} reaches {fastest:,.0f} m/s, faster than any car on a road: is it in km/h or "
+            f"mph? --unit {name}=km/h converts it"
+            for name, fastest in self.fastest.items()
+        ]
+        if self.longest_step:
+            found.append(
+                f"there is a row every {self.longest_step:,.6g} s: is the time in ms? --unit "
+                f"{time}=ms converts it"
+            )
+        if self.unplaced:
+            found.append(
+                f"{self.unplaced:,} failures lie in rows without a leader, belong to no episode, "
+                "and were not counted"
+            )
+        return found
 
 
 @dataclass(frozen=True)
@@ -60,6 +108,15 @@ class LogColumns:
         those of run, pair and segment that exist. The rows of an episode stand together.
     dt : float, optional
         Time from a row to the next [s], for a log without a clock.
+    failed : Condition, optional
+        The row with which it first holds ends the episode in failure; those after it in which it
+        still holds are left out. Without it nothing tells of failures.
+    units : mapping, optional
+        Units by the column, or the beginning of columns, that are not those of the SI; see
+        `evofsm.io.units`.
+    leader_may_lack : bool
+        Whether a row in which an observed number is missing (an empty field, NaN, infinity) ends
+        the episode, and is left out; else it is refused.
     """
 
     observe: ObservationEncoder = field(default_factory=lambda: ObservationEncoder(*VARIABLES))
@@ -67,6 +124,9 @@ class LogColumns:
     time: str = "time"
     episode: Sequence[str] | None = None
     dt: float | None = None
+    failed: Condition | None = None
+    units: Mapping[str, str] = field(default_factory=dict)
+    leader_may_lack: bool = False
 
 
 def read_traces(
@@ -74,6 +134,7 @@ def read_traces(
     columns: LogColumns | None = None,
     lengths: VehicleLengths | None = None,
     on_read: OnRead = ignore,
+    noted: Noted | None = None,
 ) -> Iterator[Chunk]:
     """Read logs (CSV, Parquet) and FCD output of SUMO (XML, CSV, Parquet), gzipped or not.
 
@@ -87,6 +148,8 @@ def read_traces(
         Lengths assumed for vehicles in FCD.
     on_read : callable, optional
         Is told the number of bytes whenever some were read.
+    noted : Noted, optional
+        Is told what was noticed in reading.
 
     Yields
     ------
@@ -106,28 +169,39 @@ def read_traces(
     """
     columns = columns or LogColumns()
     lengths = lengths or VehicleLengths()
+    noted = noted or Noted()
     clock = _Clock(columns.dt)
     for path in paths:
         clock.open(path)
-        rows = 0
-        for chunk in _read_file(path, columns, lengths, clock, on_read):
+        rows, left_out = 0, noted.leaderless
+        for chunk in _read_file(path, columns, lengths, clock, on_read, noted):
             rows += len(chunk.times)
+            noted.see(chunk, columns.observe.names)
             yield chunk
+        if rows == 0 and noted.leaderless > left_out:
+            raise ValueError(
+                f"{path}: no row has a leader; {', '.join(columns.observe.names)} must all be there"
+            )
         if rows == 0:
             raise ValueError(f"{path} has a header but no rows")
     lengths.refuse_unknown()
 
 
 def _read_file(
-    path: str, columns: LogColumns, lengths: VehicleLengths, clock: _Clock, on_read: OnRead
+    path: str,
+    columns: LogColumns,
+    lengths: VehicleLengths,
+    clock: _Clock,
+    on_read: OnRead,
+    noted: Noted,
 ) -> Iterator[Chunk]:
     kind = kind_of(path)
     if kind == "xml":
-        return _read_fcd(path, fcd.xml_timesteps(path, on_read), columns, lengths, clock)
+        return _read_fcd(path, fcd.xml_timesteps(path, on_read), columns, lengths, clock, noted)
     table: Table = CsvTable(path, on_read) if kind == "csv" else ParquetTable(path, on_read)
     if fcd.TIME in table.columns:
-        return _read_fcd(path, fcd.table_timesteps(table), columns, lengths, clock)
-    return _read_log(table, columns, clock)
+        return _read_fcd(path, fcd.table_timesteps(table), columns, lengths, clock, noted)
+    return _read_log(table, columns, clock, noted)
 
 
 # -- Time -----------------------------------------------------------------------------------------
@@ -192,45 +266,135 @@ class _Clock:
 # -- Logs -----------------------------------------------------------------------------------------
 
 
-def _read_log(table: Table, columns: LogColumns, clock: _Clock) -> Iterator[Chunk]:
+class _Sieve:
+    """Finds the rows that are learnt, and where episodes begin and fail because of others.
+
+    It knows of the row before the present ones whether a condition held in it, and whether it
+    ended its episode.
+    """
+
+    def __init__(self, noted: Noted) -> None:
+        self._noted = noted
+        self._held = self._ended = False
+
+    def sift(
+        self,
+        anew: NDArray[np.bool_],
+        starts: NDArray[np.bool_],
+        holds: NDArray[np.bool_] | None,
+        lacking: NDArray[np.bool_] | None,
+    ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+        """Which rows are kept, and which of them fail; marks ``starts`` after those that end one.
+
+        An episode begins ``anew`` where the log says so, and at ``starts``. What still ``holds``
+        is no second failure, and a hole in time does not make it one.
+        """
+        rows = len(starts)
+        kept = np.ones(rows, np.bool_) if lacking is None else ~lacking
+        fails = np.zeros(rows, np.bool_)
+        if holds is not None:
+            before = np.concatenate([[self._held], holds[:-1]]) & ~anew
+            self._held = bool(holds[-1])
+            fails = holds & ~before
+            still = holds & before
+            self._noted.unplaced += int((fails & ~kept).sum())
+            self._noted.after_failure += int((still & kept).sum())
+            fails &= kept
+            kept &= ~still
+        if lacking is not None:
+            self._noted.leaderless += int(lacking.sum())
+        ends = fails | ~kept
+        starts |= np.concatenate([[self._ended], ends[:-1]])
+        self._ended = bool(ends[-1])
+        return kept, fails
+
+
+def _read_log(table: Table, columns: LogColumns, clock: _Clock, noted: Noted) -> Iterator[Chunk]:
     variables = columns.observe.variables
-    numbers = [*(v for v in variables if isinstance(v, str)), columns.action]
-    numbers += [columns.time] if clock.ticks else []
+    observed = [v for v in variables if isinstance(v, str)]
+    learnt = [*observed, columns.action]
     episode = _episode_columns(table, columns.episode)
     texts = [*episode, *(v.name for v in variables if isinstance(v, Category))]
-    _refuse_missing(table, columns, numbers, texts)
+    others = [columns.time] if clock.ticks else []
+    failed = columns.failed
+    compared = [failed.column] if failed is not None and failed.sign else []
+    texts += [failed.column] if failed is not None and not failed.sign else []
+    _refuse_missing(table, columns, [*learnt, *others, *compared], texts)
+    dates = [name for name in others if table.holds_dates(name)]
+    numbers = [*learnt, *compared, *(name for name in others if name not in dates)]
+    factors = _factors(table, columns, numbers, noted)
+    only_compared = [name for name in compared if name not in learnt]  # may be infinite
+    gaps = learnt if columns.leader_may_lack else []
 
     rows_before = 0
     key_before: list[str] | None = None
     blocks = Blocks(episode)
-    for piece in table.pieces(numbers, texts):
+    first_date = np.nan
+    sieve = _Sieve(noted)
+    for piece in table.pieces(numbers, texts, dates, [*gaps, *only_compared]):
         rows = len(piece.places)
         if rows == 0:
             continue
+        for name, factor in factors.items():
+            piece.numbers[name] = piece.numbers[name] * factor
         keys = [piece.texts[name] for name in episode]
         starts = np.zeros(rows, np.bool_)
         for key in keys:
             starts[key.firsts] = True
         starts[0] = key_before != _key(keys, 0)
         blocks.see(piece, keys, starts)
-        jumps = 0
+        anew, holes = starts.copy(), np.zeros(rows, np.bool_)
         if clock.ticks:
             times = piece.numbers[columns.time]
+            if dates:
+                first_date = times[0] if np.isnan(first_date) else first_date
+                times = (times - first_date) * _MICROSECOND
             holes = clock.holes(times, starts, piece.at)
-            jumps = int(holes.sum())
             starts |= holes
         else:
             times = np.arange(rows_before, rows_before + rows) * np.float64(clock.dt)
+        rows_before, key_before = rows_before + rows, _key(keys, rows - 1)
+        lacking = _lacking(piece, observed) if columns.leader_may_lack else None
+        holds = None if failed is None else failed.holds(piece)
+        kept, fails = sieve.sift(anew, starts, holds, lacking)
+        if not kept.any():
+            continue
+        for name in gaps:
+            refuse_unusable(piece, name, np.where(kept, piece.numbers[name], 0.0))
+        for name in only_compared:
+            lacks = kept & np.isnan(piece.numbers[name])
+            refuse_unusable(piece, name, np.where(lacks, np.nan, 0.0))
+        rows_learnt = slice(None) if kept.all() else kept  # a slice copies nothing
         yield Chunk(
             source=table.path,
-            observations=np.column_stack([_encode(piece, variable) for variable in variables]),
-            actions=piece.numbers[columns.action],
-            times=times,
-            starts=np.flatnonzero(starts),
+            observations=np.column_stack([_encode(piece, v) for v in variables])[rows_learnt],
+            actions=piece.numbers[columns.action][rows_learnt],
+            times=times[rows_learnt],
+            starts=np.flatnonzero(starts[rows_learnt]),
             dt=clock.dt,
-            jumps=jumps,
+            jumps=int(holes[rows_learnt].sum()),
+            failures=None if failed is None else np.flatnonzero(fails[rows_learnt]),
         )
-        rows_before, key_before = rows_before + rows, _key(keys, rows - 1)
+
+
+def _factors(
+    table: Table, columns: LogColumns, numbers: Sequence[str], noted: Noted
+) -> dict[str, float]:
+    """What turns columns into units of the SI, by name, for those that need it."""
+    try:
+        given = of_columns(columns.units, numbers, table.columns, columns.time)
+    except ValueError as error:
+        raise ValueError(f"{table.path}: {error}") from None
+    noted.units |= given
+    return {name: KNOWN[unit][1] for name, unit in given.items()}
+
+
+def _lacking(piece: Piece, observed: Sequence[str]) -> NDArray[np.bool_]:
+    """Rows in which a number is missing."""
+    lacking = np.zeros(len(piece.places), np.bool_)
+    for name in observed:
+        lacking |= ~np.isfinite(piece.numbers[name])
+    return lacking
 
 
 def _key(columns: Sequence[Texts], row: int) -> list[str]:
@@ -249,6 +413,8 @@ def _refuse_missing(
         if name not in table.columns:
             option = {columns.action: "--action", columns.time: "--time"}.get(name)
             option = option or ("--episode" if name in (columns.episode or ()) else "--observe")
+            if columns.failed is not None and name == columns.failed.column:
+                option = option if name in columns.observe.names else "--failed"
             raise ValueError(
                 f"{table.path} has no column {name!r}; it has {_listed(table.columns)} "
                 f"({option} names the right one"
@@ -286,8 +452,10 @@ def _read_fcd(
     columns: LogColumns,
     lengths: VehicleLengths,
     clock: _Clock,
+    noted: Noted,
 ) -> Iterator[Chunk]:
     chosen = _fcd_variables(path, columns)
+    sieve = None if columns.failed is None else _Sieve(noted)
     waiting: list[fcd.Episode] = []
     rows = 0
     found = False
@@ -296,10 +464,10 @@ def _read_fcd(
         waiting.append(episode)
         rows += len(episode.times)
         if rows >= _ROWS_AT_ONCE:
-            yield from _join(path, waiting, chosen, clock)
+            yield from _join(path, waiting, chosen, clock, columns.failed, sieve)
             waiting, rows = [], 0
     if waiting:
-        yield from _join(path, waiting, chosen, clock)
+        yield from _join(path, waiting, chosen, clock, columns.failed, sieve)
     if not found:
         raise ValueError(f"{path}: no vehicle ever follows another one on the same lane")
 
@@ -309,6 +477,10 @@ def _fcd_variables(path: str, columns: LogColumns) -> list[int]:
     asked += [f"--action {columns.action}"] if columns.action != fcd.ACTION else []
     asked += ["--episode"] if columns.episode is not None else []
     asked += ["--dt"] if columns.dt is not None else []
+    asked += ["--unit"] if columns.units else []
+    failed = columns.failed
+    if failed is not None and not (failed.sign and failed.column in (*VARIABLES, fcd.ACTION)):
+        asked += [f"--failed {failed} (but with 'gap<=0')"]
     if asked:
         raise ValueError(
             f"{path} is FCD output of SUMO, with a clock and episodes of its own; it gives "
@@ -319,17 +491,30 @@ def _fcd_variables(path: str, columns: LogColumns) -> list[int]:
 
 
 def _join(
-    path: str, episodes: Sequence[fcd.Episode], chosen: list[int], clock: _Clock
+    path: str,
+    episodes: Sequence[fcd.Episode],
+    chosen: list[int],
+    clock: _Clock,
+    failed: Condition | None,
+    sieve: _Sieve | None,
 ) -> Iterator[Chunk]:
     """Episodes end to end, cut into chunks of a bounded number of rows."""
     times = np.concatenate([episode.times for episode in episodes])
-    observations = np.vstack([episode.observations for episode in episodes])[:, chosen]
+    seen = np.vstack([episode.observations for episode in episodes])
+    observations = seen[:, chosen]
     actions = np.concatenate([episode.actions for episode in episodes])
     lengths = [len(episode.times) for episode in episodes]
     starts = np.zeros(len(times), np.bool_)
     starts[np.cumsum([0, *lengths[:-1]])] = True
     holes = clock.holes(times, starts, lambda row: path)
+    anew = starts.copy()
     starts |= holes
+    fails = None
+    if failed is not None and sieve is not None:
+        values = dict(zip((*VARIABLES, fcd.ACTION), (*seen.T, actions), strict=True))
+        kept, fails = sieve.sift(anew, starts, failed.compare(values[failed.column]), None)
+        times, observations, actions = times[kept], observations[kept], actions[kept]
+        starts, holes, fails = starts[kept], holes[kept], fails[kept]
     cuts = sum(episode.was_cut for episode in episodes)
     for first in range(0, len(times), _ROWS_AT_ONCE):
         part = slice(first, first + _ROWS_AT_ONCE)
@@ -342,4 +527,5 @@ def _join(
             dt=clock.dt,
             jumps=int(holes[part].sum()),
             cuts=cuts if first == 0 else 0,
+            failures=None if fails is None else np.flatnonzero(fails[part]),
         )

@@ -7,7 +7,7 @@ they are counted from 0, as in the code.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
@@ -46,7 +46,14 @@ _UNCERTAIN = 0.5
 # -- For people -----------------------------------------------------------------------------------
 
 
-def print_learning(out: Console, learning: Learning, *, action: str, lengths: str | None) -> None:
+def print_learning(
+    out: Console,
+    learning: Learning,
+    *,
+    action: str,
+    lengths: str | None,
+    further: Iterable[tuple[str, str]] = (),
+) -> None:
     """Print what was read, the states, the transitions and the skill.
 
     Parameters
@@ -57,9 +64,11 @@ def print_learning(out: Console, learning: Learning, *, action: str, lengths: st
         Name of the action.
     lengths : str, optional
         Lengths assumed for vehicles, where they mattered.
+    further : iterable of (str, str)
+        What else is to be said of how it was read.
     """
     model = learning.model
-    facts = [*_read_facts(learning), ("actions", _action_text(learning, action))]
+    facts = [*_read_facts(learning), ("actions", _action_text(learning, action)), *further]
     if lengths:
         facts.append(("vehicle lengths", f"assumed, for FCD has none: {lengths}"))
     print_facts(out, "What was read", facts)
@@ -136,7 +145,14 @@ def _model_facts(model: FSMModel) -> Facts:
         ("transitions", f"{model.uses.sum():,.0f}, under {model.n_actions} actions"),
         ("states", f"{model.n_states}, of {model.n_variables} variables"),
         ("settings", settings or "not known"),
+        ("failures", _failures_text(model)),
     ]
+
+
+def _failures_text(model: FSMModel) -> str:
+    if not model.failures_told:
+        return "none was ever told"
+    return f"{model.endings.sum():,.0f} episodes ended in one"
 
 
 def _step_text(dt: float | None) -> str:
@@ -401,6 +417,7 @@ def model_document(model: FSMModel) -> dict[str, Any]:
         "names": model.names,
         "units": model.units,
         "settings": dict(model.settings),
+        "failures_told": model.failures_told,
         "states": [
             {
                 "state": i,

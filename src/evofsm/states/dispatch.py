@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import fields
 from typing import Any
@@ -85,6 +86,12 @@ def width(settings: RuleSettings, clusters: Clusters) -> float:
     if settings.code == novelty.CODE:
         return novelty.width(settings.spread, settings.radius)
     return ets.width(settings.spread, clusters)
+
+
+def reach(rule: StateRule, width: float) -> float:
+    """Distance from a centre, in scales, beyond which an observation is like no state."""
+    rule = rule.base if isinstance(rule, FailureSplit) else rule
+    return rule.radius if isinstance(rule, Novelty) else math.sqrt(width)
 
 
 def check_rule(name: str, rule: StateRule) -> StateRule:

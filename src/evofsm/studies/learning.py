@@ -39,7 +39,10 @@ _LEAST_EVIDENCE = 10.0
 _POLICIES: tuple[Policy, ...] = get_args(Policy)
 _HOLD, _OBSERVED = _POLICIES.index("hold"), _POLICIES.index("observed")
 # What a learner counts.
-_COUNTS = ("chunks", "rows", "episodes", "jumps", "cuts", "clipped_below", "clipped_above")
+_COUNTS = (
+    *("chunks", "rows", "episodes", "jumps", "cuts", "failures"),
+    *("clipped_below", "clipped_above"),
+)
 # Rows whose beliefs are kept at a time.
 _ROWS_AT_ONCE = 1024
 
@@ -78,6 +81,7 @@ class Learning:
     clipped_above: int  #: actions above the range, put into its last interval
     jumps: int  #: episodes that began because of a hole in time
     cuts: int  #: episodes cut because too many pairs were on the road at once
+    failures: int | None  #: episodes that ended in failure; None where nothing told of failures
     certainty: float  #: mean share of the belief that the most probable state has
     skills: tuple[Skill, ...]  #: of one step, then of `HORIZON` under each policy
 
@@ -147,6 +151,7 @@ def learn_traces(
         clipped_above=learner.clipped_above,
         jumps=learner.jumps,
         cuts=learner.cuts,
+        failures=learner.failures if learner.machine.failures_told else None,
         certainty=learner.certainty / learner.rows,
         skills=learner.skills(),
     )
@@ -256,7 +261,6 @@ class _Room(NamedTuple):
     n_states: NDArray[np.int64]  # (R,)
     event: NDArray[np.int8]  # (R,)
     surprise: NDArray[np.float64]  # (R,)
-    failures: NDArray[np.bool_]  # (R,) none
     vector: NDArray[np.float64]  # (capacity,)
     matrix: NDArray[np.float64]  # (capacity, capacity)
     square: NDArray[np.float64]  # (capacity, capacity)
@@ -269,7 +273,7 @@ class _Learner:
         self.machine = machine
         self.actions = actions
         self.dt = np.nan
-        self.rows = self.episodes = self.jumps = self.cuts = self.chunks = 0
+        self.rows = self.episodes = self.jumps = self.cuts = self.chunks = self.failures = 0
         self.clipped_below = self.clipped_above = 0
         self.seconds = 0.0
         self._last_time = np.nan
@@ -308,6 +312,7 @@ class _Learner:
         self.episodes += len(chunk.starts)
         self.jumps += chunk.jumps
         self.cuts += chunk.cuts
+        self.failures += 0 if chunk.failures is None else len(chunk.failures)
         self.clipped_below += int((chunk.actions < self.actions.low).sum())
         self.clipped_above += int((chunk.actions > self.actions.high).sum())
 
@@ -342,7 +347,7 @@ class _Learner:
             raise ValueError(f"its machine has {self.machine.n_actions} actions")
         scores = _Scores(*(np.array(arrays[name]) for name in _Scores._fields))
         for name in _COUNTS:
-            setattr(self, name, int(kept.content[name]))
+            setattr(self, name, int(kept.content.get(name, 0)))
         self.dt, self.seconds, self._last_time = arrays["clock"].tolist()
         n, kinds = self.machine.n_states, len(_POLICIES)
         for name, shape in (
@@ -371,6 +376,10 @@ class _Learner:
         observations = self.machine._check_observations(chunk.observations)
         self.machine._fit(observations[0])
         starts = check_rows("starts", chunk.starts, len(observations))
+        failures = np.zeros(len(observations), np.bool_)
+        if chunk.failures is not None:
+            failures = check_rows("failures", chunk.failures, len(observations))
+            self.machine.tell_of_failures()
         row = 0
         while row < len(observations):
             if len(self._scores.belief) < self.machine._capacity:
@@ -380,6 +389,7 @@ class _Learner:
                 observations,
                 indices,
                 starts,
+                failures,
                 row,
                 self._steps_ahead,
                 self._scores,
@@ -401,7 +411,6 @@ class _Learner:
             n_states=np.zeros(rows, np.int64),
             event=np.zeros(rows, np.int8),
             surprise=np.zeros(rows),
-            failures=np.zeros(rows, np.bool_),
             vector=np.zeros(capacity),
             matrix=np.zeros((capacity, capacity)),
             square=np.zeros((capacity, capacity)),
@@ -428,6 +437,7 @@ def _learn_and_score_rows(
     observations: NDArray[np.float64],
     actions: NDArray[np.int64],
     starts: NDArray[np.bool_],
+    failures: NDArray[np.bool_],
     row: int,
     steps_ahead: int,
     scores: _Scores,
@@ -448,7 +458,7 @@ def _learn_and_score_rows(
             observations[these],
             actions[these],
             starts[these],
-            room.failures,
+            failures[these],
             0,
             Trace(room.state, room.n_states, room.event, room.surprise),
             room.beliefs,
@@ -459,7 +469,7 @@ def _learn_and_score_rows(
             break
         if halts:
             _score_ahead(room.n_states[rows - 1], scores, room)
-            if actions[row - 1] != NO_ACTION:
+            if actions[row - 1] != NO_ACTION and not failures[row - 1]:
                 _look_ahead(buffer, actions[row - 1], steps_ahead, scores, room)
     return row
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from evofsm.cli.bench.common import PageFolder, Progress, WorkersOption, finish
 from evofsm.cli.common import (
+    PAGE,
     SwitchesOption,
     ToleranceOption,
     counter,
@@ -54,9 +55,7 @@ def closed_loop(
 
     Every policy drives the same held-out draws; ours learns first, with several seeds.
     """
-    require(scipy="study")
-    if not as_json:
-        require(matplotlib="plot", jinja2="plot")
+    require(scipy="study", **({} if as_json else PAGE))
     from evofsm.studies.closed_loop import Plan, run_closed_loop
     from evofsm.worlds.families import load_family
 

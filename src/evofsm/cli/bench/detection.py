@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from evofsm.cli.bench.common import PageFolder, Progress, WorkersOption, finish
-from evofsm.cli.common import counter, plain_errors, progress, require, split_names
+from evofsm.cli.common import PAGE, counter, plain_errors, progress, require, split_names
 
 if TYPE_CHECKING:
     from evofsm.report.chapter import Chapter
@@ -43,9 +43,7 @@ def detection(
 
     Nobody acts. Ours has watched other episodes; thresholds are chosen on yet others.
     """
-    require(scipy="study")
-    if not as_json:
-        require(matplotlib="plot", jinja2="plot")
+    require(scipy="study", **({} if as_json else PAGE))
     from evofsm.studies.detection import FAMILIES, Plan, run_detection
 
     plan = Plan(seed=seed).shortened() if short else Plan(seed=seed)

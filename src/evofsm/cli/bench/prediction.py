@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from evofsm.cli.bench.common import PageFolder, Progress, WorkersOption, finish
-from evofsm.cli.common import counter, plain_errors, progress, require
+from evofsm.cli.common import PAGE, counter, plain_errors, progress, require
 
 if TYPE_CHECKING:
     from evofsm.report.chapter import Chapter
@@ -36,9 +36,7 @@ def prediction(
     ] = False,
 ) -> None:
     """How well the state 0.01 to 5 s ahead is forecast, against persistence and a batch fit."""
-    require(scipy="study", deeptime="dev")
-    if not as_json:
-        require(matplotlib="plot", jinja2="plot")
+    require(scipy="study", deeptime="dev", **({} if as_json else PAGE))
     from evofsm.studies.prediction import Plan, log_sources, run_prediction
 
     plan = Plan(train=train, test=test, seeds=seeds, seed=seed)

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from evofsm.cli.bench.common import PageFolder, Progress, WorkersOption, finish
-from evofsm.cli.common import counter, plain_errors, progress, require
+from evofsm.cli.common import PAGE, counter, plain_errors, progress, require
 
 if TYPE_CHECKING:
     from evofsm.report.chapter import Chapter
@@ -53,9 +53,7 @@ def real(
     --train and is judged on --data, beside the classic measures. Checksums in MANIFEST.csv or
     SHA256SUMS are held against the files.
     """
-    require(scipy="study")
-    if not as_json:
-        require(matplotlib="plot", jinja2="plot")
+    require(scipy="study", **({} if as_json else PAGE))
     from evofsm.studies.real import Plan, read_folder, run_real
 
     plan = Plan(folds=folds, seed=seed)

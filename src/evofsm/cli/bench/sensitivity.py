@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from evofsm.cli.bench.common import PageFolder, Progress, WorkersOption, finish
-from evofsm.cli.common import counter, plain_errors, progress, require
+from evofsm.cli.common import PAGE, counter, plain_errors, progress, require
 
 if TYPE_CHECKING:
     from evofsm.report.chapter import Chapter
@@ -39,9 +39,7 @@ def sensitivity(
     The paper leaves open how fast the leader gets, how hard it brakes, the gap at the start, and
     more. Each setting drives the paper's 80 runs and is judged by the checks of `evofsm paper`.
     """
-    require(scipy="study")
-    if not as_json:
-        require(matplotlib="plot", jinja2="plot")
+    require(scipy="study", **({} if as_json else PAGE))
     from evofsm.studies.sensitivity import Plan, run_sensitivity
 
     plan = Plan(settings=settings, seed=seed)
