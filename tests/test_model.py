@@ -272,6 +272,7 @@ def test_models_and_steps_are_shown_in_a_line():
             "Novelty(radius=0.001, scales=(), spread=1.0))"
         )
     )
+    machine.start_episode()
     step = machine.observe([3.2])
     assert repr(step) == "Step(state=500, belief=1 of 501 states, event=CREATED, surprise=nan)"
     step = machine.observe([np.nan], missing=Missing.PARTIAL)

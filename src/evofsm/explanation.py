@@ -11,8 +11,8 @@ an observation that is farther from the nearest centre than a state reaches is *
 nothing that was counted is told of it. How far a state reaches is the rule's
 (`evofsm.states.dispatch.reach`): the radius beyond which `Novelty` would make a new state; with the
 paper's rule, which makes none of what is rare, the distance at which the similarity has fallen to
-1/e, the root of the width of recognition. With that rule the states may have passed over something
-rare that was seen, hence "as far as the states tell".
+2 %, twice the root of the width of recognition. With that rule the states may have passed over
+something rare that was seen, hence "as far as the states tell".
 """
 
 from __future__ import annotations

@@ -367,7 +367,7 @@ class FSMModel:
         Most often reached from #1: 1 of 1 times.
         >>> print(model.explain(observation=[30.0]))
         Never seen, as far as the states tell: 29 from the nearest, #2 (gap 1 m), where a state
-        reaches 1.4.
+        reaches 2.8.
         """
         if action is not None:
             action = check_action(action, self.n_actions)

@@ -36,6 +36,9 @@ RULES: Mapping[str, Any] = {
     "failure": FailureSplit,
 }
 
+# Where a rule has no radius that says so, a state reaches so many roots of the width.
+_WIDTHS = 2.0
+
 
 @inner_kernel
 def determine(
@@ -89,9 +92,13 @@ def width(settings: RuleSettings, clusters: Clusters) -> float:
 
 
 def reach(rule: StateRule, width: float) -> float:
-    """Distance from a centre, in scales, beyond which an observation is like no state."""
+    """Distance from a centre, in scales, beyond which an observation is like no state.
+
+    The radius of `Novelty`, beyond which it makes a new one. Other rules make no state of what is
+    rare: twice the root of the width of recognition, where the similarity is 1/e⁴, or 2 %.
+    """
     rule = rule.base if isinstance(rule, FailureSplit) else rule
-    return rule.radius if isinstance(rule, Novelty) else math.sqrt(width)
+    return rule.radius if isinstance(rule, Novelty) else _WIDTHS * math.sqrt(width)
 
 
 def check_rule(name: str, rule: StateRule) -> StateRule:
