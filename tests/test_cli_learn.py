@@ -380,7 +380,7 @@ def test_failures_are_learnt_from_a_column_or_a_comparison(evofsm, crashes, tmp_
     text = " ".join(evofsm("learn", crashes, "--failed", "hit").stdout.split())
     assert "failures 2 episodes ended with hit; 18 rows after them" in text
     assert "failures 2 episodes ended in one" in " ".join(evofsm("inspect", path).stdout.split())
-    assert "2 of 3" in " ".join(evofsm("explain", path, "--state", "1").stdout.split())
+    assert "2 of 4" in " ".join(evofsm("explain", path, "--state", "1").stdout.split())
 
 
 def test_a_log_that_tells_nothing_of_failures_is_said_to(evofsm, crashes, tmp_path):
