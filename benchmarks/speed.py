@@ -18,6 +18,7 @@ from functools import partial
 from pathlib import Path
 
 from clusterers import db_stream, stream_k_means
+from cold import FIRST, first
 from fleets import fleet
 from single import batch, call
 from table import HEADER, Row, judged, shown, worsened
@@ -49,6 +50,7 @@ ROWS = {
     "sumo_loop": Row(late("sumo_loop"), "<=", 1.25),
     "csv_learn": Row(late("csv_learn"), "<=", 3.0),
     "states_1024": Row(many_states, "<=", 20.0),
+    **{id_: Row(partial(first, id_), "s", most) for id_, (_, _, most) in FIRST.items()},
 }
 
 

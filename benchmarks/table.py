@@ -26,7 +26,8 @@ class Row(NamedTuple):
     """How a row is measured, in so many turns, short or in full, and what it should reach."""
 
     measure: Callable[[int, bool], Result]
-    better: str  # ">=": how many times as fast as the reference; "<=": how many times its cost
+    # ">=": how many times as fast as the reference; "<=": how many times its cost; "s": seconds
+    better: str
     target: float | None = None
 
 
@@ -36,16 +37,21 @@ def judged(id_: str, row: Row, measured: Result) -> Result:
     faster = row.better == ">="
     ratio = reference / ours if faster else ours / reference
     target = row.target
-    reached = target is None or (ratio >= target if faster else ratio <= target)
+    compared = ours if row.better == "s" else ratio
+    reached = target is None or (compared >= target if faster else compared <= target)
     return {
         "id": id_,
         **measured,
         "ratio": ratio,
         "ratio_is": _FASTER if faster else _COST,
-        "target": None if target is None else f"{row.better} {target:g}",
+        "target": None if target is None else _told(row.better, target),
         "reached": reached,
         "cores": os.cpu_count(),
     }
+
+
+def _told(better: str, target: float) -> str:
+    return f"<= {target:g} s" if better == "s" else f"{better} {target:g}"
 
 
 def worsened(result: Result, last: list[Result]) -> str | None:

@@ -1,6 +1,8 @@
 import os
 import subprocess
 import sys
+import tempfile
+import time
 from pathlib import Path
 
 import pytest
@@ -56,25 +58,78 @@ def test_editing_a_kernel_takes_effect_in_the_kernels_that_call_it(package):
     assert run(package) == (6.0, 0)
 
 
-def test_caches_older_than_any_kernel_are_dropped_and_newer_ones_kept(tmp_path):
-    written = Path(_compile.__file__).stat().st_mtime + 1000
-    caches = tmp_path / "room" / "__pycache__"
-    caches.mkdir(parents=True)
-    for module, compiled_after in (("old", -5), ("new", 5)):
-        (tmp_path / "room" / f"{module}.py").write_text("from package._compile import kernel")
-        os.utime(tmp_path / "room" / f"{module}.py", (written, written))
-        cache = caches / f"{module}.kernel-3.py311.nbi"
-        cache.touch()
-        os.utime(cache, (written + compiled_after,) * 2)
-    _compile._drop_stale_caches(tmp_path)
-    assert [path.name for path in caches.iterdir()] == ["new.kernel-3.py311.nbi"]
+def test_a_source_dated_in_the_future_keeps_the_caches(package):
+    in_a_year = time.time() + 3e7
+    os.utime(package / "callee.py", (in_a_year, in_a_year))
+    assert run(package) == (3.0, 0)
+    assert run(package) == (3.0, 1)
 
 
-def test_editing_what_holds_no_kernels_keeps_the_caches(tmp_path):
-    caches = tmp_path / "__pycache__"
-    caches.mkdir()
-    (caches / "old.kernel-3.py311.nbi").touch()
-    os.utime(caches / "old.kernel-3.py311.nbi", (1000, 1000))
-    (tmp_path / "page.py").write_text("draws nothing that is compiled")
+@pytest.fixture
+def cached(tmp_path):
+    """A package with a kernel, a constant that it uses, a page, and the cache of the kernel."""
+    (tmp_path / "room" / "__pycache__").mkdir(parents=True)
+    (tmp_path / "kernel.py").write_text(
+        f"from {tmp_path.name}._compile import (\n    kernel,\n)\n"
+        f"from {tmp_path.name}.room.limits import LARGEST\n"
+    )
+    (tmp_path / "room" / "limits.py").write_text("LARGEST = 1.0")
+    (tmp_path / "page.py").write_text("draws nothing that _compile compiles")
     _compile._drop_stale_caches(tmp_path)
-    assert len(list(caches.iterdir())) == 1
+    cache = tmp_path / "room" / "__pycache__" / "kernel.kernel-3.py311.nbi"
+    cache.touch()
+    return cache
+
+
+@pytest.mark.parametrize(
+    ("edited", "kept"), [("kernel.py", False), ("room/limits.py", False), ("page.py", True)]
+)
+def test_caches_go_where_what_kernels_are_made_of_was_edited(cached, tmp_path, edited, kept):
+    _compile._drop_stale_caches(tmp_path)
+    assert cached.exists()
+    with open(tmp_path / edited, "a") as file:
+        file.write("\n# another line\n")
+    _compile._drop_stale_caches(tmp_path)
+    assert cached.exists() is kept
+
+
+def test_touching_a_source_keeps_the_caches(cached, tmp_path):
+    os.utime(tmp_path / "kernel.py", (1000, 1000))
+    _compile._drop_stale_caches(tmp_path)
+    assert cached.exists()
+
+
+def test_a_machine_without_a_limit_compiles_nothing_that_gives_up_states():
+    """What is rare stays out of the kernel of every step: it takes as long to compile as a step."""
+    code = (
+        "import numpy as np, evofsm, evofsm.crowding as c\n"
+        "evofsm.EvolvingFSM(1).observe(np.zeros(2))\n"
+        "print(len(c.merge_closest.signatures), len(c.retire_least_useful.signatures))"
+    )
+    fresh = {**os.environ, "NUMBA_CACHE_DIR": tempfile.mkdtemp()}
+    finished = subprocess.run(
+        [sys.executable, "-c", code], env=fresh, capture_output=True, text=True, check=True
+    )
+    assert finished.stdout.split() == ["0", "0"]
+
+
+def test_compiling_that_takes_long_is_announced_once(capsys, monkeypatch):
+    monkeypatch.setattr(_compile.Announcement, "_PATIENCE", 0.05)
+    told = _compile.Announcement()
+    for _ in range(2):
+        told.on_start(None)
+        told.on_start(None)  # for another kernel
+        told.on_end(None)
+        deadline = time.monotonic() + 5.0
+        while told._spent < 0.05 and time.monotonic() < deadline:
+            time.sleep(0.01)
+        told.on_end(None)
+    assert capsys.readouterr().err == "compiling kernels, once ...\n"
+
+
+def test_compiling_that_is_quick_is_not_announced(capsys):
+    told = _compile.Announcement()
+    told.on_start(None)
+    told.on_end(None)
+    told._timer.join()
+    assert capsys.readouterr().err == ""

@@ -2,26 +2,31 @@
 
 from __future__ import annotations
 
-import math
+import json
+import os
+import re
+import sys
 from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
+from hashlib import sha256
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from threading import Timer
+from time import monotonic
+from typing import Any, ClassVar, TypeVar, cast
 
 import numba
-import numpy as np
-from numba import extending, types
-from numba.core import cgutils
-from numba.extending import register_jitable, type_callable
-from numba.np import arrayobj
-from numpy.typing import NDArray
+from numba.core import event, types
+from numba.core.codegen import JITCodeLibrary
+from numba.core.compiler import CompilerBase, DefaultPassBuilder
+from numba.core.compiler_machinery import AnalysisPass, register_pass
+from numba.core.typed_passes import AnnotateTypes
+from numba.extending import register_jitable
 
 Function = TypeVar("Function", bound=Callable[..., object])
-# Numba has no types for these.
-_arrays, _codegen, _extending = cast(Any, arrayobj), cast(Any, cgutils), cast(Any, extending)
 
-Floating = TypeVar("Floating", bound=np.floating)
+
+_INLINED = {"forceinline": True, "_nrt": False}
 
 
 def kernel(function: Function) -> Function:
@@ -32,23 +37,84 @@ def kernel(function: Function) -> Function:
     is NumPy's. ``fastmath`` stays off: it reorders sums, and then a single step and a batch
     would no longer agree bit for bit.
     """
-    return compiled(function, forceinline=True, _nrt=False, no_cfunc_wrapper=True)
+    return compiled(function, no_cfunc_wrapper=True, **_INLINED)
 
 
 def inner_kernel(function: Function) -> Function:
     """A kernel that only kernels call: without a way in from Python it is compiled sooner."""
-    return _compiled_inside(function, forceinline=True)
+    return _inside(function, **_INLINED)
 
 
 def rare_kernel(function: Function) -> Function:
     """An inner kernel that is seldom needed, compiled once and not into each of its callers."""
-    return _compiled_inside(function)
+    return _inside(function, _nrt=False)
 
 
-def _compiled_inside(function: Function, **options: object) -> Function:
+def _inside(function: Function, **options: Any) -> Function:
+    """Compile with Numba as a part of the kernels that call it."""
     njit: Any = numba.njit
-    inside = {"_nrt": False, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
-    return cast(Function, njit(error_model="numpy", **inside, **options)(function))
+    options |= {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+    options |= {"pipeline_class": _InnerCompiler, "error_model": "numpy"}
+    return cast(Function, njit(**options)(function))
+
+
+class _Linkable(JITCodeLibrary):  # type: ignore[misc]
+    """The code of an inner kernel: it is optimised, and made machine code, in its callers alone.
+
+    Numba would do both for each kernel by itself, and then again with all that it calls in each
+    of its callers: of a chain of calls the innermost kernel as often as the chain is long.
+    """
+
+    def _optimize_final_module(self) -> None:
+        pass
+
+    def _finalize_final_module(self) -> None:
+        self._finalize_dynamic_globals()
+        self._finalized = True
+
+    def get_pointer_to_function(self, name: str) -> int:
+        return 0
+
+    @property
+    def codegen(self) -> Any:
+        return _WithoutEnvironment(self._codegen)
+
+
+class _WithoutEnvironment:
+    """Numba's code generator, for what has no place in memory where its environment would stand.
+
+    Only code that raises or prints asks for that.
+    """
+
+    def __init__(self, codegen: Any) -> None:
+        self._codegen = codegen
+
+    def set_env(self, name: str, environment: object) -> None:
+        pass
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._codegen, name)
+
+
+@register_pass(mutates_CFG=False, analysis_only=True)
+class _LinkOnly(AnalysisPass):  # type: ignore[misc]
+    _name = "evofsm_link_only"
+
+    def __init__(self) -> None:
+        AnalysisPass.__init__(self)
+
+    def run_pass(self, state: Any) -> bool:
+        state.library = _Linkable(state.targetctx.codegen(), state.func_id.func_qualname)
+        state.library.enable_object_caching()
+        return False
+
+
+class _InnerCompiler(CompilerBase):  # type: ignore[misc]
+    def define_pipelines(self) -> list[Any]:
+        manager = DefaultPassBuilder.define_nopython_pipeline(self.state)
+        manager.add_pass_after(_LinkOnly, AnnotateTypes)
+        manager.finalize()
+        return [manager]
 
 
 def parallel_kernel(function: Function) -> Function:
@@ -56,13 +122,21 @@ def parallel_kernel(function: Function) -> Function:
     return compiled(function, parallel=True)
 
 
-def compiled(function: Function, *signature: object, **options: object) -> Function:
-    """Compile with Numba and keep the code on disk, where there is a place to keep it."""
+def compiled(function: Function, *signature: object, **options: Any) -> Function:
+    """Compile with Numba and keep the code on disk, where there is a place to keep it.
+
+    What a kernel sees of it is compiled as a part of that kernel.
+    """
     compile_ = partial(numba.njit, *signature, error_model="numpy", **options)
     try:
-        return cast(Function, compile_(cache=True)(function))
+        dispatcher = compile_(cache=True)(function)
     except RuntimeError:  # neither the package nor the user's cache folder may be written
-        return cast(Function, compile_()(function))
+        dispatcher = compile_()(function)
+    for_kernels: Any = _inside(function, **{k: v for k, v in options.items() if k in _INLINED})
+    known = dispatcher.typingctx
+    known._remove_global(dispatcher)
+    known.insert_global(dispatcher, types.Dispatcher(for_kernels))
+    return cast(Function, dispatcher)
 
 
 #: Numbers in a cache line; the arrays in which a step works are whole lines.
@@ -80,64 +154,89 @@ def lanes(n: int) -> int:
     return (n + LINE - 1) // LINE * LINE
 
 
-def part(array: NDArray[Floating], start: int, shape: tuple[int, ...]) -> NDArray[Floating]:
-    """Part of a flat array, in another shape; a view that lives no longer than the array."""
-    return array[start : start + math.prod(shape)].reshape(shape)
+class Announcement(event.Listener):  # type: ignore[misc]
+    """Says once, on stderr, that kernels are compiled, where that takes longer than a second."""
+
+    _PATIENCE: ClassVar = 1.0  # [s], over all kernels
+
+    def __init__(self) -> None:
+        self._depth = 0
+        self._spent = self._begun = 0.0
+        self._timer = Timer(0.0, self._say)
+
+    def on_start(self, event: object) -> None:
+        """A kernel is compiled, perhaps for another one."""
+        if self._depth == 0 and self._spent < self._PATIENCE:
+            self._begun = monotonic()
+            self._timer = Timer(self._PATIENCE - self._spent, self._say)
+            self._timer.daemon = True
+            self._timer.start()
+        self._depth += 1
+
+    def on_end(self, event: object) -> None:
+        """It is done."""
+        self._depth -= 1
+        if self._depth == 0 and self._spent < self._PATIENCE:
+            self._timer.cancel()
+            self._spent += monotonic() - self._begun
+
+    def _say(self) -> None:
+        self._spent = self._PATIENCE
+        print("compiling kernels, once ...", file=sys.stderr, flush=True)
 
 
-# In kernels not by ``reshape``, which takes tens of nanoseconds to find out that it need not copy.
-@type_callable(part)
-def _type_of_part(_context: Any) -> Any:
-    def type_of(array: Any, start: Any, shape: Any) -> Any:
-        return types.Array(array.dtype, len(shape), "C")
-
-    return type_of
+def announce_compiling() -> None:
+    """From now on say where compiling takes long; for commands."""
+    event.register("numba:compile", Announcement())
 
 
-def _lower_part(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-    array, start, shape = arguments
-    source = _arrays.make_array(signature.args[0])(context, builder, array)
-    view = _arrays.make_array(signature.return_type)(context, builder)
-    lengths = _codegen.unpack_tuple(builder, shape)
-    itemsize = context.get_constant(types.intp, context.get_abi_sizeof(source.data.type.pointee))
-    strides = [itemsize]
-    for length in reversed(lengths[1:]):
-        strides.insert(0, builder.mul(strides[0], length))
-    _arrays.populate_array(
-        view,
-        data=builder.gep(source.data, [start]),
-        shape=lengths,
-        strides=strides,
-        itemsize=itemsize,
-        meminfo=None,
-    )
-    return view._getvalue()
+def sources_of_kernels(package: Path) -> list[Path]:
+    """The files of a package that kernels are made of, in the order of their names.
 
-
-_extending.lower_builtin(part, types.Array, types.Integer, types.UniTuple)(_lower_part)
+    Those that import this file, which has the decorators, and what they import in turn: constants
+    that a kernel uses are a part of it.
+    """
+    modules = {
+        ".".join(path.relative_to(package).with_suffix("").parts): path
+        for path in sorted(package.rglob("*.py"))
+    }
+    imports = re.compile(rf"^from {package.name}\.?([\w.]*) import (\([^)]*\)|.*)", re.MULTILINE)
+    found: set[str] = set()
+    for name, path in modules.items():
+        imported = {
+            part
+            for room, names in imports.findall(path.read_text("utf-8"))
+            for part in (room, *(f"{room}.{one}".strip(".") for one in re.findall(r"\w+", names)))
+        }
+        if Path(__file__).stem in imported:
+            found |= {name} | (imported & set(modules))
+    return [path for name, path in modules.items() if name in found]
 
 
 def _drop_stale_caches(package: Path) -> None:
-    """Delete cached code that is older than any kernel's source.
+    """Delete cached code that was made from other sources than those there are.
 
     Numba compares a cached kernel with the file it stands in only, not with the files of the
-    kernels it calls, so editing one of those would silently leave the old code running. Caches
-    that Numba keeps elsewhere (``NUMBA_CACHE_DIR``) are for those who set it to clear.
+    kernels it calls, so editing one of those would silently leave the old code running. What the
+    caches were made from is kept beside them, as a digest. Caches that Numba keeps elsewhere
+    (``NUMBA_CACHE_DIR``) are for those who set it to clear.
     """
-    caches = {path: path.stat().st_mtime for path in package.rglob("__pycache__/*.nb[ic]")}
-    oldest = min(caches.values(), default=math.inf)
-    edited = {path: path.stat().st_mtime for path in package.rglob("*.py")}
-    newest = max(
-        (
-            written
-            for path, written in edited.items()
-            if written > oldest and Path(__file__).stem in path.read_text("utf-8")
-        ),
-        default=-math.inf,
-    )
-    for path, written in caches.items():
-        if written < newest:
+    kept = package / "__pycache__" / "kernels.json"
+    stats = ((path, path.stat()) for path in sorted(package.rglob("*.py")))
+    times = [[path.name, stat.st_size, stat.st_mtime_ns] for path, stat in stats]
+    before: dict[str, Any] = {}
+    with suppress(OSError, ValueError):
+        before = json.loads(kept.read_text("utf-8"))
+    if before.get("times") == times:
+        return
+    digest = sha256(b"".join(path.read_bytes() for path in sources_of_kernels(package)))
+    if before.get("digest") != digest.hexdigest():
+        for path in package.rglob("__pycache__/*.nb[ic]"):
             path.unlink(missing_ok=True)
+    kept.parent.mkdir(exist_ok=True)
+    written = kept.with_name(f"{kept.name}.{os.getpid()}")
+    written.write_text(json.dumps({"times": times, "digest": digest.hexdigest()}), "utf-8")
+    written.replace(kept)
 
 
 # Not possible where the installation may not be written or another process cleans up too.

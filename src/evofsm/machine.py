@@ -54,6 +54,7 @@ from evofsm.step import (
     Trace,
     fail,
     learn_rows,
+    limit_of,
     observer,
     room_for,
     updater,
@@ -372,12 +373,12 @@ prior_frequency=0.001, spread=3.0)
         """
         if type(i) is int and type(z) is np.ndarray and z.dtype is _FLOAT64:
             try:
-                surprise = self._update(self._buffer, z, i)
+                surprise = self._update(self._buffer, z, i, self._limit)
             except (TypeError, OverflowError):  # z has gaps or is read-only; i is beyond any index
                 surprise = DECLINED
             if surprise != DECLINED:
                 return surprise
-            self._update = updater()
+            self._update = updater(self._limit)
         return self._insist(z, check_action(i, self.n_actions), False)[2]
 
     def learn_many(
@@ -439,11 +440,11 @@ prior_frequency=0.001, spread=3.0)
         )
         beliefs = np.zeros((rows if belief else 0, self._capacity))
         given = observations, actions, starts, ends
-        row = learn_rows(self._buffer, *given, 0, trace, beliefs)
+        row = learn_rows(self._buffer, *given, 0, trace, beliefs, self._limit)
         while row < rows:
             self._grow()
             beliefs = widen(beliefs, self._capacity)
-            row = learn_rows(self._buffer, *given, row, trace, beliefs)
+            row = learn_rows(self._buffer, *given, row, trace, beliefs, self._limit)
         return trace._replace(belief=beliefs[:, : self.n_states]) if belief else trace
 
     def start_episode(self) -> None:
@@ -484,9 +485,9 @@ prior_frequency=0.001, spread=3.0)
         """
         if not self._memory.learnt.chained[0]:
             raise ValueError("fail before observe: this episode has no observation to fail after")
-        if not fail(self._buffer):
+        if not fail(self._buffer, self._limit):
             self._grow()
-            fail(self._buffer)
+            fail(self._buffer, self._limit)
         tell_of_failures(self._buffer)
 
     def tell_of_failures(self) -> None:
@@ -1062,6 +1063,7 @@ prior_frequency=0.001, spread=3.0)
     def _use(self, buffer: NDArray[np.float64]) -> None:
         self._buffer = buffer
         self._memory = view(buffer)
+        self._limit = limit_of(self._memory.parameters)
         self._observe = _cannot_observe
         self._update = _cannot_update
 
@@ -1135,14 +1137,14 @@ prior_frequency=0.001, spread=3.0)
         if type(z) is np.ndarray and z.dtype is _FLOAT64:
             event, state, surprise = REFUSED, 0, np.nan
             with suppress(TypeError):  # it has gaps, is read-only or is no vector
-                event, state, surprise = self._observe(self._buffer, z, action, failed)
+                event, state, surprise = self._observe(self._buffer, z, action, failed, self._limit)
             if event >= 0:
                 return event, state, surprise
             if event == FULL:
                 self._grow()
         z = self._fit(real_array("observation", z, ndim=1))
         refuse_unusable("observation", z)
-        self._observe = observer()
+        self._observe = observer(self._limit)
         return self._insist(z, action, failed)
 
     def _grow(self) -> None:

@@ -8,6 +8,7 @@ the rest, in single precision.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
@@ -15,7 +16,19 @@ import numpy as np
 from numba.extending import register_jitable
 from numpy.typing import NDArray
 
-from evofsm._compile import LINE, inner_kernel, kernel, lanes, part
+from evofsm._compile import LINE, inner_kernel, kernel, lanes
+from evofsm._layout import (
+    SHAPES,
+    SIZES,
+    Changes,
+    Counter,
+    PerState,
+    Place,
+    Setting,
+    build,
+    number_fields,
+    opener,
+)
 from evofsm.states.clusters import Clusters
 from evofsm.states.rule import RuleSettings
 from evofsm.transitions import NOT_OPEN, Outcomes, Transitions
@@ -23,11 +36,9 @@ from evofsm.validation import refuse_more_failures, refuse_unless_distribution
 
 NO_ACTION = -1
 
-# A buffer begins with its sizes (m, q, capacity, places), `Parameters`, whether anybody told of
+# A buffer begins with its sizes (m, q, capacity, places); settings follow, whether anybody told of
 # failures, and counters.
-_FAILURES_TOLD, _COUNTERS, _HEAD = 17, 20, 32
-# Then, for each kind of thing there is, so many numbers; centres are further rows of states.
-_PER_STATE, _PER_PLACE, _PER_ACTION, _PER_VARIABLE = 17, 7, 2, 5
+_SETTINGS, _HEAD = 4, 32
 # Where the centre of a state that is not there stands: too far for any belief.
 _NOWHERE = np.inf
 
@@ -35,28 +46,28 @@ _NOWHERE = np.inf
 class Parameters(NamedTuple):
     """The settings of a machine; the paper's symbols are phi, epsilon-bar."""
 
-    learning_rate: float
-    prior_frequency: float
-    belief_tolerance: float
-    max_states: float  #: infinity for no limit
-    when_full: float  #: a value of `evofsm.crowding.WhenFull`
-    failure_horizon: float  #: observations; infinity for all of an episode
+    learning_rate: Setting
+    prior_frequency: Setting
+    belief_tolerance: Setting
+    max_states: Setting  #: infinity for no limit
+    when_full: Setting  #: a value of `evofsm.crowding.WhenFull`
+    failure_horizon: Setting  #: observations; infinity for all of an episode
     rule: RuleSettings
 
 
 class Learnt(NamedTuple):
     """What the next step needs, and what people ask of the states."""
 
-    n_states: NDArray[np.float64]  # (1,)
-    n_founded: NDArray[np.float64]  # (1,) states so far, with those given up
-    action: NDArray[np.float64]  # (1,) taken after the latest observation, or NO_ACTION
-    chained: NDArray[np.float64]  # (1,) 1 where `belief` belongs to the present episode
-    state: NDArray[np.float64]  # (1,) the most probable state at the latest observation
-    belief: NDArray[np.float64]  # (capacity,)
-    ids: NDArray[np.float64]  # (capacity,) number of its founding, from 0
-    visits: NDArray[np.float64]  # (capacity,) observations in which it was the most probable
-    founded: NDArray[np.float64]  # (capacity,) number of the observation that did it, from 1
-    changes: NDArray[np.float64]  # (capacity, capacity) steps from a state (row) to a state
+    n_states: Counter  #
+    n_founded: Counter  # states so far, with those given up
+    action: Counter  # taken after the latest observation, or NO_ACTION
+    chained: Counter  # 1 where `belief` belongs to the present episode
+    state: Counter  # the most probable state at the latest observation
+    belief: PerState
+    ids: PerState  # number of its founding, from 0
+    visits: PerState  # observations in which it was the most probable
+    founded: PerState  # number of the observation that did it, from 1
+    changes: Changes  # steps from a state (row) to a state
     clusters: Clusters
     transitions: Transitions
     outcomes: Outcomes
@@ -65,12 +76,12 @@ class Learnt(NamedTuple):
 class Scratch(NamedTuple):
     """Room in which a step works; worth nothing after it."""
 
-    predicted: NDArray[np.float64]  # (capacity,)
-    recognised: NDArray[np.float64]  # (capacity,)
-    rates: NDArray[np.float64]  # (capacity,)
-    terms: NDArray[np.float64]  # (capacity,)
-    lines: NDArray[np.float64]  # (capacity,)
-    forecast: NDArray[np.float64]  # (capacity,) all of it, where `predicted` is only a part
+    predicted: PerState
+    recognised: PerState
+    rates: PerState
+    terms: PerState
+    lines: PerState
+    forecast: PerState  # all of it, where `predicted` is only a part
 
 
 class Memory(NamedTuple):
@@ -81,26 +92,37 @@ class Memory(NamedTuple):
     scratch: Scratch
 
 
-class _Sections(NamedTuple):
-    """Where the parts of a buffer begin."""
+# How many arrays there are of each kind, and settings.
+_KINDS = number_fields(Memory)
+_FAILURES_TOLD = _SETTINGS + _KINDS["setting"]
+_COUNTERS = _FAILURES_TOLD + 1
+_PER_STATE, _PER_PLACE = _KINDS["state"], _KINDS["place"]
+_PER_ACTION, _PER_VARIABLE = _KINDS["action"], _KINDS["variable"]
 
-    of_states: int
-    changes: int
-    of_places: int
-    of_actions: int
-    of_variables: int
-    matrices: int
+
+class _Sections(NamedTuple):
+    """Where the arrays of each kind begin."""
+
+    setting: int
+    counter: int
+    state: int
+    center: int
+    change: int
+    place: int
+    action: int
+    variable: int
+    matrix: int  # apart from the others, or behind them
 
 
 @register_jitable
 def _sections(m: int, q: int, capacity: int, places: int) -> _Sections:
-    of_states = _HEAD
-    changes = of_states + (_PER_STATE + m) * capacity
-    of_places = changes + capacity * capacity
-    of_actions = of_places + _PER_PLACE * places * capacity
-    of_variables = of_actions + _PER_ACTION * q
-    matrices = lanes(of_variables + _PER_VARIABLE * m)
-    return _Sections(of_states, changes, of_places, of_actions, of_variables, matrices)
+    center = _HEAD + _PER_STATE * capacity
+    change = center + m * capacity
+    place = change + capacity * capacity
+    action = place + _PER_PLACE * places * capacity
+    variable = action + _PER_ACTION * q
+    matrix = lanes(variable + _PER_VARIABLE * m)
+    return _Sections(_SETTINGS, _COUNTERS, _HEAD, center, change, place, action, variable, matrix)
 
 
 @register_jitable
@@ -111,104 +133,47 @@ def _sizes(buffer: NDArray[np.float64]) -> tuple[int, int, int, int]:
 @register_jitable
 def matrices_of(buffer: NDArray[np.float64]) -> int:
     """Where the matrices begin in a whole buffer."""
-    return _sections(*_sizes(buffer)).matrices
+    return _sections(*_sizes(buffer)).matrix
 
 
 @register_jitable
 def lengths(m: int, q: int, capacity: int, places: int) -> tuple[int, int]:
     """Numbers in a buffer without its matrices, and in those."""
-    return _sections(m, q, capacity, places).matrices, places * capacity * capacity
+    return _sections(m, q, capacity, places).matrix, places * capacity * capacity
 
 
 @inner_kernel
 def open_memory(buffer: NDArray[np.float64]) -> Memory:
-    """Views into a whole buffer, for kernels."""
+    """A whole buffer, for kernels."""
     return open_apart(buffer, buffer[matrices_of(buffer) :])
 
 
-def _open_apart(buffer: NDArray[np.float64], matrices: NDArray[Any]) -> Memory:
-    """Views into a buffer whose matrices are somewhere else; for kernels `open_apart`."""
-    m, q, capacity, places = _sizes(buffer)
-    begin = _sections(m, q, capacity, places)
-    counters = part(buffer, _COUNTERS, (9, 1))
-    of_states = part(buffer, begin.of_states, (_PER_STATE + m, capacity))
-    of_places = part(buffer, begin.of_places, (_PER_PLACE, places, capacity))
-    of_actions = part(buffer, begin.of_actions, (_PER_ACTION, q))
-    of_variables = part(buffer, begin.of_variables, (_PER_VARIABLE, m))
-    return Memory(
-        Parameters(
-            float(buffer[4]),
-            float(buffer[5]),
-            float(buffer[6]),
-            float(buffer[7]),
-            float(buffer[8]),
-            float(buffer[9]),
-            RuleSettings(
-                float(buffer[10]),
-                float(buffer[11]),
-                float(buffer[12]),
-                float(buffer[13]),
-                float(buffer[14]),
-                float(buffer[15]),
-                float(buffer[16]),
-                of_variables[4],
-            ),
-        ),
-        Learnt(
-            counters[0],
-            counters[1],
-            counters[2],
-            counters[3],
-            counters[4],
-            of_states[0],
-            of_states[1],
-            of_states[2],
-            of_states[3],
-            part(buffer, begin.changes, (capacity, capacity)),
-            Clusters(
-                counters[5],
-                of_variables[0],
-                of_variables[1],
-                of_variables[2],
-                counters[6],
-                of_states[_PER_STATE:],
-                of_states[4],
-                of_states[5],
-            ),
-            Transitions(
-                of_actions[0],
-                of_actions[1],
-                part(matrices, 0, (places, capacity, capacity)),
-                of_places[0],
-                of_places[1],
-            ),
-            Outcomes(
-                of_places[2],
-                of_places[3],
-                of_states[6],
-                counters[7],
-                counters[8],
-                of_states[7],
-                of_states[8],
-                of_states[9],
-                of_states[10],
-                of_places[4],
-                of_places[5],
-                of_places[6],
-            ),
-        ),
-        Scratch(
-            of_states[11],
-            of_states[12],
-            of_states[13],
-            of_states[14],
-            of_states[15],
-            of_states[16],
-        ),
-    )
+@inner_kernel
+def open_apart(buffer: NDArray[np.float64], matrices: NDArray[Any]) -> Memory:
+    """A buffer whose matrices are somewhere else, for kernels."""
+    sizes = _sizes(buffer)
+    memory: Memory = _opened(buffer, matrices, sizes, tuple(_sections(*sizes)))
+    return memory
 
 
-open_apart = inner_kernel(_open_apart)
+_opened = opener(Memory)
+
+
+def view(buffer: NDArray[np.float64]) -> Memory:
+    """Views into a whole buffer, for Python."""
+    sizes = _sizes(buffer)
+    begins, lengths = _sections(*sizes), {"one": 1, **dict(zip(SIZES, sizes, strict=True))}
+
+    def value(place: Place) -> Any:
+        begin = getattr(begins, place.kind)
+        if place.kind == "setting":
+            return float(buffer[begin + place.number])
+        shape = tuple(lengths[size] for size in SHAPES[place.kind])
+        begin += place.number * math.prod(shape)
+        return buffer[begin : begin + math.prod(shape)].reshape(shape)
+
+    memory: Memory = build(Memory, value)
+    return memory
 
 
 def allocate(
@@ -218,7 +183,7 @@ def allocate(
     buffer = _blank(n_variables, n_actions, capacity, places)
     *numbers, rule = parameters
     *rule_numbers, weights = rule
-    buffer[4:17] = (*numbers, *rule_numbers)
+    buffer[_SETTINGS:_FAILURES_TOLD] = (*numbers, *rule_numbers)
     memory = view(buffer)
     memory.parameters.rule.weights[:] = weights
     memory.learnt.action[0] = NO_ACTION
@@ -244,11 +209,6 @@ def _vacate(clusters: Clusters, n: int) -> None:
     clusters.squared_distances[n:] = _NOWHERE
 
 
-def view(buffer: NDArray[np.float64]) -> Memory:
-    """Views into a buffer, for Python."""
-    return _open_apart(buffer, buffer[matrices_of(buffer) :])
-
-
 def resize(buffer: NDArray[np.float64], capacity: int, places: int) -> NDArray[np.float64]:
     """Copy of a buffer with room for another number of states and matrices."""
     m, q, *_ = _sizes(buffer)
@@ -269,17 +229,17 @@ def move(
     m, q, new, new_places = _sizes(resized)
     begin, begins = _sections(m, q, old, old_places), _sections(m, q, new, new_places)
     n, places = min(old, new), min(old_places, new_places)
-    for i in range(4, _HEAD):
+    for i in range(_SETTINGS, _HEAD):
         resized[i] = buffer[i]
     for i in range(_PER_ACTION * q):
-        resized[begins.of_actions + i] = buffer[begin.of_actions + i]
+        resized[begins.action + i] = buffer[begin.action + i]
     for i in range(_PER_VARIABLE * m):
-        resized[begins.of_variables + i] = buffer[begin.of_variables + i]
-    _copy_rows(buffer, begin.of_states, old, resized, begins.of_states, new, _PER_STATE + m, n)
-    _copy_rows(buffer, begin.changes, old, resized, begins.changes, new, n, n)
+        resized[begins.variable + i] = buffer[begin.variable + i]
+    _copy_rows(buffer, begin.state, old, resized, begins.state, new, _PER_STATE + m, n)
+    _copy_rows(buffer, begin.change, old, resized, begins.change, new, n, n)
     for kind in range(_PER_PLACE):
-        start = begin.of_places + kind * old_places * old
-        starts = begins.of_places + kind * new_places * new
+        start = begin.place + kind * old_places * old
+        starts = begins.place + kind * new_places * new
         _copy_rows(buffer, start, old, resized, starts, new, places, n)
     for place in range(places):
         start, starts = place * old * old, place * new * new

@@ -13,7 +13,7 @@ from collections.abc import Callable
 from enum import IntFlag
 from functools import cache
 from threading import Lock
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numba.extending import register_jitable
@@ -23,7 +23,7 @@ from evofsm import crowding
 from evofsm._compile import inner_kernel, kernel, lanes, rare_kernel
 from evofsm.crowding import MERGED, NEWCOMER, RETIRE, RETIRED, merge_closest, retire_least_useful
 from evofsm.divergence import jensen_shannon_kernel
-from evofsm.memory import NO_ACTION, Memory, open_memory
+from evofsm.memory import NO_ACTION, Memory, Parameters, open_memory
 from evofsm.notebook import step_html
 from evofsm.states import clusters, spread
 from evofsm.states.clusters import place_center, potential_of
@@ -49,6 +49,9 @@ FULL, REFUSED = -1, -2
 # What `_update` answers where it did nothing; no surprise is below 0.
 DECLINED = -1.0
 _COMPILING = Lock()
+# Whether a machine may have to give up states (`evofsm.crowding`): a number, or None. Numba
+# compiles a kernel for each of the two, and that without a limit in a fraction of the time.
+Limit: TypeAlias = int | None
 
 
 class Event(IntFlag):
@@ -146,9 +149,9 @@ def widen(belief: NDArray[np.float64], n: int) -> NDArray[np.float64]:
 
 @inner_kernel
 def step(
-    memory: Memory, z: NDArray[np.float64], failed: bool, whole: bool
+    memory: Memory, z: NDArray[np.float64], failed: bool, whole: bool, limit: Limit
 ) -> tuple[int, int, float]:
-    """Take in one observation; answers event, state and surprise.
+    """Take in one observation; returns event, state and surprise.
 
     Where the episode ``failed`` it ends in failure after this observation. If the ``whole``
     forecast is wanted it stands in ``scratch``.
@@ -164,9 +167,9 @@ def step(
     # Section 2.2.1: does the observation move a state, or found one?
     event, nearest, potential = determine(parameters.rule, now.clusters, n, z)
     if event == clusters.CREATED:
-        event, nearest = _found(memory, n, nearest, potential)
+        event, nearest = _found(memory, n, nearest, potential, limit)
     elif event == clusters.UNCHANGED and failed and _splits(memory, nearest):
-        event, nearest = _split(memory, n, nearest)
+        event, nearest = _split(memory, n, nearest, limit)
     n = int(now.n_states[0])
 
     # Section 2.2.2: which state is this?
@@ -231,6 +234,7 @@ def step_and_act(
     starts: bool,
     failed: bool,
     whole: bool,
+    limit: Limit,
 ) -> tuple[int, int, float]:
     """`step`, in a new episode if it ``starts`` one, then an action (or `NO_ACTION`).
 
@@ -239,7 +243,7 @@ def step_and_act(
     now = memory.learnt
     if starts:
         now.chained[0] = 0.0
-    event, state, surprise = step(memory, z, failed, whole)
+    event, state, surprise = step(memory, z, failed, whole, limit)
     if event >= 0 and not failed:
         now.action[0] = action
     return event, state, surprise
@@ -247,51 +251,52 @@ def step_and_act(
 
 @kernel
 def _observe(
-    buffer: NDArray[np.float64], z: NDArray[np.float64], action: int, failed: bool
+    buffer: NDArray[np.float64], z: NDArray[np.float64], action: int, failed: bool, limit: Limit
 ) -> tuple[int, int, float]:
     """`step_and_act`, with the whole machine in a single argument."""
     memory = open_memory(buffer)
     if not NO_ACTION <= action < len(memory.learnt.transitions.uses):
         return REFUSED, 0, np.nan
-    return step_and_act(memory, z, action, False, failed, True)
+    return step_and_act(memory, z, action, False, failed, True, limit)
 
 
 @kernel
-def _update(buffer: NDArray[np.float64], z: NDArray[np.float64], action: int) -> float:
+def _update(
+    buffer: NDArray[np.float64], z: NDArray[np.float64], action: int, limit: Limit
+) -> float:
     """The same with fewer things to hand over: only the surprise, or `DECLINED`."""
     memory = open_memory(buffer)
     if not 0 <= action < len(memory.learnt.transitions.uses):
         return DECLINED
-    event, _, surprise = step_and_act(memory, z, action, False, False, False)
+    event, _, surprise = step_and_act(memory, z, action, False, False, False, limit)
     return surprise if event >= 0 else DECLINED
 
 
 @cache
-def observer() -> Callable[[NDArray[np.float64], NDArray[np.float64], int, bool], Any]:
+def observer(limit: Limit) -> Callable[..., tuple[int, int, float]]:
     """`_observe`, for arrays of float64 without gaps only.
 
     For any other type of array it raises a TypeError, where Numba would compile it once more.
     """
-    _for_plain_arrays(_observe, "(float64[::1], float64[::1], int64, boolean)")
-    return _observe
+    return _for_plain_arrays(_observe, "float64[::1], float64[::1], int64, boolean", limit)
 
 
 @cache
-def updater() -> Callable[[NDArray[np.float64], NDArray[np.float64], int], float]:
+def updater(limit: Limit) -> Callable[..., float]:
     """`_update`, in the same way; the quickest call there is to take one step."""
-    _for_plain_arrays(_update, "(float64[::1], float64[::1], int64)")
-    return _update
+    return _for_plain_arrays(_update, "float64[::1], float64[::1], int64", limit)
 
 
-def _for_plain_arrays(kernel: Any, signature: str) -> None:
+def _for_plain_arrays(kernel: Any, arguments: str, limit: Limit) -> Any:
     with _COMPILING:  # whichever thread comes first
-        if not kernel.signatures:
-            kernel.compile(signature)
-            kernel.disable_compile()
+        kernel.disable_compile(False)
+        kernel.compile(f"({arguments}, {'none' if limit is None else 'int64'})")
+        kernel.disable_compile()
+    return kernel
 
 
 @kernel
-def fail(buffer: NDArray[np.float64]) -> bool:
+def fail(buffer: NDArray[np.float64], limit: Limit) -> bool:
     """End the episode in failure, to which the pending action led from the latest observation.
 
     Answers whether there was room for what this may found.
@@ -304,7 +309,7 @@ def fail(buffer: NDArray[np.float64]) -> bool:
     nearest = int(now.state[0])
     is_whole = now.outcomes.latest_visit[nearest] == now.outcomes.clock[0]
     if is_whole and _splits(memory, nearest):
-        nearest = _split(memory, n, nearest)[1]
+        nearest = _split(memory, n, nearest, limit)[1]
         n = int(now.n_states[0])
         now.state[0] = nearest
         _recognise(memory, n, nearest)
@@ -317,6 +322,11 @@ def fail(buffer: NDArray[np.float64]) -> bool:
         _decide(memory, place, n, True)
     _end(memory)
     return True
+
+
+def limit_of(parameters: Parameters) -> Limit:
+    """What a machine tells its kernels of a limit to its states."""
+    return None if parameters.max_states == np.inf else 1
 
 
 @register_jitable
@@ -365,22 +375,24 @@ def _splits(memory: Memory, nearest: int) -> bool:
 
 
 @inner_kernel
-def _split(memory: Memory, n: int, nearest: int) -> tuple[int, int]:
+def _split(memory: Memory, n: int, nearest: int, limit: Limit) -> tuple[int, int]:
     """Found a state for a failure; the observation is absorbed and counts in its potential."""
     held = memory.learnt.clusters
     potential = potential_of(held, memory.parameters.rule.weights, held.latest)
-    return _found(memory, n, nearest, potential)
+    return _found(memory, n, nearest, potential, limit)
 
 
 @rare_kernel
-def _found(memory: Memory, n: int, nearest: int, potential: float) -> tuple[int, int]:
-    """Found a state on the latest observation; answers what happened and the nearest state.
+def _found(memory: Memory, n: int, nearest: int, potential: float, limit: Limit) -> tuple[int, int]:
+    """Create a state on the latest observation; returns what happened and the nearest state.
 
     Where there are as many states as allowed, one of them, or the newcomer, is given up.
     """
     parameters, now = memory.parameters, memory.learnt
     new, event = n, clusters.CREATED
-    if n >= parameters.max_states:
+    if limit is None:  # known as this is compiled: what gives up states is left out then
+        n += 1
+    elif n >= parameters.max_states:
         if parameters.when_full == RETIRE:
             new, event = retire_least_useful(memory, n), clusters.CREATED | RETIRED
         else:
@@ -442,6 +454,7 @@ def learn_rows(
     row: int,
     trace: Trace,
     beliefs: NDArray[np.float64],
+    limit: Limit,
 ) -> int:
     """Step through the rows from ``row`` on; answers where it stopped for want of room.
 
@@ -451,7 +464,7 @@ def learn_rows(
     now = memory.learnt
     while row < len(observations):
         event, state, surprise = step_and_act(
-            memory, observations[row], actions[row], starts[row], failures[row], False
+            memory, observations[row], actions[row], starts[row], failures[row], False, limit
         )
         if event == FULL:
             break

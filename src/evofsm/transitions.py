@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from evofsm._compile import LINE, inner_kernel, lanes, rare_kernel
 from evofsm._elementary import fma, total, work_on_line, work_on_two_lines
+from evofsm._layout import Counter, Matrices, PerAction, PerPlace, PerState
 from evofsm.validation import whole
 
 Policy = Literal["marginal", "hold", "observed"]
@@ -47,11 +48,11 @@ class Transitions(NamedTuple):
     its scale, without touching the row.
     """
 
-    places: NDArray[np.float64]  # (q,) of each action's matrix, or NOT_OPEN
-    uses: NDArray[np.float64]  # (q,) transitions identified with each action
-    matrices: NDArray[np.float64]  # (s, capacity, capacity) to be multiplied by `scales`
-    scales: NDArray[np.float64]  # (s, capacity)
-    origin_frequency: NDArray[np.float64]  # (s, capacity)
+    places: PerAction  # of each action's matrix, or NOT_OPEN
+    uses: PerAction  # transitions identified with each action
+    matrices: Matrices  # to be multiplied by `scales`
+    scales: PerPlace
+    origin_frequency: PerPlace
 
 
 class Outcomes(NamedTuple):
@@ -62,18 +63,18 @@ class Outcomes(NamedTuple):
     observations of one episode are no independent evidence.
     """
 
-    decisions: NDArray[np.float64]  # (s, capacity) belief-weighted transitions from each state
-    failures: NDArray[np.float64]  # (s, capacity) those of them that led straight into failure
-    endings: NDArray[np.float64]  # (capacity,) failures whose last observation was the state
-    clock: NDArray[np.float64]  # (1,) observations so far, with those that lacked something
-    began: NDArray[np.float64]  # (1,) the clock at the present episode's first observation
-    episodes: NDArray[np.float64]  # (capacity,) that came to the state
-    failed_soon: NDArray[np.float64]  # (capacity,) those that failed soon after they were there
-    latest_visit: NDArray[np.float64]  # (capacity,) the clock at the latest observation there
-    joined: NDArray[np.float64]  # (capacity,) 1 where an episode may count twice, of two states
-    tried: NDArray[np.float64]  # (s, capacity) episodes that took the action in the state
-    failed_after: NDArray[np.float64]  # (s, capacity) those that failed soon after they did
-    latest_try: NDArray[np.float64]  # (s, capacity) the clock at the observation that followed
+    decisions: PerPlace  # belief-weighted transitions from each state
+    failures: PerPlace  # those of them that led straight into failure
+    endings: PerState  # failures whose last observation was the state
+    clock: Counter  # observations so far, with those that lacked something
+    began: Counter  # the clock at the present episode's first observation
+    episodes: PerState  # that came to the state
+    failed_soon: PerState  # those that failed soon after they were there
+    latest_visit: PerState  # the clock at the latest observation there
+    joined: PerState  # 1 where an episode may count twice, of two states
+    tried: PerPlace  # episodes that took the action in the state
+    failed_after: PerPlace  # those that failed soon after they did
+    latest_try: PerPlace  # the clock at the observation that followed
 
 
 @inner_kernel

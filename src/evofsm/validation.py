@@ -8,8 +8,7 @@ from typing import Any, SupportsFloat, SupportsIndex
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-# Squares of larger numbers, summed over a long run, would overflow. Kernels hold it as a constant,
-# so that editing this file has to make them anew: `_compile` looks for its name.
+# Squares of larger numbers, summed over a long run, would overflow.
 LARGEST_OBSERVATION = 1e100
 # Cases, and failures among them.
 _OUTCOMES = (("decisions", "failures"), ("episodes", "failed_soon"), ("tried", "failed_after"))

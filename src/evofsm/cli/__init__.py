@@ -21,6 +21,9 @@ def main() -> None:
         needed = install_for(command)
         print(f"evofsm: the command line needs typer and rich: {needed}", file=sys.stderr)
         sys.exit(2)
+    from evofsm._compile import announce_compiling
+
+    announce_compiling()
     application()()
 
 

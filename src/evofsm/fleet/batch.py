@@ -26,7 +26,7 @@ from evofsm.memory import (
     open_apart,
     tell_of_failures,
 )
-from evofsm.step import FULL, room_for, step_and_act
+from evofsm.step import FULL, Limit, room_for, step_and_act
 from evofsm.transitions import NOT_OPEN
 from evofsm.validation import check_actions, check_rows, real_rows, refuse_unusable, whole
 
@@ -193,7 +193,9 @@ class Fleet:
             np.empty(len(rows)),
         )
         given = chosen, rows, actions, starts, ends
-        while _step_all(self._small, self._matrices, self._at, *given, *answer):
+        while _step_all(
+            self._small, self._matrices, self._at, *given, *answer, self._machine._limit
+        ):
             self._grow(chosen[answer.event == FULL])
         return answer
 
@@ -273,7 +275,7 @@ def _sum_to_1(machine: EvolvingFSM) -> None:
     transitions.scales[:, :n] /= np.where(sums > 0.0, sums, 1.0)
 
 
-@kernel
+@inner_kernel
 def _open(small: NDArray[np.float64], matrices: NDArray[Any], at: NDArray[np.int64]) -> Memory:
     """One vehicle's memory."""
     return open_apart(small[at[0] :], matrices[at[1] :])
@@ -293,6 +295,7 @@ def _step_all(
     n_states: NDArray[np.int64],
     event: NDArray[np.int8],
     surprise: NDArray[np.float64],
+    limit: Limit,
 ) -> int:
     """Step those that did not step yet; answers how many could not for want of room.
 
@@ -312,6 +315,7 @@ def _step_all(
                 actions[row],
                 starts[row],
                 failures[row],
+                limit,
             )
             full += event[row] == FULL
     return full
@@ -351,7 +355,7 @@ def _fetch_matrix(
         fetch_ahead(held.matrices, place * size + i)
 
 
-@kernel
+@inner_kernel
 def _step_one(
     small: NDArray[np.float64],
     matrices: NDArray[Any],
@@ -360,9 +364,10 @@ def _step_one(
     action: int,
     starts: bool,
     failed: bool,
+    limit: Limit,
 ) -> tuple[int, int, int, float]:
     memory = _open(small, matrices, at)
-    event, state, surprise = step_and_act(memory, z, action, starts, failed, False)
+    event, state, surprise = step_and_act(memory, z, action, starts, failed, False, limit)
     return int(memory.learnt.n_states[0]), event, state, surprise
 
 

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from evofsm._compile import inner_kernel, lanes
 from evofsm._elementary import fma, largest
+from evofsm._layout import Centers, Counter, PerState, PerVariable
 
 # What may happen to the states.
 UNCHANGED, MOVED, CREATED = 0, 1, 2
@@ -29,14 +30,14 @@ UNCHANGED, MOVED, CREATED = 0, 1, 2
 class Clusters(NamedTuple):
     """What is remembered: m variables, room for ``capacity`` centres, the first ``n`` in use."""
 
-    n_observations: NDArray[np.float64]  # (1,)
-    first: NDArray[np.float64]  # (m,) z_1, the origin of `mean`
-    latest: NDArray[np.float64]  # (m,) z_t
-    mean: NDArray[np.float64]  # (m,) of all observations, minus `first`
-    scatter: NDArray[np.float64]  # (1,) sum of squared distances to the mean
-    centers: NDArray[np.float64]  # (m, capacity)
-    potentials: NDArray[np.float64]  # (capacity,)
-    squared_distances: NDArray[np.float64]  # (capacity,) from the latest observation
+    n_observations: Counter
+    first: PerVariable  # z_1, the origin of `mean`
+    latest: PerVariable  # z_t
+    mean: PerVariable  # of all observations, minus `first`
+    scatter: Counter  # sum of squared distances to the mean
+    centers: Centers
+    potentials: PerState
+    squared_distances: PerState  # from the latest observation
 
 
 @inner_kernel

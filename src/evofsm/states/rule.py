@@ -1,28 +1,24 @@
-"""What a state rule is: frozen settings, and numbers in which it tells its kernel of them.
-
-(`_compile` makes kernels anew where a file that names it was edited: their order matters there.)
-"""
+"""What a state rule is: frozen settings, and numbers in which it tells its kernel of them."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from typing import NamedTuple, Protocol
 
-import numpy as np
-from numpy.typing import NDArray
+from evofsm._layout import PerVariable, Setting
 
 
 class RuleSettings(NamedTuple):
     """What the kernels are told of how states are determined and recognised."""
 
-    code: float  #: which rule's kernel judges an observation
-    radius: float  #: how far from a centre an observation is no longer near it
-    distance_weight: float  #: how fast distance to new data lowers a centre's potential
-    spread: float  #: width of recognition, in the rule's own measure
-    failure_share: float  #: a failure founds a state where fewer stays ended so; 0: none does
-    failure_distance: float  #: and only farther than this from the nearest centre
-    memory: float  #: number of observations after which older ones fade; infinity: never
-    weights: NDArray[np.float64]  #: (m,) 1 / scale of each variable, where m is known
+    code: Setting  #: which rule's kernel judges an observation
+    radius: Setting  #: how far from a centre an observation is no longer near it
+    distance_weight: Setting  #: how fast distance to new data lowers a centre's potential
+    spread: Setting  #: width of recognition, in the rule's own measure
+    failure_share: Setting  #: a failure founds a state where fewer stays ended so; 0: none does
+    failure_distance: Setting  #: and only farther than this from the nearest centre
+    memory: Setting  #: number of observations after which older ones fade; infinity: never
+    weights: PerVariable  #: 1 / scale of each variable, where m is known
 
 
 class StateRule(Protocol):

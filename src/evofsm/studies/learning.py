@@ -26,7 +26,7 @@ from evofsm.io import Chunk
 from evofsm.machine import EvolvingFSM
 from evofsm.memory import NO_ACTION, open_memory
 from evofsm.model import FSMModel
-from evofsm.step import Trace, learn_rows, widen
+from evofsm.step import Limit, Trace, learn_rows, widen
 from evofsm.transitions import NOT_OPEN, Policy, Transitions
 from evofsm.validation import check_rows
 
@@ -394,6 +394,7 @@ class _Learner:
                 self._steps_ahead,
                 self._scores,
                 self._room,
+                self.machine._limit,
             )
             if row < len(observations):
                 self.machine._grow()
@@ -442,6 +443,7 @@ def _learn_and_score_rows(
     steps_ahead: int,
     scores: _Scores,
     room: _Room,
+    limit: Limit,
 ) -> int:
     """Learn and score rows from ``row`` on; answers where the machine had no room.
 
@@ -462,6 +464,7 @@ def _learn_and_score_rows(
             0,
             Trace(room.state, room.n_states, room.event, room.surprise),
             room.beliefs,
+            limit,
         )
         _score_rows(starts[these], learnt, scores, room)
         row += learnt
