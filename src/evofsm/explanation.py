@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evofsm.naming import Labels
-from evofsm.proportions import bounds_text, wilson_interval
+from evofsm.proportions import bounds_text, wilson_bounds
 
 # A belief above this is not worth a word.
 _SURE = 0.995
@@ -85,8 +85,8 @@ class Tally(NamedTuple):
         """Of the share, 90 % (Wilson 1927); from 0 to 1 without any, or where it is not known."""
         if not (self.episodes and self.is_told):
             return 0.0, 1.0
-        low, high = wilson_interval(np.array([self.share]), float(self.episodes))
-        return float(low[0]), float(high[0])
+        interval: tuple[float, float] = wilson_bounds(self.share, float(self.episodes))
+        return interval
 
     def __str__(self) -> str:
         if not self.is_told:

@@ -5,9 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
-import numpy as np
-from numpy.typing import NDArray
-
 from evofsm._compile import compiled
 
 # Two-sided 90 %.
@@ -15,14 +12,12 @@ _WIDTH = 1.645
 
 
 @compiled
-def wilson_interval(
-    share: NDArray[np.float64], count: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def wilson_bounds(share: float, count: float) -> tuple[float, float]:
     """90 % interval of a share that was counted (Wilson 1927)."""
     spread = _WIDTH * _WIDTH / count
     centre = (share + 0.5 * spread) / (1.0 + spread)
-    reach = np.sqrt(spread * (share * (1.0 - share) + 0.25 * spread)) / (1.0 + spread)
-    return np.maximum(centre - reach, 0.0), np.minimum(centre + reach, 1.0)
+    reach = math.sqrt(spread * (share * (1.0 - share) + 0.25 * spread)) / (1.0 + spread)
+    return max(centre - reach, 0.0), min(centre + reach, 1.0)
 
 
 def bounds_text(low: float, high: float) -> str:

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from evofsm.proportions import wilson_interval
+from evofsm.proportions import wilson_bounds
 from evofsm.validation import (
     check_action,
     positive,
@@ -94,8 +94,8 @@ class OutcomeCounts:
         anywhere = (self._failures.sum() + 0.5) / (self._cases.sum() + 1.0)
         here = (failures.sum() + _LEAN * anywhere) / (cases.sum() + _LEAN)
         probability = (failures[action] + _LEAN * here) / (cases[action] + _LEAN)
-        low, high = wilson_interval(np.array([probability]), float(cases[action]) + _LEAN)
-        return Outcome(float(probability), (float(low[0]), float(high[0])), float(cases[action]))
+        interval = wilson_bounds(float(probability), float(cases[action]) + _LEAN)
+        return Outcome(float(probability), interval, float(cases[action]))
 
     def _close(self, *, failed: bool) -> None:
         belief, action = self._open.popleft()

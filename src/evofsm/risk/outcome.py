@@ -20,8 +20,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from evofsm import ranges, storage
-from evofsm._compile import compiled
-from evofsm.proportions import wilson_interval
+from evofsm._compile import compiled, inner_kernel
+from evofsm.proportions import wilson_bounds
 from evofsm.protocols import Situation
 from evofsm.risk.brakes import OwnBrakes, Sample
 from evofsm.risk.leaders import LeaderBrakes
@@ -399,7 +399,7 @@ class LatentRisk:
     ) -> Judgement:
         """With the interval that as many manoeuvres as were seen allow for."""
         evidence = float(len(self.manoeuvres))
-        low, high = wilson_interval(risk, evidence + 1.0)
+        low, high = np.transpose([wilson_bounds(each, evidence + 1.0) for each in risk.tolist()])
         return Judgement(risk, low, high, critical, evidence, self._seen(situation))
 
     def _seen(self, situation: Situation) -> float:
@@ -428,7 +428,7 @@ class LatentRisk:
         actions = _finite("accelerations", accelerations)
         critical = np.empty(len(actions))
         critical_decelerations(
-            np.array(_three_finite(observation)),
+            _three_finite(observation),
             actions,
             self._commands[1],
             self.body._replace(margin=margin),
@@ -629,13 +629,33 @@ def _judge(
     judged: NDArray[np.float64],
 ) -> bool:
     """Write risk, its interval and the critical deceleration; False if an action is no number."""
-    if not np.isfinite(accelerations).all():
-        return False
-    body, here = Body(decel, lag, margin), np.array(observation)
-    critical_decelerations(here, accelerations, before, body, 0, dt, judged[3])
-    judged[0] = np.interp(judged[3], table[0], table[1])
-    judged[1], judged[2] = wilson_interval(judged[0], evidence + 1.0)
+    for acceleration in accelerations:
+        if not np.isfinite(acceleration):
+            return False
+    body = Body(decel, lag, margin)
+    critical_decelerations(observation, accelerations, before, body, 0, dt, judged[3])
+    for k in range(len(accelerations)):
+        judged[0, k] = _interpolated(judged[3, k], table)
+        judged[1, k], judged[2, k] = wilson_bounds(judged[0, k], evidence + 1.0)
     return True
+
+
+@inner_kernel
+def _interpolated(x: float, table: NDArray[np.float64]) -> float:
+    """What `numpy.interp` returns for a number, which takes long to compile."""
+    low, high = 0, table.shape[1] - 1
+    if x <= table[0, low]:
+        return float(table[1, low])
+    if x >= table[0, high]:
+        return float(table[1, high])
+    while high - low > 1:
+        middle = (low + high) // 2
+        if table[0, middle] <= x:
+            low = middle
+        else:
+            high = middle
+    slope = (table[1, high] - table[1, low]) / (table[0, high] - table[0, low])
+    return float(slope * (x - table[0, low]) + table[1, low])
 
 
 @compiled
@@ -643,7 +663,12 @@ def _count(
     by_state: NDArray[np.float64], belief: NDArray[np.float64], dt: float, braking: bool
 ) -> bool:
     """Add the time of a decision to the states; nothing, and False, if ``belief`` is none."""
-    if not ((belief >= 0.0).all() and abs(belief.sum() - 1.0) < 1e-6):
+    total = 0.0
+    for share in belief:
+        if not share >= 0.0:
+            return False
+        total += share
+    if not abs(total - 1.0) < 1e-6:
         return False
     for k in range(len(belief)):
         by_state[2, k] += dt * belief[k]

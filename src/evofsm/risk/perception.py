@@ -18,9 +18,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from evofsm._compile import compiled, kernel
 from evofsm.risk.manoeuvres import latest_of_each
+from evofsm.risk.rehearsal import Three
 
 # Gap [m], speed of the follower and of the leader [m/s], or what is said of each of them.
-Three: TypeAlias = tuple[float, float, float]
 Matrix: TypeAlias = tuple[Three, Three, Three]
 
 # Standard deviation of what may happen within a decision: the accelerations of the leader, of
@@ -374,7 +374,7 @@ def _add(
         size, place, row = abs(residuals[k]), added[k] % _MEMORY, ordered[k]
         i = added[k]
         if added[k] >= _MEMORY:  # the oldest leaves, and what is larger than it closes up
-            i = np.searchsorted(row, sizes[k, place])
+            i = _place_in(row, sizes[k, place])
             while i + 1 < _MEMORY and row[i + 1] < size:
                 row[i] = row[i + 1]
                 i += 1
@@ -383,6 +383,19 @@ def _add(
             i -= 1
         row[i] = sizes[k, place] = size
         added[k] += 1
+
+
+@kernel
+def _place_in(ordered: NDArray[np.float64], size: float) -> int:
+    """Where a number stands, or the first of those equal to it."""
+    low, high = 0, len(ordered)
+    while low < high:
+        middle = (low + high) // 2
+        if ordered[middle] < size:
+            low = middle + 1
+        else:
+            high = middle
+    return low
 
 
 @kernel

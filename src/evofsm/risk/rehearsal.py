@@ -13,7 +13,7 @@ states it leads to before it is taken (Han, Filev, Ozguner, arXiv:2006.08092).
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +27,10 @@ HARDEST = 15.0
 _HALVINGS = 10
 
 
+#: Gap [m], speed of the follower and of the leader [m/s].
+Three: TypeAlias = tuple[float, float, float]
+
+
 class Body(NamedTuple):
     """What the follower is able to do, as far as is known."""
 
@@ -37,7 +41,7 @@ class Body(NamedTuple):
 
 @compiled
 def critical_decelerations(
-    observation: NDArray[np.float64],
+    observation: Three | NDArray[np.float64],
     accelerations: NDArray[np.float64],
     before: float,
     body: Body,
@@ -69,7 +73,7 @@ def critical_decelerations(
 
 @kernel
 def survives(
-    observation: NDArray[np.float64],
+    observation: Three | NDArray[np.float64],
     acceleration: float,
     before: float,
     body: Body,
