@@ -29,6 +29,7 @@ from typing import Any
 
 import numpy as np
 
+import one_machine
 import torture_audit
 from evofsm import EvolvingFSM, FSMModel, IntervalActions, storage
 from evofsm.checkpoint import Checkpoint, fingerprints
@@ -50,6 +51,8 @@ WRONG = (
     "over-allocations",
     "left behind",
     *torture_audit.WRONG,
+    "lost observations",
+    "locks held",
 )
 _REFUSED, _CRASHED = 3, 4
 
@@ -496,11 +499,11 @@ def _peak() -> int:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Answers 1 where anything was wrong."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--short", action="store_true", help="20 kills, 4 full disks, 300 files")
+    parser.add_argument("--short", action="store_true", help="few of each")
     parser.add_argument("--seed", type=int, default=0)
     asked = parser.parse_args(arguments)
     kills, disks, loads, files = (20, 4, 100, 200) if asked.short else (500, 100, 5000, 10_000)
-    reading = 1.0 if asked.short else 20.0  # [s]
+    shared, reading = (4, 1.0) if asked.short else (200, 20.0)  # machines; [s]
     random = np.random.default_rng(asked.seed)
     total: Counter[str] = Counter()
     with tempfile.TemporaryDirectory() as name:
@@ -519,6 +522,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             ("logs interrupted", partial(torture_audit.interrupt, every=30 if asked.short else 1)),
             ("logs forged", torture_audit.forge),
             ("logs read meanwhile", partial(torture_audit.read_meanwhile, seconds=reading)),
+            ("four threads a machine", partial(one_machine.threads, shared)),
+            ("interrupted at a line", one_machine.interrupts),
         ):
             began = time.perf_counter()
             found = run(folder, random)

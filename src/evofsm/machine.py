@@ -12,9 +12,13 @@ vehicle control system via online recognition of latent risks", arXiv:1908.10823
 from __future__ import annotations
 
 import copy
+import os
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from typing import Any, Self, SupportsIndex
+from functools import wraps
+from threading import RLock
+from typing import Any, Concatenate, ParamSpec, Self, SupportsIndex, TypeVar
+from weakref import WeakValueDictionary
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -27,10 +31,14 @@ from evofsm.divergence import jensen_shannon
 from evofsm.explanation import Explanation, Nearest, explain, nothing_known
 from evofsm.memory import (
     NO_ACTION,
+    Held,
     Learnt,
+    Memory,
     Parameters,
     allocate,
+    believe,
     failures_told,
+    forget_present,
     leaves,
     refuse_impossible,
     resize,
@@ -73,6 +81,9 @@ from evofsm.validation import (
     whole,
 )
 
+Given = ParamSpec("Given")
+Returned = TypeVar("Returned")
+
 _FLOAT64 = np.dtype(np.float64)
 _RADIUS, _SPREAD = 0.3, 3.0
 _SETTINGS = ("n_actions", "radius", "distance_weight", "learning_rate", "prior_frequency", "spread")
@@ -83,6 +94,21 @@ _OPTIONS = {
     "belief_tolerance": 0.0,
     "failure_horizon": None,
 }
+# Every machine there is, by its identity, for a process that is forked.
+_MACHINES: WeakValueDictionary[int, EvolvingFSM] = WeakValueDictionary()
+
+
+def _alone(
+    method: Callable[Concatenate[EvolvingFSM, Given], Returned],
+) -> Callable[Concatenate[EvolvingFSM, Given], Returned]:
+    """A method during which no other thread changes the machine."""
+
+    @wraps(method)
+    def locked(self: EvolvingFSM, /, *args: Given.args, **kwargs: Given.kwargs) -> Returned:
+        with self._lock:
+            return method(self, *args, **kwargs)
+
+    return locked
 
 
 class EvolvingFSM:
@@ -140,6 +166,11 @@ class EvolvingFSM:
     Rows of a transition matrix are "from", columns "to": a forecast is ``belief @ P``. States
     and actions are counted from 0 here, and from 1 (``#3``) in what people read.
 
+    Threads may share a machine: each method is whole, and no observation is lost. But its episode
+    is one stream; observations of two threads are learnt as if one followed the other, so give each
+    source of observations a machine of its own. An interrupt (Ctrl-C) leaves a machine as it was
+    before the observation or as it is after; `learn_many` has then learnt its first rows.
+
     Examples
     --------
     >>> machine = EvolvingFSM(n_actions=2, radius=0.5)
@@ -194,6 +225,7 @@ class EvolvingFSM:
         )
         if parameters.learning_rate >= 1.0:
             raise ValueError(f"learning_rate is {learning_rate}; it must lie below 1")
+        self._share()
         self._use(allocate(0, whole("n_actions", n_actions), LINE, 0, parameters))
         ranges.refuse_others("machine", self._content)
 
@@ -271,14 +303,16 @@ prior_frequency=0.001, spread=3.0)
         """
         if missing is Missing.REJECT and explained is None and failed is None:
             return self._step(z, NO_ACTION, False)
-        step = self._observe_any(z, bool(failed), missing)
-        if failed is not None:
-            tell_of_failures(self._buffer)
-        if explained is None:
-            return step
-        text = explain(self, step.belief, None, explained, self._nearest(step.state)).text
-        return step._replace(explanation=text)
+        with self._lock:
+            step = self._observe_any(z, bool(failed), missing)
+            if failed is not None:
+                tell_of_failures(self._buffer)
+            if explained is None:
+                return step
+            text = explain(self, step.belief, None, explained, self._nearest(step.state)).text
+            return step._replace(explanation=text)
 
+    @_alone
     def act(self, i: SupportsIndex) -> None:
         """Say which action was commanded after the latest observation.
 
@@ -373,14 +407,17 @@ prior_frequency=0.001, spread=3.0)
         """
         if type(i) is int and type(z) is np.ndarray and z.dtype is _FLOAT64:
             try:
-                surprise = self._update(self._buffer, z, i, self._limit)
+                with self._lock:
+                    surprise = self._update(self._held.buffer, z, i, self._limit)
             except (TypeError, OverflowError):  # z has gaps or is read-only; i is beyond any index
                 surprise = DECLINED
             if surprise != DECLINED:
                 return surprise
             self._update = updater(self._limit)
-        return self._insist(z, check_action(i, self.n_actions), False)[2]
+        with self._lock:
+            return self._insist(z, check_action(i, self.n_actions), False)[2]
 
+    @_alone
     def learn_many(
         self,
         Z: ArrayLike,
@@ -447,6 +484,7 @@ prior_frequency=0.001, spread=3.0)
             row = learn_rows(self._buffer, *given, row, trace, beliefs, self._limit)
         return trace._replace(belief=beliefs[:, : self.n_states]) if belief else trace
 
+    @_alone
     def start_episode(self) -> None:
         """Begin a new episode: no transition is learnt from the last observation to the next.
 
@@ -460,9 +498,9 @@ prior_frequency=0.001, spread=3.0)
         >>> machine.n_states, machine.state, machine.belief
         (2, None, array([0.5, 0.5]))
         """
-        self._memory.learnt.chained[0] = 0.0
-        self._memory.learnt.action[0] = NO_ACTION
+        forget_present(self._buffer)
 
+    @_alone
     def fail(self) -> None:
         """End the episode in failure, without a further observation.
 
@@ -511,6 +549,7 @@ prior_frequency=0.001, spread=3.0)
 
     # -- Forecasting ----------------------------------------------------------------------------
 
+    @_alone
     def predict(
         self, i: SupportsIndex, horizon: int = 1, policy: Policy = "marginal"
     ) -> NDArray[np.float64]:
@@ -553,6 +592,7 @@ prior_frequency=0.001, spread=3.0)
         i = check_action(i, self.n_actions)
         return propagate(self.belief, self._matrix, self._averaged, i, horizon, policy)
 
+    @_alone
     def explain(
         self, action: SupportsIndex | None = None, labels: Labels | None = None
     ) -> Explanation:
@@ -687,6 +727,7 @@ prior_frequency=0.001, spread=3.0)
         return len(self._memory.learnt.clusters.first)
 
     @property
+    @_alone
     def state_ids(self) -> NDArray[np.int64]:
         """(n,) ndarray: identities of the states, the number of each one's founding from 0.
 
@@ -696,16 +737,19 @@ prior_frequency=0.001, spread=3.0)
         return self._memory.learnt.ids[: self.n_states].astype(np.int64)
 
     @property
+    @_alone
     def centers(self) -> NDArray[np.float64]:
         """(n, m) ndarray: the observation at the centre of each state."""
         return self._memory.learnt.clusters.centers[:, : self.n_states].T.copy()
 
     @property
+    @_alone
     def potentials(self) -> NDArray[np.float64]:
         """(n,) ndarray: density of all observations at each centre, in (0, 1]."""
         return self._memory.learnt.clusters.potentials[: self.n_states].copy()
 
     @property
+    @_alone
     def transition_matrices(self) -> NDArray[np.float64]:
         """(q, n, n) ndarray: for each action, probabilities from state (row) to state (column).
 
@@ -715,27 +759,32 @@ prior_frequency=0.001, spread=3.0)
         return self._of_actions(transitions.scales[..., None] * transitions.matrices, 1.0)
 
     @property
+    @_alone
     def origin_frequency(self) -> NDArray[np.float64]:
         """(q, n) ndarray: the paper's F_o, the recency-weighted frequency of each row."""
         unused = self.n_states**2 * self.prior_frequency
         return self._of_actions(self._memory.learnt.transitions.origin_frequency, unused)
 
     @property
+    @_alone
     def joint_frequency(self) -> NDArray[np.float64]:
         """(q, n, n) ndarray: the paper's F, recency-weighted frequencies of transitions."""
         return self.origin_frequency[:, :, None] * self.transition_matrices
 
     @property
+    @_alone
     def visits(self) -> NDArray[np.float64]:
         """(n,) ndarray: observations in which each state was the most probable."""
         return self._memory.learnt.visits[: self.n_states].copy()
 
     @property
+    @_alone
     def changes(self) -> NDArray[np.float64]:
         """(n, n) ndarray: steps from the most probable state (row) to the next one (column)."""
         return self._memory.learnt.changes[: self.n_states, : self.n_states].copy()
 
     @property
+    @_alone
     def decisions(self) -> NDArray[np.float64]:
         """(q, n) ndarray: for each action, transitions that began in each state, by belief.
 
@@ -752,6 +801,7 @@ prior_frequency=0.001, spread=3.0)
         return self._of_actions(self._memory.learnt.outcomes.decisions, 0.0)
 
     @property
+    @_alone
     def failures(self) -> NDArray[np.float64]:
         """(q, n) ndarray: those of `decisions` that led straight into failure.
 
@@ -767,6 +817,7 @@ prior_frequency=0.001, spread=3.0)
         return self._of_actions(self._memory.learnt.outcomes.failures, 0.0)
 
     @property
+    @_alone
     def endings(self) -> NDArray[np.float64]:
         """(n,) ndarray: failures whose last observation was recognised as each state.
 
@@ -782,6 +833,7 @@ prior_frequency=0.001, spread=3.0)
         return self._memory.learnt.outcomes.endings[: self.n_states].copy()
 
     @property
+    @_alone
     def episodes(self) -> NDArray[np.float64]:
         """(n,) ndarray: episodes that came to each state, without the one that is going on.
 
@@ -796,6 +848,7 @@ prior_frequency=0.001, spread=3.0)
         return outcomes.episodes[:n] - self._under_way(outcomes.latest_visit[:n])
 
     @property
+    @_alone
     def failed_soon(self) -> NDArray[np.float64]:
         """(n,) ndarray: those of `episodes` that failed within the horizon of being there."""
         return self._memory.learnt.outcomes.failed_soon[: self.n_states].copy()
@@ -806,11 +859,13 @@ prior_frequency=0.001, spread=3.0)
         return failures_told(self._buffer) or bool(self.endings.any())
 
     @property
+    @_alone
     def joined(self) -> NDArray[np.float64]:
         """(n,) ndarray: 1 where two states were joined, so that an episode may count twice."""
         return self._memory.learnt.outcomes.joined[: self.n_states].copy()
 
     @property
+    @_alone
     def tried(self) -> NDArray[np.float64]:
         """(q, n) ndarray: episodes that took each action in each state, without the present one.
 
@@ -827,16 +882,19 @@ prior_frequency=0.001, spread=3.0)
         return self._of_actions(outcomes.tried - self._under_way(outcomes.latest_try), 0.0)
 
     @property
+    @_alone
     def failed_after(self) -> NDArray[np.float64]:
         """(q, n) ndarray: those of `tried` that failed within the horizon of doing so."""
         return self._of_actions(self._memory.learnt.outcomes.failed_after, 0.0)
 
     @property
+    @_alone
     def marginal_matrix(self) -> NDArray[np.float64]:
         """(n, n) ndarray: the paper's P*, transition probabilities if all actions are alike."""
         return self._averaged("marginal")
 
     @property
+    @_alone
     def belief(self) -> NDArray[np.float64]:
         """(n,) ndarray: the present distribution over states, uniform as an episode starts."""
         n = self.n_states
@@ -845,11 +903,13 @@ prior_frequency=0.001, spread=3.0)
         return np.full(n, 1.0 / max(n, 1))
 
     @property
+    @_alone
     def state(self) -> int | None:
         """Index of the most probable state; None until an episode's first observation."""
         now = self._memory.learnt
         return int(now.state[0]) if now.chained[0] else None
 
+    @_alone
     def model(
         self,
         *,
@@ -1017,14 +1077,18 @@ prior_frequency=0.001, spread=3.0)
         told = {"failures_told": True} if self.failures_told else {}
         return {**self.settings, "rule": describe(self._rule), **told}
 
-    # The views belong to one buffer: a copy, or what another process gets, needs its own.
+    # The views belong to one buffer: a copy, or what another process gets, needs its own. So does
+    # its lock.
+    @_alone
     def __getstate__(self) -> dict[str, Any]:
         return {"rule": self._rule, "buffer": self._buffer.copy()}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self._rule = state["rule"]
+        self._share()
         self._use(state["buffer"])
 
+    @_alone
     def _repr_html_(self) -> str:
         return machine_html(self)
 
@@ -1041,6 +1105,7 @@ prior_frequency=0.001, spread=3.0)
         told = parameters.rule._replace(weights=weights(self._rule, m))
         return parameters._replace(rule=told)
 
+    @_alone
     def _trimmed(self) -> Learnt:
         """A copy of all that was learnt, without spare room."""
         open_ = count_open(self._memory.learnt.transitions)
@@ -1060,10 +1125,24 @@ prior_frequency=0.001, spread=3.0)
         machine._use(resize(buffer, lanes(n), places))
         return machine
 
+    @property
+    def _buffer(self) -> NDArray[np.float64]:
+        return self._held.buffer
+
+    @property
+    def _memory(self) -> Memory:
+        return self._held.memory
+
+    def _share(self) -> None:
+        """Be ready for threads. They wait for whoever steps, grows, or takes a copy."""
+        self._lock = RLock()
+        _MACHINES[id(self)] = self
+
     def _use(self, buffer: NDArray[np.float64]) -> None:
-        self._buffer = buffer
-        self._memory = view(buffer)
-        self._limit = limit_of(self._memory.parameters)
+        """Go on with another buffer: in one assignment, so that an interrupt parts nothing."""
+        memory = view(buffer)
+        self._limit = limit_of(memory.parameters)  # the same for all buffers of a machine
+        self._held = Held(buffer, memory)
         self._observe = _cannot_observe
         self._update = _cannot_update
 
@@ -1086,12 +1165,15 @@ prior_frequency=0.001, spread=3.0)
 
     def _step(self, z: ArrayLike, action: int, failed: bool) -> Step:
         """Observe, then act; the whole answer."""
-        event, state, surprise = self._insist(z, action, failed)
-        n, memory = self.n_states, self._memory
-        scratch = memory.scratch
-        forecast = scratch.forecast if self.belief_tolerance else scratch.predicted
-        predicted = forecast[: n if surprise == surprise else 0].copy()
-        return Step(state, memory.learnt.belief[:n].copy(), EVENTS[event], predicted, surprise)
+        with self._lock:
+            event, state, surprise = self._insist(z, action, failed)
+            memory = self._held.memory
+            parameters, now, scratch = memory.parameters, memory.learnt, memory.scratch
+            n = int(now.n_states[0])
+            forecast = scratch.forecast if parameters.belief_tolerance else scratch.predicted
+            predicted = forecast[: n if surprise == surprise else 0].copy()
+            belief = now.belief[:n].copy()
+        return Step(state, belief, EVENTS[event], predicted, surprise)
 
     def _observe_partly(
         self,
@@ -1121,23 +1203,24 @@ prior_frequency=0.001, spread=3.0)
             centers, distances = np.ascontiguousarray(held.centers[:, :n]), np.empty(n)
             rows = filled[None], width(rule, held)
             recognise_rows(centers, counted, *rows, distances, belief[None])
-        now.outcomes.clock[0] += 1.0
-        if not now.chained[0]:
-            now.outcomes.began[0] = now.outcomes.clock[0]
-        now.belief[:n], now.state[0] = belief, belief.argmax()
-        now.chained[0], now.action[0] = 1.0, NO_ACTION
-        state = int(now.state[0])
-        if failed:
-            self.fail()
         surprise = jensen_shannon(predicted, belief) if len(predicted) else np.nan
-        return Step(state, belief, Event.NONE, predicted, surprise, gone)
+        if failed:  # both, or neither
+            grown = self._grown()
+            believe(grown, belief)
+            fail(grown)
+            self._use(grown)
+        else:
+            believe(self._buffer, belief)
+        return Step(int(belief.argmax()), belief, Event.NONE, predicted, surprise, gone)
 
     def _insist(self, z: ArrayLike, action: int, failed: bool) -> tuple[int, int, float]:
         """What the kernel answers, whatever has to be done to `z` and for room before."""
         if type(z) is np.ndarray and z.dtype is _FLOAT64:
             event, state, surprise = REFUSED, 0, np.nan
             with suppress(TypeError):  # it has gaps, is read-only or is no vector
-                event, state, surprise = self._observe(self._buffer, z, action, failed, self._limit)
+                event, state, surprise = self._observe(
+                    self._held.buffer, z, action, failed, self._limit
+                )
             if event >= 0:
                 return event, state, surprise
             if event == FULL:
@@ -1149,7 +1232,11 @@ prior_frequency=0.001, spread=3.0)
 
     def _grow(self) -> None:
         """Make room for what the next step may need."""
-        self._use(resize(self._buffer, *room_for(self._memory)))
+        self._use(self._grown())
+
+    def _grown(self) -> NDArray[np.float64]:
+        """A copy of the buffer with that room."""
+        return resize(self._buffer, *room_for(self._memory))
 
     @property
     def _capacity(self) -> int:
@@ -1206,6 +1293,16 @@ prior_frequency=0.001, spread=3.0)
             self._fit(observations[0])
         refuse_unusable("observations", observations)
         return observations
+
+
+def _unlock_all() -> None:
+    """In a process just forked: it lacks the threads that held locks and would release them."""
+    for machine in _MACHINES.values():
+        machine._lock = RLock()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_unlock_all)
 
 
 # In place of kernels, until there is something to load them for.

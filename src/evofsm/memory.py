@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,6 +19,7 @@ from numpy.typing import NDArray
 
 from evofsm._compile import LINE, inner_kernel, kernel, lanes
 from evofsm._layout import (
+    FIELDS,
     SHAPES,
     SIZES,
     Changes,
@@ -31,7 +33,7 @@ from evofsm._layout import (
 )
 from evofsm.states.clusters import Clusters
 from evofsm.states.rule import RuleSettings
-from evofsm.transitions import NOT_OPEN, Outcomes, Transitions
+from evofsm.transitions import NOT_OPEN, Outcomes, Transitions, count_open
 from evofsm.validation import refuse_more_failures, refuse_unless_distribution
 
 NO_ACTION = -1
@@ -58,7 +60,7 @@ class Parameters(NamedTuple):
 class Learnt(NamedTuple):
     """What the next step needs, and what people ask of the states."""
 
-    n_states: Counter  #
+    n_states: Counter
     n_founded: Counter  # states so far, with those given up
     action: Counter  # taken after the latest observation, or NO_ACTION
     chained: Counter  # 1 where `belief` belongs to the present episode
@@ -98,6 +100,26 @@ _FAILURES_TOLD = _SETTINGS + _KINDS["setting"]
 _COUNTERS = _FAILURES_TOLD + 1
 _PER_STATE, _PER_PLACE = _KINDS["state"], _KINDS["place"]
 _PER_ACTION, _PER_VARIABLE = _KINDS["action"], _KINDS["variable"]
+
+
+def _counter(part: type, name: str) -> int:
+    """Where a counter stands in a buffer."""
+    place = FIELDS[part][name]
+    assert isinstance(place, Place)
+    return _COUNTERS + place.number
+
+
+# The counters that tell where the present episode is; the first belief stands behind them all.
+_ACTION, _CHAINED, _STATE = (_counter(Learnt, name) for name in ("action", "chained", "state"))
+_CLOCK, _BEGAN = (_counter(Outcomes, name) for name in ("clock", "began"))
+
+
+@dataclass(frozen=True, slots=True)
+class Held:
+    """A buffer with the views into it: together, for one without the other is of no use."""
+
+    buffer: NDArray[np.float64]
+    memory: Memory
 
 
 class _Sections(NamedTuple):
@@ -210,7 +232,19 @@ def _vacate(clusters: Clusters, n: int) -> None:
 
 
 def resize(buffer: NDArray[np.float64], capacity: int, places: int) -> NDArray[np.float64]:
-    """Copy of a buffer with room for another number of states and matrices."""
+    """Copy of a buffer with room for another number of states and matrices.
+
+    Raises
+    ------
+    ValueError
+        If there would be less room than is used.
+    """
+    now = view(buffer).learnt
+    n, used = int(now.n_states[0]), count_open(now.transitions)
+    if capacity < n or places < used:
+        raise ValueError(
+            f"room for {capacity} states and {places} matrices, but {n} and {used} are in use"
+        )
     m, q, *_ = _sizes(buffer)
     resized = _blank(m, q, capacity, places)
     move(buffer, buffer[matrices_of(buffer) :], resized, resized[matrices_of(resized) :])
@@ -272,6 +306,24 @@ def failures_told(buffer: NDArray[np.float64]) -> bool:
 def tell_of_failures(buffer: NDArray[np.float64], at: int | NDArray[np.int64] = 0) -> None:
     """Note that failures are told, of the machines whose memories begin ``at`` a place."""
     buffer[at + _FAILURES_TOLD] = 1.0
+
+
+# What these two change lies side by side: one assignment does it, so that an interrupt comes
+# before or after, and never in between.
+def believe(buffer: NDArray[np.float64], belief: NDArray[np.float64]) -> None:
+    """Go on in the episode with a belief over all states, from which nothing else is learnt."""
+    present = buffer[: _HEAD + len(belief)].copy()
+    present[_CLOCK] += 1.0
+    if not present[_CHAINED]:
+        present[_BEGAN] = present[_CLOCK]
+    present[_ACTION], present[_CHAINED], present[_STATE] = NO_ACTION, 1.0, belief.argmax()
+    present[_HEAD:] = belief
+    buffer[: len(present)] = present
+
+
+def forget_present(buffer: NDArray[np.float64]) -> None:
+    """Leave the episode, so that the next observation begins another one."""
+    buffer[_ACTION : _CHAINED + 1] = NO_ACTION, 0.0
 
 
 def leaves(learnt: NamedTuple) -> Iterator[tuple[str, NDArray[np.float64]]]:
