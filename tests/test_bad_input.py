@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from evofsm import EvolvingFSM
+from evofsm import EvolvingFSM, Missing
 
 NAN, INF = float("nan"), float("inf")
 RAGGED = [[1.0, 2.0], [3.0]]
@@ -199,3 +199,53 @@ def test_a_number_of_actions_that_is_no_whole_number(value):
 def test_a_learning_rate_that_would_forget_all_at_once(value):
     with pytest.raises(ValueError, match=f"learning_rate is {value}; it must lie below 1"):
         EvolvingFSM(n_actions=2, learning_rate=value)
+
+
+# -- Masked arrays -----------------------------------------------------------------------------
+
+
+HIDDEN = {
+    "numbers": np.ma.array([0.5, 7.0], mask=[False, True]),
+    "whole numbers": np.ma.array([1, 7], mask=[False, True]),
+    "flags": np.ma.array([True, True], mask=[False, True]),
+}
+
+
+@pytest.mark.parametrize("z", HIDDEN.values(), ids=HIDDEN)
+def test_a_masked_entry_is_missing(machine, refuses, z):
+    words = "observation, variable 1: nan .*missing"
+    refuses(machine, lambda m: m.observe(z), ValueError, words)
+    refuses(machine, lambda m: m.learn_one(z, 1), ValueError, words)
+    refuses(machine, lambda m: m.update(z, 1), ValueError, words)
+    for Z in (np.ma.array([z, z]), [z, z]):
+        words = "observations, row 0, variable 1: nan"
+        refuses(machine, lambda m, Z=Z: m.learn_many(Z, [0, 0]), ValueError, words)
+
+
+@pytest.mark.parametrize("missing", [Missing.HOLD, Missing.PARTIAL])
+@pytest.mark.parametrize("z", HIDDEN.values(), ids=HIDDEN)
+def test_a_masked_entry_is_treated_as_nan_is(grown, z, missing):
+    twin = grown.copy()
+    step = grown.observe(z, missing=missing)
+    expected = twin.observe([float(z[0]), NAN], missing=missing)
+    assert step.missing == expected.missing == (1,)
+    assert step.belief.tobytes() == expected.belief.tobytes()
+
+
+def test_a_mask_that_hides_nothing_changes_nothing(machine, snapshot):
+    twin, Z = machine.copy(), np.array([[0.5, 7.0], [1.0, 2.0]])
+    machine.learn_many(np.ma.array(Z), np.ma.array([0, 1]))
+    twin.learn_many(Z, [0, 1])
+    assert snapshot(machine) == snapshot(twin)
+
+
+def test_a_masked_action_or_row_number_is_refused(machine, refuses):
+    hidden = np.ma.array([0, 1], mask=[False, True])
+    refuses(machine, lambda m: m.learn_many(ROWS[:2], hidden), ValueError, "actions .*masked")
+    words = "failures .*masked"
+    refuses(machine, lambda m: m.learn_many(ROWS[:2], [0, 0], [], hidden), ValueError, words)
+
+
+def test_a_model_does_not_see_what_is_masked(grown):
+    with pytest.raises(ValueError, match="variable 1: nan"):
+        grown.model().recognise(HIDDEN["numbers"])

@@ -236,7 +236,7 @@ def test_a_line_of_code_is_where_its_link_leads(site):
     found = {int(one.rpartition("L-")[2]) for one in links if "states/ets.html#" in one}
     source = (ROOT / "src/evofsm/states/ets.py").read_text().splitlines()
     there = [source[line - 1].strip().partition("(")[0] for line in sorted(found)]
-    assert there == ["def judge", "return MOVED if squared_distance < radius * radius else CREATED"]
+    assert there == ["def judge", "return MOVED if exceeds"]
 
 
 def test_every_public_module_is_in_the_reference(site):

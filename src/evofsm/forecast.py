@@ -226,7 +226,7 @@ class Forecasts:
         >>> forecasts.predict([0.3, 0.7], 0, steps=1)  # nothing was learnt
         array([0.3, 0.7])
         """
-        rows = real_rows("belief", np.atleast_2d(np.asarray(belief)))
+        rows = real_rows("belief", np.atleast_2d(belief))
         refuse_unless_distribution("belief", rows)
         self._check_states(rows.shape[1])
         given = np.broadcast_to(np.asarray(_NO_ACTION if i is None else i), len(rows))

@@ -37,7 +37,10 @@ def whole(name: str, value: SupportsIndex) -> int:
 
 
 def real_array(name: str, values: ArrayLike, ndim: int) -> NDArray[np.float64]:
-    """A new array of real numbers with ``ndim`` axes, the last one not empty."""
+    """A new array of real numbers with ``ndim`` axes, the last one not empty.
+
+    What is masked is NaN there: no more than any other missing value may it be guessed.
+    """
     array = _array(name, values)
     if array.dtype.kind not in "fiub":
         raise TypeError(
@@ -47,12 +50,17 @@ def real_array(name: str, values: ArrayLike, ndim: int) -> NDArray[np.float64]:
     if array.ndim != ndim or array.shape[-1] == 0:
         wanted = "(variables,)" if ndim == 1 else "(rows, variables)"
         raise ValueError(f"{name} has shape {array.shape}; it must be {wanted}, not empty")
-    return array.astype(np.float64)
+    numbers = array.astype(np.float64)
+    if (masked := _masked(values)) is not None:
+        numbers[masked] = np.nan
+    return numbers
 
 
 def real_rows(name: str, values: ArrayLike) -> NDArray[np.float64]:
     """Rows of real numbers, without gaps in memory: those given where they are that already."""
     if not isinstance(values, np.ndarray) or values.dtype != np.float64:
+        return real_array(name, values, ndim=2)
+    if _is_masked(values):
         return real_array(name, values, ndim=2)
     if values.ndim != 2 or values.shape[1] == 0:
         return real_array(name, values, ndim=2)
@@ -64,6 +72,28 @@ def _array(name: str, values: ArrayLike) -> NDArray[Any]:
         return np.asarray(values)
     except ValueError:
         raise ValueError(f"{name}: rows have different lengths") from None
+
+
+def _whole_array(name: str, values: ArrayLike) -> NDArray[Any]:
+    masked = _masked(values)
+    if masked is not None and masked.any():
+        raise ValueError(f"{name} are masked in places; each one must be known")
+    return _array(name, values)
+
+
+def _is_masked(values: Any) -> bool:
+    return type(values) is not np.ndarray and isinstance(values, np.ma.MaskedArray)
+
+
+def _masked(values: ArrayLike) -> NDArray[np.bool_] | None:
+    """Which entries a mask hides, in an array or in the rows of a list; None without a mask.
+
+    NumPy itself takes the numbers under the mask, whatever they are.
+    """
+    rows = values if isinstance(values, list | tuple) else ()
+    if _is_masked(values) or any(_is_masked(row) for row in rows):
+        return np.ma.getmaskarray(np.ma.array(values))
+    return None
 
 
 def refuse_unusable(name: str, values: NDArray[np.float64]) -> None:
@@ -123,7 +153,7 @@ def check_state(state: Any, n_states: int) -> int:
 
 def check_actions(indices: ArrayLike, rows: int, n_actions: int) -> NDArray[np.int64]:
     """An index for each row, or -1 for none."""
-    actions = _array("actions", indices)
+    actions = _whole_array("actions", indices)
     if actions.shape != (rows,):
         raise ValueError(f"actions have shape {actions.shape}; {rows} observations need ({rows},)")
     if rows and actions.dtype.kind not in "iu":
@@ -142,7 +172,7 @@ def check_actions(indices: ArrayLike, rows: int, n_actions: int) -> NDArray[np.i
 
 def check_rows(name: str, numbers: ArrayLike, rows: int) -> NDArray[np.bool_]:
     """Mark the rows that are named."""
-    given = _array(name, numbers)
+    given = _whole_array(name, numbers)
     if given.size and given.dtype.kind not in "iu":
         raise TypeError(f"{name} has dtype {given.dtype}; it must hold row numbers")
     wrong = given[(given < 0) | (given >= rows)]

@@ -26,6 +26,9 @@ from evofsm._layout import Centers, Counter, PerState, PerVariable
 # What may happen to the states.
 UNCHANGED, MOVED, CREATED = 0, 1, 2
 
+# A share that no rounding comes to, and that no two observations tell apart either.
+_ROUNDING = 1e-12
+
 
 class Clusters(NamedTuple):
     """What is remembered: m variables, room for ``capacity`` centres, the first ``n`` in use."""
@@ -63,6 +66,15 @@ def measure_distances(
         for i in range(n):
             offset = (value - centers[j, i]) * weight
             squared_distances[i] = fma(offset, offset, squared_distances[i])
+
+
+@inner_kernel
+def exceeds(value: float, other: float) -> bool:
+    """Whether a value of 0 or more is the greater one, and not by rounding alone.
+
+    Observations from a grid are often exactly as dense as a centre, or exactly a radius away.
+    """
+    return value > other * (1.0 + _ROUNDING)
 
 
 @inner_kernel

@@ -13,7 +13,7 @@ from typing import ClassVar
 
 from evofsm._compile import inner_kernel
 from evofsm.states import ets
-from evofsm.states.clusters import CREATED, UNCHANGED, Clusters
+from evofsm.states.clusters import CREATED, UNCHANGED, Clusters, exceeds
 from evofsm.states.rule import RuleSettings
 
 CODE = 1
@@ -60,9 +60,9 @@ def judge(
 ) -> int:
     """Judge as the paper does, and found a state at an edge."""
     event = ets.judge(potential, highest, squared_distance, radius)
-    if event != UNCHANGED or squared_distance <= radius * radius:
+    if event != UNCHANGED or not exceeds(squared_distance, radius * radius):
         return event
     for i in range(n):
-        if potential >= clusters.potentials[i]:
+        if not exceeds(clusters.potentials[i], potential):
             return UNCHANGED
     return CREATED

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from evofsm._compile import inner_kernel
-from evofsm.states.clusters import CREATED, MOVED, UNCHANGED, Clusters, total_variance
+from evofsm.states.clusters import CREATED, MOVED, UNCHANGED, Clusters, exceeds, total_variance
 from evofsm.states.rule import RuleSettings
 from evofsm.validation import whole
 
@@ -67,9 +67,9 @@ def check_memory(memory: int | None) -> int | None:
 @inner_kernel
 def judge(potential: float, highest: float, squared_distance: float, radius: float) -> int:
     """Leave the states as they are, move the nearest, or found one."""
-    if potential <= highest:
+    if not exceeds(potential, highest):
         return UNCHANGED
-    return MOVED if squared_distance < radius * radius else CREATED
+    return MOVED if exceeds(radius * radius, squared_distance) else CREATED
 
 
 @inner_kernel

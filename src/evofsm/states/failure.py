@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from evofsm._compile import inner_kernel
+from evofsm.states.clusters import exceeds
 from evofsm.states.novelty import Novelty
 from evofsm.states.rule import RuleSettings, StateRule
 from evofsm.validation import positive
@@ -84,7 +85,7 @@ def splits(
     Its nearest state was recognised in ``visits`` observations, ``returns`` of which followed
     one in the same state, and ``endings`` episodes failed in it.
     """
-    if squared_distance <= settings.failure_distance**2:
+    if not exceeds(squared_distance, settings.failure_distance**2):
         return False
     # Of all visits, those that did not come from the state itself began a stay.
     return endings < settings.failure_share * (visits - returns)

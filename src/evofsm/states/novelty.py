@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from evofsm._compile import inner_kernel
-from evofsm.states.clusters import CREATED, UNCHANGED
+from evofsm.states.clusters import CREATED, UNCHANGED, exceeds
 from evofsm.states.rule import RuleSettings
 from evofsm.validation import positive
 
@@ -69,7 +69,7 @@ class Novelty:
 @inner_kernel
 def judge(squared_distance: float, radius: float) -> int:
     """Found a state where the nearest centre is farther than the radius."""
-    return CREATED if squared_distance > radius * radius else UNCHANGED
+    return CREATED if exceeds(squared_distance, radius * radius) else UNCHANGED
 
 
 @inner_kernel
