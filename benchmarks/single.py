@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
+
 from evofsm.machine import EvolvingFSM
 from reference import NumpyFSM
 from streams import (
@@ -21,6 +23,7 @@ from turns import Result, Work, compare, timed
 _BATCH_ROWS = 1_000_000
 _CALL_ROWS = 50_000
 _LOOP_ROWS = 20_000
+_FLOAT64 = np.dtype(np.float64)
 
 
 def batch(n_states: int, repeats: int, short: bool) -> Result:
@@ -48,6 +51,30 @@ def call(n_states: int, repeats: int, short: bool) -> Result:
         numpy_loop(reference, stream.part(0, _sized(_LOOP_ROWS, short))),
         repeats,
         beside={"learn_one, which answers the whole Step": one_call_each(full.learn_one, stream)},
+    )
+
+
+def lock(repeats: int, short: bool) -> Result:
+    """`update` against itself without the lock that lets threads share a machine."""
+    rows = _sized(_CALL_ROWS, short)
+    machine, _, stream = pair(7, rows)
+    bare = machine.copy()
+
+    def unlocked(z: Any, i: int) -> float:
+        if type(i) is int and type(z) is np.ndarray and z.dtype is _FLOAT64:
+            try:
+                return bare._update(bare._held.buffer, z, i)
+            except (TypeError, OverflowError):
+                pass
+        raise AssertionError
+
+    bare.update(stream.observations[0], 0)  # loads the kernel
+    return compare(
+        "update(z, i) with its lock, 7 states",
+        one_call_each(machine.update, stream),
+        "update without it",
+        one_call_each(unlocked, stream),
+        repeats,
     )
 
 

@@ -20,7 +20,7 @@ from pathlib import Path
 from clusterers import db_stream, stream_k_means
 from cold import FIRST, first
 from fleets import fleet
-from single import batch, call
+from single import batch, call, lock
 from table import HEADER, Row, judged, shown, worsened
 from tolerance import cost_and_memory, many_states
 from turns import Result
@@ -43,6 +43,7 @@ ROWS = {
     "batch_64": Row(partial(batch, 64), ">=", 45.0),
     "call_7": Row(partial(call, 7), ">=", 40.0),
     "call_64": Row(partial(call, 64), ">="),
+    "call_lock": Row(lock, "<="),
     "fleet_1000": Row(partial(fleet, 1_000), ">=", 12.0),
     "fleet_10000": Row(partial(fleet, 10_000), ">="),
     "river_streamkmeans": Row(stream_k_means, ">=", 25.0),

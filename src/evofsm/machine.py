@@ -17,7 +17,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from functools import wraps
 from threading import RLock
-from typing import Any, Concatenate, ParamSpec, Self, SupportsIndex, TypeVar
+from typing import Any, Self, SupportsIndex, TypeVar, cast
 from weakref import WeakValueDictionary
 
 import numpy as np
@@ -81,8 +81,7 @@ from evofsm.validation import (
     whole,
 )
 
-Given = ParamSpec("Given")
-Returned = TypeVar("Returned")
+Method = TypeVar("Method", bound=Callable[..., Any])
 
 _FLOAT64 = np.dtype(np.float64)
 _RADIUS, _SPREAD = 0.3, 3.0
@@ -98,17 +97,15 @@ _OPTIONS = {
 _MACHINES: WeakValueDictionary[int, EvolvingFSM] = WeakValueDictionary()
 
 
-def _alone(
-    method: Callable[Concatenate[EvolvingFSM, Given], Returned],
-) -> Callable[Concatenate[EvolvingFSM, Given], Returned]:
+def _alone(method: Method) -> Method:
     """A method during which no other thread changes the machine."""
 
     @wraps(method)
-    def locked(self: EvolvingFSM, /, *args: Given.args, **kwargs: Given.kwargs) -> Returned:
+    def locked(self: EvolvingFSM, *args: Any, **kwargs: Any) -> Any:
         with self._lock:
             return method(self, *args, **kwargs)
 
-    return locked
+    return cast(Method, locked)
 
 
 class EvolvingFSM:
@@ -272,7 +269,7 @@ prior_frequency=0.001, spread=3.0)
             other; then the failure is counted, and the next observation begins an episode. Without
             it nothing is said of failures: see `failures_told`.
         missing : Missing
-            What to do where entries are NaN, which says that they were not observed. Such an
+            What to do where entries are NaN or masked: that they were not observed. Such an
             observation is recognised and no more: no state moves, no transition to it is learnt,
             and `Step.missing` tells the variables.
         explained : Labels, optional

@@ -28,7 +28,7 @@ def events_by_the_paper(Z, radius, distance_weight):
     for t, z in enumerate(rows[1:], 2):
         before = rows[: t - 1]
         a, b = sum(value**2 for value in z), sum(value**2 for row in before for value in row)
-        c = sum(value * sum(column) for value, column in zip(z, zip(*before), strict=True))
+        c = sum(value * sum(row[j] for row in before) for j, value in enumerate(z))
         potential = Fraction(t - 1) / ((t - 1) * (a + 1) - 2 * c + b)
         potentials = [
             (t - 1) * p / ((t - 2) + p * (1 + distance_weight * d))
