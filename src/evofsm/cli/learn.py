@@ -212,6 +212,8 @@ def learn(
     With --checkpoint, the same command goes on where it was stopped, whatever stopped it, and comes
     to the same result. The file is kept at the end: run again, the command prints it at once.
     """
+    radius = _or_usual(radius, rule, 0.3, of_novelty=1.0)
+    spread = _or_usual(spread, rule, 3.0, of_novelty=1.0)
     # Whatever it is told, a new option too, is a setting that a checkpoint goes by.
     settings = {name: value for name, value in locals().items() if name not in _NO_SETTINGS}
     from evofsm.checkpoint import Checkpoint, duration, fingerprints, result_kept
@@ -462,18 +464,24 @@ def _columns(
     )
 
 
+def _or_usual(given: float | None, rule: RuleName, usual: float, *, of_novelty: float) -> float:
+    """A setting, or what holds where it was not given."""
+    if given is not None:
+        return given
+    return of_novelty if rule in (RuleName.NOVELTY, RuleName.FAILURE) else usual
+
+
 def _rule(
     name: RuleName,
-    radius: float | None,
-    spread: float | None,
+    radius: float,
+    spread: float,
     scale: list[str] | None,
     columns: LogColumns,
 ) -> dict[str, Any]:
     """What a machine is told of its rule, and the settings that it shares with it."""
     from evofsm.states import Edges, FailureSplit, Novelty
 
-    shared = {"radius": radius, "spread": spread}
-    given = {name: value for name, value in shared.items() if value is not None}
+    given: dict[str, Any] = {"radius": radius, "spread": spread}
     if name in (RuleName.PAPER, RuleName.EDGES):
         if scale:
             raise ValueError(f"--scale is for --rule novelty or failure, not {name.value}")

@@ -104,7 +104,8 @@ class CsvTable:
         """Whether the first row has a time of ISO 8601 there; what else it has is not judged."""
         with open_unpacked(self.path) as file, suppress(ValueError, EOFError, OSError, csv.Error):
             file.read(self._header_size)
-            lines = _lines(self.path, _text(file), reached=self._header_lines)
+            text = _text(file)  # kept until the file is closed
+            lines = _lines(self.path, text, reached=self._header_lines)
             row = next(csv.reader(lines, delimiter=self._separator), [])
             return len(row) == len(self.columns) and looks_like_a_date(row[self._place(name)])
         return False
