@@ -32,8 +32,8 @@ _LOWEST_FREQUENCY = 1e-290
 _SMALLEST_SCALE = 1e-30
 # A row that moves farther at once is worked on as a whole.
 _MOST_BY_SCALE = 0.5
-# A row with less left of it than this is rounding.
-_LEAST_KEPT = 1e-12
+# A row with less left of it than this is rounding: scaled up it would no longer sum to 1.
+_LEAST_KEPT = 1e-9
 #: The place of an action without a matrix.
 NOT_OPEN = -1.0
 
