@@ -58,7 +58,7 @@ def _inside(function: Function, **options: Any) -> Function:
     return cast(Function, njit(**options)(function))
 
 
-class _Linkable(JITCodeLibrary):  # type: ignore[misc]
+class _Linkable(JITCodeLibrary):
     """The code of an inner kernel: it is optimised, and made machine code, in its callers alone.
 
     Numba would do both for each kernel by itself, and then again with all that it calls in each
@@ -69,7 +69,7 @@ class _Linkable(JITCodeLibrary):  # type: ignore[misc]
         pass
 
     def _finalize_final_module(self) -> None:
-        self._finalize_dynamic_globals()
+        cast(Any, self)._finalize_dynamic_globals()
         self._finalized = True
 
     def get_pointer_to_function(self, name: str) -> int:
@@ -97,19 +97,19 @@ class _WithoutEnvironment:
 
 
 @register_pass(mutates_CFG=False, analysis_only=True)
-class _LinkOnly(AnalysisPass):  # type: ignore[misc]
+class _LinkOnly(AnalysisPass):
     _name = "evofsm_link_only"
 
     def __init__(self) -> None:
         AnalysisPass.__init__(self)
 
     def run_pass(self, state: Any) -> bool:
-        state.library = _Linkable(state.targetctx.codegen(), state.func_id.func_qualname)
+        state.library = cast(Any, _Linkable)(state.targetctx.codegen(), state.func_id.func_qualname)
         state.library.enable_object_caching()
         return False
 
 
-class _InnerCompiler(CompilerBase):  # type: ignore[misc]
+class _InnerCompiler(CompilerBase):
     def define_pipelines(self) -> list[Any]:
         manager = DefaultPassBuilder.define_nopython_pipeline(self.state)
         manager.add_pass_after(_LinkOnly, AnnotateTypes)
@@ -154,7 +154,7 @@ def lanes(n: int) -> int:
     return (n + LINE - 1) // LINE * LINE
 
 
-class Announcement(event.Listener):  # type: ignore[misc]
+class Announcement(event.Listener):
     """Says once, on stderr, that kernels are compiled, where that takes longer than a second."""
 
     _PATIENCE: ClassVar = 1.0  # [s], over all kernels

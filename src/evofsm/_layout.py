@@ -27,7 +27,7 @@ from numba.np import arrayobj
 from numpy.typing import NDArray
 
 # Numba has no types for these.
-_arrays, _codegen, _models = cast(Any, arrayobj), cast(Any, cgutils), cast(Any, models)
+_arrays, _codegen = cast(Any, arrayobj), cast(Any, cgutils)
 
 _Array: TypeAlias = NDArray[np.float64]
 Setting: TypeAlias = Annotated[float, "setting"]  #: a number that a machine was told
@@ -121,23 +121,22 @@ class Opened(types.Type):
 
 
 @register_model(Opened)
-class _OpenedModel(_models.StructModel):  # type: ignore[misc]
+class _OpenedModel(models.StructModel):
     def __init__(self, manager: Any, opened: Any) -> None:
         pointers = dict.fromkeys(["setting", *SHAPES], types.CPointer(types.float64))
         pointers["matrix"] = types.CPointer(opened.matrices)
         members = [*pointers.items(), *((size, types.intp) for size in SIZES)]
-        super().__init__(manager, opened, members)
+        cast(Any, super()).__init__(manager, opened, members)
 
 
 @infer_getattr
-class _OpenedFields(AttributeTemplate):  # type: ignore[misc]
+class _OpenedFields(AttributeTemplate):
     key = Opened
 
-    def generic_resolve(self, opened: Any, name: str) -> Any:
+    def generic_resolve(self, opened: Any, name: str) -> Any:  # type: ignore[override]
         return opened.field(name)
 
 
-@lower_getattr_generic(Opened)
 def _lower_field(context: Any, builder: Any, opened: Any, value: Any, name: str) -> Any:
     told = FIELDS[opened.kind][name]
     if isinstance(told, type):
@@ -149,7 +148,8 @@ def _lower_field(context: Any, builder: Any, opened: Any, value: Any, name: str)
         )
     one = context.get_constant(types.intp, 1)
     lengths = [one if size == "one" else getattr(within, size) for size in SHAPES[told.kind]]
-    start, strides = context.get_constant(types.intp, told.number), []
+    start = context.get_constant(types.intp, told.number)
+    strides: list[Any] = []
     kind = opened.field(name)
     stride = context.get_constant(types.intp, kind.dtype.bitwidth // 8)
     for length in reversed(lengths):
@@ -166,6 +166,9 @@ def _lower_field(context: Any, builder: Any, opened: Any, value: Any, name: str)
         meminfo=None,
     )
     return array._getvalue()
+
+
+cast(Any, lower_getattr_generic)(Opened)(_lower_field)
 
 
 def opener(kind: type) -> Any:

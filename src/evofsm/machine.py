@@ -1204,7 +1204,7 @@ prior_frequency=0.001, spread=3.0)
         if failed:  # both, or neither
             grown = self._grown()
             believe(grown, belief)
-            fail(grown)
+            fail(grown, self._limit)
             self._use(grown)
         else:
             believe(self._buffer, belief)

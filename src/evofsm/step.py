@@ -278,21 +278,22 @@ def observer(limit: Limit) -> Callable[..., tuple[int, int, float]]:
 
     For any other type of array it raises a TypeError, where Numba would compile it once more.
     """
-    return _for_plain_arrays(_observe, "float64[::1], float64[::1], int64, boolean", limit)
+    _compile_plain(_observe, "float64[::1], float64[::1], int64, boolean", limit)
+    return _observe
 
 
 @cache
 def updater(limit: Limit) -> Callable[..., float]:
     """`_update`, in the same way; the quickest call there is to take one step."""
-    return _for_plain_arrays(_update, "float64[::1], float64[::1], int64", limit)
+    _compile_plain(_update, "float64[::1], float64[::1], int64", limit)
+    return _update
 
 
-def _for_plain_arrays(kernel: Any, arguments: str, limit: Limit) -> Any:
+def _compile_plain(kernel: Any, arguments: str, limit: Limit) -> None:
     with _COMPILING:  # whichever thread comes first
         kernel.disable_compile(False)
         kernel.compile(f"({arguments}, {'none' if limit is None else 'int64'})")
         kernel.disable_compile()
-    return kernel
 
 
 @kernel

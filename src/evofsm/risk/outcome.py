@@ -26,8 +26,8 @@ from evofsm.protocols import Situation
 from evofsm.risk.brakes import OwnBrakes, Sample
 from evofsm.risk.leaders import LeaderBrakes
 from evofsm.risk.manoeuvres import BrakeWatch, Manoeuvres
-from evofsm.risk.perception import Estimate, Perception, Three, is_whole
-from evofsm.risk.rehearsal import Body, critical_decelerations
+from evofsm.risk.perception import Estimate, Perception, is_whole
+from evofsm.risk.rehearsal import Body, Three, critical_decelerations
 from evofsm.validation import (
     LARGEST_OBSERVATION,
     positive,

@@ -57,9 +57,7 @@ def plan_of(scenario: Scenario) -> Plan:
 
 
 TABLE, SERIES = types.float64[:, ::1], types.float64[::1]
-PLAN = types.NamedTuple(  # type: ignore[no-untyped-call]
-    [SERIES, types.float64, TABLE, TABLE, SERIES, SERIES, SERIES, TABLE], Plan
-)
+PLAN = types.NamedTuple([SERIES, types.float64, TABLE, TABLE, SERIES, SERIES, SERIES, TABLE], Plan)
 
 
 @compiled
