@@ -169,15 +169,3 @@ def test_a_tolerance_changes_forecasts_by_little_and_rare_jumps_stay_rare_events
     np.testing.assert_allclose(b.surprise, a.surprise, atol=1e-5)
     np.testing.assert_allclose(tolerant.transition_matrices, exact.transition_matrices, atol=1e-5)
     assert np.nanmedian(b.surprise[jumps]) > np.nanmedian(b.surprise) + 0.3
-
-
-def test_rows_that_led_almost_surely_to_a_state_that_is_retired_still_sum_to_1(tmp_path):
-    for certain in range(24, 46, 2):
-        machine = sharp(max_states=3, when_full=WhenFull.RETIRE)
-        learn(machine, [0.0, 10.0] * certain)
-        learn(machine, [0.0, 20.0] * 50, [-1] * 100)
-        learn(machine, [30.0], [-1])
-        assert sorted(machine.centers.ravel()) == [0.0, 20.0, 30.0]
-        np.testing.assert_allclose(machine.transition_matrices.sum(axis=2), 1.0, atol=1e-6, rtol=0)
-        machine.save(tmp_path / "machine")
-        EvolvingFSM.load(tmp_path / "machine")

@@ -1,9 +1,11 @@
 """Transition matrices and forecasts, worked out by hand on two states and two actions."""
 
+import numba
 import numpy as np
 import pytest
 
 from evofsm import EvolvingFSM
+from evofsm.transitions import Transitions, retire_state
 
 # Learnt by `machine`, and by hand with phi = 1/2 and prior frequency 1/4 from
 # F = [[1/4, 1/4], [1/4, 1/4]]: action 0 led once from state 1 to 0, action 1 once from 0 to 0 and
@@ -86,3 +88,22 @@ def test_the_step_reports_the_forecast_made_one_step_before(machine):
     machine.act(1)
     step = machine.observe([0.0])
     np.testing.assert_allclose(step.predicted, forecast, rtol=1e-15)
+
+
+@numba.njit
+def retire(transitions, given, n, prior):
+    retire_state(transitions, given, n, prior)
+
+
+def test_a_row_that_led_almost_surely_to_a_state_that_is_retired_still_sums_to_1():
+    random, n, given = np.random.default_rng(0), 8, 3
+    for other in np.tile(10.0 ** np.arange(-13, -6, 0.25), 20):
+        row = random.random(n)
+        row[given] = 0.0
+        row *= other / row.sum()
+        row[given] = 1.0 - row.sum()
+        matrices = np.tile(row, (1, n, 1))
+        one, rows = np.zeros(1), np.ones((1, n))
+        retire(Transitions(one, one, matrices, rows, rows.copy()), given, n, 1e-3)
+        sums = np.delete(matrices[0], given, axis=0).sum(axis=1)
+        np.testing.assert_allclose(sums, 1.0, atol=1e-6, rtol=0)  # else no file of it would load
