@@ -63,7 +63,7 @@ def lock(repeats: int, short: bool) -> Result:
     def unlocked(z: Any, i: int) -> float:
         if type(i) is int and type(z) is np.ndarray and z.dtype is _FLOAT64:
             try:
-                return bare._update(bare._held.buffer, z, i)
+                return bare._update(bare._held.buffer, z, i, bare._limit)
             except (TypeError, OverflowError):
                 pass
         raise AssertionError

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evofsm.framework.gym import RevisedActions
-from evofsm.risk.outcome import wilson_interval
+from evofsm.proportions import wilson_bounds
 
 
 class Settings(NamedTuple):
@@ -31,7 +31,7 @@ class Result(NamedTuple):
     def __str__(self) -> str:
         episodes = len(self.speeds)
         rate = self.collisions / episodes
-        low, high = wilson_interval(np.array(rate), episodes)
+        low, high = wilson_bounds(rate, float(episodes))
         return (
             f"{self.collisions:3d} of {episodes} episodes end in a collision "
             f"({rate:.0%}, 90 % interval {low:.0%} to {high:.0%})"

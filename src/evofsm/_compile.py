@@ -132,10 +132,12 @@ def compiled(function: Function, *signature: object, **options: Any) -> Function
         dispatcher = compile_(cache=True)(function)
     except RuntimeError:  # neither the package nor the user's cache folder may be written
         dispatcher = compile_()(function)
-    for_kernels: Any = _inside(function, **{k: v for k, v in options.items() if k in _INLINED})
-    known = dispatcher.typingctx
-    known._remove_global(dispatcher)
-    known.insert_global(dispatcher, types.Dispatcher(for_kernels))
+    if not cast(Any, numba.config).DISABLE_JIT:
+        inlined = {name: value for name, value in options.items() if name in _INLINED}
+        for_kernels: Any = _inside(function, **inlined)
+        known = dispatcher.typingctx
+        known._remove_global(dispatcher)
+        known.insert_global(dispatcher, types.Dispatcher(for_kernels))
     return cast(Function, dispatcher)
 
 

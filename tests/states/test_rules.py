@@ -180,7 +180,6 @@ def test_what_is_no_rule_is_refused(rule):
     ("rule", "words"),
     [
         ({"name": "magic"}, "no state rule 'magic', only paper, edges"),
-        ({"name": "novelty", "radius": -1.0}, "radius is -1.0"),
         ({"name": "novelty", "gain": 1.0}, "gain"),
         ({}, "name"),
         (None, ""),
@@ -195,3 +194,14 @@ def test_a_file_with_a_rule_that_makes_no_sense_is_refused_by_name(rule, words, 
         storage.write(path, kind, {**content, "rule": rule}, arrays)
         with pytest.raises(ValueError, match=f"{path}.*{words}"):
             type(item).load(path)
+
+
+def test_a_rule_beyond_its_range_is_not_even_written(tmp_path):
+    machine, path = EvolvingFSM(1), tmp_path / "file"
+    machine.observe([0.0])
+    machine.save(path)
+    content, arrays = storage.read(path, "machine")
+    with pytest.raises(ValueError, match=r"rule\.radius of -1 cannot be right"):
+        storage.write(
+            path, "machine", {**content, "rule": {"name": "novelty", "radius": -1}}, arrays
+        )
