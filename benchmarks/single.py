@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-import numpy as np
-
 from evofsm.machine import EvolvingFSM
+from evofsm.validation import check_action
 from reference import NumpyFSM
 from streams import (
     LATTICE_RADIUS,
@@ -23,7 +22,6 @@ from turns import Result, Work, compare, timed
 _BATCH_ROWS = 1_000_000
 _CALL_ROWS = 50_000
 _LOOP_ROWS = 20_000
-_FLOAT64 = np.dtype(np.float64)
 
 
 def batch(n_states: int, repeats: int, short: bool) -> Result:
@@ -55,25 +53,21 @@ def call(n_states: int, repeats: int, short: bool) -> Result:
 
 
 def lock(repeats: int, short: bool) -> Result:
-    """`update` against itself without the lock that lets threads share a machine."""
+    """`learn_one` against itself without the lock that lets threads share a machine."""
     rows = _sized(_CALL_ROWS, short)
     machine, _, stream = pair(7, rows)
     bare = machine.copy()
+    step: Any = EvolvingFSM._step
+    unlocked = step.__wrapped__
 
-    def unlocked(z: Any, i: int) -> float:
-        if type(i) is int and type(z) is np.ndarray and z.dtype is _FLOAT64:
-            try:
-                return bare._update(bare._held.buffer, z, i, bare._limit)
-            except (TypeError, OverflowError):
-                pass
-        raise AssertionError
+    def learn_one(z: Any, i: int) -> object:
+        return unlocked(bare, z, check_action(i, bare.n_actions), False)
 
-    bare.update(stream.observations[0], 0)  # loads the kernel
     return compare(
-        "update(z, i) with its lock, 7 states",
-        one_call_each(machine.update, stream),
-        "update without it",
-        one_call_each(unlocked, stream),
+        "learn_one with its lock, 7 states; update takes none",
+        one_call_each(machine.learn_one, stream),
+        "learn_one without it",
+        one_call_each(learn_one, stream),
         repeats,
     )
 

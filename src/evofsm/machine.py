@@ -37,10 +37,12 @@ from evofsm.memory import (
     Parameters,
     allocate,
     believe,
+    close,
     failures_told,
     forget_present,
     leaves,
     refuse_impossible,
+    reopen,
     resize,
     tell_of_failures,
     view,
@@ -103,7 +105,11 @@ def _alone(method: Method) -> Method:
     @wraps(method)
     def locked(self: EvolvingFSM, *args: Any, **kwargs: Any) -> Any:
         with self._lock:
-            return method(self, *args, **kwargs)
+            was_open = close(self._held.buffer)
+            returned = method(self, *args, **kwargs)
+            if was_open:  # else it is done within another method that is alone
+                reopen(self._held.buffer)
+            return returned  # after an error `update` will find it closed, and reopen it
 
     return cast(Method, locked)
 
@@ -300,14 +306,7 @@ prior_frequency=0.001, spread=3.0)
         """
         if missing is Missing.REJECT and explained is None and failed is None:
             return self._step(z, NO_ACTION, False)
-        with self._lock:
-            step = self._observe_any(z, bool(failed), missing)
-            if failed is not None:
-                tell_of_failures(self._buffer)
-            if explained is None:
-                return step
-            text = explain(self, step.belief, None, explained, self._nearest(step.state)).text
-            return step._replace(explanation=text)
+        return self._observe_and_explain(z, failed, missing, explained)
 
     @_alone
     def act(self, i: SupportsIndex) -> None:
@@ -404,15 +403,15 @@ prior_frequency=0.001, spread=3.0)
         """
         if type(i) is int and type(z) is np.ndarray and z.dtype is _FLOAT64:
             try:
-                with self._lock:
-                    surprise = self._update(self._held.buffer, z, i, self._limit)
+                surprise = self._update(self._held.buffer, z, i, self._limit)
             except (TypeError, OverflowError):  # z has gaps or is read-only; i is beyond any index
                 surprise = DECLINED
             if surprise != DECLINED:
                 return surprise
             self._update = updater(self._limit)
-        with self._lock:
-            return self._insist(z, check_action(i, self.n_actions), False)[2]
+        surprise = self._insist_alone(z, check_action(i, self.n_actions))
+        reopen(self._held.buffer)  # an error or an interrupt may have left it closed
+        return surprise
 
     @_alone
     def learn_many(
@@ -1084,6 +1083,7 @@ prior_frequency=0.001, spread=3.0)
         self._rule = state["rule"]
         self._share()
         self._use(state["buffer"])
+        reopen(self._buffer)
 
     @_alone
     def _repr_html_(self) -> str:
@@ -1160,17 +1160,33 @@ prior_frequency=0.001, spread=3.0)
                 return self._observe_partly(given, absent, missing, failed=failed)
         return self._step(z, NO_ACTION, failed)
 
+    @_alone
     def _step(self, z: ArrayLike, action: int, failed: bool) -> Step:
         """Observe, then act; the whole answer."""
-        with self._lock:
-            event, state, surprise = self._insist(z, action, failed)
-            memory = self._held.memory
-            parameters, now, scratch = memory.parameters, memory.learnt, memory.scratch
-            n = int(now.n_states[0])
-            forecast = scratch.forecast if parameters.belief_tolerance else scratch.predicted
-            predicted = forecast[: n if surprise == surprise else 0].copy()
-            belief = now.belief[:n].copy()
-        return Step(state, belief, EVENTS[event], predicted, surprise)
+        event, state, surprise = self._insist(z, action, failed)
+        memory = self._held.memory
+        parameters, now, scratch = memory.parameters, memory.learnt, memory.scratch
+        n = int(now.n_states[0])
+        forecast = scratch.forecast if parameters.belief_tolerance else scratch.predicted
+        predicted = forecast[: n if surprise == surprise else 0].copy()
+        return Step(state, now.belief[:n].copy(), EVENTS[event], predicted, surprise)
+
+    @_alone
+    def _observe_and_explain(
+        self, z: ArrayLike, failed: bool | None, missing: Missing, explained: Labels | None
+    ) -> Step:
+        """Observe, whole or in part, and say what is known of it."""
+        step = self._observe_any(z, bool(failed), missing)
+        if failed is not None:
+            tell_of_failures(self._buffer)
+        if explained is None:
+            return step
+        text = explain(self, step.belief, None, explained, self._nearest(step.state)).text
+        return step._replace(explanation=text)
+
+    @_alone
+    def _insist_alone(self, z: ArrayLike, action: int) -> float:
+        return self._insist(z, action, False)[2]
 
     def _observe_partly(
         self,

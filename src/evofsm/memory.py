@@ -39,7 +39,7 @@ from evofsm.validation import refuse_more_failures, refuse_unless_distribution
 NO_ACTION = -1
 
 # A buffer begins with its sizes (m, q, capacity, places); settings follow, whether anybody told of
-# failures, and counters.
+# failures, whether it is closed, and counters.
 _SETTINGS, _HEAD = 4, 32
 # Where the centre of a state that is not there stands: too far for any belief.
 _NOWHERE = np.inf
@@ -97,7 +97,8 @@ class Memory(NamedTuple):
 # How many arrays there are of each kind, and settings.
 _KINDS = number_fields(Memory)
 _FAILURES_TOLD = _SETTINGS + _KINDS["setting"]
-_COUNTERS = _FAILURES_TOLD + 1
+_CLOSED = _FAILURES_TOLD + 1
+_COUNTERS = _CLOSED + 1
 _PER_STATE, _PER_PLACE = _KINDS["state"], _KINDS["place"]
 _PER_ACTION, _PER_VARIABLE = _KINDS["action"], _KINDS["variable"]
 
@@ -296,6 +297,24 @@ def _copy_rows(
     for row in range(rows):
         for i in range(n):
             target[target_start + row * target_stride + i] = source[start + row * stride + i]
+
+
+@register_jitable
+def is_closed(buffer: NDArray[np.float64]) -> bool:
+    """Whether somebody is at work on the machine, or it has gone on with another buffer."""
+    return bool(buffer[_CLOSED] != 0.0)
+
+
+def close(buffer: NDArray[np.float64]) -> bool:
+    """Close a buffer; returns whether it was open."""
+    was_open = not is_closed(buffer)
+    buffer[_CLOSED] = 1.0
+    return was_open
+
+
+def reopen(buffer: NDArray[np.float64]) -> None:
+    """Let whoever does not ask for the lock step again."""
+    buffer[_CLOSED] = 0.0
 
 
 def failures_told(buffer: NDArray[np.float64]) -> bool:

@@ -23,7 +23,7 @@ from evofsm import crowding
 from evofsm._compile import inner_kernel, kernel, lanes, rare_kernel
 from evofsm.crowding import MERGED, NEWCOMER, RETIRE, RETIRED, merge_closest, retire_least_useful
 from evofsm.divergence import jensen_shannon_kernel
-from evofsm.memory import NO_ACTION, Memory, Parameters, open_memory
+from evofsm.memory import NO_ACTION, Memory, Parameters, is_closed, open_memory
 from evofsm.notebook import step_html
 from evofsm.states import clusters, spread
 from evofsm.states.clusters import place_center, potential_of
@@ -264,7 +264,13 @@ def _observe(
 def _update(
     buffer: NDArray[np.float64], z: NDArray[np.float64], action: int, limit: Limit
 ) -> float:
-    """The same with fewer things to hand over: only the surprise, or `DECLINED`."""
+    """The same with fewer things to hand over: only the surprise, or `DECLINED`.
+
+    It takes no lock: a call of a kernel is one step for the interpreter, between which and the
+    next one threads take turns. A buffer that somebody is at work on is closed to it.
+    """
+    if is_closed(buffer):
+        return DECLINED
     memory = open_memory(buffer)
     if not 0 <= action < len(memory.learnt.transitions.uses):
         return DECLINED
