@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -16,6 +17,30 @@ INTERVAL = 0.2
 HORIZONS = (1.0, 2.0, 5.0)
 # Accelerations are taken over so many decisions: 0.4 s.
 _SPAN = 2
+
+
+def runs_in(folder: Path) -> list[Path]:
+    """The files of a folder that hold a run each, in the order of their names.
+
+    Lists of checksums and of segments in capital letters are no runs.
+
+    Raises
+    ------
+    NotADirectoryError
+        If there is no such folder.
+    ValueError
+        If there is no run in it.
+    """
+    if not folder.is_dir():
+        raise NotADirectoryError(f"{folder}: there is no such folder")
+    paths = sorted(
+        path
+        for path in folder.iterdir()
+        if path.name.endswith((".csv", ".csv.gz")) and not path.name.split(".")[0].isupper()
+    )
+    if not paths:
+        raise ValueError(f"{folder} holds no runs (*.csv, *.csv.gz)")
+    return paths
 
 
 class Question(NamedTuple):

@@ -20,6 +20,7 @@ from evofsm.io.datasets import Episode, Layout, find_checksums, read_episodes
 from evofsm.protocols import Proposal
 from evofsm.risk.leaders import REAL_DRIVES, LeaderBrakes
 from evofsm.risk.outcome import LatentRisk
+from evofsm.studies.real.cases import runs_in
 
 #: What is taken to be known in shadow mode, in the order in which it is reported.
 TOLD = ("nothing", "own brakes", "and the shipped table", "and leaders of the other runs")
@@ -105,7 +106,7 @@ def run_leaders(
     ValueError
         If the folder holds no runs, or a file is not what it should be.
     """
-    paths = _paths(folder)
+    paths = runs_in(folder)
     listed = find_checksums(folder)
     counted = in_order([partial(_watch_leaders, path) for path in paths], workers)
     told = [(k, what) for k in range(len(paths[:most])) for what in TOLD]
@@ -126,19 +127,6 @@ def run_leaders(
         ],
         sum(path.name in listed for path in paths),
     )
-
-
-def _paths(folder: Path) -> list[Path]:
-    if not folder.is_dir():
-        raise NotADirectoryError(f"--data {folder}: there is no such folder")
-    paths = sorted(
-        path
-        for path in folder.iterdir()
-        if path.name.endswith((".csv", ".csv.gz")) and not path.name.split(".")[0].isupper()
-    )
-    if not paths:
-        raise ValueError(f"{folder} holds no runs (*.csv, *.csv.gz)")
-    return paths
 
 
 def _by_car(path: Path) -> Iterator[list[Episode]]:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from evofsm.fleet.executors import in_order
 from evofsm.io.datasets import Layout, find_checksums, read_episodes
-from evofsm.studies.real.cases import INTERVAL, QUESTIONS, Case, Question, case_of
+from evofsm.studies.real.cases import INTERVAL, QUESTIONS, Case, Question, case_of, runs_in
 from evofsm.studies.real.measures import (
     MEASURES,
     OBSERVERS,
@@ -139,19 +139,11 @@ def read_folder(folder: Path, plan: Plan, *, dealt: bool = True) -> tuple[list[C
     ValueError
         If there is no run, or fewer than folds, or a file is not what it should be.
     """
-    if not folder.is_dir():
-        raise NotADirectoryError(f"{folder}: there is no such folder")
-    paths = sorted(
-        path
-        for path in folder.iterdir()
-        if path.name.endswith((".csv", ".csv.gz")) and not path.name.split(".")[0].isupper()
-    )
+    paths = runs_in(folder)
     if plan.most_runs is not None and len(paths) > plan.most_runs:
         rng = np.random.default_rng(plan.seed)
         chosen = rng.choice(len(paths), size=plan.most_runs, replace=False)
         paths = [paths[k] for k in sorted(chosen.tolist())]
-    if not paths:
-        raise ValueError(f"{folder} holds no runs (*.csv, *.csv.gz)")
     if dealt and len(paths) < plan.folds:
         raise ValueError(
             f"{folder} holds {len(paths)} runs (*.csv, *.csv.gz); {plan.folds} folds need as many"
