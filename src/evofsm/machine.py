@@ -1077,13 +1077,14 @@ prior_frequency=0.001, spread=3.0)
     # its lock.
     @_alone
     def __getstate__(self) -> dict[str, Any]:
-        return {"rule": self._rule, "buffer": self._buffer.copy()}
+        buffer = self._buffer.copy()
+        reopen(buffer)
+        return {"rule": self._rule, "buffer": buffer}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self._rule = state["rule"]
         self._share()
-        self._use(state["buffer"])
-        reopen(self._buffer)
+        self._use(np.require(state["buffer"], requirements="W"))  # a file mapped for reading is not
 
     @_alone
     def _repr_html_(self) -> str:
