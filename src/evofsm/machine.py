@@ -409,8 +409,11 @@ prior_frequency=0.001, spread=3.0)
             if surprise != DECLINED:
                 return surprise
             self._update = updater(self._limit)
-        surprise = self._insist_alone(z, check_action(i, self.n_actions))
-        reopen(self._held.buffer)  # an error or an interrupt may have left it closed
+        i = check_action(i, self.n_actions)
+        with self._lock:
+            close(self._held.buffer)
+            surprise = self._insist(z, i, False)[2]
+            reopen(self._held.buffer)  # also where an error or an interrupt had left it closed
         return surprise
 
     @_alone
@@ -1184,10 +1187,6 @@ prior_frequency=0.001, spread=3.0)
             return step
         text = explain(self, step.belief, None, explained, self._nearest(step.state)).text
         return step._replace(explanation=text)
-
-    @_alone
-    def _insist_alone(self, z: ArrayLike, action: int) -> float:
-        return self._insist(z, action, False)[2]
 
     def _observe_partly(
         self,
