@@ -544,3 +544,10 @@ print(failed)
 """
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
     assert done.stdout == "[]\n", done.stderr
+
+
+def test_what_was_told_of_failures_before_the_first_observation_holds():
+    machine = EvolvingFSM(n_actions=1)
+    machine.tell_of_failures()
+    machine.learn_one([0.0], 0)
+    assert machine.failures_told

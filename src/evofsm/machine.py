@@ -1291,7 +1291,10 @@ prior_frequency=0.001, spread=3.0)
         if self.n_states == 0:
             refuse_unusable("observation", z)
             parameters = self._parameters(len(z))
-            self._use(allocate(len(z), self.n_actions, LINE, 0, parameters))
+            buffer = allocate(len(z), self.n_actions, LINE, 0, parameters)
+            if failures_told(self._buffer):
+                tell_of_failures(buffer)
+            self._use(buffer)
         started_with = self._memory.learnt.clusters.first
         if z.shape != started_with.shape:
             raise ValueError(
