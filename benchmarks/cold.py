@@ -29,7 +29,7 @@ FIRST: dict[str, tuple[str, str, float]] = {
         "evofsm drive emergency --episodes 1, with the start of Python",
         "import subprocess, sys, time\n"
         + _TIMED.format(
-            "subprocess.run([sys.executable, '-m', 'evofsm.cli', 'drive', 'emergency', "
+            "subprocess.run([sys.executable, '-m', 'evofsm', 'drive', 'emergency', "
             "'--episodes', '1'], check=True, stdout=subprocess.DEVNULL)\n"
         ),
         20.0,

@@ -90,8 +90,8 @@ def write_log(path: Path, rows: int) -> None:
     """The paper's four cases, over and over, each time as another run."""
     import polars
 
-    from evofsm.studies.paper import Settings
-    from evofsm.worlds.kinematic import KinematicWorld
+    from evofsm.driving.worlds.kinematic import KinematicWorld
+    from evofsm.evidence.paper.settings import Settings
 
     settings = Settings.load()
     world = KinematicWorld()
@@ -129,9 +129,10 @@ def _peak() -> float:
 
 def learn(path: str) -> None:
     """What the command does with a log."""
-    from evofsm import EvolvingFSM, IntervalActions
-    from evofsm.io import read_traces
-    from evofsm.studies.learning import learn_traces
+    from evofsm.app.learning import learn_traces
+    from evofsm.core.actions import IntervalActions
+    from evofsm.core.machine import EvolvingFSM
+    from evofsm.io.traces import read_traces
 
     actions = IntervalActions(low=-2.5, high=2.5, width=0.3, outside="clip")
     learn_traces(read_traces([path]), EvolvingFSM.paper(), actions)
@@ -154,7 +155,13 @@ def command(path: Path) -> dict[str, float]:
         "subprocess.run(sys.argv[1:], check=True, stdout=subprocess.DEVNULL);"
         "print(resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1024)"
     )
-    learning = [sys.executable, "-c", "from evofsm.cli import main; main()", "learn", str(path)]
+    learning = [
+        sys.executable,
+        "-c",
+        "from evofsm.__main__ import main; main()",
+        "learn",
+        str(path),
+    ]
     begin = time.perf_counter()
     answer = subprocess.run(
         [sys.executable, "-c", code, *learning], check=True, capture_output=True, text=True

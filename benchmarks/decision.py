@@ -15,11 +15,11 @@ import time
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.framework.loop import Oversight
-from evofsm.protocols import Proposal
-from evofsm.states import Novelty
-from evofsm.studies.closed_loop import Learner
-from evofsm.worlds.families import Family, load_family
+from evofsm.core.states.novelty import Novelty
+from evofsm.driving.families.family import Family, load_family
+from evofsm.driving.learner import Learner
+from evofsm.guard.oversight import Oversight
+from evofsm.guard.protocols import Proposal
 
 _STATES = 200
 _CONTROL_STEP = 0.010

@@ -19,8 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 import evofsm
-from evofsm import EvolvingFSM, Missing, Novelty
-from evofsm.memory import leaves
+from evofsm.core.machine import EvolvingFSM
+from evofsm.core.memory import leaves
+from evofsm.core.observations import Missing
+from evofsm.core.states.novelty import Novelty
 
 _PACKAGE = str(Path(evofsm.__file__).parent)
 _ACTIONS, _VARIABLES = 3, 2

@@ -1,4 +1,4 @@
-"""The step of `evofsm.machine` as a plain NumPy loop, vectorised over states: what others are
+"""The step of `evofsm.core.machine` as a plain NumPy loop, vectorised over states: what others are
 timed against, and an independent second writing of the equations for the tests."""
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 class NumpyFSM:
     """One object, one call a step, NumPy for everything; the paper's settings by default.
 
-    With a ``novelty_radius`` states are those of `evofsm.states.Novelty` instead of the paper's.
+    With a ``novelty_radius`` states are those of `Novelty` instead of the paper's.
     """
 
     def __init__(

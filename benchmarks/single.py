@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from evofsm.machine import EvolvingFSM
-from evofsm.validation import check_action
+from evofsm.core.machine import EvolvingFSM
+from evofsm.core.validation import check_action
 from reference import NumpyFSM
 from streams import (
     LATTICE_RADIUS,

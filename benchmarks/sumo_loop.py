@@ -22,12 +22,12 @@ from typing import Any
 import numpy as np
 
 from decision import teach
-from evofsm.framework.loop import Drive
-from evofsm.states import Novelty
-from evofsm.studies.closed_loop import Learner
-from evofsm.worlds.families import Draw, Family, load_family
-from evofsm.worlds.road import Episode
-from evofsm.worlds.sumo import SumoWorld
+from evofsm.core.states.novelty import Novelty
+from evofsm.driving.families.family import Draw, Family, load_family
+from evofsm.driving.framework import Drive
+from evofsm.driving.learner import Learner
+from evofsm.driving.worlds.road import Episode
+from evofsm.driving.worlds.sumo import SumoWorld
 
 _PROMISED = 1.25
 # Time between decisions [s]: the one that is promised, and stricter ones; the last at every step.

@@ -31,15 +31,18 @@ import numpy as np
 
 import one_machine
 import torture_audit
-from evofsm import EvolvingFSM, FSMModel, IntervalActions, storage
-from evofsm.checkpoint import Checkpoint, fingerprints
-from evofsm.io import read_traces
-from evofsm.risk.outcome import LatentRisk
-from evofsm.studies.closed_loop import Learner
-from evofsm.studies.driving import Setup, drive_family
-from evofsm.studies.learning import learn_traces
-from evofsm.worlds.families import load_family
-from evofsm.worlds.kinematic import KinematicWorld
+from evofsm.app.driving import Setup, drive_family
+from evofsm.app.learning import learn_traces
+from evofsm.core.actions import IntervalActions
+from evofsm.core.machine import EvolvingFSM
+from evofsm.core.model import FSMModel
+from evofsm.driving.families.family import load_family
+from evofsm.driving.learner import Learner
+from evofsm.driving.risk.outcome import LatentRisk
+from evofsm.driving.worlds.kinematic import KinematicWorld
+from evofsm.files import storage
+from evofsm.files.checkpoint import Checkpoint, fingerprints
+from evofsm.io.traces import read_traces
 
 #: What must not happen, in the order in which it is printed.
 WRONG = (
@@ -299,7 +302,7 @@ _LOADS: dict[str, Callable[[Path], bytes]] = {
 
 def samples(folder: Path) -> list[Sample]:
     """One of each kind of this version, and those of earlier ones that the tests hold."""
-    paths = sorted((Path(__file__).parents[1] / "tests" / "files").glob("*.evofsm"))
+    paths = sorted((Path(__file__).parents[1] / "tests" / "kept").glob("*.evofsm"))
     machine = EvolvingFSM(3, radius=0.5)
     random = np.random.default_rng(0)
     machine.learn_many(random.normal(size=(60, 2)).cumsum(axis=0), np.arange(60) % 3)

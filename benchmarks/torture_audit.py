@@ -18,13 +18,15 @@ from typing import Any
 
 import numpy as np
 
-from evofsm import EvolvingFSM, IntervalActions
-from evofsm.framework.audit import AuditLog, Sync, audit
-from evofsm.framework.audit.chain import NOTHING, ChainedFile, Head, records, seal, verify
-from evofsm.framework.loop import Oversight
-from evofsm.framework.reviser import ActionReviser
-from evofsm.protocols import Proposal
-from evofsm.risk.outcome import LatentRisk
+from evofsm.core.actions import IntervalActions
+from evofsm.core.machine import EvolvingFSM
+from evofsm.driving.risk.outcome import LatentRisk
+from evofsm.files.sealed import NOTHING, ChainedFile, Head, Sync, records, seal, verify
+from evofsm.guard.auditing.log import AuditLog
+from evofsm.guard.auditing.replay import audit
+from evofsm.guard.oversight import Oversight
+from evofsm.guard.protocols import Proposal
+from evofsm.guard.reviser import ActionReviser
 
 #: What must not happen.
 WRONG = ("broken logs", "forgeries that pass")

@@ -286,7 +286,7 @@ def _list_methods(app: Sphinx, domain: str, kind: str, content: nodes.Element) -
     Every page carries the contents of all: with every method of every class they would be slow.
     """
     for signature in content.parent.findall(addnodes.desc_signature):
-        if signature.get("module") not in {"evofsm.machine", "evofsm.model"}:
+        if signature.get("module") not in {"evofsm.core.machine", "evofsm.core.model"}:
             signature["_toc_name"] = ""
 
 
@@ -328,10 +328,15 @@ def _as_written(
 
 @cache
 def imports_of(module: str) -> dict[str, str]:
-    """Full names of what a module imports, for type checking only or always."""
+    """Full names of what a module imports, or offers as the face of a room."""
     found = {}
-    for node in ast.walk(ast.parse(text_of(module) or "")):
-        if isinstance(node, ast.ImportFrom) and node.level == 0:
+    face = SOURCE.joinpath(*module.split("."), "__init__.pyi")
+    offered = face.read_text("utf-8") if face.is_file() else ""
+    for node in ast.walk(ast.parse((text_of(module) or "") + offered)):
+        if isinstance(node, ast.ImportFrom) and node.level == 1:
+            home = ".".join([module, *filter(None, [node.module])])
+            found |= {a.name: f"{home}.{a.name}" for a in node.names}
+        elif isinstance(node, ast.ImportFrom):
             found |= {a.asname or a.name: f"{node.module}.{a.name}" for a in node.names}
         elif isinstance(node, ast.Import):
             found |= {a.asname or a.name: a.name for a in node.names}

@@ -19,15 +19,14 @@ from comparison import Result, compare, settings
 from numpy.typing import NDArray
 
 from evofsm import EvolvingFSM
-from evofsm.framework.gym import RevisedActions
-from evofsm.framework.reviser import ActionReviser
-from evofsm.risk.outcome import LatentRisk
+from evofsm.driving import LatentRisk
+from evofsm.guard import ActionReviser, RevisedActions
 
 
 def main(argv: Sequence[str] | None = None) -> tuple[Result, Result]:
     """Drive, print, and answer with what came of it: unrevised, revised."""
     chosen = settings("An aggressive driver, revised.", argv, episodes=100, train=40)
-    env = gymnasium.make("evofsm.worlds.gym:evofsm/CarFollowing-v0", seed=chosen.seed)
+    env = gymnasium.make("evofsm.driving.worlds.gym:evofsm/CarFollowing-v0", seed=chosen.seed)
     car = env.unwrapped
     family = car.family
 

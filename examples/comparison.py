@@ -10,8 +10,8 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.framework.gym import RevisedActions
-from evofsm.proportions import wilson_bounds
+from evofsm import wilson_bounds
+from evofsm.guard import RevisedActions
 
 
 class Settings(NamedTuple):

@@ -26,9 +26,8 @@ from highway_env.vehicle.kinematics import Vehicle
 from numpy.typing import NDArray
 
 from evofsm import EvolvingFSM, IntervalActions
-from evofsm.framework.gym import RevisedActions
-from evofsm.framework.reviser import ActionReviser
-from evofsm.risk.outcome import LatentRisk
+from evofsm.driving import LatentRisk
+from evofsm.guard import ActionReviser, RevisedActions
 
 FULL = 5.0  # of throttle and of brakes [m/s²]; the environment's actions are shares of it
 INTERVAL = 0.25  # between decisions [s]

@@ -18,7 +18,7 @@ from urllib.parse import unquote, urlsplit
 import pytest
 import typer.testing
 
-from evofsm import cli
+from evofsm.__main__ import application
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -83,7 +83,7 @@ def run_command(command):
     words = shlex.split(command)
     if words[0] == "evofsm":
         before = set(sys.modules)
-        done = typer.testing.CliRunner().invoke(cli.application(), words[1:])
+        done = typer.testing.CliRunner().invoke(application(), words[1:])
         forget_written_since(before)
         return done.output, done.exit_code
     if words[0] == "python":
@@ -141,7 +141,7 @@ def test_every_block_is_run_or_says_why_not(page):
 
 def test_commands_that_are_not_run_would_be_understood():
     """Every command and option that a page names is there."""
-    group = typer.main.get_command(cli.application())
+    group = typer.main.get_command(application())
     looked_at = 0
     for page in PAGES:
         for block in blocks(page):
@@ -233,8 +233,8 @@ def test_formulas_are_there_without_a_script(site):
 def test_a_line_of_code_is_where_its_link_leads(site):
     folder, pages = site
     links = pages[folder / "equations" / "states.html"].links
-    found = {int(one.rpartition("L-")[2]) for one in links if "states/ets.html#" in one}
-    source = (ROOT / "src/evofsm/states/ets.py").read_text().splitlines()
+    found = {int(one.rpartition("L-")[2]) for one in links if "core/states/ets.html#" in one}
+    source = (ROOT / "src/evofsm/core/states/ets.py").read_text().splitlines()
     there = [source[line - 1].strip().partition("(")[0] for line in sorted(found)]
     assert there == ["def judge", "return MOVED if exceeds"]
 

@@ -11,8 +11,11 @@ import pytest
 from river import checks, datasets, preprocessing, stream
 from river.checks import common
 
-from evofsm import EvolvingFSM, Missing, Novelty, WhenFull
 from evofsm.adapters.river import RiverClusterer
+from evofsm.core.crowding import WhenFull
+from evofsm.core.machine import EvolvingFSM
+from evofsm.core.observations import Missing
+from evofsm.core.states.novelty import Novelty
 
 # River's own list runs these only on models it has a data set for, and has none for clusterers.
 _ON_DATA = [

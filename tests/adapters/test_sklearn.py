@@ -11,8 +11,11 @@ from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 from sklearn.utils.estimator_checks import parametrize_with_checks
 
-from evofsm import Edges, EvolvingFSM, Novelty, WhenFull
 from evofsm.adapters.sklearn import EvolvingClusterer
+from evofsm.core.crowding import WhenFull
+from evofsm.core.machine import EvolvingFSM
+from evofsm.core.states.edges import Edges
+from evofsm.core.states.novelty import Novelty
 
 # docs/river-and-scikit-learn.md lists it as well.
 _EXCEPTIONS = {

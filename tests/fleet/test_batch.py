@@ -3,8 +3,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from evofsm import Edges, EvolvingFSM, FailureSplit, Novelty, Paper
-from evofsm.crowding import WhenFull
+from evofsm.core.crowding import WhenFull
+from evofsm.core.machine import EvolvingFSM
+from evofsm.core.states.edges import Edges
+from evofsm.core.states.ets import Paper
+from evofsm.core.states.failure import FailureSplit
+from evofsm.core.states.novelty import Novelty
 from evofsm.fleet.batch import Fleet
 
 Q = 4

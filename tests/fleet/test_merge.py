@@ -7,12 +7,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from evofsm import Edges, EvolvingFSM, FailureSplit, Novelty, Paper
-from evofsm.crowding import WhenFull
+from evofsm.core.crowding import WhenFull
+from evofsm.core.machine import EvolvingFSM
+from evofsm.core.states.edges import Edges
+from evofsm.core.states.ets import Paper
+from evofsm.core.states.failure import FailureSplit
+from evofsm.core.states.novelty import Novelty
+from evofsm.driving.families.family import load_family
+from evofsm.driving.worlds.kinematic import KinematicWorld
 from evofsm.fleet.batch import Fleet
-from evofsm.fleet.merge import merge
-from evofsm.worlds.families import load_family
-from evofsm.worlds.kinematic import KinematicWorld
+from evofsm.fleet.merging import merge
 
 RULES = [
     Novelty(1.0, (2.0, 1.0)),

@@ -56,7 +56,8 @@ def parquet(data):
 
 def stored(data):
     """The file of a machine or a model."""
-    from evofsm import EvolvingFSM, FSMModel
+    from evofsm.core.machine import EvolvingFSM
+    from evofsm.core.model import FSMModel
 
     _FILE.write_bytes(data)
     for kind in (EvolvingFSM, FSMModel):
@@ -75,7 +76,7 @@ TARGETS = {target.__name__: target for target in (csv, fcd, gzipped, parquet, st
 
 def _outcome(data):
     """The chunks that are read, as bytes, or what was said against them."""
-    from evofsm.io import read_traces
+    from evofsm.io.traces import read_traces
 
     _FILE.write_bytes(data)
     try:

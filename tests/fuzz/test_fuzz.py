@@ -11,7 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from evofsm.io import LogColumns, fcd, read_traces, tables
+from evofsm.io import fcd, tables
+from evofsm.io.traces import LogColumns, read_traces
 
 HERE = Path(__file__).parent
 _spec = importlib.util.spec_from_file_location("fuzz", HERE / "fuzz.py")

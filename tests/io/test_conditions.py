@@ -5,10 +5,12 @@ import re
 import numpy as np
 import pytest
 
-from evofsm.io import Condition, LogColumns, Noted, read_traces, tables
+from evofsm.driving.naming import VARIABLES
+from evofsm.io import tables
+from evofsm.io.conditions import Condition
 from evofsm.io.dates import microseconds
+from evofsm.io.traces import LogColumns, Noted, read_traces
 from evofsm.io.units import of_columns, parse_units
-from evofsm.naming import VARIABLES
 
 HEADER = "pair,time,gap,v_follower,v_leader,a_follower,crash"
 

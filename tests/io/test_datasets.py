@@ -6,15 +6,10 @@ import hashlib
 import numpy as np
 import pytest
 
-from evofsm import EvolvingFSM
-from evofsm.io.datasets import (
-    Layout,
-    as_chunks,
-    find_checksums,
-    read_episodes,
-    verify_checksums,
-)
-from evofsm.io.datasets.episodes import cut
+from evofsm.core.machine import EvolvingFSM
+from evofsm.io.datasets.checksums import find_checksums, verify_checksums
+from evofsm.io.datasets.episodes import as_chunks, cut
+from evofsm.io.datasets.layouts import Layout, read_episodes
 
 ROWS = 40
 SECONDS = np.arange(ROWS) / 10.0

@@ -10,8 +10,10 @@ from importlib.util import find_spec
 import numpy as np
 import pytest
 
-from evofsm.io import LogColumns, VehicleLengths, fcd, read_traces
-from evofsm.observations import ObservationEncoder
+from evofsm.core.observations import ObservationEncoder
+from evofsm.io import fcd
+from evofsm.io.fcd import VehicleLengths
+from evofsm.io.traces import LogColumns, read_traces
 
 
 def xml(timesteps):

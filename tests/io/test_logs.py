@@ -7,8 +7,9 @@ import tracemalloc
 import numpy as np
 import pytest
 
-from evofsm.io import LogColumns, blocks, read_traces, tables
-from evofsm.observations import Category, ObservationEncoder
+from evofsm.core.observations import Category, ObservationEncoder
+from evofsm.io import blocks, tables
+from evofsm.io.traces import LogColumns, read_traces
 
 HEADER = "run,pair,segment,time,gap,v_follower,v_leader,a_follower"
 

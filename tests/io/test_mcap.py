@@ -5,17 +5,19 @@ import tracemalloc
 import numpy as np
 import pytest
 
-from evofsm import EvolvingFSM, IntervalActions
-from evofsm.drivers.idm import IDM
-from evofsm.framework.loop import Decision, Drive, Explain, Framework
-from evofsm.framework.reviser import ActionReviser, Mode
-from evofsm.naming import VARIABLES
-from evofsm.protocols import Intake
-from evofsm.risk.headway import time_headway
-from evofsm.risk.outcome import LatentRisk
-from evofsm.risk.ttc import time_to_collision
-from evofsm.worlds.kinematic import KinematicWorld
-from evofsm.worlds.scenario import Leader, Scenario
+from evofsm.core.actions import IntervalActions
+from evofsm.core.machine import EvolvingFSM
+from evofsm.driving.drivers.idm import IDM
+from evofsm.driving.framework import Decision, Drive, Framework
+from evofsm.driving.naming import VARIABLES
+from evofsm.driving.risk.headway import time_headway
+from evofsm.driving.risk.outcome import LatentRisk
+from evofsm.driving.risk.ttc import time_to_collision
+from evofsm.driving.worlds.kinematic import KinematicWorld
+from evofsm.driving.worlds.scenario import Leader, Scenario
+from evofsm.guard.oversight import Explain
+from evofsm.guard.protocols import Intake
+from evofsm.guard.reviser import ActionReviser, Mode
 
 pytest.importorskip("mcap")
 

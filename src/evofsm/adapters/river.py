@@ -9,11 +9,8 @@ from typing import Any, SupportsFloat
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm._extras import needs
-from evofsm.crowding import WhenFull
-from evofsm.machine import EvolvingFSM
-from evofsm.observations import Missing
-from evofsm.states.rule import StateRule
+from evofsm.core import EvolvingFSM, Missing, StateRule, WhenFull
+from evofsm.extras import needs
 
 with needs("River", "river", "a clusterer of River"):
     from river import base

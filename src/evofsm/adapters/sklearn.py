@@ -7,10 +7,8 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from evofsm._extras import needs
-from evofsm.crowding import WhenFull
-from evofsm.machine import EvolvingFSM
-from evofsm.states.rule import StateRule
+from evofsm.core import EvolvingFSM, StateRule, WhenFull
+from evofsm.extras import needs
 
 with needs("scikit-learn", "sklearn", "a clusterer of scikit-learn"):
     from sklearn.base import BaseEstimator, ClusterMixin

@@ -5,7 +5,7 @@ may be. The checks of this package's own classes are the same ones.
 
 Examples
 --------
->>> from evofsm.risk.ttc import TimeToCollision
+>>> from evofsm.driving import TimeToCollision
 >>> all(result.outcome is Outcome.PASSED for result in check(TimeToCollision()))
 True
 
@@ -16,26 +16,8 @@ In a test of your own::
         case()
 """
 
-from evofsm.checks.contracts import Broken, Check
-from evofsm.checks.kinds import Kind, kind_of
-from evofsm.checks.running import (
-    Case,
-    Outcome,
-    Result,
-    all_checks,
-    cases,
-    check,
-)
+from __future__ import annotations
 
-__all__ = [
-    "Broken",
-    "Case",
-    "Check",
-    "Kind",
-    "Outcome",
-    "Result",
-    "all_checks",
-    "cases",
-    "check",
-    "kind_of",
-]
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

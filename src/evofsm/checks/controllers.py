@@ -9,7 +9,7 @@ import numpy as np
 
 from evofsm.checks.contracts import Contract, drive, frozen, insist, refuse_growth, same
 from evofsm.checks.kinds import Make
-from evofsm.protocols import Proposal
+from evofsm.guard import Proposal
 
 CONTRACT = Contract()
 _DT = 0.25
@@ -34,7 +34,7 @@ def proposes_numbers(make: Make) -> None:
         proposal = controller.propose(row, 0.0)
         insist(
             isinstance(proposal, Proposal),
-            f"propose answers {proposal!r}; it must be an evofsm.protocols.Proposal",
+            f"propose answers {proposal!r}; it must be an evofsm.guard.protocols.Proposal",
         )
         for action in (proposal.action, *proposal.candidates):
             insist(

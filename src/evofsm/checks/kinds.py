@@ -18,10 +18,10 @@ class Kind(Enum):
     MACHINE = "machine"  #: learns states and transitions, as `evofsm.EvolvingFSM`
     FLEET = "fleet"  #: many machines at once, as `evofsm.fleet.batch.Fleet`
     MODEL = "model"  #: a frozen snapshot, as `evofsm.FSMModel`
-    RULE = "rule"  #: how states are determined, as `evofsm.states.rule.StateRule`
-    REVISER = "reviser"  #: keeps a proposal or replaces it, as `evofsm.protocols.Reviser`
-    CONTROLLER = "controller"  #: proposes, as `evofsm.protocols.Controller`
-    MEASURE = "measure"  #: how dangerous a situation is, as `evofsm.protocols.RiskMeasure`
+    RULE = "rule"  #: how states are determined, as `evofsm.core.states.rule.StateRule`
+    REVISER = "reviser"  #: keeps a proposal or replaces it, as `evofsm.guard.protocols.Reviser`
+    CONTROLLER = "controller"  #: proposes, as `evofsm.guard.protocols.Controller`
+    MEASURE = "measure"  #: how dangerous a situation is, as `evofsm.guard.protocols.RiskMeasure`
 
 
 # The first whose methods are all there is meant: what has more comes first.

@@ -9,7 +9,7 @@ import numpy as np
 
 from evofsm.checks.contracts import Broken, Contract, drive, frozen, insist, refuse_growth, same
 from evofsm.checks.kinds import Make
-from evofsm.protocols import Proposal, Revision, Situation
+from evofsm.guard import Proposal, Revision, Situation
 
 CONTRACT = Contract()
 _DT = 0.25

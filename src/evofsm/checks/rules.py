@@ -13,9 +13,7 @@ import numpy as np
 
 from evofsm.checks.contracts import Contract, insist, same
 from evofsm.checks.kinds import Make
-from evofsm.machine import EvolvingFSM
-from evofsm.states.dispatch import describe, restore
-from evofsm.states.rule import RuleSettings
+from evofsm.core import EvolvingFSM, RuleSettings, describe, restore
 
 CONTRACT = Contract()
 
@@ -82,7 +80,7 @@ def a_machine_takes_it(make: Make) -> None:
     try:
         machine = machine_of(make)()
     except TypeError as error:
-        insist(False, f"{error} (is it listed in evofsm.states.dispatch.RULES?)")
+        insist(False, f"{error} (is it listed in evofsm.core.states.dispatch.RULES?)")
     m = len(machine.rule.scales) or 2
     for k in range(10):
         machine.observe(np.arange(m) * k * 0.7)

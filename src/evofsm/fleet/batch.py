@@ -14,21 +14,31 @@ import numba
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
-from evofsm._compile import LINE, inner_kernel, kernel, parallel_kernel
-from evofsm._elementary import fetch_ahead
-from evofsm.machine import EvolvingFSM
-from evofsm.memory import (
+from evofsm.core import (
+    FULL,
+    LINE,
     NO_ACTION,
+    NOT_OPEN,
+    EvolvingFSM,
+    Limit,
     Memory,
+    check_actions,
+    check_rows,
+    fetch_ahead,
+    inner_kernel,
+    kernel,
     lengths,
     matrices_of,
     move,
     open_apart,
+    parallel_kernel,
+    real_rows,
+    refuse_unusable,
+    room_for,
+    step_and_act,
     tell_of_failures,
+    whole,
 )
-from evofsm.step import FULL, Limit, room_for, step_and_act
-from evofsm.transitions import NOT_OPEN
-from evofsm.validation import check_actions, check_rows, real_rows, refuse_unusable, whole
 
 # Room for so much more than is needed when the arrays are made anew.
 _SPARE = 1.5

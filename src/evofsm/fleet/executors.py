@@ -29,7 +29,7 @@ from threading import Thread
 from types import TracebackType
 from typing import Any, Generic, NamedTuple, ParamSpec, TypeVar
 
-from evofsm._extras import needs
+from evofsm.extras import needs
 
 # So often may a task lose its worker before it is to blame. It is run alone once it has lost two:
 # a broken pool does not say which of its tasks broke it.

@@ -1,7 +1,7 @@
 """Readers of traces: logs in CSV and Parquet, and the FCD output of SUMO."""
 
-from evofsm.io.conditions import Condition
-from evofsm.io.fcd import VehicleLengths
-from evofsm.io.traces import Chunk, LogColumns, Noted, read_traces
+from __future__ import annotations
 
-__all__ = ["Chunk", "Condition", "LogColumns", "Noted", "VehicleLengths", "read_traces"]
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

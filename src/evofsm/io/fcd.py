@@ -20,9 +20,10 @@ from xml.parsers import expat
 import numpy as np
 from numpy.typing import NDArray
 
+from evofsm.core import positive
+from evofsm.files import LARGEST_OBSERVATION
 from evofsm.io.files import OnRead, damage_explained, open_unpacked
 from evofsm.io.tables import Table, explain_text
-from evofsm.validation import LARGEST_OBSERVATION, positive
 
 #: The action of a pair of vehicles: what the follower did until the next timestep.
 ACTION = "a_follower"

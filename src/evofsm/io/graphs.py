@@ -18,8 +18,7 @@ from xml.etree import ElementTree as ET
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.model import FSMModel
-from evofsm.transitions import Policy
+from evofsm.core import FSMModel, Policy
 
 # Vermillion of Okabe and Ito's colours; what is marked by it has another shape and words as well.
 _DEAD_END = "#D55E00"
@@ -97,7 +96,7 @@ def to_dot(
     self_loops : bool
         Whether edges from a state to itself are drawn.
     dead_ends : collection of int, optional
-        Indices of the states to be called dead ends, from 0, as `evofsm.risk.by_state` finds them.
+        Indices of the states to be called dead ends, from 0, as `by_state` finds them.
         Without it, those in which failures ended are marked.
 
     Returns

@@ -23,14 +23,12 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm import __version__, storage
-from evofsm._extras import needs
-from evofsm.framework.loop import Decision, Drive
-from evofsm.model import FSMModel
-from evofsm.naming import VARIABLES
-from evofsm.protocols import Intake
-from evofsm.risk.headway import time_headway
-from evofsm.risk.ttc import time_to_collision
+from evofsm import __version__
+from evofsm.core import FSMModel
+from evofsm.driving import VARIABLES, Decision, Drive, time_headway, time_to_collision
+from evofsm.extras import needs
+from evofsm.files import storage
+from evofsm.guard import Intake
 
 with needs("mcap", "mcap", "reading and writing MCAP"):
     from lz4.frame import LZ4FrameDecompressor
@@ -197,10 +195,7 @@ def write_run(
     >>> import tempfile
     >>> from pathlib import Path
     >>> from evofsm import IntervalActions
-    >>> from evofsm.drivers.idm import IDM
-    >>> from evofsm.framework.loop import Framework
-    >>> from evofsm.worlds.kinematic import KinematicWorld
-    >>> from evofsm.worlds.scenario import Leader, Scenario
+    >>> from evofsm.driving import IDM, Framework, KinematicWorld, Leader, Scenario
     >>> actions = IntervalActions(low=-2.5, high=2.5, width=0.3, outside="clip")
     >>> hasty = IDM(2.25, 28.0, 0.8, 0.3, 2.0, lowest=-2.5, highest=2.5)
     >>> leader = Leader(IDM(1.2, 25.0, 1.0, 1.0, 2.5), brake_decel=4.0, brake_time=12.0)

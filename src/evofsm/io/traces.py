@@ -10,6 +10,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from evofsm.core import Category, ObservationEncoder
+from evofsm.driving import VARIABLES
 from evofsm.io import fcd
 from evofsm.io.blocks import Blocks
 from evofsm.io.conditions import Condition
@@ -18,8 +20,6 @@ from evofsm.io.files import OnRead, ignore, kind_of
 from evofsm.io.plain import Texts
 from evofsm.io.tables import CsvTable, ParquetTable, Piece, Table, refuse_unusable
 from evofsm.io.units import KNOWN, of_columns
-from evofsm.naming import VARIABLES
-from evofsm.observations import Category, ObservationEncoder
 
 #: Columns that tell episodes apart where nothing else was said and they exist.
 USUAL_EPISODE = ("run", "pair", "segment")

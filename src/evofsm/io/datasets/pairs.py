@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
+from evofsm.driving import VARIABLES
 from evofsm.io.datasets.columns import name_of
 from evofsm.io.datasets.episodes import Episode, cut
 from evofsm.io.fcd import ACTION
 from evofsm.io.tables import CsvTable, Piece
-from evofsm.naming import VARIABLES
 
 _NUMBERS = ("time", *VARIABLES, ACTION)
 _LABELS = ("pair", "segment")

@@ -1,0 +1,20 @@
+from .core import Category as Category
+from .core import Edges as Edges
+from .core import Event as Event
+from .core import EvolvingFSM as EvolvingFSM
+from .core import Explanation as Explanation
+from .core import FailureSplit as FailureSplit
+from .core import Forecasts as Forecasts
+from .core import FSMModel as FSMModel
+from .core import IntervalActions as IntervalActions
+from .core import Labels as Labels
+from .core import Missing as Missing
+from .core import Novelty as Novelty
+from .core import ObservationEncoder as ObservationEncoder
+from .core import Paper as Paper
+from .core import Step as Step
+from .core import Trace as Trace
+from .core import WhenFull as WhenFull
+from .core import jensen_shannon as jensen_shannon
+
+__version__: str

@@ -1,0 +1,2 @@
+from .river import RiverClusterer as RiverClusterer
+from .sklearn import EvolvingClusterer as EvolvingClusterer

@@ -1,0 +1,75 @@
+"""The command line: reads what was asked for, calls a study, prints what it found."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from contextlib import suppress
+from importlib.util import find_spec
+from typing import Annotated
+
+from evofsm.core import announce_compiling
+from evofsm.extras import install_for
+
+# Needed once the annotations below are read; `main` says what to install where it is missing.
+with suppress(ModuleNotFoundError):
+    import typer
+
+
+def main(application: Callable[[], typer.Typer]) -> None:
+    """Run the command line that ``application`` makes."""
+    if find_spec("typer") is None or find_spec("rich") is None:
+        command = next((word for word in sys.argv[1:] if not word.startswith("-")), None)
+        needed = install_for(command)
+        print(f"evofsm: the command line needs typer and rich: {needed}", file=sys.stderr)
+        sys.exit(2)
+    announce_compiling()
+    application()()
+
+
+def application(*others: Callable[..., None] | typer.Typer) -> typer.Typer:
+    """The commands of this room and ``others``, in the order in which the help names them."""
+    from evofsm.app.cli.audit import audit
+    from evofsm.app.cli.campaign import campaign
+    from evofsm.app.cli.check import check
+    from evofsm.app.cli.drive import drive
+    from evofsm.app.cli.explain import explain
+    from evofsm.app.cli.export import export
+    from evofsm.app.cli.learn import inspect, learn
+    from evofsm.app.cli.watch import watch
+
+    app = typer.Typer(
+        name="evofsm",
+        help="Online recognition of latent risk with an evolving finite state machine.",
+        add_completion=False,
+        no_args_is_help=True,
+        rich_markup_mode=None,
+        pretty_exceptions_enable=False,
+    )
+    app.callback()(options)
+    ours = (learn, inspect, explain, drive, watch, campaign, export, audit, check)
+    for command in (*ours, *others):
+        if isinstance(command, typer.Typer):
+            app.add_typer(command)
+        else:
+            app.command()(command)
+    return app
+
+
+def _print_version(asked: bool) -> None:
+    if asked:
+        from evofsm import __version__
+
+        print(f"evofsm {__version__}")
+        raise typer.Exit
+
+
+def options(
+    version: Annotated[
+        bool,
+        typer.Option(
+            "--version", is_eager=True, callback=_print_version, help="Print the version and stop."
+        ),
+    ] = False,
+) -> None:
+    """Online recognition of latent risk with an evolving finite state machine."""

@@ -1,0 +1,186 @@
+"""`evofsm audit`."""
+
+from __future__ import annotations
+
+import textwrap
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from evofsm.app.cli.common import plain_errors, print_json, say
+
+with suppress(ModuleNotFoundError):
+    import typer
+
+if TYPE_CHECKING:
+    from evofsm.files import Chain
+    from evofsm.guard import Audit, Contents, Field, Replay
+
+_LABEL = 10
+# So many fields that differ are shown, and so much of each.
+_FIELDS, _LETTERS = 5, 40
+
+
+@plain_errors
+def audit(
+    file: Annotated[Path, typer.Argument(help="An audit log.", show_default=False)],
+    head: Annotated[
+        str | None,
+        typer.Option(
+            help="NUMBER:HASH of the last record at some time, kept elsewhere: shows an end that "
+            "was cut off, and a log that was written anew.",
+            show_default=False,
+        ),
+    ] = None,
+    replay: Annotated[
+        bool, typer.Option(help="Whether to drive again, and compare every decision.")
+    ] = True,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document.")] = False,
+) -> None:
+    """Verify an audit log, and replay it.
+
+    Finds the first record that was altered, removed, moved, repeated or inserted, or that no log of
+    its version holds; then tells the
+    machine and the risk that the log began with what was observed and proposed, and compares each
+    decision to the last bit. Ends with 0 if all is well, 1 if the log was tampered with or a
+    decision comes out otherwise, and 2 if it cannot be read.
+    """
+    from evofsm.files import Head
+    from evofsm.guard import audit as audited
+
+    found = audited(file, None if head is None else Head.parse(head), replay=replay)
+    if as_json:
+        print_json({"file": str(file), **_document(found)})
+    else:
+        say(file)
+        _print(found, head_given=head is not None)
+    if not found.is_good:
+        raise typer.Exit(1)
+
+
+# -- For people -----------------------------------------------------------------------------------
+
+
+def _print(found: Audit, *, head_given: bool) -> None:
+    chain, contents = found.chain, found.contents
+    _say("chain", _of_chain(chain))
+    if chain.half_written:
+        _say(
+            "",
+            f"its last line is half written ({chain.half_written} bytes): as by a crash, or it is "
+            "being written now",
+        )
+    if found.misfit is not None:
+        _say("form", f"FORGED at record {found.misfit.record}: {found.misfit.explanation}")
+    _say("holds", _of_contents(contents) + ("" if chain.finding is None else ", so far"))
+    if found.replay is not None:
+        _print_replay(found.replay, contents.decisions)
+    elif chain.finding is None and found.misfit is None:
+        _say("replay", "not done")
+    else:
+        _say("replay", "not done, since the log was tampered with")
+    for remark in found.remarks:
+        _say("note", remark)
+    if chain.finding is None:
+        _say("head", str(chain.head))
+    if found.is_good and not head_given:
+        print()
+        _fill(
+            "Keep the head where the log is not. Without it (--head) neither an end that is "
+            "cut off nor a log that is written anew can be told."
+        )
+
+
+def _of_chain(chain: Chain) -> str:
+    if chain.finding is None:
+        return f"unbroken: {_count(chain.head.number or 0, 'record')}"
+    _, record, line, explanation = chain.finding
+    return f"TAMPERED WITH at record {record} (line {line}): {explanation}"
+
+
+def _of_contents(contents: Contents) -> str:
+    decisions = _count(contents.decisions, "decision")
+    parts = [
+        _count(contents.sessions, "session"),
+        _count(contents.episodes, "episode"),
+        f"{decisions} ({contents.spoke:,} changed something or warned)",
+    ]
+    if contents.settings:
+        parts.append(_count(contents.settings, "change of settings", "changes of settings"))
+    return ", ".join(parts)
+
+
+def _print_replay(replay: Replay, decisions: int) -> None:
+    difference = replay.difference
+    good = f"{_count(replay.decisions, 'decision')} as recorded, to the last bit"
+    if difference is None:
+        _say("replay", good)
+    else:
+        _say("replay", f"DIFFERS at record {difference.record}: {difference.explanation}")
+        for one in difference.fields[:_FIELDS]:
+            _say("", _of_field(one))
+        _say("", f"before it {good}")
+    for why in dict.fromkeys(replay.not_replayed):
+        _say("", f"{_count(replay.not_replayed.count(why), 'session')} not replayed: {why}")
+    if difference is None and replay.decisions < decisions:
+        _say("", f"{_count(decisions - replay.decisions, 'decision')} compared with nothing")
+    if difference is not None and replay.other_makers:
+        then = ", ".join(f"{one.name} {one.recorded}" for one in replay.other_makers)
+        _say("", f"it was recorded with {then}: floats may differ there")
+
+
+def _of_field(field: Field) -> str:
+    return f"{field.name}: recorded {_short(field.recorded)}, replayed {_short(field.replayed)}"
+
+
+def _short(text: str) -> str:
+    return text if len(text) <= _LETTERS else f"{text[: _LETTERS - 3]}..."
+
+
+def _count(count: int, one: str, many: str = "") -> str:
+    return f"{count:,} {one if count == 1 else many or one + 's'}"
+
+
+def _say(label: str, text: str) -> None:
+    _fill(text, f"  {label}".ljust(_LABEL), " " * _LABEL)
+
+
+def _fill(text: str, first: str = "", others: str = "") -> None:
+    """Print a text as wide as the terminal is."""
+    from evofsm.app.text.columns import console
+
+    width = max(console().width, 3 * _LABEL)
+    say(
+        textwrap.fill(
+            text, width, initial_indent=first, subsequent_indent=others, break_on_hyphens=False
+        )
+    )
+
+
+# -- For programs ---------------------------------------------------------------------------------
+
+
+def _document(found: Audit) -> dict[str, Any]:
+    chain, replay = found.chain, found.replay
+    finding = chain.finding and {**chain.finding._asdict(), "fault": chain.finding.fault.value}
+    return {
+        "is_good": found.is_good,
+        "head": str(chain.head),
+        "half_written": chain.half_written,
+        "finding": finding,
+        "misfit": found.misfit and found.misfit._asdict(),
+        "remarks": list(found.remarks),
+        "contents": found.contents._asdict(),
+        "replay": replay and _of_replay(replay),
+    }
+
+
+def _of_replay(replay: Replay) -> dict[str, Any]:
+    difference = replay.difference
+    return {
+        "decisions": replay.decisions,
+        "not_replayed": list(replay.not_replayed),
+        "other_makers": [one._asdict() for one in replay.other_makers],
+        "difference": difference
+        and {**difference._asdict(), "fields": [one._asdict() for one in difference.fields]},
+    }

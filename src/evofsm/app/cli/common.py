@@ -1,0 +1,228 @@
+"""What all commands share: errors in one line, bars, JSON."""
+
+from __future__ import annotations
+
+import functools
+import shlex
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from enum import StrEnum
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, ParamSpec
+
+from evofsm.core import visible
+from evofsm.extras import install
+
+# What folders of results hold, in the order in which it is looked for.
+_MODELS = ("machine.evofsm", "model.evofsm")
+
+
+class WorldName(StrEnum):
+    """Where to drive."""
+
+    SUMO = "sumo"
+    KINEMATIC = "kinematic"
+
+
+# Needed once annotations are read; `main` says what to install where it is missing.
+with suppress(ModuleNotFoundError):
+    import typer
+
+    # What several commands are told.
+    FamilyArgument = Annotated[
+        str,
+        typer.Argument(
+            help="Family of scenarios: emergency, paper, shift, ..., or a TOML file of your own.",
+            show_default=False,
+        ),
+    ]
+    ControllerOption = Annotated[
+        str,
+        typer.Option(
+            help="Who proposes: the family's own, aggressive, normal, acc, or sumo (SUMO's IDM)."
+        ),
+    ]
+    ReviserOption = Annotated[
+        str,
+        typer.Option(
+            help="Who revises: least-risk (what was learnt), none, rss, aeb, or another measure."
+        ),
+    ]
+    ModeOption = Annotated[
+        str, typer.Option(help="How far least-risk goes: off, shadow, advise, act.")
+    ]
+    ToleranceOption = Annotated[
+        float, typer.Option(help="Share of leaders' hard brakes that need not be survived.")
+    ]
+    WorldOption = Annotated[
+        WorldName, typer.Option(help="SUMO itself, or the same motion in closed form.")
+    ]
+    SwitchesOption = Annotated[
+        str, typer.Option("--with", help="noise, delay, actuator, jerk, third_car; with commas.")
+    ]
+    SummaryAsJson = Annotated[
+        bool, typer.Option("--json", help="Print the summary as one JSON document.")
+    ]
+
+if TYPE_CHECKING:
+    from rich.progress import Progress, ProgressColumn, Task
+
+    from evofsm.core import FSMModel
+    from evofsm.files import Header
+    from evofsm.guard import Mode
+
+P = ParamSpec("P")
+
+
+def plain_errors(command: Callable[P, None]) -> Callable[P, None]:
+    """Let a command end with one clear line instead of a traceback."""
+
+    @functools.wraps(command)
+    def run(*args: P.args, **kwargs: P.kwargs) -> None:
+        try:
+            command(*args, **kwargs)
+        except KeyboardInterrupt:
+            print("\nevofsm: stopped before the end", file=sys.stderr)
+            raise typer.Exit(130) from None
+        except BrokenPipeError:  # whoever read the output had enough
+            raise
+        except (ValueError, TypeError, OSError, ModuleNotFoundError) as error:
+            print(f"evofsm: {visible(message(error))}", file=sys.stderr)
+            raise typer.Exit(2) from None
+
+    return run
+
+
+def chosen_mode(name: str) -> Mode:
+    """How far the reviser goes, by its name."""
+    from evofsm.guard import Mode
+
+    if name not in (names := [one.value for one in Mode]):
+        raise ValueError(f"--mode is {name!r}; it must be one of {', '.join(names)}")
+    return Mode(name)
+
+
+def load_model(place: Path) -> tuple[FSMModel, Header | None]:
+    """A model from wherever one was left, and what its file says of itself, if there is one.
+
+    From a file, from a folder of results, or from a log of runs. A machine that drove a family of
+    scenarios is labelled as that family is.
+    """
+    from evofsm.core import FSMModel
+    from evofsm.files import storage
+
+    if place.is_dir():
+        within = next((place / name for name in _MODELS if (place / name).exists()), None)
+        if within is None:
+            raise FileNotFoundError(f"{place}: there is neither {' nor '.join(_MODELS)} in it")
+        return load_model(within)
+    if place.suffix == ".mcap":
+        return _model_of_log(place), None
+    header = storage.describe(place)
+    return (_labelled(place, header) if header.kind == "machine" else FSMModel.load(place)), header
+
+
+def _labelled(place: Path, header: Header) -> FSMModel:
+    """The model of a machine, with the words of the family that it drove."""
+    from evofsm.core import EvolvingFSM
+    from evofsm.driving import FAMILIES, load_family
+
+    machine = EvolvingFSM.load(place)
+    if (name := header.provenance.get("family")) not in FAMILIES:
+        return machine.model()
+    return machine.model(**load_family(name).labels._asdict())
+
+
+def _model_of_log(place: Path) -> FSMModel:
+    require(mcap="mcap")
+    from evofsm.io import read_run
+
+    model = read_run(place).model
+    if model is None:
+        raise ValueError(f"{place}: no model is attached to this log")
+    return model
+
+
+#: What a page with figures needs, and the extra that brings it.
+PAGE = {"matplotlib": "plot", "jinja2": "plot"}
+
+
+def of_world(world: WorldName) -> dict[str, str]:
+    """What a world needs, and the extra that brings it."""
+    return {"libsumo": "sumo"} if world is WorldName.SUMO else {}
+
+
+def require(**extras: str) -> None:
+    """Refuse before the long work what lacks a package after it: all at once."""
+    if lacking := [package for package in extras if find_spec(package) is None]:
+        all_extras = install(*dict.fromkeys(["cli", *extras.values()]))
+        raise ModuleNotFoundError(f"this needs {' and '.join(lacking)}: {all_extras}")
+
+
+def message(error: Exception) -> str:
+    """What an error says, in one line, and what it happened in."""
+    text = str(error)
+    if isinstance(error, OSError) and error.filename is not None and error.strerror:
+        text = f"{error.filename}: {error.strerror.lower()}"
+    return ", ".join([text, *getattr(error, "__notes__", ())])
+
+
+@contextmanager
+def progress(unit: str | None = None) -> Iterator[Progress]:
+    """Bars on standard error; none where nobody watches. With a unit, with the rate as well."""
+    from rich.console import Console
+    from rich.progress import Progress
+
+    columns = _columns_with_rate(unit) if unit else Progress.get_default_columns()
+    console = Console(stderr=True)
+    with Progress(
+        *columns, console=console, transient=True, disable=not sys.stderr.isatty()
+    ) as bars:
+        yield bars
+
+
+def _columns_with_rate(unit: str) -> tuple[ProgressColumn, ...]:
+    """How much of it is done, how many a second, and how long it will take: in 80 columns."""
+    from rich.progress import BarColumn, ProgressColumn, TextColumn, TimeRemainingColumn
+    from rich.text import Text
+
+    class Rate(ProgressColumn):
+        """Of what is done since the bar was made."""
+
+        def render(self, task: Task) -> Text:
+            return Text("" if task.speed is None else f"{task.speed:,.1f} {unit}/s")
+
+    done = TextColumn("{task.completed:,} of {task.total:,}")
+    return TextColumn("{task.description}"), BarColumn(20), done, Rate(), TimeRemainingColumn()
+
+
+def counter(bars: Progress, text: str) -> Callable[[int, int], None]:
+    """A bar that is told how much is done, of how much."""
+    if bars.disable:
+        print(f"{text} ...", file=sys.stderr)
+    task = bars.add_task(text, total=None)
+    return lambda done, total: bars.update(task, completed=done, total=total)
+
+
+def say(text: object) -> None:
+    """Print what may hold texts from files."""
+    print(visible(str(text)))
+
+
+def print_json(document: object) -> None:
+    """Print for programs."""
+    from evofsm.app.text.documents import to_json
+
+    print(to_json(document))
+
+
+def command_line() -> str:
+    """What was typed."""
+    return shlex.join(["evofsm", *sys.argv[1:]])
+
+
+def split_names(text: str) -> list[str]:
+    """Names that were given with commas between them."""
+    return [name.strip() for name in text.split(",") if name.strip()]

@@ -1,0 +1,106 @@
+"""`evofsm explain`."""
+
+from __future__ import annotations
+
+import textwrap
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from evofsm.app.cli.common import load_model, plain_errors, print_json, say
+
+with suppress(ModuleNotFoundError):
+    import typer
+
+if TYPE_CHECKING:
+    from evofsm.core import Explanation, FSMModel, Tally
+
+_WIDTH = 80
+_UNTOLD = (
+    "What was learnt tells nothing of failures: none was ever told. From a log, evofsm learn "
+    "--failed COLUMN or --failed 'gap<=0' tells of them."
+)
+
+
+@plain_errors
+def explain(
+    file: Annotated[
+        Path,
+        typer.Argument(
+            help="A machine or a model that was saved, or a folder of evofsm drive --out.",
+            show_default=False,
+        ),
+    ],
+    state: Annotated[
+        int | None,
+        typer.Option(help="Number of a state, from 1; without it all.", show_default=False),
+    ] = None,
+    observation: Annotated[
+        str | None,
+        typer.Option(
+            help="An observation, its values with commas between them: which state it is, and what "
+            "is known of it.",
+            show_default=False,
+        ),
+    ] = None,
+    action: Annotated[
+        int | None,
+        typer.Option(help="Number of an action, from 1: what came of it.", show_default=False),
+    ] = None,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print one JSON document; counts from 0.")
+    ] = False,
+) -> None:
+    """Say what was learnt of a situation: where it lies, how often it was seen, what came of it.
+
+    All numbers were counted, once for each episode that came to a state; intervals are of 90 %.
+    That one action ended better than another does not say that it was the reason.
+    """
+    if state is not None and observation is not None:
+        raise ValueError("--state and --observation exclude each other")
+    model, _ = load_model(file)
+    asked = _index("--action", action, model.n_actions)
+    one = _index("--state", state, model.n_states)
+    if observation is not None:
+        found = [model.explain(action=asked, observation=_values(observation))]
+    else:
+        states = range(model.n_states) if one is None else [one]
+        found = [model.explain(each, asked) for each in states]
+    if as_json:
+        print_json({"file": str(file), "situations": [_document(model, each) for each in found]})
+        return
+    if not model.failures_told:
+        print(textwrap.fill(_UNTOLD, _WIDTH))
+    for each in found:
+        say(textwrap.fill(each.text, _WIDTH, subsequent_indent="   "))
+
+
+def _index(option: str, number: int | None, count: int) -> int | None:
+    """From what people count from 1."""
+    if number is not None and not 1 <= number <= count:
+        raise ValueError(f"{option} is {number}; there are 1 to {count}")
+    return None if number is None else number - 1
+
+
+def _values(text: str) -> list[float]:
+    try:
+        return [float(value) for value in text.split(",")]
+    except ValueError:
+        raise ValueError(f"--observation is {text!r}; write numbers, such as 9,24,24") from None
+
+
+def _document(model: FSMModel, found: Explanation) -> dict[str, Any]:
+    center = None if found.state is None else model.centers[found.state].tolist()
+    return {
+        **found._asdict(),
+        "center": center,
+        "here": _tally(found.here),
+        "action": _tally(found.action),
+        "after_better": _tally(found.after_better),
+    }
+
+
+def _tally(tally: Tally | None) -> dict[str, Any] | None:
+    if tally is None:
+        return None
+    return {**tally._asdict(), "interval": list(tally.interval)}

@@ -1,0 +1,402 @@
+"""Drive a family of scenarios under a reviser, episode by episode, and learn on the way."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, Self, get_type_hints
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evofsm.core import EvolvingFSM
+from evofsm.driving import (
+    FIXED_MEASURES,
+    IDM,
+    VARIABLES,
+    AdaptiveCruise,
+    Draw,
+    Drive,
+    EnvelopeReviser,
+    Family,
+    LatentRisk,
+    Learner,
+    Outcome,
+    Reference,
+    Row,
+    StateRisk,
+    Unrevised,
+    World,
+    assess_states,
+    drive_alone,
+    outcome,
+    reference,
+    summarise,
+)
+from evofsm.extras import needs
+from evofsm.files import Checkpoint, Kept, storage
+from evofsm.guard import AuditLog, Controller, Explain, Mode, Reviser
+
+#: Controllers by name; ``family`` is the family's own.
+CONTROLLERS = ("family", "aggressive", "normal", "acc", "sumo")
+#: Revisers by name: none, ours, and the classic measures.
+REVISERS = ("least-risk", "none", "rss", "aeb", *FIXED_MEASURES)
+
+_SUMMARY = "summary.json"
+_ALIASES = {"rss": "rss-r157", "aeb": "aeb-ttc"}
+
+
+@dataclass(frozen=True)
+class Setup:
+    """What is asked for."""
+
+    family: Family
+    controller: str = "family"
+    reviser: str = "least-risk"
+    mode: Mode = Mode.ACT
+    tolerance: float = 0.02
+    episodes: int = 100
+    seed: int = 0
+    learn: bool = True
+    first: int = 0  #: episodes driven before, which are not driven again
+
+    @property
+    def told(self) -> dict[str, Any]:
+        """Who drives what and how, for JSON."""
+        return {
+            "family": {
+                "name": self.family.name,
+                "tables": self.family.tables,
+                "added": self.family.added,
+            },
+            "controller": self.controller,
+            "reviser": self.reviser,
+            "mode": self.mode.value,
+            "tolerance": self.tolerance,
+            "seed": self.seed,
+        }
+
+    def settings(self, world: str, learner: Learner) -> dict[str, Any]:
+        """All that an episode depends on, for JSON; not how many there are.
+
+        Parameters
+        ----------
+        world : str
+            Where is driven.
+        learner : Learner
+            With what was learnt before.
+        """
+        machine, risk = _files(learner)
+        return {
+            **self.told,
+            "learn": self.learn,
+            "first": self.first,
+            "world": world,
+            "learnt": hashlib.sha256(machine + risk).hexdigest(),
+        }
+
+
+@dataclass(frozen=True)
+class Driving:
+    """What came of it."""
+
+    row: Row
+    lead_times: tuple[float, ...]  #: from the last alarm that stayed on to the collision [s]
+    states: list[StateRisk]
+    decisions: Mapping[str, Sequence[Any]]  #: columns of the table of all decisions
+
+
+def drive_family(
+    setup: Setup,
+    learner: Learner,
+    world: World,
+    progress: Callable[[int, int], None] = lambda done, collisions: None,
+    checkpoint: Checkpoint | None = None,
+    audit: AuditLog | None = None,
+    record: Callable[[Drive], None] | None = None,
+) -> Driving:
+    """Drive the episodes in turn.
+
+    Parameters
+    ----------
+    setup : Setup
+    learner : Learner
+        Learns if ``setup.learn``.
+    world : World
+    progress : callable
+        Told how many episodes are done, and how many ended in a collision.
+    checkpoint : Checkpoint, optional
+        Keeps, between two episodes, all that came of those before. Where its file exists, it is
+        gone on from, and ``learner`` learns what it had learnt. The result is the same, bit for
+        bit; there may be more episodes than before.
+    audit : AuditLog, optional
+        Writes down what is decided; also in episodes that are driven again after a stop.
+    record : callable, optional
+        Given each episode that is driven here, none of those before a stop; every decision is then
+        explained.
+
+    Raises
+    ------
+    ValueError
+        If the checkpoint is of other work, or of more episodes.
+    """
+    family = setup.family
+    done = Driven.resumed(setup, learner, checkpoint)
+    reviser = make_reviser(setup, learner)
+    for draw in draws(setup, len(done.outcomes)):
+        controller = make_controller(setup, draw, world)
+        unrevised = drive_unrevised(family, draw, world, controller)
+        drive = learner.drive(
+            family,
+            draw,
+            reviser,
+            learn=setup.learn,
+            world=world,
+            controller=controller,
+            audit=audit,
+            explaining=None if record is None else Explain.ALL,
+        )
+        if record is not None:
+            record(drive)
+        done.add(drive, outcome(drive, unrevised, family.interval), setup.tolerance)
+        if checkpoint is not None:
+            checkpoint.offer(partial(done.keep, learner))
+        progress(len(done.outcomes), sum(o.collided for o in done.outcomes))
+    if checkpoint is not None:
+        checkpoint.keep(done.keep(learner, finished=True))
+    return Driving(
+        summarise(family.name, setup.reviser, "", done.outcomes, family.interval),
+        tuple(done.lead_times),
+        assess_states(learner.machine, learner.risk),
+        done.decisions,
+    )
+
+
+def drive_unrevised(family: Family, draw: Draw, world: World, controller: Controller) -> Reference:
+    """How far the controller comes by itself."""
+    alone = drive_alone(family, draw, Unrevised(family.actions), None, world, controller)
+    return reference(alone, draw.scenario.leader.brake_decel)
+
+
+def draws(setup: Setup, done: int = 0) -> Iterator[Draw]:
+    """What is driven: training draws while learning, held-out ones else; but those done."""
+    split = "train" if setup.learn else "test"
+    for index in range(setup.first + done, setup.first + setup.episodes):
+        yield setup.family.draw(setup.seed, index, split=split)
+
+
+def make_reviser(setup: Setup, learner: Learner) -> Reviser:
+    """A reviser by its name."""
+    family = setup.family
+    if setup.reviser == "least-risk":
+        return learner.reviser(family, setup.tolerance, setup.mode)
+    if setup.reviser == "none":
+        return Unrevised(family.actions)
+    if setup.mode is not Mode.ACT:
+        raise ValueError(f"reviser {setup.reviser!r} can only act; modes are for least-risk")
+    name = _ALIASES.get(setup.reviser, setup.reviser)
+    if name not in FIXED_MEASURES:
+        raise ValueError(f"there is no reviser {name!r}; there are {', '.join(REVISERS)}")
+    return EnvelopeReviser(FIXED_MEASURES[name], family.actions, family.interval)
+
+
+def make_controller(setup: Setup, draw: Draw, world: World) -> Controller:
+    """A controller by its name, within the family's range of actions."""
+    low, high = setup.family.actions.low, setup.family.actions.high
+    match setup.controller:
+        case "family":
+            return draw.controller
+        case "aggressive":
+            return IDM(2.25, 28.0, 0.8, 0.3, 2.0, lowest=low, highest=high)
+        case "normal":
+            return IDM(1.25, 25.0, 2.0, 1.5, 2.0, lowest=low, highest=high)
+        case "acc":
+            return AdaptiveCruise(25.0, 2.0, 1.1, lowest=low, highest=high)
+        case "sumo":
+            return _sumo_driver(world)
+    raise ValueError(
+        f"there is no controller {setup.controller!r}; there are {', '.join(CONTROLLERS)}"
+    )
+
+
+def _sumo_driver(world: World) -> Controller:
+    from evofsm.driving import SumoDriver, SumoWorld
+
+    if not isinstance(world, SumoWorld):
+        raise ValueError("the controller 'sumo' is SUMO's own; it needs the world 'sumo'")
+    return SumoDriver(world)
+
+
+def write_driving(driving: Driving, learner: Learner, setup: Setup, out: Path) -> None:
+    """Write what was learnt, every decision as a table, and the summary; each whole or not at all.
+
+    Raises
+    ------
+    OSError
+        If one of them cannot be written; those before it are, and it is as it was.
+    """
+    with needs("polars", "tables", "writing decisions as Parquet"):
+        import polars
+    drove = {"family": setup.family.name, "seed": setup.seed, "first": setup.first}
+    learner.save(out, {**drove, "episodes": setup.episodes, "reviser": setup.reviser})
+    with storage.replacing(out / "decisions.parquet") as file:
+        polars.DataFrame(driving.decisions).write_parquet(file)
+    summary = {
+        **driving.row.as_dict(),
+        "lead_times": driving.lead_times,
+        "episodes_learnt": setup.first + setup.episodes * setup.learn,
+    }
+    with storage.replacing(out / _SUMMARY) as file:
+        file.write(json.dumps(summary, indent=2).encode())
+
+
+def episodes_learnt(folder: Path) -> int:
+    """How many episodes what was saved in a folder has learnt from."""
+    return int(json.loads((folder / _SUMMARY).read_text("utf-8"))["episodes_learnt"])
+
+
+# -- What has been driven so far ------------------------------------------------------------------
+
+_WHOLE = ("episode", "intake", "state", "n_states")
+_OF_REVISION = ("proposed", "executed", "advised", "risk_proposed", "risk_executed")
+_EVIDENCE = ("risk_low", "risk_high", "evidence", "seen")
+_COLUMNS = (
+    *("episode", "time", *VARIABLES, "intake", "state", "n_states", "surprise"),
+    *(*_OF_REVISION, *_EVIDENCE, "realised", "reason"),
+)
+# Where there is no state.
+_NONE = -1
+
+
+class Driven:
+    """Outcomes of the episodes so far, and the columns of the table of their decisions."""
+
+    def __init__(self) -> None:
+        self.outcomes: list[Outcome] = []
+        self.lead_times: list[float] = []
+        self.decisions: dict[str, list[Any]] = {name: [] for name in _COLUMNS}
+
+    def add(self, drive: Drive, came_of_it: Outcome, tolerance: float) -> None:
+        """Take in the next episode."""
+        for situation, revision, realised in drive.decisions:
+            row = (
+                len(self.outcomes),
+                situation.time,
+                *situation.observation.tolist(),
+                int(situation.intake),
+                situation.state,
+                0 if situation.state is None else len(situation.belief),
+                situation.surprise,
+                *(getattr(revision, name) for name in _OF_REVISION),
+                *revision.interval,
+                revision.evidence,
+                revision.seen,
+                realised,
+                revision.reason,
+            )
+            for name, value in zip(_COLUMNS, row, strict=True):
+                self.decisions[name].append(value)
+        self.outcomes.append(came_of_it)
+        if drive.episode.collided and is_judged(drive):
+            self.lead_times.append(lead_time(drive, tolerance))
+
+    @classmethod
+    def resumed(cls, setup: Setup, learner: Learner, checkpoint: Checkpoint | None) -> Self:
+        """What was driven before, if anything was; the learner is then as it was after it."""
+        done = cls()
+        if checkpoint is None:
+            return done
+        kept = checkpoint.begin(done.keep(learner))
+        with storage.explained(checkpoint.path):
+            done._restore(kept.arrays)
+            _teach(learner, kept.arrays)
+        if len(done.outcomes) > setup.episodes:
+            raise ValueError(
+                f"{checkpoint.path} has driven {len(done.outcomes)} episodes, more than "
+                f"{setup.episodes}"
+            )
+        return done
+
+    def keep(self, learner: Learner, finished: bool = False) -> Kept:
+        """All of it and what was learnt, for a checkpoint."""
+        machine, risk = _files(learner)
+        columns = {f"decided_{name}": _column(name, self.decisions[name]) for name in _COLUMNS}
+        return Kept(
+            {"episodes": len(self.outcomes)},
+            {
+                "machine": np.frombuffer(machine, np.uint8),
+                "risk": np.frombuffer(risk, np.uint8),
+                "outcomes": np.array(self.outcomes, np.float64).reshape(-1, len(Outcome._fields)),
+                "lead_times": np.array(self.lead_times, np.float64),
+                **columns,
+            },
+            finished,
+        )
+
+    def _restore(self, arrays: Mapping[str, NDArray[Any]]) -> None:
+        kinds = get_type_hints(Outcome).values()
+        for row in arrays["outcomes"].tolist():
+            self.outcomes.append(Outcome(*(kind(v) for kind, v in zip(kinds, row, strict=True))))
+        self.lead_times = arrays["lead_times"].tolist()
+        for name in _COLUMNS:
+            self.decisions[name] = _values(name, arrays[f"decided_{name}"])
+        if len({len(column) for column in self.decisions.values()}) != 1:
+            raise ValueError("columns of decisions are of different lengths")
+
+
+def _column(name: str, values: Sequence[Any]) -> NDArray[Any]:
+    """A column of decisions as an array; texts as JSON."""
+    if name == "reason":
+        return np.frombuffer(json.dumps(values).encode(), np.uint8)
+    if name in _WHOLE:
+        return np.array([_NONE if value is None else value for value in values], np.int64)
+    return np.array(values, np.float64)
+
+
+def _values(name: str, column: NDArray[Any]) -> list[Any]:
+    """The column that `_column` made an array of."""
+    if name == "reason":
+        return [str(reason) for reason in json.loads(column.tobytes())]
+    if name in _WHOLE:
+        return [None if value == _NONE else value for value in column.tolist()]
+    values: list[float] = column.tolist()
+    return values
+
+
+def _files(learner: Learner) -> tuple[bytes, bytes]:
+    """The files of its machine and of its risk."""
+    machine, risk = io.BytesIO(), io.BytesIO()
+    learner.machine.save(machine)
+    learner.risk.save(risk)
+    return machine.getvalue(), risk.getvalue()
+
+
+def _teach(learner: Learner, arrays: Mapping[str, NDArray[Any]]) -> None:
+    """Let it have learnt what `Driven.keep` kept."""
+    learner.machine = EvolvingFSM.load(io.BytesIO(arrays["machine"].tobytes()))
+    learner.risk = LatentRisk.load(io.BytesIO(arrays["risk"].tobytes()))
+
+
+# -- One episode ----------------------------------------------------------------------------------
+
+
+def is_judged(drive: Drive) -> bool:
+    """Whether the reviser says how likely failure is."""
+    return not math.isnan(drive.decisions[0].revision.risk_proposed)
+
+
+def lead_time(drive: Drive, tolerance: float) -> float:
+    """From the alarm that stays on to the end of the run [s]; 0 without one."""
+    alarm = math.nan
+    for decision in drive.decisions:
+        if decision.revision.risk_proposed > tolerance:
+            alarm = decision.situation.time if math.isnan(alarm) else alarm
+        else:
+            alarm = math.nan
+    return 0.0 if math.isnan(alarm) else float(drive.episode.time[-1] - alarm)

@@ -1,0 +1,31 @@
+"""Documents for programs: what JSON knows, and nothing else."""
+
+from __future__ import annotations
+
+import json
+import math
+from typing import Any
+
+from evofsm.core import visible
+
+
+def to_json(document: Any) -> str:
+    """A document as JSON, with null for NaN and the infinite, which JSON does not know.
+
+    >>> print(to_json({"lead": [1.5, float("inf")]}))
+    {
+      "lead": [
+        1.5,
+        null
+      ]
+    }
+    """
+    return visible(json.dumps(_known(document), allow_nan=False, ensure_ascii=False, indent=2))
+
+
+def _known(document: Any) -> Any:
+    if isinstance(document, dict):
+        return {key: _known(value) for key, value in document.items()}
+    if isinstance(document, list | tuple):
+        return [_known(value) for value in document]
+    return None if isinstance(document, float) and not math.isfinite(document) else document

@@ -1,0 +1,27 @@
+"""A run that is looked at while it is driven: decision by decision, with a clock of its own."""
+
+from evofsm.app.watch.player import SPEEDS, Audience, Clock, Player, Watched
+from evofsm.app.watch.session import Session, Watching, learn_first, watched_learner
+from evofsm.app.watch.shown import Frame, Graph, Judged, Start, StateShown, Transition
+from evofsm.app.watch.story import Chronicle, Danger, Story
+
+__all__ = [
+    "SPEEDS",
+    "Audience",
+    "Chronicle",
+    "Clock",
+    "Danger",
+    "Frame",
+    "Graph",
+    "Judged",
+    "Player",
+    "Session",
+    "Start",
+    "StateShown",
+    "Story",
+    "Transition",
+    "Watched",
+    "Watching",
+    "learn_first",
+    "watched_learner",
+]

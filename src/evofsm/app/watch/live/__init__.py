@@ -1,0 +1,5 @@
+"""The live page: a run while it is driven, or one that was recorded, in the browser."""
+
+from evofsm.app.watch.live.server import LivePage
+
+__all__ = ["LivePage"]

@@ -1,5 +1,0 @@
-"""`python -m evofsm.cli`."""
-
-from evofsm.cli import main
-
-main()

@@ -1,0 +1,70 @@
+"""How well a share is known that was counted."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+from evofsm.core.kernels import compiled
+
+# Two-sided 90 %.
+_WIDTH = 1.645
+
+
+@compiled
+def wilson_bounds(share: float, count: float) -> tuple[float, float]:
+    """90 % interval of a share that was counted (Wilson 1927)."""
+    spread = _WIDTH * _WIDTH / count
+    centre = (share + 0.5 * spread) / (1.0 + spread)
+    reach = math.sqrt(spread * (share * (1.0 - share) + 0.25 * spread)) / (1.0 + spread)
+    return max(centre - reach, 0.0), min(centre + reach, 1.0)
+
+
+def bounds_text(low: float, high: float) -> str:
+    """Bounds of a share in percent, rounded outward, so that what is said of it holds.
+
+    Whole percents; within one percent of 0 or of 1, with the first digit that shows them.
+
+    Parameters
+    ----------
+    low, high : float
+        In [0, 1]; a bound of 0 from below, or of 1 from above, says nothing and is left out.
+
+    Returns
+    -------
+    str
+
+    Examples
+    --------
+    >>> bounds_text(0.0, 0.00309), bounds_text(0.276, 1.0), bounds_text(0.104, 0.487)
+    ('at most 0.4 %', 'at least 27 %', '10 to 49 %')
+    >>> bounds_text(0.0034, 0.9962), bounds_text(0.9969, 1.0), bounds_text(0.0, 1.0)
+    ('0.3 to 99.7 %', 'at least 99.6 %', '0 to 100 %')
+    """
+    if low <= 0.0 and high < 1.0:
+        return f"at most {_rounded_up(high)} %"
+    if high >= 1.0 and low > 0.0:
+        return f"at least {_rounded_down(low)} %"
+    return f"{_rounded_down(low)} to {_rounded_up(high)} %"
+
+
+def _rounded_up(share: float) -> str:
+    decimals = _decimals(share)
+    return f"{min(_outward(math.ceil, share, decimals), 100.0):.{decimals}f}"
+
+
+def _rounded_down(share: float) -> str:
+    decimals = _decimals(share)
+    return f"{max(_outward(math.floor, share, decimals), 0.0):.{decimals}f}"
+
+
+def _outward(round_: Callable[[float], int], share: float, decimals: int) -> float:
+    """In percent; what is off a round number by rounding only is that number."""
+    scale = 10.0**decimals
+    return round_(round(100.0 * share * scale, 6)) / scale
+
+
+def _decimals(share: float) -> int:
+    """How many show how far it is from 0 and from 1."""
+    apart = 100.0 * min(share, 1.0 - share)
+    return max(-math.floor(math.log10(apart)), 0) if 1e-9 < apart < 1.0 else 0

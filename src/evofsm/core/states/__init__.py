@@ -1,0 +1,13 @@
+"""How states are determined and recognised: one rule, one file.
+
+A machine is given its rule as an object: ``EvolvingFSM(17, rule=Novelty(radius=0.5))``. Without
+one it follows the paper.
+"""
+
+from evofsm.core.states.edges import Edges
+from evofsm.core.states.ets import Paper
+from evofsm.core.states.failure import FailureSplit
+from evofsm.core.states.novelty import Novelty
+from evofsm.core.states.rule import StateRule
+
+__all__ = ["Edges", "FailureSplit", "Novelty", "Paper", "StateRule"]

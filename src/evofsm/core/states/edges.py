@@ -1,0 +1,68 @@
+"""The paper's rule, which also founds states at the edges of the data.
+
+The paper's condition takes only observations nearer the mean of everything seen than any centre,
+so a rare corner never gets a state. Here it gets one where it lies farther out than every centre.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar
+
+from evofsm.core.kernels import inner_kernel
+from evofsm.core.states import ets
+from evofsm.core.states.clusters import CREATED, UNCHANGED, Clusters, exceeds
+from evofsm.core.states.rule import RuleSettings
+
+CODE = 1
+
+
+@dataclass(frozen=True)
+class Edges:
+    """The paper's rule, and a state at each edge, with the machine's settings.
+
+    An observation also founds a state where its potential lies below every centre's and it is
+    farther than ``radius`` from every centre.
+
+    Parameters
+    ----------
+    memory : int, optional
+        Number of observations after which older ones fade, as `Paper` has it.
+
+    Examples
+    --------
+    >>> from evofsm import EvolvingFSM
+    >>> machine = EvolvingFSM(n_actions=1, radius=0.5, rule=Edges())
+    >>> machine.learn_many([[0.0], [0.1], [2.0], [1.0]], [0, 0, 0, 0]).n_states
+    array([1, 1, 2, 3])
+    """
+
+    memory: int | None = None
+    scales: ClassVar[Sequence[float]] = ()
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "memory", ets.check_memory(self.memory))
+
+    def _tell(self, machine: RuleSettings) -> RuleSettings:
+        return machine._replace(code=CODE, memory=self.memory or math.inf)
+
+
+@inner_kernel
+def judge(
+    clusters: Clusters,
+    n: int,
+    potential: float,
+    highest: float,
+    squared_distance: float,
+    radius: float,
+) -> int:
+    """Judge as the paper does, and found a state at an edge."""
+    event = ets.judge(potential, highest, squared_distance, radius)
+    if event != UNCHANGED or not exceeds(squared_distance, radius * radius):
+        return event
+    for i in range(n):
+        if not exceeds(clusters.potentials[i], potential):
+            return UNCHANGED
+    return CREATED

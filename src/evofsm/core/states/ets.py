@@ -1,0 +1,85 @@
+"""The paper's rule: evolving Takagi-Sugeno (eTS) clustering, Sections 2.2.1 and 2.2.2.
+
+An observation founds a state where the data seen so far is denser than at every existing
+centre, or moves the nearest centre there. The more data vary, the wider states are recognised.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar
+
+from evofsm.core.kernels import inner_kernel
+from evofsm.core.states.clusters import (
+    CREATED,
+    MOVED,
+    UNCHANGED,
+    Clusters,
+    exceeds,
+    total_variance,
+)
+from evofsm.core.states.rule import RuleSettings
+from evofsm.core.validation import whole
+
+CODE = 0
+
+
+@dataclass(frozen=True)
+class Paper:
+    """The paper's rule, with the machine's radius, distance_weight and spread.
+
+    An observation that is denser than every centre moves the nearest one if that is closer than
+    ``radius``, else it founds a state. The width of recognition is ``spread`` times the total
+    variance of all observations.
+
+    Parameters
+    ----------
+    memory : int, optional
+        Number of observations after which older ones fade, so that densities and variances are
+        those of the recent past: for regimes that change. Without it, as in the paper, all count
+        alike, and the more were seen the less a new one changes.
+
+    Raises
+    ------
+    ValueError
+        If ``memory`` is no whole number of at least 2.
+
+    Examples
+    --------
+    >>> from evofsm import EvolvingFSM
+    >>> machine = EvolvingFSM(n_actions=1, radius=0.5, rule=Paper())
+    >>> machine.learn_many([[0.0], [0.1], [2.0], [1.0]], [0, 0, 0, 0]).n_states
+    array([1, 1, 1, 2])
+    """
+
+    memory: int | None = None
+    scales: ClassVar[Sequence[float]] = ()
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "memory", check_memory(self.memory))
+
+    def _tell(self, machine: RuleSettings) -> RuleSettings:
+        return machine._replace(code=CODE, memory=self.memory or math.inf)
+
+
+def check_memory(memory: int | None) -> int | None:
+    """A number of observations that are remembered; None for all of them."""
+    if memory is not None and (memory := whole("memory", memory)) < 2:
+        raise ValueError("memory is 1; of one observation nothing can be said to vary")
+    return memory
+
+
+@inner_kernel
+def judge(potential: float, highest: float, squared_distance: float, radius: float) -> int:
+    """Leave the states as they are, move the nearest, or found one."""
+    if not exceeds(potential, highest):
+        return UNCHANGED
+    return MOVED if exceeds(radius * radius, squared_distance) else CREATED
+
+
+@inner_kernel
+def width(spread: float, clusters: Clusters) -> float:
+    """Width of recognition; the paper leaves its var(z*) open."""
+    return spread * total_variance(clusters)

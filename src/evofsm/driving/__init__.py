@@ -1,0 +1,7 @@
+"""All that knows a car: its dangers, who drives, where, and what came of it."""
+
+from __future__ import annotations
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

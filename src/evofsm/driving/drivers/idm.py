@@ -1,0 +1,140 @@
+"""The Intelligent Driver Model (Treiber, Hennecke, Helbing 2000), within explicit bounds.
+
+SUMO's own IDM brakes as hard as its ``emergencyDecel`` allows, and then never collides. What a
+vehicle can really do is part of the question here, so the bounds are arguments.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import astuple, dataclass
+from functools import cached_property
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evofsm.driving.drivers.compiled import Kernel, driver_kernel
+from evofsm.guard import Proposal
+
+
+@driver_kernel
+def idm_kernel(
+    phases: NDArray[np.float64], time: float, gap: float, speed: float, leader_speed: float
+) -> float:
+    """The paper's IDM equations, by the last phase that has begun."""
+    now = 0
+    while now + 1 < len(phases) and phases[now + 1, 0] <= time:
+        now += 1
+    accel = phases[now, 1]
+    desired_speed = phases[now, 2]
+    min_gap = phases[now, 3]
+    time_headway = phases[now, 4]
+    decel = phases[now, 5]
+    exponent = phases[now, 6]
+    closing = speed * (speed - leader_speed) / (2.0 * math.sqrt(accel * decel))
+    desired_gap = min_gap + max(0.0, speed * time_headway + closing)
+    # A gap of 0 or less is a collision, beyond the model: brake as hard as the bounds allow.
+    interaction = (desired_gap / gap) ** 2 if gap > 0.0 else np.inf
+    acceleration = accel * (1.0 - (speed / desired_speed) ** exponent - interaction)
+    return float(min(max(acceleration, phases[now, 7]), phases[now, 8]))
+
+
+@dataclass(frozen=True)
+class IDM:
+    """A car follower by the Intelligent Driver Model.
+
+    Parameters
+    ----------
+    accel : float
+        Desired maximum acceleration [m/s²].
+    desired_speed : float
+        Speed on a free road [m/s].
+    min_gap : float
+        Gap at standstill [m].
+    time_headway : float
+        Desired time headway [s].
+    decel : float
+        Comfortable deceleration [m/s²], positive.
+    exponent : float
+        How acceleration falls off towards the desired speed.
+    lowest, highest : float
+        Bounds of the acceleration that comes out [m/s²].
+
+    Examples
+    --------
+    >>> IDM(1.25, 25.0, 2.0, 1.5, 2.0).propose(np.array([np.inf, 0.0, 0.0])).action
+    1.25
+    >>> IDM(1.25, 25.0, 2.0, 1.5, 2.0, lowest=-4.0).propose(np.array([5.0, 20.0, 0.0])).action
+    -4.0
+    """
+
+    accel: float
+    desired_speed: float
+    min_gap: float
+    time_headway: float
+    decel: float
+    exponent: float = 4.0
+    lowest: float = -math.inf
+    highest: float = math.inf
+
+    kernel: ClassVar[Kernel] = staticmethod(idm_kernel)
+
+    def __post_init__(self) -> None:
+        for name in ("accel", "desired_speed", "decel", "exponent"):
+            if not getattr(self, name) > 0.0:
+                raise ValueError(f"IDM {name} is {getattr(self, name)}; it must be positive")
+        for name in ("min_gap", "time_headway"):
+            if not getattr(self, name) >= 0.0:
+                raise ValueError(f"IDM {name} is {getattr(self, name)}; it must not be negative")
+        if not self.lowest < self.highest:
+            raise ValueError(f"IDM bounds are [{self.lowest}, {self.highest}]; lowest comes first")
+
+    @cached_property
+    def parameters(self) -> NDArray[np.float64]:
+        """(1, 9) ndarray: begin of the phase [s], then the arguments in order."""
+        return np.array([[0.0, *astuple(self)]])
+
+    def propose(self, observation: NDArray[np.float64], time: float = 0.0) -> Proposal:
+        """Acceleration [m/s²] for ``[gap, v_follower, v_leader]``."""
+        return Proposal(self.kernel(self.parameters, time, *observation))
+
+
+@dataclass(frozen=True)
+class ChangingIDM:
+    """One driver who drives by one IDM and, from given times on, by others.
+
+    Parameters
+    ----------
+    first : IDM
+    changes : tuple of (float, IDM)
+        When [s], and how it drives from then on, in the order of time.
+
+    Examples
+    --------
+    >>> calm, hasty = IDM(1.0, 25.0, 2.0, 1.5, 2.0), IDM(2.0, 28.0, 1.0, 0.5, 2.0)
+    >>> driver = ChangingIDM(calm, ((10.0, hasty), (12.0, calm)))
+    >>> free_road = np.array([np.inf, 0.0, 0.0])
+    >>> [driver.propose(free_road, time).action for time in (9.99, 10.0, 12.0)]
+    [1.0, 2.0, 1.0]
+    """
+
+    first: IDM
+    changes: tuple[tuple[float, IDM], ...]
+
+    def __post_init__(self) -> None:
+        times = [at for at, _ in self.changes]
+        if not all(at >= 0.0 for at in times) or times != sorted(times):
+            raise ValueError(f"the driver changes at {times} s; it must be 0 or later, in order")
+
+    kernel: ClassVar[Kernel] = staticmethod(idm_kernel)
+
+    @cached_property
+    def parameters(self) -> NDArray[np.float64]:
+        """(1 + changes, 9) ndarray: a row for each phase, as `IDM.parameters`."""
+        phases = ((0.0, self.first), *self.changes)
+        return np.array([[at, *astuple(driver)] for at, driver in phases])
+
+    def propose(self, observation: NDArray[np.float64], time: float = 0.0) -> Proposal:
+        """Acceleration [m/s²] for ``[gap, v_follower, v_leader]`` at ``time`` [s]."""
+        return Proposal(self.kernel(self.parameters, time, *observation))

@@ -1,0 +1,131 @@
+"""What is observed of car following, and how a place of it is told in words."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import groupby
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from evofsm.core import Labels, Words, real_array, use_words
+
+#: What is observed of car following, and its units.
+VARIABLES, UNITS = ("gap", "v_follower", "v_leader"), ("m", "m/s", "m/s")
+
+# Up to these a gap [m] and a speed [m/s] are called so.
+_GAPS = ((2.0, "nearly touching"), (15.0, "close"), (40.0, "at a distance"))
+_FAR = "far"
+_SPEEDS = ((0.5, "standing"), (8.0, "slow"), (20.0, "at medium speed"))
+_FAST = "fast"
+# Speeds that differ by less are called equal [m/s].
+_EQUAL = 0.5
+# With so many decimals at most two states are told apart by their numbers.
+_MOST_DECIMALS = 3
+
+
+def name_state(center: ArrayLike, decimals: int = 0) -> str:
+    """Say where a state lies.
+
+    Parameters
+    ----------
+    center : (3,) array_like
+        Gap [m], speed of the follower and of the leader [m/s].
+    decimals : int
+        Of the numbers.
+
+    Returns
+    -------
+    str
+        The gap, close up to 15 m and far beyond 40 m; the follower's speed, slow up to 8 m/s and
+        fast beyond 20 m/s; and how fast the gap closes or opens, where that is 0.5 m/s or more.
+
+    Raises
+    ------
+    ValueError
+        If it has not three variables.
+
+    Examples
+    --------
+    >>> name_state([9.2, 4.1, 3.0])
+    'close (9 m), slow (4 m/s), closing at 1 m/s'
+    >>> name_state([60.0, 25.0, 27.3], decimals=1)
+    'far (60.0 m), fast (25.0 m/s), opening at 2.3 m/s'
+    """
+    where = real_array("center", center, 1)
+    if len(where) != 3:
+        raise ValueError(f"center has {len(where)} variables; a name needs gap and both speeds")
+    gap, speed, leader = where.tolist()
+    parts = [
+        f"{_word(gap, _GAPS, _FAR)} ({_plain(gap, decimals)} m)",
+        f"{_word(speed, _SPEEDS, _FAST)} ({_plain(speed, decimals)} m/s)",
+        _change(speed - leader, decimals),
+    ]
+    return ", ".join(parts)
+
+
+def name_states(centers: ArrayLike, states: Sequence[int] | None = None) -> list[str]:
+    """Say where states lie; no two of them get the same name.
+
+    Those that would be called alike get decimals, as many as tell them apart; states that lie in
+    one place are told apart by their numbers.
+
+    Parameters
+    ----------
+    centers : (n, 3) array_like
+        Gap [m], speed of the follower and of the leader [m/s].
+    states : sequence of int, optional
+        Their indices, from 0; without them 0 to n - 1.
+
+    Returns
+    -------
+    list of str
+
+    Examples
+    --------
+    >>> for name in name_states([[9.2, 4.1, 3.0], [9.4, 4.1, 3.0], [60.0, 25.0, 25.1]]):
+    ...     print(name)
+    close (9.2 m), slow (4.1 m/s), closing at 1.1 m/s
+    close (9.4 m), slow (4.1 m/s), closing at 1.1 m/s
+    far (60 m), fast (25 m/s), at equal speeds
+    """
+    if np.size(centers) == 0:
+        return []
+    rows = real_array("centers", centers, 2)
+    names = [name_state(row) for row in rows]
+    for decimals in range(1, _MOST_DECIMALS + 1):
+        for alike in _alike(names):
+            for place in alike:
+                names[place] = name_state(rows[place], decimals)
+    for alike in _alike(names):
+        for place in alike:
+            number = place if states is None else states[place]
+            names[place] = f"{names[place]}, #{number + 1}"
+    return names
+
+
+def _alike(names: Sequence[str]) -> list[list[int]]:
+    """Places of names that occur more than once."""
+    order = sorted(range(len(names)), key=lambda place: names[place])
+    groups = [list(places) for _, places in groupby(order, key=lambda place: names[place])]
+    return [places for places in groups if len(places) > 1]
+
+
+def _word(value: float, bands: Sequence[tuple[float, str]], beyond: str) -> str:
+    return next((word for most, word in bands if value <= most), beyond)
+
+
+def _plain(value: float, decimals: int) -> str:
+    """Rounded, without a minus before a zero."""
+    return f"{round(value, decimals) + 0.0:.{decimals}f}"
+
+
+def _change(closing: float, decimals: int) -> str:
+    if abs(closing) < _EQUAL and decimals == 0:
+        return "at equal speeds"
+    return f"{'closing' if closing > 0.0 else 'opening'} at {abs(closing):.{decimals}f} m/s"
+
+
+use_words(VARIABLES, Words(name_state, "m/s²"))
+#: Of car following.
+LABELS = Labels(names=VARIABLES, units=UNITS)

@@ -1,0 +1,133 @@
+"""Revisers that know a car: brake where a classic measure calls for it, always, or never."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import asdict
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evofsm.core import IntervalActions, positive
+from evofsm.driving.naming import VARIABLES
+from evofsm.guard import (
+    Fallback,
+    Proposal,
+    Revision,
+    RiskMeasure,
+    Situation,
+    known,
+    known_name,
+    make_usable,
+    unjudged,
+    unseen,
+)
+
+#: Without a usable proposal a car brakes gently [m/s²].
+GENTLE_BRAKE = Fallback(-1.0, "braking gently")
+
+
+class EnvelopeReviser:
+    """Brakes in full wherever a measure of danger calls for it, and else keeps the proposal.
+
+    So a classic measure becomes a reviser: time to collision an emergency brake, a safe distance
+    the proper response of RSS.
+
+    Parameters
+    ----------
+    measure : RiskMeasure
+    actions : IntervalActions
+    dt : float
+        Time between decisions [s].
+
+    Examples
+    --------
+    >>> from evofsm.driving import TimeToCollision
+    >>> actions = IntervalActions(low=-2.5, high=2.5, width=0.3)
+    >>> reviser = EnvelopeReviser(TimeToCollision(threshold=1.5), actions)
+    >>> close = Situation(np.array([5.0, 20.0, 10.0]), np.ones(1), 0, 0.0, 0.0)
+    >>> reviser.revise(close, Proposal(1.0)).executed
+    -2.5
+    """
+
+    def __init__(self, measure: RiskMeasure, actions: IntervalActions, dt: float = 0.25) -> None:
+        self.measure = measure
+        self.actions = actions
+        self.dt = positive("dt", dt)
+        self.start_episode()
+
+    def start_episode(self) -> None:
+        """What was seen before belongs to another episode."""
+        self._seen: list[NDArray[np.float64]] = []
+
+    def revise(self, situation: Situation, proposal: Proposal) -> Revision:
+        """Full braking where the measure is above 0, else the proposal."""
+        wanted, remark = make_usable(proposal, self.actions, GENTLE_BRAKE)
+        self._seen = [*self._seen[-1:], situation.observation.copy()]
+        danger = float(self.measure.score(np.array(self._seen), self.dt)[-1])
+        if math.isnan(danger):
+            return unjudged(
+                self.actions.low, proposal, unseen(situation, VARIABLES) or "danger unknown"
+            )
+        if danger <= 0.0:
+            return unjudged(wanted, proposal, remark or "measure calls for nothing")
+        return unjudged(self.actions.low, proposal, remark or f"measure calls for it: {danger:.3g}")
+
+    def described(self) -> dict[str, Any] | None:
+        """What it takes to make it again; None where its measure is someone's own."""
+        name = known_name(self.measure)
+        if name is None:
+            return None
+        return {"dt": self.dt, "measure": {"class": name, **asdict(self.measure)}}  # type: ignore[call-overload]
+
+    @classmethod
+    def restored(cls, described: Mapping[str, Any], actions: IntervalActions) -> Self:
+        """The one that was `described`."""
+        given = dict(described["measure"])
+        return cls(known(given.pop("class"))(**given), actions, described["dt"])
+
+
+class Unrevised:
+    """Executes every proposal that can be executed: no reviser at all.
+
+    Parameters
+    ----------
+    actions : IntervalActions
+
+    Examples
+    --------
+    >>> actions = IntervalActions(low=-2.5, high=2.5, width=0.3)
+    >>> here = Situation(np.array([5.0, 20.0, 10.0]), np.ones(1), 0, 0.0, 0.0)
+    >>> Unrevised(actions).revise(here, Proposal(1.0)).executed
+    1.0
+    """
+
+    def __init__(self, actions: IntervalActions) -> None:
+        self.actions = actions
+
+    def start_episode(self) -> None:
+        """Nothing to forget."""
+
+    def revise(self, situation: Situation, proposal: Proposal) -> Revision:
+        """The proposal, made usable."""
+        wanted, remark = make_usable(proposal, self.actions, GENTLE_BRAKE)
+        return unjudged(wanted, proposal, remark or "not revised")
+
+    def described(self) -> dict[str, Any]:
+        """Nothing: its class says all."""
+        return {}
+
+    @classmethod
+    def restored(cls, described: Mapping[str, Any], actions: IntervalActions) -> Self:
+        """The one that was `described`."""
+        return cls(actions)
+
+
+class AlwaysBrake(Unrevised):
+    """Brakes in full always: no one is safer, or gets less far."""
+
+    def revise(self, situation: Situation, proposal: Proposal) -> Revision:
+        """Full braking."""
+        return unjudged(self.actions.low, proposal, "always brakes")

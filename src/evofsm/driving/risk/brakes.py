@@ -1,0 +1,302 @@
+"""How well one brakes oneself: learnt from what was commanded and what came of it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from math import sqrt
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evofsm.core import compiled, kernel
+from evofsm.files import hardest_seen
+
+# Full braking is judged by so many of the latest decisions, and by no fewer than the second number;
+# that it is weaker than before shows in as few, and in no more than the third number.
+_MEMORY, _FEWEST, _SUSPECT = 80, 6, 12
+# One-sided bounds, in standard errors: of 95 %, and one that may be asked at every decision.
+_BOUND, _SURE = 1.645, 4.0
+# Full braking is known where its bound comes so close to its mean.
+_CLEAR = 0.9
+# Below this share of the command nothing brakes that is called a brake.
+_WEAKEST = 0.2
+# Braking harder than this tells whether it brings what was commanded, and whether it falls short
+# of what it brought before [m/s²].
+_GENTLE, _SHORTFALL = 1.0, 0.1
+# Commands that differ by less are the same [m/s²].
+_SAME = 0.05
+# Slower than this one may stand still, and only noise moves [m/s].
+_STANDING = 1.0
+
+
+class Sample(NamedTuple):
+    """What came of a steady command within one decision."""
+
+    value: float  #: [m/s²]
+    begins: bool  #: whether a stretch of steady decisions begins with it
+
+
+class Latest:
+    """The latest samples, the oldest first, and what can be said of their mean.
+
+    Parameters
+    ----------
+    most : int
+        How many are kept.
+
+    Examples
+    --------
+    >>> latest = Latest(2)
+    >>> for value in (9.0, 2.0, 4.0):
+    ...     latest.add(Sample(value, begins=True))
+    >>> latest.mean_and_bound(errors=0.0)
+    (3.0, 3.0)
+    """
+
+    def __init__(self, most: int) -> None:
+        self._rows = np.empty((most, 2))  # value, and 1 where a stretch begins
+        self._count = 0
+
+    def __len__(self) -> int:
+        return self._count
+
+    def __iter__(self) -> Iterator[Sample]:
+        for value, begins in self._rows[: self._count].tolist():
+            yield Sample(value, bool(begins))
+
+    def add(self, sample: Sample) -> None:
+        """Take in one more; the oldest goes where there is no room."""
+        self._count = _add(self._rows, self._count, *sample)
+
+    def clear(self) -> None:
+        """Forget them."""
+        self._count = 0
+
+    def mean_and_bound(self, errors: float, latest: int | None = None) -> tuple[float, float]:
+        """Mean, and so many standard errors below it; of all, or of the ``latest``.
+
+        A decision's acceleration is a difference of two speeds, and what noise does to one it
+        undoes in the next: the mean of a stretch has the noise of its two ends only.
+        """
+        first = 0 if latest is None else self._count - latest
+        return _mean_and_bound(self._rows, first, self._count, errors)
+
+
+class OwnBrakes:
+    """What full braking really brings, and how late commands take effect.
+
+    Parameters
+    ----------
+    lowest : float
+        The hardest braking that can be commanded [m/s²], negative.
+    assumed : float
+        Share of it that is believed in until braking was seen.
+    dt : float
+        Time between decisions [s].
+
+    Examples
+    --------
+    >>> brakes = OwnBrakes(lowest=-4.0, assumed=0.5, dt=0.25)
+    >>> brakes.decel
+    2.0
+    >>> speed = 20.0
+    >>> for _ in range(10):
+    ...     brakes.see(speed, -4.0)
+    ...     speed -= 0.25 * 3.0  # they are weaker than commanded
+    >>> brakes.decel, brakes.lag
+    (3.0, 0.0)
+    """
+
+    def __init__(self, lowest: float, assumed: float, dt: float) -> None:
+        self.lowest = lowest
+        self.assumed = assumed
+        self.dt = dt
+        self._most_change = hardest_seen(dt) * dt  # of a speed within a decision [m/s]
+        self.samples = Latest(_MEMORY)  #: of full braking
+        self._shortfalls = Latest(_SUSPECT)  # of any braking against what was to be expected
+        self._brought = Latest(_FEWEST)  # by the latest of it
+        #: Whether full braking was seen often and clearly enough to count on what was seen.
+        self.known = False
+        #: Full braking that can be counted on [m/s²], positive; and as it most likely is.
+        self.decel = self._likely = max(assumed, _WEAKEST) * -lowest
+        self.set_lagged(0.0, 0.0)
+        self.clear()
+
+    @property
+    def doubts(self) -> dict[str, Latest]:
+        """What may yet show that the brakes have weakened, by name."""
+        return {"brought": self._brought, "shortfalls": self._shortfalls}
+
+    def set_lagged(self, products: float, squares: float) -> None:
+        """Tell the lag by least squares, from sums of products and of squares."""
+        self.lagged = products, squares
+        #: Share of an interval in which the command before still rules, in [0, 1].
+        self.lag = min(max(products / squares, 0.0), 1.0) if squares > 0.0 else 0.0
+
+    def trust(self, decel: float) -> None:
+        """Take full braking as known [m/s²], positive."""
+        self.remember([Sample(decel, begins=True)] * _FEWEST)
+
+    def remember(self, samples: Iterable[Sample]) -> None:
+        """Take in what full braking brought, the oldest first."""
+        for sample in samples:
+            self.samples.add(sample)
+        if len(self.samples) < _FEWEST:
+            return
+        mean, bound = self.samples.mean_and_bound(_BOUND)
+        self.known = len(self.samples) == _MEMORY or bound >= _CLEAR * mean
+        counted_on = bound if self.known else min(bound, -self.assumed * self.lowest)
+        self.decel = max(counted_on, -_WEAKEST * self.lowest)
+        self._likely = mean if self.known else self.decel
+
+    def merge(self, others: Iterable[OwnBrakes]) -> None:
+        """Take in what full braking brought others, of the same brakes; one's own is the latest."""
+        own, (products, squares) = list(self.samples), self.lagged
+        self.samples.clear()
+        for other in others:
+            self.remember(other.samples)
+            products, squares = products + other.lagged[0], squares + other.lagged[1]
+        self.remember(own)
+        self.set_lagged(products, squares)
+
+    def show(self, decel: float) -> None:
+        """Take in that the car braked so hard [m/s²], whatever was commanded.
+
+        So hard it can brake, which is believed in until full braking is known; that it can brake
+        no harder is not shown by it.
+        """
+        share = min(decel / -self.lowest, 1.0)
+        if share > self.assumed and len(self.samples) < _FEWEST:
+            self.assumed = share
+            self.decel = self._likely = max(share, _WEAKEST) * -self.lowest
+
+    def expected(self, before: float, command: float) -> float:
+        """Acceleration that a command most likely brings, after the one before it [m/s²]."""
+        hardest = -self._likely
+        last, asked, lag = max(before, hardest), max(command, hardest), self.lag
+        return lag * last + (1.0 - lag) * asked
+
+    def clear(self) -> None:
+        """An episode begins: what comes is not a consequence of what was."""
+        self._speed: float | None = None
+        self._estimate = 0.0
+        self._commands: list[float] = []
+        self._was_full = self._was_braking = False
+
+    def see(
+        self,
+        speed: float,
+        command: float,
+        estimate: float | None = None,
+        *,
+        watched: bool = False,
+    ) -> None:
+        """Take in a speed, and what is commanded after it.
+
+        Parameters
+        ----------
+        speed : float
+            As it was observed [m/s].
+        command : float
+            [m/s²].
+        estimate : float, optional
+            The speed as it most likely is [m/s], if it was observed with noise. Commands answer
+            to noise, so that the lag must not be told from it.
+        watched : bool
+            Whether someone else drives, whose proposal may be no command to the brakes but what
+            the car does anyway. Then ordinary braking does not show that they weakened.
+        """
+        asked = max(command, self.lowest)
+        # Nothing is learnt from standing still, nor from a sensor's jump.
+        if (
+            self._speed is not None
+            and min(speed, self._speed) > _STANDING
+            and abs(speed - self._speed) <= self._most_change
+        ):
+            realised, estimated = (speed - self._speed), (speed - self._estimate)
+            self._learn(realised / self.dt, estimated / self.dt, asked, watched=watched)
+        self._speed = speed
+        self._estimate = speed if estimate is None else estimate
+        self._commands = [*self._commands[-2:], asked]
+
+    def _learn(self, realised: float, estimated: float, now: float, *, watched: bool) -> None:
+        if self.known and len(self._commands) >= 2:
+            last, asked = (max(command, -self._likely) for command in self._commands[-2:])
+            products, squares = self.lagged
+            change = last - asked
+            self.set_lagged(products + (estimated - asked) * change, squares + change * change)
+        # However late commands take effect, it was one of the latest three that ruled.
+        ruled = max(self._commands) if len(self._commands) == 3 else 0.0
+        self._learn_full(max(ruled, now), realised)
+        if watched:
+            self._was_braking = False
+        else:
+            self._learn_shortfall(ruled, realised)
+
+    def _learn_full(self, ruled: float, realised: float) -> None:
+        """Braking in full shows what it brings.
+
+        What is commanded now must be it, too: commands answer to noise, and of braking that noise
+        has ended the brakes would seem better than they are.
+        """
+        is_full = ruled < self.lowest + _SAME
+        if is_full:
+            self.remember([Sample(-realised, begins=not self._was_full)])
+        self._was_full = is_full
+
+    def _learn_shortfall(self, ruled: float, realised: float) -> None:
+        """Any braking shows whether the brakes are weaker than they were."""
+        is_braking = ruled < -_GENTLE and len(self.samples) >= _FEWEST
+        if is_braking:
+            brought = Sample(-realised, begins=not self._was_braking)
+            self._brought.add(brought)
+            shortfall = min(-ruled, self.decel) - brought.value
+            self._shortfalls.add(brought._replace(value=shortfall))
+        self._was_braking = is_braking
+        if is_braking and self._is_sure_to_fall_short():  # begin anew
+            self.samples.clear()
+            self.remember(self._brought)
+            self._shortfalls.clear()
+
+    def _is_sure_to_fall_short(self) -> bool:
+        """Without noise the latest few tell; in noise it takes more."""
+        if len(self._shortfalls) < _FEWEST:
+            return False
+        _, of_few = self._shortfalls.mean_and_bound(_SURE, _FEWEST)
+        return of_few > _SHORTFALL or self._shortfalls.mean_and_bound(_SURE)[1] > _SHORTFALL
+
+
+@compiled
+def _add(rows: NDArray[np.float64], count: int, value: float, begins: bool) -> int:
+    """Add a row; answers how many there are."""
+    if count == len(rows):
+        count -= 1
+        for i in range(count):
+            rows[i, 0], rows[i, 1] = rows[i + 1, 0], rows[i + 1, 1]
+    rows[count, 0], rows[count, 1] = value, begins
+    return count + 1
+
+
+@compiled
+def _mean_and_bound(
+    rows: NDArray[np.float64], first: int, end: int, errors: float
+) -> tuple[float, float]:
+    values, count = rows[first:end, 0], end - first
+    mean = _sum(values) / count
+    variance = _sum((values - mean) ** 2) / (count - 1)
+    stretches = max(1.0, rows[first:end, 1].sum())
+    few = 1.0 + 1.2 / (count - 1)  # roughly what Student's t adds: few say little of their variance
+    return mean, mean - few * errors * sqrt(variance * stretches) / count
+
+
+@kernel
+def _sum(values: NDArray[np.float64]) -> float:
+    """Sum in twice the precision, so that equal samples have no variance (Ogita et al. 2005)."""
+    total = rest = 0.0
+    for value in values:
+        more = total + value
+        part = more - total
+        rest += (total - (more - part)) + (value - part)
+        total = more
+    return total + rest

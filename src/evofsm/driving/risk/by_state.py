@@ -1,0 +1,140 @@
+"""Latent risk of states: what is said of a state as a whole, and risk read through the belief.
+
+A situation may be judged where it is, or by the states it is recognised as: then the risk of an
+action is that at the centres of the states, weighed by the belief. The first is sharper; the
+second says what a machine's states are worth to steer by, and which of them are dead ends.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from evofsm.core import EvolvingFSM, FSMModel
+from evofsm.driving.risk.outcome import LatentRisk
+from evofsm.guard import Judgement, Situation, Trial
+
+# States of a smaller belief are left out.
+_LEAST_BELIEF = 1e-3
+
+
+class RiskByState:
+    """Judges actions by the states that a situation is recognised as.
+
+    Parameters
+    ----------
+    risk : LatentRisk
+        What was learnt of leaders and brakes.
+    machine : EvolvingFSM
+        Whose states they are.
+    caution : float
+        Where states disagree, so many standard deviations are added to their mean risk.
+    """
+
+    def __init__(self, risk: LatentRisk, machine: EvolvingFSM, caution: float = 1.0) -> None:
+        self.risk = risk
+        self.machine = machine
+        self.caution = caution
+
+    labels = LatentRisk.labels
+    fallback = LatentRisk.fallback
+
+    def why(self, judged: Judgement) -> str:
+        """Why the first action that was judged is dangerous, in a few words."""
+        return self.risk.why(judged)
+
+    def trial(self) -> Trial | None:
+        """What the risk has to try first."""
+        return self.risk.trial()
+
+    def effective(self, situation: Situation, actions: NDArray[np.float64]) -> NDArray[np.float64]:
+        """What actions come to here."""
+        return self.risk.effective(situation, actions)
+
+    def refuse_unfit(self, low: float, high: float) -> None:
+        """Raise a ValueError if the risk counts on harder braking than there is."""
+        self.risk.refuse_unfit(low, high)
+
+    def described(self) -> dict[str, Any]:
+        """What it takes to make it again beside the same machine and risk."""
+        return {"caution": self.caution}
+
+    @classmethod
+    def restored(cls, described: Mapping[str, Any], machine: EvolvingFSM, risk: LatentRisk) -> Self:
+        """The one that was `described`."""
+        return cls(risk, machine, described["caution"])
+
+    def judge(self, situation: Situation, accelerations: ArrayLike) -> Judgement:
+        """Latent risk of each acceleration: of the states, weighed by the belief."""
+        states, known = len(situation.belief), self.machine.n_states
+        if states > max(known, 1):
+            raise ValueError(
+                f"belief is over {states} states, but the machine has {known} (is it another one?)"
+            )
+        taking_part = np.flatnonzero(situation.belief >= _LEAST_BELIEF)
+        if len(taking_part) == 0 or self.machine.n_states == 0:
+            return self.risk.judge(situation, accelerations)
+        belief = situation.belief[taking_part]
+        centers = self.machine.centers[taking_part]
+        critical = np.stack([self.risk.critical(center, accelerations) for center in centers])
+        weights = belief / belief.sum()
+        risks = self.risk.manoeuvres.harder(critical)
+        risk = weights @ risks
+        disagreement = np.sqrt(weights @ (risks - risk) ** 2)
+        cautious = np.minimum(risk + self.caution * disagreement, 1.0)
+        return self.risk.judgement(situation, cautious, weights @ critical)
+
+
+class StateRisk(NamedTuple):
+    """How dangerous it is to be in a state."""
+
+    state: int
+    risk: float  #: latent risk if one brakes in full at once, with the leader: high in a dead end
+    margin: float  #: escape margin: how much lower that is than if speed is kept
+    critical: float  #: hardest braking of a leader that is then survived [m/s²]
+    seconds: float  #: time for which the state was seen [s]
+    failures: float  #: number of failures that ended in it
+
+    @property
+    def is_dead_end(self) -> bool:
+        """Whether a hard brake of the leader now is more likely than not to end in failure."""
+        return self.risk > 0.5
+
+
+def assess_states(known: EvolvingFSM | FSMModel, risk: LatentRisk) -> list[StateRisk]:
+    """Latent risk at the centre of every state, in the order of founding.
+
+    Parameters
+    ----------
+    known : EvolvingFSM or FSMModel
+        A machine, or the model of one, that observes gap [m], v_follower [m/s] and v_leader [m/s].
+    risk : LatentRisk
+
+    Examples
+    --------
+    >>> machine = EvolvingFSM(n_actions=1, radius=0.5)
+    >>> trace = machine.learn_many([[50.0, 5.0, 5.0], [9.0, 20.0, 20.0]], [0, 0])
+    >>> risk = LatentRisk(lowest=-4.0)
+    >>> [state.is_dead_end for state in assess_states(machine, risk)]
+    [False]
+    """
+    actions = np.array([risk.lowest, 0.0])
+    assessed, endings = [], known.endings
+    for state, center in enumerate(known.centers):
+        critical = risk.critical(center, actions)
+        braking, keeping = risk.manoeuvres.harder(critical)
+        alone: NDArray[np.float64] = np.eye(known.n_states)[state]
+        assessed.append(
+            StateRisk(
+                state,
+                float(braking),
+                float(keeping - braking),
+                float(critical[0]),
+                risk.seconds_seen(alone),
+                float(endings[state]),
+            )
+        )
+    return assessed

@@ -1,0 +1,245 @@
+"""How hard others brake: every braking manoeuvre seen is remembered, pooled over situations.
+
+What a leader does next hardly depends on the follower, so each hard manoeuvre seen anywhere counts
+everywhere. The chance that the next one is harder than some deceleration is read from a kernel
+density over those remembered (Epanechnikov's kernel, Silverman's bandwidth), together with one
+manoeuvre that was only assumed, as hard as a cautious engineer would have it: with N remembered it
+weighs 1 / (N + 1), which is also the chance that the next one is harder than all before it.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable, Sequence
+from itertools import zip_longest
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from evofsm.core import positive
+from evofsm.driving.risk.leaders import LeaderBrakes
+from evofsm.driving.risk.rehearsal import HARDEST
+
+# Of a manoeuvre the hardest second counts; it shows in the latest half, and takes at least three
+# quarters: less may be noise [s].
+_WINDOW, _RECENT, _SHORTEST = 1.0, 0.5, 0.75
+# A leader brakes from the first of these decelerations on, until below the second [m/s²].
+_BEGINS, _ENDS = 1.0, 0.4
+# Where speeds are noisy both are looked at for longer: until noise is no more than this [m/s²]; and
+# a speed must have fallen by so many standard deviations of the noise more.
+_BLUR, _BLUR_HARDEST, _DOUBT = 0.4, 0.15, 3.0
+# A gap that changes by so much more than the speeds explain belongs to another leader [m], and
+# so does a speed that changes by so much more than a car can [m/s].
+_ANOTHER_GAP, _ANOTHER_SPEED = 3.0, 1.0
+# Between two points of the table of `Manoeuvres.harder` [m/s²], and its narrowest kernel.
+_GRID, _NARROWEST = 0.05, 0.1
+
+
+class Manoeuvres:
+    """The decelerations of the latest braking manoeuvres, and how likely harder ones are.
+
+    Parameters
+    ----------
+    assumed : float
+        The deceleration of the one that is only assumed [m/s²].
+    hard : float
+        Softer ones are counted, no more [m/s²]: however many were seen, they say nothing of how
+        hard the next hard one will be.
+    memory : int
+        How many are remembered; older ones are forgotten, so that a change shows.
+
+    Examples
+    --------
+    >>> manoeuvres = Manoeuvres(assumed=10.0)
+    >>> manoeuvres.harder([4.0, 12.0])  # nothing seen: only the assumed one counts
+    array([1., 0.])
+    >>> manoeuvres.remember(3.0, 3.5, 4.0)
+    >>> manoeuvres.harder([2.0, 3.5, 6.0, 12.0]).round(2)
+    array([1.  , 0.62, 0.25, 0.  ])
+    """
+
+    def __init__(self, assumed: float, hard: float = 2.5, memory: int = 500) -> None:
+        self.assumed = positive("assumed", assumed)
+        self.hard = positive("hard", hard)
+        self.gentle = 0
+        self.decels: deque[float] = deque(maxlen=memory)
+        self._tabulate()
+
+    def __len__(self) -> int:
+        return len(self.decels)
+
+    def remember(self, *decels: float) -> None:
+        """Take in manoeuvres [m/s²], the oldest first."""
+        seen = [min(positive("decel", decel), HARDEST) for decel in decels]
+        hard = [decel for decel in seen if decel >= self.hard]
+        self.gentle += len(seen) - len(hard)
+        if hard:
+            self.decels.extend(hard)
+            self._tabulate()
+
+    def begin_with(self, leaders: LeaderBrakes) -> None:
+        """Take in a table of others' manoeuvres as if they had been seen.
+
+        Raises
+        ------
+        ValueError
+            If some that are hard here were not counted there.
+        """
+        if leaders.hard > self.hard:
+            raise ValueError(
+                f"leaders counts from {leaders.hard:g} m/s² on, but hard is {self.hard:g}; a "
+                "table that begins no higher is needed"
+            )
+        self.remember(*leaders.decels)
+        self.gentle += leaders.gentle
+
+    def merge(self, others: Sequence[Manoeuvres]) -> None:
+        """Take in what others saw, who call the same hard; of too many the latest of each."""
+        self.gentle += sum(other.gentle for other in others)
+        every = latest_of_each([*(other.decels for other in others), self.decels])
+        self.decels.clear()
+        self.decels.extend(every)
+        self._tabulate()
+
+    def harder(self, decel: ArrayLike) -> NDArray[np.float64]:
+        """Probability that the next hard manoeuvre is harder than these decelerations [m/s²]."""
+        grid, harder = self.table
+        return np.asarray(np.interp(np.asarray(decel, dtype=np.float64), grid, harder))
+
+    def any_harder(self, decel: ArrayLike) -> NDArray[np.float64]:
+        """Probability that the next manoeuvre, hard or gentle, is harder than these [m/s²]."""
+        share = (len(self.decels) + 1) / (len(self.decels) + 1 + self.gentle)
+        return np.where(np.asarray(decel) < self.hard, 1.0, share * self.harder(decel))
+
+    def exceeded_by(self, share: float) -> float:
+        """What a share of hard manoeuvres exceeds [m/s²]: the inverse of `harder`."""
+        grid, harder = self.table
+        return float(grid[np.argmax(harder <= share)])
+
+    def _tabulate(self) -> None:
+        grid = np.arange(0.0, HARDEST + _GRID, _GRID)
+        harder = (self.assumed > grid).astype(np.float64)
+        if self.decels:
+            seen = np.array(self.decels)
+            # Silverman's rule; where few were seen their spread says little.
+            width = max(_NARROWEST, 2.34 * seen.std() * len(seen) ** -0.2)
+            offset = np.clip((seen - grid[:, None]) / width, -1.0, 1.0)
+            harder += (0.5 + offset * (0.75 - 0.25 * offset * offset)).sum(axis=1)
+        harder[grid >= HARDEST] = 0.0
+        #: Decelerations [m/s²], and the chance that the next hard manoeuvre is harder.
+        self.table: NDArray[np.float64] = np.array([grid, harder / (len(self.decels) + 1)])
+
+
+def latest_of_each(series: Iterable[Iterable[float]]) -> list[float]:
+    """Values of several series, so that the latest of each come last.
+
+    Examples
+    --------
+    >>> latest_of_each([[1.0, 2.0, 3.0], [30.0]])
+    [1.0, 2.0, 30.0, 3.0]
+    """
+    columns = zip_longest(*(reversed(list(values)) for values in series))
+    return [value for column in columns for value in column if value is not None][::-1]
+
+
+class Seen(NamedTuple):
+    """One observation, as far as others' braking is concerned."""
+
+    gap: float
+    speed: float
+    leader_speed: float
+
+
+class BrakeWatch:
+    """Watches a leader's speed, and tells a manoeuvre when it has ended.
+
+    The deceleration of a manoeuvre is that of its hardest second, which neither its blurred ends
+    nor noise on the speeds change much.
+
+    Parameters
+    ----------
+    dt : float
+        Time between observations [s].
+
+    Examples
+    --------
+    >>> watch = BrakeWatch(dt=0.25)
+    >>> for speed in (20.0, 20.0, 19.0, 18.0, 17.0, 16.0, 16.0):
+    ...     decel = watch.see(50.0, speed, speed)
+    >>> watch.braking, watch.see(50.0, 16.0, 16.0)
+    (True, 4.0)
+    """
+
+    def __init__(self, dt: float) -> None:
+        self.dt = positive("dt", dt)
+        self._recently = max(1, round(_RECENT / dt))
+        self._shortest = max(self._recently + 1, round(_SHORTEST / dt))
+        self._window = max(self._shortest, round(_WINDOW / dt))
+        self.clear()
+
+    @property
+    def braking(self) -> bool:
+        """Whether the leader brakes now."""
+        return bool(self._braking)
+
+    def clear(self) -> None:
+        """Forget the leader: another comes, or an episode begins."""
+        self._recent: deque[Seen] = deque(maxlen=4 * self._recently + 1)
+        self._braking: list[float] = []
+        self._noise = 0.0
+
+    def see(
+        self, gap: float, speed: float, leader_speed: float, noise: float = 0.0
+    ) -> float | None:
+        """Take in an observation; answers the deceleration of a manoeuvre that ended [m/s²].
+
+        ``noise`` is the standard deviation of that on the difference of two speeds [m/s].
+        """
+        now = Seen(gap, speed, leader_speed)
+        if self._recent and self._is_another(self._recent[-1], now):
+            ended = self.end()
+            self.clear()
+            self._recent.append(now)
+            return ended
+        self._recent.append(now)
+        self._noise = noise
+        span = min(self._long_enough(self._recently, _BLUR), 4 * self._recently)
+        if len(self._recent) <= span:
+            return None
+        lost = self._recent[-1 - span].leader_speed - leader_speed
+        seconds = span * self.dt
+        if self._braking:
+            self._braking.append(leader_speed)
+            if leader_speed <= 0.0:
+                self._recent.clear()  # who stands does not brake, though noise may move it
+            if lost < _ENDS * seconds or leader_speed <= 0.0:
+                return self.end()
+        elif lost >= _BEGINS * seconds + _DOUBT * noise:
+            self._braking = [seen.leader_speed for seen in self._recent][-1 - span :]
+        return None
+
+    def end(self) -> float | None:
+        """Close the manoeuvre under way, as an episode ends; answers its deceleration [m/s²]."""
+        speeds, self._braking = self._braking, []
+        while len(speeds) > 1 and speeds[-1] <= 0.0:
+            speeds.pop()  # in the interval in which it came to a standstill it did not only brake
+        if len(speeds) <= self._shortest:
+            return None
+        span = min(self._long_enough(self._window, _BLUR_HARDEST), len(speeds) - 1)
+        lost = np.array(speeds[:-span]) - np.array(speeds[span:])
+        # Less than a gentle second's worth may be noise, however short.
+        least = _BEGINS * _WINDOW + _DOUBT * self._noise
+        return float(lost.max()) / (span * self.dt) if lost.max() >= least else None
+
+    def _long_enough(self, span: int, blur: float) -> int:
+        """So many decisions, or more if noise blurs a deceleration over them."""
+        return max(span, round(self._noise / (blur * self.dt)))
+
+    def _is_another(self, before: Seen, now: Seen) -> bool:
+        expected = before.gap + 0.5 * self.dt * (
+            before.leader_speed + now.leader_speed - before.speed - now.speed
+        )
+        if abs(now.leader_speed - before.leader_speed) > HARDEST * self.dt + _ANOTHER_SPEED:
+            return True
+        return abs(now.gap - expected) > _ANOTHER_GAP

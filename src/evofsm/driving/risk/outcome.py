@@ -1,0 +1,702 @@
+"""Latent risk: how likely failure is after an action, even if one is cautious from then on.
+
+A failure is rare and its causes are long past when it comes, so counting failures says too little
+and too late. What leads to it can be learnt from every ordinary minute: how hard leaders brake
+(`risk.manoeuvres`), how often they begin to (by state, here), and how well one brakes
+oneself (`risk.brakes`). An action is then *rehearsed* (`evofsm.driving.risk.rehearsal`): it is
+taken, full braking follows, and the leader brakes. The hardest braking of the leader that still
+ends well is the critical deceleration, and the latent risk is the probability that the leader
+brakes harder than that. A situation is a dead end where, if the leader braked hard now, even
+braking in full at once would be too late; while the leader does not, it can still be left.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from evofsm.core import (
+    compiled,
+    inner_kernel,
+    positive,
+    real_array,
+    refuse_unless_distribution,
+    refuse_unusable,
+    wilson_bounds,
+)
+from evofsm.driving.naming import LABELS
+from evofsm.driving.revisers import GENTLE_BRAKE
+from evofsm.driving.risk.brakes import OwnBrakes, Sample
+from evofsm.driving.risk.leaders import LeaderBrakes
+from evofsm.driving.risk.manoeuvres import BrakeWatch, Manoeuvres
+from evofsm.driving.risk.perception import Estimate, Perception, is_whole
+from evofsm.driving.risk.rehearsal import Body, Three, critical_decelerations
+from evofsm.files import LARGEST_OBSERVATION, ranges, storage
+from evofsm.guard import Judgement, Situation, Trial
+
+# Pseudo-evidence for the pooled rate of manoeuvres, against that of a state [s].
+_POOLED = 20.0
+# Slower than this a car stands, though a sensor may show that it moves [m/s].
+_STANDS = 0.1
+# Where a situation is not sure, it may be worse by so many standard deviations.
+_CAUTION = 2.5
+
+
+class LatentRisk:
+    """Learns online what an action leads to if the leader brakes and one is cautious from then on.
+
+    Parameters
+    ----------
+    lowest : float
+        The hardest braking that can be commanded [m/s²], negative.
+    dt : float
+        Time between decisions [s].
+    leader_decel : float
+        Until enough was seen, leaders are assumed to brake so hard [m/s²].
+    own_brakes : float
+        Until it was seen, full braking is assumed to bring this share of what was commanded.
+    margin : float
+        Smallest gap that counts as no collision [m].
+    hard : float
+        Leaders' manoeuvres from which on it learns how hard they brake [m/s²]. Softer ones, of
+        which everyday traffic is full, must not water down the hard ones.
+    leaders : LeaderBrakes, optional
+        Leaders' brakes to begin with, as if they had been seen; `leaders.REAL_DRIVES` are those
+        of public drives. Without them it begins with the assumption alone.
+
+    Examples
+    --------
+    >>> risk = LatentRisk(lowest=-2.5)
+    >>> here = Situation(np.array([30.0, 20.0, 20.0]), np.ones(1), 0, np.nan, 0.0)
+    >>> unseen = risk.judge(here, [0.0, -2.5])
+    >>> unseen.risk, unseen.evidence  # nothing was learnt: the assumptions rule
+    (array([1., 1.]), 0.0)
+    """
+
+    labels = LABELS
+    fallback = GENTLE_BRAKE
+
+    def __init__(
+        self,
+        lowest: float,
+        dt: float = 0.25,
+        *,
+        leader_decel: float = 10.0,
+        own_brakes: float = 0.6,
+        margin: float = 0.5,
+        hard: float = 2.5,
+        leaders: LeaderBrakes | None = None,
+    ) -> None:
+        if not -math.inf < lowest < 0.0:
+            raise ValueError(f"lowest is {lowest}; the hardest braking must be negative and finite")
+        self.lowest = float(lowest)
+        self.dt = positive("dt", dt)
+        self.leader_decel = positive("leader_decel", leader_decel)
+        self.own_brakes = positive("own_brakes", own_brakes)
+        self.margin = positive("margin", margin)
+        self.hard = positive("hard", hard)
+        ranges.refuse_others("risk", self._settings)
+        self.manoeuvres = Manoeuvres(leader_decel, hard)
+        if leaders is not None:
+            self.manoeuvres.begin_with(leaders)
+        self.brakes = OwnBrakes(lowest, own_brakes, dt)
+        self.perception = Perception(dt)
+        self._watch = BrakeWatch(dt)
+        self._own_watch = BrakeWatch(dt)  # of the car itself, where someone else drives it
+        self._watched = False  # the latest decision
+        self._by_state = np.zeros((3, 0))  # onsets of braking, seconds without, all seconds
+        self._commands = (0.0, 0.0)  # the latest two
+
+    @classmethod
+    def told(
+        cls,
+        lowest: float,
+        decel: float,
+        leader_decel: float,
+        dt: float = 0.25,
+        *,
+        leaders: LeaderBrakes | None = None,
+    ) -> Self:
+        """Told the limits instead of learning them: the best that could be learnt.
+
+        Parameters
+        ----------
+        lowest : float
+            The hardest braking that can be commanded [m/s²], negative.
+        decel, leader_decel : float
+            Hardest braking of the follower and of leaders [m/s²], positive.
+        dt : float
+            Time between decisions [s].
+        leaders : LeaderBrakes, optional
+            What leaders' brakes are like, so that not each is taken to be the hardest.
+        """
+        risk = cls(lowest, dt, leader_decel=leader_decel, leaders=leaders)
+        risk.brakes.trust(positive("decel", decel))
+        return risk
+
+    # -- Learning -------------------------------------------------------------------------------
+
+    def learn(
+        self, observation: ArrayLike, acceleration: float, belief: ArrayLike = (1.0,)
+    ) -> None:
+        """Take in an observation and the acceleration commanded after it.
+
+        Parameters
+        ----------
+        observation : (3,) array_like
+            Gap [m], speed of the follower and of the leader [m/s]; NaN where it was not seen.
+            Then nothing is learnt, and what is under way is not gone on with.
+        acceleration : float
+            Commanded [m/s²].
+        belief : (n,) array_like
+            Distribution over states, to learn where leaders begin to brake.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If one of them does not hold real, finite numbers, or has another shape, or ``belief``
+            is no distribution. What was learnt is then as it was.
+        """
+        self._learn(observation, acceleration, belief, watched=False)
+
+    def watch(
+        self, observation: ArrayLike, acceleration: float, belief: ArrayLike = (1.0,)
+    ) -> None:
+        """Learn as `learn` does, where someone else drives, as in shadow mode.
+
+        The ``acceleration`` may then be no command but what the car does anyway. Hard braking
+        shows what its brakes can do; ordinary braking does not show what they cannot.
+
+        Examples
+        --------
+        >>> risk = LatentRisk(lowest=-8.0)
+        >>> before = risk.brakes.decel
+        >>> for speed in (20.0, 20.0, 18.5, 17.0, 15.5, 14.0, 14.0, 14.0, 14.0):
+        ...     risk.watch([40.0, speed, speed], -6.0)
+        >>> before, risk.brakes.decel
+        (4.8, 6.0)
+        """
+        self._learn(observation, acceleration, belief, watched=True)
+
+    def _learn(
+        self, observation: ArrayLike, acceleration: float, belief: ArrayLike, *, watched: bool
+    ) -> None:
+        seen = _three_finite(observation, whole=False)
+        command = _one_finite("acceleration", acceleration)
+        states = _series("belief", belief)
+        if not is_whole(seen):
+            self.follow(observation, acceleration)
+            return
+        was_braking = self._watch.braking
+        self._count(states, was_braking)
+        estimate = self._perceive(seen, learn=True)
+        self._remember(self._follow(seen, command))
+        if self._watch.braking and not was_braking:
+            self._by_state[0, : len(states)] += states
+        self.brakes.see(seen[1], command, estimate.mean[1], watched=watched)
+        if watched:
+            if not self._watched:
+                self._own_watch.clear()
+            self._show(self._own_watch.see(0.0, seen[1], seen[1], self._of_change(1)))
+        self._watched = watched
+
+    def follow(self, observation: ArrayLike, acceleration: float) -> None:
+        """Keep up with what happens, as `learn`, without learning from it."""
+        command = _one_finite("acceleration", acceleration)
+        seen = _three_finite(observation, whole=False)
+        self._watched = False
+        self._perceive(seen, learn=False)
+        if is_whole(seen):
+            self._follow(seen, command)
+        else:
+            self._watch.clear()
+            self.brakes.clear()
+            self._commands = (self._commands[1], command)
+
+    def start_episode(self, *, learn: bool = True) -> None:
+        """What comes is not a consequence of what was; a manoeuvre under way counts as it is."""
+        ended, shown = self._watch.end(), self._own_watch.end()
+        if learn:
+            self._remember(ended)
+            self._show(shown)
+        self._watch.clear()
+        self._own_watch.clear()
+        self.brakes.clear()
+        self.perception.clear()
+        self._commands = (0.0, 0.0)
+
+    def _perceive(self, seen: Three, *, learn: bool) -> Estimate:
+        return self.perception.see(seen, self._expected, sure=self.brakes.known, learn=learn)
+
+    def _follow(self, seen: Three, acceleration: float) -> float | None:
+        self._commands = (self._commands[1], acceleration)
+        return self._watch.see(*seen, self._of_change(2))
+
+    def _of_change(self, variable: int) -> float:
+        """Standard deviation of the noise on a difference of two of its values."""
+        return math.sqrt(2.0) * self.perception.noise[variable]
+
+    @property
+    def _expected(self) -> float:
+        """What the latest command brings until the next decision, most likely [m/s²]."""
+        return self.brakes.expected(*self._commands)
+
+    def _remember(self, decel: float | None) -> None:
+        if decel is not None:
+            self.manoeuvres.remember(decel)
+
+    def _show(self, decel: float | None) -> None:
+        if decel is not None:
+            self.brakes.show(decel)
+
+    def _count(self, belief: NDArray[np.float64], braking: bool) -> None:
+        counts, missing = self._by_state, len(belief) - self._by_state.shape[1]
+        if missing > 0:
+            counts = np.concatenate([counts, np.zeros((len(counts), missing))], axis=1)
+        if not _count(counts, belief, self.dt, braking):
+            refuse_unless_distribution("belief", belief)
+        self._by_state = counts
+
+    # -- Sharing --------------------------------------------------------------------------------
+
+    def merge(
+        self, others: Iterable[LatentRisk], *, same_states: bool = False, brakes: bool = False
+    ) -> None:
+        """Take in what others saw of their leaders, as if it had been seen here.
+
+        They must have learnt apart: what two of them began with in common counts twice, a table of
+        `leaders` too, which only this one may begin with. They stay as they are.
+
+        Parameters
+        ----------
+        others : iterable of LatentRisk
+            Leaders' manoeuvres and the noise of the sensors add up; where there are more than are
+            remembered, the latest of each stay. Where leaders begin to brake adds up if no states
+            are told apart, or if they are the same.
+        same_states : bool
+            Whether all of them learnt by the states of one machine.
+        brakes : bool
+            Whether all of them are cars with the same brakes, so that those add up as well.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If one is no `LatentRisk`, is this one, or was made for another time between decisions,
+            another ``hard`` or, for the brakes, another ``lowest``. Nothing is then changed.
+
+        Examples
+        --------
+        >>> mine, yours = LatentRisk(lowest=-2.5), LatentRisk(lowest=-4.0)
+        >>> mine.manoeuvres.remember(3.0, 4.0)
+        >>> yours.manoeuvres.remember(3.5)
+        >>> mine.merge([yours])
+        >>> sorted(mine.manoeuvres.decels)
+        [3.0, 3.5, 4.0]
+        """
+        given = list(others)
+        alike = ("dt", "hard", "lowest") if brakes else ("dt", "hard")
+        for other in given:
+            self._refuse_unlike(other, alike)
+        every = [*given, self]
+        self.manoeuvres.merge([other.manoeuvres for other in given])
+        self.perception.merge([other.perception for other in given])
+        if same_states or max(one._by_state.shape[1] for one in every) <= 1:
+            states = max(one._by_state.shape[1] for one in every)
+            self._by_state = sum(
+                (
+                    np.pad(one._by_state, ((0, 0), (0, states - one._by_state.shape[1])))
+                    for one in every
+                ),
+                start=np.zeros((3, states)),
+            )
+        if brakes:
+            self.brakes.merge([other.brakes for other in given])
+
+    def _refuse_unlike(self, other: object, alike: Iterable[str]) -> None:
+        if not isinstance(other, LatentRisk):
+            raise TypeError(f"only a LatentRisk can be merged, not {type(other).__name__}")
+        if other is self:
+            raise ValueError("a risk cannot be merged with itself: what it saw would count twice")
+        for name in alike:
+            mine, its = getattr(self, name), getattr(other, name)
+            if mine != its:
+                raise ValueError(f"{name} is {mine:g} here and {its:g} there; it must be the same")
+
+    # -- Judging --------------------------------------------------------------------------------
+
+    def judge(self, situation: Situation, accelerations: ArrayLike) -> Judgement:
+        """Latent risk of each acceleration that could be commanded now.
+
+        What was not seen (NaN) is estimated from what was seen before; the less sure that is, the
+        higher the risk. Where nothing was seen before either, every risk is 1.
+
+        Parameters
+        ----------
+        situation : Situation
+        accelerations : (k,) array_like
+            To be judged [m/s²].
+
+        Returns
+        -------
+        Judgement
+        """
+        here = self._cautious(situation.observation)
+        actions = _series("accelerations", accelerations)
+        if not is_whole(here):
+            return self._blind(situation, _finite("accelerations", actions))
+        judged = np.empty((4, len(actions)))
+        table, evidence = self.manoeuvres.table, float(len(self.manoeuvres))
+        if not _judge(
+            here, actions, self._commands[1], *self.body, self.dt, table, evidence, judged
+        ):
+            refuse_unusable("accelerations", actions)
+        risk, low, high, critical = judged
+        return Judgement(risk, low, high, critical, evidence, self._seen(situation))
+
+    def why(self, judged: Judgement) -> str:
+        """Why the first action that was judged is dangerous, in a few words."""
+        return (
+            "could not survive a leader braking harder than "
+            f"{float(judged.critical[0]):.1f} m/s² (risk {float(judged.risk[0]):.1%})"
+        )
+
+    def trial(self) -> Trial | None:
+        """Full braking, until it is known what it brings."""
+        if self.brakes.known:
+            return None
+        assumed = f"{self.brakes.decel:.1f} m/s² assumed"
+        doing = "braking in full to learn them"
+        return Trial(self.lowest, "own brakes not known yet", "in full", doing, assumed)
+
+    def effective(self, situation: Situation, actions: NDArray[np.float64]) -> NDArray[np.float64]:
+        """What actions come to here: where the car stands, to stay is enough."""
+        if situation.observation[1] < _STANDS:
+            return np.maximum(actions, min(float(actions[0]), 0.0))
+        return actions
+
+    def refuse_unfit(self, low: float, high: float) -> None:
+        """Raise a ValueError if it counts on harder braking than there is."""
+        if self.lowest < low:
+            raise ValueError(
+                f"the risk counts on braking down to {self.lowest:g}, but the set of "
+                f"actions ends at {low:g}"
+            )
+
+    def sums(self, n_states: int) -> dict[str, float]:
+        """A few sums that whatever is learnt changes."""
+        return {
+            "brakes": self.brakes.decel,
+            "manoeuvres": len(self.manoeuvres) + self.manoeuvres.gentle,
+            "seconds": self.seconds_seen(np.ones(max(1, n_states))),
+        }
+
+    def _cautious(self, observation: ArrayLike) -> Three:
+        """The situation as it most likely is, but closer by what is not sure about it."""
+        seen = _three_finite(observation, whole=False)
+        here = self.perception.estimate(seen, self._expected, sure=self.brakes.known)
+        gap, speed, leader_speed = here.mean
+        # What is wrong about a speed adds up while both brake.
+        decel = self.brakes.decel
+        doubt = here.deviation((1.0, -speed / decel, leader_speed / decel))
+        return gap - _CAUTION * doubt, speed, leader_speed
+
+    def _blind(self, situation: Situation, actions: NDArray[np.float64]) -> Judgement:
+        """Where one is was not seen, nor can it be told: nothing can be survived for sure."""
+        sure, none = np.ones(len(actions)), np.zeros(len(actions))
+        evidence = float(len(self.manoeuvres))
+        return Judgement(sure, none, sure, none, evidence, self._seen(situation))
+
+    def judgement(
+        self, situation: Situation, risk: NDArray[np.float64], critical: NDArray[np.float64]
+    ) -> Judgement:
+        """With the interval that as many manoeuvres as were seen allow for."""
+        evidence = float(len(self.manoeuvres))
+        low, high = np.transpose([wilson_bounds(each, evidence + 1.0) for each in risk.tolist()])
+        return Judgement(risk, low, high, critical, evidence, self._seen(situation))
+
+    def _seen(self, situation: Situation) -> float:
+        return math.nan if situation.state is None else self.seconds_seen(situation.belief)
+
+    def critical(
+        self, observation: ArrayLike, accelerations: ArrayLike, onset: float = 0.0
+    ) -> NDArray[np.float64]:
+        """Hardest braking of the leader, ``onset`` [s] from now, that is survived.
+
+        Returns
+        -------
+        (k,) ndarray
+            [m/s²]; 0 where even a leader who keeps its speed is hit, `rehearsal.HARDEST` where
+            none is.
+        """
+        return self._critical(observation, accelerations, onset, self.margin)
+
+    def _critical(
+        self,
+        observation: ArrayLike,
+        accelerations: ArrayLike,
+        onset: float = 0.0,
+        margin: float = 0.0,
+    ) -> NDArray[np.float64]:
+        actions = _finite("accelerations", accelerations)
+        critical = np.empty(len(actions))
+        critical_decelerations(
+            _three_finite(observation),
+            actions,
+            self._commands[1],
+            self.body._replace(margin=margin),
+            round(onset / self.dt),
+            self.dt,
+            critical,
+        )
+        return critical
+
+    def probability(
+        self,
+        observation: ArrayLike,
+        acceleration: float,
+        horizon: float,
+        belief: ArrayLike | None = None,
+    ) -> float:
+        """Probability of failure within ``horizon`` [s]: action now, then caution.
+
+        Unlike the latent risk this does not suppose that the leader brakes: it weighs by how
+        often leaders begin to, in states like this one (``belief``) or anywhere (None).
+        """
+        positive("horizon", horizon)
+        at_once = self.critical(observation, [acceleration])
+        if self._watch.braking or at_once[0] == 0.0:  # or it fails whatever the leader does
+            return float(self.manoeuvres.any_harder(at_once)[0])
+        rate = self.onset_rate(belief)
+        delays = np.arange(0.0, horizon, self.dt)
+        begins = np.exp(-rate * delays) * -math.expm1(-rate * self.dt)
+        critical = [self.critical(observation, [acceleration], delay)[0] for delay in delays]
+        return float(begins @ self.manoeuvres.any_harder(critical))
+
+    def onset_rate(self, belief: ArrayLike | None = None) -> float:
+        """How often leaders begin to brake [1/s], in states like this one or anywhere."""
+        onsets, exposure, _ = self._by_state
+        pooled = (onsets.sum() + 1.0) / (exposure.sum() + _POOLED)
+        if belief is None:
+            return float(pooled)
+        here = np.asarray(belief)[: len(onsets)]
+        n = len(here)
+        onsets, seconds = here @ onsets[:n], here @ exposure[:n]
+        return float((onsets + _POOLED * pooled) / (seconds + _POOLED))
+
+    def seconds_seen(self, belief: ArrayLike) -> float:
+        """How long states like this one were seen so far [s]: near 0 for what is new."""
+        return _weighed(self._by_state[2], np.asarray(belief, dtype=np.float64))
+
+    @property
+    def body(self) -> Body:
+        """What the follower is able to do, as far as was learnt."""
+        return Body(self.brakes.decel, self.brakes.lag, self.margin)
+
+    def score(
+        self, observations: NDArray[np.float64], dt: float = 0.25, tolerance: float = 0.02
+    ) -> NDArray[np.float64]:
+        """How surely each row is a dead end if the leader brakes now, as a `RiskMeasure` [m/s²].
+
+        By how much the hardest braking of a leader that is survived by braking in full now falls
+        short of the one that leaders exceed with a probability of ``tolerance``. A dead end is a
+        collision, however small the gap that is left, so no margin is kept. Rows are judged one by
+        one, so ``dt`` does not matter.
+        """
+        full = np.array([self.lowest])
+        critical = [self._critical(row, full, margin=0.0)[0] for row in np.asarray(observations)]
+        return self.manoeuvres.exceeded_by(tolerance) - np.array(critical)
+
+    # -- Keeping it -----------------------------------------------------------------------------
+
+    def save(self, path: storage.Place, provenance: Mapping[str, Any] | None = None) -> None:
+        """Write what was learnt to a file (arrays and a JSON header, nothing that can run).
+
+        Parameters
+        ----------
+        path : path-like, or file open for writing bytes
+        provenance : mapping, optional
+            What it learnt from, for people; kept in the file.
+
+        Raises
+        ------
+        OSError
+            If the folder does not exist, or the file cannot be written. A file that was there
+            before is then as it was.
+        """
+        settings = {**self._settings, "own_brakes": self.brakes.assumed}
+        storage.write(path, "risk", settings, self._learnt(), provenance)
+
+    @classmethod
+    def load(cls, path: storage.Place) -> Self:
+        """Read what was learnt, between two episodes.
+
+        Raises
+        ------
+        OSError
+            If there is no such file, or it may not be read.
+        ValueError
+            If the file holds something else, or is damaged.
+
+        Examples
+        --------
+        >>> import tempfile
+        >>> from pathlib import Path
+        >>> risk = LatentRisk(lowest=-2.5)
+        >>> risk.manoeuvres.remember(4.0)
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     risk.save(Path(folder) / "risk.evofsm")
+        ...     len(LatentRisk.load(Path(folder) / "risk.evofsm").manoeuvres)
+        1
+        """
+        settings, arrays = storage.read(path, "risk")
+        with storage.explained(path):
+            risk = cls(**settings)
+            risk.manoeuvres.remember(*arrays["decels"].tolist())
+            risk.manoeuvres.gentle = int(arrays["gentle"][0])
+            samples = zip(arrays["brakes"].tolist(), arrays["stretches"].tolist(), strict=True)
+            risk.brakes.remember(Sample(decel, bool(begins)) for decel, begins in samples)
+            risk.perception.restore(arrays)
+            risk.brakes.set_lagged(*arrays["lagged"].tolist())
+            risk._by_state = np.array([arrays[name] for name in ("onsets", "exposure", "seconds")])
+            for name, latest in risk.brakes.doubts.items():
+                pairs = arrays.get(f"doubts_{name}", np.empty(0)).reshape(-1, 2)  # new in format 4
+                for value, begins in pairs.tolist():
+                    latest.add(Sample(value, bool(begins)))
+        return risk
+
+    @property
+    def _settings(self) -> dict[str, float]:
+        names = ("lowest", "dt", "leader_decel", "own_brakes", "margin", "hard")
+        return {name: getattr(self, name) for name in names}
+
+    def _learnt(self) -> dict[str, NDArray[np.float64]]:
+        return {
+            "decels": np.array(self.manoeuvres.decels),
+            "gentle": np.array([self.manoeuvres.gentle], dtype=np.float64),
+            "brakes": np.array([sample.value for sample in self.brakes.samples]),
+            "stretches": np.array([float(sample.begins) for sample in self.brakes.samples]),
+            **self.perception.learnt(),
+            "lagged": np.array(self.brakes.lagged),
+            **{
+                f"doubts_{name}": np.array(list(latest), dtype=np.float64).reshape(-1)
+                for name, latest in self.brakes.doubts.items()
+            },
+            **dict(zip(("onsets", "exposure", "seconds"), self._by_state, strict=True)),
+        }
+
+
+def _three_finite(observation: ArrayLike, *, whole: bool = True) -> Three:
+    """Gap and speeds, as they can be judged; unless they must be ``whole``, NaN where not seen."""
+    seen = _series("observation", observation)
+    if len(seen) != 3:
+        raise ValueError(
+            f"observation has shape {seen.shape}; it must be (3,): gap, speed of the follower "
+            "and of the leader"
+        )
+    gap, speed, leader_speed = seen.tolist()
+    if not math.isfinite(gap + speed + leader_speed):  # looked at closely only where it has to be
+        refuse_unusable("observation", seen if whole else seen[~np.isnan(seen)])
+    return gap, speed, leader_speed
+
+
+def _one_finite(name: str, value: float) -> float:
+    if type(value) is float and abs(value) <= LARGEST_OBSERVATION:  # false of NaN
+        return value
+    given = _series(name, [value])
+    refuse_unusable(name, given)
+    return float(given[0])
+
+
+def _finite(name: str, values: ArrayLike) -> NDArray[np.float64]:
+    array = _series(name, values)
+    if not np.isfinite(array).all():
+        refuse_unusable(name, array)
+    return array
+
+
+def _series(name: str, values: ArrayLike) -> NDArray[np.float64]:
+    """Real numbers in a row; what is that already is not looked at for long, nor copied."""
+    if (
+        type(values) is np.ndarray
+        and values.dtype == np.float64
+        and values.ndim == 1
+        and len(values)
+        and values.flags.carray  # a read-only one would be compiled for
+    ):
+        return values
+    return real_array(name, values, 1)
+
+
+@compiled
+def _judge(
+    observation: Three,
+    accelerations: NDArray[np.float64],
+    before: float,
+    decel: float,
+    lag: float,
+    margin: float,
+    dt: float,
+    table: NDArray[np.float64],
+    evidence: float,
+    judged: NDArray[np.float64],
+) -> bool:
+    """Write risk, its interval and the critical deceleration; False if an action is no number."""
+    for acceleration in accelerations:
+        if not np.isfinite(acceleration):
+            return False
+    body = Body(decel, lag, margin)
+    critical_decelerations(observation, accelerations, before, body, 0, dt, judged[3])
+    for k in range(len(accelerations)):
+        judged[0, k] = _interpolated(judged[3, k], table)
+        judged[1, k], judged[2, k] = wilson_bounds(judged[0, k], evidence + 1.0)
+    return True
+
+
+@inner_kernel
+def _interpolated(x: float, table: NDArray[np.float64]) -> float:
+    """What `numpy.interp` returns for a number, which takes long to compile."""
+    low, high = 0, table.shape[1] - 1
+    if x <= table[0, low]:
+        return float(table[1, low])
+    if x >= table[0, high]:
+        return float(table[1, high])
+    while high - low > 1:
+        middle = (low + high) // 2
+        if table[0, middle] <= x:
+            low = middle
+        else:
+            high = middle
+    slope = (table[1, high] - table[1, low]) / (table[0, high] - table[0, low])
+    return float(slope * (x - table[0, low]) + table[1, low])
+
+
+@compiled
+def _count(
+    by_state: NDArray[np.float64], belief: NDArray[np.float64], dt: float, braking: bool
+) -> bool:
+    """Add the time of a decision to the states; nothing, and False, if ``belief`` is none."""
+    total = 0.0
+    for share in belief:
+        if not share >= 0.0:
+            return False
+        total += share
+    if not abs(total - 1.0) < 1e-6:
+        return False
+    for k in range(len(belief)):
+        by_state[2, k] += dt * belief[k]
+        if not braking:
+            by_state[1, k] += dt * belief[k]
+    return True
+
+
+@compiled
+def _weighed(by_state: NDArray[np.float64], belief: NDArray[np.float64]) -> float:
+    """Mean over states; of those that were never counted it is 0."""
+    total = 0.0
+    for k in range(min(len(by_state), len(belief))):
+        total += by_state[k] * belief[k]
+    return total

@@ -1,0 +1,122 @@
+"""Rehearse what would happen: this action now, caution from then on, against a braking leader.
+
+The follower does what is asked of it for one decision interval and then brakes in full; the leader
+begins to brake, now or a little later, and keeps braking until it stands. The *critical
+deceleration* is the hardest braking of the leader that ends without a collision. Only kinematics
+is taken as known; how hard the follower itself can brake, how late it answers and how hard leaders
+brake is for others to learn.
+
+Asking for the fixed cautious policy, and not for the best of many uncertain answers, keeps luck
+out of the estimate. The authors of the paper test an action in the same spirit, by predicting the
+states it leads to before it is taken (Han, Filev, Ozguner, arXiv:2006.08092).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evofsm.core import compiled, kernel
+
+#: A leader who brakes harder is beyond physics; no critical deceleration is higher [m/s²].
+HARDEST = 15.0
+
+# Halvings of [0, HARDEST] in search of the critical deceleration: to 0.015 m/s².
+_HALVINGS = 10
+
+
+#: Gap [m], speed of the follower and of the leader [m/s].
+Three: TypeAlias = tuple[float, float, float]
+
+
+class Body(NamedTuple):
+    """What the follower is able to do, as far as is known."""
+
+    decel: float  #: full braking that it realises [m/s²], positive
+    lag: float  #: share of a decision interval in which the command before it still rules
+    margin: float  #: smallest gap that counts as no collision [m]
+
+
+@compiled
+def critical_decelerations(
+    observation: Three | NDArray[np.float64],
+    accelerations: NDArray[np.float64],
+    before: float,
+    body: Body,
+    onset: int,
+    dt: float,
+    critical: NDArray[np.float64],
+) -> None:
+    """Write the critical deceleration under each acceleration that could be commanded now.
+
+    ``before`` is the acceleration commanded last, ``onset`` after how many decision intervals
+    of ``dt`` the leader begins to brake.
+    """
+    for k in range(len(accelerations)):
+        low, high = 0.0, HARDEST
+        if survives(observation, accelerations[k], before, body, high, onset, dt):
+            critical[k] = HARDEST
+            continue
+        if not survives(observation, accelerations[k], before, body, low, onset, dt):
+            critical[k] = 0.0
+            continue
+        for _ in range(_HALVINGS):
+            middle = 0.5 * (low + high)
+            if survives(observation, accelerations[k], before, body, middle, onset, dt):
+                low = middle
+            else:
+                high = middle
+        critical[k] = low
+
+
+@kernel
+def survives(
+    observation: Three | NDArray[np.float64],
+    acceleration: float,
+    before: float,
+    body: Body,
+    leader_decel: float,
+    onset: int,
+    dt: float,
+) -> bool:
+    """Whether no collision comes of ``acceleration`` now and full braking after it."""
+    gap = observation[0] - body.margin
+    # Sensors may show a car that stands as one that rolls back.
+    speed, leader_speed = max(observation[1], 0.0), max(observation[2], 0.0)
+    caution = -body.decel
+    asked = max(acceleration, caution)
+    last = max(before, caution)
+    if speed <= 0.0 and max(asked, last) <= 0.0:
+        return bool(observation[0] > 0.0)  # who stands, and stays, may be closer than the margin
+    interval = 0
+    while gap > 0.0:
+        realised = body.lag * last + (1.0 - body.lag) * asked
+        if speed <= 0.0 and realised <= 0.0 and asked == caution:
+            return True
+        leader = -leader_decel if interval >= onset else 0.0
+        distance, speed = _drive_on(speed, realised, dt)
+        leader_distance, leader_speed = _drive_on(leader_speed, leader, dt)
+        gap += leader_distance - distance
+        if (
+            asked == caution and last == caution and interval >= onset
+        ):  # both brake until they stand
+            if leader_decel > body.decel:  # then the gap is smallest at the end, if it shrinks
+                leader_distance = 0.5 * leader_speed * leader_speed / leader_decel
+                left = gap + leader_distance - 0.5 * speed * speed / body.decel
+                return bool(min(gap, left) > 0.0)
+            if speed <= leader_speed:  # a faster leader who brakes less is never met
+                return bool(gap > 0.0)
+        last, asked = asked, caution
+        interval += 1
+    return False
+
+
+@kernel
+def _drive_on(speed: float, acceleration: float, dt: float) -> tuple[float, float]:
+    """Distance covered and speed reached in ``dt``; no one drives backwards."""
+    reached = speed + acceleration * dt
+    if reached >= 0.0:
+        return 0.5 * (speed + reached) * dt, reached
+    return -0.5 * speed * speed / acceleration, 0.0

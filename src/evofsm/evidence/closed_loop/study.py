@@ -1,0 +1,363 @@
+"""The closed loop: how many collisions are prevented, and what that costs.
+
+Every policy drives the same held-out draws. Ours learns first, from draws of its own, several
+times with other seeds; tuned baselines are tuned on the same training draws. Work is split by
+policy and learning seed over the cores, and put together in the order of the tasks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from functools import partial
+from importlib.util import find_spec
+from itertools import repeat
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from evofsm.core import Edges, FailureSplit, Novelty, StateRule
+from evofsm.driving import (
+    TUNED_MEASURES,
+    Draw,
+    EnvelopeReviser,
+    Family,
+    Group,
+    LatentRisk,
+    Learner,
+    Outcome,
+    Reference,
+    Row,
+    drive_alone,
+    fixed_policies,
+    held_out,
+    references,
+    score,
+    summarise,
+    training,
+)
+from evofsm.evidence.closed_loop.calibration import Reliability, run_calibration
+from evofsm.evidence.closed_loop.cases import CaseResult, run_cases
+from evofsm.evidence.closed_loop.separation import Separation, run_separation
+from evofsm.evidence.closed_loop.shift import Check, ShiftPlan, Stream, run_shift
+from evofsm.evidence.closed_loop.two_worlds import InWorld, run_two_worlds
+from evofsm.fleet import in_order
+from evofsm.guard import Reviser
+
+#: Collision rate at most, on so many held-out draws, for `episodes_until_safe`.
+SAFE_RATE, SAFE_EPISODES = 0.01, 200
+#: After so many training episodes the learning curve has a point.
+CHECKPOINTS = (0, 1, 2, 5, 10, 20, 50, 100, 200, 300)
+#: Tolerances of the trade-off.
+TOLERANCES = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.4)
+# Training episodes in the comparison of state rules.
+_RULE_TRAIN = 60
+#: State rules that are compared, by name.
+RULES: dict[str, StateRule | None] = {
+    "paper": None,
+    "edges": Edges(),
+    "novelty": Novelty(radius=1.0, scales=(4.0, 2.0, 2.0)),
+    "failure-split": FailureSplit(base=Novelty(radius=2.0, scales=(4.0, 2.0, 2.0))),
+}
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How much is driven."""
+
+    train: int = 300  #: training episodes
+    test: int = 1000  #: held-out episodes
+    seeds: int = 20  #: learning seeds
+    seed: int = 0  #: of everything
+    tolerance: float = 0.02
+    rule_seeds: int = 2  #: learning seeds in the comparison of state rules
+    rule_test: int = 100  #: held-out episodes in it, and in the trade-off
+    side_train: int = 100  #: training episodes of the studies beside the table
+    side_test: int = 300  #: held-out episodes of them
+    world_test: int = 50  #: episodes driven in both worlds
+    shift: ShiftPlan = field(default_factory=ShiftPlan)
+
+    def shortened(self) -> Plan:
+        """About a tenth of everything: a look, not evidence."""
+        return replace(
+            self,
+            train=min(self.train, 100),
+            test=min(self.test, 100),
+            seeds=min(self.seeds, 2),
+            rule_seeds=min(self.rule_seeds, 1),
+            rule_test=20,
+            side_train=40,
+            side_test=60,
+            world_test=5,
+            shift=replace(self.shift, before=60, after=10, held_out=20),
+        )
+
+
+class Point(NamedTuple):
+    """A point of the learning curve."""
+
+    learning_seed: int
+    episodes: int  #: learnt from
+    collisions: int  #: of `held_out`
+    held_out: int
+    mobility: float
+    states: int
+    train_collisions: int  #: so far, while learning
+
+
+class TradeOff(NamedTuple):
+    """What a policy reaches at one setting."""
+
+    policy: str
+    setting: str
+    collision_rate: float
+    mobility: float
+
+
+@dataclass(frozen=True)
+class ClosedLoop:
+    """All that the study measured on one family."""
+
+    family: Family
+    plan: Plan
+    rows: list[Row]  #: baselines, then ours for each learning seed
+    curve: list[Point] = field(default_factory=list)
+    trade_offs: list[TradeOff] = field(default_factory=list)
+    by_rule: list[Row] = field(default_factory=list)  #: risk read through the states alone
+    separations: list[Separation] = field(default_factory=list)
+    reliabilities: list[Reliability] = field(default_factory=list)
+    cases: list[CaseResult] = field(default_factory=list)  #: of the family `paper`
+    worlds: list[InWorld] = field(default_factory=list)  #: empty without SUMO
+    streams: list[Stream] = field(default_factory=list)  #: of families that shift
+    checks: list[Check] = field(default_factory=list)
+
+    def as_dict(self) -> dict[str, Any]:
+        """All of it, for JSON."""
+        lists = {
+            name: [one.as_dict() if isinstance(one, Row) else _plain(one) for one in values]
+            for name, values in vars(self).items()
+            if isinstance(values, list)
+        }
+        return {"family": self.family.name, "plan": asdict(self.plan), **lists}
+
+
+def run_closed_loop(
+    family: Family,
+    plan: Plan,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+    workers: int | None = None,
+) -> ClosedLoop:
+    """Drive all policies.
+
+    Parameters
+    ----------
+    family : Family
+    plan : Plan
+    progress : callable
+        Told how many tasks are done, of how many.
+    workers : int, optional
+        Processes; as many as there are cores unless told.
+    """
+    names = [policy.name for policy in fixed_policies(family)]
+    tasks: list[partial[Any]] = [
+        *(partial(_test_fixed, family, plan, name) for name in names),
+        *(partial(_test_tuned, family, plan, name) for name in TUNED_MEASURES),
+        *(partial(_test_learner, family, plan, seed) for seed in range(plan.seeds)),
+        *(
+            partial(_test_rule, family, plan, rule, seed)
+            for rule in RULES
+            for seed in range(min(plan.rule_seeds, plan.seeds))
+        ),
+        partial(run_separation, family, plan.side_train, plan.side_test, plan.seed),
+        partial(run_calibration, family, plan.side_train, plan.side_test, plan.seed),
+    ]
+    if find_spec("libsumo") is not None:
+        tasks.append(
+            partial(
+                run_two_worlds,
+                *(family, plan.side_train, plan.world_test, plan.tolerance, plan.seed),
+            )
+        )
+    if family.name == "paper":
+        tasks.append(partial(run_cases, family, plan.tolerance, plan.seed))
+    if family.shifted is not None:
+        shift = replace(plan.shift, seed=plan.seed, tolerance=plan.tolerance)
+        tasks += [partial(run_shift, family, shift, seed) for seed in range(plan.seeds)]
+    study = ClosedLoop(family, plan, [])
+    for result in in_order(tasks, workers, progress):
+        for name, values in result.items():
+            getattr(study, name).extend(values)
+    return study
+
+
+def _plain(record: Any) -> dict[str, Any]:
+    """A tuple of names, with those inside it, for JSON."""
+    return {
+        name: [_plain(one) if hasattr(one, "_asdict") else one for one in value]
+        if isinstance(value, tuple)
+        else value
+        for name, value in record._asdict().items()
+    }
+
+
+def _drive_all(
+    family: Family,
+    draws: Sequence[Draw],
+    base: Sequence[Reference],
+    revisers: Iterable[Reviser],
+    risk: LatentRisk | None = None,
+) -> list[Outcome]:
+    """Drive draws without learning, each with its reviser."""
+    drives = (
+        drive_alone(family, draw, reviser, risk)
+        for draw, reviser in zip(draws, revisers, strict=False)
+    )
+    return score(family, base, drives)
+
+
+def _test_fixed(family: Family, plan: Plan, name: str) -> dict[str, list[Any]]:
+    policy = next(policy for policy in fixed_policies(family) if policy.name == name)
+    draws = held_out(family, plan.seed, plan.test)
+    revisers = (policy.make(family, draw) for draw in draws)
+    outcomes = _drive_all(family, draws, references(family, draws), revisers)
+    return {"rows": [summarise(family.name, name, policy.group, outcomes, family.interval)]}
+
+
+def _test_tuned(family: Family, plan: Plan, name: str) -> dict[str, list[Any]]:
+    """Of the settings without a collision in training the fastest, else the safest."""
+    measures = TUNED_MEASURES[name]
+    draws = list(training(family, plan.seed, 0, min(plan.train, 100)))
+    base = references(family, draws)
+    tried: list[tuple[int, float, int]] = []
+    for index, measure in enumerate(measures):
+        reviser = EnvelopeReviser(measure, family.actions, family.interval)
+        outcomes = _drive_all(family, draws, base, repeat(reviser))
+        tried.append((sum(o.collided for o in outcomes), -_mobility(outcomes), index))
+    best = measures[min(tried)[2]]
+    reviser = EnvelopeReviser(best, family.actions, family.interval)
+    tests = held_out(family, plan.seed, plan.test)
+    outcomes = _drive_all(family, tests, references(family, tests), repeat(reviser))
+    row = summarise(
+        family.name,
+        name,
+        Group.TUNED,
+        outcomes,
+        family.interval,
+        train_episodes=len(draws) * len(measures),
+    )
+    return {
+        "rows": [row],
+        "trade_offs": [
+            TradeOff(name, repr(measures[i]), collisions / len(draws), -slower)
+            for collisions, slower, i in sorted(tried, key=lambda one: one[2])
+        ],
+    }
+
+
+def _test_learner(family: Family, plan: Plan, seed: int) -> dict[str, list[Any]]:
+    """Learn with one seed; test on the way and at the end."""
+    learner = Learner.new(family)
+    reviser = learner.reviser(family, plan.tolerance)
+    tests = held_out(family, plan.seed, plan.test)
+    base = references(family, tests)
+    checks = slice(SAFE_EPISODES)
+    checkpoints = [k for k in CHECKPOINTS if k <= plan.train]
+    curve: list[Point] = []
+    rows: list[Row] = []
+    collisions = 0
+    draws = training(family, plan.seed, seed, plan.train)
+    for episodes in range(plan.train + 1):
+        if episodes > 0:
+            drive = learner.drive(family, next(draws), reviser, learn=True)
+            collisions += drive.episode.collided
+        if episodes in checkpoints:
+            outcomes = _frozen(family, learner, plan.tolerance, tests[checks], base[checks])
+            curve.append(
+                Point(
+                    seed,
+                    episodes,
+                    sum(o.collided for o in outcomes),
+                    len(outcomes),
+                    _mobility(outcomes),
+                    learner.machine.n_states,
+                    collisions,
+                )
+            )
+        if episodes in {min(100, plan.train), plan.train}:
+            outcomes = _frozen(family, learner, plan.tolerance, tests, base)
+            rows.append(_final_row(family, outcomes, seed, episodes, collisions, curve))
+    few = slice(plan.rule_test)
+    trade_offs = _trade_offs(family, learner, tests[few], base[few]) if seed == 0 else []
+    return {"rows": rows, "curve": curve, "trade_offs": trade_offs}
+
+
+def _final_row(
+    family: Family,
+    outcomes: Sequence[Outcome],
+    seed: int,
+    episodes: int,
+    train_collisions: int,
+    curve: Sequence[Point],
+) -> Row:
+    safe = [point.episodes for point in curve if point.collisions <= SAFE_RATE * point.held_out]
+    return summarise(
+        family.name,
+        "evofsm",
+        Group.LEARNT,
+        outcomes,
+        family.interval,
+        learning_seed=seed,
+        train_episodes=episodes,
+        episodes_until_safe=safe[0] if safe else None,
+        train_collisions=train_collisions,
+    )
+
+
+def _trade_offs(
+    family: Family, learner: Learner, draws: Sequence[Draw], base: Sequence[Reference]
+) -> list[TradeOff]:
+    found = []
+    for tolerance in TOLERANCES:
+        outcomes = _frozen(family, learner, tolerance, draws, base)
+        rate = sum(o.collided for o in outcomes) / len(outcomes)
+        found.append(TradeOff("evofsm", f"{tolerance:g}", rate, _mobility(outcomes)))
+    return found
+
+
+def _test_rule(family: Family, plan: Plan, rule: str, seed: int) -> dict[str, list[Any]]:
+    """Steer by the states alone: what a rule's states are worth."""
+    learner = Learner.new(family, RULES[rule])
+    by_state = learner.reviser_by_state(family, plan.tolerance)
+    episodes = min(_RULE_TRAIN, plan.train)
+    taught = learner.teach(family, training(family, plan.seed, seed, episodes), by_state)
+    draws = held_out(family, plan.seed, min(plan.rule_test, plan.test))
+    drives = (learner.drive(family, draw, by_state, learn=False) for draw in draws)
+    outcomes = score(family, references(family, draws), drives)
+    row = summarise(
+        family.name,
+        f"states: {rule} ({learner.machine.n_states})",
+        Group.LEARNT,
+        outcomes,
+        family.interval,
+        learning_seed=seed,
+        train_episodes=episodes,
+        train_collisions=sum(drive.episode.collided for drive in taught),
+    )
+    return {"by_rule": [row]}
+
+
+def _frozen(
+    family: Family,
+    learner: Learner,
+    tolerance: float,
+    draws: Sequence[Draw],
+    base: Sequence[Reference],
+) -> list[Outcome]:
+    """Drive held-out draws with what was learnt so far."""
+    frozen = learner.frozen()
+    reviser = frozen.reviser(family, tolerance)
+    return _drive_all(family, draws, base, repeat(reviser), frozen.risk)
+
+
+def _mobility(outcomes: Iterable[Outcome]) -> float:
+    return float(np.mean([o.mobility for o in outcomes]))

@@ -1,0 +1,216 @@
+"""Detection: who sees danger, how early, and at how many false alarms.
+
+Every decision of unrevised held-out episodes is a case. Ours has watched other episodes without
+acting; thresholds are chosen, and probabilities calibrated, on yet others. Work is split by world
+and learning seed over the cores, and put together in the order of the tasks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from itertools import islice, product
+from typing import Any, NamedTuple
+
+from evofsm.driving import Group, ResponsibilitySensitiveSafety
+from evofsm.evidence.detection.measures import (
+    Detector,
+    Ours,
+    Watcher,
+    behind_filter,
+    classic,
+    fixed,
+    tuned,
+)
+from evofsm.evidence.detection.plan import FAMILIES, Plan, World, grid_world, world
+from evofsm.evidence.detection.rows import Judged, Reliable, Row, Scored, judge
+from evofsm.evidence.detection.watch import (
+    Exposure,
+    Target,
+    calibration_draws,
+    expose,
+    held_out_draws,
+    watch,
+)
+from evofsm.evidence.scores import auroc
+from evofsm.fleet import in_order
+
+#: Limits that are told to the safe distance of the grid that is wrong almost everywhere [m/s²].
+ASSUMED = (4.0, 6.0)
+#: Measures of the grid.
+IN_GRID = (Ours.DEFAULT, Ours.PAPER, "rss-r157", "rss-assumed", "rss-matched")
+
+
+@dataclass(frozen=True)
+class Detection:
+    """All that the study measured."""
+
+    plan: Plan
+    families: tuple[str, ...]
+    rows: list[Row]
+    grid: list[Row] = field(default_factory=list)
+    reliable: list[Reliable] = field(default_factory=list)
+
+    def find(self, family: str, measure: str, target: Target) -> Row:
+        """The row of one measure.
+
+        Raises
+        ------
+        KeyError
+            If there is none.
+        """
+        for row in self.rows:
+            if (row.family, row.measure, row.target) == (family, measure, target):
+                return row
+        raise KeyError(f"{measure} was not judged by {target} in {family}")
+
+
+def run_detection(
+    families: Sequence[str] = FAMILIES,
+    plan: Plan | None = None,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+    workers: int | None = None,
+    *,
+    grid: bool = True,
+) -> Detection:
+    """Judge every measure in every world.
+
+    Parameters
+    ----------
+    families : sequence of str
+        Names as `world` knows them.
+    plan : Plan, optional
+    progress : callable
+        Told how many tasks are done, of how many.
+    workers : int, optional
+        Processes; one per core if not given. The numbers do not depend on it.
+    grid : bool
+        Whether the grid of brakes that nobody knows is driven as well.
+
+    Raises
+    ------
+    ValueError
+        If a name is none, or there is no family at all.
+    """
+    chosen = plan or Plan()
+    if not families:
+        raise ValueError("there is no family to judge in")
+    for name in families:  # so that a wrong name shows at once
+        world(name, chosen)
+    longest = sorted(families, key=lambda name: -chosen.hours_of(name))
+    tasks: list[partial[Any]] = [partial(_judge_world, name, chosen) for name in longest]
+    tasks += [
+        partial(_other_seed, name, chosen, seed)
+        for name, seed in product(families, range(1, chosen.seeds))
+    ]
+    if grid:
+        tasks += [
+            partial(_judge_cell, decel, leader_decel, chosen)
+            for decel, leader_decel in product(chosen.grid, chosen.grid_leader)
+        ]
+    found = in_order(tasks, workers, progress)
+    by_name = dict(zip(longest, found, strict=False))
+    judged = [one for name in families for one in by_name[name]]
+    areas = [area for result in found if isinstance(result, _Areas) for area in result.areas]
+    return Detection(
+        chosen,
+        tuple(families),
+        [_with_seeds(one.row, areas) for one in judged],
+        [row for result in found if isinstance(result, _Cell) for row in result.rows],
+        [fit for one in judged for fit in one.reliable],
+    )
+
+
+class _Area(NamedTuple):
+    """Area under the ROC curve of another learning seed."""
+
+    family: str
+    measure: str
+    target: Target
+    auroc: float
+
+
+class _Areas(NamedTuple):
+    areas: list[_Area]
+
+
+class _Cell(NamedTuple):
+    rows: list[Row]
+
+
+def _judge_world(name: str, plan: Plan) -> list[Judged]:
+    here = world(name, plan)
+    hours = plan.hours_of(name)
+    watcher = Watcher(here.watched).watch(here.training(plan, 0))
+    held_out = expose(here.family, held_out_draws(here.family, plan.seed), hours)
+    calibration = expose(here.settled, calibration_draws(here.settled, plan.seed), hours)
+    training = _first_watched(here, plan)
+    detectors = [*watcher.detectors(), *fixed(here.family)]
+    if any(watcher.risk.perception.noise):
+        detectors += behind_filter(here.family, watcher.risk)
+
+    def scored(detector: Detector) -> tuple[Detector, Scored, Scored]:
+        now, before = (Scored(one, detector.score(one)) for one in (held_out, calibration))
+        return detector, now, before
+
+    known = [scored(detector) for detector in detectors]
+    return [
+        judge(name, detector, target, on_held_out, on_calibration, plan.rounds)
+        for target in Target
+        for detector, on_held_out, on_calibration in [*known, scored(tuned(training, target))]
+    ]
+
+
+def _first_watched(here: World, plan: Plan) -> Exposure:
+    """What baselines are tuned on: the world that is watched first, before any shift."""
+    draws = islice(here.training(plan, 0), plan.train)
+    return Exposure(here.watched, tuple(watch(family, draw) for family, draw in draws))
+
+
+def _other_seed(name: str, plan: Plan, seed: int) -> _Areas:
+    """How far what is learnt depends on what happened to be watched."""
+    here = world(name, plan)
+    watcher = Watcher(here.watched).watch(here.training(plan, seed))
+    held_out = expose(here.family, held_out_draws(here.family, plan.seed), plan.seed_hours)
+    areas = []
+    for detector in watcher.detectors():
+        scores = detector.score(held_out)
+        for target in Target:
+            cases = held_out.cases(target)
+            area = auroc(scores[cases.rows], cases.truth)
+            areas.append(_Area(name, detector.name, target, area))
+    return _Areas(areas)
+
+
+def _with_seeds(row: Row, areas: Sequence[_Area]) -> Row:
+    """With those of the other learning seeds, where there are some."""
+    mine = (row.family, row.measure, row.target)
+    return replace(row, auroc_seeds=tuple(one.auroc for one in areas if one[:3] == mine))
+
+
+def _judge_cell(decel: float, leader_decel: float, plan: Plan) -> _Cell:
+    """One world of the grid, by dead ends alone."""
+    here = grid_world(decel, leader_decel, plan)
+    watcher = Watcher(here.watched).watch(here.training(plan, 0))
+    held_out = expose(here.family, held_out_draws(here.family, plan.seed), plan.grid_hours)
+    assumed = ResponsibilitySensitiveSafety.matched(*ASSUMED)
+    known: list[Detector] = [
+        *watcher.detectors(),
+        *fixed(here.family),
+        classic("rss-assumed", Group.FIXED, assumed),
+    ]
+    return _Cell(
+        [
+            judge(
+                here.name,
+                one,
+                Target.DEAD_END,
+                Scored(held_out, one.score(held_out)),
+                None,
+                plan.rounds,
+            ).row
+            for one in known
+            if one.name in IN_GRID
+        ]
+    )

@@ -1,0 +1,261 @@
+"""Forecasts of the coming state, on drives that nothing was learnt from.
+
+A machine learns the training episodes one after another, each row once, and ours learn beside it;
+then all is frozen, and every method forecasts the same rows of the held-out episodes. Scenarios
+are driven unrevised; each learning seed has its own training draws, all have the same held-out
+ones. Logs are split by run into parts, and each part is held out once.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from typing import Any, NamedTuple
+
+from evofsm.evidence.prediction.forecasters import (
+    REFERENCES,
+    Method,
+    Taught,
+    Together,
+    Variant,
+    ablate,
+    compare,
+)
+from evofsm.evidence.prediction.scoring import Row, Sums, row, score
+from evofsm.evidence.prediction.sources import (
+    FAMILIES,
+    LogSource,
+    Pace,
+    Source,
+    drive,
+    read,
+    split_logs,
+)
+from evofsm.fleet import in_order
+
+# More than there are test episodes in one part of the logs.
+_APART = 1_000_000
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How much is driven and read."""
+
+    train: int = 100  #: training episodes of a learning seed
+    test: int = 100  #: held-out episodes
+    fine_train: int = 20  #: the same, where every step of 0.01 s is observed
+    fine_test: int = 20
+    seeds: int = 20  #: learning seeds
+    fine_seeds: int = 5  #: learning seeds of those
+    parts: int = 3  #: into which runs are split
+    runs: int | None = None  #: of one origin at most; None for all
+    ablation: tuple[str, ...] = ("emergency", "stop_and_go")  #: families in the ablation
+    ablation_runs: int = 6  #: of one origin at most in the ablation; 0: none
+    rounds: int = 1000  #: of the bootstrap
+    seed: int = 0  #: of everything
+
+    def shortened(self) -> Plan:
+        """A look, not evidence."""
+        return replace(
+            self,
+            train=min(self.train, 40),
+            test=min(self.test, 30),
+            fine_train=min(self.fine_train, 5),
+            fine_test=min(self.fine_test, 5),
+            seeds=min(self.seeds, 2),
+            fine_seeds=min(self.fine_seeds, 1),
+            parts=min(self.parts, 2),
+            runs=12,
+            ablation=self.ablation[-1:],
+            rounds=min(self.rounds, 200),
+        )
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """All that was found."""
+
+    plan: Plan
+    rows: list[Row]
+    ablation: list[Row]  #: one learning seed, or one part of the runs; methods are `Variant`s
+    logs: tuple[LogSource, ...] = ()
+
+    def of(self, source: str, method: Method) -> list[Row]:
+        """Rows of a method, by horizon."""
+        return [one for one in self.rows if (one.source, one.method) == (source, method)]
+
+    @property
+    def sources(self) -> list[str]:
+        """Names of families and of origins of logs, in their order."""
+        return list(dict.fromkeys(one.source for one in self.rows))
+
+    def as_dicts(self) -> list[dict[str, Any]]:
+        """Rows for JSON; those of the ablation say so."""
+        return [
+            {**one.as_dict(), "ablation": part is self.ablation}
+            for part in (self.rows, self.ablation)
+            for one in part
+        ]
+
+    def as_dict(self) -> dict[str, Any]:
+        """All of it, for JSON."""
+        return {"plan": asdict(self.plan), "rows": self.as_dicts()}
+
+
+class _Scored(NamedTuple):
+    """What one method got in one round; persistence and batch are those of the same states."""
+
+    source: str
+    horizon: float
+    method: str
+    ours: Sums
+    persistence: Sums
+    batch: Sums
+
+
+def run_prediction(
+    plan: Plan,
+    logs: Sequence[LogSource] = (),
+    progress: Callable[[int, int], None] = lambda done, total: None,
+    workers: int | None = None,
+    families: Sequence[str] = FAMILIES,
+) -> Prediction:
+    """Let all methods forecast all sources.
+
+    Parameters
+    ----------
+    plan : Plan
+    logs : sequence of LogSource
+        Real drives; none if empty.
+    progress : callable
+        Told how many tasks are done, of how many.
+    workers : int, optional
+        Processes; as many as there are cores unless told. What comes out is the same.
+    families : sequence of str
+        That are driven.
+    """
+    logs = tuple(_at_most(one, plan.runs) for one in logs)
+    real = [
+        partial(_log_task, plan, one, part)
+        for one in logs
+        for part in range(min(plan.parts, len(one.files)))
+    ]
+    driven = [
+        partial(_family_task, plan, name, pace, seed)
+        for pace, seeds in ((Pace.DECISIONS, plan.seeds), (Pace.STEPS, plan.fine_seeds))
+        for name in families
+        for seed in range(seeds)
+    ]
+    ablated = [partial(_ablated_family, plan, name) for name in plan.ablation if name in families]
+    if plan.ablation_runs > 1:
+        few = (_at_most(one, plan.ablation_runs) for one in logs)
+        ablated += [partial(_ablated_logs, plan, one) for one in few]
+    # The longest first, so that no core is left waiting for them at the end.
+    tasks = [*real, *ablated, *driven]
+    found = in_order(tasks, workers, progress)
+    of_ablation = found[len(real) : len(real) + len(ablated)]
+    of_rows = found[len(real) + len(ablated) :] + found[: len(real)]
+    return Prediction(plan, list(_rows(plan, of_rows)), list(_rows(plan, of_ablation)), logs)
+
+
+def _at_most(source: LogSource, most: int | None) -> LogSource:
+    """At most so many runs, evenly chosen."""
+    if most is None or len(source.files) <= most:
+        return source
+    chosen = tuple(source.files[k * len(source.files) // most] for k in range(most))
+    return source._replace(files=chosen)
+
+
+def _rows(plan: Plan, found: Sequence[Sequence[_Scored]]) -> Iterator[Row]:
+    """A row for each method at each horizon of each source, in the order in which they came."""
+    rounds: dict[tuple[str, float, str], list[_Scored]] = defaultdict(list)
+    for one in (scored for task in found for scored in task):
+        rounds[one.source, one.horizon, one.method].append(one)
+    for (source, horizon, method), of_one in rounds.items():
+        yield row(
+            source,
+            horizon,
+            method,
+            [one.ours for one in of_one],
+            [one.persistence for one in of_one],
+            [one.batch for one in of_one],
+            plan.seed,
+            plan.rounds,
+        )
+
+
+# -- Tasks ----------------------------------------------------------------------------------------
+
+
+def _family_task(plan: Plan, name: str, pace: Pace, learning_seed: int) -> list[_Scored]:
+    return _scored(_drawn(plan, name, pace, learning_seed))
+
+
+def _log_task(plan: Plan, logs: LogSource, part: int) -> list[_Scored]:
+    return _scored(_part_of(plan, logs, part))
+
+
+def _ablated_family(plan: Plan, name: str) -> list[_Scored]:
+    return _scored_ablation(_drawn(plan, name, Pace.DECISIONS, 0))
+
+
+def _ablated_logs(plan: Plan, logs: LogSource) -> list[_Scored]:
+    return _scored_ablation(_part_of(plan, logs, 0))
+
+
+def _drawn(plan: Plan, name: str, pace: Pace, learning_seed: int) -> Source:
+    fine = pace is Pace.STEPS
+    train, test = (plan.fine_train, plan.fine_test) if fine else (plan.train, plan.test)
+    return drive(name, pace, plan.seed, learning_seed, train, test)
+
+
+def _part_of(plan: Plan, logs: LogSource, part: int) -> Source:
+    parts = min(plan.parts, len(logs.files))
+    train, test = split_logs(logs, plan.seed, part, parts)
+    return read(logs, train, test, first=part * _APART)
+
+
+def _scored(source: Source) -> list[_Scored]:
+    """Every method beside the references in its states."""
+    found = []
+    for seconds, sets in compare(source).items():
+        got: dict[str, Sums] = {}
+        for taught, forecasters in sets:
+            got |= _judge(source, taught, forecasters, seconds)
+        for method in Method:
+            persistence, batch = REFERENCES[method]
+            found.append(
+                _Scored(source.name, seconds, method, got[method], got[persistence], got[batch])
+            )
+    return found
+
+
+def _scored_ablation(source: Source) -> list[_Scored]:
+    """Every variant, in the order in which they build on each other."""
+    found = []
+    for seconds, sets in ablate(source).items():
+        of_variant: dict[str, _Scored] = {}
+        for taught, forecasters in sets:
+            got = _judge(source, taught, forecasters, seconds)
+            references = got.pop(Method.PERSISTENCE), got.pop(Method.BATCH)
+            of_variant |= {
+                name: _Scored(source.name, seconds, name, sums, *references)
+                for name, sums in got.items()
+            }
+        found += [of_variant[name] for name in Variant]
+    return found
+
+
+def _judge(
+    source: Source, taught: Taught, forecasters: Together, seconds: float
+) -> dict[str, Sums]:
+    pace = source.pace
+    return score(
+        forecasters,
+        taught.judged(source.test),
+        pace.steps(seconds),
+        pace.steps(pace.every),
+        source.first,
+    )

@@ -1,0 +1,43 @@
+"""What was asked of a study, and whether it came out: marks and colours follow this alone."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from evofsm.app import Table
+
+
+class Asked(NamedTuple):
+    """Something that was asked for, and what came out."""
+
+    claim: str
+    asked: str
+    measured: str
+    met: bool
+
+
+def failures(asked: Sequence[Asked]) -> tuple[str, ...] | None:
+    """A sentence for each that is not met; None where nothing could be judged."""
+    if not asked:
+        return None
+    return tuple(
+        f"{one.claim}: {one.measured}, where {one.asked} was asked." for one in asked if not one.met
+    )
+
+
+def tables_of_asked(asked: Sequence[Asked]) -> tuple[Table, ...]:
+    """All of it in a table; none where nothing could be judged."""
+    if not asked:
+        return ()
+    return (
+        Table(
+            "What was asked for",
+            ("target", "asked", "measured", "met"),
+            tuple(
+                (one.claim, one.asked, one.measured, "yes" if one.met else "no") for one in asked
+            ),
+            in_words=True,
+            failing=tuple(place for place, one in enumerate(asked) if not one.met),
+        ),
+    )

@@ -1,0 +1,10 @@
+"""The online evolving framework: a controller proposes, a reviser improves, a machine learns.
+
+The paper's Section 4. Nothing here knows who the controller is or where it drives.
+"""
+
+from __future__ import annotations
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,0 +1,237 @@
+"""Who takes part in a drive, written down so that the drive can be repeated: plain data, no code.
+
+Machine and judge are kept as the files that they save themselves to. A reviser is described by its
+settings. Judges, revisers and measures are known by the entry points of the group
+``evofsm.participants`` that an installed package declares: a name, and the class that it stands
+for. What is not known, such as a reviser of someone's own, is written by its name: its decisions
+are kept all the same, but cannot be replayed.
+"""
+
+from __future__ import annotations
+
+import base64
+import math
+import platform
+from collections.abc import Mapping
+from dataclasses import asdict
+from functools import cache
+from hashlib import sha256
+from importlib.metadata import EntryPoint, entry_points
+from io import BytesIO
+from typing import Any, Protocol, TypeVar
+
+import numba
+import numpy as np
+
+import evofsm
+from evofsm.core import EvolvingFSM, IntervalActions
+from evofsm.guard.oversight import Participants
+from evofsm.guard.protocols import ActionJudge, LearningJudge, Reviser
+from evofsm.guard.reviser import ActionReviser, Mode, Way
+
+# The judge of logs that do not name it.
+_JUDGE = "LatentRisk"
+
+
+@cache
+def _entry_points() -> Mapping[str, EntryPoint]:
+    return {point.name: point for point in entry_points(group="evofsm.participants")}
+
+
+def known(name: str) -> Any:
+    """The class that a name stands for.
+
+    Raises
+    ------
+    ValueError
+        If no installed package declares it.
+    """
+    if name not in _entry_points():
+        raise ValueError(f"no installed package declares a participant {name!r}")
+    return _entry_points()[name].load()
+
+
+def known_name(one: object) -> str | None:
+    """The name of a thing's class, if that stands for this very class."""
+    name = type(one).__name__
+    return name if name in _entry_points() and known(name) is type(one) else None
+
+
+class CannotBeReplayedError(Exception):
+    """Says why."""
+
+
+# -- What is written ------------------------------------------------------------------------------
+
+
+def describe(who: Participants) -> dict[str, Any]:
+    """All that it takes to begin where they are now."""
+    return {
+        "actions": asdict(who.actions),
+        "machine": None if who.machine is None else _file(who.machine),
+        "made_by": made_by(),
+        "reviser": _reviser(who),
+        "risk": None if who.risk is None else _file(who.risk),
+    }
+
+
+def made_by() -> dict[str, str]:
+    """What computes: floats are the same to the last bit only where this is."""
+    return {
+        "evofsm": evofsm.__version__,
+        "numba": numba.__version__,
+        "numpy": np.__version__,
+        "processor": platform.machine(),
+        "python": platform.python_version(),
+    }
+
+
+def settings(reviser: Reviser) -> dict[str, Any]:
+    """What may be changed while driving."""
+    if not isinstance(reviser, ActionReviser):
+        return {}
+    return {
+        "mode": reviser.mode.value,
+        "overridden": reviser.overridden,
+        "release": reviser.release,
+        "tolerance": reviser.tolerance,
+        "way": reviser.way.value,
+    }
+
+
+def learnt(machine: EvolvingFSM | None, risk: LearningJudge | None) -> dict[str, float]:
+    """A few sums that whatever is learnt changes."""
+    sums: dict[str, float] = {}
+    if machine is not None:
+        sums["states"] = machine.n_states
+        sums["failures"] = math.fsum(machine.endings.tolist())
+        sums["potential"] = math.fsum(machine.potentials.tolist())
+        sums["transitions"] = math.fsum(machine.decisions.ravel().tolist())
+    if risk is not None:
+        sums |= risk.sums(0 if machine is None else machine.n_states)
+    return sums
+
+
+class _Saved(Protocol):
+    def save(self, path: BytesIO) -> None: ...
+
+
+def _file(saved: _Saved) -> dict[str, str]:
+    file = BytesIO()
+    saved.save(file)
+    data = file.getvalue()
+    return {"file": base64.b64encode(data).decode(), "sha256": sha256(data).hexdigest()}
+
+
+def _reviser(who: Participants) -> dict[str, Any]:
+    """By what it is made of; without it only the class, if it is not known how to make it."""
+    reviser = who.reviser
+    described: dict[str, Any] = {"class": type(reviser).__name__, "known": True}
+    if type(reviser) is ActionReviser:
+        described |= {"judge": _judge(reviser.risk, who), "settings": settings(reviser)}
+        described["known"] = described["judge"] is not None and reviser.actions == who.actions
+        return described
+    made_of = reviser.described() if known_name(reviser) else None  # type: ignore[attr-defined]
+    return described | (made_of or {}) | {"known": made_of is not None}
+
+
+def _judge(judge: ActionJudge, who: Participants) -> dict[str, Any] | None:
+    """Whom the reviser asks, if those who learn are whom it asks."""
+    name = known_name(judge)
+    if name is None:
+        return None
+    if judge is who.risk:
+        return {"class": name}
+    if getattr(judge, "risk", None) is who.risk and getattr(judge, "machine", None) is who.machine:
+        return {"class": name, **judge.described()}  # type: ignore[attr-defined]
+    return None
+
+
+# -- What is made of it again ---------------------------------------------------------------------
+
+
+def restore(described: Mapping[str, Any]) -> Participants:
+    """Those that `describe` wrote down.
+
+    Raises
+    ------
+    CannotBeReplayedError
+        If the reviser is not known here.
+    KeyError, TypeError, ValueError
+        If they are described as nothing that there is.
+    """
+    reviser = described["reviser"]
+    if not reviser["known"]:
+        raise CannotBeReplayedError(
+            f"{reviser['class']} is no reviser that is known here, or asks a risk that was not "
+            "told what happened"
+        )
+    actions = IntervalActions(**described["actions"])
+    machine = _restored(EvolvingFSM, described["machine"])
+    risk = _restored(known(_JUDGE), described["risk"])
+    again = _restored_reviser(reviser, actions, machine, risk)
+    who = Participants(actions, again, machine, risk)
+    if _names(described["actions"]) != _names(asdict(actions)) or (
+        _names(reviser) != _names(_reviser(who))
+    ):
+        raise ValueError("the actions or the reviser are described by other names than are written")
+    return who
+
+
+def _names(described: Any) -> Any:
+    """Without what they stand for."""
+    if not isinstance(described, Mapping):
+        return None
+    return {name: _names(value) for name, value in described.items()}
+
+
+_Kept = TypeVar("_Kept", EvolvingFSM, LearningJudge)
+
+
+def _restored(kind: type[_Kept], kept: Mapping[str, Any] | None) -> _Kept | None:
+    if kept is None:
+        return None
+    data = base64.b64decode(kept["file"], validate=True)
+    if sha256(data).hexdigest() != kept["sha256"]:
+        raise ValueError(f"the {kind.__name__} in it has not the SHA-256 that is said")
+    return kind.load(BytesIO(data))
+
+
+def _restored_reviser(
+    described: Mapping[str, Any],
+    actions: IntervalActions,
+    machine: EvolvingFSM | None,
+    risk: LearningJudge | None,
+) -> Reviser:
+    if described["class"] != "ActionReviser":
+        reviser: Reviser = known(described["class"]).restored(described, actions)
+        return reviser
+    reviser = ActionReviser(_restored_judge(described["judge"], machine, risk), actions)
+    set_again(reviser, described["settings"])
+    return reviser
+
+
+def _restored_judge(
+    described: Mapping[str, Any], machine: EvolvingFSM | None, risk: LearningJudge | None
+) -> ActionJudge:
+    if risk is None:
+        raise ValueError("the reviser asks a risk, but none is there")
+    kind = known(described["class"])
+    if kind is type(risk):
+        return risk
+    if machine is None:
+        raise ValueError("the reviser asks the states of a machine, but none is there")
+    judge: ActionJudge = kind.restored(described, machine, risk)
+    return judge
+
+
+def set_again(reviser: Reviser, kept: Mapping[str, Any]) -> None:
+    """Give a reviser the `settings` that it had."""
+    if not isinstance(reviser, ActionReviser):
+        raise ValueError("settings are of an ActionReviser, but it is none")
+    reviser.mode, reviser.way = Mode(kept["mode"]), Way(kept["way"])
+    reviser.release, reviser.tolerance = float(kept["release"]), float(kept["tolerance"])
+    if kept["overridden"]:
+        reviser.take_over()
+    else:
+        reviser.hand_back()

@@ -1,0 +1,212 @@
+"""The few shapes that rooms agree on: who proposes, who judges, who revises."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from enum import IntFlag
+from typing import Any, NamedTuple, Protocol, Self, runtime_checkable
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from evofsm.core import Labels
+from evofsm.files import Place
+
+
+class Proposal(NamedTuple):
+    """What a controller wants to do.
+
+    Examples
+    --------
+    >>> Proposal(1.2)
+    Proposal(action=1.2, candidates=())
+    """
+
+    action: float  #: acceleration [m/s²]
+    candidates: tuple[float, ...] = ()  #: others it could do as well [m/s²]
+
+
+class Intake(IntFlag):
+    """What was wrong with an observation, and so what was done about it."""
+
+    WHOLE = 0  #: nothing
+    PARTIAL = 1  #: variables are missing: recognised by the others, and not learnt from
+    HELD = 2  #: the same, but recognised by the values of before
+    GAP = 4  #: it came long after the one before: no transition is learnt to it
+    REPEATED = 8  #: as old as the one before: nothing new is known, or learnt
+    LATE = 16  #: older than the one before: left out
+
+
+#: Observations that bring nothing new, and such as lack something.
+STALE, INCOMPLETE = Intake.REPEATED | Intake.LATE, Intake.PARTIAL | Intake.HELD
+
+
+class Situation(NamedTuple):
+    """Where the vehicle is, as it was observed and as the machine recognised it."""
+
+    observation: NDArray[np.float64]  #: (3,) gap [m], v_follower [m/s], v_leader [m/s]
+    belief: NDArray[np.float64]  #: (n,) distribution over states
+    state: int | None  #: index of the most probable state; None where there is none yet
+    surprise: float  #: divergence of forecast and belief [bit]; NaN where nothing was forecast
+    time: float  #: [s]
+    intake: Intake = Intake.WHOLE  #: whether the observation was whole and in time
+
+
+class Revision(NamedTuple):
+    """What a reviser made of a proposal, and why."""
+
+    executed: float  #: acceleration to command [m/s²]
+    proposed: float  #: acceleration that the controller wanted [m/s²]; NaN where it had none
+    risk_proposed: float  #: probability of failure under the proposal; NaN where not judged
+    risk_executed: float  #: the same for what is executed
+    interval: tuple[float, float]  #: 90 % interval of `risk_executed`
+    reason: str  #: in a few words
+    evidence: float  #: number of leaders' braking manoeuvres that the risks rest on
+    seen: float  #: time spent in states like this one before [s]; NaN where that is not known
+    advised: float  #: what the reviser would execute, whether or not it may act [m/s²]
+    explanation: str = ""  #: what a machine's experience says of it, where that was asked for
+
+
+class Controller(Protocol):
+    """Anything that drives the follower."""
+
+    def propose(self, observation: NDArray[np.float64], time: float = 0.0) -> Proposal:
+        """What it wants to do at ``time`` [s], seeing ``observation``.
+
+        The observation is ``[gap [m], v_follower [m/s], v_leader [m/s]]``, the gap from bumper
+        to bumper.
+        """
+        ...
+
+
+class Reviser(Protocol):
+    """Anything that keeps a proposal or replaces it by a better action."""
+
+    def start_episode(self) -> None:
+        """Forget what was under way."""
+        ...
+
+    def revise(self, situation: Situation, proposal: Proposal) -> Revision:
+        """What to execute instead of the proposal; the proposal itself where it will do."""
+        ...
+
+
+class Judgement(NamedTuple):
+    """How dangerous some actions are; an entry for each of them.
+
+    ``risk`` is the probability that failure can no longer be avoided if the action is taken now,
+    with its 90 % interval from ``low`` to ``high``.
+    """
+
+    risk: NDArray[np.float64]  #: (k,)
+    low: NDArray[np.float64]  #: (k,)
+    high: NDArray[np.float64]  #: (k,)
+    critical: NDArray[np.float64]  #: (k,) hardest disturbance that is survived, in its own unit
+    evidence: float  #: number of disturbances it rests on
+    seen: float = math.nan  #: time spent in states like this one [s]; NaN where that is not known
+
+
+class Fallback(NamedTuple):
+    """What is done where a controller proposes nothing that can be executed."""
+
+    action: float  #: put at the edge of the set of actions where it lies outside
+    doing: str  #: in words
+
+
+class Trial(NamedTuple):
+    """An action that has to be tried, because the judge does not know yet what it brings."""
+
+    action: float
+    unknown: str  #: what is not known, such as "own brakes not known yet"
+    how: str  #: such as "in full"
+    doing: str  #: such as "braking in full to learn them"
+    assumed: str  #: what is assumed until it is known
+
+
+class ActionJudge(Protocol):
+    """Anything that can be asked how dangerous an action is, whatever system it knows."""
+
+    #: What it calls the variables of an observation.
+    labels: Labels
+    #: What is done without a usable proposal.
+    fallback: Fallback
+
+    def judge(self, situation: Situation, actions: ArrayLike, /) -> Judgement:
+        """How dangerous each action is."""
+        ...
+
+    def why(self, judged: Judgement, /) -> str:
+        """Why the first action that was judged is dangerous, in a few words."""
+        ...
+
+    def trial(self) -> Trial | None:
+        """What it has to try before its judgement can be relied on; None if nothing."""
+        ...
+
+    def effective(
+        self, situation: Situation, actions: NDArray[np.float64], /
+    ) -> NDArray[np.float64]:
+        """What actions come to here, where some of them would change nothing."""
+        ...
+
+    def refuse_unfit(self, low: float, high: float, /) -> None:
+        """Raise a ValueError if it counts on actions outside ``low`` to ``high``."""
+        ...
+
+
+@runtime_checkable
+class LearningJudge(ActionJudge, Protocol):
+    """A judge that learns from what happens, and can be kept in a file."""
+
+    dt: float  #: time between decisions [s]
+
+    def learn(self, observation: ArrayLike, action: float, belief: ArrayLike, /) -> None:
+        """Take in an observation, recognised as ``belief``, and the action executed after it."""
+        ...
+
+    def watch(self, observation: ArrayLike, action: float, belief: ArrayLike, /) -> None:
+        """Learn where someone else acts."""
+        ...
+
+    def follow(self, observation: ArrayLike, action: float, /) -> None:
+        """Keep up with what happens, without learning from it."""
+        ...
+
+    def start_episode(self, *, learn: bool = True) -> None:
+        """What comes is not a consequence of what was."""
+        ...
+
+    def sums(self, n_states: int, /) -> dict[str, float]:
+        """A few sums, by name, that whatever is learnt changes."""
+        ...
+
+    def save(self, path: Place, provenance: Mapping[str, Any] | None = None) -> None:
+        """Write what was learnt to a file."""
+        ...
+
+    @classmethod
+    def load(cls, path: Place) -> Self:
+        """Read what was learnt, between two episodes."""
+        ...
+
+
+class RiskMeasure(Protocol):
+    """Anything that says how dangerous a situation is."""
+
+    def score(self, observations: NDArray[np.float64], dt: float) -> NDArray[np.float64]:
+        """Danger of each row of an episode, from it and the rows before it only.
+
+        Parameters
+        ----------
+        observations : (T, 3) ndarray
+            Gap [m], speed of the follower and of the leader [m/s], in the order of time.
+        dt : float
+            Time between two rows [s].
+
+        Returns
+        -------
+        (T,) ndarray
+            In the measure's own unit; higher is more dangerous. Above 0 it calls for braking.
+        """
+        ...

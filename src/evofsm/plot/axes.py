@@ -1,0 +1,746 @@
+"""Plots of a model, of beliefs and of a drive, each on axes that are given, or on new ones.
+
+They draw in whatever style holds, and set none. Functions that ``plot_`` are for everyone; those
+below them draw the same things in the figures of the studies.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from evofsm.core import FSMModel, Policy, Trace, variable_label
+from evofsm.driving import Drive
+from evofsm.extras import needs
+
+with needs("matplotlib", "plot", "plotting"):
+    from matplotlib.colors import Normalize
+    from matplotlib.patches import FancyArrowPatch
+    from matplotlib.patheffects import withStroke
+    from matplotlib.ticker import MaxNLocator
+
+    from evofsm.plot.style import (
+        DEAD_END,
+        FOLLOWER,
+        INK,
+        MOST_DISCS,
+        SOFT,
+        draw_collision,
+        draw_state,
+        ink,
+        label_of,
+        points,
+    )
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.axis import Axis
+    from matplotlib.image import AxesImage
+
+#: Of probabilities, from 0 on.
+COLORS = "Blues"
+#: Up to so many states a matrix has room for its values.
+MOST_VALUES = 8
+# Up to so many states each has its number on an axis.
+_MOST_TICKS = 12
+# How much of the colour of type arrows have.
+_PALE, _DARK = 0.19, 0.6923
+
+
+# -- Of a model -------------------------------------------------------------------------------
+
+
+def plot_states(
+    model: FSMModel,
+    ax: Axes | None = None,
+    *,
+    variables: tuple[int, int] = (0, 1),
+    dead_ends: Collection[int] = (),
+) -> Axes:
+    """Centres of the states in the plane of two variables.
+
+    A state is recognised by the distance in all variables, so that no plane alone decides. Where
+    discs would overlap they are moved apart and point to their place. What is on the axes before,
+    observations for example, sets their limits as well.
+
+    Parameters
+    ----------
+    model : FSMModel
+    ax : matplotlib.axes.Axes, optional
+        Where to plot; without it on new axes of pyplot.
+    variables : (int, int)
+        Indices of the variables to the right and upward.
+    dead_ends : collection of int
+        Indices of states to mark by a hexagon, as `by_state.assess_states` finds them.
+
+    Returns
+    -------
+    matplotlib.axes.Axes
+        Those that were plotted on.
+
+    Raises
+    ------
+    ValueError
+        If there are no states, or no such variable or state.
+
+    Examples
+    --------
+    >>> from matplotlib.figure import Figure
+    >>> from evofsm import EvolvingFSM
+    >>> machine = EvolvingFSM(n_actions=1, radius=0.5)
+    >>> trace = machine.learn_many([[0.0, 3.0], [0.1, 3.0], [2.0, 5.0], [1.0, 4.0]], [0] * 4)
+    >>> model = machine.model(names=["gap", "speed"], units=["m", "m/s"])
+    >>> ax = plot_states(model, Figure().subplots(), dead_ends=[1])
+    >>> ax.get_xlabel(), ax.get_ylabel()
+    ('gap [m]', 'speed [m/s]')
+    """
+    _refuse_unknown(model, dead_ends)
+    for variable in variables:
+        if not 0 <= variable < model.n_variables:
+            raise ValueError(f"there is no variable {variable}: the model has {model.n_variables}")
+    ax = _given_or_new(ax)
+    centers = model.centers[:, list(variables)]
+    ax.update_datalim(centers)
+    ax.margins(0.1)
+    ax.autoscale_view()
+    limits = ax.axis()
+    draw_centers(ax, centers, dead_ends, size=13.0)
+    ax.axis(limits)
+    ax.set_xlabel(variable_label(model, variables[0]))
+    ax.set_ylabel(variable_label(model, variables[1]))
+    return ax
+
+
+def plot_graph(
+    model: FSMModel,
+    ax: Axes | None = None,
+    *,
+    policy: Policy = "observed",
+    dead_ends: Collection[int] = (),
+) -> Axes:
+    """The states on a circle, with arrows as wide as the next state is probable.
+
+    Staying is written beside the state; the two likeliest ways out of each state stand out.
+
+    Parameters
+    ----------
+    model : FSMModel
+    ax : matplotlib.axes.Axes, optional
+        Where to plot; without it on new axes of pyplot.
+    policy : {"observed", "marginal"}
+        How actions are weighed, as in `FSMModel.averaged_matrix`.
+    dead_ends : collection of int
+        Indices of states to mark by a hexagon and in words.
+
+    Returns
+    -------
+    matplotlib.axes.Axes
+        Those that were plotted on.
+
+    Raises
+    ------
+    ValueError
+        If there are no states, or no such state or policy.
+
+    Examples
+    --------
+    >>> from matplotlib.figure import Figure
+    >>> from evofsm import EvolvingFSM
+    >>> machine = EvolvingFSM(n_actions=1, radius=0.5)
+    >>> trace = machine.learn_many([[0.0], [0.1], [2.0], [1.0]], [0, 0, 0, 0])
+    >>> ax = plot_graph(machine.model(), Figure().subplots())
+    >>> "stays 77 %" in [text.get_text() for text in ax.texts]
+    True
+    """
+    _refuse_unknown(model, dead_ends)
+    ax = _given_or_new(ax)
+    matrix = model.averaged_matrix(policy)
+    notes = [f"stays {percent(value)}" for value in np.diag(matrix)]
+    draw_chain(ax, matrix, notes, dead_ends, widest=1.6, strongest=2)
+    between = matrix[~np.eye(len(matrix), dtype=bool)]
+    if len(between):
+        strong = "dark" if ink() < ink(0.0) else "bright"  # the ground is light, or is not
+        ax.annotate(
+            f"each arrow: {percent(between.min())} to {percent(between.max())}; "
+            f"{strong if len(matrix) <= MOST_DISCS else 'drawn'}: the two likeliest of each state",
+            (0.03, -0.03),
+            xycoords="axes fraction",
+            fontsize=points(7.0),
+            color=ink(),
+            annotation_clip=False,
+        )
+    return ax
+
+
+def plot_transitions(
+    model: FSMModel,
+    ax: Axes | None = None,
+    *,
+    action: int | None = None,
+    dead_ends: Collection[int] = (),
+) -> Axes:
+    """Transition probabilities as a heat map, from state (row) to state (column).
+
+    Parameters
+    ----------
+    model : FSMModel
+    ax : matplotlib.axes.Axes, optional
+        Where to plot; without it on new axes of pyplot. A colour bar takes some of their place.
+    action : int, optional
+        Index of an action, from 0; without it all actions as often as each was used.
+    dead_ends : collection of int
+        Indices of states whose numbers are bold.
+
+    Returns
+    -------
+    matplotlib.axes.Axes
+        Those that were plotted on.
+
+    Raises
+    ------
+    ValueError
+        If there are no states, or no such state or action.
+
+    Examples
+    --------
+    >>> from matplotlib.figure import Figure
+    >>> from evofsm import EvolvingFSM
+    >>> machine = EvolvingFSM(n_actions=2, radius=0.5)
+    >>> trace = machine.learn_many([[0.0], [0.1], [2.0], [1.0]], [0, 0, 0, 0])
+    >>> ax = plot_transitions(machine.model(), Figure().subplots(), action=0)
+    >>> [text.get_text() for text in ax.texts]  # in %
+    ['77', '23', '50', '50']
+    """
+    _refuse_unknown(model, dead_ends)
+    if action is not None and not 0 <= action < model.n_actions:
+        raise ValueError(f"there is no action {action}: the model has {model.n_actions}")
+    ax = _given_or_new(ax)
+    matrix = model.averaged_matrix("observed") if action is None else _matrix(model, action)
+    image = draw_matrix(ax, matrix, Normalize(0.0, float(matrix.max())), size=7.0)
+    ax.set_title("all actions, as used" if action is None else name_action(model, action))
+    for axis, way in ((ax.xaxis, "to"), (ax.yaxis, "from")):
+        label_states(axis, model.n_states, dead_ends)
+        axis.set_label_text(f"{way} state" + (" (bold: dead end)" if dead_ends else ""))
+    written = ", written in %" if model.n_states <= MOST_VALUES else ""
+    ax.figure.colorbar(image, ax=ax, label=f"probability of the next state{written}")
+    return ax
+
+
+def _matrix(model: FSMModel, action: int) -> NDArray[np.float64]:
+    return np.asarray(model.transition_matrices[action])
+
+
+# -- Of beliefs -------------------------------------------------------------------------------
+
+
+def plot_belief(
+    belief: ArrayLike | Trace,
+    ax: Axes | None = None,
+    *,
+    time: ArrayLike | None = None,
+    dead_ends: Collection[int] = (),
+) -> Axes:
+    """A belief as bars; or many of them over time, with the most probable state as a line.
+
+    Parameters
+    ----------
+    belief : (n,) or (T, n) array_like, or Trace
+        One distribution over states, or one in each row; a trace that holds beliefs.
+    ax : matplotlib.axes.Axes, optional
+        Where to plot; without it on new axes of pyplot. Over time, a colour bar takes some of
+        their place.
+    time : (T,) array_like, optional
+        When each row was observed [s], in rising order; without it rows are counted from 0.
+    dead_ends : collection of int
+        Indices of states to mark in words.
+
+    Returns
+    -------
+    matplotlib.axes.Axes
+        Those that were plotted on.
+
+    Raises
+    ------
+    ValueError
+        If the trace holds no beliefs, or shapes do not fit.
+
+    Examples
+    --------
+    >>> from matplotlib.figure import Figure
+    >>> from evofsm import EvolvingFSM
+    >>> machine = EvolvingFSM(n_actions=1, radius=0.5)
+    >>> trace = machine.learn_many([[0.0], [0.1], [2.0], [1.0]], [0] * 4, belief=True)
+    >>> ax = plot_belief(trace, Figure().subplots(), time=[0.0, 0.1, 0.2, 0.3])
+    >>> ax.get_xlabel(), ax.lines[0].get_ydata()  # the state is #2 at last
+    ('time [s]', array([1, 1, 1, 2]))
+    >>> plot_belief(machine.belief, Figure().subplots()).get_ylabel()
+    'belief'
+    """
+    if isinstance(belief, Trace):
+        if belief.belief is None:
+            raise ValueError("the trace holds no beliefs (learn_many(..., belief=True) keeps them)")
+        belief = belief.belief
+    rows = np.asarray(belief, dtype=np.float64)
+    if rows.ndim not in (1, 2) or rows.size == 0:
+        raise ValueError(f"belief has shape {rows.shape}; it must be (n,) or (T, n), not empty")
+    _refuse_unknown_states(rows.shape[-1], dead_ends)
+    if rows.ndim == 1:
+        if time is not None:
+            raise ValueError("time is given, but only one belief: (n,)")
+        return _plot_one_belief(rows, _given_or_new(ax), dead_ends)
+    when = np.arange(1.0 * len(rows)) if time is None else np.asarray(time, dtype=np.float64)
+    if when.shape != (len(rows),):
+        raise ValueError(f"time has shape {when.shape}; {len(rows)} beliefs need ({len(rows)},)")
+    ax = _given_or_new(ax)
+    _plot_beliefs(rows, when, ax, dead_ends)
+    ax.set_xlabel("observation" if time is None else "time [s]")
+    return ax
+
+
+def _plot_one_belief(belief: NDArray[np.float64], ax: Axes, dead_ends: Collection[int]) -> Axes:
+    states = np.arange(len(belief))
+    marked = np.isin(states, list(dead_ends))
+    bars = ax.bar(states, belief, color=np.where(marked, DEAD_END, FOLLOWER))
+    for state in states[marked]:
+        bars[state].set_hatch("///")
+        bars[state].set_edgecolor("white")
+        ax.annotate(
+            "dead end",
+            (state, belief[state]),
+            xytext=(0, 2),
+            textcoords="offset points",
+            ha="center",
+            va="bottom",
+            fontsize=points(7.0),
+            fontweight="bold",
+            color=DEAD_END,
+        )
+    label_states(ax.xaxis, len(belief), dead_ends)
+    ax.set_ylim(0.0, 1.0)
+    ax.set_xlabel("state")
+    ax.set_ylabel("belief")
+    return ax
+
+
+def _plot_beliefs(
+    rows: NDArray[np.float64], when: NDArray[np.float64], ax: Axes, dead_ends: Collection[int]
+) -> None:
+    n = rows.shape[1]
+    mesh = ax.pcolormesh(
+        when,
+        np.arange(1, n + 1),
+        rows.T,
+        cmap=COLORS,
+        vmin=0.0,
+        vmax=1.0,
+        shading="nearest",
+        rasterized=True,
+    )
+    ax.grid(False)
+    if n <= MOST_DISCS:  # among more it would hide the belief
+        (line,) = ax.step(
+            when, rows.argmax(axis=1) + 1, where="mid", color=INK, label="most probable state"
+        )
+        line.set_path_effects([withStroke(linewidth=3.0, foreground="white")])
+        _explain(ax)
+    name_rows(ax, n, dead_ends)
+    ax.set_ylabel("state")
+    # Below, for the words beside the rows stand to the right.
+    ax.figure.colorbar(mesh, ax=ax, label="belief", location="bottom", aspect=40)
+
+
+# -- Of a drive -------------------------------------------------------------------------------
+
+
+def plot_risk(drive: Drive, ax: Axes | None = None, *, tolerance: float | None = None) -> Axes:
+    """Latent risk over time: of what was proposed, and of what was executed, with its interval.
+
+    Parameters
+    ----------
+    drive : Drive
+        Under a reviser that judges actions.
+    ax : matplotlib.axes.Axes, optional
+        Where to plot; without it on new axes of pyplot.
+    tolerance : float, optional
+        The reviser's, drawn as a line.
+
+    Returns
+    -------
+    matplotlib.axes.Axes
+        Those that were plotted on.
+
+    Raises
+    ------
+    ValueError
+        If no decision of the drive was judged.
+
+    Examples
+    --------
+    >>> from matplotlib.figure import Figure
+    >>> from evofsm import IntervalActions
+    >>> from evofsm.driving import IDM, Framework, FunctionController, KinematicWorld, LatentRisk
+    >>> from evofsm.driving import Leader, Scenario
+    >>> from evofsm.guard import ActionReviser
+    >>> actions = IntervalActions(low=-4.0, high=2.5, width=0.5, outside="clip")
+    >>> reviser = ActionReviser(LatentRisk(lowest=-4.0), actions)
+    >>> leader = Leader(IDM(1.2, 25.0, 1.0, 1.0, 2.5), brake_decel=4.0, brake_time=12.0)
+    >>> framework = Framework(FunctionController(lambda z: 2.0), actions, reviser)
+    >>> drive = framework.drive(KinematicWorld(), Scenario(leader, initial_gap=10.0))
+    >>> ax = plot_risk(drive, Figure().subplots(), tolerance=reviser.tolerance)
+    >>> ax.get_ylabel()
+    'latent risk'
+    """
+    revisions = [decision.revision for decision in drive.decisions]
+    proposed = np.array([revision.risk_proposed for revision in revisions])
+    executed = np.array([revision.risk_executed for revision in revisions])
+    if not np.isfinite(executed).any():
+        raise ValueError(
+            "no decision of this drive was judged (was there a reviser, and was its mode not OFF?)"
+        )
+    ax = _given_or_new(ax)
+    low, high = np.array([revision.interval for revision in revisions]).T
+    when = _until_the_end(drive)
+    ax.fill_between(
+        when,
+        _held(low),
+        _held(high),
+        step="post",
+        color=FOLLOWER,
+        alpha=0.25,
+        linewidth=0.0,
+        label="90 % interval",
+    )
+    ax.step(when, _held(proposed), where="post", color=DEAD_END, linestyle="--", label="proposed")
+    ax.step(when, _held(executed), where="post", color=FOLLOWER, label="executed")
+    if tolerance is not None:
+        label = f"tolerance, {tolerance:g}"
+        ax.axhline(tolerance, color=ink(), linestyle=":", linewidth=1.0, label=label)
+    ax.set_ylim(-0.03, 1.03)
+    ax.set_ylabel("latent risk")
+    _finish(ax, drive, 0.0)
+    return ax
+
+
+def plot_accelerations(drive: Drive, ax: Axes | None = None) -> Axes:
+    """What was proposed and what was executed, over time; where they differ it is shaded.
+
+    Parameters
+    ----------
+    drive : Drive
+    ax : matplotlib.axes.Axes, optional
+        Where to plot; without it on new axes of pyplot.
+
+    Returns
+    -------
+    matplotlib.axes.Axes
+        Those that were plotted on.
+
+    Raises
+    ------
+    ValueError
+        If nothing was decided in the drive.
+
+    Examples
+    --------
+    >>> from matplotlib.figure import Figure
+    >>> from evofsm import IntervalActions
+    >>> from evofsm.driving import IDM, Framework, KinematicWorld, Leader, Scenario
+    >>> driver = IDM(1.2, 25.0, 1.0, 1.0, 2.5, lowest=-2.5, highest=2.5)
+    >>> actions = IntervalActions(low=-2.5, high=2.5, width=0.3, outside="clip")
+    >>> scenario = Scenario(Leader(driver, brake_decel=2.0, brake_time=5.0), initial_gap=10.0)
+    >>> drive = Framework(driver, actions).drive(KinematicWorld(), scenario)
+    >>> ax = plot_accelerations(drive, Figure().subplots())
+    >>> ax.get_ylabel()
+    'acceleration [m/s²]'
+    """
+    if not drive.decisions:
+        raise ValueError("nothing was decided in this drive")
+    ax = _given_or_new(ax)
+    when, proposed, executed = _until_the_end(drive), _held(drive.proposed), _held(drive.executed)
+    ax.axhline(0.0, color=SOFT, linewidth=0.6)
+    ax.fill_between(
+        when,
+        proposed,
+        executed,
+        step="post",
+        color=DEAD_END,
+        alpha=0.25,
+        linewidth=0.0,
+        label="revised",
+    )
+    ax.step(when, proposed, where="post", color=DEAD_END, linestyle="--", label="proposed")
+    ax.step(when, executed, where="post", color=FOLLOWER, label="executed")
+    ax.set_ylabel("acceleration [m/s²]")
+    _finish(ax, drive, float(executed[-1]))
+    return ax
+
+
+def _until_the_end(drive: Drive) -> NDArray[np.float64]:
+    """(D + 1,) times of the decisions, and the end of the drive [s]."""
+    times = [decision.situation.time for decision in drive.decisions]
+    return np.array([*times, float(drive.episode.time[-1])])
+
+
+def _held(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(D + 1,) what was decided; the last holds until the end."""
+    return np.append(values, values[-1])
+
+
+def _finish(ax: Axes, drive: Drive, y: float) -> None:
+    """Mark a collision at height ``y``, and explain."""
+    if drive.episode.collided:
+        draw_collision(ax, float(drive.episode.time[-1]), y)
+        ax.lines[-1].set_label("collision")
+    ax.set_xlabel("time [s]")
+    _explain(ax)
+
+
+def _explain(ax: Axes) -> None:
+    """Put the legend above, where it hides nothing."""
+    ax.legend(
+        loc="lower left",
+        bbox_to_anchor=(0.0, 1.0),
+        borderaxespad=0.2,
+        columnspacing=1.2,
+        fontsize=points(7.5),
+        frameon=False,
+        ncols=3,
+    )
+
+
+# -- Where to plot ----------------------------------------------------------------------------
+
+
+def _given_or_new(ax: Axes | None) -> Axes:
+    if ax is not None:
+        return ax
+    from matplotlib import pyplot  # late: whoever gives axes needs none of it
+
+    return pyplot.subplots(layout="constrained")[1]
+
+
+def _refuse_unknown(model: FSMModel, dead_ends: Collection[int]) -> None:
+    if model.n_states == 0:
+        raise ValueError("this model has no states: its machine had observed nothing")
+    _refuse_unknown_states(model.n_states, dead_ends)
+
+
+def _refuse_unknown_states(n: int, dead_ends: Collection[int]) -> None:
+    for state in dead_ends:
+        if not 0 <= state < n:
+            raise ValueError(f"dead_ends name state {state}, but there are states 0 to {n - 1}")
+
+
+# -- What the figures of studies draw as well -------------------------------------------------
+
+
+def percent(share: float) -> str:
+    """A share in whole percent: there is no room for more in a graph."""
+    return f"{100 * share:.0f} %"
+
+
+def draw_centers(
+    axes: Axes, centers: NDArray[np.float64], dead_ends: Collection[int], size: float
+) -> None:
+    """Draw centres (n, 2); where two discs would meet, they move apart and point to their place."""
+    places = centers
+    numbered = len(centers) <= MOST_DISCS
+    if numbered:
+        least = (size + 1.0) * axes.figure.dpi / 72.0
+        drawn = _move_apart(axes.transData.transform(centers), least)
+        places = axes.transData.inverted().transform(drawn)
+    for state, (center, (x, y)) in enumerate(zip(centers, places, strict=True)):
+        axes.plot([center[0], x], [center[1], y], color=ink(), linewidth=0.6, zorder=4.5)
+        axes.plot(*center, marker="o", markersize=1.6, color=ink(), zorder=4.5)
+        draw_state(axes, x, y, state, size, dead_end=state in dead_ends, numbered=numbered)
+
+
+def _move_apart(places: NDArray[np.float64], least: float) -> NDArray[np.float64]:
+    """Push points away from each other until no two are closer than ``least``."""
+    places = places.copy()
+    for _ in range(100):
+        quiet = True
+        for i in range(len(places)):
+            for j in range(i):
+                apart = places[i] - places[j]
+                distance = float(np.hypot(*apart))
+                if distance >= 0.99 * least:
+                    continue
+                quiet = False
+                way = apart / distance if distance > 0.0 else np.array([0.0, 1.0])
+                places[i] += 0.5 * (least - distance) * way
+                places[j] -= 0.5 * (least - distance) * way
+        if quiet:
+            break
+    return places
+
+
+def draw_chain(
+    axes: Axes,
+    weights: NDArray[np.float64],
+    notes: Sequence[str],
+    dead_ends: Collection[int],
+    widest: float,
+    strongest: int | None = None,
+    counted: bool = False,
+) -> None:
+    """Draw states on a circle, with notes, and arrows between them as wide as their weights.
+
+    With ``strongest`` all but so many arrows of each state are pale; ``counted`` weights are
+    written on the arrows.
+    """
+    _draw_nodes(axes, notes, dead_ends)
+    _draw_edges(axes, weights, dead_ends, widest, strongest, counted)
+
+
+def _place(n: int) -> NDArray[np.float64]:
+    """(n, 2) positions on a circle, the first on top, then clockwise."""
+    angle = 0.5 * np.pi - 2.0 * np.pi * np.arange(n) / max(n, 1)
+    return np.column_stack([np.cos(angle), np.sin(angle)])
+
+
+def _draw_nodes(axes: Axes, notes: Sequence[str], dead_ends: Collection[int]) -> None:
+    numbered = len(notes) <= MOST_DISCS
+    for state, ((x, y), note) in enumerate(zip(_place(len(notes)), notes, strict=True)):
+        dead_end = state in dead_ends
+        draw_state(axes, x, y, state, 13.0, dead_end=dead_end, numbered=numbered)
+        if not numbered and not dead_end:
+            note = str(state + 1)
+        axes.annotate(
+            f"dead end\n{note}" if dead_end else note,
+            (x, y),
+            xytext=(11.0 * x, 11.0 * y),
+            textcoords="offset points",
+            ha="center" if abs(x) < 0.2 else "left" if x > 0.0 else "right",
+            va="center" if abs(y) < 0.5 else "bottom" if y > 0.0 else "top",
+            fontsize=points(7.0 if numbered or dead_end else 5.5),
+            color=DEAD_END if dead_end else ink(),
+        )
+    axes.set_xlim(-1.75, 1.75)
+    axes.set_ylim(-1.35, 1.35)
+    axes.set_aspect("equal")
+    axes.set_axis_off()
+
+
+def _draw_edges(
+    axes: Axes,
+    weights: NDArray[np.float64],
+    dead_ends: Collection[int],
+    widest: float,
+    strongest: int | None,
+    counted: bool,
+) -> None:
+    """Draw an arrow from state to state, its width by weight; self-loops are left out."""
+    n = len(weights)
+    places = _place(n)
+    between = weights * (1.0 - np.eye(n))
+    heaviest = max(float(between.max(initial=0.0)), 1e-12)
+    rank = np.argsort(np.argsort(-between, axis=1), axis=1)
+    for i, j in np.argwhere(between > 0.005 * heaviest):
+        pale = strongest is not None and rank[i, j] >= strongest
+        if pale and n > MOST_DISCS:
+            continue
+        bend = 0.28 / float(np.hypot(*(places[j] - places[i])))
+        axes.add_patch(
+            FancyArrowPatch(
+                places[i],
+                places[j],
+                connectionstyle=f"arc3,rad={bend}",
+                arrowstyle="-|>",
+                mutation_scale=6.5,
+                shrinkA=7.5,
+                shrinkB=8.5,
+                linewidth=max(widest * between[i, j] / heaviest, 0.4),
+                color=ink(_PALE) if pale else DEAD_END if j in dead_ends else ink(_DARK),
+                zorder=1.5 if pale else 2.0,
+            )
+        )
+        if counted and n <= MOST_DISCS:
+            _write_on_arc(axes, places[i], places[j], bend, f"{weights[i, j]:.0f}")
+
+
+def _write_on_arc(
+    axes: Axes, start: NDArray[np.float64], end: NDArray[np.float64], bend: float, text: str
+) -> None:
+    """Write in the middle of an arrow that is bent by ``bend``."""
+    dx, dy = end - start
+    x, y = 0.5 * (start + end) + 0.5 * bend * np.array([dy, -dx])
+    axes.annotate(
+        text,
+        (x, y),
+        ha="center",
+        va="center_baseline",
+        fontsize=points(7.0),
+        bbox={"boxstyle": "round,pad=0.12", "facecolor": ink(0.0), "edgecolor": "none"},
+        zorder=3,
+    )
+
+
+def draw_matrix(
+    axes: Axes, matrix: NDArray[np.float64], scale: Normalize, size: float
+) -> AxesImage:
+    """Draw a transition matrix, its values in type of this ``size`` where there is room."""
+    image = axes.imshow(matrix, cmap=COLORS, norm=scale, interpolation="nearest")
+    axes.grid(False)
+    for spine in axes.spines.values():
+        spine.set_visible(False)
+    if len(matrix) <= MOST_VALUES:
+        for i, j in np.ndindex(matrix.shape):
+            axes.text(
+                j,
+                i,
+                f"{100 * matrix[i, j]:.0f}",
+                ha="center",
+                va="center_baseline",
+                fontsize=points(size),
+                color="white" if scale(matrix[i, j]) > 0.68 else INK,
+            )
+    return image
+
+
+def name_action(model: FSMModel, action: int) -> str:
+    """What an action is, and how many transitions were learnt with it."""
+    name = f"a({action + 1})"
+    if model.actions is not None:
+        name += f"  {model.actions.label(action)}".replace("-", "−") + " m/s²"
+    return f"{name}\n{model.uses[action]:,.0f} transitions"
+
+
+def label_states(axis: Axis, n: int, dead_ends: Collection[int], shown: bool = True) -> None:
+    """Put the states' numbers on an axis that counts them from 0, the dead ends' bold."""
+    step = math.ceil(n / _MOST_TICKS)
+    states = range(0, n, step)
+    axis.set_ticks(states, [str(state + 1) for state in states] if shown else [])
+    axis.set_tick_params(length=0, labelsize=points(7.0), pad=2.0)
+    for state, label in zip(states, axis.get_ticklabels(), strict=False):
+        if state in dead_ends:
+            label.set_color(DEAD_END)
+            label.set_fontweight("bold")
+
+
+def name_rows(axes: Axes, n: int, dead_ends: Collection[int], called: str = "dead end") -> None:
+    """Give each state a row, from 1 upward; those of dead ends are tinted, and called so."""
+    axes.set_ylim(0.4, n + 0.6)
+    if n <= _MOST_TICKS:
+        axes.set_yticks(range(1, n + 1), [label_of(state) for state in range(n)])
+    else:
+        axes.yaxis.set_major_locator(MaxNLocator(8, integer=True))
+    for state in dead_ends:
+        row = state + 1
+        axes.axhspan(row - 0.5, row + 0.5, color=DEAD_END, alpha=0.18, linewidth=0.0, zorder=0.5)
+        axes.annotate(
+            called,
+            (1.0, row),
+            xycoords=("axes fraction", "data"),
+            xytext=(4, 0),
+            textcoords="offset points",
+            va="center",
+            fontsize=points(7.0),
+            fontweight="bold",
+            color=DEAD_END,
+            annotation_clip=False,
+        )

@@ -1,1 +1,0 @@
-"""Studies: each makes numbers and draws nothing."""

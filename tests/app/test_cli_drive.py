@@ -1,0 +1,92 @@
+import json
+import subprocess
+import sys
+
+import pytest
+
+pytest.importorskip("typer")
+pytest.importorskip("scipy")
+
+
+def evofsm(*arguments):
+    command = [sys.executable, "-m", "evofsm", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, check=False)
+
+
+def test_drive_learns_saves_and_drives_frozen(tmp_path):
+    learnt = tmp_path / "learnt"
+    first = evofsm("drive", "emergency", "--episodes", 12, "--out", learnt)
+    assert first.returncode == 0, first.stderr
+    assert "0 of 12" in first.stdout
+    assert {path.name for path in learnt.iterdir()} == {
+        *("machine.evofsm", "risk.evofsm", "summary.json", "decisions.parquet"),
+    }
+    frozen = evofsm("drive", "emergency", "--episodes", 5, "--frozen", learnt, "--json")
+    row = json.loads(frozen.stdout)
+    assert row["episodes"] == 5
+    assert row["collisions"] == 0
+    further = tmp_path / "further"
+    again = evofsm("drive", "emergency", "--episodes", 2, "--learn", learnt, "--out", further)
+    assert again.returncode == 0, again.stderr
+    assert json.loads((further / "summary.json").read_text())["episodes_learnt"] == 14
+
+
+def test_decisions_are_recorded_with_their_reasons(tmp_path):
+    polars = pytest.importorskip("polars")
+    evofsm("drive", "emergency", "--episodes", 2, "--out", tmp_path / "out")
+    table = polars.read_parquet(tmp_path / "out" / "decisions.parquet")
+    assert {"proposed", "executed", "realised", "reason", "risk_proposed"} <= set(table.columns)
+    changed = table.filter(polars.col("proposed") != polars.col("executed"))
+    assert len(changed) > 0
+    assert changed["reason"].str.len_chars().min() > 10
+
+
+def test_left_to_itself_the_driver_collides_and_in_shadow_there_was_an_alarm():
+    row = json.loads(
+        evofsm("drive", "emergency", "--reviser", "none", "--episodes", 5, "--json").stdout
+    )
+    assert row["collision_rate"] > 0.5
+    shadow = evofsm("drive", "emergency", "--mode", "shadow", "--episodes", 5, "--json")
+    row = json.loads(shadow.stdout)
+    assert row["intervention_rate"] == 0.0
+    assert len(row["lead_times"]) == row["collisions"]
+    assert min(row["lead_times"]) > 1.0
+
+
+@pytest.mark.parametrize("controller", ["aggressive", "normal", "acc"])
+def test_any_controller_is_revised(controller):
+    result = evofsm("drive", "emergency", "--controller", controller, "--episodes", 3, "--json")
+    assert json.loads(result.stdout)["collisions"] == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "word"),
+    [
+        (("nowhere",), "nowhere"),
+        (("emergency", "--reviser", "magic"), "magic"),
+        (("emergency", "--controller", "magic"), "magic"),
+        (("emergency", "--controller", "sumo"), "sumo"),
+        (("emergency", "--mode", "maybe"), "maybe"),
+        (("emergency", "--mode", "shadow", "--reviser", "rss"), "rss"),
+        (("emergency", "--with", "rain"), "rain"),
+        (("emergency", "--frozen", "nothing-here"), "nothing-here"),
+        (("emergency", "--tolerance", "2"), "tolerance"),
+    ],
+)
+def test_what_cannot_be_driven_is_refused_in_one_line(arguments, word):
+    result = evofsm("drive", *arguments, "--episodes", 1)
+    assert result.returncode == 2
+    assert word in result.stderr
+    assert len(result.stderr.splitlines()) == 1
+
+
+def test_bench_prints_rows_as_json():
+    result = evofsm(
+        *("bench", "closed-loop", "--short", "--train", 3, "--test", 4, "--seeds", 1),
+        *("--workers", 2, "--json"),
+    )
+    assert result.returncode == 0, result.stderr
+    rows = json.loads(result.stdout)
+    assert {"unrevised", "evofsm", "aeb-ttc", "rss-r157", "rss-matched"} <= {
+        row["policy"] for row in rows
+    }

@@ -1,0 +1,74 @@
+import json
+import signal
+import subprocess
+import sys
+from urllib.parse import urlsplit
+from urllib.request import urlopen
+
+import pytest
+
+pytest.importorskip("websockets")
+
+from websockets.sync.client import connect
+
+pytestmark = pytest.mark.usefixtures("compiled")
+
+
+def watch(*arguments):
+    command = [sys.executable, "-m", "evofsm", "watch", *arguments]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def test_it_prints_an_address_that_answers_and_ends_with_control_c():
+    process = watch("paper", "--learn-first", "3", "--no-browser")
+    with process:
+        assert "steer the run" in process.stdout.readline()
+        address = process.stdout.readline().strip()
+        with urlopen(address, timeout=10) as answer:
+            assert b"<!doctype html>" in answer.read()
+        process.send_signal(signal.SIGINT)
+        rest, errors = process.communicate(timeout=20)
+    assert process.returncode == 0
+    assert rest == "\nevofsm: the page is closed\n"
+    assert errors == ""
+
+
+def test_paused_shows_the_first_frame():
+    with watch("paper", "--fresh", "--no-browser", "--paused") as process:
+        process.stdout.readline()
+        address = urlsplit(process.stdout.readline().strip())
+        socket = f"ws://{address.netloc}{address.path}socket"
+        with connect(socket, origin=f"http://{address.netloc}", proxy=None) as client:
+            shown = []
+            while "frame" not in {part["kind"] for part in shown}:
+                message = json.loads(client.recv(timeout=30))
+                shown += message.get("parts", [message])
+        process.send_signal(signal.SIGINT)
+        process.communicate(timeout=20)
+    assert process.returncode == 0
+    (frame,) = [part for part in shown if part["kind"] == "frame"]
+    (*_, clock) = [part for part in shown if part["kind"] == "clock"]
+    assert frame["number"] == 0
+    assert clock["paused"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error"),
+    [
+        (["paper", "--case", "5"], "--case is 5; paper has 1 to 4"),
+        (["paper", "--speed", "3"], "--speed is 3; it must be one of 0.25, 0.5, 1, 2, 4, 8"),
+        (["paper", "--fresh", "--learn", "x"], "--fresh and --learn exclude each other"),
+        (["missing.mcap"], "missing.mcap: no such file or directory"),
+        (["paper", "--reviser", "hope"], "there is no reviser 'hope'"),
+        (["paper", "--controller", "nobody"], "there is no controller 'nobody'"),
+    ],
+)
+def test_what_cannot_be_watched_is_said_in_a_line(arguments, error, capfd):
+    typer_testing = pytest.importorskip("typer.testing")
+    from evofsm.__main__ import application
+
+    result = typer_testing.CliRunner().invoke(
+        application(), ["watch", *arguments, "--no-browser", "--learn-first", "1"]
+    )
+    assert result.exit_code == 2
+    assert error in result.output + capfd.readouterr().err

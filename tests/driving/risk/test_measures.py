@@ -1,0 +1,285 @@
+import inspect
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from evofsm.driving.risk.drac import DecelerationToAvoidCollision, deceleration_to_avoid_collision
+from evofsm.driving.risk.fuzzy import FuzzySafety, critical_fuzzy, proactive_fuzzy
+from evofsm.driving.risk.headway import TimeHeadway, time_headway
+from evofsm.driving.risk.mttc import ModifiedTimeToCollision, modified_time_to_collision
+from evofsm.driving.risk.picud import Picud, picud
+from evofsm.driving.risk.r157 import PerformanceModel, distance_to_avoid
+from evofsm.driving.risk.rss import ResponsibilitySensitiveSafety, safe_distance
+from evofsm.driving.risk.ttc import TimeToCollision
+from evofsm.guard.protocols import RiskMeasure
+
+MEASURES = [
+    TimeToCollision(),
+    ModifiedTimeToCollision(),
+    DecelerationToAvoidCollision(),
+    TimeHeadway(),
+    Picud(),
+    ResponsibilitySensitiveSafety.r157(),
+    ResponsibilitySensitiveSafety.matched(2.5, 4.5),
+    PerformanceModel.regulation(),
+    PerformanceModel.careful_human(),
+    FuzzySafety(),
+]
+CAN_BE_ZERO = {"reaction", "response", "accel", "margin"}
+EVERY_MEASURE = pytest.mark.parametrize("measure", MEASURES, ids=repr)
+
+DT = 0.1
+SPEEDS = st.floats(0.0, 60.0)
+ROWS = st.tuples(st.floats(-10.0, 500.0), SPEEDS, SPEEDS)
+EPISODES = st.lists(ROWS, min_size=1, max_size=8).map(np.array)
+AT_EQUAL_SPEED = np.array([[10.0, 24.0, 24.0]])
+
+
+def last_score(measure, episode):
+    return measure.score(episode, DT)[-1]
+
+
+def at_least(larger, smaller):
+    return larger >= smaller or np.isclose(larger, smaller, rtol=1e-9, atol=1e-9)
+
+
+@EVERY_MEASURE
+def test_every_measure_has_the_shape_of_the_protocol(measure):
+    assert inspect.signature(type(measure).score) == inspect.signature(RiskMeasure.score)
+    hash(measure)
+
+
+@EVERY_MEASURE
+@given(EPISODES)
+def test_every_row_gets_a_score_and_observations_stay(measure, episode):
+    before = episode.copy()
+    scores = measure.score(episode, DT)
+    assert scores.shape == (len(episode),)
+    assert scores.dtype == np.float64
+    assert not np.isnan(scores).any()
+    np.testing.assert_array_equal(episode, before)
+
+
+@EVERY_MEASURE
+@given(arrays(float, (4, 3), elements=st.floats(-1e100, 1e100)))
+def test_no_score_is_missing_however_wild_the_numbers(measure, episode):
+    assert not np.isnan(measure.score(episode, DT)).any()
+
+
+@EVERY_MEASURE
+@given(EPISODES, SPEEDS, SPEEDS, st.floats(-10.0, 0.0))
+def test_nothing_is_more_dangerous_than_to_have_met(measure, episode, speed, leader, gap):
+    met = measure.score(np.vstack([episode, [[gap, speed, leader]]]), DT)
+    assert met[-1] > 0.0
+    assert met[-1] == met.max()
+
+
+@EVERY_MEASURE
+@given(EPISODES, st.floats(0.0, 100.0))
+def test_a_smaller_gap_is_not_safer(measure, episode, nearer):
+    closer = episode.copy()
+    closer[-1, 0] -= nearer
+    assert at_least(last_score(measure, closer), last_score(measure, episode))
+
+
+@EVERY_MEASURE
+@given(EPISODES, st.floats(0.0, 20.0))
+def test_a_faster_follower_is_not_safer(measure, episode, faster):
+    hasty = episode.copy()
+    hasty[-1, 1] += faster
+    assert at_least(last_score(measure, hasty), last_score(measure, episode))
+
+
+@EVERY_MEASURE
+@given(EPISODES, st.floats(0.0, 20.0))
+def test_a_faster_leader_is_not_more_dangerous(measure, episode, faster):
+    away = episode.copy()
+    away[-1, 2] += faster
+    assert at_least(last_score(measure, episode), last_score(measure, away))
+
+
+@EVERY_MEASURE
+@given(EPISODES, st.data())
+def test_later_rows_change_nothing(measure, episode, data):
+    rows = data.draw(st.integers(1, len(episode)))
+    np.testing.assert_array_equal(
+        measure.score(episode, DT)[:rows], measure.score(episode[:rows], DT)
+    )
+
+
+@EVERY_MEASURE
+def test_far_behind_a_faster_leader_nothing_calls_for_braking(measure):
+    assert measure.score(np.array([[200.0, 20.0, 25.0]]), DT) <= 0.0
+
+
+@EVERY_MEASURE
+def test_close_behind_a_standing_leader_everything_calls_for_braking(measure):
+    assert measure.score(np.array([[3.0, 20.0, 0.0]]), DT) > 0.0
+
+
+@EVERY_MEASURE
+def test_whole_numbers_are_taken(measure):
+    whole = np.array([[30, 20, 10], [29, 21, 10]])
+    np.testing.assert_array_equal(measure.score(whole, DT), measure.score(whole * 1.0, DT))
+
+
+@pytest.mark.parametrize("measure", MEASURES, ids=repr)
+@pytest.mark.parametrize("wrong", [-1.0, 0.0, float("nan"), float("inf"), "1"])
+def test_wrong_arguments_are_named(measure, wrong):
+    for field in fields(measure):
+        if wrong == 0.0 and (field.name in CAN_BE_ZERO or isinstance(measure, FuzzySafety)):
+            continue
+        with pytest.raises(ValueError, match=f"{type(measure).__name__} {field.name} is"):
+            replace(measure, **{field.name: wrong})
+
+
+def test_times_of_no_reaction_are_allowed():
+    assert Picud(reaction=0.0).reaction == 0.0
+    assert PerformanceModel(0.0, 6.0).reaction == 0.0
+    assert ResponsibilitySensitiveSafety(0.0, 0.0, 6.0, 6.0).response == 0.0
+    assert FuzzySafety(reaction=0.0, margin=0.0).margin == 0.0
+
+
+def test_fuzzy_arguments_that_do_not_fit_are_named():
+    with pytest.raises(ValueError, match=r"decel is 3\.0; it must not be below comfortable_decel"):
+        FuzzySafety(comfortable_decel=4.0, decel=3.0)
+    with pytest.raises(ValueError, match=r"threshold is 1\.0; it must be below 1"):
+        FuzzySafety(threshold=1.0)
+
+
+@pytest.mark.parametrize("measure", [ModifiedTimeToCollision(), FuzzySafety()], ids=repr)
+def test_measures_that_need_the_time_step_refuse_a_wrong_one(measure):
+    with pytest.raises(ValueError, match=r"dt is 0\.0"):
+        measure.score(AT_EQUAL_SPEED, 0.0)
+
+
+def test_at_equal_speed_some_are_blind_and_others_see():
+    blind = {TimeToCollision, ModifiedTimeToCollision, DecelerationToAvoidCollision}
+    for measure in MEASURES:
+        sees = measure.score(AT_EQUAL_SPEED, DT)[0] > 0.0
+        assert sees == (type(measure) not in blind | {PerformanceModel})
+
+
+def test_ttc_scores_by_its_inverse():
+    rows = np.array([[10.0, 25.0, 20.0], [10.0, 20.0, 20.0], [0.0, 20.0, 20.0]])
+    assert TimeToCollision(threshold=4.0).score(rows, DT).tolist() == [0.25, -0.25, np.inf]
+
+
+def test_mttc_is_ttc_while_accelerations_are_equal():
+    rows = np.array([[20.0, 25.0, 20.0], [19.5, 26.0, 21.0], [19.0, 26.0, 26.0]])
+    assert modified_time_to_collision(rows[:2], DT).tolist() == [4.0, 3.9]
+    assert modified_time_to_collision(rows, DT)[2] == np.inf
+
+
+def test_mttc_solves_for_the_first_meeting():
+    # Opening at 1 m/s, but 2 m/s² faster and faster: t² - t = 6.
+    rows = np.array([[6.0, 10.0, 13.0], [6.0, 10.0, 11.0]])
+    assert modified_time_to_collision(rows, 1.0)[1] == pytest.approx(3.0)
+    # Closing at 5 m/s, but braking by 2 m/s²: 5t - t² = 6, first at 2 s and never again.
+    rows = np.array([[6.0, 17.0, 10.0], [6.0, 15.0, 10.0]])
+    assert modified_time_to_collision(rows, 1.0)[1] == pytest.approx(2.0)
+    rows[1, 0] = 6.5
+    assert modified_time_to_collision(rows, 1.0)[1] == np.inf
+
+
+@given(st.floats(0.5, 100.0), st.floats(-20.0, 20.0), st.floats(-8.0, 8.0))
+def test_at_the_mttc_the_gap_is_closed(gap, closing, relative_acceleration):
+    assume(abs(relative_acceleration) > 1e-3)
+    before = closing - relative_acceleration
+    rows = np.array([[gap, 50.0 + before, 50.0], [gap, 50.0 + closing, 50.0]])
+    time = modified_time_to_collision(rows, 1.0)[1]
+    if np.isfinite(time):
+        closed = closing * time + relative_acceleration * time**2 / 2
+        assert closed == pytest.approx(gap, rel=1e-6, abs=1e-6)
+
+
+def test_drac_is_what_stops_the_closing_within_the_gap():
+    rows = np.array([[10.0, 30.0, 20.0], [10.0, 20.0, 30.0], [0.0, 20.0, 30.0]])
+    assert deceleration_to_avoid_collision(rows).tolist() == [5.0, 0.0, np.inf]
+    assert DecelerationToAvoidCollision(5.0).score(rows, DT).tolist() == [0.0, -5.0, np.inf]
+
+
+def test_headway_is_gap_over_own_speed():
+    rows = np.array([[30.0, 20.0, 0.0], [30.0, 0.0, 20.0], [-1.0, 0.0, 0.0]])
+    assert time_headway(rows).tolist() == [1.5, np.inf, 0.0]
+    assert TimeHeadway(2.0).score(rows, DT).tolist() == pytest.approx([1 / 6, -0.5, np.inf])
+
+
+def test_picud_is_the_gap_at_standstill():
+    # 30 m + 10²/6 m of the leader - 20 m of reaction - 20²/6 m of the follower.
+    assert picud(np.array([30.0, 20.0, 10.0]), 3.0, 1.0) == pytest.approx(-40.0)
+    assert Picud(3.0, 1.0).score(np.array([[30.0, 20.0, 10.0]]), DT) == pytest.approx(40.0)
+
+
+def test_rss_is_the_published_safe_distance():
+    speed, leader, response, accel, decel, leader_decel = 20.0, 15.0, 0.75, 3.0, 6.0, 7.0
+    published = (
+        speed * response
+        + accel * response**2 / 2
+        + (speed + response * accel) ** 2 / (2 * decel)
+        - leader**2 / (2 * leader_decel)
+    )
+    row = np.array([9.0, speed, leader])
+    assert safe_distance(row, response, accel, decel, leader_decel) == pytest.approx(published)
+    rss = ResponsibilitySensitiveSafety(response, accel, decel, leader_decel)
+    assert rss.score(row[None], DT) == pytest.approx(published - 9.0)
+    assert safe_distance(np.array([9.0, 5.0, 40.0]), response, accel, decel, leader_decel) == 0.0
+
+
+def test_constants_of_the_regulation():
+    assert ResponsibilitySensitiveSafety.r157() == ResponsibilitySensitiveSafety(0.75, 3, 6, 6)
+    matched = ResponsibilitySensitiveSafety(0.25, 2.5, 2.5, 4.5)
+    assert ResponsibilitySensitiveSafety.matched(2.5, 4.5) == matched
+    assert PerformanceModel.regulation() == PerformanceModel(0.35, 6.0)
+    assert PerformanceModel.careful_human() == PerformanceModel(0.75, 0.774 * 9.81)
+
+
+@given(st.floats(0.1, 100.0), st.floats(0.0, 30.0), st.floats(0.01, 30.0))
+def test_performance_models_brake_below_the_ttc_of_the_regulation(gap, leader, closing):
+    ttc = gap / closing
+    critical = closing / 12.0 + 0.35
+    assume(abs(ttc - critical) > 1e-6)
+    score = PerformanceModel.regulation().score(np.array([[gap, leader + closing, leader]]), DT)
+    assert (score[0] > 0.0) == (ttc < critical)
+
+
+def test_performance_models_score_in_metres_and_see_no_danger_in_opening_gaps():
+    rows = np.array([[17.0, 30.0, 18.0], [17.0, 18.0, 30.0]])
+    assert distance_to_avoid(rows, 0.5, 6.0).tolist() == [18.0, 0.0]
+    assert PerformanceModel(0.5, 6.0).score(rows, DT).tolist() == [1.0, -17.0]
+
+
+def test_pfs_falls_from_the_unsafe_to_the_safe_distance():
+    # Unsafe below 20 m and safe from 32 m on, behind a margin of 2 m.
+    gaps = np.array([21.0, 22.0, 28.0, 33.9, 34.0, 40.0, 0.0, -1.0])
+    rows = np.column_stack([gaps, np.full(8, 20.0), np.full(8, 20.0)])
+    pfs = proactive_fuzzy(rows, 1.0, 4.0, 5.0, 5.0, margin=2.0)
+    assert pfs == pytest.approx([1.0, 1.0, 0.5, 0.1 / 12.0, 0.0, 0.0, 1.0, 1.0])
+
+
+def test_cfs_falls_from_what_hard_to_what_comfortable_braking_needs():
+    # 10 m of reaction, then 10 m or 12.5 m of braking.
+    gaps = np.array([19.0, 20.0, 21.0, 22.5, 30.0])
+    rows = np.column_stack([gaps, np.full(5, 20.0), np.full(5, 10.0)])
+    assert critical_fuzzy(rows, DT, 1.0, 4.0, 5.0).tolist() == [1.0, 1.0, 0.6, 0.0, 0.0]
+
+
+def test_cfs_trusts_braking_that_is_under_way_up_to_the_comfortable():
+    # Braking by 3 m/s², 2 m/s too fast: 2²/6 m are needed.
+    rows = np.array([[9.0, 13.0, 8.0], [0.7, 10.0, 8.0], [0.6, 7.0, 5.0]])
+    assert critical_fuzzy(rows, 1.0, 1.0, 4.0, 5.0)[1:].tolist() == [0.0, 1.0]
+    # Braking by 8 m/s², taken for 4 m/s²: from 10 to 6 m/s in 8 m, then 36/10 or 36/8 m.
+    rows = np.array([[99.0, 28.0, 10.0], [12.05, 20.0, 10.0]])
+    assert critical_fuzzy(rows, 1.0, 1.0, 4.0, 5.0)[1] == pytest.approx(0.45 / 0.9)
+
+
+def test_fuzzy_safety_takes_the_more_dangerous_of_the_two():
+    rows = np.array([[60.0, 30.0, 20.0], [30.0, 15.0, 0.0], [4.5, 0.0, 0.0]])
+    model = FuzzySafety(threshold=0.25)
+    pfs = proactive_fuzzy(rows, 0.75, 4.0, 6.0, 7.0, 2.0)
+    cfs = critical_fuzzy(rows, DT, 0.75, 4.0, 6.0)
+    assert model.score(rows, DT).tolist() == (np.maximum(pfs, cfs) - 0.25).tolist()

@@ -1,0 +1,220 @@
+import subprocess
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+gymnasium = pytest.importorskip("gymnasium")
+
+from gymnasium.utils.env_checker import check_env  # noqa: E402
+
+from evofsm.driving.families.family import load_family  # noqa: E402
+from evofsm.driving.worlds.gym import ID, CarFollowing  # noqa: E402
+
+NAME = f"evofsm.driving.worlds.gym:{ID}"
+INFO = {"time", "gap", "distance", "failed", "rear_ended", "split", "index"}
+
+
+def drive(env, policy, **reset):
+    """What reset and every step answered, in an episode."""
+    answers = [env.reset(**reset)]
+    over = False
+    while not over:
+        answers.append(env.step([policy(answers[-1][0], answers[-1][-1])]))
+        over = answers[-1][2] or answers[-1][3]
+    return answers
+
+
+def own_driver(env):
+    return lambda observation, info: env.draw.controller.propose(observation, info["time"]).action
+
+
+def observations(answers):
+    return np.array([answer[0] for answer in answers])
+
+
+# Accelerations are in m/s² here; gymnasium.wrappers.RescaleAction gives the range that is advised.
+@pytest.mark.filterwarnings("ignore:.*symmetric and normalized space:UserWarning")
+@pytest.mark.parametrize("family", ["emergency", "cut_in"])
+def test_gymnasium_finds_nothing_to_complain_of(family):
+    check_env(gymnasium.make(NAME, family=family).unwrapped)
+
+
+def test_it_is_made_by_its_name():
+    env = gymnasium.make(NAME, collision_cost=5.0)
+    assert env.spec.id == ID
+    assert isinstance(env.unwrapped, CarFollowing)
+    assert env.unwrapped.collision_cost == 5.0
+
+
+def test_spaces_are_those_of_the_family():
+    env = CarFollowing()
+    actions = load_family("emergency").actions
+    assert (env.action_space.low, env.action_space.high) == ([actions.low], [actions.high])
+    assert env.action_space.shape == (1,)
+    assert env.observation_space.shape == (3,)
+
+
+def test_the_same_seed_drives_the_same_episodes():
+    first, again, other = CarFollowing(), CarFollowing(), CarFollowing()
+    for seed in (3, None, None):  # the seed rules the episodes after it as well
+        one, two = (drive(env, own_driver(env), seed=seed) for env in (first, again))
+        assert np.array_equal(observations(one), observations(two))
+        assert one[-1][-1] == two[-1][-1]
+    assert other.reset(seed=4)[1]["index"] != first.reset(seed=3)[1]["index"]
+
+
+def test_an_episode_is_chosen_exactly():
+    env = CarFollowing(seed=5)
+    _, info = env.reset(seed=1, options={"index": 7, "split": "test"})
+    assert (info["index"], info["split"]) == (7, "test")
+    assert env.draw == load_family("emergency").draw(5, 7, "test")
+    assert env.reset(options={"index": 7})[1]["split"] == "train"
+    assert CarFollowing(split="test").reset()[1]["split"] == "test"
+
+
+def test_choosing_an_index_does_not_change_what_is_drawn_next():
+    env = CarFollowing()
+    env.reset(seed=1)
+    drawn = env.reset()[1]["index"]
+    env.reset(seed=1, options={"index": 7})
+    assert env.reset()[1]["index"] == drawn
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [({"idx": 3}, "no option idx"), ({"split": "tset"}, "tset"), ({"index": -1}, "-1")],
+)
+def test_an_option_that_there_is_not_is_refused(options, message):
+    with pytest.raises(ValueError, match=message):
+        CarFollowing().reset(options=options)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"family": "emergancy"}, "emergancy"),
+        ({"world": "mars"}, "mars"),
+        ({"render_mode": "human"}, "human"),
+        ({"collision_cost": np.nan}, "collision_cost"),
+    ],
+)
+def test_an_argument_that_makes_no_sense_is_refused(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        CarFollowing(**arguments)
+
+
+def test_a_step_is_an_interval_and_pays_the_distance():
+    env = CarFollowing()
+    env.reset(options={"index": 0})
+    for k in range(1, 5):
+        observation, reward, terminated, truncated, info = env.step([2.0])
+        assert info.keys() == INFO
+        assert (terminated, truncated) == (False, False)
+        assert info["time"] == pytest.approx(0.25 * k)
+        assert observation[1] == pytest.approx(0.5 * k)
+        assert reward == info["distance"] == pytest.approx(0.5 * 2.0 * 0.25**2 * (2 * k - 1))
+
+
+def test_a_collision_terminates_costs_and_is_a_failure():
+    env = CarFollowing(collision_cost=100.0)
+    *before, (observation, reward, terminated, truncated, info) = drive(
+        env, lambda *_: 2.5, options={"index": 0}
+    )
+    assert (terminated, truncated) == (True, False)
+    assert (info["failed"], info["rear_ended"]) == (True, False)
+    assert reward == info["distance"] - 100.0
+    assert observation[0] == info["gap"] <= 0.0
+    assert not any(answer[-1]["failed"] for answer in before)
+
+
+def test_the_end_of_time_truncates():
+    answers = drive(CarFollowing(), lambda *_: 0.0, options={"index": 0})
+    _, reward, terminated, truncated, info = answers[-1]
+    assert (terminated, truncated, info["failed"], reward) == (False, True, False, 0.0)
+    assert info["time"] == pytest.approx(35.0, abs=0.02)
+
+
+def test_being_rear_ended_terminates_and_costs_but_is_no_failure():
+    behind = {"driver": "aggressive", "gap": 5.0}
+    env = CarFollowing(replace(load_family("emergency"), added=({"behind": behind},)))
+
+    def stops_dead(observation, info):
+        return 2.5 if info["time"] < 3.0 else -2.5
+
+    ends = [drive(env, stops_dead, options={"index": index})[-1] for index in range(8)]
+    rear_ended = [end for end in ends if end[-1]["rear_ended"]]
+    assert rear_ended
+    for _, reward, terminated, truncated, info in rear_ended:
+        assert (terminated, truncated, info["failed"]) == (True, False, False)
+        assert reward == info["distance"] - env.collision_cost
+
+
+def test_what_lies_beyond_the_range_is_commanded_at_its_edge():
+    wild, full = CarFollowing(), CarFollowing()
+    answers = [env.reset(options={"index": 1}) for env in (wild, full)]
+    answers = [env.step([a]) for env, a in ((wild, 99.0), (full, 2.5))]
+    assert np.array_equal(answers[0][0], answers[1][0])
+
+
+@pytest.mark.parametrize("action", [[np.nan], [np.inf], [1.0, 2.0]])
+def test_an_action_that_is_no_number_is_refused(action):
+    env = CarFollowing()
+    env.reset()
+    with pytest.raises(ValueError):  # noqa: PT011
+        env.step(action)
+
+
+def test_there_is_no_step_without_an_episode():
+    env = CarFollowing()
+    with pytest.raises(RuntimeError, match="reset"):
+        env.step([0.0])
+    drive(env, lambda *_: 2.5, options={"index": 0})
+    with pytest.raises(RuntimeError, match="reset"):
+        env.step([0.0])
+
+
+def test_noise_and_delay_are_in_what_is_seen_and_not_in_what_is_told():
+    env = CarFollowing(load_family("emergency").with_switches(["noise"]))
+    observation, info = env.reset(options={"index": 0})
+    assert observation[0] != info["gap"] == env.draw.scenario.initial_gap
+    assert observation in env.observation_space
+
+
+def test_a_line_says_where_the_cars_are():
+    env = CarFollowing(render_mode="ansi")
+    assert env.render() is None
+    env.reset(options={"index": 0})
+    env.step([2.0])
+    assert env.render().startswith("0.25 s: at 0.5 m/s, ")
+    assert CarFollowing().render() is None
+
+
+def test_closing_twice_is_allowed():
+    env = CarFollowing()
+    env.reset()
+    env.close()
+    env.close()
+
+
+def test_sumo_drives_the_same():
+    pytest.importorskip("libsumo")
+    in_closed_form, in_sumo = CarFollowing(), CarFollowing(world="sumo")
+    try:
+        for index in range(2):
+            one, two = (
+                drive(env, own_driver(env), options={"index": index})
+                for env in (in_closed_form, in_sumo)
+            )
+            assert np.abs(observations(one) - observations(two)).max() < 1e-9
+            assert one[-1][2:4] == two[-1][2:4]
+    finally:
+        in_sumo.close()
+
+
+@pytest.mark.parametrize("module", ["evofsm.driving.worlds.gym", "evofsm.guard.gym"])
+def test_without_gymnasium_the_extra_is_named(module):
+    program = f"import sys; sys.modules['gymnasium'] = None; import {module}"
+    finished = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert finished.stderr.rstrip().endswith("pip install '.[gym]' in a clone of evofsm")

@@ -1,0 +1,285 @@
+import math
+from dataclasses import replace
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+
+from evofsm.driving.drivers.idm import IDM
+from evofsm.driving.worlds.kinematic import KinematicWorld
+from evofsm.driving.worlds.motion import REALISED
+from evofsm.driving.worlds.scenario import Behind, Body, CutIn, Leader, Scenario, Sensors
+from evofsm.driving.worlds.sumo import SumoWorld
+from evofsm.evidence.paper.runs import CASES
+from evofsm.evidence.paper.settings import Settings
+from evofsm.guard.protocols import Proposal
+
+pytest.importorskip("libsumo")
+
+SETTINGS = Settings.load()
+GOLDEN = Path(__file__).parents[2] / "golden" / "paper_four_runs.npz"
+
+
+@pytest.fixture(scope="module")
+def in_both():
+    """The four cases, driven in SUMO and in closed form."""
+    with SumoWorld() as sumo:
+        return {
+            case: (
+                sumo.run(SETTINGS.scenario, SETTINGS.drivers[case]),
+                KinematicWorld().run(SETTINGS.scenario, SETTINGS.drivers[case]),
+            )
+            for case in CASES
+        }
+
+
+class Plain:
+    """A controller without a kernel."""
+
+    def __init__(self, propose):
+        self.propose = propose
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_both_worlds_agree_at_every_step(in_both, case):
+    in_sumo, in_closed_form = in_both[case]
+    assert in_sumo.observations.shape == in_closed_form.observations.shape
+    assert np.abs(in_sumo.observations - in_closed_form.observations).max() < 1e-9
+    assert np.abs(in_sumo.accelerations - in_closed_form.accelerations).max() < 1e-9
+
+
+def test_the_closed_form_drives_the_golden_runs(in_both):
+    golden = np.load(GOLDEN)["observations"]
+    driven = np.concatenate([in_both[case][1].observations for case in CASES])
+    assert np.abs(driven - golden).max() < 1e-9
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_sumo_carries_out_every_acceleration_exactly(in_both, case):
+    episode = in_both[case][0]
+    speed = episode.observations[:, 1]
+    wanted = np.maximum(0.0, speed[:-1] + episode.accelerations[:-1] * SETTINGS.scenario.dt)
+    assert np.abs(speed[1:] - wanted).max() < 1e-12
+
+
+def test_sumo_itself_reports_the_collision_at_the_last_step(tmp_path, in_both):
+    report = tmp_path / "collisions.xml"
+    episode = in_both[1][0]
+    with SumoWorld(("--collision-output", str(report))) as world:
+        again = world.run(SETTINGS.scenario, SETTINGS.drivers[1])
+    assert np.array_equal(again.observations, episode.observations)
+    collisions = ElementTree.parse(report).getroot().findall("collision")
+    assert len(collisions) == 1
+    assert float(collisions[0].get("time")) == episode.time[-1]
+
+
+def test_a_second_simulation_in_the_process_is_refused():
+    with SumoWorld() as first:
+        first.run(replace(SETTINGS.scenario, duration=0.1), SETTINGS.drivers[2])
+        with pytest.raises(RuntimeError, match="another process"):
+            SumoWorld().run(SETTINGS.scenario, SETTINGS.drivers[2])
+    with SumoWorld() as after:
+        assert len(after.run(replace(SETTINGS.scenario, duration=0.1), SETTINGS.drivers[2]).time)
+
+
+def test_a_world_changes_its_step_between_runs():
+    with SumoWorld() as world:
+        for dt in (0.01, 0.1):
+            scenario = replace(SETTINGS.scenario, dt=dt, duration=2.0)
+            episode = world.run(scenario, SETTINGS.drivers[1])
+            closed_form = KinematicWorld().run(scenario, SETTINGS.drivers[1])
+            assert np.abs(episode.observations - closed_form.observations).max() < 1e-9
+
+
+def test_a_controller_in_python_drives_as_its_kernel_would():
+    driver = SETTINGS.drivers[3]
+    compiled = KinematicWorld().run(SETTINGS.scenario, driver)
+    stepped = KinematicWorld().run(SETTINGS.scenario, Plain(driver.propose))
+    assert np.array_equal(compiled.observations, stepped.observations)
+    assert np.array_equal(compiled.accelerations, stepped.accelerations)
+    assert np.array_equal(compiled.leader_accelerations, stepped.leader_accelerations)
+
+
+def test_the_run_ends_with_the_first_row_whose_gap_is_zero_or_less(in_both):
+    gap = in_both[4][1].observations[:, 0]
+    assert gap[-1] <= 0.0 < gap[-2]
+    assert in_both[4][1].collided
+    assert not in_both[2][1].collided
+    assert len(in_both[2][1].time) == 3500
+
+
+def test_the_leader_brakes_once_in_full_from_the_time_it_is_told():
+    leader = Leader(IDM(1.2, 25.0, 1.0, 1.0, 2.5), brake_decel=9.0, brake_time=0.07)
+    episode = KinematicWorld().run(Scenario(leader, initial_gap=50.0), SETTINGS.drivers[2])
+    braking = episode.leader_accelerations == -9.0
+    assert np.array_equal(braking, np.arange(len(braking)) >= 7)
+    assert (np.diff(episode.observations[8:, 2]) <= 0.0).all()
+    assert episode.observations[-1, 2] == 0.0
+
+
+def test_nobody_drives_backwards():
+    episode = KinematicWorld().run(SETTINGS.scenario, Plain(lambda z, time: Proposal(-2.0)))
+    assert (episode.observations[:, 1] == 0.0).all()
+
+
+@pytest.mark.parametrize("wrong", [math.nan, math.inf])
+def test_a_controller_that_proposes_no_number_is_named(wrong):
+    with pytest.raises(ValueError, match="controller proposed"):
+        KinematicWorld().run(SETTINGS.scenario, Plain(lambda z, time: Proposal(wrong)))
+
+
+@pytest.mark.parametrize("name", ["initial_gap", "duration", "dt"])
+def test_an_impossible_scenario_is_refused_by_name(name):
+    with pytest.raises(ValueError, match=name):
+        replace(SETTINGS.scenario, **{name: 0.0})
+
+
+@pytest.mark.parametrize("dt", [0.0125, 0.0005])
+def test_a_step_that_sumos_clock_cannot_count_is_refused(dt):
+    with pytest.raises(ValueError, match="whole milliseconds"):
+        SumoWorld().run(replace(SETTINGS.scenario, dt=dt), SETTINGS.drivers[1])
+
+
+def test_a_road_that_may_be_too_short_is_refused():
+    with pytest.raises(ValueError, match="beyond the road"):
+        SumoWorld().run(replace(SETTINGS.scenario, duration=5000.0), SETTINGS.drivers[1])
+
+
+def test_a_world_closed_from_outside_starts_again():
+    import libsumo
+
+    short = replace(SETTINGS.scenario, duration=0.5)
+    with SumoWorld() as world:
+        before = world.run(short, SETTINGS.drivers[1])
+        libsumo.close()
+        after = world.run(short, SETTINGS.drivers[1])
+    assert np.array_equal(before.observations, after.observations)
+
+
+def test_a_start_that_fails_leaves_no_simulation_behind():
+    with pytest.raises(Exception, match="commandline options"):
+        SumoWorld(("--no-such-option", "1")).run(SETTINGS.scenario, SETTINGS.drivers[1])
+    with SumoWorld() as world:
+        assert world.run(replace(SETTINGS.scenario, duration=0.5), SETTINGS.drivers[1])
+
+
+def test_what_was_realised_is_what_was_commanded_until_standstill(in_both):
+    episode = in_both[3][1]
+    moving = episode.observations[1:, 1] > 0.0
+    realised, commanded = episode.realised[:-1], episode.accelerations[:-1]
+    assert np.isnan(episode.realised[-1])
+    assert np.abs(realised - commanded)[moving].max() < 1e-9
+
+
+def test_a_controller_cannot_write_into_the_record():
+    def meddle(observation, time):
+        observation[:] = 99.0
+        return Proposal(1.0)
+
+    episode = KinematicWorld().run(replace(SETTINGS.scenario, duration=0.5), Plain(meddle))
+    assert episode.observations[0].tolist() == [5.0, 0.0, 0.0]
+
+
+@pytest.mark.parametrize(
+    ("change", "word"),
+    [
+        ({"brake_decel": -9.0}, "brake_decel"),
+        ({"brake_decel": math.nan}, "brake_decel"),
+        ({"brake_time": math.nan}, "brake_time"),
+        ({"brake_speed": -1.0}, "brake_speed"),
+    ],
+)
+def test_an_impossible_leader_is_refused_by_name(change, word):
+    with pytest.raises(ValueError, match=word):
+        replace(SETTINGS.scenario.leader, **change)
+
+
+def test_a_scenario_lasts_two_steps_or_more():
+    with pytest.raises(ValueError, match="two steps"):
+        replace(SETTINGS.scenario, duration=0.01)
+
+
+IDM_LEADER = IDM(1.2, 25.0, 1.0, 1.0, 2.5)
+FULL = Scenario(
+    Leader(
+        IDM_LEADER,
+        brake_decel=5.0,
+        brake_time=8.0,
+        initial_speed=12.0,
+        waves=((1.0, -2.0), (3.0, 1.5)),
+        cut_in=CutIn(5.0, gap=9.0, speed=11.0),
+    ),
+    initial_gap=20.0,
+    duration=20.0,
+    initial_speed=14.0,
+    body=Body(lowest=-6.0, highest=2.0, delay=0.2, jerk=15.0),
+    sensors=Sensors(gap_noise=0.5, speed_noise=0.3, delay=0.2, seed=3),
+    behind=Behind(IDM(1.25, 25.0, 2.0, 1.0, 2.0, lowest=-8.0), gap=15.0),
+)
+
+
+def test_both_worlds_agree_with_everything_switched_on():
+    driver = IDM(2.25, 28.0, 0.8, 0.8, 2.0, lowest=-8.0, highest=2.5)
+    closed_form = KinematicWorld().run(FULL, driver)
+    with SumoWorld() as world:
+        in_sumo = world.run(FULL, driver)
+    assert in_sumo.record.shape == closed_form.record.shape
+    assert np.abs(in_sumo.record - closed_form.record).max() < 1e-9
+    assert len(closed_form.time) > 900
+
+
+def test_a_cut_in_replaces_the_leader_at_its_time():
+    episode = KinematicWorld().run(FULL, Plain(lambda z, time: Proposal(-1.0)))
+    assert episode.observations[500, 0] == pytest.approx(9.0)
+    assert episode.observations[500, 2] == 11.0
+    assert episode.observations[499, 2] != pytest.approx(11.0, abs=0.5)
+
+
+def test_waves_then_the_brake_move_the_leader():
+    accelerations = KinematicWorld().run(FULL, SETTINGS.drivers[2]).leader_accelerations
+    assert accelerations[0] == IDM_LEADER.propose(np.array([np.inf, 12.0, 0.0])).action
+    assert (accelerations[100:300] == -2.0).all()
+    assert (accelerations[300:800] == 1.5).all()
+    assert (accelerations[800:] == -5.0).all()
+
+
+def test_a_body_is_late_limited_and_smooth():
+    scenario = replace(FULL, sensors=Sensors(), behind=None)
+    episode = KinematicWorld().run(scenario, Plain(lambda z, time: Proposal(-9.0)))
+    realised = episode.record[:, REALISED]
+    assert (realised[:20] == 0.0).all()
+    assert np.diff(realised[:100]).min() == pytest.approx(-0.15)
+    assert realised.min() == -6.0
+
+
+def test_sensors_see_late_and_with_the_noise_of_their_seed():
+    seen = []
+    look = Plain(lambda z, time: seen.append(z) or Proposal(0.0))
+    episode = KinematicWorld().run(replace(FULL, duration=5.0), look)
+    late = np.array(seen)[20:] - episode.observations[:-20]
+    assert late[:, 0].std() == pytest.approx(0.5, rel=0.2)
+    assert late[:, 1].std() == pytest.approx(0.3, rel=0.2)
+    first = seen.copy()
+    seen.clear()
+    KinematicWorld().run(replace(FULL, duration=5.0), look)
+    assert np.array_equal(first, seen)
+
+
+def test_a_car_behind_may_run_into_a_follower_who_brakes():
+    sleepy = IDM(1.25, 25.0, 2.0, 0.1, 2.0, lowest=-1.0)
+    scenario = replace(FULL, behind=Behind(sleepy, gap=4.0), sensors=Sensors())
+    episode = KinematicWorld().run(scenario, Plain(lambda z, time: Proposal(-6.0)))
+    assert episode.rear_ended
+    assert not episode.collided
+
+
+def test_a_road_that_is_over_moves_no_more():
+    with KinematicWorld().open(replace(FULL, duration=1.0)) as road:
+        road.advance(0.0, steps=1000)
+        assert road.over
+        assert road.row == 99
+        assert road.time == 0.99
+        assert math.isfinite(road.realised)
+        road.advance(1.0)
+        assert road.row == 99

@@ -1,0 +1,114 @@
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("typer")
+pytest.importorskip("matplotlib")
+pytest.importorskip("polars")
+
+
+def evofsm(*arguments, folder):
+    command = [sys.executable, "-m", "evofsm", *map(str, arguments)]
+    return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+
+
+@pytest.fixture(scope="module")
+def reproduced(tmp_path_factory):
+    """The whole command, in SUMO, as a stranger runs it."""
+    pytest.importorskip("libsumo")
+    folder = tmp_path_factory.mktemp("paper")
+    return evofsm("paper", "--out", "out", folder=folder), folder / "out"
+
+
+def test_all_claims_hold_and_the_page_is_named(reproduced):
+    run, _ = reproduced
+    assert run.returncode == 0, run.stderr
+    assert "10 of 10 claims of the paper hold" in run.stdout
+    assert "out/index.html" in run.stdout
+    assert "\x1b" not in run.stdout, "colours in a pipe"
+
+
+def test_the_folder_holds_page_claims_traces_model_and_figures(reproduced):
+    _, folder = reproduced
+    names = {path.name for path in folder.iterdir()}
+    assert names >= {"index.html", "claims.json", "traces.parquet", "model.evofsm", "figures"}
+    figures = {path.stem for path in (folder / "figures").iterdir()}
+    for figure in figures:
+        assert (folder / "figures" / f"{figure}.png").stat().st_size > 10_000
+        assert (folder / "figures" / f"{figure}.svg").stat().st_size > 10_000
+    assert len(figures) == 9
+    claims = json.loads((folder / "claims.json").read_text())
+    assert all(claim["holds"] for claim in claims)
+    assert claims[0]["claim"] in (folder / "index.html").read_text()
+
+
+def test_the_model_it_saves_can_be_inspected(reproduced):
+    _, folder = reproduced
+    run = evofsm("inspect", folder / "model.evofsm", folder=folder)
+    assert run.returncode == 0, run.stderr
+    assert "#7" in run.stdout
+
+
+def test_a_claim_that_fails_is_shown_and_ends_with_1(tmp_path):
+    settings = tmp_path / "coarse.toml"
+    settings.write_text("[machine]\nradius = 30.0\n")
+    run = evofsm(
+        *("paper", "--world", "kinematic", "--rounds", 1, "--settings", settings, "--json"),
+        *("--out", tmp_path / "out"),
+        folder=tmp_path,
+    )
+    assert run.returncode == 1, run.stderr
+    failing = [claim["id"] for claim in json.loads(run.stdout) if not claim["holds"]]
+    assert "states_final" in failing
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("--settings", "missing.toml"), "missing.toml: no such file"),
+        (("--settings", "wrong.toml"), "there is no 'radios'"),
+        (("--out", "file"), "file"),
+        (("--rounds", "0"), "--rounds"),
+        (("--world", "mars"), "mars"),
+    ],
+)
+def test_what_cannot_be_done_is_said_in_a_line_and_ends_with_2(tmp_path, arguments, message):
+    (tmp_path / "wrong.toml").write_text("[machine]\nradios = 1\n")
+    (tmp_path / "file").write_text("in the way")
+    run = evofsm("paper", "--world", "kinematic", *arguments, folder=tmp_path)
+    assert run.returncode == 2
+    assert message in run.stderr
+    assert "Traceback" not in run.stderr
+
+
+def test_without_the_extras_it_names_them_before_any_work(tmp_path):
+    hidden = tmp_path / "hidden"
+    hidden.mkdir()
+    (hidden / "sitecustomize.py").write_text(
+        "import importlib.util as util\n"
+        "found = util.find_spec\n"
+        "util.find_spec = lambda name, *rest: None if name == 'polars' else found(name, *rest)\n"
+    )
+    command = [sys.executable, "-m", "evofsm", "paper", "--world", "kinematic"]
+    run = subprocess.run(
+        command,
+        cwd=tmp_path,
+        env={"PYTHONPATH": str(hidden)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert run.returncode == 2
+    assert "pip install '.[cli,tables,plot]'" in run.stderr
+    assert not Path(tmp_path / "evofsm-paper").exists()
+
+
+def test_the_docs_show_what_the_command_measures(reproduced):
+    _, folder = reproduced
+    page = (Path(__file__).parents[2] / "docs" / "paper.md").read_text()
+    for claim in json.loads((folder / "claims.json").read_text()):
+        cells = (claim["claim"], claim["paper"], claim["measured"])
+        assert f"| {' | '.join(cells)} | {'yes' if claim['holds'] else 'no'} |" in page

@@ -1,0 +1,226 @@
+"""The closed loop in its short form: the claims of the issue, on fewer draws."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+pytest.importorskip("scipy")
+
+from evofsm.driving.families.family import load_family
+from evofsm.driving.learner import Learner, drive_alone
+from evofsm.driving.outcomes import bootstrap, outcome, reference
+from evofsm.driving.policies import fixed_policies
+from evofsm.driving.revisers import Unrevised
+from evofsm.evidence.closed_loop.calibration import reliability, run_calibration
+from evofsm.evidence.closed_loop.cases import run_cases
+from evofsm.evidence.closed_loop.separation import run_separation
+from evofsm.evidence.closed_loop.shift import ShiftPlan, run_shift
+from evofsm.evidence.closed_loop.study import Plan, run_closed_loop
+from evofsm.evidence.closed_loop.two_worlds import run_two_worlds
+from evofsm.evidence.scores import auroc
+
+EMERGENCY = load_family("emergency")
+TINY = Plan(
+    train=10,
+    test=20,
+    seeds=2,
+    rule_seeds=1,
+    rule_test=3,
+    side_train=10,
+    side_test=10,
+    world_test=2,
+)
+
+
+@pytest.fixture(scope="module")
+def study():
+    return run_closed_loop(EMERGENCY, TINY, workers=2)
+
+
+def rows_of(study, policy):
+    return [row for row in study.rows if row.policy == policy]
+
+
+def test_the_unrevised_driver_collides_and_ours_does_not(study):
+    [unrevised] = rows_of(study, "unrevised")
+    assert unrevised.collision_rate > 0.8
+    ours = rows_of(study, "evofsm")
+    assert [row.learning_seed for row in ours] == [0, 1]
+    assert all(row.collisions == 0 and row.mobility > 0.6 for row in ours)
+    assert all(row.train_collisions == 0 for row in ours)
+
+
+def test_every_baseline_stands_in_the_table_once(study):
+    expected = {policy.name for policy in fixed_policies(EMERGENCY)}
+    assert {"unrevised", "aeb-ttc", "rss-r157", "rss-matched", "oracle"} <= expected
+    for name in expected:
+        assert len(rows_of(study, name)) == 1, name
+
+
+def test_a_row_has_the_fields_that_others_rely_on(study):
+    assert {
+        *("family", "policy", "learning_seed", "train_episodes", "episodes", "collisions"),
+        *("collision_rate", "mobility", "intervention_rate", "mean_change", "jerk"),
+        "episodes_until_safe",
+    } <= set(study.rows[0].as_dict())
+    json.dumps(study.as_dict(), allow_nan=False)
+
+
+def test_the_unrevised_driver_is_the_measure_of_mobility(study):
+    [unrevised] = rows_of(study, "unrevised")
+    assert unrevised.mobility == 1.0
+    assert unrevised.intervention_rate == 0.0
+    [always] = rows_of(study, "always-brake")
+    assert always.mobility == 0.0
+    assert always.collisions == 0
+
+
+def test_the_result_does_not_depend_on_the_number_of_workers(study):
+    small = replace(TINY, seeds=1, rule_seeds=0, test=5, train=2)
+    alone = run_closed_loop(EMERGENCY, small, workers=1)
+    together = run_closed_loop(EMERGENCY, small, workers=2)
+    assert [row.as_dict() for row in alone.rows] == [row.as_dict() for row in together.rows]
+
+
+def test_the_papers_cases_are_driven_without_a_collision_and_left_alone_where_safe():
+    by_name = {case.name: case for case in run_cases(load_family("paper"), 0.02)["cases"]}
+    assert by_name["case 1"].unrevised_collided
+    assert by_name["case 4"].unrevised_collided
+    assert not any(case.collided for case in by_name.values())
+    assert all(case.end > 59.9 for case in by_name.values())
+    assert {"brake at 11 s", "brake at 15 s"} <= set(by_name)
+    assert by_name["case 2"].changed <= 0.05
+    assert by_name["case 3"].changed_late <= 0.05
+
+
+def test_brakes_that_weaken_are_noticed_while_unchanged_constants_collide():
+    plan = ShiftPlan(before=12, after=6, held_out=25)
+    found = run_shift(load_family("shift"), plan, learning_seed=0)
+    checks = {(check.policy, check.episodes_after): check for check in found["checks"]}
+    assert checks["evofsm", 5].collisions == 0
+    assert checks["rss-unchanged", -1].collisions == 0
+    assert checks["rss-unchanged", 6].collisions > 15
+
+
+def test_the_same_model_revises_alike_in_both_worlds():
+    pytest.importorskip("libsumo")
+    sumo, kinematic = run_two_worlds(EMERGENCY, train=8, test=4, tolerance=0.02)["worlds"]
+    assert sumo.collisions == kinematic.collisions == 0
+    assert sumo.mean_speed == pytest.approx(kinematic.mean_speed, rel=1e-6)
+    assert sumo.intervention_rate == pytest.approx(kinematic.intervention_rate)
+
+
+@pytest.mark.parametrize("family", ["rare", "weak_brakes"])
+def test_dead_ends_are_told_apart(family):
+    found = run_separation(load_family(family), train=30, test=40)["separations"]
+    areas = {one.measure: one.auroc for one in found}
+    assert areas["evofsm"] > 0.98
+    assert areas["evofsm"] > areas["aeb-ttc"]
+
+
+def test_probabilities_are_better_than_the_base_rate():
+    counted, rehearsed = run_calibration(EMERGENCY, train=40, test=60)["reliabilities"]
+    for one in (counted, rehearsed):
+        assert one.brier < 0.6 * one.base_brier
+        assert sum(part.cases for part in one.bins) == one.cases
+
+
+def test_a_reliability_counts_what_it_is_told():
+    one = reliability("", [0.05, 0.05, 0.95, 0.95], [False, True, True, True])
+    assert [(part.observed, part.cases) for part in one.bins] == [(0.5, 2), (1.0, 2)]
+    assert one.failures == 3
+
+
+def test_the_area_under_the_curve():
+    truth = np.array([False, True, False, True])
+    assert auroc(np.array([0.0, 1.0, 0.0, 1.0]), truth) == 1.0
+    assert auroc(np.zeros(4), truth) == 0.5
+    assert np.isnan(auroc(np.zeros(4), np.zeros(4, bool)))
+
+
+def test_the_bootstrap_surrounds_the_mean():
+    values = np.random.default_rng(0).normal(size=200)
+    low, high = bootstrap(values)
+    assert low < values.mean() < high
+
+
+def test_a_driver_who_proposes_nothing_usable_is_replaced_and_counted():
+    class Broken:
+        def propose(self, observation, time=0.0):
+            raise RuntimeError("no")
+
+    draw = EMERGENCY.draw(0, 0, split="test")
+    none = Unrevised(EMERGENCY.actions)
+    base = reference(drive_alone(EMERGENCY, draw, none, None), draw.scenario.leader.brake_decel)
+    drive = drive_alone(EMERGENCY, draw, none, None, controller=Broken())
+    found = outcome(drive, base, EMERGENCY.interval)
+    assert found.changed == found.decisions
+    assert found.change == 0.0
+
+
+def test_gentle_traffic_does_not_make_it_bold(tmp_path):
+    """Learnt among gentle waves only, then one leader stops in earnest."""
+    text = """
+about = "waves, then perhaps a stop"
+interval = 0.25
+actions = { low = -6.0, high = 2.5, width = 0.5 }
+limits = { decel = 6.0, leader_decel = 8.0 }
+scenario = { initial_gap = [2.0, 20.0], duration = 60.0, dt = 0.01 }
+body = { lowest = -6.0, highest = 2.5 }
+[leader]
+driver = "leader"
+brake_time = TIME
+brake_decel = [7.0, 8.0]
+[leader.traffic]
+fast = [15.0, 22.0]
+slow = [5.0, 12.0]
+accel = [0.8, 1.5]
+decel = [1.2, 2.4]
+cruise = [2.0, 5.0]
+pause = [1.0, 4.0]
+[follower]
+driver = "aggressive"
+[drivers.leader]
+accel = 1.2
+desired_speed = 25.0
+min_gap = 1.0
+time_headway = 1.0
+decel = 2.5
+[drivers.aggressive]
+accel = 2.25
+desired_speed = 28.0
+min_gap = 0.8
+time_headway = 0.3
+decel = 2.0
+lowest = -6.0
+highest = 2.5
+"""
+    gentle, stop = tmp_path / "gentle.toml", tmp_path / "stop.toml"
+    gentle.write_text(text.replace("TIME", "inf"))
+    stop.write_text(text.replace("TIME", "[20.0, 50.0]"))
+    waves, stops = load_family(gentle), load_family(stop)
+    learner = Learner.new(waves)
+    reviser = learner.reviser(waves, 0.02)
+    learner.teach(waves, (waves.draw(0, index) for index in range(30)), reviser)
+    assert learner.risk.manoeuvres.gentle > 60
+    drives = [
+        drive_alone(stops, stops.draw(0, index, split="test"), reviser, learner.risk)
+        for index in range(40)
+    ]
+    assert not any(drive.episode.collided for drive in drives)
+
+
+def test_what_was_learnt_is_kept(tmp_path):
+    learner = Learner.new(EMERGENCY)
+    draws = [EMERGENCY.draw(0, index) for index in range(3)]
+    learner.teach(EMERGENCY, draws, learner.reviser(EMERGENCY, 0.01))
+    learner.save(tmp_path)
+    again = Learner.load(tmp_path)
+    assert again.machine.n_states == learner.machine.n_states
+    situation = np.array([20.0, 15.0, 15.0])
+    actions = [-1.0, 0.0, 1.0]
+    assert np.array_equal(
+        again.risk.critical(situation, actions), learner.risk.critical(situation, actions)
+    )

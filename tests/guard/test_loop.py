@@ -1,0 +1,382 @@
+"""The loop: who is told what, what is recorded, and what is learnt."""
+
+import logging
+import math
+
+import numpy as np
+import pytest
+
+from evofsm.core.actions import IntervalActions
+from evofsm.core.machine import EvolvingFSM
+from evofsm.driving.drivers.idm import IDM
+from evofsm.driving.framework import Framework
+from evofsm.driving.revisers import AlwaysBrake, Unrevised
+from evofsm.driving.risk.outcome import LatentRisk
+from evofsm.driving.worlds.kinematic import KinematicWorld
+from evofsm.driving.worlds.motion import COMMANDED, SPEED
+from evofsm.driving.worlds.scenario import Body, Leader, Scenario, Sensors
+from evofsm.guard.oversight import Oversight
+from evofsm.guard.protocols import Proposal
+from evofsm.guard.reviser import ActionReviser, Mode, speaks
+
+ACTIONS = IntervalActions(low=-2.5, high=2.5, width=0.3, outside="clip")
+LEADER = Leader(IDM(1.2, 25.0, 1.0, 1.0, 2.5), brake_decel=4.0, brake_time=6.0)
+HASTY = IDM(2.25, 28.0, 0.8, 0.3, 2.0, lowest=-2.5, highest=2.5)
+
+
+def scenario(duration=10.0, **others):
+    return Scenario(LEADER, initial_gap=8.0, duration=duration, **others)
+
+
+class Script:
+    """Proposes what is written for a decision; the last for all that follow."""
+
+    def __init__(self, *lines):
+        self.lines = lines
+        self.seen = []
+
+    def propose(self, observation, time=0.0):
+        self.seen.append((observation, time))
+        line = self.lines[min(len(self.seen), len(self.lines)) - 1]
+        if isinstance(line, Exception):
+            raise line
+        return line if isinstance(line, Proposal) else Proposal(line)
+
+
+class Listening(LatentRisk):
+    """Remembers what it was told."""
+
+    def __init__(self, *args, **kwargs):
+        super().__init__(*args, **kwargs)
+        self.learnt, self.followed = [], []
+
+    def learn(self, observation, acceleration, belief=(1.0,)):
+        self.learnt.append((observation.tolist(), acceleration))
+        super().learn(observation, acceleration, belief)
+
+    def follow(self, observation, acceleration):
+        self.followed.append((observation.tolist(), acceleration))
+        super().follow(observation, acceleration)
+
+
+def drive(controller=HASTY, reviser=None, *, on=None, **others):
+    framework = Framework(controller, ACTIONS, reviser, **others)
+    return framework.drive(KinematicWorld(), on or scenario())
+
+
+# -- What is recorded ---------------------------------------------------------------------------
+
+
+def test_decisions_are_those_of_the_record():
+    risk = LatentRisk(lowest=-2.5)
+    told = drive(reviser=ActionReviser(risk, ACTIONS), risk=risk)
+    record, time = told.episode.record, told.episode.time
+    starts = [round(d.situation.time / 0.01) for d in told.decisions]
+    assert starts == list(range(0, starts[-1] + 1, 25))
+    assert (told.executed != told.proposed).any()
+    for decision, row in zip(told.decisions, starts, strict=True):
+        end = min(row + 25, len(time) - 1)
+        assert decision.situation.observation.tolist() == record[row, :3].tolist()
+        assert set(record[row:end, COMMANDED]) == {decision.revision.executed}
+        did = (record[end, SPEED] - record[row, SPEED]) / (time[end] - time[row])
+        assert decision.realised == pytest.approx(did)
+
+
+def test_realised_is_what_the_body_did_whatever_the_sensors_show():
+    weak = Body(lowest=-1.0, highest=1.0)
+    blind = Sensors(gap_noise=1.0, speed_noise=0.5, delay=0.3)
+    told = drive(Script(2.0), on=scenario(2.0, body=weak, sensors=blind))
+    assert [d.realised for d in told.decisions] == [pytest.approx(1.0)] * 8
+    assert (told.executed == 2.0).all()
+
+
+def test_a_collision_ends_the_last_decision_early():
+    told = drive(Script(2.5))
+    assert told.episode.collided
+    assert math.isfinite(told.decisions[-1].realised)
+    assert told.decisions[-1].situation.time < told.episode.time[-1]
+
+
+def test_recorded_modes():
+    for mode, changed in ((Mode.OFF, False), (Mode.SHADOW, False), (Mode.ADVISE, False)):
+        risk = LatentRisk(lowest=-2.5)
+        told = drive(reviser=ActionReviser(risk, ACTIONS, mode=mode), risk=risk)
+        assert (told.executed != told.proposed).any() == changed
+        advised = np.array([d.revision.advised for d in told.decisions])
+        assert (advised != told.executed).any() == (mode is not Mode.OFF)
+
+
+def test_a_driver_may_take_over_and_hand_back_while_driving():
+    risk = LatentRisk(lowest=-2.5)
+    reviser = ActionReviser(risk, ACTIONS)
+
+    class Driver:
+        def propose(self, observation, time=0.0):
+            if time == 2.0:
+                reviser.take_over()
+            if time == 3.0:
+                reviser.hand_back()
+            return Proposal(2.5)
+
+    told = drive(Driver(), reviser, risk=risk)
+    overridden = [d for d in told.decisions if 2.0 <= d.situation.time < 3.0]
+    assert all(d.revision.executed == 2.5 for d in overridden)
+    assert all("taken over" in d.revision.reason for d in overridden if d.revision.advised != 2.5)
+    assert any(d.revision.executed != 2.5 for d in told.decisions if d.situation.time >= 3.0)
+
+
+# -- Controllers that fail ----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        RuntimeError("lost"),
+        math.nan,
+        math.inf,
+        Proposal(None),
+        Proposal(1.0, ("much", None)),
+        Proposal(1.0, None),
+    ],
+)
+def test_a_controller_that_fails_once_is_driven_on_without(line, caplog):
+    risk = LatentRisk(lowest=-2.5)
+    script = Script(1.0, 1.0, line, 1.0)
+    with caplog.at_level(logging.WARNING, logger="evofsm"):
+        told = drive(script, Unrevised(ACTIONS), risk=risk, on=scenario(3.0))
+    assert len(caplog.records) == 1
+    assert "controller" in caplog.text
+    assert "0.5 s" in caplog.text
+    assert told.executed.tolist() == [1.0, 1.0, -1.0] + [1.0] * 9
+    assert not math.isfinite(told.proposed[2])
+    assert "no usable proposal" in told.decisions[2].revision.reason
+
+
+def test_a_proposal_outside_the_set_is_put_at_its_edge_and_logged(caplog):
+    with caplog.at_level(logging.INFO, logger="evofsm"):
+        told = drive(Script(1.0, -7.0, 9.0, 1.0), on=scenario(2.0))
+    assert told.executed[:4].tolist() == [1.0, -2.5, 2.5, 1.0]
+    assert told.proposed[1:3].tolist() == [-7.0, 9.0]
+    assert all("outside" in d.revision.reason for d in told.decisions[1:3])
+    assert len(caplog.records) == 2
+
+
+def test_a_bare_number_is_no_proposal():
+    class Bare:
+        def propose(self, observation, time=0.0):
+            return 1.0
+
+    assert (drive(Bare(), on=scenario(1.0)).executed == -1.0).all()
+
+
+def test_a_controller_cannot_change_what_was_observed():
+    class Meddler:
+        def propose(self, observation, time=0.0):
+            observation[:] = 99.0
+            return Proposal(0.5)
+
+    told = drive(Meddler(), on=scenario(1.0))
+    assert told.decisions[0].situation.observation[0] == 8.0
+
+
+# -- Who is told what ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("learn", [True, False])
+def test_machine_and_risk_are_told_what_was_executed(learn, monkeypatch):
+    machine = EvolvingFSM(ACTIONS.n_actions, radius=1.0)
+    machine.learn_many([[8.0, 0.0, 0.0]], [0])
+    acted = []
+    act = EvolvingFSM.act
+    monkeypatch.setattr(EvolvingFSM, "act", lambda self, i: (acted.append(i), act(self, i))[1])
+    risk = Listening(lowest=-2.5)
+    told = drive(Script(1.0), AlwaysBrake(ACTIONS), machine=machine, risk=risk, learn=learn)
+    heard, deaf = (risk.learnt, risk.followed) if learn else (risk.followed, risk.learnt)
+    assert [acceleration for _, acceleration in heard] == told.executed.tolist()
+    assert [seen for seen, _ in heard] == [d.situation.observation.tolist() for d in told.decisions]
+    assert deaf == []
+    assert acted == ([0] * len(told.decisions) if learn else [])
+    assert (told.executed == -2.5).all()
+
+
+# -- Shadow mode beside ordinary driving ----------------------------------------------------------
+
+
+def ordinary_driving(seed, minutes=2.0):
+    """A log at 10 Hz: a driver close behind a leader who brakes gently now and then.
+
+    Gap and speeds as recorded, and the driver's own acceleration, which a recorder smooths over
+    the latest second.
+    """
+    rng = np.random.default_rng(seed)
+    rows = round(600 * minutes)
+    braking = rng.uniform(0.0, rows, size=6)
+    leader, speed, gap, log = 15.0, 15.0, 13.0, []
+    for k in range(rows):
+        log.append((gap, speed, leader))
+        brakes = any(start <= k < start + 30 for start in braking)
+        push = -2.0 if brakes else 0.5 * (15.0 - leader)
+        wish = 0.3 * (gap - 4.0 - 0.6 * speed) + 0.8 * (leader - speed)
+        before = leader, speed
+        leader = max(leader + 0.1 * push, 0.0)
+        speed = max(speed + 0.1 * min(max(wish, -3.0), 1.5), 0.0)
+        gap += 0.05 * (leader + before[0] - speed - before[1])
+    seen = np.array(log)
+    did = np.diff(seen[:, 1], append=seen[-1, 1]) / 0.1
+    return seen, np.convolve(did, np.ones(10) / 10.0)[: len(did)]
+
+
+def shadowed(risk, mode=Mode.SHADOW, drives=2):
+    """What a reviser says beside it, of every row."""
+    reviser = ActionReviser(risk, IntervalActions(-8.0, 8.0, 0.5, outside="clip"), mode=mode)
+    said = []
+    for seed in range(drives):
+        oversight = Oversight(reviser.actions, reviser, risk=risk, interval=0.1)
+        for k, (row, did) in enumerate(zip(*ordinary_driving(seed), strict=True)):
+            situation = oversight.recognise(row, 0.1 * k)
+            said.append(oversight.revise(situation, Proposal(float(did))))
+        oversight.end(None, failed=False)
+    return reviser, said
+
+
+def test_ordinary_driving_raises_few_alarms_and_none_that_speaks_of_braking_not_done():
+    told = LatentRisk.told(-8.0, decel=7.0, leader_decel=8.0, dt=0.1)
+    unlearnt = LatentRisk(-8.0, dt=0.1)
+    for risk, least, most in ((told, 0.0, 0.05), (unlearnt, 0.05, 1.0)):
+        reviser, said = shadowed(risk)
+        alarms = [revision for revision in said if speaks(reviser, revision)]
+        assert least * len(said) <= len(alarms) <= most * len(said)
+        assert not [revision.reason for revision in alarms if "in full" in revision.reason]
+    assert unlearnt.brakes.decel == pytest.approx(0.6 * 8.0)  # no harder braking was shown
+
+
+@pytest.mark.parametrize("mode", [Mode.SHADOW, Mode.ADVISE, Mode.OFF])
+def test_brakes_that_were_told_stay_as_told_beside_a_driver(mode):
+    risk = LatentRisk.told(-8.0, decel=7.0, leader_decel=8.0, dt=0.1)
+    shadowed(risk, mode)
+    assert risk.brakes.known
+    assert risk.brakes.decel == pytest.approx(7.0)
+
+
+def test_a_driver_who_brakes_hard_shows_what_the_brakes_can_do(tmp_path):
+    risk = LatentRisk(-8.0, dt=0.1)
+    reviser = ActionReviser(risk, IntervalActions(-8.0, 2.0, 0.5), mode=Mode.SHADOW)
+
+    def braked(*decels):
+        oversight, speed, time = Oversight(reviser.actions, reviser, risk=risk), 25.0, 0.0
+        for decel in np.repeat((0.0, *decels, 0.0), 20):
+            situation = oversight.recognise(np.array([60.0, speed, speed]), time)
+            oversight.revise(situation, Proposal(-decel))
+            speed, time = max(speed - 0.1 * decel, 0.0), time + 0.1
+        oversight.end(None, failed=False)
+        return risk.brakes.decel
+
+    assert braked(3.0) == pytest.approx(4.8)  # what was never shown stays as assumed
+    assert braked(6.0) == pytest.approx(6.0)
+    assert braked(2.0) == pytest.approx(6.0)
+    risk.save(tmp_path / "risk.evofsm")
+    assert LatentRisk.load(tmp_path / "risk.evofsm").brakes.decel == pytest.approx(6.0)
+    reviser.mode = Mode.ACT
+    assert braked(7.0) == pytest.approx(6.0)  # its own braking is told from what it commands
+
+
+# -- Learning, and not learning -----------------------------------------------------------------
+
+
+def test_learning_goes_on_from_episode_to_episode(snapshot):
+    risk, machine = LatentRisk(lowest=-2.5), EvolvingFSM(ACTIONS.n_actions, radius=1.0)
+    framework = Framework(HASTY, ACTIONS, ActionReviser(risk, ACTIONS), machine=machine, risk=risk)
+    seen, first = [], None
+    for _ in range(3):
+        told = framework.drive(KinematicWorld(), scenario(14.0))
+        first = first or told
+        seen.append((len(risk.manoeuvres), machine.n_states))
+        assert not told.episode.collided
+    assert [manoeuvres for manoeuvres, _ in seen] == [1, 2, 3]
+    assert seen[0][1] > 1
+    assert risk.brakes.decel == pytest.approx(2.5)
+
+
+def test_frozen_nothing_changes_and_it_drives_the_same_again(snapshot):
+    risk, machine = LatentRisk(lowest=-2.5), EvolvingFSM(ACTIONS.n_actions, radius=1.0)
+    framework = Framework(HASTY, ACTIONS, ActionReviser(risk, ACTIONS), machine=machine, risk=risk)
+    framework.drive(KinematicWorld(), scenario(14.0))
+    before = snapshot(machine), snapshot(risk)
+    framework.learn = False
+    told = [framework.drive(KinematicWorld(), scenario(14.0)) for _ in range(2)]
+    assert (snapshot(machine), snapshot(risk)) == before
+    np.testing.assert_array_equal(told[0].executed, told[1].executed)
+    assert told[0].decisions[20].situation.state is not None
+    assert told[0].decisions[20].situation.belief.sum() == pytest.approx(1.0)
+    framework.learn = True
+    framework.drive(KinematicWorld(), scenario(14.0))
+    assert snapshot(risk) != before[1]
+    assert snapshot(machine) != before[0]
+
+
+def test_frozen_with_an_empty_machine_nothing_is_recognised():
+    machine = EvolvingFSM(ACTIONS.n_actions, radius=1.0)
+    told = drive(machine=machine, learn=False, on=scenario(1.0))
+    assert machine.n_states == 0
+    assert all(d.situation.state is None for d in told.decisions)
+
+
+def test_a_failure_is_learnt_as_one():
+    machine = EvolvingFSM(ACTIONS.n_actions, radius=1.0)
+    told = drive(Script(2.5), machine=machine)
+    assert told.episode.collided
+    assert machine.model().endings.sum() == 1
+
+
+def test_of_an_episode_that_was_broken_off_nothing_follows(snapshot):
+    def broken_off():
+        risk = LatentRisk(lowest=-2.5)
+        oversight = Oversight(ACTIONS, Unrevised(ACTIONS), risk=risk)
+        for k in range(12):
+            situation = oversight.recognise(np.array([50.0, 30.0 - k, 30.0 - k]), 0.25 * k)
+            oversight.revise(situation, Proposal(-2.5))
+        return risk
+
+    risk, before = broken_off(), snapshot(broken_off())
+    oversight = Oversight(ACTIONS, Unrevised(ACTIONS), risk=risk)
+    situation = oversight.recognise(np.array([9.0, 5.0, 5.0]), 0.0)
+    oversight.revise(situation, Proposal(0.0))
+    oversight.end(None, failed=False)
+    after = snapshot(risk)
+    assert after["decels"] == before["decels"]
+    assert after["brakes"] == before["brakes"]
+
+
+def test_two_runs_of_the_same_are_the_same():
+    told = []
+    for _ in range(2):
+        risk, machine = LatentRisk(lowest=-2.5), EvolvingFSM(ACTIONS.n_actions, radius=1.0)
+        told.append(
+            drive(reviser=ActionReviser(risk, ACTIONS), machine=machine, risk=risk).episode.record
+        )
+    np.testing.assert_array_equal(*told)
+
+
+# -- What is refused ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("interval", [0.0, -0.25, math.nan, math.inf])
+def test_an_interval_that_is_no_time_is_refused(interval):
+    with pytest.raises(ValueError, match="interval"):
+        Framework(HASTY, ACTIONS, interval=interval)
+
+
+@pytest.mark.parametrize("interval", [0.255, 0.001])
+def test_an_interval_of_no_whole_number_of_steps_is_refused(interval):
+    with pytest.raises(ValueError, match="no whole number"):
+        drive(interval=interval)
+
+
+def test_a_risk_for_other_intervals_is_refused():
+    with pytest.raises(ValueError, match=r"every 0\.1 s"):
+        Framework(HASTY, ACTIONS, risk=LatentRisk(lowest=-2.5, dt=0.1))
+
+
+def test_a_machine_for_another_set_is_refused():
+    with pytest.raises(ValueError, match="3 actions"):
+        Framework(HASTY, ACTIONS, machine=EvolvingFSM(n_actions=3))

@@ -1,0 +1,368 @@
+"""What the action reviser may do to a proposal, and what it never does."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
+
+from evofsm.core.actions import IntervalActions
+from evofsm.driving.revisers import AlwaysBrake, EnvelopeReviser, Unrevised
+from evofsm.driving.risk.brakes import OwnBrakes
+from evofsm.driving.risk.outcome import LatentRisk
+from evofsm.driving.risk.ttc import TimeToCollision
+from evofsm.guard.protocols import Judgement, Proposal, Situation
+from evofsm.guard.reviser import ActionReviser, Mode, Way, nearest_values
+
+LOW, HIGH, TOLERANCE = -2.5, 2.5, 0.02
+ACTIONS = IntervalActions(low=LOW, high=HIGH, width=0.3)
+HERE = Situation(np.array([30.0, 20.0, 20.0]), np.ones(1), 0, 0.0, 0.0)
+CLOSE = Situation(np.array([5.0, 20.0, 20.0]), np.ones(1), 0, 0.0, 0.0)
+PROPOSALS = st.floats(LOW, HIGH)
+
+
+class Told:
+    """Judges actions by a function; the brakes are known unless it is said otherwise."""
+
+    def __init__(self, risk, *, known=True, lowest=LOW):
+        self.risk = risk
+        self.brakes = OwnBrakes(lowest=lowest, assumed=0.6, dt=0.25)
+        if known:
+            self.brakes.trust(2.5)
+
+    def judge(self, situation, accelerations):
+        risk = np.array([self.risk(a) for a in accelerations])
+        return Judgement(risk, 0.5 * risk, np.sqrt(risk), 10.0 * (1.0 - risk), 7.0)
+
+
+def above(limit, low=0.0, high=1.0):
+    """Tolerable up to an acceleration, and not above it."""
+    return lambda a: low if a <= limit else high
+
+
+@st.composite
+def risks(draw):
+    """Any risk at all: waves on a slope, around the tolerance."""
+    slope, waves, phase = (draw(st.floats(-3.0, 3.0)) for _ in range(3))
+    level = draw(st.floats(-8.0, 0.0))
+    return lambda a: (
+        1.0 / (1.0 + math.exp(-(level + slope * a + waves * math.sin(3.0 * a + phase))))
+    )
+
+
+@st.composite
+def sets(draw):
+    low = draw(st.floats(-6.0, -0.2))
+    high = low + draw(st.floats(0.5, 8.0))
+    width = draw(st.floats(0.05, 2.0))
+    closed = draw(st.sampled_from(["left", "right"]))
+    return IntervalActions(low=low, high=high, width=width, closed=closed)
+
+
+# -- What is executed ---------------------------------------------------------------------------
+
+
+@given(risks(), PROPOSALS)
+def test_a_tolerable_proposal_keeps_its_exact_value(risk, wanted):
+    assume(risk(wanted) <= TOLERANCE)
+    for way in Way:
+        reviser = ActionReviser(Told(risk), ACTIONS, way=way)
+        assert reviser.revise(HERE, Proposal(wanted, (-2.0, 1.0))).executed == wanted
+
+
+@given(risks(), PROPOSALS)
+def test_else_the_closest_action_that_is_tolerable_else_the_least_risky(risk, wanted):
+    revision = ActionReviser(Told(risk), ACTIONS).revise(HERE, Proposal(wanted))
+    could = np.array([wanted, *nearest_values(ACTIONS, wanted)])
+    danger = np.array([risk(a) for a in could])
+    assert revision.executed in could
+    tolerable = could[danger <= TOLERANCE]
+    if len(tolerable):
+        assert revision.risk_executed <= TOLERANCE
+        assert abs(revision.executed - wanted) == np.abs(tolerable - wanted).min()
+    else:
+        assert revision.risk_executed == danger.min()
+    assert revision.risk_executed <= max(revision.risk_proposed, TOLERANCE)
+
+
+@given(sets(), st.floats(0.0, 1.0))
+def test_a_revised_action_is_the_nearest_value_of_its_interval(actions, share):
+    wanted = actions.low + share * (actions.high - actions.low)
+    values = nearest_values(actions, wanted)
+    assert values[-2:] == [actions.low, actions.high]
+    for i, value in enumerate(values[:-2]):
+        assert actions.encode(value) == i
+        lower, upper = actions.interval(i)
+        inside = [a for a in np.linspace(lower, upper, 50) if actions.encode(a) == i]
+        assert all(abs(value - wanted) <= abs(a - wanted) + 1e-12 for a in inside)
+
+
+@given(sets(), risks(), st.floats(-20.0, 20.0) | st.sampled_from([math.nan, math.inf, -math.inf]))
+def test_nothing_outside_the_set_is_ever_executed(actions, risk, wanted):
+    proposal = Proposal(wanted, (wanted, 99.0, -99.0, math.nan))
+    for mode in Mode:
+        for way in Way:
+            for known in (True, False):
+                judge = Told(risk, known=known, lowest=actions.low)
+                reviser = ActionReviser(judge, actions, mode=mode, way=way)
+                for _ in range(3):
+                    revision = reviser.revise(HERE, proposal)
+                    assert actions.low <= revision.executed <= actions.high
+                    assert actions.low <= revision.advised <= actions.high
+    for reviser in (
+        Unrevised(actions),
+        AlwaysBrake(actions),
+        EnvelopeReviser(TimeToCollision(), actions),
+    ):
+        assert actions.low <= reviser.revise(HERE, proposal).executed <= actions.high
+
+
+def test_the_least_change_and_the_limit():
+    assert ActionReviser(Told(above(-0.75)), ACTIONS).revise(HERE, Proposal(2.0)).executed < -0.75
+    limit = ActionReviser(Told(above(-2.45)), ACTIONS).revise(HERE, Proposal(2.0))
+    assert limit.executed == LOW  # the outer interval reaches to the limit
+    hopeless = ActionReviser(Told(lambda a: 1.0), ACTIONS).revise(HERE, Proposal(2.0))
+    assert hopeless.executed == LOW
+    assert "nothing can" in hopeless.reason
+
+
+def test_what_is_revised_is_said_with_numbers():
+    revision = ActionReviser(Told(above(-0.75)), ACTIONS).revise(HERE, Proposal(2.0))
+    assert revision.proposed == 2.0
+    assert (revision.risk_proposed, revision.risk_executed) == (1.0, 0.0)
+    assert revision.interval == (0.0, 0.0)
+    assert revision.evidence == 7.0
+    assert "risk 100.0%" in revision.reason
+
+
+# -- The two ways -------------------------------------------------------------------------------
+
+
+@given(risks(), PROPOSALS, st.lists(st.floats(-9.0, 9.0) | st.just(math.nan), max_size=6))
+def test_to_choose_is_to_take_one_of_the_candidates(risk, wanted, candidates):
+    reviser = ActionReviser(Told(risk), ACTIONS, way=Way.CHOOSE)
+    revision = reviser.revise(HERE, Proposal(wanted, tuple(candidates)))
+    could = [wanted, *(a for a in candidates if LOW <= a <= HIGH)]
+    assert revision.executed in could
+    if risk(wanted) > TOLERANCE:
+        tolerable = [a for a in could if risk(a) <= TOLERANCE]
+        if tolerable:
+            closest = min(abs(a - wanted) for a in tolerable)
+            assert abs(revision.executed - wanted) == closest
+        else:
+            assert revision.risk_executed == min(risk(a) for a in could)
+
+
+def test_without_candidates_there_is_nothing_to_choose():
+    reviser = ActionReviser(Told(lambda a: 1.0), ACTIONS, way=Way.CHOOSE)
+    assert reviser.revise(HERE, Proposal(1.0)).executed == 1.0
+
+
+# -- Modes, and the driver ----------------------------------------------------------------------
+
+
+@given(risks(), PROPOSALS)
+def test_shadow_and_advise_execute_the_proposal_and_tell_what_they_would_do(risk, wanted):
+    acting = ActionReviser(Told(risk), ACTIONS).revise(HERE, Proposal(wanted))
+    for mode in (Mode.SHADOW, Mode.ADVISE):
+        revision = ActionReviser(Told(risk), ACTIONS, mode=mode).revise(HERE, Proposal(wanted))
+        assert revision.executed == wanted
+        assert revision.advised == acting.executed == acting.advised
+        assert revision.risk_executed == revision.risk_proposed == acting.risk_proposed
+        if acting.executed != wanted:
+            assert mode.value in revision.reason
+
+
+def test_off_judges_nothing():
+    def fail(a):
+        raise AssertionError("it was judged")
+
+    revision = ActionReviser(Told(fail), ACTIONS, mode=Mode.OFF).revise(CLOSE, Proposal(1.0))
+    assert (revision.executed, revision.advised) == (1.0, 1.0)
+    assert math.isnan(revision.risk_executed)
+    assert revision.reason == "reviser is off"
+
+
+def test_a_driver_takes_over_and_hands_back():
+    reviser = ActionReviser(Told(above(-1.0)), ACTIONS)
+    assert reviser.revise(HERE, Proposal(2.0)).executed <= -1.0
+    reviser.take_over()
+    overridden = reviser.revise(HERE, Proposal(2.0))
+    assert overridden.executed == 2.0
+    assert overridden.advised <= -1.0
+    assert overridden.risk_executed == 1.0
+    assert "taken over" in overridden.reason
+    reviser.start_episode()  # the driver still drives
+    assert reviser.revise(HERE, Proposal(2.0)).executed == 2.0
+    reviser.hand_back()
+    assert reviser.revise(HERE, Proposal(2.0)).executed <= -1.0
+
+
+def not_acting(judge, **others):
+    """Revisers whose decisions are not executed."""
+    for mode in (Mode.SHADOW, Mode.ADVISE):
+        yield ActionReviser(judge, ACTIONS, mode=mode, **others)
+    driven = ActionReviser(judge, ACTIONS, **others)
+    driven.take_over()
+    yield driven
+
+
+def test_where_nothing_is_executed_brakes_are_not_tested():
+    danger = True
+    judge = Told(lambda a: 0.5 if danger and a > -1.0 else 0.0, known=False)
+    for reviser in not_acting(judge):
+        danger = True
+        first = reviser.revise(HERE, Proposal(1.0))
+        assert LOW < first.advised <= -1.0  # the least change, and no test in full
+        assert "in full" not in first.reason
+        assert "1.5 m/s² assumed" in first.reason
+        danger = False
+        again = reviser.revise(HERE, Proposal(1.0))
+        assert again.advised == 1.0
+        assert again.reason == "risk is within the tolerance"
+
+
+def test_a_test_of_the_brakes_ends_where_the_driver_takes_over():
+    danger = True
+    reviser = ActionReviser(
+        Told(lambda a: 0.5 if danger and a > -1.0 else 0.0, known=False), ACTIONS
+    )
+    assert "in full" in reviser.revise(HERE, Proposal(1.0)).reason
+    danger = False
+    reviser.take_over()
+    assert reviser.revise(HERE, Proposal(1.0)).advised == 1.0
+    reviser.hand_back()
+    assert reviser.revise(HERE, Proposal(1.0)).executed == 1.0
+
+
+@pytest.mark.parametrize("wanted", [-0.3, 0.0, 0.02, 1.0])
+def test_where_nothing_is_executed_no_braking_is_asked_of_a_car_that_stands(wanted):
+    standing = Situation(np.array([0.4, 0.02, 0.0]), np.ones(1), 0, 0.0, 0.0)
+    for reviser in not_acting(Told(lambda a: 1.0 if a > -9.0 else 0.0)):
+        assert reviser.revise(standing, Proposal(wanted)).advised >= min(wanted, 0.0)
+        moving = standing._replace(observation=np.array([0.4, 0.5, 0.0]))
+        assert reviser.revise(moving, Proposal(wanted)).advised == LOW
+
+
+# -- Hysteresis ---------------------------------------------------------------------------------
+
+
+@given(risks(), PROPOSALS)
+def test_in_one_and_the_same_situation_it_does_not_change_its_mind(risk, wanted):
+    reviser = ActionReviser(Told(risk), ACTIONS)
+    kept = [reviser.revise(HERE, Proposal(wanted)).executed == wanted for _ in range(12)]
+    assert len(set(kept)) == 1
+
+
+def test_once_revising_it_goes_on_until_the_proposal_is_safe_by_a_margin():
+    level = 0.0
+    judge = Told(lambda a: level if a > -1.0 else 0.001)
+    reviser = ActionReviser(judge, ACTIONS, release=0.5)
+    kept = []
+    for level in (0.9, 1.1, 0.9, 0.6, 1.1, 0.4, 0.9):  # the judge reads it
+        level *= TOLERANCE
+        kept.append(reviser.revise(HERE, Proposal(1.0)).executed == 1.0)
+    assert kept == [True, False, False, False, False, True, True]
+    reviser.start_episode()
+    assert reviser.revise(HERE, Proposal(1.0)).executed == 1.0
+
+
+def test_where_no_margin_can_be_had_what_is_tolerable_will_do():
+    level = 2.0 * TOLERANCE
+    reviser = ActionReviser(
+        Told(lambda a: level if a > 0.0 else 0.9 * TOLERANCE), ACTIONS, release=0.5
+    )
+    first = reviser.revise(HERE, Proposal(1.0))
+    assert LOW < first.executed <= 0.0
+    assert reviser.revise(HERE, Proposal(1.0)).executed == first.executed
+
+
+# -- Thin evidence, and unusable proposals ------------------------------------------------------
+
+
+def test_while_the_own_brakes_are_unknown_it_brakes_in_full_for_a_second():
+    danger = True
+    judge = Told(lambda a: 0.5 if danger and a > -1.0 else 0.0, known=False)
+    reviser = ActionReviser(judge, ACTIONS)
+    first = reviser.revise(HERE, Proposal(1.0))
+    assert first.executed == LOW
+    assert "brakes not known" in first.reason
+    danger = False
+    held = [reviser.revise(HERE, Proposal(1.0)).executed for _ in range(6)]
+    assert held == [LOW] * 4 + [1.0] * 2
+    danger = True
+    judge.brakes.trust(2.5)
+    assert LOW < reviser.revise(HERE, Proposal(1.0)).executed <= -1.0
+
+
+def test_who_has_seen_nothing_counts_on_the_assumptions():
+    unseen = ActionReviser(LatentRisk(lowest=LOW), ACTIONS).revise(CLOSE, Proposal(1.0))
+    assert unseen.executed == LOW
+    assert unseen.evidence == 0.0
+    assert unseen.interval[1] - unseen.interval[0] > 0.5
+
+
+@pytest.mark.parametrize("wanted", [math.nan, math.inf, -math.inf])
+def test_what_is_no_number_becomes_gentle_braking_and_is_judged_as_such(wanted):
+    for risk, executed in ((above(2.0), -1.0), (above(-2.0), LOW)):
+        revision = ActionReviser(Told(risk), ACTIONS).revise(HERE, Proposal(wanted))
+        assert revision.executed <= -1.0
+        assert (revision.executed == -1.0) == (executed == -1.0)
+        assert "no usable proposal" in revision.reason
+        assert revision.proposed == wanted or math.isnan(wanted)
+
+
+def test_a_proposal_outside_the_set_is_put_at_its_edge():
+    for mode in Mode:
+        reviser = ActionReviser(Told(above(5.0)), ACTIONS, mode=mode)
+        for wanted, executed in ((9.0, HIGH), (-9.0, LOW)):
+            revision = reviser.revise(HERE, Proposal(wanted))
+            assert revision.executed == executed
+            assert revision.proposed == wanted
+            assert "outside" in revision.reason
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"tolerance": 0.0}, {"tolerance": math.nan}, {"release": 0.0}, {"release": 1.5}]
+)
+def test_settings_that_cannot_be_right_are_refused(wrong):
+    with pytest.raises(ValueError, match=next(iter(wrong))):
+        ActionReviser(Told(above(0.0)), ACTIONS, **wrong)
+
+
+def test_a_risk_that_counts_on_brakes_beyond_the_set_is_refused():
+    with pytest.raises(ValueError, match=r"-4\.5, but the set of actions ends at -2\.5"):
+        ActionReviser(LatentRisk(lowest=-4.5), ACTIONS)
+
+
+# -- On the real risk ---------------------------------------------------------------------------
+
+
+@given(st.floats(0.1, 80.0), st.floats(0.0, 35.0), st.floats(0.0, 35.0), PROPOSALS)
+def test_it_never_adds_risk(gap, speed, leader_speed, wanted):
+    risk = LatentRisk(lowest=LOW)
+    risk.brakes.trust(2.4)
+    risk.manoeuvres.remember(*np.linspace(2.5, 4.5, 150))
+    there = Situation(np.array([gap, speed, leader_speed]), np.ones(1), 0, 0.0, 0.0)
+    revision = ActionReviser(risk, ACTIONS).revise(there, Proposal(wanted))
+    assert revision.risk_executed <= revision.risk_proposed
+    assert revision.executed <= wanted
+    low, high = revision.interval
+    assert low <= revision.risk_executed <= high
+
+
+def test_what_was_never_seen_is_said_to_be_so_and_what_is_known_is_not():
+    risk = LatentRisk(lowest=LOW)
+    reviser = ActionReviser(risk, ACTIONS)
+    far = Situation(np.array([200.0, 10.0, 10.0]), np.array([0.0, 1.0]), 1, math.nan, 0.0)
+    first = reviser.revise(far, Proposal(0.0))
+    assert "never seen before" in first.reason
+    assert first.seen == 0.0
+    for _ in range(8):
+        risk.learn(far.observation, 0.0, far.belief)
+    again = reviser.revise(far, Proposal(0.0))
+    assert again.reason == "risk is within the tolerance"
+    assert again.seen == 2.0
+    nobody = reviser.revise(far._replace(state=None), Proposal(0.0))
+    assert math.isnan(nobody.seen)
