@@ -14,7 +14,11 @@ from .core import ObservationEncoder as ObservationEncoder
 from .core import Paper as Paper
 from .core import Step as Step
 from .core import Trace as Trace
+from .core import StateRule as StateRule
+from .core import Tally as Tally
 from .core import WhenFull as WhenFull
+from .core import model_html as model_html
+from .core import wilson_bounds as wilson_bounds
 from .core import jensen_shannon as jensen_shannon
 
 __version__: str

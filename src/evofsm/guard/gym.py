@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from evofsm.core import EvolvingFSM, IntervalActions
 from evofsm.extras import needs
 from evofsm.guard.oversight import Oversight, Witness, own_risk, refuse_mismatch
-from evofsm.guard.protocols import LearningJudge, Proposal, Reviser, Revision
+from evofsm.guard.protocols import Fallback, LearningJudge, Proposal, Reviser, Revision
 from evofsm.guard.reviser import make_usable, unjudged
 
 with needs("gymnasium", "gym", "a wrapper for Gymnasium"):
@@ -31,6 +31,11 @@ class BoundedReviser(Reviser, Protocol):
     @property
     def actions(self) -> IntervalActions:
         """The set of actions."""
+        ...
+
+    @property
+    def fallback(self) -> Fallback:
+        """What is done without a usable proposal."""
         ...
 
 
@@ -162,7 +167,7 @@ class RevisedActions(gymnasium.Wrapper[Any, Any, Any, Any]):
 
     def _decide(self, proposal: Proposal) -> Revision:
         if self._seen is None:
-            wanted, remark = make_usable(proposal, self.reviser.actions)
+            wanted, remark = make_usable(proposal, self.reviser.actions, self.reviser.fallback)
             return unjudged(wanted, proposal, f"nothing is ahead; {remark or 'not revised'}")
         if self._oversight is None:
             self._oversight = Oversight(

@@ -151,6 +151,11 @@ class ActionReviser:
         self._trial = 0
 
     @property
+    def fallback(self) -> Fallback:
+        """What is done without a usable proposal."""
+        return self.risk.fallback
+
+    @property
     def overridden(self) -> bool:
         """Whether the driver has taken over."""
         return self._overridden
