@@ -317,7 +317,7 @@ def samples(folder: Path) -> list[Sample]:
     return [
         Sample(path.name, path.read_bytes(), _LOADS[header.kind], header.version >= 4)
         for path in paths
-        for header in [storage.describe(path)]
+        for header in [storage.read_header(path)]
     ]
 
 

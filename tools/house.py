@@ -53,7 +53,7 @@ def room_of(module: str) -> str:
 def arrows_between(graph: grimp.ImportGraph) -> Arrows:
     """The modules that each module imports, imports for types included."""
     return {
-        module: {other for other in graph.find_modules_directly_imported_by(module)}
+        module: set(graph.find_modules_directly_imported_by(module))
         for module in graph.modules
         if module != PACKAGE.name
     }
@@ -241,6 +241,7 @@ def main() -> int:
             print(f"{lines_of(room):6,}  {room:<9} {', '.join(sorted(rooms[room]))}")
     print(f"{sum(lines_of(room) for floor in floors() for room in floor):6,}  lines of Python")
     past = [str(use) for use in imports_past_a_face(trees)]
+    stale = [PAGE.name] if drawn != PAGE.read_text("utf-8") else []
     wrong = [
         report("rooms at the top", [room for floor in floors() for room in floor], MOST_ROOMS),
         report("circles of rooms", circles(rooms), 0),
@@ -249,7 +250,9 @@ def main() -> int:
         report("imports past a face", past, 0),
         report("private names across rooms", private_names(trees), 0),
         report("places that README, docs and examples import from", places(), MOST_PLACES),
-        report("pictures that are out of date", [PAGE.name] * (drawn != PAGE.read_text("utf-8")), 0),
+        report(
+            "pictures that are out of date", [PAGE.name] * (drawn != PAGE.read_text("utf-8")), 0
+        ),
     ]
     return int(any(wrong))
 
