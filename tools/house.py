@@ -158,7 +158,8 @@ def _names_defined(tree: ast.Module) -> Iterator[str]:
 def _names_used(tree: ast.Module) -> Iterator[tuple[str, int]]:
     for node in ast.walk(tree):
         if isinstance(node, ast.Attribute):
-            yield node.attr, node.lineno
+            if not (isinstance(node.value, ast.Name) and node.value.id in ("self", "cls")):
+                yield node.attr, node.lineno
         elif isinstance(node, ast.ImportFrom) and (node.module or "").startswith("evofsm"):
             yield from ((name.name, node.lineno) for name in node.names)
 
