@@ -12,6 +12,13 @@ from .cli.common import print_json as print_json
 from .cli.common import progress as progress
 from .cli.common import require as require
 from .cli.common import split_names as split_names
+from .cli.declared import REQUIRED as REQUIRED
+from .cli.declared import Command as Command
+from .cli.declared import argument as argument
+from .cli.declared import is_required as is_required
+from .cli.declared import option as option
+from .cli.groups import InWorld as InWorld
+from .cli.groups import WithJson as WithJson
 from .text.columns import console as console
 from .text.columns import print_columns as print_columns
 from .text.columns import print_table as print_table

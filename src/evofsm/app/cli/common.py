@@ -26,33 +26,10 @@ class WorldName(StrEnum):
     KINEMATIC = "kinematic"
 
 
-# Needed once annotations are read; `main` says what to install where it is missing.
+# What the studies are told.
 with suppress(ModuleNotFoundError):
     import typer
 
-    # What several commands are told.
-    FamilyArgument = Annotated[
-        str,
-        typer.Argument(
-            help="Family of scenarios: emergency, paper, shift, ..., or a TOML file of your own.",
-            show_default=False,
-        ),
-    ]
-    ControllerOption = Annotated[
-        str,
-        typer.Option(
-            help="Who proposes: the family's own, aggressive, normal, acc, or sumo (SUMO's IDM)."
-        ),
-    ]
-    ReviserOption = Annotated[
-        str,
-        typer.Option(
-            help="Who revises: least-risk (what was learnt), none, rss, aeb, or another measure."
-        ),
-    ]
-    ModeOption = Annotated[
-        str, typer.Option(help="How far least-risk goes: off, shadow, advise, act.")
-    ]
     ToleranceOption = Annotated[
         float, typer.Option(help="Share of leaders' hard brakes that need not be survived.")
     ]
@@ -61,9 +38,6 @@ with suppress(ModuleNotFoundError):
     ]
     SwitchesOption = Annotated[
         str, typer.Option("--with", help="noise, delay, actuator, jerk, third_car; with commas.")
-    ]
-    SummaryAsJson = Annotated[
-        bool, typer.Option("--json", help="Print the summary as one JSON document.")
     ]
 
 if TYPE_CHECKING:
