@@ -9,7 +9,6 @@ from importlib.util import find_spec
 from typing import Annotated
 
 from evofsm.app.cli.declared import Command, callback
-from evofsm.core import announce_compiling
 from evofsm.extras import install_for
 
 # Needed once the annotations below are read; `main` says what to install where it is missing.
@@ -24,6 +23,8 @@ def main(application: Callable[[], typer.Typer]) -> None:
         needed = install_for(command)
         print(f"evofsm: the command line needs typer and rich: {needed}", file=sys.stderr)
         sys.exit(2)
+    from evofsm.core import announce_compiling
+
     announce_compiling()
     application()()
 
