@@ -80,7 +80,7 @@ _DAMAGE = (
 class Header(NamedTuple):
     """What a file says of itself."""
 
-    kind: str  #: ``"machine"``, ``"model"``, ``"risk"`` or ``"checkpoint"``
+    kind: str  #: ``"machine"``, ``"model"``, ``"risk"``, ``"guard"`` or ``"checkpoint"``
     version: int  #: of the format
     library: str | None  #: version of evofsm that wrote it; None before format 4
     content: dict[str, Any]  #: settings, by name
