@@ -99,13 +99,14 @@ def test_drive():
 
 
 def test_evidence(tmp_path, monkeypatch):
-    from evofsm.evidence.cli import evidence
     from evofsm.evidence.report.chapter import Chapter
+    from evofsm.evidence.studies import STUDIES
 
     table = Table("T", ("a", "b"), (("1", "2"),))
     chapter = Chapter("x", "Is it?", "", "It is.", (), ("not always",), (table,), (), (), "y")
-    study = evidence._Study(lambda done: None, lambda *given: chapter, "y")
-    monkeypatch.setattr(evidence, "_studies", lambda *given: {"x": study})
+    for study in STUDIES.values():
+        monkeypatch.setattr(study, "run", lambda *given: None)
+        monkeypatch.setattr(study, "chapter", lambda *given: chapter)
     found = document("evidence", "--out", tmp_path)
     assert Path(found["page"]).is_file()
     assert found["chapters"][0]["headline"] == "It is."

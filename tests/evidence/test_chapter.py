@@ -6,9 +6,10 @@ from dataclasses import replace
 
 import pytest
 
-from evofsm.app.text import terminal
+from evofsm.app import console
 from evofsm.app.text.documents import to_json
 from evofsm.app.text.table import Table
+from evofsm.evidence import terminal
 from evofsm.evidence.report.chapter import Chapter, Section, write_chapters
 from evofsm.evidence.report.drawing import Sketch, draw_all
 from evofsm.evidence.report.html import Setting
@@ -20,7 +21,7 @@ def chapter(tmp_path):
 
     figure = Figure(figsize=(2, 1))
     figure.add_subplot().plot([0, 1])
-    sketch = Sketch("lines", "Two lines", "What they say.", "A line that rises.", figure)
+    sketch = Sketch("lines", "Two lines", "What they say.", "A line that rises.", lambda: figure)
     return Chapter(
         id="detection",
         title="Who sees it coming?",
@@ -29,7 +30,7 @@ def chapter(tmp_path):
         answer=("In 90 % of episodes.",),
         losses=("rss is better by 0.1",),
         tables=(Table("Areas", ("who", "area"), (("ours", "0.9"), ("rss", "1.0")), ours=(0,)),),
-        figures=tuple(draw_all([lambda: sketch], tmp_path / "figures")),
+        figures=tuple(draw_all([sketch], tmp_path / "figures")),
         plan=(Setting("seed", "0"),),
         command="evofsm bench detection",
     )
@@ -92,7 +93,7 @@ def test_marks_of_the_summary_say_whether_what_was_asked_holds(chapter, tmp_path
     assert re.search(r'<tr class="holds"><th scope="row"><span data-mark>✓ </span>good', text)
     assert re.search(r'<tr class="fails"><th scope="row"><span data-mark>✗ </span>bad', text)
     assert '<tr><th scope="row">open' in text
-    terminal.print_headlines(terminal.console(), chapters)
+    terminal.print_headlines(console(), chapters)
     lines = capsys.readouterr().out.split("\n")
     marks = ["✓", "✗", ""]
     assert lines[1:6:2] == [f"  {mark} {chapter.headline}".replace("   ", "  ") for mark in marks]
@@ -125,7 +126,7 @@ def test_a_study_without_losses_says_so(chapter, tmp_path):
 
 
 def test_the_terminal_says_the_same(chapter, capsys):
-    terminal.print_chapter(terminal.console(), chapter)
+    terminal.print_chapter(console(), chapter)
     said = capsys.readouterr().out
     for words in (chapter.headline, *chapter.losses, "Areas", "0.9"):
         assert words in said

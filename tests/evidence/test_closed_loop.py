@@ -15,9 +15,10 @@ from evofsm.driving.policies import fixed_policies
 from evofsm.driving.revisers import Unrevised
 from evofsm.evidence.closed_loop.calibration import reliability, run_calibration
 from evofsm.evidence.closed_loop.cases import run_cases
+from evofsm.evidence.closed_loop.plan import Plan, ShiftPlan
 from evofsm.evidence.closed_loop.separation import run_separation
-from evofsm.evidence.closed_loop.shift import ShiftPlan, run_shift
-from evofsm.evidence.closed_loop.study import Plan, run_closed_loop
+from evofsm.evidence.closed_loop.shift import run_shift
+from evofsm.evidence.closed_loop.study import run_closed_loop
 from evofsm.evidence.closed_loop.two_worlds import run_two_worlds
 from evofsm.evidence.scores import auroc
 

@@ -20,7 +20,7 @@ from evofsm.evidence.detection.alarms import (
     lead_times,
 )
 from evofsm.evidence.detection.measures import Detector, Ours, Watcher, classic, fixed, tuned
-from evofsm.evidence.detection.plan import GRID, Plan, grid_world, world
+from evofsm.evidence.detection.plan import Plan
 from evofsm.evidence.detection.rows import Row, Scored, judge
 from evofsm.evidence.detection.study import run_detection
 from evofsm.evidence.detection.watch import (
@@ -33,7 +33,9 @@ from evofsm.evidence.detection.watch import (
     held_out_draws,
     watch,
 )
+from evofsm.evidence.detection.worlds import GRID, grid_world, world
 from evofsm.evidence.scores import Ranked, auprc, auroc, bootstrap, brier, isotonic
+from evofsm.evidence.study import Frame
 
 TINY = Plan(
     train=6,
@@ -342,14 +344,13 @@ def test_with_hours_enough_lead_times_are_told() -> None:
 
 
 def test_the_study_does_not_depend_on_the_number_of_workers() -> None:
-    plan = replace(TINY, grid=(2.0,))
+    plan = replace(TINY, grid=(2.0,), family="r157,ncap")
     seen: list[tuple[int, int]] = []
-    names = ("r157", "ncap")
-    alone = run_detection(names, plan, lambda done, total: seen.append((done, total)), workers=1)
-    shared = run_detection(names, plan, workers=2)
+    alone = run_detection(plan, lambda done, total: seen.append((done, total)), workers=1)
+    shared = run_detection(plan, workers=2)
     assert repr(alone) == repr(shared)
     assert seen[-1] == (5, 5)
-    assert {row.family for row in alone.rows} == set(names)
+    assert {row.family for row in alone.rows} == set(plan.families)
     assert {row.target for row in alone.rows} == set(Target)
     assert all(row.family == GRID for row in alone.grid)
     row = alone.find("ncap", Ours.DEFAULT, Target.DEAD_END)
@@ -359,11 +360,11 @@ def test_the_study_does_not_depend_on_the_number_of_workers() -> None:
 
 
 def test_rows_are_plain_numbers() -> None:
-    study = run_detection(["r157"], replace(TINY, seeds=1), workers=1, grid=False)
+    study = replace(TINY, seeds=1, family="r157", with_grid=False).run(workers=1)
     assert study.grid == []
     for row in study.rows:
         assert isinstance(row, Row)
-        document = row.as_dict()
+        (document,) = Frame([row]).as_dicts()
         json.dumps(document)
         assert {"family", "measure", "target", "auroc", "auprc", "brier", "episodes"} < set(
             document
@@ -374,9 +375,7 @@ def test_rows_are_plain_numbers() -> None:
 
 def test_a_wrong_family_is_told_before_anything_is_driven() -> None:
     with pytest.raises(ValueError, match="nowhere"):
-        run_detection(["emergency", "nowhere"], TINY)
-    with pytest.raises(ValueError, match="no family"):
-        run_detection([], TINY)
+        run_detection(replace(TINY, family="emergency,nowhere"))
 
 
 def test_a_short_plan_still_measures_one_alarm_an_hour() -> None:

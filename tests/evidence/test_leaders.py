@@ -8,7 +8,7 @@ from typer.testing import CliRunner
 
 from evofsm.__main__ import application
 from evofsm.evidence.real.leaders import TOLD, Limits, run_leaders
-from evofsm.evidence.report.leaders import leader_tables
+from evofsm.evidence.real.tables_of_leaders import leader_tables
 
 # When leaders of the pairs brake [s], and how hard [m/s²].
 BRAKES = {"a_1": [(3.0, 4.2)], "a_2": [], "b_1": [(3.0, 3.1), (6.0, 2.9)]}

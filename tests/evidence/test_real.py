@@ -12,7 +12,8 @@ from evofsm.driving.risk.counts import OutcomeCounts
 from evofsm.evidence.real.cases import HORIZONS, Question, case_of, recent_acceleration
 from evofsm.evidence.real.measures import MEASURES, ComingByState, approach, learn_logistic
 from evofsm.evidence.real.moments import Kind, alarm_threshold, lead_before, leads, telling_moments
-from evofsm.evidence.real.study import Plan, fold_of_runs, read_folder, run_real
+from evofsm.evidence.real.plan import Plan
+from evofsm.evidence.real.study import fold_of_runs, read_folder, run_real
 from evofsm.evidence.real.targets import TARGETS, coming, onsets
 from evofsm.evidence.scores import auroc
 from evofsm.io.datasets.episodes import Episode

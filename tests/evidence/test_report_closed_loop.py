@@ -12,7 +12,6 @@ import pytest
 from rich.console import Console
 
 from evofsm.app.text.documents import to_json
-from evofsm.app.text.terminal import print_closed_loop
 from evofsm.app.text.words import percent
 from evofsm.driving.families.family import load_family
 from evofsm.driving.outcomes import Row
@@ -22,15 +21,17 @@ from evofsm.evidence.closed_loop.cases import CaseResult
 from evofsm.evidence.closed_loop.comparison import chosen, front, our_lines, ours
 from evofsm.evidence.closed_loop.losses import What, losses
 from evofsm.evidence.closed_loop.over_seeds import along_stream
+from evofsm.evidence.closed_loop.plan import Plan, ShiftPlan
 from evofsm.evidence.closed_loop.separation import Separation
-from evofsm.evidence.closed_loop.shift import Check, ShiftPlan, Stream
-from evofsm.evidence.closed_loop.study import ClosedLoop, Plan, Point, TradeOff
+from evofsm.evidence.closed_loop.shift import Check, Stream
+from evofsm.evidence.closed_loop.study import ClosedLoop, Point, TradeOff
 from evofsm.evidence.closed_loop.two_worlds import InWorld
 from evofsm.evidence.report.beside import side_tables, why_not_by_state
 from evofsm.evidence.report.chapter import write_chapters
 from evofsm.evidence.report.closed_loop import closed_loop_chapter
 from evofsm.evidence.report.comparison import answer, headline, what_was_asked
 from evofsm.evidence.report.losses import losses_in_words
+from evofsm.evidence.terminal import print_closed_loop
 
 _N = 200
 

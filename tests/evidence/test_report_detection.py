@@ -12,13 +12,14 @@ from rich.console import Console
 
 from evofsm.driving.policies import Group
 from evofsm.evidence.closed_loop.calibration import Bin, Reliability
+from evofsm.evidence.detection.chapter import claims, losses
 from evofsm.evidence.detection.measures import Ours
-from evofsm.evidence.detection.plan import GRID, Plan
+from evofsm.evidence.detection.plan import Plan
 from evofsm.evidence.detection.rows import Reliable, Row
 from evofsm.evidence.detection.study import IN_GRID, Detection
 from evofsm.evidence.detection.watch import Target
+from evofsm.evidence.detection.worlds import GRID
 from evofsm.evidence.report.chapter import Chapter, write_chapters
-from evofsm.evidence.report.detection import claims, detection_chapter, losses
 from evofsm.evidence.terminal import print_chapter
 
 FAMILIES = ("paper", "emergency", "weak_brakes", "rare", "shift")
@@ -93,7 +94,7 @@ def study() -> Detection:
 
 
 def chapter(study: Detection, folder: Path) -> Chapter:
-    return detection_chapter(study, folder, "evofsm bench detection")
+    return study.plan.chapter(study, folder, "evofsm bench detection")
 
 
 def change(

@@ -9,7 +9,6 @@ from evofsm.evidence.prediction.forecasters import Method, Variant
 from evofsm.evidence.prediction.scoring import Row
 from evofsm.evidence.prediction.study import Plan, Prediction
 from evofsm.evidence.report.chapter import write_chapters
-from evofsm.evidence.report.prediction import prediction_chapter
 
 
 def row(source, horizon, method, skill, **others):
@@ -52,7 +51,7 @@ def study(**changed):
 @pytest.fixture(scope="module")
 def chapter(tmp_path_factory):
     folder = tmp_path_factory.mktemp("figures")
-    return prediction_chapter(study(), folder, "evofsm bench prediction")
+    return Plan().chapter(study(), folder, "evofsm bench prediction")
 
 
 def test_figures_and_page_exist_without_nan(chapter, tmp_path):
@@ -83,7 +82,7 @@ def test_tables_have_a_row_for_each_source_and_horizon_and_variant(chapter):
 
 
 def test_what_goes_against_us_is_said(tmp_path):
-    lost = " ".join(prediction_chapter(study(EVOFSM=-0.2), tmp_path, "x").losses)
+    lost = " ".join(Plan().tell(study(EVOFSM=-0.2)).losses)
     assert "stop and go, 5 s: no safe gain over persistence in divergence, skill -0.20" in lost
     assert "deeptime's batch has the smaller divergence" in lost
     assert "the blend has the better log score" in lost
@@ -93,5 +92,5 @@ def test_what_goes_against_us_is_said(tmp_path):
 def test_where_all_is_won_nothing_is_lost_and_all_that_was_asked_holds(chapter, tmp_path):
     assert (chapter.losses, chapter.fails) == ((), ())
     assert "how useful a forecast is depends on how fine the states are" in chapter.about
-    lost = prediction_chapter(study(EVOFSM=-0.2), tmp_path, "x").fails
+    lost = Plan().tell(study(EVOFSM=-0.2)).fails
     assert any("by divergence: in 0 of 4 cases" in failure for failure in lost)

@@ -7,12 +7,13 @@ import pytest
 
 from evofsm.driving.naming import name_state, name_states
 from evofsm.evidence.real.cases import HORIZONS
+from evofsm.evidence.real.chapter import losses
 from evofsm.evidence.real.measures import MEASURES, StateShare
 from evofsm.evidence.real.moments import Kind, Moment, Warned
-from evofsm.evidence.real.study import WARNED_OF, Drives, Plan, RealStudy, Row
+from evofsm.evidence.real.plan import Plan
+from evofsm.evidence.real.study import WARNED_OF, Drives, RealStudy, Row
 from evofsm.evidence.real.targets import TARGETS
 from evofsm.evidence.report.chapter import write_chapters
-from evofsm.evidence.report.real import losses, real_chapter
 
 
 def row(target, horizon, measure, area, enough):
@@ -65,7 +66,7 @@ def make(areas, enough=True):
 @pytest.fixture(scope="module")
 def written(tmp_path_factory):
     folder = tmp_path_factory.mktemp("real")
-    chapter = real_chapter(make({"ttc": 0.9, "evofsm-approach": 0.95}), folder, "evofsm bench")
+    chapter = Plan().chapter(make({"ttc": 0.9, "evofsm-approach": 0.95}), folder, "evofsm bench")
     page = write_chapters(
         folder / "index.html", [chapter], title=chapter.title, about="", command="evofsm bench"
     )
@@ -120,15 +121,15 @@ def test_whoever_ranks_better_is_named_with_both_numbers():
 
 def test_the_headline_counts_only_what_is_clear(tmp_path):
     clear = make({"ttc": 0.9, "evofsm-approach": 0.97})  # the difference is 0.02 to 0.12
-    told = real_chapter(clear, tmp_path, "")
+    told = Plan().tell(clear)
     assert ("in 6 of 6 questions, worse in 0" in told.headline, told.mark) == (True, "✓")
     unclear = make({"ttc": 0.9, "evofsm-approach": 0.94})  # -0.01 to 0.09
-    told = real_chapter(unclear, tmp_path, "")
+    told = Plan().tell(unclear)
     assert ("in 0 of 6 questions, worse in 0" in told.headline, told.mark) == (True, "✗")
 
 
 def test_without_enough_events_nothing_is_claimed(tmp_path):
-    chapter = real_chapter(make({}, enough=False), tmp_path, "evofsm bench")
+    chapter = Plan().chapter(make({}, enough=False), tmp_path, "evofsm bench")
     assert chapter.headline == "Too few events in these runs to compare anything."
     assert (chapter.losses, chapter.mark) == ((), "")
     assert [figure.name for figure in chapter.figures] == ["real-moments"]
@@ -145,7 +146,7 @@ def test_it_says_who_taught_what_is_judged(tmp_path):
 
 
 def _said(study, folder):
-    chapter = real_chapter(study, folder, "evofsm bench")
+    chapter = Plan().chapter(study, folder, "evofsm bench")
     plan = "; ".join(f"{one.name} {one.value}" for one in chapter.plan)
     return " ".join([chapter.about, plan, *(table.note for table in chapter.tables)])
 

@@ -9,8 +9,9 @@ from typer.testing import CliRunner
 
 from evofsm.__main__ import application
 from evofsm.evidence.report.chapter import write_chapters
-from evofsm.evidence.report.sensitivity import sensitivity_chapter, short_name
-from evofsm.evidence.sensitivity.study import Plan, Sensitivity, run_sensitivity
+from evofsm.evidence.sensitivity.chapter import short_name
+from evofsm.evidence.sensitivity.plan import Plan
+from evofsm.evidence.sensitivity.study import Sensitivity, run_sensitivity
 
 
 @pytest.fixture(scope="module")
@@ -21,7 +22,7 @@ def study():
 
 @pytest.fixture(scope="module")
 def chapter(study, tmp_path_factory):
-    return sensitivity_chapter(study, tmp_path_factory.mktemp("chapter"), "a command")
+    return study.plan.chapter(study, tmp_path_factory.mktemp("chapter"), "a command")
 
 
 def judged(study: Sensitivity, verdict) -> Sensitivity:
@@ -34,10 +35,9 @@ def judged(study: Sensitivity, verdict) -> Sensitivity:
 
 
 @pytest.fixture
-def told(tmp_path, monkeypatch):
+def told():
     """What the chapter says, without its figures, which take seconds."""
-    monkeypatch.setattr("evofsm.evidence.report.sensitivity.draw_all", lambda *given: [])
-    return lambda study: sensitivity_chapter(study, tmp_path, "a command")
+    return lambda study: study.plan.tell(study)
 
 
 def words(chapter) -> str:
@@ -110,7 +110,7 @@ def test_the_command_prints_a_row_for_each_setting_and_writes_nothing(study, tmp
     monkeypatch.chdir(tmp_path)
     asked = []
     monkeypatch.setattr(
-        "evofsm.evidence.sensitivity.run_sensitivity",
+        "evofsm.evidence.sensitivity.study.run_sensitivity",
         lambda plan, progress, workers: asked.append((plan, workers)) or study,
     )
     command = "bench sensitivity --short --seed 3 --workers 1 --json"

@@ -11,6 +11,7 @@ from evofsm.evidence.paper.runs import CASES, run_paper
 from evofsm.evidence.paper.settings import Settings
 from evofsm.evidence.sensitivity.designs import NEAR, Design, filling, maps, sweeps
 from evofsm.evidence.sensitivity.parameters import PARAMETERS, Parameter, Scale, Standing, parameter
+from evofsm.evidence.sensitivity.plan import Plan
 from evofsm.evidence.sensitivity.setting import (
     SCALES,
     SPEED_NOISE,
@@ -22,7 +23,7 @@ from evofsm.evidence.sensitivity.setting import (
     study_of,
 )
 from evofsm.evidence.sensitivity.shares import first_order, share_of, worst_sweeps
-from evofsm.evidence.sensitivity.study import Plan, _reach, _try_all, run_sensitivity
+from evofsm.evidence.sensitivity.study import _reach, _try_all, run_sensitivity
 from evofsm.fleet.executors import in_order
 
 TINY = Plan(settings=8, levels=3, side=2, halvings=1, rounds=1)
@@ -267,7 +268,7 @@ def test_the_study_tries_what_its_plan_says(tiny):
 
 
 def test_rows_are_plain_json_with_a_verdict_for_each_claim(tiny):
-    rows = json.loads(json.dumps(tiny.as_dicts(), allow_nan=False))
+    rows = json.loads(json.dumps(tiny.frame.as_dicts(), allow_nan=False))
     assert len(rows) == len(tiny.rows)
     claims = [claim.id for claim in tiny.claims]
     for row in rows:

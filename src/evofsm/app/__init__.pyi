@@ -17,9 +17,12 @@ from .text.columns import print_columns as print_columns
 from .text.columns import print_table as print_table
 from .text.columns import print_words as print_words
 from .text.documents import to_json as to_json
+from .text.table import Column as Column
 from .text.table import Table as Table
 from .text.words import NONE as NONE
+from .text.words import bare_percent as bare_percent
 from .text.words import count as count
+from .text.words import decimals as decimals
 from .text.words import interval as interval
 from .text.words import listed as listed
 from .text.words import number as number
@@ -27,6 +30,8 @@ from .text.words import part as part
 from .text.words import percent as percent
 from .text.words import percents as percents
 from .text.words import seeds_text as seeds_text
+from .text.words import span as span
+from .text.words import within as within
 from .watch.session import Session as Session
 from .watch.session import Watching as Watching
 from .watch.session import learn_first as learn_first

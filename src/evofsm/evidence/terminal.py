@@ -20,9 +20,9 @@ from evofsm.app import (
     print_table,
     print_words,
 )
-from evofsm.evidence.closed_loop import ClosedLoop
 from evofsm.evidence.closed_loop.comparison import Line, has_third_car, table_groups
-from evofsm.evidence.paper import Claim
+from evofsm.evidence.closed_loop.study import ClosedLoop
+from evofsm.evidence.paper.claims import Claim
 from evofsm.evidence.report.asked import tables_of_asked
 from evofsm.evidence.report.beside import side_tables
 from evofsm.evidence.report.chapter import Chapter

@@ -1,4 +1,4 @@
-"""Numbers as people read them, on pages and in the terminal."""
+"""Numbers as people read them, on pages and in the terminal; `NONE` where there is none."""
 
 from __future__ import annotations
 
@@ -9,35 +9,69 @@ from collections.abc import Callable, Iterable
 NONE = "–"
 
 
-def percent(share: float, sign: str = " %") -> str:
+def percent(share: float | None, sign: str = " %") -> str:
     """A share; one that is small but not 0 is not shown as 0."""
-    if not math.isfinite(share):
+    if share is None or not math.isfinite(share):
         return NONE
     value = 100.0 * share
     decimals = 2 if 0.0 < value < 0.05 else 1
     return f"{value:.{decimals}f}{sign}"
 
 
-def number(value: float, decimals: int) -> str:
+def bare_percent(share: float | None) -> str:
+    """A share in percent; the sign stands elsewhere."""
+    return percent(share, "")
+
+
+def number(value: float | None, decimals: int) -> str:
     """A number, if it is one."""
-    return f"{value:.{decimals}f}" if math.isfinite(value) else NONE
+    return NONE if value is None or not math.isfinite(value) else f"{value:.{decimals}f}"
 
 
-def count(value: float) -> str:
+def decimals(n: int) -> Callable[[float | None], str]:
+    """How a column writes numbers, with ``n`` decimals.
+
+    >>> decimals(2)(0.125), decimals(2)(None)
+    ('0.12', '–')
+    """
+    return lambda value: number(value, n)
+
+
+def count(value: float | None) -> str:
     """A count, or the median of counts."""
-    return f"{value:,.1f}".removesuffix(".0") if math.isfinite(value) else NONE
+    if value is None or not math.isfinite(value):
+        return NONE
+    return f"{value:,.1f}".removesuffix(".0")
 
 
-def interval(low: float, high: float, show: Callable[[float], str]) -> str:
+def interval(low: float | None, high: float | None, show: Callable[[float], str]) -> str:
     """From and to, if they are known."""
-    if not (math.isfinite(low) and math.isfinite(high)):
+    if low is None or high is None or not (math.isfinite(low) and math.isfinite(high)):
         return NONE
     return f"{show(low)}–{show(high)}"
 
 
+def span(n: int) -> Callable[[float | None, float | None], str]:
+    """How a column writes intervals, with ``n`` decimals.
+
+    >>> span(1)(0.25, 2.0)
+    '0.2–2.0'
+    """
+    return lambda low, high: interval(low, high, decimals(n))
+
+
+def within(n: int, ends: int) -> Callable[[float, float, float], str]:
+    """How a column writes a number and, in brackets, its interval, with so many decimals each.
+
+    >>> within(3, 2)(0.5, 0.25, 0.75)
+    '0.500 (0.25–0.75)'
+    """
+    return lambda value, low, high: f"{number(value, n)} ({interval(low, high, decimals(ends))})"
+
+
 def percents(low: float, high: float) -> str:
     """From and to, in percent; the sign stands elsewhere."""
-    return interval(low, high, lambda share: percent(share, ""))
+    return interval(low, high, bare_percent)
 
 
 def listed(names: Iterable[str]) -> str:

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+from typing import Annotated
 
 from evofsm.app import (
     PAGE,
@@ -21,13 +20,11 @@ from evofsm.app import (
     progress,
     require,
 )
-from evofsm.evidence.cli.common import Progress, WorkersOption
+from evofsm.evidence.cli.leaders import WorkersOption
+from evofsm.evidence.studies import STUDIES
 
 with suppress(ModuleNotFoundError):
     import typer
-
-if TYPE_CHECKING:
-    from evofsm.evidence.report.chapter import Chapter
 
 
 @plain_errors
@@ -61,12 +58,13 @@ def evidence(
 
     out.mkdir(parents=True, exist_ok=True)
     chapters = []
+    given = {"data": data, "seed": seed, "world": world.value}
+    studies = [made for study in STUDIES.values() if (made := study.in_short(**given)) is not None]
     with progress() as bars:
-        for name, study in _studies(data, world, seed, workers).items():
-            begun = time.monotonic()
-            found = study.run(counter(bars, f"Study: {name}"))
-            folder = out / name.replace(" ", "-")
-            chapters.append(study.tell(found, folder, study.command, _silent))
+        for study in studies:
+            begun, name = time.monotonic(), study.id.replace("-", " ")
+            found = study.run(counter(bars, f"Study: {name}"), workers)
+            chapters.append(study.chapter(found, out / study.id, study.command))
             print(f"{name}: {time.monotonic() - begun:.0f} s", file=sys.stderr)
     page = write_chapters(
         out / "index.html",
@@ -83,67 +81,3 @@ def evidence(
     console = app.console()
     terminal.print_headlines(console, chapters)
     console.print(f"Page with all tables and figures: {page}", soft_wrap=True)
-
-
-class _Study(NamedTuple):
-    """How a study is made, and told."""
-
-    run: Callable[[Progress], Any]
-    tell: Callable[[Any, Path, str, Progress], Chapter]
-    command: str  #: of the long form
-
-
-def _studies(
-    data: Path | None, world: WorldName, seed: int, workers: int | None
-) -> dict[str, _Study]:
-    """All studies in their short form, by name."""
-    from evofsm.driving import load_family, open_world
-    from evofsm.evidence import closed_loop, detection, paper, prediction, real, sensitivity
-    from evofsm.evidence.report.closed_loop import closed_loop_chapter
-    from evofsm.evidence.report.detection import detection_chapter
-    from evofsm.evidence.report.paper import paper_chapter
-    from evofsm.evidence.report.prediction import prediction_chapter
-    from evofsm.evidence.report.real import real_chapter
-    from evofsm.evidence.report.sensitivity import sensitivity_chapter
-
-    def run_paper(done: Progress) -> paper.PaperStudy:
-        with open_world(world.value) as place:
-            return paper.run_paper(place, world.value, paper.Settings.load(None), 20, done)
-
-    def run_closed_loop(done: Progress) -> closed_loop.ClosedLoop:
-        plan = closed_loop.Plan(seed=seed).shortened()
-        return closed_loop.run_closed_loop(load_family("emergency"), plan, done, workers)
-
-    def run_detection(done: Progress) -> detection.Detection:
-        plan = detection.Plan(seed=seed).shortened()
-        return detection.run_detection(detection.FAMILIES, plan, done, workers)
-
-    def run_prediction(done: Progress) -> prediction.Prediction:
-        logs = prediction.log_sources(data) if data is not None else ()
-        return prediction.run_prediction(
-            prediction.Plan(seed=seed).shortened(), logs, done, workers
-        )
-
-    def run_sensitivity(done: Progress) -> sensitivity.Sensitivity:
-        return sensitivity.run_sensitivity(sensitivity.Plan(seed=seed).shortened(), done, workers)
-
-    studies = {
-        "paper": _Study(run_paper, paper_chapter, "evofsm paper"),
-        "closed loop": _Study(run_closed_loop, closed_loop_chapter, "evofsm bench closed-loop"),
-        "detection": _Study(run_detection, detection_chapter, "evofsm bench detection"),
-        "prediction": _Study(run_prediction, prediction_chapter, "evofsm bench prediction"),
-        "sensitivity": _Study(run_sensitivity, sensitivity_chapter, "evofsm bench sensitivity"),
-    }
-    if data is not None:
-
-        def run_real(done: Progress) -> real.RealStudy:
-            plan = real.Plan(seed=seed).shortened()
-            cases, verified = real.read_folder(data, plan)
-            return real.run_real(cases, plan, verified, done, workers)
-
-        studies["real"] = _Study(run_real, real_chapter, f"evofsm bench real --data {data}")
-    return studies
-
-
-def _silent(done: int, total: int) -> None:
-    """Drawing is quick beside the studies."""

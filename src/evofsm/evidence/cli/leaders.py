@@ -7,10 +7,13 @@ from pathlib import Path
 from typing import Annotated
 
 from evofsm.app import counter, plain_errors, print_json, progress
-from evofsm.evidence.cli.common import WorkersOption
 
 with suppress(ModuleNotFoundError):
     import typer
+
+    WorkersOption = Annotated[
+        int | None, typer.Option(min=1, help="Processes. [default: one per core]")
+    ]
 
 
 @plain_errors
@@ -57,7 +60,7 @@ def leaders(
         return
     from evofsm import app
     from evofsm.app import print_table
-    from evofsm.evidence.report.leaders import leader_tables
+    from evofsm.evidence.real.tables_of_leaders import leader_tables
 
     console = app.console()
     for table in leader_tables(study, limits):

@@ -6,7 +6,6 @@ constants that were right before.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from evofsm.driving import (
@@ -18,21 +17,11 @@ from evofsm.driving import (
     held_out,
     training,
 )
+from evofsm.evidence.closed_loop.plan import ShiftPlan
 from evofsm.guard import Reviser
 
 #: Episodes after the shift at which what was learnt so far is tested on held-out draws.
 AFTER = (0, 1, 2, 5, 10, 20, 30)
-
-
-@dataclass(frozen=True)
-class ShiftPlan:
-    """How much is driven."""
-
-    before: int = 100  #: episodes of the stream before the shift
-    after: int = 60  #: and after it
-    held_out: int = 200  #: episodes of each test
-    seed: int = 0
-    tolerance: float = 0.02
 
 
 class Stream(NamedTuple):

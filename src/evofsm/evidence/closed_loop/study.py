@@ -38,9 +38,11 @@ from evofsm.driving import (
 )
 from evofsm.evidence.closed_loop.calibration import Reliability, run_calibration
 from evofsm.evidence.closed_loop.cases import CaseResult, run_cases
+from evofsm.evidence.closed_loop.plan import Plan
 from evofsm.evidence.closed_loop.separation import Separation, run_separation
-from evofsm.evidence.closed_loop.shift import Check, ShiftPlan, Stream, run_shift
+from evofsm.evidence.closed_loop.shift import Check, Stream, run_shift
 from evofsm.evidence.closed_loop.two_worlds import InWorld, run_two_worlds
+from evofsm.evidence.study import Frame
 from evofsm.fleet import in_order
 from evofsm.guard import Reviser
 
@@ -59,38 +61,6 @@ RULES: dict[str, StateRule | None] = {
     "novelty": Novelty(radius=1.0, scales=(4.0, 2.0, 2.0)),
     "failure-split": FailureSplit(base=Novelty(radius=2.0, scales=(4.0, 2.0, 2.0))),
 }
-
-
-@dataclass(frozen=True)
-class Plan:
-    """How much is driven."""
-
-    train: int = 300  #: training episodes
-    test: int = 1000  #: held-out episodes
-    seeds: int = 20  #: learning seeds
-    seed: int = 0  #: of everything
-    tolerance: float = 0.02
-    rule_seeds: int = 2  #: learning seeds in the comparison of state rules
-    rule_test: int = 100  #: held-out episodes in it, and in the trade-off
-    side_train: int = 100  #: training episodes of the studies beside the table
-    side_test: int = 300  #: held-out episodes of them
-    world_test: int = 50  #: episodes driven in both worlds
-    shift: ShiftPlan = field(default_factory=ShiftPlan)
-
-    def shortened(self) -> Plan:
-        """About a tenth of everything: a look, not evidence."""
-        return replace(
-            self,
-            train=min(self.train, 100),
-            test=min(self.test, 100),
-            seeds=min(self.seeds, 2),
-            rule_seeds=min(self.rule_seeds, 1),
-            rule_test=20,
-            side_train=40,
-            side_test=60,
-            world_test=5,
-            shift=replace(self.shift, before=60, after=10, held_out=20),
-        )
 
 
 class Point(NamedTuple):
@@ -130,6 +100,11 @@ class ClosedLoop:
     worlds: list[InWorld] = field(default_factory=list)  #: empty without SUMO
     streams: list[Stream] = field(default_factory=list)  #: of families that shift
     checks: list[Check] = field(default_factory=list)
+
+    @property
+    def frame(self) -> Frame:
+        """The rows of the table."""
+        return Frame(self.rows)
 
     def as_dict(self) -> dict[str, Any]:
         """All of it, for JSON."""

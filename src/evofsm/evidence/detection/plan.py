@@ -1,34 +1,48 @@
-"""What is watched and judged: how much of it, and in which worlds."""
+"""How much is watched and judged."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from itertools import chain
-from pathlib import Path
+from typing import TYPE_CHECKING
 
-from evofsm.driving import Draw, Family, load_family, merge, training
+from evofsm.app import split_names
+from evofsm.evidence.study import Progress, Study, option, silent
 
-#: What is judged if nothing else is asked for; see `world`.
+if TYPE_CHECKING:
+    from evofsm.evidence.detection.study import Detection
+    from evofsm.evidence.report.chapter import Chapter
+
+#: What is judged if nothing else is asked for; see `evofsm.evidence.detection.worlds.world`.
 FAMILIES = (
     *("paper", "emergency", "stop_and_go", "cut_in", "ncap", "r157"),
     *("weak_brakes", "rare", "shift", "shift-at-once", "emergency+noise"),
 )
-#: Name of the worlds of the grid, in which nobody knows the limits: see `grid_world`.
-GRID = "grid"
-
-_AT_ONCE = "-at-once"
-_PAPER = Path(__file__).with_name("paper_drawn.toml")
 
 
 @dataclass(frozen=True)
-class Plan:
-    """How much is driven."""
+class Plan(Study["Detection"]):
+    """Who sees dead ends and collisions coming: ours, and the classic measures.
 
+    Nobody acts. Ours has watched other episodes; thresholds are chosen on yet others.
+    """
+
+    id = "detection"
+    question = "Who sees danger, and how early?"
+    doing = "Watching and judging"
+    short = "A tenth of everything: a look, not evidence."
+
+    family: str = option(
+        "",
+        "Families with commas, emergency+noise for one with a switch, shift-at-once for "
+        "one just shifted. [default: all of the study]",
+    )
+    seed: int = option(0, "Of everything.", min=0)
+    with_grid: bool = option(
+        True, "Also over brakes that nobody was told of, own and leader's.", name="--grid/--no-grid"
+    )
     train: int = 100  #: episodes that are watched before anything is judged
     since: int = 20  #: episodes that are watched after a shift
     seeds: int = 20  #: learning seeds; the first one's are the rows, the others their spread
-    seed: int = 0  #: of everything
     hours: float = 3.0  #: of held-out driving, and as many to choose thresholds on
     long_hours: float = 30.0  #: the same in the families of `long`
     long: tuple[str, ...] = ("paper", "emergency")
@@ -58,85 +72,19 @@ class Plan:
         """How long a family is driven [h]."""
         return self.long_hours if name in self.long else self.hours
 
+    @property
+    def families(self) -> tuple[str, ...]:
+        """Names of the worlds that are judged, as `evofsm.evidence.detection.worlds` knows them."""
+        return tuple(split_names(self.family)) or FAMILIES
 
-@dataclass(frozen=True, eq=False)
-class World:
-    """Where something is judged, and what may be watched before."""
+    def run(self, progress: Progress = silent, workers: int | None = None) -> Detection:
+        """Judge every measure in every world."""
+        from evofsm.evidence.detection.study import run_detection
 
-    name: str
-    family: Family  #: that is judged
-    watched: Family  #: that is watched first; another one where the world shifts
-    since: int  #: episodes of ``family`` that are watched after that
-    settled: Family  #: on which thresholds are chosen
+        return run_detection(self, progress, workers)
 
-    def training(self, plan: Plan, learning_seed: int) -> Iterator[tuple[Family, Draw]]:
-        """What one learner watches, with the family that each draw is of."""
-        train = plan.grid_train if self.name == GRID else plan.train
-        first = training(self.watched, plan.seed, learning_seed, train)
-        then = training(self.family, plan.seed, learning_seed, self.since, first=train)
-        return chain(
-            ((self.watched, draw) for draw in first), ((self.family, draw) for draw in then)
-        )
+    def tell(self, found: Detection) -> Chapter:
+        """Who sees danger, how early, and where ours does not."""
+        from evofsm.evidence.detection.chapter import tell
 
-
-def world(name: str, plan: Plan) -> World:
-    """A world by its name.
-
-    ``emergency+noise`` is a family with a switch on. A family that shifts is judged after its
-    shift, with some episodes watched since; ``shift-at-once`` is the same with none, and with
-    thresholds from before it. ``paper`` is the paper's four cases with what it leaves open drawn.
-
-    Raises
-    ------
-    ValueError
-        If there is no such family or switch.
-
-    Examples
-    --------
-    >>> at_once = world("shift-at-once", Plan())
-    >>> at_once.watched.decel, at_once.family.decel, at_once.since
-    (4.5, 2.5, 0)
-    """
-    base, *switches = name.split("+")
-    at_once = base.endswith(_AT_ONCE)
-    family = _family(base.removesuffix(_AT_ONCE)).with_switches(switches)
-    shifted = family.shifted
-    if at_once and shifted is None:
-        raise ValueError(f"family {family.name!r} has no shift, so there is no {name!r}")
-    if shifted is None:
-        return World(name, family, family, 0, family)
-    return World(
-        name, shifted, family, 0 if at_once else plan.since, family if at_once else shifted
-    )
-
-
-def _family(name: str) -> Family:
-    return replace(load_family(_PAPER), name=name) if name == "paper" else load_family(name)
-
-
-def grid_world(decel: float, leader_decel: float, plan: Plan) -> World:
-    """As `emergency`, but with brakes of anyone's choice; commands always reach further.
-
-    Parameters
-    ----------
-    decel, leader_decel : float
-        Hardest braking of the follower, and of leaders, who draw theirs from 2.5 m/s² on [m/s²].
-    plan : Plan
-
-    Examples
-    --------
-    >>> cell = grid_world(3.0, 6.0, Plan()).family
-    >>> cell.decel, cell.leader_decel, cell.actions.low
-    (3.0, 6.0, -6.0)
-    """
-    emergency = load_family("emergency")
-    lowest = -max(plan.grid)
-    changes = {
-        "actions": {"low": lowest},
-        "limits": {"decel": decel, "leader_decel": leader_decel},
-        "body": {"lowest": -decel},
-        "leader": {"brake_decel": [2.5, leader_decel]},
-        "drivers": {"aggressive": {"lowest": lowest}},
-    }
-    family = replace(emergency, name=GRID, tables=merge(emergency.tables, changes))
-    return World(GRID, family, family, 0, family)
+        return tell(found)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -59,10 +59,6 @@ class Row:
     decel: float  #: the true limits [m/s²]
     leader_decel: float
     auroc_seeds: tuple[float, ...] = ()  #: of the other learning seeds, on fewer episodes
-
-    def as_dict(self) -> dict[str, Any]:
-        """For JSON."""
-        return asdict(self)
 
 
 class Reliable(NamedTuple):

@@ -7,7 +7,7 @@ and learning seed over the cores, and put together in the order of the tasks.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import islice, product
@@ -23,7 +23,7 @@ from evofsm.evidence.detection.measures import (
     fixed,
     tuned,
 )
-from evofsm.evidence.detection.plan import FAMILIES, Plan, World, grid_world, world
+from evofsm.evidence.detection.plan import Plan
 from evofsm.evidence.detection.rows import Judged, Reliable, Row, Scored, judge
 from evofsm.evidence.detection.watch import (
     Exposure,
@@ -33,7 +33,9 @@ from evofsm.evidence.detection.watch import (
     held_out_draws,
     watch,
 )
+from evofsm.evidence.detection.worlds import World, grid_world, world
 from evofsm.evidence.scores import auroc
+from evofsm.evidence.study import Frame, Progress, silent
 from evofsm.fleet import in_order
 
 #: Limits that are told to the safe distance of the grid that is wrong almost everywhere [m/s²].
@@ -52,6 +54,11 @@ class Detection:
     grid: list[Row] = field(default_factory=list)
     reliable: list[Reliable] = field(default_factory=list)
 
+    @property
+    def frame(self) -> Frame:
+        """Every row, those of the grid last."""
+        return Frame([*self.rows, *self.grid])
+
     def find(self, family: str, measure: str, target: Target) -> Row:
         """The row of one measure.
 
@@ -66,56 +73,43 @@ class Detection:
         raise KeyError(f"{measure} was not judged by {target} in {family}")
 
 
-def run_detection(
-    families: Sequence[str] = FAMILIES,
-    plan: Plan | None = None,
-    progress: Callable[[int, int], None] = lambda done, total: None,
-    workers: int | None = None,
-    *,
-    grid: bool = True,
-) -> Detection:
+def run_detection(plan: Plan, progress: Progress = silent, workers: int | None = None) -> Detection:
     """Judge every measure in every world.
 
     Parameters
     ----------
-    families : sequence of str
-        Names as `world` knows them.
-    plan : Plan, optional
+    plan : Plan
     progress : callable
         Told how many tasks are done, of how many.
     workers : int, optional
         Processes; one per core if not given. The numbers do not depend on it.
-    grid : bool
-        Whether the grid of brakes that nobody knows is driven as well.
 
     Raises
     ------
     ValueError
-        If a name is none, or there is no family at all.
+        If a name is none.
     """
-    chosen = plan or Plan()
-    if not families:
-        raise ValueError("there is no family to judge in")
+    families = plan.families
     for name in families:  # so that a wrong name shows at once
-        world(name, chosen)
-    longest = sorted(families, key=lambda name: -chosen.hours_of(name))
-    tasks: list[partial[Any]] = [partial(_judge_world, name, chosen) for name in longest]
+        world(name, plan)
+    longest = sorted(families, key=lambda name: -plan.hours_of(name))
+    tasks: list[partial[Any]] = [partial(_judge_world, name, plan) for name in longest]
     tasks += [
-        partial(_other_seed, name, chosen, seed)
-        for name, seed in product(families, range(1, chosen.seeds))
+        partial(_other_seed, name, plan, seed)
+        for name, seed in product(families, range(1, plan.seeds))
     ]
-    if grid:
+    if plan.with_grid:
         tasks += [
-            partial(_judge_cell, decel, leader_decel, chosen)
-            for decel, leader_decel in product(chosen.grid, chosen.grid_leader)
+            partial(_judge_cell, decel, leader_decel, plan)
+            for decel, leader_decel in product(plan.grid, plan.grid_leader)
         ]
     found = in_order(tasks, workers, progress)
     by_name = dict(zip(longest, found, strict=False))
     judged = [one for name in families for one in by_name[name]]
     areas = [area for result in found if isinstance(result, _Areas) for area in result.areas]
     return Detection(
-        chosen,
-        tuple(families),
+        plan,
+        families,
         [_with_seeds(one.row, areas) for one in judged],
         [row for result in found if isinstance(result, _Cell) for row in result.rows],
         [fit for one in judged for fit in one.reliable],

@@ -9,8 +9,8 @@ where it is as good as the reference (D. Wilks, "Statistical Methods in the Atmo
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import asdict, dataclass
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,10 +57,7 @@ class Row:
     forecasts: int
     episodes: int  #: test episodes
     states: int  #: in the median
-
-    def as_dict(self) -> dict[str, Any]:
-        """For JSON."""
-        return asdict(self)
+    ablation: bool = False  #: one learning seed, or one part of the runs; the method is a `Variant`
 
 
 def score(
@@ -157,6 +154,8 @@ def row(
     batch: Sequence[Sums],
     seed: int,
     rounds: int,
+    *,
+    ablation: bool,
 ) -> Row:
     """Judge a method against both references, all of them in the same rounds."""
     mine, still, rival = together(ours), together(persistence), together(batch)
@@ -183,6 +182,7 @@ def row(
         forecasts=int(forecasts),
         episodes=len(mine.episodes),
         states=mine.states,
+        ablation=ablation,
     )
 
 

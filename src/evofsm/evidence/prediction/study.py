@@ -9,10 +9,10 @@ ones. Logs are split by run into parts, and each part is held out once.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from evofsm.evidence.prediction.forecasters import (
     REFERENCES,
@@ -23,6 +23,7 @@ from evofsm.evidence.prediction.forecasters import (
     ablate,
     compare,
 )
+from evofsm.evidence.prediction.plan import Plan
 from evofsm.evidence.prediction.scoring import Row, Sums, row, score
 from evofsm.evidence.prediction.sources import (
     FAMILIES,
@@ -33,44 +34,11 @@ from evofsm.evidence.prediction.sources import (
     read,
     split_logs,
 )
+from evofsm.evidence.study import Frame, Progress, silent
 from evofsm.fleet import in_order
 
 # More than there are test episodes in one part of the logs.
 _APART = 1_000_000
-
-
-@dataclass(frozen=True)
-class Plan:
-    """How much is driven and read."""
-
-    train: int = 100  #: training episodes of a learning seed
-    test: int = 100  #: held-out episodes
-    fine_train: int = 20  #: the same, where every step of 0.01 s is observed
-    fine_test: int = 20
-    seeds: int = 20  #: learning seeds
-    fine_seeds: int = 5  #: learning seeds of those
-    parts: int = 3  #: into which runs are split
-    runs: int | None = None  #: of one origin at most; None for all
-    ablation: tuple[str, ...] = ("emergency", "stop_and_go")  #: families in the ablation
-    ablation_runs: int = 6  #: of one origin at most in the ablation; 0: none
-    rounds: int = 1000  #: of the bootstrap
-    seed: int = 0  #: of everything
-
-    def shortened(self) -> Plan:
-        """A look, not evidence."""
-        return replace(
-            self,
-            train=min(self.train, 40),
-            test=min(self.test, 30),
-            fine_train=min(self.fine_train, 5),
-            fine_test=min(self.fine_test, 5),
-            seeds=min(self.seeds, 2),
-            fine_seeds=min(self.fine_seeds, 1),
-            parts=min(self.parts, 2),
-            runs=12,
-            ablation=self.ablation[-1:],
-            rounds=min(self.rounds, 200),
-        )
 
 
 @dataclass(frozen=True)
@@ -91,17 +59,10 @@ class Prediction:
         """Names of families and of origins of logs, in their order."""
         return list(dict.fromkeys(one.source for one in self.rows))
 
-    def as_dicts(self) -> list[dict[str, Any]]:
-        """Rows for JSON; those of the ablation say so."""
-        return [
-            {**one.as_dict(), "ablation": part is self.ablation}
-            for part in (self.rows, self.ablation)
-            for one in part
-        ]
-
-    def as_dict(self) -> dict[str, Any]:
-        """All of it, for JSON."""
-        return {"plan": asdict(self.plan), "rows": self.as_dicts()}
+    @property
+    def frame(self) -> Frame:
+        """Every row; those of the ablation say so."""
+        return Frame([*self.rows, *self.ablation])
 
 
 class _Scored(NamedTuple):
@@ -118,7 +79,7 @@ class _Scored(NamedTuple):
 def run_prediction(
     plan: Plan,
     logs: Sequence[LogSource] = (),
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: Progress = silent,
     workers: int | None = None,
     families: Sequence[str] = FAMILIES,
 ) -> Prediction:
@@ -157,7 +118,9 @@ def run_prediction(
     found = in_order(tasks, workers, progress)
     of_ablation = found[len(real) : len(real) + len(ablated)]
     of_rows = found[len(real) + len(ablated) :] + found[: len(real)]
-    return Prediction(plan, list(_rows(plan, of_rows)), list(_rows(plan, of_ablation)), logs)
+    return Prediction(
+        plan, list(_rows(plan, of_rows)), list(_rows(plan, of_ablation, ablation=True)), logs
+    )
 
 
 def _at_most(source: LogSource, most: int | None) -> LogSource:
@@ -168,7 +131,9 @@ def _at_most(source: LogSource, most: int | None) -> LogSource:
     return source._replace(files=chosen)
 
 
-def _rows(plan: Plan, found: Sequence[Sequence[_Scored]]) -> Iterator[Row]:
+def _rows(
+    plan: Plan, found: Sequence[Sequence[_Scored]], *, ablation: bool = False
+) -> Iterator[Row]:
     """A row for each method at each horizon of each source, in the order in which they came."""
     rounds: dict[tuple[str, float, str], list[_Scored]] = defaultdict(list)
     for one in (scored for task in found for scored in task):
@@ -183,6 +148,7 @@ def _rows(plan: Plan, found: Sequence[Sequence[_Scored]]) -> Iterator[Row]:
             [one.batch for one in of_one],
             plan.seed,
             plan.rounds,
+            ablation=ablation,
         )
 
 

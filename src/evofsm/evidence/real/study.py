@@ -6,10 +6,10 @@ The others are those of the other folds, or those of another folder.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +26,9 @@ from evofsm.evidence.real.measures import (
     score_fixed,
 )
 from evofsm.evidence.real.moments import Moment, Warned, alarm_threshold, leads, telling_moments
+from evofsm.evidence.real.plan import Plan
 from evofsm.evidence.scores import Ranked, interval, resampled
+from evofsm.evidence.study import Frame, Progress, silent
 from evofsm.fleet import in_order
 from evofsm.io import Layout, find_checksums, read_episodes
 
@@ -45,20 +47,7 @@ _KEPT = 60
 
 
 @dataclass(frozen=True)
-class Plan:
-    """How much is done."""
-
-    folds: int = 5
-    rounds: int = 500  #: of the bootstrap
-    seed: int = 0  #: of the folds and the bootstrap
-    most_runs: int | None = None  #: as many runs at most, drawn with the seed; None for all
-
-    def shortened(self) -> Plan:
-        """A few runs: a look, not evidence."""
-        return replace(self, folds=2, rounds=100, most_runs=10)
-
-
-class Row(NamedTuple):
+class Row:
     """One measure, asked one question."""
 
     target: str
@@ -104,9 +93,10 @@ class RealStudy:
     moments: list[Moment]
     taught_by: Drives | None = None  #: of another folder; None where folds taught each other
 
-    def as_rows(self) -> list[dict[str, Any]]:
-        """Every row as plain values."""
-        return [row._asdict() for row in self.rows]
+    @property
+    def frame(self) -> Frame:
+        """Every row."""
+        return Frame(self.rows)
 
     def of(self, target: str, horizon: float) -> list[Row]:
         """The rows of one question."""
@@ -167,7 +157,7 @@ def run_real(
     cases: Sequence[Case],
     plan: Plan,
     verified: int = 0,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: Progress = silent,
     workers: int | None = None,
     training: Sequence[Case] | None = None,
 ) -> RealStudy:

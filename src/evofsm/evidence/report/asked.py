@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from evofsm.app import Table
+from evofsm.app import Column, Table
 
 
 class Asked(NamedTuple):
@@ -28,16 +28,12 @@ def failures(asked: Sequence[Asked]) -> tuple[str, ...] | None:
 
 def tables_of_asked(asked: Sequence[Asked]) -> tuple[Table, ...]:
     """All of it in a table; none where nothing could be judged."""
-    if not asked:
-        return ()
-    return (
-        Table(
-            "What was asked for",
-            ("target", "asked", "measured", "met"),
-            tuple(
-                (one.claim, one.asked, one.measured, "yes" if one.met else "no") for one in asked
-            ),
-            in_words=True,
-            failing=tuple(place for place, one in enumerate(asked) if not one.met),
-        ),
+    columns: tuple[Column[Asked], ...] = (
+        Column("target", "claim"),
+        Column("asked", "asked"),
+        Column("measured", "measured"),
+        Column("met", lambda one: "yes" if one.met else "no"),
     )
+    title = "What was asked for"
+    table = Table.of(title, columns, asked, in_words=True, failing=lambda one: not one.met)
+    return (table,) if asked else ()

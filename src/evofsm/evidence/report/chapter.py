@@ -7,14 +7,15 @@ it loses. Each study makes its own; the page, and the terminal, show them all al
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import count
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from evofsm.app import Table
-from evofsm.evidence.report.drawing import Drawing
+from evofsm.evidence.report.drawing import Drawing, Sketch, draw_all
 from evofsm.evidence.report.html import Setting, inline, versions, write_html
+from evofsm.evidence.study import Progress, silent
 
 
 class Source(NamedTuple):
@@ -34,6 +35,7 @@ class Section:
     text: str = ""
     tables: tuple[Table, ...] = ()
     figures: tuple[Drawing, ...] = ()
+    sketches: tuple[Sketch, ...] = ()  #: figures that `Chapter.drawn` is to draw
 
 
 @dataclass(frozen=True)
@@ -47,15 +49,28 @@ class Chapter:
     answer: tuple[str, ...]  #: the same in two or three sentences with their numbers
     losses: tuple[str, ...]  #: what goes against us, a sentence with its numbers each
     tables: tuple[Table, ...]
-    figures: tuple[Drawing, ...]
-    plan: tuple[Setting, ...]  #: seeds and sizes
-    command: str  #: what makes these numbers
+    figures: tuple[Drawing, ...] = ()
+    plan: tuple[Setting, ...] = ()  #: seeds and sizes
+    command: str = ""  #: what makes these numbers
     #: What was asked for and does not hold; None where nothing was asked, or could be judged.
     fails: tuple[str, ...] | None = None
     losses_table: Table | None = None  #: all losses, where sentences would be too many
     sections: tuple[Section, ...] = ()  #: what is told where the chapter has a page to itself
     packages: tuple[str, ...] = ()  #: whose versions matter beside the usual ones
     sources: tuple[Source, ...] = ()
+    sketches: tuple[Sketch, ...] = ()  #: figures that `drawn` is to draw
+
+    def drawn(self, folder: Path, progress: Progress = silent) -> Chapter:
+        """The same with its figures, and those of its sections, drawn into a folder."""
+        parts: list[Chapter | Section] = [self, *self.sections]
+        drawings = draw_all([one for part in parts for one in part.sketches], folder, progress)
+        left = iter(drawings)
+        figures = [part.figures + tuple(next(left) for _ in part.sketches) for part in parts]
+        sections = (
+            replace(section, figures=found, sketches=())
+            for section, found in zip(self.sections, figures[1:], strict=True)
+        )
+        return replace(self, figures=figures[0], sketches=(), sections=tuple(sections))
 
     @property
     def n_losses(self) -> int:

@@ -1,4 +1,4 @@
-"""A figure in its files, with the words that belong to it."""
+"""A figure before and after it is in files, with the words that belong to it."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from evofsm.evidence.study import Progress, silent
 from evofsm.extras import needs
 
 with needs("matplotlib", "plot", "drawing figures"):
@@ -27,26 +28,23 @@ class Drawing:
 
 @dataclass(frozen=True)
 class Sketch:
-    """A figure before it is in files."""
+    """A figure that is still to be drawn, by `figure`."""
 
     name: str
     title: str
     caption: str
     alt: str
-    figure: Figure
+    figure: Callable[[], Figure] | Figure
 
 
 def draw_all(
-    sketches: Sequence[Callable[[], Sketch]],
-    folder: Path,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    sketches: Sequence[Sketch | Callable[[], Sketch]], folder: Path, progress: Progress = silent
 ) -> list[Drawing]:
     """Draw figures one by one in the house's style, each as PNG and SVG.
 
     Parameters
     ----------
-    sketches : sequence of callable
-        Each draws one figure.
+    sketches : sequence of Sketch
     folder : Path
         Where the files are put; made if it is not there.
     progress : callable
@@ -55,9 +53,10 @@ def draw_all(
     folder.mkdir(parents=True, exist_ok=True)
     drawings = []
     with house_style():
-        for draw in sketches:
-            sketch = draw()
-            paths = save(sketch.figure, folder, sketch.name)
+        for one in sketches:
+            sketch = one if isinstance(one, Sketch) else one()
+            figure = sketch.figure if isinstance(sketch.figure, Figure) else sketch.figure()
+            paths = save(figure, folder, sketch.name)
             drawings.append(Drawing(sketch.name, sketch.title, sketch.caption, sketch.alt, paths))
             progress(len(drawings), len(sketches))
     return drawings

@@ -2,69 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from evofsm.driving import KinematicWorld
 from evofsm.evidence.paper.claims import Claim, check_claims
 from evofsm.evidence.sensitivity.designs import Design, Trial, filling, maps, sweeps
 from evofsm.evidence.sensitivity.parameters import PARAMETERS, Parameter
+from evofsm.evidence.sensitivity.plan import Plan
 from evofsm.evidence.sensitivity.setting import (
-    ROUNDS,
     Remembering,
     Row,
     evaluate,
     recovered,
     study_of,
 )
+from evofsm.evidence.study import Frame, Progress, silent
 from evofsm.fleet import in_order
 
 # Settings a worker tries in one go: worth crossing a process boundary.
 _TOGETHER = 16
-
-
-@dataclass(frozen=True)
-class Plan:
-    """How much is tried."""
-
-    settings: int = 2000  #: drawn over everything; others in proportion
-    seed: int = 0  #: of the draws and of the noise
-    levels: int = 33  #: of each parameter in its sweep
-    side: int = 15  #: of a map
-    halvings: int = 7  #: of the last step of a sweep, in search of where a claim breaks
-    rounds: int = ROUNDS  #: in which the four cases are driven; fewer are not the paper's study
-
-    def __post_init__(self) -> None:
-        for name, least in (
-            ("settings", 4),
-            ("levels", 2),
-            ("side", 2),
-            ("halvings", 0),
-            ("rounds", 1),
-        ):
-            if getattr(self, name) < least:
-                raise ValueError(f"{name} is {getattr(self, name)}; it must be {least} or more")
-
-    def shortened(self) -> Plan:
-        """About a twentieth of everything: a look, not evidence."""
-        return replace(
-            self,
-            settings=min(self.settings, 80),
-            levels=min(self.levels, 7),
-            side=min(self.side, 3),
-            halvings=min(self.halvings, 2),
-        )
-
-    @property
-    def sizes(self) -> dict[Design, int]:
-        """How many points each design that fills a space has."""
-        return {
-            Design.ALL: self.settings,
-            Design.OPEN: self.settings // 2,
-            Design.NEAR: self.settings // 4,
-        }
 
 
 class Reach(NamedTuple):
@@ -92,14 +51,15 @@ class Sensitivity:
         """Rows of a design; of one sweep or map, where what it varies is named."""
         return [row for row in self.rows if row.design == design and varied in ((), row.varied)]
 
-    def as_dicts(self) -> list[dict[str, Any]]:
-        """A row for each setting, for JSON."""
-        return [row.as_dict() for row in self.rows]
+    @property
+    def frame(self) -> Frame:
+        """A row for each setting."""
+        return Frame(self.rows)
 
 
 def run_sensitivity(
     plan: Plan,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: Progress = silent,
     workers: int | None = None,
 ) -> Sensitivity:
     """Try all settings of the plan; the same for every number of workers.
@@ -144,8 +104,17 @@ def _trials(plan: Plan) -> Iterator[Trial]:
     yield Trial(Design.RECOVERED, (), recovered())
     yield from sweeps(plan.levels, plan.seed)
     yield from maps(plan.side, plan.seed)
-    for design, number in plan.sizes.items():
+    for design, number in _sizes(plan).items():
         yield from filling(design, number, plan.seed)
+
+
+def _sizes(plan: Plan) -> dict[Design, int]:
+    """How many points each design that fills a space has."""
+    return {
+        Design.ALL: plan.settings,
+        Design.OPEN: plan.settings // 2,
+        Design.NEAR: plan.settings // 4,
+    }
 
 
 def _try_all(trials: Sequence[Trial], rounds: int) -> list[Row]:

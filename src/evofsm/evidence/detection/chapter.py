@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from functools import partial
 from itertools import product
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -27,7 +26,7 @@ with needs("matplotlib", "plot", "drawing figures"):
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
 
-    from evofsm.evidence.report.drawing import Sketch, draw_all
+    from evofsm.evidence.report.drawing import Sketch
     from evofsm.evidence.report.of_policies import draw_reliability
     from evofsm.plot import DEAD_END, FIRST, FOLLOWER, INK, LEADER, SOFT, WIDTH
 
@@ -55,41 +54,24 @@ _CLOSEST = 1e-4
 _ASKED_LEAD, _ASKED_MARGIN = 5.0, 0.2
 
 
-def detection_chapter(
-    study: Detection,
-    folder: Path,
-    command: str,
-    progress: Callable[[int, int], None] = lambda done, total: None,
-) -> Chapter:
-    """Draw the figures of the study and say what it found.
-
-    Parameters
-    ----------
-    study : Detection
-    folder : Path
-        Where the figures are put.
-    command : str
-        What was typed to get it.
-    progress : callable
-        Told how many figures are done, of how many.
-    """
+def tell(study: Detection) -> Chapter:
+    """What the study found."""
     asked = list(claims(study))
     met = sum(claim.met for claim in asked)
     headline = f"{met} of the {len(asked)} targets that can be judged are met."
     if asked and met == len(asked):
         headline = f"All {len(asked)} targets that can be judged are met."
     return Chapter(
-        id="detection",
-        title="Who sees danger, and how early?",
+        id=study.plan.id,
+        title=study.plan.question,
         about=_about(study),
         headline=headline,
         answer=tuple(_answer(study)),
         fails=failures(asked),
         losses=tuple(losses(study)),
         tables=tuple(_tables(study, asked)),
-        figures=tuple(draw_all(_sketches(study), folder, progress)),
+        sketches=tuple(_sketches(study)),
         plan=tuple(_plan(study)),
-        command=command,
         packages=("scipy",),
     )
 
@@ -503,14 +485,14 @@ def _plan(study: Detection) -> Iterator[Setting]:
 # -- Figures --------------------------------------------------------------------------------------
 
 
-def _sketches(study: Detection) -> list[Callable[[], Sketch]]:
-    sketches: list[Callable[[], Sketch]] = [partial(_sketch_areas, study)]
+def _sketches(study: Detection) -> list[Sketch]:
+    sketches: list[Sketch] = [_sketch_areas(study)]
     if any(row.lead_median_1 is not None for row in study.rows):
-        sketches.append(partial(_sketch_leads, study))
+        sketches.append(_sketch_leads(study))
     if any(True for _ in _fits(study)):
-        sketches.append(partial(_sketch_reliability, study))
+        sketches.append(_sketch_reliability(study))
     if study.grid:
-        sketches.append(partial(_sketch_grid, study))
+        sketches.append(_sketch_grid(study))
     return sketches
 
 
@@ -521,7 +503,7 @@ def _sketch_areas(study: Detection) -> Sketch:
         "What AUROC lacks to 1, on a logarithmic scale: left is better. Shaded: worlds by turns. "
         "Bars: 95 %, over episodes. Half, the dashed line, is chance.",
         "Dots by world and measure; ours is furthest left on dead ends, and mixed on collisions.",
-        draw_areas(study),
+        partial(draw_areas, study),
     )
 
 
@@ -592,7 +574,7 @@ def _sketch_leads(study: Detection) -> Sketch:
         "90 % of collisions. Open: at one in ten hours, where there were hours enough. Blue: ours; "
         "black: fixed constants; green: tuned, or told the truth.",
         "Lead times by measure; ours and the safe distances are longest on dead ends.",
-        draw_leads(study),
+        partial(draw_leads, study),
     )
 
 
@@ -684,7 +666,7 @@ def _sketch_reliability(study: Detection) -> Sketch:
         f"Probability of a {_WHAT[Target.COLLISION]}, going on as driven, against how often it "
         "came on held-out draws. On the dashed line both agree.",
         "Two reliability diagrams with the number of cases below each.",
-        draw_reliability(list(_fits(study))),
+        partial(draw_reliability, list(_fits(study))),
     )
 
 
@@ -699,7 +681,7 @@ def _sketch_grid(study: Detection) -> Sketch:
         "ends at all, so that only false calls count below.",
         "Heat maps over own and leader's brakes; ours is the lightest but for worlds without any "
         "dead end.",
-        draw_grid(study),
+        partial(draw_grid, study),
     )
 
 

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from functools import partial
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -29,7 +28,7 @@ with needs("matplotlib", "plot", "drawing figures"):
     from matplotlib.figure import Figure
     from matplotlib.patches import Patch
 
-    from evofsm.evidence.report.drawing import Sketch, draw_all
+    from evofsm.evidence.report.drawing import Sketch
     from evofsm.plot import DEAD_END, FIRST, FOLLOWER, INK, LEADER, SOFT, WIDTH
 
 _STANDINGS = {Standing.OPEN: "open", Standing.STATED: "stated", Standing.ADDED: NONE}
@@ -87,34 +86,18 @@ _NEAR = _Space(f"within ±{100 * NEAR:g} % of recovered", "near", Design.NEAR, "
 _SPACES = (_OPEN, _SAME, _ALL, _NEAR)
 
 
-def sensitivity_chapter(
-    study: Sensitivity,
-    folder: Path,
-    command: str,
-    progress: Callable[[int, int], None] = lambda done, total: None,
-) -> Chapter:
-    """The study as a chapter of a page.
-
-    Parameters
-    ----------
-    study : Sensitivity
-    folder : Path
-        Where the figures are put.
-    command : str
-        What makes these numbers.
-    progress : callable
-        Told how many figures are done, of how many.
-    """
+def tell(study: Sensitivity) -> Chapter:
+    """What the study found."""
     sketches = [
-        partial(_sketch_shares, study),
-        partial(_sketch_sweeps, study),
-        partial(_sketch_maps, study),
-        partial(_sketch_deciders, study),
-        partial(_sketch_counts, study),
+        _sketch_shares(study),
+        _sketch_sweeps(study),
+        _sketch_maps(study),
+        _sketch_deciders(study),
+        _sketch_counts(study),
     ]
     return Chapter(
-        id="sensitivity",
-        title="Do the paper's claims depend on what it leaves open?",
+        id=study.plan.id,
+        title=study.plan.question,
         about=_about(study),
         headline=_headline(study),
         answer=tuple(_answer(study)),
@@ -126,9 +109,8 @@ def sensitivity_chapter(
             _table_of_parameters(study),
             *tables_of_asked(asked),
         ),
-        figures=tuple(draw_all(sketches, folder, progress)),
+        sketches=tuple(sketches),
         plan=tuple(_plan(study)),
-        command=command,
         packages=("scipy",),
     )
 
@@ -466,7 +448,7 @@ def _sketch_shares(study: Sensitivity) -> Sketch:
         "In what share of settings each claim holds",
         "Bars: 95 % intervals, often smaller than the mark.",
         "Dots with intervals: share of settings with which each claim holds, in three spaces.",
-        draw_shares(study),
+        partial(draw_shares, study),
     )
 
 
@@ -477,7 +459,7 @@ def _sketch_sweeps(study: Sensitivity) -> Sketch:
         "Each row is a claim, each column a value of one parameter, all others being as recovered. "
         "The line marks the recovered value. Ranges are spaced as their axes say.",
         "Twelve strips, one for each parameter, that show for each claim where it holds.",
-        draw_sweeps(study),
+        partial(draw_sweeps, study),
     )
 
 
@@ -488,7 +470,7 @@ def _sketch_maps(study: Sensitivity) -> Sketch:
         "Star: the recovered setting. Cells with a dot: all claims hold. Numbers: states at the "
         "end, in a few cells. The others are as recovered.",
         "Six maps of the number of claims that hold over pairs of parameters.",
-        draw_maps(study),
+        partial(draw_maps, study),
     )
 
 
@@ -500,7 +482,7 @@ def _sketch_deciders(study: Sensitivity) -> Sketch:
         "drawn over their ranges; what is missing to 100 % lies in their interplay. Empty: no more "
         "than chance.",
         "Two matrices of first-order sensitivity indices, parameters by claims.",
-        draw_deciders(study),
+        partial(draw_deciders, study),
     )
 
 
@@ -510,7 +492,7 @@ def _sketch_counts(study: Sensitivity) -> Sketch:
         "How many states there are, and how many claims hold",
         "The broken line marks the paper: 7 states, all claims.",
         "Two histograms for three spaces: number of states, and number of claims that hold.",
-        draw_counts(study),
+        partial(draw_counts, study),
     )
 
 

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -23,7 +22,7 @@ with needs("matplotlib", "plot", "drawing figures"):
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from evofsm.evidence.report.drawing import Sketch, draw_all
+    from evofsm.evidence.report.drawing import Sketch
     from evofsm.plot import DEAD_END, FIRST, FOLLOWER, INK, LEADER, WIDTH
 
 #: The horizons that the study is about [s]; shorter ones show where the paper's test is made.
@@ -42,27 +41,11 @@ _DECIMALS = 2
 _FAR_BELOW = -99.0
 
 
-def prediction_chapter(
-    study: Prediction,
-    folder: Path,
-    command: str,
-    progress: Callable[[int, int], None] = lambda done, total: None,
-) -> Chapter:
-    """The study as a chapter of a page.
-
-    Parameters
-    ----------
-    study : Prediction
-    folder : Path
-        Where the figures are put.
-    command : str
-        What makes these numbers.
-    progress : callable
-        Told how many figures are done, of how many.
-    """
+def tell(study: Prediction) -> Chapter:
+    """What the study found."""
     return Chapter(
-        id="prediction",
-        title="How far ahead is the state foreseen?",
+        id=study.plan.id,
+        title=study.plan.question,
         about=_about(study),
         headline=_headline(study),
         answer=tuple(_answer(study)),
@@ -74,9 +57,8 @@ def prediction_chapter(
             *_tables_of_ablation(study),
             *tables_of_asked(asked),
         ),
-        figures=tuple(draw_all([partial(_sketch_skills, study)], folder, progress)),
+        sketches=(_sketch_skills(study),),
         plan=tuple(_plan(study)),
-        command=command,
         packages=("scipy", "deeptime"),
     )
 
@@ -320,6 +302,20 @@ def _tables_of_ablation(study: Prediction) -> Iterator[Table]:
 
 
 def _sketch_skills(study: Prediction) -> Sketch:
+    return Sketch(
+        name="skill-over-horizon",
+        title="Skill over horizon",
+        caption=(
+            "Skill in divergence against persistence; bars are 95 % over test episodes. Marks "
+            "at the lower edge lie below it. Lines are broken where another machine begins."
+        ),
+        alt=_headline(study),
+        figure=partial(draw_skills, study),
+    )
+
+
+def draw_skills(study: Prediction) -> Figure:
+    """Skill over horizon, a panel for each source."""
     columns = 3 if len(study.sources) > 4 else 2
     lines = -(-len(study.sources) // columns)
     figure = Figure(figsize=(WIDTH, 0.75 + 1.85 * lines), layout="constrained")
@@ -336,16 +332,7 @@ def _sketch_skills(study: Prediction) -> Sketch:
             axes.tick_params(labelbottom=True)
     handles, labels = grid.flat[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper center", ncols=len(labels))
-    return Sketch(
-        name="skill-over-horizon",
-        title="Skill over horizon",
-        caption=(
-            "Skill in divergence against persistence; bars are 95 % over test episodes. Marks "
-            "at the lower edge lie below it. Lines are broken where another machine begins."
-        ),
-        alt=_headline(study),
-        figure=figure,
-    )
+    return figure
 
 
 def _draw_panel(axes: Axes, study: Prediction, source: str) -> None:

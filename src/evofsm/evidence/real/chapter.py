@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -38,7 +37,7 @@ with needs("matplotlib", "plot", "drawing figures"):
 
     from evofsm.evidence.report.asked import Asked, failures, tables_of_asked
     from evofsm.evidence.report.chapter import Chapter
-    from evofsm.evidence.report.drawing import Sketch, draw_all
+    from evofsm.evidence.report.drawing import Sketch
     from evofsm.plot import DEAD_END, FIRST, FOLLOWER, INK, LEADER, LEADER_DASHES, SOFT, WIDTH
 
 _OURS = tuple(measure.name for measure in MEASURES if measure.group is Group.OURS)
@@ -57,42 +56,22 @@ _GROUPS = {measure.name: measure.group for measure in MEASURES}
 _TARGETS = {target.name: target for target in TARGETS}
 
 
-def real_chapter(
-    study: RealStudy,
-    folder: Path,
-    command: str,
-    progress: Callable[[int, int], None] = lambda done, total: None,
-) -> Chapter:
-    """What the study found, with its figures drawn into a folder.
-
-    Parameters
-    ----------
-    study : RealStudy
-    folder : Path
-    command : str
-        What was typed to get it.
-    progress : callable
-        Told how many figures are done, of how many.
-
-    Returns
-    -------
-    Chapter
-    """
-    sketches = [partial(_sketch_areas, study)] if _comparable(study) else []
+def tell(study: RealStudy) -> Chapter:
+    """What the study found."""
+    sketches = [_sketch_areas(study)] if _comparable(study) else []
     if study.moments:
-        sketches.append(partial(_sketch_moments, study))
+        sketches.append(_sketch_moments(study))
     return Chapter(
-        id="real",
-        title="Does what was learnt on some real drives foretell danger in others?",
+        id=study.plan.id,
+        title=study.plan.question,
         about=_about(study),
         headline=_headline(study),
         answer=tuple(_answer(study)),
         losses=tuple(losses(study)),
         fails=failures(asked := list(_what_was_asked(study))),
         tables=(*_tables(study), *tables_of_asked(asked)),
-        figures=tuple(draw_all(sketches, folder, progress)),
+        sketches=tuple(sketches),
         plan=tuple(_plan(study)),
-        command=command,
         packages=("scipy",),
     )
 
@@ -386,7 +365,7 @@ def _sketch_areas(study: RealStudy) -> Sketch:
         "Area under the ROC curve with its 95 % interval (whole runs drawn), for every event that "
         "is frequent enough. Filled circles are ours. 0.5 is chance.",
         "A grid of panels, events by horizons, with a dot and an interval for each measure.",
-        draw_areas(study),
+        partial(draw_areas, study),
     )
 
 
@@ -452,7 +431,7 @@ def _sketch_moments(study: RealStudy) -> Sketch:
         "the gap does not close; it is drawn at the bottom there.",
         "Columns of three panels each: the gap, both speeds, and the risk of both measures over "
         "the 10 seconds before a moment.",
-        draw_moments(study.moments),
+        partial(draw_moments, study.moments),
     )
 
 

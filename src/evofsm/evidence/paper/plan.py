@@ -1,0 +1,54 @@
+"""How often the paper's cases are driven, and where."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from evofsm.evidence.study import Progress, Study, silent
+
+if TYPE_CHECKING:
+    from evofsm.evidence.paper.runs import PaperStudy
+    from evofsm.evidence.report.chapter import Chapter
+
+
+@dataclass(frozen=True)
+class Plan(Study["PaperStudy"]):
+    """Reproduce the paper: drive its 80 runs, and hold every claim against them."""
+
+    id = "paper"
+    question = "Does the paper's machine do what the paper says?"
+    doing = "Driving and learning"
+    short = "All of it, which is short."
+    group = ""
+
+    world: str = "sumo"
+    rounds: int = 20  #: how often the four cases are driven
+    settings: Path | None = None  #: TOML file with settings in place of the paper's
+
+    def shortened(self) -> Plan:
+        """All of it, which is short."""
+        return replace(self)
+
+    def run(self, progress: Progress = silent, workers: int | None = None) -> PaperStudy:
+        """Drive the four cases, round by round, in one process."""
+        from evofsm.driving import open_world
+        from evofsm.evidence.paper.runs import run_paper
+        from evofsm.evidence.paper.settings import Settings
+
+        with open_world(self.world) as place:
+            settings = Settings.load(self.settings)
+            return run_paper(place, self.world, settings, self.rounds, progress)
+
+    def tell(self, found: PaperStudy) -> Chapter:
+        """Every claim beside what was measured."""
+        raise NotImplementedError
+
+    def chapter(
+        self, found: PaperStudy, folder: Path, command: str, progress: Progress = silent
+    ) -> Chapter:
+        """Every claim beside what was measured."""
+        from evofsm.evidence.report.paper import paper_chapter
+
+        return paper_chapter(found, folder, command, progress)

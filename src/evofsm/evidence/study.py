@@ -1,0 +1,159 @@
+"""What a study is: a question, how much is done to answer it, and a chapter with the answer.
+
+Every study is a frozen dataclass that derives from `Study`, and stands once in
+`evofsm.evidence.studies.STUDIES`; ``evofsm bench``, ``evofsm evidence`` and the docs read it there.
+Its fields say how much is done; those made by `option` are the options of its command.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar, Generic, Protocol, Self, TypeVar
+
+from evofsm.extras import needs
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from evofsm.evidence.report.chapter import Chapter
+
+#: Is told how many tasks are done, of how many.
+Progress = Callable[[int, int], None]
+
+
+def silent(done: int, total: int) -> None:
+    """A `Progress` that tells nobody."""
+
+
+def option(
+    default: Any, about: str, *, name: str = "", required: bool = False, **limits: float
+) -> Any:
+    """A field of a study that is an option of its command.
+
+    Parameters
+    ----------
+    default
+        Of the field and of the option.
+    about : str
+        What the help says.
+    name : str
+        Of the option, such as ``"--with"``, where it is not that of the field.
+    required : bool
+        Whether the command refuses to run without it.
+    **limits
+        ``min`` and ``max``.
+    """
+    told = {"about": about, "name": name, "required": required, "limits": limits}
+    return field(default=default, metadata=told)
+
+
+@dataclass(frozen=True)
+class Frame:
+    """Rows of a study, all of one type: a frozen dataclass, one row a line of one table."""
+
+    rows: Sequence[Any]
+
+    def as_dicts(self) -> list[dict[str, Any]]:
+        """Every row as plain values, for JSON; a row may say by ``as_dict`` what it is."""
+        return [row.as_dict() if hasattr(row, "as_dict") else asdict(row) for row in self.rows]
+
+    def write_parquet(self, path: Path) -> None:
+        """Write all rows as one Parquet file.
+
+        Raises
+        ------
+        ModuleNotFoundError
+            If polars is not installed.
+        """
+        with needs("polars", "tables", "writing rows as Parquet"):
+            import polars
+        # An absolute path, for polars takes others for addresses on the network.
+        polars.DataFrame(self.as_dicts(), infer_schema_length=None).write_parquet(path.absolute())
+
+
+class Findings(Protocol):
+    """What a study found."""
+
+    @property
+    def frame(self) -> Frame:
+        """Every row, for programs."""
+
+
+F = TypeVar("F", bound=Findings)
+
+
+@dataclass(frozen=True)
+class Study(ABC, Generic[F]):
+    """A question, and how much is done to answer it. The docstring is the help of its command."""
+
+    id: ClassVar[str]  #: of its command and in addresses, such as ``"detection"``
+    question: ClassVar[str]  #: that it asks, the title of its chapter
+    doing: ClassVar[str]  #: what its progress bar says
+    short: ClassVar[str]  #: what `shortened` leaves, for the help
+    group: ClassVar[str] = "bench "  #: of commands that its own is in
+    #: Packages that it needs, with the extra that brings each.
+    needed: ClassVar[Mapping[str, str]] = {"scipy": "study"}
+
+    @abstractmethod
+    def shortened(self) -> Self:
+        """A look, not evidence: the same in a minute or a few."""
+
+    @abstractmethod
+    def run(self, progress: Progress = silent, workers: int | None = None) -> F:
+        """Do it.
+
+        Parameters
+        ----------
+        progress : callable
+            Told how many tasks are done, of how many.
+        workers : int, optional
+            Processes; one per core if not given. The numbers do not depend on it.
+        """
+
+    @abstractmethod
+    def tell(self, found: F) -> Chapter:
+        """What was found, in words, tables, and figures that are still to be drawn."""
+
+    def chapter(self, found: F, folder: Path, command: str, progress: Progress = silent) -> Chapter:
+        """What was found, with its figures drawn.
+
+        Parameters
+        ----------
+        found
+            What `run` returned.
+        folder : Path
+            Where the figures are put.
+        command : str
+            What was typed to get it.
+        progress : callable
+            Told how many figures are done, of how many.
+        """
+        return replace(self.tell(found), command=command).drawn(folder, progress)
+
+    def document(self, found: F) -> object:
+        """What is written as JSON beside the page."""
+        return found.frame.as_dicts()
+
+    def say(self, out: Console, found: F, chapter: Chapter) -> None:
+        """Print what was found in the terminal."""
+        from evofsm.evidence.terminal import print_chapter
+
+        print_chapter(out, chapter)
+
+    @classmethod
+    def in_short(cls, **given: Any) -> Self | None:
+        """Its short form with those of the given fields that it has; None if it lacks one."""
+        mine = {one.name: given[one.name] for one in fields(cls) if one.name in given}
+        if any(one.metadata.get("required") and mine.get(one.name) is None for one in fields(cls)):
+            return None
+        return cls(**mine).shortened()
+
+    @property
+    def command(self) -> str:
+        """The command of the long form, with what it cannot do without."""
+        told = [one for one in fields(self) if one.metadata.get("required")]
+        asked = [f"--{one.name} {getattr(self, one.name)}" for one in told]
+        return " ".join([f"evofsm {self.group}{self.id}", *asked])
