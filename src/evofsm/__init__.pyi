@@ -23,5 +23,6 @@ from .core import wilson_bounds as wilson_bounds
 from .files import read_header as read_header
 from .fleet import Fleet as Fleet
 from .fleet import merge as merge
+from .guard import Guard as Guard
 
 __version__: str

@@ -8,8 +8,9 @@ import pytest
 
 pytest.importorskip("scipy")
 
-from evofsm.driving.families.family import load_family
 from evofsm.driving.learner import Learner, drive_alone
+
+from evofsm.driving.families.family import load_family
 from evofsm.driving.outcomes import bootstrap, outcome, reference
 from evofsm.driving.policies import fixed_policies
 from evofsm.driving.revisers import Unrevised

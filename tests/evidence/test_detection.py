@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from evofsm.driving.learner import drive_alone
 
 from evofsm.driving.families.family import load_family
-from evofsm.driving.learner import drive_alone
 from evofsm.driving.policies import Group
 from evofsm.driving.revisers import Unrevised
 from evofsm.driving.risk.rss import ResponsibilitySensitiveSafety

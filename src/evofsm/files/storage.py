@@ -98,6 +98,7 @@ _SHAPES: dict[str, dict[str, _Shape] | None] = {
         "doubts_brought": ("brought",),
         "doubts_shortfalls": ("shortfalls",),
     },
+    "guard": {"machine": ("machine",), "judge": ("judge",)},  # the files of both, as bytes
     "checkpoint": None,
 }
 # The version from which on there are those that were not there from the first.
@@ -143,7 +144,7 @@ _DAMAGE = (
 class Header(NamedTuple):
     """What a file says of itself."""
 
-    kind: str  #: ``"machine"``, ``"model"``, ``"risk"`` or ``"checkpoint"``
+    kind: str  #: ``"machine"``, ``"model"``, ``"risk"``, ``"guard"`` or ``"checkpoint"``
     version: int  #: of the format
     library: str | None  #: version of evofsm that wrote it; None before format 4
     content: dict[str, Any]  #: settings, by name
@@ -373,7 +374,7 @@ def _is_left(file: BinaryIO) -> bool:
 
 
 def kind_of(place: Place) -> str:
-    """Say what a file holds: ``"machine"``, ``"model"``, ``"risk"`` or ``"checkpoint"``."""
+    """Say what a file holds: the kind of its `Header`."""
     return read_header(place).kind
 
 
