@@ -4,7 +4,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 INSTALL = $(PYTHON) -m pip --python $(BIN)/python --disable-pip-version-check install --quiet
 
-.PHONY: paper watch closed-loop evidence docs test check bench fuzz torture soak lock lowest supply \
+.PHONY: paper watch closed-loop evidence docs test check house bench fuzz torture soak lock lowest supply \
     clean
 
 paper: .venv/installed          ## reproduce every claim of the paper in SUMO
@@ -21,6 +21,9 @@ test: .venv/installed           ## all tests, doctests included
 
 check: .venv/installed          ## lint, types and the import rule
 	@$(BIN)/ruff check . && $(BIN)/ruff format --check . && $(BIN)/mypy && $(BIN)/lint-imports
+
+house: .venv/installed          ## draw the rooms from their imports; fails where an arrow goes up
+	@$(BIN)/python tools/house.py
 
 bench: .venv/installed          ## how fast it is, as ratios against named references; bench.json
 	@$(BIN)/python benchmarks/speed.py --json bench.json

@@ -16,10 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evofsm.core.states.novelty import Novelty
+from evofsm.driving.cars import drive, guard_for_family, learnt_by
 from evofsm.driving.families.family import Family, load_family
-from evofsm.driving.learner import Learner
-from evofsm.guard.oversight import Oversight
-from evofsm.guard.protocols import Proposal
+from evofsm.guard.guard import Guard
 
 _STATES = 200
 _CONTROL_STEP = 0.010
@@ -32,13 +31,13 @@ def main() -> int:
     parser.add_argument("--steps", type=int, default=1_000_000)
     steps = parser.parse_args().steps
     family = load_family("emergency")
-    learner = Learner.new(family, Novelty(radius=1.0, scales=(2.0, 1.0, 1.0)))
-    stream = teach(family, learner)
-    seconds = measure(family, learner, stream, steps)
+    guard = guard_for_family(family, rule=Novelty(radius=1.0, scales=(2.0, 1.0, 1.0)))
+    stream = teach(family, guard)
+    seconds = measure(family, guard, stream, steps)
     median, p99, worst = np.quantile(seconds, [0.5, 0.99, 1.0])
     share = p99 / _CONTROL_STEP
     print(
-        f"one decision, {learner.machine.n_states} states, {family.actions.n_actions} actions, "
+        f"one decision, {learnt_by(guard)[0].n_states} states, {family.actions.n_actions} actions, "
         f"{steps} decisions: median {1e6 * median:.0f} µs, p99 {1e6 * p99:.0f} µs, "
         f"longest {1e3 * worst:.1f} ms\n"
         f"p99 is {share:.1%} of a 10 ms control step (promised: {_PROMISED:.0%})"
@@ -46,37 +45,31 @@ def main() -> int:
     return int(share > _PROMISED)
 
 
-def teach(family: Family, learner: Learner) -> list[NDArray[np.float64]]:
-    """Learn until there are states enough; answers what was observed, by episode."""
-    stream = []
-    reviser = learner.reviser(family, tolerance=0.02)
-    index = 0
-    while learner.machine.n_states < _STATES:
-        drive = learner.drive(family, family.draw(0, index), reviser, learn=True)
-        stream.append(np.array([decision.situation.observation for decision in drive.decisions]))
-        index += 1
+def teach(family: Family, guard: Guard) -> list[NDArray[np.float64]]:
+    """Learn until there are states enough; returns what was observed, by episode."""
+    stream: list[NDArray[np.float64]] = []
+    while learnt_by(guard)[0].n_states < _STATES:
+        driven = drive(guard, family.draw(0, len(stream)))
+        stream.append(np.array([decision.situation.observation for decision in driven.decisions]))
     return stream
 
 
 def measure(
-    family: Family, learner: Learner, stream: list[NDArray[np.float64]], steps: int
+    family: Family, guard: Guard, stream: list[NDArray[np.float64]], steps: int
 ) -> NDArray[np.float64]:
     """(steps,) seconds of each decision."""
     seconds = np.empty(steps)
     done = 0
     wishes = np.random.default_rng(0).uniform(family.actions.low, family.actions.high, steps)
-    reviser = learner.reviser(family, tolerance=0.02)
     while done < steps:
-        oversight = Oversight(family.actions, reviser, machine=learner.machine, risk=learner.risk)
         for observation in stream[done % len(stream)]:
             begun = time.perf_counter()
-            situation = oversight.recognise(observation, 0.0)
-            oversight.revise(situation, Proposal(float(wishes[done])))
+            guard.decide(observation, float(wishes[done]))
             seconds[done] = time.perf_counter() - begun
             done += 1
             if done == steps:
                 break
-        oversight.end(None, failed=False)
+        guard.end()
     return seconds
 
 

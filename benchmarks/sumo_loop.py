@@ -23,11 +23,12 @@ import numpy as np
 
 from decision import teach
 from evofsm.core.states.novelty import Novelty
+from evofsm.driving.cars import drive, guard_for_family, learnt_by
 from evofsm.driving.families.family import Draw, Family, load_family
 from evofsm.driving.framework import Drive
-from evofsm.driving.learner import Learner
 from evofsm.driving.worlds.road import Episode
 from evofsm.driving.worlds.sumo import SumoWorld
+from evofsm.guard.guard import Guard
 
 _PROMISED = 1.25
 # Time between decisions [s]: the one that is promised, and stricter ones; the last at every step.
@@ -71,17 +72,17 @@ def _measure(id_: str, interval: float, repeats: int) -> dict[str, Any]:
     """Medians over repeats; both sides take turns. Every repeat drives the same draws."""
     family = load_family("emergency")
     family = replace(family, tables={**family.tables, "interval": interval})
-    learner = Learner.new(family, Novelty(radius=1.0, scales=(2.0, 1.0, 1.0)))
-    teach(family, learner)
+    guard = guard_for_family(family, rule=Novelty(radius=1.0, scales=(2.0, 1.0, 1.0)))
+    teach(family, guard)
     draws = [family.draw(0, index, split="test") for index in range(_DRAWS)]
     ours: list[float] = []
     reference: list[float] = []
     with SumoWorld() as world:
-        drive(family, learner, draws[0], world)  # compiles, or reads what was compiled
+        drive_timed(guard, draws[0], world)  # compiles, or reads what was compiled
         for _ in range(repeats):
             taken, steps = np.zeros(2), 0
             for draw in draws:
-                seconds, driven = drive(family, learner, draw, world)
+                seconds, driven = drive_timed(guard, draw, world)
                 seconds_without, replayed = replay(family, draw, driven.executed.tolist(), world)
                 if not np.array_equal(driven.episode.record, replayed.record):
                     raise RuntimeError("the reference drives another way: the ratio means nothing")
@@ -93,7 +94,7 @@ def _measure(id_: str, interval: float, repeats: int) -> dict[str, Any]:
     ratio = statistics.median(np.divide(ours, reference).tolist())
     return {
         "id": id_,
-        "what": f"decisions every {interval:g} s, {learner.machine.n_states} states",
+        "what": f"decisions every {interval:g} s, {learnt_by(guard)[0].n_states} states",
         "ours_s": ours_s,
         "reference": "the same SUMO run, replayed",
         "reference_s": reference_s,
@@ -103,11 +104,10 @@ def _measure(id_: str, interval: float, repeats: int) -> dict[str, Any]:
     }
 
 
-def drive(family: Family, learner: Learner, draw: Draw, world: SumoWorld) -> tuple[float, Drive]:
-    """Seconds taken, and what was driven under the reviser; the learner goes on learning."""
-    reviser = learner.reviser(family, tolerance=0.02)
+def drive_timed(guard: Guard, draw: Draw, world: SumoWorld) -> tuple[float, Drive]:
+    """Seconds taken, and what was driven under the guard, which goes on learning."""
     begun = time.process_time()
-    driven = learner.drive(family, draw, reviser, learn=True, world=world)
+    driven = drive(guard, draw, world)
     return time.process_time() - begun, driven
 
 

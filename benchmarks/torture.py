@@ -31,13 +31,12 @@ import numpy as np
 
 import one_machine
 import torture_audit
-from evofsm.app.driving import Setup, drive_family
+from evofsm.app.driving import Setup, drive_family, make_guard
 from evofsm.app.learning import learn_traces
 from evofsm.core.actions import IntervalActions
 from evofsm.core.machine import EvolvingFSM
 from evofsm.core.model import FSMModel
 from evofsm.driving.families.family import load_family
-from evofsm.driving.learner import Learner
 from evofsm.driving.risk.outcome import LatentRisk
 from evofsm.driving.worlds.kinematic import KinematicWorld
 from evofsm.files import storage
@@ -115,11 +114,11 @@ def _learn(logs: Sequence[str], path: Path) -> bytes:
 
 def _drive(path: Path) -> bytes:
     setup = Setup(load_family("emergency"), episodes=4)
-    learner = Learner.new(setup.family)
-    checkpoint = Checkpoint(path, setup.settings("kinematic", learner), every=0.0)
-    driving = drive_family(setup, learner, KinematicWorld(), checkpoint=checkpoint)
+    guard = make_guard(setup)
+    checkpoint = Checkpoint(path, setup.settings("kinematic", guard), every=0.0)
+    driving = drive_family(setup, guard, KinematicWorld(), checkpoint=checkpoint)
     told = json.dumps([driving.row.as_dict(), driving.lead_times, dict(driving.decisions)])
-    return _saved(learner.machine) + _saved(learner.risk) + told.encode()
+    return _saved(driving.guard.machine) + _saved(driving.guard.judge) + told.encode()
 
 
 def _saved(learnt: Any) -> bytes:
@@ -317,7 +316,7 @@ def samples(folder: Path) -> list[Sample]:
     return [
         Sample(path.name, path.read_bytes(), _LOADS[header.kind], header.version >= 4)
         for path in paths
-        for header in [storage.describe(path)]
+        for header in [storage.read_header(path)]
     ]
 
 

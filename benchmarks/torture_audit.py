@@ -24,8 +24,7 @@ from evofsm.driving.risk.outcome import LatentRisk
 from evofsm.files.sealed import NOTHING, ChainedFile, Head, Sync, records, seal, verify
 from evofsm.guard.auditing.log import AuditLog
 from evofsm.guard.auditing.replay import audit
-from evofsm.guard.oversight import Oversight
-from evofsm.guard.protocols import Proposal
+from evofsm.guard.guard import Guard
 from evofsm.guard.reviser import ActionReviser
 
 #: What must not happen.
@@ -54,11 +53,10 @@ def _drive(log: AuditLog, decisions: int, machine: EvolvingFSM | None = None) ->
     """Approach a leader, so that the first decisions say nothing, and the others do."""
     risk = LatentRisk(_ACTIONS.low)
     reviser = ActionReviser(risk, _ACTIONS)
-    oversight = Oversight(_ACTIONS, reviser, machine=machine, risk=risk, audit=log)
+    guard = Guard.of(reviser, machine=machine, audit=log)
     for gap, when in zip(np.linspace(60.0, 5.0, decisions), np.arange(decisions), strict=True):
-        situation = oversight.recognise(np.array([gap, 15.0, 8.0]), 0.25 * when)
-        oversight.revise(situation, Proposal(0.0))
-    oversight.end(np.array([4.0, 15.0, 8.0]), failed=False)
+        guard.decide([gap, 15.0, 8.0], 0.0, 0.25 * when)
+    guard.end(observation=[4.0, 15.0, 8.0])
 
 
 # -- Interrupts -----------------------------------------------------------------------------------

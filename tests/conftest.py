@@ -29,14 +29,14 @@ def spiral():
 @pytest.fixture(scope="session")
 def compiled():
     """All that a watched run needs is compiled, for tests that wait for some seconds only."""
-    from evofsm.app.watch.session import Session, Watching, learn_first, watched_learner
+    from evofsm.app.watch.session import Session, Watching, learn_first, watched_guard
     from evofsm.driving.families.family import load_family
     from evofsm.driving.worlds.kinematic import KinematicWorld
 
     watching = Watching(load_family("paper"))
-    learner = watched_learner(watching.family)
-    learn_first(watching, learner, 2)
-    with Session(watching, learner, KinematicWorld()) as session:
+    guard = watched_guard(watching.family)
+    learn_first(watching, guard, 2)
+    with Session(watching, guard, KinematicWorld()) as session:
         while not session.step().over:
             session.graph()
 

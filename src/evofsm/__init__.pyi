@@ -12,9 +12,17 @@ from .core import Missing as Missing
 from .core import Novelty as Novelty
 from .core import ObservationEncoder as ObservationEncoder
 from .core import Paper as Paper
+from .core import StateRule as StateRule
 from .core import Step as Step
+from .core import Tally as Tally
 from .core import Trace as Trace
 from .core import WhenFull as WhenFull
 from .core import jensen_shannon as jensen_shannon
+from .core import model_html as model_html
+from .core import wilson_bounds as wilson_bounds
+from .files import read_header as read_header
+from .fleet import Fleet as Fleet
+from .fleet import merge as merge
+from .guard import Guard as Guard
 
 __version__: str

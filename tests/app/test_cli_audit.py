@@ -15,7 +15,7 @@ from evofsm.core.actions import IntervalActions
 from evofsm.driving.risk.outcome import LatentRisk
 from evofsm.files.sealed import NOTHING, Head, seal, unseal
 from evofsm.guard.auditing.log import AuditLog
-from evofsm.guard.oversight import Oversight
+from evofsm.guard.guard import Guard
 from evofsm.guard.protocols import Proposal
 from evofsm.guard.reviser import ActionReviser
 
@@ -27,11 +27,11 @@ def log(tmp_path):
     """A log of ten records, seven of them decisions; and its head."""
     risk = LatentRisk(ACTIONS.low)
     with AuditLog(tmp_path / "log.jsonl") as written:
-        oversight = Oversight(ACTIONS, ActionReviser(risk, ACTIONS), risk=risk, audit=written)
+        guard = Guard.of(ActionReviser(risk, ACTIONS), judge=risk, audit=written)
         for step in range(7):
             seen = np.array([20.0 - step, 15.0 - 0.6 * step, 11.0])
-            oversight.revise(oversight.recognise(seen, 0.25 * step), Proposal(1.0))
-        oversight.end(np.array([13.0, 10.0, 11.0]), failed=False)
+            guard.revise(guard.recognise(seen, 0.25 * step), Proposal(1.0))
+        guard.end(failed=False, observation=np.array([13.0, 10.0, 11.0]))
     return written.path, str(written.head)
 
 

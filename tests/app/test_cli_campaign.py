@@ -17,9 +17,9 @@ from typer.testing import CliRunner
 
 from evofsm.__main__ import application
 from evofsm.app.campaign import Campaign, drive_campaign
-from evofsm.app.driving import Setup, drive_family
+from evofsm.app.driving import Setup, drive_family, make_guard
+from evofsm.driving.cars import load_learnt, save_learnt
 from evofsm.driving.families.family import load_family
-from evofsm.driving.learner import Learner
 from evofsm.driving.worlds import open_world
 from evofsm.fleet.executors import Here, Processes
 from evofsm.guard.reviser import Mode
@@ -37,9 +37,9 @@ def evofsm(*arguments):
 
 
 def driven(out, setup, open_executor=Here, workers=1, world="kinematic"):
-    learner = Learner.new(setup.family)
+    risk = make_guard(setup).judge
     out.mkdir(exist_ok=True)
-    return drive_campaign(Campaign(setup, learner.risk, world), out, open_executor, workers)
+    return drive_campaign(Campaign(setup, risk, world), out, open_executor, workers)
 
 
 def held_out(family=EMERGENCY, **options):
@@ -104,7 +104,7 @@ def test_it_is_what_drive_makes_of_the_same_episodes(tmp_path, world):
         pytest.importorskip("libsumo")
     setup = held_out(load_family("rare"), reviser="aeb", episodes=6, seed=3)
     with open_world(world) as place:
-        driving = drive_family(setup, Learner.new(setup.family), place)
+        driving = drive_family(setup, make_guard(setup), place)
     # A process has one SUMO only, so that here must be closed before another one is opened.
     result = driven(tmp_path, setup, partial(Processes, 2) if world == "sumo" else Here, 2, world)
     assert result.row == driving.row
@@ -226,18 +226,19 @@ def test_a_folder_of_other_settings_is_refused(undisturbed, changes, message):
 
 
 def test_what_was_learnt_is_one_of_the_settings(tmp_path):
-    learner = Learner.new(EMERGENCY)
+    setup = Setup(EMERGENCY, episodes=1)
+    guard = make_guard(setup)
 
     def digest():
-        return Campaign(held_out(), learner.risk).settings["learnt"]
+        return Campaign(held_out(), guard.judge).settings["learnt"]
 
     nothing = digest()
     assert nothing == digest()
     with open_world("kinematic") as place:
-        drive_family(Setup(EMERGENCY, episodes=1), learner, place)
+        drive_family(setup, guard, place)
     assert digest() != nothing
-    learner.save(tmp_path)
-    assert Campaign(held_out(), Learner.load(tmp_path).risk).settings["learnt"] == digest()
+    save_learnt(guard, tmp_path)
+    assert Campaign(held_out(), load_learnt(tmp_path)[1]).settings["learnt"] == digest()
 
 
 @pytest.mark.parametrize(

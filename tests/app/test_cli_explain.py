@@ -10,20 +10,23 @@ from typer.testing import CliRunner
 
 from evofsm.__main__ import application
 from evofsm.core.machine import EvolvingFSM
+from evofsm.driving.cars import guard_for_family, learnt_by, save_learnt, teach
 from evofsm.driving.families.family import load_family
-from evofsm.driving.learner import Learner
 from evofsm.driving.revisers import Unrevised
+from evofsm.guard.guard import Guard
 
 
 @pytest.fixture(scope="module")
 def saved(tmp_path_factory):
     """What unrevised driving into collisions has taught."""
     family, folder = load_family("emergency"), tmp_path_factory.mktemp("learnt")
-    learner = Learner.new(family)
+    machine, risk = learnt_by(guard_for_family(family))
+    reviser = Unrevised(family.actions)
+    guard = Guard.of(reviser, interval=family.interval, machine=machine, judge=risk)
     draws = [family.draw(0, index, split="train") for index in range(6)]
-    learner.teach(family, draws, Unrevised(family.actions))
-    learner.save(folder, {"family": "emergency"})
-    return folder / "machine.evofsm", learner
+    teach(guard, draws)
+    save_learnt(guard, folder, {"family": "emergency"})
+    return folder / "machine.evofsm", machine
 
 
 def run(*arguments):
@@ -31,22 +34,21 @@ def run(*arguments):
 
 
 def test_every_state_is_explained_with_the_words_of_its_family(saved):
-    file, learner = saved
+    file, machine = saved
     answer = run(file)
     assert answer.exit_code == 0
     told = answer.stdout.replace("\n   ", " ").splitlines()
     assert [line.split(":")[0] for line in told] == [
-        f"#{state + 1}" for state in range(learner.machine.n_states)
+        f"#{state + 1}" for state in range(machine.n_states)
     ]
     assert all("m/s)" in line for line in told)
     assert max(map(len, answer.stdout.splitlines())) <= 80
 
 
 def test_an_observation_is_recognised_and_an_action_counted(saved):
-    file, learner = saved
+    file, machine = saved
     found = json.loads(run(file, "--observation", "9,14,14", "--action", "12", "--json").stdout)
     (one,) = found["situations"]
-    machine = learner.machine
     assert one["state"] == machine.model().recognise([9.0, 14.0, 14.0]).argmax()
     assert one["here"]["episodes"] == machine.episodes[one["state"]]
     assert one["action"]["failed"] == machine.failed_after[11, one["state"]]

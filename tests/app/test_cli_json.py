@@ -18,7 +18,7 @@ from evofsm.core.actions import IntervalActions
 from evofsm.core.machine import EvolvingFSM
 from evofsm.driving.risk.outcome import LatentRisk
 from evofsm.guard.auditing.log import AuditLog
-from evofsm.guard.oversight import Oversight
+from evofsm.guard.guard import Guard
 from evofsm.guard.protocols import Proposal
 from evofsm.guard.reviser import ActionReviser
 
@@ -58,9 +58,9 @@ def a_log(folder: Path) -> Path:
     actions = IntervalActions(low=-2.5, high=2.5, width=0.3, outside="clip")
     risk = LatentRisk(actions.low)
     with AuditLog(folder / "log.jsonl") as written:
-        oversight = Oversight(actions, ActionReviser(risk, actions), risk=risk, audit=written)
-        oversight.revise(oversight.recognise(np.array([20.0, 15.0, 11.0]), 0.0), Proposal(1.0))
-        oversight.end(np.array([19.0, 15.0, 11.0]), failed=False)
+        guard = Guard.of(ActionReviser(risk, actions), judge=risk, audit=written)
+        guard.revise(guard.recognise(np.array([20.0, 15.0, 11.0]), 0.0), Proposal(1.0))
+        guard.end(failed=False, observation=np.array([19.0, 15.0, 11.0]))
     return written.path
 
 

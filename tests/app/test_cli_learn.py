@@ -475,6 +475,6 @@ def test_wrong_words_on_rules_failures_and_units_end_with_one_line(
 def test_novelty_counts_as_the_closed_loop_does():
     pytest.importorskip("scipy")
     from evofsm.app.cli.learn import _SCALES
-    from evofsm.driving.learner import SAFETY_RULE
+    from evofsm.driving.cars import SAFETY_RULE
 
     assert tuple(SAFETY_RULE.scales) == _SCALES

@@ -14,7 +14,7 @@ from playwright import sync_api as playwright
 
 from evofsm.app.watch.live.server import LivePage
 from evofsm.app.watch.player import Player
-from evofsm.app.watch.session import Session, Watching, learn_first, watched_learner
+from evofsm.app.watch.session import Session, Watching, learn_first, watched_guard
 from evofsm.driving.families.family import load_family
 from evofsm.driving.worlds.kinematic import KinematicWorld
 
@@ -30,9 +30,9 @@ def seen(browser):
 
     @contextmanager
     def session():
-        learner = watched_learner(PAPER.family)
-        learn_first(PAPER, learner, 6)
-        with Session(PAPER, learner, KinematicWorld()) as opened:
+        guard = watched_guard(PAPER.family)
+        learn_first(PAPER, guard, 6)
+        with Session(PAPER, guard, KinematicWorld()) as opened:
             yield opened
 
     with LivePage() as live:

@@ -19,7 +19,7 @@ from websockets.sync.client import connect
 from evofsm.app.watch.live.server import LivePage
 from evofsm.app.watch.live.wire import encode, frame_message
 from evofsm.app.watch.player import Player
-from evofsm.app.watch.session import Session, Watching, watched_learner
+from evofsm.app.watch.session import Session, Watching, watched_guard
 from evofsm.driving.families.family import load_family
 from evofsm.driving.worlds.kinematic import KinematicWorld
 
@@ -30,7 +30,7 @@ PAPER = Watching(load_family("paper"))
 
 @contextmanager
 def session():
-    with Session(PAPER, watched_learner(PAPER.family), KinematicWorld()) as opened:
+    with Session(PAPER, watched_guard(PAPER.family), KinematicWorld()) as opened:
         yield opened
 
 

@@ -8,9 +8,9 @@ from itertools import pairwise
 import pytest
 
 from evofsm.app.watch.player import Player
-from evofsm.app.watch.session import Session, Watching, learn_first, watched_learner
+from evofsm.app.watch.session import Session, Watching, learn_first, watched_guard
+from evofsm.driving.cars import guard_for_family, learnt_by, load_learnt, save_learnt, teach
 from evofsm.driving.families.family import load_family
-from evofsm.driving.learner import Learner
 from evofsm.driving.worlds.kinematic import KinematicWorld
 from evofsm.guard.reviser import Mode
 
@@ -20,13 +20,13 @@ PAPER = Watching(load_family("paper"))
 
 
 def learnt(episodes=6):
-    learner = watched_learner(PAPER.family)
-    learn_first(PAPER, learner, episodes)
-    return learner
+    guard = watched_guard(PAPER.family)
+    learn_first(PAPER, guard, episodes)
+    return guard
 
 
-def opened(watching=PAPER, learner=None):
-    return Session(watching, learner or learnt(), KinematicWorld())
+def opened(watching=PAPER, guard=None):
+    return Session(watching, guard or learnt(), KinematicWorld())
 
 
 def drive(session):
@@ -101,7 +101,7 @@ def test_positions_follow_from_speeds():
 
 
 def test_states_grow_from_empty_and_keep_their_numbers():
-    session = Session(PAPER, watched_learner(PAPER.family), KinematicWorld())
+    session = Session(PAPER, watched_guard(PAPER.family), KinematicWorld())
     assert session.graph().states == ()
     created = [frame for frame in drive(session) if frame.event == "created"]
     graph = session.graph()
@@ -127,9 +127,10 @@ def test_other_revisers_are_judged_by_the_same_risk(reviser):
 
 
 def test_what_was_saved_is_gone_on_from(tmp_path):
-    learnt().save(tmp_path)
-    loaded = Learner.load(tmp_path)
-    session = opened(learner=loaded)
+    save_learnt(learnt(), tmp_path)
+    machine, risk = load_learnt(tmp_path)
+    loaded = guard_for_family(PAPER.family, machine=machine, judge=risk)
+    session = opened(guard=loaded)
     assert len(session.graph().states) == loaded.machine.n_states > 3
 
 
@@ -142,13 +143,17 @@ def recorded(tmp_path):
     pytest.importorskip("mcap")
     from evofsm.io.mcap import write_run
 
-    learner, family = learnt(), PAPER.family
+    family = PAPER.family
+    machine, risk = learnt_by(learnt())
     drives = [
-        learner.drive(family, family.draw(0, 0), learner.reviser(family, 0.02, mode), learn=True)
+        drive
         for mode in (Mode.ACT, Mode.SHADOW)
+        for drive in teach(
+            guard_for_family(family, mode=mode, machine=machine, judge=risk), [family.draw(0, 0)]
+        )
     ]
     path = tmp_path / "run.mcap"
-    write_run(path, drives, model=learner.machine.model(), about={"family": "paper"})
+    write_run(path, drives, model=machine.model(), about={"family": "paper"})
     return path, drives
 
 
@@ -227,11 +232,11 @@ def ends(told):
 
 
 def played(told, **settings):
-    learner = learnt()
+    guard = learnt()
 
     @contextmanager
     def session():
-        with opened(learner=learner) as one:
+        with opened(guard=guard) as one:
             yield one
 
     return Player(session, told, **settings)

@@ -221,9 +221,9 @@ def test_where_nothing_can_be_kept_nothing_is_begun(chunks, full_disk, tmp_path)
 
 def drive(path=None, episodes=5, stop_after=None):
     pytest.importorskip("scipy")
-    from evofsm.app.driving import Setup, drive_family
+    from evofsm.app.driving import Setup, drive_family, make_guard
+    from evofsm.driving.cars import learnt_by
     from evofsm.driving.families.family import load_family
-    from evofsm.driving.learner import Learner
     from evofsm.driving.worlds.kinematic import KinematicWorld
 
     def progress(done, collisions):
@@ -231,13 +231,14 @@ def drive(path=None, episodes=5, stop_after=None):
             raise StoppedError
 
     setup = Setup(load_family("emergency"), tolerance=0.3, episodes=episodes)
-    learner = Learner.new(setup.family)
-    checkpoint = path and Checkpoint(path, setup.settings("kinematic", learner), every=0.0)
-    driving = drive_family(setup, learner, KinematicWorld(), progress, checkpoint)
+    guard = make_guard(setup)
+    checkpoint = path and Checkpoint(path, setup.settings("kinematic", guard), every=0.0)
+    driving = drive_family(setup, guard, KinematicWorld(), progress, checkpoint)
     files = io.BytesIO(), io.BytesIO()
-    for file, learnt in zip(files, (learner.machine, learner.risk), strict=True):
-        learnt.save(file)
-    brakes = learner.risk.brakes
+    machine, risk = learnt_by(driving.guard)
+    machine.save(files[0])
+    risk.save(files[1])
+    brakes = risk.brakes
     told = [driving.row.as_dict(), driving.lead_times, dict(driving.decisions), driving.states]
     told += [list(brakes._shortfalls), list(brakes._brought)]
     return [file.getvalue() for file in files], repr(told)

@@ -600,7 +600,7 @@ def test_a_risk_of_format_3_is_read():
 
 
 def test_files_of_earlier_versions_have_no_checksum_and_say_nothing_of_their_origin():
-    header = storage.describe(FILES / "machine-format-3.evofsm")
+    header = storage.read_header(FILES / "machine-format-3.evofsm")
     assert (header.version, header.library, header.provenance) == (3, None, {})
 
 
@@ -611,7 +611,7 @@ def test_a_file_says_who_wrote_it_and_what_it_learnt_from(grown, tmp_path):
     provenance = {"files": [{"name": "drive.csv", "bytes": 12}], "rows": 40}
     for item, kind in ((grown, "machine"), (grown.model(), "model")):
         item.save(tmp_path / kind, provenance)
-        header = storage.describe(tmp_path / kind)
+        header = storage.read_header(tmp_path / kind)
         assert (header.kind, header.version) == (kind, 5)
         assert header.library == __version__
         assert header.provenance == provenance

@@ -41,8 +41,8 @@ from evofsm.files.sealed import (
 from evofsm.guard.auditing.log import AuditLog
 from evofsm.guard.auditing.participants import describe, restore
 from evofsm.guard.auditing.replay import audit
-from evofsm.guard.oversight import Oversight, Participants
-from evofsm.guard.protocols import Proposal
+from evofsm.guard.guard import Guard
+from evofsm.guard.protocols import Participants, Proposal
 from evofsm.guard.reviser import ActionReviser, Mode, Way
 
 ACTIONS = IntervalActions(low=-2.5, high=2.5, width=0.3, outside="clip")
@@ -64,8 +64,10 @@ class Learner:
         self.reviser = ActionReviser(self.risk, ACTIONS, **of_reviser)
 
     def framework(self, log, controller=HASTY, **others):
-        taking_part = {"machine": self.machine, "risk": self.risk, "reviser": self.reviser}
-        return Framework(controller, ACTIONS, audit=log, **(taking_part | others))
+        taking_part = {"machine": self.machine, "judge": self.risk, "interval": 0.25}
+        reviser = others.pop("reviser", self.reviser)
+        guard = Guard.of(reviser, actions=ACTIONS, audit=log, **(taking_part | others))
+        return Framework(controller, guard)
 
 
 def drive(log, *scenarios, learner=None, **others):
@@ -297,10 +299,10 @@ def test_a_controller_that_fails_and_one_out_of_range_are_written(tmp_path):
     path = tmp_path / "log"
     proposals = iter([1.0, math.nan, 99.0, math.inf])
     with AuditLog(path) as log:
-        oversight = Oversight(ACTIONS, Unrevised(ACTIONS), audit=log)
+        guard = Guard.of(Unrevised(ACTIONS), audit=log)
         for step, proposed in enumerate(proposals):
-            situation = oversight.recognise(np.array([50.0, 9.0, 9.0]), step * 0.25)
-            oversight.revise(situation, Proposal(proposed, (0.5, -math.inf)))
+            situation = guard.recognise(np.array([50.0, 9.0, 9.0]), step * 0.25)
+            guard.revise(situation, Proposal(proposed, (0.5, -math.inf)))
     decisions = [record for record in contents(path) if record["kind"] == "decision"]
     assert [one["proposed"] for one in decisions] == ["NaN", 99.0, "Infinity"]
     assert decisions[0]["candidates"] == [0.5, "-Infinity"]
@@ -310,10 +312,10 @@ def test_a_controller_that_fails_and_one_out_of_range_are_written(tmp_path):
 def test_quiet_decisions_are_held_back_for_a_while_only(tmp_path):
     path = tmp_path / "log"
     with AuditLog(path, most_quiet=5) as log:
-        oversight = Oversight(ACTIONS, Unrevised(ACTIONS), audit=log)
+        guard = Guard.of(Unrevised(ACTIONS), audit=log)
         for step in range(12):
-            situation = oversight.recognise(np.array([50.0, 9.0, 9.0]), step * 0.25)
-            oversight.revise(situation, Proposal(0.5))
+            situation = guard.recognise(np.array([50.0, 9.0, 9.0]), step * 0.25)
+            guard.revise(situation, Proposal(0.5))
         assert kinds(path) == ["start", "begin", "quiet", "quiet"]
     assert kinds(path)[-1] == "quiet"  # closing writes the rest
     assert audit(path).replay.decisions == 12
@@ -447,19 +449,18 @@ def test_sensors_that_fail_come_out_the_same(tmp_path):
         (2.25, [18.0, 14.0, 8.0]),
     ]
     with AuditLog(path) as log:
-        oversight = Oversight(
-            ACTIONS,
+        guard = Guard.of(
             learner.reviser,
             machine=learner.machine,
-            risk=learner.risk,
+            judge=learner.risk,
             interval=0.25,
             audit=log,
         )
         for time, observation in came:
-            situation = oversight.recognise(np.array(observation), time)
-            oversight.revise(situation, Proposal(-0.5))
-        oversight.recognise(np.array([16.0, 13.0, 7.0]), 2.5)  # nothing is decided
-        oversight.end(np.array([14.0, 12.0, 6.0]), failed=False)
+            situation = guard.recognise(np.array(observation), time)
+            guard.revise(situation, Proposal(-0.5))
+        guard.recognise(np.array([16.0, 13.0, 7.0]), 2.5)  # nothing is decided
+        guard.end(failed=False, observation=np.array([14.0, 12.0, 6.0]))
     result = audit(path)
     assert result.replay == (len(came), (), (), None)
 
@@ -703,8 +704,8 @@ def test_a_process_that_was_killed_while_writing_loses_the_half_record(driven, t
     with AuditLog(path) as log:
         assert log.head.number == finished
         assert log.cut_off == left - (whole.rfind(b"\n", 0, left) + 1)
-        oversight = Oversight(ACTIONS, Unrevised(ACTIONS), audit=log)
-        oversight.end(None, failed=False)
+        guard = Guard.of(Unrevised(ACTIONS), audit=log)
+        guard.end(failed=False)
     assert audit(path, log.head, replay=False).is_good
     again = contents(path)[finished]
     assert (again["kind"], again["cut_off"]) == ("start", log.cut_off)
@@ -835,11 +836,11 @@ def test_an_interrupt_while_a_record_is_written_breaks_no_chain(tmp_path):
 def brief(log):
     """An episode of two decisions, of which one speaks."""
     risk = LatentRisk(ACTIONS.low)
-    oversight = Oversight(ACTIONS, ActionReviser(risk, ACTIONS), risk=risk, audit=log)
+    guard = Guard.of(ActionReviser(risk, ACTIONS), judge=risk, audit=log)
     for step in range(2):
         seen = np.array([60.0 - 40.0 * step, 15.0, 8.0])
-        oversight.revise(oversight.recognise(seen, 0.25 * step), Proposal(0.0))
-    oversight.end(np.array([5.0, 15.0, 8.0]), failed=False)
+        guard.revise(guard.recognise(seen, 0.25 * step), Proposal(0.0))
+    guard.end(failed=False, observation=np.array([5.0, 15.0, 8.0]))
 
 
 def test_an_interrupt_while_a_log_is_written_costs_that_episode_only(tmp_path, monkeypatch):
@@ -856,15 +857,15 @@ def test_an_interrupt_while_a_log_is_written_costs_that_episode_only(tmp_path, m
 def test_an_episode_that_goes_on_after_an_interrupt_is_not_written_any_more(tmp_path, caplog):
     path, risk = tmp_path / "log", LatentRisk(ACTIONS.low)
     with AuditLog(path) as log:
-        oversight = Oversight(ACTIONS, ActionReviser(risk, ACTIONS), risk=risk, audit=log)
+        guard = Guard.of(ActionReviser(risk, ACTIONS), judge=risk, audit=log)
         for step in range(6):
             seen = np.array([30.0 - 4.0 * step, 15.0, 8.0])
-            situation = oversight.recognise(seen, 0.25 * step)
+            situation = guard.recognise(seen, 0.25 * step)
             with suppress(CtrlCError):
                 functions = (ChainedFile.sync,) if step == 3 else ()
                 with interrupt(functions, 0):
-                    oversight.revise(situation, Proposal(1.0))
-        oversight.end(np.array([9.0, 15.0, 8.0]), failed=False)
+                    guard.revise(situation, Proposal(1.0))
+        guard.end(failed=False, observation=np.array([9.0, 15.0, 8.0]))
         brief(log)
     assert [one.message for one in caplog.records if "was interrupted" in one.message]
     result = audit(path, log.head)
@@ -890,16 +891,16 @@ def in_a_child(do):
 def test_a_child_that_inherits_a_log_leaves_it_to_its_parent(tmp_path):
     path = tmp_path / "log"
     log = AuditLog(path, most_quiet=50)
-    oversight = Oversight(ACTIONS, Unrevised(ACTIONS), audit=log)
+    guard = Guard.of(Unrevised(ACTIONS), audit=log)
 
     def decide(time):
-        situation = oversight.recognise(np.array([50.0, 9.0, 9.0]), time)
-        oversight.revise(situation, Proposal(0.5))
+        situation = guard.recognise(np.array([50.0, 9.0, 9.0]), time)
+        guard.revise(situation, Proposal(0.5))
 
     def drive_on():
         decide(1.0)
         with pytest.raises(OSError, match="belongs to the process"):
-            oversight.end(None, failed=False)
+            guard.end(failed=False)
         with pytest.raises(OSError, match="belongs to the process"):
             log.close()
 
@@ -908,7 +909,7 @@ def test_a_child_that_inherits_a_log_leaves_it_to_its_parent(tmp_path):
     assert in_a_child(drive_on)
     assert kinds(path) == ["start", "begin"]
     decide(1.0)
-    oversight.end(None, failed=False)
+    guard.end(failed=False)
     log.close()
     result = audit(path, log.head)
     assert result.is_good
@@ -969,14 +970,8 @@ def test_a_wrapped_environment_is_audited(tmp_path):
     reviser = ActionReviser(risk, env.family.actions)
     machine = EvolvingFSM(env.family.actions.n_actions, radius=4.0)
     with AuditLog(tmp_path / "log") as log:
-        env = RevisedActions(
-            env,
-            reviser,
-            observe=lambda seen: seen,
-            failed=lambda info: info["failed"],
-            machine=machine,
-            audit=log,
-        )
+        guard = Guard.of(reviser, machine=machine, interval=env.family.interval, audit=log)
+        env = RevisedActions(env, guard, failed=lambda info: info["failed"])
         steps = 0
         for seed in (1, 2):
             env.reset(seed=seed)

@@ -7,7 +7,7 @@ import pytest
 
 gymnasium = pytest.importorskip("gymnasium")
 
-from gymnasium.spaces import Box, Discrete  # noqa: E402
+from gymnasium.spaces import Box, MultiBinary  # noqa: E402
 from gymnasium.utils.env_checker import check_env  # noqa: E402
 
 from evofsm.core.actions import IntervalActions  # noqa: E402
@@ -18,6 +18,7 @@ from evofsm.driving.revisers import Unrevised  # noqa: E402
 from evofsm.driving.risk.outcome import LatentRisk  # noqa: E402
 from evofsm.driving.worlds.gym import CarFollowing  # noqa: E402
 from evofsm.driving.worlds.kinematic import KinematicWorld  # noqa: E402
+from evofsm.guard.guard import Guard  # noqa: E402
 from evofsm.guard.gym import RevisedActions  # noqa: E402
 from evofsm.guard.reviser import ActionReviser, Mode  # noqa: E402
 
@@ -62,14 +63,11 @@ def make_reviser():
     return ActionReviser(LatentRisk(ACTIONS.low, FAMILY.interval), ACTIONS)
 
 
-def revise(env, reviser=None, **options):
-    return RevisedActions(
-        env,
-        reviser or make_reviser(),
-        observe=lambda observation: observation,
-        failed=lambda info: info["failed"],
-        **options,
+def revise(env, reviser=None, *, machine=None, learn=True, **options):
+    guard = Guard.of(
+        reviser or make_reviser(), machine=machine, learn=learn, interval=FAMILY.interval
     )
+    return RevisedActions(env, guard, failed=lambda info: info["failed"], **options)
 
 
 def own_driver(env):
@@ -101,11 +99,10 @@ def test_it_decides_and_learns_bit_for_bit_as_the_framework(learn, snapshot):
     wrapped_machine, machine = (EvolvingFSM(ACTIONS.n_actions, radius=3.0) for _ in range(2))
     reviser = make_reviser()
     env = revise(CarFollowing(FAMILY), machine=wrapped_machine)
-    framework = Framework(
-        None, ACTIONS, reviser, machine=machine, risk=reviser.risk, interval=FAMILY.interval
-    )
+    guard = Guard.of(reviser, machine=machine, interval=FAMILY.interval)
+    framework = Framework(None, guard)
     for index in range(4):
-        env.learn = framework.learn = learn or index < 2
+        env.guard.learn = guard.learn = learn or index < 2
         infos = drive(env, own_driver(env), options={"index": index})
         scenario, framework.controller, _ = FAMILY.draw(0, index)
         driven = framework.drive(KinematicWorld(), scenario)
@@ -115,7 +112,7 @@ def test_it_decides_and_learns_bit_for_bit_as_the_framework(learn, snapshot):
         assert [i["reviser/reason"] for i in infos] == [d.revision.reason for d in driven.decisions]
         assert infos[-1]["failed"] == driven.episode.collided
     assert snapshot(wrapped_machine) == snapshot(machine)
-    assert env.risk.manoeuvres.decels == reviser.risk.manoeuvres.decels
+    assert env.guard.judge.manoeuvres.decels == reviser.risk.manoeuvres.decels
 
 
 def test_who_would_collide_does_not():
@@ -215,14 +212,14 @@ def test_frozen_it_learns_nothing(snapshot):
     env = revise(CarFollowing(FAMILY), machine=EvolvingFSM(ACTIONS.n_actions, radius=3.0))
     for index in range(2):
         drive(env, own_driver(env), options={"index": index})
-    env.learn = False
-    machine, risk = snapshot(env.machine), repr(env.risk._learnt())
+    env.guard.learn = False
+    machine, risk = snapshot(env.guard.machine), repr(env.guard.judge._learnt())
     drive(env, own_driver(env), options={"index": 2})
-    assert (snapshot(env.machine), repr(env.risk._learnt())) == (machine, risk)
-    env.learn = True
+    assert (snapshot(env.guard.machine), repr(env.guard.judge._learnt())) == (machine, risk)
+    env.guard.learn = True
     drive(env, own_driver(env), options={"index": 2})
-    assert snapshot(env.machine) != machine
-    assert repr(env.risk._learnt()) != risk
+    assert snapshot(env.guard.machine) != machine
+    assert repr(env.guard.judge._learnt()) != risk
 
 
 def test_a_failure_is_reported_to_the_machine_and_the_end_of_time_is_none():
@@ -231,23 +228,23 @@ def test_a_failure_is_reported_to_the_machine_and_the_end_of_time_is_none():
             Script(FAR, NEAR, HIT, failed=failed), Unrevised(ACTIONS), machine=EvolvingFSM(17)
         )
         drive(env, full_throttle)
-        assert env.machine.endings.sum() == failed
-        assert env.machine.failures.sum(axis=1).argmax() == failed * (ACTIONS.n_actions - 1)
-        assert env.machine.model().uses.sum() == 2  # the last transition is learnt as well
+        assert env.guard.machine.endings.sum() == failed
+        assert env.guard.machine.failures.sum(axis=1).argmax() == failed * (ACTIONS.n_actions - 1)
+        assert env.guard.machine.model().uses.sum() == 2  # the last transition is learnt as well
 
 
 def test_a_failure_that_is_not_seen_is_reported_as_well():
     env = revise(Script(FAR, NEAR, None, failed=True), machine=EvolvingFSM(17))
     drive(env, full_throttle)
-    assert env.machine.endings.sum() == 1
+    assert env.guard.machine.endings.sum() == 1
 
 
 def test_a_failure_ends_the_episode_where_the_environment_goes_on():
     env = revise(Script(FAR, HIT, failed=True, terminates=False), machine=EvolvingFSM(17))
     env.reset()
     env.step(np.array([0.0]))
-    assert env.machine.endings.sum() == 1
-    assert env.machine.state is None  # the next observation is no consequence
+    assert env.guard.machine.endings.sum() == 1
+    assert env.guard.machine.state is None  # the next observation is no consequence
 
 
 def test_a_reset_in_mid_episode_ends_it_without_failure():
@@ -257,8 +254,8 @@ def test_a_reset_in_mid_episode_ends_it_without_failure():
     env.reset(seed=2, options={"a": "b"})
     env.step(np.array([0.0]))
     assert env.env.resets == [(1, None), (2, {"a": "b"})]
-    assert env.machine.model().uses.sum() == 1  # FAR to NEAR, and not NEAR to FAR
-    assert env.machine.endings.sum() == 0
+    assert env.guard.machine.model().uses.sum() == 1  # FAR to NEAR, and not NEAR to FAR
+    assert env.guard.machine.endings.sum() == 0
 
 
 def test_where_nothing_is_ahead_the_proposal_is_kept_and_nothing_is_learnt():
@@ -267,7 +264,7 @@ def test_where_nothing_is_ahead_the_proposal_is_kept_and_nothing_is_learnt():
     kept = [info["reviser/reason"].startswith("nothing is ahead") for info in infos]
     assert kept == [True, True, False, True, False]
     assert env.env.executed[0] == [2.5]
-    assert env.machine.model().uses.sum() == 1  # FAR to FAR; what was not seen, is not counted
+    assert env.guard.machine.model().uses.sum() == 1  # FAR to FAR: the unseen is not
 
 
 def test_nan_is_not_executed_where_nothing_is_ahead_either():
@@ -301,7 +298,7 @@ def test_one_number_is_taken_for_an_acceleration_and_stays_in_the_space(shape):
     assert info["reviser/executed_action"] == -2.0
 
 
-@pytest.mark.parametrize("space", [Box(-1.0, 1.0, (2,)), Discrete(5)])
+@pytest.mark.parametrize("space", [Box(-1.0, 1.0, (2,)), MultiBinary(2)])
 def test_actions_that_are_not_one_number_need_a_conversion(space):
     with pytest.raises(ValueError, match="give to_acceleration and to_action"):
         revise(Script(FAR, action_space=space))

@@ -15,7 +15,7 @@ from evofsm.driving.risk.outcome import LatentRisk
 from evofsm.driving.worlds.kinematic import KinematicWorld
 from evofsm.driving.worlds.motion import COMMANDED, SPEED
 from evofsm.driving.worlds.scenario import Body, Leader, Scenario, Sensors
-from evofsm.guard.oversight import Oversight
+from evofsm.guard.guard import Guard
 from evofsm.guard.protocols import Proposal
 from evofsm.guard.reviser import ActionReviser, Mode, speaks
 
@@ -60,8 +60,12 @@ class Listening(LatentRisk):
 
 
 def drive(controller=HASTY, reviser=None, *, on=None, **others):
-    framework = Framework(controller, ACTIONS, reviser, **others)
-    return framework.drive(KinematicWorld(), on or scenario())
+    guard = make_guard(reviser, **others)
+    return Framework(controller, guard).drive(KinematicWorld(), on or scenario())
+
+
+def make_guard(reviser=None, interval=0.25, **others):
+    return Guard.of(reviser or Unrevised(ACTIONS), interval=interval, **others)
 
 
 # -- What is recorded ---------------------------------------------------------------------------
@@ -69,7 +73,7 @@ def drive(controller=HASTY, reviser=None, *, on=None, **others):
 
 def test_decisions_are_those_of_the_record():
     risk = LatentRisk(lowest=-2.5)
-    told = drive(reviser=ActionReviser(risk, ACTIONS), risk=risk)
+    told = drive(reviser=ActionReviser(risk, ACTIONS), judge=risk)
     record, time = told.episode.record, told.episode.time
     starts = [round(d.situation.time / 0.01) for d in told.decisions]
     assert starts == list(range(0, starts[-1] + 1, 25))
@@ -100,7 +104,7 @@ def test_a_collision_ends_the_last_decision_early():
 def test_recorded_modes():
     for mode, changed in ((Mode.OFF, False), (Mode.SHADOW, False), (Mode.ADVISE, False)):
         risk = LatentRisk(lowest=-2.5)
-        told = drive(reviser=ActionReviser(risk, ACTIONS, mode=mode), risk=risk)
+        told = drive(reviser=ActionReviser(risk, ACTIONS, mode=mode), judge=risk)
         assert (told.executed != told.proposed).any() == changed
         advised = np.array([d.revision.advised for d in told.decisions])
         assert (advised != told.executed).any() == (mode is not Mode.OFF)
@@ -118,7 +122,7 @@ def test_a_driver_may_take_over_and_hand_back_while_driving():
                 reviser.hand_back()
             return Proposal(2.5)
 
-    told = drive(Driver(), reviser, risk=risk)
+    told = drive(Driver(), reviser, judge=risk)
     overridden = [d for d in told.decisions if 2.0 <= d.situation.time < 3.0]
     assert all(d.revision.executed == 2.5 for d in overridden)
     assert all("taken over" in d.revision.reason for d in overridden if d.revision.advised != 2.5)
@@ -143,7 +147,7 @@ def test_a_controller_that_fails_once_is_driven_on_without(line, caplog):
     risk = LatentRisk(lowest=-2.5)
     script = Script(1.0, 1.0, line, 1.0)
     with caplog.at_level(logging.WARNING, logger="evofsm"):
-        told = drive(script, Unrevised(ACTIONS), risk=risk, on=scenario(3.0))
+        told = drive(script, Unrevised(ACTIONS), judge=risk, on=scenario(3.0))
     assert len(caplog.records) == 1
     assert "controller" in caplog.text
     assert "0.5 s" in caplog.text
@@ -190,7 +194,7 @@ def test_machine_and_risk_are_told_what_was_executed(learn, monkeypatch):
     act = EvolvingFSM.act
     monkeypatch.setattr(EvolvingFSM, "act", lambda self, i: (acted.append(i), act(self, i))[1])
     risk = Listening(lowest=-2.5)
-    told = drive(Script(1.0), AlwaysBrake(ACTIONS), machine=machine, risk=risk, learn=learn)
+    told = drive(Script(1.0), AlwaysBrake(ACTIONS), machine=machine, judge=risk, learn=learn)
     heard, deaf = (risk.learnt, risk.followed) if learn else (risk.followed, risk.learnt)
     assert [acceleration for _, acceleration in heard] == told.executed.tolist()
     assert [seen for seen, _ in heard] == [d.situation.observation.tolist() for d in told.decisions]
@@ -231,11 +235,11 @@ def shadowed(risk, mode=Mode.SHADOW, drives=2):
     reviser = ActionReviser(risk, IntervalActions(-8.0, 8.0, 0.5, outside="clip"), mode=mode)
     said = []
     for seed in range(drives):
-        oversight = Oversight(reviser.actions, reviser, risk=risk, interval=0.1)
+        guard = Guard.of(reviser, judge=risk, interval=0.1)
         for k, (row, did) in enumerate(zip(*ordinary_driving(seed), strict=True)):
-            situation = oversight.recognise(row, 0.1 * k)
-            said.append(oversight.revise(situation, Proposal(float(did))))
-        oversight.end(None, failed=False)
+            situation = guard.recognise(row, 0.1 * k)
+            said.append(guard.revise(situation, Proposal(float(did))))
+        guard.end(failed=False)
     return reviser, said
 
 
@@ -263,12 +267,12 @@ def test_a_driver_who_brakes_hard_shows_what_the_brakes_can_do(tmp_path):
     reviser = ActionReviser(risk, IntervalActions(-8.0, 2.0, 0.5), mode=Mode.SHADOW)
 
     def braked(*decels):
-        oversight, speed, time = Oversight(reviser.actions, reviser, risk=risk), 25.0, 0.0
+        guard, speed, time = Guard.of(reviser, judge=risk), 25.0, 0.0
         for decel in np.repeat((0.0, *decels, 0.0), 20):
-            situation = oversight.recognise(np.array([60.0, speed, speed]), time)
-            oversight.revise(situation, Proposal(-decel))
+            situation = guard.recognise(np.array([60.0, speed, speed]), time)
+            guard.revise(situation, Proposal(-decel))
             speed, time = max(speed - 0.1 * decel, 0.0), time + 0.1
-        oversight.end(None, failed=False)
+        guard.end(failed=False)
         return risk.brakes.decel
 
     assert braked(3.0) == pytest.approx(4.8)  # what was never shown stays as assumed
@@ -285,7 +289,8 @@ def test_a_driver_who_brakes_hard_shows_what_the_brakes_can_do(tmp_path):
 
 def test_learning_goes_on_from_episode_to_episode(snapshot):
     risk, machine = LatentRisk(lowest=-2.5), EvolvingFSM(ACTIONS.n_actions, radius=1.0)
-    framework = Framework(HASTY, ACTIONS, ActionReviser(risk, ACTIONS), machine=machine, risk=risk)
+    guard = make_guard(ActionReviser(risk, ACTIONS), machine=machine)
+    framework = Framework(HASTY, guard)
     seen, first = [], None
     for _ in range(3):
         told = framework.drive(KinematicWorld(), scenario(14.0))
@@ -299,16 +304,17 @@ def test_learning_goes_on_from_episode_to_episode(snapshot):
 
 def test_frozen_nothing_changes_and_it_drives_the_same_again(snapshot):
     risk, machine = LatentRisk(lowest=-2.5), EvolvingFSM(ACTIONS.n_actions, radius=1.0)
-    framework = Framework(HASTY, ACTIONS, ActionReviser(risk, ACTIONS), machine=machine, risk=risk)
+    guard = make_guard(ActionReviser(risk, ACTIONS), machine=machine)
+    framework = Framework(HASTY, guard)
     framework.drive(KinematicWorld(), scenario(14.0))
     before = snapshot(machine), snapshot(risk)
-    framework.learn = False
+    guard.learn = False
     told = [framework.drive(KinematicWorld(), scenario(14.0)) for _ in range(2)]
     assert (snapshot(machine), snapshot(risk)) == before
     np.testing.assert_array_equal(told[0].executed, told[1].executed)
     assert told[0].decisions[20].situation.state is not None
     assert told[0].decisions[20].situation.belief.sum() == pytest.approx(1.0)
-    framework.learn = True
+    guard.learn = True
     framework.drive(KinematicWorld(), scenario(14.0))
     assert snapshot(risk) != before[1]
     assert snapshot(machine) != before[0]
@@ -331,17 +337,17 @@ def test_a_failure_is_learnt_as_one():
 def test_of_an_episode_that_was_broken_off_nothing_follows(snapshot):
     def broken_off():
         risk = LatentRisk(lowest=-2.5)
-        oversight = Oversight(ACTIONS, Unrevised(ACTIONS), risk=risk)
+        guard = Guard.of(Unrevised(ACTIONS), judge=risk)
         for k in range(12):
-            situation = oversight.recognise(np.array([50.0, 30.0 - k, 30.0 - k]), 0.25 * k)
-            oversight.revise(situation, Proposal(-2.5))
+            situation = guard.recognise(np.array([50.0, 30.0 - k, 30.0 - k]), 0.25 * k)
+            guard.revise(situation, Proposal(-2.5))
         return risk
 
     risk, before = broken_off(), snapshot(broken_off())
-    oversight = Oversight(ACTIONS, Unrevised(ACTIONS), risk=risk)
-    situation = oversight.recognise(np.array([9.0, 5.0, 5.0]), 0.0)
-    oversight.revise(situation, Proposal(0.0))
-    oversight.end(None, failed=False)
+    guard = Guard.of(Unrevised(ACTIONS), judge=risk)
+    situation = guard.recognise(np.array([9.0, 5.0, 5.0]), 0.0)
+    guard.revise(situation, Proposal(0.0))
+    guard.end(failed=False)
     after = snapshot(risk)
     assert after["decels"] == before["decels"]
     assert after["brakes"] == before["brakes"]
@@ -352,7 +358,7 @@ def test_two_runs_of_the_same_are_the_same():
     for _ in range(2):
         risk, machine = LatentRisk(lowest=-2.5), EvolvingFSM(ACTIONS.n_actions, radius=1.0)
         told.append(
-            drive(reviser=ActionReviser(risk, ACTIONS), machine=machine, risk=risk).episode.record
+            drive(reviser=ActionReviser(risk, ACTIONS), machine=machine, judge=risk).episode.record
         )
     np.testing.assert_array_equal(*told)
 
@@ -363,7 +369,7 @@ def test_two_runs_of_the_same_are_the_same():
 @pytest.mark.parametrize("interval", [0.0, -0.25, math.nan, math.inf])
 def test_an_interval_that_is_no_time_is_refused(interval):
     with pytest.raises(ValueError, match="interval"):
-        Framework(HASTY, ACTIONS, interval=interval)
+        make_guard(interval=interval)
 
 
 @pytest.mark.parametrize("interval", [0.255, 0.001])
@@ -374,9 +380,9 @@ def test_an_interval_of_no_whole_number_of_steps_is_refused(interval):
 
 def test_a_risk_for_other_intervals_is_refused():
     with pytest.raises(ValueError, match=r"every 0\.1 s"):
-        Framework(HASTY, ACTIONS, risk=LatentRisk(lowest=-2.5, dt=0.1))
+        make_guard(judge=LatentRisk(lowest=-2.5, dt=0.1))
 
 
 def test_a_machine_for_another_set_is_refused():
     with pytest.raises(ValueError, match="3 actions"):
-        Framework(HASTY, ACTIONS, machine=EvolvingFSM(n_actions=3))
+        make_guard(machine=EvolvingFSM(n_actions=3))

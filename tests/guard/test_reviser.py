@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 
 from evofsm.core.actions import IntervalActions
 from evofsm.driving.revisers import AlwaysBrake, EnvelopeReviser, Unrevised
-from evofsm.driving.risk.brakes import OwnBrakes
 from evofsm.driving.risk.outcome import LatentRisk
 from evofsm.driving.risk.ttc import TimeToCollision
 from evofsm.guard.protocols import Judgement, Proposal, Situation
@@ -22,12 +21,12 @@ CLOSE = Situation(np.array([5.0, 20.0, 20.0]), np.ones(1), 0, 0.0, 0.0)
 PROPOSALS = st.floats(LOW, HIGH)
 
 
-class Told:
+class Told(LatentRisk):
     """Judges actions by a function; the brakes are known unless it is said otherwise."""
 
     def __init__(self, risk, *, known=True, lowest=LOW):
+        super().__init__(lowest)
         self.risk = risk
-        self.brakes = OwnBrakes(lowest=lowest, assumed=0.6, dt=0.25)
         if known:
             self.brakes.trust(2.5)
 

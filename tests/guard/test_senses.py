@@ -17,7 +17,7 @@ from evofsm.driving.risk.outcome import LatentRisk
 from evofsm.driving.risk.ttc import TimeToCollision
 from evofsm.driving.worlds.kinematic import KinematicWorld
 from evofsm.driving.worlds.scenario import Leader, Scenario
-from evofsm.guard.oversight import Oversight
+from evofsm.guard.guard import Guard
 from evofsm.guard.protocols import Intake, Proposal, Situation
 from evofsm.guard.reviser import ActionReviser
 from evofsm.guard.senses import Senses
@@ -58,12 +58,10 @@ def machine():
     return taught
 
 
-def oversight(learn=True, **options):
+def guard(learn=True, **options):
     risk = LatentRisk.told(-4.0, 4.0, 8.0)
     reviser = ActionReviser(risk, ACTIONS)
-    return Oversight(
-        ACTIONS, reviser, machine=machine(), risk=risk, learn=learn, interval=0.25, **options
-    )
+    return Guard.of(reviser, machine=machine(), learn=learn, interval=0.25, **options)
 
 
 # -- The machine --------------------------------------------------------------------------------
@@ -146,7 +144,7 @@ def test_a_failure_that_was_seen_in_part_is_counted():
 
 
 def test_the_less_is_seen_the_more_careful_it_gets():
-    watch, risks = oversight(), []
+    watch, risks = guard(), []
     for k in range(4):
         situation = watch.recognise(np.array([30.0, 10.0, 10.0]), 0.25 * k)
         watch.revise(situation, Proposal(0.0))
@@ -162,7 +160,7 @@ def test_the_less_is_seen_the_more_careful_it_gets():
 
 
 def test_blind_from_the_start_it_brakes():
-    watch = oversight()
+    watch = guard()
     situation = watch.recognise(np.array([NAN, 10.0, 10.0]), 0.0)
     revision = watch.revise(situation, Proposal(1.0))
     assert revision.risk_proposed == 1.0
@@ -180,7 +178,7 @@ def test_a_classic_measure_that_sees_nothing_brakes_and_says_so():
 @pytest.mark.parametrize("learn", [True, False])
 @pytest.mark.parametrize("policy", [Missing.PARTIAL, Missing.HOLD])
 def test_it_drives_on_when_sensors_fail_now_and_then(learn, policy):
-    watch, rng = oversight(learn=learn, missing=policy), np.random.default_rng(1)
+    watch, rng = guard(learn=learn, missing=policy), np.random.default_rng(1)
     for k in range(200):
         observation = np.array([40.0, 12.0, 12.0 + np.sin(0.1 * k)])
         observation[rng.random(3) < 0.3] = NAN
@@ -191,7 +189,7 @@ def test_it_drives_on_when_sensors_fail_now_and_then(learn, policy):
 
 
 def test_rejecting_is_an_error_that_names_the_variables():
-    watch = oversight(missing=Missing.REJECT)
+    watch = guard(missing=Missing.REJECT)
     with pytest.raises(ValueError, match=r"variables \[0, 2\] of the observation at 0 s"):
         watch.recognise(np.array([NAN, 10.0, NAN]), 0.0)
 
@@ -200,17 +198,17 @@ def test_the_reviser_keeps_its_promise_with_a_gap_sensor_that_fails_half_the_tim
     hasty = IDM(2.25, 28.0, 0.8, 0.3, 2.0, lowest=-4.0, highest=2.5)
     leader = Leader(IDM(1.2, 25.0, 1.0, 1.0, 2.5), brake_decel=8.0, brake_time=12.0)
     risk = LatentRisk.told(-4.0, 4.0, 8.0)
-    framework = Framework(hasty, ACTIONS, ActionReviser(risk, ACTIONS), risk=risk, learn=False)
-    drive = framework.drive(FlickeringWorld(), Scenario(leader, initial_gap=5.0))
+    guard = Guard.of(ActionReviser(risk, ACTIONS), learn=False, interval=0.25)
+    drive = Framework(hasty, guard).drive(FlickeringWorld(), Scenario(leader, initial_gap=5.0))
     assert any(decision.situation.intake for decision in drive.decisions)
     assert not drive.episode.collided
 
 
 def test_an_episode_may_end_unseen():
-    watch = oversight()
+    watch = guard()
     watch.recognise(np.array([5.0, 10.0, 0.0]), 0.0)
     before = watch.machine.endings.sum()
-    watch.end(np.array([NAN, 10.0, 0.0]), failed=True)
+    watch.end(failed=True, observation=np.array([NAN, 10.0, 0.0]))
     assert watch.machine.endings.sum() == before + 1
 
 
@@ -219,7 +217,7 @@ def test_an_episode_may_end_unseen():
 
 @pytest.mark.parametrize(("time", "flag"), [(1.0, Intake.REPEATED), (0.4, Intake.LATE)])
 def test_what_is_not_new_changes_nothing(time, flag, snapshot):
-    watch = oversight()
+    watch = guard()
     for k in range(5):
         first = watch.recognise(np.array([30.0, 10.0, 10.0]), 0.25 * k)
         watch.revise(first, Proposal(0.0))
@@ -232,7 +230,7 @@ def test_what_is_not_new_changes_nothing(time, flag, snapshot):
 
 
 def test_after_a_hole_in_time_no_transition_is_learnt():
-    watch = oversight()
+    watch = guard()
     for time in (0.0, 0.25):
         watch.revise(watch.recognise(np.array([30.0, 10.0, 10.0]), time), Proposal(0.0))
     before = watch.machine.model().uses.sum()

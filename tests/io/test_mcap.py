@@ -15,7 +15,7 @@ from evofsm.driving.risk.outcome import LatentRisk
 from evofsm.driving.risk.ttc import time_to_collision
 from evofsm.driving.worlds.kinematic import KinematicWorld
 from evofsm.driving.worlds.scenario import Leader, Scenario
-from evofsm.guard.oversight import Explain
+from evofsm.guard.guard import Explain, Guard
 from evofsm.guard.protocols import Intake
 from evofsm.guard.reviser import ActionReviser, Mode
 
@@ -39,8 +39,10 @@ def run():
     drives = []
     for mode in (Mode.SHADOW, Mode.ACT, Mode.ACT):
         reviser = ActionReviser(risk, ACTIONS, mode=mode)
-        framework = Framework(HASTY, ACTIONS, reviser, machine=machine, explaining=Explain.ALL)
-        drives.append(framework.drive(KinematicWorld(), Scenario(LEADER, 8.0, duration=14.0)))
+        guard = Guard.of(reviser, machine=machine, interval=0.25, explaining=Explain.ALL)
+        drives.append(
+            Framework(HASTY, guard).drive(KinematicWorld(), Scenario(LEADER, 8.0, duration=14.0))
+        )
     assert [drive.episode.collided for drive in drives] == [True, False, False]
     names = {"names": VARIABLES, "units": ("m", "m/s", "m/s")}
     return drives, machine.model(actions=ACTIONS, dt=0.25, **names)

@@ -18,6 +18,7 @@ from evofsm.driving.framework import Framework
 from evofsm.driving.risk.outcome import LatentRisk
 from evofsm.driving.worlds.kinematic import KinematicWorld
 from evofsm.driving.worlds.scenario import Leader, Scenario
+from evofsm.guard.guard import Guard
 from evofsm.guard.reviser import ActionReviser, Mode
 from evofsm.plot.style import DEAD_END
 
@@ -52,7 +53,8 @@ def _drive(mode):
     leader = Leader(IDM(1.2, 25.0, 1.0, 1.0, 2.5), brake_decel=9.0, brake_speed=24.2)
     reviser = ActionReviser(LatentRisk(lowest=-4.0), actions, mode=mode)
     scenario = Scenario(leader, initial_gap=5.0)
-    return Framework(hasty, actions, reviser).drive(KinematicWorld(), scenario)
+    guard = Guard.of(reviser, interval=0.25)
+    return Framework(hasty, guard).drive(KinematicWorld(), scenario)
 
 
 @pytest.fixture(scope="module")

@@ -35,4 +35,4 @@ from .text.words import within as within
 from .watch.session import Session as Session
 from .watch.session import Watching as Watching
 from .watch.session import learn_first as learn_first
-from .watch.session import watched_learner as watched_learner
+from .watch.session import watched_guard as watched_guard

@@ -14,7 +14,7 @@ import pickle
 from collections.abc import Callable
 from concurrent.futures import Executor
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache, lru_cache, partial
 from importlib.metadata import version
 from pathlib import Path
@@ -23,26 +23,25 @@ from typing import Any
 
 from evofsm.app.driving import (
     Setup,
-    drive_unrevised,
+    drive_alone,
     is_judged,
     lead_time,
     make_controller,
-    make_reviser,
+    make_guard,
 )
 from evofsm.driving import (
     LatentRisk,
-    Learner,
     Outcome,
     Row,
     World,
-    drive_alone,
+    drive,
     open_world,
     outcome,
     summarise,
 )
 from evofsm.files import Journal, Record, room_needed, versions
 from evofsm.fleet import Batch, run_campaign
-from evofsm.guard import Reviser
+from evofsm.guard import Guard
 
 #: The journal in the folder of a campaign.
 JOURNAL = "journal.jsonl"
@@ -57,10 +56,9 @@ class Campaign:
     risk: LatentRisk  #: what was learnt before
     world: str = "kinematic"
 
-    def reviser(self) -> Reviser:
-        """Who revises."""
-        learner = replace(Learner.new(self.setup.family), risk=self.risk)
-        return make_reviser(self.setup, learner)
+    def guard(self) -> Guard:
+        """Who revises; no states are asked."""
+        return make_guard(self.setup, judge=self.risk)
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -104,10 +102,10 @@ def drive_campaign(
         If the folder holds a campaign of other settings.
     """
     setup = campaign.setup
-    campaign.reviser()  # if there is none of this name, it shows here and not in a worker
+    campaign.guard()  # if there is none of this name, it shows here and not in a worker
     with Journal(out / JOURNAL, campaign.settings) as journal:
-        drive = partial(drive_batch, pickle.dumps((campaign, _versions(campaign.world))))
-        records = run_campaign(drive, setup.episodes, journal, open_executor, workers, progress)
+        work = partial(drive_batch, pickle.dumps((campaign, _versions(campaign.world))))
+        records = run_campaign(work, setup.episodes, journal, open_executor, workers, progress)
         outcomes = [Outcome(*(record[name] for name in Outcome._fields)) for record in records]
         row = summarise(setup.family.name, setup.reviser, "", outcomes, setup.family.interval)
         lead_times = (record["lead_time"] for record in records)
@@ -161,16 +159,16 @@ def drive_batch(packed: bytes, batch: Batch) -> list[Record]:
         If other versions are installed here.
     """
     with _one_at_a_time:
-        campaign, reviser = _unpacked(packed)
-        return [_drive(campaign, reviser, episode) for episode in batch]
+        campaign, guard = _unpacked(packed)
+        return [_drive(campaign, guard, episode) for episode in batch]
 
 
 @lru_cache(maxsize=1)
-def _unpacked(packed: bytes) -> tuple[Campaign, Reviser]:
+def _unpacked(packed: bytes) -> tuple[Campaign, Guard]:
     campaign, versions = pickle.loads(packed)
     if (here := _versions(campaign.world)) != versions:
         raise ValueError(f"a worker has {here}, but the campaign needs {versions}")
-    return campaign, campaign.reviser()
+    return campaign, campaign.guard()
 
 
 @cache
@@ -179,16 +177,16 @@ def _world(name: str) -> World:
     return open_world(name).__enter__()
 
 
-def _drive(campaign: Campaign, reviser: Reviser, episode: int) -> Record:
+def _drive(campaign: Campaign, guard: Guard, episode: int) -> Record:
     setup, world = campaign.setup, _world(campaign.world)
     family = setup.family
     draw = family.draw(setup.seed, episode, split="test")
     controller = make_controller(setup, draw, world)
-    unrevised = drive_unrevised(family, draw, world, controller)
-    drive = drive_alone(family, draw, reviser, campaign.risk, world, controller)
-    told = drive.episode.collided and is_judged(drive)
+    alone = drive_alone(family, draw, world, controller)
+    driven = drive(guard, draw, world, controller)
+    has_lead = driven.episode.collided and is_judged(driven)
     return {
         "variant": draw.variant,
-        **outcome(drive, unrevised, family.interval)._asdict(),
-        "lead_time": lead_time(drive, setup.tolerance) if told else None,
+        **outcome(driven, alone, family.interval)._asdict(),
+        "lead_time": lead_time(driven, setup.tolerance) if has_lead else None,
     }

@@ -26,7 +26,6 @@ from evofsm.driving import (
     EnvelopeReviser,
     Family,
     LatentRisk,
-    Learner,
     Outcome,
     Reference,
     Row,
@@ -34,14 +33,18 @@ from evofsm.driving import (
     Unrevised,
     World,
     assess_states,
-    drive_alone,
+    drive,
+    guard_for_family,
+    learnt_by,
     outcome,
     reference,
+    save_learnt,
     summarise,
+    unrevised,
 )
 from evofsm.extras import needs
 from evofsm.files import Checkpoint, Kept, storage
-from evofsm.guard import AuditLog, Controller, Explain, Mode, Reviser
+from evofsm.guard import AuditLog, Controller, Explain, Guard, LearningJudge, Mode, Reviser
 
 #: Controllers by name; ``family`` is the family's own.
 CONTROLLERS = ("family", "aggressive", "normal", "acc", "sumo")
@@ -82,17 +85,17 @@ class Setup:
             "seed": self.seed,
         }
 
-    def settings(self, world: str, learner: Learner) -> dict[str, Any]:
+    def settings(self, world: str, guard: Guard) -> dict[str, Any]:
         """All that an episode depends on, for JSON; not how many there are.
 
         Parameters
         ----------
         world : str
             Where is driven.
-        learner : Learner
+        guard : Guard
             With what was learnt before.
         """
-        machine, risk = _files(learner)
+        machine, risk = _files(guard)
         return {
             **self.told,
             "learn": self.learn,
@@ -109,12 +112,13 @@ class Driving:
     row: Row
     lead_times: tuple[float, ...]  #: from the last alarm that stayed on to the collision [s]
     states: list[StateRisk]
+    guard: Guard  #: with what it learnt
     decisions: Mapping[str, Sequence[Any]]  #: columns of the table of all decisions
 
 
 def drive_family(
     setup: Setup,
-    learner: Learner,
+    guard: Guard,
     world: World,
     progress: Callable[[int, int], None] = lambda done, collisions: None,
     checkpoint: Checkpoint | None = None,
@@ -126,15 +130,15 @@ def drive_family(
     Parameters
     ----------
     setup : Setup
-    learner : Learner
-        Learns if ``setup.learn``.
+    guard : Guard
+        Of `make_guard`.
     world : World
     progress : callable
         Told how many episodes are done, and how many ended in a collision.
     checkpoint : Checkpoint, optional
         Keeps, between two episodes, all that came of those before. Where its file exists, it is
-        gone on from, and ``learner`` learns what it had learnt. The result is the same, bit for
-        bit; there may be more episodes than before.
+        gone on from, with a guard that has learnt what was learnt until then. The result is the
+        same, bit for bit; there may be more episodes than before.
     audit : AuditLog, optional
         Writes down what is decided; also in episodes that are driven again after a stop.
     record : callable, optional
@@ -147,40 +151,32 @@ def drive_family(
         If the checkpoint is of other work, or of more episodes.
     """
     family = setup.family
-    done = Driven.resumed(setup, learner, checkpoint)
-    reviser = make_reviser(setup, learner)
+    done, guard = Driven.resumed(setup, guard, checkpoint)
+    guard.audit, guard.explaining = audit, None if record is None else Explain.ALL
     for draw in draws(setup, len(done.outcomes)):
         controller = make_controller(setup, draw, world)
-        unrevised = drive_unrevised(family, draw, world, controller)
-        drive = learner.drive(
-            family,
-            draw,
-            reviser,
-            learn=setup.learn,
-            world=world,
-            controller=controller,
-            audit=audit,
-            explaining=None if record is None else Explain.ALL,
-        )
+        alone = drive_alone(family, draw, world, controller)
+        driven = drive(guard, draw, world, controller)
         if record is not None:
-            record(drive)
-        done.add(drive, outcome(drive, unrevised, family.interval), setup.tolerance)
+            record(driven)
+        done.add(driven, outcome(driven, alone, family.interval), setup.tolerance)
         if checkpoint is not None:
-            checkpoint.offer(partial(done.keep, learner))
+            checkpoint.offer(partial(done.keep, guard))
         progress(len(done.outcomes), sum(o.collided for o in done.outcomes))
     if checkpoint is not None:
-        checkpoint.keep(done.keep(learner, finished=True))
+        checkpoint.keep(done.keep(guard, finished=True))
     return Driving(
         summarise(family.name, setup.reviser, "", done.outcomes, family.interval),
         tuple(done.lead_times),
-        assess_states(learner.machine, learner.risk),
+        assess_states(*learnt_by(guard)),
+        guard,
         done.decisions,
     )
 
 
-def drive_unrevised(family: Family, draw: Draw, world: World, controller: Controller) -> Reference:
+def drive_alone(family: Family, draw: Draw, world: World, controller: Controller) -> Reference:
     """How far the controller comes by itself."""
-    alone = drive_alone(family, draw, Unrevised(family.actions), None, world, controller)
+    alone = drive(unrevised(family), draw, world, controller)
     return reference(alone, draw.scenario.leader.brake_decel)
 
 
@@ -191,19 +187,35 @@ def draws(setup: Setup, done: int = 0) -> Iterator[Draw]:
         yield setup.family.draw(setup.seed, index, split=split)
 
 
-def make_reviser(setup: Setup, learner: Learner) -> Reviser:
-    """A reviser by its name."""
-    family = setup.family
-    if setup.reviser == "least-risk":
-        return learner.reviser(family, setup.tolerance, setup.mode)
-    if setup.reviser == "none":
-        return Unrevised(family.actions)
-    if setup.mode is not Mode.ACT:
-        raise ValueError(f"reviser {setup.reviser!r} can only act; modes are for least-risk")
-    name = _ALIASES.get(setup.reviser, setup.reviser)
-    if name not in FIXED_MEASURES:
+def make_guard(
+    setup: Setup, machine: EvolvingFSM | None = None, judge: LearningJudge | None = None
+) -> Guard:
+    """A guard whose reviser has the setup's name, with what was learnt before."""
+    family, name = setup.family, _ALIASES.get(setup.reviser, setup.reviser)
+    ours = guard_for_family(
+        family,
+        tolerance=setup.tolerance,
+        mode=setup.mode,
+        machine=machine,
+        judge=judge,
+        learn=setup.learn,
+    )
+    if name == "least-risk":
+        return ours
+    if name not in ("none", *FIXED_MEASURES):
         raise ValueError(f"there is no reviser {name!r}; there are {', '.join(REVISERS)}")
-    return EnvelopeReviser(FIXED_MEASURES[name], family.actions, family.interval)
+    reviser: Reviser = Unrevised(family.actions)
+    if name != "none":
+        if setup.mode is not Mode.ACT:
+            raise ValueError(f"reviser {setup.reviser!r} can only act; modes are for least-risk")
+        reviser = EnvelopeReviser(FIXED_MEASURES[name], family.actions, family.interval)
+    return Guard.of(
+        reviser,
+        interval=family.interval,
+        machine=ours.machine,
+        judge=ours.judge,
+        learn=setup.learn,
+    )
 
 
 def make_controller(setup: Setup, draw: Draw, world: World) -> Controller:
@@ -233,7 +245,7 @@ def _sumo_driver(world: World) -> Controller:
     return SumoDriver(world)
 
 
-def write_driving(driving: Driving, learner: Learner, setup: Setup, out: Path) -> None:
+def write_driving(driving: Driving, setup: Setup, out: Path) -> None:
     """Write what was learnt, every decision as a table, and the summary; each whole or not at all.
 
     Raises
@@ -244,7 +256,8 @@ def write_driving(driving: Driving, learner: Learner, setup: Setup, out: Path) -
     with needs("polars", "tables", "writing decisions as Parquet"):
         import polars
     drove = {"family": setup.family.name, "seed": setup.seed, "first": setup.first}
-    learner.save(out, {**drove, "episodes": setup.episodes, "reviser": setup.reviser})
+    told = {**drove, "episodes": setup.episodes, "reviser": setup.reviser}
+    save_learnt(driving.guard, out, told)
     with storage.replacing(out / "decisions.parquet") as file:
         polars.DataFrame(driving.decisions).write_parquet(file)
     summary = {
@@ -307,25 +320,29 @@ class Driven:
             self.lead_times.append(lead_time(drive, tolerance))
 
     @classmethod
-    def resumed(cls, setup: Setup, learner: Learner, checkpoint: Checkpoint | None) -> Self:
-        """What was driven before, if anything was; the learner is then as it was after it."""
+    def resumed(
+        cls, setup: Setup, guard: Guard, checkpoint: Checkpoint | None
+    ) -> tuple[Self, Guard]:
+        """What was driven before, if anything was, and the guard as it was after it."""
         done = cls()
         if checkpoint is None:
-            return done
-        kept = checkpoint.begin(done.keep(learner))
+            return done, guard
+        kept = checkpoint.begin(done.keep(guard))
         with storage.explained(checkpoint.path):
             done._restore(kept.arrays)
-            _teach(learner, kept.arrays)
+            files = (io.BytesIO(kept.arrays[name].tobytes()) for name in ("machine", "risk"))
+            machine, risk = files
+            guard = make_guard(setup, EvolvingFSM.load(machine), LatentRisk.load(risk))
         if len(done.outcomes) > setup.episodes:
             raise ValueError(
                 f"{checkpoint.path} has driven {len(done.outcomes)} episodes, more than "
                 f"{setup.episodes}"
             )
-        return done
+        return done, guard
 
-    def keep(self, learner: Learner, finished: bool = False) -> Kept:
+    def keep(self, guard: Guard, finished: bool = False) -> Kept:
         """All of it and what was learnt, for a checkpoint."""
-        machine, risk = _files(learner)
+        machine, risk = _files(guard)
         columns = {f"decided_{name}": _column(name, self.decisions[name]) for name in _COLUMNS}
         return Kept(
             {"episodes": len(self.outcomes)},
@@ -369,18 +386,13 @@ def _values(name: str, column: NDArray[Any]) -> list[Any]:
     return values
 
 
-def _files(learner: Learner) -> tuple[bytes, bytes]:
-    """The files of its machine and of its risk."""
-    machine, risk = io.BytesIO(), io.BytesIO()
-    learner.machine.save(machine)
-    learner.risk.save(risk)
-    return machine.getvalue(), risk.getvalue()
-
-
-def _teach(learner: Learner, arrays: Mapping[str, NDArray[Any]]) -> None:
-    """Let it have learnt what `Driven.keep` kept."""
-    learner.machine = EvolvingFSM.load(io.BytesIO(arrays["machine"].tobytes()))
-    learner.risk = LatentRisk.load(io.BytesIO(arrays["risk"].tobytes()))
+def _files(guard: Guard) -> tuple[bytes, bytes]:
+    """The files of its machine and of its judge."""
+    files = io.BytesIO(), io.BytesIO()
+    machine, risk = learnt_by(guard)
+    machine.save(files[0])
+    risk.save(files[1])
+    return files[0].getvalue(), files[1].getvalue()
 
 
 # -- One episode ----------------------------------------------------------------------------------

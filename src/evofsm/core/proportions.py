@@ -13,7 +13,26 @@ _WIDTH = 1.645
 
 @compiled
 def wilson_bounds(share: float, count: float) -> tuple[float, float]:
-    """90 % interval of a share that was counted (Wilson 1927)."""
+    """90 % interval of a share that was counted (Wilson 1927).
+
+    Parameters
+    ----------
+    share : float
+        Of the cases, in [0, 1].
+    count : float
+        Number of cases, above 0.
+
+    Returns
+    -------
+    (float, float)
+        Lower and upper bound.
+
+    Examples
+    --------
+    >>> low, high = wilson_bounds(0.25, 12.0)
+    >>> round(low, 2), round(high, 2)
+    (0.1, 0.49)
+    """
     spread = _WIDTH * _WIDTH / count
     centre = (share + 0.5 * spread) / (1.0 + spread)
     reach = math.sqrt(spread * (share * (1.0 - share) + 0.25 * spread)) / (1.0 + spread)

@@ -15,23 +15,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.core import EvolvingFSM, IntervalActions, Missing, positive
-from evofsm.driving.revisers import Unrevised
 from evofsm.driving.worlds.road import Episode, World
 from evofsm.driving.worlds.scenario import Scenario
-from evofsm.guard import (
-    Controller,
-    Explain,
-    LearningJudge,
-    Oversight,
-    Proposal,
-    Reviser,
-    Revision,
-    Situation,
-    Witness,
-    own_risk,
-    refuse_mismatch,
-)
+from evofsm.guard import Controller, Guard, Proposal, Revision, Situation
 
 _log = logging.getLogger(__name__)
 
@@ -72,79 +58,44 @@ class Drive:
 
 
 class Framework:
-    """Drives a controller under a reviser, and learns while it drives.
+    """Drives a controller under a guard, in any world.
 
     Parameters
     ----------
     controller : Controller
-        Anything that proposes. Where it raises or proposes no number, the reviser falls back.
-    actions : IntervalActions
-        The set of actions; made with ``outside="clip"``.
-    reviser : Reviser, optional
-        Without one every proposal is executed.
-    machine : EvolvingFSM, optional
-        Recognises and learns; without one nothing is recognised.
-    risk : LearningJudge, optional
-        Learns from what happens; without it the reviser's own, if it has one.
-    learn : bool
-        Whether machine and risk learn while driving. It may be changed between runs.
-    interval : float
-        Time between decisions [s].
-    missing : Missing
-        What to do where a variable was not observed (NaN). Controllers are given its latest value.
-    audit : Witness, optional
-        Is told what is decided: an `AuditLog`.
-    explaining : Explain, optional
-        Of which decisions the machine's experience is told; without it of none, and with an audit
-        log of those that speak.
+        Anything that proposes. Where it raises or proposes no number, the guard falls back. Where
+        a variable was not observed, it is given the latest value.
+    guard : Guard
+        Made with the interval between decisions. It learns while driving unless it is frozen.
+
+    Raises
+    ------
+    ValueError
+        If the guard has no interval.
 
     Examples
     --------
-    >>> from evofsm.driving import IDM, KinematicWorld, Leader
-    >>> actions = IntervalActions(low=-2.5, high=2.5, width=0.3, outside="clip")
+    >>> from evofsm.driving import IDM, KinematicWorld, Leader, Unrevised, guard_for_cars
+    >>> guard = guard_for_cars(low=-2.5, high=2.5)
     >>> hasty = IDM(2.25, 28.0, 0.8, 0.3, 2.0, lowest=-2.5, highest=2.5)
     >>> leader = Leader(IDM(1.2, 25.0, 1.0, 1.0, 2.5), brake_decel=4.0, brake_time=12.0)
     >>> scenario = Scenario(leader, initial_gap=10.0)
-    >>> Framework(hasty, actions).drive(KinematicWorld(), scenario).episode.collided
+    >>> unrevised = Guard.of(Unrevised(guard.actions), interval=0.25)
+    >>> Framework(hasty, unrevised).drive(KinematicWorld(), scenario).episode.collided
     True
-    >>> revised = Framework(hasty, actions, ActionReviser(LatentRisk(lowest=-2.5), actions))
-    >>> revised.drive(KinematicWorld(), scenario).episode.collided
+    >>> Framework(hasty, guard).drive(KinematicWorld(), scenario).episode.collided
     False
     """
 
-    def __init__(
-        self,
-        controller: Controller,
-        actions: IntervalActions,
-        reviser: Reviser | None = None,
-        *,
-        machine: EvolvingFSM | None = None,
-        risk: LearningJudge | None = None,
-        learn: bool = True,
-        interval: float = 0.25,
-        missing: Missing = Missing.PARTIAL,
-        audit: Witness | None = None,
-        explaining: Explain | None = None,
-    ) -> None:
-        refuse_mismatch(machine, actions)
-        self.interval = positive("interval", interval)
-        risk = own_risk(reviser) if risk is None else risk
-        if risk is not None and not math.isclose(risk.dt, interval):
-            raise ValueError(
-                f"interval is {interval} s, but the risk was made for decisions every {risk.dt} s"
-            )
+    def __init__(self, controller: Controller, guard: Guard) -> None:
+        if guard.interval is None:
+            raise ValueError("the guard was made without an interval, the time between decisions")
+        self.interval: float = guard.interval
         self.controller = controller
-        self.actions = actions
-        self.reviser = Unrevised(actions) if reviser is None else reviser
-        self.machine = machine
-        self.risk = risk
-        self.learn = learn
-        self.missing = missing
-        self.audit = audit
-        self.explaining = explaining
+        self.guard = guard
 
     def drive(self, world: World, scenario: Scenario) -> Drive:
-        """Drive one scenario, and learn from it if `learn`.
+        """Drive one scenario; the guard learns from it unless it is frozen.
 
         Raises
         ------
@@ -157,31 +108,23 @@ class Framework:
                 f"interval is {self.interval} s, which is no whole number of the scenario's "
                 f"steps of {scenario.dt} s"
             )
-        oversight = Oversight(
-            self.actions,
-            self.reviser,
-            machine=self.machine,
-            risk=self.risk,
-            learn=self.learn,
-            missing=self.missing,
-            interval=self.interval,
-            audit=self.audit,
-            explaining=self.explaining,
-        )
+        guard = self.guard
+        guard.begin()
         decided: list[tuple[int, Situation, Revision]] = []
         with world.open(scenario) as road:
             while not road.over:
-                situation = oversight.recognise(road.observation, road.time)
-                revision = oversight.revise(situation, self._ask(situation, oversight.senses.held))
+                situation = guard.recognise(road.observation, road.time)
+                revision = guard.revise(situation, self._ask(situation))
                 decided.append((road.row, situation, revision))
                 road.advance(revision.executed, steps)
-            oversight.end(road.observation, failed=road.collided)
+            guard.end(road.collided, road.observation)
             return _drive(road.episode(), decided)
 
-    def _ask(self, situation: Situation, held: NDArray[np.float64]) -> Proposal:
-        """What the controller proposes, seeing what was ``held``; NaN where it fails to."""
+    def _ask(self, situation: Situation) -> Proposal:
+        """What the controller proposes, seeing the latest values; NaN where it fails to."""
+        actions = self.guard.actions
         try:
-            proposal = self.controller.propose(held.copy(), situation.time)
+            proposal = self.controller.propose(self.guard.held, situation.time)
             action = float(proposal.action)
             candidates = tuple(float(candidate) for candidate in proposal.candidates)
         except Exception as error:  # whatever it is, someone has to go on driving
@@ -189,7 +132,7 @@ class Framework:
             return Proposal(math.nan)
         if not math.isfinite(action):
             _log.warning("controller proposed %g at %g s", action, situation.time)
-        elif not self.actions.low <= action <= self.actions.high:
+        elif not actions.low <= action <= actions.high:
             _log.info("controller proposed %g at %g s, outside the set", action, situation.time)
         return Proposal(action, candidates)
 

@@ -32,7 +32,7 @@ class Outcome(NamedTuple):
     mobility: float  #: distance, in those of the unrevised controller
     changed: int  #: decisions in which the proposal was not executed
     decisions: int
-    change: float  #: sum of |executed - proposed| [m/s²]
+    change: float  #: sum of the absolute differences of executed and proposed [m/s²]
     jerk: float  #: sum over decisions of the squared jerk [m²/s⁶]
     speed: float  #: mean [m/s]
 

@@ -52,6 +52,8 @@ class EnvelopeReviser:
     -2.5
     """
 
+    fallback = GENTLE_BRAKE
+
     def __init__(self, measure: RiskMeasure, actions: IntervalActions, dt: float = 0.25) -> None:
         self.measure = measure
         self.actions = actions
@@ -64,7 +66,7 @@ class EnvelopeReviser:
 
     def revise(self, situation: Situation, proposal: Proposal) -> Revision:
         """Full braking where the measure is above 0, else the proposal."""
-        wanted, remark = make_usable(proposal, self.actions, GENTLE_BRAKE)
+        wanted, remark = make_usable(proposal, self.actions, self.fallback)
         self._seen = [*self._seen[-1:], situation.observation.copy()]
         danger = float(self.measure.score(np.array(self._seen), self.dt)[-1])
         if math.isnan(danger):
@@ -104,6 +106,8 @@ class Unrevised:
     1.0
     """
 
+    fallback = GENTLE_BRAKE
+
     def __init__(self, actions: IntervalActions) -> None:
         self.actions = actions
 
@@ -112,7 +116,7 @@ class Unrevised:
 
     def revise(self, situation: Situation, proposal: Proposal) -> Revision:
         """The proposal, made usable."""
-        wanted, remark = make_usable(proposal, self.actions, GENTLE_BRAKE)
+        wanted, remark = make_usable(proposal, self.actions, self.fallback)
         return unjudged(wanted, proposal, remark or "not revised")
 
     def described(self) -> dict[str, Any]:

@@ -25,3 +25,4 @@ from .sealed import records as records
 from .sealed import verify as verify
 from .storage import Header as Header
 from .storage import Place as Place
+from .storage import read_header as read_header

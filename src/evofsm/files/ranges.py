@@ -101,6 +101,7 @@ ARRAYS: Mapping[str, Mapping[str, Range]] = {
         **dict.fromkeys(("noise_gap", "noise_speed", "noise_leader"), _PRODUCT),
         # "brakes" and what is kept of doubts in them: see `_of_brakes`.
     },
+    "guard": {},
     "checkpoint": {},
 }
 
@@ -138,6 +139,7 @@ SETTINGS: Mapping[str, Settings] = {
         "own_brakes": Range(_SMALLEST, 10.0),
         "margin": _SIZE,
     },
+    "guard": {},
     "checkpoint": {},
 }
 

@@ -98,6 +98,7 @@ _SHAPES: dict[str, dict[str, _Shape] | None] = {
         "doubts_brought": ("brought",),
         "doubts_shortfalls": ("shortfalls",),
     },
+    "guard": {"machine": ("machine",), "judge": ("judge",)},  # the files of both, as bytes
     "checkpoint": None,
 }
 # The version from which on there are those that were not there from the first.
@@ -143,7 +144,7 @@ _DAMAGE = (
 class Header(NamedTuple):
     """What a file says of itself."""
 
-    kind: str  #: ``"machine"``, ``"model"``, ``"risk"`` or ``"checkpoint"``
+    kind: str  #: ``"machine"``, ``"model"``, ``"risk"``, ``"guard"`` or ``"checkpoint"``
     version: int  #: of the format
     library: str | None  #: version of evofsm that wrote it; None before format 4
     content: dict[str, Any]  #: settings, by name
@@ -373,12 +374,21 @@ def _is_left(file: BinaryIO) -> bool:
 
 
 def kind_of(place: Place) -> str:
-    """Say what a file holds: ``"machine"``, ``"model"``, ``"risk"`` or ``"checkpoint"``."""
-    return describe(place).kind
+    """Say what a file holds: the kind of its `Header`."""
+    return read_header(place).kind
 
 
-def describe(place: Place) -> Header:
+def read_header(place: Place) -> Header:
     """Read what a file says of itself; what it holds is neither read nor checked.
+
+    Parameters
+    ----------
+    place : path-like, or file open for reading bytes
+
+    Returns
+    -------
+    Header
+        Its kind, versions and provenance.
 
     Raises
     ------
@@ -386,6 +396,16 @@ def describe(place: Place) -> Header:
         If there is no such file, or it may not be read.
     ValueError
         If it is no file of evofsm, or of a newer version.
+
+    Examples
+    --------
+    >>> from io import BytesIO
+    >>> from evofsm import EvolvingFSM
+    >>> file = BytesIO()
+    >>> EvolvingFSM(n_actions=2).save(file, provenance={"drive": "Monday"})
+    >>> header = read_header(BytesIO(file.getvalue()))
+    >>> header.kind, header.provenance
+    ('machine', {'drive': 'Monday'})
     """
     with _opened(place) as file, explained(place):
         return _described(_Archive(file).header)

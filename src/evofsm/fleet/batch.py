@@ -210,7 +210,18 @@ class Fleet:
         return answer
 
     def start_episode(self, vehicles: Sequence[int] | NDArray[np.integer] | None = None) -> None:
-        """Begin a new episode of some vehicles, or of all, as `EvolvingFSM.start_episode` does."""
+        """Begin a new episode of some vehicles, or of all, as `EvolvingFSM.start_episode` does.
+
+        Parameters
+        ----------
+        vehicles : sequence of int, optional
+            Their indices, from 0.
+
+        Examples
+        --------
+        >>> fleet = Fleet(EvolvingFSM.paper(), 3)
+        >>> fleet.start_episode([0, 2])
+        """
         chosen = self._everyone if vehicles is None else self._vehicles(vehicles)
         _start_episodes(self._small, self._matrices, self._at, chosen)
 

@@ -1,4 +1,4 @@
-"""The action reviser as a wrapper: any Gymnasium environment drives under it.
+"""A guard as a wrapper: any Gymnasium environment is driven under it.
 
 Whoever acts, a policy that was trained or one that is being trained, keeps its environment. What
 it does is revised before it is executed, and what comes of it is learnt.
@@ -9,35 +9,25 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from copy import deepcopy
-from typing import Any, Protocol, SupportsFloat
+from typing import Any, SupportsFloat
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from evofsm.core import EvolvingFSM, IntervalActions
 from evofsm.extras import needs
-from evofsm.guard.oversight import Oversight, Witness, own_risk, refuse_mismatch
-from evofsm.guard.protocols import LearningJudge, Proposal, Reviser, Revision
+from evofsm.guard.guard import Guard
+from evofsm.guard.protocols import Proposal, Revision
 from evofsm.guard.reviser import make_usable, unjudged
 
 with needs("gymnasium", "gym", "a wrapper for Gymnasium"):
     import gymnasium
-    from gymnasium.spaces import Box
-
-
-class BoundedReviser(Reviser, Protocol):
-    """A reviser that knows the set of actions, as all of `evofsm.guard.reviser` do."""
-
-    @property
-    def actions(self) -> IntervalActions:
-        """The set of actions."""
-        ...
+    from gymnasium.spaces import Box, Discrete
 
 
 class RevisedActions(gymnasium.Wrapper[Any, Any, Any, Any]):
-    """Executes what a reviser makes of the actions, and forwards all else as it is.
+    """Executes what a guard makes of the actions, and forwards all else as it is.
 
-    The reviser's risk, and the machine if there is one, learn while it drives. In ``info`` stand
+    The guard learns while the environment is driven. In ``info`` stand
     ``reviser/proposed_action`` and ``reviser/executed_action``, both as the environment takes
     them, ``reviser/reason``, and ``reviser/risk``, the probability of failure under what is
     executed (``reviser/risk_proposed`` under what was proposed; NaN where none was judged).
@@ -46,48 +36,40 @@ class RevisedActions(gymnasium.Wrapper[Any, Any, Any, Any]):
     Parameters
     ----------
     env : gymnasium.Env
-        A step of it is one decision, ``risk.dt`` long [s].
-    reviser : ActionReviser or another with a set of actions
-        What is executed lies in its ``actions`` always.
-    observe : callable
-        From an observation of ``env`` to ``[gap [m], v_follower [m/s], v_leader [m/s]]``; to None
-        where nothing is ahead: then nothing is revised, and nothing learnt.
-    failed : callable
-        From the ``info`` of a step to whether it ended in failure.
-    machine : EvolvingFSM, optional
-        Recognises and learns; without one nothing is recognised.
-    risk : LearningJudge, optional
-        Learns from what happens; without it the reviser's own, if that is one.
-    learn : bool
-        Whether machine and risk learn. It may be changed between episodes.
+        A step of it is one decision, ``guard.interval`` long [s].
+    guard : Guard
+        What is executed lies in its set of actions always.
+    observe : callable, optional
+        From an observation of ``env`` to what the guard observes; to None where there is nothing
+        to judge, such as no car ahead: then nothing is revised, and nothing learnt. Without it the
+        observation is taken as it is.
+    failed : callable, optional
+        From the ``info`` of a step to whether it ended in failure. Without it the guard's own
+        function says so, or nothing does.
     to_acceleration : callable, optional
-        From an action of ``env`` to an acceleration [m/s²]. Where the action is one number, it
-        is taken for that.
+        From an action of ``env`` to one of the guard. Where it is one number, or an index, it is
+        taken for that.
     to_action : callable, optional
-        From an acceleration [m/s²] to an action of ``env``.
-    audit : Witness, optional
-        Is told what is decided while something is ahead: an `AuditLog`.
+        From an action of the guard to one of ``env``.
 
     Raises
     ------
     ValueError
-        If an action of ``env`` is not one number and it was not told how to convert it, if only
-        one of the two conversions is given, or if ``machine`` is for another set of actions.
+        If an action of ``env`` is not one number and it was not told how to convert it, or if only
+        one of the two conversions is given.
 
     Notes
     -----
     A proposal that is kept is passed on untouched, without being converted back and forth. With a
-    failure the episode is over for machine and risk, also where the environment would go on. A
-    collision with what was not seen before it is no one's consequence: it is not counted.
+    failure the episode is over for the guard, also where the environment would go on. A failure
+    right after nothing was to be judged is no one's consequence: it is not counted.
 
     Examples
     --------
-    >>> from evofsm.driving import CarFollowing
-    >>> from evofsm.guard import ActionReviser
+    >>> from evofsm.driving import CarFollowing, guard_for_family
     >>> env = CarFollowing()
-    >>> risk = LatentRisk(env.family.actions.low, env.family.interval)
-    >>> reviser = ActionReviser(risk, env.family.actions)
-    >>> env = RevisedActions(env, reviser, observe=lambda seen: seen, failed=lambda i: i["failed"])
+    >>> guard = guard_for_family(env.family)
+    >>> env = RevisedActions(env, guard, failed=lambda info: info["failed"])
     >>> observation, info = env.reset(seed=1)
     >>> full_throttle, over = env.action_space.high, False
     >>> while not over:
@@ -100,26 +82,17 @@ class RevisedActions(gymnasium.Wrapper[Any, Any, Any, Any]):
     def __init__(
         self,
         env: gymnasium.Env[Any, Any],
-        reviser: BoundedReviser,
-        observe: Callable[[Any], ArrayLike | None],
-        failed: Callable[[dict[str, Any]], bool],
+        guard: Guard,
+        observe: Callable[[Any], ArrayLike | None] = lambda observation: observation,
+        failed: Callable[[dict[str, Any]], bool] = lambda info: False,
         *,
-        machine: EvolvingFSM | None = None,
-        risk: LearningJudge | None = None,
-        learn: bool = True,
         to_acceleration: Callable[[Any], float] | None = None,
         to_action: Callable[[float], Any] | None = None,
-        audit: Witness | None = None,
     ) -> None:
         super().__init__(env)
-        refuse_mismatch(machine, reviser.actions)
-        self.reviser = reviser
+        self.guard = guard
         self.observe = observe
         self.failed = failed
-        self.machine = machine
-        self.risk = own_risk(reviser) if risk is None else risk
-        self.learn = learn
-        self.audit = audit
         if to_acceleration is not None and to_action is not None:
             self.to_acceleration, self.to_action = to_acceleration, to_action
         elif to_acceleration is None and to_action is None:
@@ -127,7 +100,7 @@ class RevisedActions(gymnasium.Wrapper[Any, Any, Any, Any]):
         else:
             raise ValueError("of to_acceleration and to_action there is one; give both or neither")
         self.revision: Revision | None = None  #: the latest decision
-        self._oversight: Oversight | None = None  # of what is ahead, for as long as it is
+        self._is_judged = False  # whether an episode of the guard is under way
         self._seen: NDArray[np.float64] | None = None
         self._steps = 0
 
@@ -162,35 +135,30 @@ class RevisedActions(gymnasium.Wrapper[Any, Any, Any, Any]):
 
     def _decide(self, proposal: Proposal) -> Revision:
         if self._seen is None:
-            wanted, remark = make_usable(proposal, self.reviser.actions)
+            wanted, remark = make_usable(proposal, self.guard.actions, self.guard.fallback)
             return unjudged(wanted, proposal, f"nothing is ahead; {remark or 'not revised'}")
-        if self._oversight is None:
-            self._oversight = Oversight(
-                self.reviser.actions,
-                self.reviser,
-                machine=self.machine,
-                risk=self.risk,
-                learn=self.learn,
-                audit=self.audit,
-            )
-        time = math.nan if self.risk is None else self._steps * self.risk.dt
-        situation = self._oversight.recognise(self._seen, time)
-        return self._oversight.revise(situation, proposal)
+        if not self._is_judged:
+            self.guard.begin()
+            self._is_judged = True
+        interval = self.guard.interval
+        time = math.nan if interval is None else self._steps * interval
+        return self.guard.decide(self._seen, proposal, time)
 
     def _end(self, *, failed: bool) -> None:
-        if self._oversight is not None:
-            self._oversight.end(self._seen, failed=failed)
-            self._oversight = None
+        if self._is_judged:
+            self._is_judged = False
+            self.guard.end(failed, self._seen)
 
     def _look(self, observation: Any) -> NDArray[np.float64] | None:
-        answer = self.observe(observation)
-        if answer is None:
+        given = self.observe(observation)
+        if given is None:
             return None
-        seen = np.array(answer, dtype=np.float64)
-        if seen.shape != (3,) or not np.isfinite(seen).all():
+        seen, names = np.array(given, dtype=np.float64), self.guard.variables
+        if seen.ndim != 1 or len(seen) != (len(names) or len(seen)) or not np.isfinite(seen).all():
+            what = f"{' and '.join(names)}, {len(names)} finite numbers" if names else "finite"
             raise ValueError(
-                f"observe answered {answer}; it must be gap, v_follower and v_leader, three finite "
-                "numbers, or None where nothing is ahead"
+                f"observe returned {given}; it must be {what}, or None where there is nothing to "
+                "judge"
             )
         return seen
 
@@ -198,7 +166,10 @@ class RevisedActions(gymnasium.Wrapper[Any, Any, Any, Any]):
 def _conversions(
     space: gymnasium.Space[Any],
 ) -> tuple[Callable[[Any], float], Callable[[float], Any]]:
-    """To an acceleration and back, where an action is one number."""
+    """To an action of the guard and back, where it is one number or an index."""
+    if isinstance(space, Discrete):
+        first = int(space.start)
+        return lambda action: float(action) - first, lambda action: first + int(action)
     if not isinstance(space, Box) or space.shape not in ((), (1,)):
         raise ValueError(
             f"the environment's actions are {space}, not one acceleration; "

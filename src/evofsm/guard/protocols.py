@@ -4,14 +4,62 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass
 from enum import IntFlag
-from typing import Any, NamedTuple, Protocol, Self, runtime_checkable
+from typing import Any, NamedTuple, Protocol, Self, TypeAlias, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from evofsm.core import Labels
+from evofsm.core import EvolvingFSM, IntervalActions, Labels, Missing, whole
 from evofsm.files import Place
+
+
+@dataclass(frozen=True)
+class Choices:
+    """A set of actions that are told apart by their index alone: none is nearer than another.
+
+    Parameters
+    ----------
+    n_actions : int
+
+    Raises
+    ------
+    ValueError
+        If ``n_actions`` is no whole number of at least 1.
+
+    Examples
+    --------
+    >>> actions = Choices(3)
+    >>> actions.encode(2.0), 1.0 in actions, 0.5 in actions, 3.0 in actions
+    (2, True, False, False)
+    """
+
+    n_actions: int
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "n_actions", whole("n_actions", self.n_actions))
+
+    @property
+    def low(self) -> float:
+        """The first index."""
+        return 0.0
+
+    @property
+    def high(self) -> float:
+        """The last index."""
+        return self.n_actions - 1.0
+
+    def __contains__(self, action: float) -> bool:
+        return self.low <= action <= self.high and action == int(action)
+
+    def encode(self, action: float) -> int:
+        """The action itself, as an index."""
+        return int(action)
+
+
+#: What can be executed: an interval of numbers, or one of a few things.
+ActionSet: TypeAlias = IntervalActions | Choices
 
 
 class Proposal(NamedTuple):
@@ -188,6 +236,37 @@ class LearningJudge(ActionJudge, Protocol):
     @classmethod
     def load(cls, path: Place) -> Self:
         """Read what was learnt, between two episodes."""
+        ...
+
+
+class Participants(NamedTuple):
+    """Everything that a decision depends on but the observation and the proposal."""
+
+    actions: ActionSet
+    reviser: Reviser
+    machine: EvolvingFSM | None
+    risk: LearningJudge | None
+
+
+class Witness(Protocol):
+    """Anything that records what happens in an episode, such as an audit log."""
+
+    def begin(
+        self, who: Participants, *, interval: float | None, learn: bool, missing: Missing
+    ) -> None:
+        """An episode begins."""
+        ...
+
+    def seen(self, observation: NDArray[np.float64], time: float) -> None:
+        """An observation came in, at ``time`` [s]."""
+        ...
+
+    def decided(self, situation: Situation, proposal: Proposal, revision: Revision) -> None:
+        """A decision was made."""
+        ...
+
+    def ended(self, observation: NDArray[np.float64] | None, *, failed: bool) -> None:
+        """The episode ended."""
         ...
 
 

@@ -16,10 +16,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.core import IntervalActions, compiled
+from evofsm.core import compiled
 from evofsm.guard.protocols import (
     STALE,
     ActionJudge,
+    ActionSet,
+    Choices,
     Fallback,
     Judgement,
     Proposal,
@@ -59,12 +61,11 @@ class Usable(NamedTuple):
     remark: str  #: empty where it is what the controller proposed
 
 
-def make_usable(
-    proposal: Proposal, actions: IntervalActions, fallback: Fallback = NOTHING
-) -> Usable:
+def make_usable(proposal: Proposal, actions: ActionSet, fallback: Fallback = NOTHING) -> Usable:
     """An action of the set, whatever a controller came up with.
 
-    A proposal outside the set is put at its edge; NaN or infinity becomes the fallback.
+    A proposal outside an interval is put at its edge; NaN, infinity or an index of no action
+    becomes the fallback.
 
     Examples
     --------
@@ -75,7 +76,8 @@ def make_usable(
     Usable(action=0.0, remark='no usable proposal (nan): doing nothing')
     """
     low, high = actions.low, actions.high
-    if not math.isfinite(proposal.action):
+    is_none = isinstance(actions, Choices) and proposal.action not in actions
+    if not math.isfinite(proposal.action) or is_none:
         action = min(max(fallback.action, low), high)
         return Usable(action, f"no usable proposal ({proposal.action:g}): {fallback.doing}")
     if not low <= proposal.action <= high:
@@ -100,8 +102,9 @@ class ActionReviser:
     ----------
     risk : ActionJudge
         Usually a `LatentRisk`.
-    actions : IntervalActions
-        The set of actions. Nothing outside it is ever executed.
+    actions : IntervalActions or Choices
+        The set of actions. Nothing outside it is ever executed. Of `Choices` none is closer than
+        another: a proposal is kept, or replaced by the least risky one.
     tolerance : float
         Highest latent risk that is accepted, in (0, 1).
     release : float
@@ -123,7 +126,7 @@ class ActionReviser:
     def __init__(
         self,
         risk: ActionJudge,
-        actions: IntervalActions,
+        actions: ActionSet,
         *,
         tolerance: float = 0.02,
         release: float = 0.9,
@@ -149,6 +152,11 @@ class ActionReviser:
         """Nothing is under way yet."""
         self._revising = False
         self._trial = 0
+
+    @property
+    def fallback(self) -> Fallback:
+        """What is done without a usable proposal."""
+        return self.risk.fallback
 
     @property
     def overridden(self) -> bool:
@@ -220,8 +228,8 @@ class ActionReviser:
         """What could be executed, the proposal first."""
         if self.way is Way.IMPROVE:
             return np.minimum(np.maximum(wanted, self._lowest), self._highest)
-        low, high = self.actions.low, self.actions.high
-        return np.array([wanted, *(a for a in proposal.candidates if low <= a <= high)])
+        offered = (make_usable(Proposal(one), self.actions) for one in proposal.candidates)
+        return np.array([wanted, *(one.action for one in offered if not one.remark)])
 
     def _decide(self, options: NDArray[np.float64], judged: Judgement) -> tuple[int, str]:
         """Index of the best option, and why."""
@@ -241,11 +249,14 @@ class ActionReviser:
                 return _closest_to(trial.action, options), f"{why}; {trial.unknown}, so {trial.how}"
             why = f"{why}; {trial.unknown}, {trial.assumed}"
         # Once revising, what is safe by the margin; else whatever is tolerable.
+        least = _least_risky(options, judged.risk)
+        if isinstance(self.actions, Choices) and judged.risk[least] <= self.tolerance:
+            return least, f"{why}; the least risky that can"
         for tolerated in (limit, self.tolerance):
             closest = _closest_within(options, judged.risk, tolerated)
             if closest >= 0:
                 return closest, f"{why}; the closest that can"
-        return _least_risky(options, judged.risk), f"{why}; nothing can, the least risky"
+        return least, f"{why}; nothing can, the least risky"
 
 
 @compiled
@@ -301,21 +312,11 @@ def speaks(reviser: Reviser, revision: Revision) -> bool:
     return isinstance(reviser, ActionReviser) and revision.risk_proposed > reviser.tolerance
 
 
-def nearest_values(actions: IntervalActions, wanted: float) -> list[float]:
-    """For each interval the value in it that is nearest to ``wanted``, and both limits.
-
-    Examples
-    --------
-    >>> actions = IntervalActions(low=-1.0, high=1.0, width=1.0)
-    >>> [round(value, 6) for value in nearest_values(actions, 0.5)]
-    [-0.0, 0.5, -1.0, 1.0]
-    """
-    lowest, highest = _bounds(actions)
-    return [float(value) for value in np.clip(wanted, lowest, highest)[1:]]
-
-
-def _bounds(actions: IntervalActions) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _bounds(actions: ActionSet) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Lowest and highest value of the whole set, of each interval, and of both limits alone."""
+    if isinstance(actions, Choices):
+        every = np.arange(actions.n_actions, dtype=np.float64)
+        return np.append(0.0, every), np.append(actions.high, every)
     lowest, highest = actions.edges[:-1].copy(), actions.edges[1:].copy()
     if actions.closed == "left":
         highest[:-1] = np.nextafter(highest[:-1], -math.inf)

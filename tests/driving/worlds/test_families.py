@@ -8,12 +8,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from evofsm.driving.cars import drive, unrevised
 from evofsm.driving.drivers.idm import IDM, ChangingIDM
 from evofsm.driving.families.family import FAMILIES, SWITCHES, load_family
 from evofsm.driving.families.numbers import Numbers
-from evofsm.driving.framework import Framework
 from evofsm.driving.risk.dead_end import is_dead_end
-from evofsm.driving.worlds.kinematic import KinematicWorld
 from evofsm.evidence.paper.settings import Settings
 
 SEEDS = st.integers(0, 2**32 - 1)
@@ -74,13 +73,10 @@ def own(tmp_path):
     return load
 
 
-def drive(family, draw):
-    framework = Framework(draw.controller, family.actions, interval=family.interval)
-    return framework.drive(KinematicWorld(), draw.scenario)
-
-
 def drive_many(family, count):
-    return [drive(family, family.draw(1, index, "test")).episode for index in range(count)]
+    return [
+        drive(unrevised(family), family.draw(1, index, "test")).episode for index in range(count)
+    ]
 
 
 def dead_end_share(family, episodes):
@@ -381,8 +377,7 @@ def test_both_worlds_agree(name):
         for index in range(2):
             draw = family.draw(2, index)
             closed_form = drive(family, draw).episode
-            framework = Framework(draw.controller, family.actions)
-            episode = framework.drive(sumo, draw.scenario).episode
+            episode = drive(unrevised(family), draw, sumo).episode
             assert episode.observations.shape == closed_form.observations.shape
             assert np.abs(episode.observations - closed_form.observations).max() < 1e-9
 

@@ -6,11 +6,13 @@ import pytest
 from evofsm.core.actions import IntervalActions
 from evofsm.driving.drivers.idm import IDM
 from evofsm.driving.framework import Framework
+from evofsm.driving.revisers import Unrevised
 from evofsm.driving.risk.outcome import LatentRisk
 from evofsm.driving.worlds.kinematic import KinematicWorld
 from evofsm.driving.worlds.scenario import CutIn, Leader, Scenario, Sensors
 from evofsm.driving.worlds.sumo import SumoWorld
 from evofsm.driving.worlds.sumo_driver import MODELS, SumoDriver
+from evofsm.guard.guard import Guard
 from evofsm.guard.protocols import Proposal
 from evofsm.guard.reviser import ActionReviser
 
@@ -115,10 +117,10 @@ def test_under_a_reviser_what_is_executed_is_carried_out_exactly(world):
     risk = LatentRisk(lowest=-2.5)
     leader = replace(LEADER, brake_decel=4.0, brake_time=12.0, waves=())
     scenario = Scenario(leader, initial_gap=30.0, duration=25.0, initial_speed=10.0)
-    unrevised = Framework(driver, actions).drive(world, scenario)
-    revised = Framework(driver, actions, ActionReviser(risk, actions), risk=risk).drive(
-        world, scenario
-    )
+    alone = Guard.of(Unrevised(actions), interval=0.25)
+    unrevised = Framework(driver, alone).drive(world, scenario)
+    guard = Guard.of(ActionReviser(risk, actions), interval=0.25)
+    revised = Framework(driver, guard).drive(world, scenario)
     assert unrevised.episode.collided
     assert not revised.episode.collided
     assert np.isfinite(revised.proposed).all()

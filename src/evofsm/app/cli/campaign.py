@@ -96,24 +96,24 @@ def campaign(
     workers_too = {"distributed": "cluster"} if executor == "dask" else {}
     require(scipy="study", **of_world(world), **workers_too)
     from evofsm.app.campaign import Campaign
-    from evofsm.app.driving import Setup
+    from evofsm.app.driving import Setup, make_guard
     from evofsm.app.text.columns import console
     from evofsm.app.text.driving import print_outcome
-    from evofsm.driving import Learner, load_family
+    from evofsm.driving import learnt_by, load_family, load_learnt
 
     chosen = load_family(family).with_switches(split_names(switches))
     setup = Setup(
         *(chosen, controller, reviser, chosen_mode(mode), tolerance, episodes, seed), learn=False
     )
-    learner = Learner.load(frozen) if frozen else Learner.new(chosen)
+    guard = make_guard(setup, *(load_learnt(frozen) if frozen else ()))
     open_executor, count = _executor(executor, scheduler, workers)
     out.mkdir(parents=True, exist_ok=True)
-    result = _drive(Campaign(setup, learner.risk, world.value), out, open_executor, count)
+    result = _drive(Campaign(setup, learnt_by(guard)[1], world.value), out, open_executor, count)
     if as_json:
         print_json({**result.row.as_dict(), "lead_times": list(result.lead_times)})
         return
     screen = console()
-    print_outcome(screen, result.row, result.lead_times, learner, setup)
+    print_outcome(screen, result.row, result.lead_times, guard, setup)
     screen.print(f"Every episode, and their journal: {out}", soft_wrap=True)
 
 

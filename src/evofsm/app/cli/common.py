@@ -120,7 +120,7 @@ def load_model(place: Path) -> tuple[FSMModel, Header | None]:
         return load_model(within)
     if place.suffix == ".mcap":
         return _model_of_log(place), None
-    header = storage.describe(place)
+    header = storage.read_header(place)
     return (_labelled(place, header) if header.kind == "machine" else FSMModel.load(place)), header
 
 

@@ -30,9 +30,9 @@ with suppress(ModuleNotFoundError):
 
 if TYPE_CHECKING:
     from evofsm.app.driving import Driving, Setup
-    from evofsm.driving import Learner, World
+    from evofsm.driving import World
     from evofsm.files import Checkpoint
-    from evofsm.guard import AuditLog
+    from evofsm.guard import AuditLog, Guard
     from evofsm.io import RunWriter
 
 
@@ -106,10 +106,10 @@ def drive(
         **({"polars": "tables"} if out else {}),
         **({"mcap": "mcap"} if mcap else {}),
     )
-    from evofsm.app.driving import Setup, episodes_learnt, write_driving
+    from evofsm.app.driving import Setup, episodes_learnt, make_guard, write_driving
     from evofsm.app.text.columns import console
     from evofsm.app.text.driving import driving_document, print_driving
-    from evofsm.driving import Learner, load_family, open_world
+    from evofsm.driving import learnt_by, load_family, load_learnt, open_world
     from evofsm.files import Checkpoint, duration, result_kept
     from evofsm.guard import AuditLog
 
@@ -133,28 +133,28 @@ def drive(
         first=episodes_learnt(learn) if learn else 0,
     )
     start = learn or frozen
-    learner = Learner.load(start) if start else Learner.new(chosen)
+    guard = make_guard(setup, *(load_learnt(start) if start else ()))
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
     keeper = None
     if checkpoint is not None:
-        keeper = Checkpoint(checkpoint, setup.settings(world.value, learner), interval)
+        keeper = Checkpoint(checkpoint, setup.settings(world.value, guard), interval)
     with (
         AuditLog(audit) if audit else nullcontext() as log,
         open_world(world.value) as place,
         _recording(mcap, setup, world.value) as run,
     ):
-        driving = _drive(setup, learner, place, keeper, log, run)
+        driving = _drive(setup, guard, place, keeper, log, run)
         if run is not None:
-            run.attach(learner.machine.model(**chosen.labels._asdict()))
+            run.attach(learnt_by(driving.guard)[0].model(**chosen.labels._asdict()))
     if out is not None:
         with result_kept(keeper):
-            write_driving(driving, learner, setup, out)
+            write_driving(driving, setup, out)
     if as_json:
         print_json(driving_document(driving))
         return
     screen = console()
-    print_driving(screen, driving, learner, setup)
+    print_driving(screen, driving, setup)
     if out is not None:
         screen.print(f"What was learnt, and every decision: {out}", soft_wrap=True)
     if mcap is not None:
@@ -165,7 +165,7 @@ def drive(
 
 def _drive(
     setup: Setup,
-    learner: Learner,
+    guard: Guard,
     place: World,
     checkpoint: Checkpoint | None,
     audit: AuditLog | None,
@@ -182,7 +182,7 @@ def _drive(
             bars.update(task, completed=done, description=text)
 
         record = None if run is None else run.add
-        return drive_family(setup, learner, place, show, checkpoint, audit, record)
+        return drive_family(setup, guard, place, show, checkpoint, audit, record)
 
 
 def _recording(

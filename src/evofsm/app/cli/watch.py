@@ -28,7 +28,7 @@ with suppress(ModuleNotFoundError):
 if TYPE_CHECKING:
     from evofsm.app.watch.player import Watched
     from evofsm.app.watch.session import Session, Watching
-    from evofsm.driving import Learner
+    from evofsm.guard import Guard
 
 
 @plain_errors
@@ -129,7 +129,7 @@ def _session(watching: Watching, learn: Path | None, learn_first: int) -> Openin
     cases = len(watching.cases)
     if watching.case >= cases:
         raise ValueError(f"--case is {watching.case + 1}; {watching.family.name} has 1 to {cases}")
-    learner, learnt = _learner(watching, learn, learn_first)
+    guard, learnt = _guard(watching, learn, learn_first)
 
     @contextmanager
     def session() -> Iterator[Session]:
@@ -138,28 +138,30 @@ def _session(watching: Watching, learn: Path | None, learn_first: int) -> Openin
 
         with (
             open_world(watching.world) as world,
-            Session(watching, learner, world, learnt) as opened,
+            Session(watching, guard, world, learnt) as opened,
         ):
             yield opened
 
     return session
 
 
-def _learner(watching: Watching, folder: Path | None, episodes: int) -> tuple[Learner, int]:
+def _guard(watching: Watching, folder: Path | None, episodes: int) -> tuple[Guard, int]:
     """One that has learnt something, and from how many episodes."""
     from evofsm.app.driving import episodes_learnt
-    from evofsm.app.watch.session import learn_first, watched_learner
-    from evofsm.driving import Learner
+    from evofsm.app.watch.session import learn_first, watched_guard
+    from evofsm.driving import guard_for_family, load_learnt
 
     if folder is not None:
-        return Learner.load(folder), episodes_learnt(folder)
-    learner = watched_learner(watching.family)
+        machine, judge = load_learnt(folder)
+        guard = guard_for_family(watching.family, machine=machine, judge=judge)
+        return guard, episodes_learnt(folder)
+    guard = watched_guard(watching.family)
     with progress() as bars:
         task = bars.add_task("Learning first", total=episodes)
         learn_first(
-            watching, learner, episodes, lambda done, total: bars.update(task, completed=done)
+            watching, guard, episodes, lambda done, total: bars.update(task, completed=done)
         )
-    return learner, episodes
+    return guard, episodes
 
 
 def _show(address: str, no_browser: bool) -> None:

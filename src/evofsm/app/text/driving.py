@@ -10,7 +10,8 @@ from rich.console import Console
 
 from evofsm.app.driving import Driving, Setup
 from evofsm.app.text.columns import print_columns, print_facts
-from evofsm.driving import Learner, Row
+from evofsm.driving import Row, learnt_by
+from evofsm.guard import Guard
 
 # More states than these are not listed.
 _MOST = 8
@@ -20,14 +21,14 @@ _DEAD_END_HEADER = (
 )
 
 
-def print_driving(out: Console, driving: Driving, learner: Learner, setup: Setup) -> None:
+def print_driving(out: Console, driving: Driving, setup: Setup) -> None:
     """Print collisions and their price, what was learnt, and the dead ends that were found."""
-    print_outcome(out, driving.row, driving.lead_times, learner, setup)
-    _print_dead_ends(out, driving, learner)
+    print_outcome(out, driving.row, driving.lead_times, driving.guard, setup)
+    _print_dead_ends(out, driving)
 
 
 def print_outcome(
-    out: Console, row: Row, lead_times: Sequence[float], learner: Learner, setup: Setup
+    out: Console, row: Row, lead_times: Sequence[float], guard: Guard, setup: Setup
 ) -> None:
     """Print collisions and their price, and what was learnt."""
     facts = [
@@ -47,7 +48,7 @@ def print_outcome(
         ),
         ("comfort", f"RMS jerk {row.jerk:.2f} m/s³"),
         *_lead_times(lead_times),
-        ("learnt", _learnt(learner)),
+        ("learnt", _learnt(guard)),
     ]
     print_facts(out, "What came of driving", facts)
 
@@ -64,16 +65,17 @@ def _lead_times(times: Sequence[float]) -> list[tuple[str, str]]:
     return [("lead time", f"{text}; median {median(times):.1f} s before")]
 
 
-def _learnt(learner: Learner) -> str:
-    risk, brakes = learner.risk, learner.risk.brakes
+def _learnt(guard: Guard) -> str:
+    machine, risk = learnt_by(guard)
+    brakes = risk.brakes
     own = f"{brakes.decel:.1f} m/s²" if brakes.known else "not known yet"
     return (
-        f"{learner.machine.n_states} states; {len(risk.manoeuvres)} manoeuvres of leaders, "
+        f"{machine.n_states} states; {len(risk.manoeuvres)} manoeuvres of leaders, "
         f"1 % brake harder than {risk.manoeuvres.exceeded_by(0.01):.1f} m/s²; own brakes: {own}"
     )
 
 
-def _print_dead_ends(out: Console, driving: Driving, learner: Learner) -> None:
+def _print_dead_ends(out: Console, driving: Driving) -> None:
     """Those that were seen longest, and what could still be survived in them."""
     dead_ends = sorted(
         (state for state in driving.states if state.is_dead_end), key=lambda state: -state.seconds
@@ -82,7 +84,7 @@ def _print_dead_ends(out: Console, driving: Driving, learner: Learner) -> None:
         out.print(f"No dead ends among the {len(driving.states)} states.")
         return
     out.print(f"Dead ends: {len(dead_ends)} of {len(driving.states)} states; seen longest:")
-    centers = learner.machine.centers
+    centers = learnt_by(driving.guard)[0].centers
     rows = [
         (
             f"#{state.state + 1}",

@@ -1,7 +1,7 @@
 """A run that is looked at while it is driven: decision by decision, with a clock of its own."""
 
 from evofsm.app.watch.player import SPEEDS, Audience, Clock, Player, Watched
-from evofsm.app.watch.session import Session, Watching, learn_first, watched_learner
+from evofsm.app.watch.session import Session, Watching, learn_first, watched_guard
 from evofsm.app.watch.shown import Frame, Graph, Judged, Start, StateShown, Transition
 from evofsm.app.watch.story import Chronicle, Danger, Story
 
@@ -23,5 +23,5 @@ __all__ = [
     "Watched",
     "Watching",
     "learn_first",
-    "watched_learner",
+    "watched_guard",
 ]

@@ -55,12 +55,12 @@ class Recording:
     Examples
     --------
     >>> import tempfile
-    >>> from evofsm.driving import Unrevised, drive_alone, load_family
+    >>> from evofsm.driving import drive, load_family, unrevised
     >>> from evofsm.io import write_run
     >>> family = load_family("paper")
-    >>> drive = drive_alone(family, family.draw(0, 0), Unrevised(family.actions), None)
+    >>> driven = drive(unrevised(family), family.draw(0, 0))
     >>> with tempfile.TemporaryDirectory() as folder:
-    ...     write_run(Path(folder) / "run.mcap", [drive], about={"family": "paper"})
+    ...     write_run(Path(folder) / "run.mcap", [driven], about={"family": "paper"})
     ...     recording = Recording(Path(folder) / "run.mcap")
     >>> frame = recording.step()
     >>> while not frame.over:

@@ -8,7 +8,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import Self
 
-from evofsm.app.driving import Setup, make_controller, make_reviser
+from evofsm.app.driving import Setup, make_controller, make_guard
 from evofsm.app.watch.shown import (
     CAR_LENGTH,
     HEADWAY,
@@ -31,17 +31,19 @@ from evofsm.driving import (
     Draw,
     Family,
     LatentRisk,
-    Learner,
-    Unrevised,
     World,
-    drive_alone,
+    drive,
+    guard_for_family,
+    learnt_by,
+    teach,
     time_headway,
     time_to_collision,
+    unrevised,
 )
 from evofsm.guard import (
     Explain,
+    Guard,
     Judgement,
-    Oversight,
     Proposal,
     Reviser,
     Revision,
@@ -102,14 +104,14 @@ class Watching:
         )
 
 
-def watched_learner(family: Family) -> Learner:
-    """One that has seen nothing, with few enough states to look at."""
-    return Learner.new(family, WATCHED_RULE)
+def watched_guard(family: Family) -> Guard:
+    """A guard that has seen nothing, with few enough states to look at."""
+    return guard_for_family(family, rule=WATCHED_RULE)
 
 
 def learn_first(
     watching: Watching,
-    learner: Learner,
+    guard: Guard,
     episodes: int,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> None:
@@ -119,17 +121,17 @@ def learn_first(
     ----------
     watching : Watching
         Of whose family.
-    learner : Learner
-        Who learns.
+    guard : Guard
+        What learns.
     episodes : int
     progress : callable
         Told how many episodes are done, of how many.
     """
-    family = watching.family
-    reviser = learner.reviser(family, watching.tolerance)
+    teacher = guard_for_family(
+        watching.family, tolerance=watching.tolerance, machine=guard.machine, judge=guard.judge
+    )
     for index in range(episodes):
-        draw = family.draw(watching.seed + 1, index)  # not those that will be watched
-        learner.drive(family, draw, reviser, learn=True)
+        teach(teacher, [watching.family.draw(watching.seed + 1, index)])  # none that is watched
         progress(index + 1, episodes)
 
 
@@ -186,8 +188,8 @@ class Session:
     Parameters
     ----------
     watching : Watching
-    learner : Learner
-        Goes on learning.
+    guard : Guard
+        Its machine and its judge go on learning.
     world : World
     learnt : int
         Episodes that it has learnt from before.
@@ -196,22 +198,28 @@ class Session:
     --------
     >>> from evofsm.driving import KinematicWorld, load_family
     >>> watching = Watching(load_family("paper"), reviser="none")
-    >>> with Session(watching, watched_learner(watching.family), KinematicWorld()) as session:
+    >>> with Session(watching, watched_guard(watching.family), KinematicWorld()) as session:
     ...     while not (frame := session.step()).over:
     ...         pass
     >>> frame.collided, frame.time
     (True, 31.4)
     """
 
-    def __init__(self, watching: Watching, learner: Learner, world: World, learnt: int = 0) -> None:
+    def __init__(self, watching: Watching, guard: Guard, world: World, learnt: int = 0) -> None:
         self.watching = watching
-        self.learner = learner
+        self.machine, self.risk = learnt_by(guard)
         self.world = world
         self.learnt = learnt
         self.case = watching.case
-        setup, family = watching.setup, watching.family
-        self._reviser = Switchable(
-            make_reviser(setup, learner), family.actions, learner.risk, watching.reviser != "none"
+        family = watching.family
+        ours = make_guard(watching.setup, self.machine, self.risk).reviser
+        self._reviser = Switchable(ours, family.actions, self.risk, watching.reviser != "none")
+        self._guard = Guard.of(
+            self._reviser,
+            interval=family.interval,
+            machine=self.machine,
+            judge=self.risk,
+            explaining=Explain.ALL,
         )
         self._closing = ExitStack()
         self.start = self.restart()
@@ -243,14 +251,7 @@ class Session:
         self._controller = make_controller(watching.setup, draw, self.world)
         self._road = self._closing.enter_context(self.world.open(draw.scenario))
         self._steps = draw.scenario.steps(family.interval)
-        self._oversight = Oversight(
-            family.actions,
-            self._reviser,
-            machine=self.learner.machine,
-            risk=self.learner.risk,
-            interval=family.interval,
-            explaining=Explain.ALL,
-        )
+        self._guard.begin()
         self._chronicle = Chronicle(
             watching.tolerance, (TTC.threshold, HEADWAY.threshold), self._alone(draw)
         )
@@ -283,7 +284,7 @@ class Session:
 
     def graph(self) -> Graph:
         """The states found so far."""
-        return graph_of(self.learner.machine, self.learner.risk, self._number)
+        return graph_of(self.machine, self.risk, self._number)
 
     def close(self) -> None:
         """Leave the road."""
@@ -320,25 +321,20 @@ class Session:
         if self.watching.controller == "sumo":  # which drives in SUMO only, where a run is open
             return math.nan
         controller = make_controller(self.watching.setup, draw, self.world)
-        unrevised = Unrevised(self.watching.family.actions)
-        episode = drive_alone(
-            self.watching.family, draw, unrevised, None, controller=controller
-        ).episode
+        episode = drive(unrevised(self.watching.family), draw, controller=controller).episode
         return float(episode.time[-1]) if episode.collided else math.inf
 
     def _decide(self) -> Frame:
-        road, machine = self._road, self.learner.machine
-        known = machine.n_states
-        situation = self._oversight.recognise(road.observation, road.time)
-        proposal = self._controller.propose(self._oversight.senses.held.copy(), road.time)
-        revision = self._oversight.revise(situation, proposal)
+        road, guard, known = self._road, self._guard, self.machine.n_states
+        situation = guard.recognise(road.observation, road.time)
+        revision = guard.revise(situation, self._controller.propose(guard.held, road.time))
         judged = self._reviser.judged
         assert judged is not None
         wanted, does, braking = range(3)
         frame = self._seen()._replace(
             belief=most_believed(situation.belief),
             state=situation.state,
-            event=self._event(situation.state, machine.n_states > known),
+            event=self._event(situation.state, self.machine.n_states > known),
             surprise=situation.surprise,
             proposed_risk=_judged(judged, wanted),
             executed_risk=_judged(judged, does),
@@ -355,7 +351,7 @@ class Session:
 
     def _end(self) -> Frame:
         self._over = True
-        self._oversight.end(self._road.observation, failed=self._road.collided)
+        self._guard.end(self._road.collided, self._road.observation)
         self.learnt += 1
         return self._seen()._replace(
             over=True, collided=self._road.collided, rear_ended=self._road.rear_ended
@@ -386,9 +382,9 @@ class Session:
             x_follower=self._position,
             gap_behind=float(now[GAP_BEHIND]),
             observation=tuple(observation.tolist()),
-            n_states=self.learner.machine.n_states,
-            decel=self.learner.risk.brakes.decel,
-            brakes_to=self.learner.risk.manoeuvres.exceeded_by(self.watching.tolerance),
+            n_states=self.machine.n_states,
+            decel=self.risk.brakes.decel,
+            brakes_to=self.risk.manoeuvres.exceeded_by(self.watching.tolerance),
             time_to_collision=float(time_to_collision(observation)),
             time_headway=float(time_headway(observation)),
             revising=self.revising,

@@ -27,6 +27,12 @@ class StateRule(Protocol):
     A rule is a frozen dataclass of settings in a file of its own, with a kernel that judges an
     observation; `states.dispatch` lists the rules. All distances, potentials and variances
     are those of observations divided by the rule's scales, where it has some.
+
+    Examples
+    --------
+    >>> from evofsm import Novelty
+    >>> Novelty(radius=0.5, scales=(4.0, 2.0, 2.0)).scales
+    (4.0, 2.0, 2.0)
     """
 
     @property

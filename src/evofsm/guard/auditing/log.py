@@ -37,8 +37,7 @@ from evofsm.core import Missing
 from evofsm.files import ABOUT, ChainedFile, Head, Sync, records
 from evofsm.guard.auditing.form import VERSION
 from evofsm.guard.auditing.participants import describe, learnt, settings
-from evofsm.guard.oversight import Participants
-from evofsm.guard.protocols import Proposal, Reviser, Revision, Situation
+from evofsm.guard.protocols import Participants, Proposal, Reviser, Revision, Situation
 from evofsm.guard.reviser import speaks
 
 _log = logging.getLogger(__name__)
@@ -80,9 +79,8 @@ def _whole(
 class AuditLog:
     """Writes down what a reviser decides, so that nobody can change it unnoticed.
 
-    Give it to a `Framework`, an `Oversight` or `RevisedActions`. Where the disk fails while
-    driving, someone has to go on driving: the log is broken off there, which is logged, and raised
-    as the episode ends.
+    Give it to a `Guard`. Where the disk fails while driving, someone has to go on driving: the
+    log is broken off there, which is logged, and raised as the episode ends.
 
     Parameters
     ----------
@@ -112,18 +110,14 @@ class AuditLog:
     Examples
     --------
     >>> from tempfile import TemporaryDirectory
-    >>> from evofsm import IntervalActions
-    >>> from evofsm.driving import LatentRisk
-    >>> from evofsm.guard import ActionReviser, Oversight, audit
-    >>> actions = IntervalActions(low=-2.5, high=2.5, width=0.3, outside="clip")
-    >>> risk = LatentRisk(actions.low)
+    >>> from evofsm.driving import guard_for_cars
+    >>> from evofsm.guard import audit
     >>> with TemporaryDirectory() as folder:
     ...     path = Path(folder) / "audit.jsonl"
     ...     with AuditLog(path) as log:
-    ...         oversight = Oversight(actions, ActionReviser(risk, actions), risk=risk, audit=log)
-    ...         seen = oversight.recognise(np.array([9.0, 20.0, 10.0]), time=0.0)
-    ...         revision = oversight.revise(seen, Proposal(1.0))
-    ...         oversight.end(np.array([7.0, 19.0, 10.0]), failed=False)
+    ...         guard = guard_for_cars(low=-2.5, high=2.5, audit=log)
+    ...         revision = guard.decide([9.0, 20.0, 10.0], proposal=1.0)
+    ...         guard.end(observation=[7.0, 19.0, 10.0])
     ...     found = audit(path, log.head)
     >>> revision.executed, found.chain.head.number, found.replay.decisions, found.is_good
     (-2.5, 4, 1, True)

@@ -18,15 +18,21 @@ from functools import cache
 from hashlib import sha256
 from importlib.metadata import EntryPoint, entry_points
 from io import BytesIO
-from typing import Any, Protocol, TypeVar
+from typing import Any, Protocol
 
 import numba
 import numpy as np
 
 import evofsm
 from evofsm.core import EvolvingFSM, IntervalActions
-from evofsm.guard.oversight import Participants
-from evofsm.guard.protocols import ActionJudge, LearningJudge, Reviser
+from evofsm.guard.protocols import (
+    ActionJudge,
+    ActionSet,
+    Choices,
+    LearningJudge,
+    Participants,
+    Reviser,
+)
 from evofsm.guard.reviser import ActionReviser, Mode, Way
 
 # The judge of logs that do not name it.
@@ -67,12 +73,16 @@ class CannotBeReplayedError(Exception):
 def describe(who: Participants) -> dict[str, Any]:
     """All that it takes to begin where they are now."""
     return {
-        "actions": asdict(who.actions),
+        **outline(who),
         "machine": None if who.machine is None else _file(who.machine),
         "made_by": made_by(),
-        "reviser": _reviser(who),
         "risk": None if who.risk is None else _file(who.risk),
     }
+
+
+def outline(who: Participants) -> dict[str, Any]:
+    """The set of actions and the reviser: all but the files of machine and judge."""
+    return {"actions": asdict(who.actions), "reviser": _reviser(who)}
 
 
 def made_by() -> dict[str, str]:
@@ -166,16 +176,45 @@ def restore(described: Mapping[str, Any]) -> Participants:
             f"{reviser['class']} is no reviser that is known here, or asks a risk that was not "
             "told what happened"
         )
-    actions = IntervalActions(**described["actions"])
-    machine = _restored(EvolvingFSM, described["machine"])
-    risk = _restored(known(_JUDGE), described["risk"])
-    again = _restored_reviser(reviser, actions, machine, risk)
-    who = Participants(actions, again, machine, risk)
-    if _names(described["actions"]) != _names(asdict(actions)) or (
-        _names(reviser) != _names(_reviser(who))
-    ):
+    who = rebuild(described, _data(described["machine"]), _data(described["risk"]))
+    if _names(described) | _names(outline(who)) != _names(described):
         raise ValueError("the actions or the reviser are described by other names than are written")
     return who
+
+
+def rebuild(
+    described: Mapping[str, Any],
+    machine_file: bytes,
+    judge_file: bytes,
+    judge: ActionJudge | type[LearningJudge] | None = None,
+) -> Participants:
+    """Those of an `outline`, from the files of machine and judge; an empty one stands for none.
+
+    ``judge`` is the judge's class, or a judge as it is, where its name is not known.
+    """
+    reviser = described["reviser"]
+    actions: ActionSet
+    if "n_actions" in described["actions"]:
+        actions = Choices(**described["actions"])
+    else:
+        actions = IntervalActions(**described["actions"])
+    machine = EvolvingFSM.load(BytesIO(machine_file)) if machine_file else None
+    risk: LearningJudge | None = None
+    if judge_file:
+        kind = judge if isinstance(judge, type) else _kind_of_judge(reviser)
+        risk = kind.load(BytesIO(judge_file))
+    if reviser["class"] != "ActionReviser":
+        again: Reviser = known(reviser["class"]).restored(reviser, actions)
+        return Participants(actions, again, machine, risk)
+    if judge is None:
+        asked = _restored_judge(reviser["judge"], machine, risk)
+    elif risk is None and isinstance(judge, type):
+        raise ValueError(f"no {judge.__name__} is in it; give a judge as it is")
+    else:
+        asked = judge if risk is None else risk  # type: ignore[assignment]
+    again = ActionReviser(asked, actions)
+    set_again(again, reviser["settings"])
+    return Participants(actions, again, machine, risk)
 
 
 def _names(described: Any) -> Any:
@@ -185,37 +224,30 @@ def _names(described: Any) -> Any:
     return {name: _names(value) for name, value in described.items()}
 
 
-_Kept = TypeVar("_Kept", EvolvingFSM, LearningJudge)
+def _kind_of_judge(reviser: Mapping[str, Any]) -> Any:
+    """The class of what learns: the judge's own, or of what it asks in turn."""
+    described = reviser.get("judge", {"class": _JUDGE})
+    if described is None:
+        raise ValueError("no installed package declares its judge; give the judge's class")
+    kind = known(described["class"])
+    return kind if hasattr(kind, "load") else known(_JUDGE)
 
 
-def _restored(kind: type[_Kept], kept: Mapping[str, Any] | None) -> _Kept | None:
+def _data(kept: Mapping[str, Any] | None) -> bytes:
+    """A file that was written down; empty where there was none."""
     if kept is None:
-        return None
+        return b""
     data = base64.b64decode(kept["file"], validate=True)
     if sha256(data).hexdigest() != kept["sha256"]:
-        raise ValueError(f"the {kind.__name__} in it has not the SHA-256 that is said")
-    return kind.load(BytesIO(data))
-
-
-def _restored_reviser(
-    described: Mapping[str, Any],
-    actions: IntervalActions,
-    machine: EvolvingFSM | None,
-    risk: LearningJudge | None,
-) -> Reviser:
-    if described["class"] != "ActionReviser":
-        reviser: Reviser = known(described["class"]).restored(described, actions)
-        return reviser
-    reviser = ActionReviser(_restored_judge(described["judge"], machine, risk), actions)
-    set_again(reviser, described["settings"])
-    return reviser
+        raise ValueError("a file in it has not the SHA-256 that is said")
+    return data
 
 
 def _restored_judge(
     described: Mapping[str, Any], machine: EvolvingFSM | None, risk: LearningJudge | None
 ) -> ActionJudge:
     if risk is None:
-        raise ValueError("the reviser asks a risk, but none is there")
+        raise ValueError("the reviser asks a judge, but none is there; give it")
     kind = known(described["class"])
     if kind is type(risk):
         return risk

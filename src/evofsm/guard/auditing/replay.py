@@ -28,8 +28,8 @@ from evofsm.guard.auditing.participants import (
     restore,
     set_again,
 )
-from evofsm.guard.oversight import Explain, Oversight, Participants
-from evofsm.guard.protocols import Proposal, Revision, Situation
+from evofsm.guard.guard import Explain, Guard
+from evofsm.guard.protocols import Participants, Proposal, Revision, Situation
 from evofsm.guard.reviser import speaks
 
 # What a record that someone made up may run into.
@@ -180,7 +180,7 @@ class _Player:
     not_replayed: list[str] = field(default_factory=list)
     other_makers: dict[str, tuple[str, str]] = field(default_factory=dict)
     _who: Participants | None = None
-    _oversight: Oversight | None = None
+    _guard: Guard | None = None
     _is_known: bool = True
     _version: int = VERSION
 
@@ -221,7 +221,7 @@ class _Player:
         for name, then in content["made_by"].items():
             if then != now.get(name):
                 self.other_makers[name] = str(then), now.get(name, "")
-        self._oversight = None
+        self._guard = None
         try:
             self._who, self._is_known = restore(content), True
         except CannotBeReplayedError as reason:
@@ -235,21 +235,22 @@ class _Player:
 
     def _begin(self, content: Mapping[str, Any]) -> None:
         actions, reviser, machine, risk = self._present()
-        self._oversight = Oversight(
-            actions,
+        self._guard = Guard.of(
             reviser,
+            actions=actions,
             machine=machine,
-            risk=risk,
+            judge=risk,
             learn=content["learn"],
             missing=Missing(content["missing"]),
             interval=content["interval"],
             explaining=Explain.SPOKEN,
         )
+        self._guard.begin()
 
-    def _overseer(self) -> Oversight:
-        if self._oversight is None:
+    def _present_guard(self) -> Guard:
+        if self._guard is None:
             raise ValueError("it belongs to no episode")
-        return self._oversight
+        return self._guard
 
     def _silent(self, row: Sequence[Any]) -> None:
         time, observation, *proposed = row
@@ -283,17 +284,17 @@ class _Player:
         self, time: Any, observation: Sequence[Any], proposal: Proposal
     ) -> tuple[Situation, Revision]:
         situation = self._recognise(time, observation)
-        return situation, self._overseer().revise(situation, proposal)
+        return situation, self._present_guard().revise(situation, proposal)
 
     def _recognise(self, time: Any, observation: Sequence[Any]) -> Situation:
-        return self._overseer().recognise(_observation(observation), number(time))
+        return self._present_guard().recognise(_observation(observation), number(time))
 
     def _end(self, content: Mapping[str, Any]) -> None:
-        oversight, observation = self._overseer(), content["observation"]
+        guard, observation = self._present_guard(), content["observation"]
         seen = None if observation is None else _observation(observation)
-        oversight.end(seen, failed=content["failed"])
-        self._oversight = None
-        recorded, again = content["learnt"], learnt(oversight.machine, oversight.risk)
+        guard.end(content["failed"], seen)
+        self._guard = None
+        recorded, again = content["learnt"], learnt(guard.machine, guard.judge)
         if unknown := sorted(recorded.keys() - again.keys()):
             raise _DiffersError(f"nothing is learnt that is called {unknown[0]!r}")
         fields = _differing(recorded, again)

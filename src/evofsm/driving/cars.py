@@ -1,0 +1,224 @@
+"""A guard for cars, and what is done with it in a family: teach it, test it, keep it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from evofsm.core import EvolvingFSM, IntervalActions, Novelty, StateRule
+from evofsm.driving.families.family import Draw, Family
+from evofsm.driving.framework import Drive, Framework
+from evofsm.driving.outcomes import Outcome, Reference, outcome, reference
+from evofsm.driving.revisers import Unrevised
+from evofsm.driving.risk.outcome import LatentRisk
+from evofsm.driving.worlds.kinematic import KinematicWorld
+from evofsm.driving.worlds.road import World
+from evofsm.guard import ActionReviser, Controller, Guard, LearningJudge, Mode
+
+#: The state rule for safety work: fine enough to steer by. The study compares the rules.
+SAFETY_RULE = Novelty(radius=1.0, scales=(4.0, 2.0, 2.0))
+
+# With hundreds of states this makes a step several times as quick.
+_BELIEF_TOLERANCE = 1e-6
+# What a machine's explanations call soon [s].
+_SOON = 5.0
+_MACHINE, _RISK = "machine.evofsm", "risk.evofsm"
+
+
+def guard_for_cars(
+    low: float,
+    high: float,
+    interval: float = 0.25,
+    *,
+    width: float = 0.3,
+    tolerance: float = 0.02,
+    mode: Mode = Mode.ACT,
+    rule: StateRule | None = SAFETY_RULE,
+    machine: EvolvingFSM | None = None,
+    judge: LearningJudge | None = None,
+    **settings: Any,
+) -> Guard:
+    """A guard that knows how cars follow each other, and learns how hard they brake.
+
+    It observes gap [m], own speed and the leader's speed [m/s], and decides on the acceleration.
+
+    Parameters
+    ----------
+    low, high : float
+        The hardest braking that can be commanded, negative, and the hardest acceleration [m/s²].
+    interval : float
+        Time between two decisions [s].
+    width : float
+        Of an interval of accelerations, for the machine [m/s²].
+    tolerance : float
+        Highest latent risk that is accepted, in (0, 1).
+    mode : Mode
+    rule : StateRule, optional
+        Of the machine that is made; None for the paper's.
+    machine : EvolvingFSM, optional
+        One that has learnt; without it a new one.
+    judge : LearningJudge, optional
+        One that has learnt; without it a new `LatentRisk`.
+    **settings
+        As in `Guard.of`: ``failed``, ``seed``, ``learn``, ``audit``, ``explaining``, ``missing``.
+
+    Examples
+    --------
+    >>> guard = guard_for_cars(low=-4.0, high=2.5)
+    >>> guard.decide([40.0, 20.0, 20.0], proposal=0.5).reason
+    'never seen before; risk is within the tolerance'
+    """
+    actions = IntervalActions(low, high, width, outside="clip")
+    return _guard(
+        actions, interval, tolerance, mode, rule=rule, machine=machine, judge=judge, **settings
+    )
+
+
+def guard_for_family(
+    family: Family, *, tolerance: float = 0.02, mode: Mode = Mode.ACT, **settings: Any
+) -> Guard:
+    """The same for a family's set of actions and interval.
+
+    Parameters
+    ----------
+    family : Family
+    tolerance, mode, **settings
+        As in `guard_for_cars`.
+    """
+    return _guard(family.actions, family.interval, tolerance, mode, **settings)
+
+
+def _guard(
+    actions: IntervalActions,
+    interval: float,
+    tolerance: float,
+    mode: Mode,
+    *,
+    rule: StateRule | None = SAFETY_RULE,
+    machine: EvolvingFSM | None = None,
+    judge: LearningJudge | None = None,
+    **settings: Any,
+) -> Guard:
+    judge = LatentRisk(actions.low, interval) if judge is None else judge
+    machine = machine or EvolvingFSM(
+        actions.n_actions,
+        rule=rule,
+        belief_tolerance=_BELIEF_TOLERANCE,
+        failure_horizon=round(_SOON / interval),
+    )
+    reviser = ActionReviser(judge, actions, tolerance=tolerance, mode=mode)
+    return Guard.of(reviser, interval=interval, machine=machine, judge=judge, **settings)
+
+
+# -- In a family ----------------------------------------------------------------------------------
+
+
+def training(
+    family: Family, seed: int, learning_seed: int, episodes: int, first: int = 0
+) -> Iterator[Draw]:
+    """Draws to learn from, other ones for every learning seed."""
+    for index in range(first, first + episodes):
+        yield family.draw(seed * 1000 + learning_seed, index, split="train")
+
+
+def held_out(family: Family, seed: int, episodes: int) -> list[Draw]:
+    """Draws that nothing learns from."""
+    return [family.draw(seed, index, split="test") for index in range(episodes)]
+
+
+def drive(
+    guard: Guard, draw: Draw, world: World | None = None, controller: Controller | None = None
+) -> Drive:
+    """Drive one draw under a guard, which learns from it unless it is frozen.
+
+    Parameters
+    ----------
+    guard : Guard
+    draw : Draw
+    world : World, optional
+        Without one, it is driven in closed form.
+    controller : Controller, optional
+        Without one, the draw's own drives.
+    """
+    return Framework(controller or draw.controller, guard).drive(
+        world or KinematicWorld(), draw.scenario
+    )
+
+
+def teach(guard: Guard, draws: Iterable[Draw]) -> list[Drive]:
+    """Drive each draw in turn."""
+    return [drive(guard, draw) for draw in draws]
+
+
+def unrevised(family: Family) -> Guard:
+    """A guard that executes whatever is proposed, and learns nothing."""
+    return Guard.of(Unrevised(family.actions), interval=family.interval, learn=False)
+
+
+def references(family: Family, draws: Sequence[Draw]) -> list[Reference]:
+    """How far the controller comes by itself in each draw."""
+    return [
+        reference(drive(unrevised(family), draw), draw.scenario.leader.brake_decel)
+        for draw in draws
+    ]
+
+
+def score(family: Family, alone: Sequence[Reference], drives: Iterable[Drive]) -> list[Outcome]:
+    """Outcomes of driven draws, against the controller alone."""
+    return [
+        outcome(driven, base, family.interval) for base, driven in zip(alone, drives, strict=True)
+    ]
+
+
+def try_out(
+    guard: Guard, family: Family, draws: Sequence[Draw], alone: Sequence[Reference] | None = None
+) -> list[Outcome]:
+    """What comes of draws under a frozen copy of a guard, against the controller alone.
+
+    Parameters
+    ----------
+    guard : Guard
+        Its copy has no machine: the same is decided, and nothing is recognised.
+    family : Family
+    draws : sequence of Draw
+    alone : sequence of Reference, optional
+        Of these draws; without them the controller is driven alone first.
+
+    Examples
+    --------
+    >>> from evofsm.driving import load_family
+    >>> family = load_family("emergency")
+    >>> outcomes = try_out(guard_for_family(family), family, held_out(family, seed=0, episodes=3))
+    >>> [outcome.collided for outcome in outcomes]
+    [False, False, False]
+    """
+    frozen = guard.copy(states=False)
+    frozen.freeze()
+    return score(family, alone or references(family, draws), teach(frozen, draws))
+
+
+def learnt_by(guard: Guard) -> tuple[EvolvingFSM, LatentRisk]:
+    """The machine and the latent risk of a guard for cars.
+
+    Raises
+    ------
+    TypeError
+        If it has others.
+    """
+    if guard.machine is None or not isinstance(guard.judge, LatentRisk):
+        raise TypeError("the guard has no machine, or its judge is no LatentRisk")
+    return guard.machine, guard.judge
+
+
+def save_learnt(guard: Guard, folder: Path, provenance: Mapping[str, Any] | None = None) -> None:
+    """Write what a guard learnt, machine and judge in a file each, and what it learnt from."""
+    folder.mkdir(parents=True, exist_ok=True)
+    machine, risk = learnt_by(guard)
+    machine.save(folder / _MACHINE, provenance)
+    risk.save(folder / _RISK, provenance)
+
+
+def load_learnt(folder: Path) -> tuple[EvolvingFSM, LatentRisk]:
+    """The machine and the latent risk that `save_learnt` wrote."""
+    return EvolvingFSM.load(folder / _MACHINE), LatentRisk.load(folder / _RISK)

@@ -1,0 +1,589 @@
+"""The framework's loop: observe, recognise, propose, revise, execute, learn.
+
+Whoever the controller is and whatever it controls, what it proposes is revised before it is
+executed, and what came of it is learnt before the next decision (the paper's Section 4.1).
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Callable, Mapping
+from enum import Enum
+from io import BytesIO
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from evofsm.core import (
+    EvolvingFSM,
+    FSMModel,
+    IntervalActions,
+    Labels,
+    Missing,
+    explain,
+    positive,
+    real_array,
+    refuse_unusable,
+)
+from evofsm.files import Place, storage
+from evofsm.guard.auditing.participants import outline, rebuild
+from evofsm.guard.protocols import (
+    INCOMPLETE,
+    STALE,
+    ActionJudge,
+    ActionSet,
+    Choices,
+    Fallback,
+    Intake,
+    LearningJudge,
+    Participants,
+    Proposal,
+    Reviser,
+    Revision,
+    Situation,
+    Witness,
+)
+from evofsm.guard.reviser import NOTHING, ActionReviser, Mode, speaks
+from evofsm.guard.senses import Senses
+
+# Intervals that a range of actions is divided into for the machine, unless a width is given.
+_INTERVALS = 17
+# States of the machine that is made where none is given: no more than this, and recognised by
+# similarities that add up to all but this share.
+_MOST_STATES, _BELIEF_TOLERANCE = 200, 1e-6
+
+
+class Explain(Enum):
+    """For which decisions a revision holds the machine's experience (`Revision.explanation`)."""
+
+    NONE = "none"
+    SPOKEN = "spoken"  #: those that change a proposal or warn
+    ALL = "all"
+
+
+class Guard:
+    """Keeps any controller from failing: a state machine, a judge and a reviser that learn.
+
+    Before an action is executed, the judge says how likely it is that failure can no longer be
+    avoided after it. A proposal within the tolerance is kept; any other is replaced by the closest
+    action that is tolerable. The machine recognises and counts the states in which that happens.
+
+    An episode begins with the first `decide` after `end`; until then machine and judge learn.
+
+    Parameters
+    ----------
+    low, high : float, optional
+        Range of the action, where that is one number.
+    n_actions : int, optional
+        Number of actions, where an action is an index from 0.
+    interval : float
+        Time between two decisions [s].
+    judge : ActionJudge
+        Says how dangerous an action is. There is no default yet; for cars
+        `evofsm.driving.guard_for_cars` brings one.
+    failed : callable, optional
+        From an observation to whether it is a failure; asked as an episode ends.
+    horizon : float, optional
+        What the machine's explanations call soon [s].
+    tolerance : float
+        Highest risk that is accepted, in (0, 1).
+    mode : Mode
+        Whether what it decides is executed, or only recorded.
+    seed : int
+        For a judge that draws random numbers.
+    machine : EvolvingFSM, optional
+        Recognises and learns; without it one with recommended settings is made.
+    width : float, optional
+        Width of an interval of actions, for the machine; without it a 17th of the range.
+    audit : Witness, optional
+        Records what is decided: an `AuditLog`.
+    explaining : Explain, optional
+        For which decisions the machine's experience is looked up; without it for none, and with
+        an audit log for those that speak.
+    missing : Missing
+        What to do where a variable was not observed (NaN).
+
+    Raises
+    ------
+    ValueError
+        If there is no judge, neither a range of actions nor a number of them (or both), an action
+        has several dimensions, a number is out of its range, or judge and machine were made for
+        other actions or another interval.
+
+    Notes
+    -----
+    An input that is refused leaves the guard as it was. Where the judge itself raises, the
+    observation was taken in; asking again with the same time decides on it.
+
+    Examples
+    --------
+    >>> from evofsm.driving import LatentRisk
+    >>> from evofsm.guard import Guard
+    >>> guard = Guard(low=-2.5, high=2.5, interval=0.25, judge=LatentRisk(lowest=-2.5))
+    >>> for observation in ([9.0, 20.0, 20.0], [8.9, 20.2, 19.8]):  # gap, own speed, leader's
+    ...     revision = guard.decide(observation, proposal=1.0)
+    >>> revision.executed, revision.risk_proposed, guard.machine.n_states
+    (-2.5, 1.0, 2)
+    >>> guard.end(failed=False, observation=[8.7, 20.0, 19.5])
+    """
+
+    def __init__(
+        self,
+        low: float | None = None,
+        high: float | None = None,
+        *,
+        n_actions: int | None = None,
+        interval: float,
+        judge: ActionJudge | None = None,
+        failed: Callable[[NDArray[np.float64]], bool] | None = None,
+        horizon: float | None = None,
+        tolerance: float = 0.02,
+        mode: Mode = Mode.ACT,
+        seed: int = 0,
+        machine: EvolvingFSM | None = None,
+        width: float | None = None,
+        audit: Witness | None = None,
+        explaining: Explain | None = None,
+        missing: Missing = Missing.PARTIAL,
+    ) -> None:
+        if judge is None:
+            raise ValueError(
+                "a guard needs a judge that says how dangerous an action is: give judge=, an "
+                "ActionJudge (for cars: evofsm.driving.guard_for_cars)"
+            )
+        actions = _actions(low, high, n_actions, width)
+        interval = positive("interval", interval)
+        soon = None if horizon is None else max(1, round(positive("horizon", horizon) / interval))
+        self._set_up(
+            ActionReviser(judge, actions, tolerance=tolerance, mode=mode),
+            interval=interval,
+            machine=machine
+            or EvolvingFSM(
+                actions.n_actions,
+                max_states=_MOST_STATES,
+                belief_tolerance=_BELIEF_TOLERANCE,
+                failure_horizon=soon,
+            ),
+            failed=failed,
+            seed=seed,
+            audit=audit,
+            explaining=explaining,
+            missing=missing,
+        )
+
+    @classmethod
+    def of(cls, reviser: Reviser, **settings: Any) -> Self:
+        """A guard of parts that were made before; nothing is added to them.
+
+        Parameters
+        ----------
+        reviser : Reviser
+            Any; what it returns is executed.
+        actions : IntervalActions or Choices, optional
+            The set of actions; without it the reviser's own.
+        interval : float, optional
+            Time between decisions [s]; an observation that comes later than 1.5 of them begins an
+            episode anew. Without it no such gap is seen, and times must be given to `decide`.
+        machine : EvolvingFSM, optional
+            Without one nothing is recognised.
+        judge : LearningJudge, optional
+            Learns from what happens; without it the reviser's own, if it has one that learns.
+        learn : bool
+            Whether machine and judge learn.
+        failed, seed, audit, explaining, missing
+            As in `Guard`.
+
+        Examples
+        --------
+        >>> from evofsm import IntervalActions
+        >>> from evofsm.driving import Unrevised
+        >>> actions = IntervalActions(low=-2.5, high=2.5, width=0.3, outside="clip")
+        >>> guard = Guard.of(Unrevised(actions), interval=0.25)
+        >>> guard.decide([5.0, 20.0, 10.0], 9.0).executed
+        2.5
+        """
+        guard = cls.__new__(cls)
+        guard._set_up(reviser, **settings)
+        return guard
+
+    def _set_up(
+        self,
+        reviser: Reviser,
+        *,
+        actions: ActionSet | None = None,
+        interval: float | None = None,
+        machine: EvolvingFSM | None = None,
+        judge: LearningJudge | None = None,
+        learn: bool = True,
+        failed: Callable[[NDArray[np.float64]], bool] | None = None,
+        seed: int = 0,
+        audit: Witness | None = None,
+        explaining: Explain | None = None,
+        missing: Missing = Missing.PARTIAL,
+    ) -> None:
+        self.actions: ActionSet = actions or reviser.actions  # type: ignore[attr-defined]
+        self.interval = None if interval is None else positive("interval", interval)
+        asked = reviser.risk if isinstance(reviser, ActionReviser) else judge
+        if judge is None and isinstance(asked, LearningJudge):
+            judge = asked
+        if judge and self.interval and not math.isclose(judge.dt, self.interval):
+            raise ValueError(
+                f"interval is {interval} s, but the judge was made for decisions every {judge.dt} s"
+            )
+        if machine is not None and machine.n_actions != self.actions.n_actions:
+            raise ValueError(
+                f"the machine has {machine.n_actions} actions, but the set has "
+                f"{self.actions.n_actions}"
+            )
+        self.reviser = reviser
+        self.machine = machine
+        #: Learns from what happens; None where nothing but the machine does.
+        self.judge = judge
+        self.failed = failed
+        self.seed = seed
+        self.audit = audit
+        self.explaining = explaining
+        self.missing = missing
+        #: What the judge calls the variables of an observation; empty where it does not say.
+        self.variables: tuple[str, ...] = () if asked is None else asked.labels.names
+        #: What is done without a usable proposal where nothing is judged.
+        self.fallback: Fallback = getattr(reviser, "fallback", NOTHING)
+        self._labels = (Labels() if asked is None else asked.labels)._replace(
+            actions=self.actions if isinstance(self.actions, IntervalActions) else None,
+            dt=interval,
+        )
+        self._frozen: FSMModel | None = None
+        self._senses = Senses(missing, interval)
+        self._under_way = False
+        self.learn = learn
+
+    # -- An episode -----------------------------------------------------------------------------
+
+    @property
+    def learn(self) -> bool:
+        """Whether machine and judge learn; if it is set, an episode under way is broken off."""
+        return self._learn
+
+    @learn.setter
+    def learn(self, learn: bool) -> None:
+        self._learn = learn
+        self._under_way = False
+        self._frozen = None if learn or self.machine is None else self.machine.model()
+
+    def freeze(self) -> None:
+        """Learn nothing from now on: what is decided depends on the present episode alone.
+
+        The same episode is then decided the same again, bit for bit. An episode that is under way
+        is broken off: nothing more is learnt from it.
+        """
+        self.learn = False
+
+    @property
+    def held(self) -> NDArray[np.float64]:
+        """(m,) ndarray: the latest value of each variable; NaN of one that was never observed."""
+        return self._senses.held.copy()
+
+    def begin(self) -> None:
+        """Begin an episode; one that is under way is broken off, and nothing follows from it."""
+        self._senses = Senses(self.missing, self.interval)
+        self._latest: Situation | None = None
+        self._decisions = 0
+        self.reviser.start_episode()
+        if self.judge is not None:
+            self.judge.start_episode(learn=False)
+        if self.machine is not None and self.learn:
+            self.machine.start_episode()
+        if self.audit is not None:
+            who = self._participants
+            self.audit.begin(who, interval=self.interval, learn=self.learn, missing=self.missing)
+        self._under_way = True
+
+    def decide(
+        self,
+        observation: ArrayLike,
+        proposal: Proposal | float | None,
+        time: float | None = None,
+    ) -> Revision:
+        """What to execute instead of a proposal; the proposal itself where that will do.
+
+        Parameters
+        ----------
+        observation : (m,) array_like
+            NaN where a variable was not observed.
+        proposal : float, Proposal or None
+            What the controller wants; None, or NaN, where it has nothing.
+        time : float, optional
+            Of the observation, in this episode [s]; without it decisions are counted, one every
+            `interval`.
+
+        Returns
+        -------
+        Revision
+            What is executed is a whole number, of type int, where actions are `Choices`.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If observation or proposal are not real numbers, or an entry is infinite or too large.
+        """
+        if isinstance(proposal, Proposal):
+            others = tuple(float(candidate) for candidate in proposal.candidates)
+            proposal = Proposal(float(proposal.action), others)
+        else:
+            proposal = Proposal(math.nan if proposal is None else float(proposal))
+        if time is None:
+            count = self._decisions if self._under_way else 0
+            time = math.nan if self.interval is None else count * self.interval
+        return self.revise(self.recognise(observation, time), proposal)
+
+    def recognise(self, observation: ArrayLike, time: float) -> Situation:
+        """The first half of `decide`: where the system is at ``time`` [s].
+
+        The machine learns the transition to it. An observation that is no newer than the one
+        before changes nothing: the situation is still that one.
+        """
+        z = self._checked(observation)
+        if not self._under_way:
+            self.begin()
+        intake = self._senses.take(z, time)
+        if intake and intake & STALE and self._latest is not None:
+            situation = self._latest._replace(intake=intake)
+        else:
+            if intake and intake & Intake.GAP:
+                self._begin_anew()
+            situation = self._latest = self._recognised(z, time, intake)
+        if self.audit is not None:
+            self.audit.seen(z, time)
+        return situation
+
+    def _checked(self, observation: ArrayLike) -> NDArray[np.float64]:
+        """An observation that judge and machine can take in; NaN stays."""
+        z = real_array("observation", observation, 1)
+        refuse_unusable("observation", np.where(np.isnan(z), 0.0, z))
+        known = len(self.variables) or (0 if self.machine is None else self.machine.n_variables)
+        if known and len(z) != known:
+            named = f" ({', '.join(self.variables)})" if self.variables else ""
+            raise ValueError(f"observation has {len(z)} variables; it must have {known}{named}")
+        return z
+
+    def _begin_anew(self) -> None:
+        """What comes after a gap in time does not follow from what was before it."""
+        if self.judge is not None:
+            self.judge.start_episode(learn=self.learn)
+        if self.machine is not None and self.learn:
+            self.machine.start_episode()
+
+    def _recognised(self, z: NDArray[np.float64], time: float, intake: Intake) -> Situation:
+        nothing = Situation(z, np.ones(1), None, math.nan, time, intake)
+        incomplete = bool(intake) and bool(intake & INCOMPLETE)
+        if self.machine is None or (incomplete and self.machine.n_states == 0):
+            return nothing
+        if self._frozen is None:
+            policy = Missing.REJECT
+            if incomplete:
+                policy = self.missing if self.machine.state is not None else Missing.PARTIAL
+            step = self.machine.observe(z, missing=policy)
+            return Situation(z, step.belief, step.state, step.surprise, time, intake)
+        if self._frozen.n_states == 0 or np.isnan(self._senses.held).any():
+            return nothing
+        belief = self._frozen.recognise(self._senses.held)
+        return Situation(z, belief, int(belief.argmax()), math.nan, time, intake)
+
+    def revise(self, situation: Situation, proposal: Proposal) -> Revision:
+        """The second half of `decide`: what to execute; machine and judge learn from it."""
+        revision = self._explained(situation, self.reviser.revise(situation, proposal))
+        if self.audit is not None:
+            self.audit.decided(situation, proposal, revision)
+        executed = revision.executed
+        self._decisions += 1
+        if self.machine is not None and self.learn and self.machine.state is not None:
+            self.machine.act(self.actions.encode(executed))
+        if self.judge is not None and not (situation.intake and situation.intake & STALE):
+            if not self.learn:
+                self.judge.follow(situation.observation, executed)
+            else:
+                watched = isinstance(self.reviser, ActionReviser) and not self.reviser.acts
+                take_in = self.judge.watch if watched else self.judge.learn
+                take_in(situation.observation, executed, situation.belief)
+        if isinstance(self.actions, Choices):
+            return revision._replace(executed=int(executed), advised=int(revision.advised))
+        return revision
+
+    def _explained(self, situation: Situation, revision: Revision) -> Revision:
+        """With what the machine has seen come of what is executed, where that is asked for."""
+        explaining = self.explaining or (Explain.NONE if self.audit is None else Explain.SPOKEN)
+        if explaining is Explain.NONE or self.machine is None or situation.state is None:
+            return revision
+        if explaining is Explain.SPOKEN and not speaks(self.reviser, revision):
+            return revision
+        action = self.actions.encode(revision.executed)
+        if self._frozen is None:
+            text = self.machine.explain(action, self._labels).text
+        else:
+            nearest = self._frozen.nearest(self._senses.held)
+            text = explain(self._frozen, situation.belief, action, self._labels, nearest).text
+        return revision._replace(explanation=text)
+
+    def end(self, failed: bool = False, observation: ArrayLike | None = None) -> None:
+        """End the episode, and learn from how it ended.
+
+        Parameters
+        ----------
+        failed : bool
+            Whether it ended in failure; also if `failed` of the guard says so of the last
+            observation.
+        observation : (m,) array_like, optional
+            The last one, on which nothing was decided any more.
+        """
+        z = None if observation is None else self._checked(observation)
+        if not self._under_way:
+            self.begin()
+        last = self._latest.observation if z is None and self._latest is not None else z
+        if self.failed is not None and last is not None:
+            failed = failed or bool(self.failed(last))
+        if self.machine is not None and self.learn:
+            if z is not None and (self.machine.n_states or not np.isnan(z).any()):
+                self.machine.observe(z, failed=failed, missing=Missing.PARTIAL)
+            elif failed and self.machine.state is not None:
+                self.machine.fail()
+            self.machine.tell_of_failures()
+        if self.judge is not None:
+            self.judge.start_episode(learn=self.learn)
+        self._under_way = False
+        if self.audit is not None:
+            self.audit.ended(z, failed=failed)
+
+    # -- Keeping it -----------------------------------------------------------------------------
+
+    @property
+    def _participants(self) -> Participants:
+        return Participants(self.actions, self.reviser, self.machine, self.judge)
+
+    def copy(self, *, states: bool = True) -> Self:
+        """A twin that learns for itself, as between two episodes; without the audit log.
+
+        Parameters
+        ----------
+        states : bool
+            Whether it has the machine too. Without it the same is decided, unless the judge asks
+            the states, and nothing is recognised.
+        """
+        machine = None if self.machine is None else self.machine.copy()
+        reviser, judge = copy.deepcopy(
+            (self.reviser, self.judge),
+            {} if self.machine is None else {id(self.machine): machine},
+        )
+        return type(self).of(
+            reviser, judge=judge, machine=machine if states else None, **self._settings
+        )
+
+    @property
+    def _settings(self) -> dict[str, Any]:
+        names = ("actions", "interval", "learn", "failed", "seed", "explaining", "missing")
+        return {name: getattr(self, name) for name in names}
+
+    def save(self, path: Place, provenance: Mapping[str, Any] | None = None) -> None:
+        """Write all of it to one file: machine, judge and settings.
+
+        An episode under way is not kept: whoever loads the file begins a new one. Neither are the
+        audit log and the function `failed`, which is code; `load` takes them again.
+
+        Parameters
+        ----------
+        path : path-like, or file open for writing bytes
+        provenance : mapping, optional
+            What it learnt from, for people; kept in the file.
+
+        Raises
+        ------
+        OSError
+            If it cannot be written.
+        ValueError
+            If the reviser is of someone's own class, so that no file can say what it is.
+        """
+        described = outline(self._participants)
+        reviser = described["reviser"]
+        if not (reviser["known"] or isinstance(self.reviser, ActionReviser)):
+            raise ValueError(f"a {reviser['class']} is no reviser that a file can hold")
+        kept = {
+            **described,
+            "explaining": None if self.explaining is None else self.explaining.value,
+            "missing": self.missing.value,
+            "failed": self.failed is not None,
+            **{name: getattr(self, name) for name in ("interval", "learn", "seed")},
+        }
+        files = {"machine": _bytes(self.machine), "judge": _bytes(self.judge)}
+        storage.write(path, "guard", kept, files, provenance)
+
+    @classmethod
+    def load(
+        cls,
+        path: Place,
+        *,
+        judge: ActionJudge | type[LearningJudge] | None = None,
+        failed: Callable[[NDArray[np.float64]], bool] | None = None,
+        audit: Witness | None = None,
+    ) -> Self:
+        """Read a guard, as it was between two episodes.
+
+        Parameters
+        ----------
+        path : path-like, or file open for reading bytes
+        judge : type or ActionJudge, optional
+            The class of the judge, or a judge as it is, where no installed package declares it as
+            an entry point of ``evofsm.participants``.
+        failed : callable, optional
+            As in `Guard`; needed where the guard had one.
+        audit : Witness, optional
+
+        Raises
+        ------
+        OSError
+            If there is no such file, or it may not be read.
+        ValueError
+            If the file holds something else or is damaged, or judge or ``failed`` are needed.
+        """
+        kept, files = storage.read(path, "guard")
+        if kept["failed"] and failed is None:
+            raise ValueError("this guard knew failures by a function; give it again: failed=")
+        with storage.explained(path):
+            actions, reviser, machine, risk = rebuild(
+                kept, files["machine"].tobytes(), files["judge"].tobytes(), judge
+            )
+            return cls.of(
+                reviser,
+                actions=actions,
+                machine=machine,
+                judge=risk,
+                failed=failed,
+                audit=audit,
+                explaining=None if kept["explaining"] is None else Explain(kept["explaining"]),
+                missing=Missing(kept["missing"]),
+                **{name: kept[name] for name in ("interval", "learn", "seed")},
+            )
+
+
+def _actions(
+    low: float | None, high: float | None, n_actions: int | None, width: float | None
+) -> ActionSet:
+    if n_actions is not None:
+        if (low, high, width) != (None, None, None):
+            raise ValueError("give low and high, or n_actions, not both")
+        return Choices(n_actions)
+    if low is None or high is None:
+        raise ValueError("give low and high of the action, or n_actions")
+    if np.size(low) != 1 or np.size(high) != 1:
+        raise ValueError("an action of several dimensions cannot be guarded yet; low is one number")
+    least, most = np.asarray(low, np.float64).item(), np.asarray(high, np.float64).item()
+    width = (most - least) / _INTERVALS if width is None and least < most else width
+    return IntervalActions(least, most, width or 1.0, outside="clip")
+
+
+def _bytes(saved: EvolvingFSM | LearningJudge | None) -> NDArray[np.uint8]:
+    """The file that it saves itself to; empty where there is none."""
+    file = BytesIO()
+    if saved is not None:
+        saved.save(file)
+    return np.frombuffer(file.getvalue(), np.uint8)

@@ -1,0 +1,390 @@
+"""One object for any system: it decides, learns, is frozen, and is kept in a file."""
+
+import io
+import math
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from evofsm import EvolvingFSM, Guard, IntervalActions, Labels
+from evofsm.driving.cars import guard_for_cars
+from evofsm.driving.revisers import Unrevised
+from evofsm.driving.risk.outcome import LatentRisk
+from evofsm.files import storage
+from evofsm.guard.auditing.log import AuditLog
+from evofsm.guard.auditing.replay import audit
+from evofsm.guard.guard import Explain
+from evofsm.guard.protocols import Choices, Fallback, Judgement, Proposal
+from evofsm.guard.reviser import Mode
+
+DT = 0.1
+PUSHES = (-4.0, -1.0, 0.0, 1.0, 4.0)
+
+
+class Balance:
+    """A judge of an inverted pendulum, no car: it fails where it cannot be brought back any more.
+
+    It learns one number, the hardest gust so far, by which it is careful; `index` says that
+    actions are told apart by index.
+    """
+
+    labels = Labels(names=("angle", "rate"), units=("rad", "rad/s"))
+
+    def __init__(self, dt=DT, index=False, gust=0.05):
+        self.dt = dt
+        self.index = index
+        self.gust = gust
+        self.fallback = Fallback(2.0 if index else 0.0, "doing nothing")
+        self._before = None
+
+    def _push(self, actions):
+        return np.take(PUSHES, np.asarray(actions, int)) if self.index else np.asarray(actions)
+
+    def judge(self, situation, actions):
+        angle, rate = np.nan_to_num(situation.observation)
+        after = rate + (5.0 * np.sin(angle) + self._push(actions)) * self.dt
+        where = np.abs(angle + after * self.dt + 0.4 * after) + self.gust
+        risk = 1.0 / (1.0 + np.exp(-20.0 * (where - 0.5)))
+        return Judgement(risk, risk, risk, where, evidence=1.0, seen=math.nan)
+
+    def why(self, judged):
+        return "it would fall"
+
+    def trial(self):
+        return None
+
+    def effective(self, situation, actions):
+        return actions
+
+    def refuse_unfit(self, low, high):
+        if self.index and high != len(PUSHES) - 1:
+            raise ValueError(f"there are {len(PUSHES)} pushes")
+
+    def learn(self, observation, action, belief):
+        self.follow(observation, action, learn=True)
+
+    watch = learn
+
+    def follow(self, observation, action, learn=False):
+        if self._before is not None and learn and not np.isnan(observation).any():
+            self.gust = max(self.gust, min(abs(observation[1] - self._before), 0.2))
+        self._before = None if np.isnan(observation).any() else float(observation[1])
+
+    def start_episode(self, *, learn=True):
+        self._before = None
+
+    def sums(self, n_states):
+        return {"gust": self.gust}
+
+    def save(self, path, provenance=None):
+        path.write(f"{self.dt} {self.index:d} {self.gust!r}".encode())
+
+    @classmethod
+    def load(cls, path):
+        dt, index, gust = path.read().decode().split()
+        return cls(float(dt), bool(int(index)), float(gust))
+
+
+def continuous(**others):
+    return Guard(low=-4.0, high=4.0, interval=DT, judge=Balance(), **others)
+
+
+def discrete(**others):
+    return Guard(n_actions=len(PUSHES), interval=DT, judge=Balance(index=True), **others)
+
+
+def balance(guard, proposals, gusts=(), missing=()):
+    """One episode from a small lean; revisions, and whether it fell."""
+    angle, rate, said = 0.1, 0.0, []
+    for k, proposal in enumerate(proposals):
+        seen = np.array([angle, rate])
+        seen[[k in missing, False]] = math.nan
+        revision = guard.decide(seen, proposal)
+        said.append(revision)
+        push = revision.executed if isinstance(guard.actions, IntervalActions) else None
+        push = PUSHES[revision.executed] if push is None else push
+        rate += (5.0 * math.sin(angle) + push) * DT + (gusts[k] if k < len(gusts) else 0.0)
+        angle += rate * DT
+        if abs(angle) > 0.8:
+            break
+    guard.end(failed=abs(angle) > 0.8, observation=[angle, rate])
+    return said, abs(angle) > 0.8
+
+
+@pytest.fixture(params=[continuous, discrete])
+def make(request):
+    return request.param
+
+
+def pushes(make, count, seed=0):
+    rng = np.random.default_rng(seed)
+    high = len(PUSHES) - 1 if make is discrete else 4.0
+    return [int(p) if make is discrete else float(p) for p in rng.uniform(0.4 * high, high, count)]
+
+
+# -- What it decides ----------------------------------------------------------------------------
+
+
+def test_it_holds_off_what_would_fall_without_it(make):
+    wishes = pushes(make, 40)
+    assert balance(make(mode=Mode.OFF), wishes)[1]
+    said, fell = balance(make(), wishes)
+    assert not fell
+    assert any(one.executed != one.proposed for one in said)
+    assert any("it would fall" in one.reason for one in said)
+
+
+@pytest.mark.parametrize("mode", [Mode.OFF, Mode.SHADOW, Mode.ADVISE])
+def test_looking_on_it_executes_what_is_proposed(make, mode):
+    said, _ = balance(make(mode=mode), pushes(make, 10))
+    assert [one.executed for one in said] == [one.proposed for one in said]
+    assert any(one.advised != one.executed for one in said) == (mode is not Mode.OFF)
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    make=st.sampled_from([continuous, discrete]),
+    mode=st.sampled_from(list(Mode)),
+    proposals=st.lists(
+        st.one_of(st.none(), st.floats(), st.sampled_from([0.0, 1.0, 4.0, 7.0, -1.0, 0.5])),
+        min_size=1,
+        max_size=12,
+    ),
+    gusts=st.lists(st.floats(-0.3, 0.3), max_size=12),
+    missing=st.sets(st.integers(0, 11)),
+)
+def test_whatever_is_proposed_what_is_executed_can_be(make, mode, proposals, gusts, missing):
+    guard = make(mode=mode)
+    for revision in balance(guard, proposals, gusts, missing)[0]:
+        assert guard.actions.low <= revision.executed <= guard.actions.high
+        assert type(revision.executed) is (int if make is discrete else float)
+        assert revision.reason
+        low, high = revision.interval
+        assert math.isnan(low) or 0.0 <= low <= revision.risk_executed <= high <= 1.0
+    assert guard.machine.n_states >= (0 if 0 in missing else 1)
+
+
+def test_of_things_that_are_only_told_apart_a_kept_proposal_is_the_least_change():
+    class Fixed(Balance):
+        def judge(self, situation, actions):
+            risk = np.take((0.5, 0.01, 0.3, 0.001, 0.3), np.asarray(actions, int))
+            return Judgement(risk, risk, risk, risk, 1.0)
+
+    guard = Guard(n_actions=5, interval=DT, judge=Fixed(index=True))
+    assert guard.decide([0.0, 0.0], 1).executed == 1
+    assert guard.decide([0.0, 0.0], 4).executed == 3  # the least risky, however far its index
+    for unusable in (7, -1, 1.5, None):
+        revision = guard.decide([0.0, 0.0], unusable)
+        assert (revision.executed, "no usable proposal" in revision.reason) == (3, True)
+
+
+def test_candidates_of_a_proposal_are_taken_as_they_are():
+    guard = continuous()
+    assert guard.decide([0.0, 0.0], Proposal(0.0, (1.0, math.nan, 9.0))).executed == 0.0
+
+
+def test_time_is_counted_where_it_is_not_told():
+    counted, told = continuous(explaining=Explain.ALL), continuous(explaining=Explain.ALL)
+    for episode in range(2):
+        one = [counted.decide([0.1 * k, episode], 0.0) for k in range(5)]
+        assert one == [told.decide([0.1 * k, episode], 0.0, DT * k) for k in range(5)]
+        for guard in (counted, told):
+            guard.end()
+    assert one[-1].explanation
+
+
+# -- What it learns -----------------------------------------------------------------------------
+
+
+def test_a_failure_is_told_or_found_by_the_function():
+    guard = continuous(failed=lambda z: abs(z[0]) > 0.8)
+    for end, told, failures in (
+        ({"observation": [0.9, 0.0]}, False, 1),
+        ({}, False, 1),
+        ({"failed": True}, False, 2),
+        ({}, True, 3),  # the last observation decided on was one
+    ):
+        guard.decide([0.9 if told else 0.1, 0.0], 0.0)
+        guard.end(**end)
+        assert guard.machine.endings.sum() == failures
+
+
+def test_frozen_it_learns_nothing_and_decides_the_same_again(make, snapshot):
+    guard = make()
+    balance(guard, pushes(make, 30), gusts=[0.1, -0.1])
+    guard.freeze()
+    before = snapshot(guard.machine), guard.judge.gust
+    one, other = (balance(guard, pushes(make, 30, 1), gusts=[0.15] * 9)[0] for _ in range(2))
+    assert repr(one) == repr(other)
+    assert (snapshot(guard.machine), guard.judge.gust) == before
+
+
+def test_frozen_a_guard_of_cars_keeps_brakes_and_noise_as_they_are():
+    guard, rng = guard_for_cars(-4.0, 2.5), np.random.default_rng(0)
+    episodes = [rng.normal([20.0, 12.0, 11.0], [2.0, 0.5, 0.5], (60, 3)) for _ in range(3)]
+
+    def drive(episode):
+        said = [guard.decide(row, 1.0) for row in episode]
+        guard.end()
+        return repr(said)
+
+    drive(episodes[0])
+    guard.decide(episodes[1][0], 1.0)
+    guard.freeze()  # in the middle of an episode, which is broken off
+    before = repr(guard.judge._learnt()), guard.judge.perception.noise
+    assert drive(episodes[2]) == drive(episodes[2])
+    assert (repr(guard.judge._learnt()), guard.judge.perception.noise) == before
+    assert guard.judge.perception.noise != (0.0, 0.0, 0.0)
+
+
+def test_a_copy_goes_its_own_way(make, snapshot):
+    guard = make()
+    balance(guard, pushes(make, 20))
+    twin, bare = guard.copy(), guard.copy(states=False)
+    before = snapshot(guard.machine), guard.judge.gust
+    first = balance(twin, pushes(make, 20, 2), gusts=[0.19])[0]
+    assert (snapshot(guard.machine), guard.judge.gust) == before
+    again = balance(bare, pushes(make, 20, 2), gusts=[0.19])[0]
+    assert [one.executed for one in first] == [one.executed for one in again]
+    assert bare.machine is None
+
+
+# -- What is kept -------------------------------------------------------------------------------
+
+
+def test_what_was_saved_goes_on_bit_for_bit(make, snapshot):
+    guard, file = make(tolerance=0.05, mode=Mode.ADVISE, seed=7), io.BytesIO()
+    balance(guard, pushes(make, 20))
+    guard.save(file)
+    file.seek(0)
+    again = Guard.load(file, judge=Balance)
+    assert (again.reviser.tolerance, again.reviser.mode, again.seed) == (0.05, Mode.ADVISE, 7)
+    assert (again.interval, again.actions) == (guard.interval, guard.actions)
+    future = [repr(balance(one, pushes(make, 30, 3), gusts=[0.1])) for one in (guard, again)]
+    assert future[0] == future[1]
+    assert snapshot(guard.machine) == snapshot(again.machine)
+    assert guard.judge.gust == again.judge.gust
+
+
+def test_a_guard_of_cars_is_one_file(tmp_path):
+    guard = guard_for_cars(-4.0, 2.5, tolerance=0.1)
+    for _ in range(2):
+        for gap in np.linspace(40.0, 5.0, 30):
+            guard.decide([gap, 15.0, 12.0], 1.0)
+        guard.end(failed=True)
+    guard.decide([40.0, 15.0, 12.0], 1.0)  # what is under way is not kept
+    guard.save(tmp_path / "guard.evofsm", {"roads": 3})
+    again = Guard.load(tmp_path / "guard.evofsm")
+    guard.begin()
+    said = [
+        repr([one.decide([gap, 15.0, 12.0], 1.0) for gap in (9.0, 8.0)]) for one in (guard, again)
+    ]
+    assert said[0] == said[1]
+    assert storage.read_header(tmp_path / "guard.evofsm").provenance == {"roads": 3}
+    guard.freeze()
+    guard.save(tmp_path / "guard.evofsm")
+    assert not Guard.load(tmp_path / "guard.evofsm").learn
+
+
+def test_what_a_file_cannot_hold_has_to_be_given_again(tmp_path):
+    path = tmp_path / "guard.evofsm"
+    continuous(failed=lambda z: z[0] > 1.0).save(path)
+    with pytest.raises(ValueError, match="failed="):
+        Guard.load(path, judge=Balance)
+    with pytest.raises(ValueError, match="give the judge's class"):
+        Guard.load(path, failed=lambda z: False)
+    assert Guard.load(path, judge=Balance, failed=lambda z: z[0] > 1.0).failed is not None
+    with pytest.raises(ValueError, match="no reviser that a file can hold"):
+        Guard.of(SimpleNamespace(actions=Choices(2))).save(path)
+    with pytest.raises(ValueError, match="holds a guard, not a machine"):
+        EvolvingFSM.load(path)
+
+
+def test_a_damaged_file_is_refused(tmp_path):
+    path = tmp_path / "guard.evofsm"
+    guard_for_cars(-4.0, 2.5).save(path)
+    content, arrays = storage.read(path, "guard")
+    for spoilt, files in (
+        ({**content, "missing": "guess"}, arrays),
+        ({**content, "reviser": {**content["reviser"], "class": "Nobody"}}, arrays),
+        (content, {**arrays, "machine": arrays["machine"][:-7]}),
+        (content, {**arrays, "judge": arrays["machine"]}),
+    ):
+        storage.write(path, "guard", spoilt, files)
+        with pytest.raises(ValueError, match="cannot be read as an evofsm file"):
+            Guard.load(path)
+
+
+def test_choices_are_audited_and_replayed(tmp_path):
+    with AuditLog(tmp_path / "log") as log:
+        balance(discrete(audit=log), pushes(discrete, 12))
+    found = audit(tmp_path / "log")
+    assert found.is_good
+    assert found.contents.decisions == 12
+    assert found.replay.not_replayed  # its judge is of this test
+    with AuditLog(tmp_path / "other") as log:
+        guard = Guard.of(Unrevised(Choices(5)), interval=DT, audit=log)
+        for action in (0, 3, 9):
+            guard.decide([0.0, 0.0], action)
+        guard.end()
+    assert audit(tmp_path / "other").replay == (3, (), (), None)
+
+
+# -- What is refused ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"low": -1.0, "high": 1.0}, "needs a judge"),
+        ({"judge": Balance()}, "give low and high of the action, or n_actions"),
+        ({"low": -1.0, "high": 1.0, "n_actions": 3, "judge": Balance()}, "not both"),
+        ({"low": [-1.0, -1.0], "high": [1.0, 1.0], "judge": Balance()}, "several dimensions"),
+        ({"low": 1.0, "high": -1.0, "judge": Balance()}, "low must be below high"),
+        ({"n_actions": 0, "judge": Balance()}, "n_actions"),
+        ({"n_actions": 4, "judge": Balance(index=True)}, "5 pushes"),
+        ({"low": -1.0, "high": 1.0, "judge": Balance(dt=0.2)}, r"every 0\.2 s"),
+        ({"low": -1.0, "high": 1.0, "judge": Balance(), "horizon": -1.0}, "horizon"),
+        ({"n_actions": 5, "judge": Balance(), "machine": EvolvingFSM(4)}, "4 actions"),
+    ],
+)
+def test_what_makes_no_guard_is_refused(settings, message):
+    with pytest.raises(ValueError, match=message):
+        Guard(interval=DT, **settings)
+
+
+@pytest.mark.parametrize(
+    ("observation", "proposal"),
+    [
+        ([0.1], 0.0),
+        ([0.1, 0.0, 0.0], 0.0),
+        ([[0.1, 0.0]], 0.0),
+        ([0.1, math.inf], 0.0),
+        ([0.1, 1e200], 0.0),
+        (["a", "b"], 0.0),
+        (None, 0.0),
+        ([0.1, 0.0], "much"),
+        ([0.1, 0.0], Proposal("much")),
+        ([0.1, 0.0], Proposal(0.0, (None,))),
+    ],
+)
+def test_what_is_refused_leaves_it_as_it_was(make, observation, proposal, snapshot):
+    guard, twin = make(), make()
+    for one in (guard, twin):
+        balance(one, pushes(make, 10))
+        one.decide([0.1, 0.0], 1)
+    with pytest.raises((TypeError, ValueError)):
+        guard.decide(observation, proposal)
+    with pytest.raises((TypeError, ValueError)):
+        guard.end(observation=[0.0])
+    assert repr(guard.decide([0.2, 0.1], 1)) == repr(twin.decide([0.2, 0.1], 1))
+    assert snapshot(guard.machine) == snapshot(twin.machine)
+    assert guard.judge.gust == twin.judge.gust
+
+
+def test_a_judge_of_cars_is_told_by_its_interval():
+    with pytest.raises(ValueError, match=r"every 0\.25 s"):
+        Guard.of(Unrevised(IntervalActions(-1.0, 1.0, 1.0)), interval=0.1, judge=LatentRisk(-1.0))

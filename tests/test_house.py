@@ -1,0 +1,41 @@
+"""The house is as CONTRIBUTING.md draws it, and its faces offer what they say."""
+
+import subprocess
+import sys
+from importlib import import_module
+from pathlib import Path
+
+import pytest
+
+import evofsm
+
+ROOT = Path(__file__).parents[1]
+PACKAGE = ROOT / "src" / "evofsm"
+FACES = sorted(PACKAGE.rglob("__init__.pyi"))
+
+
+def test_no_arrow_goes_up_and_nothing_private_is_touched():
+    house = subprocess.run(
+        [sys.executable, ROOT / "tools" / "house.py"], capture_output=True, text=True, check=False
+    )
+    assert house.returncode == 0, house.stdout + house.stderr
+
+
+@pytest.mark.parametrize("face", FACES, ids=lambda face: face.parent.name)
+def test_a_face_offers_each_name_once_in_order_and_no_module_hides_it(face):
+    lines = [line for line in face.read_text("utf-8").splitlines() if line.startswith("from ")]
+    names = [line.rpartition(" as ")[2] for line in lines]
+    assert len(set(names)) == len(names)
+    room = import_module(".".join(face.parent.relative_to(PACKAGE.parent).parts))
+    for name in names:
+        assert getattr(room, name) is not None
+    modules = {path.stem for path in face.parent.iterdir()}
+    offered = {line.rpartition(" as ")[2] for line in lines if not line.startswith("from . ")}
+    assert not offered & modules
+    assert room.__all__ == sorted(names)
+
+
+def test_the_top_offers_nothing_that_a_room_does_not():
+    for name in evofsm.__all__:
+        home = getattr(evofsm, name).__module__
+        assert home.startswith("evofsm."), name
