@@ -352,10 +352,10 @@ def test_the_study_does_not_depend_on_the_number_of_workers() -> None:
     assert {row.family for row in alone.rows} == set(plan.families)
     assert {row.target for row in alone.rows} == set(Target)
     assert all(row.family == GRID for row in alone.grid)
-    row = alone.find("ncap", Ours.DEFAULT, Target.DEAD_END)
+    row = alone.row("ncap", Ours.DEFAULT, Target.DEAD_END)
+    assert row is not None
     assert len(row.auroc_seeds) == plan.seeds - 1
-    with pytest.raises(KeyError):
-        alone.find("ncap", "nobody", Target.DEAD_END)
+    assert alone.row("ncap", "nobody", Target.DEAD_END) is None
 
 
 def test_rows_are_plain_numbers() -> None:

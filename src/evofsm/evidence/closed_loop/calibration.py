@@ -55,6 +55,12 @@ class Reliability(NamedTuple):
     cases: int
     failures: int
 
+    @property
+    def title(self) -> str:
+        """What is predicted, and how well."""
+        what = f"{self.what[:1].upper()}{self.what[1:]}"
+        return f"{what}\nBrier {self.brier:.3f}, of the base rate {self.base_brier:.3f}"
+
 
 def run_calibration(family: Family, train: int, test: int, seed: int = 0) -> dict[str, list[Any]]:
     """Learn from the unrevised controller, then hold both probabilities against held-out runs."""
