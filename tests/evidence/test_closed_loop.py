@@ -8,12 +8,10 @@ import pytest
 
 pytest.importorskip("scipy")
 
-from evofsm.driving.learner import Learner, drive_alone
-
+from evofsm.driving.cars import drive, guard_for_family, load_learnt, save_learnt, teach, unrevised
 from evofsm.driving.families.family import load_family
 from evofsm.driving.outcomes import bootstrap, outcome, reference
 from evofsm.driving.policies import fixed_policies
-from evofsm.driving.revisers import Unrevised
 from evofsm.evidence.closed_loop.calibration import reliability, run_calibration
 from evofsm.evidence.closed_loop.cases import run_cases
 from evofsm.evidence.closed_loop.plan import Plan, ShiftPlan
@@ -154,10 +152,9 @@ def test_a_driver_who_proposes_nothing_usable_is_replaced_and_counted():
             raise RuntimeError("no")
 
     draw = EMERGENCY.draw(0, 0, split="test")
-    none = Unrevised(EMERGENCY.actions)
-    base = reference(drive_alone(EMERGENCY, draw, none, None), draw.scenario.leader.brake_decel)
-    drive = drive_alone(EMERGENCY, draw, none, None, controller=Broken())
-    found = outcome(drive, base, EMERGENCY.interval)
+    none = unrevised(EMERGENCY)
+    base = reference(drive(none, draw), draw.scenario.leader.brake_decel)
+    found = outcome(drive(none, draw, controller=Broken()), base, EMERGENCY.interval)
     assert found.changed == found.decisions
     assert found.change == 0.0
 
@@ -203,26 +200,22 @@ highest = 2.5
     gentle.write_text(text.replace("TIME", "inf"))
     stop.write_text(text.replace("TIME", "[20.0, 50.0]"))
     waves, stops = load_family(gentle), load_family(stop)
-    learner = Learner.new(waves)
-    reviser = learner.reviser(waves, 0.02)
-    learner.teach(waves, (waves.draw(0, index) for index in range(30)), reviser)
-    assert learner.risk.manoeuvres.gentle > 60
-    drives = [
-        drive_alone(stops, stops.draw(0, index, split="test"), reviser, learner.risk)
-        for index in range(40)
-    ]
+    guard = guard_for_family(waves)
+    teach(guard, (waves.draw(0, index) for index in range(30)))
+    assert guard.judge.manoeuvres.gentle > 60
+    guard.freeze()
+    drives = teach(guard, (stops.draw(0, index, split="test") for index in range(40)))
     assert not any(drive.episode.collided for drive in drives)
 
 
 def test_what_was_learnt_is_kept(tmp_path):
-    learner = Learner.new(EMERGENCY)
-    draws = [EMERGENCY.draw(0, index) for index in range(3)]
-    learner.teach(EMERGENCY, draws, learner.reviser(EMERGENCY, 0.01))
-    learner.save(tmp_path)
-    again = Learner.load(tmp_path)
-    assert again.machine.n_states == learner.machine.n_states
+    guard = guard_for_family(EMERGENCY, tolerance=0.01)
+    teach(guard, (EMERGENCY.draw(0, index) for index in range(3)))
+    save_learnt(guard, tmp_path)
+    machine, risk = load_learnt(tmp_path)
+    assert machine.n_states == guard.machine.n_states
     situation = np.array([20.0, 15.0, 15.0])
     actions = [-1.0, 0.0, 1.0]
     assert np.array_equal(
-        again.risk.critical(situation, actions), learner.risk.critical(situation, actions)
+        risk.critical(situation, actions), guard.judge.critical(situation, actions)
     )

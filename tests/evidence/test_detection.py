@@ -7,11 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from evofsm.driving.learner import drive_alone
 
+from evofsm.driving.cars import drive, unrevised
 from evofsm.driving.families.family import load_family
 from evofsm.driving.policies import Group
-from evofsm.driving.revisers import Unrevised
 from evofsm.driving.risk.rss import ResponsibilitySensitiveSafety
 from evofsm.evidence.detection.alarms import (
     choose_threshold,
@@ -184,12 +183,12 @@ def test_lead_time_is_that_of_the_alarm_that_stays_on() -> None:
 def test_watching_is_driving_unrevised() -> None:
     family = load_family("rare").with_switches(["noise"])
     draw = family.draw(1, 2, split="test")
-    one, drive = watch(family, draw), drive_alone(family, draw, Unrevised(family.actions), None)
-    seen = [decision.situation.observation for decision in drive.decisions]
+    one, driven = watch(family, draw), drive(unrevised(family), draw)
+    seen = [decision.situation.observation for decision in driven.decisions]
     assert np.array_equal(one.seen, seen)
-    assert np.array_equal(one.commands, drive.executed)
-    assert np.array_equal(one.true, drive.episode.observations[::25][: len(seen)])
-    assert (one.end, one.collided) == (drive.episode.time[-1], drive.episode.collided)
+    assert np.array_equal(one.commands, driven.executed)
+    assert np.array_equal(one.true, driven.episode.observations[::25][: len(seen)])
+    assert (one.end, one.collided) == (driven.episode.time[-1], driven.episode.collided)
 
 
 def test_runs_that_are_always_the_same_add_no_hours() -> None:
@@ -353,10 +352,10 @@ def test_the_study_does_not_depend_on_the_number_of_workers() -> None:
     assert {row.family for row in alone.rows} == set(plan.families)
     assert {row.target for row in alone.rows} == set(Target)
     assert all(row.family == GRID for row in alone.grid)
-    row = alone.find("ncap", Ours.DEFAULT, Target.DEAD_END)
+    row = alone.row("ncap", Ours.DEFAULT, Target.DEAD_END)
+    assert row is not None
     assert len(row.auroc_seeds) == plan.seeds - 1
-    with pytest.raises(KeyError):
-        alone.find("ncap", "nobody", Target.DEAD_END)
+    assert alone.row("ncap", "nobody", Target.DEAD_END) is None
 
 
 def test_rows_are_plain_numbers() -> None:

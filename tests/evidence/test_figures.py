@@ -12,12 +12,18 @@ import pytest
 
 from evofsm.driving.risk.dead_end import is_dead_end
 from evofsm.driving.worlds.kinematic import KinematicWorld
+from evofsm.evidence.paper.figures import (
+    draw_case,
+    draw_divergence,
+    draw_graph,
+    draw_growth,
+    draw_matrices,
+    draw_space,
+    sketches,
+)
 from evofsm.evidence.paper.runs import PaperStudy, run_paper
 from evofsm.evidence.paper.settings import Settings
-from evofsm.evidence.report.drawing import Drawing
-from evofsm.evidence.report.figures import paper_figures
-from evofsm.evidence.report.of_states import draw_graph, draw_matrices, draw_space
-from evofsm.evidence.report.over_time import draw_case, draw_divergence, draw_growth
+from evofsm.evidence.report.drawing import Drawing, draw_all
 from evofsm.plot.style import house_style
 
 _NAMES = [
@@ -48,7 +54,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def drawings(study: PaperStudy, folder: Path) -> list[Drawing]:
-    return paper_figures(study, folder)
+    return draw_all(list(sketches(study)), folder)
 
 
 def _texts(figure: matplotlib.figure.Figure) -> list[str]:
@@ -105,14 +111,14 @@ def test_the_users_style_neither_matters_nor_changes(study: PaperStudy, tmp_path
 def test_pyplot_stays_out_and_a_missing_matplotlib_is_named() -> None:
     code = """
 import sys
-import evofsm.evidence.report.figures
+import evofsm.evidence.paper.figures
 assert "matplotlib.pyplot" not in sys.modules
-OURS = ("matplotlib", "evofsm.evidence.report", "evofsm.plot")
+OURS = ("matplotlib", "evofsm.evidence", "evofsm.plot")
 for name in [name for name in sys.modules if name.startswith(OURS)]:
     del sys.modules[name]
 sys.modules["matplotlib"] = None
 try:
-    import evofsm.evidence.report.figures
+    import evofsm.evidence.paper.figures
 except ModuleNotFoundError as error:
     print(error)
 """
@@ -136,7 +142,7 @@ def test_a_case_shows_its_moments_its_states_and_its_collision(study: PaperStudy
         assert all(np.allclose(axes.get_xlim(), (0.0, 35.0)) for axes in figures[case].axes)
 
 
-def test_a_case_draws_states_and_actions_counted_from_1(study: PaperStudy) -> None:
+def test_a_case_draws_states_and_actions_as_they_are_counted_from_0(study: PaperStudy) -> None:
     run = study.last_round[0]
     with house_style():
         gap, speeds, acceleration, state, action = draw_case(study, run).axes
@@ -144,8 +150,8 @@ def test_a_case_draws_states_and_actions_counted_from_1(study: PaperStudy) -> No
     assert np.array_equal(speeds.lines[0].get_ydata(), run.episode.observations[:, 1])
     assert np.array_equal(speeds.lines[1].get_ydata(), run.episode.observations[:, 2])
     assert np.array_equal(acceleration.lines[1].get_ydata(), run.episode.accelerations)
-    assert np.array_equal(state.lines[0].get_ydata(), run.state + 1)
-    assert np.array_equal(action.lines[0].get_ydata(), run.action + 1)
+    assert np.array_equal(state.lines[0].get_ydata(), run.state)
+    assert np.array_equal(action.lines[0].get_ydata(), run.action)
 
 
 def test_texts_above_a_case_do_not_meet(tmp_path: Path) -> None:
@@ -189,7 +195,7 @@ def test_growth_ends_at_the_number_of_states(study: PaperStudy) -> None:
 
 def test_only_used_actions_have_a_matrix(study: PaperStudy) -> None:
     with house_style():
-        figure = draw_matrices(study.model, study.dead_end)
+        figure = draw_matrices(study)
     titles = [axes.get_title(loc="left") for axes in figure.axes]
     used = np.flatnonzero(study.model.uses)
     assert sum(title.startswith("a(") for title in titles) == len(used)
@@ -258,4 +264,4 @@ def test_a_dead_end_is_tinted_as_long_as_a_brake_could_not_be_survived(study: Pa
 def test_a_model_without_transitions_can_be_drawn(study: PaperStudy) -> None:
     untaught = replace(study.model, uses=np.zeros_like(study.model.uses), actions=None)
     with house_style():
-        assert draw_matrices(untaught, dead_end=-1).axes
+        assert draw_matrices(replace(study, model=untaught)).axes

@@ -8,8 +8,8 @@ from evofsm.core.machine import EvolvingFSM
 from evofsm.core.model import FSMModel
 from evofsm.driving.worlds.kinematic import KinematicWorld
 from evofsm.driving.worlds.sumo import SumoWorld
+from evofsm.evidence.paper.chapter import context_tables
 from evofsm.evidence.paper.claims import check_claims
-from evofsm.evidence.paper.context import context_tables
 from evofsm.evidence.paper.files import write_data
 from evofsm.evidence.paper.runs import run_paper
 from evofsm.evidence.paper.settings import Settings

@@ -10,14 +10,12 @@ import pytest
 import evofsm
 from evofsm.core.divergence import jensen_shannon
 from evofsm.driving.worlds.kinematic import KinematicWorld
+from evofsm.evidence.paper.chapter import context_tables, losses, paper_chapter
 from evofsm.evidence.paper.claims import Claim, check_claims
-from evofsm.evidence.paper.context import context_tables
 from evofsm.evidence.paper.runs import run_paper
 from evofsm.evidence.paper.settings import Settings
-from evofsm.evidence.report import paper
 from evofsm.evidence.report.chapter import write_chapters
 from evofsm.evidence.report.drawing import Drawing
-from evofsm.evidence.report.paper import losses, paper_chapter
 
 SVG = b'<svg xmlns="http://www.w3.org/2000/svg"/>'
 
@@ -33,12 +31,11 @@ def claims(study):
 
 
 @pytest.fixture
-def figure(tmp_path, monkeypatch):
+def figure(tmp_path):
     """The only figure, in place of the paper's, which take seconds to draw."""
     path = tmp_path / "a.svg"
     path.write_bytes(SVG)
     drawing = Drawing("a", "A title", "A caption.", 'What "it" shows.', {"svg": path})
-    monkeypatch.setattr(paper, "paper_figures", lambda study, folder, progress: [drawing])
     return drawing
 
 
@@ -47,7 +44,8 @@ def page(tmp_path, figure, read_page):
     """Writes the page of a study and reads it."""
 
     def write(study, command="make paper", **others):
-        chapter = paper_chapter(study, tmp_path, command, **others)
+        made = paper_chapter(study, **others)
+        chapter = replace(made, figures=(figure,), sketches=(), command=command)
         made = write_chapters(tmp_path / "new" / "index.html", [chapter], command=command)
         assert [path.name for path in made.parent.iterdir()] == ["index.html"]
         return read_page(made)
@@ -105,13 +103,15 @@ def test_settings_versions_command_and_paper_are_there(page, study):
 def test_all_holds_is_said_on_top_and_a_failing_claim_cannot_be_missed(page, study, claims):
     good = [replace(claim, holds=True) for claim in claims]
     read = page(study, claims=good)
-    assert f"{len(good)} of {len(good)} claims hold in the kinematic world" in read.text
+    assert (
+        f"{len(good)} of {len(good)} claims of the paper hold in the kinematic world" in read.text
+    )
     assert "fails" not in read.text
     assert 'class="verdict holds"' in read.verdict
 
     bad = [replace(good[0], holds=False, measured="quite the contrary"), *good[1:]]
     read = page(study, claims=bad)
-    assert f"{len(bad) - 1} of {len(bad)} claims hold" in read.verdict
+    assert f"{len(bad) - 1} of {len(bad)} claims of the paper hold" in read.verdict
     assert 'class="verdict fails"' in read.verdict
     assert "quite the contrary" in read.verdict
     assert read.text.count("✗ ") == 1

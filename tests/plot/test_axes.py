@@ -9,6 +9,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import same_color, to_rgba
 from matplotlib.figure import Figure
 
+from evofsm import plot
 from evofsm.core.actions import IntervalActions
 from evofsm.core.machine import EvolvingFSM
 from evofsm.core.states.novelty import Novelty
@@ -19,17 +20,9 @@ from evofsm.driving.worlds.kinematic import KinematicWorld
 from evofsm.driving.worlds.scenario import Leader, Scenario
 from evofsm.guard.guard import Guard
 from evofsm.guard.reviser import ActionReviser, Mode
-from evofsm.plot.axes import (
-    plot_accelerations,
-    plot_belief,
-    plot_graph,
-    plot_risk,
-    plot_states,
-    plot_transitions,
-)
 from evofsm.plot.style import DEAD_END
 
-_OF_A_MODEL = (plot_states, plot_graph, plot_transitions)
+_OF_A_MODEL = (plot.states, plot.graph, plot.transitions)
 
 
 def new():
@@ -78,36 +71,36 @@ def lost():
 
 
 def test_they_answer_with_the_axes_they_were_given(machine, model, saved):
-    for plot in (*_OF_A_MODEL, lambda model, ax: plot_belief(machine.belief, ax)):
+    for draw in (*_OF_A_MODEL, lambda model, ax: plot.belief(machine.belief, ax)):
         ax = new()
-        assert plot(model, ax) is ax
-    for plot in (plot_risk, plot_accelerations):
+        assert draw(model, ax) is ax
+    for draw in (plot.risk, plot.accelerations):
         ax = new()
-        assert plot(saved, ax) is ax
+        assert draw(saved, ax) is ax
 
 
 def test_without_axes_they_make_some_of_pyplot(model):
     from matplotlib import pyplot
 
-    ax = plot_graph(model)
+    ax = plot.graph(model)
     assert ax.figure.number in pyplot.get_fignums()
     pyplot.close(ax.figure)
 
 
 def test_they_leave_the_style_as_it_was(machine, model, saved):
     before = dict(matplotlib.rcParams)
-    for plot in _OF_A_MODEL:
-        plot(model, new(), dead_ends=[2])
-    plot_belief(machine.belief, new())
-    plot_risk(saved, new())
-    plot_accelerations(saved, new())
+    for draw in _OF_A_MODEL:
+        draw(model, new(), dead_ends=[2])
+    plot.belief(machine.belief, new())
+    plot.risk(saved, new())
+    plot.accelerations(saved, new())
     assert dict(matplotlib.rcParams) == before
 
 
 def test_type_has_the_size_and_colour_of_the_users_style(model):
     with matplotlib.rc_context({"font.size": 16.0, "text.color": "#eeeeee"}):
-        large = plot_graph(model, new()).texts[-1]
-    plain = plot_graph(model, new()).texts[-1]
+        large = plot.graph(model, new()).texts[-1]
+    plain = plot.graph(model, new()).texts[-1]
     assert large.get_fontsize() == 1.6 * plain.get_fontsize()
     assert same_color(large.get_color(), "#eeeeee")
 
@@ -116,7 +109,7 @@ def test_type_has_the_size_and_colour_of_the_users_style(model):
 
 
 def test_states_stand_where_their_centres_are(model):
-    ax = plot_states(model, new(), variables=(1, 0), dead_ends=[2])
+    ax = plot.states(model, new(), variables=(1, 0), dead_ends=[2])
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("speed [m/s]", "gap [m]")
     assert texts(ax) == ["1", "2", "3"]
     assert [text.xy for text in ax.texts] == [pytest.approx(z[::-1]) for z in model.centers]
@@ -127,7 +120,7 @@ def test_states_stand_where_their_centres_are(model):
 def test_discs_that_would_meet_move_apart():
     machine = EvolvingFSM(n_actions=1, rule=Novelty(radius=0.01))
     machine.learn_many([[0.0, 0.0], [0.02, 0.0], [9.0, 9.0]], [0, 0, 0])
-    ax = plot_states(machine.model(), new())
+    ax = plot.states(machine.model(), new())
     drawn = ax.transData.transform([text.xy for text in ax.texts])
     assert np.hypot(*(drawn[0] - drawn[1])) > 13.0 * ax.figure.dpi / 72.0
 
@@ -135,14 +128,14 @@ def test_discs_that_would_meet_move_apart():
 def test_what_is_on_the_axes_stays_in_view(model):
     ax = new()
     ax.plot([-50.0, 50.0], [-50.0, 50.0])
-    plot_states(model, ax)
+    plot.states(model, ax)
     assert ax.get_xlim()[0] <= -50.0
     assert ax.get_xlim()[1] >= 50.0
 
 
-@pytest.mark.parametrize("plot", [plot_states, plot_graph])
-def test_a_dead_end_differs_by_its_shape(plot, model):
-    ax = plot(model, new(), dead_ends=[2])
+@pytest.mark.parametrize("draw", [plot.states, plot.graph])
+def test_a_dead_end_differs_by_its_shape(draw, model):
+    ax = draw(model, new(), dead_ends=[2])
     discs = [
         line for line in ax.lines if line.get_marker() in ("o", "h") and line.get_zorder() >= 5
     ]
@@ -151,14 +144,14 @@ def test_a_dead_end_differs_by_its_shape(plot, model):
 
 def test_the_graph_says_how_likely_states_stay(model):
     stays = np.diag(model.averaged_matrix("marginal"))
-    said = texts(plot_graph(model, new(), policy="marginal", dead_ends=[2]))
+    said = texts(plot.graph(model, new(), policy="marginal", dead_ends=[2]))
     assert f"stays {100 * stays[0]:.0f} %" in said
     assert f"dead end\nstays {100 * stays[2]:.0f} %" in said
 
 
 @pytest.mark.parametrize("action", [None, 0, 1])
 def test_transitions_are_those_of_the_action_or_of_all(model, action):
-    ax = plot_transitions(model, new(), action=action, dead_ends=[2])
+    ax = plot.transitions(model, new(), action=action, dead_ends=[2])
     matrix = model.averaged_matrix() if action is None else model.transition_matrices[action]
     assert np.array_equal(ax.images[0].get_array(), matrix)
     assert texts(ax) == [f"{100 * value:.0f}" for value in matrix.ravel()]
@@ -169,19 +162,19 @@ def test_transitions_are_those_of_the_action_or_of_all(model, action):
     assert ax.get_xlabel() == "to state (bold: dead end)"
 
 
-@pytest.mark.parametrize("plot", _OF_A_MODEL)
-def test_what_a_model_does_not_have_is_named(plot, model):
+@pytest.mark.parametrize("draw", _OF_A_MODEL)
+def test_what_a_model_does_not_have_is_named(draw, model):
     with pytest.raises(ValueError, match="dead_ends name state 3, but there are states 0 to 2"):
-        plot(model, new(), dead_ends=[3])
+        draw(model, new(), dead_ends=[3])
     with pytest.raises(ValueError, match="no states: its machine had observed nothing"):
-        plot(EvolvingFSM(n_actions=1).model(), new())
+        draw(EvolvingFSM(n_actions=1).model(), new())
 
 
 def test_variables_and_actions_that_are_not_there_are_named(model):
     with pytest.raises(ValueError, match="no variable 2: the model has 2"):
-        plot_states(model, new(), variables=(0, 2))
+        plot.states(model, new(), variables=(0, 2))
     with pytest.raises(ValueError, match="no action 2: the model has 2"):
-        plot_transitions(model, new(), action=2)
+        plot.transitions(model, new(), action=2)
 
 
 @pytest.mark.parametrize("n", [1, 30])
@@ -190,8 +183,8 @@ def test_one_state_and_many_can_be_drawn(n, tmp_path):
     Z = np.column_stack([np.arange(n), np.arange(n) ** 2])
     trace = machine.learn_many(Z, np.zeros(n, np.int64), belief=True)
     assert machine.n_states == n
-    axes = [plot(machine.model(), new(), dead_ends=[0]) for plot in _OF_A_MODEL]
-    for ax in (*axes, plot_belief(trace, new()), plot_belief(machine.belief, new())):
+    axes = [draw(machine.model(), new(), dead_ends=[0]) for draw in _OF_A_MODEL]
+    for ax in (*axes, plot.belief(trace, new()), plot.belief(machine.belief, new())):
         FigureCanvasAgg(ax.figure).draw()
 
 
@@ -199,7 +192,7 @@ def test_one_state_and_many_can_be_drawn(n, tmp_path):
 
 
 def test_a_belief_is_bars_and_a_dead_end_is_hatched_and_named():
-    ax = plot_belief([0.2, 0.7, 0.1], new(), dead_ends=[1])
+    ax = plot.belief([0.2, 0.7, 0.1], new(), dead_ends=[1])
     assert [bar.get_height() for bar in ax.patches] == [0.2, 0.7, 0.1]
     assert [bar.get_hatch() for bar in ax.patches] == [None, "///", None]
     assert texts(ax) == ["dead end"]
@@ -208,26 +201,26 @@ def test_a_belief_is_bars_and_a_dead_end_is_hatched_and_named():
 
 def test_beliefs_over_time_are_a_map_and_a_line():
     rows = np.array([[1.0, 0.0], [0.4, 0.6], [0.3, 0.7]])
-    ax = plot_belief(rows, new(), time=[0.0, 0.5, 2.0], dead_ends=[1])
+    ax = plot.belief(rows, new(), time=[0.0, 0.5, 2.0], dead_ends=[1])
     assert np.array_equal(ax.collections[0].get_array(), rows.T)
     assert np.array_equal(ax.lines[0].get_xdata(), [0.0, 0.5, 2.0])
-    assert np.array_equal(ax.lines[0].get_ydata(), [1, 2, 2])
+    assert np.array_equal(ax.lines[0].get_ydata(), [0, 1, 1])
     assert [tick.get_text() for tick in ax.get_yticklabels()] == ["#1", "#2"]
     assert texts(ax) == ["dead end"]
     assert ax.get_xlabel() == "time [s]"
-    assert plot_belief(rows, new()).get_xlabel() == "observation"
+    assert plot.belief(rows, new()).get_xlabel() == "observation"
 
 
 def test_beliefs_that_do_not_fit_are_refused(machine):
     twin = machine.copy()
     with pytest.raises(ValueError, match=r"holds no beliefs \(learn_many\(..., belief=True\)"):
-        plot_belief(twin.learn_many([[0.0, 0.0]], [0]), new())
+        plot.belief(twin.learn_many([[0.0, 0.0]], [0]), new())
     with pytest.raises(ValueError, match=r"belief has shape \(0,\)"):
-        plot_belief([], new())
+        plot.belief([], new())
     with pytest.raises(ValueError, match=r"time has shape \(1,\); 2 beliefs need \(2,\)"):
-        plot_belief([[1.0], [1.0]], new(), time=[0.0])
+        plot.belief([[1.0], [1.0]], new(), time=[0.0])
     with pytest.raises(ValueError, match="only one belief"):
-        plot_belief([1.0], new(), time=[0.0])
+        plot.belief([1.0], new(), time=[0.0])
 
 
 # -- Of a drive -------------------------------------------------------------------------------
@@ -238,7 +231,7 @@ def lines(ax):
 
 
 def test_risk_is_that_of_the_decisions_and_holds_until_the_end(saved):
-    ax = plot_risk(saved, new(), tolerance=0.02)
+    ax = plot.risk(saved, new(), tolerance=0.02)
     revisions = [decision.revision for decision in saved.decisions]
     drawn = lines(ax)
     assert drawn["proposed"].get_ydata()[:-1].tolist() == [r.risk_proposed for r in revisions]
@@ -252,7 +245,7 @@ def test_risk_is_that_of_the_decisions_and_holds_until_the_end(saved):
 
 
 def test_accelerations_are_what_was_proposed_and_executed(saved):
-    ax = plot_accelerations(saved, new())
+    ax = plot.accelerations(saved, new())
     drawn = lines(ax)
     assert saved.changed.any()
     assert np.array_equal(drawn["proposed"].get_ydata()[:-1], saved.proposed)
@@ -261,17 +254,17 @@ def test_accelerations_are_what_was_proposed_and_executed(saved):
     assert same_color(ax.collections[0].get_facecolor()[0], to_rgba(DEAD_END, 0.25))
 
 
-@pytest.mark.parametrize("plot", [plot_risk, plot_accelerations])
-def test_a_collision_is_marked_where_there_was_one(plot, saved, lost):
+@pytest.mark.parametrize("draw", [plot.risk, plot.accelerations])
+def test_a_collision_is_marked_where_there_was_one(draw, saved, lost):
     assert lost.episode.collided
     assert not saved.episode.collided
-    assert lines(plot(lost, new()))["collision"].get_xdata()[0] == lost.episode.time[-1]
-    assert "collision" not in lines(plot(saved, new()))
+    assert lines(draw(lost, new()))["collision"].get_xdata()[0] == lost.episode.time[-1]
+    assert "collision" not in lines(draw(saved, new()))
 
 
 def test_a_drive_that_nobody_judged_is_refused(saved):
     unjudged = _drive(Mode.OFF)
     with pytest.raises(ValueError, match="no decision of this drive was judged"):
-        plot_risk(unjudged, new())
+        plot.risk(unjudged, new())
     with pytest.raises(ValueError, match="nothing was decided"):
-        plot_accelerations(replace(saved, decisions=()), new())
+        plot.accelerations(replace(saved, decisions=()), new())

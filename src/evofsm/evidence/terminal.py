@@ -10,7 +10,6 @@ from rich.padding import Padding
 
 from evofsm.app import (
     NONE,
-    Table,
     count,
     interval,
     number,
@@ -18,11 +17,9 @@ from evofsm.app import (
     percents,
     print_columns,
     print_table,
-    print_words,
 )
 from evofsm.evidence.closed_loop.comparison import Line, has_third_car, table_groups
 from evofsm.evidence.closed_loop.study import ClosedLoop
-from evofsm.evidence.paper.claims import Claim
 from evofsm.evidence.report.asked import tables_of_asked
 from evofsm.evidence.report.beside import side_tables
 from evofsm.evidence.report.chapter import Chapter
@@ -31,26 +28,6 @@ from evofsm.evidence.report.losses import InWords, losses_in_words
 
 # Of the tables beside, those that are short enough.
 _IN_THE_TERMINAL = ("shift", "separation", "cases", "worlds")
-
-
-def print_claims(out: Console, claims: Sequence[Claim], context: Sequence[Table]) -> None:
-    """Print the paper's claims with a verdict each, and the tables that stand beside them."""
-    held = sum(claim.holds for claim in claims)
-    out.print(f"{held} of {len(claims)} claims of the paper hold", style="bold")
-    rows = [
-        (claim.claim, claim.paper, claim.measured, "yes" if claim.holds else "NO")
-        for claim in claims
-    ]
-    failing = [place for place, claim in enumerate(claims) if not claim.holds]
-    print_words(
-        out,
-        ("claim", "paper", "measured", "holds"),
-        rows,
-        styles=dict.fromkeys(failing, "bold red"),
-    )
-    out.print()
-    for beside in context:
-        print_table(out, beside)
 
 
 def print_closed_loop(out: Console, study: ClosedLoop) -> None:

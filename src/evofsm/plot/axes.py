@@ -1,7 +1,8 @@
 """Plots of a model, of beliefs and of a drive, each on axes that are given, or on new ones.
 
-They draw in whatever style holds, and set none. Functions that ``plot_`` are for everyone; those
-below them draw the same things in the figures of the studies.
+They draw in whatever style holds, and set none. Data on the axes are counted from 0, as in the
+code, and labels from 1. The functions whose names begin with ``draw_`` or ``label_`` draw parts of
+them, in the figures of the studies as well.
 """
 
 from __future__ import annotations
@@ -21,19 +22,22 @@ with needs("matplotlib", "plot", "plotting"):
     from matplotlib.colors import Normalize
     from matplotlib.patches import FancyArrowPatch
     from matplotlib.patheffects import withStroke
-    from matplotlib.ticker import MaxNLocator
 
+    from evofsm.plot.placing import around, in_points, settle
     from evofsm.plot.style import (
         DEAD_END,
         FOLLOWER,
         INK,
         MOST_DISCS,
         SOFT,
+        Look,
         draw_collision,
         draw_state,
         ink,
         label_of,
+        name_of,
         points,
+        write,
     )
 
 if TYPE_CHECKING:
@@ -45,7 +49,7 @@ if TYPE_CHECKING:
 COLORS = "Blues"
 #: Up to so many states a matrix has room for its values.
 MOST_VALUES = 8
-# Up to so many states each has its number on an axis.
+# Up to so many states each has its number on an axis, beyond about 8 have.
 _MOST_TICKS = 12
 # How much of the colour of type arrows have.
 _PALE, _DARK = 0.19, 0.6923
@@ -54,7 +58,7 @@ _PALE, _DARK = 0.19, 0.6923
 # -- Of a model -------------------------------------------------------------------------------
 
 
-def plot_states(
+def states(
     model: FSMModel,
     ax: Axes | None = None,
     *,
@@ -90,15 +94,15 @@ def plot_states(
     Examples
     --------
     >>> from matplotlib.figure import Figure
-    >>> from evofsm import EvolvingFSM
+    >>> from evofsm import EvolvingFSM, plot
     >>> machine = EvolvingFSM(n_actions=1, radius=0.5)
     >>> trace = machine.learn_many([[0.0, 3.0], [0.1, 3.0], [2.0, 5.0], [1.0, 4.0]], [0] * 4)
     >>> model = machine.model(names=["gap", "speed"], units=["m", "m/s"])
-    >>> ax = plot_states(model, Figure().subplots(), dead_ends=[1])
+    >>> ax = plot.states(model, Figure().subplots(), dead_ends=[1])
     >>> ax.get_xlabel(), ax.get_ylabel()
     ('gap [m]', 'speed [m/s]')
     """
-    _refuse_unknown(model, dead_ends)
+    _refuse_unknown(model.n_states, dead_ends)
     for variable in variables:
         if not 0 <= variable < model.n_variables:
             raise ValueError(f"there is no variable {variable}: the model has {model.n_variables}")
@@ -115,7 +119,7 @@ def plot_states(
     return ax
 
 
-def plot_graph(
+def graph(
     model: FSMModel,
     ax: Axes | None = None,
     *,
@@ -149,14 +153,14 @@ def plot_graph(
     Examples
     --------
     >>> from matplotlib.figure import Figure
-    >>> from evofsm import EvolvingFSM
+    >>> from evofsm import EvolvingFSM, plot
     >>> machine = EvolvingFSM(n_actions=1, radius=0.5)
     >>> trace = machine.learn_many([[0.0], [0.1], [2.0], [1.0]], [0, 0, 0, 0])
-    >>> ax = plot_graph(machine.model(), Figure().subplots())
+    >>> ax = plot.graph(machine.model(), Figure().subplots())
     >>> "stays 77 %" in [text.get_text() for text in ax.texts]
     True
     """
-    _refuse_unknown(model, dead_ends)
+    _refuse_unknown(model.n_states, dead_ends)
     ax = _given_or_new(ax)
     matrix = model.averaged_matrix(policy)
     notes = [f"stays {percent(value)}" for value in np.diag(matrix)]
@@ -164,19 +168,19 @@ def plot_graph(
     between = matrix[~np.eye(len(matrix), dtype=bool)]
     if len(between):
         strong = "dark" if ink() < ink(0.0) else "bright"  # the ground is light, or is not
-        ax.annotate(
+        write(
+            ax,
             f"each arrow: {percent(between.min())} to {percent(between.max())}; "
             f"{strong if len(matrix) <= MOST_DISCS else 'drawn'}: the two likeliest of each state",
             (0.03, -0.03),
             xycoords="axes fraction",
-            fontsize=points(7.0),
+            va="baseline",
             color=ink(),
-            annotation_clip=False,
         )
     return ax
 
 
-def plot_transitions(
+def transitions(
     model: FSMModel,
     ax: Axes | None = None,
     *,
@@ -208,20 +212,20 @@ def plot_transitions(
     Examples
     --------
     >>> from matplotlib.figure import Figure
-    >>> from evofsm import EvolvingFSM
+    >>> from evofsm import EvolvingFSM, plot
     >>> machine = EvolvingFSM(n_actions=2, radius=0.5)
     >>> trace = machine.learn_many([[0.0], [0.1], [2.0], [1.0]], [0, 0, 0, 0])
-    >>> ax = plot_transitions(machine.model(), Figure().subplots(), action=0)
+    >>> ax = plot.transitions(machine.model(), Figure().subplots(), action=0)
     >>> [text.get_text() for text in ax.texts]  # in %
     ['77', '23', '50', '50']
     """
-    _refuse_unknown(model, dead_ends)
+    _refuse_unknown(model.n_states, dead_ends)
     if action is not None and not 0 <= action < model.n_actions:
         raise ValueError(f"there is no action {action}: the model has {model.n_actions}")
     ax = _given_or_new(ax)
-    matrix = model.averaged_matrix("observed") if action is None else _matrix(model, action)
+    matrix = model.averaged_matrix() if action is None else model.transition_matrices[action]
     image = draw_matrix(ax, matrix, Normalize(0.0, float(matrix.max())), size=7.0)
-    ax.set_title("all actions, as used" if action is None else name_action(model, action))
+    ax.set_title("all actions, as used" if action is None else describe_action(model, action))
     for axis, way in ((ax.xaxis, "to"), (ax.yaxis, "from")):
         label_states(axis, model.n_states, dead_ends)
         axis.set_label_text(f"{way} state" + (" (bold: dead end)" if dead_ends else ""))
@@ -230,14 +234,10 @@ def plot_transitions(
     return ax
 
 
-def _matrix(model: FSMModel, action: int) -> NDArray[np.float64]:
-    return np.asarray(model.transition_matrices[action])
-
-
 # -- Of beliefs -------------------------------------------------------------------------------
 
 
-def plot_belief(
+def belief(
     belief: ArrayLike | Trace,
     ax: Axes | None = None,
     *,
@@ -271,13 +271,13 @@ def plot_belief(
     Examples
     --------
     >>> from matplotlib.figure import Figure
-    >>> from evofsm import EvolvingFSM
+    >>> from evofsm import EvolvingFSM, plot
     >>> machine = EvolvingFSM(n_actions=1, radius=0.5)
     >>> trace = machine.learn_many([[0.0], [0.1], [2.0], [1.0]], [0] * 4, belief=True)
-    >>> ax = plot_belief(trace, Figure().subplots(), time=[0.0, 0.1, 0.2, 0.3])
-    >>> ax.get_xlabel(), ax.lines[0].get_ydata()  # the state is #2 at last
-    ('time [s]', array([1, 1, 1, 2]))
-    >>> plot_belief(machine.belief, Figure().subplots()).get_ylabel()
+    >>> ax = plot.belief(trace, Figure().subplots(), time=[0.0, 0.1, 0.2, 0.3])
+    >>> ax.get_xlabel(), ax.lines[0].get_ydata()  # from 0: #2 at last
+    ('time [s]', array([0, 0, 0, 1]))
+    >>> plot.belief(machine.belief, Figure().subplots()).get_ylabel()
     'belief'
     """
     if isinstance(belief, Trace):
@@ -287,7 +287,7 @@ def plot_belief(
     rows = np.asarray(belief, dtype=np.float64)
     if rows.ndim not in (1, 2) or rows.size == 0:
         raise ValueError(f"belief has shape {rows.shape}; it must be (n,) or (T, n), not empty")
-    _refuse_unknown_states(rows.shape[-1], dead_ends)
+    _refuse_unknown(rows.shape[-1], dead_ends)
     if rows.ndim == 1:
         if time is not None:
             raise ValueError("time is given, but only one belief: (n,)")
@@ -301,28 +301,14 @@ def plot_belief(
     return ax
 
 
-def _plot_one_belief(belief: NDArray[np.float64], ax: Axes, dead_ends: Collection[int]) -> Axes:
-    states = np.arange(len(belief))
-    marked = np.isin(states, list(dead_ends))
-    bars = ax.bar(states, belief, color=np.where(marked, DEAD_END, FOLLOWER))
-    for state in states[marked]:
-        bars[state].set_hatch("///")
-        bars[state].set_edgecolor("white")
-        ax.annotate(
-            "dead end",
-            (state, belief[state]),
-            xytext=(0, 2),
-            textcoords="offset points",
-            ha="center",
-            va="bottom",
-            fontsize=points(7.0),
-            fontweight="bold",
-            color=DEAD_END,
-        )
-    label_states(ax.xaxis, len(belief), dead_ends)
-    ax.set_ylim(0.0, 1.0)
-    ax.set_xlabel("state")
-    ax.set_ylabel("belief")
+def _plot_one_belief(row: NDArray[np.float64], ax: Axes, dead_ends: Collection[int]) -> Axes:
+    bars = ax.bar(range(len(row)), row, color=FOLLOWER)
+    for state in dead_ends:
+        bars[state].set(color=DEAD_END, hatch="///", edgecolor="white")
+        look: Look = {"ha": "center", "va": "bottom", "fontweight": "bold", "color": DEAD_END}
+        write(ax, "dead end", (state, row[state]), (0.0, 2.0), **look)
+    label_states(ax.xaxis, len(row), dead_ends)
+    ax.set(ylim=(0.0, 1.0), xlabel="state", ylabel="belief")
     return ax
 
 
@@ -330,24 +316,17 @@ def _plot_beliefs(
     rows: NDArray[np.float64], when: NDArray[np.float64], ax: Axes, dead_ends: Collection[int]
 ) -> None:
     n = rows.shape[1]
+    scale = Normalize(0.0, 1.0)
     mesh = ax.pcolormesh(
-        when,
-        np.arange(1, n + 1),
-        rows.T,
-        cmap=COLORS,
-        vmin=0.0,
-        vmax=1.0,
-        shading="nearest",
-        rasterized=True,
+        when, range(n), rows.T, cmap=COLORS, norm=scale, shading="nearest", rasterized=True
     )
     ax.grid(False)
     if n <= MOST_DISCS:  # among more it would hide the belief
-        (line,) = ax.step(
-            when, rows.argmax(axis=1) + 1, where="mid", color=INK, label="most probable state"
-        )
+        look: Look = {"where": "mid", "color": INK, "label": "most probable state"}
+        (line,) = ax.step(when, rows.argmax(axis=1), **look)
         line.set_path_effects([withStroke(linewidth=3.0, foreground="white")])
         _explain(ax)
-    name_rows(ax, n, dead_ends)
+    label_states(ax.yaxis, n, dead_ends, called="dead end")
     ax.set_ylabel("state")
     # Below, for the words beside the rows stand to the right.
     ax.figure.colorbar(mesh, ax=ax, label="belief", location="bottom", aspect=40)
@@ -356,7 +335,7 @@ def _plot_beliefs(
 # -- Of a drive -------------------------------------------------------------------------------
 
 
-def plot_risk(drive: Drive, ax: Axes | None = None, *, tolerance: float | None = None) -> Axes:
+def risk(drive: Drive, ax: Axes | None = None, *, tolerance: float | None = None) -> Axes:
     """Latent risk over time: of what was proposed, and of what was executed, with its interval.
 
     Parameters
@@ -381,7 +360,7 @@ def plot_risk(drive: Drive, ax: Axes | None = None, *, tolerance: float | None =
     Examples
     --------
     >>> from matplotlib.figure import Figure
-    >>> from evofsm import IntervalActions
+    >>> from evofsm import IntervalActions, plot
     >>> from evofsm.driving import IDM, Framework, FunctionController, KinematicWorld, LatentRisk
     >>> from evofsm.driving import Leader, Scenario
     >>> from evofsm.guard import ActionReviser
@@ -390,7 +369,7 @@ def plot_risk(drive: Drive, ax: Axes | None = None, *, tolerance: float | None =
     >>> leader = Leader(IDM(1.2, 25.0, 1.0, 1.0, 2.5), brake_decel=4.0, brake_time=12.0)
     >>> framework = Framework(FunctionController(lambda z: 2.0), actions, reviser)
     >>> drive = framework.drive(KinematicWorld(), Scenario(leader, initial_gap=10.0))
-    >>> ax = plot_risk(drive, Figure().subplots(), tolerance=reviser.tolerance)
+    >>> ax = plot.risk(drive, Figure().subplots(), tolerance=reviser.tolerance)
     >>> ax.get_ylabel()
     'latent risk'
     """
@@ -404,16 +383,8 @@ def plot_risk(drive: Drive, ax: Axes | None = None, *, tolerance: float | None =
     ax = _given_or_new(ax)
     low, high = np.array([revision.interval for revision in revisions]).T
     when = _until_the_end(drive)
-    ax.fill_between(
-        when,
-        _held(low),
-        _held(high),
-        step="post",
-        color=FOLLOWER,
-        alpha=0.25,
-        linewidth=0.0,
-        label="90 % interval",
-    )
+    fill: Look = {"step": "post", "color": FOLLOWER, "alpha": 0.25, "linewidth": 0.0}
+    ax.fill_between(when, _held(low), _held(high), label="90 % interval", **fill)
     ax.step(when, _held(proposed), where="post", color=DEAD_END, linestyle="--", label="proposed")
     ax.step(when, _held(executed), where="post", color=FOLLOWER, label="executed")
     if tolerance is not None:
@@ -425,7 +396,7 @@ def plot_risk(drive: Drive, ax: Axes | None = None, *, tolerance: float | None =
     return ax
 
 
-def plot_accelerations(drive: Drive, ax: Axes | None = None) -> Axes:
+def accelerations(drive: Drive, ax: Axes | None = None) -> Axes:
     """What was proposed and what was executed, over time; where they differ it is shaded.
 
     Parameters
@@ -447,13 +418,13 @@ def plot_accelerations(drive: Drive, ax: Axes | None = None) -> Axes:
     Examples
     --------
     >>> from matplotlib.figure import Figure
-    >>> from evofsm import IntervalActions
+    >>> from evofsm import IntervalActions, plot
     >>> from evofsm.driving import IDM, Framework, KinematicWorld, Leader, Scenario
     >>> driver = IDM(1.2, 25.0, 1.0, 1.0, 2.5, lowest=-2.5, highest=2.5)
     >>> actions = IntervalActions(low=-2.5, high=2.5, width=0.3, outside="clip")
     >>> scenario = Scenario(Leader(driver, brake_decel=2.0, brake_time=5.0), initial_gap=10.0)
     >>> drive = Framework(driver, actions).drive(KinematicWorld(), scenario)
-    >>> ax = plot_accelerations(drive, Figure().subplots())
+    >>> ax = plot.accelerations(drive, Figure().subplots())
     >>> ax.get_ylabel()
     'acceleration [m/s²]'
     """
@@ -462,16 +433,8 @@ def plot_accelerations(drive: Drive, ax: Axes | None = None) -> Axes:
     ax = _given_or_new(ax)
     when, proposed, executed = _until_the_end(drive), _held(drive.proposed), _held(drive.executed)
     ax.axhline(0.0, color=SOFT, linewidth=0.6)
-    ax.fill_between(
-        when,
-        proposed,
-        executed,
-        step="post",
-        color=DEAD_END,
-        alpha=0.25,
-        linewidth=0.0,
-        label="revised",
-    )
+    fill: Look = {"step": "post", "color": DEAD_END, "alpha": 0.25, "linewidth": 0.0}
+    ax.fill_between(when, proposed, executed, label="revised", **fill)
     ax.step(when, proposed, where="post", color=DEAD_END, linestyle="--", label="proposed")
     ax.step(when, executed, where="post", color=FOLLOWER, label="executed")
     ax.set_ylabel("acceleration [m/s²]")
@@ -523,19 +486,15 @@ def _given_or_new(ax: Axes | None) -> Axes:
     return pyplot.subplots(layout="constrained")[1]
 
 
-def _refuse_unknown(model: FSMModel, dead_ends: Collection[int]) -> None:
-    if model.n_states == 0:
+def _refuse_unknown(n: int, dead_ends: Collection[int]) -> None:
+    if n == 0:
         raise ValueError("this model has no states: its machine had observed nothing")
-    _refuse_unknown_states(model.n_states, dead_ends)
-
-
-def _refuse_unknown_states(n: int, dead_ends: Collection[int]) -> None:
     for state in dead_ends:
         if not 0 <= state < n:
             raise ValueError(f"dead_ends name state {state}, but there are states 0 to {n - 1}")
 
 
-# -- What the figures of studies draw as well -------------------------------------------------
+# -- Parts, in the figures of studies as well ------------------------------------------------------
 
 
 def percent(share: float) -> str:
@@ -546,37 +505,23 @@ def percent(share: float) -> str:
 def draw_centers(
     axes: Axes, centers: NDArray[np.float64], dead_ends: Collection[int], size: float
 ) -> None:
-    """Draw centres (n, 2); where two discs would meet, they move apart and point to their place."""
+    """Draw centres (n, 2); discs that would meet move apart and point to their place."""
     places = centers
     numbered = len(centers) <= MOST_DISCS
     if numbered:
-        least = (size + 1.0) * axes.figure.dpi / 72.0
-        drawn = _move_apart(axes.transData.transform(centers), least)
-        places = axes.transData.inverted().transform(drawn)
+        anchors = in_points(axes, centers)
+        sizes = np.full_like(anchors, size + 1.0)
+        moved = anchors + settle(anchors, sizes, _moves)
+        places = axes.transData.inverted().transform(moved * axes.figure.dpi / 72.0)
     for state, (center, (x, y)) in enumerate(zip(centers, places, strict=True)):
         axes.plot([center[0], x], [center[1], y], color=ink(), linewidth=0.6, zorder=4.5)
         axes.plot(*center, marker="o", markersize=1.6, color=ink(), zorder=4.5)
         draw_state(axes, x, y, state, size, dead_end=state in dead_ends, numbered=numbered)
 
 
-def _move_apart(places: NDArray[np.float64], least: float) -> NDArray[np.float64]:
-    """Push points away from each other until no two are closer than ``least``."""
-    places = places.copy()
-    for _ in range(100):
-        quiet = True
-        for i in range(len(places)):
-            for j in range(i):
-                apart = places[i] - places[j]
-                distance = float(np.hypot(*apart))
-                if distance >= 0.99 * least:
-                    continue
-                quiet = False
-                way = apart / distance if distance > 0.0 else np.array([0.0, 1.0])
-                places[i] += 0.5 * (least - distance) * way
-                places[j] -= 0.5 * (least - distance) * way
-        if quiet:
-            break
-    return places
+def _moves(width: float, height: float) -> NDArray[np.float64]:
+    """Offsets that are tried for a disc: none, then all around, ever further away."""
+    return np.vstack([np.zeros(2), around(0.0, 0.0, width * np.arange(0.25, 5.0, 0.25))])
 
 
 def draw_chain(
@@ -593,58 +538,36 @@ def draw_chain(
     With ``strongest`` all but so many arrows of each state are pale; ``counted`` weights are
     written on the arrows.
     """
-    _draw_nodes(axes, notes, dead_ends)
-    _draw_edges(axes, weights, dead_ends, widest, strongest, counted)
-
-
-def _place(n: int) -> NDArray[np.float64]:
-    """(n, 2) positions on a circle, the first on top, then clockwise."""
+    n = len(notes)
     angle = 0.5 * np.pi - 2.0 * np.pi * np.arange(n) / max(n, 1)
-    return np.column_stack([np.cos(angle), np.sin(angle)])
-
-
-def _draw_nodes(axes: Axes, notes: Sequence[str], dead_ends: Collection[int]) -> None:
-    numbered = len(notes) <= MOST_DISCS
-    for state, ((x, y), note) in enumerate(zip(_place(len(notes)), notes, strict=True)):
+    places = np.column_stack([np.cos(angle), np.sin(angle)])  # from the top, clockwise
+    numbered = n <= MOST_DISCS
+    for state, ((x, y), note) in enumerate(zip(places, notes, strict=True)):
         dead_end = state in dead_ends
         draw_state(axes, x, y, state, 13.0, dead_end=dead_end, numbered=numbered)
         if not numbered and not dead_end:
-            note = str(state + 1)
-        axes.annotate(
+            note = label_of(state)[1:]
+        write(
+            axes,
             f"dead end\n{note}" if dead_end else note,
             (x, y),
-            xytext=(11.0 * x, 11.0 * y),
-            textcoords="offset points",
+            (11.0 * x, 11.0 * y),
+            size=7.0 if numbered or dead_end else 5.5,
             ha="center" if abs(x) < 0.2 else "left" if x > 0.0 else "right",
             va="center" if abs(y) < 0.5 else "bottom" if y > 0.0 else "top",
-            fontsize=points(7.0 if numbered or dead_end else 5.5),
             color=DEAD_END if dead_end else ink(),
         )
-    axes.set_xlim(-1.75, 1.75)
-    axes.set_ylim(-1.35, 1.35)
-    axes.set_aspect("equal")
+    axes.set(xlim=(-1.75, 1.75), ylim=(-1.35, 1.35), aspect="equal")
     axes.set_axis_off()
-
-
-def _draw_edges(
-    axes: Axes,
-    weights: NDArray[np.float64],
-    dead_ends: Collection[int],
-    widest: float,
-    strongest: int | None,
-    counted: bool,
-) -> None:
-    """Draw an arrow from state to state, its width by weight; self-loops are left out."""
-    n = len(weights)
-    places = _place(n)
     between = weights * (1.0 - np.eye(n))
     heaviest = max(float(between.max(initial=0.0)), 1e-12)
     rank = np.argsort(np.argsort(-between, axis=1), axis=1)
     for i, j in np.argwhere(between > 0.005 * heaviest):
         pale = strongest is not None and rank[i, j] >= strongest
-        if pale and n > MOST_DISCS:
+        if pale and not numbered:
             continue
-        bend = 0.28 / float(np.hypot(*(places[j] - places[i])))
+        way = places[j] - places[i]
+        bend = 0.28 / float(np.hypot(*way))
         axes.add_patch(
             FancyArrowPatch(
                 places[i],
@@ -659,25 +582,11 @@ def _draw_edges(
                 zorder=1.5 if pale else 2.0,
             )
         )
-        if counted and n <= MOST_DISCS:
-            _write_on_arc(axes, places[i], places[j], bend, f"{weights[i, j]:.0f}")
-
-
-def _write_on_arc(
-    axes: Axes, start: NDArray[np.float64], end: NDArray[np.float64], bend: float, text: str
-) -> None:
-    """Write in the middle of an arrow that is bent by ``bend``."""
-    dx, dy = end - start
-    x, y = 0.5 * (start + end) + 0.5 * bend * np.array([dy, -dx])
-    axes.annotate(
-        text,
-        (x, y),
-        ha="center",
-        va="center_baseline",
-        fontsize=points(7.0),
-        bbox={"boxstyle": "round,pad=0.12", "facecolor": ink(0.0), "edgecolor": "none"},
-        zorder=3,
-    )
+        if counted and numbered:
+            middle = 0.5 * (places[i] + places[j]) + 0.5 * bend * np.array([way[1], -way[0]])
+            box: Look = {"boxstyle": "round,pad=0.12", "facecolor": ink(0.0), "edgecolor": "none"}
+            look: Look = {"ha": "center", "va": "center_baseline", "zorder": 3}
+            write(axes, f"{weights[i, j]:.0f}", tuple(middle), bbox=box, **look)
 
 
 def draw_matrix(
@@ -686,61 +595,48 @@ def draw_matrix(
     """Draw a transition matrix, its values in type of this ``size`` where there is room."""
     image = axes.imshow(matrix, cmap=COLORS, norm=scale, interpolation="nearest")
     axes.grid(False)
-    for spine in axes.spines.values():
-        spine.set_visible(False)
+    axes.spines[:].set_visible(False)
     if len(matrix) <= MOST_VALUES:
         for i, j in np.ndindex(matrix.shape):
-            axes.text(
-                j,
-                i,
-                f"{100 * matrix[i, j]:.0f}",
-                ha="center",
-                va="center_baseline",
-                fontsize=points(size),
-                color="white" if scale(matrix[i, j]) > 0.68 else INK,
-            )
+            look: Look = {"ha": "center", "va": "center_baseline", "fontsize": points(size)}
+            color = "white" if scale(matrix[i, j]) > 0.68 else INK
+            axes.text(j, i, f"{100 * matrix[i, j]:.0f}", color=color, **look)
     return image
 
 
-def name_action(model: FSMModel, action: int) -> str:
+def describe_action(model: FSMModel, action: int) -> str:
     """What an action is, and how many transitions were learnt with it."""
-    name = f"a({action + 1})"
+    name = name_of(action)
     if model.actions is not None:
         name += f"  {model.actions.label(action)}".replace("-", "−") + " m/s²"
     return f"{name}\n{model.uses[action]:,.0f} transitions"
 
 
-def label_states(axis: Axis, n: int, dead_ends: Collection[int], shown: bool = True) -> None:
-    """Put the states' numbers on an axis that counts them from 0, the dead ends' bold."""
-    step = math.ceil(n / _MOST_TICKS)
-    states = range(0, n, step)
-    axis.set_ticks(states, [str(state + 1) for state in states] if shown else [])
+def label_states(
+    axis: Axis,
+    n: int,
+    dead_ends: Collection[int] = (),
+    *,
+    shown: bool = True,
+    called: str = "",
+) -> None:
+    """Put the states' numbers, from 1, on an axis that counts them from 0; the dead ends' bold.
+
+    On an upward axis the rows of dead ends are tinted as well where they are ``called`` something.
+    """
+    states = range(0, n, 1 if n <= _MOST_TICKS else math.ceil(n / 8))
+    sign = "#" if axis is axis.axes.xaxis else ""  # which there is no room for
+    axis.set_ticks(states, [label_of(state).strip(sign) for state in states] if shown else [])
     axis.set_tick_params(length=0, labelsize=points(7.0), pad=2.0)
     for state, label in zip(states, axis.get_ticklabels(), strict=False):
         if state in dead_ends:
-            label.set_color(DEAD_END)
-            label.set_fontweight("bold")
-
-
-def name_rows(axes: Axes, n: int, dead_ends: Collection[int], called: str = "dead end") -> None:
-    """Give each state a row, from 1 upward; those of dead ends are tinted, and called so."""
-    axes.set_ylim(0.4, n + 0.6)
-    if n <= _MOST_TICKS:
-        axes.set_yticks(range(1, n + 1), [label_of(state) for state in range(n)])
-    else:
-        axes.yaxis.set_major_locator(MaxNLocator(8, integer=True))
-    for state in dead_ends:
-        row = state + 1
-        axes.axhspan(row - 0.5, row + 0.5, color=DEAD_END, alpha=0.18, linewidth=0.0, zorder=0.5)
-        axes.annotate(
-            called,
-            (1.0, row),
-            xycoords=("axes fraction", "data"),
-            xytext=(4, 0),
-            textcoords="offset points",
-            va="center",
-            fontsize=points(7.0),
-            fontweight="bold",
-            color=DEAD_END,
-            annotation_clip=False,
-        )
+            label.set(color=DEAD_END, fontweight="bold")
+    if called:
+        axes = axis.axes
+        axes.set_ylim(-0.6, n - 0.4)
+        for state in dead_ends:
+            axes.axhspan(
+                state - 0.5, state + 0.5, color=DEAD_END, alpha=0.18, linewidth=0.0, zorder=0.5
+            )
+            look: Look = {"xycoords": ("axes fraction", "data"), "fontweight": "bold"}
+            write(axes, called, (1.0, state), (4.0, 0.0), color=DEAD_END, **look)

@@ -12,7 +12,11 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import to_hex, to_rgb
 from matplotlib.figure import Figure
+from matplotlib.text import Annotation
 from numpy.typing import NDArray
+
+#: How something is drawn, as matplotlib is told.
+Look = dict[str, Any]
 
 #: Width of every figure [inch]: that of a page's text.
 WIDTH = 7.2
@@ -41,6 +45,7 @@ COLLISION: Mapping[str, Any] = {
 MOST_DISCS = 20
 
 _SETTINGS: Mapping[str, Any] = {
+    "figure.dpi": DPI,  # as it is saved: texts are as wide when they are placed
     "font.family": "DejaVu Sans",  # comes with matplotlib: looks the same everywhere
     "font.size": 8.0,
     "text.color": INK,
@@ -86,7 +91,7 @@ def house_style() -> Iterator[None]:
 
 
 def save(figure: Figure, folder: Path, name: str) -> dict[str, Path]:
-    """Write a figure as PNG and SVG; answers the paths by format."""
+    """Write a figure as PNG and SVG; returns the paths by format."""
     paths = {kind: folder / f"{name}.{kind}" for kind in ("png", "svg")}
     figure.savefig(paths["png"], dpi=DPI)
     figure.savefig(paths["svg"], metadata={"Date": None})
@@ -94,8 +99,21 @@ def save(figure: Figure, folder: Path, name: str) -> dict[str, Path]:
 
 
 def label_of(state: int) -> str:
-    """A state's name as people read it, counted from 1."""
+    """A state's name in text, counted from 1.
+
+    >>> label_of(3)
+    '#4'
+    """
     return f"#{state + 1}"
+
+
+def name_of(action: int) -> str:
+    """An action's name in text, counted from 1.
+
+    >>> name_of(16)
+    'a(17)'
+    """
+    return f"a({action + 1})"
 
 
 def points(size: float) -> float:
@@ -114,9 +132,23 @@ def ink(share: float = 1.0) -> str:
     return to_hex((red, green, blue))
 
 
-def dead_ends_of(dead_end: int) -> tuple[int, ...]:
-    """The dead end of a study that has at most one, as those to mark; -1 stands for none."""
-    return (dead_end,) if dead_end >= 0 else ()
+def write(
+    axes: Axes,
+    text: str,
+    xy: tuple[float, float],
+    offset: tuple[float, float] = (0.0, 0.0),
+    *,
+    size: float = 7.0,
+    **look: Any,
+) -> Annotation:
+    """Write beside a place, ``offset`` points from it, in type of a size of this style."""
+    given = {"textcoords": "offset points", "annotation_clip": False, "va": "center", **look}
+    return axes.annotate(text, xy, xytext=offset, fontsize=points(size), **given)
+
+
+def mark(axes: Axes, x: float, y: float, **look: Any) -> None:
+    """Mark a place, beyond the edge of the axes as well."""
+    axes.plot([x], [y], **{"linestyle": "none", "clip_on": False, **look})
 
 
 def draw_state(
@@ -131,21 +163,21 @@ def draw_state(
 ) -> None:
     """Draw a state: a disc, or a filled hexagon for a dead end; the latter is always numbered."""
     numbered = numbered or dead_end
-    axes.plot(
-        [x],
-        [y],
-        linestyle="none",
+    color = DEAD_END if dead_end else INK
+    mark(
+        axes,
+        x,
+        y,
         marker="h" if dead_end else "o",
         markersize=(1.18 if dead_end else 1.0) * (size if numbered else 0.35 * size),
         markerfacecolor=DEAD_END if dead_end else "white",
-        markeredgecolor=DEAD_END if dead_end else INK,
+        markeredgecolor=color,
         markeredgewidth=0.8,
-        clip_on=False,
         zorder=5.5 if dead_end else 5.0,
     )
     if numbered:
         axes.annotate(
-            str(state + 1),
+            label_of(state)[1:],
             (x, y),
             ha="center",
             va="center_baseline",
@@ -159,7 +191,7 @@ def draw_state(
 
 def draw_collision(axes: Axes, x: float, y: float) -> None:
     """Mark where a run ended in a collision."""
-    axes.plot([x], [y], linestyle="none", color=INK, clip_on=False, zorder=7, **COLLISION)
+    mark(axes, x, y, color=INK, zorder=7, **COLLISION)
 
 
 def stretches(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:

@@ -20,7 +20,7 @@ from evofsm.app.cli.groups import Driven
 if TYPE_CHECKING:
     from evofsm.app.campaign import Result
     from evofsm.app.driving import Setup
-    from evofsm.driving import Learner
+    from evofsm.guard import Guard
 
 
 class ExecutorName(StrEnum):
@@ -65,10 +65,10 @@ class Campaign(Driven):
 
     def run(self) -> int | None:
         """Drive what the folder does not hold yet, and print what came of all of it."""
-        from evofsm.app.driving import Setup
+        from evofsm.app.driving import Setup, make_guard
         from evofsm.app.text.columns import console
         from evofsm.app.text.driving import print_outcome
-        from evofsm.driving import Learner
+        from evofsm.driving import load_learnt
 
         family = self.load_family(self.family)
         mode = chosen_mode(self.mode)
@@ -77,17 +77,17 @@ class Campaign(Driven):
             *(self.episodes, self.seed),
             learn=False,
         )
-        learner = Learner.load(self.frozen) if self.frozen else Learner.new(family)
+        guard = make_guard(setup, *(load_learnt(self.frozen) if self.frozen else ()))
         open_executor, count = self._executor()
         self.out.mkdir(parents=True, exist_ok=True)
-        result = self._drive(setup, learner, open_executor, count)
+        result = self._drive(setup, guard, open_executor, count)
         if result is None:
             return 130
         if self.as_json:
             print_json({**result.row.as_dict(), "lead_times": list(result.lead_times)})
             return None
         screen = console()
-        print_outcome(screen, result.row, result.lead_times, learner, setup)
+        print_outcome(screen, result.row, result.lead_times, guard, setup)
         screen.print(f"Every episode, and their journal: {self.out}", soft_wrap=True)
         return None
 
@@ -107,14 +107,15 @@ class Campaign(Driven):
     def _drive(
         self,
         setup: Setup,
-        learner: Learner,
+        guard: Guard,
         open_executor: Callable[[], AbstractContextManager[Executor]],
         workers: int,
     ) -> Result | None:
         """With a bar; an interruption says how far it came, and returns None."""
         from evofsm.app import campaign
+        from evofsm.driving import learnt_by
 
-        driven = campaign.Campaign(setup, learner.risk, self.world.value)
+        driven = campaign.Campaign(setup, learnt_by(guard)[1], self.world.value)
         reached = 0
         with progress("episodes") as bars:
             task = bars.add_task("Driving", total=self.episodes, start=False)

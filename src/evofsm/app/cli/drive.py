@@ -13,9 +13,9 @@ from evofsm.app.cli.groups import Driven
 
 if TYPE_CHECKING:
     from evofsm.app.driving import Driving, Setup
-    from evofsm.driving import Learner, World
+    from evofsm.driving import World
     from evofsm.files import Checkpoint
-    from evofsm.guard import AuditLog
+    from evofsm.guard import AuditLog, Guard
     from evofsm.io import RunWriter
 
 
@@ -61,10 +61,10 @@ class Drive(Driven):
 
     def run(self) -> None:
         """Drive, and print what came of it."""
-        from evofsm.app.driving import Setup, episodes_learnt, write_driving
+        from evofsm.app.driving import Setup, episodes_learnt, make_guard, write_driving
         from evofsm.app.text.columns import console
         from evofsm.app.text.driving import driving_document, print_driving
-        from evofsm.driving import Learner, open_world
+        from evofsm.driving import learnt_by, load_learnt, open_world
         from evofsm.files import Checkpoint, duration, result_kept
         from evofsm.guard import AuditLog
 
@@ -88,29 +88,29 @@ class Drive(Driven):
             first=episodes_learnt(self.learn) if self.learn else 0,
         )
         start = self.learn or self.frozen
-        learner = Learner.load(start) if start else Learner.new(family)
+        guard = make_guard(setup, *(load_learnt(start) if start else ()))
         if self.out is not None:
             self.out.mkdir(parents=True, exist_ok=True)
         keeper = None
         if self.checkpoint is not None:
-            work = setup.settings(self.world.value, learner)
+            work = setup.settings(self.world.value, guard)
             keeper = Checkpoint(self.checkpoint, work, interval)
         with (
             AuditLog(self.audit) if self.audit else nullcontext() as log,
             open_world(self.world.value) as place,
             self._recording(setup) as run,
         ):
-            driving = _drive(setup, learner, place, keeper, log, run)
+            driving = _drive(setup, guard, place, keeper, log, run)
             if run is not None:
-                run.attach(learner.machine.model(**family.labels._asdict()))
+                run.attach(learnt_by(driving.guard)[0].model(**family.labels._asdict()))
         if self.out is not None:
             with result_kept(keeper):
-                write_driving(driving, learner, setup, self.out)
+                write_driving(driving, setup, self.out)
         if self.as_json:
             print_json(driving_document(driving))
             return
         screen = console()
-        print_driving(screen, driving, learner, setup)
+        print_driving(screen, driving, setup)
         if self.out is not None:
             screen.print(f"What was learnt, and every decision: {self.out}", soft_wrap=True)
         if self.mcap is not None:
@@ -131,7 +131,7 @@ class Drive(Driven):
 
 def _drive(
     setup: Setup,
-    learner: Learner,
+    guard: Guard,
     place: World,
     checkpoint: Checkpoint | None,
     audit: AuditLog | None,
@@ -148,4 +148,4 @@ def _drive(
             bars.update(task, completed=done, description=text)
 
         record = None if run is None else run.add
-        return drive_family(setup, learner, place, show, checkpoint, audit, record)
+        return drive_family(setup, guard, place, show, checkpoint, audit, record)

@@ -16,7 +16,7 @@ from evofsm.app.cli.groups import Revised
 if TYPE_CHECKING:
     from evofsm.app.watch.player import Watched
     from evofsm.app.watch.session import Session, Watching
-    from evofsm.driving import Learner
+    from evofsm.guard import Guard
 
 Opening = Callable[[], "AbstractContextManager[Watched]"]
 
@@ -107,7 +107,7 @@ class Watch(Revised):
         )
         if watching.case >= (cases := len(watching.cases)):
             raise ValueError(f"--case is {self.case}; {family.name} has 1 to {cases}")
-        learner, learnt = self._learner(watching)
+        guard, learnt = self._guard(watching)
 
         @contextmanager
         def session() -> Iterator[Session]:
@@ -116,28 +116,30 @@ class Watch(Revised):
 
             with (
                 open_world(watching.world) as world,
-                Session(watching, learner, world, learnt) as opened,
+                Session(watching, guard, world, learnt) as opened,
             ):
                 yield opened
 
         return session
 
-    def _learner(self, watching: Watching) -> tuple[Learner, int]:
+    def _guard(self, watching: Watching) -> tuple[Guard, int]:
         """One that has learnt something, and from how many episodes."""
         from evofsm.app.driving import episodes_learnt
-        from evofsm.app.watch.session import learn_first, watched_learner
-        from evofsm.driving import Learner
+        from evofsm.app.watch.session import learn_first, watched_guard
+        from evofsm.driving import guard_for_family, load_learnt
 
         if self.learn is not None:
-            return Learner.load(self.learn), episodes_learnt(self.learn)
-        learner = watched_learner(watching.family)
+            machine, judge = load_learnt(self.learn)
+            guard = guard_for_family(watching.family, machine=machine, judge=judge)
+            return guard, episodes_learnt(self.learn)
+        guard = watched_guard(watching.family)
         episodes = 0 if self.fresh else self.learn_first
         with progress() as bars:
             task = bars.add_task("Learning first", total=episodes)
             learn_first(
-                watching, learner, episodes, lambda done, total: bars.update(task, completed=done)
+                watching, guard, episodes, lambda done, total: bars.update(task, completed=done)
             )
-        return learner, episodes
+        return guard, episodes
 
 
 def _show(address: str, no_browser: bool) -> None:

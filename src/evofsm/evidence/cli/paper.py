@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from contextlib import suppress
-from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
 
@@ -47,38 +46,25 @@ def paper(
     Ends with 0 if all claims hold, with 1 if any does not.
     """
     require(polars="tables", **PAGE, **of_world(world))
-    from evofsm import app
-    from evofsm.driving import open_world
-    from evofsm.evidence import terminal
-    from evofsm.evidence.paper.claims import check_claims
-    from evofsm.evidence.paper.context import context_tables
+    from evofsm.app import console
     from evofsm.evidence.paper.files import write_data
-    from evofsm.evidence.paper.runs import run_paper
-    from evofsm.evidence.paper.settings import Settings
+    from evofsm.evidence.paper.plan import Plan
     from evofsm.evidence.report.chapter import write_chapters
-    from evofsm.evidence.report.paper import paper_chapter
 
-    chosen = Settings.load(settings)
-    out.mkdir(parents=True, exist_ok=True)
-    with progress() as bars, open_world(world.value) as place:
-        study = run_paper(
-            place, world.value, chosen, rounds, counter(bars, f"Driving and learning ({world})")
-        )
-        claims, context = check_claims(study), context_tables(study)
-        write_data(study, claims, context, out)
-        chapter = paper_chapter(
-            study,
-            out / "figures",
-            command_line(),
-            counter(bars, "Drawing figures"),
-            claims=claims,
-        )
+    plan = Plan(world.value, rounds, settings)
+    with progress() as bars:
+        study = plan.run(counter(bars, f"{plan.doing} ({world})"))
+        out.mkdir(parents=True, exist_ok=True)
+        drawn = counter(bars, "Drawing figures")
+        chapter = plan.chapter(study, out / "figures", command_line(), drawn)
+    claims = study.frame.rows
+    write_data(study, claims, chapter.tables[1:], out)
     page = write_chapters(out / "index.html", [chapter], command=command_line())
     if as_json:
-        print_json([asdict(claim) for claim in claims])
+        print_json(study.frame.as_dicts())
     else:
-        console = app.console()
-        terminal.print_claims(console, claims, context)
-        console.print(f"Page with all figures: {page}", soft_wrap=True)
+        screen = console()
+        plan.say(screen, study, chapter)
+        screen.print(f"Page with all figures: {page}", soft_wrap=True)
     if not all(claim.holds for claim in claims):
         raise typer.Exit(1)

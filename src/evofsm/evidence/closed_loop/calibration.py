@@ -6,6 +6,7 @@ now on, which is tried: held-out runs are cut short at a random moment by full b
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -17,14 +18,17 @@ from evofsm.driving import (
     Draw,
     Family,
     KinematicWorld,
-    Learner,
+    LatentRisk,
     OutcomeCounts,
     Unrevised,
-    drive_alone,
+    drive,
+    guard_for_family,
     held_out,
+    learnt_by,
     training,
+    unrevised,
 )
-from evofsm.guard import make_usable
+from evofsm.guard import Guard, make_usable
 
 #: Looked ahead [s].
 HORIZON = 5.0
@@ -51,25 +55,33 @@ class Reliability(NamedTuple):
     cases: int
     failures: int
 
+    @property
+    def title(self) -> str:
+        """What is predicted, and how well."""
+        what = f"{self.what[:1].upper()}{self.what[1:]}"
+        return f"{what}\nBrier {self.brier:.3f}, of the base rate {self.base_brier:.3f}"
+
 
 def run_calibration(family: Family, train: int, test: int, seed: int = 0) -> dict[str, list[Any]]:
     """Learn from the unrevised controller, then hold both probabilities against held-out runs."""
-    learner = Learner.new(family)
+    of_guard, risk = learnt_by(guard_for_family(family))
+    reviser = Unrevised(family.actions)
+    guard = Guard.of(reviser, interval=family.interval, machine=of_guard, judge=risk)
     counts = OutcomeCounts(family.actions.n_actions, HORIZON, family.interval)
     machine = EvolvingFSM(family.actions.n_actions, rule=SAFETY_RULE)
     for draw in training(family, seed, 0, train):
-        drive = learner.drive(family, draw, Unrevised(family.actions), learn=True)
+        driven = drive(guard, draw)
         machine.start_episode()
-        for decision in drive.decisions:
+        for decision in driven.decisions:
             action = int(family.actions.encode(decision.revision.executed))
             step = machine.learn_one(decision.situation.observation, action)
             counts.learn(step.belief, action)
-        counts.end_episode(failed=drive.episode.collided)
+        counts.end_episode(failed=driven.episode.collided)
     draws = held_out(family, seed, test)
     return {
         "reliabilities": [
             _as_driven(family, draws, machine, counts),
-            _cautious(family, draws, learner, np.random.default_rng([seed, 7])),
+            _cautious(family, draws, of_guard, risk, np.random.default_rng([seed, 7])),
         ]
     }
 
@@ -81,31 +93,35 @@ def _as_driven(
     predicted: list[float] = []
     came: list[bool] = []
     for draw in draws:
-        drive = drive_alone(family, draw, Unrevised(family.actions), None)
-        end = drive.episode.time[-1]
-        for decision in drive.decisions:
+        driven = drive(unrevised(family), draw)
+        end = driven.episode.time[-1]
+        for decision in driven.decisions:
             left = end - decision.situation.time
-            if not drive.episode.collided and left < HORIZON:
+            if not driven.episode.collided and left < HORIZON:
                 break  # what would have come is not known
             belief = model.recognise(decision.situation.observation)
             action = int(family.actions.encode(decision.revision.executed))
             predicted.append(counts.outcome(belief, action).probability)
-            came.append(drive.episode.collided and left <= HORIZON)
+            came.append(driven.episode.collided and left <= HORIZON)
     return reliability(
         f"counted: failure within {HORIZON:g} s, going on as driven", predicted, came
     )
 
 
 def _cautious(
-    family: Family, draws: Sequence[Draw], learner: Learner, rng: np.random.Generator
+    family: Family,
+    draws: Sequence[Draw],
+    machine: EvolvingFSM,
+    learnt: LatentRisk,
+    rng: np.random.Generator,
 ) -> Reliability:
     """Brake in full from a random moment on."""
-    model = learner.machine.model()
+    model = machine.model()
     steps = round(family.interval / draws[0].scenario.dt)
     predicted: list[float] = []
     came: list[bool] = []
     for draw in draws:
-        risk = learner.frozen().risk
+        risk = copy.deepcopy(learnt)
         begin = rng.uniform(1.0, draw.scenario.duration - 1.0)
         with KinematicWorld().open(draw.scenario) as road:
             while not road.over and road.time < begin:

@@ -7,7 +7,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from evofsm.driving import Draw, Family, Learner, Unrevised, drive_alone
+from evofsm.driving import Draw, Family, drive, guard_for_family, teach, unrevised
+from evofsm.guard import Guard
 
 #: Times of the leader's full brake in two runs that are not learnt from [s], as in the paper.
 UNSEEN_BRAKES = (11.0, 15.0)
@@ -28,13 +29,14 @@ class CaseResult(NamedTuple):
 
 def run_cases(family: Family, tolerance: float, seed: int = 0) -> dict[str, list[Any]]:
     """Learn from each case once, while revising; then drive all again with learning frozen."""
-    learner = Learner.new(family)
-    reviser = learner.reviser(family, tolerance)
+    guard = guard_for_family(family, tolerance=tolerance)
     cases = [family.draw(seed, index) for index in range(family.cases)]
-    learner.teach(family, cases, reviser)
+    teach(guard, cases)
+    frozen = guard.copy(states=False)
+    frozen.freeze()
     runs = [(f"case {number}", draw) for number, draw in enumerate(cases, 1)]
     runs += [(f"brake at {time:g} s", _braking_at(cases[0], time)) for time in UNSEEN_BRAKES]
-    return {"cases": [_result(family, learner, tolerance, name, draw) for name, draw in runs]}
+    return {"cases": [_result(family, frozen, name, draw) for name, draw in runs]}
 
 
 def _braking_at(draw: Draw, time: float) -> Draw:
@@ -42,12 +44,8 @@ def _braking_at(draw: Draw, time: float) -> Draw:
     return draw._replace(scenario=replace(draw.scenario, leader=leader))
 
 
-def _result(
-    family: Family, learner: Learner, tolerance: float, name: str, draw: Draw
-) -> CaseResult:
-    frozen = learner.frozen()
-    revised = drive_alone(family, draw, frozen.reviser(family, tolerance), frozen.risk)
-    alone = drive_alone(family, draw, Unrevised(family.actions), None)
+def _result(family: Family, frozen: Guard, name: str, draw: Draw) -> CaseResult:
+    revised, alone = drive(frozen, draw), drive(unrevised(family), draw)
     changed = revised.changed
     late = np.array([decision.situation.time for decision in revised.decisions]) >= _SETTLED
     return CaseResult(

@@ -16,13 +16,15 @@ from evofsm.driving import (
     FIXED_MEASURES,
     Family,
     Group,
-    Learner,
     ResponsibilitySensitiveSafety,
-    Unrevised,
-    drive_alone,
+    drive,
+    guard_for_family,
     held_out,
     is_dead_end,
+    learnt_by,
+    teach,
     training,
+    unrevised,
 )
 from evofsm.evidence.scores import auroc, bootstrap
 from evofsm.guard import Mode, RiskMeasure
@@ -43,11 +45,10 @@ class Separation(NamedTuple):
 
 def run_separation(family: Family, train: int, test: int, seed: int = 0) -> dict[str, list[Any]]:
     """Score every measure; ours has watched the training runs, without acting."""
-    learner = Learner.new(family)
-    watching = learner.reviser(family, 0.01, Mode.SHADOW)
-    learner.teach(family, training(family, seed, 0, train), watching)
+    watching = guard_for_family(family, tolerance=0.01, mode=Mode.SHADOW)
+    teach(watching, training(family, seed, 0, train))
     measures: dict[tuple[str, str], RiskMeasure] = {
-        ("evofsm", Group.LEARNT): learner.risk,
+        ("evofsm", Group.LEARNT): learnt_by(watching)[1],
         ("rss-matched", Group.MATCHED): ResponsibilitySensitiveSafety.matched(
             family.decel, family.leader_decel
         ),
@@ -55,8 +56,8 @@ def run_separation(family: Family, train: int, test: int, seed: int = 0) -> dict
     }
     seen, truth = [], []
     for draw in held_out(family, seed, test):
-        drive = drive_alone(family, draw, Unrevised(family.actions), None)
-        rows = np.array([decision.situation.observation for decision in drive.decisions])
+        decisions = drive(unrevised(family), draw).decisions
+        rows = np.array([decision.situation.observation for decision in decisions])
         seen.append(rows)
         truth.append(is_dead_end(rows, family.decel, family.leader_decel))
     share = float(np.concatenate(truth).mean())

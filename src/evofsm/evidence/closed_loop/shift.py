@@ -11,14 +11,15 @@ from typing import Any, NamedTuple
 from evofsm.driving import (
     EnvelopeReviser,
     Family,
-    Learner,
     ResponsibilitySensitiveSafety,
-    drive_alone,
+    drive,
+    guard_for_family,
     held_out,
+    teach,
     training,
 )
 from evofsm.evidence.closed_loop.plan import ShiftPlan
-from evofsm.guard import Reviser
+from evofsm.guard import Guard
 
 #: Episodes after the shift at which what was learnt so far is tested on held-out draws.
 AFTER = (0, 1, 2, 5, 10, 20, 30)
@@ -53,56 +54,36 @@ def run_shift(family: Family, plan: ShiftPlan, learning_seed: int) -> dict[str, 
     ]
     constants = ResponsibilitySensitiveSafety.matched(family.decel, family.leader_decel)
     unchanged = EnvelopeReviser(constants, family.actions, family.interval)
+    guard = Guard.of(unchanged, interval=family.interval, learn=False)
     streams = [
         Stream(
             "rss-unchanged",
             learning_seed,
-            tuple(
-                drive_alone(
-                    shifted if index >= plan.before else family, draw, unchanged, None
-                ).episode.collided
-                for index, draw in enumerate(stream)
-            ),
+            tuple(driven.episode.collided for driven in teach(guard, stream)),
         )
     ]
     checks = [
-        _check("rss-unchanged", learning_seed, -1, family, plan, unchanged),
-        _check("rss-unchanged", learning_seed, plan.after, shifted, plan, unchanged),
+        _check("rss-unchanged", learning_seed, -1, family, plan, guard),
+        _check("rss-unchanged", learning_seed, plan.after, shifted, plan, guard),
     ]
-    learner = Learner.new(family)
-    reviser = learner.reviser(family, plan.tolerance)
+    guard = guard_for_family(family, tolerance=plan.tolerance)
     collided = []
     for index, draw in enumerate(stream):
         after = index - plan.before
         if after == 0:
-            checks.append(_check_frozen(learner, learning_seed, -1, family, plan))
+            checks.append(_check("evofsm", learning_seed, -1, family, plan, guard))
         if after in AFTER:
-            checks.append(_check_frozen(learner, learning_seed, after, shifted, plan))
-        now = family if after < 0 else shifted
-        drive = learner.drive(now, draw, reviser, learn=True)
-        collided.append(drive.episode.collided)
+            checks.append(_check("evofsm", learning_seed, after, shifted, plan, guard))
+        collided.append(drive(guard, draw).episode.collided)
     streams.append(Stream("evofsm", learning_seed, tuple(collided)))
     return {"streams": streams, "checks": checks}
 
 
-def _check_frozen(
-    learner: Learner, seed: int, after: int, family: Family, plan: ShiftPlan
-) -> Check:
-    frozen = learner.frozen()
-    reviser = frozen.reviser(family, plan.tolerance)
-    return _check("evofsm", seed, after, family, plan, reviser, frozen)
-
-
 def _check(
-    policy: str,
-    seed: int,
-    after: int,
-    family: Family,
-    plan: ShiftPlan,
-    reviser: Reviser,
-    learner: Learner | None = None,
+    policy: str, seed: int, after: int, family: Family, plan: ShiftPlan, guard: Guard
 ) -> Check:
-    draws = held_out(family, plan.seed, plan.held_out)
-    risk = learner.risk if learner else None
-    collisions = sum(drive_alone(family, draw, reviser, risk).episode.collided for draw in draws)
-    return Check(policy, seed, after, collisions, len(draws))
+    """Drive held-out draws with what was learnt so far."""
+    frozen = guard.copy(states=False)
+    frozen.freeze()
+    drives = teach(frozen, held_out(family, plan.seed, plan.held_out))
+    return Check(policy, seed, after, sum(one.episode.collided for one in drives), len(drives))

@@ -23,18 +23,21 @@ from evofsm.driving import (
     EnvelopeReviser,
     Family,
     Group,
-    LatentRisk,
-    Learner,
     Outcome,
     Reference,
+    RiskByState,
     Row,
-    drive_alone,
+    drive,
     fixed_policies,
+    guard_for_family,
     held_out,
+    learnt_by,
     references,
     score,
     summarise,
+    teach,
     training,
+    try_out,
 )
 from evofsm.evidence.closed_loop.calibration import Reliability, run_calibration
 from evofsm.evidence.closed_loop.cases import CaseResult, run_cases
@@ -44,7 +47,7 @@ from evofsm.evidence.closed_loop.shift import Check, Stream, run_shift
 from evofsm.evidence.closed_loop.two_worlds import InWorld, run_two_worlds
 from evofsm.evidence.study import Frame
 from evofsm.fleet import in_order
-from evofsm.guard import Reviser
+from evofsm.guard import ActionReviser, Guard, Reviser
 
 #: Collision rate at most, on so many held-out draws, for `episodes_until_safe`.
 SAFE_RATE, SAFE_EPISODES = 0.01, 200
@@ -180,11 +183,10 @@ def _drive_all(
     draws: Sequence[Draw],
     base: Sequence[Reference],
     revisers: Iterable[Reviser],
-    risk: LatentRisk | None = None,
 ) -> list[Outcome]:
     """Drive draws without learning, each with its reviser."""
     drives = (
-        drive_alone(family, draw, reviser, risk)
+        drive(Guard.of(reviser, interval=family.interval, learn=False), draw)
         for draw, reviser in zip(draws, revisers, strict=False)
     )
     return score(family, base, drives)
@@ -231,8 +233,7 @@ def _test_tuned(family: Family, plan: Plan, name: str) -> dict[str, list[Any]]:
 
 def _test_learner(family: Family, plan: Plan, seed: int) -> dict[str, list[Any]]:
     """Learn with one seed; test on the way and at the end."""
-    learner = Learner.new(family)
-    reviser = learner.reviser(family, plan.tolerance)
+    guard = guard_for_family(family, tolerance=plan.tolerance)
     tests = held_out(family, plan.seed, plan.test)
     base = references(family, tests)
     checks = slice(SAFE_EPISODES)
@@ -243,10 +244,9 @@ def _test_learner(family: Family, plan: Plan, seed: int) -> dict[str, list[Any]]
     draws = training(family, plan.seed, seed, plan.train)
     for episodes in range(plan.train + 1):
         if episodes > 0:
-            drive = learner.drive(family, next(draws), reviser, learn=True)
-            collisions += drive.episode.collided
+            collisions += drive(guard, next(draws)).episode.collided
         if episodes in checkpoints:
-            outcomes = _frozen(family, learner, plan.tolerance, tests[checks], base[checks])
+            outcomes = try_out(guard, family, tests[checks], base[checks])
             curve.append(
                 Point(
                     seed,
@@ -254,15 +254,15 @@ def _test_learner(family: Family, plan: Plan, seed: int) -> dict[str, list[Any]]
                     sum(o.collided for o in outcomes),
                     len(outcomes),
                     _mobility(outcomes),
-                    learner.machine.n_states,
+                    learnt_by(guard)[0].n_states,
                     collisions,
                 )
             )
         if episodes in {min(100, plan.train), plan.train}:
-            outcomes = _frozen(family, learner, plan.tolerance, tests, base)
+            outcomes = try_out(guard, family, tests, base)
             rows.append(_final_row(family, outcomes, seed, episodes, collisions, curve))
     few = slice(plan.rule_test)
-    trade_offs = _trade_offs(family, learner, tests[few], base[few]) if seed == 0 else []
+    trade_offs = _trade_offs(family, guard, tests[few], base[few]) if seed == 0 else []
     return {"rows": rows, "curve": curve, "trade_offs": trade_offs}
 
 
@@ -289,11 +289,12 @@ def _final_row(
 
 
 def _trade_offs(
-    family: Family, learner: Learner, draws: Sequence[Draw], base: Sequence[Reference]
+    family: Family, guard: Guard, draws: Sequence[Draw], base: Sequence[Reference]
 ) -> list[TradeOff]:
     found = []
     for tolerance in TOLERANCES:
-        outcomes = _frozen(family, learner, tolerance, draws, base)
+        other = guard_for_family(family, tolerance=tolerance, judge=guard.judge)
+        outcomes = try_out(other, family, draws, base)
         rate = sum(o.collided for o in outcomes) / len(outcomes)
         found.append(TradeOff("evofsm", f"{tolerance:g}", rate, _mobility(outcomes)))
     return found
@@ -301,37 +302,26 @@ def _trade_offs(
 
 def _test_rule(family: Family, plan: Plan, rule: str, seed: int) -> dict[str, list[Any]]:
     """Steer by the states alone: what a rule's states are worth."""
-    learner = Learner.new(family, RULES[rule])
-    by_state = learner.reviser_by_state(family, plan.tolerance)
+    machine, risk = learnt_by(guard_for_family(family, rule=RULES[rule]))
+    by_state = RiskByState(risk, machine)
+    reviser = ActionReviser(by_state, family.actions, tolerance=plan.tolerance)
+    guard = Guard.of(reviser, interval=family.interval, machine=machine, judge=risk)
     episodes = min(_RULE_TRAIN, plan.train)
-    taught = learner.teach(family, training(family, plan.seed, seed, episodes), by_state)
+    taught = teach(guard, training(family, plan.seed, seed, episodes))
     draws = held_out(family, plan.seed, min(plan.rule_test, plan.test))
-    drives = (learner.drive(family, draw, by_state, learn=False) for draw in draws)
-    outcomes = score(family, references(family, draws), drives)
+    guard.freeze()
+    outcomes = score(family, references(family, draws), teach(guard, draws))
     row = summarise(
         family.name,
-        f"states: {rule} ({learner.machine.n_states})",
+        f"states: {rule} ({machine.n_states})",
         Group.LEARNT,
         outcomes,
         family.interval,
         learning_seed=seed,
         train_episodes=episodes,
-        train_collisions=sum(drive.episode.collided for drive in taught),
+        train_collisions=sum(driven.episode.collided for driven in taught),
     )
     return {"by_rule": [row]}
-
-
-def _frozen(
-    family: Family,
-    learner: Learner,
-    tolerance: float,
-    draws: Sequence[Draw],
-    base: Sequence[Reference],
-) -> list[Outcome]:
-    """Drive held-out draws with what was learnt so far."""
-    frozen = learner.frozen()
-    reviser = frozen.reviser(family, tolerance)
-    return _drive_all(family, draws, base, repeat(reviser), frozen.risk)
 
 
 def _mobility(outcomes: Iterable[Outcome]) -> float:

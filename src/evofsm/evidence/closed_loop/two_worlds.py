@@ -6,7 +6,16 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from evofsm.driving import WORLDS, Family, Learner, held_out, open_world, training
+from evofsm.driving import (
+    WORLDS,
+    Family,
+    drive,
+    guard_for_family,
+    held_out,
+    open_world,
+    teach,
+    training,
+)
 
 
 class InWorld(NamedTuple):
@@ -23,24 +32,21 @@ def run_two_worlds(
     family: Family, train: int, test: int, tolerance: float, seed: int = 0
 ) -> dict[str, list[Any]]:
     """Learn in closed form, then drive the same draws in every world with learning frozen."""
-    learner = Learner.new(family)
-    learner.teach(family, training(family, seed, 0, train), learner.reviser(family, tolerance))
+    guard = guard_for_family(family, tolerance=tolerance)
+    teach(guard, training(family, seed, 0, train))
     found = []
     for name in WORLDS:
-        frozen = learner.frozen()
-        reviser = frozen.reviser(family, tolerance)
+        frozen = guard.copy(states=False)
+        frozen.freeze()
         with open_world(name) as world:
-            drives = [
-                frozen.drive(family, draw, reviser, learn=False, world=world)
-                for draw in held_out(family, seed, test)
-            ]
+            drives = [drive(frozen, draw, world) for draw in held_out(family, seed, test)]
         found.append(
             InWorld(
                 name,
                 test,
-                sum(drive.episode.collided for drive in drives),
-                float(np.mean([drive.episode.observations[:, 1].mean() for drive in drives])),
-                float(np.concatenate([drive.changed for drive in drives]).mean()),
+                sum(one.episode.collided for one in drives),
+                float(np.mean([one.episode.observations[:, 1].mean() for one in drives])),
+                float(np.concatenate([one.changed for one in drives]).mean()),
             )
         )
     return {"worlds": found}

@@ -21,18 +21,18 @@ from evofsm.driving import (
     Draw,
     Drive,
     Family,
-    Framework,
     Group,
-    KinematicWorld,
     LatentRisk,
-    Learner,
     OutcomeCounts,
     ResponsibilitySensitiveSafety,
     Unrevised,
+    drive,
+    guard_for_family,
+    learnt_by,
 )
 from evofsm.evidence.detection.watch import HORIZON, Exposure, Target, Watched
 from evofsm.evidence.scores import auroc
-from evofsm.guard import RiskMeasure
+from evofsm.guard import Guard, RiskMeasure
 
 # Of a standard normal variable: the middles of seven parts that are as likely each.
 _QUANTILES = (-1.465, -0.792, -0.366, 0.0, 0.366, 0.792, 1.465)
@@ -145,15 +145,11 @@ class Watcher:
     """
 
     def __init__(self, family: Family, *, states: bool = True) -> None:
-        self.learner = Learner.new(family)
-        self.default = Chain(self.learner.machine, family)
+        # What is learnt of leaders and brakes, and the machine beside it.
+        machine, self.risk = learnt_by(guard_for_family(family))
+        self.default = Chain(machine, family)
         self.paper = Chain(EvolvingFSM(family.actions.n_actions), family)
         self.states = states
-
-    @property
-    def risk(self) -> LatentRisk:
-        """What was learnt of leaders and brakes."""
-        return self.learner.risk
 
     def watch(self, draws: Iterable[tuple[Family, Draw]]) -> Self:
         """Learn from unrevised episodes, each with the family it is of."""
@@ -205,15 +201,8 @@ class Watcher:
 def _drive(
     family: Family, draw: Draw, machine: EvolvingFSM | None, risk: LatentRisk | None
 ) -> Drive:
-    framework = Framework(
-        draw.controller,
-        family.actions,
-        Unrevised(family.actions),
-        machine=machine,
-        risk=risk,
-        interval=family.interval,
-    )
-    return framework.drive(KinematicWorld(), draw.scenario)
+    reviser = Unrevised(family.actions)
+    return drive(Guard.of(reviser, interval=family.interval, machine=machine, judge=risk), draw)
 
 
 def _all_seen(exposure: Exposure) -> NDArray[np.float64]:

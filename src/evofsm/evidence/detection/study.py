@@ -59,18 +59,10 @@ class Detection:
         """Every row, those of the grid last."""
         return Frame([*self.rows, *self.grid])
 
-    def find(self, family: str, measure: str, target: Target) -> Row:
-        """The row of one measure.
-
-        Raises
-        ------
-        KeyError
-            If there is none.
-        """
-        for row in self.rows:
-            if (row.family, row.measure, row.target) == (family, measure, target):
-                return row
-        raise KeyError(f"{measure} was not judged by {target} in {family}")
+    def row(self, family: str, measure: str, target: Target) -> Row | None:
+        """The row of one measure, if there is one."""
+        wanted = family, measure, target
+        return next((r for r in self.rows if (r.family, r.measure, r.target) == wanted), None)
 
 
 def run_detection(plan: Plan, progress: Progress = silent, workers: int | None = None) -> Detection:

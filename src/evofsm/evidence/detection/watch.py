@@ -33,6 +33,10 @@ class Target(StrEnum):
     COLLISION = "collision"  #: within `HORIZON`, going on as driven
 
 
+#: Targets in words.
+WHAT = {Target.DEAD_END: "dead end", Target.COLLISION: f"collision within {HORIZON:g} s"}
+
+
 class Watched(NamedTuple):
     """Decisions of one episode; n of them."""
 

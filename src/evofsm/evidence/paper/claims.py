@@ -65,7 +65,7 @@ def _claims(study: PaperStudy) -> Iterator[Claim]:
         )
     yield Claim(
         "states_after_each_run",
-        "States are founded in the first four runs, then none",
+        "States are created in the first four runs, then none",
         "0 to 7 in 4 runs, 7 after 80",
         f"{', '.join(map(str, counts[:4]))} after runs 1 to 4, {counts[-1]} after {len(counts)}",
         len(set(counts[3:])) == 1 and counts == sorted(counts),
@@ -81,7 +81,7 @@ def _claims(study: PaperStudy) -> Iterator[Claim]:
     yield Claim(
         "dead_end_state",
         f"One and the same state at every collision of the {len(study.runs)} runs, the dead end "
-        "(numbers: order of founding)",
+        "(numbers: order of creation)",
         "#3",
         ", ".join(map(_name, at_collisions)) or "no collision",
         len(at_collisions) == 1,

@@ -43,12 +43,6 @@ class Plan(Study["PaperStudy"]):
 
     def tell(self, found: PaperStudy) -> Chapter:
         """Every claim beside what was measured."""
-        raise NotImplementedError
+        from evofsm.evidence.paper.chapter import paper_chapter
 
-    def chapter(
-        self, found: PaperStudy, folder: Path, command: str, progress: Progress = silent
-    ) -> Chapter:
-        """Every claim beside what was measured."""
-        from evofsm.evidence.report.paper import paper_chapter
-
-        return paper_chapter(found, folder, command, progress)
+        return paper_chapter(found)

@@ -74,6 +74,11 @@ class PaperStudy:
         return Frame(check_claims(self))
 
     @property
+    def dead_ends(self) -> tuple[int, ...]:
+        """The dead end, if there is one, as the states to mark."""
+        return (self.dead_end,) if self.dead_end >= 0 else ()
+
+    @property
     def last_round(self) -> tuple[Run, ...]:
         """The last run of each case, in the order of the cases."""
         return tuple(sorted(self.runs[-len(CASES) :], key=lambda run: run.case))

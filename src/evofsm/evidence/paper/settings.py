@@ -11,7 +11,6 @@ from typing import Any
 
 from evofsm.core import IntervalActions
 from evofsm.driving import IDM, ChangingIDM, Leader, Scenario
-from evofsm.guard import Controller
 
 
 @dataclass(frozen=True)
@@ -20,7 +19,7 @@ class Settings:
 
     scenario: Scenario
     safe_until: float
-    drivers: Mapping[int, Controller]  #: by case
+    drivers: Mapping[int, IDM | ChangingIDM]  #: by case
     switch_at: Mapping[int, float]  #: when the driver changes, by case
     brake_at: tuple[float, ...]
     decel: float  #: hardest braking of the follower [m/s²], positive

@@ -16,7 +16,7 @@ from evofsm.core import IntervalActions
 from evofsm.driving import REAL_DRIVES, LatentRisk, LeaderBrakes
 from evofsm.evidence.real.cases import runs_in
 from evofsm.fleet import in_order
-from evofsm.guard import ActionReviser, Mode, Oversight, Proposal, speaks
+from evofsm.guard import ActionReviser, Guard, Mode, speaks
 from evofsm.io import Episode, Layout, find_checksums, read_episodes
 
 #: What is taken to be known in shadow mode, in the order in which it is reported.
@@ -165,13 +165,13 @@ def _shadow(path: Path, limits: Limits | None, leaders: LeaderBrakes | None) -> 
         if limits is not None:
             risk.brakes.trust(limits.decel)
         reviser = ActionReviser(risk, actions, mode=Mode.SHADOW)
+        guard = Guard.of(reviser, interval=dt)
         for episode in episodes:
-            oversight = Oversight(actions, reviser, risk=risk, interval=dt)
+            guard.begin()
             rows = (episode.times.tolist(), episode.observations, episode.accelerations.tolist())
             for time, row, did in zip(*rows, strict=True):
-                revision = oversight.revise(oversight.recognise(row, time), Proposal(did))
-                alarms += speaks(reviser, revision)
-            oversight.end(None, failed=False)
+                alarms += speaks(reviser, guard.decide(row, did, time))
+            guard.end()
             decisions += len(episode.times)
     return decisions, alarms
 
