@@ -1,13 +1,7 @@
 from . import cli as cli
 from .cli.common import PAGE as PAGE
-from .cli.common import SwitchesOption as SwitchesOption
-from .cli.common import ToleranceOption as ToleranceOption
-from .cli.common import WorldName as WorldName
-from .cli.common import WorldOption as WorldOption
 from .cli.common import command_line as command_line
 from .cli.common import counter as counter
-from .cli.common import of_world as of_world
-from .cli.common import plain_errors as plain_errors
 from .cli.common import print_json as print_json
 from .cli.common import progress as progress
 from .cli.common import require as require
@@ -19,6 +13,7 @@ from .cli.declared import is_required as is_required
 from .cli.declared import option as option
 from .cli.groups import InWorld as InWorld
 from .cli.groups import WithJson as WithJson
+from .cli.groups import WorldName as WorldName
 from .text.columns import console as console
 from .text.columns import print_columns as print_columns
 from .text.columns import print_table as print_table

@@ -23,13 +23,14 @@ def main(application: Callable[[], typer.Typer]) -> None:
         needed = install_for(command)
         print(f"evofsm: the command line needs typer and rich: {needed}", file=sys.stderr)
         sys.exit(2)
-    from evofsm.core import announce_compiling
+    if not {"--help", "--version"} & set(sys.argv):  # which should not wait for Numba
+        from evofsm.core import announce_compiling
 
-    announce_compiling()
+        announce_compiling()
     application()()
 
 
-def application(*others: type[Command] | Callable[..., None] | typer.Typer) -> typer.Typer:
+def application(*others: type[Command] | typer.Typer) -> typer.Typer:
     """The commands of this room and ``others``, in the order in which the help names them."""
     from evofsm.app.cli.audit import Audit
     from evofsm.app.cli.campaign import Campaign
@@ -46,10 +47,8 @@ def application(*others: type[Command] | Callable[..., None] | typer.Typer) -> t
     for command in (*ours, *others):
         if isinstance(command, typer.Typer):
             app.add_typer(command)
-        elif isinstance(command, type):
-            app.command()(callback(command))
         else:
-            app.command()(command)
+            app.command()(callback(command))
     return app
 
 

@@ -25,6 +25,7 @@ Hello, Ada. Hello, Ada.
 from __future__ import annotations
 
 import re
+import sys
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import MISSING, Field, dataclass, field, fields, is_dataclass
@@ -32,7 +33,7 @@ from inspect import Parameter, Signature
 from types import MappingProxyType, NoneType
 from typing import Annotated, Any, NamedTuple, TypeVar, get_args, get_origin, get_type_hints
 
-from evofsm.app.cli.common import plain_errors, require
+from evofsm.app.cli.common import message, require
 
 T = TypeVar("T")
 _KEY = "evofsm"
@@ -127,14 +128,25 @@ def settings(options: Any) -> dict[str, Any]:
 def callback(command: type[Command]) -> Callable[..., None]:
     """The function of which Typer makes the command; errors that users can mend are one line."""
 
-    @plain_errors
     def run(**given: Any) -> None:
         import typer
 
-        made = _made(command, given)
-        require(**made.packages())
-        if status := made.run():
-            raise typer.Exit(status)
+        from evofsm.core import visible
+
+        try:
+            made = _made(command, given)
+            require(**made.packages())
+            status = made.run()
+        except KeyboardInterrupt:
+            print("\nevofsm: stopped before the end", file=sys.stderr)
+            status = 130
+        except BrokenPipeError:  # whoever read the output had enough
+            raise
+        except (ValueError, TypeError, OSError, ModuleNotFoundError) as error:
+            print(f"evofsm: {visible(message(error))}", file=sys.stderr)
+            status = 2
+        if status:
+            raise typer.Exit(status) from None
 
     run.__name__ = re.sub(r"(?<!^)(?=[A-Z])", "-", command.__name__).lower()
     run.__doc__ = command.__doc__

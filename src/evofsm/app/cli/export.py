@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING
 
 from evofsm.app.cli.common import load_model, require, say
 from evofsm.app.cli.declared import REQUIRED, Command, argument, option
-from evofsm.core import visible
 
 if TYPE_CHECKING:
     from evofsm.core import FSMModel
@@ -70,6 +69,8 @@ class Export(Command):
         if self.policy not in ("observed", "marginal"):
             raise ValueError(f"--policy is {self.policy!r}; it must be observed or marginal")
         _refuse_learnt(self.out)
+        from evofsm.core import visible
+
         text = visible(self._written())
         if self.out is None:
             sys.stdout.write(text)

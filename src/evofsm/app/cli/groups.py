@@ -3,13 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import StrEnum
 from typing import TYPE_CHECKING
 
-from evofsm.app.cli.common import WorldName, of_world, split_names
+from evofsm.app.cli.common import split_names
 from evofsm.app.cli.declared import Command, argument, option
 
 if TYPE_CHECKING:
     from evofsm.driving import Family
+
+
+class WorldName(StrEnum):
+    """Where to drive."""
+
+    SUMO = "sumo"
+    KINEMATIC = "kinematic"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,7 +39,7 @@ class InWorld(Command):
 
     def packages(self) -> dict[str, str]:
         """Libsumo for SUMO."""
-        return super().packages() | of_world(self.world)
+        return super().packages() | ({"libsumo": "sumo"} if self.world is WorldName.SUMO else {})
 
 
 @dataclass(frozen=True, kw_only=True)
