@@ -194,18 +194,15 @@ def write_run(
     --------
     >>> import tempfile
     >>> from pathlib import Path
-    >>> from evofsm import IntervalActions
-    >>> from evofsm.driving import IDM, Framework, KinematicWorld, Leader, Scenario
-    >>> actions = IntervalActions(low=-2.5, high=2.5, width=0.3, outside="clip")
-    >>> hasty = IDM(2.25, 28.0, 0.8, 0.3, 2.0, lowest=-2.5, highest=2.5)
-    >>> leader = Leader(IDM(1.2, 25.0, 1.0, 1.0, 2.5), brake_decel=4.0, brake_time=12.0)
-    >>> drive = Framework(hasty, actions).drive(KinematicWorld(), Scenario(leader, 10.0))
+    >>> from evofsm.driving import drive, load_family, unrevised
+    >>> family = load_family("emergency")
+    >>> driven = drive(unrevised(family), family.draw(seed=0, index=0))
     >>> with tempfile.TemporaryDirectory() as folder:
-    ...     write_run(Path(folder) / "run.mcap", [drive], about={"controller": "hasty"})
+    ...     write_run(Path(folder) / "run.mcap", [driven], about={"controller": "hasty"})
     ...     run = read_run(Path(folder) / "run.mcap")
     >>> run.about["controller"], run.episodes[0].collided
     ('hasty', True)
-    >>> bool((run.episodes[0].columns["executed"] == drive.executed).all())
+    >>> bool((run.episodes[0].columns["executed"] == driven.executed).all())
     True
     """
     with recording(path, about) as log:
