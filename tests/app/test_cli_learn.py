@@ -284,10 +284,12 @@ def test_without_the_command_line_all_that_a_command_needs_is_named_at_once():
 
 def test_all_that_lacks_is_named_at_once(monkeypatch):
     from evofsm.app.cli import common
+    from evofsm.app.cli.drive import Drive
+    from evofsm.app.cli.groups import WorldName
 
     monkeypatch.setattr(common, "find_spec", lambda name: None)
     with pytest.raises(ModuleNotFoundError, match="needs scipy and libsumo") as caught:
-        common.require(scipy="study", **common.of_world(common.WorldName.SUMO))
+        common.require(**Drive(family="paper", world=WorldName.SUMO).packages())
     assert "pip install '.[cli,study,sumo]'" in str(caught.value)
 
 

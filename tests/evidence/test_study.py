@@ -6,10 +6,11 @@ import pytest
 from typer.testing import CliRunner
 
 from evofsm.__main__ import application
+from evofsm.app.cli.declared import option
 from evofsm.evidence.report.chapter import Chapter, Section
 from evofsm.evidence.report.drawing import Sketch
 from evofsm.evidence.studies import STUDIES
-from evofsm.evidence.study import Frame, Study, option
+from evofsm.evidence.study import Frame, Study
 
 
 @dataclass(frozen=True)

@@ -2,17 +2,18 @@
 
 Every study is a frozen dataclass that derives from `Study`, and stands once in
 `evofsm.evidence.studies.STUDIES`; ``evofsm bench``, ``evofsm evidence`` and the docs read it there.
-Its fields say how much is done; those made by `option` are the options of its command.
+Its fields say how much is done; those made by `evofsm.app.option` are the options of its command.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, Protocol, Self, TypeVar
 
+from evofsm.app import is_required
 from evofsm.extras import needs
 
 if TYPE_CHECKING:
@@ -26,28 +27,6 @@ Progress = Callable[[int, int], None]
 
 def silent(done: int, total: int) -> None:
     """A `Progress` that tells nobody."""
-
-
-def option(
-    default: Any, about: str, *, name: str = "", required: bool = False, **limits: float
-) -> Any:
-    """A field of a study that is an option of its command.
-
-    Parameters
-    ----------
-    default
-        Of the field and of the option.
-    about : str
-        What the help says.
-    name : str
-        Of the option, such as ``"--with"``, where it is not that of the field.
-    required : bool
-        Whether the command refuses to run without it.
-    **limits
-        ``min`` and ``max``.
-    """
-    told = {"about": about, "name": name, "required": required, "limits": limits}
-    return field(default=default, metadata=told)
 
 
 @dataclass(frozen=True)
@@ -147,13 +126,13 @@ class Study(ABC, Generic[F]):
     def in_short(cls, **given: Any) -> Self | None:
         """Its short form with those of the given fields that it has; None if it lacks one."""
         mine = {one.name: given[one.name] for one in fields(cls) if one.name in given}
-        if any(one.metadata.get("required") and mine.get(one.name) is None for one in fields(cls)):
+        if any(is_required(one) and mine.get(one.name) is None for one in fields(cls)):
             return None
         return cls(**mine).shortened()
 
     @property
     def command(self) -> str:
         """The command of the long form, with what it cannot do without."""
-        told = [one for one in fields(self) if one.metadata.get("required")]
+        told = [one for one in fields(self) if is_required(one)]
         asked = [f"--{one.name} {getattr(self, one.name)}" for one in told]
         return " ".join([f"evofsm {self.group}{self.id}", *asked])

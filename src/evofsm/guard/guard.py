@@ -27,7 +27,7 @@ from evofsm.core import (
     real_array,
     refuse_unusable,
 )
-from evofsm.files import Place, storage
+from evofsm.files import Place, ranges, storage
 from evofsm.guard.auditing.participants import outline, rebuild
 from evofsm.guard.protocols import (
     INCOMPLETE,
@@ -61,6 +61,17 @@ class Explain(Enum):
     NONE = "none"
     SPOKEN = "spoken"  #: those that change a proposal or warn
     ALL = "all"
+
+
+# The files of the machine and of the judge, as bytes.
+_BYTE = ranges.Range(0.0, 255.0, whole=True)
+_KIND = ranges.register(
+    ranges.Kind(
+        "guard",
+        {"machine": ranges.Member(("machine",), _BYTE), "judge": ranges.Member(("judge",), _BYTE)},
+        {},
+    )
+).name
 
 
 class Guard:
@@ -515,7 +526,7 @@ class Guard:
             **{name: getattr(self, name) for name in ("interval", "learn", "seed")},
         }
         files = {"machine": _bytes(self.machine), "judge": _bytes(self.judge)}
-        storage.write(path, "guard", kept, files, provenance)
+        storage.write(path, _KIND, kept, files, provenance)
 
     @classmethod
     def load(
@@ -545,7 +556,7 @@ class Guard:
         ValueError
             If the file holds something else or is damaged, or judge or ``failed`` are needed.
         """
-        kept, files = storage.read(path, "guard")
+        kept, files = storage.read(path, _KIND)
         if kept["failed"] and failed is None:
             raise ValueError("this guard knew failures by a function; give it again: failed=")
         with storage.explained(path):

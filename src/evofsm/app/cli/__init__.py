@@ -8,7 +8,7 @@ from contextlib import suppress
 from importlib.util import find_spec
 from typing import Annotated
 
-from evofsm.core import announce_compiling
+from evofsm.app.cli.declared import Command, callback
 from evofsm.extras import install_for
 
 # Needed once the annotations below are read; `main` says what to install where it is missing.
@@ -23,36 +23,48 @@ def main(application: Callable[[], typer.Typer]) -> None:
         needed = install_for(command)
         print(f"evofsm: the command line needs typer and rich: {needed}", file=sys.stderr)
         sys.exit(2)
-    announce_compiling()
+    if not {"--help", "--version"} & set(sys.argv):  # which should not wait for Numba
+        from evofsm.core import announce_compiling
+
+        announce_compiling()
     application()()
 
 
-def application(*others: Callable[..., None] | typer.Typer) -> typer.Typer:
+def application(*others: type[Command] | typer.Typer) -> typer.Typer:
     """The commands of this room and ``others``, in the order in which the help names them."""
-    from evofsm.app.cli.audit import audit
-    from evofsm.app.cli.campaign import campaign
-    from evofsm.app.cli.check import check
-    from evofsm.app.cli.drive import drive
-    from evofsm.app.cli.explain import explain
-    from evofsm.app.cli.export import export
-    from evofsm.app.cli.learn import inspect, learn
-    from evofsm.app.cli.watch import watch
+    from evofsm.app.cli.audit import Audit
+    from evofsm.app.cli.campaign import Campaign
+    from evofsm.app.cli.check import Check
+    from evofsm.app.cli.drive import Drive
+    from evofsm.app.cli.explain import Explain
+    from evofsm.app.cli.export import Export
+    from evofsm.app.cli.learn import Inspect, Learn
+    from evofsm.app.cli.watch import Watch
 
+    app = group("evofsm", options.__doc__ or "")
+    app.callback()(options)
+    ours = (Learn, Inspect, Explain, Drive, Watch, Campaign, Export, Audit, Check)
+    for command in (*ours, *others):
+        if isinstance(command, typer.Typer):
+            app.add_typer(command)
+        else:
+            app.command()(callback(command))
+    return app
+
+
+def group(name: str, about: str, *commands: type[Command]) -> typer.Typer:
+    """Some commands under a name."""
     app = typer.Typer(
-        name="evofsm",
-        help="Online recognition of latent risk with an evolving finite state machine.",
+        name=name,
+        help=about,
         add_completion=False,
         no_args_is_help=True,
         rich_markup_mode=None,
         pretty_exceptions_enable=False,
     )
-    app.callback()(options)
-    ours = (learn, inspect, explain, drive, watch, campaign, export, audit, check)
-    for command in (*ours, *others):
-        if isinstance(command, typer.Typer):
-            app.add_typer(command)
-        else:
-            app.command()(command)
+    app.callback()(lambda: None)
+    for command in commands:
+        app.command()(callback(command))
     return app
 
 

@@ -3,65 +3,62 @@
 from __future__ import annotations
 
 import textwrap
-from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
-from evofsm.app.cli.common import plain_errors, print_json, say
-
-with suppress(ModuleNotFoundError):
-    import typer
+from evofsm.app.cli.common import print_json, say
+from evofsm.app.cli.declared import argument, option
+from evofsm.app.cli.groups import WithJson
 
 if TYPE_CHECKING:
     from evofsm.files import Chain
-    from evofsm.guard import Audit, Contents, Field, Replay
+    from evofsm.guard import Audit as Audited
+    from evofsm.guard import Contents, Field, Replay
 
 _LABEL = 10
 # So many fields that differ are shown, and so much of each.
 _FIELDS, _LETTERS = 5, 40
 
 
-@plain_errors
-def audit(
-    file: Annotated[Path, typer.Argument(help="An audit log.", show_default=False)],
-    head: Annotated[
-        str | None,
-        typer.Option(
-            help="NUMBER:HASH of the last record at some time, kept elsewhere: shows an end that "
-            "was cut off, and a log that was written anew.",
-            show_default=False,
-        ),
-    ] = None,
-    replay: Annotated[
-        bool, typer.Option(help="Whether to drive again, and compare every decision.")
-    ] = True,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document.")] = False,
-) -> None:
+@dataclass(frozen=True, kw_only=True)
+class Audit(WithJson):
     """Verify an audit log, and replay it.
 
     Finds the first record that was altered, removed, moved, repeated or inserted, or that no log of
-    its version holds; then tells the
-    machine and the risk that the log began with what was observed and proposed, and compares each
-    decision to the last bit. Ends with 0 if all is well, 1 if the log was tampered with or a
-    decision comes out otherwise, and 2 if it cannot be read.
+    its version holds; then tells the machine and the risk that the log began with what was observed
+    and proposed, and compares each decision to the last bit. Ends with 0 if all is well, 1 if the
+    log was tampered with or a decision comes out otherwise, and 2 if it cannot be read.
     """
-    from evofsm.files import Head
-    from evofsm.guard import audit as audited
 
-    found = audited(file, None if head is None else Head.parse(head), replay=replay)
-    if as_json:
-        print_json({"file": str(file), **_document(found)})
-    else:
-        say(file)
-        _print(found, head_given=head is not None)
-    if not found.is_good:
-        raise typer.Exit(1)
+    file: Path = argument("An audit log.")
+    head: str | None = option(
+        None,
+        "NUMBER:HASH of the last record at some time, kept elsewhere: shows an end that was cut "
+        "off, and a log that was written anew.",
+    )
+    replay: bool = option(True, "Whether to drive again, and compare every decision.")
+
+    def run(self) -> int:
+        """Print what was found."""
+        from evofsm.files import Head
+        from evofsm.guard import audit
+
+        found = audit(
+            self.file, None if self.head is None else Head.parse(self.head), replay=self.replay
+        )
+        if self.as_json:
+            print_json({"file": str(self.file), **_document(found)})
+        else:
+            say(self.file)
+            _print(found, head_given=self.head is not None)
+        return 0 if found.is_good else 1
 
 
 # -- For people -----------------------------------------------------------------------------------
 
 
-def _print(found: Audit, *, head_given: bool) -> None:
+def _print(found: Audited, *, head_given: bool) -> None:
     chain, contents = found.chain, found.contents
     _say("chain", _of_chain(chain))
     if chain.half_written:
@@ -160,7 +157,7 @@ def _fill(text: str, first: str = "", others: str = "") -> None:
 # -- For programs ---------------------------------------------------------------------------------
 
 
-def _document(found: Audit) -> dict[str, Any]:
+def _document(found: Audited) -> dict[str, Any]:
     chain, replay = found.chain, found.replay
     finding = chain.finding and {**chain.finding._asdict(), "fault": chain.finding.fault.value}
     return {

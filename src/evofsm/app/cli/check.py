@@ -4,84 +4,69 @@ from __future__ import annotations
 
 import importlib
 import sys
-from contextlib import suppress
-from typing import TYPE_CHECKING, Annotated, Any
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
-from evofsm.app.cli.common import plain_errors, print_json
-
-with suppress(ModuleNotFoundError):
-    import typer
+from evofsm.app.cli.common import print_json
+from evofsm.app.cli.declared import argument, option
+from evofsm.app.cli.groups import WithJson
 
 if TYPE_CHECKING:
     from evofsm.checks import Kind, Result
 
 
-@plain_errors
-def check(
-    name: Annotated[
-        str,
-        typer.Argument(
-            help="module:Class, module:instance, or module:function that makes one.",
-            show_default=False,
-        ),
-    ],
-    kind: Annotated[
-        str | None,
-        typer.Option(
-            help="machine, fleet, model, rule, reviser, controller or measure; without it, "
-            "what its methods tell.",
-            show_default=False,
-        ),
-    ] = None,
-    make: Annotated[
-        str | None,
-        typer.Option(
-            help="How to make it, in Python with the module's names: 'MyRule(radius=2.0)'.",
-            show_default=False,
-        ),
-    ] = None,
-    as_json: Annotated[
-        bool, typer.Option("--json", help="Print the results as one JSON document.")
-    ] = False,
-) -> None:
+@dataclass(frozen=True, kw_only=True)
+class Check(WithJson):
     """Hold a class of your own against the contract of its kind.
 
     It imports the module, from the present folder too, and makes the class: run it on code that
     you trust. Ends with 1 where a check failed.
     """
-    from evofsm.checks import Outcome, kind_of
-    from evofsm.checks import check as run_checks
 
-    thing = _thing(name, make)
-    chosen = kind_of(thing) if kind is None else _kind(kind)
-    results = run_checks(thing, chosen)
-    if as_json:
-        print_json([{**result._asdict(), "outcome": result.outcome.value} for result in results])
-    else:
-        _print(name, chosen, results)
-    if any(result.outcome is Outcome.FAILED for result in results):
-        raise typer.Exit(1)
+    name: str = argument("module:Class, module:instance, or module:function that makes one.")
+    kind: str | None = option(
+        None,
+        "machine, fleet, model, rule, reviser, controller or measure; without it, what its methods "
+        "tell.",
+    )
+    make: str | None = option(
+        None, "How to make it, in Python with the module's names: 'MyRule(radius=2.0)'."
+    )
 
+    def run(self) -> int:
+        """Print a line for each check."""
+        from evofsm.checks import Outcome, check, kind_of
 
-def _thing(name: str, make: str | None) -> Any:
-    """What a name says, imported; or a function that makes it as told."""
-    module_name, colon, path = name.partition(":")
-    if not colon or not path:
-        raise ValueError(f"{name!r} names nothing to check; write module:Class")
-    sys.path.insert(0, "")  # as `python -m` does
-    try:
-        module = importlib.import_module(module_name)
-    except ModuleNotFoundError as error:
-        raise ValueError(f"{module_name}: {error} (is it in this folder, or installed?)") from error
-    thing: Any = module
-    for part in path.split("."):
-        if not hasattr(thing, part):
-            raise ValueError(f"{module_name} has no {path!r}")
-        thing = getattr(thing, part)
-    if make is None:
-        return thing
-    code = compile(make, "--make", "eval")
-    return lambda: eval(code, vars(module))
+        thing = self._thing()
+        kind = kind_of(thing) if self.kind is None else _kind(self.kind)
+        results = check(thing, kind)
+        if self.as_json:
+            print_json([{**one._asdict(), "outcome": one.outcome.value} for one in results])
+        else:
+            _print(self.name, kind, results)
+        return int(any(one.outcome is Outcome.FAILED for one in results))
+
+    def _thing(self) -> Any:
+        """What the name says, imported; or a function that makes it as told."""
+        module_name, colon, path = self.name.partition(":")
+        if not colon or not path:
+            raise ValueError(f"{self.name!r} names nothing to check; write module:Class")
+        sys.path.insert(0, "")  # as `python -m` does
+        try:
+            module = importlib.import_module(module_name)
+        except ModuleNotFoundError as error:
+            raise ValueError(
+                f"{module_name}: {error} (is it in this folder, or installed?)"
+            ) from error
+        thing: Any = module
+        for part in path.split("."):
+            if not hasattr(thing, part):
+                raise ValueError(f"{module_name} has no {path!r}")
+            thing = getattr(thing, part)
+        if self.make is None:
+            return thing
+        code = compile(self.make, "--make", "eval")
+        return lambda: eval(code, vars(module))
 
 
 def _kind(name: str) -> Kind:

@@ -2,69 +2,19 @@
 
 from __future__ import annotations
 
-import functools
 import shlex
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
-from enum import StrEnum
+from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, ParamSpec
+from typing import TYPE_CHECKING
 
-from evofsm.core import visible
 from evofsm.extras import install
 
 # What folders of results hold, in the order in which it is looked for.
 _MODELS = ("machine.evofsm", "model.evofsm")
 
-
-class WorldName(StrEnum):
-    """Where to drive."""
-
-    SUMO = "sumo"
-    KINEMATIC = "kinematic"
-
-
-# Needed once annotations are read; `main` says what to install where it is missing.
-with suppress(ModuleNotFoundError):
-    import typer
-
-    # What several commands are told.
-    FamilyArgument = Annotated[
-        str,
-        typer.Argument(
-            help="Family of scenarios: emergency, paper, shift, ..., or a TOML file of your own.",
-            show_default=False,
-        ),
-    ]
-    ControllerOption = Annotated[
-        str,
-        typer.Option(
-            help="Who proposes: the family's own, aggressive, normal, acc, or sumo (SUMO's IDM)."
-        ),
-    ]
-    ReviserOption = Annotated[
-        str,
-        typer.Option(
-            help="Who revises: least-risk (what was learnt), none, rss, aeb, or another measure."
-        ),
-    ]
-    ModeOption = Annotated[
-        str, typer.Option(help="How far least-risk goes: off, shadow, advise, act.")
-    ]
-    ToleranceOption = Annotated[
-        float, typer.Option(help="Share of leaders' hard brakes that need not be survived.")
-    ]
-    WorldOption = Annotated[
-        WorldName, typer.Option(help="SUMO itself, or the same motion in closed form.")
-    ]
-    SwitchesOption = Annotated[
-        str, typer.Option("--with", help="noise, delay, actuator, jerk, third_car; with commas.")
-    ]
-    SummaryAsJson = Annotated[
-        bool, typer.Option("--json", help="Print the summary as one JSON document.")
-    ]
 
 if TYPE_CHECKING:
     from rich.progress import Progress, ProgressColumn, Task
@@ -72,27 +22,6 @@ if TYPE_CHECKING:
     from evofsm.core import FSMModel
     from evofsm.files import Header
     from evofsm.guard import Mode
-
-P = ParamSpec("P")
-
-
-def plain_errors(command: Callable[P, None]) -> Callable[P, None]:
-    """Let a command end with one clear line instead of a traceback."""
-
-    @functools.wraps(command)
-    def run(*args: P.args, **kwargs: P.kwargs) -> None:
-        try:
-            command(*args, **kwargs)
-        except KeyboardInterrupt:
-            print("\nevofsm: stopped before the end", file=sys.stderr)
-            raise typer.Exit(130) from None
-        except BrokenPipeError:  # whoever read the output had enough
-            raise
-        except (ValueError, TypeError, OSError, ModuleNotFoundError) as error:
-            print(f"evofsm: {visible(message(error))}", file=sys.stderr)
-            raise typer.Exit(2) from None
-
-    return run
 
 
 def chosen_mode(name: str) -> Mode:
@@ -149,11 +78,6 @@ def _model_of_log(place: Path) -> FSMModel:
 PAGE = {"matplotlib": "plot", "jinja2": "plot"}
 
 
-def of_world(world: WorldName) -> dict[str, str]:
-    """What a world needs, and the extra that brings it."""
-    return {"libsumo": "sumo"} if world is WorldName.SUMO else {}
-
-
 def require(**extras: str) -> None:
     """Refuse before the long work what lacks a package after it: all at once."""
     if lacking := [package for package in extras if find_spec(package) is None]:
@@ -208,6 +132,8 @@ def counter(bars: Progress, text: str) -> Callable[[int, int], None]:
 
 def say(text: object) -> None:
     """Print what may hold texts from files."""
+    from evofsm.core import visible
+
     print(visible(str(text)))
 
 

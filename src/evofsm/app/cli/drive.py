@@ -2,31 +2,14 @@
 
 from __future__ import annotations
 
-from contextlib import AbstractContextManager, nullcontext, suppress
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
-from evofsm.app.cli.common import (
-    ControllerOption,
-    FamilyArgument,
-    ModeOption,
-    ReviserOption,
-    SummaryAsJson,
-    SwitchesOption,
-    ToleranceOption,
-    WorldName,
-    WorldOption,
-    chosen_mode,
-    of_world,
-    plain_errors,
-    print_json,
-    progress,
-    require,
-    split_names,
-)
-
-with suppress(ModuleNotFoundError):
-    import typer
+from evofsm.app.cli.common import chosen_mode, print_json, progress
+from evofsm.app.cli.declared import option
+from evofsm.app.cli.groups import Driven
 
 if TYPE_CHECKING:
     from evofsm.app.driving import Driving, Setup
@@ -36,62 +19,8 @@ if TYPE_CHECKING:
     from evofsm.io import RunWriter
 
 
-@plain_errors
-def drive(
-    family: FamilyArgument,
-    controller: ControllerOption = "family",
-    reviser: ReviserOption = "least-risk",
-    mode: ModeOption = "act",
-    tolerance: ToleranceOption = 0.02,
-    world: WorldOption = WorldName.KINEMATIC,
-    episodes: Annotated[int, typer.Option(min=1, help="How many are driven.")] = 100,
-    seed: Annotated[int, typer.Option(min=0, help="Of the draws.")] = 0,
-    switches: SwitchesOption = "",
-    learn: Annotated[
-        Path | None,
-        typer.Option(
-            help="Go on learning from this folder of an earlier --out.", show_default=False
-        ),
-    ] = None,
-    frozen: Annotated[
-        Path | None,
-        typer.Option(
-            help="Drive held-out draws with what this folder holds; learn nothing.",
-            show_default=False,
-        ),
-    ] = None,
-    out: Annotated[
-        Path | None,
-        typer.Option(help="Folder for what was learnt and every decision.", show_default=False),
-    ] = None,
-    checkpoint: Annotated[
-        Path | None,
-        typer.Option(
-            help="Keep what came of the episodes so far in this file; where it exists, go on "
-            "from it.",
-            show_default=False,
-        ),
-    ] = None,
-    every: Annotated[
-        str, typer.Option(help="Time between two checkpoints: 10s, 5m; 0s for every episode.")
-    ] = "60s",
-    audit: Annotated[
-        Path | None,
-        typer.Option(
-            help="Append to this log what the reviser changed or warned of, to be verified and "
-            "replayed by evofsm audit.",
-            show_default=False,
-        ),
-    ] = None,
-    mcap: Annotated[
-        Path | None,
-        typer.Option(
-            help="Write every episode to this log, for Foxglove and evofsm export.",
-            show_default=False,
-        ),
-    ] = None,
-    as_json: SummaryAsJson = False,
-) -> None:
+@dataclass(frozen=True, kw_only=True)
+class Drive(Driven):
     """Drive scenarios under a reviser; learn on the way.
 
     A machine and its latent risk learn from every episode, from the first on, unless --frozen.
@@ -100,67 +29,104 @@ def drive(
     With --checkpoint, the same command goes on where it was stopped, whatever stopped it, and comes
     to the same result; with more --episodes, it goes on to these.
     """
-    require(
-        scipy="study",
-        **of_world(world),
-        **({"polars": "tables"} if out else {}),
-        **({"mcap": "mcap"} if mcap else {}),
-    )
-    from evofsm.app.driving import Setup, episodes_learnt, make_guard, write_driving
-    from evofsm.app.text.columns import console
-    from evofsm.app.text.driving import driving_document, print_driving
-    from evofsm.driving import learnt_by, load_family, load_learnt, open_world
-    from evofsm.files import Checkpoint, duration, result_kept
-    from evofsm.guard import AuditLog
 
-    if learn is not None and frozen is not None:
-        raise ValueError("--learn and --frozen exclude each other")
-    if mcap is not None and checkpoint is not None:
-        raise ValueError(
-            "--mcap and --checkpoint exclude each other: a log holds what one run has driven"
-        )
-    interval = duration(every)
-    chosen = load_family(family).with_switches(split_names(switches))
-    setup = Setup(
-        chosen,
-        controller,
-        reviser,
-        chosen_mode(mode),
-        tolerance,
-        episodes,
-        seed,
-        learn=frozen is None,
-        first=episodes_learnt(learn) if learn else 0,
+    episodes: int = option(100, "How many are driven.", min=1)
+    learn: Path | None = option(None, "Go on learning from this folder of an earlier --out.")
+    frozen: Path | None = option(
+        None, "Drive held-out draws with what this folder holds; learn nothing."
     )
-    start = learn or frozen
-    guard = make_guard(setup, *(load_learnt(start) if start else ()))
-    if out is not None:
-        out.mkdir(parents=True, exist_ok=True)
-    keeper = None
-    if checkpoint is not None:
-        keeper = Checkpoint(checkpoint, setup.settings(world.value, guard), interval)
-    with (
-        AuditLog(audit) if audit else nullcontext() as log,
-        open_world(world.value) as place,
-        _recording(mcap, setup, world.value) as run,
-    ):
-        driving = _drive(setup, guard, place, keeper, log, run)
-        if run is not None:
-            run.attach(learnt_by(driving.guard)[0].model(**chosen.labels._asdict()))
-    if out is not None:
-        with result_kept(keeper):
-            write_driving(driving, setup, out)
-    if as_json:
-        print_json(driving_document(driving))
-        return
-    screen = console()
-    print_driving(screen, driving, setup)
-    if out is not None:
-        screen.print(f"What was learnt, and every decision: {out}", soft_wrap=True)
-    if mcap is not None:
-        screen.print(f"Every episode, for Foxglove: {mcap}", soft_wrap=True)
-    if log is not None:
-        screen.print(f"Head of {audit}, to be kept elsewhere: {log.head}", soft_wrap=True)
+    out: Path | None = option(None, "Folder for what was learnt and every decision.")
+    checkpoint: Path | None = option(
+        None,
+        "Keep what came of the episodes so far in this file; where it exists, go on from it.",
+    )
+    every: str = option("60s", "Time between two checkpoints: 10s, 5m; 0s for every episode.")
+    audit: Path | None = option(
+        None,
+        "Append to this log what the reviser changed or warned of, to be verified and replayed by "
+        "evofsm audit.",
+    )
+    mcap: Path | None = option(
+        None, "Write every episode to this log, for Foxglove and evofsm export."
+    )
+
+    def packages(self) -> dict[str, str]:
+        """What the files that are asked for need as well."""
+        needed = super().packages()
+        return (
+            needed
+            | ({"polars": "tables"} if self.out else {})
+            | ({"mcap": "mcap"} if self.mcap else {})
+        )
+
+    def run(self) -> None:
+        """Drive, and print what came of it."""
+        from evofsm.app.driving import Setup, episodes_learnt, make_guard, write_driving
+        from evofsm.app.text.columns import console
+        from evofsm.app.text.driving import driving_document, print_driving
+        from evofsm.driving import learnt_by, load_learnt, open_world
+        from evofsm.files import Checkpoint, duration, result_kept
+        from evofsm.guard import AuditLog
+
+        if self.learn is not None and self.frozen is not None:
+            raise ValueError("--learn and --frozen exclude each other")
+        if self.mcap is not None and self.checkpoint is not None:
+            raise ValueError(
+                "--mcap and --checkpoint exclude each other: a log holds what one run has driven"
+            )
+        interval = duration(self.every)
+        family = self.load_family(self.family)
+        setup = Setup(
+            family,
+            self.controller,
+            self.reviser,
+            chosen_mode(self.mode),
+            self.tolerance,
+            self.episodes,
+            self.seed,
+            learn=self.frozen is None,
+            first=episodes_learnt(self.learn) if self.learn else 0,
+        )
+        start = self.learn or self.frozen
+        guard = make_guard(setup, *(load_learnt(start) if start else ()))
+        if self.out is not None:
+            self.out.mkdir(parents=True, exist_ok=True)
+        keeper = None
+        if self.checkpoint is not None:
+            work = setup.settings(self.world.value, guard)
+            keeper = Checkpoint(self.checkpoint, work, interval)
+        with (
+            AuditLog(self.audit) if self.audit else nullcontext() as log,
+            open_world(self.world.value) as place,
+            self._recording(setup) as run,
+        ):
+            driving = _drive(setup, guard, place, keeper, log, run)
+            if run is not None:
+                run.attach(learnt_by(driving.guard)[0].model(**family.labels._asdict()))
+        if self.out is not None:
+            with result_kept(keeper):
+                write_driving(driving, setup, self.out)
+        if self.as_json:
+            print_json(driving_document(driving))
+            return
+        screen = console()
+        print_driving(screen, driving, setup)
+        if self.out is not None:
+            screen.print(f"What was learnt, and every decision: {self.out}", soft_wrap=True)
+        if self.mcap is not None:
+            screen.print(f"Every episode, for Foxglove: {self.mcap}", soft_wrap=True)
+        if log is not None:
+            screen.print(f"Head of {self.audit}, to be kept elsewhere: {log.head}", soft_wrap=True)
+
+    def _recording(self, setup: Setup) -> AbstractContextManager[RunWriter | None]:
+        """A log of the run, where one is asked for."""
+        if self.mcap is None:
+            return nullcontext()
+        from evofsm.io import recording
+
+        told = setup.told | {"family": setup.family.name, "learn": setup.learn}
+        told |= {"first": setup.first, "episodes": setup.episodes, "world": self.world.value}
+        return recording(self.mcap, told)
 
 
 def _drive(
@@ -183,15 +149,3 @@ def _drive(
 
         record = None if run is None else run.add
         return drive_family(setup, guard, place, show, checkpoint, audit, record)
-
-
-def _recording(
-    path: Path | None, setup: Setup, world: str
-) -> AbstractContextManager[RunWriter | None]:
-    """A log of the run, where one is asked for."""
-    if path is None:
-        return nullcontext()
-    from evofsm.io import recording
-
-    told = {**setup.told, "family": setup.family.name, "learn": setup.learn, "first": setup.first}
-    return recording(path, {**told, "episodes": setup.episodes, "world": world})

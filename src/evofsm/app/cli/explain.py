@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import textwrap
-from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
-from evofsm.app.cli.common import load_model, plain_errors, print_json, say
-
-with suppress(ModuleNotFoundError):
-    import typer
+from evofsm.app.cli.common import load_model, print_json, say
+from evofsm.app.cli.declared import argument, option
+from evofsm.app.cli.groups import WithJson
 
 if TYPE_CHECKING:
     from evofsm.core import Explanation, FSMModel, Tally
@@ -22,57 +21,43 @@ _UNTOLD = (
 )
 
 
-@plain_errors
-def explain(
-    file: Annotated[
-        Path,
-        typer.Argument(
-            help="A machine or a model that was saved, or a folder of evofsm drive --out.",
-            show_default=False,
-        ),
-    ],
-    state: Annotated[
-        int | None,
-        typer.Option(help="Number of a state, from 1; without it all.", show_default=False),
-    ] = None,
-    observation: Annotated[
-        str | None,
-        typer.Option(
-            help="An observation, its values with commas between them: which state it is, and what "
-            "is known of it.",
-            show_default=False,
-        ),
-    ] = None,
-    action: Annotated[
-        int | None,
-        typer.Option(help="Number of an action, from 1: what came of it.", show_default=False),
-    ] = None,
-    as_json: Annotated[
-        bool, typer.Option("--json", help="Print one JSON document; counts from 0.")
-    ] = False,
-) -> None:
+@dataclass(frozen=True, kw_only=True)
+class Explain(WithJson):
     """Say what was learnt of a situation: where it lies, how often it was seen, what came of it.
 
     All numbers were counted, once for each episode that came to a state; intervals are of 90 %.
     That one action ended better than another does not say that it was the reason.
     """
-    if state is not None and observation is not None:
-        raise ValueError("--state and --observation exclude each other")
-    model, _ = load_model(file)
-    asked = _index("--action", action, model.n_actions)
-    one = _index("--state", state, model.n_states)
-    if observation is not None:
-        found = [model.explain(action=asked, observation=_values(observation))]
-    else:
-        states = range(model.n_states) if one is None else [one]
-        found = [model.explain(each, asked) for each in states]
-    if as_json:
-        print_json({"file": str(file), "situations": [_document(model, each) for each in found]})
-        return
-    if not model.failures_told:
-        print(textwrap.fill(_UNTOLD, _WIDTH))
-    for each in found:
-        say(textwrap.fill(each.text, _WIDTH, subsequent_indent="   "))
+
+    file: Path = argument("A machine or a model that was saved, or a folder of evofsm drive --out.")
+    state: int | None = option(None, "Number of a state, from 1; without it all.")
+    observation: str | None = option(
+        None,
+        "An observation, its values with commas between them: which state it is, and what is known "
+        "of it.",
+    )
+    action: int | None = option(None, "Number of an action, from 1: what came of it.")
+
+    def run(self) -> None:
+        """Print a paragraph for each situation."""
+        if self.state is not None and self.observation is not None:
+            raise ValueError("--state and --observation exclude each other")
+        model, _ = load_model(self.file)
+        action = _index("--action", self.action, model.n_actions)
+        state = _index("--state", self.state, model.n_states)
+        if self.observation is not None:
+            found = [model.explain(action=action, observation=_values(self.observation))]
+        else:
+            states = range(model.n_states) if state is None else [state]
+            found = [model.explain(each, action) for each in states]
+        if self.as_json:
+            situations = [_document(model, each) for each in found]
+            print_json({"file": str(self.file), "situations": situations})
+            return
+        if not model.failures_told:
+            print(textwrap.fill(_UNTOLD, _WIDTH))
+        for each in found:
+            say(textwrap.fill(each.text, _WIDTH, subsequent_indent="   "))
 
 
 def _index(option: str, number: int | None, count: int) -> int | None:

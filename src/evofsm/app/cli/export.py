@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import sys
-from contextlib import suppress
+from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
-from evofsm.app.cli.common import load_model, plain_errors, require, say
-from evofsm.core import visible
-
-with suppress(ModuleNotFoundError):
-    import typer
+from evofsm.app.cli.common import load_model, require, say
+from evofsm.app.cli.declared import REQUIRED, Command, argument, option
 
 if TYPE_CHECKING:
     from evofsm.core import FSMModel
@@ -36,71 +33,86 @@ class Format(StrEnum):
     SUMO = "sumo"
 
 
-@plain_errors
-def export(
-    file: Annotated[
-        Path,
-        typer.Argument(
-            help="A machine or a model that was saved, a folder of evofsm drive --out or make "
-            "paper, or a log of evofsm drive --mcap.",
-            show_default=False,
-        ),
-    ],
-    to: Annotated[
-        Format,
-        typer.Option(
-            help="Graph for Graphviz, for a page in Markdown, or for graph tools; process for "
-            "PRISM and Storm; episode of a log for sumo-gui.",
-            show_default=False,
-        ),
-    ],
-    out: Annotated[
-        Path | None,
-        typer.Option(help="File to write (sumo: folder); else it is printed.", show_default=False),
-    ] = None,
-    policy: Annotated[
-        str,
-        typer.Option(help="Weights of actions in a graph: observed, as used, or marginal, alike."),
-    ] = "observed",
-    least: Annotated[
-        float | None,
-        typer.Option(
-            min=0.0,
-            max=1.0,
-            help="Leave out what is less probable; 0.001 in a picture, else 0.",
-            show_default=False,
-        ),
-    ] = None,
-    evidence: Annotated[
-        float | None,
-        typer.Option(
-            min=0.0,
-            help="Leave out edges, for prism actions, that were seen less often; 1, graphml 0.",
-            show_default=False,
-        ),
-    ] = None,
-    loops: Annotated[
-        bool, typer.Option(help="Whether a graph shows that states lead to themselves.")
-    ] = True,
-    episode: Annotated[
-        int, typer.Option(min=1, help="Which episode of a log, from 1, for sumo.")
-    ] = 1,
-) -> None:
+@dataclass(frozen=True, kw_only=True)
+class Export(Command):
     """Write what was learnt, or driven, in the formats of other tools."""
-    if to is Format.SUMO:
-        _export_replay(file, out, episode)
-        return
-    if policy not in ("observed", "marginal"):
-        raise ValueError(f"--policy is {policy!r}; it must be observed or marginal")
-    _refuse_learnt(out)
-    text = _written(file, to, policy, least, evidence, loops)
-    if out is None:
-        sys.stdout.write(visible(text))
-        return
-    from evofsm.files import storage
 
-    with storage.replacing(out) as place:
-        place.write(visible(text).encode())
+    file: Path = argument(
+        "A machine or a model that was saved, a folder of evofsm drive --out or make paper, or a "
+        "log of evofsm drive --mcap."
+    )
+    to: Format = option(
+        REQUIRED,
+        "Graph for Graphviz, for a page in Markdown, or for graph tools; process for PRISM and "
+        "Storm; episode of a log for sumo-gui.",
+    )
+    out: Path | None = option(None, "File to write (sumo: folder); else it is printed.")
+    policy: str = option(
+        "observed", "Weights of actions in a graph: observed, as used, or marginal, alike."
+    )
+    least: float | None = option(
+        None, "Leave out what is less probable; 0.001 in a picture, else 0.", min=0.0, max=1.0
+    )
+    evidence: float | None = option(
+        None,
+        "Leave out edges, for prism actions, that were seen less often; 1, graphml 0.",
+        min=0.0,
+    )
+    loops: bool = option(True, "Whether a graph shows that states lead to themselves.")
+    episode: int = option(1, "Which episode of a log, from 1, for sumo.", min=1)
+
+    def run(self) -> None:
+        """Write it, or print it."""
+        if self.to is Format.SUMO:
+            self._export_replay()
+            return
+        if self.policy not in ("observed", "marginal"):
+            raise ValueError(f"--policy is {self.policy!r}; it must be observed or marginal")
+        _refuse_learnt(self.out)
+        from evofsm.core import visible
+
+        text = visible(self._written())
+        if self.out is None:
+            sys.stdout.write(text)
+            return
+        from evofsm.files import storage
+
+        with storage.replacing(self.out) as place:
+            place.write(text.encode())
+
+    def _written(self) -> str:
+        from evofsm.io import graphs
+
+        model, dead_ends = _learnt(self.file)
+        if self.to is Format.PRISM:
+            evidence = 1.0 if self.evidence is None else self.evidence
+            return graphs.to_prism(model, evidence, self.least or 0.0)
+        is_picture = self.to is not Format.GRAPHML
+        write = {
+            Format.DOT: graphs.to_dot,
+            Format.MERMAID: graphs.to_mermaid,
+            Format.GRAPHML: graphs.to_graphml,
+        }[self.to]
+        return write(
+            model,
+            "marginal" if self.policy == "marginal" else "observed",
+            _PICTURE_LEAST * is_picture if self.least is None else self.least,
+            _PICTURE_EVIDENCE * is_picture if self.evidence is None else self.evidence,
+            self_loops=self.loops,
+            dead_ends=dead_ends,
+        )
+
+    def _export_replay(self) -> None:
+        """An episode of a log, for sumo-gui."""
+        require(mcap="mcap")
+        from evofsm.io import read_run, write_replay
+
+        if self.out is None:
+            raise ValueError("--to sumo writes several files; --out names a folder for them")
+        episodes = read_run(self.file).episodes
+        if self.episode > len(episodes):
+            raise ValueError(f"--episode is {self.episode}; {self.file} holds {len(episodes)}")
+        say(f"Open it: sumo-gui {write_replay(self.out, episodes[self.episode - 1])}")
 
 
 def _refuse_learnt(out: Path | None) -> None:
@@ -113,30 +125,6 @@ def _refuse_learnt(out: Path | None) -> None:
                 )
 
 
-def _written(
-    file: Path, to: Format, policy: str, least: float | None, evidence: float | None, loops: bool
-) -> str:
-    from evofsm.io import graphs
-
-    model, dead_ends = _learnt(file)
-    if to is Format.PRISM:
-        return graphs.to_prism(model, 1.0 if evidence is None else evidence, least or 0.0)
-    is_picture = to is not Format.GRAPHML
-    write = {
-        Format.DOT: graphs.to_dot,
-        Format.MERMAID: graphs.to_mermaid,
-        Format.GRAPHML: graphs.to_graphml,
-    }[to]
-    return write(
-        model,
-        "marginal" if policy == "marginal" else "observed",
-        _PICTURE_LEAST * is_picture if least is None else least,
-        _PICTURE_EVIDENCE * is_picture if evidence is None else evidence,
-        self_loops=loops,
-        dead_ends=dead_ends,
-    )
-
-
 def _learnt(file: Path) -> tuple[FSMModel, list[int] | None]:
     """The model, and its dead ends where the risk that was learnt with it is known."""
     from evofsm.driving import LatentRisk, assess_states
@@ -146,16 +134,3 @@ def _learnt(file: Path) -> tuple[FSMModel, list[int] | None]:
         return model, None
     assessed = assess_states(model, LatentRisk.load(file / _RISK))
     return model, [one.state for one in assessed if one.is_dead_end]
-
-
-def _export_replay(file: Path, out: Path | None, episode: int) -> None:
-    """An episode of a log, for sumo-gui."""
-    require(mcap="mcap")
-    from evofsm.io import read_run, write_replay
-
-    if out is None:
-        raise ValueError("--to sumo writes several files; --out names a folder for them")
-    episodes = read_run(file).episodes
-    if episode > len(episodes):
-        raise ValueError(f"--episode is {episode}; {file} holds {len(episodes)}")
-    say(f"Open it: sumo-gui {write_replay(out, episodes[episode - 1])}")

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from contextlib import suppress
+from typing import TYPE_CHECKING
 
 from evofsm.evidence.cli.bench import bench
-from evofsm.evidence.cli.evidence import evidence
-from evofsm.evidence.cli.paper import paper
+from evofsm.evidence.cli.evidence import Evidence
+from evofsm.evidence.cli.paper import Paper
 
-with suppress(ModuleNotFoundError):
+if TYPE_CHECKING:
     import typer
 
+    from evofsm.app import Command
 
-def commands() -> tuple[Callable[..., None] | typer.Typer, ...]:
+
+def commands() -> tuple[type[Command] | typer.Typer, ...]:
     """All of them."""
-    return paper, bench(), evidence
+    return Paper, bench(), Evidence

@@ -2,66 +2,45 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
 
-from evofsm.app import counter, plain_errors, print_json, progress
-
-with suppress(ModuleNotFoundError):
-    import typer
-
-    WorkersOption = Annotated[
-        int | None, typer.Option(min=1, help="Processes. [default: one per core]")
-    ]
+from evofsm.app import REQUIRED, Command, counter, option, print_json, progress
 
 
-@plain_errors
-def leaders(
-    data: Annotated[
-        Path,
-        typer.Option(help="Folder of runs, as `evofsm bench real` takes it.", show_default=False),
-    ],
-    first: Annotated[
-        int | None,
-        typer.Option(
-            min=1, help="Count alarms in so many runs, the first by name. [default: in all]"
-        ),
-    ] = None,
-    lowest: Annotated[
-        float, typer.Option(max=-0.1, help="Hardest braking that can be commanded [m/s²].")
-    ] = -8.0,
-    decel: Annotated[
-        float, typer.Option(min=0.1, help="What it brings, where own brakes are told [m/s²].")
-    ] = 7.0,
-    workers: WorkersOption = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the numbers as JSON.")] = False,
-) -> None:
+@dataclass(frozen=True, kw_only=True)
+class Leaders(Command):
     """How hard leaders brake in real drives, and how often shadow mode would alarm beside them.
 
     Counts hard brakes of leaders, and so the hours until enough were seen to do without an
     assumption; it is the command behind the table in leaders. Then every row is a
     decision in shadow mode, the driver's acceleration the proposal.
     """
-    from evofsm.evidence.real.leaders import Limits, run_leaders
 
-    limits = Limits(lowest, decel)
-    with progress() as bars:
-        study = run_leaders(data, limits, first, counter(bars, "Driving beside"), workers)
-    if as_json:
-        print_json(
-            {
-                "leaders": [
-                    {**one._asdict(), "brakes": one.brakes._asdict()} for one in study.braked
-                ],
-                "alarms": [one._asdict() for one in study.alarms],
-            }
-        )
-        return
-    from evofsm import app
-    from evofsm.app import print_table
-    from evofsm.evidence.real.tables_of_leaders import leader_tables
+    data: Path = option(REQUIRED, "Folder of runs, as `evofsm bench real` takes it.")
+    first: int | None = option(
+        None, "Count alarms in so many runs, the first by name. [default: in all]", min=1
+    )
+    lowest: float = option(-8.0, "Hardest braking that can be commanded [m/s²].", max=-0.1)
+    decel: float = option(7.0, "What it brings, where own brakes are told [m/s²].", min=0.1)
+    workers: int | None = option(None, "Processes. [default: one per core]", min=1)
+    as_json: bool = option(False, "Print the numbers as JSON.", name="--json")
 
-    console = app.console()
-    for table in leader_tables(study, limits):
-        print_table(console, table)
+    def run(self) -> None:
+        """Count, and print the tables."""
+        from evofsm.evidence.real.leaders import Limits, run_leaders
+
+        limits = Limits(self.lowest, self.decel)
+        with progress() as bars:
+            done = counter(bars, "Driving beside")
+            study = run_leaders(self.data, limits, self.first, done, self.workers)
+        if self.as_json:
+            braked = [{**one._asdict(), "brakes": one.brakes._asdict()} for one in study.braked]
+            print_json({"leaders": braked, "alarms": [one._asdict() for one in study.alarms]})
+            return
+        from evofsm.app import console, print_table
+        from evofsm.evidence.real.tables_of_leaders import leader_tables
+
+        screen = console()
+        for table in leader_tables(study, limits):
+            print_table(screen, table)

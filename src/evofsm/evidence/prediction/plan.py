@@ -7,7 +7,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
-from evofsm.evidence.study import Progress, Study, option, silent
+from evofsm.app import option
+from evofsm.evidence.study import Progress, Study, silent
 
 if TYPE_CHECKING:
     from evofsm.evidence.prediction.study import Prediction

@@ -6,7 +6,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from evofsm.evidence.study import Progress, Study, option, silent
+from evofsm.app import option
+from evofsm.evidence.study import Progress, Study, silent
 
 if TYPE_CHECKING:
     from evofsm.evidence.real.study import RealStudy

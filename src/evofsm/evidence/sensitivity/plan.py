@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from evofsm.evidence.study import Progress, Study, option, silent
+from evofsm.app import option
+from evofsm.evidence.study import Progress, Study, silent
 
 if TYPE_CHECKING:
     from evofsm.evidence.report.chapter import Chapter
