@@ -12,13 +12,15 @@ from evofsm.driving.cars import drive, guard_for_family, load_learnt, save_learn
 from evofsm.driving.families.family import load_family
 from evofsm.driving.outcomes import bootstrap, outcome, reference
 from evofsm.driving.policies import fixed_policies
+from evofsm.evidence.closed_loop.beside import (
+    run_cases,
+    run_separation,
+    run_shift,
+    run_two_worlds,
+)
 from evofsm.evidence.closed_loop.calibration import reliability, run_calibration
-from evofsm.evidence.closed_loop.cases import run_cases
 from evofsm.evidence.closed_loop.plan import Plan, ShiftPlan
-from evofsm.evidence.closed_loop.separation import run_separation
-from evofsm.evidence.closed_loop.shift import run_shift
 from evofsm.evidence.closed_loop.study import run_closed_loop
-from evofsm.evidence.closed_loop.two_worlds import run_two_worlds
 from evofsm.evidence.scores import auroc
 
 EMERGENCY = load_family("emergency")
@@ -85,7 +87,7 @@ def test_the_result_does_not_depend_on_the_number_of_workers(study):
 
 
 def test_the_papers_cases_are_driven_without_a_collision_and_left_alone_where_safe():
-    by_name = {case.name: case for case in run_cases(load_family("paper"), 0.02)["cases"]}
+    by_name = {case.name: case for case in run_cases(load_family("paper"), Plan())["cases"]}
     assert by_name["case 1"].unrevised_collided
     assert by_name["case 4"].unrevised_collided
     assert not any(case.collided for case in by_name.values())
@@ -96,7 +98,7 @@ def test_the_papers_cases_are_driven_without_a_collision_and_left_alone_where_sa
 
 
 def test_brakes_that_weaken_are_noticed_while_unchanged_constants_collide():
-    plan = ShiftPlan(before=12, after=6, held_out=25)
+    plan = Plan(shift=ShiftPlan(before=12, after=6, held_out=25))
     found = run_shift(load_family("shift"), plan, learning_seed=0)
     checks = {(check.policy, check.episodes_after): check for check in found["checks"]}
     assert checks["evofsm", 5].collisions == 0
@@ -106,7 +108,7 @@ def test_brakes_that_weaken_are_noticed_while_unchanged_constants_collide():
 
 def test_the_same_model_revises_alike_in_both_worlds():
     pytest.importorskip("libsumo")
-    sumo, kinematic = run_two_worlds(EMERGENCY, train=8, test=4, tolerance=0.02)["worlds"]
+    sumo, kinematic = run_two_worlds(EMERGENCY, Plan(side_train=8, world_test=4))["worlds"]
     assert sumo.collisions == kinematic.collisions == 0
     assert sumo.mean_speed == pytest.approx(kinematic.mean_speed, rel=1e-6)
     assert sumo.intervention_rate == pytest.approx(kinematic.intervention_rate)
@@ -114,14 +116,16 @@ def test_the_same_model_revises_alike_in_both_worlds():
 
 @pytest.mark.parametrize("family", ["rare", "weak_brakes"])
 def test_dead_ends_are_told_apart(family):
-    found = run_separation(load_family(family), train=30, test=40)["separations"]
+    found = run_separation(load_family(family), Plan(side_train=30, side_test=40))["separations"]
     areas = {one.measure: one.auroc for one in found}
     assert areas["evofsm"] > 0.98
     assert areas["evofsm"] > areas["aeb-ttc"]
 
 
 def test_probabilities_are_better_than_the_base_rate():
-    counted, rehearsed = run_calibration(EMERGENCY, train=40, test=60)["reliabilities"]
+    counted, rehearsed = run_calibration(EMERGENCY, Plan(side_train=40, side_test=60))[
+        "reliabilities"
+    ]
     for one in (counted, rehearsed):
         assert one.brier < 0.6 * one.base_brier
         assert sum(part.cases for part in one.bins) == one.cases

@@ -9,8 +9,8 @@ from typer.testing import CliRunner
 
 from evofsm.__main__ import application
 from evofsm.evidence.report.chapter import write_chapters
-from evofsm.evidence.sensitivity.chapter import short_name
 from evofsm.evidence.sensitivity.plan import Plan
+from evofsm.evidence.sensitivity.spaces import short_name
 from evofsm.evidence.sensitivity.study import Sensitivity, run_sensitivity
 
 

@@ -9,6 +9,7 @@ from evofsm.driving.worlds.kinematic import KinematicWorld
 from evofsm.evidence.paper.claims import check_claims
 from evofsm.evidence.paper.runs import CASES, run_paper
 from evofsm.evidence.paper.settings import Settings
+from evofsm.evidence.scores import share_of
 from evofsm.evidence.sensitivity.designs import NEAR, Design, filling, maps, sweeps
 from evofsm.evidence.sensitivity.parameters import PARAMETERS, Parameter, Scale, Standing, parameter
 from evofsm.evidence.sensitivity.plan import Plan
@@ -22,7 +23,7 @@ from evofsm.evidence.sensitivity.setting import (
     recovered,
     study_of,
 )
-from evofsm.evidence.sensitivity.shares import first_order, share_of, worst_sweeps
+from evofsm.evidence.sensitivity.shares import first_order, worst_sweeps
 from evofsm.evidence.sensitivity.study import _reach, _try_all, run_sensitivity
 from evofsm.fleet.executors import in_order
 

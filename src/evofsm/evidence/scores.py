@@ -6,6 +6,7 @@ Rows of one episode are much alike, so whatever is uncertain here is resampled b
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
@@ -17,6 +18,7 @@ from evofsm.extras import needs
 
 with needs("scipy", "study", "calibrating scores"):
     from scipy.optimize import isotonic_regression
+    from scipy.stats import binomtest
 
 # Of an interval, in both directions: 95 %.
 _TAILS = (0.025, 0.975)
@@ -27,6 +29,44 @@ class Interval(NamedTuple):
 
     low: float
     high: float
+
+
+class Share(NamedTuple):
+    """So many of so many, with its 95 % interval (Clopper and Pearson 1934)."""
+
+    held: int
+    tried: int
+    low: float
+    high: float
+
+    @property
+    def value(self) -> float:
+        """The share itself; NaN of none."""
+        return self.held / self.tried if self.tried else math.nan
+
+
+def share_of(verdicts: ArrayLike) -> Share:
+    """Share of the true ones.
+
+    The interval takes the draws for independent; those of a Latin hypercube are spread more evenly
+    than that, so it is rather too wide than too narrow (Stein 1987).
+
+    Parameters
+    ----------
+    verdicts : (n,) array_like of bool
+
+    Examples
+    --------
+    >>> share = share_of([True] * 3 + [False] * 7)
+    >>> share.value, round(share.low, 3), round(share.high, 3)
+    (0.3, 0.067, 0.652)
+    """
+    values = np.asarray(verdicts, dtype=np.bool_)
+    if not len(values):
+        return Share(0, 0, 0.0, 1.0)
+    held, tried = int(values.sum()), len(values)
+    exact = binomtest(held, tried).proportion_ci(0.95, method="exact")
+    return Share(held, tried, float(exact.low), float(exact.high))
 
 
 class Areas(NamedTuple):

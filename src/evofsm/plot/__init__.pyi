@@ -26,6 +26,7 @@ from .marks import name_lines as name_lines
 from .marks import panels as panels
 from .marks import reliability as reliability
 from .marks import strips as strips
+from .placing import Rows as Rows
 from .placing import around as around
 from .placing import in_points as in_points
 from .placing import place_labels as place_labels

@@ -53,11 +53,9 @@ def panels(rows: int, columns: int, height: float, **shared: Any) -> tuple[Figur
 
 def legend(figure: Figure, looks: Mapping[str, Look], columns: int | None = None) -> None:
     """Explain looks above all panels."""
-    handles = [
-        Line2D([], [], label=name, **{"linestyle": "none", **look}) for name, look in looks.items()
-    ]
+    usual: Look = {"linestyle": "none", "markersize": 4.5}
     figure.legend(
-        handles=handles,
+        handles=[Line2D([], [], label=name, **{**usual, **look}) for name, look in looks.items()],
         loc="outside upper center",
         ncols=columns or len(looks),
         columnspacing=1.1,

@@ -39,7 +39,7 @@ def settle(
     sizes: ArrayLike,
     offsets: Callable[[float, float], ArrayLike],
     taken: ArrayLike = (),
-    frame: Sequence[float] | None = None,
+    frame: ArrayLike | None = None,
 ) -> Rows:
     """Place boxes one after another, each where it is near its anchor and covers least.
 
@@ -54,7 +54,7 @@ def settle(
         tried; of several that cost the same the first is taken.
     taken : (m, 4) array_like
         Boxes that must stay free: left, lower, right and upper edge.
-    frame : (4,) sequence of float, optional
+    frame : (4,) array_like, optional
         The box to stay within.
 
     Returns
@@ -96,7 +96,7 @@ def place_labels(
     anchors: ArrayLike,
     offsets: Callable[[float, float], ArrayLike],
     taken: ArrayLike = (),
-    frame: Sequence[float] | None = None,
+    frame: ArrayLike | None = None,
 ) -> Rows:
     """Move texts with an offset in points to where `settle` puts them; returns their sizes.
 

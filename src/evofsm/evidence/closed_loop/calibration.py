@@ -28,6 +28,7 @@ from evofsm.driving import (
     training,
     unrevised,
 )
+from evofsm.evidence.closed_loop.plan import Plan
 from evofsm.guard import Guard, make_usable
 
 #: Looked ahead [s].
@@ -62,14 +63,14 @@ class Reliability(NamedTuple):
         return f"{what}\nBrier {self.brier:.3f}, of the base rate {self.base_brier:.3f}"
 
 
-def run_calibration(family: Family, train: int, test: int, seed: int = 0) -> dict[str, list[Any]]:
+def run_calibration(family: Family, plan: Plan) -> dict[str, list[Any]]:
     """Learn from the unrevised controller, then hold both probabilities against held-out runs."""
     of_guard, risk = learnt_by(guard_for_family(family))
     reviser = Unrevised(family.actions)
     guard = Guard.of(reviser, interval=family.interval, machine=of_guard, judge=risk)
     counts = OutcomeCounts(family.actions.n_actions, HORIZON, family.interval)
     machine = EvolvingFSM(family.actions.n_actions, rule=SAFETY_RULE)
-    for draw in training(family, seed, 0, train):
+    for draw in training(family, plan.seed, 0, plan.side_train):
         driven = drive(guard, draw)
         machine.start_episode()
         for decision in driven.decisions:
@@ -77,11 +78,11 @@ def run_calibration(family: Family, train: int, test: int, seed: int = 0) -> dic
             step = machine.learn_one(decision.situation.observation, action)
             counts.learn(step.belief, action)
         counts.end_episode(failed=driven.episode.collided)
-    draws = held_out(family, seed, test)
+    draws = held_out(family, plan.seed, plan.side_test)
     return {
         "reliabilities": [
             _as_driven(family, draws, machine, counts),
-            _cautious(family, draws, of_guard, risk, np.random.default_rng([seed, 7])),
+            _cautious(family, draws, of_guard, risk, np.random.default_rng([plan.seed, 7])),
         ]
     }
 

@@ -113,6 +113,16 @@ def unrevised(study: ClosedLoop) -> Row | None:
     return next((row for row in study.rows if row.policy == UNREVISED), None)
 
 
+def never_safe(study: ClosedLoop, mine: Line) -> int:
+    """How many learning seeds of all training were never as safe as is asked."""
+    return sum(
+        row.group == Group.LEARNT
+        and row.train_episodes == mine.train_episodes
+        and row.episodes_until_safe is None
+        for row in study.rows
+    )
+
+
 def has_third_car(study: ClosedLoop) -> bool:
     """Whether a car drives behind, which our braking may surprise."""
     return study.family.draw(study.plan.seed, 0).scenario.behind is not None

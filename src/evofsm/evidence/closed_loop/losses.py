@@ -1,59 +1,45 @@
-"""Where ours loses: found in the study's numbers, whatever they are."""
+"""Where ours loses: found in the study's numbers, whatever they are, and said in words."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from enum import StrEnum
-from itertools import pairwise, product
+from collections.abc import Callable, Iterator
+from itertools import pairwise
 from typing import NamedTuple
 
+from evofsm.app import number, part, percent, seeds_text, within
 from evofsm.driving import Group
+from evofsm.evidence.closed_loop.beside import Separation
 from evofsm.evidence.closed_loop.comparison import (
     ROUNDING,
     Line,
     has_third_car,
+    never_safe,
     ours,
     standing,
     table_groups,
 )
-from evofsm.evidence.closed_loop.over_seeds import around_shift
+from evofsm.evidence.closed_loop.over_seeds import around_shift, when
 from evofsm.evidence.closed_loop.study import SAFE_RATE, ClosedLoop
 
 #: So many episodes after a shift collisions must be as rare as where it is safe.
 RECOVERED_AFTER = 30
-
-
-class What(StrEnum):
-    """In what one may lose, and which numbers tell it."""
-
-    BOTH = "collisions and mobility, both"  #: rate, mobility
-    COLLISIONS = "collisions, at less mobility"  #: rate, mobility
-    WORST_SEED = "collisions of our worst seed"  #: rate, mobility
-    INTERVENTIONS = "interventions, at no more collisions"  #: share of decisions
-    CHANGE = "mean change, at no more collisions"  #: [m/s²]
-    JERK = "RMS jerk, at no more collisions"  #: [m/s³]
-    REAR_ENDS = "rear-end collisions by the car behind"  #: number, episodes
-    LEARNING = "collisions while learning"  #: number, episodes
-    BECOMING_SAFE = "becoming safe"  #: seeds that did not, seeds, episodes
-    SHIFT = "collisions around the shift"  #: rate
-    AUROC = "AUROC for the dead end"  #: area, low, high
-    BRIER = "Brier score"  #: score
-    CASE_COLLIDES = "collision in a case of the paper"  #: the run's end [s]
-    CASE_CHANGED = "changes in a case of the paper"  #: share of decisions, of late ones
-    WORLDS = "collisions in both worlds"  #: number, episodes
+# What safety costs; held against those who collide no more often.
+_PRICES: dict[str, tuple[str, Callable[[float], str]]] = {
+    "interventions": ("intervention_rate", percent),
+    "mean change": ("mean_change", lambda x: f"{number(x, 2)} m/s²"),
+    "RMS jerk": ("jerk", lambda x: f"{number(x, 2)} m/s³"),
+}
 
 
 class Loss(NamedTuple):
     """Something in which another does better than ours, or ours worse than it should."""
 
-    what: What
-    who: str  #: policy, measure or world; empty where ours is held against what it should do
-    group: str
-    theirs: tuple[float, ...]  #: empty where there are no numbers
-    ours: tuple[float, ...]
+    what: str
+    who: str  #: with what it was told, or what ours is held against
+    theirs: str
+    ours: str
     apart: bool | None = None  #: whether 95 % intervals do not meet; None where there are none
     loud: bool = False  #: whether it breaks what was asked for
-    about: str | int = ""  #: which test, probability, case or other world
 
 
 def losses(study: ClosedLoop) -> list[Loss]:
@@ -74,115 +60,101 @@ def _in_the_table(study: ClosedLoop) -> Iterator[Loss]:
         return
     found = standing(study, mine)
     for line in found.better:
-        yield _on_axes(What.BOTH, line, mine, loud=line.group == Group.FIXED)
+        fixed = line.group == Group.FIXED
+        apart = line.mobility_low > mine.mobility_high
+        yield _on_axes("collisions and mobility, both", line, mine, apart=apart, loud=fixed)
     for line in found.rivals:
         if line in found.better:
             continue
         if line.collision_rate < mine.collision_rate - ROUNDING:
-            yield _on_axes(What.COLLISIONS, line, mine)
+            yield _on_axes("collisions, at less mobility", line, mine)
         elif line.collision_rate < worst.collision_rate - ROUNDING:
-            yield _on_axes(What.WORST_SEED, line, worst)
-    for what, name in _PRICES.items():
+            yield _on_axes("collisions of our worst seed", line, worst)
+    for what, (name, show) in _PRICES.items():
         own = getattr(mine, name)
         for line in found.as_safe:
-            if getattr(line, name) < own - ROUNDING:
-                yield Loss(what, line.policy, line.group, (getattr(line, name),), (own,))
+            if (price := getattr(line, name)) < own - ROUNDING:
+                yield Loss(f"{what}, at no more collisions", _told(line), show(price), show(own))
     if has_third_car(study):
-        yield from _behind(study, mine)
-    yield from _of_learning(study, mine)
-
-
-# What safety costs; held against those who collide no more often.
-_PRICES = {
-    What.INTERVENTIONS: "intervention_rate",
-    What.CHANGE: "mean_change",
-    What.JERK: "jerk",
-}
-
-
-def _on_axes(what: What, line: Line, mine: Line, *, loud: bool = False) -> Loss:
-    apart = line.collision_high < mine.collision_low
-    if what == What.BOTH:
-        apart = apart or line.mobility_low > mine.mobility_high
-    theirs, own = ((one.collision_rate, one.mobility) for one in (line, mine))
-    return Loss(what, line.policy, line.group, theirs, own, apart, loud)
-
-
-def _behind(study: ClosedLoop, mine: Line) -> Iterator[Loss]:
-    own = (mine.rear_ends, mine.episodes)
-    for group, lines in table_groups(study):
-        for line in lines:
+        for line in (line for _, lines in table_groups(study) for line in lines):
             if not line.is_ours and line.rear_ends < mine.rear_ends:
-                theirs = (line.rear_ends, line.episodes)
-                yield Loss(What.REAR_ENDS, line.policy, group, theirs, own)
-
-
-def _of_learning(study: ClosedLoop, mine: Line) -> Iterator[Loss]:
+                what = "rear-end collisions by the car behind"
+                yield Loss(what, _told(line), _behind(line), _behind(mine))
     if mine.train_collisions > 0.0:
-        own = (mine.train_collisions, mine.train_episodes)
-        yield Loss(What.LEARNING, "", "", (0.0, mine.train_episodes), own)
+        own = f"{part(mine.train_collisions, mine.train_episodes)} episodes (median)"
+        yield Loss("collisions while learning", "whatever does not learn", "0", own)
     if never := never_safe(study, mine):
         yield Loss(
-            What.BECOMING_SAFE, "", "", (), (never, mine.seeds, mine.train_episodes), loud=True
+            "becoming safe",
+            f"the mark of {SAFE_RATE:.0%}",
+            "reached by every seed",
+            f"not reached by {never} of {seeds_text(mine.seeds)} in {mine.train_episodes:,} "
+            "episodes",
+            loud=True,
         )
 
 
-def never_safe(study: ClosedLoop, mine: Line) -> int:
-    """How many learning seeds of all training were never as safe as is asked."""
-    return sum(
-        row.group == Group.LEARNT
-        and row.train_episodes == mine.train_episodes
-        and row.episodes_until_safe is None
-        for row in study.rows
+def _told(one: Line | Separation) -> str:
+    return f"{one.policy if isinstance(one, Line) else one.measure} ({one.group})"
+
+
+def _behind(line: Line) -> str:
+    return part(line.rear_ends, line.episodes)
+
+
+def _on_axes(what: str, line: Line, mine: Line, *, apart: bool = False, loud: bool = False) -> Loss:
+    theirs, own = (
+        f"{percent(one.collision_rate)} at mobility {number(one.mobility, 3)}"
+        for one in (line, mine)
+    )
+    return Loss(
+        what, _told(line), theirs, own, apart or line.collision_high < mine.collision_low, loud
     )
 
 
 def _after_a_shift(study: ClosedLoop) -> Iterator[Loss]:
-    tested = list(around_shift(study))
-    for after, own, theirs in tested:
+    for after, own, theirs in around_shift(study):
         if theirs and own.median > theirs.median + ROUNDING:
             yield Loss(
-                What.SHIFT,
+                f"collisions {when(after)}",
                 "rss-unchanged",
-                "",
-                (theirs.median,),
-                (own.median,),
+                percent(theirs.median),
+                f"{percent(own.median)} (median)",
                 loud=after >= RECOVERED_AFTER and own.median > SAFE_RATE,
-                about=after,
             )
 
 
 def _in_separation(study: ClosedLoop) -> Iterator[Loss]:
-    mine = [one for one in study.separations if one.group == Group.LEARNT][:1]
-    for own, other in product(mine, study.separations):
-        if other.group != Group.LEARNT and other.auroc > own.auroc:
-            yield Loss(
-                What.AUROC,
-                other.measure,
-                other.group,
-                (other.auroc, other.low, other.high),
-                (own.auroc, own.low, own.high),
-                other.low > own.high,
-            )
+    mine = next((one for one in study.separations if one.group == Group.LEARNT), None)
+    for other in study.separations:
+        if mine and other.group != Group.LEARNT and other.auroc > mine.auroc:
+            theirs, own = (within(3, 3)(one.auroc, one.low, one.high) for one in (other, mine))
+            apart = other.low > mine.high
+            yield Loss("AUROC for the dead end", _told(other), theirs, own, apart)
 
 
 def _in_calibration(study: ClosedLoop) -> Iterator[Loss]:
     for one in study.reliabilities:
         if one.brier >= one.base_brier:
-            yield Loss(What.BRIER, "", "", (one.base_brier,), (one.brier,), about=one.what)
+            base, own = number(one.base_brier, 4), number(one.brier, 4)
+            yield Loss(f"Brier score, {one.what}", "always the base rate", base, own)
 
 
 def _in_cases(study: ClosedLoop) -> Iterator[Loss]:
     for case in study.cases:
+        what = f"the paper's {case.name}"
         if case.collided:
-            yield Loss(What.CASE_COLLIDES, "", "", (), (case.end,), loud=True, about=case.name)
+            own = f"collides at {case.end:.1f} s"
+            yield Loss(what, "no collision", "the run's end", own, loud=True)
         elif not case.unrevised_collided and case.changed > 0.0:
-            own = (case.changed, case.changed_late)
-            yield Loss(What.CASE_CHANGED, "", "", (0.0, 0.0), own, about=case.name)
+            own = (
+                f"{percent(case.changed)} of decisions changed ({percent(case.changed_late)} late)"
+            )
+            yield Loss(what, "the driver alone, who does not collide", percent(0.0), own)
 
 
 def _between_worlds(study: ClosedLoop) -> Iterator[Loss]:
     for one, other in pairwise(study.worlds):
         if one.collisions != other.collisions:
-            theirs, own = ((w.collisions, w.episodes) for w in (one, other))
-            yield Loss(What.WORLDS, one.world, "", theirs, own, about=other.world)
+            own = ", ".join(f"{part(w.collisions, w.episodes)} in {w.world}" for w in (one, other))
+            yield Loss("collisions in both worlds", "the same model", "equal", own)

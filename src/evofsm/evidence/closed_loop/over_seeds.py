@@ -8,7 +8,7 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.evidence.closed_loop.shift import Check
+from evofsm.evidence.closed_loop.beside import Check
 from evofsm.evidence.closed_loop.study import ClosedLoop
 
 #: The policy that learns, by name.
@@ -71,6 +71,15 @@ class AroundShift(NamedTuple):
     after: int  #: episodes; -1 before the shift
     ours: Spread
     theirs: Spread | None  #: of the policy that is never told
+
+
+def when(after: int) -> str:
+    """A test's place in the stream."""
+    if after < 0:
+        return "before the shift"
+    if after == 0:
+        return "right after the shift"
+    return f"{after} episode{'' if after == 1 else 's'} after the shift"
 
 
 def around_shift(study: ClosedLoop) -> list[AroundShift]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from evofsm.app import option, split_names
@@ -15,16 +14,17 @@ if TYPE_CHECKING:
     from evofsm.evidence.closed_loop.study import ClosedLoop
     from evofsm.evidence.report.chapter import Chapter
 
+# Of the sections with tables beside, those that are short enough.
+_IN_THE_TERMINAL = ("shift", "separation", "cases", "worlds")
+
 
 @dataclass(frozen=True)
 class ShiftPlan:
-    """How much is driven."""
+    """How much is driven around a shift."""
 
     before: int = 100  #: episodes of the stream before the shift
     after: int = 60  #: and after it
     held_out: int = 200  #: episodes of each test
-    seed: int = 0
-    tolerance: float = 0.02
 
 
 @dataclass(frozen=True)
@@ -82,22 +82,19 @@ class Plan(Study["ClosedLoop"]):
 
     def tell(self, found: ClosedLoop) -> Chapter:
         """Its table, its figures, and where it loses."""
-        raise NotImplementedError
+        from evofsm.evidence.closed_loop.chapter import closed_loop_chapter
 
-    def chapter(
-        self, found: ClosedLoop, folder: Path, command: str, progress: Progress = silent
-    ) -> Chapter:
-        """Its table, its figures, and where it loses."""
-        from evofsm.evidence.report.closed_loop import closed_loop_chapter
-
-        return closed_loop_chapter(found, folder, command, progress)
+        return closed_loop_chapter(found)
 
     def document(self, found: ClosedLoop) -> object:
         """All that was measured, not the rows of the table alone."""
         return found.as_dict()
 
     def say(self, out: Console, found: ClosedLoop, chapter: Chapter) -> None:
-        """Print the table, where it loses, and the short tables beside it."""
-        from evofsm.evidence.terminal import print_closed_loop
+        """Print what all studies print, and the short tables beside it."""
+        from evofsm.app import print_table
 
-        print_closed_loop(out, found)
+        super().say(out, found, chapter)
+        for section in chapter.sections:
+            for table in section.tables if section.id in _IN_THE_TERMINAL else ():
+                print_table(out, table)

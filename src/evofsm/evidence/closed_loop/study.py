@@ -8,7 +8,7 @@ policy and learning seed over the cores, and put together in the order of the ta
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from functools import partial
 from importlib.util import find_spec
 from itertools import repeat
@@ -39,12 +39,19 @@ from evofsm.driving import (
     training,
     try_out,
 )
+from evofsm.evidence.closed_loop.beside import (
+    CaseResult,
+    Check,
+    InWorld,
+    Separation,
+    Stream,
+    run_cases,
+    run_separation,
+    run_shift,
+    run_two_worlds,
+)
 from evofsm.evidence.closed_loop.calibration import Reliability, run_calibration
-from evofsm.evidence.closed_loop.cases import CaseResult, run_cases
 from evofsm.evidence.closed_loop.plan import Plan
-from evofsm.evidence.closed_loop.separation import Separation, run_separation
-from evofsm.evidence.closed_loop.shift import Check, Stream, run_shift
-from evofsm.evidence.closed_loop.two_worlds import InWorld, run_two_worlds
 from evofsm.evidence.study import Frame
 from evofsm.fleet import in_order
 from evofsm.guard import ActionReviser, Guard, Reviser
@@ -146,21 +153,15 @@ def run_closed_loop(
             for rule in RULES
             for seed in range(min(plan.rule_seeds, plan.seeds))
         ),
-        partial(run_separation, family, plan.side_train, plan.side_test, plan.seed),
-        partial(run_calibration, family, plan.side_train, plan.side_test, plan.seed),
+        partial(run_separation, family, plan),
+        partial(run_calibration, family, plan),
     ]
     if find_spec("libsumo") is not None:
-        tasks.append(
-            partial(
-                run_two_worlds,
-                *(family, plan.side_train, plan.world_test, plan.tolerance, plan.seed),
-            )
-        )
+        tasks.append(partial(run_two_worlds, family, plan))
     if family.name == "paper":
-        tasks.append(partial(run_cases, family, plan.tolerance, plan.seed))
+        tasks.append(partial(run_cases, family, plan))
     if family.shifted is not None:
-        shift = replace(plan.shift, seed=plan.seed, tolerance=plan.tolerance)
-        tasks += [partial(run_shift, family, shift, seed) for seed in range(plan.seeds)]
+        tasks += [partial(run_shift, family, plan, seed) for seed in range(plan.seeds)]
     study = ClosedLoop(family, plan, [])
     for result in in_order(tasks, workers, progress):
         for name, values in result.items():

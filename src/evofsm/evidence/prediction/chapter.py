@@ -2,47 +2,49 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import partial
-from typing import Any
 
 import numpy as np
 
-from evofsm.app import NONE, Table, interval, listed, number
+from evofsm.app import NONE, Column, Table, decimals, interval, listed, number
 from evofsm.evidence.prediction.forecasters import Method, Variant
 from evofsm.evidence.prediction.scoring import Row
 from evofsm.evidence.prediction.sources import Pace
 from evofsm.evidence.prediction.study import Prediction
+from evofsm.evidence.report.against import ahead
 from evofsm.evidence.report.asked import Asked, failures, tables_of_asked
 from evofsm.evidence.report.chapter import Chapter
+from evofsm.evidence.report.drawing import Sketch
 from evofsm.evidence.report.html import Setting
 from evofsm.extras import needs
 
 with needs("matplotlib", "plot", "drawing figures"):
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from evofsm.evidence.report.drawing import Sketch
-    from evofsm.plot import DEAD_END, FIRST, FOLLOWER, INK, LEADER, WIDTH
+    from evofsm.plot import FIXED, INK, OTHER, OURS, TOLD, Look, curves, legend, level, panels
 
 #: The horizons that the study is about [s]; shorter ones show where the paper's test is made.
 _ASKED = 0.5
 _TABLED = (Method.EVOFSM, Method.BLEND, Method.BATCH, Method.PAPER)
-_LOOKS: dict[str, dict[str, Any]] = {
-    Method.EVOFSM: {"color": FOLLOWER, "marker": "o", "linewidth": 1.6, "zorder": 5},
-    Method.BATCH: {"color": DEAD_END, "marker": "s", "linestyle": (0, (4, 1.6))},
-    Method.BLEND: {"color": LEADER, "marker": "^", "linestyle": (0, (1, 1.2))},
-    Method.PAPER: {"color": FIRST, "marker": "D", "linestyle": (0, (5, 1.2, 1, 1.2))},
+_LOOKS: dict[str, Look] = {
+    Method.EVOFSM: {**OURS, "linewidth": 1.6, "zorder": 5},
+    Method.BLEND: {**TOLD, "marker": "^", "linestyle": (0, (1, 1.2))},
+    Method.BATCH: {**FIXED, "linestyle": (0, (4, 1.6))},
+    Method.PAPER: {**OTHER, "marker": "D", "linestyle": (0, (5, 1.2, 1, 1.2))},
 }
 # Skills lower than this are drawn at the panel's edge.
 _LOWEST = -1.05
 _DECIMALS = 2
+# Lower is better; how they are called, and with how many decimals.
+_SCORES = (("jsd", "smaller divergence", 3), ("log_score", "better log score", 2))
 # Skills of this and less are all alike: nothing is foreseen.
 _FAR_BELOW = -99.0
 
 
 def tell(study: Prediction) -> Chapter:
-    """What the study found."""
+    """Skill over horizon, and what makes it."""
+    asked = list(_what_was_asked(study))
     return Chapter(
         id=study.plan.id,
         title=study.plan.question,
@@ -50,14 +52,18 @@ def tell(study: Prediction) -> Chapter:
         headline=_headline(study),
         answer=tuple(_answer(study)),
         losses=tuple(_losses(study)),
-        fails=failures(asked := list(_what_was_asked(study))),
-        tables=(
-            _table_of_skills(study),
-            _table_of_scores(study),
-            *_tables_of_ablation(study),
-            *tables_of_asked(asked),
+        fails=failures(asked),
+        tables=(*_tables(study), *tables_of_asked(asked)),
+        sketches=(
+            Sketch(
+                "skill-over-horizon",
+                "Skill over horizon",
+                "Skill in divergence against persistence; bands are 95 % over test episodes. Marks "
+                "at the lower edge lie below it. Lines are broken where another machine begins.",
+                _headline(study),
+                partial(draw_skills, study),
+            ),
         ),
-        sketches=(_sketch_skills(study),),
         plan=tuple(_plan(study)),
         packages=("scipy", "deeptime"),
     )
@@ -129,26 +135,23 @@ def _answer(study: Prediction) -> Iterator[str]:
 
 def _losses(study: Prediction) -> Iterator[str]:
     """Where a reference does better, or as well, the most important first."""
-    ours = [row for row in study.rows if row.method == Method.EVOFSM]
-    by_key = {(row.source, row.horizon, row.method): row for row in study.rows}
-    for row in ours:
-        if row.low <= 0.0 and row.horizon >= _ASKED:
+    for row in _asked(study, Method.EVOFSM):
+        if row.low <= 0.0:
             yield _against(row, "persistence in divergence", row.skill_persistence, row.low)
-        if row.log_low <= 0.0 and row.horizon >= _ASKED:
+        if row.log_low <= 0.0:
             yield _against(row, "persistence in log score", row.log_skill_persistence, row.log_low)
     for rival, reference in ((Method.BATCH, "deeptime's batch"), (Method.BLEND, "the blend")):
-        for row in ours:
-            other = by_key[row.source, row.horizon, rival]
-            if other.jsd < row.jsd and row.horizon >= _ASKED:
-                yield (
-                    f"{_where(row)}: {reference} has the smaller divergence, {other.jsd:.3f} "
-                    f"against {row.jsd:.3f} bit."
-                )
-            if other.log_score < row.log_score and row.horizon >= _ASKED:
-                yield (
-                    f"{_where(row)}: {reference} has the better log score, {other.log_score:.2f} "
-                    f"against {row.log_score:.2f} bit."
-                )
+        rows = [row for method in (Method.EVOFSM, rival) for row in _asked(study, method)]
+        for what, text, n in _SCORES:
+            for other, mine in ahead(
+                rows,
+                lambda row: row.method == Method.EVOFSM,
+                lambda row: (row.source, row.horizon),
+                partial(_smaller, what),
+            ):
+                theirs, own = (number(getattr(row, what), n) for row in (other, mine))
+                yield f"{_where(mine)}: {reference} has the {text}, {theirs} against {own} bit."
+    ours = [row for row in study.rows if row.method == Method.EVOFSM]
     short = [row for row in ours if row.horizon < _ASKED and row.skill_persistence < 0.0]
     if short:
         named = [f"{_where(row)} {_skill(row.skill_persistence)}" for row in short]
@@ -157,6 +160,10 @@ def _losses(study: Prediction) -> Iterator[str]:
     if unsteady:
         named = [f"{_where(row)} {_skill(row.worst)}" for row in unsteady]
         yield f"Negative for the worst learning seed or part of the runs: {listed(named)}."
+
+
+def _smaller(what: str, one: Row, mine: Row) -> bool:
+    return bool(getattr(one, what) < getattr(mine, what))
 
 
 def _where(row: Row) -> str:
@@ -195,170 +202,125 @@ def _plan(study: Prediction) -> Iterator[Setting]:
 # -- Tables ---------------------------------------------------------------------------------------
 
 
-def _table_of_skills(study: Prediction) -> Table:
-    """Skill of every method at every horizon."""
-    rows = []
-    for source in study.sources:
-        for row in _by_horizon(study, source):
-            by_method = {
-                one.method: one
-                for one in study.rows
-                if (one.source, one.horizon) == (source, row.horizon)
-            }
-            rows.append(
-                (
-                    f"{source} {row.horizon:g} s",
-                    _skill(row.skill_persistence),
-                    interval(row.low, row.high, _plain),
-                    *(_skill(by_method[other].skill_persistence) for other in _TABLED[1:]),
-                    _skill(row.log_skill_persistence),
-                    _skill(by_method[Method.BLEND].log_skill_persistence),
-                )
-            )
-    return Table(
+def _tables(study: Prediction) -> Iterator[Table]:
+    """Skills and scores of every source at every horizon, and what makes the skill."""
+    by_key = {(row.source, row.horizon, row.method): row for row in study.rows}
+    rows = [row for source in study.sources for row in _by_horizon(study, source, Method.EVOFSM)]
+    place = Column[Row]("source, horizon", lambda row: f"{row.source} {row.horizon:g} s")
+
+    def of(
+        header: str, method: Method, what: str, show: Callable[..., str] | None = None
+    ) -> Column[Row]:
+        def value(row: Row) -> float:
+            return float(getattr(by_key[row.source, row.horizon, method], what))
+
+        return Column(header, value, show or _skill)
+
+    yield Table.of(
         "Skill against persistence",
-        ("source, horizon", "evofsm", "95 %", "blend", "batch", "paper", "log", "blend"),
-        tuple(rows),
-        note=(
-            "By divergence, and in the last two columns by log score: ours and the blend's. The "
-            "paper's machine against persistence in its own states. 95 % by bootstrap over test "
-            "episodes."
+        (
+            place,
+            Column("evofsm", "skill_persistence", _skill),
+            Column("95 %", "low high", lambda low, high: interval(low, high, _plain)),
+            *(
+                of(name, method, "skill_persistence")
+                for name, method in zip(("blend", "batch", "paper"), _TABLED[1:], strict=True)
+            ),
+            Column("log", "log_skill_persistence", _skill),
+            of("blend", Method.BLEND, "log_skill_persistence"),
         ),
+        rows,
+        "By divergence, and in the last two columns by log score: ours and the blend's. The "
+        "paper's machine against persistence in its own states. 95 % by bootstrap over test "
+        "episodes.",
     )
+    compared = ((Method.PERSISTENCE, "persist."), (Method.BATCH, "batch"))
+    yield Table.of(
+        "Scores [bit]",
+        (
+            place,
+            Column("evofsm", "jsd", decimals(4)),
+            *(of(name, method, "jsd", decimals(4)) for method, name in compared),
+            Column("log", "log_score", decimals(2)),
+            *(of(name, method, "log_score", decimals(2)) for method, name in compared),
+            Column("worst", "worst", _skill),
+        ),
+        rows,
+        "Mean divergence, then mean log score, of ours, persistence and batch; the lowest "
+        "skill in divergence of a learning seed, or of a part of the runs.",
+    )
+    for source in dict.fromkeys(row.source for row in study.ablation):
+        yield _ablation(study, source)
 
 
-def _by_horizon(study: Prediction, source: str) -> list[Row]:
-    """Our rows, the shortest horizon first."""
-    return sorted(study.of(source, Method.EVOFSM), key=lambda row: row.horizon)
+def _by_horizon(study: Prediction, source: str, method: Method) -> list[Row]:
+    """Rows of a method, the shortest horizon first."""
+    return sorted(study.of(source, method), key=lambda row: row.horizon)
 
 
 def _plain(value: float) -> str:
     return number(value, _DECIMALS) if value > -10.0 else f"{max(value, _FAR_BELOW):.0f}"
 
 
-def _table_of_scores(study: Prediction) -> Table:
-    """The scores themselves, ours beside the references."""
-    rows = []
-    for source in study.sources:
-        for row in _by_horizon(study, source):
-            still, batch = (
-                next(one for one in study.of(source, other) if one.horizon == row.horizon)
-                for other in (Method.PERSISTENCE, Method.BATCH)
-            )
-            rows.append(
-                (
-                    f"{source} {row.horizon:g} s",
-                    number(row.jsd, 4),
-                    number(still.jsd, 4),
-                    number(batch.jsd, 4),
-                    number(row.log_score, 2),
-                    number(still.log_score, 2),
-                    number(batch.log_score, 2),
-                    _skill(row.worst),
-                )
-            )
-    return Table(
-        "Scores [bit]",
+def _ablation(study: Prediction, source: str) -> Table:
+    """What each thing brings."""
+    rows = {(row.method, row.horizon): row for row in study.ablation if row.source == source}
+    horizons = sorted({horizon for _, horizon in rows if horizon >= _ASKED})
+
+    def of(name: str, horizon: float, what: str) -> Column[Variant]:
+        return Column(name, lambda variant: getattr(rows[variant, horizon], what), _skill)
+
+    return Table.of(
+        f"What makes the skill: {source.replace('_', ' ')}",
         (
-            *("source, horizon", "evofsm", "persist.", "batch"),
-            *("log", "persist.", "batch", "worst"),
+            Column("variant", str),
+            *(of(f"{h:g} s", h, "skill_persistence") for h in horizons),
+            *(of(f"log {h:g} s", h, "log_skill_persistence") for h in horizons[1:2]),
         ),
-        tuple(rows),
-        note=(
-            "Mean divergence, then mean log score, of ours, persistence and batch; the lowest "
-            "skill in divergence of a learning seed, or of a part of the runs."
-        ),
+        list(Variant),
+        "Skill against persistence in the same states, by divergence and by log score; one "
+        f"learning seed, or one part of {study.plan.ablation_runs} runs at most. evofsm "
+        "has evidence 0.3 and moved 0.003.",
+        ours=lambda variant: variant is Variant.ACTIONS,
     )
-
-
-def _tables_of_ablation(study: Prediction) -> Iterator[Table]:
-    """What each thing brings, a table for each source."""
-    for source in dict.fromkeys(row.source for row in study.ablation):
-        rows = [row for row in study.ablation if row.source == source]
-        horizons = sorted({row.horizon for row in rows if row.horizon >= _ASKED})
-        logs = horizons[1:2]
-        skills = {(row.method, row.horizon): row for row in rows}
-        yield Table(
-            f"What makes the skill: {source.replace('_', ' ')}",
-            ("variant", *(f"{h:g} s" for h in horizons), *(f"log {h:g} s" for h in logs)),
-            tuple(
-                (
-                    str(variant),
-                    *(_skill(skills[variant, h].skill_persistence) for h in horizons),
-                    *(_skill(skills[variant, h].log_skill_persistence) for h in logs),
-                )
-                for variant in Variant
-            ),
-            note=(
-                "Skill against persistence in the same states, by divergence and by log score; one "
-                f"learning seed, or one part of {study.plan.ablation_runs} runs at most. evofsm "
-                "has evidence 0.3 and moved 0.003."
-            ),
-            ours=(list(Variant).index(Variant.ACTIONS),),
-        )
 
 
 # -- Figure ---------------------------------------------------------------------------------------
-
-
-def _sketch_skills(study: Prediction) -> Sketch:
-    return Sketch(
-        name="skill-over-horizon",
-        title="Skill over horizon",
-        caption=(
-            "Skill in divergence against persistence; bars are 95 % over test episodes. Marks "
-            "at the lower edge lie below it. Lines are broken where another machine begins."
-        ),
-        alt=_headline(study),
-        figure=partial(draw_skills, study),
-    )
 
 
 def draw_skills(study: Prediction) -> Figure:
     """Skill over horizon, a panel for each source."""
     columns = 3 if len(study.sources) > 4 else 2
     lines = -(-len(study.sources) // columns)
-    figure = Figure(figsize=(WIDTH, 0.75 + 1.85 * lines), layout="constrained")
-    grid: Any = figure.subplots(lines, columns, sharex=True, sharey=True, squeeze=False)
-    for axes, source in zip(grid.flat, study.sources, strict=False):
-        _draw_panel(axes, study, source)
-    for axes in grid.flat[len(study.sources) :]:
-        axes.set_visible(False)
-    for axes in grid[:, 0]:
-        axes.set_ylabel("skill")
-    for k, axes in enumerate(grid.flat[: len(study.sources)]):
-        if k + columns >= len(study.sources):
+    figure, grid = panels(lines, columns, 0.75 + 1.85 * lines, sharex=True, sharey=True)
+    for place, axes in enumerate(grid.flat):
+        axes.set_visible(place < len(study.sources))
+        if place + columns >= len(study.sources):
             axes.set_xlabel("horizon [s]")
             axes.tick_params(labelbottom=True)
-    handles, labels = grid.flat[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside upper center", ncols=len(labels))
+    for axes, source in zip(grid.flat, study.sources, strict=False):
+        axes.set_title(source.replace("_", " "))
+        level(axes, 0.0, color=INK, linestyle="-")
+        for method in _TABLED:
+            for rows in _by_machine(_by_horizon(study, source, method)):
+                values = np.array([(r.skill_persistence, r.low, r.high) for r in rows])
+                drawn = np.maximum(values, _LOWEST)
+                curves(axes, _LOOKS[method], [row.horizon for row in rows], *drawn.T)
+    for axes in grid[:, 0]:
+        axes.set_ylabel("skill")
+    ticks = [0.01, 0.1, 0.5, 1.0, 2.0, 5.0]
+    grid[0, 0].set(xscale="log", ylim=(_LOWEST, 1.0))
+    grid[0, 0].set_xticks(ticks, [f"{tick:g}" for tick in ticks])
+    for axes in grid.flat:
+        axes.minorticks_off()
+    zero: Look = {"color": INK, "linestyle": "-", "linewidth": 0.8}
+    looks = {str(method): {"linestyle": "-", **_LOOKS[method]} for method in _TABLED}
+    legend(figure, {"persistence": zero, **looks})
     return figure
 
 
-def _draw_panel(axes: Axes, study: Prediction, source: str) -> None:
-    axes.set_title(source.replace("_", " "))
-    axes.axhline(0.0, color=INK, linewidth=0.8, label="persistence")
-    for method in _TABLED:
-        label: str | None = str(method)
-        for rows in _by_machine(study, source, method):
-            horizons = [row.horizon for row in rows]
-            skills, low, high = (
-                np.maximum([getattr(row, name) for row in rows], _LOWEST)
-                for name in ("skill_persistence", "low", "high")
-            )
-            look = _LOOKS[method]
-            axes.plot(horizons, skills, markersize=4.0, label=label, clip_on=False, **look)
-            axes.vlines(horizons, low, high, color=look["color"], linewidth=1.0)
-            label = None
-    axes.set_xscale("log")
-    axes.set_xticks([0.01, 0.1, 0.5, 1.0, 2.0, 5.0], ["0.01", "0.1", "0.5", "1", "2", "5"])
-    axes.minorticks_off()
-    axes.set_ylim(_LOWEST, 1.0)
-
-
-def _by_machine(study: Prediction, source: str, method: Method) -> Iterator[list[Row]]:
-    """Rows by horizon; apart where a machine that observes every 0.01 s made the short ones."""
-    rows = sorted(study.of(source, method), key=lambda row: row.horizon)
+def _by_machine(rows: list[Row]) -> Iterator[list[Row]]:
+    """Rows apart where a machine that observes every 0.01 s made the short ones."""
     two_paces = rows[0].horizon < min(Pace.LOGS.horizons)
     short = [row for row in rows if two_paces and row.horizon < _ASKED]
     yield from (part for part in (short, rows[len(short) :]) if part)

@@ -36,6 +36,11 @@ class Braked(NamedTuple):
     hardest: float  #: [m/s²]; 0 where none was hard
     waves: int  #: hard brakes, those of a run that are less than 10 s apart counted once
 
+    @property
+    def seen(self) -> int:
+        """How many were hard."""
+        return sum(self.brakes.counts)
+
 
 class Alarms(NamedTuple):
     """Decisions in shadow mode beside some drives, and the alarms among them."""

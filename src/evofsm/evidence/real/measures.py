@@ -114,6 +114,10 @@ MEASURES = (
 )
 
 
+#: Names of those that are ours.
+OURS = tuple(measure.name for measure in MEASURES if measure.group is Group.OURS)
+
+
 def score_fixed(cases: Sequence[Case]) -> dict[str, list[NDArray[np.float64]]]:
     """Scores of what learns nothing: one series for each case, whatever is asked."""
     scores = {

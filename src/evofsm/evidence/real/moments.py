@@ -52,6 +52,11 @@ class Warned(NamedTuple):
     median: float  #: lead of those that were warned of [s]; NaN where none was
     leads: tuple[float, ...]  #: of every event [s], 0 where it was not warned of
 
+    @property
+    def share(self) -> tuple[int, int]:
+        """So many of so many."""
+        return self.warned, self.events
+
 
 def alarm_threshold(
     scores: Sequence[NDArray[np.float64]], cases: Sequence[Case], target: str, horizon: float

@@ -27,6 +27,7 @@ from evofsm.evidence.real.measures import (
 )
 from evofsm.evidence.real.moments import Moment, Warned, alarm_threshold, leads, telling_moments
 from evofsm.evidence.real.plan import Plan
+from evofsm.evidence.real.targets import Target
 from evofsm.evidence.scores import Ranked, interval, resampled
 from evofsm.evidence.study import Frame, Progress, silent
 from evofsm.fleet import in_order
@@ -98,9 +99,22 @@ class RealStudy:
         """Every row."""
         return Frame(self.rows)
 
+    @property
+    def comparable(self) -> list[Row]:
+        """Rows that rest on enough events."""
+        return [row for row in self.rows if row.enough]
+
+    def is_enough(self, target: Target) -> bool:
+        """Whether there were events enough of a target, within some horizon."""
+        return any(row.target == target.name for row in self.comparable)
+
     def of(self, target: str, horizon: float) -> list[Row]:
         """The rows of one question."""
         return [row for row in self.rows if (row.target, row.horizon) == (target, horizon)]
+
+    def row(self, target: str, horizon: float, measure: str) -> Row:
+        """The row of one measure and one question."""
+        return next(row for row in self.of(target, horizon) if row.measure == measure)
 
 
 def read_folder(folder: Path, plan: Plan, *, dealt: bool = True) -> tuple[list[Case], int]:

@@ -57,6 +57,10 @@ TARGETS = (
 )
 
 
+#: What happens, in words, by the name of the target.
+TITLES = {target.name: target.title for target in TARGETS}
+
+
 class Coming(NamedTuple):
     """Whether an event came within a horizon after each row."""
 

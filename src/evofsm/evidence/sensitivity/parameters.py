@@ -143,6 +143,24 @@ class Parameter:
             return "".join(map(str, value))
         return f"{value:.{digits}g}" if self.is_number else str(value)
 
+    @property
+    def range(self) -> str:
+        """What is tried, as people read it."""
+        if self.choices:
+            return f"all {len(self.choices)}"
+        return f"{self.show(self.low)}–{self.show(self.high)}"
+
+    @property
+    def axis(self) -> str:
+        """What stands on its axis: its name, the paper's letter and the unit."""
+        unit = f" [{self.unit}]" if self.unit else ""
+        return f"{self.label} {self.symbol}".strip() + unit
+
+    @property
+    def in_unit(self) -> str:
+        """What stands behind a value."""
+        return f" {self.unit}" if self.unit else ""
+
     def moved(self, setting: Setting, value: Any) -> Setting:
         """The same setting with another value."""
         changes: dict[str, Any] = {self.name: value}

@@ -138,6 +138,11 @@ class Row:
         """Whether all claims hold."""
         return all(self.verdicts.values())
 
+    @property
+    def broken(self) -> tuple[str, ...]:
+        """Claims that do not hold."""
+        return tuple(claim for claim, holds in self.verdicts.items() if not holds)
+
     def as_dict(self) -> dict[str, Any]:
         """For JSON."""
         return {

@@ -12,51 +12,9 @@ from numpy.typing import ArrayLike, NDArray
 from evofsm.evidence.sensitivity.designs import Design
 from evofsm.evidence.sensitivity.parameters import PARAMETERS, Parameter
 from evofsm.evidence.sensitivity.setting import Row
-from evofsm.extras import needs
-
-with needs("scipy", "study", "exact intervals"):
-    from scipy.stats import binomtest
 
 # Into so many parts of equal size a range is cut, where there are points enough for it.
 _BINS, _FEWEST_IN_BIN = 16, 8
-
-
-class Share(NamedTuple):
-    """So many of so many, with its 95 % interval (Clopper and Pearson 1934)."""
-
-    held: int
-    tried: int
-    low: float
-    high: float
-
-    @property
-    def value(self) -> float:
-        """The share itself; NaN of none."""
-        return self.held / self.tried if self.tried else math.nan
-
-
-def share_of(verdicts: ArrayLike) -> Share:
-    """Share of the true ones.
-
-    The interval takes the draws for independent; those of a Latin hypercube are spread more evenly
-    than that, so it is rather too wide than too narrow (Stein 1987).
-
-    Parameters
-    ----------
-    verdicts : (n,) array_like of bool
-
-    Examples
-    --------
-    >>> share = share_of([True] * 3 + [False] * 7)
-    >>> share.value, round(share.low, 3), round(share.high, 3)
-    (0.3, 0.067, 0.652)
-    """
-    values = np.asarray(verdicts, dtype=np.bool_)
-    if not len(values):
-        return Share(0, 0, 0.0, 1.0)
-    held, tried = int(values.sum()), len(values)
-    exact = binomtest(held, tried).proportion_ci(0.95, method="exact")
-    return Share(held, tried, float(exact.low), float(exact.high))
 
 
 class Harm(NamedTuple):
@@ -64,6 +22,11 @@ class Harm(NamedTuple):
 
     parameter: Parameter
     kept: float  #: share of its other values with which the claim still holds
+
+    @property
+    def label(self) -> str | None:
+        """The parameter, if it does any harm."""
+        return self.parameter.label if self.kept < 1.0 else None
 
 
 def worst_sweeps(rows: Sequence[Row], claim: str) -> list[Harm]:
@@ -100,6 +63,11 @@ class Index(NamedTuple):
     def counts(self) -> bool:
         """Whether it is more than chance."""
         return self.value > self.chance
+
+    @property
+    def percent(self) -> str:
+        """The share in whole percent; 0 where it is no more than chance."""
+        return f"{100.0 * self.value:.0f}" if self.counts else "0"
 
 
 def first_order(rows: Sequence[Row], of: ArrayLike, parameter: Parameter) -> Index:

@@ -47,6 +47,11 @@ class Sensitivity:
     rows: tuple[Row, ...]
     reaches: tuple[Reach, ...]
 
+    @property
+    def ids(self) -> list[str]:
+        """Of the claims."""
+        return [claim.id for claim in self.claims]
+
     def of(self, design: Design, *varied: str) -> list[Row]:
         """Rows of a design; of one sweep or map, where what it varies is named."""
         return [row for row in self.rows if row.design == design and varied in ((), row.varied)]
@@ -153,7 +158,7 @@ class _Edge(NamedTuple):
 def _edge(one: Parameter, outward: Sequence[Row], plan: Plan) -> tuple[_Edge, list[Row]]:
     """From the recovered setting outward, to where all claims hold for the last time."""
     if not outward[0].holds:  # not even there: nowhere to go from
-        return _Edge(_value(one, outward[0]), _broken(outward[0])), []
+        return _Edge(_value(one, outward[0]), outward[0].broken), []
     first_bad = next((k for k, row in enumerate(outward) if not row.holds), None)
     if first_bad is None:
         return _Edge(_value(one, outward[-1]), ()), []
@@ -166,12 +171,8 @@ def _edge(one: Parameter, outward: Sequence[Row], plan: Plan) -> tuple[_Edge, li
         row = evaluate(setting, world, Design.EDGE, (one.name,), plan.rounds)
         tried.append(row)
         good, bad = (row, bad) if row.holds else (good, row)
-    return _Edge(_value(one, good), _broken(bad)), tried
+    return _Edge(_value(one, good), bad.broken), tried
 
 
 def _value(one: Parameter, row: Row) -> float:
     return float(getattr(row.setting, one.name))
-
-
-def _broken(row: Row) -> tuple[str, ...]:
-    return tuple(claim for claim, holds in row.verdicts.items() if not holds)
