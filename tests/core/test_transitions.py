@@ -4,8 +4,9 @@ import numba
 import numpy as np
 import pytest
 
+from evofsm.core.learnt import Transitions
 from evofsm.core.machine import EvolvingFSM
-from evofsm.core.transitions import Transitions, retire_state
+from evofsm.core.transitions import retire_state
 
 # Learnt by `machine`, and by hand with phi = 1/2 and prior frequency 1/4 from
 # F = [[1/4, 1/4], [1/4, 1/4]]: action 0 led once from state 1 to 0, action 1 once from 0 to 0 and

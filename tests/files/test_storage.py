@@ -26,6 +26,7 @@ from evofsm.core.states.ets import Paper
 from evofsm.core.states.failure import FailureSplit
 from evofsm.core.states.novelty import Novelty
 from evofsm.driving.risk.outcome import LatentRisk
+from evofsm.driving.risk.ranges import hardest_seen
 from evofsm.driving.risk.rehearsal import HARDEST
 from evofsm.files import ranges, storage
 from evofsm.files.storage import kind_of
@@ -449,15 +450,15 @@ def test_a_risk_that_no_drive_could_have_left_is_refused(forged, tmp_path, name,
 
 
 def test_every_array_of_every_kind_has_its_range():
-    for kind, shapes in storage._SHAPES.items():
+    for kind in ranges.KINDS.values():
         settings = {"dt": 0.25}
-        for name in shapes or ():
+        for name in kind.members or ():
             with pytest.raises(ValueError, match=f"{name} of nan"):
-                ranges.refuse_others(kind, settings, {name: np.array([np.nan])})
+                ranges.refuse_others(kind.name, settings, {name: np.array([np.nan])})
 
 
 def test_the_hardest_braking_is_the_same_for_leaders_and_in_files():
-    assert ranges.hardest_seen(np.inf) == HARDEST
+    assert hardest_seen(np.inf) == HARDEST
 
 
 @pytest.mark.parametrize("kind", ["machine", "model", "risk"])

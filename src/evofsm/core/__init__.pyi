@@ -14,9 +14,14 @@ from .kernels import compiled as compiled
 from .kernels import inner_kernel as inner_kernel
 from .kernels import kernel as kernel
 from .kernels import parallel_kernel as parallel_kernel
+from .known import Known as Known
+from .learnt import NO_ACTION as NO_ACTION
+from .learnt import NOT_OPEN as NOT_OPEN
+from .learnt import Counts as Counts
+from .learnt import Learnt as Learnt
+from .learnt import Transitions as Transitions
+from .learnt import arrays_of as arrays_of
 from .machine import EvolvingFSM as EvolvingFSM
-from .memory import NO_ACTION as NO_ACTION
-from .memory import Learnt as Learnt
 from .memory import Memory as Memory
 from .memory import Parameters as Parameters
 from .memory import leaves as leaves
@@ -54,9 +59,7 @@ from .step import learn_rows as learn_rows
 from .step import room_for as room_for
 from .step import step_and_act as step_and_act
 from .step import widen as widen
-from .transitions import NOT_OPEN as NOT_OPEN
 from .transitions import Policy as Policy
-from .transitions import Transitions as Transitions
 from .validation import check_action as check_action
 from .validation import check_actions as check_actions
 from .validation import check_rows as check_rows

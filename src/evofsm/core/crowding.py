@@ -7,16 +7,23 @@ from __future__ import annotations
 
 from enum import IntEnum
 
-from evofsm.core.kernels import rare_kernel
+import numpy as np
+from numpy.typing import NDArray
+
+from evofsm.core.kernels import inner_kernel, rare_kernel
+from evofsm.core.layout import joined_by
 from evofsm.core.memory import Memory
 from evofsm.core.states.clusters import measure_distances
-from evofsm.core.transitions import Outcomes, merge_episodes, merge_states, retire_state
+from evofsm.core.transitions import merge_states, retire_state
 
 # What may happen besides what `evofsm.core.states.clusters` knows.
 MERGED: int = 4
 RETIRED: int = 8
 # Stands for the newcomer where it is itself given up.
 NEWCOMER = -1
+# Numbers of the arrays that are joined by their sum, and by the larger of both.
+_SUMMED_STATES, _LARGER_STATES = joined_by("sum", "state"), joined_by("most", "state")
+_SUMMED_PLACES, _LARGER_PLACES = joined_by("sum", "place"), joined_by("most", "place")
 
 
 class WhenFull(IntEnum):
@@ -79,20 +86,24 @@ def merge_closest(memory: Memory, n: int, nearest: int) -> int:
 @rare_kernel
 def _merge(memory: Memory, kept: int, given: int, n: int) -> None:
     now = memory.learnt
-    clusters = now.clusters
-    share = now.visits[given] / max(now.visits[kept] + now.visits[given], 1.0)
+    clusters, counted = now.clusters, now.outcomes
+    share = counted.visits[given] / max(counted.visits[kept] + counted.visits[given], 1.0)
     for k in range(len(clusters.centers)):
         center = clusters.centers[k]
         center[kept] += share * (center[given] - center[kept])
-    clusters.potentials[kept] = max(clusters.potentials[kept], clusters.potentials[given])
     merge_states(now.transitions, kept, given, n)
     for i in range(n):
-        now.changes[kept, i] += now.changes[given, i]
+        counted.changes[kept, i] += counted.changes[given, i]
     for i in range(n):
-        now.changes[i, kept] += now.changes[i, given]
-    _merge_outcomes(now.outcomes, kept, given)
-    now.visits[kept] += now.visits[given]
-    now.belief[kept] += now.belief[given]
+        counted.changes[i, kept] += counted.changes[i, given]
+    # Of the present episode it is known that it came to both; of those before it is not.
+    counted.episodes[kept] -= _both(counted.latest_visit, kept, given, counted.began[0])
+    for place in range(len(counted.tried)):
+        latest = counted.latest_try[place]
+        counted.tried[place, kept] -= _both(latest, kept, given, counted.began[0])
+        _join(memory.per_place[:, place], _SUMMED_PLACES, _LARGER_PLACES, kept, given)
+    _join(memory.per_state, _SUMMED_STATES, _LARGER_STATES, kept, given)
+    counted.joined[kept] = 1.0
     if now.state[0] == given:
         now.state[0] = kept
     _clear(memory, given, n)
@@ -105,28 +116,34 @@ def _merge(memory: Memory, kept: int, given: int, n: int) -> None:
     )
 
 
+@inner_kernel
+def _both(latest: NDArray[np.float64], kept: int, given: int, began: float) -> bool:
+    return bool(latest[kept] >= began and latest[given] >= began)
+
+
 @rare_kernel
-def _merge_outcomes(outcomes: Outcomes, kept: int, given: int) -> None:
-    began = outcomes.began[0]
-    for place in range(len(outcomes.decisions)):
-        outcomes.decisions[place, kept] += outcomes.decisions[place, given]
-        outcomes.failures[place, kept] += outcomes.failures[place, given]
-        tried, latest = outcomes.tried[place], outcomes.latest_try[place]
-        merge_episodes(tried, outcomes.failed_after[place], latest, kept, given, began)
-    episodes, latest_visit = outcomes.episodes, outcomes.latest_visit
-    merge_episodes(episodes, outcomes.failed_soon, latest_visit, kept, given, began)
-    outcomes.joined[kept] = 1.0
-    outcomes.endings[kept] += outcomes.endings[given]
+def _join(
+    arrays: NDArray[np.float64],
+    summed: tuple[int, ...],
+    larger: tuple[int, ...],
+    kept: int,
+    given: int,
+) -> None:
+    """Give what the table says of one state to another: arrays (all of a kind, capacity)."""
+    for number in summed:
+        arrays[number, kept] += arrays[number, given]
+    for number in larger:
+        arrays[number, kept] = max(arrays[number, kept], arrays[number, given])
 
 
 @rare_kernel
 def retire_least_useful(memory: Memory, n: int) -> int:
     """Give up one of ``n`` states; answers its index."""
-    now = memory.learnt
+    now, counted = memory.learnt, memory.learnt.outcomes
     given, least, failed = NEWCOMER, 0.0, True
     for i in range(n):
-        utility = now.visits[i] / (now.clusters.n_observations[0] - now.founded[i] + 1.0)
-        ended = now.outcomes.endings[i] > 0.0
+        utility = counted.visits[i] / (now.clusters.n_observations[0] - counted.founded[i] + 1.0)
+        ended = counted.endings[i] > 0.0
         if i != now.state[0] and (
             given == NEWCOMER or (failed and not ended) or (failed == ended and utility < least)
         ):
@@ -144,27 +161,12 @@ def retire_least_useful(memory: Memory, n: int) -> int:
 @rare_kernel
 def _clear(memory: Memory, given: int, n: int) -> None:
     """Make an index as good as new."""
-    now = memory.learnt
+    changes = memory.learnt.outcomes.changes
     for i in range(n):
-        now.changes[given, i] = 0.0
-        now.changes[i, given] = 0.0
-    outcomes = now.outcomes
-    for of_places in (
-        outcomes.decisions,
-        outcomes.failures,
-        outcomes.tried,
-        outcomes.failed_after,
-        outcomes.latest_try,
-    ):
-        for place in range(len(of_places)):
-            of_places[place, given] = 0.0
-    for of_states in (
-        outcomes.endings,
-        outcomes.episodes,
-        outcomes.failed_soon,
-        outcomes.latest_visit,
-        outcomes.joined,
-    ):
-        of_states[given] = 0.0
-    now.visits[given] = 0.0
-    now.belief[given] = 0.0
+        changes[given, i] = 0.0
+        changes[i, given] = 0.0
+    for number in _SUMMED_STATES + _LARGER_STATES:
+        memory.per_state[number, given] = 0.0
+    for number in _SUMMED_PLACES + _LARGER_PLACES:
+        for place in range(memory.per_place.shape[1]):
+            memory.per_place[number, place, given] = 0.0

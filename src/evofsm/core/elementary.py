@@ -16,7 +16,7 @@ from numba.extending import intrinsic
 from numba.np import arrayobj
 from numpy.typing import NDArray
 
-from evofsm.core.kernels import LINE, inner_kernel
+from evofsm.core.kernels import LINE, NOT_COMPILED, inner_kernel
 
 _arrays = cast(Any, arrayobj)  # Numba has no types for it
 
@@ -181,18 +181,51 @@ def _fetch_ahead(_context: Any, array: Any, i: Any) -> Any:
     return types.void(array, types.intp), generate
 
 
+# The same in Python, for where nothing is compiled; a product is then rounded before its sum.
+def _multiply_add(x: float, y: float, z: float) -> float:
+    return x * y + z
+
+
+def _work(
+    matrix: NDArray[np.float64],
+    i: int,
+    j: int,
+    predicted: NDArray[np.float64],
+    reached: NDArray[np.float64],
+    *numbers: float,
+) -> None:
+    columns = slice(j, j + LINE)
+    for k in range(len(numbers) // 3):
+        believed, kept, gain = numbers[3 * k : 3 * k + 3]
+        row = matrix[i + k, columns]
+        predicted[columns] += believed * row
+        row[:] = kept * row + gain * reached[columns]
+
+
 #: ``x * y + z``, rounded once: one instruction in place of two, and the same one everywhere.
-fma: Callable[[float, float, float], float] = cast(Any, _fused_multiply_add)
+fma: Callable[[float, float, float], float] = (
+    _multiply_add if NOT_COMPILED else cast(Any, _fused_multiply_add)
+)
 #: ``work_on_line(matrix, i, j, predicted, reached, believed, kept, gain)``, for a line of columns
 #: from j on: ``predicted += believed * row``, then ``row = kept * row + gain * reached``.
-work_on_line: Callable[..., None] = cast(Any, _work_on_line)
+work_on_line: Callable[..., None] = _work if NOT_COMPILED else cast(Any, _work_on_line)
 #: The same for two rows, i and the next one, with three numbers for each: a sum is loaded once.
-work_on_two_lines: Callable[..., None] = cast(Any, _work_on_two_lines)
+work_on_two_lines: Callable[..., None] = _work if NOT_COMPILED else cast(Any, _work_on_two_lines)
 #: ``fetch_ahead(array, i)``: have the line that holds an element brought near, for a later step.
-fetch_ahead: Callable[[NDArray[Any], int], None] = cast(Any, _fetch_ahead)
+fetch_ahead: Callable[[NDArray[Any], int], None] = (
+    (lambda array, i: None) if NOT_COMPILED else cast(Any, _fetch_ahead)
+)
 # What a kernel sees of the others.
-_bits_of: Callable[[float], int] = cast(Any, _bits_of_float)
-_float_of: Callable[[int], float] = cast(Any, _float_of_bits)
+_bits_of: Callable[[float], int] = (
+    (lambda number: int(np.float64(number).view(np.int64)))
+    if NOT_COMPILED
+    else cast(Any, _bits_of_float)
+)
+_float_of: Callable[[int], float] = (
+    (lambda bits: float(np.uint64(bits & 0xFFFF_FFFF_FFFF_FFFF).view(np.float64)))
+    if NOT_COMPILED
+    else cast(Any, _float_of_bits)
+)
 
 
 @inner_kernel

@@ -26,6 +26,9 @@ from numba.extending import register_jitable
 Function = TypeVar("Function", bound=Callable[..., object])
 
 
+#: Whether kernels are plain Python, to be debugged or covered (``NUMBA_DISABLE_JIT=1``).
+NOT_COMPILED: bool = cast(Any, numba.config).DISABLE_JIT
+
 _INLINED = {"forceinline": True, "_nrt": False}
 
 
@@ -132,7 +135,7 @@ def compiled(function: Function, *signature: object, **options: Any) -> Function
         dispatcher = compile_(cache=True)(function)
     except RuntimeError:  # neither the package nor the user's cache folder may be written
         dispatcher = compile_()(function)
-    if not cast(Any, numba.config).DISABLE_JIT:
+    if not NOT_COMPILED:
         inlined = {name: value for name, value in options.items() if name in _INLINED}
         for_kernels: Any = _inside(function, **inlined)
         known = dispatcher.typingctx

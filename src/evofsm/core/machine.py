@@ -15,6 +15,7 @@ import copy
 import os
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import fields
 from functools import wraps
 from threading import RLock
 from typing import Any, Self, SupportsIndex, TypeVar, cast
@@ -28,10 +29,11 @@ from evofsm.core.crowding import WhenFull
 from evofsm.core.divergence import jensen_shannon
 from evofsm.core.explanation import Explanation, Nearest, explain, nothing_known
 from evofsm.core.kernels import LINE, lanes
+from evofsm.core.known import Known, recognise_rows
+from evofsm.core.layout import Array
+from evofsm.core.learnt import MACHINE, NO_ACTION, NOT_OPEN, Learnt
 from evofsm.core.memory import (
-    NO_ACTION,
     Held,
-    Learnt,
     Memory,
     Parameters,
     allocate,
@@ -46,7 +48,7 @@ from evofsm.core.memory import (
     tell_of_failures,
     view,
 )
-from evofsm.core.model import FSMModel, recognise_rows
+from evofsm.core.model import FSMModel
 from evofsm.core.naming import Labels
 from evofsm.core.notebook import machine_html
 from evofsm.core.observations import Missing
@@ -69,7 +71,7 @@ from evofsm.core.step import (
     updater,
     widen,
 )
-from evofsm.core.transitions import NOT_OPEN, Policy, count_open, marginal, propagate
+from evofsm.core.transitions import Policy, count_open, propagate
 from evofsm.core.validation import (
     check_action,
     check_actions,
@@ -114,7 +116,7 @@ def _alone(method: Method) -> Method:
     return cast(Method, locked)
 
 
-class EvolvingFSM:
+class EvolvingFSM(Known):
     """A finite state machine that grows its states and transitions from what it observes.
 
     Parameters
@@ -230,7 +232,7 @@ class EvolvingFSM:
             raise ValueError(f"learning_rate is {learning_rate}; it must lie below 1")
         self._share()
         self._use(allocate(0, whole("n_actions", n_actions), LINE, 0, parameters))
-        ranges.refuse_others("machine", self._content)
+        ranges.refuse_others(MACHINE.name, self._content)
 
     @classmethod
     def paper(cls) -> Self:
@@ -589,7 +591,7 @@ prior_frequency=0.001, spread=3.0)
         array([0.686, 0.314])
         """
         i = check_action(i, self.n_actions)
-        return propagate(self.belief, self._matrix, self._averaged, i, horizon, policy)
+        return propagate(self.belief, self._matrix, self.averaged_matrix, i, horizon, policy)
 
     @_alone
     def explain(
@@ -632,6 +634,17 @@ prior_frequency=0.001, spread=3.0)
             return nothing_known("Nothing was observed yet in this episode.")
         labels, nearest = Labels() if labels is None else labels, self._nearest(self.state)
         return explain(self, self.belief, index, labels, nearest)
+
+    # Asked of a machine, all of an answer is of one moment.
+    recognise = _alone(Known.recognise)
+    nearest = _alone(Known.nearest)
+    propagate = _alone(Known.propagate)
+    averaged_matrix = _alone(Known.averaged_matrix)
+    stationary_distribution = _alone(Known.stationary_distribution)
+    committor_forward = _alone(Known.committor_forward)
+    mfpt = _alone(Known.mfpt)
+    simulate = _alone(Known.simulate)
+    joint_frequency = property(_alone(cast(Any, Known.joint_frequency).fget))
 
     # -- What it was told -----------------------------------------------------------------------
 
@@ -743,12 +756,6 @@ prior_frequency=0.001, spread=3.0)
 
     @property
     @_alone
-    def potentials(self) -> NDArray[np.float64]:
-        """(n,) ndarray: density of all observations at each centre, in (0, 1]."""
-        return self._memory.learnt.clusters.potentials[: self.n_states].copy()
-
-    @property
-    @_alone
     def transition_matrices(self) -> NDArray[np.float64]:
         """(q, n, n) ndarray: for each action, probabilities from state (row) to state (column).
 
@@ -765,132 +772,18 @@ prior_frequency=0.001, spread=3.0)
         return self._of_actions(self._memory.learnt.transitions.origin_frequency, unused)
 
     @property
-    @_alone
-    def joint_frequency(self) -> NDArray[np.float64]:
-        """(q, n, n) ndarray: the paper's F, recency-weighted frequencies of transitions."""
-        return self.origin_frequency[:, :, None] * self.transition_matrices
-
-    @property
-    @_alone
-    def visits(self) -> NDArray[np.float64]:
-        """(n,) ndarray: observations in which each state was the most probable."""
-        return self._memory.learnt.visits[: self.n_states].copy()
-
-    @property
-    @_alone
-    def changes(self) -> NDArray[np.float64]:
-        """(n, n) ndarray: steps from the most probable state (row) to the next one (column)."""
-        return self._memory.learnt.changes[: self.n_states, : self.n_states].copy()
-
-    @property
-    @_alone
-    def decisions(self) -> NDArray[np.float64]:
-        """(q, n) ndarray: for each action, transitions that began in each state, by belief.
-
-        Counts never forget, unlike `origin_frequency`: they are the evidence that there is.
-
-        Examples
-        --------
-        >>> machine = EvolvingFSM(n_actions=2, radius=0.5)
-        >>> trace = machine.learn_many([[0.0], [0.1], [2.0], [1.0], [1.2]], [0, 0, 0, 1, 0])
-        >>> machine.decisions.round(2)
-        array([[3.  , 0.  ],
-               [0.37, 0.63]])
-        """
-        return self._of_actions(self._memory.learnt.outcomes.decisions, 0.0)
-
-    @property
-    @_alone
-    def failures(self) -> NDArray[np.float64]:
-        """(q, n) ndarray: those of `decisions` that led straight into failure.
-
-        Examples
-        --------
-        >>> machine = EvolvingFSM(n_actions=2, radius=0.5)
-        >>> trace = machine.learn_many([[0.0], [0.1], [2.0], [1.0]], [0, 0, 0, 1])
-        >>> step = machine.observe([1.2], failed=True)
-        >>> machine.failures.round(2)
-        array([[0.  , 0.  ],
-               [0.37, 0.63]])
-        """
-        return self._of_actions(self._memory.learnt.outcomes.failures, 0.0)
-
-    @property
-    @_alone
-    def endings(self) -> NDArray[np.float64]:
-        """(n,) ndarray: failures whose last observation was recognised as each state.
-
-        Where failures end, a dead end may be.
-
-        Examples
-        --------
-        >>> machine = EvolvingFSM(n_actions=2, radius=0.5)
-        >>> trace = machine.learn_many([[0.0], [0.1], [2.0], [1.0]], [0, 0, 0, 1], failures=[1, 3])
-        >>> machine.endings
-        array([1., 1.])
-        """
-        return self._memory.learnt.outcomes.endings[: self.n_states].copy()
-
-    @property
-    @_alone
-    def episodes(self) -> NDArray[np.float64]:
-        """(n,) ndarray: episodes that came to each state, without the one that is going on.
-
-        Examples
-        --------
-        >>> machine = EvolvingFSM(n_actions=2, radius=0.5)
-        >>> trace = machine.learn_many([[0.0], [0.1], [2.0], [1.0]], [0, 0, 0, 1], [0, 2], [3])
-        >>> machine.episodes, machine.failed_soon
-        (array([2., 1.]), array([1., 1.]))
-        """
-        outcomes, n = self._memory.learnt.outcomes, self.n_states
-        return outcomes.episodes[:n] - self._under_way(outcomes.latest_visit[:n])
-
-    @property
-    @_alone
-    def failed_soon(self) -> NDArray[np.float64]:
-        """(n,) ndarray: those of `episodes` that failed within the horizon of being there."""
-        return self._memory.learnt.outcomes.failed_soon[: self.n_states].copy()
-
-    @property
     def failures_told(self) -> bool:
         """Whether anybody told of failures: of one, or that there was none."""
         return failures_told(self._buffer) or bool(self.endings.any())
 
     @property
     @_alone
-    def joined(self) -> NDArray[np.float64]:
-        """(n,) ndarray: 1 where two states were joined, so that an episode may count twice."""
-        return self._memory.learnt.outcomes.joined[: self.n_states].copy()
-
-    @property
-    @_alone
-    def tried(self) -> NDArray[np.float64]:
-        """(q, n) ndarray: episodes that took each action in each state, without the present one.
-
-        Examples
-        --------
-        >>> machine = EvolvingFSM(n_actions=2, radius=0.5)
-        >>> trace = machine.learn_many([[0.0], [0.1], [2.0], [1.0]], [0, 1, 0, 0], [0, 2], [3])
-        >>> machine.tried, machine.failed_after
-        (array([[2., 0.],
-               [0., 0.]]), array([[1., 0.],
-               [0., 0.]]))
-        """
-        outcomes = self._memory.learnt.outcomes
-        return self._of_actions(outcomes.tried - self._under_way(outcomes.latest_try), 0.0)
-
-    @property
-    @_alone
-    def failed_after(self) -> NDArray[np.float64]:
-        """(q, n) ndarray: those of `tried` that failed within the horizon of doing so."""
-        return self._of_actions(self._memory.learnt.outcomes.failed_after, 0.0)
-
-    @property
-    @_alone
-    def marginal_matrix(self) -> NDArray[np.float64]:
-        """(n, n) ndarray: the paper's P*, transition probabilities if all actions are alike."""
-        return self._averaged("marginal")
+    def width(self) -> float:
+        """Width of recognition, a squared distance; 0 before the first observation."""
+        held = self._memory.learnt.clusters
+        if not held.n_observations[0]:
+            return 0.0
+        return width(self._memory.parameters.rule, held.scatter[0] / held.n_observations[0])
 
     @property
     @_alone
@@ -948,32 +841,13 @@ prior_frequency=0.001, spread=3.0)
         >>> model.visits, machine.model().visits
         (array([3., 1.]), array([3., 2.]))
         """
-        learnt, n = self._memory.learnt, self.n_states
+        known = [entry.name for entry in fields(Known)]
         return FSMModel(
-            centers=self.centers,
-            potentials=self.potentials,
-            width=width(self._memory.parameters.rule, learnt.clusters) if n else 0.0,
-            transition_matrices=self.transition_matrices,
-            origin_frequency=self.origin_frequency,
-            uses=learnt.transitions.uses.copy(),
-            visits=self.visits,
-            founded=learnt.founded[:n].copy(),
-            changes=self.changes,
-            decisions=self.decisions,
-            failures=self.failures,
-            endings=self.endings,
-            episodes=self.episodes,
-            failed_soon=self.failed_soon,
-            joined=self.joined,
-            tried=self.tried,
-            failed_after=self.failed_after,
-            failures_told=self.failures_told,
-            rule=self._rule,
+            **{name: getattr(self, name) for name in known},
             actions=actions,
             names=tuple(names),
             units=tuple(units),
             dt=dt,
-            settings=self.settings,
         )
 
     # -- Keeping it -----------------------------------------------------------------------------
@@ -1006,7 +880,7 @@ prior_frequency=0.001, spread=3.0)
         2
         """
         # Without spare room the shapes of the arrays tell the sizes, and nothing else is stored.
-        storage.write(path, "machine", self._content, dict(leaves(self._trimmed())), provenance)
+        storage.write(path, MACHINE.name, self._content, dict(leaves(self._trimmed())), provenance)
 
     @classmethod
     def load(cls, path: storage.Place) -> Self:
@@ -1041,7 +915,7 @@ prior_frequency=0.001, spread=3.0)
         >>> again.observe([1.1]).surprise == machine.observe([1.1]).surprise
         True
         """
-        content, arrays = storage.read(path, "machine")
+        content, arrays = storage.read(path, MACHINE.name)
         with storage.explained(path):
             refuse_unless_told(told := content.pop("failures_told", False))
             machine = cls(**{**content, "rule": restore(content["rule"])})
@@ -1152,7 +1026,7 @@ prior_frequency=0.001, spread=3.0)
         now = self._memory.learnt
         if state is None or now.outcomes.latest_visit[state] != now.outcomes.clock[0]:
             return None
-        beyond = reach(self._rule, width(self._memory.parameters.rule, now.clusters))
+        beyond = reach(self._rule, self.width)
         return Nearest(state, float(np.sqrt(now.clusters.squared_distances[state])), beyond)
 
     def _observe_any(self, z: ArrayLike, failed: bool, missing: Missing) -> Step:
@@ -1214,7 +1088,7 @@ prior_frequency=0.001, spread=3.0)
             counted = rule.weights * ~absent if missing is Missing.PARTIAL else rule.weights
             held, belief = now.clusters, np.empty(n)
             centers, distances = np.ascontiguousarray(held.centers[:, :n]), np.empty(n)
-            rows = filled[None], width(rule, held)
+            rows = filled[None], self.width
             recognise_rows(centers, counted, *rows, distances, belief[None])
         surprise = jensen_shannon(predicted, belief) if len(predicted) else np.nan
         if failed:  # both, or neither
@@ -1263,13 +1137,25 @@ prior_frequency=0.001, spread=3.0)
         place = int(transitions.places[i])
         return transitions.scales[place, :n, None] * transitions.matrices[place, :n, :n]
 
-    def _averaged(self, policy: Policy) -> NDArray[np.float64]:
-        """(n, n) transition probabilities, averaged over the actions."""
+    def _matrices(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """(s, n, n) and (s,): the matrices of all actions that were used, and their uses."""
         n, transitions = self.n_states, self._memory.learnt.transitions
         used = np.flatnonzero(transitions.places != NOT_OPEN)
         places = transitions.places[used].astype(int)
         scales, stored = transitions.scales[places, :n, None], transitions.matrices[places, :n, :n]
-        return marginal(scales * stored, transitions.uses[used], self.n_actions, policy)
+        return scales * stored, transitions.uses[used]
+
+    @_alone
+    def _array(self, array: Array) -> NDArray[np.float64]:
+        """An array of the table, as people see it."""
+        n, arrays = self.n_states, dict(leaves(self._memory.learnt))
+        values = arrays[array.name]
+        if array.latest:  # what belongs to an episode that is going on is not shown yet
+            values = values - self._under_way(arrays[array.latest])
+        if array.kind == "place":
+            return self._of_actions(values, 0.0)
+        seen: NDArray[np.float64] = values[tuple(slice(n) for _ in values.shape)]
+        return values.copy() if array.kind == "action" else seen.copy()
 
     def _of_actions(self, of_places: NDArray[np.float64], unused: float) -> NDArray[np.float64]:
         """An array with a row for each action; those never used get equal shares of ``unused``."""

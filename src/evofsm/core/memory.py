@@ -9,9 +9,9 @@ the rest, in single precision.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 from numba.extending import register_jitable
@@ -19,11 +19,15 @@ from numpy.typing import NDArray
 
 from evofsm.core.kernels import LINE, inner_kernel, kernel, lanes
 from evofsm.core.layout import (
+    ALL,
+    COUNTS,
     FIELDS,
+    PLACES,
     SHAPES,
     SIZES,
-    Changes,
-    Counter,
+    AllPerPlace,
+    AllPerState,
+    Array,
     PerState,
     Place,
     Setting,
@@ -31,12 +35,10 @@ from evofsm.core.layout import (
     number_fields,
     opener,
 )
-from evofsm.core.states.clusters import Clusters
+from evofsm.core.learnt import NO_ACTION, NOT_OPEN, Clusters, Learnt, Outcomes
 from evofsm.core.states.rule import RuleSettings
-from evofsm.core.transitions import NOT_OPEN, Outcomes, Transitions, count_open
+from evofsm.core.transitions import count_open
 from evofsm.core.validation import refuse_more_failures, refuse_unless_distribution
-
-NO_ACTION = -1
 
 # A buffer begins with its sizes (m, q, capacity, places); settings follow, whether anybody told of
 # failures, whether it is closed, and counters.
@@ -57,24 +59,6 @@ class Parameters(NamedTuple):
     rule: RuleSettings
 
 
-class Learnt(NamedTuple):
-    """What the next step needs, and what people ask of the states."""
-
-    n_states: Counter
-    n_founded: Counter  # states so far, with those given up
-    action: Counter  # taken after the latest observation, or NO_ACTION
-    chained: Counter  # 1 where `belief` belongs to the present episode
-    state: Counter  # the most probable state at the latest observation
-    belief: PerState
-    ids: PerState  # number of its founding, from 0
-    visits: PerState  # observations in which it was the most probable
-    founded: PerState  # number of the observation that did it, from 1
-    changes: Changes  # steps from a state (row) to a state
-    clusters: Clusters
-    transitions: Transitions
-    outcomes: Outcomes
-
-
 class Scratch(NamedTuple):
     """Room in which a step works; worth nothing after it."""
 
@@ -92,27 +76,23 @@ class Memory(NamedTuple):
     parameters: Parameters
     learnt: Learnt
     scratch: Scratch
+    per_state: AllPerState
+    per_place: AllPerPlace
 
 
-# How many arrays there are of each kind, and settings.
-_KINDS = number_fields(Memory)
-_FAILURES_TOLD = _SETTINGS + _KINDS["setting"]
+number_fields(Memory)
+_FAILURES_TOLD = _SETTINGS + COUNTS["setting"]
 _CLOSED = _FAILURES_TOLD + 1
 _COUNTERS = _CLOSED + 1
-_PER_STATE, _PER_PLACE = _KINDS["state"], _KINDS["place"]
-_PER_ACTION, _PER_VARIABLE = _KINDS["action"], _KINDS["variable"]
-
-
-def _counter(part: type, name: str) -> int:
-    """Where a counter stands in a buffer."""
-    place = FIELDS[part][name]
-    assert isinstance(place, Place)
-    return _COUNTERS + place.number
+_PER_STATE, _PER_PLACE = COUNTS["state"], COUNTS["place"]
+_PER_ACTION, _PER_VARIABLE = COUNTS["action"], COUNTS["variable"]
 
 
 # The counters that tell where the present episode is; the first belief stands behind them all.
-_ACTION, _CHAINED, _STATE = (_counter(Learnt, name) for name in ("action", "chained", "state"))
-_CLOCK, _BEGAN = (_counter(Outcomes, name) for name in ("clock", "began"))
+_ACTION, _CHAINED, _STATE, _CLOCK, _BEGAN = (
+    _COUNTERS + PLACES[cast(Array, array)].number
+    for array in (Learnt.action, Learnt.chained, Learnt.state, Outcomes.clock, Outcomes.began)
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -179,24 +159,37 @@ def open_apart(buffer: NDArray[np.float64], matrices: NDArray[Any]) -> Memory:
     return memory
 
 
-_opened = opener(Memory)
-
-
 def view(buffer: NDArray[np.float64]) -> Memory:
     """Views into a whole buffer, for Python."""
     sizes = _sizes(buffer)
-    begins, lengths = _sections(*sizes), {"one": 1, **dict(zip(SIZES, sizes, strict=True))}
+    begins = _sections(*sizes)
+    return _view(buffer, buffer[begins.matrix :], sizes, begins)
+
+
+def _view(
+    buffer: NDArray[np.float64],
+    matrices: NDArray[Any],
+    sizes: Sequence[int],
+    begins: Sequence[int],
+) -> Memory:
+    lengths = {"one": 1, **dict(zip(SIZES, sizes, strict=True))}
+    where = dict(zip(_Sections._fields, begins, strict=True)) | {"matrix": 0}
 
     def value(place: Place) -> Any:
-        begin = getattr(begins, place.kind)
+        begin, source = where[place.kind], matrices if place.kind == "matrix" else buffer
         if place.kind == "setting":
             return float(buffer[begin + place.number])
-        shape = tuple(lengths[size] for size in SHAPES[place.kind])
-        begin += place.number * math.prod(shape)
-        return buffer[begin : begin + math.prod(shape)].reshape(shape)
+        shape = [lengths[size] for size in SHAPES[place.kind]]
+        if place.number == ALL:
+            shape.insert(0, COUNTS[place.kind])
+        begin += max(place.number, 0) * math.prod(shape)
+        return source[begin : begin + math.prod(shape)].reshape(shape)
 
     memory: Memory = build(Memory, value)
     return memory
+
+
+_opened = opener(Memory, _view)
 
 
 def allocate(
@@ -345,9 +338,10 @@ def forget_present(buffer: NDArray[np.float64]) -> None:
     buffer[_ACTION : _CHAINED + 1] = NO_ACTION, 0.0
 
 
-def leaves(learnt: NamedTuple) -> Iterator[tuple[str, NDArray[np.float64]]]:
-    """Every array in a tuple of arrays and further such tuples, with its name."""
-    for name, value in zip(learnt._fields, learnt, strict=True):
+def leaves(learnt: object) -> Iterator[tuple[str, NDArray[np.float64]]]:
+    """Every array in a part and the parts in it, with its name."""
+    for name in FIELDS[type(learnt)]:
+        value = getattr(learnt, name)
         if isinstance(value, np.ndarray):
             yield name, value
         else:

@@ -29,15 +29,15 @@ from evofsm.core.crowding import (
     retire_least_useful,
 )
 from evofsm.core.divergence import jensen_shannon_kernel
-from evofsm.core.kernels import inner_kernel, kernel, lanes, rare_kernel
-from evofsm.core.memory import NO_ACTION, Memory, Parameters, is_closed, open_memory
+from evofsm.core.kernels import NOT_COMPILED, inner_kernel, kernel, lanes, rare_kernel
+from evofsm.core.learnt import NO_ACTION, NOT_OPEN
+from evofsm.core.memory import Memory, Parameters, is_closed, open_memory
 from evofsm.core.notebook import step_html
 from evofsm.core.states import clusters, spread
-from evofsm.core.states.clusters import place_center, potential_of
+from evofsm.core.states.clusters import place_center, potential_of, total_variance
 from evofsm.core.states.dispatch import determine, width
 from evofsm.core.states.failure import splits
 from evofsm.core.transitions import (
-    NOT_OPEN,
     count,
     count_failure,
     count_open,
@@ -192,11 +192,11 @@ def step(
         _decide(memory, place, n, failed)
 
     if now.chained[0]:
-        now.changes[int(now.state[0]), nearest] += 1.0
+        now.outcomes.changes[int(now.state[0]), nearest] += 1.0
     for i in range(lanes(n)):
         now.belief[i] = scratch.recognised[i]
     now.state[0] = nearest
-    now.visits[nearest] += 1.0
+    now.outcomes.visits[nearest] += 1.0
     count_visit(now.outcomes, nearest)
     now.action[0] = NO_ACTION
     now.chained[0] = 1.0
@@ -303,6 +303,8 @@ def updater(limit: Limit) -> Callable[..., float]:
 
 
 def _compile_plain(kernel: Any, arguments: str, limit: Limit) -> None:
+    if NOT_COMPILED:
+        return
     with _COMPILING:  # whichever thread comes first
         kernel.disable_compile(False)
         kernel.compile(f"({arguments}, {'none' if limit is None else 'int64'})")
@@ -382,8 +384,8 @@ def _splits(memory: Memory, nearest: int) -> bool:
     return splits(
         memory.parameters.rule,
         now.clusters.squared_distances[nearest],
-        now.visits[nearest],
-        now.changes[nearest, nearest],
+        now.outcomes.visits[nearest],
+        now.outcomes.changes[nearest, nearest],
         now.outcomes.endings[nearest],
     )
 
@@ -418,7 +420,7 @@ def _found(memory: Memory, n: int, nearest: int, potential: float, limit: Limit)
     place_center(now.clusters, new, now.clusters.latest, potential)
     expand(now.transitions, new, n, parameters.prior_frequency)
     now.ids[new] = now.n_founded[0]
-    now.founded[new] = now.clusters.n_observations[0]
+    now.outcomes.founded[new] = now.clusters.n_observations[0]
     now.n_founded[0] += 1.0
     now.n_states[0] = n
     return event, new
@@ -432,7 +434,7 @@ def _recognise(memory: Memory, n: int, nearest: int) -> None:
         held.squared_distances,
         lanes(n),
         nearest,
-        width(parameters.rule, held),
+        width(parameters.rule, total_variance(held)),
         parameters.belief_tolerance,
         memory.scratch.recognised,
     )

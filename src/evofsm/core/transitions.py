@@ -13,7 +13,7 @@ the other way round, with the same meaning of rows.)
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Literal, NamedTuple, get_args
+from typing import Literal, get_args
 
 import numpy as np
 from numba.extending import register_jitable
@@ -21,60 +21,17 @@ from numpy.typing import NDArray
 
 from evofsm.core.elementary import fma, total, work_on_line, work_on_two_lines
 from evofsm.core.kernels import LINE, inner_kernel, lanes, rare_kernel
-from evofsm.core.layout import Counter, Matrices, PerAction, PerPlace, PerState
+from evofsm.core.learnt import NOT_OPEN, SMALLEST_SCALE, Outcomes, Transitions
 from evofsm.core.validation import whole
 
 Policy = Literal["marginal", "hold", "observed"]
 
 # A weight below this is taken as 0: smaller numbers turn denormal and slow every step.
 _LOWEST_FREQUENCY = 1e-290
-# A row with a smaller scale is multiplied out, long before it underflows.
-_SMALLEST_SCALE = 1e-30
 # A row that moves farther at once is worked on as a whole.
 _MOST_BY_SCALE = 0.5
 # A row with less left of it than this is rounding: scaled up it would no longer sum to 1.
 _LEAST_KEPT = 1e-9
-#: The place of an action without a matrix.
-NOT_OPEN = -1.0
-
-
-class Transitions(NamedTuple):
-    """One row-stochastic matrix per action, the first n of ``capacity`` states in use.
-
-    An action has a place among the s matrices from its first use on. One that was never used
-    has none, and costs nothing: all its transitions are alike.
-
-    A row is kept as a scale times what is stored of it. What decays as a whole then decays by
-    its scale, without touching the row.
-    """
-
-    places: PerAction  # of each action's matrix, or NOT_OPEN
-    uses: PerAction  # transitions identified with each action
-    matrices: Matrices  # to be multiplied by `scales`
-    scales: PerPlace
-    origin_frequency: PerPlace
-
-
-class Outcomes(NamedTuple):
-    """Evidence on failure, in counts that never forget: a rare failure must not fade.
-
-    It is kept apart from `Transitions.origin_frequency`, which forgets. Places are the same. What
-    came of an episode is counted once for each state it came to, and each action it took there:
-    observations of one episode are no independent evidence.
-    """
-
-    decisions: PerPlace  # belief-weighted transitions from each state
-    failures: PerPlace  # those of them that led straight into failure
-    endings: PerState  # failures whose last observation was the state
-    clock: Counter  # observations so far, with those that lacked something
-    began: Counter  # the clock at the present episode's first observation
-    episodes: PerState  # that came to the state
-    failed_soon: PerState  # those that failed soon after they were there
-    latest_visit: PerState  # the clock at the latest observation there
-    joined: PerState  # 1 where an episode may count twice, of two states
-    tried: PerPlace  # episodes that took the action in the state
-    failed_after: PerPlace  # those that failed soon after they did
-    latest_try: PerPlace  # the clock at the observation that followed
 
 
 @inner_kernel
@@ -117,22 +74,6 @@ def count_failure(outcomes: Outcomes, n: int, horizon: float) -> None:
     for place in range(len(outcomes.tried)):
         for i in range(n):
             outcomes.failed_after[place, i] += outcomes.latest_try[place, i] >= since
-
-
-@rare_kernel
-def merge_episodes(
-    episodes: NDArray[np.float64],
-    failed: NDArray[np.float64],
-    latest: NDArray[np.float64],
-    kept: int,
-    given: int,
-    began: float,
-) -> None:
-    """Add up the episodes of two states; of those before it is not known who came to both."""
-    both = latest[kept] >= began and latest[given] >= began
-    episodes[kept] += episodes[given] - both
-    failed[kept] += failed[given]
-    latest[kept] = max(latest[kept], latest[given])
 
 
 @register_jitable
@@ -178,7 +119,7 @@ def multiply_out(transitions: Transitions, place: int, i: int, n: int) -> None:
 def fade_row(transitions: Transitions, place: int, i: int, n: int, kept: float) -> None:
     """Multiply a row by ``kept``."""
     transitions.scales[place, i] *= kept
-    if transitions.scales[place, i] < _SMALLEST_SCALE:
+    if transitions.scales[place, i] < SMALLEST_SCALE:
         multiply_out(transitions, place, i, n)
 
 

@@ -10,7 +10,6 @@ from .journal import Journal as Journal
 from .journal import Record as Record
 from .journal import room_needed as room_needed
 from .ranges import LARGEST_OBSERVATION as LARGEST_OBSERVATION
-from .ranges import hardest_seen as hardest_seen
 from .sealed import ABOUT as ABOUT
 from .sealed import Chain as Chain
 from .sealed import ChainedFile as ChainedFile

@@ -24,11 +24,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evofsm import __version__
-from evofsm.files import storage
+from evofsm.files import ranges, storage
 
 _log = logging.getLogger(__name__)
 
-_KIND = "checkpoint"
+_KIND = ranges.register(ranges.Kind("checkpoint", None, {})).name
 _SECONDS = {"s": 1.0, "m": 60.0, "h": 3600.0}
 # Of a file so much at its beginning and at its end tells it from others [bytes].
 _END = 1 << 16

@@ -1,15 +1,15 @@
-"""What numbers in a file may be: least, most and whether whole, for each array and setting.
+"""What a file of a kind may hold: arrays with their shapes and ranges, and settings with theirs.
 
-One table for every kind of file. What was read is held against it, and what is to be written: a
-file whose checksum is right may still hold what no learning could have left. The bounds are those
-of learning from observations up to `LARGEST_OBSERVATION` in size, with room for rounding, so that
-whatever was learnt can be kept.
+A room that keeps something in files registers its `Kind`. What was read is held against it, and
+what is to be written: a file whose checksum is right may still hold what no learning could have
+left. The bounds are those of learning from observations up to `LARGEST_OBSERVATION` in size, with
+room for rounding, so that whatever was learnt can be kept.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
@@ -17,17 +17,14 @@ from numpy.typing import NDArray
 
 #: Squares of larger numbers, summed over a long run, would overflow.
 LARGEST_OBSERVATION = 1e100
-_SMALLEST = math.ulp(0.0)
-_BELOW_1 = math.nextafter(1.0, 0.0)
-# Counts that go up by 1 end here.
-_MOST_COUNTED = float(1 << 53)
-_ROUNDING = 1e-6
-# Products of two observations, each over the smallest scale there may be, and sums of many.
-_LARGEST_PRODUCT = 1e300
-# No car brakes harder than this, nor does its speed jump by more in a decision [m/s², m/s].
-_HARDEST, _JUMP = 15.0, 5.0
-# Nor is it asked to [m/s²]; and decisions are no closer, nor farther apart [s].
-_ASKED, _SHORTEST, _LONGEST = 100.0, 1e-6, 1e6
+#: The smallest number above 0.
+SMALLEST = math.ulp(0.0)
+#: Counts that go up by 1 end here.
+MOST_COUNTED = float(1 << 53)
+#: Part of a number by which rounding may be off.
+ROUNDING = 1e-6
+#: Products of two observations, each over the smallest scale there may be, and sums of many.
+LARGEST_PRODUCT = 1e300
 
 
 class Range(NamedTuple):
@@ -51,106 +48,53 @@ class Range(NamedTuple):
             raise ValueError(f"{name} holds a fraction; it must be whole")
 
 
-_COUNT = Range(0.0, _MOST_COUNTED, whole=True)
-_FROM_1 = Range(1.0, _MOST_COUNTED, whole=True)
-_SUM = Range(0.0, _MOST_COUNTED)
-_FLAG = Range(0.0, 1.0, whole=True)
-_SHARE = Range(0.0, 1.0 + _ROUNDING)
-_FARTHEST = (1.0 + _ROUNDING) * LARGEST_OBSERVATION
-_OBSERVED = Range(-_FARTHEST, _FARTHEST)
-_APART = Range(-2.0 * _FARTHEST, 2.0 * _FARTHEST)
-_PRODUCT = Range(0.0, _LARGEST_PRODUCT)
-_SIZE = Range(_SMALLEST, LARGEST_OBSERVATION)
-_ACCELERATION = Range(_SMALLEST, _ASKED)
-# Of all states together, where they were merged into one.
-_FREQUENCY = Range(0.0, LARGEST_OBSERVATION)
-
-_OF_STATES = {
-    "centers": _OBSERVED,
-    "potentials": _SHARE,
-    "uses": _COUNT,
-    "origin_frequency": _FREQUENCY,
-    **dict.fromkeys(("visits", "endings", "episodes", "failed_soon", "changes"), _COUNT),
-    **dict.fromkeys(("tried", "failed_after"), _COUNT),
-    **dict.fromkeys(("decisions", "failures"), _SUM),  # shared out by belief
-    "founded": _COUNT,
-    "joined": _FLAG,
-}
-ARRAYS: Mapping[str, Mapping[str, Range]] = {
-    "machine": {
-        **_OF_STATES,
-        **dict.fromkeys(("n_states", "n_founded", "n_observations", "clock", "began"), _COUNT),
-        **dict.fromkeys(("state", "ids", "latest_visit", "latest_try"), _COUNT),
-        **dict.fromkeys(("action", "places"), Range(-1.0, _MOST_COUNTED, whole=True)),
-        "chained": _FLAG,
-        **dict.fromkeys(("first", "latest"), _OBSERVED),
-        "mean": _APART,
-        **dict.fromkeys(("scatter", "squared_distances"), _PRODUCT),
-        "belief": _SHARE,
-        "matrices": Range(0.0, 1e31),  # over their scales
-        "scales": Range(1e-31, _SHARE.most),
-    },
-    "model": {**_OF_STATES, "transition_matrices": _SHARE},
-    "risk": {
-        **dict.fromkeys(("onsets", "exposure"), Range(0.0, _LONGEST * _MOST_COUNTED)),
-        "seconds": Range(0.0, _LONGEST * _MOST_COUNTED),
-        "decels": Range(_SMALLEST, _HARDEST),
-        "gentle": _COUNT,
-        "stretches": _FLAG,
-        "lagged": Range(-_LARGEST_PRODUCT, _LARGEST_PRODUCT),
-        **dict.fromkeys(("noise_gap", "noise_speed", "noise_leader"), _PRODUCT),
-        # "brakes" and what is kept of doubts in them: see `_of_brakes`.
-    },
-    "checkpoint": {},
-}
+COUNT = Range(0.0, MOST_COUNTED, whole=True)
+FROM_1 = Range(1.0, MOST_COUNTED, whole=True)
+SUM = Range(0.0, MOST_COUNTED)
+FLAG = Range(0.0, 1.0, whole=True)
+SHARE = Range(0.0, 1.0 + ROUNDING)
+SIZE = Range(SMALLEST, LARGEST_OBSERVATION)
+PRODUCT = Range(0.0, LARGEST_PRODUCT)
 
 Settings: TypeAlias = "Mapping[str, Range | Settings]"
-_RULE: dict[str, Any] = {
-    "memory": Range(2.0, _MOST_COUNTED, whole=True),
-    **dict.fromkeys(("radius", "spread", "distance"), _SIZE),
-    "scales": Range(1e-20, 1e20),
-    "share": Range(_SMALLEST, 1.0),
-}
-_RULE["base"] = _RULE
-_OF_MACHINE: dict[str, Any] = {
-    "n_actions": _FROM_1,
-    **dict.fromkeys(("radius", "spread"), _SIZE),
-    **dict.fromkeys(("distance_weight", "prior_frequency"), Range(_SMALLEST, 1e50)),
-    "learning_rate": Range(_SMALLEST, _BELOW_1),
-    "belief_tolerance": Range(0.0, _BELOW_1),
-    **dict.fromkeys(("max_states", "failure_horizon"), _FROM_1),
-    "when_full": _FLAG,
-    "rule": _RULE,
-}
-SETTINGS: Mapping[str, Settings] = {
-    "machine": _OF_MACHINE,
-    "model": {
-        "width": Range(0.0, 1e308),
-        "dt": _SIZE,
-        "rule": _RULE,
-        "settings": _OF_MACHINE,
-        "actions": {"low": _OBSERVED, "high": _OBSERVED, "width": _SIZE},
-    },
-    "risk": {
-        "lowest": Range(-_ASKED, -_SMALLEST),
-        "dt": Range(_SHORTEST, _LONGEST),
-        **dict.fromkeys(("leader_decel", "hard"), _ACCELERATION),
-        "own_brakes": Range(_SMALLEST, 10.0),
-        "margin": _SIZE,
-    },
-    "checkpoint": {},
-}
 
 
-def hardest_seen(dt: float) -> float:
-    """Braking beyond which a change of one's own speed is no braking, but a sensor's jump [m/s²].
+class Member(NamedTuple):
+    """An array of a kind of file."""
 
-    Examples
-    --------
-    >>> hardest_seen(0.25)
-    35.0
-    """
-    return _HARDEST + _JUMP / dt
+    shape: tuple[int | str, ...]  #: a letter stands for the same number throughout a file
+    range: Range | None  #: None where `Kind.limits` has it
+    since: int = 1  #: the version of the format from which on files have it; before, it is 0
+
+
+def _no_limits(settings: Mapping[str, Any]) -> Mapping[str, Range]:
+    return {}
+
+
+def _as_it_is(version: int, settings: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> None:
+    pass
+
+
+class Kind(NamedTuple):
+    """A kind of file, as the room that owns it describes it."""
+
+    name: str
+    members: Mapping[str, Member] | None  #: None: it holds what its work needs
+    settings: Settings
+    #: Gives the ranges of arrays that depend on settings.
+    limits: Callable[[Mapping[str, Any]], Mapping[str, Range]] = _no_limits
+    #: Gives a file of an earlier version, in place, what it lacks and is not 0.
+    upgrade: Callable[[int, dict[str, Any], dict[str, NDArray[Any]]], None] = _as_it_is
+
+
+#: Kinds of files by name, as far as their rooms were imported.
+KINDS: dict[str, Kind] = {}
+
+
+def register(kind: Kind) -> Kind:
+    """Let files of a kind be written and read."""
+    KINDS[kind.name] = kind
+    return kind
 
 
 def refuse_others(
@@ -160,23 +104,19 @@ def refuse_others(
 
     Examples
     --------
+    >>> from evofsm import FSMModel  # which has its kind registered
     >>> refuse_others("model", {"width": float("nan")})
     Traceback (most recent call last):
     ValueError: width of nan cannot be right: it must lie between 0 and 1e+308
     """
-    _refuse_settings(settings, SETTINGS[kind])
-    ranges = dict(ARRAYS[kind])
-    if kind == "risk":
-        ranges |= _of_brakes(settings["dt"])
+    its = KINDS[kind]
+    _refuse_settings(settings, its.settings)
+    limits = its.limits(settings)
     for name, array in arrays.items():
-        if name in ranges:
-            ranges[name].refuse_others(name, array)
-
-
-def _of_brakes(dt: float) -> dict[str, Range]:
-    most = hardest_seen(dt)
-    brought, short = Range(-most, most), Range(-2.0 * most - _ASKED, 2.0 * most + _ASKED)
-    return {"brakes": brought, "doubts_brought": brought, "doubts_shortfalls": short}
+        member = (its.members or {}).get(name)
+        wanted = limits.get(name, member.range if member else None)
+        if wanted is not None:
+            wanted.refuse_others(name, array)
 
 
 def _refuse_settings(settings: Mapping[str, Any], ranges: Settings, within: str = "") -> None:

@@ -5,9 +5,8 @@ JSON; ``docs/files.md`` says what stands in it, and how the SHA-256 over all of 
 machine's file holds the views of its buffer, with centres by variable (m, n); a model's its fields,
 centres by state (n, m).
 
-Version 1 knew the paper's state rule only and did not count failures. Version 2 held a matrix for
-every action, used or not. Version 3 had neither a checksum nor a provenance. Version 4 did not
-count episodes.
+What a kind holds, and since which version, is registered by its owner (`ranges.Kind`). Version 3
+had neither a checksum nor a provenance.
 
 Whatever a file claims is looked at before anything is made room for: first how its archive is
 built, then the headers of all arrays, and only then what they hold.
@@ -44,7 +43,8 @@ from evofsm.files import ranges
 Place: TypeAlias = str | os.PathLike[str] | BinaryIO
 
 _FORMAT = "evofsm"
-_VERSION = 5
+# A kind with a newer array makes a newer version.
+_LEAST_VERSION = 5
 _HEADER = "header"
 #: No file holds more, unpacked [bytes].
 LARGEST = 1 << 32
@@ -58,69 +58,6 @@ _OLD = 86400.0
 # Booleans, bytes, integers and numbers; no objects, which could run.
 _TYPES = ("|b1", "|u1", "<i8", "<f8")
 
-_Shape: TypeAlias = tuple[int | str, ...]
-# Arrays by kind of file, and their shapes; a letter stands for the same number throughout a file. A
-# checkpoint holds what its work needs.
-_SHAPES: dict[str, dict[str, _Shape] | None] = {
-    "machine": {
-        **dict.fromkeys(("n_states", "n_founded", "action", "chained", "state"), (1,)),
-        **dict.fromkeys(("n_observations", "scatter", "clock", "began"), (1,)),
-        **dict.fromkeys(("belief", "ids", "visits", "founded", "endings"), ("n",)),
-        **dict.fromkeys(("potentials", "squared_distances"), ("n",)),
-        **dict.fromkeys(("episodes", "failed_soon", "latest_visit", "joined"), ("n",)),
-        **dict.fromkeys(("first", "latest", "mean"), ("m",)),
-        **dict.fromkeys(("places", "uses"), ("q",)),
-        **dict.fromkeys(("scales", "origin_frequency", "decisions", "failures"), ("places", "n")),
-        **dict.fromkeys(("tried", "failed_after", "latest_try"), ("places", "n")),
-        "changes": ("n", "n"),
-        "centers": ("m", "n"),
-        "matrices": ("places", "n", "n"),
-    },
-    "model": {
-        **dict.fromkeys(("potentials", "visits", "founded", "endings"), ("n",)),
-        **dict.fromkeys(("episodes", "failed_soon", "joined"), ("n",)),
-        **dict.fromkeys(("origin_frequency", "decisions", "failures"), ("q", "n")),
-        **dict.fromkeys(("tried", "failed_after"), ("q", "n")),
-        "uses": ("q",),
-        "changes": ("n", "n"),
-        "centers": ("n", "m"),
-        "transition_matrices": ("q", "n", "n"),
-    },
-    "risk": {
-        **dict.fromkeys(("onsets", "exposure", "seconds"), ("n",)),
-        **dict.fromkeys(("brakes", "stretches"), ("samples",)),
-        "decels": ("decels",),
-        "gentle": (1,),
-        "lagged": (2,),
-        "noise_gap": ("gaps",),
-        "noise_speed": ("speeds",),
-        "noise_leader": ("leaders",),
-        "doubts_brought": ("brought",),
-        "doubts_shortfalls": ("shortfalls",),
-    },
-    "checkpoint": None,
-}
-# The version from which on there are those that were not there from the first.
-_SINCE = {
-    "machine": {
-        **dict.fromkeys(("decisions", "failures", "endings", "latest"), 2),
-        **dict.fromkeys(("places", "scales", "n_founded", "ids"), 3),
-        **dict.fromkeys(("clock", "began", "episodes", "failed_soon", "latest_visit", "joined"), 5),
-        **dict.fromkeys(("tried", "failed_after", "latest_try"), 5),
-    },
-    "model": {
-        **dict.fromkeys(("decisions", "failures", "endings"), 2),
-        **dict.fromkeys(("episodes", "failed_soon", "joined", "tried", "failed_after"), 5),
-    },
-    "risk": dict.fromkeys(("doubts_brought", "doubts_shortfalls"), 4),
-}
-# Counts that earlier versions had not, and an array of the same shape: in these they are zeros.
-_ADDED = {
-    **dict.fromkeys(("decisions", "failures", "tried", "failed_after"), "origin_frequency"),
-    **dict.fromkeys(("endings", "episodes", "failed_soon", "latest_visit", "joined"), "visits"),
-    "latest_try": "origin_frequency",
-    "latest": "first",
-}
 # Of an error that quotes a damaged file so many letters are told.
 _MOST_SAID = 300
 # What reading a damaged archive may run into (OSError: a place before its beginning;
@@ -148,6 +85,12 @@ class Header(NamedTuple):
     library: str | None  #: version of evofsm that wrote it; None before format 4
     content: dict[str, Any]  #: settings, by name
     provenance: dict[str, Any]  #: what it learnt from, as far as it was told
+
+
+def newest() -> int:
+    """The newest version of the format, which files are written in."""
+    members = [member for kind in ranges.KINDS.values() for member in (kind.members or {}).values()]
+    return max([_LEAST_VERSION, *(member.since for member in members)])
 
 
 # -- Writing --------------------------------------------------------------------------------------
@@ -190,14 +133,14 @@ def write(
     plain = {name: _plain(name, array) for name, array in arrays.items()}
     header = {
         "format": _FORMAT,
-        "version": _VERSION,
+        "version": newest(),
         "library": __version__,
         "kind": kind,
         "content": dict(content),
         "provenance": dict(provenance or {}),
     }
     header = json.loads(json.dumps(header))  # as it will be read: a tuple is a list there
-    _refuse_unfit(kind, header["content"], _VERSION, {n: a.shape for n, a in plain.items()})
+    _refuse_unfit(kind, header["content"], newest(), {n: a.shape for n, a in plain.items()})
     ranges.refuse_others(kind, header["content"], plain)
     header["sha256"] = _sha256(header, plain)
     encoded = np.frombuffer(json.dumps(header).encode(), np.uint8)
@@ -409,8 +352,6 @@ def read(place: Place, kind: str) -> tuple[dict[str, Any], dict[str, NDArray[Any
             raise ValueError(f"{_named(place)} holds a {header['kind']}, not a {kind}")
         with explained(place):
             arrays = archive.arrays()
-            if header["version"] < _VERSION:
-                _upgrade(header, arrays)
             ranges.refuse_others(kind, header["content"], arrays)
     return header["content"], arrays
 
@@ -442,17 +383,26 @@ class _Archive:
         self.header = _header(self._read(entry).tobytes())
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """All arrays, once their shapes agree; in version 4, once their checksum does."""
+        """All arrays, once their shapes and, from version 4 on, their checksum agree.
+
+        What the version lacks is added.
+        """
         version = self.header["version"]
         entries = {name: self._entry(name) for name in self._infos if name != _HEADER}
         shapes = {name: entry.shape for name, entry in entries.items()}
-        _refuse_unfit(self.header["kind"], self.header["content"], version, shapes)
+        kind, content = self.header["kind"], self.header["content"]
+        sizes = _refuse_unfit(kind, content, version, shapes)
         arrays = {name: self._read(entry) for name, entry in entries.items()}
         if version >= 4:
             told = self.header["sha256"]
             header = {name: value for name, value in self.header.items() if name != "sha256"}
             if _sha256(header, arrays) != told:
                 raise ValueError("its SHA-256 is another one: it was changed or damaged")
+        for name, member in (ranges.KINDS[kind].members or {}).items():
+            shape = [sizes.get(size, size) for size in member.shape]
+            if member.since > version and all(isinstance(size, int) for size in shape):
+                arrays[name] = np.zeros(cast(Any, shape))
+        ranges.KINDS[kind].upgrade(version, content, arrays)
         return arrays
 
     def _entry(self, name: str) -> _Entry:
@@ -551,16 +501,16 @@ def _header(encoded: bytes) -> dict[str, Any]:
     version = header["version"]
     if type(version) is not int or version < 1:
         raise ValueError(f"its version is {version!r}, which is none")
-    if version > _VERSION:
+    if version > newest():
         raise ValueError(
-            f"its version {version} is newer than this library's {_VERSION}; "
+            f"its version {version} is newer than this library's {newest()}; "
             "a newer evofsm reads it"
         )
     needed = {"kind", "content"} | ({"library", "provenance", "sha256"} if version >= 4 else set())
     if not needed <= set(header):
         raise ValueError("its header lacks what it holds")
-    if not isinstance(header["kind"], str) or header["kind"] not in _SHAPES:
-        raise ValueError(f"it holds a {header['kind']!r}; there are {', '.join(_SHAPES)}")
+    if not isinstance(header["kind"], str) or not re.fullmatch("[a-z]{1,20}", header["kind"]):
+        raise ValueError(f"it holds a {header['kind']!r}, which is no kind of file")
     for name in {"content", "provenance"} & set(header):
         if not isinstance(header[name], dict):
             raise ValueError(f"the {name} in its header has no names")
@@ -585,26 +535,29 @@ def _refuse_unfit(
     content: Mapping[str, Any],
     version: int,
     shapes: Mapping[str, tuple[int, ...]],
-) -> None:
-    """Raise where arrays lack or are too many for their kind, or their shapes disagree."""
-    needed = _SHAPES[kind]
-    if needed is None:
-        return
-    since = _SINCE.get(kind, {})
-    expected = {name for name in needed if since.get(name, 1) <= version}
+) -> dict[int | str, int]:
+    """Raise where arrays lack or are too many for their kind, or their shapes disagree.
+
+    Returns the size that each letter stands for.
+    """
+    members = ranges.KINDS[kind].members
+    sizes: dict[int | str, int] = {"q": content["n_actions"]} if "n_actions" in content else {}
+    if members is None:
+        return sizes
+    expected = {name for name, member in members.items() if member.since <= version}
     if lacking := expected - set(shapes):
         raise ValueError(f"it lacks {', '.join(sorted(lacking))}")
     if unknown := set(shapes) - expected:
         raise ValueError(f"it has {', '.join(sorted(unknown))}, which no {kind} has")
-    sizes: dict[str, int] = {"q": content["n_actions"]} if kind == "machine" else {}
     for name in sorted(expected):
-        told, shape = needed[name], shapes[name]
+        told, shape = members[name].shape, shapes[name]
         fits = len(told) == len(shape)
         for one, have in zip(told, shape, strict=False):
             fits &= have == (one if isinstance(one, int) else sizes.setdefault(one, have))
         if not fits:
-            wanted = tuple(one if isinstance(one, int) else sizes.get(one, one) for one in told)
+            wanted = tuple(sizes.get(one, one) for one in told)
             raise ValueError(f"{name} has shape {shape}, not {wanted}, as others say")
+    return sizes
 
 
 def _sha256(header: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> str:
@@ -622,22 +575,6 @@ def _sha256(header: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> st
 
 def _canonical(value: Any) -> bytes:
     return json.dumps(value, sort_keys=True, separators=(",", ":")).encode() + b"\n"
-
-
-def _upgrade(header: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> None:
-    """Give a file of an earlier version what it lacks."""
-    if header["version"] < 2:
-        header["content"]["rule"] = {"name": "paper"}
-    for name, since in _SINCE.get(header["kind"], {}).items():
-        if header["version"] < since and name in _ADDED:
-            arrays[name] = np.zeros_like(arrays[_ADDED[name]])
-    if header["version"] < 3 and header["kind"] == "machine":
-        arrays["places"] = np.arange(len(arrays["uses"]), dtype=np.float64)
-        arrays["scales"] = np.ones_like(arrays["origin_frequency"])
-        arrays["n_founded"] = arrays["n_states"]
-        arrays["ids"] = np.arange(len(arrays["visits"]), dtype=np.float64)
-    if header["version"] < 5 and header["kind"] == "machine":  # episodes count from here on
-        arrays["clock"] = arrays["began"] = arrays["n_observations"]
 
 
 # -- Errors ---------------------------------------------------------------------------------------

@@ -20,7 +20,17 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.core import NO_ACTION, NOT_OPEN, EvolvingFSM, Learnt, Parameters, leaves, positive
+from evofsm.core import (
+    NO_ACTION,
+    NOT_OPEN,
+    Counts,
+    EvolvingFSM,
+    Learnt,
+    Parameters,
+    arrays_of,
+    leaves,
+    positive,
+)
 
 # A row with a smaller share of evidence than this is all prior, and rounding.
 _LEAST_EVIDENCE = 1e-9
@@ -120,8 +130,8 @@ def merge(machines: Sequence[EvolvingFSM], *, radius: float | None = None) -> Ev
     match = _match(learnt, parameters, within)
     merged = experienced[0]._holding(
         {
-            **_no_episode(match.n),
-            **_states(learnt, match),
+            **_blank(match),
+            **_counts(learnt, match),
             **_densities(learnt, match, parameters),
             **_transitions(learnt, match, parameters),
         }
@@ -185,7 +195,10 @@ def _match(learnt: Sequence[Learnt], parameters: Parameters, radius: float) -> _
     places = [part.clusters.centers.T * weights for part in learnt]
     sizes = np.array([len(place) for place in places])
     rivals = _rivals(places, parameters.rule.radius)
-    points, visits = np.concatenate(places), np.concatenate([part.visits for part in learnt])
+    points, visits = (
+        np.concatenate(places),
+        np.concatenate([part.outcomes.visits for part in learnt]),
+    )
     group = np.full(len(points), -1, np.int64)
     leaders: list[int] = []
     led = np.empty_like(points)
@@ -222,45 +235,43 @@ def _rivals(places: Sequence[NDArray[np.float64]], radius: float) -> dict[int, l
 # -- Add up ---------------------------------------------------------------------------------------
 
 
-def _no_episode(n: int) -> dict[str, NDArray[Any]]:
+def _blank(match: _Match) -> dict[str, NDArray[Any]]:
+    """Zeros of the merged states' sizes, for all that stands for one episode."""
     return {
-        "n_states": np.array([n]),
-        "n_founded": np.array([n]),
-        "ids": np.arange(n),
+        **{array.name: np.zeros(match.n) for array in arrays_of(Learnt) if array.kind == "state"},
+        **{array.name: np.zeros(1) for array in arrays_of(Learnt) if array.kind == "counter"},
+        "n_states": np.array([match.n]),
+        "n_founded": np.array([match.n]),
+        "ids": np.arange(match.n),
         "action": np.array([NO_ACTION]),
-        "chained": np.zeros(1),
-        "state": np.zeros(1),
-        "belief": np.full(n, 1.0 / n),
-        "clock": np.zeros(1),
-        "began": np.zeros(1),
-        "latest_visit": np.zeros(n),
+        "belief": np.full(match.n, 1.0 / match.n),
     }
 
 
-def _states(learnt: Sequence[Learnt], match: _Match) -> dict[str, NDArray[Any]]:
-    visits, endings, episodes, failed_soon, joined = np.zeros((5, match.n))
-    founded = np.ones(match.n)
-    changes = np.zeros((match.n, match.n))
+def _counts(learnt: Sequence[Learnt], match: _Match) -> dict[str, NDArray[Any]]:
+    """What was counted, as the table says that it is joined."""
+    n, is_open = match.n, _is_open(learnt)
+    places = np.cumsum(is_open) - 1
+    shapes = {"state": (n,), "change": (n, n), "place": (int(is_open.sum()), n)}
+    summed = [array for array in arrays_of(Counts) if array.joined_by == "sum"]
+    merged = {array.name: np.zeros(shapes[array.kind]) for array in summed}
+    joined, founded = np.zeros(n), np.ones(n)
     for part, group in zip(learnt, match.groups, strict=True):
-        np.add.at(visits, group, part.visits)
-        np.add.at(endings, group, part.outcomes.endings)
-        np.add.at(episodes, group, part.outcomes.episodes)
-        np.add.at(failed_soon, group, part.outcomes.failed_soon)
-        of_part = np.bincount(group, minlength=match.n) > 1
+        of_place = places[_actions_of(part)][:, None]
+        where: dict[str, Any] = {
+            "state": group,
+            "change": (group[:, None], group),
+            "place": (of_place, group),
+        }
+        for array in summed:
+            np.add.at(merged[array.name], where[array.kind], getattr(part.outcomes, array.name))
+        of_part = np.bincount(group, minlength=n) > 1
         np.maximum.at(joined, group, np.maximum(part.outcomes.joined, of_part[group]))
-        np.add.at(changes, (group[:, None], group), part.changes)
-        earliest = np.full(match.n, np.inf)
-        np.minimum.at(earliest, group, part.founded)
+        earliest = np.full(n, np.inf)
+        np.minimum.at(earliest, group, part.outcomes.founded)
         founded += np.where(np.isfinite(earliest), earliest - 1.0, 0.0)
-    return {
-        "visits": visits,
-        "endings": endings,
-        "episodes": episodes,
-        "failed_soon": failed_soon,
-        "joined": joined,
-        "founded": founded,
-        "changes": changes,
-    }
+    latest_try = np.zeros(shapes["place"])
+    return {**merged, "joined": joined, "founded": founded, "latest_try": latest_try}
 
 
 def _densities(
@@ -310,24 +321,19 @@ def _densities(
 def _transitions(
     learnt: Sequence[Learnt], match: _Match, parameters: Parameters
 ) -> dict[str, NDArray[Any]]:
-    n = match.n
+    n, is_open = match.n, _is_open(learnt)
     uses = np.sum([part.transitions.uses for part in learnt], axis=0)
-    is_open = np.any([part.transitions.places != NOT_OPEN for part in learnt], axis=0)
     places = np.where(is_open, np.cumsum(is_open) - 1.0, NOT_OPEN)
     open_ = int(is_open.sum())
     joint = np.zeros((open_, n, n))
-    decisions, failures, tried, failed_after, frequencies = np.zeros((5, open_, n))
+    decisions, frequencies = np.zeros((2, open_, n))
     for part, group in zip(learnt, match.groups, strict=True):
         shares, weight = _evidence(part, parameters)
         counts = part.outcomes.decisions
         place = places[_actions_of(part)].astype(np.int64)
         np.add.at(joint, (place[:, None, None], group[:, None], group), counts[..., None] * shares)
-        rows = (place[:, None], group)
-        np.add.at(decisions, rows, counts)
-        np.add.at(failures, rows, part.outcomes.failures)
-        np.add.at(tried, rows, part.outcomes.tried)
-        np.add.at(failed_after, rows, part.outcomes.failed_after)
-        np.add.at(frequencies, rows, counts * weight)
+        np.add.at(decisions, (place[:, None], group), counts)
+        np.add.at(frequencies, (place[:, None], group), counts * weight)
 
     known = joint.sum(axis=-1)
     seen = known > 0.0
@@ -343,12 +349,15 @@ def _transitions(
         "matrices": rows + of_prior[..., None] * (1.0 / n - rows),
         "scales": np.ones((open_, n)),
         "origin_frequency": together,
-        "decisions": decisions,
-        "failures": failures,
-        "tried": tried,
-        "failed_after": failed_after,
-        "latest_try": np.zeros((open_, n)),
     }
+
+
+def _is_open(learnt: Sequence[Learnt]) -> NDArray[np.bool_]:
+    """(q,) whether any part has a matrix of an action."""
+    opened: NDArray[np.bool_] = np.any(
+        [part.transitions.places != NOT_OPEN for part in learnt], axis=0
+    )
+    return opened
 
 
 def _actions_of(part: Learnt) -> NDArray[np.int64]:

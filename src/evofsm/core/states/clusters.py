@@ -14,33 +14,18 @@ Differences are multiplied by ``weights``, 1 / scale of each variable: 1 in the 
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 from numpy.typing import NDArray
 
 from evofsm.core.elementary import fma, largest
 from evofsm.core.kernels import inner_kernel, lanes
-from evofsm.core.layout import Centers, Counter, PerState, PerVariable
+from evofsm.core.learnt import Clusters
 
 # What may happen to the states.
 UNCHANGED, MOVED, CREATED = 0, 1, 2
 
 # A share that no rounding comes to, and that no two observations tell apart either.
 _ROUNDING = 1e-12
-
-
-class Clusters(NamedTuple):
-    """What is remembered: m variables, room for ``capacity`` centres, the first ``n`` in use."""
-
-    n_observations: Counter
-    first: PerVariable  # z_1, the origin of `mean`
-    latest: PerVariable  # z_t
-    mean: PerVariable  # of all observations, minus `first`
-    scatter: Counter  # sum of squared distances to the mean
-    centers: Centers
-    potentials: PerState
-    squared_distances: PerState  # from the latest observation
 
 
 @inner_kernel

@@ -11,11 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evofsm.core.kernels import inner_kernel, kernel, lanes
+from evofsm.core.learnt import Clusters
 from evofsm.core.states import edges, ets, novelty
 from evofsm.core.states.clusters import (
     CREATED,
     MOVED,
-    Clusters,
     absorb,
     measure_distances,
     nearest_center,
@@ -84,11 +84,11 @@ def _judge(
 
 
 @kernel
-def width(settings: RuleSettings, clusters: Clusters) -> float:
-    """Width of recognition after the latest observation."""
+def width(settings: RuleSettings, variance: float) -> float:
+    """Width of recognition, where observations so far have this total variance."""
     if settings.code == novelty.CODE:
         return novelty.width(settings.spread, settings.radius)
-    return ets.width(settings.spread, clusters)
+    return ets.width(settings.spread, variance)
 
 
 def reach(rule: StateRule, width: float) -> float:

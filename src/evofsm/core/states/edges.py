@@ -12,8 +12,9 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from evofsm.core.kernels import inner_kernel
+from evofsm.core.learnt import Clusters
 from evofsm.core.states import ets
-from evofsm.core.states.clusters import CREATED, UNCHANGED, Clusters, exceeds
+from evofsm.core.states.clusters import CREATED, UNCHANGED, exceeds
 from evofsm.core.states.rule import RuleSettings
 
 CODE = 1

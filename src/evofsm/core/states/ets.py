@@ -16,9 +16,7 @@ from evofsm.core.states.clusters import (
     CREATED,
     MOVED,
     UNCHANGED,
-    Clusters,
     exceeds,
-    total_variance,
 )
 from evofsm.core.states.rule import RuleSettings
 from evofsm.core.validation import whole
@@ -80,6 +78,6 @@ def judge(potential: float, highest: float, squared_distance: float, radius: flo
 
 
 @inner_kernel
-def width(spread: float, clusters: Clusters) -> float:
+def width(spread: float, variance: float) -> float:
     """Width of recognition; the paper leaves its var(z*) open."""
-    return spread * total_variance(clusters)
+    return spread * variance

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evofsm.core import compiled, kernel
-from evofsm.files import hardest_seen
+from evofsm.driving.risk.ranges import hardest_seen
 
 # Full braking is judged by so many of the latest decisions, and by no fewer than the second number;
 # that it is weaker than before shows in as few, and in no more than the third number.

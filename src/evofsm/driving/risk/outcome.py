@@ -34,6 +34,7 @@ from evofsm.driving.risk.brakes import OwnBrakes, Sample
 from evofsm.driving.risk.leaders import LeaderBrakes
 from evofsm.driving.risk.manoeuvres import BrakeWatch, Manoeuvres
 from evofsm.driving.risk.perception import Estimate, Perception, is_whole
+from evofsm.driving.risk.ranges import RISK
 from evofsm.driving.risk.rehearsal import Body, Three, critical_decelerations
 from evofsm.files import LARGEST_OBSERVATION, ranges, storage
 from evofsm.guard import Judgement, Situation, Trial
@@ -99,7 +100,7 @@ class LatentRisk:
         self.own_brakes = positive("own_brakes", own_brakes)
         self.margin = positive("margin", margin)
         self.hard = positive("hard", hard)
-        ranges.refuse_others("risk", self._settings)
+        ranges.refuse_others(RISK.name, self._settings)
         self.manoeuvres = Manoeuvres(leader_decel, hard)
         if leaders is not None:
             self.manoeuvres.begin_with(leaders)
@@ -528,7 +529,7 @@ class LatentRisk:
             before is then as it was.
         """
         settings = {**self._settings, "own_brakes": self.brakes.assumed}
-        storage.write(path, "risk", settings, self._learnt(), provenance)
+        storage.write(path, RISK.name, settings, self._learnt(), provenance)
 
     @classmethod
     def load(cls, path: storage.Place) -> Self:
@@ -552,7 +553,7 @@ class LatentRisk:
         ...     len(LatentRisk.load(Path(folder) / "risk.evofsm").manoeuvres)
         1
         """
-        settings, arrays = storage.read(path, "risk")
+        settings, arrays = storage.read(path, RISK.name)
         with storage.explained(path):
             risk = cls(**settings)
             risk.manoeuvres.remember(*arrays["decels"].tolist())
