@@ -123,23 +123,24 @@ class EvolvingFSM(Known):
     ----------
     n_actions : int
         Number q of discrete actions; each has a transition matrix of its own.
-    radius : float
+    radius : float, optional
         The paper's epsilon, in the unit of the observations: an observation that is denser
-        than every centre moves the nearest one if that is closer than this, else it founds
-        a state.
+        than every centre moves the nearest one if that is closer than this, else it creates
+        a state. 0.3 for `Paper` and `Edges`; other rules have their own.
     distance_weight : float
         The paper's rho, how fast distance to new data lowers a centre's potential.
     learning_rate : float
         The paper's phi, the weight of the newest transition, in (0, 1).
     prior_frequency : float
         The paper's epsilon-bar, the frequency given to every transition of a new state.
-    spread : float
+    spread : float, optional
         Width of recognition: the similarity to a centre is
-        ``exp(-distance^2 / (spread * total variance of all observations))``.
+        ``exp(-distance^2 / (spread * total variance of all observations))``. 3 for `Paper` and
+        `Edges`; other rules have their own.
     rule : StateRule, optional
         How states are determined, as an object: `Edges`, `Novelty`, `FailureSplit`; without it
-        the paper's rule, `Paper`. A rule may have a radius and a spread of its own, which then
-        take the place of these.
+        the paper's rule, `Paper`. Where it has a radius and a spread of its own, other ones may
+        not be given beside it.
     max_states : int, optional
         Number of states at which another one is only founded where one is given up; without it
         there is no limit.
@@ -162,7 +163,7 @@ class EvolvingFSM(Known):
         If ``rule`` is no rule (or the class of one).
     ValueError
         If ``n_actions`` is no whole number of at least 1, another setting is not positive, or
-        beyond what can be computed with (``evofsm.files.ranges``), ``learning_rate`` is 1 or more,
+        beyond what can be computed with (the ranges in ``evofsm.core.learnt``), ``learning_rate`` is 1 or more,
         ``radius`` or ``spread`` contradicts the rule's, ``belief_tolerance`` is not in its range,
         or ``failure_horizon`` is no whole number of at least 1.
 
@@ -194,11 +195,11 @@ class EvolvingFSM(Known):
     def __init__(
         self,
         n_actions: int,
-        radius: float = _RADIUS,
+        radius: float | None = None,
         distance_weight: float = 0.85,
         learning_rate: float = 0.01,
         prior_frequency: float = 1e-3,
-        spread: float = _SPREAD,
+        spread: float | None = None,
         rule: StateRule | None = None,
         max_states: int | None = None,
         when_full: WhenFull = WhenFull.MERGE,
@@ -208,17 +209,18 @@ class EvolvingFSM(Known):
         self._rule = Paper() if rule is None else check_rule("rule", rule)
         given = RuleSettings(
             code=0,
-            radius=positive("radius", radius),
+            radius=_RADIUS if radius is None else positive("radius", radius),
             distance_weight=positive("distance_weight", distance_weight),
-            spread=positive("spread", spread),
+            spread=_SPREAD if spread is None else positive("spread", spread),
             failure_share=0.0,
             failure_distance=0.0,
             memory=np.inf,
             weights=np.empty(0),
         )
-        told = self._rule._tell(given)
-        _refuse_contradiction("radius", given.radius, told.radius, _RADIUS, self._rule)
-        _refuse_contradiction("spread", given.spread, told.spread, _SPREAD, self._rule)
+        told = given._replace(**cast(Any, self._rule.table))
+        for name, value in (("radius", radius), ("spread", spread)):
+            if value not in (None, getattr(told, name)):
+                raise ValueError(f"{name} is {value}, but the rule has its own: {self._rule}")
         parameters = Parameters(
             positive("learning_rate", learning_rate),
             positive("prior_frequency", prior_frequency),
@@ -1222,11 +1224,3 @@ def _tolerance(tolerance: float) -> float:
     if positive("belief_tolerance", tolerance) >= 1.0:
         raise ValueError(f"belief_tolerance is {tolerance}; it must lie below 1")
     return float(tolerance)
-
-
-def _refuse_contradiction(
-    name: str, given: float, told: float, default: float, rule: StateRule
-) -> None:
-    """Raise where a setting was given to a machine whose rule has another one of its own."""
-    if given not in (told, default):
-        raise ValueError(f"{name} is {given}, but the rule has its own: {rule}")

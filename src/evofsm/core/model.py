@@ -39,7 +39,7 @@ class FSMModel(Known):
     ------
     ValueError
         If an array has not its shape, a number is none that learning can leave, such as NaN or
-        a count below 0 (`files.ranges`), a row of a transition matrix is no distribution, more
+        a count below 0 (the ranges in `core.learnt`), a row of a transition matrix is no distribution, more
         decisions failed than were taken,
         ``actions``, ``names`` or ``units`` are of another number than the arrays say, or ``dt``
         is not positive and finite.

@@ -7,7 +7,7 @@ so a rare corner never gets a state. Here it gets one where it lies farther out 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -15,7 +15,6 @@ from evofsm.core.kernels import inner_kernel
 from evofsm.core.learnt import Clusters
 from evofsm.core.states import ets
 from evofsm.core.states.clusters import CREATED, UNCHANGED, exceeds
-from evofsm.core.states.rule import RuleSettings
 
 CODE = 1
 
@@ -46,8 +45,10 @@ class Edges:
     def __post_init__(self) -> None:
         object.__setattr__(self, "memory", ets.check_memory(self.memory))
 
-    def _tell(self, machine: RuleSettings) -> RuleSettings:
-        return machine._replace(code=CODE, memory=self.memory or math.inf)
+    @property
+    def table(self) -> Mapping[str, float]:
+        """What the kernel judges by, in place of the machine's settings."""
+        return {"code": CODE, "memory": self.memory or math.inf}
 
 
 @inner_kernel

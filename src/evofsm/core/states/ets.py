@@ -7,7 +7,7 @@ centre, or moves the nearest centre there. The more data vary, the wider states 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -18,7 +18,6 @@ from evofsm.core.states.clusters import (
     UNCHANGED,
     exceeds,
 )
-from evofsm.core.states.rule import RuleSettings
 from evofsm.core.validation import whole
 
 CODE = 0
@@ -58,8 +57,10 @@ class Paper:
     def __post_init__(self) -> None:
         object.__setattr__(self, "memory", check_memory(self.memory))
 
-    def _tell(self, machine: RuleSettings) -> RuleSettings:
-        return machine._replace(code=CODE, memory=self.memory or math.inf)
+    @property
+    def table(self) -> Mapping[str, float]:
+        """What the kernel judges by, in place of the machine's settings."""
+        return {"code": CODE, "memory": self.memory or math.inf}
 
 
 def check_memory(memory: int | None) -> int | None:

@@ -6,7 +6,7 @@ state is a run of observations of one episode that are all recognised as it.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from evofsm.core.kernels import inner_kernel
@@ -55,7 +55,7 @@ class FailureSplit:
     distance: float = 0.25
 
     def __post_init__(self) -> None:
-        if isinstance(self.base, type | FailureSplit) or not hasattr(self.base, "_tell"):
+        if isinstance(self.base, type | FailureSplit) or not hasattr(self.base, "table"):
             raise TypeError(f"base is {self.base!r}; it must be another rule, as an object")
         object.__setattr__(self, "share", positive("share", self.share))
         object.__setattr__(self, "distance", positive("distance", self.distance))
@@ -67,9 +67,11 @@ class FailureSplit:
         """Those of ``base``."""
         return self.base.scales
 
-    def _tell(self, machine: RuleSettings) -> RuleSettings:
-        told = self.base._tell(machine)
-        return told._replace(failure_share=self.share, failure_distance=self.distance)
+    @property
+    def table(self) -> Mapping[str, float]:
+        """What the kernel judges by, in place of the machine's settings."""
+        of_failures = {"failure_share": self.share, "failure_distance": self.distance}
+        return {**self.base.table, **of_failures}
 
 
 @inner_kernel

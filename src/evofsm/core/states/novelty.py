@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from evofsm.core.kernels import inner_kernel
 from evofsm.core.states.clusters import CREATED, UNCHANGED, exceeds
-from evofsm.core.states.rule import RuleSettings
 from evofsm.core.validation import positive
 
 CODE = 2
@@ -62,8 +61,10 @@ class Novelty:
         object.__setattr__(self, "radius", positive("radius", self.radius))
         object.__setattr__(self, "spread", positive("spread", self.spread))
 
-    def _tell(self, machine: RuleSettings) -> RuleSettings:
-        return machine._replace(code=CODE, radius=self.radius, spread=self.spread)
+    @property
+    def table(self) -> Mapping[str, float]:
+        """What the kernel judges by, in place of the machine's settings."""
+        return {"code": CODE, "radius": self.radius, "spread": self.spread}
 
 
 @inner_kernel
