@@ -15,6 +15,7 @@ from .kernels import inner_kernel as inner_kernel
 from .kernels import kernel as kernel
 from .kernels import parallel_kernel as parallel_kernel
 from .known import Known as Known
+from .known import Policy as Policy
 from .learnt import NO_ACTION as NO_ACTION
 from .learnt import NOT_OPEN as NOT_OPEN
 from .learnt import Counts as Counts
@@ -34,6 +35,8 @@ from .memory import tell_of_failures as tell_of_failures
 from .model import FSMModel as FSMModel
 from .naming import Labels as Labels
 from .naming import Words as Words
+from .naming import action_name as action_name
+from .naming import state_name as state_name
 from .naming import use_words as use_words
 from .naming import visible as visible
 from .notebook import model_html as model_html
@@ -61,7 +64,6 @@ from .step import learn_rows as learn_rows
 from .step import room_for as room_for
 from .step import step_and_act as step_and_act
 from .step import widen as widen
-from .transitions import Policy as Policy
 from .validation import check_action as check_action
 from .validation import check_actions as check_actions
 from .validation import check_rows as check_rows

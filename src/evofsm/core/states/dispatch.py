@@ -85,7 +85,7 @@ def determine(
 ) -> tuple[int, int, float]:
     """Judge one observation against ``n`` centres; the nearest may be moved onto it.
 
-    Answers the event, the nearest centre, and the potential of the observation. Where the event
+    Returns the event, the nearest centre, and the potential of the observation. Where the event
     is ``CREATED``, whoever asked has to place the new centre.
     """
     if clusters.n_observations[0] == 0.0:

@@ -1,4 +1,4 @@
-"""The paper's rule, which also founds states at the edges of the data.
+"""The paper's rule, which also creates states at the edges of the data.
 
 The paper's condition takes only observations nearer the mean of everything seen than any centre,
 so a rare corner never gets a state. Here it gets one where it lies farther out than every centre.
@@ -23,7 +23,7 @@ CODE = 1
 class Edges:
     """The paper's rule, and a state at each edge, with the machine's settings.
 
-    An observation also founds a state where its potential lies below every centre's and it is
+    An observation also creates a state where its potential lies below every centre's and it is
     farther than ``radius`` from every centre.
 
     Parameters
@@ -60,7 +60,7 @@ def judge(
     squared_distance: float,
     radius: float,
 ) -> int:
-    """Judge as the paper does, and found a state at an edge."""
+    """Judge as the paper does, and create a state at an edge."""
     event = ets.judge(potential, highest, squared_distance, radius)
     if event != UNCHANGED or not exceeds(squared_distance, radius * radius):
         return event

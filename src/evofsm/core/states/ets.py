@@ -1,6 +1,6 @@
 """The paper's rule: evolving Takagi-Sugeno (eTS) clustering, Sections 2.2.1 and 2.2.2.
 
-An observation founds a state where the data seen so far is denser than at every existing
+An observation creates a state where the data seen so far is denser than at every existing
 centre, or moves the nearest centre there. The more data vary, the wider states are recognised.
 """
 
@@ -28,7 +28,7 @@ class Paper:
     """The paper's rule, with the machine's radius, distance_weight and spread.
 
     An observation that is denser than every centre moves the nearest one if that is closer than
-    ``radius``, else it founds a state. The width of recognition is ``spread`` times the total
+    ``radius``, else it creates a state. The width of recognition is ``spread`` times the total
     variance of all observations.
 
     Parameters
@@ -72,7 +72,7 @@ def check_memory(memory: int | None) -> int | None:
 
 @inner_kernel
 def judge(potential: float, highest: float, squared_distance: float, radius: float) -> int:
-    """Leave the states as they are, move the nearest, or found one."""
+    """Leave the states as they are, move the nearest, or create one."""
     if not exceeds(potential, highest):
         return UNCHANGED
     return MOVED if exceeds(radius * radius, squared_distance) else CREATED

@@ -15,14 +15,14 @@ class RuleSettings(NamedTuple):
     radius: Setting  #: how far from a centre an observation is no longer near it
     distance_weight: Setting  #: how fast distance to new data lowers a centre's potential
     spread: Setting  #: width of recognition, in the rule's own measure
-    failure_share: Setting  #: a failure founds a state where fewer stays ended so; 0: none does
+    failure_share: Setting  #: a failure creates a state where fewer stays ended so; 0: none does
     failure_distance: Setting  #: and only farther than this from the nearest centre
     memory: Setting  #: number of observations after which older ones fade; infinity: never
     weights: PerVariable  #: 1 / scale of each variable, where m is known
 
 
 class StateRule(Protocol):
-    """When an observation founds or moves a state, and how wide a state is recognised.
+    """When an observation creates or moves a state, and how wide a state is recognised.
 
     A rule is a frozen dataclass of settings, made known with `register_rule`: a small table of
     numbers for the kernel that judges an observation, which is that of a rule there is or, in the
