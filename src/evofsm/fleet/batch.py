@@ -318,7 +318,7 @@ def _step_all(
     surprise: NDArray[np.float64],
     limit: Limit,
 ) -> int:
-    """Step those that did not step yet; answers how many could not for want of room.
+    """Step those that did not step yet; returns how many could not for want of room.
 
     Its arrays are not in tuples: Numba loses what a ``prange`` writes to an array in a tuple.
     """
