@@ -42,6 +42,9 @@ class Piece:
     places: NDArray[np.int64]  #: (T,)
     numbers: dict[str, NDArray[np.float64]]
     texts: dict[str, Texts]
+    #: Rows that begin an episode, of a table that knows; None where columns tell episodes apart.
+    starts: NDArray[np.int64] | None = None
+    cuts: int = 0  #: episodes in it that were cut because too many pairs were on the road at once
 
     def at(self, row: int) -> str:
         """Where a row stands, for a message."""
