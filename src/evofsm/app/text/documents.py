@@ -29,7 +29,7 @@ def spelled_out(value: Any) -> Any:
 
     >>> from evofsm.core import Tally
     >>> spelled_out({"here": [Tally(3, 12)]})
-    {'here': [{'failed': 3, 'episodes': 12, 'is_told': True, 'is_exact': True}]}
+    {'here': [{'failed': 3, 'episodes': 12, 'is_exact': True, 'is_told': True}]}
     """
     if isinstance(value, Enum):
         return value.value
