@@ -17,7 +17,6 @@ from evofsm.io.blocks import Blocks
 from evofsm.io.conditions import Condition
 from evofsm.io.fcd import VehicleLengths
 from evofsm.io.files import OnRead, ignore, kind_of
-from evofsm.io.plain import Texts
 from evofsm.io.tables import CsvTable, ParquetTable, Piece, Table, refuse_unusable
 from evofsm.io.units import KNOWN, of_columns
 
@@ -328,7 +327,6 @@ def _read_table(table: Table, columns: LogColumns, clock: _Clock, noted: Noted) 
     gaps = learnt if columns.leader_may_lack else []
 
     rows_before = 0
-    key_before: list[str] | None = None
     blocks = Blocks(episode)
     first_date = np.nan
     sieve = _Sieve(noted)
@@ -338,16 +336,11 @@ def _read_table(table: Table, columns: LogColumns, clock: _Clock, noted: Noted) 
             continue
         for name, factor in factors.items():
             piece.numbers[name] = piece.numbers[name] * factor
-        starts = np.zeros(rows, np.bool_)
-        if piece.starts is not None:
-            starts[piece.starts] = True
+        if piece.starts is None:
+            starts = blocks.starts(piece)
         else:
-            keys = [piece.texts[name] for name in episode]
-            for key in keys:
-                starts[key.firsts] = True
-            starts[0] = key_before != _key(keys, 0)
-            key_before = _key(keys, rows - 1)
-            blocks.see(piece, keys, starts)
+            starts = np.zeros(rows, np.bool_)
+            starts[piece.starts] = True
         anew, holes = starts.copy(), np.zeros(rows, np.bool_)
         if clock.ticks:
             times = piece.numbers[columns.time]
@@ -401,11 +394,6 @@ def _lacking(piece: Piece, observed: Sequence[str]) -> NDArray[np.bool_]:
     for name in observed:
         lacking |= ~np.isfinite(piece.numbers[name])
     return lacking
-
-
-def _key(columns: Sequence[Texts], row: int) -> list[str]:
-    """What tells the episode of a row from others."""
-    return [column.at(row) for column in columns]
 
 
 def _episode_columns(table: Table, asked: Sequence[str] | None) -> Sequence[str]:
