@@ -7,6 +7,7 @@ from .explanation import Explanation as Explanation
 from .explanation import Tally as Tally
 from .explanation import explain as explain
 from .forecast import Forecasts as Forecasts
+from .inside import Inside as Inside
 from .kernels import LINE as LINE
 from .kernels import Function as Function
 from .kernels import announce_compiling as announce_compiling

@@ -8,19 +8,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Sequence
+from enum import Enum
 from html import escape
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from evofsm.core.known import Known
 from evofsm.core.naming import state_name
-
-if TYPE_CHECKING:
-    from evofsm.core.known import Known
-    from evofsm.core.machine import EvolvingFSM
-    from evofsm.core.model import FSMModel
-    from evofsm.core.step import Step
 
 # More rows than these are summed up in one.
 _MOST_STATES = 12
@@ -41,6 +37,25 @@ _EVENTS = {
 _NOT_CREATED = "none was created: there are as many states as allowed, and the nearest is close"
 
 
+class Happened(Protocol):
+    """What a `Step` says."""
+
+    @property
+    def belief(self) -> NDArray[np.float64]: ...  # noqa: D102
+    @property
+    def predicted(self) -> NDArray[np.float64]: ...  # noqa: D102
+    @property
+    def state(self) -> int: ...  # noqa: D102
+    @property
+    def surprise(self) -> float: ...  # noqa: D102
+    @property
+    def event(self) -> Enum: ...  # noqa: D102
+    @property
+    def missing(self) -> Sequence[int]: ...  # noqa: D102
+    @property
+    def explanation(self) -> str: ...  # noqa: D102
+
+
 class _Column(NamedTuple):
     """A column of a table of states; the texts in it are not escaped yet."""
 
@@ -50,7 +65,7 @@ class _Column(NamedTuple):
     bars: NDArray[np.float64] | None = None  #: their lengths, as shares
 
 
-def machine_html(machine: EvolvingFSM) -> str:
+def machine_html(machine: Known) -> str:
     """A machine: its settings, its states, and where it is.
 
     Parameters
@@ -70,16 +85,17 @@ def machine_html(machine: EvolvingFSM) -> str:
     >>> "2 states, 2 actions, now in #2" in machine_html(machine)
     True
     """
-    now = "no episode has begun" if machine.state is None else f"now in {state_name(machine.state)}"
-    shown = _most(machine.visits, machine.state)
+    state: int | None = getattr(machine, "state", None)
+    now = "no episode has begun" if state is None else f"now in {state_name(state)}"
+    shown = _most(machine.visits, state)
     columns = _columns(machine, shown)
-    if machine.state is not None:
-        columns.append(_shares("belief", machine.belief, shown))
+    if state is not None:
+        columns.append(_shares("belief", getattr(machine, "belief", np.ones(1)), shown))
     head = _head(machine, [*_counts(machine), now], _settings(machine))
     return _html(head, shown, machine.n_states, columns)
 
 
-def model_html(model: FSMModel) -> str:
+def model_html(model: Known) -> str:
     """A model: its states, and where each leads most often.
 
     Parameters
@@ -100,8 +116,8 @@ def model_html(model: FSMModel) -> str:
     True
     """
     counts = list(_counts(model))
-    if model.dt is not None:
-        counts.append(f"an observation every {model.dt:g} s")
+    if (dt := getattr(model, "dt", None)) is not None:
+        counts.append(f"an observation every {dt:g} s")
     shown = _most(model.visits)
     columns = _columns(model, shown)
     if model.uses.any() and model.n_states > 1:
@@ -109,7 +125,7 @@ def model_html(model: FSMModel) -> str:
     return _html(_head(model, counts, _settings(model)), shown, model.n_states, columns)
 
 
-def step_html(step: Step) -> str:
+def step_html(step: Happened) -> str:
     """A step: what was recognised, what happened to the states, and whether it was foreseen.
 
     Parameters
@@ -161,7 +177,7 @@ def _settings(model: Known) -> str:
     return ", ".join([*told, f"rule {model.rule}"])
 
 
-def _happened(step: Step) -> str:
+def _happened(step: Happened) -> str:
     events = (step.event.name or "NONE").split("|")
     if events == ["MERGED"]:
         return _NOT_CREATED
@@ -240,7 +256,7 @@ def _variables(model: Known) -> list[str]:
     return heads
 
 
-def _transitions(model: FSMModel, shown: Sequence[int]) -> list[_Column]:
+def _transitions(model: Known, shown: Sequence[int]) -> list[_Column]:
     """How likely each state stays, and which other one is likeliest next."""
     matrix = model.averaged_matrix("observed")
     elsewhere = matrix - np.diag(np.diag(matrix))

@@ -25,6 +25,7 @@ from evofsm.core import (
     NOT_OPEN,
     Counts,
     EvolvingFSM,
+    Inside,
     Learnt,
     Parameters,
     arrays_of,
@@ -124,11 +125,11 @@ def merge(machines: Sequence[EvolvingFSM], *, radius: float | None = None) -> Ev
         alone = (experienced or parts)[0].copy()
         alone.start_episode()
         return alone
-    parameters = experienced[0]._memory.parameters
+    parameters = Inside(experienced[0]).memory.parameters
     within = parameters.rule.radius if radius is None else positive("radius", radius)
-    learnt = sorted((part._trimmed() for part in experienced), key=_content)
+    learnt = sorted((Inside(part).trimmed() for part in experienced), key=_content)
     match = _match(learnt, parameters, within)
-    merged = experienced[0]._holding(
+    merged = Inside(experienced[0]).holding(
         {
             **_blank(match),
             **_counts(learnt, match),
@@ -165,7 +166,7 @@ def _refuse_unlike(machines: Iterable[EvolvingFSM]) -> list[EvolvingFSM]:
                     f"{name} of machine {number} is {given!r}, but {expected!r} of machine 0; "
                     "machines to merge must have the same settings"
                 )
-    if np.isfinite(parts[0]._memory.parameters.rule.memory):
+    if np.isfinite(Inside(parts[0]).memory.parameters.rule.memory):
         raise ValueError(
             f"machines with {parts[0].rule} cannot be merged: what each still remembers depends on "
             "when it saw it"
