@@ -360,16 +360,13 @@ def risk(drive: Drive, ax: Axes | None = None, *, tolerance: float | None = None
     Examples
     --------
     >>> from matplotlib.figure import Figure
-    >>> from evofsm import IntervalActions, plot
-    >>> from evofsm.driving import IDM, Framework, FunctionController, KinematicWorld, LatentRisk
-    >>> from evofsm.driving import Leader, Scenario
-    >>> from evofsm.guard import ActionReviser
-    >>> actions = IntervalActions(low=-4.0, high=2.5, width=0.5, outside="clip")
-    >>> reviser = ActionReviser(LatentRisk(lowest=-4.0), actions)
+    >>> from evofsm import plot
+    >>> from evofsm.driving import IDM, Framework, FunctionController, KinematicWorld, Leader
+    >>> from evofsm.driving import Scenario, guard_for_cars
     >>> leader = Leader(IDM(1.2, 25.0, 1.0, 1.0, 2.5), brake_decel=4.0, brake_time=12.0)
-    >>> framework = Framework(FunctionController(lambda z: 2.0), actions, reviser)
+    >>> framework = Framework(FunctionController(lambda z: 2.0), guard_for_cars(-4.0, 2.5))
     >>> drive = framework.drive(KinematicWorld(), Scenario(leader, initial_gap=10.0))
-    >>> ax = plot.risk(drive, Figure().subplots(), tolerance=reviser.tolerance)
+    >>> ax = plot.risk(drive, Figure().subplots(), tolerance=0.02)
     >>> ax.get_ylabel()
     'latent risk'
     """
@@ -413,12 +410,12 @@ def accelerations(drive: Drive, ax: Axes | None = None) -> Axes:
     Examples
     --------
     >>> from matplotlib.figure import Figure
-    >>> from evofsm import IntervalActions, plot
+    >>> from evofsm import plot
     >>> from evofsm.driving import IDM, Framework, KinematicWorld, Leader, Scenario
+    >>> from evofsm.driving import guard_for_cars
     >>> driver = IDM(1.2, 25.0, 1.0, 1.0, 2.5, lowest=-2.5, highest=2.5)
-    >>> actions = IntervalActions(low=-2.5, high=2.5, width=0.3, outside="clip")
     >>> scenario = Scenario(Leader(driver, brake_decel=2.0, brake_time=5.0), initial_gap=10.0)
-    >>> drive = Framework(driver, actions).drive(KinematicWorld(), scenario)
+    >>> drive = Framework(driver, guard_for_cars(-2.5, 2.5)).drive(KinematicWorld(), scenario)
     >>> ax = plot.accelerations(drive, Figure().subplots())
     >>> ax.get_ylabel()
     'acceleration [m/s²]'
