@@ -18,9 +18,8 @@ import numpy as np
 from comparison import Result, compare, settings
 from numpy.typing import NDArray
 
-from evofsm import EvolvingFSM
-from evofsm.driving import LatentRisk
-from evofsm.guard import ActionReviser, RevisedActions
+from evofsm.driving import guard_for_family
+from evofsm.guard import RevisedActions
 
 
 def main(argv: Sequence[str] | None = None) -> tuple[Result, Result]:
@@ -28,18 +27,12 @@ def main(argv: Sequence[str] | None = None) -> tuple[Result, Result]:
     chosen = settings("An aggressive driver, revised.", argv, episodes=100, train=40)
     env = gymnasium.make("evofsm.driving.worlds.gym:evofsm/CarFollowing-v0", seed=chosen.seed)
     car = env.unwrapped
-    family = car.family
 
     def aggressive(observation: NDArray[np.float64], info: dict[str, Any]) -> NDArray[np.float64]:
         return np.array([car.draw.controller.propose(observation, info["time"]).action])
 
-    revised = RevisedActions(
-        env,
-        ActionReviser(LatentRisk(family.actions.low, family.interval), family.actions),
-        observe=lambda observation: observation,
-        failed=lambda info: info["failed"],
-        machine=EvolvingFSM(family.actions.n_actions, radius=3.0),
-    )
+    guard = guard_for_family(car.family)
+    revised = RevisedActions(env, guard, failed=lambda info: info["failed"])
     results = compare(
         revised,
         aggressive,

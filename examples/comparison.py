@@ -89,7 +89,7 @@ def compare(
     print(f"unrevised      {without}")
     learning = drive(revised, policy, training, revised.failed, speed)
     print(f"while learning {learning}")
-    revised.learn = False
+    revised.guard.freeze()
     under = drive(revised, policy, held_out, revised.failed, speed)
     print(f"revised        {under}")
     print(

@@ -25,9 +25,8 @@ from comparison import Result, compare, settings
 from highway_env.vehicle.kinematics import Vehicle
 from numpy.typing import NDArray
 
-from evofsm import EvolvingFSM, IntervalActions
-from evofsm.driving import LatentRisk
-from evofsm.guard import ActionReviser, RevisedActions
+from evofsm.driving import guard_for_cars
+from evofsm.guard import RevisedActions
 
 FULL = 5.0  # of throttle and of brakes [m/s²]; the environment's actions are shares of it
 INTERVAL = 0.25  # between decisions [s]
@@ -78,13 +77,11 @@ def full_throttle(observation: NDArray[np.float32], info: dict[str, Any]) -> NDA
 def main(argv: Sequence[str] | None = None) -> tuple[Result, Result]:
     """Drive, print, and answer with what came of it: unrevised, revised."""
     chosen = settings("Full throttle on a highway, revised.", argv, episodes=25, train=10)
-    actions = IntervalActions(-FULL, FULL, width=0.5, outside="clip")
     revised = RevisedActions(
         gymnasium.make("highway-fast-v0", config=CONFIG),
-        ActionReviser(LatentRisk(actions.low, INTERVAL), actions),
+        guard_for_cars(-FULL, FULL, INTERVAL, width=0.5),
         observe=ahead,
         failed=lambda info: info["crashed"],
-        machine=EvolvingFSM(actions.n_actions, radius=3.0),
         to_acceleration=lambda action: FULL * float(action[0]),
         to_action=lambda acceleration: np.array([acceleration / FULL], dtype=np.float32),
     )

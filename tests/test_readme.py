@@ -53,6 +53,26 @@ def test_the_closed_loop_table_is_what_the_study_printed(page):
     assert checked >= 7
 
 
+def test_the_bold_row_is_rebuilt_in_ten_lines():
+    from evofsm.driving import load_family
+    from evofsm.evidence.closed_loop.study import Plan, _test_learner
+
+    blocks = re.findall(r"```pycon\n(.*?)```", README, re.DOTALL)
+    (block,) = [block for block in blocks if "try_out(" in block]
+    lines = [line[4:] for line in block.splitlines() if line.startswith(">>> ")]
+    assert len(lines) <= 10
+    few = "\n".join(lines).replace("episodes=20", "episodes=4")
+    names = {}
+    exec(few.replace("learning_seed=0", "learning_seed=1"), names)
+    plan = Plan(train=4, test=4)
+    (row,) = _test_learner(load_family("emergency"), plan, 1)["rows"]
+    ours = names["row"]
+    assert ours.collisions == row.collisions == 0
+    assert sum(drive.episode.collided for drive in names["drives"]) == row.train_collisions == 0
+    for name in ("mobility", "mobility_low", "intervention_rate", "mean_change", "jerk"):
+        assert getattr(ours, name) == getattr(row, name)
+
+
 def test_our_own_lines_are_the_median_and_the_worst_of_the_seeds():
     ours = [row for row in RESULTS if row["policy"] == "evofsm" and row["train_episodes"] == 100]
     assert len(ours) == 20

@@ -12,7 +12,7 @@ from evofsm.driving.revisers import AlwaysBrake, EnvelopeReviser, Unrevised
 from evofsm.driving.risk.outcome import LatentRisk
 from evofsm.driving.risk.ttc import TimeToCollision
 from evofsm.guard.protocols import Judgement, Proposal, Situation
-from evofsm.guard.reviser import ActionReviser, Mode, Way, nearest_values
+from evofsm.guard.reviser import ActionReviser, Mode, Way
 
 LOW, HIGH, TOLERANCE = -2.5, 2.5, 0.02
 ACTIONS = IntervalActions(low=LOW, high=HIGH, width=0.3)
@@ -33,6 +33,12 @@ class Told(LatentRisk):
     def judge(self, situation, accelerations):
         risk = np.array([self.risk(a) for a in accelerations])
         return Judgement(risk, 0.5 * risk, np.sqrt(risk), 10.0 * (1.0 - risk), 7.0)
+
+
+def nearest_values(actions, wanted):
+    """For each interval the value in it that is nearest to what is wanted, and both limits."""
+    reviser = ActionReviser(Told(above(0.0), lowest=actions.low), actions)
+    return reviser._options(wanted, Proposal(wanted))[1:].tolist()
 
 
 def above(limit, low=0.0, high=1.0):

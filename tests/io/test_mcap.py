@@ -336,4 +336,4 @@ def test_a_small_log_that_unpacks_to_hundreds_of_megabytes_is_refused(
 def test_beliefs_that_are_far_too_many_are_refused():
     rows = [{"belief": [0.0] * 20_000}, *({"belief": []} for _ in range(10_000))]
     with pytest.raises(ValueError, match="10,001 beliefs in 20,000 states"):
-        _column("belief", rows)
+        _column("belief", "belief", rows)

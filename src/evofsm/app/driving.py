@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from evofsm.core import EvolvingFSM
 from evofsm.driving import (
+    COLUMNS,
     FIXED_MEASURES,
     IDM,
     VARIABLES,
@@ -276,12 +277,10 @@ def episodes_learnt(folder: Path) -> int:
 
 # -- What has been driven so far ------------------------------------------------------------------
 
-_WHOLE = ("episode", "intake", "state", "n_states")
-_OF_REVISION = ("proposed", "executed", "advised", "risk_proposed", "risk_executed")
-_EVIDENCE = ("risk_low", "risk_high", "evidence", "seen")
 _COLUMNS = (
     *("episode", "time", *VARIABLES, "intake", "state", "n_states", "surprise"),
-    *(*_OF_REVISION, *_EVIDENCE, "realised", "reason"),
+    *("proposed", "executed", "advised", "risk_proposed", "risk_executed", "risk_low"),
+    *("risk_high", "evidence", "seen", "realised", "reason"),
 )
 # Where there is no state.
 _NONE = -1
@@ -297,24 +296,9 @@ class Driven:
 
     def add(self, drive: Drive, came_of_it: Outcome, tolerance: float) -> None:
         """Take in the next episode."""
-        for situation, revision, realised in drive.decisions:
-            row = (
-                len(self.outcomes),
-                situation.time,
-                *situation.observation.tolist(),
-                int(situation.intake),
-                situation.state,
-                0 if situation.state is None else len(situation.belief),
-                situation.surprise,
-                *(getattr(revision, name) for name in _OF_REVISION),
-                *revision.interval,
-                revision.evidence,
-                revision.seen,
-                realised,
-                revision.reason,
-            )
-            for name, value in zip(_COLUMNS, row, strict=True):
-                self.decisions[name].append(value)
+        self.decisions["episode"] += [len(self.outcomes)] * len(drive.decisions)
+        for name in _COLUMNS[1:]:
+            self.decisions[name] += map(COLUMNS[name].read, drive.decisions)
         self.outcomes.append(came_of_it)
         if drive.episode.collided and is_judged(drive):
             self.lead_times.append(lead_time(drive, tolerance))
@@ -367,23 +351,25 @@ class Driven:
             raise ValueError("columns of decisions are of different lengths")
 
 
+def _kind(name: str) -> type:
+    return int if name == "episode" else COLUMNS[name].kind
+
+
 def _column(name: str, values: Sequence[Any]) -> NDArray[Any]:
     """A column of decisions as an array; texts as JSON."""
-    if name == "reason":
+    if _kind(name) is str:
         return np.frombuffer(json.dumps(values).encode(), np.uint8)
-    if name in _WHOLE:
+    if _kind(name) is int:
         return np.array([_NONE if value is None else value for value in values], np.int64)
     return np.array(values, np.float64)
 
 
 def _values(name: str, column: NDArray[Any]) -> list[Any]:
     """The column that `_column` made an array of."""
-    if name == "reason":
-        return [str(reason) for reason in json.loads(column.tobytes())]
-    if name in _WHOLE:
-        return [None if value == _NONE else value for value in column.tolist()]
-    values: list[float] = column.tolist()
-    return values
+    if _kind(name) is str:
+        return [str(text) for text in json.loads(column.tobytes())]
+    values: list[Any] = column.tolist()
+    return values if _kind(name) is float else [None if one == _NONE else one for one in values]
 
 
 def _files(guard: Guard) -> tuple[bytes, bytes]:

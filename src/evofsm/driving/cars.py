@@ -66,7 +66,7 @@ def guard_for_cars(
     Examples
     --------
     >>> guard = guard_for_cars(low=-4.0, high=2.5)
-    >>> guard.decide([40.0, 20.0, 20.0], proposal=0.5).reason
+    >>> guard.decide([150.0, 20.0, 20.0], proposal=0.5).reason
     'never seen before; risk is within the tolerance'
     """
     actions = IntervalActions(low, high, width, outside="clip")

@@ -27,6 +27,9 @@ from .protocols import RiskMeasure as RiskMeasure
 from .protocols import Situation as Situation
 from .protocols import Trial as Trial
 from .protocols import Witness as Witness
+from .record import RECORD as RECORD
+from .record import Column as Column
+from .record import Pair as Pair
 from .reviser import ActionReviser as ActionReviser
 from .reviser import Mode as Mode
 from .reviser import Way as Way

@@ -136,7 +136,7 @@ class Guard:
     >>> for observation in ([9.0, 20.0, 20.0], [8.9, 20.2, 19.8]):  # gap, own speed, leader's
     ...     revision = guard.decide(observation, proposal=1.0)
     >>> revision.executed, revision.risk_proposed, guard.machine.n_states
-    (-2.5, 1.0, 2)
+    (-2.5, 1.0, 1)
     >>> guard.end(failed=False, observation=[8.7, 20.0, 19.5])
     """
 

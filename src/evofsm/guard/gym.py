@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from evofsm.extras import needs
 from evofsm.guard.guard import Guard
 from evofsm.guard.protocols import Proposal, Revision
+from evofsm.guard.record import info_of
 from evofsm.guard.reviser import make_usable, unjudged
 
 with needs("gymnasium", "gym", "a wrapper for Gymnasium"):
@@ -124,14 +125,11 @@ class RevisedActions(gymnasium.Wrapper[Any, Any, Any, Any]):
         failed = bool(self.failed(info))
         if failed or terminated or truncated or self._seen is None:
             self._end(failed=failed)
-        told = {
+        actions = {
             "reviser/proposed_action": deepcopy(action),
             "reviser/executed_action": deepcopy(executed),
-            "reviser/reason": revision.reason,
-            "reviser/risk": revision.risk_executed,
-            "reviser/risk_proposed": revision.risk_proposed,
         }
-        return observation, reward, terminated, truncated, {**info, **told}
+        return observation, reward, terminated, truncated, {**info, **actions, **info_of(revision)}
 
     def _decide(self, proposal: Proposal) -> Revision:
         if self._seen is None:

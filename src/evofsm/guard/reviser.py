@@ -69,6 +69,7 @@ def make_usable(proposal: Proposal, actions: ActionSet, fallback: Fallback = NOT
 
     Examples
     --------
+    >>> from evofsm import IntervalActions
     >>> actions = IntervalActions(low=-2.5, high=2.5, width=0.3)
     >>> make_usable(Proposal(9.0), actions)
     Usable(action=2.5, remark='proposal 9 is outside [-2.5, 2.5]')
@@ -114,6 +115,7 @@ class ActionReviser:
 
     Examples
     --------
+    >>> from evofsm import IntervalActions
     >>> actions = IntervalActions(low=-2.5, high=2.5, width=0.3)
     >>> from evofsm.driving import LatentRisk
     >>> reviser = ActionReviser(LatentRisk(lowest=-2.5), actions)

@@ -25,10 +25,9 @@ from numpy.typing import NDArray
 
 from evofsm import __version__
 from evofsm.core import FSMModel
-from evofsm.driving import VARIABLES, Decision, Drive, time_headway, time_to_collision
+from evofsm.driving import COLUMNS, VARIABLES, Decision, Drive
 from evofsm.extras import needs
 from evofsm.files import storage
-from evofsm.guard import Intake
 
 with needs("mcap", "mcap", "reading and writing MCAP"):
     from lz4.frame import LZ4FrameDecompressor
@@ -56,45 +55,34 @@ def _of(kind: str, description: str) -> dict[str, Any]:
     return {"type": kind, "description": description}
 
 
-_ACCELERATION = "[m/s²]; left out where there is none"
+# The columns of an episode, by channel; the channel of risks has them without ``risk_``.
+_OF_DECISIONS = {
+    "/observation": ("time", *VARIABLES, "intake"),
+    "/belief": ("state", "belief", "surprise", "n_states"),
+    "/risk": (
+        *("risk_proposed", "risk_executed", "risk_low", "risk_high", "evidence", "seen"),
+        *("time_to_collision", "time_headway"),
+    ),
+    "/decision": ("proposed", "executed", "advised", "realised", "reason", "explanation"),
+}
+_JSON_TYPES = {float: "number", int: "integer", str: "string"}
+
+
+def _field(topic: str, name: str) -> str:
+    return name.removeprefix("risk_") if topic == "/risk" else name
+
+
+def _schema(name: str) -> dict[str, Any]:
+    if name == "belief":
+        items = _of("number", "probability")
+        return {**_of("array", "probability of each state, from 0"), "items": items}
+    return _of(_JSON_TYPES[COLUMNS[name].kind], COLUMNS[name].about)
+
+
 _CHANNELS: dict[str, dict[str, dict[str, Any]]] = {
-    "/observation": {
-        "time": _of("number", "since the start of the episode [s]"),
-        "gap": _of("number", "from bumper to bumper, as observed [m]; left out where missing"),
-        "v_follower": _of("number", "speed of the follower [m/s]; left out where missing"),
-        "v_leader": _of("number", "speed of the leader [m/s]; left out where missing"),
-        "intake": _of(
-            "integer",
-            "what was wrong: a sum of "
-            + ", ".join(f"{flag.value} {flag.name}" for flag in Intake if flag.name),
-        ),
-    },
-    "/belief": {
-        "state": _of("integer", "the most probable one, from 0; left out where none is known"),
-        "belief": {
-            **_of("array", "probability of each state, from 0"),
-            "items": _of("number", "probability"),
-        },
-        "surprise": _of("number", "divergence of forecast and belief [bit]; left out at first"),
-        "n_states": _of("integer", "how many states there were"),
-    },
-    "/risk": {
-        "proposed": _of("number", "probability of failure under the proposal"),
-        "executed": _of("number", "the same for what is executed"),
-        "low": _of("number", "lower end of its 90 % interval"),
-        "high": _of("number", "upper end of its 90 % interval"),
-        "evidence": _of("number", "braking manoeuvres of leaders that it rests on"),
-        "seen": _of("number", "time spent in states like this one before [s]"),
-        "time_to_collision": _of("number", "[s]; left out where the gap does not close"),
-        "time_headway": _of("number", "[s]; left out where the follower stands"),
-    },
-    "/decision": {
-        "proposed": _of("number", f"what the controller wanted {_ACCELERATION}"),
-        "executed": _of("number", "what was commanded [m/s²]"),
-        "advised": _of("number", "what the reviser would have executed [m/s²]"),
-        "realised": _of("number", f"what the body did until the next decision {_ACCELERATION}"),
-        "reason": _of("string", "why, in a few words"),
-        "explanation": _of("string", "why, in detail; empty where nothing was said"),
+    **{
+        topic: {_field(topic, name): _schema(name) for name in names}
+        for topic, names in _OF_DECISIONS.items()
     },
     "/event": {
         "kind": _of("string", "episode started, collision, rear-end collision or episode ended"),
@@ -126,15 +114,6 @@ _CHANNELS: dict[str, dict[str, dict[str, Any]]] = {
     },
 }
 _SCHEMA_NAMES = {"/log": "foxglove.Log"}
-# The columns of an episode, by channel and field; those in common are told apart.
-_RENAMED = {
-    ("/risk", "proposed"): "risk_proposed",
-    ("/risk", "executed"): "risk_executed",
-    ("/risk", "low"): "risk_low",
-    ("/risk", "high"): "risk_high",
-}
-_OF_DECISIONS = ("/observation", "/belief", "/risk", "/decision")
-_TEXTS, _WHOLE = ("reason", "explanation"), ("intake", "state", "n_states")
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,18 +173,15 @@ def write_run(
     --------
     >>> import tempfile
     >>> from pathlib import Path
-    >>> from evofsm import IntervalActions
-    >>> from evofsm.driving import IDM, Framework, KinematicWorld, Leader, Scenario
-    >>> actions = IntervalActions(low=-2.5, high=2.5, width=0.3, outside="clip")
-    >>> hasty = IDM(2.25, 28.0, 0.8, 0.3, 2.0, lowest=-2.5, highest=2.5)
-    >>> leader = Leader(IDM(1.2, 25.0, 1.0, 1.0, 2.5), brake_decel=4.0, brake_time=12.0)
-    >>> drive = Framework(hasty, actions).drive(KinematicWorld(), Scenario(leader, 10.0))
+    >>> from evofsm.driving import drive, load_family, unrevised
+    >>> family = load_family("emergency")
+    >>> driven = drive(unrevised(family), family.draw(seed=0, index=0))
     >>> with tempfile.TemporaryDirectory() as folder:
-    ...     write_run(Path(folder) / "run.mcap", [drive], about={"controller": "hasty"})
+    ...     write_run(Path(folder) / "run.mcap", [driven], about={"controller": "hasty"})
     ...     run = read_run(Path(folder) / "run.mcap")
     >>> run.about["controller"], run.episodes[0].collided
     ('hasty', True)
-    >>> bool((run.episodes[0].columns["executed"] == drive.executed).all())
+    >>> bool((run.episodes[0].columns["executed"] == driven.executed).all())
     True
     """
     with recording(path, about) as log:
@@ -335,43 +311,11 @@ class RunWriter:
 
 def _messages(decision: Decision) -> Iterator[tuple[str, dict[str, Any]]]:
     """What a decision says on each channel."""
-    situation, revision = decision.situation, decision.revision
-    observation = dict(zip(VARIABLES, situation.observation.tolist(), strict=True))
-    yield "/observation", {"time": situation.time, **observation, "intake": int(situation.intake)}
-    belief = [] if situation.state is None else situation.belief.tolist()
-    yield (
-        "/belief",
-        {
-            "state": situation.state,
-            "belief": belief,
-            "surprise": situation.surprise,
-            "n_states": len(belief),
-        },
-    )
-    yield (
-        "/risk",
-        {
-            "proposed": revision.risk_proposed,
-            "executed": revision.risk_executed,
-            "low": revision.interval[0],
-            "high": revision.interval[1],
-            "evidence": revision.evidence,
-            "seen": revision.seen,
-            "time_to_collision": float(time_to_collision(situation.observation)),
-            "time_headway": float(time_headway(situation.observation)),
-        },
-    )
-    yield (
-        "/decision",
-        {
-            "proposed": revision.proposed,
-            "executed": revision.executed,
-            "advised": revision.advised,
-            "realised": decision.realised,
-            "reason": revision.reason,
-            "explanation": revision.explanation,
-        },
-    )
+    known = decision.situation.state is not None
+    belief = decision.situation.belief.tolist() if known else []
+    for topic, names in _OF_DECISIONS.items():
+        read = (belief if name == "belief" else COLUMNS[name].read(decision) for name in names)
+        yield topic, dict(zip((_field(topic, name) for name in names), read, strict=True))
 
 
 def _said(decision: Decision) -> str:
@@ -532,9 +476,9 @@ def _episode(
     if len(set(counts.values())) != 1:
         raise ValueError(f"its channels hold different numbers of decisions: {counts}")
     columns = {
-        _RENAMED.get((topic, name), name): _column(name, messages[topic])
-        for topic in _OF_DECISIONS
-        for name in _CHANNELS[topic]
+        name: _column(name, _field(topic, name), messages[topic])
+        for topic, names in _OF_DECISIONS.items()
+        for name in names
     }
     _restore_infinities(columns)
     where = np.array([end[name] for name in VARIABLES], np.float64)
@@ -549,10 +493,10 @@ def _episode(
     )
 
 
-def _column(name: str, messages: list[dict[str, Any]]) -> NDArray[Any]:
+def _column(name: str, field: str, messages: list[dict[str, Any]]) -> NDArray[Any]:
     """A field of all messages, in their order."""
     if name == "belief":
-        rows = [message[name] for message in messages]
+        rows = [message[field] for message in messages]
         longest = max(map(len, rows), default=0)
         if len(rows) * longest > _MOST_BELIEFS:
             raise ValueError(f"an episode of {len(rows):,} beliefs in {longest:,} states")
@@ -560,11 +504,12 @@ def _column(name: str, messages: list[dict[str, Any]]) -> NDArray[Any]:
         for row, belief in zip(beliefs, rows, strict=True):
             row[: len(belief)] = belief
         return beliefs
-    if name in _TEXTS:
-        return np.array([str(message[name]) for message in messages], dtype=object)
-    if name in _WHOLE:
-        return np.array([message.get(name, _NONE) for message in messages], np.int64)
-    return np.array([message.get(name, math.nan) for message in messages], np.float64)
+    kind = COLUMNS[name].kind
+    if kind is str:
+        return np.array([str(message[field]) for message in messages], dtype=object)
+    if kind is int:
+        return np.array([message.get(field, _NONE) for message in messages], np.int64)
+    return np.array([message.get(field, math.nan) for message in messages], np.float64)
 
 
 def _restore_infinities(columns: dict[str, NDArray[Any]]) -> None:

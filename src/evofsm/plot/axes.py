@@ -360,16 +360,13 @@ def risk(drive: Drive, ax: Axes | None = None, *, tolerance: float | None = None
     Examples
     --------
     >>> from matplotlib.figure import Figure
-    >>> from evofsm import IntervalActions, plot
-    >>> from evofsm.driving import IDM, Framework, FunctionController, KinematicWorld, LatentRisk
-    >>> from evofsm.driving import Leader, Scenario
-    >>> from evofsm.guard import ActionReviser
-    >>> actions = IntervalActions(low=-4.0, high=2.5, width=0.5, outside="clip")
-    >>> reviser = ActionReviser(LatentRisk(lowest=-4.0), actions)
+    >>> from evofsm import plot
+    >>> from evofsm.driving import IDM, Framework, FunctionController, KinematicWorld, Leader
+    >>> from evofsm.driving import Scenario, guard_for_cars
     >>> leader = Leader(IDM(1.2, 25.0, 1.0, 1.0, 2.5), brake_decel=4.0, brake_time=12.0)
-    >>> framework = Framework(FunctionController(lambda z: 2.0), actions, reviser)
+    >>> framework = Framework(FunctionController(lambda z: 2.0), guard_for_cars(-4.0, 2.5))
     >>> drive = framework.drive(KinematicWorld(), Scenario(leader, initial_gap=10.0))
-    >>> ax = plot.risk(drive, Figure().subplots(), tolerance=reviser.tolerance)
+    >>> ax = plot.risk(drive, Figure().subplots(), tolerance=0.02)
     >>> ax.get_ylabel()
     'latent risk'
     """
@@ -381,17 +378,12 @@ def risk(drive: Drive, ax: Axes | None = None, *, tolerance: float | None = None
             "no decision of this drive was judged (was there a reviser, and was its mode not OFF?)"
         )
     ax = _given_or_new(ax)
-    low, high = np.array([revision.interval for revision in revisions]).T
-    when = _until_the_end(drive)
-    fill: Look = {"step": "post", "color": FOLLOWER, "alpha": 0.25, "linewidth": 0.0}
-    ax.fill_between(when, _held(low), _held(high), label="90 % interval", **fill)
-    ax.step(when, _held(proposed), where="post", color=DEAD_END, linestyle="--", label="proposed")
-    ax.step(when, _held(executed), where="post", color=FOLLOWER, label="executed")
+    between = np.array([revision.interval for revision in revisions]).T
+    _draw_decisions(ax, drive, (proposed, executed), between, FOLLOWER, "90 % interval")
     if tolerance is not None:
         label = f"tolerance, {tolerance:g}"
         ax.axhline(tolerance, color=ink(), linestyle=":", linewidth=1.0, label=label)
-    ax.set_ylim(-0.03, 1.03)
-    ax.set_ylabel("latent risk")
+    ax.set(ylim=(-0.03, 1.03), ylabel="latent risk")
     _finish(ax, drive, 0.0)
     return ax
 
@@ -418,12 +410,12 @@ def accelerations(drive: Drive, ax: Axes | None = None) -> Axes:
     Examples
     --------
     >>> from matplotlib.figure import Figure
-    >>> from evofsm import IntervalActions, plot
+    >>> from evofsm import plot
     >>> from evofsm.driving import IDM, Framework, KinematicWorld, Leader, Scenario
+    >>> from evofsm.driving import guard_for_cars
     >>> driver = IDM(1.2, 25.0, 1.0, 1.0, 2.5, lowest=-2.5, highest=2.5)
-    >>> actions = IntervalActions(low=-2.5, high=2.5, width=0.3, outside="clip")
     >>> scenario = Scenario(Leader(driver, brake_decel=2.0, brake_time=5.0), initial_gap=10.0)
-    >>> drive = Framework(driver, actions).drive(KinematicWorld(), scenario)
+    >>> drive = Framework(driver, guard_for_cars(-2.5, 2.5)).drive(KinematicWorld(), scenario)
     >>> ax = plot.accelerations(drive, Figure().subplots())
     >>> ax.get_ylabel()
     'acceleration [m/s²]'
@@ -431,26 +423,28 @@ def accelerations(drive: Drive, ax: Axes | None = None) -> Axes:
     if not drive.decisions:
         raise ValueError("nothing was decided in this drive")
     ax = _given_or_new(ax)
-    when, proposed, executed = _until_the_end(drive), _held(drive.proposed), _held(drive.executed)
     ax.axhline(0.0, color=SOFT, linewidth=0.6)
-    fill: Look = {"step": "post", "color": DEAD_END, "alpha": 0.25, "linewidth": 0.0}
-    ax.fill_between(when, proposed, executed, label="revised", **fill)
-    ax.step(when, proposed, where="post", color=DEAD_END, linestyle="--", label="proposed")
-    ax.step(when, executed, where="post", color=FOLLOWER, label="executed")
+    both = drive.proposed, drive.executed
+    _draw_decisions(ax, drive, both, both, DEAD_END, "revised")
     ax.set_ylabel("acceleration [m/s²]")
-    _finish(ax, drive, float(executed[-1]))
+    _finish(ax, drive, float(drive.executed[-1]))
     return ax
 
 
-def _until_the_end(drive: Drive) -> NDArray[np.float64]:
-    """(D + 1,) times of the decisions, and the end of the drive [s]."""
+def _draw_decisions(
+    ax: Axes, drive: Drive, values: ArrayLike, between: ArrayLike, color: str, label: str
+) -> None:
+    """Draw what was proposed and executed (2, D), and a band (2, D), until the end of the drive."""
     times = [decision.situation.time for decision in drive.decisions]
-    return np.array([*times, float(drive.episode.time[-1])])
-
-
-def _held(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(D + 1,) what was decided; the last holds until the end."""
-    return np.append(values, values[-1])
+    when = np.array([*times, float(drive.episode.time[-1])])
+    (proposed, executed), (low, high) = (
+        np.pad(np.asarray(rows, dtype=np.float64), ((0, 0), (0, 1)), mode="edge")
+        for rows in (values, between)
+    )
+    fill: Look = {"step": "post", "color": color, "alpha": 0.25, "linewidth": 0.0}
+    ax.fill_between(when, low, high, label=label, **fill)
+    ax.step(when, proposed, where="post", color=DEAD_END, linestyle="--", label="proposed")
+    ax.step(when, executed, where="post", color=FOLLOWER, label="executed")
 
 
 def _finish(ax: Axes, drive: Drive, y: float) -> None:

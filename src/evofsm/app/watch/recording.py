@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from evofsm.app.watch.shown import (
     CAR_LENGTH,
     HEADWAY,
+    RECORDED,
     TTC,
     Frame,
     Graph,
@@ -25,6 +26,7 @@ from evofsm.app.watch.shown import (
 from evofsm.app.watch.story import Chronicle
 from evofsm.core import FSMModel
 from evofsm.driving import VARIABLES, time_headway, time_to_collision
+from evofsm.guard import RECORD
 from evofsm.io import RecordedEpisode, Run, read_run
 
 # What is accepted where a log does not say.
@@ -189,15 +191,12 @@ def _decided(columns: Any, number: int) -> dict[str, Any]:
     is_kept = proposed == executed.risk
     unknown = Judged(proposed, math.nan, math.nan)
     return {
+        **{name: RECORD[name].kind(columns[name][number]) for name in RECORDED},
         "belief": most_believed(columns["belief"][number]),
         "state": None if state == _NONE else state,
         "event": "moved" if state != before else "",
-        "surprise": float(columns["surprise"][number]),
         "proposed_risk": executed if is_kept else unknown,
         "executed_risk": executed,
-        **{name: float(columns[name][number]) for name in ("proposed", "executed", "advised")},
-        "reason": str(columns["reason"][number]),
-        "explanation": str(columns["explanation"][number]),
     }
 
 

@@ -12,6 +12,7 @@ from evofsm.app.driving import Setup, make_controller, make_guard
 from evofsm.app.watch.shown import (
     CAR_LENGTH,
     HEADWAY,
+    RECORDED,
     TTC,
     Frame,
     Graph,
@@ -41,9 +42,11 @@ from evofsm.driving import (
     unrevised,
 )
 from evofsm.guard import (
+    RECORD,
     Explain,
     Guard,
     Judgement,
+    Pair,
     Proposal,
     Reviser,
     Revision,
@@ -332,19 +335,13 @@ class Session:
         assert judged is not None
         wanted, does, braking = range(3)
         frame = self._seen()._replace(
+            **{name: RECORD[name].read(Pair(situation, revision)) for name in RECORDED},
             belief=most_believed(situation.belief),
-            state=situation.state,
             event=self._event(situation.state, self.machine.n_states > known),
-            surprise=situation.surprise,
             proposed_risk=_judged(judged, wanted),
             executed_risk=_judged(judged, does),
             braking_risk=float(judged.risk[braking]),
             critical=float(judged.critical[wanted]),
-            proposed=revision.proposed,
-            executed=revision.executed,
-            advised=revision.advised,
-            reason=revision.reason,
-            explanation=revision.explanation,
         )
         self._state = situation.state
         return frame

@@ -101,6 +101,10 @@ class Frame(NamedTuple):
     over: bool = False  #: whether the run ended here
 
 
+#: What a frame takes over from the record of a decision (`evofsm.guard.RECORD`), as it is.
+RECORDED = ("state", "surprise", "proposed", "executed", "advised", "reason", "explanation")
+
+
 class StateShown(NamedTuple):
     """A state, as it is drawn."""
 

@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass, field
 from functools import partial
 from importlib.util import find_spec
 from itertools import repeat
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 
@@ -118,11 +118,7 @@ class ClosedLoop:
 
     def as_dict(self) -> dict[str, Any]:
         """All of it, for JSON."""
-        lists = {
-            name: [one.as_dict() if isinstance(one, Row) else _plain(one) for one in values]
-            for name, values in vars(self).items()
-            if isinstance(values, list)
-        }
+        lists = {name: _plain(one) for name, one in vars(self).items() if isinstance(one, list)}
         return {"family": self.family.name, "plan": asdict(self.plan), **lists}
 
 
@@ -169,76 +165,91 @@ def run_closed_loop(
     return study
 
 
-def _plain(record: Any) -> dict[str, Any]:
-    """A tuple of names, with those inside it, for JSON."""
-    return {
-        name: [_plain(one) if hasattr(one, "_asdict") else one for one in value]
-        if isinstance(value, tuple)
-        else value
-        for name, value in record._asdict().items()
-    }
+def _plain(record: Any) -> Any:
+    """Rows and tuples of names, with those inside them, for JSON."""
+    if isinstance(record, Row):
+        return record.as_dict()
+    if hasattr(record, "_asdict"):
+        return {name: _plain(value) for name, value in record._asdict().items()}
+    return [_plain(one) for one in record] if isinstance(record, tuple | list) else record
 
 
-def _drive_all(
-    family: Family,
-    draws: Sequence[Draw],
-    base: Sequence[Reference],
-    revisers: Iterable[Reviser],
-) -> list[Outcome]:
-    """Drive draws without learning, each with its reviser."""
-    drives = (
-        drive(Guard.of(reviser, interval=family.interval, learn=False), draw)
-        for draw, reviser in zip(draws, revisers, strict=False)
-    )
-    return score(family, base, drives)
+# -- Policies -------------------------------------------------------------------------------------
+
+
+class _Course(NamedTuple):
+    """Draws that policies are tried on, and how the controller comes along in each by itself."""
+
+    family: Family
+    draws: Sequence[Draw]
+    alone: Sequence[Reference]
+
+    @classmethod
+    def of(cls, family: Family, draws: Iterable[Draw]) -> Self:
+        every = list(draws)
+        return cls(family, every, references(family, every))
+
+    def first(self, n: int) -> Self:
+        return self._replace(draws=self.draws[:n], alone=self.alone[:n])
+
+    def under(self, revisers: Iterable[Reviser]) -> list[Outcome]:
+        """What comes of the draws, each with its reviser."""
+        drives = (
+            drive(Guard.of(reviser, interval=self.family.interval, learn=False), draw)
+            for draw, reviser in zip(self.draws, revisers, strict=False)
+        )
+        return score(self.family, self.alone, drives)
+
+    def by(self, guard: Guard) -> list[Outcome]:
+        """What comes of the draws by what a guard has learnt so far."""
+        return try_out(guard, self.family, self.draws, self.alone)
+
+    def row(self, policy: str, group: str, outcomes: Sequence[Outcome], **others: Any) -> Row:
+        return summarise(self.family.name, policy, group, outcomes, self.family.interval, **others)
+
+
+def _trade_off(policy: str, setting: str, outcomes: Sequence[Outcome]) -> TradeOff:
+    rate = sum(o.collided for o in outcomes) / len(outcomes)
+    return TradeOff(policy, setting, rate, _mobility(outcomes))
+
+
+def _mobility(outcomes: Sequence[Outcome]) -> float:
+    return float(np.mean([o.mobility for o in outcomes]))
+
+
+def _tests(family: Family, plan: Plan) -> _Course:
+    return _Course.of(family, held_out(family, plan.seed, plan.test))
 
 
 def _test_fixed(family: Family, plan: Plan, name: str) -> dict[str, list[Any]]:
     policy = next(policy for policy in fixed_policies(family) if policy.name == name)
-    draws = held_out(family, plan.seed, plan.test)
-    revisers = (policy.make(family, draw) for draw in draws)
-    outcomes = _drive_all(family, draws, references(family, draws), revisers)
-    return {"rows": [summarise(family.name, name, policy.group, outcomes, family.interval)]}
+    tests = _tests(family, plan)
+    outcomes = tests.under(policy.make(family, draw) for draw in tests.draws)
+    return {"rows": [tests.row(name, policy.group, outcomes)]}
 
 
 def _test_tuned(family: Family, plan: Plan, name: str) -> dict[str, list[Any]]:
     """Of the settings without a collision in training the fastest, else the safest."""
-    measures = TUNED_MEASURES[name]
-    draws = list(training(family, plan.seed, 0, min(plan.train, 100)))
-    base = references(family, draws)
-    tried: list[tuple[int, float, int]] = []
-    for index, measure in enumerate(measures):
-        reviser = EnvelopeReviser(measure, family.actions, family.interval)
-        outcomes = _drive_all(family, draws, base, repeat(reviser))
-        tried.append((sum(o.collided for o in outcomes), -_mobility(outcomes), index))
-    best = measures[min(tried)[2]]
-    reviser = EnvelopeReviser(best, family.actions, family.interval)
-    tests = held_out(family, plan.seed, plan.test)
-    outcomes = _drive_all(family, tests, references(family, tests), repeat(reviser))
-    row = summarise(
-        family.name,
-        name,
-        Group.TUNED,
-        outcomes,
-        family.interval,
-        train_episodes=len(draws) * len(measures),
-    )
-    return {
-        "rows": [row],
-        "trade_offs": [
-            TradeOff(name, repr(measures[i]), collisions / len(draws), -slower)
-            for collisions, slower, i in sorted(tried, key=lambda one: one[2])
-        ],
-    }
+    course = _Course.of(family, training(family, plan.seed, 0, min(plan.train, 100)))
+    revisers = [
+        EnvelopeReviser(measure, family.actions, family.interval)
+        for measure in TUNED_MEASURES[name]
+    ]
+    tried = [
+        _trade_off(name, repr(reviser.measure), course.under(repeat(reviser)))
+        for reviser in revisers
+    ]
+    best = min(range(len(tried)), key=lambda i: (tried[i].collision_rate, -tried[i].mobility))
+    tests, driven = _tests(family, plan), len(course.draws) * len(tried)
+    outcomes = tests.under(repeat(revisers[best]))
+    row = tests.row(name, Group.TUNED, outcomes, train_episodes=driven)
+    return {"rows": [row], "trade_offs": tried}
 
 
 def _test_learner(family: Family, plan: Plan, seed: int) -> dict[str, list[Any]]:
     """Learn with one seed; test on the way and at the end."""
     guard = guard_for_family(family, tolerance=plan.tolerance)
-    tests = held_out(family, plan.seed, plan.test)
-    base = references(family, tests)
-    checks = slice(SAFE_EPISODES)
-    checkpoints = [k for k in CHECKPOINTS if k <= plan.train]
+    tests = _tests(family, plan)
     curve: list[Point] = []
     rows: list[Row] = []
     collisions = 0
@@ -246,8 +257,8 @@ def _test_learner(family: Family, plan: Plan, seed: int) -> dict[str, list[Any]]
     for episodes in range(plan.train + 1):
         if episodes > 0:
             collisions += drive(guard, next(draws)).episode.collided
-        if episodes in checkpoints:
-            outcomes = try_out(guard, family, tests[checks], base[checks])
+        if episodes in CHECKPOINTS:
+            outcomes = tests.first(SAFE_EPISODES).by(guard)
             curve.append(
                 Point(
                     seed,
@@ -260,45 +271,23 @@ def _test_learner(family: Family, plan: Plan, seed: int) -> dict[str, list[Any]]
                 )
             )
         if episodes in {min(100, plan.train), plan.train}:
-            outcomes = try_out(guard, family, tests, base)
-            rows.append(_final_row(family, outcomes, seed, episodes, collisions, curve))
-    few = slice(plan.rule_test)
-    trade_offs = _trade_offs(family, guard, tests[few], base[few]) if seed == 0 else []
-    return {"rows": rows, "curve": curve, "trade_offs": trade_offs}
-
-
-def _final_row(
-    family: Family,
-    outcomes: Sequence[Outcome],
-    seed: int,
-    episodes: int,
-    train_collisions: int,
-    curve: Sequence[Point],
-) -> Row:
-    safe = [point.episodes for point in curve if point.collisions <= SAFE_RATE * point.held_out]
-    return summarise(
-        family.name,
-        "evofsm",
-        Group.LEARNT,
-        outcomes,
-        family.interval,
-        learning_seed=seed,
-        train_episodes=episodes,
-        episodes_until_safe=safe[0] if safe else None,
-        train_collisions=train_collisions,
-    )
-
-
-def _trade_offs(
-    family: Family, guard: Guard, draws: Sequence[Draw], base: Sequence[Reference]
-) -> list[TradeOff]:
-    found = []
-    for tolerance in TOLERANCES:
+            safe = (one.episodes for one in curve if one.collisions <= SAFE_RATE * one.held_out)
+            row = tests.row(
+                "evofsm",
+                Group.LEARNT,
+                tests.by(guard),
+                learning_seed=seed,
+                train_episodes=episodes,
+                episodes_until_safe=next(safe, None),
+                train_collisions=collisions,
+            )
+            rows.append(row)
+    trade_offs = []
+    for tolerance in TOLERANCES if seed == 0 else ():
         other = guard_for_family(family, tolerance=tolerance, judge=guard.judge)
-        outcomes = try_out(other, family, draws, base)
-        rate = sum(o.collided for o in outcomes) / len(outcomes)
-        found.append(TradeOff("evofsm", f"{tolerance:g}", rate, _mobility(outcomes)))
-    return found
+        outcomes = tests.first(plan.rule_test).by(other)
+        trade_offs.append(_trade_off("evofsm", f"{tolerance:g}", outcomes))
+    return {"rows": rows, "curve": curve, "trade_offs": trade_offs}
 
 
 def _test_rule(family: Family, plan: Plan, rule: str, seed: int) -> dict[str, list[Any]]:
@@ -309,21 +298,14 @@ def _test_rule(family: Family, plan: Plan, rule: str, seed: int) -> dict[str, li
     guard = Guard.of(reviser, interval=family.interval, machine=machine, judge=risk)
     episodes = min(_RULE_TRAIN, plan.train)
     taught = teach(guard, training(family, plan.seed, seed, episodes))
-    draws = held_out(family, plan.seed, min(plan.rule_test, plan.test))
     guard.freeze()
-    outcomes = score(family, references(family, draws), teach(guard, draws))
-    row = summarise(
-        family.name,
+    tests = _Course.of(family, held_out(family, plan.seed, min(plan.rule_test, plan.test)))
+    row = tests.row(
         f"states: {rule} ({machine.n_states})",
         Group.LEARNT,
-        outcomes,
-        family.interval,
+        score(family, tests.alone, teach(guard, tests.draws)),
         learning_seed=seed,
         train_episodes=episodes,
         train_collisions=sum(driven.episode.collided for driven in taught),
     )
     return {"by_rule": [row]}
-
-
-def _mobility(outcomes: Iterable[Outcome]) -> float:
-    return float(np.mean([o.mobility for o in outcomes]))

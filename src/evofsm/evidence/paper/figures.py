@@ -20,7 +20,6 @@ with needs("matplotlib", "plot", "drawing figures"):
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
     from matplotlib.figure import Figure
-    from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
     from matplotlib.ticker import MaxNLocator
 
@@ -283,8 +282,7 @@ def _label_moments(axes: Axes, moments: Sequence[_Moment]) -> None:
 
 def draw_divergence(study: PaperStudy) -> Figure:
     """Divergence of forecast and recognised state over time, a panel for each case."""
-    figure = Figure(figsize=(WIDTH, 4.5), layout="constrained")
-    grid = figure.subplots(2, 2, sharex=True, sharey=True)
+    figure, grid = plot.panels(2, 2, 4.5, sharex=True, sharey=True)
     values = [LARGEST_DIVERGENCE]
     for axes, run in zip(grid.flat, study.last_round, strict=True):
         _draw_surprise(axes, run)
@@ -382,9 +380,7 @@ def _draw_foundings(axes: Axes, study: PaperStudy, runs: int) -> None:
 
 def draw_space(study: PaperStudy) -> Figure:
     """States and trajectories in (gap, speed), a column for each case."""
-    figure = Figure(figsize=(WIDTH, 5.2))
-    grid = figure.subplots(2, len(CASES), sharex=True, sharey=True)
-    figure.subplots_adjust(0.07, 0.09, 0.985, 0.88, wspace=0.07, hspace=0.07)
+    figure, grid = plot.panels(2, len(CASES), 5.2, sharex=True, sharey=True)
     first: Axes = grid[0, 0]
     observations = np.concatenate([run.episode.observations for run in study.last_round])
     widest, fastest = float(observations[:, _GAP].max()), float(observations[:, 1:].max())
@@ -393,16 +389,18 @@ def draw_space(study: PaperStudy) -> Figure:
     first.set_xscale("function", functions=root)
     first.set(xlim=(-0.12, 1.08 * widest), ylim=(-0.07 * fastest, 1.1 * fastest))
     first.set_xticks([tick for tick in _GAP_TICKS if tick <= widest])
-    for column, run in enumerate(study.last_round):
-        for axes, speed in zip(grid[:, column], (_FOLLOWER, _LEADER), strict=True):
-            _draw_trajectory(axes, study, run, speed)
-            centers = study.model.centers[:, (_GAP, speed)]
-            plot.draw_centers(axes, centers, study.dead_ends, 8.5)
-        grid[0, column].set_title(run.name.capitalize())
-        grid[1, column].set_xlabel("gap [m], root scale")
+    for (above, below), run in zip(grid.T, study.last_round, strict=True):
+        above.set_title(run.name.capitalize())
+        below.set_xlabel("gap [m], root scale")
     first.set_ylabel("follower's speed [m/s]")
     grid[1, 0].set_ylabel("leader's speed [m/s]")
     _explain_space(figure, study)
+    figure.draw_without_rendering()  # discs and arrowheads need to know where everything is
+    for speed, row in zip((_FOLLOWER, _LEADER), grid, strict=True):
+        for axes, run in zip(row, study.last_round, strict=True):
+            _draw_trajectory(axes, study, run, speed)
+            centers = study.model.centers[:, (_GAP, speed)]
+            plot.draw_centers(axes, centers, study.dead_ends, 8.5)
     return figure
 
 
@@ -435,23 +433,18 @@ def _draw_direction(axes: Axes, x: NDArray[np.float64], y: NDArray[np.float64], 
 
 
 def _explain_space(figure: Figure, study: PaperStudy) -> None:
-    disc: Look = {"linestyle": "none", "markersize": 7.0}
-    state: Look = {"marker": "o", "markerfacecolor": "white", "markeredgecolor": INK, **disc}
-    entries = {
-        "centre of a state": Line2D([], [], **state),
-        "end of a run": Line2D([], [], color=INK, **{**_END, **disc}),
+    looks: dict[str, Look] = {
+        "centre of a state": {"marker": "o", "markerfacecolor": "white", "markeredgecolor": INK},
+        "end of a run": {**_END, "color": INK, "markersize": 7.0},
     }
     if study.dead_ends:
-        veil = Line2D([], [], color=DEAD_END, alpha=_VEIL, linewidth=5.0, solid_capstyle="butt")
-        entries |= {
-            "collision": Line2D([], [], color=INK, linestyle="none", **plot.COLLISION),
-            "the dead end": Line2D([], [], marker="h", color=DEAD_END, **disc),
-            "recognised as the dead end": veil,
+        veil: Look = {"linestyle": "-", "linewidth": 5.0, "alpha": _VEIL, "color": DEAD_END}
+        looks |= {
+            "collision": {"color": INK, **plot.COLLISION},
+            "the dead end": {"marker": "h", "color": DEAD_END, "markersize": 7.0},
+            "recognised as the dead end": {**veil, "solid_capstyle": "butt"},
         }
-    place: Look = {"loc": "upper left", "bbox_to_anchor": (0.055, 0.995), "ncols": len(entries)}
-    figure.legend(
-        list(entries.values()), list(entries), columnspacing=1.4, handlelength=1.8, **place
-    )
+    plot.legend(figure, looks)
 
 
 # -- As a graph, and as matrices ------------------------------------------------------------------

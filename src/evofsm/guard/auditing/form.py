@@ -13,6 +13,7 @@ from datetime import UTC, datetime, timedelta
 from typing import Any, NamedTuple
 
 from evofsm.files import ABOUT, SealedRecord
+from evofsm.guard.record import RECORD
 
 #: Of what is written now; every version from 1 on is read.
 VERSION = 2
@@ -23,6 +24,9 @@ _NOTHING = type(None)
 _Types = tuple[type, ...]
 # Numbers that are not finite are words.
 _NUMBER: _Types = (float, str)
+_AS_JSON: Mapping[type, _Types] = {int: (int,), float: _NUMBER, str: (str,)}
+# What is told of a decision as it is recorded elsewhere; lists are told beside.
+TOLD = tuple(name for name in RECORD if name not in ("time", "n_states", "risk_low", "risk_high"))
 # What stands in every record, and what else in those of a kind.
 _ALWAYS: Mapping[str, _Types] = {"kind": (str,), "clock": (str,)}
 _KINDS: Mapping[str, Mapping[str, _Types]] = {
@@ -43,24 +47,9 @@ _KINDS: Mapping[str, Mapping[str, _Types]] = {
         "missing": (str,),
     },
     "decision": {
-        "advised": _NUMBER,
-        "before": (list,),
-        "belief": (list,),
-        "candidates": (list,),
-        "evidence": _NUMBER,
-        "executed": _NUMBER,
-        "explanation": (str,),
-        "intake": (int,),
-        "interval": (list,),
-        "observation": (list,),
-        "proposed": _NUMBER,
-        "reason": (str,),
-        "risk_executed": _NUMBER,
-        "risk_proposed": _NUMBER,
-        "seen": _NUMBER,
+        **{name: _AS_JSON[RECORD[name].kind] for name in (*TOLD, "time")},
+        **dict.fromkeys(("before", "belief", "candidates", "interval", "observation"), (list,)),
         "state": (int, _NOTHING),
-        "surprise": _NUMBER,
-        "time": _NUMBER,
     },
     "quiet": {"before": (list,)},
     "settings": {"settings": (dict,)},

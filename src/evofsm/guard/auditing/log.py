@@ -35,9 +35,10 @@ from numpy.typing import NDArray
 
 from evofsm.core import Missing
 from evofsm.files import ABOUT, ChainedFile, Head, Sync, records
-from evofsm.guard.auditing.form import VERSION
+from evofsm.guard.auditing.form import TOLD, VERSION
 from evofsm.guard.auditing.participants import describe, learnt, settings
 from evofsm.guard.protocols import Participants, Proposal, Reviser, Revision, Situation
+from evofsm.guard.record import RECORD, Pair
 from evofsm.guard.reviser import speaks
 
 _log = logging.getLogger(__name__)
@@ -330,23 +331,17 @@ class AuditLog:
 def told(situation: Situation, proposal: Proposal, revision: Revision) -> dict[str, Any]:
     """A decision, as it is written, but for what came in."""
     likely = np.argsort(-situation.belief, kind="stable")[:_STATES].tolist()
+    decided = Pair(situation, revision._replace(proposed=proposal.action))
     return {
-        "advised": float(revision.advised),
+        **{name: _plain(RECORD[name].kind, RECORD[name].read(decided)) for name in TOLD},
         "belief": [[state, float(situation.belief[state])] for state in likely],
         "candidates": _candidates(proposal),
-        "evidence": float(revision.evidence),
-        "executed": float(revision.executed),
-        "explanation": revision.explanation,
-        "intake": int(situation.intake),
         "interval": [float(bound) for bound in revision.interval],
-        "proposed": float(proposal.action),
-        "reason": revision.reason,
-        "risk_executed": float(revision.risk_executed),
-        "risk_proposed": float(revision.risk_proposed),
-        "seen": float(revision.seen),
-        "state": None if situation.state is None else int(situation.state),
-        "surprise": float(situation.surprise),
     }
+
+
+def _plain(kind: type, value: Any) -> Any:
+    return None if value is None else kind(value)
 
 
 def _candidates(proposal: Proposal) -> list[float]:
