@@ -87,7 +87,10 @@ from evofsm.files import ranges
 Method = TypeVar("Method", bound=Callable[..., Any])
 
 _FLOAT64 = np.dtype(np.float64)
-_RADIUS, _SPREAD = 0.3, 3.0
+# The paper's epsilon, where neither the rule nor the user has another one, in the unit of z.
+_RADIUS = 0.3
+# Width of recognition, in total variances of all observations, where nobody has another one.
+_SPREAD = 3.0
 _SETTINGS = ("n_actions", "radius", "distance_weight", "learning_rate", "prior_frequency", "spread")
 # What a machine does not have to be told, with what holds if it is not.
 _OPTIONS = {
@@ -152,9 +155,8 @@ class EvolvingFSM(Known):
         hundreds of states this saves most of the time, 1e-6 for example. A jump to a state that
         got none teaches nothing about it until it is recognised. 0 leaves nothing out.
     failure_horizon : int, optional
-        A failure so many observations later, or sooner, came soon after a state: it is counted
-        among what came of being there (`failed_soon`). Without it every failure later in the same
-        episode is.
+        A failure within this many observations of a visit is counted in `failed_soon`; without
+        it, every failure later in the same episode.
 
     Raises
     ------

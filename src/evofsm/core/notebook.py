@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.core.naming import state_name
+from evofsm.core.numbering import state_name
 
 if TYPE_CHECKING:
     from evofsm.core.known import Known
