@@ -234,7 +234,16 @@ class Known(Counts):
         >>> model.propagate([1.0, 0.0], 0, horizon=20, policy="hold").round(3)
         array([0.686, 0.314])
         """
-        there = self._belief(belief)
+        return self._ahead(self._belief(belief), action, horizon, policy)
+
+    def _ahead(
+        self,
+        there: NDArray[np.float64],
+        action: SupportsIndex | None,
+        horizon: int,
+        policy: Policy,
+    ) -> NDArray[np.float64]:
+        """`propagate`, of a belief that is known to be one."""
         if policy not in get_args(Policy):
             known = ", ".join(get_args(Policy))
             raise ValueError(f"policy is {policy!r}; it must be one of {known}")
