@@ -52,6 +52,7 @@ def test_a_judge(tmp_path):
     python(tmp_path, "-c", write("Add a judge", tmp_path))
 
 
+@pytest.mark.slow
 def test_a_family(tmp_path):
     pytest.importorskip("typer")
     pytest.importorskip("scipy")
@@ -62,6 +63,7 @@ def test_a_family(tmp_path):
     assert "mine, 3 training episodes" in said
 
 
+@pytest.mark.slow
 def test_a_study(tmp_path):
     pytest.importorskip("typer")
     pytest.importorskip("matplotlib")

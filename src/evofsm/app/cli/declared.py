@@ -118,11 +118,14 @@ def is_required(one: Field[Any]) -> bool:
 
 def settings(options: Any) -> dict[str, Any]:
     """What determines the result: all fields but those declared with ``is_setting=False``."""
-    return {
-        one.name: getattr(options, one.name)
-        for one in fields(options)
-        if _KEY in one.metadata and one.metadata[_KEY].is_setting
-    }
+    found: dict[str, Any] = {}
+    for one in fields(options):
+        value = getattr(options, one.name)
+        if _KEY not in one.metadata:
+            found |= settings(value) if is_dataclass(value) else {}
+        elif one.metadata[_KEY].is_setting:
+            found[one.name] = value
+    return found
 
 
 def callback(command: type[Command]) -> Callable[..., None]:
