@@ -279,6 +279,7 @@ def test_a_fleet_is_measured_in_both_precisions():
     assert list(result["beside"]) == ["in float32"]
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")  # whatever others warn of
 @pytest.mark.parametrize("row", [clusterers.stream_k_means, clusterers.db_stream])
 def test_others_cluster_the_same_stream(row):

@@ -107,6 +107,7 @@ def reader(tmp_path, monkeypatch):
     forget_written_since(before)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("page", RUN, ids=name_of)
 def test_a_page_does_what_it_shows(page, reader):
     names, parser = {}, doctest.DocTestParser()
@@ -198,6 +199,7 @@ def is_elsewhere(address):
     return urlsplit(address).scheme != "" or address.startswith("//")
 
 
+@pytest.mark.slow
 def test_every_link_of_the_site_leads_somewhere(site):
     _, pages = site
     looked_at = 0
@@ -230,6 +232,7 @@ def test_formulas_are_there_without_a_script(site):
     assert "\\frac" not in text
 
 
+@pytest.mark.slow
 def test_a_line_of_code_is_where_its_link_leads(site):
     folder, pages = site
     links = pages[folder / "equations" / "states.html"].links

@@ -151,6 +151,7 @@ def test_the_wheel_holds_every_source_file_and_nothing_else(wheel):
     assert held == sources
 
 
+@pytest.mark.slow
 def test_the_wheel_learns_saves_and_forecasts_with_its_core_dependencies_alone(fresh, tmp_path):
     program = """
 import sys

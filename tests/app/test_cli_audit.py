@@ -112,6 +112,7 @@ def test_what_cannot_be_read_ends_with_two(log, tmp_path):
         assert says in result.stderr
 
 
+@pytest.mark.slow
 def test_drive_writes_a_log(tmp_path):
     pytest.importorskip("scipy")
     path = tmp_path / "log.jsonl"

@@ -98,6 +98,7 @@ def is_alive(process):
 # -- What comes out ----------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("world", ["kinematic", "sumo"])
 def test_it_is_what_drive_makes_of_the_same_episodes(tmp_path, world):
     if world == "sumo":
@@ -118,6 +119,7 @@ def test_in_shadow_it_says_how_early_the_alarms_were(tmp_path):
     assert min(result.lead_times) > 1.0
 
 
+@pytest.mark.slow
 def test_more_episodes_are_added_to_those_that_are_there(tmp_path, undisturbed):
     shutil.copy(undisturbed / "journal.jsonl", tmp_path)
     before = lines(tmp_path / "journal.jsonl")
@@ -131,6 +133,7 @@ def test_more_episodes_are_added_to_those_that_are_there(tmp_path, undisturbed):
 # -- Whatever happens --------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_killed_workers_and_a_killed_parent_change_nothing(tmp_path, undisturbed):
     journal = tmp_path / "journal.jsonl"
     arguments = unrevised(tmp_path, "--workers", 2)
@@ -153,6 +156,7 @@ def test_killed_workers_and_a_killed_parent_change_nothing(tmp_path, undisturbed
     assert json.loads(again.stdout)["episodes"] == EPISODES
 
 
+@pytest.mark.slow
 def test_a_killed_worker_of_a_cluster_changes_nothing(tmp_path, undisturbed):
     pytest.importorskip("distributed")
     where = tmp_path / "scheduler.json"
@@ -191,6 +195,7 @@ def test_a_killed_worker_of_a_cluster_changes_nothing(tmp_path, undisturbed):
     assert results_of(out) == results_of(undisturbed)
 
 
+@pytest.mark.slow
 def test_an_interruption_is_quiet_and_says_how_to_go_on(tmp_path):
     arguments = unrevised(tmp_path, "--workers", 2, "--episodes", 10_000)
     with subprocess.Popen(

@@ -13,6 +13,7 @@ def evofsm(*arguments):
     return subprocess.run(command, capture_output=True, text=True, check=False)
 
 
+@pytest.mark.slow
 def test_drive_learns_saves_and_drives_frozen(tmp_path):
     learnt = tmp_path / "learnt"
     first = evofsm("drive", "emergency", "--episodes", 12, "--out", learnt)
@@ -31,6 +32,7 @@ def test_drive_learns_saves_and_drives_frozen(tmp_path):
     assert json.loads((further / "summary.json").read_text())["episodes_learnt"] == 14
 
 
+@pytest.mark.slow
 def test_decisions_are_recorded_with_their_reasons(tmp_path):
     polars = pytest.importorskip("polars")
     evofsm("drive", "emergency", "--episodes", 2, "--out", tmp_path / "out")
@@ -41,6 +43,7 @@ def test_decisions_are_recorded_with_their_reasons(tmp_path):
     assert changed["reason"].str.len_chars().min() > 10
 
 
+@pytest.mark.slow
 def test_left_to_itself_the_driver_collides_and_in_shadow_there_was_an_alarm():
     row = json.loads(
         evofsm("drive", "emergency", "--reviser", "none", "--episodes", 5, "--json").stdout
@@ -53,12 +56,14 @@ def test_left_to_itself_the_driver_collides_and_in_shadow_there_was_an_alarm():
     assert min(row["lead_times"]) > 1.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("controller", ["aggressive", "normal", "acc"])
 def test_any_controller_is_revised(controller):
     result = evofsm("drive", "emergency", "--controller", controller, "--episodes", 3, "--json")
     assert json.loads(result.stdout)["collisions"] == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "word"),
     [
@@ -80,6 +85,7 @@ def test_what_cannot_be_driven_is_refused_in_one_line(arguments, word):
     assert len(result.stderr.splitlines()) == 1
 
 
+@pytest.mark.slow
 def test_bench_prints_rows_as_json():
     result = evofsm(
         *("bench", "closed-loop", "--short", "--train", 3, "--test", 4, "--seeds", 1),

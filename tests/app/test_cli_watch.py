@@ -19,6 +19,7 @@ def watch(*arguments):
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
+@pytest.mark.slow
 def test_it_prints_an_address_that_answers_and_ends_with_control_c():
     process = watch("paper", "--learn-first", "3", "--no-browser")
     with process:
@@ -33,6 +34,7 @@ def test_it_prints_an_address_that_answers_and_ends_with_control_c():
     assert errors == ""
 
 
+@pytest.mark.slow
 def test_paused_shows_the_first_frame():
     with watch("paper", "--fresh", "--no-browser", "--paused") as process:
         process.stdout.readline()

@@ -92,6 +92,7 @@ DESCENDING = {
 }
 
 
+@pytest.mark.slow
 def test_a_table_sorts_both_ways_and_back(page):
     assert names(page) == ORIGINAL
     for column, ascending in SORTED.items():

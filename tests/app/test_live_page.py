@@ -76,6 +76,7 @@ def time_shown(page):
     return float(text(page, "time").split()[0])
 
 
+@pytest.mark.slow
 def test_the_cars_move_smoothly_and_can_be_stopped(seen):
     page = seen(speed=2.0)
     shows(page, "mode", "live")
@@ -101,6 +102,7 @@ def test_the_cars_move_smoothly_and_can_be_stopped(seen):
     playwright.expect(page.locator("#speed")).to_have_value("4")
 
 
+@pytest.mark.slow
 def test_switched_on_the_reviser_prevents_the_collision_that_happens_with_it_off(seen):
     page = seen(speed=math.inf)
     shows(page, "headline", "No collision")
@@ -123,6 +125,7 @@ def test_switched_on_the_reviser_prevents_the_collision_that_happens_with_it_off
     shows(page, "headline", "No collision")
 
 
+@pytest.mark.slow
 def test_the_past_can_be_looked_at_and_left(seen):
     page = seen(speed=math.inf)
     shows(page, "headline", "No collision")
@@ -145,6 +148,7 @@ def test_the_past_can_be_looked_at_and_left(seen):
     assert text(page, "mode").strip() == "ended"
 
 
+@pytest.mark.slow
 def test_states_and_help_are_shown_and_the_theme_changes(seen):
     page = seen(speed=math.inf)
     shows(page, "headline", "No collision")
@@ -161,6 +165,7 @@ def test_states_and_help_are_shown_and_the_theme_changes(seen):
     shows(page, "about", "case 4")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("width", "height"), [(1280, 720), (1366, 768), (1100, 800)])
 def test_the_longest_story_is_shown_to_its_end(seen, width, height):
     """No column hides words below its edge, whether the reviser acts or not."""
@@ -180,6 +185,7 @@ def test_the_longest_story_is_shown_to_its_end(seen, width, height):
     assert story.evaluate(hidden) <= 0
 
 
+@pytest.mark.slow
 def test_on_a_phone_nothing_is_wider_than_the_screen(seen):
     page = seen(390, 844, speed=math.inf)
     shows(page, "headline", "No collision")

@@ -335,6 +335,7 @@ class Counted:
         self.ends += frame.over
 
 
+@pytest.mark.slow
 def test_who_does_not_read_does_not_hold_the_run_up_and_is_later_shown_all_of_it():
     runs = 5  # far more than all buffers on the way hold
     with LivePage() as page:

@@ -37,6 +37,7 @@ def drive(session):
     return frames
 
 
+@pytest.mark.slow
 def test_the_reviser_prevents_the_collision_that_happens_without_it():
     session = opened()
     revised = drive(session)[-1]

@@ -99,6 +99,7 @@ def contracts():
                 yield pytest.param(case, id=f"{name}: {case}")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", list(contracts()))
 def test_what_we_have_keeps_its_contract(case):
     result = case()
@@ -630,6 +631,7 @@ def test_something_is_broken_for_every_check():
     }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("kind", "name", "thing"), CAUGHT)
 def test_what_breaks_a_contract_is_caught_by_the_check_for_it(kind, name, thing):
     (one,) = [one for one in all_checks(kind) if one.name == name]
@@ -731,6 +733,7 @@ def test_the_command_checks_a_class_in_the_folder(run):
     assert max(map(len, result.output.splitlines())) <= 80
 
 
+@pytest.mark.slow
 def test_the_command_ends_with_1_and_says_what_is_wrong(run):
     result = run("own_driver:Hasty", "--make", "Hasty(float('nan'))", "--json")
     assert result.exit_code == 1

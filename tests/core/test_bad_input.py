@@ -110,6 +110,7 @@ def refuses(snapshot):
     return check
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("z", "error", "words"), cases(OBSERVATIONS))
 def test_an_observation_that_cannot_be_right(machine, refuses, z, error, words):
     refuses(machine, lambda m: m.observe(z), error, words)
@@ -128,6 +129,7 @@ def test_an_observation_of_another_length(grown, refuses, z, error, words):
     refuses(grown, lambda m: m.observe(np.array(z)), error, words)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("i", "error", "words"), cases(ACTIONS))
 def test_an_action_that_cannot_be_right(machine, refuses, i, error, words):
     refuses(machine, lambda m: m.act(i), error, words)
@@ -144,6 +146,7 @@ def test_an_action_before_the_first_observation_of_an_episode(grown, refuses):
     refuses(grown, lambda m: m.act(0), ValueError, "act before observe: this episode")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("Z", "I", "starts", "error", "words"), cases(BATCHES))
 def test_a_batch_that_cannot_be_right(machine, refuses, Z, I, starts, error, words):
     refuses(machine, lambda m: m.learn_many(Z, I, starts), error, words)
@@ -159,6 +162,7 @@ def test_failures_of_a_batch_that_cannot_be_right(machine, refuses, failures, er
     refuses(machine, lambda m: m.learn_many(ROWS, [0] * 3, [], failures), error, words)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("z", "error", "words"), cases(OBSERVATIONS))
 def test_a_failed_observation_that_cannot_be_right(machine, refuses, z, error, words):
     refuses(machine, lambda m: m.observe(z, failed=True), error, words)
@@ -214,6 +218,7 @@ HIDDEN = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("z", HIDDEN.values(), ids=HIDDEN)
 def test_a_masked_entry_is_missing(machine, refuses, z):
     words = "observation, variable 1: nan .*missing"

@@ -52,6 +52,7 @@ def run(package):
     return float(result), int(hits)
 
 
+@pytest.mark.slow
 def test_editing_a_kernel_takes_effect_in_the_kernels_that_call_it(package):
     assert run(package) == (3.0, 0)
     assert run(package) == (3.0, 1)  # the second process finds the compiled code
@@ -59,6 +60,7 @@ def test_editing_a_kernel_takes_effect_in_the_kernels_that_call_it(package):
     assert run(package) == (6.0, 0)
 
 
+@pytest.mark.slow
 def test_a_source_dated_in_the_future_keeps_the_caches(package):
     in_a_year = time.time() + 3e7
     os.utime(package / "callee.py", (in_a_year, in_a_year))
@@ -103,6 +105,7 @@ def test_touching_a_source_keeps_the_caches(cached, tmp_path):
     assert cached.exists()
 
 
+@pytest.mark.slow
 def test_a_machine_without_a_limit_compiles_nothing_that_gives_up_states():
     """What is rare stays out of the kernel of every step: it takes as long to compile as a step."""
     code = (

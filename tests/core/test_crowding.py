@@ -24,6 +24,7 @@ def learn(machine, points, actions=None):
     return machine.learn_many(Z, np.zeros(len(Z), int) if actions is None else actions)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("when_full", WhenFull)
 @given(seed=st.integers(0, 1000), most=st.integers(1, 12))
 def test_there_are_never_more_states_and_every_array_stays_sound(when_full, seed, most):

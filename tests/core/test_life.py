@@ -278,6 +278,7 @@ class Life(RuleBasedStateMachine):
         assert everything(self.machine) == everything(self.twin)
 
 
+@pytest.mark.slow
 def test_whatever_happens_in_its_life_a_machine_stays_sound():
     run_state_machine_as_test(
         Life,

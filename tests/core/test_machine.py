@@ -529,6 +529,7 @@ def test_a_width_beyond_all_bounds_leaves_no_belief_to_states_that_are_not_there
     assert machine.observe([0.0]).belief.tolist() == [1.0]
 
 
+@pytest.mark.slow
 def test_threads_may_begin_at_once():
     program = """
 import threading, numpy as np

@@ -207,6 +207,7 @@ def test_the_stationary_distribution_of_two_states_is_worked_out_by_hand():
     np.testing.assert_allclose(chain(SWITCH).stationary_distribution(), [5 / 6, 1 / 6])
 
 
+@pytest.mark.slow
 @given(st.integers(1, 12), st.integers(1, 4), st.integers(0, 2**32 - 1))
 def test_the_stationary_distribution_is_where_power_iteration_ends(n, q, seed):
     rng = np.random.default_rng(seed)

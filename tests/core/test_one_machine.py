@@ -31,6 +31,7 @@ def test_threads_on_one_machine_lose_no_observation(interval):
     assert one_machine.share(one_machine.growing(), 4, 100, interval) == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("deed", "every"),
     [

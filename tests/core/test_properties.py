@@ -103,6 +103,7 @@ def test_shifting_all_observations_changes_no_belief(stream, offset):
     assert (shifted.centers == machine.centers + offset).all()
 
 
+@pytest.mark.slow
 @settings(max_examples=50)
 @given(
     st.integers(0, 2**32 - 1),

@@ -1,8 +1,11 @@
 """Numbers hold for ten million steps here; `make soak` takes a thousand million."""
 
+import pytest
+
 import soak
 
 
+@pytest.mark.slow
 def test_numbers_hold_for_ten_million_steps():
     found = list(soak.soak(10_000_000))
     assert [health.stream for health in found if not health.holds] == []

@@ -23,6 +23,7 @@ def reproduced(tmp_path_factory):
     return evofsm("paper", "--out", "out", folder=folder), folder / "out"
 
 
+@pytest.mark.slow
 def test_all_claims_hold_and_the_page_is_named(reproduced):
     run, _ = reproduced
     assert run.returncode == 0, run.stderr
@@ -45,6 +46,7 @@ def test_the_folder_holds_page_claims_traces_model_and_figures(reproduced):
     assert claims[0]["claim"] in (folder / "index.html").read_text()
 
 
+@pytest.mark.slow
 def test_the_model_it_saves_can_be_inspected(reproduced):
     _, folder = reproduced
     run = evofsm("inspect", folder / "model.evofsm", folder=folder)
@@ -52,6 +54,7 @@ def test_the_model_it_saves_can_be_inspected(reproduced):
     assert "#7" in run.stdout
 
 
+@pytest.mark.slow
 def test_a_claim_that_fails_is_shown_and_ends_with_1(tmp_path):
     settings = tmp_path / "coarse.toml"
     settings.write_text("[machine]\nradius = 30.0\n")
@@ -65,6 +68,7 @@ def test_a_claim_that_fails_is_shown_and_ends_with_1(tmp_path):
     assert "states_final" in failing
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

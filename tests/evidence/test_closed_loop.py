@@ -45,6 +45,7 @@ def rows_of(study, policy):
     return [row for row in study.rows if row.policy == policy]
 
 
+@pytest.mark.slow
 def test_the_unrevised_driver_collides_and_ours_does_not(study):
     [unrevised] = rows_of(study, "unrevised")
     assert unrevised.collision_rate > 0.8
@@ -79,6 +80,7 @@ def test_the_unrevised_driver_is_the_measure_of_mobility(study):
     assert always.collisions == 0
 
 
+@pytest.mark.slow
 def test_the_result_does_not_depend_on_the_number_of_workers(study):
     small = replace(TINY, seeds=1, rule_seeds=0, test=5, train=2)
     alone = run_closed_loop(EMERGENCY, small, workers=1)
@@ -97,6 +99,7 @@ def test_the_papers_cases_are_driven_without_a_collision_and_left_alone_where_sa
     assert by_name["case 3"].changed_late <= 0.05
 
 
+@pytest.mark.slow
 def test_brakes_that_weaken_are_noticed_while_unchanged_constants_collide():
     plan = Plan(shift=ShiftPlan(before=12, after=6, held_out=25))
     found = run_shift(load_family("shift"), plan, learning_seed=0)
@@ -114,6 +117,7 @@ def test_the_same_model_revises_alike_in_both_worlds():
     assert sumo.intervention_rate == pytest.approx(kinematic.intervention_rate)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("family", ["rare", "weak_brakes"])
 def test_dead_ends_are_told_apart(family):
     found = run_separation(load_family(family), Plan(side_train=30, side_test=40))["separations"]
@@ -163,6 +167,7 @@ def test_a_driver_who_proposes_nothing_usable_is_replaced_and_counted():
     assert found.change == 0.0
 
 
+@pytest.mark.slow
 def test_gentle_traffic_does_not_make_it_bold(tmp_path):
     """Learnt among gentle waves only, then one leader stops in earnest."""
     text = """

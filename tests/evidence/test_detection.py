@@ -342,6 +342,7 @@ def test_with_hours_enough_lead_times_are_told() -> None:
 # -- The study ------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_study_does_not_depend_on_the_number_of_workers() -> None:
     plan = replace(TINY, grid=(2.0,), family="r157,ncap")
     seen: list[tuple[int, int]] = []

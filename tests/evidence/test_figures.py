@@ -62,6 +62,7 @@ def _texts(figure: matplotlib.figure.Figure) -> list[str]:
     return [text.get_text() for text in texts if text.get_text()]
 
 
+@pytest.mark.slow
 def test_every_figure_is_a_png_and_an_svg_of_some_size(
     drawings: list[Drawing], folder: Path
 ) -> None:
@@ -108,6 +109,7 @@ def test_the_users_style_neither_matters_nor_changes(study: PaperStudy, tmp_path
         assert dict(matplotlib.rcParams) == before
 
 
+@pytest.mark.slow
 def test_pyplot_stays_out_and_a_missing_matplotlib_is_named() -> None:
     code = """
 import sys
@@ -214,6 +216,7 @@ def test_only_used_actions_have_a_matrix(study: PaperStudy) -> None:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("settings", "n_states"),
     [

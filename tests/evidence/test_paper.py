@@ -47,6 +47,7 @@ def test_all_ten_claims_hold_in_closed_form(study):
     assert verdicts(study) == dict.fromkeys(IDS, True)
 
 
+@pytest.mark.slow
 def test_all_ten_claims_hold_in_sumo():
     pytest.importorskip("libsumo")
     with SumoWorld() as world:

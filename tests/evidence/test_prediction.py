@@ -80,6 +80,7 @@ def test_a_reference_has_no_skill_against_itself_and_all_are_judged_alike(study)
             assert row.skill_persistence == row.log_skill_persistence == 0.0
 
 
+@pytest.mark.slow
 def test_workers_change_nothing():
     small = replace(TINY, train=3, test=2, fine_seeds=0)
     alone, shared = (run(small, workers=n, families=["cut_in"]) for n in (1, 2))

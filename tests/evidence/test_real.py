@@ -296,6 +296,7 @@ def test_what_a_run_shows_does_not_teach_how_it_is_judged(cases, study):
     assert again.shares == study.shares
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_numbers_with_any_number_of_workers(cases, study):
     assert repr(run_real(cases, TINY, workers=2).rows) == repr(study.rows)
 

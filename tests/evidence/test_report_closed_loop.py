@@ -160,6 +160,7 @@ def _printed(study: ClosedLoop, width: int = 80) -> str:
     return out.getvalue()
 
 
+@pytest.mark.slow
 def test_the_page_is_sound(page) -> None:
     page.is_sound()
     assert len(page.loads) == 4

@@ -109,6 +109,7 @@ def change(
     return replace(study, rows=rows)
 
 
+@pytest.mark.slow
 def test_page_and_terminal_hold_no_nan(study: Detection, tmp_path: Path) -> None:
     made = chapter(study, tmp_path)
     assert {one.name for one in made.figures} == {
@@ -135,6 +136,7 @@ def test_all_targets_are_judged_and_met(study: Detection) -> None:
     assert all(claim.met for claim in found)
 
 
+@pytest.mark.slow
 def test_a_missed_target_does_not_hold_and_is_no_loss(study: Detection, tmp_path: Path) -> None:
     worse = change(study, "rare", Ours.DEFAULT, Target.DEAD_END, auroc=0.6)
     assert sum(claim.met for claim in claims(worse)) == 6

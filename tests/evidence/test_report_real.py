@@ -73,6 +73,7 @@ def written(tmp_path_factory):
     return chapter, page.read_text(encoding="utf-8")
 
 
+@pytest.mark.slow
 def test_the_page_has_its_figures_and_no_nan(written):
     chapter, page = written
     assert [figure.name for figure in chapter.figures] == ["real-areas", "real-moments"]
@@ -119,6 +120,7 @@ def test_whoever_ranks_better_is_named_with_both_numbers():
     assert any(text.startswith("evofsm ranks worse than time to collision") for text in lost)
 
 
+@pytest.mark.slow
 def test_the_headline_counts_only_what_is_clear(tmp_path):
     clear = make({"ttc": 0.9, "evofsm-approach": 0.97})  # the difference is 0.02 to 0.12
     told = Plan().tell(clear)
@@ -135,6 +137,7 @@ def test_without_enough_events_nothing_is_claimed(tmp_path):
     assert [figure.name for figure in chapter.figures] == ["real-moments"]
 
 
+@pytest.mark.slow
 def test_it_says_who_taught_what_is_judged(tmp_path):
     folds = make({})
     assert "by what was learnt on the runs of the other 4 of 5 folds" in _said(folds, tmp_path)

@@ -47,6 +47,7 @@ def words(chapter) -> str:
     return "\n".join([*texts, *notes, *tables, *(line.value for line in chapter.plan)])
 
 
+@pytest.mark.slow
 def test_the_page_holds_every_figure_and_no_nan(chapter, tmp_path):
     page = write_chapters(
         tmp_path / "index.html", [chapter], title=chapter.title, about="", command="a command"

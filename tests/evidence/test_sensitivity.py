@@ -257,6 +257,7 @@ def test_the_worst_sweep_leaves_the_recovered_value_out():
 # -- The study ------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_study_tries_what_its_plan_says(tiny):
     assert len(tiny.of(Design.ALL)) == 8
     assert len(tiny.of(Design.OPEN)) == 4
@@ -278,6 +279,7 @@ def test_rows_are_plain_json_with_a_verdict_for_each_claim(tiny):
         assert {one.name for one in PARAMETERS} <= set(row)
 
 
+@pytest.mark.slow
 def test_the_same_rows_come_out_of_one_process_and_of_two():
     trials = list(filling(Design.ALL, 6, seed=0))
     tasks = [partial(_try_all, trials[:3], 1), partial(_try_all, trials[3:], 1)]

@@ -65,6 +65,7 @@ def stopping(chunks, after):
 # -- Learning --------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("after", range(8))
 def test_learning_that_is_stopped_goes_on_bit_for_bit(after, chunks, tmp_path):
     with pytest.raises(StoppedError):
@@ -364,6 +365,7 @@ def test_drive_writes_the_same_files_with_a_checkpoint(evofsm, tmp_path):
 # -- Torture ---------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="it forks")
 def test_a_little_torture_harms_nothing():
     script = Path(__file__).parents[2] / "benchmarks" / "torture.py"

@@ -962,6 +962,7 @@ def test_what_cannot_be_read_again_takes_no_place(grown, tmp_path, monkeypatch):
 
 
 # Where it comes as an archive is made or closed, Python says that it could not be closed once more.
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 def test_an_interrupt_anywhere_in_a_save_is_an_interrupt_and_leaves_a_whole_file(tmp_path):
     machine, path = EvolvingFSM(n_actions=1), tmp_path / "machine"

@@ -31,6 +31,7 @@ def settings():
     )
 
 
+@pytest.mark.slow
 @given(settings=settings(), seed=st.integers(0, 100))
 def test_each_vehicle_is_the_machine_alone_bit_for_bit(settings, seed):
     """With vehicles that enter late, are silent now and then, begin episodes, and fail."""

@@ -23,6 +23,7 @@ MEGABYTE = 1 << 20
 LOG = "time,gap,v_follower,v_leader,a_follower\n"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", fuzz.TARGETS)
 def test_what_is_in_the_corpus_is_read_or_refused(name):
     if name == "parquet":
@@ -60,6 +61,7 @@ def refusal(path, content, most=30 * MEGABYTE, **columns):
 # -- What fuzzing and reading with an eye on it found ----------------------------------------------
 
 
+@pytest.mark.slow
 def test_no_row_is_written_beyond_the_arrays(tmp_path):
     # Empty fields once were. In a process of its own, whose kernels look where an array ends.
     code = (
@@ -160,6 +162,7 @@ def test_a_bomb_behind_a_header_is_refused_in_little_memory(tmp_path, fill):
     refusal(tmp_path / "a.gz", packed, 200 * MEGABYTE)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("header", ["", LOG])
 def test_a_row_that_goes_on_over_lines_without_end_is_refused(tmp_path, header):
     # Each line opens a quote that the next one closes: one row, of any number of lines.

@@ -336,6 +336,7 @@ def test_each_record_is_on_the_disk_before_its_action_is_executed(tmp_path, monk
 # -- Replaying ------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_episodes_of_learning_come_out_the_same(tmp_path):
     path, learner = tmp_path / "log", Learner(tolerance=0.3)
     noisy = scenario(sensors=Sensors(gap_noise=0.5, speed_noise=0.2))

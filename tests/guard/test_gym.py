@@ -330,6 +330,7 @@ def test_the_set_of_actions_may_be_coarser_than_the_environments():
 # -- The examples ------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("example", "arguments", "needs"),
     [

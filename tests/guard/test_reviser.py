@@ -91,6 +91,7 @@ def test_else_the_closest_action_that_is_tolerable_else_the_least_risky(risk, wa
     assert revision.risk_executed <= max(revision.risk_proposed, TOLERANCE)
 
 
+@pytest.mark.slow
 @given(sets(), st.floats(0.0, 1.0))
 def test_a_revised_action_is_the_nearest_value_of_its_interval(actions, share):
     wanted = actions.low + share * (actions.high - actions.low)

@@ -292,6 +292,7 @@ def test_pairs_are_those_that_sumo_drove(sumo, tmp_path):
     assert actions[:-1] == pytest.approx(np.diff(mine[:, 1]) / 0.1, abs=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ending", ["xml.gz", "csv", "csv.gz", "parquet"])
 def test_all_of_sumo_s_formats_tell_the_same(sumo, ending):
     if ending == "parquet":

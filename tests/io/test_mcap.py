@@ -308,6 +308,7 @@ def test_a_file_that_is_not_there_keeps_its_own_error(tmp_path):
 ZSTD, LZ4 = CompressionType.ZSTD, CompressionType.LZ4  # to 1 part in thousands, and in 255
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("packing", "chunks", "size"), [(ZSTD, 1, 1 << 28), (LZ4, 1, 1 << 28), (ZSTD, 20, 1 << 23)]
 )

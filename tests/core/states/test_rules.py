@@ -122,6 +122,7 @@ def copied(machine, path):
     return copy.deepcopy(machine)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rows", [0, 1, 300])
 @pytest.mark.parametrize("again", [saved, pickled, copied])
 def test_a_machine_that_was_kept_goes_on_bit_for_bit(again, rows, rule, walk, snapshot, tmp_path):

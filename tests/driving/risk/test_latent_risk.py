@@ -70,6 +70,7 @@ def smallest_gap(gap, speed, leader_speed, action, before, decel, lag, onset, le
 # -- Rehearsal ----------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @settings(max_examples=400)
 @given(GAPS, SPEEDS, SPEEDS, ACTIONS, ACTIONS, DECELS, LAGS, ONSETS)
 def test_the_critical_deceleration_agrees_with_driving_it_out(

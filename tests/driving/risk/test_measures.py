@@ -53,6 +53,7 @@ def test_every_measure_has_the_shape_of_the_protocol(measure):
     hash(measure)
 
 
+@pytest.mark.slow
 @EVERY_MEASURE
 @given(EPISODES)
 def test_every_row_gets_a_score_and_observations_stay(measure, episode):
@@ -64,12 +65,14 @@ def test_every_row_gets_a_score_and_observations_stay(measure, episode):
     np.testing.assert_array_equal(episode, before)
 
 
+@pytest.mark.slow
 @EVERY_MEASURE
 @given(arrays(float, (4, 3), elements=st.floats(-1e100, 1e100)))
 def test_no_score_is_missing_however_wild_the_numbers(measure, episode):
     assert not np.isnan(measure.score(episode, DT)).any()
 
 
+@pytest.mark.slow
 @EVERY_MEASURE
 @given(EPISODES, SPEEDS, SPEEDS, st.floats(-10.0, 0.0))
 def test_nothing_is_more_dangerous_than_to_have_met(measure, episode, speed, leader, gap):
@@ -78,6 +81,7 @@ def test_nothing_is_more_dangerous_than_to_have_met(measure, episode, speed, lea
     assert met[-1] == met.max()
 
 
+@pytest.mark.slow
 @EVERY_MEASURE
 @given(EPISODES, st.floats(0.0, 100.0))
 def test_a_smaller_gap_is_not_safer(measure, episode, nearer):
@@ -86,6 +90,7 @@ def test_a_smaller_gap_is_not_safer(measure, episode, nearer):
     assert at_least(last_score(measure, closer), last_score(measure, episode))
 
 
+@pytest.mark.slow
 @EVERY_MEASURE
 @given(EPISODES, st.floats(0.0, 20.0))
 def test_a_faster_follower_is_not_safer(measure, episode, faster):
@@ -94,6 +99,7 @@ def test_a_faster_follower_is_not_safer(measure, episode, faster):
     assert at_least(last_score(measure, hasty), last_score(measure, episode))
 
 
+@pytest.mark.slow
 @EVERY_MEASURE
 @given(EPISODES, st.floats(0.0, 20.0))
 def test_a_faster_leader_is_not_more_dangerous(measure, episode, faster):
@@ -102,6 +108,7 @@ def test_a_faster_leader_is_not_more_dangerous(measure, episode, faster):
     assert at_least(last_score(measure, episode), last_score(measure, away))
 
 
+@pytest.mark.slow
 @EVERY_MEASURE
 @given(EPISODES, st.data())
 def test_later_rows_change_nothing(measure, episode, data):

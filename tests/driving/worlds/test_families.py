@@ -150,6 +150,7 @@ def test_no_run_starts_in_a_dead_end(name):
 # How draws are made
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", FAMILIES)
 @given(seed=SEEDS, index=st.integers(0, 10_000), split=st.sampled_from(["train", "test"]))
 def test_a_draw_is_always_the_same(name, seed, index, split):
@@ -359,6 +360,7 @@ def test_emergency_ends_in_a_collision_for_the_unrevised():
     assert 0.93 <= share <= 0.98
 
 
+@pytest.mark.slow
 def test_in_rare_dead_ends_are_rare_but_there():
     family = LOADED["rare"]
     episodes = drive_many(family, 300)

@@ -213,6 +213,7 @@ def test_sumo_drives_the_same():
         in_sumo.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("module", ["evofsm.driving.worlds.gym", "evofsm.guard.gym"])
 def test_without_gymnasium_the_extra_is_named(module):
     program = f"import sys; sys.modules['gymnasium'] = None; import {module}"
