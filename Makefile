@@ -4,7 +4,8 @@ PYTHON ?= python3
 BIN := .venv/bin
 INSTALL = $(PYTHON) -m pip --python $(BIN)/python --disable-pip-version-check install --quiet
 
-.PHONY: paper watch closed-loop evidence docs test check house bench fuzz torture soak lock lowest supply \
+.PHONY: paper watch closed-loop evidence docs test test-all check house \
+    bench fuzz torture soak lock lowest supply \
     clean
 
 paper: .venv/installed          ## reproduce every claim of the paper in SUMO
@@ -16,11 +17,16 @@ watch: .venv/installed          ## look on while it drives case 1 of the paper, 
 closed-loop: .venv/installed    ## does the reviser prevent collisions, at what cost? some 15 minutes
 	@$(BIN)/evofsm bench closed-loop --out results/closed-loop
 
-test: .venv/installed           ## all tests, doctests included
-	@$(BIN)/python -m pytest -q -n auto --maxprocesses 4 --dist worksteal
+PYTEST = $(BIN)/python -m pytest -q -n auto --maxprocesses 4 --dist worksteal --durations=10
+test: .venv/installed           ## the quick tests, doctests included; a few minutes
+	@$(PYTEST) -m 'not slow'
 
-check: .venv/installed          ## lint, types and the import rule
+test-all: test                  ## those, and the slow rest: whole studies, torture, the browser
+	@$(PYTEST) -m slow
+
+check: .venv/installed          ## lint, types, the import rule and the house
 	@$(BIN)/ruff check . && $(BIN)/ruff format --check . && $(BIN)/mypy && $(BIN)/lint-imports
+	@$(BIN)/python tools/house.py
 
 house: .venv/installed          ## draw the rooms from their imports; fails where an arrow goes up
 	@$(BIN)/python tools/house.py

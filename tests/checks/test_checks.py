@@ -3,6 +3,7 @@
 import random
 import sys
 from dataclasses import dataclass, fields, replace
+from itertools import count
 from typing import ClassVar
 
 import numpy as np
@@ -324,8 +325,7 @@ class AnswersNaN(BrokenModel):
 class NotFrozen:
     scales = ()
 
-    def _tell(self, machine):
-        return machine
+    table: ClassVar = {}
 
 
 @dataclass
@@ -334,16 +334,19 @@ class Thawed(NotFrozen):
 
 
 @dataclass(frozen=True)
-class SpoilsWeights(Paper):
-    def _tell(self, machine):
-        machine.weights[:] = 0.0
-        return super()._tell(machine)
+class TellsOtherwise(Paper):
+    counts: ClassVar = count(1)
+
+    @property
+    def table(self):
+        return {**super().table, "distance_weight": float(next(self.counts))}
 
 
 @dataclass(frozen=True)
 class NegativeRadius(Paper):
-    def _tell(self, machine):
-        return super()._tell(machine)._replace(radius=-1.0)
+    @property
+    def table(self):
+        return {**super().table, "radius": -1.0}
 
 
 @dataclass(frozen=True)
@@ -574,7 +577,7 @@ BROKEN = {
     },
     Kind.RULE: {
         "is_frozen": [NotFrozen, Thawed],
-        "telling_changes_nothing": [SpoilsWeights],
+        "telling_changes_nothing": [TellsOtherwise],
         "what_it_tells_is_usable": [NegativeRadius],
         "a_machine_takes_it": [Unlisted],
         "a_file_keeps_it": [Unlisted],

@@ -166,13 +166,13 @@ def test_a_step_shows_belief_forecast_and_surprise(machine):
 def test_a_step_says_in_words_what_happened():
     machine = EvolvingFSM(1, rule=Novelty(1.0), max_states=2, when_full=WhenFull.RETIRE)
     said = [Reader(step_html(machine.learn_one([z], 0))).text for z in (0.0, 0.1, 4.0, 9.0)]
-    assert "a state was founded here, nothing was forecast" in said[0]
+    assert "a state was created here, nothing was forecast" in said[0]
     assert "the states stayed as they were, surprise 0.000 bit" in said[1]
-    assert "a state was founded here, a state was given up" in said[3]
+    assert "a state was created here, a state was given up" in said[3]
     assert "when_full RETIRE" in machine_html(machine)
     machine = EvolvingFSM(1, rule=Novelty(1.0), max_states=2)
     machine.learn_many([[0.0], [5.0]], [0, 0])
-    assert "none was founded" in step_html(machine.observe([1.5]))
+    assert "none was created" in step_html(machine.observe([1.5]))
     assert "two states were merged" in step_html(merging_step())
     moved = EvolvingFSM(n_actions=1, radius=5.0)
     moved.learn_many([[0.0], [4.0], [0.0]], [0, 0, 0])

@@ -32,7 +32,7 @@ class RiverClusterer(base.Clusterer):
     features : sequence of hashable, optional
         Names of the features that are observed. Without them, those of the first observation
         that holds any; name them where it may lack some.
-    radius, distance_weight, learning_rate, prior_frequency, spread : float
+    radius, distance_weight, learning_rate, prior_frequency, spread : float, optional
         As `EvolvingFSM` takes them; ``radius`` in the unit of the features, which all count
         alike: scale them first.
     rule : StateRule, optional
@@ -70,11 +70,11 @@ class RiverClusterer(base.Clusterer):
     def __init__(
         self,
         features: Sequence[Hashable] | None = None,
-        radius: float = 0.3,
+        radius: float | None = None,
         distance_weight: float = 0.85,
         learning_rate: float = 0.01,
         prior_frequency: float = 1e-3,
-        spread: float = 3.0,
+        spread: float | None = None,
         rule: StateRule | None = None,
         max_states: int | None = None,
         when_full: WhenFull = WhenFull.MERGE,

@@ -23,7 +23,7 @@ class EvolvingClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc] # bo
 
     Parameters
     ----------
-    radius, distance_weight, learning_rate, prior_frequency, spread : float
+    radius, distance_weight, learning_rate, prior_frequency, spread : float, optional
         As `EvolvingFSM` takes them; ``radius`` in the unit of the features, which all count
         alike: scale them first.
     rule : StateRule, optional
@@ -60,11 +60,11 @@ class EvolvingClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc] # bo
 
     def __init__(
         self,
-        radius: float = 0.3,
+        radius: float | None = None,
         distance_weight: float = 0.85,
         learning_rate: float = 0.01,
         prior_frequency: float = 1e-3,
-        spread: float = 3.0,
+        spread: float | None = None,
         rule: StateRule | None = None,
         max_states: int | None = None,
         when_full: WhenFull | None = None,

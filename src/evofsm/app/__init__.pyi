@@ -18,6 +18,7 @@ from .text.columns import console as console
 from .text.columns import print_columns as print_columns
 from .text.columns import print_table as print_table
 from .text.columns import print_words as print_words
+from .text.documents import spelled_out as spelled_out
 from .text.documents import to_json as to_json
 from .text.table import Column as Column
 from .text.table import Table as Table

@@ -22,6 +22,7 @@ from evofsm.core import (
     NOT_OPEN,
     EvolvingFSM,
     FSMModel,
+    Inside,
     IntervalActions,
     Limit,
     Policy,
@@ -381,8 +382,8 @@ class _Learner:
         known = ~np.isnan(chunk.actions)
         indices = np.full(len(known), NO_ACTION)
         indices[known] = self.actions.encode(chunk.actions[known])
-        observations = self.machine._check_observations(chunk.observations)
-        self.machine._fit(observations[0])
+        inside = Inside(self.machine)
+        observations = inside.check(chunk.observations)
         starts = check_rows("starts", chunk.starts, len(observations))
         failures = np.zeros(len(observations), np.bool_)
         if chunk.failures is not None:
@@ -390,10 +391,10 @@ class _Learner:
             self.machine.tell_of_failures()
         row = 0
         while row < len(observations):
-            if len(self._scores.belief) < self.machine._capacity:
+            if len(self._scores.belief) < inside.capacity:
                 self._make_room()
             row = _learn_and_score(
-                self.machine._buffer,
+                inside.buffer,
                 observations,
                 indices,
                 starts,
@@ -402,14 +403,14 @@ class _Learner:
                 self._steps_ahead,
                 self._scores,
                 self._room,
-                self.machine._limit,
+                inside.limit,
             )
             if row < len(observations):
-                self.machine._grow()
+                inside.grow()
 
     def _make_room(self) -> None:
         """Make room for as many states as the machine has room for."""
-        rows, capacity = _ROWS_AT_ONCE, self.machine._capacity
+        rows, capacity = _ROWS_AT_ONCE, Inside(self.machine).capacity
         self._scores = self._scores._replace(
             belief=widen(self._scores.belief, capacity),
             forecasts=widen(self._scores.forecasts, capacity),

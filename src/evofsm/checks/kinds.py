@@ -29,7 +29,7 @@ _METHODS = {
     Kind.FLEET: ("observe", "start_episode", "n_states", "__getitem__"),
     Kind.MACHINE: ("observe", "act", "predict"),
     Kind.MODEL: ("recognise", "propagate"),
-    Kind.RULE: ("_tell",),
+    Kind.RULE: ("table", "scales"),
     Kind.REVISER: ("revise", "start_episode"),
     Kind.CONTROLLER: ("propose",),
     Kind.MEASURE: ("score",),

@@ -7,6 +7,7 @@ from .explanation import Explanation as Explanation
 from .explanation import Tally as Tally
 from .explanation import explain as explain
 from .forecast import Forecasts as Forecasts
+from .inside import Inside as Inside
 from .kernels import LINE as LINE
 from .kernels import Function as Function
 from .kernels import announce_compiling as announce_compiling
@@ -15,6 +16,7 @@ from .kernels import inner_kernel as inner_kernel
 from .kernels import kernel as kernel
 from .kernels import parallel_kernel as parallel_kernel
 from .known import Known as Known
+from .known import Policy as Policy
 from .learnt import NO_ACTION as NO_ACTION
 from .learnt import NOT_OPEN as NOT_OPEN
 from .learnt import Counts as Counts
@@ -34,6 +36,8 @@ from .memory import tell_of_failures as tell_of_failures
 from .model import FSMModel as FSMModel
 from .naming import Labels as Labels
 from .naming import Words as Words
+from .naming import action_name as action_name
+from .naming import state_name as state_name
 from .naming import use_words as use_words
 from .naming import visible as visible
 from .notebook import model_html as model_html
@@ -42,7 +46,9 @@ from .observations import Category as Category
 from .observations import Missing as Missing
 from .observations import ObservationEncoder as ObservationEncoder
 from .proportions import wilson_bounds as wilson_bounds
+from .reference import Reference as Reference
 from .states.dispatch import describe as describe
+from .states.dispatch import register_rule as register_rule
 from .states.dispatch import restore as restore
 from .states.edges import Edges as Edges
 from .states.ets import Paper as Paper
@@ -59,7 +65,6 @@ from .step import learn_rows as learn_rows
 from .step import room_for as room_for
 from .step import step_and_act as step_and_act
 from .step import widen as widen
-from .transitions import Policy as Policy
 from .validation import check_action as check_action
 from .validation import check_actions as check_actions
 from .validation import check_rows as check_rows

@@ -1,4 +1,4 @@
-"""What happens where a state is founded and there are as many as allowed: one is given up.
+"""What happens where a state is created and there are as many as allowed: one is given up.
 
 Its index goes to the new state, so that no other index changes; `state_ids` tell the two apart.
 """
@@ -27,14 +27,14 @@ _SUMMED_PLACES, _LARGER_PLACES = joined_by("sum", "place"), joined_by("most", "p
 
 
 class WhenFull(IntEnum):
-    """Which state is given up where ``max_states`` exist and another one is founded.
+    """Which state is given up where ``max_states`` exist and another one is created.
 
     ``MERGE`` joins the two whose centres are closest, the newcomer among them: evidence is added
     up, and the centre lies between theirs, by visits. If the newcomer is one of the two, it is
     left out, and the other one stays where it is.
 
     ``RETIRE`` gives up the least useful one, with all that was learnt of it: the one visited for
-    the smallest share of the time since it was founded (the utility of Angelov and Filev's
+    the smallest share of the time since it was created (the utility of Angelov and Filev's
     simpl_eTS, 2005). The present state is kept, and so are those in which failures ended while
     there are others.
 
@@ -62,7 +62,7 @@ RETIRE = int(WhenFull.RETIRE)
 
 @rare_kernel
 def merge_closest(memory: Memory, n: int, nearest: int) -> int:
-    """Merge the two closest of ``n`` states and the newcomer; answers the index that is free.
+    """Merge the two closest of ``n`` states and the newcomer; returns the index that is free.
 
     The newcomer is the latest observation, and ``nearest`` the centre closest to it.
     """
@@ -138,7 +138,7 @@ def _join(
 
 @rare_kernel
 def retire_least_useful(memory: Memory, n: int) -> int:
-    """Give up one of ``n`` states; answers its index."""
+    """Give up one of ``n`` states; returns its index."""
     now, counted = memory.learnt, memory.learnt.outcomes
     given, least, failed = NEWCOMER, 0.0, True
     for i in range(n):

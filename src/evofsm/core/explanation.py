@@ -18,43 +18,17 @@ something rare that was seen, hence "as far as the states tell".
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.core.naming import Labels
+from evofsm.core.known import Known, Nearest
+from evofsm.core.naming import Labels, state_name
 from evofsm.core.proportions import bounds_text, wilson_bounds
 
 # A belief above this is not worth a word.
 _SURE = 0.995
-
-
-class Experience(Protocol):
-    """The graph that was learnt, as a machine and its model hold it."""
-
-    @property
-    def n_states(self) -> int: ...  # noqa: D102
-    @property
-    def failure_horizon(self) -> int | None: ...  # noqa: D102
-    @property
-    def failures_told(self) -> bool: ...  # noqa: D102
-    @property
-    def centers(self) -> NDArray[np.float64]: ...  # noqa: D102
-    @property
-    def visits(self) -> NDArray[np.float64]: ...  # noqa: D102
-    @property
-    def changes(self) -> NDArray[np.float64]: ...  # noqa: D102
-    @property
-    def episodes(self) -> NDArray[np.float64]: ...  # noqa: D102
-    @property
-    def failed_soon(self) -> NDArray[np.float64]: ...  # noqa: D102
-    @property
-    def joined(self) -> NDArray[np.float64]: ...  # noqa: D102
-    @property
-    def tried(self) -> NDArray[np.float64]: ...  # noqa: D102
-    @property
-    def failed_after(self) -> NDArray[np.float64]: ...  # noqa: D102
 
 
 class Tally(NamedTuple):
@@ -99,19 +73,6 @@ class Tally(NamedTuple):
         return f"{self.failed:,} of {self.episodes:,} ({bounds_text(low, high)})"
 
 
-class Nearest(NamedTuple):
-    """The state that an observation is nearest to, in the scales of the rule."""
-
-    state: int  #: its index
-    distance: float  #: from its centre
-    reach: float  #: how far from a centre an observation still belongs to the state
-
-    @property
-    def is_beyond(self) -> bool:
-        """Whether no state reaches as far as the observation."""
-        return self.distance > self.reach
-
-
 class Explanation(NamedTuple):
     """What is known of a situation; as text, its sentence.
 
@@ -146,7 +107,7 @@ class Explanation(NamedTuple):
 
 
 def explain(
-    known: Experience,
+    known: Known,
     belief: NDArray[np.float64],
     action: int | None,
     labels: Labels,
@@ -203,14 +164,14 @@ def nothing_known(text: str) -> Explanation:
 
 
 def _never_seen(
-    known: Experience, belief: NDArray[np.float64], nearest: Nearest, labels: Labels
+    known: Known, belief: NDArray[np.float64], nearest: Nearest, labels: Labels
 ) -> Explanation:
     state, none = nearest.state, Tally(0, 0, is_told=known.failures_told)
     place = labels.place(known.centers[state])
     place = place if place.startswith("(") else f"({place})"
     text = (
         f"Never seen, as far as the states tell: {nearest.distance:.3g} from the nearest, "
-        f"#{state + 1} {place}, where a state reaches {nearest.reach:.3g}."
+        f"{state_name(state)} {place}, where a state reaches {nearest.reach:.3g}."
     )
     return Explanation(text, state, float(belief[state]), 0, none, None, None, None, None, True)
 
@@ -228,13 +189,13 @@ def _best(after: Sequence[Tally], than: Tally) -> int | None:
 # -- In words -------------------------------------------------------------------------------------
 
 
-def _of_place(known: Experience, belief: NDArray[np.float64], state: int, labels: Labels) -> str:
-    place = f"#{state + 1}: {labels.place(known.centers[state])}"
+def _of_place(known: Known, belief: NDArray[np.float64], state: int, labels: Labels) -> str:
+    place = f"{state_name(state)}: {labels.place(known.centers[state])}"
     if belief[state] > _SURE or len(belief) == 1:
         return place
     second = int(np.argsort(-belief, kind="stable")[1])
     return (
-        f"{place} (belief {100.0 * belief[state]:.0f} %, next #{second + 1} "
+        f"{place} (belief {100.0 * belief[state]:.0f} %, next {state_name(second)} "
         f"{100.0 * belief[second]:.0f} %)"
     )
 
@@ -261,7 +222,7 @@ def _of_origin(arrivals: NDArray[np.float64], came_from: int | None) -> str:
     if came_from is None:
         return ""
     most, all_ = arrivals[came_from], arrivals.sum()
-    return f"Most often reached from #{came_from + 1}: {most:,.0f} of {all_:,.0f} times"
+    return f"Most often reached from {state_name(came_from)}: {most:,.0f} of {all_:,.0f} times"
 
 
 def _count(number: int, noun: str) -> str:

@@ -211,7 +211,7 @@ class Forecasts:
         Returns
         -------
         (n,) or (T, n) ndarray
-            Distribution over states that many steps later. States founded since nothing was
+            Distribution over states that many steps later. States created since nothing was
             learnt of stay as they are.
 
         Raises
@@ -390,7 +390,7 @@ def _share_moved(learnt: _Learnt, horizon: int) -> float:
 
 @inner_kernel
 def _above(belief: NDArray[np.float64], least: float, found: NDArray[np.int64]) -> int:
-    """Write which states are believed in more than that; answers how many."""
+    """Write which states are believed in more than that; returns how many."""
     n = 0
     for i in range(len(belief)):
         if belief[i] > least:

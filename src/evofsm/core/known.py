@@ -1,36 +1,52 @@
 """What a machine knows, and its snapshot: every array and every question to them once.
 
-A machine answers from its buffer, as it is at the moment; a model from arrays that never change.
+A machine reads them from its buffer, as it is at the moment; a model has arrays of its own.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, SupportsIndex
+from typing import Any, ClassVar, Literal, NamedTuple, Self, SupportsIndex, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from evofsm.core import chains
-from evofsm.core.explanation import Nearest
 from evofsm.core.kernels import kernel
 from evofsm.core.layout import Floats
 from evofsm.core.learnt import Clusters, Counts, Transitions
 from evofsm.core.states.clusters import measure_distances, nearest_center
-from evofsm.core.states.dispatch import reach, weights
+from evofsm.core.states.dispatch import reach, restore, weights
 from evofsm.core.states.ets import Paper
 from evofsm.core.states.rule import StateRule
 from evofsm.core.states.spread import recognise
-from evofsm.core.transitions import Policy, marginal, propagate
 from evofsm.core.validation import (
     check_action,
     check_state,
     real_array,
     refuse_unless_distribution,
+    refuse_unless_told,
     refuse_unusable,
     whole,
 )
+from evofsm.files import ranges, storage
+
+#: Which actions are taken: each alike, the first one again, or each as often as it was used.
+Policy = Literal["marginal", "hold", "observed"]
+
+
+class Nearest(NamedTuple):
+    """The state that an observation is nearest to, in the scales of the rule."""
+
+    state: int  #: its index
+    distance: float  #: from its centre
+    reach: float  #: how far from a centre an observation still belongs to the state
+
+    @property
+    def is_beyond(self) -> bool:
+        """Whether no state reaches as far as the observation."""
+        return self.distance > self.reach
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
@@ -218,10 +234,21 @@ class Known(Counts):
         >>> model.propagate([1.0, 0.0], 0, horizon=20, policy="hold").round(3)
         array([0.686, 0.314])
         """
-        start = self._belief(belief)
+        there = self._belief(belief)
+        if policy not in get_args(Policy):
+            known = ", ".join(get_args(Policy))
+            raise ValueError(f"policy is {policy!r}; it must be one of {known}")
+        steps = whole("horizon", horizon)
+        if action is None and policy == "hold":
+            raise ValueError("policy 'hold' needs the action that is held")
         if action is not None:
-            action = check_action(action, self.n_actions)
-        return propagate(start, self._matrix, self.averaged_matrix, action, horizon, policy)
+            first = self._matrix(self._index(action))
+            there, steps = there @ first, steps - 1
+        if steps:
+            holds = action is not None and policy == "hold"
+            then = first if holds else self.averaged_matrix(policy)
+            there = there @ np.linalg.matrix_power(then, steps)
+        return there
 
     def averaged_matrix(self, policy: Policy = "observed") -> NDArray[np.float64]:
         """(n, n) transition probabilities, averaged over the actions.
@@ -253,8 +280,13 @@ class Known(Counts):
         >>> model.averaged_matrix("marginal")[0].round(3)
         array([0.636, 0.364])
         """
+        if policy not in ("marginal", "observed"):
+            raise ValueError(f"policy is {policy!r}; an average is 'marginal' or 'observed'")
         matrices, uses = self._matrices()
-        return marginal(matrices, uses, self.n_actions, policy)
+        if policy == "observed" and uses.sum() > 0.0:
+            return np.asarray(np.tensordot(uses / uses.sum(), matrices, axes=1))
+        unused = (self.n_actions - len(matrices)) / max(self.n_states, 1)
+        return np.asarray((matrices.sum(axis=0) + unused) / self.n_actions)
 
     def stationary_distribution(self, policy: Policy = "marginal") -> NDArray[np.float64]:
         """(n,) share of time that the chain would spend in each state if it ran on for ever.
@@ -443,7 +475,93 @@ class Known(Counts):
             first = check_state(start, self.n_states)
         return chains.path(P, first, steps, rng)
 
+    # -- Keeping it -----------------------------------------------------------------------------
+
+    def save(self, path: storage.Place, provenance: Mapping[str, Any] | None = None) -> None:
+        """Write it to a file (arrays and a JSON header, nothing that can run).
+
+        Parameters
+        ----------
+        path : str, path-like or binary file
+            Name of the file, used as it is; a file of that name is replaced.
+        provenance : mapping, optional
+            What it learnt from, for JSON; `evofsm inspect` shows it.
+
+        Raises
+        ------
+        OSError
+            If the folder does not exist, or the file cannot be written. A file that was there
+            before is then as it was.
+
+        Examples
+        --------
+        >>> import tempfile
+        >>> from pathlib import Path
+        >>> from evofsm import EvolvingFSM
+        >>> machine = EvolvingFSM(n_actions=2, radius=0.5)
+        >>> trace = machine.learn_many([[0.0], [0.1], [2.0], [1.0]], [0, 0, 0, 0])
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     machine.save(Path(folder) / "machine.evofsm")
+        ...     again = EvolvingFSM.load(Path(folder) / "machine.evofsm")
+        >>> again.observe([1.1]).surprise == machine.observe([1.1]).surprise
+        True
+        """
+        storage.write(path, self._kind.name, self._content, self._kept(), provenance)
+
+    @classmethod
+    def load(cls, path: storage.Place) -> Self:
+        """Read it from a file; a machine goes on bit for bit as if it had never been stopped.
+
+        Parameters
+        ----------
+        path : str, path-like or binary file
+            Name of the file.
+
+        Returns
+        -------
+        EvolvingFSM or FSMModel
+            As it was saved; a machine in the middle of its episode.
+
+        Raises
+        ------
+        OSError
+            If there is no such file, or it may not be read.
+        ValueError
+            If the file holds something else, is damaged, or of a newer version.
+
+        Examples
+        --------
+        >>> import tempfile
+        >>> from pathlib import Path
+        >>> from evofsm import EvolvingFSM, FSMModel
+        >>> model = EvolvingFSM(n_actions=2).model()
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     model.save(Path(folder) / "model.evofsm")
+        ...     FSMModel.load(Path(folder) / "model.evofsm").n_actions
+        2
+        """
+        content, arrays = storage.read(path, cls._kind.name)
+        with storage.explained(path):
+            refuse_unless_told(content.setdefault("failures_told", False))
+            return cls._restored({**content, "rule": restore(content["rule"])}, arrays)
+
     # -- Inside ---------------------------------------------------------------------------------
+
+    _kind: ClassVar[ranges.Kind]
+
+    @property
+    def _content(self) -> dict[str, Any]:
+        """All but the arrays, for JSON."""
+        raise NotImplementedError
+
+    def _kept(self) -> dict[str, NDArray[Any]]:
+        """The arrays of a file."""
+        raise NotImplementedError
+
+    @classmethod
+    def _restored(cls, content: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> Self:
+        """What was kept so."""
+        raise NotImplementedError
 
     def _matrix(self, i: int) -> NDArray[np.float64]:
         """(n, n) transition probabilities under an action."""

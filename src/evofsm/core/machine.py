@@ -27,9 +27,9 @@ from numpy.typing import ArrayLike, NDArray
 from evofsm.core.actions import IntervalActions
 from evofsm.core.crowding import WhenFull
 from evofsm.core.divergence import jensen_shannon
-from evofsm.core.explanation import Explanation, Nearest, explain, nothing_known
+from evofsm.core.explanation import Explanation, explain, nothing_known
 from evofsm.core.kernels import LINE, lanes
-from evofsm.core.known import Known, recognise_rows
+from evofsm.core.known import Known, Nearest, Policy, recognise_rows
 from evofsm.core.layout import Array
 from evofsm.core.learnt import MACHINE, NO_ACTION, NOT_OPEN, Learnt
 from evofsm.core.memory import (
@@ -52,7 +52,7 @@ from evofsm.core.model import FSMModel
 from evofsm.core.naming import Labels
 from evofsm.core.notebook import machine_html
 from evofsm.core.observations import Missing
-from evofsm.core.states.dispatch import check_rule, describe, reach, restore, weights, width
+from evofsm.core.states.dispatch import check_rule, describe, reach, weights, width
 from evofsm.core.states.ets import Paper
 from evofsm.core.states.rule import RuleSettings, StateRule
 from evofsm.core.step import (
@@ -71,7 +71,7 @@ from evofsm.core.step import (
     updater,
     widen,
 )
-from evofsm.core.transitions import Policy, count_open, propagate
+from evofsm.core.transitions import count_open
 from evofsm.core.validation import (
     check_action,
     check_actions,
@@ -79,11 +79,10 @@ from evofsm.core.validation import (
     positive,
     real_array,
     real_rows,
-    refuse_unless_told,
     refuse_unusable,
     whole,
 )
-from evofsm.files import ranges, storage
+from evofsm.files import ranges
 
 Method = TypeVar("Method", bound=Callable[..., Any])
 
@@ -123,25 +122,26 @@ class EvolvingFSM(Known):
     ----------
     n_actions : int
         Number q of discrete actions; each has a transition matrix of its own.
-    radius : float
+    radius : float, optional
         The paper's epsilon, in the unit of the observations: an observation that is denser
-        than every centre moves the nearest one if that is closer than this, else it founds
-        a state.
+        than every centre moves the nearest one if that is closer than this, else it creates
+        a state. 0.3 for `Paper` and `Edges`; other rules have their own.
     distance_weight : float
         The paper's rho, how fast distance to new data lowers a centre's potential.
     learning_rate : float
         The paper's phi, the weight of the newest transition, in (0, 1).
     prior_frequency : float
         The paper's epsilon-bar, the frequency given to every transition of a new state.
-    spread : float
+    spread : float, optional
         Width of recognition: the similarity to a centre is
-        ``exp(-distance^2 / (spread * total variance of all observations))``.
+        ``exp(-distance^2 / (spread * total variance of all observations))``. 3 for `Paper` and
+        `Edges`; other rules have their own.
     rule : StateRule, optional
         How states are determined, as an object: `Edges`, `Novelty`, `FailureSplit`; without it
-        the paper's rule, `Paper`. A rule may have a radius and a spread of its own, which then
-        take the place of these.
+        the paper's rule, `Paper`. Where it has a radius and a spread of its own, other ones may
+        not be given beside it.
     max_states : int, optional
-        Number of states at which another one is only founded where one is given up; without it
+        Number of states at which another one is only created where one is given up; without it
         there is no limit.
     when_full : WhenFull
         Which one is given up: ``MERGE`` joins the two that are closest, ``RETIRE`` forgets the
@@ -162,9 +162,9 @@ class EvolvingFSM(Known):
         If ``rule`` is no rule (or the class of one).
     ValueError
         If ``n_actions`` is no whole number of at least 1, another setting is not positive, or
-        beyond what can be computed with (``evofsm.files.ranges``), ``learning_rate`` is 1 or more,
-        ``radius`` or ``spread`` contradicts the rule's, ``belief_tolerance`` is not in its range,
-        or ``failure_horizon`` is no whole number of at least 1.
+        beyond its range in ``evofsm.core.learnt``, ``learning_rate`` is 1 or more, ``radius`` or
+        ``spread`` contradicts the rule's, ``belief_tolerance`` is not in its range, or
+        ``failure_horizon`` is no whole number of at least 1.
 
     Notes
     -----
@@ -187,18 +187,17 @@ class EvolvingFSM(Known):
     array([0.48, 0.52])
     """
 
-    # The kernels that take a step, once they are loaded.
-    _observe: Callable[..., tuple[int, int, float]]
-    _update: Callable[..., float]
+    _kind = MACHINE
+    _update: Callable[..., float]  # the quickest kernel that takes a step, once it is loaded
 
     def __init__(
         self,
         n_actions: int,
-        radius: float = _RADIUS,
+        radius: float | None = None,
         distance_weight: float = 0.85,
         learning_rate: float = 0.01,
         prior_frequency: float = 1e-3,
-        spread: float = _SPREAD,
+        spread: float | None = None,
         rule: StateRule | None = None,
         max_states: int | None = None,
         when_full: WhenFull = WhenFull.MERGE,
@@ -208,17 +207,18 @@ class EvolvingFSM(Known):
         self._rule = Paper() if rule is None else check_rule("rule", rule)
         given = RuleSettings(
             code=0,
-            radius=positive("radius", radius),
+            radius=_RADIUS if radius is None else positive("radius", radius),
             distance_weight=positive("distance_weight", distance_weight),
-            spread=positive("spread", spread),
+            spread=_SPREAD if spread is None else positive("spread", spread),
             failure_share=0.0,
             failure_distance=0.0,
             memory=np.inf,
             weights=np.empty(0),
         )
-        told = self._rule._tell(given)
-        _refuse_contradiction("radius", given.radius, told.radius, _RADIUS, self._rule)
-        _refuse_contradiction("spread", given.spread, told.spread, _SPREAD, self._rule)
+        told = given._replace(**cast(Any, self._rule.table))
+        for name, value in (("radius", radius), ("spread", spread)):
+            if value not in (None, getattr(told, name)):
+                raise ValueError(f"{name} is {value}, but the rule has its own: {self._rule}")
         parameters = Parameters(
             positive("learning_rate", learning_rate),
             positive("prior_frequency", prior_frequency),
@@ -256,6 +256,7 @@ prior_frequency=0.001, spread=3.0)
 
     # -- Learning -------------------------------------------------------------------------------
 
+    @_alone
     def observe(
         self,
         z: ArrayLike,
@@ -306,9 +307,19 @@ prior_frequency=0.001, spread=3.0)
         >>> step.state, step.predicted.round(2), step.belief.round(2), round(step.surprise, 2)
         (1, array([0.6, 0.4]), array([0.32, 0.68]), 0.06)
         """
-        if missing is Missing.REJECT and explained is None and failed is None:
-            return self._step(z, NO_ACTION, False)
-        return self._observe_and_explain(z, failed, missing, explained)
+        step = None
+        if missing is not Missing.REJECT:
+            given = real_array("observation", z, ndim=1)
+            if (absent := np.isnan(given)).any():
+                step = self._observe_partly(given, absent, missing, failed=bool(failed))
+        if step is None:
+            step = self._step(z, NO_ACTION, bool(failed))
+        if failed is not None:
+            tell_of_failures(self._buffer)
+        if explained is None:
+            return step
+        text = explain(self, step.belief, None, explained, self._nearest(step.state)).text
+        return step._replace(explanation=text)
 
     @_alone
     def act(self, i: SupportsIndex) -> None:
@@ -343,6 +354,7 @@ prior_frequency=0.001, spread=3.0)
             raise ValueError("act before observe: this episode has no observation to act on yet")
         self._memory.learnt.action[0] = i
 
+    @_alone
     def learn_one(self, z: ArrayLike, i: SupportsIndex) -> Step:
         """Observe ``z``, then act with ``i``.
 
@@ -414,7 +426,7 @@ prior_frequency=0.001, spread=3.0)
         i = check_action(i, self.n_actions)
         with self._lock:
             close(self._held.buffer)
-            surprise = self._insist(z, i, False)[2]
+            surprise = self._take(z, i, False)[2]
             reopen(self._held.buffer)  # also where an error or an interrupt had left it closed
         return surprise
 
@@ -591,7 +603,7 @@ prior_frequency=0.001, spread=3.0)
         array([0.686, 0.314])
         """
         i = check_action(i, self.n_actions)
-        return propagate(self.belief, self._matrix, self.averaged_matrix, i, horizon, policy)
+        return self.propagate(self.belief, i, horizon, policy)
 
     @_alone
     def explain(
@@ -741,7 +753,7 @@ prior_frequency=0.001, spread=3.0)
     @property
     @_alone
     def state_ids(self) -> NDArray[np.int64]:
-        """(n,) ndarray: identities of the states, the number of each one's founding from 0.
+        """(n,) ndarray: identities of the states, the number of each one's creation from 0.
 
         They equal the indices, unless states were given up (``max_states``): an index that became
         free goes to a new state, with a new identity.
@@ -852,79 +864,6 @@ prior_frequency=0.001, spread=3.0)
 
     # -- Keeping it -----------------------------------------------------------------------------
 
-    def save(self, path: storage.Place, provenance: Mapping[str, Any] | None = None) -> None:
-        """Write the machine to a file (arrays and a JSON header, nothing that can run).
-
-        Parameters
-        ----------
-        path : str, path-like or binary file
-            Name of the file, used as it is; a file of that name is replaced.
-        provenance : mapping, optional
-            What it learnt from, for JSON; `evofsm inspect` shows it.
-
-        Raises
-        ------
-        OSError
-            If the folder does not exist, or the file cannot be written. A file that was there
-            before is then as it was.
-
-        Examples
-        --------
-        >>> import tempfile
-        >>> from pathlib import Path
-        >>> machine = EvolvingFSM(n_actions=2, radius=0.5)
-        >>> trace = machine.learn_many([[0.0], [0.1], [2.0], [1.0]], [0, 0, 0, 0])
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     machine.save(Path(folder) / "machine.evofsm")
-        ...     EvolvingFSM.load(Path(folder) / "machine.evofsm").n_states
-        2
-        """
-        # Without spare room the shapes of the arrays tell the sizes, and nothing else is stored.
-        storage.write(path, MACHINE.name, self._content, dict(leaves(self._trimmed())), provenance)
-
-    @classmethod
-    def load(cls, path: storage.Place) -> Self:
-        """Read a machine that was saved; it goes on learning bit for bit as if never stopped.
-
-        Parameters
-        ----------
-        path : str, path-like or binary file
-            Name of the file.
-
-        Returns
-        -------
-        EvolvingFSM
-            The machine as it was saved, in the middle of its episode.
-
-        Raises
-        ------
-        OSError
-            If there is no such file, or it may not be read.
-        ValueError
-            If the file is not a machine's, is damaged, or of a newer version.
-
-        Examples
-        --------
-        >>> import tempfile
-        >>> from pathlib import Path
-        >>> machine = EvolvingFSM(n_actions=2, radius=0.5)
-        >>> trace = machine.learn_many([[0.0], [0.1], [2.0], [1.0]], [0, 0, 0, 0])
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     machine.save(Path(folder) / "machine.evofsm")
-        ...     again = EvolvingFSM.load(Path(folder) / "machine.evofsm")
-        >>> again.observe([1.1]).surprise == machine.observe([1.1]).surprise
-        True
-        """
-        content, arrays = storage.read(path, MACHINE.name)
-        with storage.explained(path):
-            refuse_unless_told(told := content.pop("failures_told", False))
-            machine = cls(**{**content, "rule": restore(content["rule"])})
-            _, n = arrays["centers"].shape
-            machine = machine._holding(arrays) if n else machine
-        if told:
-            tell_of_failures(machine._buffer)
-        return machine
-
     def copy(self) -> Self:
         """An independent machine in the same state.
 
@@ -949,6 +888,19 @@ prior_frequency=0.001, spread=3.0)
         """The settings, and whether failures were told, for JSON."""
         told = {"failures_told": True} if self.failures_told else {}
         return {**self.settings, "rule": describe(self._rule), **told}
+
+    def _kept(self) -> dict[str, NDArray[Any]]:
+        # Without spare room the shapes of the arrays tell the sizes, and nothing else is stored.
+        return dict(leaves(self._trimmed()))
+
+    @classmethod
+    def _restored(cls, content: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> Self:
+        told = content.pop("failures_told")
+        machine = cls(**content)
+        machine = machine._holding(arrays) if arrays["centers"].shape[1] else machine
+        if told:
+            tell_of_failures(machine._buffer)
+        return machine
 
     # The views belong to one buffer: a copy, or what another process gets, needs its own. So does
     # its lock.
@@ -1018,7 +970,6 @@ prior_frequency=0.001, spread=3.0)
         memory = view(buffer)
         self._limit = limit_of(memory.parameters)  # the same for all buffers of a machine
         self._held = Held(buffer, memory)
-        self._observe = _cannot_observe
         self._update = _cannot_update
 
     def _nearest(self, state: int | None) -> Nearest | None:
@@ -1029,38 +980,15 @@ prior_frequency=0.001, spread=3.0)
         beyond = reach(self._rule, self.width)
         return Nearest(state, float(np.sqrt(now.clusters.squared_distances[state])), beyond)
 
-    def _observe_any(self, z: ArrayLike, failed: bool, missing: Missing) -> Step:
-        """Observe, whole or in part."""
-        if missing is not Missing.REJECT:
-            given = real_array("observation", z, ndim=1)
-            absent = np.isnan(given)
-            if absent.any():
-                return self._observe_partly(given, absent, missing, failed=failed)
-        return self._step(z, NO_ACTION, failed)
-
-    @_alone
     def _step(self, z: ArrayLike, action: int, failed: bool) -> Step:
         """Observe, then act; the whole answer."""
-        event, state, surprise = self._insist(z, action, failed)
+        event, state, surprise = self._take(z, action, failed)
         memory = self._held.memory
         parameters, now, scratch = memory.parameters, memory.learnt, memory.scratch
         n = int(now.n_states[0])
         forecast = scratch.forecast if parameters.belief_tolerance else scratch.predicted
         predicted = forecast[: n if surprise == surprise else 0].copy()
         return Step(state, now.belief[:n].copy(), EVENTS[event], predicted, surprise)
-
-    @_alone
-    def _observe_and_explain(
-        self, z: ArrayLike, failed: bool | None, missing: Missing, explained: Labels | None
-    ) -> Step:
-        """Observe, whole or in part, and say what is known of it."""
-        step = self._observe_any(z, bool(failed), missing)
-        if failed is not None:
-            tell_of_failures(self._buffer)
-        if explained is None:
-            return step
-        text = explain(self, step.belief, None, explained, self._nearest(step.state)).text
-        return step._replace(explanation=text)
 
     def _observe_partly(
         self,
@@ -1100,22 +1028,28 @@ prior_frequency=0.001, spread=3.0)
             believe(self._buffer, belief)
         return Step(int(belief.argmax()), belief, Event.NONE, predicted, surprise, gone)
 
-    def _insist(self, z: ArrayLike, action: int, failed: bool) -> tuple[int, int, float]:
-        """What the kernel answers, whatever has to be done to `z` and for room before."""
-        if type(z) is np.ndarray and z.dtype is _FLOAT64:
+    def _take(self, z: ArrayLike, action: int, failed: bool) -> tuple[int, int, float]:
+        """A step of the kernel: event, state and surprise, once it has a plain vector and room."""
+        if not self.n_variables or type(z) is not np.ndarray or z.dtype is not _FLOAT64:
+            z = self._checked(z)
+        while True:
             event, state, surprise = REFUSED, 0, np.nan
-            with suppress(TypeError):  # it has gaps, is read-only or is no vector
-                event, state, surprise = self._observe(
+            with suppress(TypeError):  # z has gaps, is read-only or is no vector
+                event, state, surprise = observer(self._limit)(
                     self._held.buffer, z, action, failed, self._limit
                 )
             if event >= 0:
                 return event, state, surprise
             if event == FULL:
                 self._grow()
-        z = self._fit(real_array("observation", z, ndim=1))
-        refuse_unusable("observation", z)
-        self._observe = observer(self._limit)
-        return self._insist(z, action, failed)
+            else:
+                z = self._checked(z)
+
+    def _checked(self, z: ArrayLike) -> NDArray[np.float64]:
+        """An observation as a vector of its own, of as many variables as the first one had."""
+        vector = self._fit(real_array("observation", z, ndim=1))
+        refuse_unusable("observation", vector)
+        return vector
 
     def _grow(self) -> None:
         """Make room for what the next step may need."""
@@ -1207,11 +1141,7 @@ if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_unlock_all)
 
 
-# In place of kernels, until there is something to load them for.
-def _cannot_observe(*_: object) -> tuple[int, int, float]:
-    return REFUSED, 0, np.nan
-
-
+# In place of the kernel, until there is something to load it for.
 def _cannot_update(*_: object) -> float:
     return DECLINED
 
@@ -1222,11 +1152,3 @@ def _tolerance(tolerance: float) -> float:
     if positive("belief_tolerance", tolerance) >= 1.0:
         raise ValueError(f"belief_tolerance is {tolerance}; it must lie below 1")
     return float(tolerance)
-
-
-def _refuse_contradiction(
-    name: str, given: float, told: float, default: float, rule: StateRule
-) -> None:
-    """Raise where a setting was given to a machine whose rule has another one of its own."""
-    if given not in (told, default):
-        raise ValueError(f"{name} is {given}, but the rule has its own: {rule}")

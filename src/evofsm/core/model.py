@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass, fields, replace
 from typing import Any, Self, cast
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from evofsm.core.actions import IntervalActions
 from evofsm.core.explanation import Explanation, explain
@@ -16,16 +16,15 @@ from evofsm.core.layout import Array
 from evofsm.core.learnt import MODEL
 from evofsm.core.naming import Labels
 from evofsm.core.notebook import model_html
-from evofsm.core.states.dispatch import describe, restore
+from evofsm.core.states.dispatch import describe
 from evofsm.core.validation import (
     check_action,
     check_state,
     positive,
     refuse_more_failures,
     refuse_unless_distribution,
-    refuse_unless_told,
 )
-from evofsm.files import ranges, storage
+from evofsm.files import ranges
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
@@ -38,11 +37,10 @@ class FSMModel(Known):
     Raises
     ------
     ValueError
-        If an array has not its shape, a number is none that learning can leave, such as NaN or
-        a count below 0 (`files.ranges`), a row of a transition matrix is no distribution, more
-        decisions failed than were taken,
-        ``actions``, ``names`` or ``units`` are of another number than the arrays say, or ``dt``
-        is not positive and finite.
+        If an array has not its shape, a number is out of its range in `core.learnt`, such as NaN
+        or a count below 0, a row of a transition matrix is no distribution, more decisions failed
+        than were taken, ``actions``, ``names`` or ``units`` are of another number than the arrays
+        say, or ``dt`` is not positive and finite.
 
     Examples
     --------
@@ -60,6 +58,7 @@ class FSMModel(Known):
     names: tuple[str, ...] = ()  #: of the m variables
     units: tuple[str, ...] = ()  #: of the m variables
     dt: float | None = None  #: time between two observations [s]
+    _kind = MODEL
 
     def __post_init__(self) -> None:
         m, q = self.n_variables, self.n_actions
@@ -235,84 +234,19 @@ class FSMModel(Known):
             "failures_told": self.failures_told,
         }
 
-    def save(self, path: storage.Place, provenance: Mapping[str, Any] | None = None) -> None:
-        """Write the model to a file (arrays and a JSON header, nothing that can run).
-
-        Parameters
-        ----------
-        path : str, path-like or binary file
-            Name of the file, used as it is; a file of that name is replaced.
-        provenance : mapping, optional
-            What it learnt from, for JSON; `evofsm inspect` shows it.
-
-        Raises
-        ------
-        OSError
-            If the folder does not exist, or the file cannot be written. A file that was there
-            before is then as it was.
-
-        Examples
-        --------
-        >>> import tempfile
-        >>> from pathlib import Path
-        >>> from evofsm import EvolvingFSM
-        >>> machine = EvolvingFSM(n_actions=2, radius=0.5)
-        >>> trace = machine.learn_many([[0.0], [0.1], [2.0], [1.0]], [0, 0, 0, 0])
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     machine.model(names=["gap"]).save(Path(folder) / "model.evofsm")
-        ...     FSMModel.load(Path(folder) / "model.evofsm").names
-        ('gap',)
-        """
-        arrays = {name: getattr(self, name) for name in cast(Any, MODEL.members)}
-        storage.write(path, MODEL.name, self._content, arrays, provenance)
+    def _kept(self) -> dict[str, NDArray[Any]]:
+        return {name: getattr(self, name) for name in cast(Any, MODEL.members)}
 
     @classmethod
-    def load(cls, path: storage.Place) -> Self:
-        """Read a model that was saved.
-
-        Parameters
-        ----------
-        path : str, path-like or binary file
-            Name of the file.
-
-        Returns
-        -------
-        FSMModel
-            The model as it was saved.
-
-        Raises
-        ------
-        OSError
-            If there is no such file, or it may not be read.
-        ValueError
-            If the file is not a model's, is damaged, or of a newer version.
-
-        Examples
-        --------
-        >>> import tempfile
-        >>> from pathlib import Path
-        >>> from evofsm import EvolvingFSM
-        >>> machine = EvolvingFSM(n_actions=2, radius=0.5)
-        >>> trace = machine.learn_many([[0.0], [0.1], [2.0], [1.0]], [0, 0, 0, 0])
-        >>> model = machine.model()
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     model.save(Path(folder) / "model.evofsm")
-        ...     again = FSMModel.load(Path(folder) / "model.evofsm")
-        >>> np.array_equal(again.transition_matrices, model.transition_matrices)
-        True
-        """
-        content, arrays = storage.read(path, MODEL.name)
-        with storage.explained(path):
-            if content["actions"] is not None:
-                content["actions"] = _actions(content["actions"], len(arrays["uses"]))
-            for name in ("names", "units"):
-                content[name] = tuple(content[name])
-            content["rule"] = restore(content["rule"])
-            refuse_unless_told(content.setdefault("failures_told", False))
-            values: dict[str, Any] = {**content, **arrays}
-            if lacking := {entry.name for entry in fields(cls)} - set(values):
-                raise ValueError(f"it lacks {', '.join(sorted(lacking))}")
-            return cls(**values)
+    def _restored(cls, content: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> Self:
+        if content["actions"] is not None:
+            content["actions"] = _actions(content["actions"], len(arrays["uses"]))
+        for name in ("names", "units"):
+            content[name] = tuple(content[name])
+        values: dict[str, Any] = {**content, **arrays}
+        if lacking := {entry.name for entry in fields(cls)} - set(values):
+            raise ValueError(f"it lacks {', '.join(sorted(lacking))}")
+        return cls(**values)
 
 
 def _actions(settings: Mapping[str, Any], q: int) -> IntervalActions:

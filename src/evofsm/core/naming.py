@@ -29,6 +29,28 @@ def visible(text: str) -> str:
     return _UNPRINTABLE.sub(lambda found: f"\\u{ord(found[0]):04x}", text)
 
 
+def state_name(index: int) -> str:
+    """A state as people read it, counted from 1, by its index from 0.
+
+    Examples
+    --------
+    >>> state_name(3)
+    '#4'
+    """
+    return f"#{index + 1}"
+
+
+def action_name(index: int) -> str:
+    """An action as people read it, counted from 1 as in the paper, by its index from 0.
+
+    Examples
+    --------
+    >>> action_name(16)
+    'a(17)'
+    """
+    return f"a({index + 1})"
+
+
 class Words(NamedTuple):
     """How places and actions of one kind of system are told in words."""
 
@@ -105,7 +127,7 @@ class Labels(NamedTuple):
         >>> Labels(actions).action(16), Labels().action(16)
         ('a(17) [2.3, 2.5]', 'a(17)')
         """
-        name = f"a({index + 1})"
+        name = action_name(index)
         if self.actions is None:
             return name
         unit = f" {_WORDS[self.names].unit}" if self.names in _WORDS else ""

@@ -8,18 +8,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Sequence
+from enum import Enum
 from html import escape
-from typing import TYPE_CHECKING, NamedTuple, TypeAlias
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    from evofsm.core.machine import EvolvingFSM
-    from evofsm.core.model import FSMModel
-    from evofsm.core.step import Step
-
-    _Known: TypeAlias = EvolvingFSM | FSMModel
+from evofsm.core.known import Known
+from evofsm.core.naming import state_name
 
 # More rows than these are summed up in one.
 _MOST_STATES = 12
@@ -33,11 +30,30 @@ _NUMBER = f"{_LINE}text-align:right;white-space:nowrap;font-variant-numeric:tabu
 _EVENTS = {
     "NONE": "the states stayed as they were",
     "MOVED": "the nearest state moved here",
-    "CREATED": "a state was founded here",
+    "CREATED": "a state was created here",
     "MERGED": "two states were merged",
     "RETIRED": "a state was given up",
 }
-_NOT_FOUNDED = "none was founded: there are as many states as allowed, and the nearest is close"
+_NOT_CREATED = "none was created: there are as many states as allowed, and the nearest is close"
+
+
+class Happened(Protocol):
+    """What a `Step` says."""
+
+    @property
+    def belief(self) -> NDArray[np.float64]: ...  # noqa: D102
+    @property
+    def predicted(self) -> NDArray[np.float64]: ...  # noqa: D102
+    @property
+    def state(self) -> int: ...  # noqa: D102
+    @property
+    def surprise(self) -> float: ...  # noqa: D102
+    @property
+    def event(self) -> Enum: ...  # noqa: D102
+    @property
+    def missing(self) -> Sequence[int]: ...  # noqa: D102
+    @property
+    def explanation(self) -> str: ...  # noqa: D102
 
 
 class _Column(NamedTuple):
@@ -49,7 +65,7 @@ class _Column(NamedTuple):
     bars: NDArray[np.float64] | None = None  #: their lengths, as shares
 
 
-def machine_html(machine: EvolvingFSM) -> str:
+def machine_html(machine: Known) -> str:
     """A machine: its settings, its states, and where it is.
 
     Parameters
@@ -69,16 +85,17 @@ def machine_html(machine: EvolvingFSM) -> str:
     >>> "2 states, 2 actions, now in #2" in machine_html(machine)
     True
     """
-    now = "no episode has begun" if machine.state is None else f"now in {_name(machine.state)}"
-    shown = _most(machine.visits, machine.state)
+    state: int | None = getattr(machine, "state", None)
+    now = "no episode has begun" if state is None else f"now in {state_name(state)}"
+    shown = _most(machine.visits, state)
     columns = _columns(machine, shown)
-    if machine.state is not None:
-        columns.append(_shares("belief", machine.belief, shown))
+    if state is not None:
+        columns.append(_shares("belief", getattr(machine, "belief", np.ones(1)), shown))
     head = _head(machine, [*_counts(machine), now], _settings(machine))
     return _html(head, shown, machine.n_states, columns)
 
 
-def model_html(model: FSMModel) -> str:
+def model_html(model: Known) -> str:
     """A model: its states, and where each leads most often.
 
     Parameters
@@ -99,8 +116,8 @@ def model_html(model: FSMModel) -> str:
     True
     """
     counts = list(_counts(model))
-    if model.dt is not None:
-        counts.append(f"an observation every {model.dt:g} s")
+    if (dt := getattr(model, "dt", None)) is not None:
+        counts.append(f"an observation every {dt:g} s")
     shown = _most(model.visits)
     columns = _columns(model, shown)
     if model.uses.any() and model.n_states > 1:
@@ -108,7 +125,7 @@ def model_html(model: FSMModel) -> str:
     return _html(_head(model, counts, _settings(model)), shown, model.n_states, columns)
 
 
-def step_html(step: Step) -> str:
+def step_html(step: Happened) -> str:
     """A step: what was recognised, what happened to the states, and whether it was foreseen.
 
     Parameters
@@ -124,7 +141,7 @@ def step_html(step: Step) -> str:
     --------
     >>> from evofsm import EvolvingFSM
     >>> step = EvolvingFSM(n_actions=1).observe([0.0])
-    >>> "a state was founded here" in step_html(step)
+    >>> "a state was created here" in step_html(step)
     True
     """
     surprise = "nothing was forecast"
@@ -135,14 +152,14 @@ def step_html(step: Step) -> str:
     if len(step.predicted):
         columns.append(_shares("forecast", step.predicted, shown))
     details = _unseen(step.missing) or step.explanation
-    head = _head(step, [_name(step.state), _happened(step), surprise], details)
+    head = _head(step, [state_name(step.state), _happened(step), surprise], details)
     return _html(head, shown, len(step.belief), columns)
 
 
 # -- What is said -----------------------------------------------------------------------------
 
 
-def _counts(model: _Known) -> Iterable[str]:
+def _counts(model: Known) -> Iterable[str]:
     yield _some(model.n_states, "state")
     yield _some(model.n_actions, "action")
 
@@ -151,7 +168,7 @@ def _some(number: int, thing: str) -> str:
     return f"{number:,} {thing}{'' if number == 1 else 's'}"
 
 
-def _settings(model: _Known) -> str:
+def _settings(model: Known) -> str:
     told = [
         f"{name} {getattr(value, 'name', value)}"  # a member of an enumeration by its name
         for name, value in model.settings.items()
@@ -160,10 +177,10 @@ def _settings(model: _Known) -> str:
     return ", ".join([*told, f"rule {model.rule}"])
 
 
-def _happened(step: Step) -> str:
+def _happened(step: Happened) -> str:
     events = (step.event.name or "NONE").split("|")
     if events == ["MERGED"]:
-        return _NOT_FOUNDED
+        return _NOT_CREATED
     return ", ".join(_EVENTS[event] for event in events)
 
 
@@ -183,7 +200,7 @@ def _most(weights: NDArray[np.float64], present: int | None = None) -> list[int]
     return sorted(heaviest[:_MOST_STATES])
 
 
-def _columns(model: _Known, shown: Sequence[int]) -> list[_Column]:
+def _columns(model: Known, shown: Sequence[int]) -> list[_Column]:
     """Where the states lie, and how often each was seen."""
     columns = [
         _Column(head, [_value(model.centers[state, j]) for state in shown], "")
@@ -201,7 +218,7 @@ def _columns(model: _Known, shown: Sequence[int]) -> list[_Column]:
     return columns
 
 
-def variable_label(model: _Known, variable: int) -> str:
+def variable_label(model: Known, variable: int) -> str:
     """Name and unit of a variable, as far as they are known.
 
     Parameters
@@ -230,7 +247,7 @@ def variable_label(model: _Known, variable: int) -> str:
     return f"{name} [{unit}]" if unit else name
 
 
-def _variables(model: _Known) -> list[str]:
+def _variables(model: Known) -> list[str]:
     """Heads of the columns of the centres."""
     m = model.n_variables
     heads = [variable_label(model, j) for j in range(min(m, _MOST_VARIABLES))]
@@ -239,13 +256,13 @@ def _variables(model: _Known) -> list[str]:
     return heads
 
 
-def _transitions(model: FSMModel, shown: Sequence[int]) -> list[_Column]:
+def _transitions(model: Known, shown: Sequence[int]) -> list[_Column]:
     """How likely each state stays, and which other one is likeliest next."""
     matrix = model.averaged_matrix("observed")
     elsewhere = matrix - np.diag(np.diag(matrix))
     likeliest = elsewhere.argmax(axis=1)
     nexts = [
-        f"{_name(likeliest[state])} ({_percent(elsewhere[state, likeliest[state]])})"
+        f"{state_name(likeliest[state])} ({_percent(elsewhere[state, likeliest[state]])})"
         for state in shown
     ]
     return [
@@ -274,10 +291,6 @@ def _summed(
     """A column whose last row is the sum of what has no row."""
     cells = [show(values[state]) for state in shown]
     return _Column(head, cells, show(np.delete(values, list(shown)).sum()))
-
-
-def _name(state: int) -> str:
-    return f"#{state + 1}"
 
 
 def _value(number: float) -> str:
@@ -310,7 +323,7 @@ def _table(shown: Sequence[int], n: int, columns: Sequence[_Column]) -> str:
         f"<th scope='col' style='{_NUMBER}'>{escape(column.head)}</th>" for column in columns
     )
     rows = [
-        _row(_name(state), [_cell(column, row) for column in columns])
+        _row(state_name(state), [_cell(column, row) for column in columns])
         for row, state in enumerate(shown)
     ]
     if n > len(shown):

@@ -1,6 +1,6 @@
 """One observation through the machine: the paper's Section 2 on one screen.
 
-An observation may found a state (`states.ets`, or another rule), is recognised as a distribution
+An observation may create a state (`states.ets`, or another rule), is recognised as a distribution
 over states (`states.spread`), and, where an action was taken after the observation before it,
 teaches that action's transition matrix (`transitions`). An episode may end in failure, which is no
 state of the machine: it is counted, and the next observation begins another episode.
@@ -51,9 +51,9 @@ from evofsm.core.transitions import (
 )
 from evofsm.files import LARGEST_OBSERVATION
 
-# What `step` answers instead of an event where it did nothing.
+# What `step` returns instead of an event where it did nothing.
 FULL, REFUSED = -1, -2
-# What `_update` answers where it did nothing; no surprise is below 0.
+# What `_update` returns where it did nothing; no surprise is below 0.
 DECLINED = -1.0
 _COMPILING = Lock()
 # Whether a machine may have to give up states (`evofsm.core.crowding`): a number, or None. Numba
@@ -67,7 +67,7 @@ class Event(IntFlag):
     ``NONE`` left them as they were, ``MOVED`` put the nearest one on the observation, and
     ``CREATED`` founded a new one there. Where there were ``max_states`` before, two were
     ``MERGED`` or one was ``RETIRED`` to make room, and the new one has the index that became
-    free; ``MERGED`` alone says that none was founded, for the nearest one was close enough.
+    free; ``MERGED`` alone says that none was created, for the nearest one was close enough.
 
     Examples
     --------
@@ -145,11 +145,11 @@ class Trace(NamedTuple):
     n_states: NDArray[np.int64]  #: (T,) number of states after the row
     event: NDArray[np.int8]  #: (T,) values of `Event`
     surprise: NDArray[np.float64]  #: (T,) [bit], NaN where nothing was predicted
-    belief: NDArray[np.float64] | None = None  #: (T, n), 0 for states not yet founded
+    belief: NDArray[np.float64] | None = None  #: (T, n), 0 for states not yet created
 
 
 def widen(belief: NDArray[np.float64], n: int) -> NDArray[np.float64]:
-    """Beliefs (..., n) over n states, 0 for those founded since."""
+    """Beliefs (..., n) over n states, 0 for those created since."""
     missing = n - belief.shape[-1]
     return np.pad(belief, [(0, 0)] * (belief.ndim - 1) + [(0, missing)]) if missing else belief
 
@@ -171,7 +171,7 @@ def step(
     n = int(now.n_states[0])
     tick(now.outcomes, not now.chained[0])
 
-    # Section 2.2.1: does the observation move a state, or found one?
+    # Section 2.2.1: does the observation move a state, or create one?
     event, nearest, potential = determine(parameters.rule, now.clusters, n, z)
     if event == clusters.CREATED:
         event, nearest = _found(memory, n, nearest, potential, limit)
@@ -207,7 +207,7 @@ def step(
 
 @inner_kernel
 def _learn(memory: Memory, place: int, n: int, whole: bool) -> float:
-    """Learn the transition from the belief to what was recognised; answers the surprise.
+    """Learn the transition from the belief to what was recognised; returns the surprise.
 
     Where few states take part, all of the forecast is only made if asked for: a state that was
     not reached adds half of its forecast to the divergence, whichever it is.
@@ -315,7 +315,7 @@ def _compile_plain(kernel: Any, arguments: str, limit: Limit) -> None:
 def fail(buffer: NDArray[np.float64], limit: Limit) -> bool:
     """End the episode in failure, to which the pending action led from the latest observation.
 
-    Answers whether there was room for what this may found.
+    Returns whether there was room for what this may found.
     """
     memory = open_memory(buffer)
     now = memory.learnt
@@ -360,7 +360,7 @@ def room_for(memory: Memory) -> tuple[int, int]:
 
 @inner_kernel
 def _has_room(memory: Memory) -> bool:
-    """Whether another state could be founded, and the pending action have a matrix."""
+    """Whether another state could be created, and the pending action have a matrix."""
     capacity, places = room_for(memory)
     now = memory.learnt
     return capacity == len(now.belief) and places == len(now.transitions.matrices)
@@ -379,7 +379,7 @@ def _is_usable(memory: Memory, z: NDArray[np.float64]) -> bool:
 
 @inner_kernel
 def _splits(memory: Memory, nearest: int) -> bool:
-    """Whether a failure at the latest observation founds a state, amid its nearest one."""
+    """Whether a failure at the latest observation creates a state, amid its nearest one."""
     now = memory.learnt
     return splits(
         memory.parameters.rule,
@@ -392,7 +392,7 @@ def _splits(memory: Memory, nearest: int) -> bool:
 
 @inner_kernel
 def _split(memory: Memory, n: int, nearest: int, limit: Limit) -> tuple[int, int]:
-    """Found a state for a failure; the observation is absorbed and counts in its potential."""
+    """Create a state for a failure; the observation is absorbed and counts in its potential."""
     held = memory.learnt.clusters
     potential = potential_of(held, memory.parameters.rule.weights, held.latest)
     return _found(memory, n, nearest, potential, limit)
@@ -472,7 +472,7 @@ def learn_rows(
     beliefs: NDArray[np.float64],
     limit: Limit,
 ) -> int:
-    """Step through the rows from ``row`` on; answers where it stopped for want of room.
+    """Step through the rows from ``row`` on; returns where it stopped for want of room.
 
     ``beliefs`` is (T, capacity), or empty where nobody wants them.
     """

@@ -12,9 +12,6 @@ the other way round, with the same meaning of rows.)
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Literal, get_args
-
 import numpy as np
 from numba.extending import register_jitable
 from numpy.typing import NDArray
@@ -22,9 +19,6 @@ from numpy.typing import NDArray
 from evofsm.core.elementary import fma, total, work_on_line, work_on_two_lines
 from evofsm.core.kernels import LINE, inner_kernel, lanes, rare_kernel
 from evofsm.core.learnt import NOT_OPEN, SMALLEST_SCALE, Outcomes, Transitions
-from evofsm.core.validation import whole
-
-Policy = Literal["marginal", "hold", "observed"]
 
 # A weight below this is taken as 0: smaller numbers turn denormal and slow every step.
 _LOWEST_FREQUENCY = 1e-290
@@ -237,7 +231,7 @@ def forecast_and_identify(
 
     ``by_lines``, where few states are reached, only the lines with their columns are touched, and
     the others decay by the scale of their row; the forecast is then written for those columns
-    alone. Answers how much of it is missing. ``rates`` and ``lines`` are room to work in.
+    alone. Returns how much of it is missing. ``rates`` and ``lines`` are room to work in.
     """
     _set_rates(transitions, place, n, origin, learning_rate, rates, predicted)
     if by_lines:
@@ -324,7 +318,7 @@ def _by_lines(
 
 @inner_kernel
 def _lines_above_0(values: NDArray[np.float64], n: int, lines: NDArray[np.float64]) -> int:
-    """Write where the lines begin that hold anything above 0; answers how many there are."""
+    """Write where the lines begin that hold anything above 0; returns how many there are."""
     found = 0
     for begin in range(0, n, LINE):
         largest_there = 0.0
@@ -333,50 +327,3 @@ def _lines_above_0(values: NDArray[np.float64], n: int, lines: NDArray[np.float6
         lines[found] = begin
         found += largest_there > 0.0
     return found
-
-
-def marginal(
-    matrices: NDArray[np.float64],
-    uses: NDArray[np.float64],
-    n_actions: int,
-    policy: Policy = "marginal",
-) -> NDArray[np.float64]:
-    """Average the matrices of all actions: each alike, or as often as it was used.
-
-    Given are the (s, n, n) matrices of some actions and their (s,) uses; those of all others were
-    never used, so that they hold 1 / n.
-    """
-    if policy not in ("marginal", "observed"):
-        raise ValueError(f"policy is {policy!r}; an average is 'marginal' or 'observed'")
-    if policy == "observed" and uses.sum() > 0.0:
-        mixed: NDArray[np.float64] = np.tensordot(uses / uses.sum(), matrices, axes=1)
-        return mixed
-    unused = (n_actions - len(matrices)) / max(matrices.shape[-1], 1)
-    average: NDArray[np.float64] = (matrices.sum(axis=0) + unused) / n_actions
-    return average
-
-
-def propagate(
-    belief: NDArray[np.float64],
-    matrix_of: Callable[[int], NDArray[np.float64]],
-    averaged: Callable[[Policy], NDArray[np.float64]],
-    action: int | None,
-    horizon: int,
-    policy: Policy,
-) -> NDArray[np.float64]:
-    """Forecast ``horizon`` steps: the first under ``action``, the others by ``policy``.
-
-    Without an action the policy rules from the first step on.
-    """
-    if policy not in get_args(Policy):
-        raise ValueError(f"policy is {policy!r}; it must be one of {', '.join(get_args(Policy))}")
-    horizon = whole("horizon", horizon)
-    if action is None and policy == "hold":
-        raise ValueError("policy 'hold' needs the action that is held")
-    if action is not None:
-        belief = belief @ matrix_of(action)
-        horizon -= 1
-    if horizon > 0:
-        then = matrix_of(action) if action is not None and policy == "hold" else averaged(policy)
-        belief = belief @ np.linalg.matrix_power(then, horizon)
-    return belief

@@ -20,6 +20,7 @@ from evofsm.core import (
     NO_ACTION,
     NOT_OPEN,
     EvolvingFSM,
+    Inside,
     Limit,
     Memory,
     check_actions,
@@ -109,7 +110,7 @@ class Fleet:
         self._n_vehicles = whole("n_vehicles", n_vehicles)
         self._dtype = np.dtype(dtype)
         self._everyone = np.arange(self._n_vehicles)
-        self._fill(machine._buffer)
+        self._fill(Inside(machine).buffer)
 
     def __len__(self) -> int:
         return self._n_vehicles
@@ -121,7 +122,7 @@ class Fleet:
         length, of_matrices = lengths(*self._small[at : at + 4].astype(int).tolist())
         small = self._small[at : at + length]
         matrices = self._matrices[at_matrices : at_matrices + of_matrices]
-        machine._use(np.concatenate([small, matrices]))
+        Inside(machine).use(np.concatenate([small, matrices]))
         if self._dtype == _SINGLE:
             _sum_to_1(machine)
         return machine
@@ -192,8 +193,8 @@ class Fleet:
         ends = check_rows("failures", () if failures is None else failures, len(rows))
         # The number of variables is known from the first observation on.
         if len(rows) and self._small[self._at[0, 0]] == 0:
-            self._machine._fit(rows[0])
-            self._fill(self._machine._buffer)
+            Inside(self._machine).check(rows[:1])
+            self._fill(Inside(self._machine).buffer)
         if failures is not None:
             tell_of_failures(self._small, self._at[chosen, 0])
         answer = FleetStep(
@@ -204,7 +205,7 @@ class Fleet:
         )
         given = chosen, rows, actions, starts, ends
         while _step_all(
-            self._small, self._matrices, self._at, *given, *answer, self._machine._limit
+            self._small, self._matrices, self._at, *given, *answer, Inside(self._machine).limit
         ):
             self._grow(chosen[answer.event == FULL])
         return answer
@@ -291,7 +292,7 @@ class Fleet:
 
 def _sum_to_1(machine: EvolvingFSM) -> None:
     """Make rows distributions to the last digit again, which single precision does not keep."""
-    n, transitions = machine.n_states, machine._memory.learnt.transitions
+    n, transitions = machine.n_states, Inside(machine).memory.learnt.transitions
     sums = (transitions.scales[..., None] * transitions.matrices)[:, :n, :n].sum(axis=2)
     transitions.scales[:, :n] /= np.where(sums > 0.0, sums, 1.0)
 
@@ -318,7 +319,7 @@ def _step_all(
     surprise: NDArray[np.float64],
     limit: Limit,
 ) -> int:
-    """Step those that did not step yet; answers how many could not for want of room.
+    """Step those that did not step yet; returns how many could not for want of room.
 
     Its arrays are not in tuples: Numba loses what a ``prange`` writes to an array in a tuple.
     """

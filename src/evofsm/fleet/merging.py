@@ -1,7 +1,7 @@
 """Merge machines that learnt apart into one: what a fleet knows, or the shards of a log.
 
 Three steps. *Match*: the centres of all parts, strongest first, each join the nearest state within
-a radius or found one. *Add up*: what was counted, and what potentials are made of, are sums over
+a radius or create one. *Add up*: what was counted, and what potentials are made of, are sums over
 observations. *Combine*: rows of matrices by the decisions that they rest on, after taking out of
 each what is left in it of its prior::
 
@@ -25,6 +25,7 @@ from evofsm.core import (
     NOT_OPEN,
     Counts,
     EvolvingFSM,
+    Inside,
     Learnt,
     Parameters,
     arrays_of,
@@ -70,7 +71,7 @@ def merge(machines: Sequence[EvolvingFSM], *, radius: float | None = None) -> Ev
     Notes
     -----
     *States.* By visits, strongest first, a centre joins the nearest state within ``radius``, else
-    it founds one: what the rule `Novelty` would have made of the centres. A merged centre is the
+    it creates one: what the rule `Novelty` would have made of the centres. A merged centre is the
     strongest of its group, and not the mean. So it remains an observation that was made, no
     centre of that rule moves, and all remain farther apart than ``radius``, which the width of
     recognition is made for. Two states of one part may join the same third one, but not where
@@ -100,7 +101,7 @@ def merge(machines: Sequence[EvolvingFSM], *, radius: float | None = None) -> Ev
 
     *Further*: mean and scatter are pooled exactly [1]_. A centre's potential is what the recursion
     would have made of it, had it seen the data of all other parts since; ``founded`` is one more
-    than the observations that were made before, in the parts that founded it. An episode that came
+    than the observations that were made before, in the parts that created it. An episode that came
     to two states of one part that are joined is counted twice.
 
     References
@@ -124,11 +125,11 @@ def merge(machines: Sequence[EvolvingFSM], *, radius: float | None = None) -> Ev
         alone = (experienced or parts)[0].copy()
         alone.start_episode()
         return alone
-    parameters = experienced[0]._memory.parameters
+    parameters = Inside(experienced[0]).memory.parameters
     within = parameters.rule.radius if radius is None else positive("radius", radius)
-    learnt = sorted((part._trimmed() for part in experienced), key=_content)
+    learnt = sorted((Inside(part).trimmed() for part in experienced), key=_content)
     match = _match(learnt, parameters, within)
-    merged = experienced[0]._holding(
+    merged = Inside(experienced[0]).holding(
         {
             **_blank(match),
             **_counts(learnt, match),
@@ -165,7 +166,7 @@ def _refuse_unlike(machines: Iterable[EvolvingFSM]) -> list[EvolvingFSM]:
                     f"{name} of machine {number} is {given!r}, but {expected!r} of machine 0; "
                     "machines to merge must have the same settings"
                 )
-    if np.isfinite(parts[0]._memory.parameters.rule.memory):
+    if np.isfinite(Inside(parts[0]).memory.parameters.rule.memory):
         raise ValueError(
             f"machines with {parts[0].rule} cannot be merged: what each still remembers depends on "
             "when it saw it"
@@ -280,7 +281,7 @@ def _densities(
     """Pool the data's mean, scatter and potentials.
 
     ``(t - 1) / potential`` is a sum over z_1 .. z_{t-1}, of ``1 + rho |z - centre|^2`` for each
-    observation since the centre was founded; see `clusters.update_potentials`. That
+    observation since the centre was created; see `clusters.update_potentials`. That
     sum over another part's data is known from their mean and scatter.
     """
     rho, weights = parameters.rule.distance_weight, parameters.rule.weights
@@ -386,7 +387,7 @@ def _prior_left(
 ) -> NDArray[np.float64]:
     """What the prior has left in joint frequencies (s, n, n); no more than they are.
 
-    A state's founding gives the prior frequency to all transitions between it and those before,
+    A state's creation gives the prior frequency to all transitions between it and those before,
     which then age alike. Where the least of those into it and the least of those out of it agree,
     this is what is left; else it is as much as all uses would leave, which is less. (Where an
     index was given to a newer state, less is found than there is.)

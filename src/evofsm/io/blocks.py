@@ -8,7 +8,6 @@ from hashlib import blake2b
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.io.plain import Texts
 from evofsm.io.tables import Piece
 
 # Episodes of a file that are kept in mind, some 30 MB; of those after them nothing is known.
@@ -31,26 +30,34 @@ class Blocks:
         self._names = names
         self._episodes: set[bytes] = set()
         self._blocks = 0  # of these episodes
+        self._latest: tuple[str, ...] | None = None
 
-    def see(self, piece: Piece, keys: Sequence[Texts], starts: NDArray[np.bool_]) -> None:
-        """Look at the next rows, of which those at ``starts`` begin another episode.
+    def starts(self, piece: Piece) -> NDArray[np.bool_]:
+        """The rows of the next piece that begin another episode.
 
         Raises
         ------
         ValueError
             If one of the episodes was there before.
         """
-        rows = np.flatnonzero(starts)
-        came_back = -1
-        for row, key in zip(rows.tolist(), _keys(keys, rows), strict=True):
-            digest = blake2b(repr(key).encode(), digest_size=16).digest()
+        keys = [piece.texts[name] for name in self._names]
+        starts = np.zeros(len(piece.places), np.bool_)
+        for key in keys:
+            starts[key.firsts] = True
+        starts[0] = self._latest != tuple(key.at(0) for key in keys)
+        self._latest = tuple(key.at(len(starts) - 1) for key in keys)
+        came_back = None
+        for row in np.flatnonzero(starts).tolist():
+            episode = repr([key.at(row) for key in keys])
+            digest = blake2b(episode.encode(), digest_size=16).digest()
             if digest in self._episodes:
-                came_back = row if came_back < 0 else came_back
-                self._blocks += 1
+                came_back = row if came_back is None else came_back
             elif len(self._episodes) < _MOST_EPISODES:
                 self._episodes.add(digest)
-                self._blocks += 1
-        if came_back >= 0:
+            else:
+                continue
+            self._blocks += 1
+        if came_back is not None:
             names = ", ".join(self._names)
             values = ", ".join(key.at(came_back)[:40] for key in keys)
             raise ValueError(
@@ -59,12 +66,4 @@ class Blocks:
                 f"take turns in {self._blocks:,} blocks of rows, and each block would be taken for "
                 f"an episode of its own; sort the file by {names} and then by time"
             )
-
-
-def _keys(columns: Sequence[Texts], rows: NDArray[np.int64]) -> list[tuple[str, ...]]:
-    """What tells the episodes of some rows from others."""
-    texts = []
-    for column in columns:
-        places = np.searchsorted(column.firsts, rows, side="right") - 1
-        texts.append([column.values[place] for place in places.tolist()])
-    return [*zip(*texts, strict=True)] if texts else [()] * len(rows)
+        return starts

@@ -11,9 +11,9 @@ from __future__ import annotations
 
 import math
 from array import array
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
-from itertools import pairwise
+from itertools import chain, pairwise
 from typing import NamedTuple, Self
 from xml.parsers import expat
 
@@ -21,16 +21,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evofsm.core import positive
+from evofsm.driving import VARIABLES
 from evofsm.files import LARGEST_OBSERVATION
 from evofsm.io.files import OnRead, damage_explained, open_unpacked
-from evofsm.io.tables import Table, explain_text
+from evofsm.io.tables import Piece, Table, explain_text
 
 #: The action of a pair of vehicles: what the follower did until the next timestep.
 ACTION = "a_follower"
+#: What is known of a pair at one time.
+COLUMNS = ("time", *VARIABLES, ACTION)
 #: The column by which an FCD table is known.
 TIME = "timestep_time"
 
 _BYTES_AT_ONCE = 1 << 16
+_ROWS_AT_ONCE = 8192
 # Those that the parser knows itself; for any other it would ask Python's codecs.
 _ENCODINGS = ("utf-8", "us-ascii", "iso-8859-1", "utf-16")
 # What SUMO writes stays far below these, which bound what a file can make of memory: bytes of a tag
@@ -128,10 +132,56 @@ class Timestep(NamedTuple):
 class Episode(NamedTuple):
     """A pair for as long as it stays one: T timesteps."""
 
-    times: NDArray[np.float64]  #: (T,) [s]
-    observations: NDArray[np.float64]  #: (T, 3) `VARIABLES`
-    actions: NDArray[np.float64]  #: (T,) [m/s²], NaN in the last row
+    rows: NDArray[np.float64]  #: (T, 5) `COLUMNS`; the action is NaN in the last row
     was_cut: bool  #: the pair went on, in an episode of its own
+
+
+class PairTable:
+    """The pairs in FCD output, as a table with a row for each pair and time.
+
+    Parameters
+    ----------
+    path : str
+        For messages.
+    timesteps : iterable of Timestep
+    lengths : VehicleLengths
+    """
+
+    columns: tuple[str, ...] = COLUMNS
+
+    def __init__(self, path: str, timesteps: Iterable[Timestep], lengths: VehicleLengths) -> None:
+        self.path = path
+        self._episodes = pair_episodes(checked(path, timesteps), lengths)
+
+    def holds_dates(self, name: str) -> bool:
+        """Never: SUMO's clock counts seconds."""
+        return False
+
+    def pieces(self, *_: Sequence[str]) -> Iterator[Piece]:
+        """All columns, whichever are asked for; episodes end to end, some thousand rows at once."""
+        reached, waiting, count = 0, list[Episode](), 0
+        for episode in chain(self._episodes, [None]):
+            if episode is not None:
+                waiting.append(episode)
+                count += len(episode.rows)
+            if count >= (_ROWS_AT_ONCE if episode is not None else 1):
+                for piece in self._joined(waiting, reached):
+                    reached += len(piece.places)
+                    yield piece
+                waiting, count = [], 0
+        if reached == 0:
+            raise ValueError(f"{self.path}: no vehicle ever follows another one on the same lane")
+
+    def _joined(self, episodes: Sequence[Episode], reached: int) -> Iterator[Piece]:
+        table = np.concatenate([episode.rows for episode in episodes])
+        starts = np.cumsum([0, *(len(episode.rows) for episode in episodes[:-1])])
+        cuts = sum(episode.was_cut for episode in episodes)
+        for first in range(0, len(table), _ROWS_AT_ONCE):
+            part = table[first : first + _ROWS_AT_ONCE]
+            places = np.arange(reached + first + 1, reached + first + len(part) + 1)
+            within = starts[(starts >= first) & (starts < first + len(part))] - first
+            numbers = dict(zip(COLUMNS, part.T, strict=True))
+            yield Piece(self.path, "row", places, numbers, {}, within, 0 if first else cuts)
 
 
 def pair_episodes(timesteps: Iterable[Timestep], lengths: VehicleLengths) -> Iterator[Episode]:
@@ -167,7 +217,7 @@ def _episode(rows: array[float], was_cut: bool = False) -> Episode:
     with np.errstate(over="ignore"):
         actions = np.append(np.diff(speeds) / np.diff(times), np.nan)
     actions[np.isinf(actions)] = np.nan  # beyond any number: none is known
-    return Episode(times, table[:, 1:], actions, was_cut)
+    return Episode(np.column_stack([table, actions]), was_cut)
 
 
 def checked(path: str, timesteps: Iterable[Timestep]) -> Iterator[Timestep]:

@@ -11,8 +11,8 @@ observation, or from the prior alone.
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from typing import NamedTuple
 from xml.etree import ElementTree as ET
 
 import numpy as np
@@ -22,6 +22,9 @@ from evofsm.core import FSMModel, Policy
 
 # Vermillion of Okabe and Ito's colours; what is marked by it has another shape and words as well.
 _DEAD_END = "#D55E00"
+_DOT_MARK = (
+    f',\n      shape=hexagon, style=filled, fillcolor="{_DEAD_END}", fontcolor=white, penwidth=2'
+)
 # Width of the largest node beyond the smallest [inch], and of the line of a certain edge [point].
 _LARGEST_NODE, _WIDEST_LINE = 1.2, 3.0
 _GRAPHML = "http://graphml.graphdrawing.org/xmlns"
@@ -29,47 +32,16 @@ _GRAPHML = "http://graphml.graphdrawing.org/xmlns"
 _DECIMALS = 12
 
 
-@dataclass(frozen=True)
-class _Node:
-    """A state as it is drawn."""
+class _Graph(NamedTuple):
+    """What all graphs show."""
 
-    number: int  # from 1
-    center: list[tuple[str, float, str]]  # name, value and unit of each variable
-    visits: float
-    founded: float
-    endings: float
-    all_endings: float
-    is_dead_end: bool
-    is_called_dead_end: bool
-
-    @property
-    def lines(self) -> list[str]:
-        """What stands in it."""
-        lines = [f"#{self.number}"]
-        for name, value, unit in self.center:
-            lines.append(" ".join(part for part in (name, f"{value:.4g}", unit) if part))
-        lines.append(_counted(self.visits, "visit"))
-        if self.endings:
-            share = self.endings / self.all_endings
-            lines.append(f"{_counted(self.endings, 'failure')}, {share:.0%} of all")
-        if self.is_called_dead_end:
-            lines.append("dead end")
-        return lines
+    lines: list[list[str]]  # what stands in each state
+    marked: frozenset[int]  # states that are drawn as dead ends
+    edges: list[tuple[int, int, float, float]]  # from, to, probability and how often it was seen
 
 
-@dataclass(frozen=True)
-class _Edge:
-    """A transition as it is drawn."""
-
-    begin: int  # number of a state, from 1
-    end: int
-    probability: float
-    changes: float  # how often it was seen
-
-    @property
-    def label(self) -> str:
-        """Probability, and how often it was seen."""
-        return f"{self.probability:.3f} ({self.changes:,.0f})"
+def _label(probability: float, seen: float) -> str:
+    return f"{probability:.3f} ({seen:,.0f})"
 
 
 def to_dot(
@@ -132,7 +104,7 @@ def to_dot(
     }
     <BLANKLINE>
     """
-    nodes, edges = _graph(model, policy, least, evidence, self_loops, dead_ends)
+    graph = _graph(model, policy, least, evidence, self_loops, dead_ends)
     lines = [
         "digraph evofsm {",
         '  graph [rankdir=LR, fontname="Helvetica", fontsize=10, labelloc=b,',
@@ -140,23 +112,16 @@ def to_dot(
         '  node [shape=ellipse, fontname="Helvetica", fontsize=10];',
         '  edge [fontname="Helvetica", fontsize=9];',
     ]
-    most = max((node.visits for node in nodes), default=0.0) or 1.0
-    for node in nodes:
-        label = r"\n".join(_dot_text(line) for line in node.lines)
-        width = 0.75 + _LARGEST_NODE * (node.visits / most) ** 0.5
-        marked = (
-            f',\n      shape=hexagon, style=filled, fillcolor="{_DEAD_END}", fontcolor=white, '
-            "penwidth=2"
-            if node.is_dead_end
-            else ""
-        )
-        lines.append(f'  s{node.number} [label="{label}", width={width:.2f}{marked}];')
-    for edge in edges:
-        width = max(_WIDEST_LINE * edge.probability, 0.3)
-        dashed = "" if edge.changes else ", style=dashed"
-        lines.append(
-            f'  s{edge.begin} -> s{edge.end} [label="{edge.label}", penwidth={width:.2f}{dashed}];'
-        )
+    most = model.visits.max(initial=0.0) or 1.0
+    for state, texts in enumerate(graph.lines):
+        label = r"\n".join(_dot_text(text) for text in texts)
+        width = 0.75 + _LARGEST_NODE * (model.visits[state] / most) ** 0.5
+        marked = _DOT_MARK if state in graph.marked else ""
+        lines.append(f'  s{state + 1} [label="{label}", width={width:.2f}{marked}];')
+    for i, j, probability, seen in graph.edges:
+        width = max(_WIDEST_LINE * probability, 0.3)
+        told = f'label="{_label(probability, seen)}", penwidth={width:.2f}'
+        lines.append(f"  s{i + 1} -> s{j + 1} [{told}{'' if seen else ', style=dashed'}];")
     return "\n".join([*lines, "}", ""])
 
 
@@ -200,15 +165,15 @@ def to_mermaid(
       classDef marked fill:#D55E00,color:#fff,stroke:#222,stroke-width:2px
     <BLANKLINE>
     """
-    nodes, edges = _graph(model, policy, least, evidence, self_loops, dead_ends)
+    graph = _graph(model, policy, least, evidence, self_loops, dead_ends)
     lines = ["flowchart LR"]
-    for node in nodes:
-        label = "<br/>".join(_mermaid_text(line) for line in node.lines)
-        shape = f'{{{{"{label}"}}}}:::marked' if node.is_dead_end else f'(["{label}"])'
-        lines.append(f"  s{node.number}{shape}")
-    for edge in edges:
-        arrow = "-->" if edge.changes else "-.->"
-        lines.append(f'  s{edge.begin} {arrow}|"{edge.label}"| s{edge.end}')
+    for state, texts in enumerate(graph.lines):
+        label = "<br/>".join(_mermaid_text(text) for text in texts)
+        shape = f'{{{{"{label}"}}}}:::marked' if state in graph.marked else f'(["{label}"])'
+        lines.append(f"  s{state + 1}{shape}")
+    for i, j, probability, seen in graph.edges:
+        arrow = "-->" if seen else "-.->"
+        lines.append(f'  s{i + 1} {arrow}|"{_label(probability, seen)}"| s{j + 1}')
     lines.append(f"  classDef marked fill:{_DEAD_END},color:#fff,stroke:#222,stroke-width:2px")
     return "\n".join([*lines, ""])
 
@@ -250,7 +215,7 @@ def to_graphml(
     >>> [line.strip() for line in document.splitlines() if "center" in line][0]
     '<key id="center1" for="node" attr.name="center.gap" attr.type="double">'
     """
-    nodes, edges = _graph(model, policy, least, evidence, self_loops, dead_ends)
+    graph = _graph(model, policy, least, evidence, self_loops, dead_ends)
     root = ET.Element("graphml", xmlns=_GRAPHML)
     of_nodes = {"label": "string", "visits": "double", "founded": "double", "failures": "double"}
     for name, kind in {**of_nodes, "dead_end": "boolean"}.items():
@@ -260,20 +225,20 @@ def to_graphml(
         ET.SubElement(key, "desc").text = _xml_text(unit) or "no unit"
     for name in ("probability", "changes"):
         _key(root, name, "edge", name, "double")
-    graph = ET.SubElement(root, "graph", id="evofsm", edgedefault="directed")
-    for node in nodes:
-        element = ET.SubElement(graph, "node", id=f"s{node.number}")
-        _data(element, "label", f"#{node.number}")
-        _data(element, "visits", node.visits)
-        _data(element, "founded", node.founded)
-        _data(element, "failures", node.endings)
-        _data(element, "dead_end", str(node.is_dead_end).lower())
-        for place, (_, value, _) in enumerate(node.center, 1):
-            _data(element, f"center{place}", value)
-    for edge in edges:
-        element = ET.SubElement(graph, "edge", source=f"s{edge.begin}", target=f"s{edge.end}")
-        _data(element, "probability", edge.probability)
-        _data(element, "changes", edge.changes)
+    parent = ET.SubElement(root, "graph", id="evofsm", edgedefault="directed")
+    for i, center in enumerate(model.centers.tolist()):
+        data = {
+            "label": f"#{i + 1}",
+            "visits": float(model.visits[i]),
+            "founded": float(model.founded[i]),
+            "failures": float(model.endings[i]),
+            "dead_end": str(i in graph.marked).lower(),
+            **{f"center{place}": value for place, value in enumerate(center, 1)},
+        }
+        _data(ET.SubElement(parent, "node", id=f"s{i + 1}"), data)
+    for i, j, probability, seen in graph.edges:
+        edge = ET.SubElement(parent, "edge", source=f"s{i + 1}", target=f"s{j + 1}")
+        _data(edge, {"probability": probability, "changes": seen})
     ET.indent(root)
     return "<?xml version='1.0' encoding='UTF-8'?>\n" + ET.tostring(root, "unicode") + "\n"
 
@@ -285,35 +250,37 @@ def _graph(
     evidence: float,
     self_loops: bool,
     dead_ends: Collection[int] | None,
-) -> tuple[list[_Node], list[_Edge]]:
-    """What all graphs show."""
+) -> _Graph:
     _refuse_no_probability(least)
     ended = np.flatnonzero(model.endings) if dead_ends is None else dead_ends
     marked = frozenset(int(state) for state in ended)
     if beyond := sorted(state for state in marked if not 0 <= state < model.n_states):
         raise ValueError(f"dead_ends names {beyond}; the model has {model.n_states} states, from 0")
-    names, units = _variables(model)
-    nodes = [
-        _Node(
-            number=i + 1,
-            center=list(zip(names, model.centers[i].tolist(), units, strict=True)),
-            visits=float(model.visits[i]),
-            founded=float(model.founded[i]),
-            endings=float(model.endings[i]),
-            all_endings=float(model.endings.sum()),
-            is_dead_end=i in marked,
-            is_called_dead_end=dead_ends is not None and i in dead_ends,
-        )
-        for i in range(model.n_states)
-    ]
+    lines = []
+    for state in range(model.n_states):
+        texts = [f"#{state + 1}", *_where(model, state), _counted(model.visits[state], "visit")]
+        if ends := model.endings[state]:
+            share = ends / model.endings.sum()
+            texts.append(f"{_counted(ends, 'failure')}, {share:.0%} of all")
+        if dead_ends is not None and state in marked:
+            texts.append("dead end")
+        lines.append(texts)
     matrix = model.averaged_matrix(policy)
-    drawn = (matrix >= least) & (model.changes >= evidence)
+    drawn = (matrix >= least) & (model.changes >= evidence) & (matrix > 0.0)
     edges = [
-        _Edge(i + 1, j + 1, float(matrix[i, j]), float(model.changes[i, j]))
-        for i, j in np.argwhere(drawn & (matrix > 0.0)).tolist()
+        (i, j, float(matrix[i, j]), float(model.changes[i, j]))
+        for i, j in np.argwhere(drawn).tolist()
         if self_loops or i != j
     ]
-    return nodes, edges
+    return _Graph(lines, marked, edges)
+
+
+def _where(model: FSMModel, state: int) -> list[str]:
+    """Name, value and unit of each variable at the centre of a state."""
+    return [
+        " ".join(part for part in (_one_line(name), f"{value:.4g}", _one_line(unit)) if part)
+        for name, unit, value in zip(*_variables(model), model.centers[state], strict=True)
+    ]
 
 
 def _variables(model: FSMModel) -> tuple[Sequence[str], Sequence[str]]:
@@ -354,8 +321,9 @@ def _key(root: ET.Element, key: str, of: str, name: str, kind: str) -> ET.Elemen
     return ET.SubElement(root, "key", told)
 
 
-def _data(element: ET.Element, key: str, value: str | float) -> None:
-    ET.SubElement(element, "data", key=key).text = str(value)
+def _data(element: ET.Element, values: Mapping[str, str | float]) -> None:
+    for key, value in values.items():
+        ET.SubElement(element, "data", key=key).text = str(value)
 
 
 # -- PRISM ----------------------------------------------------------------------------------------
@@ -479,13 +447,8 @@ def _header(model: FSMModel, evidence: float, least: float, unknown: int) -> lis
 
 
 def _described(model: FSMModel, state: int) -> str:
-    names, units = _variables(model)
-    where = [
-        " ".join(part for part in (_one_line(name), f"{value:.4g}", _one_line(unit)) if part)
-        for name, value, unit in zip(names, model.centers[state].tolist(), units, strict=True)
-        if name
-    ]
-    return ", ".join([f"#{state + 1}", *where, _counted(float(model.visits[state]), "visit")])
+    where = _where(model, state) if model.names else []
+    return ", ".join([f"#{state + 1}", *where, _counted(model.visits[state], "visit")])
 
 
 def _commands(model: FSMModel, state: int, evidence: float, least: float) -> Iterator[str]:

@@ -42,6 +42,9 @@ class Piece:
     places: NDArray[np.int64]  #: (T,)
     numbers: dict[str, NDArray[np.float64]]
     texts: dict[str, Texts]
+    #: Rows that begin an episode, of a table that knows; None where columns tell episodes apart.
+    starts: NDArray[np.int64] | None = None
+    cuts: int = 0  #: episodes in it that were cut because too many pairs were on the road at once
 
     def at(self, row: int) -> str:
         """Where a row stands, for a message."""
@@ -94,7 +97,7 @@ class CsvTable:
             self.columns = tuple(name.strip() for name in next(rows, []))
             self._header_lines = rows.line_num
             self._header_size = sum(len(line.encode()) for line in (first, *header))
-        if all(_is_number(name) for name in self.columns):
+        if all(_reads(name) for name in self.columns):
             raise ValueError(
                 f"{path}, line 1: {unmarked.strip()[:200]!r} is no header; the first line must "
                 "name the columns"
@@ -351,15 +354,8 @@ def _kept(lines: Iterator[str], into: list[str]) -> Iterator[str]:
         yield line
 
 
-def _is_date(text: str) -> bool:
-    try:
-        microseconds([text])
-    except ValueError:
-        return False
-    return True
-
-
-def _is_number(text: str, read: Callable[[str], float] = float) -> bool:
+def _reads(text: str, read: Callable[[str], object] = float) -> bool:
+    """Whether a text can be read, as a number or by another function."""
     try:
         read(text)
     except ValueError:
@@ -372,7 +368,7 @@ def _numbers(piece: Piece, name: str, fields: Sequence[str], may_lack: bool) -> 
     try:
         values = np.fromiter(map(read, fields), np.float64, len(fields))
     except ValueError:
-        row = next(row for row, field in enumerate(fields) if not _is_number(field, read))
+        row = next(row for row, field in enumerate(fields) if not _reads(field, read))
         raise ValueError(f"{piece.at(row)}, column {name!r}: {explain_text(fields[row])}") from None
     if not may_lack:
         refuse_unusable(piece, name, values)
@@ -385,8 +381,8 @@ def _microseconds(piece: Piece, name: str) -> NDArray[np.float64]:
     try:
         return np.repeat(microseconds(texts.values), texts.lengths)
     except ValueError as error:
-        is_date = [_is_date(text) for text in texts.values]
-        row = 0 if all(is_date) else int(texts.firsts[is_date.index(False)])
+        wrong = [not _reads(text, lambda one: microseconds([one])) for text in texts.values]
+        row = int(texts.firsts[wrong.index(True)]) if any(wrong) else 0
         raise ValueError(
             f"{piece.at(row)}, column {name!r}: {error}; the first row has a date, so all must "
             "have one in ISO 8601, such as 2026-03-14T09:26:53.5+01:00"
@@ -412,6 +408,6 @@ def explain_text(text: str) -> str:
             "the field is empty (a missing measurement, or no leader? --no-leader end leaves such "
             "rows out; an episode's last action may be any number)"
         )
-    if _is_number(text.replace(",", ".")):
+    if _reads(text.replace(",", ".")):
         return f"{text[:40]!r} is no number (a decimal comma? write 1.5)"
     return f"{text[:40]!r} is no number (a text, a date, or a unit behind the number?)"

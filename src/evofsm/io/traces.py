@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -17,7 +17,6 @@ from evofsm.io.blocks import Blocks
 from evofsm.io.conditions import Condition
 from evofsm.io.fcd import VehicleLengths
 from evofsm.io.files import OnRead, ignore, kind_of
-from evofsm.io.plain import Texts
 from evofsm.io.tables import CsvTable, ParquetTable, Piece, Table, refuse_unusable
 from evofsm.io.units import KNOWN, of_columns
 
@@ -33,8 +32,6 @@ _SPEED = re.compile(r"v([_0-9]|$)|.*(speed|velocity)", re.IGNORECASE)
 _MICROSECOND = 1e-6
 # Share by which the usual steps of two files may differ.
 _SAME_STEP = 0.05
-
-_ROWS_AT_ONCE = 8192
 
 
 class Chunk(NamedTuple):
@@ -197,11 +194,14 @@ def _read_file(
 ) -> Iterator[Chunk]:
     kind = kind_of(path)
     if kind == "xml":
-        return _read_fcd(path, fcd.xml_timesteps(path, on_read), columns, lengths, clock, noted)
-    table: Table = CsvTable(path, on_read) if kind == "csv" else ParquetTable(path, on_read)
-    if fcd.TIME in table.columns:
-        return _read_fcd(path, fcd.table_timesteps(table), columns, lengths, clock, noted)
-    return _read_log(table, columns, clock, noted)
+        timesteps = fcd.xml_timesteps(path, on_read)
+    else:
+        table: Table = CsvTable(path, on_read) if kind == "csv" else ParquetTable(path, on_read)
+        if fcd.TIME not in table.columns:
+            return _read_table(table, columns, clock, noted)
+        timesteps = fcd.table_timesteps(table)
+    pairs = fcd.PairTable(path, timesteps, lengths)
+    return _read_table(pairs, _columns_of_fcd(path, columns), clock, noted)
 
 
 # -- Time -----------------------------------------------------------------------------------------
@@ -309,7 +309,7 @@ class _Sieve:
         return kept, fails
 
 
-def _read_log(table: Table, columns: LogColumns, clock: _Clock, noted: Noted) -> Iterator[Chunk]:
+def _read_table(table: Table, columns: LogColumns, clock: _Clock, noted: Noted) -> Iterator[Chunk]:
     variables = columns.observe.variables
     observed = [v for v in variables if isinstance(v, str)]
     learnt = [*observed, columns.action]
@@ -327,7 +327,6 @@ def _read_log(table: Table, columns: LogColumns, clock: _Clock, noted: Noted) ->
     gaps = learnt if columns.leader_may_lack else []
 
     rows_before = 0
-    key_before: list[str] | None = None
     blocks = Blocks(episode)
     first_date = np.nan
     sieve = _Sieve(noted)
@@ -337,12 +336,11 @@ def _read_log(table: Table, columns: LogColumns, clock: _Clock, noted: Noted) ->
             continue
         for name, factor in factors.items():
             piece.numbers[name] = piece.numbers[name] * factor
-        keys = [piece.texts[name] for name in episode]
-        starts = np.zeros(rows, np.bool_)
-        for key in keys:
-            starts[key.firsts] = True
-        starts[0] = key_before != _key(keys, 0)
-        blocks.see(piece, keys, starts)
+        if piece.starts is None:
+            starts = blocks.starts(piece)
+        else:
+            starts = np.zeros(rows, np.bool_)
+            starts[piece.starts] = True
         anew, holes = starts.copy(), np.zeros(rows, np.bool_)
         if clock.ticks:
             times = piece.numbers[columns.time]
@@ -353,7 +351,7 @@ def _read_log(table: Table, columns: LogColumns, clock: _Clock, noted: Noted) ->
             starts |= holes
         else:
             times = np.arange(rows_before, rows_before + rows) * np.float64(clock.dt)
-        rows_before, key_before = rows_before + rows, _key(keys, rows - 1)
+        rows_before += rows
         lacking = _lacking(piece, observed) if columns.leader_may_lack else None
         holds = None if failed is None else failed.holds(piece)
         kept, fails = sieve.sift(anew, starts, holds, lacking)
@@ -373,6 +371,7 @@ def _read_log(table: Table, columns: LogColumns, clock: _Clock, noted: Noted) ->
             starts=np.flatnonzero(starts[rows_learnt]),
             dt=clock.dt,
             jumps=int(holes[rows_learnt].sum()),
+            cuts=piece.cuts,
             failures=None if failed is None else np.flatnonzero(fails[rows_learnt]),
         )
 
@@ -395,11 +394,6 @@ def _lacking(piece: Piece, observed: Sequence[str]) -> NDArray[np.bool_]:
     for name in observed:
         lacking |= ~np.isfinite(piece.numbers[name])
     return lacking
-
-
-def _key(columns: Sequence[Texts], row: int) -> list[str]:
-    """What tells the episode of a row from others."""
-    return [column.at(row) for column in columns]
 
 
 def _episode_columns(table: Table, asked: Sequence[str] | None) -> Sequence[str]:
@@ -443,36 +437,14 @@ def _encode(piece: Piece, variable: str | Category) -> NDArray[np.float64]:
     return np.repeat([codes[value] for value in texts.values], texts.lengths, axis=0)
 
 
-# -- FCD ------------------------------------------------------------------------------------------
+def _columns_of_fcd(path: str, columns: LogColumns) -> LogColumns:
+    """What is read of FCD output, which has a clock and episodes of its own.
 
-
-def _read_fcd(
-    path: str,
-    timesteps: Iterable[fcd.Timestep],
-    columns: LogColumns,
-    lengths: VehicleLengths,
-    clock: _Clock,
-    noted: Noted,
-) -> Iterator[Chunk]:
-    chosen = _fcd_variables(path, columns)
-    sieve = None if columns.failed is None else _Sieve(noted)
-    waiting: list[fcd.Episode] = []
-    rows = 0
-    found = False
-    for episode in fcd.pair_episodes(fcd.checked(path, timesteps), lengths):
-        found = True
-        waiting.append(episode)
-        rows += len(episode.times)
-        if rows >= _ROWS_AT_ONCE:
-            yield from _join(path, waiting, chosen, clock, columns.failed, sieve)
-            waiting, rows = [], 0
-    if waiting:
-        yield from _join(path, waiting, chosen, clock, columns.failed, sieve)
-    if not found:
-        raise ValueError(f"{path}: no vehicle ever follows another one on the same lane")
-
-
-def _fcd_variables(path: str, columns: LogColumns) -> list[int]:
+    Raises
+    ------
+    ValueError
+        If something else was asked for.
+    """
     asked = [f"--observe {name}" for name in columns.observe.names if name not in VARIABLES]
     asked += [f"--action {columns.action}"] if columns.action != fcd.ACTION else []
     asked += ["--episode"] if columns.episode is not None else []
@@ -487,45 +459,4 @@ def _fcd_variables(path: str, columns: LogColumns) -> list[int]:
             f"{', '.join(VARIABLES)} and the action {fcd.ACTION}, and cannot be read with "
             f"{', '.join(asked)}"
         )
-    return [VARIABLES.index(name) for name in columns.observe.names]
-
-
-def _join(
-    path: str,
-    episodes: Sequence[fcd.Episode],
-    chosen: list[int],
-    clock: _Clock,
-    failed: Condition | None,
-    sieve: _Sieve | None,
-) -> Iterator[Chunk]:
-    """Episodes end to end, cut into chunks of a bounded number of rows."""
-    times = np.concatenate([episode.times for episode in episodes])
-    seen = np.vstack([episode.observations for episode in episodes])
-    observations = seen[:, chosen]
-    actions = np.concatenate([episode.actions for episode in episodes])
-    lengths = [len(episode.times) for episode in episodes]
-    starts = np.zeros(len(times), np.bool_)
-    starts[np.cumsum([0, *lengths[:-1]])] = True
-    holes = clock.holes(times, starts, lambda row: path)
-    anew = starts.copy()
-    starts |= holes
-    fails = None
-    if failed is not None and sieve is not None:
-        values = dict(zip((*VARIABLES, fcd.ACTION), (*seen.T, actions), strict=True))
-        kept, fails = sieve.sift(anew, starts, failed.compare(values[failed.column]), None)
-        times, observations, actions = times[kept], observations[kept], actions[kept]
-        starts, holes, fails = starts[kept], holes[kept], fails[kept]
-    cuts = sum(episode.was_cut for episode in episodes)
-    for first in range(0, len(times), _ROWS_AT_ONCE):
-        part = slice(first, first + _ROWS_AT_ONCE)
-        yield Chunk(
-            source=path,
-            observations=observations[part],
-            actions=actions[part],
-            times=times[part],
-            starts=np.flatnonzero(starts[part]),
-            dt=clock.dt,
-            jumps=int(holes[part].sum()),
-            cuts=cuts if first == 0 else 0,
-            failures=None if fails is None else np.flatnonzero(fails[part]),
-        )
+    return replace(columns, time="time", leader_may_lack=False)

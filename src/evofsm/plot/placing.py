@@ -28,7 +28,7 @@ def around(width: float, height: float, distances: Iterable[float]) -> Rows:
         (90, 270, 0, 180, *(90, 90, 270, 270), *range(45, 360, 90), *range(20, 360, 50))
     )
     ways = np.column_stack([np.cos(angles), np.sin(angles)])
-    ends = ways.copy()
+    ends = np.sign(ways.round(9))  # of several ways the box is equally far
     ends[4:8, 0] = (-0.9, 0.9, -0.9, 0.9)  # above and below, to one side
     half = 0.5 * np.array([width, height])
     return np.concatenate([distance * ways + half * ends for distance in distances])
@@ -77,7 +77,7 @@ def settle(
         cost += _COVERED * _shared(candidates, boxes).sum(axis=1)
         if frame is not None:
             cost -= _COVERED * _shared(candidates, np.array([frame]))[:, 0]
-        best = int(np.argmin(cost))
+        best = int(np.argmin(cost.round(6)))
         found.append(tried[best])
         boxes = np.vstack([boxes, candidates[best]])
     return np.array(found).reshape(-1, 2)

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from evofsm.core.machine import EvolvingFSM
 from evofsm.core.model import FSMModel
-from evofsm.core.states.dispatch import describe, restore
+from evofsm.core.states.dispatch import describe, register_rule, restore
 from evofsm.core.states.edges import Edges
 from evofsm.core.states.ets import Paper
 from evofsm.core.states.failure import FailureSplit
@@ -212,3 +212,17 @@ def test_a_rule_beyond_its_range_is_not_even_written(tmp_path):
         storage.write(
             path, "machine", {**content, "rule": {"name": "novelty", "radius": -1}}, arrays
         )
+
+
+@pytest.mark.parametrize("name", ["radius", "spread"])
+def test_no_setting_is_ignored_beside_a_rule_that_has_its_own(name):
+    with pytest.raises(ValueError, match=f"{name} is .*, but the rule has its own: Novelty"):
+        EvolvingFSM(1, rule=Novelty(radius=1.0), **{name: {"radius": 0.3, "spread": 3.0}[name]})
+
+
+def test_a_rule_is_registered_once_under_its_name():
+    register_rule("novelty", Novelty)
+    with pytest.raises(ValueError, match="a state rule 'novelty' already: Novelty"):
+        register_rule("novelty", Edges)
+    with pytest.raises(TypeError, match="is no state rule"):
+        register_rule("something", int)

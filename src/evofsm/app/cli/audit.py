@@ -5,7 +5,7 @@ from __future__ import annotations
 import textwrap
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from evofsm.app.cli.common import print_json, say
 from evofsm.app.cli.declared import argument, option
@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from evofsm.guard import Contents, Field, Replay
 
 _LABEL = 10
+# Of what was found, in the document for programs.
+_PARTS = ("misfit", "remarks", "contents", "replay")
 # So many fields that differ are shown, and so much of each.
 _FIELDS, _LETTERS = 5, 40
 
@@ -41,6 +43,7 @@ class Audit(WithJson):
 
     def run(self) -> int:
         """Print what was found."""
+        from evofsm.app.text.documents import spelled_out
         from evofsm.files import Head
         from evofsm.guard import audit
 
@@ -48,14 +51,21 @@ class Audit(WithJson):
             self.file, None if self.head is None else Head.parse(self.head), replay=self.replay
         )
         if self.as_json:
-            print_json({"file": str(self.file), **_document(found)})
+            chain = found.chain
+            print_json(
+                {
+                    "file": str(self.file),
+                    "is_good": found.is_good,
+                    "head": str(chain.head),
+                    "half_written": chain.half_written,
+                    "finding": spelled_out(chain.finding),
+                    **{key: spelled_out(getattr(found, key)) for key in _PARTS},
+                }
+            )
         else:
             say(self.file)
             _print(found, head_given=self.head is not None)
         return 0 if found.is_good else 1
-
-
-# -- For people -----------------------------------------------------------------------------------
 
 
 def _print(found: Audited, *, head_given: bool) -> None:
@@ -152,32 +162,3 @@ def _fill(text: str, first: str = "", others: str = "") -> None:
             text, width, initial_indent=first, subsequent_indent=others, break_on_hyphens=False
         )
     )
-
-
-# -- For programs ---------------------------------------------------------------------------------
-
-
-def _document(found: Audited) -> dict[str, Any]:
-    chain, replay = found.chain, found.replay
-    finding = chain.finding and {**chain.finding._asdict(), "fault": chain.finding.fault.value}
-    return {
-        "is_good": found.is_good,
-        "head": str(chain.head),
-        "half_written": chain.half_written,
-        "finding": finding,
-        "misfit": found.misfit and found.misfit._asdict(),
-        "remarks": list(found.remarks),
-        "contents": found.contents._asdict(),
-        "replay": replay and _of_replay(replay),
-    }
-
-
-def _of_replay(replay: Replay) -> dict[str, Any]:
-    difference = replay.difference
-    return {
-        "decisions": replay.decisions,
-        "not_replayed": list(replay.not_replayed),
-        "other_makers": [one._asdict() for one in replay.other_makers],
-        "difference": difference
-        and {**difference._asdict(), "fields": [one._asdict() for one in difference.fields]},
-    }

@@ -35,13 +35,14 @@ class Check(WithJson):
 
     def run(self) -> int:
         """Print a line for each check."""
+        from evofsm.app.text.documents import spelled_out
         from evofsm.checks import Outcome, check, kind_of
 
         thing = self._thing()
         kind = kind_of(thing) if self.kind is None else _kind(self.kind)
         results = check(thing, kind)
         if self.as_json:
-            print_json([{**one._asdict(), "outcome": one.outcome.value} for one in results])
+            print_json(spelled_out(results))
         else:
             _print(self.name, kind, results)
         return int(any(one.outcome is Outcome.FAILED for one in results))

@@ -185,21 +185,17 @@ def _parameter(one: Field[Any], hint: Any) -> Parameter:
 
     declared: _Declared = one.metadata[_KEY]
     default = Parameter.empty if is_required(one) else one.default
-    optional = NoneType in get_args(hint)
+    may_lack = NoneType in get_args(hint)
     if declared.parse is not None:
-        hint = str
-        default = ",".join(default) if isinstance(default, tuple) else default and str(default)
+        hint = str | None if may_lack else str
+        default = ",".join(default) if isinstance(default, tuple) else default
     elif tuple in (get_origin(part) for part in (hint, *get_args(hint))):
-        hint = list[str]
-    elif optional:
-        hint = next(part for part in get_args(hint) if part is not NoneType)
+        hint = list[str] | None if may_lack else list[str]
     names = declared.names
     if default is False and not names:
         names = (f"--{one.name.replace('_', '-')}",)
     told = typer.Argument if declared.positional else typer.Option
     shown = default is not None and default is not Parameter.empty
     information = told(*names, help=declared.about, show_default=shown, **declared.further)
-    kind: Any = hint | None if optional else hint
-    return Parameter(
-        one.name, Parameter.KEYWORD_ONLY, default=default, annotation=Annotated[kind, information]
-    )
+    kind: Any = Annotated[hint, information]
+    return Parameter(one.name, Parameter.KEYWORD_ONLY, default=default, annotation=kind)

@@ -12,7 +12,7 @@ from evofsm.app.cli.declared import argument, option
 from evofsm.app.cli.groups import WithJson
 
 if TYPE_CHECKING:
-    from evofsm.core import Explanation, FSMModel, Tally
+    from evofsm.core import Explanation, FSMModel
 
 _WIDTH = 80
 _UNTOLD = (
@@ -75,17 +75,11 @@ def _values(text: str) -> list[float]:
 
 
 def _document(model: FSMModel, found: Explanation) -> dict[str, Any]:
-    center = None if found.state is None else model.centers[found.state].tolist()
-    return {
-        **found._asdict(),
-        "center": center,
-        "here": _tally(found.here),
-        "action": _tally(found.action),
-        "after_better": _tally(found.after_better),
-    }
+    from evofsm.app.text.documents import spelled_out
 
-
-def _tally(tally: Tally | None) -> dict[str, Any] | None:
-    if tally is None:
-        return None
-    return {**tally._asdict(), "interval": list(tally.interval)}
+    document: dict[str, Any] = spelled_out(found)
+    document["center"] = None if found.state is None else model.centers[found.state].tolist()
+    for name in ("here", "action", "after_better"):
+        if (tally := getattr(found, name)) is not None:
+            document[name]["interval"] = list(tally.interval)
+    return document

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from enum import Enum
 from typing import Any
 
 from evofsm.core import visible
@@ -21,6 +22,22 @@ def to_json(document: Any) -> str:
     }
     """
     return visible(json.dumps(_known(document), allow_nan=False, ensure_ascii=False, indent=2))
+
+
+def spelled_out(value: Any) -> Any:
+    """The same, with named tuples as dictionaries and members of enumerations as their values.
+
+    >>> from evofsm.core import Tally
+    >>> spelled_out({"here": [Tally(3, 12)]})
+    {'here': [{'failed': 3, 'episodes': 12, 'is_exact': True, 'is_told': True}]}
+    """
+    if isinstance(value, Enum):
+        return value.value
+    if hasattr(value, "_asdict"):
+        value = value._asdict()
+    if isinstance(value, dict):
+        return {key: spelled_out(one) for key, one in value.items()}
+    return [spelled_out(one) for one in value] if isinstance(value, list | tuple) else value
 
 
 def _known(document: Any) -> Any:

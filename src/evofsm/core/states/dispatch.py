@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import fields
-from typing import Any
+from dataclasses import fields, is_dataclass
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,12 +29,51 @@ from evofsm.core.states.failure import FailureSplit
 from evofsm.core.states.novelty import Novelty
 from evofsm.core.states.rule import RuleSettings, StateRule
 
-RULES: Mapping[str, Any] = {
-    "paper": Paper,
-    "edges": Edges,
-    "novelty": Novelty,
-    "failure": FailureSplit,
-}
+# By name in files.
+_RULES: dict[str, Any] = {}
+
+
+def register_rule(name: str, rule: type) -> None:
+    """Let machines take a state rule, and files name it.
+
+    Parameters
+    ----------
+    name : str
+        Its name in files.
+    rule : type
+        A frozen dataclass as `StateRule`, whose settings JSON has words for.
+
+    Raises
+    ------
+    TypeError
+        If ``rule`` is no frozen dataclass with a ``table``.
+    ValueError
+        If another rule has that name.
+
+    Examples
+    --------
+    >>> from dataclasses import dataclass
+    >>> from evofsm import EvolvingFSM, Novelty
+    >>> @dataclass(frozen=True)
+    ... class Fine(Novelty):
+    ...     radius: float = 0.1
+    >>> register_rule("fine", Fine)
+    >>> EvolvingFSM(n_actions=1, rule=Fine()).radius
+    0.1
+    """
+    is_frozen = is_dataclass(rule) and cast(Any, rule).__dataclass_params__.frozen
+    if not (is_frozen and hasattr(rule, "table")):
+        raise TypeError(f"{rule!r} is no state rule: a frozen dataclass with a `table`")
+    known = _RULES.get(name, rule)
+    if (known.__module__, known.__qualname__) != (rule.__module__, rule.__qualname__):
+        raise ValueError(f"there is a state rule {name!r} already: {known.__name__}")
+    _RULES[name] = rule  # anew where its module, or a cell of a notebook, was run again
+
+
+register_rule("paper", Paper)
+register_rule("edges", Edges)
+register_rule("novelty", Novelty)
+register_rule("failure", FailureSplit)
 
 # Where a rule has no radius that says so, a state reaches so many roots of the width.
 _WIDTHS = 2.0
@@ -46,7 +85,7 @@ def determine(
 ) -> tuple[int, int, float]:
     """Judge one observation against ``n`` centres; the nearest may be moved onto it.
 
-    Answers the event, the nearest centre, and the potential of the observation. Where the event
+    Returns the event, the nearest centre, and the potential of the observation. Where the event
     is ``CREATED``, whoever asked has to place the new centre.
     """
     if clusters.n_observations[0] == 0.0:
@@ -103,8 +142,8 @@ def reach(rule: StateRule, width: float) -> float:
 
 def check_rule(name: str, rule: StateRule) -> StateRule:
     """One of the rules, as an object."""
-    if type(rule) not in RULES.values():
-        known = ", ".join(f"{kind.__name__}(...)" for kind in RULES.values())
+    if type(rule) not in _RULES.values():
+        known = ", ".join(f"{kind.__name__}(...)" for kind in _RULES.values())
         raise TypeError(f"{name} is {rule!r}; it must be an object: {known}")
     return rule
 
@@ -119,7 +158,7 @@ def weights(rule: StateRule, m: int) -> NDArray[np.float64]:
 
 def describe(rule: StateRule) -> dict[str, Any]:
     """A rule in plain JSON: its name and its settings, but for those that are None."""
-    name, kind = next(item for item in RULES.items() if item[1] is type(rule))
+    name, kind = next(item for item in _RULES.items() if item[1] is type(rule))
     given = {entry.name: getattr(rule, entry.name) for entry in fields(kind)}
     settings = {name: value for name, value in given.items() if value is not None}
     if "base" in settings:
@@ -131,9 +170,9 @@ def restore(description: Mapping[str, Any]) -> StateRule:
     """The rule that `describe` put into words."""
     settings = dict(description)
     name = settings.pop("name")
-    if name not in RULES:
-        raise ValueError(f"there is no state rule {name!r}, only {', '.join(RULES)}")
+    if name not in _RULES:
+        raise ValueError(f"there is no state rule {name!r}, only {', '.join(_RULES)}")
     if "base" in settings:
         settings["base"] = restore(settings["base"])
-    rule: StateRule = RULES[name](**settings)
+    rule: StateRule = _RULES[name](**settings)
     return rule

@@ -1,4 +1,4 @@
-"""The paper's rule, which also founds states at the edges of the data.
+"""The paper's rule, which also creates states at the edges of the data.
 
 The paper's condition takes only observations nearer the mean of everything seen than any centre,
 so a rare corner never gets a state. Here it gets one where it lies farther out than every centre.
@@ -7,7 +7,7 @@ so a rare corner never gets a state. Here it gets one where it lies farther out 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -15,7 +15,6 @@ from evofsm.core.kernels import inner_kernel
 from evofsm.core.learnt import Clusters
 from evofsm.core.states import ets
 from evofsm.core.states.clusters import CREATED, UNCHANGED, exceeds
-from evofsm.core.states.rule import RuleSettings
 
 CODE = 1
 
@@ -24,7 +23,7 @@ CODE = 1
 class Edges:
     """The paper's rule, and a state at each edge, with the machine's settings.
 
-    An observation also founds a state where its potential lies below every centre's and it is
+    An observation also creates a state where its potential lies below every centre's and it is
     farther than ``radius`` from every centre.
 
     Parameters
@@ -46,8 +45,10 @@ class Edges:
     def __post_init__(self) -> None:
         object.__setattr__(self, "memory", ets.check_memory(self.memory))
 
-    def _tell(self, machine: RuleSettings) -> RuleSettings:
-        return machine._replace(code=CODE, memory=self.memory or math.inf)
+    @property
+    def table(self) -> Mapping[str, float]:
+        """What the kernel judges by, in place of the machine's settings."""
+        return {"code": CODE, "memory": self.memory or math.inf}
 
 
 @inner_kernel
@@ -59,7 +60,7 @@ def judge(
     squared_distance: float,
     radius: float,
 ) -> int:
-    """Judge as the paper does, and found a state at an edge."""
+    """Judge as the paper does, and create a state at an edge."""
     event = ets.judge(potential, highest, squared_distance, radius)
     if event != UNCHANGED or not exceeds(squared_distance, radius * radius):
         return event

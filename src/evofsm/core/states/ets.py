@@ -1,13 +1,13 @@
 """The paper's rule: evolving Takagi-Sugeno (eTS) clustering, Sections 2.2.1 and 2.2.2.
 
-An observation founds a state where the data seen so far is denser than at every existing
+An observation creates a state where the data seen so far is denser than at every existing
 centre, or moves the nearest centre there. The more data vary, the wider states are recognised.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -18,7 +18,6 @@ from evofsm.core.states.clusters import (
     UNCHANGED,
     exceeds,
 )
-from evofsm.core.states.rule import RuleSettings
 from evofsm.core.validation import whole
 
 CODE = 0
@@ -29,7 +28,7 @@ class Paper:
     """The paper's rule, with the machine's radius, distance_weight and spread.
 
     An observation that is denser than every centre moves the nearest one if that is closer than
-    ``radius``, else it founds a state. The width of recognition is ``spread`` times the total
+    ``radius``, else it creates a state. The width of recognition is ``spread`` times the total
     variance of all observations.
 
     Parameters
@@ -58,8 +57,10 @@ class Paper:
     def __post_init__(self) -> None:
         object.__setattr__(self, "memory", check_memory(self.memory))
 
-    def _tell(self, machine: RuleSettings) -> RuleSettings:
-        return machine._replace(code=CODE, memory=self.memory or math.inf)
+    @property
+    def table(self) -> Mapping[str, float]:
+        """What the kernel judges by, in place of the machine's settings."""
+        return {"code": CODE, "memory": self.memory or math.inf}
 
 
 def check_memory(memory: int | None) -> int | None:
@@ -71,7 +72,7 @@ def check_memory(memory: int | None) -> int | None:
 
 @inner_kernel
 def judge(potential: float, highest: float, squared_distance: float, radius: float) -> int:
-    """Leave the states as they are, move the nearest, or found one."""
+    """Leave the states as they are, move the nearest, or create one."""
     if not exceeds(potential, highest):
         return UNCHANGED
     return MOVED if exceeds(radius * radius, squared_distance) else CREATED

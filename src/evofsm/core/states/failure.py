@@ -6,7 +6,7 @@ state is a run of observations of one episode that are all recognised as it.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from evofsm.core.kernels import inner_kernel
@@ -18,17 +18,17 @@ from evofsm.core.validation import positive
 
 @dataclass(frozen=True)
 class FailureSplit:
-    """Found states as another rule does, and at failures in states that were mostly safe.
+    """Create states as another rule does, and at failures in states that were mostly safe.
 
     Where an episode ends in failure, let s be the most probable state at its last observation.
     If, of the stays in s that began before the failure, fewer than ``share`` ended in a failure,
-    and the observation is farther than ``distance`` from the centre of s, it founds a state. A
+    and the observation is farther than ``distance`` from the centre of s, it creates a state. A
     stay is a run of observations of one episode that are all recognised as s.
 
     Parameters
     ----------
     base : StateRule
-        The rule that founds and moves all other states, and says how wide they are recognised.
+        The rule that creates and moves all other states, and says how wide they are recognised.
     share : float
         Share of stays that end in failure from which on a state is no longer safe, in (0, 1].
     distance : float
@@ -55,7 +55,7 @@ class FailureSplit:
     distance: float = 0.25
 
     def __post_init__(self) -> None:
-        if isinstance(self.base, type | FailureSplit) or not hasattr(self.base, "_tell"):
+        if isinstance(self.base, type | FailureSplit) or not hasattr(self.base, "table"):
             raise TypeError(f"base is {self.base!r}; it must be another rule, as an object")
         object.__setattr__(self, "share", positive("share", self.share))
         object.__setattr__(self, "distance", positive("distance", self.distance))
@@ -67,9 +67,11 @@ class FailureSplit:
         """Those of ``base``."""
         return self.base.scales
 
-    def _tell(self, machine: RuleSettings) -> RuleSettings:
-        told = self.base._tell(machine)
-        return told._replace(failure_share=self.share, failure_distance=self.distance)
+    @property
+    def table(self) -> Mapping[str, float]:
+        """What the kernel judges by, in place of the machine's settings."""
+        of_failures = {"failure_share": self.share, "failure_distance": self.distance}
+        return {**self.base.table, **of_failures}
 
 
 @inner_kernel
@@ -80,7 +82,7 @@ def splits(
     returns: float,
     endings: float,
 ) -> bool:
-    """Whether the latest observation, at which an episode failed, founds a state.
+    """Whether the latest observation, at which an episode failed, creates a state.
 
     Its nearest state was recognised in ``visits`` observations, ``returns`` of which followed
     one in the same state, and ``endings`` episodes failed in it.

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from evofsm.core.kernels import inner_kernel
 from evofsm.core.states.clusters import CREATED, UNCHANGED, exceeds
-from evofsm.core.states.rule import RuleSettings
 from evofsm.core.validation import positive
 
 CODE = 2
@@ -18,7 +17,7 @@ _SMALLEST_SCALE, _LARGEST_SCALE = 1e-20, 1e20
 
 @dataclass(frozen=True)
 class Novelty:
-    """Found a state where every centre is farther than a radius; no centre ever moves.
+    """Create a state where every centre is farther than a radius; no centre ever moves.
 
     Distances are those of observations divided by ``scales``, so that a metre and a metre per
     second may count differently; observations and centres themselves stay in their units. The
@@ -27,7 +26,7 @@ class Novelty:
     Parameters
     ----------
     radius : float
-        Distance, in scales, beyond which an observation founds a state. It takes the place of
+        Distance, in scales, beyond which an observation creates a state. It takes the place of
         the machine's.
     scales : sequence of float
         For each of the m variables, the difference that counts as 1, in the variable's unit;
@@ -62,13 +61,15 @@ class Novelty:
         object.__setattr__(self, "radius", positive("radius", self.radius))
         object.__setattr__(self, "spread", positive("spread", self.spread))
 
-    def _tell(self, machine: RuleSettings) -> RuleSettings:
-        return machine._replace(code=CODE, radius=self.radius, spread=self.spread)
+    @property
+    def table(self) -> Mapping[str, float]:
+        """What the kernel judges by, in place of the machine's settings."""
+        return {"code": CODE, "radius": self.radius, "spread": self.spread}
 
 
 @inner_kernel
 def judge(squared_distance: float, radius: float) -> int:
-    """Found a state where the nearest centre is farther than the radius."""
+    """Create a state where the nearest centre is farther than the radius."""
     return CREATED if exceeds(squared_distance, radius * radius) else UNCHANGED
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple, Protocol
 
 from evofsm.core.layout import PerVariable, Setting
@@ -15,18 +15,19 @@ class RuleSettings(NamedTuple):
     radius: Setting  #: how far from a centre an observation is no longer near it
     distance_weight: Setting  #: how fast distance to new data lowers a centre's potential
     spread: Setting  #: width of recognition, in the rule's own measure
-    failure_share: Setting  #: a failure founds a state where fewer stays ended so; 0: none does
+    failure_share: Setting  #: a failure creates a state where fewer stays ended so; 0: none does
     failure_distance: Setting  #: and only farther than this from the nearest centre
     memory: Setting  #: number of observations after which older ones fade; infinity: never
     weights: PerVariable  #: 1 / scale of each variable, where m is known
 
 
 class StateRule(Protocol):
-    """When an observation founds or moves a state, and how wide a state is recognised.
+    """When an observation creates or moves a state, and how wide a state is recognised.
 
-    A rule is a frozen dataclass of settings in a file of its own, with a kernel that judges an
-    observation; `states.dispatch` lists the rules. All distances, potentials and variances
-    are those of observations divided by the rule's scales, where it has some.
+    A rule is a frozen dataclass of settings, made known with `register_rule`: a small table of
+    numbers for the kernel that judges an observation, which is that of a rule there is or, in the
+    package, one of its own. All distances, potentials and variances are those of observations
+    divided by the rule's scales, where it has some.
 
     Examples
     --------
@@ -40,6 +41,10 @@ class StateRule(Protocol):
         """Difference that counts as 1, for each of the m variables; empty: 1 for each."""
         ...
 
-    def _tell(self, machine: RuleSettings) -> RuleSettings:
-        """The machine's settings, with the rule's own in place of some."""
+    @property
+    def table(self) -> Mapping[str, float]:
+        """What its kernel judges by: fields of `RuleSettings`, in place of the machine's.
+
+        At least ``code``, unless it is that of the paper's rule.
+        """
         ...

@@ -28,6 +28,7 @@ class Leaders(Command):
 
     def run(self) -> None:
         """Count, and print the tables."""
+        from evofsm.app import console, print_table, spelled_out
         from evofsm.evidence.real.leaders import Limits, run_leaders
 
         limits = Limits(self.lowest, self.decel)
@@ -35,10 +36,8 @@ class Leaders(Command):
             done = counter(bars, "Driving beside")
             study = run_leaders(self.data, limits, self.first, done, self.workers)
         if self.as_json:
-            braked = [{**one._asdict(), "brakes": one.brakes._asdict()} for one in study.braked]
-            print_json({"leaders": braked, "alarms": [one._asdict() for one in study.alarms]})
+            print_json(spelled_out({"leaders": study.braked, "alarms": study.alarms}))
             return
-        from evofsm.app import console, print_table
         from evofsm.evidence.real.tables_of_leaders import leader_tables
 
         screen = console()

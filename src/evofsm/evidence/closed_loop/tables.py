@@ -156,11 +156,11 @@ def side_tables(study: ClosedLoop) -> dict[str, Table]:
     return {name: make(study) for name, (found, make) in tables.items() if found}
 
 
-def _spread(show: Callable[[float], str]) -> Callable[[float, float, float], str]:
-    """How a column writes median and range of a `Spread`, which is a tuple."""
+def _spread(show: Callable[[float], str]) -> Callable[[Spread], str]:
+    """How a column writes median and range."""
 
-    def written(*values: float) -> str:
-        low, middle, high = map(show, Spread(*values))
+    def written(values: Spread) -> str:
+        low, middle, high = map(show, values)
         return middle if low == high else f"{middle} ({low}–{high})"
 
     return written

@@ -123,7 +123,7 @@ def read_folder(folder: Path, plan: Plan, *, dealt: bool = True) -> tuple[list[C
     Parameters
     ----------
     folder : Path
-        Holds ``*.csv`` or ``*.csv.gz`` in the layout `evofsm.io.datasets.Layout.PAIRS`, one file
+        Holds ``*.csv`` or ``*.csv.gz`` in the layout `evofsm.io.Layout.PAIRS`, one file
         a run; lists of checksums and of segments in capital letters are no runs.
     plan : Plan
         Tells how many runs at most.

@@ -11,7 +11,6 @@ from pathlib import Path
 #: Names under which a list of checksums is looked for in a folder, in this order.
 LISTS = ("MANIFEST.csv", "SHA256SUMS", "sha256sums.txt")
 
-_BYTES_AT_ONCE = 1 << 20
 _SUM = re.compile(r"[0-9a-fA-F]{64}")
 
 
@@ -67,11 +66,8 @@ def verify_checksums(paths: Iterable[Path], checksums: Mapping[str, str]) -> int
 
 
 def _sha256(path: Path) -> str:
-    digest = hashlib.sha256()
     with path.open("rb") as file:
-        while data := file.read(_BYTES_AT_ONCE):
-            digest.update(data)
-    return digest.hexdigest()
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _read(path: Path) -> dict[str, str]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+from array import array
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -12,7 +13,6 @@ from numpy.typing import NDArray
 
 from evofsm.io.files import damage_explained, open_unpacked
 
-_ROWS_AT_ONCE = 8192
 #: How layouts write that a value is missing.
 MISSING = frozenset({"", ".", "nan", "na", "null"})
 
@@ -37,13 +37,7 @@ def header_and_rows(path: Path) -> Iterator[list[str]]:
 
 
 def places(path: Path, header: Sequence[str], names: Sequence[Sequence[str]]) -> list[int]:
-    """Where columns stand, each under one of several names; upper and lower case are alike.
-
-    Raises
-    ------
-    ValueError
-        Naming the file and the column that is not there.
-    """
+    """Where columns stand, each under one of several names; upper and lower case are alike."""
     known = {name.strip().lower(): place for place, name in enumerate(header)}
     found = []
     for options in names:
@@ -57,44 +51,27 @@ def places(path: Path, header: Sequence[str], names: Sequence[Sequence[str]]) ->
     return found
 
 
+def read_columns(path: Path, names: Sequence[Sequence[str]]) -> NDArray[np.float64]:
+    """Columns of a file with a header, each under one of several names: (columns, rows)."""
+    rows = header_and_rows(path)
+    return numbers(path, rows, places(path, next(rows, []), names)).T
+
+
 def numbers(
     path: Path, rows: Iterator[list[str]], columns: Sequence[int], first_line: int = 2
 ) -> NDArray[np.float64]:
-    """The named columns of the rows that are left, one row each; NaN where a value is missing.
+    """The columns at some places of the rows that are left, (rows, columns); NaN: missing.
 
-    Parameters
-    ----------
-    path : Path
-        For messages.
-    rows : iterator of list of str
-    columns : sequence of int
-        Their places.
-    first_line : int
-        Line of the first of the rows, for messages.
-
-    Returns
-    -------
-    (rows, columns) ndarray
-
-    Raises
-    ------
-    ValueError
-        Naming file, line and column of what is no number.
+    A `ValueError` names the file, the line, counted from ``first_line`` on, and the column of what
+    is no number.
     """
-    parts: list[NDArray[np.float64]] = []
-    block: list[list[float]] = []
+    found = array("d")
     for line, row in enumerate(rows, first_line):
-        if not row:
-            continue
-        block.append([_number(path, line, row, place) for place in columns])
-        if len(block) == _ROWS_AT_ONCE:
-            parts.append(np.array(block))
-            block = []
-    if block:
-        parts.append(np.array(block))
-    if not parts:
+        if row:
+            found.extend(_number(path, line, row, place) for place in columns)
+    if not found:
         raise ValueError(f"{path} has a header but no rows")
-    return np.concatenate(parts)
+    return np.array(found).reshape(-1, len(columns))
 
 
 def _number(path: Path, line: int, row: list[str], place: int) -> float:

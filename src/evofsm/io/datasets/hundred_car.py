@@ -32,22 +32,7 @@ HALF_LANE = 1.8
 
 
 def read_hundred_car(path: Path) -> Iterator[Episode]:
-    """Read event time series; the leader is the nearest target ahead on the own lane.
-
-    Parameters
-    ----------
-    path : Path
-        Comma-separated, with or without a header.
-
-    Yields
-    ------
-    Episode
-
-    Raises
-    ------
-    ValueError
-        If it has too few columns, or what stands in one is no number.
-    """
+    """Read event time series; the leader is the nearest target ahead on the own lane."""
     rows = header_and_rows(path)
     first = next(rows, [])
     if len(first) <= max(_COLUMNS):

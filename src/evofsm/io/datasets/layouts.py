@@ -8,11 +8,10 @@ from pathlib import Path
 
 from evofsm.io.datasets.checksums import find_checksums, verify_checksums
 from evofsm.io.datasets.episodes import Episode
-from evofsm.io.datasets.highd import read_highd
 from evofsm.io.datasets.hundred_car import read_hundred_car
-from evofsm.io.datasets.ngsim import read_ngsim
 from evofsm.io.datasets.openacc import read_openacc
 from evofsm.io.datasets.pairs import read_pairs
+from evofsm.io.datasets.tracks import read_highd, read_ngsim
 
 
 class Layout(StrEnum):
@@ -25,6 +24,7 @@ class Layout(StrEnum):
     HUNDRED_CAR = "100car"
 
 
+# Each raises a ValueError that names the file, and the column it lacks or the line that is none.
 _READERS: Mapping[Layout, Callable[[Path], Iterator[Episode]]] = {
     Layout.PAIRS: read_pairs,
     Layout.OPENACC: read_openacc,

@@ -22,21 +22,7 @@ _SPACING = re.compile(r"IVS(\d+)", re.IGNORECASE)
 
 
 def read_openacc(path: Path) -> Iterator[Episode]:
-    """Read one file of OpenACC; every spacing in it is a pair.
-
-    Parameters
-    ----------
-    path : Path
-
-    Yields
-    ------
-    Episode
-
-    Raises
-    ------
-    ValueError
-        If there is no header with ``Time``, or no spacing with both speeds.
-    """
+    """Read one file of OpenACC; every spacing in it is a pair."""
     rows = header_and_rows(path)
     line, header = _header(path, rows)
     known = {name.lower() for name in header}

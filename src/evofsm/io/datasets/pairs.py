@@ -20,21 +20,8 @@ _LABELS = ("pair", "segment")
 def read_pairs(path: Path) -> Iterator[Episode]:
     """Read ``run, pair, segment, time, gap, v_follower, v_leader, a_follower``.
 
-    The run is the file. A pair's episode ends where its segment does.
-
-    Parameters
-    ----------
-    path : Path
-        CSV, gzipped or not; rows of one segment together, in the order of time.
-
-    Yields
-    ------
-    Episode
-
-    Raises
-    ------
-    ValueError
-        Naming the file and the column that it lacks, or the line that is none.
+    The run is the file. Rows of one segment stand together, in the order of time; a pair's episode
+    ends where its segment does.
     """
     table = CsvTable(str(path))
     for name in (*_NUMBERS, *_LABELS):

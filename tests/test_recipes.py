@@ -1,0 +1,78 @@
+"""The recipes of CONTRIBUTING.md, followed as they stand there."""
+
+import re
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+
+
+def blocks(title):
+    """The code of a recipe: file name, or none, and text."""
+    text = (ROOT / "CONTRIBUTING.md").read_text("utf-8")
+    chapter = text.split(f"\n## {title}\n")[1].split("\n## ")[0]
+    found = re.findall(r"^ *```python\n(.*?)^ *```", chapter, re.DOTALL | re.MULTILINE)
+    for code in map(textwrap.dedent, found):
+        named = re.match(r"# (\w+\.py)\n", code)
+        yield (named[1] if named else None), code
+
+
+def write(title, folder):
+    """Put the files of a recipe into a folder; returns the code that has no file."""
+    loose = []
+    for name, code in blocks(title):
+        if name is None:
+            loose.append(code)
+        else:
+            (folder / name).write_text(code, encoding="utf-8")
+    return "\n".join(loose)
+
+
+def python(folder, *arguments):
+    """Run Python in a folder; returns what it printed."""
+    command = [sys.executable, *map(str, arguments)]
+    result = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stdout + result.stderr
+    return result.stdout
+
+
+def test_a_state_rule(tmp_path):
+    pytest.importorskip("typer")
+    write("Add a state rule", tmp_path)
+    said = python(tmp_path, "-m", "evofsm", "check", "my_rule:Coarse")
+    assert "a_file_keeps_it" in said
+    assert "failed" not in said
+
+
+def test_a_judge(tmp_path):
+    python(tmp_path, "-c", write("Add a judge", tmp_path))
+
+
+def test_a_family(tmp_path):
+    pytest.importorskip("typer")
+    pytest.importorskip("scipy")
+    source = ROOT / "src" / "evofsm" / "driving" / "families" / "emergency.toml"
+    changed = source.read_text("utf-8").replace("duration = 35.0", "duration = 31.0")
+    (tmp_path / "mine.toml").write_text(changed, encoding="utf-8")
+    said = python(tmp_path, "-m", "evofsm", "drive", "mine.toml", "--episodes", 3)
+    assert "mine, 3 training episodes" in said
+
+
+def test_a_study(tmp_path):
+    pytest.importorskip("typer")
+    pytest.importorskip("matplotlib")
+    write("Add a study", tmp_path)
+    run = (
+        "from evofsm.evidence.studies import STUDIES\n"
+        "from plan import Plan\n"
+        "STUDIES[Plan.id] = Plan\n"
+        "from evofsm.__main__ import application\n"
+        "application()(['bench', 'coin', '--short', '--throws', '5', '--out', 'out'])"
+    )
+    said = python(tmp_path, "-c", run)
+    assert "of the throws are heads" in said
+    assert {path.suffix for path in (tmp_path / "out").iterdir()} >= {".html", ".json"}
