@@ -1,13 +1,15 @@
 """Tables in the terminal fit its width, and a pipe gets plain text."""
 
 import io
+import math
 import sys
 
 import pytest
 from rich.console import Console
 
 from evofsm.app.text.columns import console, print_columns, print_facts, print_table, print_words
-from evofsm.app.text.table import Table
+from evofsm.app.text.table import Column, Table
+from evofsm.app.text.words import count, percent, span
 
 HEADER = ("name", "gap [m]", "a long header of many words", *(f"column {c}" for c in range(6)))
 ROWS = [[f"row {r}", *(f"{r}.{c}5" for c in range(8))] for r in range(3)]
@@ -86,3 +88,22 @@ def test_a_terminal_gets_colours_unless_it_wants_none(plain, capsys, monkeypatch
     monkeypatch.setenv("NO_COLOR", "1") if plain else monkeypatch.delenv("NO_COLOR", raising=False)
     print_columns(console(), ("a", "b"), [("1", "2")], styles={0: "red"})
     assert ("\x1b[31m" in capsys.readouterr().out) == (not plain)
+
+
+def test_a_table_of_typed_columns_says_what_its_rows_hold():
+    rows = [("ours", 0.25, (1.0, 2.0), 1), ("ttc", None, (math.nan, 2.0), 1234)]
+    columns = (
+        Column("who", lambda row: row[0]),
+        Column("rate", lambda row: row[1], percent),
+        Column("lead", lambda row: row[2], span(1), "s"),
+        Column("cases", lambda row: row[3], count),
+    )
+    table = Table.of("T", columns, rows, "Note.", ours=lambda row: row[0] == "ours")
+    assert table.header == ("who", "rate", "lead [s]", "cases")
+    assert table.rows == (("ours", "25.0 %", "1.0–2.0", "1"), ("ttc", "–", "–", "1,234"))
+    assert (table.ours, table.failing, table.note) == ((0,), (), "Note.")
+
+
+def test_a_column_may_name_attributes_of_its_rows():
+    interval = Column("95 %", "real imag", span(1))
+    assert interval.cell(complex(1.0, 2.5)) == "1.0–2.5"

@@ -77,7 +77,7 @@ class Areas(NamedTuple):
 
 
 class Ranked:
-    """Scores in falling order, to be asked for both areas again and again without sorting them.
+    """Scores in falling order: both areas for many weightings, sorted once.
 
     Parameters
     ----------
@@ -261,8 +261,8 @@ def bootstrap(
     Parameters
     ----------
     function : callable
-        Answers the number for the episodes it is given, some of them several times; NaN where
-        there is none, which is left out.
+        Takes the indices of episodes, some of them several times, and returns the number, or NaN
+        where there is none, which is left out.
     episodes : int
         How many there are.
     rounds : int
@@ -287,7 +287,7 @@ def resampled(episodes: int, rounds: int, seed: int = 0) -> Iterator[NDArray[np.
 
 
 def interval(values: ArrayLike) -> Interval:
-    """95 % interval of what a bootstrap has found; NaN is left out."""
+    """95 % interval of bootstrap values; NaN is left out."""
     found = np.asarray(values, dtype=np.float64)
     found = found[~np.isnan(found)]
     if found.size == 0:

@@ -21,12 +21,12 @@ if TYPE_CHECKING:
 
     from evofsm.evidence.report.chapter import Chapter
 
-#: Is told how many tasks are done, of how many.
+#: Called with the number of tasks done, and of all tasks.
 Progress = Callable[[int, int], None]
 
 
 def silent(done: int, total: int) -> None:
-    """A `Progress` that tells nobody."""
+    """A `Progress` that does nothing."""
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,7 @@ class Study(ABC, Generic[F]):
         Parameters
         ----------
         progress : callable
-            Told how many tasks are done, of how many.
+            Called with the number of tasks done, and of all tasks.
         workers : int, optional
             Processes; one per core if not given. The numbers do not depend on it.
         """
@@ -108,7 +108,7 @@ class Study(ABC, Generic[F]):
         command : str
             What was typed to get it.
         progress : callable
-            Told how many figures are done, of how many.
+            Called with the number of figures drawn, and of all figures.
         """
         return replace(self.tell(found), command=command).drawn(folder, progress)
 

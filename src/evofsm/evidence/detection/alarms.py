@@ -30,7 +30,7 @@ _TRIED = 400
 
 
 class Alarms(NamedTuple):
-    """What came of the alarms above one threshold."""
+    """Alarms above one threshold, counted."""
 
     false: int  #: events
     true: int  #: events
@@ -64,10 +64,10 @@ def count_alarms(
 def choose_threshold(
     score: NDArray[np.float64], cases: Cases, rate: float, interval: float
 ) -> float:
-    """The lowest threshold at which, and above which, false alarms are rare enough.
+    """The lowest threshold such that it and all above it keep the rate of false alarms.
 
-    Long alarms swallow short ones, so that a very low threshold may have few false alarms again;
-    it is not taken where those above it have more.
+    Long alarms merge with short ones, so that a very low threshold may have few false alarms again;
+    it is not chosen if a higher one has too many.
 
     Parameters
     ----------
@@ -82,7 +82,7 @@ def choose_threshold(
     Returns
     -------
     float
-        Minus infinity where there is nothing but the target.
+        Minus infinity if the target holds at every decision.
     """
     chosen = np.inf
     for threshold in _candidates(score[~cases.truth]):

@@ -40,18 +40,18 @@ class Row:
     lead_median_1: float | None  #: before collisions, at one false alarm per hour [s]
     lead_median_1_low: float | None
     lead_median_1_high: float | None
-    lead_p10_1: float | None  #: exceeded before 90 % of collisions [s]
+    lead_p10_1: float | None  #: 10th percentile of lead times [s]
     lead_median_01: float | None  #: at one in ten hours [s]
     lead_p10_01: float | None
-    false_alarms_1: float | None  #: that came on held-out draws [1/h]
+    false_alarms_1: float | None  #: false alarms on held-out draws [1/h]
     false_alarms_01: float | None
     false_time_1: float | None  #: share of decisions without the target that are in alarm
     warned_1: float | None  #: share of collisions with an alarm that stayed on
     warned_01: float | None
     brier: float | None  #: after isotonic calibration on other draws
     brier_own: float | None  #: of its own probability
-    missed: float | None  #: share of decisions with the target at which its score is not above 0
-    called: float | None  #: share of those without at which it is
+    missed: float | None  #: miss rate at threshold 0
+    called: float | None  #: false-alarm rate at threshold 0, of decisions without the target
     share: float  #: of decisions with the target
     collisions: int
     episodes: int
@@ -84,7 +84,7 @@ class AtRate(NamedTuple):
         return _mean(self.lead > 0.0)
 
     def lead_in(self, share: float) -> float | None:
-        """Lead time that is exceeded in all but a share of the collisions [s]."""
+        """Quantile of the lead times [s]."""
         return float(np.quantile(self.lead, share)) if len(self.lead) else None
 
     def median_interval(self, rounds: int) -> tuple[float | None, float | None]:
@@ -121,7 +121,7 @@ def judge(
     calibration: Scored | None,
     rounds: int,
 ) -> Judged:
-    """Hold the scores of a measure against what was true.
+    """Judge the scores of a measure by the truth.
 
     Parameters
     ----------

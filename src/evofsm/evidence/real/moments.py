@@ -118,10 +118,9 @@ def telling_moments(
 ) -> list[Moment]:
     """Where ours was earlier, where it was later, and where it was wrong.
 
-    These are the three events that it warned of earlier by most, the one that it warned of later
-    by most (else one that both missed), and its longest false alarm.
-    At most one of each kind of a run is taken, so that no single drive makes the picture; of
-    equals the first. Where there are fewer such events there are fewer moments.
+    The three events with the largest gain in lead time, the one with the largest loss (else one
+    that both missed), and the longest false alarm. At most one of each kind of a run is taken, so
+    that no single drive makes the picture; of equals the first.
 
     Parameters
     ----------

@@ -48,7 +48,7 @@ def draw_all(
     folder : Path
         Where the files are put; made if it is not there.
     progress : callable
-        Told how many figures are done, of how many.
+        Called with the number of figures drawn, and of all figures.
     """
     folder.mkdir(parents=True, exist_ok=True)
     drawings = []
