@@ -28,7 +28,7 @@ from evofsm.driving import (
     training,
     unrevised,
 )
-from evofsm.evidence.closed_loop.plan import Plan
+from evofsm.evidence.closed_loop.amounts import Amounts
 from evofsm.guard import Guard, make_usable
 
 #: Looked ahead [s].
@@ -63,7 +63,7 @@ class Reliability(NamedTuple):
         return f"{what}\nBrier {self.brier:.3f}, of the base rate {self.base_brier:.3f}"
 
 
-def run_calibration(family: Family, plan: Plan) -> dict[str, list[Any]]:
+def run_calibration(family: Family, plan: Amounts) -> dict[str, list[Any]]:
     """Learn from the unrevised controller, then hold both probabilities against held-out runs."""
     of_guard, risk = learnt_by(guard_for_family(family))
     reviser = Unrevised(family.actions)
