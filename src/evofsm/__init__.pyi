@@ -19,6 +19,7 @@ from .core import Trace as Trace
 from .core import WhenFull as WhenFull
 from .core import jensen_shannon as jensen_shannon
 from .core import model_html as model_html
+from .core import register_rule as register_rule
 from .core import wilson_bounds as wilson_bounds
 from .files import read_header as read_header
 from .fleet import Fleet as Fleet

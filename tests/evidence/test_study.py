@@ -1,6 +1,7 @@
 """Every study has one shape: fields that are options, rows that are one table, a chapter."""
 
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import pytest
 from typer.testing import CliRunner
@@ -36,6 +37,12 @@ def test_a_study_says_what_it_asks_and_has_a_short_form(study):
     assert short.shortened() == short
     assert getattr(short, "seed", 3) == 3
     assert short.command.startswith(f"evofsm {study.group}{study.id}")
+
+
+def test_the_page_of_the_evidence_names_the_command_of_every_study():
+    page = (Path(__file__).parents[2] / "docs" / "evidence.md").read_text("utf-8")
+    for study in STUDIES.values():
+        assert f"`make {study.id}`" in page or f"`evofsm bench {study.id}" in page
 
 
 def test_a_study_that_lacks_what_it_needs_is_left_out():

@@ -24,7 +24,7 @@ class RiverClusterer(base.Clusterer):
 
     It observes features of fixed names, whatever their order. One that is absent, None or NaN was
     *not observed*, which is not to say that it is 0: such an observation is recognised by the
-    features that are there, founds and moves no state, and teaches no transition. A feature that
+    features that are there, creates and moves no state, and teaches no transition. A feature that
     is not among those observed is left out.
 
     Parameters
@@ -38,7 +38,7 @@ class RiverClusterer(base.Clusterer):
     rule : StateRule, optional
         How states are determined.
     max_states : int, optional
-        Number of states at which another one is only founded where one is given up.
+        Number of states at which another one is only created where one is given up.
     when_full : WhenFull
         Which one is given up. Its number goes to the new state.
     belief_tolerance : float

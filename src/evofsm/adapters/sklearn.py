@@ -18,7 +18,7 @@ with needs("scikit-learn", "sklearn", "a clusterer of scikit-learn"):
 class EvolvingClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc] # both are untyped
     """The states of an `EvolvingFSM` as the clusters of a scikit-learn clusterer.
 
-    Rows are observations in the order of time. Their order matters: states are founded and moved
+    Rows are observations in the order of time. Their order matters: states are created and moved
     as the rows come, and how one follows another is learnt beside them.
 
     Parameters
@@ -29,7 +29,7 @@ class EvolvingClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc] # bo
     rule : StateRule, optional
         How states are determined.
     max_states : int, optional
-        Number of states at which another one is only founded where one is given up.
+        Number of states at which another one is only created where one is given up.
     when_full : WhenFull, optional
         Which one is given up; its number goes to the new state. Without it the machine's own
         default, ``MERGE``: scikit-learn allows no enumeration as a default.

@@ -349,7 +349,7 @@ class _Learner:
         )
 
     def restore(self, kept: Kept) -> None:
-        """Take over what `keep` answered."""
+        """Take over what `keep` returned."""
         arrays = kept.arrays
         self.machine = type(self.machine).load(io.BytesIO(arrays["machine"].tobytes()))
         if self.machine.n_actions != self.actions.n_actions:
@@ -454,7 +454,7 @@ def _learn_and_score_rows(
     room: _Room,
     limit: Limit,
 ) -> int:
-    """Learn and score rows from ``row`` on; answers where the machine had no room.
+    """Learn and score rows from ``row`` on; returns the row for which the machine had no room.
 
     Every ``steps_ahead`` rows of an episode it halts, to score the longer forecasts made at the
     halt before, and to make others.

@@ -28,13 +28,13 @@ def _numbers(proposals: list[Any]) -> list[tuple[float, ...]]:
 
 @CONTRACT.clause()
 def proposes_numbers(make: Make) -> None:
-    """It answers with a `Proposal` of finite numbers, on a free road too."""
+    """It returns a `Proposal` of finite numbers, on a free road too."""
     controller = make()
     for row in [*drive(), _FREE_ROAD]:
         proposal = controller.propose(row, 0.0)
         insist(
             isinstance(proposal, Proposal),
-            f"propose answers {proposal!r}; it must be an evofsm.guard.protocols.Proposal",
+            f"propose returns {proposal!r}; it must be an evofsm.guard.protocols.Proposal",
         )
         for action in (proposal.action, *proposal.candidates):
             insist(

@@ -44,7 +44,7 @@ def kind_of(thing: object) -> Kind:
     Parameters
     ----------
     thing : object
-        A class, an instance, or a function without arguments that answers with an instance.
+        A class, an instance, or a function without arguments that returns an instance.
 
     Returns
     -------

@@ -45,7 +45,7 @@ def stream(machine: Any, rows: int = _ROWS, seed: int = 0) -> Rows:
 
 
 def teach(machine: Any, Z: NDArray[np.float64], actions: NDArray[np.int64]) -> list[Any]:
-    """Observe and act row by row; answers the steps."""
+    """Observe and act row by row; returns the steps."""
     steps = []
     for z, i in zip(Z, actions.tolist(), strict=True):
         steps.append(machine.observe(z))
@@ -69,7 +69,7 @@ def _answer(step: Any) -> tuple[Any, ...]:
 
 
 def _future(machine: Any) -> list[tuple[Any, ...]]:
-    """What it will answer to observations that come next."""
+    """What it will return for observations that come next."""
     return [_answer(step) for step in teach(machine, *stream(machine, 20, seed=1))]
 
 
@@ -118,7 +118,7 @@ def inputs_not_kept(make: Make) -> None:
 
 @CONTRACT.clause()
 def answers_stay(make: Make) -> None:
-    """What a step answered does not change with later steps."""
+    """What a step returned does not change with later steps."""
     machine = make()
     Z, actions = stream(machine)
     steps = teach(machine, Z[:-20], actions[:-20])
@@ -131,8 +131,8 @@ def answers_stay(make: Make) -> None:
             for x, y in zip(after, before, strict=True)
             for a, b in zip(x, y, strict=True)
         ),
-        "an earlier answer changed when the machine went on (does it share an array with the "
-        "machine? answer with a copy)",
+        "an earlier result changed when the machine went on (does it share an array with the "
+        "machine? return a copy)",
     )
 
 
@@ -143,7 +143,9 @@ def asking_changes_nothing(make: Make) -> None:
     taken = int(stream(make())[1][-1])
     before = held(asked)
     first = asked.predict(taken)
-    insist(same(asked.predict(taken), first), "predict answers otherwise when it is asked again")
+    insist(
+        same(asked.predict(taken), first), "predict returns something else when it is asked again"
+    )
     if hasattr(asked, "model"):
         asked.model()
     for i in range(1, asked.n_actions):  # the last question is about what was not done
@@ -152,7 +154,7 @@ def asking_changes_nothing(make: Make) -> None:
     insist(not wrong, f"predict changed {wrong} (does it work in the machine's own arrays?)")
     insist(
         same(_future(asked), _future(left_alone)),
-        "after predict it learns and answers otherwise than a machine that was not asked (does "
+        "after predict it learns and returns otherwise than a machine that was not asked (does "
         "predict store the action?)",
     )
 
@@ -165,7 +167,7 @@ def predicts_before_learning(make: Make) -> None:
     if machine.n_states == 0:
         insist(
             fresh.shape == (0,),
-            f"before any observation predict answers with shape {fresh.shape}; there are no "
+            f"before any observation predict returns shape {fresh.shape}; there are no "
             "states, so it must be an empty array",
         )
     teach(machine, *stream(machine))
@@ -174,7 +176,7 @@ def predicts_before_learning(make: Make) -> None:
     at_start = np.asarray(machine.predict(0))
     insist(
         at_start.shape == (machine.n_states,) and is_distribution(at_start, _EXACT),
-        f"as an episode starts predict answers {at_start}; it must be a distribution over the "
+        f"as an episode starts predict returns {at_start}; it must be a distribution over the "
         "states (forecast from the uniform belief)",
     )
 
@@ -341,7 +343,7 @@ def labels_of_actions_mean_nothing(make: Make) -> None:
 
 @CONTRACT.clause()
 def memory_is_bounded(make: Make) -> None:
-    """Seeing the same again and again takes no more memory, and founds no states without end."""
+    """Seeing the same again and again takes no more memory, and creates no states without end."""
     machine = make()
     Z, actions = stream(machine, 25)
 

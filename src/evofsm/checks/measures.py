@@ -22,13 +22,13 @@ def _score(measure: Any, rows: NDArray[np.float64], dt: float = _DT) -> NDArray[
 
 @CONTRACT.clause()
 def one_score_a_row(make: Make) -> None:
-    """Its answer is an array with a number for each row, of one row too."""
+    """It returns an array with a number for each row, of one row too."""
     measure = make()
     for rows in (1, 2, 7):
         scores = measure.score(drive(rows), _DT)
         insist(
             isinstance(scores, np.ndarray) and scores.shape == (rows,),
-            f"{rows} rows are answered with {_shape(scores)}, not with an array of shape ({rows},)",
+            f"{rows} rows give {_shape(scores)}, not with an array of shape ({rows},)",
         )
         insist(scores.dtype.kind == "f", f"scores have dtype {scores.dtype}, not float")
 

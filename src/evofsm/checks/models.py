@@ -54,12 +54,12 @@ def rows_sum_to_1(make: Make) -> None:
     )
     insist(
         is_distribution(model.recognise(_rows(model))),
-        "recognise answers with what is no distribution",
+        "recognise returns what is no distribution",
     )
     for horizon in (1, 5):
         insist(
             is_distribution(model.propagate(_uniform(model), 0, horizon)),
-            f"propagate over {horizon} steps answers with what is no distribution "
+            f"propagate over {horizon} steps returns what is no distribution "
             "(rows from, columns to: belief @ P?)",
         )
 
@@ -75,7 +75,7 @@ def asking_changes_nothing(make: Make) -> None:
     insist(same(given, rows), "recognise changed the observations it was given")
     insist(same(asked, belief), "propagate changed the belief it was given")
     insist(same(_held(model), before), "a question changed the model")
-    insist(same(first, second), "the same question is answered otherwise the second time")
+    insist(same(first, second), "the same question is answered differently the second time")
 
 
 @CONTRACT.clause()
@@ -86,13 +86,13 @@ def many_are_one_by_one(make: Make) -> None:
     together = model.recognise(rows)
     insist(
         all(same(together[k], model.recognise(row)) for k, row in enumerate(rows)),
-        "recognise answers otherwise for a row alone than for the same row among others",
+        "recognise returns something else for a row alone than for the same row among others",
     )
 
 
 @CONTRACT.clause("save", "load")
 def a_file_keeps_it(make: Make) -> None:
-    """What was saved and loaded answers the same."""
+    """What was saved and loaded returns the same."""
     model = make()
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "model"

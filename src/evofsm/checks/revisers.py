@@ -58,7 +58,7 @@ def executes_what_can_be(make: Make) -> None:
     for row, proposed in zip(drive(30), (*_PROPOSED, 5.0, -9.0) * 4, strict=False):
         candidates = (0.5, -40.0, 40.0)
         revision = reviser.revise(_situation(row, 5), Proposal(proposed, candidates))
-        insist(isinstance(revision, Revision), f"revise answers {revision!r}, not a Revision")
+        insist(isinstance(revision, Revision), f"revise returns {revision!r}, not a Revision")
         _insist_executable(reviser, revision.executed, proposed)
 
 

@@ -79,7 +79,7 @@ def a_machine_takes_it(make: Make) -> None:
     m = len(machine.rule.scales) or 2
     for k in range(10):
         machine.observe(np.arange(m) * k * 0.7)
-    insist(machine.n_states > 0, "a machine with this rule founds no state at all")
+    insist(machine.n_states > 0, "a machine with this rule creates no state at all")
 
 
 @CONTRACT.clause()

@@ -36,12 +36,12 @@ from .memory import tell_of_failures as tell_of_failures
 from .model import FSMModel as FSMModel
 from .naming import Labels as Labels
 from .naming import Words as Words
-from .naming import action_name as action_name
-from .naming import state_name as state_name
 from .naming import use_words as use_words
 from .naming import visible as visible
 from .notebook import model_html as model_html
 from .notebook import variable_label as variable_label
+from .numbering import action_name as action_name
+from .numbering import state_name as state_name
 from .observations import Category as Category
 from .observations import Missing as Missing
 from .observations import ObservationEncoder as ObservationEncoder

@@ -19,7 +19,7 @@ from evofsm.core.transitions import merge_states, retire_state
 # What may happen besides what `evofsm.core.states.clusters` knows.
 MERGED: int = 4
 RETIRED: int = 8
-# Stands for the newcomer where it is itself given up.
+# Returned instead of an index where the new state itself is left out.
 NEWCOMER = -1
 # Numbers of the arrays that are joined by their sum, and by the larger of both.
 _SUMMED_STATES, _LARGER_STATES = joined_by("sum", "state"), joined_by("most", "state")

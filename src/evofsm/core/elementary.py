@@ -21,13 +21,17 @@ from evofsm.core.kernels import LINE, NOT_COMPILED, inner_kernel
 _arrays = cast(Any, arrayobj)  # Numba has no types for it
 
 _LOG2_E = 1.4426950408889634
-# ln 2 in two parts: a multiple of the first, up to 2^11 of them, is exact.
-_LN_2_HIGH, _LN_2_LOW = 6.93147180369123816490e-01, 1.90821492927058770002e-10
+# The first part of ln 2: a multiple of it, up to 2^11 of them, is exact.
+_LN_2_HIGH = 6.93147180369123816490e-01
+# The rest of it.
+_LN_2_LOW = 1.90821492927058770002e-10
 # Added to a whole number below 2^51 it leaves it in the lowest bits.
 _WHOLE = 1.5 * 2.0**52
 _WHOLE_BITS = 0x4338_0000_0000_0000
-# A float holds its exponent, plus 1023, above 52 bits of mantissa.
-_BIAS, _PLACE = 1023, 52
+# A float holds its exponent plus this ...
+_BIAS = 1023
+# ... above so many bits of mantissa.
+_PLACE = 52
 # The bits of 1 less those of the root of 1/2: what a mantissa needs to be split off around 1.
 _TO_ROOT = 0x3FF0_0000_0000_0000 - 0x3FE6_A09E_667F_3BCD
 

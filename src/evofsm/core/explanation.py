@@ -24,7 +24,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evofsm.core.known import Known, Nearest
-from evofsm.core.naming import Labels, state_name
+from evofsm.core.naming import Labels
+from evofsm.core.numbering import state_name
 from evofsm.core.proportions import bounds_text, wilson_bounds
 
 # A belief above this is not worth a word.

@@ -32,6 +32,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from evofsm.core.kernels import inner_kernel, kernel, lanes
+from evofsm.core.learnt import NO_ACTION, NOT_OPEN
 from evofsm.core.model import FSMModel
 from evofsm.core.validation import (
     check_action,
@@ -49,7 +50,8 @@ _LEAST_BELIEF = 1e-3
 _ANYWHERE = 1e-3
 # In place of a forecast of 0, by which nothing can be divided.
 _TINY = 1e-300
-_NO_ACTION, _NOT_OPEN = -1, -1
+# The place of an action without matrices.
+_NOT_OPEN = int(NOT_OPEN)
 
 
 class _Learnt(NamedTuple):
@@ -229,7 +231,7 @@ class Forecasts:
         rows = real_rows("belief", np.atleast_2d(belief))
         refuse_unless_distribution("belief", rows)
         self._check_states(rows.shape[1])
-        given = np.broadcast_to(np.asarray(_NO_ACTION if i is None else i), len(rows))
+        given = np.broadcast_to(np.asarray(NO_ACTION if i is None else i), len(rows))
         actions = check_actions(given, len(rows), self.n_actions)
         predicted = np.zeros_like(rows)
         _predict_rows(self._learnt, self._horizon(steps), self.evidence, rows, actions, predicted)
@@ -294,7 +296,7 @@ class Forecasts:
     def _make_room(self, n: int, actions: NDArray[np.int64]) -> None:
         """Make room for as many states, and for the actions that are used for the first time."""
         learnt = self._learnt
-        used = np.unique(actions[actions != _NO_ACTION])
+        used = np.unique(actions[actions != NO_ACTION])
         fresh = used[learnt.places[used] == _NOT_OPEN]
         open_, capacity = learnt.counts.shape[1] - 1, len(learnt.nearby)
         if n <= capacity and len(fresh) == 0:
@@ -416,7 +418,7 @@ def _learn(
     """
     n_origins = _above(origin, _LEAST_BELIEF, room.origins)
     n_targets = _above(reached, _LEAST_BELIEF, room.targets)
-    place = learnt.places[action] if action != _NO_ACTION else _NOT_OPEN
+    place = learnt.places[action] if action != NO_ACTION else _NOT_OPEN
     share = _share_moved(learnt, horizon)
     for a in range(n_origins):
         i = room.origins[a]
@@ -473,7 +475,7 @@ def _predict_rows(
 ) -> None:
     share = _share_moved(learnt, horizon)
     for row in range(len(beliefs)):
-        place = learnt.places[actions[row]] if actions[row] != _NO_ACTION else _NOT_OPEN
+        place = learnt.places[actions[row]] if actions[row] != NO_ACTION else _NOT_OPEN
         for i in range(beliefs.shape[1]):
             believed = beliefs[row, i]
             if believed == 0.0:

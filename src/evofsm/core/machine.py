@@ -30,7 +30,7 @@ from evofsm.core.divergence import jensen_shannon
 from evofsm.core.explanation import Explanation, explain, nothing_known
 from evofsm.core.kernels import LINE, lanes
 from evofsm.core.known import Known, Nearest, Policy, recognise_rows
-from evofsm.core.layout import Array
+from evofsm.core.layout import PLACES, Array
 from evofsm.core.learnt import MACHINE, NO_ACTION, NOT_OPEN, Learnt
 from evofsm.core.memory import (
     Held,
@@ -87,7 +87,10 @@ from evofsm.files import ranges
 Method = TypeVar("Method", bound=Callable[..., Any])
 
 _FLOAT64 = np.dtype(np.float64)
-_RADIUS, _SPREAD = 0.3, 3.0
+# The paper's epsilon, where neither the rule nor the user has another one, in the unit of z.
+_RADIUS = 0.3
+# Width of recognition, in total variances of all observations, where nobody has another one.
+_SPREAD = 3.0
 _SETTINGS = ("n_actions", "radius", "distance_weight", "learning_rate", "prior_frequency", "spread")
 # What a machine does not have to be told, with what holds if it is not.
 _OPTIONS = {
@@ -152,9 +155,8 @@ class EvolvingFSM(Known):
         hundreds of states this saves most of the time, 1e-6 for example. A jump to a state that
         got none teaches nothing about it until it is recognised. 0 leaves nothing out.
     failure_horizon : int, optional
-        A failure so many observations later, or sooner, came soon after a state: it is counted
-        among what came of being there (`failed_soon`). Without it every failure later in the same
-        episode is.
+        A failure within this many observations of a visit is counted in `failed_soon`; without
+        it, every failure later in the same episode.
 
     Raises
     ------
@@ -602,8 +604,7 @@ prior_frequency=0.001, spread=3.0)
         >>> machine.predict(0, horizon=10, policy="hold").round(3)
         array([0.686, 0.314])
         """
-        i = check_action(i, self.n_actions)
-        return self.propagate(self.belief, i, horizon, policy)
+        return self._ahead(self.belief, check_action(i, self.n_actions), horizon, policy)
 
     @_alone
     def explain(
@@ -1082,10 +1083,15 @@ prior_frequency=0.001, spread=3.0)
     @_alone
     def _array(self, array: Array) -> NDArray[np.float64]:
         """An array of the table, as people see it."""
-        n, arrays = self.n_states, dict(leaves(self._memory.learnt))
-        values = arrays[array.name]
+        n, memory, place = self.n_states, self._memory, PLACES[array]
+        if array.kind == "state":
+            values = memory.per_state[place.number]
+        elif array.kind == "place":
+            values = memory.per_place[place.number]
+        else:
+            values = dict(leaves(memory.learnt))[array.name]
         if array.latest:  # what belongs to an episode that is going on is not shown yet
-            values = values - self._under_way(arrays[array.latest])
+            values = values - self._under_way(getattr(memory.learnt.outcomes, array.latest))
         if array.kind == "place":
             return self._of_actions(values, 0.0)
         seen: NDArray[np.float64] = values[tuple(slice(n) for _ in values.shape)]

@@ -40,9 +40,9 @@ from evofsm.core.states.rule import RuleSettings
 from evofsm.core.transitions import count_open
 from evofsm.core.validation import refuse_more_failures, refuse_unless_distribution
 
-# A buffer begins with its sizes (m, q, capacity, places); settings follow, whether anybody told of
-# failures, whether it is closed, and counters.
-_SETTINGS, _HEAD = 4, 32
+# A buffer begins with its sizes (m, q, capacity, places); settings follow from here on, whether
+# anybody told of failures, whether it is closed, and counters.
+_SETTINGS = 4
 # Where the centre of a state that is not there stands: too far for any belief.
 _NOWHERE = np.inf
 
@@ -84,9 +84,11 @@ number_fields(Memory)
 _FAILURES_TOLD = _SETTINGS + COUNTS["setting"]
 _CLOSED = _FAILURES_TOLD + 1
 _COUNTERS = _CLOSED + 1
-_PER_STATE, _PER_PLACE = COUNTS["state"], COUNTS["place"]
-_PER_ACTION, _PER_VARIABLE = COUNTS["action"], COUNTS["variable"]
-
+_HEAD = lanes(_COUNTERS + COUNTS["counter"])
+_PER_STATE = COUNTS["state"]
+_PER_PLACE = COUNTS["place"]
+_PER_ACTION = COUNTS["action"]
+_PER_VARIABLE = COUNTS["variable"]
 
 # The counters that tell where the present episode is; the first belief stands behind them all.
 _ACTION, _CHAINED, _STATE, _CLOCK, _BEGAN = (

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from evofsm.core.actions import IntervalActions
+from evofsm.core.numbering import action_name
 
 # What a terminal obeys, or cannot print: control characters but for tab and newline, ends of lines
 # and directions of Unicode, halves of characters.
@@ -27,28 +28,6 @@ def visible(text: str) -> str:
     'gap \\u001b[2J'
     """
     return _UNPRINTABLE.sub(lambda found: f"\\u{ord(found[0]):04x}", text)
-
-
-def state_name(index: int) -> str:
-    """A state as people read it, counted from 1, by its index from 0.
-
-    Examples
-    --------
-    >>> state_name(3)
-    '#4'
-    """
-    return f"#{index + 1}"
-
-
-def action_name(index: int) -> str:
-    """An action as people read it, counted from 1 as in the paper, by its index from 0.
-
-    Examples
-    --------
-    >>> action_name(16)
-    'a(17)'
-    """
-    return f"a({index + 1})"
 
 
 class Words(NamedTuple):

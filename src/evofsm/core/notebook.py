@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evofsm.core.known import Known
-from evofsm.core.naming import state_name
+from evofsm.core.numbering import state_name
 
 # More rows than these are summed up in one.
 _MOST_STATES = 12

@@ -51,9 +51,11 @@ from evofsm.core.transitions import (
 )
 from evofsm.files import LARGEST_OBSERVATION
 
-# What `step` returns instead of an event where it did nothing.
-FULL, REFUSED = -1, -2
-# What `_update` returns where it did nothing; no surprise is below 0.
+# Returned by `step` instead of an event: it did nothing, for there was no room for a state.
+FULL = -1
+# The same, for the observation or the action is none that the machine knows.
+REFUSED = -2
+# Returned by `_update` where it did nothing [bit]; no surprise is below 0.
 DECLINED = -1.0
 _COMPILING = Lock()
 # Whether a machine may have to give up states (`evofsm.core.crowding`): a number, or None. Numba

@@ -8,6 +8,7 @@ from typing import Any, SupportsFloat, SupportsIndex
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from evofsm.core.numbering import action_name, state_name
 from evofsm.files import LARGEST_OBSERVATION
 
 # Cases, and failures among them.
@@ -136,7 +137,10 @@ def check_action(i: SupportsIndex, n_actions: int) -> int:
             "(IntervalActions.encode turns a number into one)"
         ) from None
     if not 0 <= index < n_actions:
-        raise ValueError(f"action is {index}; there are actions 0 to {n_actions - 1}")
+        raise ValueError(
+            f"action is {index}; there are actions 0 to {n_actions - 1}, which texts call "
+            f"{action_name(0)} to {action_name(n_actions - 1)}"
+        )
     return index
 
 
@@ -147,7 +151,10 @@ def check_state(state: Any, n_states: int) -> int:
     except TypeError:
         raise TypeError(f"state is {state!r}; it must be an integer index, from 0") from None
     if not 0 <= index < n_states:
-        raise ValueError(f"state is {index}; there are {n_states} states, from 0")
+        raise ValueError(
+            f"state is {index}; there are {n_states} states, from 0, which texts call "
+            f"{state_name(0)}"
+        )
     return index
 
 

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import astuple
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from evofsm.core import EvolvingFSM, IntervalActions, Novelty, StateRule
 from evofsm.driving.families.family import Draw, Family
@@ -32,6 +33,7 @@ def guard_for_cars(
     interval: float = 0.25,
     *,
     width: float = 0.3,
+    closed: Literal["left", "right"] = "left",
     tolerance: float = 0.02,
     mode: Mode = Mode.ACT,
     rule: StateRule | None = SAFETY_RULE,
@@ -51,6 +53,8 @@ def guard_for_cars(
         Time between two decisions [s].
     width : float
         Of an interval of accelerations, for the machine [m/s²].
+    closed : {"left", "right"}
+        Which edge belongs to an interval.
     tolerance : float
         Highest latent risk that is accepted, in (0, 1).
     mode : Mode
@@ -69,37 +73,7 @@ def guard_for_cars(
     >>> guard.decide([150.0, 20.0, 20.0], proposal=0.5).reason
     'never seen before; risk is within the tolerance'
     """
-    actions = IntervalActions(low, high, width, outside="clip")
-    return _guard(
-        actions, interval, tolerance, mode, rule=rule, machine=machine, judge=judge, **settings
-    )
-
-
-def guard_for_family(
-    family: Family, *, tolerance: float = 0.02, mode: Mode = Mode.ACT, **settings: Any
-) -> Guard:
-    """The same for a family's set of actions and interval.
-
-    Parameters
-    ----------
-    family : Family
-    tolerance, mode, **settings
-        As in `guard_for_cars`.
-    """
-    return _guard(family.actions, family.interval, tolerance, mode, **settings)
-
-
-def _guard(
-    actions: IntervalActions,
-    interval: float,
-    tolerance: float,
-    mode: Mode,
-    *,
-    rule: StateRule | None = SAFETY_RULE,
-    machine: EvolvingFSM | None = None,
-    judge: LearningJudge | None = None,
-    **settings: Any,
-) -> Guard:
+    actions = IntervalActions(low, high, width, closed, outside="clip")
     judge = LatentRisk(actions.low, interval) if judge is None else judge
     machine = machine or EvolvingFSM(
         actions.n_actions,
@@ -109,6 +83,12 @@ def _guard(
     )
     reviser = ActionReviser(judge, actions, tolerance=tolerance, mode=mode)
     return Guard.of(reviser, interval=interval, machine=machine, judge=judge, **settings)
+
+
+def guard_for_family(family: Family, **settings: Any) -> Guard:
+    """The same for a family's set of actions and interval; settings as in `guard_for_cars`."""
+    low, high, width, closed, _ = astuple(family.actions)
+    return guard_for_cars(low, high, family.interval, width=width, closed=closed, **settings)
 
 
 # -- In a family ----------------------------------------------------------------------------------

@@ -45,7 +45,7 @@ class Kept(NamedTuple):
 
 
 class Checkpoint:
-    """Keeps how far work has come in a file, as often as it is told to.
+    """Keeps how far work has come in a file, at intervals of time.
 
     Parameters
     ----------
@@ -80,7 +80,7 @@ class Checkpoint:
         self._latest = time.monotonic()
 
     def begin(self, start: Kept) -> Kept:
-        """What to go on from: what the file holds, or ``start``, which is then written.
+        """Return what to go on from: the content of the file, or ``start``, which is then written.
 
         Raises
         ------
@@ -116,7 +116,7 @@ class Checkpoint:
         return time.monotonic() - self._latest >= self.every
 
     def offer(self, take: Callable[[], Kept]) -> None:
-        """Keep what ``take`` answers, if it is time to."""
+        """Keep what ``take`` returns, if `is_due`."""
         if self.is_due:
             self.keep(take())
 

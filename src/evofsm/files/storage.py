@@ -48,9 +48,15 @@ _LEAST_VERSION = 5
 _HEADER = "header"
 #: No file holds more, unpacked [bytes].
 LARGEST = 1 << 32
-_LARGEST_HEADER, _MOST_MEMBERS, _LARGEST_DIRECTORY = 1 << 24, 128, 1 << 16
+# A longer header is refused [bytes].
+_LARGEST_HEADER = 1 << 24
+# More arrays are refused.
+_MOST_MEMBERS = 128
+# A longer directory of an archive is refused [bytes].
+_LARGEST_DIRECTORY = 1 << 16
 # Deflate cannot do better than this; whoever claims more is lying.
 _DENSEST = 1032
+# So much of an array is unpacked at once [bytes].
 _AT_ONCE = 1 << 20
 _BEGINNING = b"PK\x03\x04"  # of a ZIP
 # Where nothing can be locked, what is as old as this is no longer written [s].

@@ -8,23 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from operator import attrgetter
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 from evofsm.guard.protocols import Intake, Revision, Situation
-
-
-class Decided(Protocol):
-    """Anything that holds a situation and what was decided in it."""
-
-    @property
-    def situation(self) -> Situation:
-        """Where the system was."""
-        ...
-
-    @property
-    def revision(self) -> Revision:
-        """What was decided."""
-        ...
 
 
 class Pair(NamedTuple):

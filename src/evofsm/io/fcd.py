@@ -274,7 +274,7 @@ class _XmlReader:
         parser.StartDoctypeDeclHandler = self._refuse_doctype
 
     def feed(self, data: bytes, last: bool = False) -> list[Timestep]:
-        """Parse more of the file; answers the timesteps that ended in it."""
+        """Parse more of the file; returns the timesteps that ended in it."""
         try:
             self._parser.Parse(data, last)
         except expat.ExpatError as error:

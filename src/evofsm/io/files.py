@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from typing import BinaryIO, Literal, cast
 
 Kind = Literal["csv", "parquet", "xml"]
-#: Is told the number of bytes each time some were read from a file.
+#: Called with the number of bytes each time some were read from a file.
 OnRead = Callable[[int], object]
 
 BYTE_ORDER_MARK = b"\xef\xbb\xbf"
@@ -67,8 +67,8 @@ class _WatchedFile(io.FileIO):
 def open_unpacked(path: str, on_read: OnRead = ignore) -> Iterator[BinaryIO]:
     """Open a file for reading bytes; one that is gzipped is unpacked on the way.
 
-    Of one that grows meanwhile no more is read than was there at first, and its last line; where
-    someone is told what is read, that is logged as a warning.
+    Of one that grows meanwhile no more is read than was there at first, and its last line; with
+    ``on_read``, a warning is logged.
     """
     if os.path.isdir(path):
         raise IsADirectoryError(f"{path} is a folder; name the files in it")

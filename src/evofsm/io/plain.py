@@ -1,9 +1,9 @@
-"""Parse plain CSV in compiled code: a block of whole lines at a time, without any doubt.
+"""Parse plain CSV in compiled code, a block of whole lines at a time.
 
-What is plain is parsed exactly as Python's ``csv`` and ``float`` would: rows of the right number
-of fields, quoted or not, and decimal numbers. A single field that may be a number of another kind
-is left to ``float``; a block in which anything else is odd is not parsed at all, and whoever
-asked has to look at it more carefully.
+Plain are rows of the right number of fields, quoted or not, and decimal numbers; they are parsed
+exactly as Python's ``csv`` and ``float`` would. A single field that may be a number of another kind
+is left to ``float``; a block with anything else in it is not parsed, and the caller has to read it
+with Python's own reader.
 """
 
 from __future__ import annotations
@@ -93,7 +93,7 @@ def parse_plain(
     texts: Sequence[int],
     gaps: Container[int] = (),
 ) -> PlainRows | None:
-    """Parse whole lines of CSV, or answer None where they are not plain.
+    """Parse whole lines of CSV; returns None if they are not plain.
 
     Parameters
     ----------
@@ -163,7 +163,7 @@ def _parse(
     changes: NDArray[np.int64],
     counts: NDArray[np.int64],
 ) -> tuple[int, int, int, bool]:
-    """Fill the arrays; answers lines or `_NOT_PLAIN`, rows, doubts, and whether all is ASCII.
+    """Fill the arrays; returns lines or `_NOT_PLAIN`, rows, doubts, and whether all is ASCII.
 
     A doubt is a slot, a row, and where the field begins and ends; a change of a text is a row
     and the same. No loop needs to look for the end of the block: a line's end stops each.

@@ -144,9 +144,9 @@ def read_traces(
     lengths : VehicleLengths, optional
         Lengths assumed for vehicles in FCD.
     on_read : callable, optional
-        Is told the number of bytes whenever some were read.
+        Called with the number of bytes whenever some were read.
     noted : Noted, optional
-        Is told what was noticed in reading.
+        Collects what is noticed in reading.
 
     Yields
     ------

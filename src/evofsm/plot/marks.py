@@ -19,9 +19,10 @@ from evofsm.extras import needs
 from evofsm.plot.style import DEAD_END, FIRST, FOLLOWER, INK, LEADER, SOFT, WIDTH, Look
 
 with needs("matplotlib", "plot", "plotting"):
+    from matplotlib import colormaps
     from matplotlib.axes import Axes
     from matplotlib.cm import ScalarMappable
-    from matplotlib.colors import ListedColormap, Normalize
+    from matplotlib.colors import ListedColormap
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
 
@@ -120,9 +121,10 @@ def dots(
 def heat(
     axes: Axes,
     values: ArrayLike,
-    scale: Normalize,
+    limits: tuple[float, float],
     *,
-    colors: Any = "cividis_r",
+    steps: int | None = None,
+    colors: str = "cividis_r",
     edges: tuple[ArrayLike, ArrayLike] | None = None,
     text: Callable[[float], str] | None = None,
     size: float = 6.0,
@@ -134,9 +136,12 @@ def heat(
     axes : matplotlib.axes.Axes
     values : (m, n) array_like
         The first row stands below.
-    scale : Normalize
-        From values to [0, 1].
-    colors : colormap
+    limits : (float, float)
+        Values of the first and the last colour.
+    steps : int, optional
+        So many colours; as many as there are without.
+    colors : str
+        Name of a colour map.
     edges : ((n + 1,) array_like, (m + 1,) array_like), optional
         Between cells, to the right and upward; cells 0, 1, ... are of equal size without.
     text : callable, optional
@@ -152,7 +157,9 @@ def heat(
     cells = np.asarray(values, dtype=np.float64)
     x, y = edges or (np.arange(n + 1) - 0.5 for n in cells.shape[::-1])
     right, up = np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64)
-    mesh = axes.pcolormesh(right, up, np.ma.masked_invalid(cells), cmap=colors, norm=scale)
+    shades = colormaps[colors].resampled(steps or 256)
+    seen = np.ma.masked_invalid(cells)
+    mesh = axes.pcolormesh(right, up, seen, cmap=shades, vmin=limits[0], vmax=limits[1])
     axes.grid(visible=False)
     axes.tick_params(length=0.0)
     for j, i in np.ndindex(cells.shape):

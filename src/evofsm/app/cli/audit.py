@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
-import textwrap
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from evofsm.app.cli.common import print_json, say
+from evofsm.app.cli.common import print_json
 from evofsm.app.cli.declared import argument, option
 from evofsm.app.cli.groups import WithJson
 
 if TYPE_CHECKING:
     from evofsm.files import Chain
     from evofsm.guard import Audit as Audited
-    from evofsm.guard import Contents, Field, Replay
+    from evofsm.guard import Contents, Replay
 
-_LABEL = 10
+_KEEP = (
+    "Keep the head where the log is not. Without it (--head) neither an end that is cut off nor a "
+    "log that is written anew can be detected."
+)
 # Of what was found, in the document for programs.
 _PARTS = ("misfit", "remarks", "contents", "replay")
 # So many fields that differ are shown, and so much of each.
@@ -43,6 +46,7 @@ class Audit(WithJson):
 
     def run(self) -> int:
         """Print what was found."""
+        from evofsm.app.text.columns import console, print_facts
         from evofsm.app.text.documents import spelled_out
         from evofsm.files import Head
         from evofsm.guard import audit
@@ -63,39 +67,32 @@ class Audit(WithJson):
                 }
             )
         else:
-            say(self.file)
-            _print(found, head_given=self.head is not None)
+            out = console()
+            print_facts(out, str(self.file), list(_facts(found)))
+            if found.is_good and self.head is None:
+                out.print(_KEEP)
         return 0 if found.is_good else 1
 
 
-def _print(found: Audited, *, head_given: bool) -> None:
+def _facts(found: Audited) -> Iterator[tuple[str, str]]:
+    """What was found, line by line."""
     chain, contents = found.chain, found.contents
-    _say("chain", _of_chain(chain))
+    yield "chain", _of_chain(chain)
     if chain.half_written:
-        _say(
-            "",
-            f"its last line is half written ({chain.half_written} bytes): as by a crash, or it is "
-            "being written now",
-        )
+        cause = "as by a crash, or it is being written now"
+        yield "", f"its last line is half written ({chain.half_written} bytes): {cause}"
     if found.misfit is not None:
-        _say("form", f"FORGED at record {found.misfit.record}: {found.misfit.explanation}")
-    _say("holds", _of_contents(contents) + ("" if chain.finding is None else ", so far"))
+        yield "form", f"FORGED at record {found.misfit.record}: {found.misfit.explanation}"
+    yield "holds", _of_contents(contents) + ("" if chain.finding is None else ", so far")
     if found.replay is not None:
-        _print_replay(found.replay, contents.decisions)
+        yield from _of_replay(found.replay, contents.decisions)
     elif chain.finding is None and found.misfit is None:
-        _say("replay", "not done")
+        yield "replay", "not done"
     else:
-        _say("replay", "not done, since the log was tampered with")
-    for remark in found.remarks:
-        _say("note", remark)
+        yield "replay", "not done, since the log was tampered with"
+    yield from (("note", remark) for remark in found.remarks)
     if chain.finding is None:
-        _say("head", str(chain.head))
-    if found.is_good and not head_given:
-        print()
-        _fill(
-            "Keep the head where the log is not. Without it (--head) neither an end that is "
-            "cut off nor a log that is written anew can be told."
-        )
+        yield "head", str(chain.head)
 
 
 def _of_chain(chain: Chain) -> str:
@@ -117,27 +114,23 @@ def _of_contents(contents: Contents) -> str:
     return ", ".join(parts)
 
 
-def _print_replay(replay: Replay, decisions: int) -> None:
+def _of_replay(replay: Replay, decisions: int) -> Iterator[tuple[str, str]]:
     difference = replay.difference
     good = f"{_count(replay.decisions, 'decision')} as recorded, to the last bit"
     if difference is None:
-        _say("replay", good)
+        yield "replay", good
     else:
-        _say("replay", f"DIFFERS at record {difference.record}: {difference.explanation}")
-        for one in difference.fields[:_FIELDS]:
-            _say("", _of_field(one))
-        _say("", f"before it {good}")
+        yield "replay", f"DIFFERS at record {difference.record}: {difference.explanation}"
+        for name, recorded, replayed in difference.fields[:_FIELDS]:
+            yield "", f"{name}: recorded {_short(recorded)}, replayed {_short(replayed)}"
+        yield "", f"before it {good}"
     for why in dict.fromkeys(replay.not_replayed):
-        _say("", f"{_count(replay.not_replayed.count(why), 'session')} not replayed: {why}")
+        yield "", f"{_count(replay.not_replayed.count(why), 'session')} not replayed: {why}"
     if difference is None and replay.decisions < decisions:
-        _say("", f"{_count(decisions - replay.decisions, 'decision')} compared with nothing")
+        yield "", f"{_count(decisions - replay.decisions, 'decision')} compared with nothing"
     if difference is not None and replay.other_makers:
         then = ", ".join(f"{one.name} {one.recorded}" for one in replay.other_makers)
-        _say("", f"it was recorded with {then}: floats may differ there")
-
-
-def _of_field(field: Field) -> str:
-    return f"{field.name}: recorded {_short(field.recorded)}, replayed {_short(field.replayed)}"
+        yield "", f"it was recorded with {then}: floats may differ there"
 
 
 def _short(text: str) -> str:
@@ -146,19 +139,3 @@ def _short(text: str) -> str:
 
 def _count(count: int, one: str, many: str = "") -> str:
     return f"{count:,} {one if count == 1 else many or one + 's'}"
-
-
-def _say(label: str, text: str) -> None:
-    _fill(text, f"  {label}".ljust(_LABEL), " " * _LABEL)
-
-
-def _fill(text: str, first: str = "", others: str = "") -> None:
-    """Print a text as wide as the terminal is."""
-    from evofsm.app.text.columns import console
-
-    width = max(console().width, 3 * _LABEL)
-    say(
-        textwrap.fill(
-            text, width, initial_indent=first, subsequent_indent=others, break_on_hyphens=False
-        )
-    )

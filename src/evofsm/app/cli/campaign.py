@@ -13,7 +13,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from evofsm.app.cli.common import chosen_mode, print_json, progress
+from evofsm.app.cli.common import print_json, progress
 from evofsm.app.cli.declared import option
 from evofsm.app.cli.groups import Driven
 
@@ -65,18 +65,12 @@ class Campaign(Driven):
 
     def run(self) -> int | None:
         """Drive what the folder does not hold yet, and print what came of all of it."""
-        from evofsm.app.driving import Setup, make_guard
+        from evofsm.app.driving import make_guard
         from evofsm.app.text.columns import console
         from evofsm.app.text.driving import print_outcome
         from evofsm.driving import load_learnt
 
-        family = self.load_family(self.family)
-        mode = chosen_mode(self.mode)
-        setup = Setup(
-            *(family, self.controller, self.reviser, mode, self.tolerance),
-            *(self.episodes, self.seed),
-            learn=False,
-        )
+        setup = self.setup(self.episodes, learn=False)
         guard = make_guard(setup, *(load_learnt(self.frozen) if self.frozen else ()))
         open_executor, count = self._executor()
         self.out.mkdir(parents=True, exist_ok=True)

@@ -123,7 +123,7 @@ def _columns_with_rate(unit: str) -> tuple[ProgressColumn, ...]:
 
 
 def counter(bars: Progress, text: str) -> Callable[[int, int], None]:
-    """A bar that is told how much is done, of how much."""
+    """Add a bar; returns a function of how much is done, and of how much."""
     if bars.disable:
         print(f"{text} ...", file=sys.stderr)
     task = bars.add_task(text, total=None)

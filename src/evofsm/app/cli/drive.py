@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from evofsm.app.cli.common import chosen_mode, print_json, progress
+from evofsm.app.cli.common import print_json, progress
 from evofsm.app.cli.declared import option
 from evofsm.app.cli.groups import Driven
 
@@ -52,16 +52,12 @@ class Drive(Driven):
 
     def packages(self) -> dict[str, str]:
         """What the files that are asked for need as well."""
-        needed = super().packages()
-        return (
-            needed
-            | ({"polars": "tables"} if self.out else {})
-            | ({"mcap": "mcap"} if self.mcap else {})
-        )
+        written = {"polars": "tables"} if self.out else {}
+        return super().packages() | written | ({"mcap": "mcap"} if self.mcap else {})
 
     def run(self) -> None:
         """Drive, and print what came of it."""
-        from evofsm.app.driving import Setup, episodes_learnt, make_guard, write_driving
+        from evofsm.app.driving import episodes_learnt, make_guard, write_driving
         from evofsm.app.text.columns import console
         from evofsm.app.text.driving import driving_document, print_driving
         from evofsm.driving import learnt_by, load_learnt, open_world
@@ -75,18 +71,8 @@ class Drive(Driven):
                 "--mcap and --checkpoint exclude each other: a log holds what one run has driven"
             )
         interval = duration(self.every)
-        family = self.load_family(self.family)
-        setup = Setup(
-            family,
-            self.controller,
-            self.reviser,
-            chosen_mode(self.mode),
-            self.tolerance,
-            self.episodes,
-            self.seed,
-            learn=self.frozen is None,
-            first=episodes_learnt(self.learn) if self.learn else 0,
-        )
+        first = episodes_learnt(self.learn) if self.learn else 0
+        setup = self.setup(self.episodes, learn=self.frozen is None, first=first)
         start = self.learn or self.frozen
         guard = make_guard(setup, *(load_learnt(start) if start else ()))
         if self.out is not None:
@@ -102,7 +88,7 @@ class Drive(Driven):
         ):
             driving = _drive(setup, guard, place, keeper, log, run)
             if run is not None:
-                run.attach(learnt_by(driving.guard)[0].model(**family.labels._asdict()))
+                run.attach(learnt_by(driving.guard)[0].model(**setup.family.labels._asdict()))
         if self.out is not None:
             with result_kept(keeper):
                 write_driving(driving, setup, self.out)

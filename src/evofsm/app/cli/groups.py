@@ -6,10 +6,11 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import TYPE_CHECKING
 
-from evofsm.app.cli.common import split_names
+from evofsm.app.cli.common import chosen_mode, split_names
 from evofsm.app.cli.declared import Command, argument, option
 
 if TYPE_CHECKING:
+    from evofsm.app.driving import Setup
     from evofsm.driving import Family
 
 
@@ -82,3 +83,19 @@ class Driven(Revised, WithJson):
         "Family of scenarios: emergency, paper, shift, ..., or a TOML file of your own."
     )
     mode: str = option("act", "How far least-risk goes: off, shadow, advise, act.")
+
+    def setup(self, episodes: int, *, learn: bool, first: int = 0) -> Setup:
+        """What is driven; ``first`` is how many episodes were driven before."""
+        from evofsm.app.driving import Setup
+
+        return Setup(
+            self.load_family(self.family),
+            self.controller,
+            self.reviser,
+            chosen_mode(self.mode),
+            self.tolerance,
+            episodes,
+            self.seed,
+            learn=learn,
+            first=first,
+        )

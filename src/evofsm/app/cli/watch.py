@@ -26,8 +26,8 @@ class Watch(Revised):
     """Watch a run in the browser while it is driven, and act on it; or one that was recorded.
 
     The page shows the cars, what the machine believes, latent risk beside time to collision, and
-    what was done about it. It answers on this computer only, under the address that is printed,
-    and the run begins as the page is first opened. Ctrl-C ends it.
+    what was done about it. It is served to this computer only, at the address that is printed, and
+    the run begins when the page is first opened. Ctrl-C ends it.
     """
 
     what: str = argument(

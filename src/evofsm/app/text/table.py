@@ -23,7 +23,7 @@ class Column(Generic[R]):
         Name of the row's attribute (several names with spaces between them: a tuple), or a function
         of the row. None is written as the text of a missing number.
     show : callable
-        Writes a value: `percent`, `count`, `decimals(2)`, `span(1)`, ...; a plain tuple is passed
+        Writes a value: `percent`, `count`, `decimals(2)`, `span(1)`, ...; a tuple is passed
         as several arguments.
     unit : str
         Stands in brackets behind the header.
@@ -46,7 +46,7 @@ class Column(Generic[R]):
         found = read(row)
         if found is None:
             return NONE
-        return self.show(*found) if type(found) is tuple else self.show(found)
+        return self.show(*found) if isinstance(found, tuple) else self.show(found)
 
 
 @dataclass(frozen=True)

@@ -2,8 +2,17 @@
 
 from evofsm.app.watch.player import SPEEDS, Audience, Clock, Player, Watched
 from evofsm.app.watch.session import Session, Watching, learn_first, watched_guard
-from evofsm.app.watch.shown import Frame, Graph, Judged, Start, StateShown, Transition
-from evofsm.app.watch.story import Chronicle, Danger, Story
+from evofsm.app.watch.shown import (
+    Danger,
+    Frame,
+    Graph,
+    Judged,
+    Start,
+    StateShown,
+    Story,
+    Transition,
+)
+from evofsm.app.watch.story import Chronicle
 
 __all__ = [
     "SPEEDS",

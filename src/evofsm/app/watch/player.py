@@ -14,7 +14,7 @@ from evofsm.app.watch.shown import Frame, Graph, Start
 #: Speeds that can be chosen, as multiples of real time.
 SPEEDS = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
 
-# Between two graphs, unless a state was founded [decisions].
+# Between two graphs, unless a state was created [decisions].
 _GRAPH_EVERY = 8
 # Who is late by more does not hurry to make up for it [s].
 _LATE = 0.1

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, NamedTuple
 
-if TYPE_CHECKING:
-    from evofsm.app.watch.shown import Frame
+from evofsm.app.watch.shown import Danger, Frame, Story
 
 # Danger is over once the driver's wishes were tolerable for so long [s].
 _CALM = 2.0
@@ -14,48 +12,6 @@ _CALM = 2.0
 _DEAD_END = 0.5
 # Actions that differ by less are the same, and softer braking is no full brake [m/s²].
 _SAME, _LEADER_BRAKES = 0.05, -2.5
-
-
-class Danger(NamedTuple):
-    """A stretch of time in which the driver's wishes were not tolerable."""
-
-    since: float  #: [s]
-    gap: float  #: then [m]
-    speed: float  #: the follower's, then [m/s]
-    closing: float  #: the follower's speed less the leader's, then [m/s]
-    risk: float  #: of what the driver then wanted
-    critical: float  #: hardest braking of the leader that was then survived [m/s²]
-    brakes_to: float  #: how hard leaders were then known to brake [m/s²]
-    decel: float  #: how hard the follower was then known to brake in full [m/s²]
-    proposed: float  #: what the driver then wanted [m/s²]
-    advised: float  #: what the reviser then found better [m/s²]
-    stepped_in: float = math.nan  #: when the reviser first changed something in it [s]
-    wished: float = math.nan  #: what the driver wanted then [m/s²]
-    instead: float = math.nan  #: and what was executed [m/s²]
-    revised: int = 0  #: decisions in it that the reviser changed
-    change: float = 0.0  #: by how much, all of them together [m/s²]
-    off: float = math.nan  #: time of the latest decision in it with the reviser off [s]
-    decisions: int = 0  #: decisions in it
-    hardest: float = math.inf  #: lowest acceleration that the reviser put through in it [m/s²]
-    dead_end: float = math.nan  #: since when full braking was too late as well [s]
-    last: float = math.nan  #: time of the latest decision that was not tolerable [s]
-
-
-class Story(NamedTuple):
-    """What has happened so far; times are NaN where it has not."""
-
-    danger: Danger | None = None  #: the present or the latest one
-    in_danger: bool = False
-    first: float = math.nan  #: when danger began for the first time [s]
-    time_to_collision: float = math.nan  #: when it first fell below its threshold [s]
-    time_headway: float = math.nan  #: the same of time headway [s]
-    leader_brakes: float = math.nan  #: when the leader first braked hard [s]
-    leader_decel: float = math.nan  #: how hard it has braked since, at most [m/s²]
-    revised: int = 0  #: decisions that the reviser changed, in danger or not
-    alone: float = math.nan  #: when the driver left alone collides [s]; infinite if it does not
-    collision: float = math.nan  #: [s]
-    impact: float = math.nan  #: speed at which the cars met [m/s]
-    ended: float = math.nan  #: [s]
 
 
 class Chronicle:

@@ -21,8 +21,10 @@ from evofsm.core.elementary import fma, largest
 from evofsm.core.kernels import inner_kernel, lanes
 from evofsm.core.learnt import Clusters
 
-# What may happen to the states.
-UNCHANGED, MOVED, CREATED = 0, 1, 2
+# What may happen to the states: bits of an `Event`.
+UNCHANGED = 0
+MOVED = 1
+CREATED = 2
 
 # A share that no rounding comes to, and that no two observations tell apart either.
 _ROUNDING = 1e-12

@@ -11,8 +11,9 @@ from evofsm.core.validation import positive
 
 CODE = 2
 
-# Squares of observations over these, summed over a long run, must not overflow.
-_SMALLEST_SCALE, _LARGEST_SCALE = 1e-20, 1e20
+# Squares of observations over the scales, summed over a long run, must not overflow.
+_SMALLEST_SCALE = 1e-20
+_LARGEST_SCALE = 1e20
 
 
 @dataclass(frozen=True)

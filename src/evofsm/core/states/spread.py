@@ -12,7 +12,7 @@ from evofsm.core.kernels import inner_kernel
 _LOWEST_EXPONENT = -690.0
 # In place of 1 / width where that would overflow: only the nearest centres keep a belief.
 _SHARPEST = 1e300
-# Steps in which it is found out how large a similarity may be left out.
+# Factor by which the cut-off is raised while what is left out stays below `tolerance`.
 _COARSENESS = 4.0
 
 

@@ -41,7 +41,7 @@ class FunctionController:
             raise TypeError(f"function is {self.function!r}, which cannot be called")
 
     def propose(self, observation: NDArray[np.float64], time: float = 0.0) -> Proposal:
-        """What the function answers to ``observation``; the time does not matter.
+        """What the function returns for ``observation``; the time does not matter.
 
         Raises
         ------

@@ -269,7 +269,7 @@ class OwnBrakes:
 
 @compiled
 def _add(rows: NDArray[np.float64], count: int, value: float, begins: bool) -> int:
-    """Add a row; answers how many there are."""
+    """Add a row; returns how many there are."""
     if count == len(rows):
         count -= 1
         for i in range(count):

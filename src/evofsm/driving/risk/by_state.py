@@ -105,7 +105,7 @@ class StateRisk(NamedTuple):
 
 
 def assess_states(known: EvolvingFSM | FSMModel, risk: LatentRisk) -> list[StateRisk]:
-    """Latent risk at the centre of every state, in the order of founding.
+    """Latent risk at the centre of every state, in the order of creation.
 
     Parameters
     ----------

@@ -192,7 +192,7 @@ class BrakeWatch:
     def see(
         self, gap: float, speed: float, leader_speed: float, noise: float = 0.0
     ) -> float | None:
-        """Take in an observation; answers the deceleration of a manoeuvre that ended [m/s²].
+        """Take in an observation; returns the deceleration of a manoeuvre that ended [m/s²].
 
         ``noise`` is the standard deviation of that on the difference of two speeds [m/s].
         """
@@ -220,7 +220,7 @@ class BrakeWatch:
         return None
 
     def end(self) -> float | None:
-        """Close the manoeuvre under way, as an episode ends; answers its deceleration [m/s²]."""
+        """Close the manoeuvre under way, as an episode ends; returns its deceleration [m/s²]."""
         speeds, self._braking = self._braking, []
         while len(speeds) > 1 and speeds[-1] <= 0.0:
             speeds.pop()  # in the interval in which it came to a standstill it did not only brake

@@ -84,11 +84,11 @@ class Spreads:
     def take_in(
         self, before: Three, now: Three, realised: float, changes: tuple[float, float], dt: float
     ) -> tuple[Three, tuple[float, float]]:
-        """Add what kinematics do not explain; answers the noise, and the `changes` of now."""
+        """Add what kinematics do not explain; returns the noise, and the `changes` of now."""
         return _take_in(self._sizes, self._sorted, self._added, before, now, realised, changes, dt)
 
     def restore(self, sizes: Iterable[NDArray[np.float64]]) -> None:
-        """Take over what `sizes` answered."""
+        """Take over what `sizes` returned."""
         for k, latest in enumerate(np.abs(given[-_MEMORY:]) for given in sizes):
             count = self._added[k] = len(latest)
             self._sizes[k, :count], self._sorted[k, :count] = latest, np.sort(latest)
@@ -196,7 +196,7 @@ class Perception:
         self.restore(dict(zip(_NAMES, merged, strict=True)))
 
     def restore(self, arrays: dict[str, NDArray[np.float64]]) -> None:
-        """Take over what `learnt` answered."""
+        """Take over what `learnt` returned."""
         self.spreads.restore([arrays[name] for name in _NAMES])
         self.noise = _noise(self.spreads.deviations, self.dt)
         self._asked = None

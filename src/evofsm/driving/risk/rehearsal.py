@@ -3,7 +3,7 @@
 The follower does what is asked of it for one decision interval and then brakes in full; the leader
 begins to brake, now or a little later, and keeps braking until it stands. The *critical
 deceleration* is the hardest braking of the leader that ends without a collision. Only kinematics
-is taken as known; how hard the follower itself can brake, how late it answers and how hard leaders
+is taken as known; how hard the follower itself can brake, how late it responds and how hard leaders
 brake is for others to learn.
 
 Asking for the fixed cautious policy, and not for the best of many uncertain answers, keeps luck

@@ -90,7 +90,7 @@ def _drive(
     record: NDArray[np.float64],
     positions: NDArray[np.float64],
 ) -> int:
-    """Ask a compiled driver at every step; answers the row in which it ended."""
+    """Ask a compiled driver at every step; returns the row in which it ended."""
     row = 0
     while True:
         now = record[row]

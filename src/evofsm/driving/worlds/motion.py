@@ -113,7 +113,7 @@ def advance(
     command: float,
     steps: int,
 ) -> int:
-    """Some steps under one command, in closed form; answers the row reached.
+    """Some steps under one command, in closed form; returns the row reached.
 
     ``positions`` are those of the follower, the leader, and the car behind. Where the run is over
     no one moves any more.

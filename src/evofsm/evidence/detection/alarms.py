@@ -58,7 +58,7 @@ def count_alarms(
         Between decisions [s].
     """
     hold, patience = (round(seconds / interval) for seconds in (HOLD, PATIENCE))
-    return Alarms(*_count(score, cases.truth, cases.first, threshold, hold, patience))
+    return Alarms(*_follow(score, cases.truth, cases.first, threshold, hold, patience)[:3])
 
 
 def choose_threshold(
@@ -121,21 +121,27 @@ def lead_times(
     """
     interval = exposure.family.interval
     first = np.append(0, np.cumsum([len(one.commands) for one in exposure.watched]))
-    since = _since(score, first, threshold, round(HOLD / interval))
+    nothing = np.zeros(len(score), dtype=np.bool_)
+    *_, since = _follow(score, nothing, first, threshold, round(HOLD / interval), 0)
     lead = np.where(since >= 0, exposure.ends - interval * since, 0.0)
     return np.asarray(lead[exposure.collided])
 
 
 @compiled
-def _count(
+def _follow(
     score: NDArray[np.float64],
     truth: NDArray[np.bool_],
     first: NDArray[np.intp],
     threshold: float,
     hold: int,
     patience: int,
-) -> tuple[int, int, int]:
+) -> tuple[int, int, int, NDArray[np.intp]]:
+    """Alarms that were false and true, decisions in false alarm, and those still on at the end.
+
+    The last are the decisions at which they came on, for each episode; -1 where none is on.
+    """
     false = true = false_decisions = 0
+    since = np.full(len(first) - 1, -1)
     for episode in range(len(first) - 1):
         left, came_true, came_on = 0, False, 0
         for row in range(first[episode], first[episode + 1]):
@@ -155,24 +161,5 @@ def _count(
         if left > 0:
             true += came_true
             false += not came_true
-    return false, true, false_decisions
-
-
-@compiled
-def _since(
-    score: NDArray[np.float64], first: NDArray[np.intp], threshold: float, hold: int
-) -> NDArray[np.intp]:
-    """Decision at which the alarm came that is on at the end of each episode; -1 for none."""
-    since = np.full(len(first) - 1, -1)
-    for episode in range(len(first) - 1):
-        left = 0
-        for row in range(first[episode], first[episode + 1]):
-            if score[row] > threshold:
-                if left == 0:
-                    since[episode] = row - first[episode]
-                left = hold
-            elif left > 0:
-                left -= 1
-        if left == 0:
-            since[episode] = -1
-    return since
+            since[episode] = came_on - first[episode]
+    return false, true, false_decisions, since

@@ -6,9 +6,11 @@ import math
 from collections.abc import Iterator
 from functools import partial
 from itertools import product
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from evofsm import plot
 from evofsm.driving import Group
 from evofsm.evidence.closed_loop.calibration import Reliability
 from evofsm.evidence.detection.measures import Ours
@@ -16,37 +18,19 @@ from evofsm.evidence.detection.rows import Row
 from evofsm.evidence.detection.study import ASSUMED, IN_GRID, Detection
 from evofsm.evidence.detection.watch import WHAT, Target
 from evofsm.evidence.report.drawing import Sketch
-from evofsm.extras import needs
 
-with needs("matplotlib", "plot", "drawing figures"):
-    from matplotlib.colors import Normalize
+if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from evofsm.plot import (
-        FIXED,
-        INK,
-        OTHER,
-        OURS,
-        PLAIN,
-        TOLD,
-        Look,
-        dots,
-        heat,
-        legend,
-        level,
-        name_lines,
-        panels,
-        reliability,
-    )
 
-_LOOKS: dict[str, Look] = {
-    Ours.DEFAULT: {**OURS, "markersize": 7.5},
-    Ours.STATES: {**OURS, "markersize": 5.0, "fillstyle": "none"},
-    Ours.PAPER: {**OTHER, "marker": "P", "markersize": 6.0},
-    "rss-r157": FIXED,
-    "rss-matched": TOLD,
-    "headway": {**PLAIN, "marker": "^"},
-    "ttc": {**PLAIN, "marker": "x", "color": INK},
+_LOOKS: dict[str, plot.Look] = {
+    Ours.DEFAULT: {**plot.OURS, "markersize": 7.5},
+    Ours.STATES: {**plot.OURS, "markersize": 5.0, "fillstyle": "none"},
+    Ours.PAPER: {**plot.OTHER, "marker": "P", "markersize": 6.0},
+    "rss-r157": plot.FIXED,
+    "rss-matched": plot.TOLD,
+    "headway": {**plot.PLAIN, "marker": "^"},
+    "ttc": {**plot.PLAIN, "marker": "x", "color": plot.INK},
 }
 # AUROC is drawn as what it lacks to 1, and nothing below this is told apart.
 _CLOSEST = 1e-4
@@ -79,7 +63,7 @@ def sketches(study: Detection) -> Iterator[Sketch]:
             f"Probability of a {WHAT[Target.COLLISION]}, going on as driven, against how often it "
             "came on held-out draws. On the dashed line both agree.",
             "Two reliability diagrams with the number of cases below each.",
-            partial(reliability, {one.title: one.bins for one in fits}),
+            partial(plot.reliability, {one.title: one.bins for one in fits}),
         )
     if study.grid:
         yield Sketch(
@@ -99,27 +83,27 @@ def sketches(study: Detection) -> Iterator[Sketch]:
 def draw_areas(study: Detection) -> Figure:
     """AUROC by world and measure, for both targets."""
     worlds = study.families
-    figure, grid = panels(1, 2, 1.1 + 0.36 * len(worlds), sharex=True, sharey=True)
+    figure, grid = plot.panels(1, 2, 1.1 + 0.36 * len(worlds), sharex=True, sharey=True)
     shifts = np.linspace(-0.36, 0.36, len(_LOOKS))
     for axes, target in zip(grid.flat, Target, strict=True):
-        level(axes, 0.5, across=False)
+        plot.level(axes, 0.5, across=False)
         for shift, (measure, look) in zip(shifts, _LOOKS.items(), strict=True):
             rows = [study.row(world, measure, target) for world in worlds]
             areas = np.array(
                 [(r.auroc, r.auroc_low, r.auroc_high) if r else (math.nan,) * 3 for r in rows]
             )
             lacking = np.maximum(1.0 - areas, _CLOSEST)
-            dots(axes, look, np.arange(len(worlds)) + shift, *lacking.T)
+            plot.dots(axes, look, np.arange(len(worlds)) + shift, *lacking.T)
         axes.set_title(WHAT[target].capitalize())
         axes.set_xlabel("1 − AUROC")
-        name_lines(axes, worlds, striped=True)
+        plot.name_lines(axes, worlds, striped=True)
     ticks = {_CLOSEST: "≤ 0.0001", 1e-3: "0.001", 1e-2: "0.01", 0.1: "0.1", 0.5: "0.5"}
     grid[0, 0].set(xscale="log", xlim=(0.7 * _CLOSEST, 1.15))
     grid[0, 0].set_xticks(list(ticks), list(ticks.values()))
     for axes in grid.flat:
         axes.minorticks_off()
         axes.tick_params(axis="x", labelsize=6.5)
-    legend(figure, _LOOKS)
+    plot.legend(figure, _LOOKS)
     return figure
 
 
@@ -130,13 +114,13 @@ def draw_leads(study: Detection) -> Figure:
     wanted = list(product(families or study.families[:1], Target))
     names = list(dict.fromkeys(row.measure for row in study.rows if "filtered" not in row.measure))
     height = len(wanted) // 2 * (0.5 + 0.15 * len(names)) + 0.6
-    figure, grid = panels(len(wanted) // 2, 2, height, sharey=True)
+    figure, grid = plot.panels(len(wanted) // 2, 2, height, sharey=True)
     ours, fixed, told = ("ours", "fixed constants", "tuned, or told the truth")
     kinds = {Group.LEARNT: ours, Group.FIXED: fixed}
-    looks = {ours: OURS, fixed: {**FIXED, "color": INK}, told: TOLD}
+    looks = {ours: plot.OURS, fixed: {**plot.FIXED, "color": plot.INK}, told: plot.TOLD}
     for axes, (family, target) in zip(grid.flat, wanted, strict=True):
         axes.set_title(f"{family}: {WHAT[target]}")
-        name_lines(axes, names, bold=(Ours.DEFAULT,))
+        plot.name_lines(axes, names, bold=(Ours.DEFAULT,))
         for row in study.rows:
             if (row.family, row.target) != (family, target) or row.measure not in names:
                 continue
@@ -148,14 +132,14 @@ def draw_leads(study: Detection) -> Figure:
                 ],
                 dtype=np.float64,  # NaN for None
             )
-            dots(axes, look, line, median, least, median, width=0.7)
-            dots(axes, look, line, median, low, high, width=2.4)
+            plot.dots(axes, look, line, median, least, median, width=0.7)
+            plot.dots(axes, look, line, median, low, high, width=2.4)
             hollow = {**look, "fillstyle": "none", "markersize": 6.5}
-            dots(axes, hollow, line, seldom, seldom, seldom)
+            plot.dots(axes, hollow, line, seldom, seldom, seldom)
         axes.set_xlim(left=-0.4)
     for axes in grid[-1]:
         axes.set_xlabel("lead time [s]")
-    legend(figure, looks)
+    plot.legend(figure, looks)
     return figure
 
 
@@ -178,13 +162,13 @@ def draw_grid(study: Detection) -> Figure:
     names = [name for name in IN_GRID if any(row.measure == name for row in study.grid)]
     own = sorted({row.decel for row in study.grid})
     leader = sorted({row.leader_decel for row in study.grid})
-    figure, grid = panels(2, len(names), 3.9, sharex=True, sharey=True)
+    figure, grid = plot.panels(2, len(names), 3.9, sharex=True, sharey=True)
     for column, name in enumerate(names):
         cells = {(r.decel, r.leader_decel): r for r in study.grid if r.measure == name}
         lacking = [[1.0 - cells[b, a].auroc for b in own] for a in leader]
         wrong = [[_misjudged(cells[b, a]) for b in own] for a in leader]
         for axes, values, most in zip(grid[:, column], (lacking, wrong), (0.05, 0.5), strict=True):
-            drawn = heat(axes, values, Normalize(0.0, most), text=_short, size=5.5)
+            drawn = plot.heat(axes, values, (0.0, most), text=_short, size=5.5)
             if name == names[-1]:
                 text = "misjudged" if most == 0.5 else "1 − AUROC"
                 figure.colorbar(drawn, ax=axes, extend="max", label=text)

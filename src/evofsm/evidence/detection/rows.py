@@ -75,8 +75,28 @@ class AtRate(NamedTuple):
     """What a measure reaches at the threshold that was chosen for a rate of false alarms."""
 
     lead: NDArray[np.float64]  #: (collisions,) [s]
-    false_alarms: float  #: [1/h]
-    false_time: float
+    false_alarms: float | None  #: [1/h]
+    false_time: float | None
+
+    @property
+    def warned(self) -> float | None:
+        """Share of collisions with an alarm that stayed on."""
+        return _mean(self.lead > 0.0)
+
+    def lead_in(self, share: float) -> float | None:
+        """Lead time that is exceeded in all but a share of the collisions [s]."""
+        return float(np.quantile(self.lead, share)) if len(self.lead) else None
+
+    def median_interval(self, rounds: int) -> tuple[float | None, float | None]:
+        """95 % interval of the median lead time [s]."""
+        lead = self.lead
+        if len(lead) == 0:
+            return None, None
+        return bootstrap(lambda chosen: float(np.median(lead[chosen])), len(lead), rounds)
+
+
+# Of a rate that cannot be measured.
+_UNKNOWN = AtRate(np.empty(0), None, None)
 
 
 class Scored(NamedTuple):
@@ -129,9 +149,9 @@ def judge(
     )
     roc, prc = interval(drawn[:, 0]), interval(drawn[:, 1])
     at = _at_rates(target, held_out, cases, calibration)
-    often, seldom = (at.get(rate) for rate in RATES)
+    often, seldom = (at.get(rate, _UNKNOWN) for rate in RATES)
     collisions = int(exposure.collided.sum())
-    spread = _median_interval(often, collisions, rounds)
+    spread = often.median_interval(rounds)
     reliable = _reliable(name, detector, target, score, truth, calibration)
     briers = {one.calibrated: one.fit.brier for one in reliable}
     is_call = not detector.is_probability
@@ -146,17 +166,17 @@ def judge(
         auprc=areas.auprc,
         auprc_low=prc.low,
         auprc_high=prc.high,
-        lead_median_1=_quantile(often, 0.5),
+        lead_median_1=often.lead_in(0.5),
         lead_median_1_low=spread[0],
         lead_median_1_high=spread[1],
-        lead_p10_1=_quantile(often, 0.1),
-        lead_median_01=_quantile(seldom, 0.5),
-        lead_p10_01=_quantile(seldom, 0.1),
-        false_alarms_1=often.false_alarms if often else None,
-        false_alarms_01=seldom.false_alarms if seldom else None,
-        false_time_1=often.false_time if often else None,
-        warned_1=_warned(often),
-        warned_01=_warned(seldom),
+        lead_p10_1=often.lead_in(0.1),
+        lead_median_01=seldom.lead_in(0.5),
+        lead_p10_01=seldom.lead_in(0.1),
+        false_alarms_1=often.false_alarms,
+        false_alarms_01=seldom.false_alarms,
+        false_time_1=often.false_time,
+        warned_1=often.warned,
+        warned_01=seldom.warned,
         brier=briers.get(True),
         brier_own=briers.get(False),
         missed=_mean(score[truth] <= 0.0) if is_call else None,
@@ -219,23 +239,6 @@ def _reliable(
         )
         for calibrated, probability in found
     ]
-
-
-def _quantile(at: AtRate | None, share: float) -> float | None:
-    return float(np.quantile(at.lead, share)) if at and len(at.lead) else None
-
-
-def _median_interval(
-    at: AtRate | None, collisions: int, rounds: int
-) -> tuple[float | None, float | None]:
-    if at is None or collisions == 0:
-        return None, None
-    lead = at.lead
-    return bootstrap(lambda chosen: float(np.median(lead[chosen])), collisions, rounds)
-
-
-def _warned(at: AtRate | None) -> float | None:
-    return _mean(at.lead > 0.0) if at else None
 
 
 def _mean(values: NDArray[np.bool_]) -> float | None:

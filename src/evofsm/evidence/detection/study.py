@@ -66,15 +66,7 @@ class Detection:
 
 
 def run_detection(plan: Plan, progress: Progress = silent, workers: int | None = None) -> Detection:
-    """Judge every measure in every world.
-
-    Parameters
-    ----------
-    plan : Plan
-    progress : callable
-        Told how many tasks are done, of how many.
-    workers : int, optional
-        Processes; one per core if not given. The numbers do not depend on it.
+    """Judge every measure in every world; see `Study.run`.
 
     Raises
     ------

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from functools import partial
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from evofsm import plot
 from evofsm.app import NONE, Column, Table, decimals, interval, listed, number
 from evofsm.evidence.prediction.forecasters import Method, Variant
 from evofsm.evidence.prediction.scoring import Row
@@ -17,21 +19,19 @@ from evofsm.evidence.report.asked import Asked, failures, tables_of_asked
 from evofsm.evidence.report.chapter import Chapter
 from evofsm.evidence.report.drawing import Sketch
 from evofsm.evidence.report.html import Setting
-from evofsm.extras import needs
 
-with needs("matplotlib", "plot", "drawing figures"):
+if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from evofsm.plot import FIXED, INK, OTHER, OURS, TOLD, Look, curves, legend, level, panels
 
 #: The horizons that the study is about [s]; shorter ones show where the paper's test is made.
 _ASKED = 0.5
 _TABLED = (Method.EVOFSM, Method.BLEND, Method.BATCH, Method.PAPER)
-_LOOKS: dict[str, Look] = {
-    Method.EVOFSM: {**OURS, "linewidth": 1.6, "zorder": 5},
-    Method.BLEND: {**TOLD, "marker": "^", "linestyle": (0, (1, 1.2))},
-    Method.BATCH: {**FIXED, "linestyle": (0, (4, 1.6))},
-    Method.PAPER: {**OTHER, "marker": "D", "linestyle": (0, (5, 1.2, 1, 1.2))},
+_LOOKS: dict[str, plot.Look] = {
+    Method.EVOFSM: {**plot.OURS, "linewidth": 1.6, "zorder": 5},
+    Method.BLEND: {**plot.TOLD, "marker": "^", "linestyle": (0, (1, 1.2))},
+    Method.BATCH: {**plot.FIXED, "linestyle": (0, (4, 1.6))},
+    Method.PAPER: {**plot.OTHER, "marker": "D", "linestyle": (0, (5, 1.2, 1, 1.2))},
 }
 # Skills lower than this are drawn at the panel's edge.
 _LOWEST = -1.05
@@ -292,7 +292,7 @@ def draw_skills(study: Prediction) -> Figure:
     """Skill over horizon, a panel for each source."""
     columns = 3 if len(study.sources) > 4 else 2
     lines = -(-len(study.sources) // columns)
-    figure, grid = panels(lines, columns, 0.75 + 1.85 * lines, sharex=True, sharey=True)
+    figure, grid = plot.panels(lines, columns, 0.75 + 1.85 * lines, sharex=True, sharey=True)
     for place, axes in enumerate(grid.flat):
         axes.set_visible(place < len(study.sources))
         if place + columns >= len(study.sources):
@@ -300,12 +300,12 @@ def draw_skills(study: Prediction) -> Figure:
             axes.tick_params(labelbottom=True)
     for axes, source in zip(grid.flat, study.sources, strict=False):
         axes.set_title(source.replace("_", " "))
-        level(axes, 0.0, color=INK, linestyle="-")
+        plot.level(axes, 0.0, color=plot.INK, linestyle="-")
         for method in _TABLED:
             for rows in _by_machine(_by_horizon(study, source, method)):
                 values = np.array([(r.skill_persistence, r.low, r.high) for r in rows])
                 drawn = np.maximum(values, _LOWEST)
-                curves(axes, _LOOKS[method], [row.horizon for row in rows], *drawn.T)
+                plot.curves(axes, _LOOKS[method], [row.horizon for row in rows], *drawn.T)
     for axes in grid[:, 0]:
         axes.set_ylabel("skill")
     ticks = [0.01, 0.1, 0.5, 1.0, 2.0, 5.0]
@@ -313,9 +313,9 @@ def draw_skills(study: Prediction) -> Figure:
     grid[0, 0].set_xticks(ticks, [f"{tick:g}" for tick in ticks])
     for axes in grid.flat:
         axes.minorticks_off()
-    zero: Look = {"color": INK, "linestyle": "-", "linewidth": 0.8}
+    zero: plot.Look = {"color": plot.INK, "linestyle": "-", "linewidth": 0.8}
     looks = {str(method): {"linestyle": "-", **_LOOKS[method]} for method in _TABLED}
-    legend(figure, {"persistence": zero, **looks})
+    plot.legend(figure, {"persistence": zero, **looks})
     return figure
 
 

@@ -90,10 +90,8 @@ def run_prediction(
     plan : Plan
     logs : sequence of LogSource
         Real drives; none if empty.
-    progress : callable
-        Told how many tasks are done, of how many.
-    workers : int, optional
-        Processes; as many as there are cores unless told. What comes out is the same.
+    progress, workers
+        As `Study.run` takes them.
     families : sequence of str
         That are driven.
     """

@@ -5,10 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from functools import partial
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from evofsm import plot
 from evofsm.app import percent
 from evofsm.evidence.real.cases import HORIZONS
 from evofsm.evidence.real.measures import MEASURES, Group
@@ -16,42 +18,23 @@ from evofsm.evidence.real.moments import ALARM_SHARE, Kind, Moment
 from evofsm.evidence.real.study import REFERENCE, SHOWN, SHOWN_QUESTION, RealStudy
 from evofsm.evidence.real.targets import TARGETS, TITLES
 from evofsm.evidence.report.drawing import Sketch
-from evofsm.extras import needs
 
-with needs("matplotlib", "plot", "drawing figures"):
+if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from evofsm.plot import (
-        DEAD_END,
-        FIXED,
-        FOLLOWER,
-        INK,
-        LEADER,
-        LEADER_DASHES,
-        OTHER,
-        OURS,
-        PLAIN,
-        Look,
-        curves,
-        dots,
-        legend,
-        level,
-        name_lines,
-        panels,
-    )
 
-_LOOKS: dict[str, Look] = {
-    Group.FIXED: {**FIXED, "markersize": 3.5},
-    Group.NOW: PLAIN,
-    Group.LEARNT: {**OTHER, "marker": "D", "markersize": 3.5},
-    Group.OURS: OURS,
+_LOOKS: dict[str, plot.Look] = {
+    Group.FIXED: {**plot.FIXED, "markersize": 3.5},
+    Group.NOW: plot.PLAIN,
+    Group.LEARNT: {**plot.OTHER, "marker": "D", "markersize": 3.5},
+    Group.OURS: plot.OURS,
 }
-_LINES: dict[str, Look] = {
-    "gap": {"color": INK},
-    "follower": {"color": FOLLOWER},
-    "leader": {"color": LEADER, "linestyle": LEADER_DASHES},
-    SHOWN: {"color": FOLLOWER, "linewidth": 2.0},
-    "1 / time to collision": {"color": DEAD_END, "linestyle": (0, (3, 1))},
+_LINES: dict[str, plot.Look] = {
+    "gap": {"color": plot.INK},
+    "follower": {"color": plot.FOLLOWER},
+    "leader": {"color": plot.LEADER, "linestyle": plot.LEADER_DASHES},
+    SHOWN: {"color": plot.FOLLOWER, "linewidth": 2.0},
+    "1 / time to collision": {"color": plot.DEAD_END, "linestyle": (0, (3, 1))},
 }
 # Where the axis of areas begins: below chance, which is 0.5.
 _LEAST_AREA = 0.3
@@ -95,47 +78,47 @@ def draw_areas(study: RealStudy) -> Figure:
     """AUROC of every measure, a panel for each question that can be answered."""
     targets = [target for target in TARGETS if study.is_enough(target)]
     height = 0.75 + 2.55 * len(targets)
-    figure, grid = panels(len(targets), len(HORIZONS), height, sharex=True, sharey=True)
+    figure, grid = plot.panels(len(targets), len(HORIZONS), height, sharex=True, sharey=True)
     for line, target in zip(grid, targets, strict=True):
         for axes, horizon in zip(line, HORIZONS, strict=True):
             rows = study.of(target.name, horizon)
             for place, row in enumerate(rows):
-                dots(axes, _LOOKS[_GROUPS[row.measure]], place, row.auroc, row.low, row.high)
+                plot.dots(axes, _LOOKS[_GROUPS[row.measure]], place, row.auroc, row.low, row.high)
             reference = study.row(target.name, horizon, REFERENCE).auroc
-            level(axes, reference, across=False, linestyle=(0, (1, 1.5)))
-            name_lines(axes, [row.measure for row in rows])
+            plot.level(axes, reference, across=False, linestyle=(0, (1, 1.5)))
+            plot.name_lines(axes, [row.measure for row in rows])
             title = f"{target.name} within {horizon:g} s ({rows[0].events} events)"
             axes.set_title(title, fontsize=7.6)
     grid[0, 0].set_xlim(_LEAST_AREA, 1.0)
     for axes in grid[-1]:
         axes.set_xlabel("AUROC")
-    legend(figure, _LOOKS)
+    plot.legend(figure, _LOOKS)
     return figure
 
 
 def draw_moments(moments: Sequence[Moment]) -> Figure:
     """Gap, speeds and risk around each moment, a column for each."""
-    figure, grid = panels(3, len(moments), 5.0, sharex=True)
+    figure, grid = plot.panels(3, len(moments), 5.0, sharex=True)
     gap, follower, leader, ours, other = _LINES.values()
     for column, (axes, moment) in enumerate(zip(grid.T, moments, strict=True)):
         above, middle, below = axes
         observed = moment.observations.T
-        curves(above, gap, moment.times, observed[0])
-        curves(middle, follower, moment.times, observed[1])
-        curves(middle, leader, moment.times, observed[2])
-        curves(below, ours, moment.times, _scaled(moment.ours))
-        curves(below, other, moment.times, _scaled(moment.other))
-        level(below, 0.0, linestyle="-")
+        plot.curves(above, gap, moment.times, observed[0])
+        plot.curves(middle, follower, moment.times, observed[1])
+        plot.curves(middle, leader, moment.times, observed[2])
+        plot.curves(below, ours, moment.times, _scaled(moment.ours))
+        plot.curves(below, other, moment.times, _scaled(moment.other))
+        plot.level(below, 0.0, linestyle="-")
         above.set_ylim(bottom=0.0)
         below.set_ylim(-1.1, 1.1)
         below.set_yticks([-1.0, 0.0, 1.0], [] if column else ["none", "alarm", "most"])
         for one in axes:
-            level(one, 0.0, across=False, linestyle=(0, (1, 1.5)))
+            plot.level(one, 0.0, across=False, linestyle=(0, (1, 1.5)))
         above.set_title(_title(moment), fontsize=6.8)
         below.set_xlabel("time [s]")
     for one, label in zip(grid[:, 0], ("gap [m]", "speed [m/s]", "risk"), strict=True):
         one.set_ylabel(label)
-    legend(figure, {name: {"linestyle": "-", **look} for name, look in _LINES.items()})
+    plot.legend(figure, {name: {"linestyle": "-", **look} for name, look in _LINES.items()})
     return figure
 
 

@@ -6,7 +6,7 @@ the driver did is the proposal.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from functools import partial
 from itertools import groupby, pairwise
 from pathlib import Path
@@ -15,6 +15,7 @@ from typing import NamedTuple, TypeVar
 from evofsm.core import IntervalActions
 from evofsm.driving import REAL_DRIVES, LatentRisk, LeaderBrakes
 from evofsm.evidence.real.cases import runs_in
+from evofsm.evidence.study import Progress, silent
 from evofsm.fleet import in_order
 from evofsm.guard import ActionReviser, Guard, Mode, speaks
 from evofsm.io import Episode, Layout, find_checksums, read_episodes
@@ -85,7 +86,7 @@ def run_leaders(
     folder: Path,
     limits: Limits,
     most: int | None = None,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: Progress = silent,
     workers: int | None = None,
 ) -> LeaderStudy:
     """Count leaders' hard brakes in a folder of runs, and alarms in shadow mode.
@@ -98,10 +99,8 @@ def run_leaders(
     most : int, optional
         Alarms are counted in so many runs, the first in the order of their names; in all unless
         told. Brakes are counted in all.
-    progress : callable
-        Told how many tasks are done, of how many.
-    workers : int, optional
-        Processes; as many as there are cores unless told. Results do not depend on it.
+    progress, workers
+        As `Study.run` takes them.
 
     Raises
     ------

@@ -183,17 +183,11 @@ def run_real(
     plan : Plan
     verified : int
         Files whose checksum was held against a list; told on, no more.
-    progress : callable
-        Told how many tasks are done, of how many.
-    workers : int, optional
-        Processes; as many as there are cores unless told. Results do not depend on it.
+    progress, workers
+        As `Study.run` takes them.
     training : sequence of Case, optional
         All that is learnt from, and all of ``cases`` are judged by it. Without it the runs of
         ``cases`` are dealt to folds, and each fold is judged by what the others taught.
-
-    Returns
-    -------
-    RealStudy
 
     Raises
     ------

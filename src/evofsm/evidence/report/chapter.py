@@ -6,15 +6,14 @@ it loses. Each study makes its own; the page, and the terminal, show them all al
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import count
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from evofsm.app import Table
+from evofsm.app import Column, Table
 from evofsm.evidence.report.drawing import Drawing, Sketch, draw_all
-from evofsm.evidence.report.html import Setting, inline, versions, write_html
+from evofsm.evidence.report.html import Setting, versions, write_html
 from evofsm.evidence.study import Progress, silent
 
 
@@ -71,6 +70,12 @@ class Chapter:
             for section, found in zip(self.sections, figures[1:], strict=True)
         )
         return replace(self, figures=figures[0], sketches=(), sections=tuple(sections))
+
+    @property
+    def parts(self) -> tuple[Section, ...]:
+        """Its numbers, and all that is told where it has a page to itself."""
+        numbers = Section("numbers", "The numbers", "", self.tables, self.figures)
+        return numbers, *self.sections
 
     @property
     def n_losses(self) -> int:
@@ -133,83 +138,27 @@ def write_chapters(
     Path
         The page.
     """
-    alone = len(chapters) == 1
-    shown = list(_shown(chapters))
     return write_html(
         page,
-        title=chapters[0].title if alone else title,
+        title=chapters[0].title if len(chapters) == 1 else title,
         about=about,
-        shown=shown,
+        chapters=chapters,
         summary=_summary(chapters),
-        contents=list(_contents(shown)),
         versions=list(versions(dict.fromkeys(p for one in chapters for p in one.packages))),
         sources=list(dict.fromkeys(source for one in chapters for source in one.sources)),
         command=command,
     )
 
 
-# -- What the template shows ----------------------------------------------------------------------
-
-
-class _Figure(NamedTuple):
-    number: int
-    drawing: Drawing
-    address: str
-
-
-class _Part(NamedTuple):
-    id: str
-    title: str
-    text: str
-    tables: list[tuple[str, Table]]
-    figures: list[_Figure]
-
-
-class _Shown(NamedTuple):
-    chapter: Chapter
-    parts: list[_Part]
-    plan: list[Setting]
-
-
-def _shown(chapters: Sequence[Chapter]) -> Iterator[_Shown]:
-    """The chapters with figures and tables numbered through the page."""
-    figures, tables = count(1), count(1)
-    for chapter in chapters:
-        numbers = Section("numbers", "The numbers", "", chapter.tables, chapter.figures)
-        sections = [numbers, *(chapter.sections if len(chapters) == 1 else ())]
-        parts = [
-            _Part(
-                section.id,
-                section.title,
-                section.text,
-                [(f"table-{next(tables)}", table) for table in section.tables],
-                [_Figure(next(figures), one, inline(one.paths["svg"])) for one in section.figures],
-            )
-            for section in sections
-        ]
-        yield _Shown(chapter, parts, [Setting("command", chapter.command), *chapter.plan])
-
-
-def _contents(shown: Sequence[_Shown]) -> Iterator[Setting]:
-    """Places on the page, and what they are called."""
-    if len(shown) == 1:
-        yield from (Setting(part.id, part.title) for part in shown[0].parts)
-    else:
-        for one in shown:
-            yield Setting(one.chapter.id, one.chapter.id.replace("-", " ").capitalize())
-    yield Setting("loses", "Where it loses")
-    yield Setting("reproduce", "Reproduce it")
-
-
 def _summary(chapters: Sequence[Chapter]) -> Table:
-    marks = [chapter.mark for chapter in chapters]
-    return Table(
+    columns: tuple[Column[Chapter], ...] = Column("question", "title"), Column("answer", "headline")
+    return Table.of(
         "In a line each",
-        ("question", "answer"),
-        tuple((chapter.title, chapter.headline) for chapter in chapters),
+        columns,
+        chapters,
         "✓: all that was asked for holds. ✗: some of it does not; the study's part says what. "
         "Without a mark nothing could be judged.",
         in_words=True,
-        failing=tuple(place for place, mark in enumerate(marks) if mark == "✗"),
-        holding=tuple(place for place, mark in enumerate(marks) if mark == "✓"),
+        failing=lambda one: one.mark == "✗",
+        holding=lambda one: one.mark == "✓",
     )

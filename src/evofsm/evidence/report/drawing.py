@@ -34,11 +34,11 @@ class Sketch:
     title: str
     caption: str
     alt: str
-    figure: Callable[[], Figure] | Figure
+    figure: Callable[[], Figure]
 
 
 def draw_all(
-    sketches: Sequence[Sketch | Callable[[], Sketch]], folder: Path, progress: Progress = silent
+    sketches: Sequence[Sketch], folder: Path, progress: Progress = silent
 ) -> list[Drawing]:
     """Draw figures one by one in the house's style, each as PNG and SVG.
 
@@ -53,10 +53,8 @@ def draw_all(
     folder.mkdir(parents=True, exist_ok=True)
     drawings = []
     with house_style():
-        for one in sketches:
-            sketch = one if isinstance(one, Sketch) else one()
-            figure = sketch.figure if isinstance(sketch.figure, Figure) else sketch.figure()
-            paths = save(figure, folder, sketch.name)
+        for sketch in sketches:
+            paths = save(sketch.figure(), folder, sketch.name)
             drawings.append(Drawing(sketch.name, sketch.title, sketch.caption, sketch.alt, paths))
             progress(len(drawings), len(sketches))
     return drawings

@@ -36,7 +36,7 @@ def write_html(page: Path, **values: Any) -> Path:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters["minus"] = _with_minus_signs
+    environment.filters |= {"minus": _with_minus_signs, "inline": _inline}
     text = environment.get_template("page.html.j2").render(
         date=datetime.now(UTC).date().isoformat(), version=evofsm.__version__, **values
     )
@@ -50,7 +50,7 @@ def _with_minus_signs(text: str) -> str:
     return re.sub(r"(?<![\w.])-(?=[\d.])", "−", text)
 
 
-def inline(path: Path) -> str:
+def _inline(path: Path) -> str:
     """An SVG file as the address of an image that holds it."""
     return f"data:image/svg+xml;base64,{b64encode(path.read_bytes()).decode('ascii')}"
 

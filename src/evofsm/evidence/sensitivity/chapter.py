@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 
@@ -257,8 +258,9 @@ def _tables(study: Sensitivity) -> Iterator[Table]:
     yield _parameters(study)
 
 
-def _share(share: Share) -> str:
+def _share(*of: Any) -> str:
     """A share in percent with its interval; small ones with more digits."""
+    share = Share(*of)
     if not share.tried:
         return NONE
     return f"{_brief(share.value)} ({_brief(share.low)}–{_brief(share.high)})"

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from evofsm import plot
 from evofsm.evidence.report.drawing import Sketch
 from evofsm.evidence.scores import share_of
 from evofsm.evidence.sensitivity.designs import PAIRS, Design
@@ -16,30 +17,17 @@ from evofsm.evidence.sensitivity.parameters import PARAMETERS, Parameter, parame
 from evofsm.evidence.sensitivity.setting import Row
 from evofsm.evidence.sensitivity.spaces import ALL, NEARBY, OPEN, SAME, Space, short_name
 from evofsm.evidence.sensitivity.study import Sensitivity
-from evofsm.extras import needs
 
-with needs("matplotlib", "plot", "drawing figures"):
-    from matplotlib.colors import BoundaryNorm, Normalize
+if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from evofsm.plot import (
-        FIXED,
-        INK,
-        OTHER,
-        OURS,
-        TOLD,
-        Look,
-        curves,
-        dots,
-        heat,
-        legend,
-        level,
-        name_lines,
-        panels,
-        strips,
-    )
 
-_LOOKS: dict[Space, Look] = {OPEN: OURS, SAME: OTHER, ALL: FIXED, NEARBY: TOLD}
+_LOOKS: dict[Space, plot.Look] = {
+    OPEN: plot.OURS,
+    SAME: plot.OTHER,
+    ALL: plot.FIXED,
+    NEARBY: plot.TOLD,
+}
 # More states are counted as so many.
 _MOST_STATES = 13
 
@@ -92,18 +80,20 @@ def sketches(study: Sensitivity) -> Iterator[Sketch]:
 def draw_shares(study: Sensitivity) -> Figure:
     """A row for each claim, and one for all of them."""
     claims: list[str | None] = [*study.ids, None]
-    figure, ((axes,),) = panels(1, 1, 4.5)
+    figure, ((axes,),) = plot.panels(1, 1, 4.5)
     looks = {}
     shifts = np.linspace(-0.28, 0.28, len(_LOOKS))
     for shift, (space, look) in zip(shifts, _LOOKS.items(), strict=True):
         shares = [space.share(study, claim) for claim in claims]
         reach = 100.0 * np.array([(one.value, one.low, one.high) for one in shares])
-        dots(axes, {**look, "markersize": 3.6}, np.arange(len(claims)) + shift, *reach.T)
+        plot.dots(axes, {**look, "markersize": 3.6}, np.arange(len(claims)) + shift, *reach.T)
         looks[f"{space.name} ({shares[0].tried:,})"] = look
-    name_lines(axes, [short_name(claim) for claim in claims], striped=True, bold=("all of them",))
+    plot.name_lines(
+        axes, [short_name(claim) for claim in claims], striped=True, bold=("all of them",)
+    )
     axes.set_xlim(0.0, 100.0)
     axes.set_xlabel("settings with which it holds [%]")
-    legend(figure, looks, columns=2)
+    plot.legend(figure, looks, columns=2)
     return figure
 
 
@@ -111,13 +101,13 @@ def draw_sweeps(study: Sensitivity) -> Figure:
     """A panel for each parameter: claims by values."""
     columns = 3
     rows = -(-len(PARAMETERS) // columns)
-    figure, grid = panels(rows, columns, 1.72 * rows + 0.35, sharey=True)
+    figure, grid = plot.panels(rows, columns, 1.72 * rows + 0.35, sharey=True)
     for axes, one in zip(grid.flat, PARAMETERS, strict=False):
         sweep = sorted(study.of(Design.SWEEP, one.name), key=partial(_place, one))
         holds = [[row.verdicts[claim] for row in sweep] for claim in study.ids]
         edges = _edges(np.array([_place(one, row) for row in sweep]))
-        strips(axes, edges, holds, [short_name(claim) for claim in study.ids])
-        level(axes, one.place_of(one.recovered), across=False, color=INK, zorder=3.0)
+        plot.strips(axes, edges, holds, [short_name(claim) for claim in study.ids])
+        plot.level(axes, one.place_of(one.recovered), across=False, color=plot.INK, zorder=3.0)
         axes.set_title(one.axis, pad=3.0)
         _tick(axes.set_xticks, one)
         axes.tick_params(axis="x", labelsize=7.0, pad=1.5)
@@ -129,22 +119,23 @@ def draw_sweeps(study: Sensitivity) -> Figure:
 def draw_maps(study: Sensitivity) -> Figure:
     """A panel for each pair: number of claims that hold."""
     n = len(study.claims)
-    figure, grid = panels(2, 3, 5.1)
-    scale = BoundaryNorm(np.arange(n + 2) - 0.5, 256)
+    figure, grid = plot.panels(2, 3, 5.1)
     for axes, names in zip(grid.flat, PAIRS, strict=True):
         one, other = map(parameter, names)
         x, y, held, states = _map_of(study.of(Design.MAP, *names), one, other)
-        drawn = heat(axes, held, scale, colors="cividis", edges=(_edges(x), _edges(y)))
+        edges = _edges(x), _edges(y)
+        limits = -0.5, n + 0.5
+        drawn = plot.heat(axes, held, limits, steps=n + 1, colors="cividis", edges=edges)
         star = one.place_of(one.recovered), other.place_of(other.recovered)
         labelled = set(_labelled(x, y, star))
         for j, i in np.ndindex(held.shape):
-            color = "white" if held[j, i] < 0.6 * n else INK
+            color = "white" if held[j, i] < 0.6 * n else plot.INK
             if (j, i) in labelled:
                 text = f"{states[j, i]:.0f}"
                 axes.text(x[i], y[j], text, ha="center", va="center", fontsize=6.5, color=color)
             elif held[j, i] == n:
-                axes.plot(x[i], y[j], ".", color=INK, markersize=2.2)
-        look = {"marker": "*", "markersize": 11.0, "color": "white", "markeredgecolor": INK}
+                axes.plot(x[i], y[j], ".", color=plot.INK, markersize=2.2)
+        look = {"marker": "*", "markersize": 11.0, "color": "white", "markeredgecolor": plot.INK}
         axes.plot(*star, clip_on=False, zorder=6, **look)
         axes.set_xlabel(one.axis)
         axes.set_ylabel(other.axis, labelpad=2.0)
@@ -181,7 +172,7 @@ def _labelled(
 def draw_deciders(study: Sensitivity) -> Figure:
     """First-order indices of every parameter on every claim."""
     names = [*map(short_name, study.ids), "number that hold"]
-    figure, grid = panels(1, 2, 4.2, sharey=True)
+    figure, grid = plot.panels(1, 2, 4.2, sharey=True)
     for axes, space in zip(grid.flat, (OPEN, ALL), strict=True):
         rows = space.rows(study)
         explained: list[list[bool] | list[int]] = [
@@ -193,15 +184,15 @@ def draw_deciders(study: Sensitivity) -> Figure:
             for one, index in space.ranked(study, values):
                 indices[PARAMETERS.index(one), j] = 100.0 * index.value if index.counts else 0.0
         axes.set_facecolor("#ECECEC")
-        heat(
+        plot.heat(
             axes,
             indices,
-            Normalize(0.0, 80.0),
+            (0.0, 80.0),
             colors="Blues",
             text=lambda value: f"{value:.0f}" if value > 0.0 else "",
         )
-        name_lines(axes, [one.label for one in PARAMETERS])
-        level(axes, len(names) - 1.5, across=False, linestyle="-", zorder=3.0)
+        plot.name_lines(axes, [one.label for one in PARAMETERS])
+        plot.level(axes, len(names) - 1.5, across=False, linestyle="-", zorder=3.0)
         axes.set_title(f"{space.name} is varied [%]")
         axes.set_xticks(range(len(names)), names, rotation=55, ha="right", rotation_mode="anchor")
         axes.tick_params(labelsize=7.0)
@@ -211,7 +202,7 @@ def draw_deciders(study: Sensitivity) -> Figure:
 def draw_counts(study: Sensitivity) -> Figure:
     """Shares of settings by the number of states and of claims that hold."""
     n = len(study.claims)
-    figure, ((left, right),) = panels(1, 2, 2.7, sharey=True)
+    figure, ((left, right),) = plot.panels(1, 2, 2.7, sharey=True)
     spaces = (OPEN, ALL, NEARBY)
     for space in spaces:
         rows = space.rows(study)
@@ -220,17 +211,17 @@ def draw_counts(study: Sensitivity) -> Figure:
         for axes, values, first, last in ((left, states, 1, _MOST_STATES), (right, held, 0, n)):
             shares = [share_of(values == k) for k in range(first, last + 1)]
             reach = 100.0 * np.array([(one.value, one.low, one.high) for one in shares])
-            curves(axes, _LOOKS[space], range(first, last + 1), *reach.T)
+            plot.curves(axes, _LOOKS[space], range(first, last + 1), *reach.T)
     left.set_xticks(
         range(1, _MOST_STATES + 1), [*map(str, range(1, _MOST_STATES)), f"≥{_MOST_STATES}"]
     )
     right.set_xticks(range(n + 1))
     for axes, title, paper in ((left, "states at the end", 7), (right, "claims that hold", n)):
         axes.set_xlabel(title)
-        level(axes, paper, across=False, color=INK)
+        plot.level(axes, paper, across=False, color=plot.INK)
     left.set_ylabel("settings [%]")
     left.set_ylim(bottom=0.0)
-    legend(figure, {space.name: {"linestyle": "-", **_LOOKS[space]} for space in spaces})
+    plot.legend(figure, {space.name: {"linestyle": "-", **_LOOKS[space]} for space in spaces})
     return figure
 
 

@@ -67,15 +67,7 @@ def run_sensitivity(
     progress: Progress = silent,
     workers: int | None = None,
 ) -> Sensitivity:
-    """Try all settings of the plan; the same for every number of workers.
-
-    Parameters
-    ----------
-    plan : Plan
-    progress : callable
-        Told how many settings are done, of how many.
-    workers : int, optional
-        Processes; one per core if not said.
+    """Try all settings of the plan; see `Study.run`.
 
     Returns
     -------

@@ -36,14 +36,14 @@ def find_checksums(folder: Path) -> dict[str, str]:
 
 
 def verify_checksums(paths: Iterable[Path], checksums: Mapping[str, str]) -> int:
-    """Hold files against a list; answers how many of them it names.
+    """Compare files with a list; returns how many of them it names.
 
     Parameters
     ----------
     paths : iterable of Path
     checksums : mapping
-        SHA-256 in hexadecimal by file name, as `find_checksums` answers. Files it does not name
-        are passed over.
+        SHA-256 in hexadecimal by file name, as `find_checksums` returns. Files that it does not
+        name are skipped.
 
     Raises
     ------

@@ -73,7 +73,7 @@ def _episodes(
 ) -> Iterator[Episode]:
     """The episodes of everybody whose vehicle ``ahead`` (0: none) is in sight in the same frame.
 
-    ``observe`` is told rows of a follower and those of its leader.
+    ``observe`` makes observations of the rows of a follower and of its leader.
     """
     frames = float(frame.max()) + 1.0
     keys = vehicle * frames + frame

@@ -6,8 +6,7 @@ import math
 import re
 from typing import NamedTuple
 
-from evofsm.app.watch.shown import Frame, Start
-from evofsm.app.watch.story import Danger, Story
+from evofsm.app.watch.shown import Danger, Frame, Start, Story
 
 # Changes of speed that are smaller are "at the same speed" [m/s], and softer accelerations none.
 _EQUAL, _HARDLY = 0.5, 0.3
