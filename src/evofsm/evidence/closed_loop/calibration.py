@@ -29,6 +29,7 @@ from evofsm.driving import (
     unrevised,
 )
 from evofsm.evidence.closed_loop.amounts import Amounts
+from evofsm.evidence.scores import brier
 from evofsm.guard import Guard, make_usable
 
 #: Looked ahead [s].
@@ -104,9 +105,8 @@ def _as_driven(
             action = int(family.actions.encode(decision.revision.executed))
             predicted.append(counts.outcome(belief, action).probability)
             came.append(driven.episode.collided and left <= HORIZON)
-    return reliability(
-        f"counted: failure within {HORIZON:g} s, going on as driven", predicted, came
-    )
+    what = f"counted: failure within {HORIZON:g} s, going on as driven"
+    return reliability(what, predicted, came)
 
 
 def _cautious(
@@ -150,11 +150,4 @@ def reliability(what: str, predicted: Sequence[float], came: Sequence[bool]) -> 
         for i in range(_BINS)
         if (index == i).any()
     )
-    return Reliability(
-        what,
-        bins,
-        float(((p - y) ** 2).mean()),
-        float(y.var()),
-        len(y),
-        int(y.sum()),
-    )
+    return Reliability(what, bins, brier(p, y), float(y.var()), len(y), int(y.sum()))
