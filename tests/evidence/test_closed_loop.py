@@ -12,6 +12,7 @@ from evofsm.driving.cars import drive, guard_for_family, load_learnt, save_learn
 from evofsm.driving.families.family import load_family
 from evofsm.driving.outcomes import bootstrap, outcome, reference
 from evofsm.driving.policies import fixed_policies
+from evofsm.evidence.closed_loop.amounts import ShiftPlan
 from evofsm.evidence.closed_loop.beside import (
     run_cases,
     run_separation,
@@ -19,7 +20,7 @@ from evofsm.evidence.closed_loop.beside import (
     run_two_worlds,
 )
 from evofsm.evidence.closed_loop.calibration import reliability, run_calibration
-from evofsm.evidence.closed_loop.plan import Plan, ShiftPlan
+from evofsm.evidence.closed_loop.plan import Plan
 from evofsm.evidence.closed_loop.study import run_closed_loop
 from evofsm.evidence.scores import auroc
 

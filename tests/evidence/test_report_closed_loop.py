@@ -16,6 +16,7 @@ from evofsm.app.text.words import percent
 from evofsm.driving.families.family import load_family
 from evofsm.driving.outcomes import Row
 from evofsm.driving.policies import Group
+from evofsm.evidence.closed_loop.amounts import ShiftPlan
 from evofsm.evidence.closed_loop.beside import CaseResult, Check, InWorld, Separation, Stream
 from evofsm.evidence.closed_loop.calibration import Bin, Reliability
 from evofsm.evidence.closed_loop.chapter import (
@@ -27,7 +28,7 @@ from evofsm.evidence.closed_loop.chapter import (
 from evofsm.evidence.closed_loop.comparison import chosen, front, our_lines, ours
 from evofsm.evidence.closed_loop.losses import losses
 from evofsm.evidence.closed_loop.over_seeds import along_stream
-from evofsm.evidence.closed_loop.plan import Plan, ShiftPlan
+from evofsm.evidence.closed_loop.plan import Plan
 from evofsm.evidence.closed_loop.study import ClosedLoop, Point, TradeOff
 from evofsm.evidence.closed_loop.tables import side_tables, why_not_by_state
 from evofsm.evidence.report.chapter import write_chapters

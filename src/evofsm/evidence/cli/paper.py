@@ -43,17 +43,16 @@ class Paper(InWorld):
 
         plan = Plan(self.world.value, self.rounds, self.settings)
         with progress() as bars:
-            study = plan.run(counter(bars, f"{plan.doing} ({self.world})"))
+            found = plan.run(counter(bars, f"{plan.doing} ({self.world})"))
             self.out.mkdir(parents=True, exist_ok=True)
             drawn = counter(bars, "Drawing figures")
-            chapter = plan.chapter(study, self.out / "figures", command_line(), drawn)
-        claims = study.frame.rows
-        write_data(study, claims, chapter.tables[1:], self.out)
+            chapter = plan.chapter(found, self.out / "figures", command_line(), drawn)
+        write_data(found.study, found.claims, chapter.tables[1:], self.out)
         page = write_chapters(self.out / "index.html", [chapter], command=command_line())
         if self.as_json:
-            print_json(study.frame.as_dicts())
+            print_json(found.frame.as_dicts())
         else:
             screen = console()
-            plan.say(screen, study, chapter)
+            plan.say(screen, found, chapter)
             screen.print(f"Page with all figures: {page}", soft_wrap=True)
-        return 0 if all(claim.holds for claim in claims) else 1
+        return 0 if all(claim.holds for claim in found.claims) else 1

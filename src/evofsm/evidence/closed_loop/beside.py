@@ -1,7 +1,7 @@
 """Tests that stand beside the table: the paper's cases, both worlds, dead ends told apart, a shift.
 
-Each learns with one seed from `Plan.side_train` episodes unless said otherwise, and returns lists
-by the name that they have in `ClosedLoop`.
+Each learns with one seed from `Amounts.side_train` episodes unless said otherwise, and returns
+lists by the name that they have in `ClosedLoop`.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from evofsm.driving import (
     training,
     unrevised,
 )
-from evofsm.evidence.closed_loop.plan import Plan
+from evofsm.evidence.closed_loop.amounts import Amounts
 from evofsm.evidence.scores import Ranked, bootstrap
 from evofsm.guard import Guard, Mode, RiskMeasure
 
@@ -63,7 +63,7 @@ class CaseResult(NamedTuple):
     unrevised_collided: bool
 
 
-def run_cases(family: Family, plan: Plan) -> dict[str, list[Any]]:
+def run_cases(family: Family, plan: Amounts) -> dict[str, list[Any]]:
     """Learn from each case once, while revising; then drive all again with learning frozen."""
     guard = guard_for_family(family, tolerance=plan.tolerance)
     cases = [family.draw(plan.seed, index) for index in range(family.cases)]
@@ -106,7 +106,7 @@ class InWorld(NamedTuple):
     intervention_rate: float
 
 
-def run_two_worlds(family: Family, plan: Plan) -> dict[str, list[Any]]:
+def run_two_worlds(family: Family, plan: Amounts) -> dict[str, list[Any]]:
     """Learn in closed form, then drive the same draws in every world with learning frozen."""
     guard = guard_for_family(family, tolerance=plan.tolerance)
     teach(guard, training(family, plan.seed, 0, plan.side_train))
@@ -143,7 +143,7 @@ class Separation(NamedTuple):
     episodes: int
 
 
-def run_separation(family: Family, plan: Plan) -> dict[str, list[Any]]:
+def run_separation(family: Family, plan: Amounts) -> dict[str, list[Any]]:
     """Score every measure; ours has watched the training runs, without acting.
 
     The truth is the oracle's, which knows both cars' limits: leader and follower brake as hard as
@@ -203,7 +203,7 @@ class Check(NamedTuple):
     held_out: int
 
 
-def run_shift(family: Family, plan: Plan, learning_seed: int) -> dict[str, list[Any]]:
+def run_shift(family: Family, plan: Amounts, learning_seed: int) -> dict[str, list[Any]]:
     """Drive the stream of one learning seed, with our policy and with the one never told.
 
     In the second half of the stream brakes are weaker, or leaders brake harder. Ours goes on

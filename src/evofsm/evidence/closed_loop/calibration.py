@@ -28,7 +28,8 @@ from evofsm.driving import (
     training,
     unrevised,
 )
-from evofsm.evidence.closed_loop.plan import Plan
+from evofsm.evidence.closed_loop.amounts import Amounts
+from evofsm.evidence.scores import brier
 from evofsm.guard import Guard, make_usable
 
 #: Looked ahead [s].
@@ -63,7 +64,7 @@ class Reliability(NamedTuple):
         return f"{what}\nBrier {self.brier:.3f}, of the base rate {self.base_brier:.3f}"
 
 
-def run_calibration(family: Family, plan: Plan) -> dict[str, list[Any]]:
+def run_calibration(family: Family, plan: Amounts) -> dict[str, list[Any]]:
     """Learn from the unrevised controller, then hold both probabilities against held-out runs."""
     of_guard, risk = learnt_by(guard_for_family(family))
     reviser = Unrevised(family.actions)
@@ -104,9 +105,8 @@ def _as_driven(
             action = int(family.actions.encode(decision.revision.executed))
             predicted.append(counts.outcome(belief, action).probability)
             came.append(driven.episode.collided and left <= HORIZON)
-    return reliability(
-        f"counted: failure within {HORIZON:g} s, going on as driven", predicted, came
-    )
+    what = f"counted: failure within {HORIZON:g} s, going on as driven"
+    return reliability(what, predicted, came)
 
 
 def _cautious(
@@ -150,11 +150,4 @@ def reliability(what: str, predicted: Sequence[float], came: Sequence[bool]) -> 
         for i in range(_BINS)
         if (index == i).any()
     )
-    return Reliability(
-        what,
-        bins,
-        float(((p - y) ** 2).mean()),
-        float(y.var()),
-        len(y),
-        int(y.sum()),
-    )
+    return Reliability(what, bins, brier(p, y), float(y.var()), len(y), int(y.sum()))

@@ -1,11 +1,12 @@
-"""How much is driven."""
+"""The study as a command: how much is driven, and what is told of it."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from evofsm.app import option, split_names
+from evofsm.app import split_names
+from evofsm.evidence.closed_loop.amounts import Amounts
 from evofsm.evidence.study import Progress, Study, silent
 
 if TYPE_CHECKING:
@@ -19,43 +20,14 @@ _IN_THE_TERMINAL = ("shift", "separation", "cases", "worlds")
 
 
 @dataclass(frozen=True)
-class ShiftPlan:
-    """How much is driven around a shift."""
-
-    before: int = 100  #: episodes of the stream before the shift
-    after: int = 60  #: and after it
-    held_out: int = 200  #: episodes of each test
-
-
-@dataclass(frozen=True)
-class Plan(Study["ClosedLoop"]):
+class Plan(Amounts, Study["ClosedLoop"]):
     """How many collisions are prevented, what that costs, and who does better.
 
     Every policy drives the same held-out draws; ours learns first, with several seeds.
     """
 
-    id = "closed-loop"
-    question = (
-        "Does latent risk, learnt online, prevent collisions, at what cost, and against whom?"
-    )
     doing = "Driving and learning"
     short = "A tenth of everything: a look, not evidence."
-
-    family: str = option("emergency", "Family of scenarios, or a TOML file of your own.")
-    train: int = option(300, "Training episodes of a learning seed.", min=1)
-    test: int = option(1000, "Held-out episodes of every policy.", min=1)
-    seeds: int = option(20, "Learning seeds.", min=1)
-    seed: int = option(0, "Of everything.", min=0)
-    tolerance: float = option(0.02, "Share of leaders' hard brakes that need not be survived.")
-    switches: str = option(
-        "", "noise, delay, actuator, jerk, third_car; with commas.", name="--with"
-    )
-    rule_seeds: int = option(2, "Learning seeds in the comparison of state rules; 0: none.", min=0)
-    rule_test: int = 100  #: held-out episodes in it, and in the trade-off
-    side_train: int = 100  #: training episodes of the studies beside the table
-    side_test: int = 300  #: held-out episodes of them
-    world_test: int = 50  #: episodes driven in both worlds
-    shift: ShiftPlan = field(default_factory=ShiftPlan)
 
     def shortened(self) -> Plan:
         """About a tenth of everything: a look, not evidence."""

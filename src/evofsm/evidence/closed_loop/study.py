@@ -39,6 +39,7 @@ from evofsm.driving import (
     training,
     try_out,
 )
+from evofsm.evidence.closed_loop.amounts import Amounts
 from evofsm.evidence.closed_loop.beside import (
     CaseResult,
     Check,
@@ -51,7 +52,6 @@ from evofsm.evidence.closed_loop.beside import (
     run_two_worlds,
 )
 from evofsm.evidence.closed_loop.calibration import Reliability, run_calibration
-from evofsm.evidence.closed_loop.plan import Plan
 from evofsm.evidence.study import Frame
 from evofsm.fleet import in_order
 from evofsm.guard import ActionReviser, Guard, Reviser
@@ -99,7 +99,7 @@ class ClosedLoop:
     """All that the study measured on one family."""
 
     family: Family
-    plan: Plan
+    plan: Amounts
     rows: list[Row]  #: baselines, then ours for each learning seed
     curve: list[Point] = field(default_factory=list)
     trade_offs: list[TradeOff] = field(default_factory=list)
@@ -124,7 +124,7 @@ class ClosedLoop:
 
 def run_closed_loop(
     family: Family,
-    plan: Plan,
+    plan: Amounts,
     progress: Callable[[int, int], None] = lambda done, total: None,
     workers: int | None = None,
 ) -> ClosedLoop:
@@ -217,18 +217,18 @@ def _mobility(outcomes: Sequence[Outcome]) -> float:
     return float(np.mean([o.mobility for o in outcomes]))
 
 
-def _tests(family: Family, plan: Plan) -> _Course:
+def _tests(family: Family, plan: Amounts) -> _Course:
     return _Course.of(family, held_out(family, plan.seed, plan.test))
 
 
-def _test_fixed(family: Family, plan: Plan, name: str) -> dict[str, list[Any]]:
+def _test_fixed(family: Family, plan: Amounts, name: str) -> dict[str, list[Any]]:
     policy = next(policy for policy in fixed_policies(family) if policy.name == name)
     tests = _tests(family, plan)
     outcomes = tests.under(policy.make(family, draw) for draw in tests.draws)
     return {"rows": [tests.row(name, policy.group, outcomes)]}
 
 
-def _test_tuned(family: Family, plan: Plan, name: str) -> dict[str, list[Any]]:
+def _test_tuned(family: Family, plan: Amounts, name: str) -> dict[str, list[Any]]:
     """Of the settings without a collision in training the fastest, else the safest."""
     course = _Course.of(family, training(family, plan.seed, 0, min(plan.train, 100)))
     revisers = [
@@ -246,7 +246,7 @@ def _test_tuned(family: Family, plan: Plan, name: str) -> dict[str, list[Any]]:
     return {"rows": [row], "trade_offs": tried}
 
 
-def _test_learner(family: Family, plan: Plan, seed: int) -> dict[str, list[Any]]:
+def _test_learner(family: Family, plan: Amounts, seed: int) -> dict[str, list[Any]]:
     """Learn with one seed; test on the way and at the end."""
     guard = guard_for_family(family, tolerance=plan.tolerance)
     tests = _tests(family, plan)
@@ -290,7 +290,7 @@ def _test_learner(family: Family, plan: Plan, seed: int) -> dict[str, list[Any]]
     return {"rows": rows, "curve": curve, "trade_offs": trade_offs}
 
 
-def _test_rule(family: Family, plan: Plan, rule: str, seed: int) -> dict[str, list[Any]]:
+def _test_rule(family: Family, plan: Amounts, rule: str, seed: int) -> dict[str, list[Any]]:
     """Steer by the states alone: what a rule's states are worth."""
     machine, risk = learnt_by(guard_for_family(family, rule=RULES[rule]))
     by_state = RiskByState(risk, machine)

@@ -156,14 +156,10 @@ def side_tables(study: ClosedLoop) -> dict[str, Table]:
     return {name: make(study) for name, (found, make) in tables.items() if found}
 
 
-def _spread(show: Callable[[float], str]) -> Callable[[Spread], str]:
-    """How a column writes median and range."""
-
-    def written(values: Spread) -> str:
-        low, middle, high = map(show, values)
-        return middle if low == high else f"{middle} ({low}–{high})"
-
-    return written
+def _spread(values: Spread, show: Callable[[float], str]) -> str:
+    """Median and range."""
+    low, middle, high = map(show, values)
+    return middle if low == high else f"{middle} ({low}–{high})"
 
 
 def _table_of_learning(study: ClosedLoop) -> Table:
@@ -172,10 +168,10 @@ def _table_of_learning(study: ClosedLoop) -> Table:
         "Learning: held-out tests on the way",
         (
             Column("episodes", "episodes", count),
-            Column("collisions", "collision_rate", _spread(bare_percent), "%"),
-            Column("mobility", "mobility", _spread(decimals(3))),
-            Column("states", "states", _spread(count)),
-            Column("collided while learning", "train_collisions", _spread(count)),
+            Column("collisions", lambda one: _spread(one.collision_rate, bare_percent), unit="%"),
+            Column("mobility", lambda one: _spread(one.mobility, decimals(3))),
+            Column("states", lambda one: _spread(one.states, count)),
+            Column("collided while learning", lambda one: _spread(one.train_collisions, count)),
         ),
         learning_curve(study),
         f"Median and range over {seeds_text(seeds)}; {_checked_on(study):,} held-out episodes "

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from evofsm.evidence.paper.runs import PaperStudy, Run
+from evofsm.evidence.study import Frame
 
 #: In which cases the paper saw a collision.
 _COLLIDES = {1: True, 2: False, 3: False, 4: True}
@@ -25,6 +26,19 @@ class Claim:
     paper: str
     measured: str
     holds: bool
+
+
+@dataclass(frozen=True)
+class Reproduction:
+    """The runs, and every claim held against them."""
+
+    study: PaperStudy
+    claims: tuple[Claim, ...]
+
+    @property
+    def frame(self) -> Frame:
+        """The claims, each with its verdict."""
+        return Frame(self.claims)
 
 
 def check_claims(study: PaperStudy) -> tuple[Claim, ...]:

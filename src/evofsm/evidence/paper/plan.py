@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING
 from evofsm.evidence.study import Progress, Study, silent
 
 if TYPE_CHECKING:
-    from evofsm.evidence.paper.runs import PaperStudy
+    from evofsm.evidence.paper.claims import Reproduction
     from evofsm.evidence.report.chapter import Chapter
 
 
 @dataclass(frozen=True)
-class Plan(Study["PaperStudy"]):
+class Plan(Study["Reproduction"]):
     """Reproduce the paper: drive its 80 runs, and hold every claim against them."""
 
     id = "paper"
@@ -31,18 +31,20 @@ class Plan(Study["PaperStudy"]):
         """All of it, which is short."""
         return replace(self)
 
-    def run(self, progress: Progress = silent, workers: int | None = None) -> PaperStudy:
+    def run(self, progress: Progress = silent, workers: int | None = None) -> Reproduction:
         """Drive the four cases, round by round, in one process."""
         from evofsm.driving import open_world
+        from evofsm.evidence.paper.claims import Reproduction, check_claims
         from evofsm.evidence.paper.runs import run_paper
         from evofsm.evidence.paper.settings import Settings
 
         with open_world(self.world) as place:
             settings = Settings.load(self.settings)
-            return run_paper(place, self.world, settings, self.rounds, progress)
+            study = run_paper(place, self.world, settings, self.rounds, progress)
+        return Reproduction(study, check_claims(study))
 
-    def tell(self, found: PaperStudy) -> Chapter:
+    def tell(self, found: Reproduction) -> Chapter:
         """Every claim beside what was measured."""
         from evofsm.evidence.paper.chapter import paper_chapter
 
-        return paper_chapter(found)
+        return paper_chapter(found.study, found.claims)

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from evofsm.core import EvolvingFSM, FSMModel, jensen_shannon, widen
 from evofsm.driving import UNITS, VARIABLES, Episode, World
 from evofsm.evidence.paper.settings import Settings
-from evofsm.evidence.study import Frame
 
 CASES = (1, 2, 3, 4)
 
@@ -65,13 +64,6 @@ class PaperStudy:
             time = float(self.runs[run].episode.time[row - first_rows[run]])
             foundings.append(Founding(state, run, time))
         return foundings
-
-    @property
-    def frame(self) -> Frame:
-        """The claims, each with its verdict."""
-        from evofsm.evidence.paper.claims import check_claims
-
-        return Frame(check_claims(self))
 
     @property
     def dead_ends(self) -> tuple[int, ...]:
