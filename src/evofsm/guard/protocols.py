@@ -71,8 +71,8 @@ class Proposal(NamedTuple):
     Proposal(action=1.2, candidates=())
     """
 
-    action: float  #: acceleration [m/s²]
-    candidates: tuple[float, ...] = ()  #: others it could do as well [m/s²]
+    action: float  #: of a car the acceleration [m/s²]; of `Choices` an index
+    candidates: tuple[float, ...] = ()  #: others it could do as well
 
 
 class Intake(IntFlag):
@@ -91,9 +91,9 @@ STALE, INCOMPLETE = Intake.REPEATED | Intake.LATE, Intake.PARTIAL | Intake.HELD
 
 
 class Situation(NamedTuple):
-    """Where the vehicle is, as it was observed and as the machine recognised it."""
+    """Where the system is, as it was observed and as the machine recognised it."""
 
-    observation: NDArray[np.float64]  #: (3,) gap [m], v_follower [m/s], v_leader [m/s]
+    observation: NDArray[np.float64]  #: (m,) in the judge's units; NaN where not seen
     belief: NDArray[np.float64]  #: (n,) distribution over states
     state: int | None  #: index of the most probable state; None where there is none yet
     surprise: float  #: divergence of forecast and belief [bit]; NaN where nothing was forecast
@@ -104,20 +104,20 @@ class Situation(NamedTuple):
 class Revision(NamedTuple):
     """What a reviser made of a proposal, and why."""
 
-    executed: float  #: acceleration to command [m/s²]
-    proposed: float  #: acceleration that the controller wanted [m/s²]; NaN where it had none
+    executed: float  #: action to execute; of a car the acceleration [m/s²]
+    proposed: float  #: action that the controller wanted; NaN where it had none
     risk_proposed: float  #: probability of failure under the proposal; NaN where not judged
     risk_executed: float  #: the same for what is executed
     interval: tuple[float, float]  #: 90 % interval of `risk_executed`
     reason: str  #: in a few words
-    evidence: float  #: number of leaders' braking manoeuvres that the risks rest on
+    evidence: float  #: number of disturbances that the risks rest on
     seen: float  #: time spent in states like this one before [s]; NaN where that is not known
-    advised: float  #: what the reviser would execute, whether or not it may act [m/s²]
+    advised: float  #: what the reviser would execute, whether or not it may act
     explanation: str = ""  #: what a machine's experience says of it, where that was asked for
 
 
 class Controller(Protocol):
-    """Anything that drives the follower."""
+    """Anything that proposes actions."""
 
     def propose(self, observation: NDArray[np.float64], time: float = 0.0) -> Proposal:
         """What it wants to do at ``time`` [s], seeing ``observation``.

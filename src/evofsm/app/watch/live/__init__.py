@@ -1,5 +1,1 @@
 """The live page: a run while it is driven, or one that was recorded, in the browser."""
-
-from evofsm.app.watch.live.server import LivePage
-
-__all__ = ["LivePage"]
