@@ -33,8 +33,8 @@ from evofsm.evidence.detection.watch import (
     watch,
 )
 from evofsm.evidence.detection.worlds import GRID, grid_world, world
+from evofsm.evidence.frame import Frame
 from evofsm.evidence.scores import Ranked, auprc, auroc, bootstrap, brier, isotonic
-from evofsm.evidence.study import Frame
 
 TINY = Plan(
     train=6,

@@ -8,10 +8,11 @@ from typer.testing import CliRunner
 
 from evofsm.__main__ import application
 from evofsm.app.cli.declared import option
+from evofsm.evidence.frame import Frame
 from evofsm.evidence.report.chapter import Chapter, Section
 from evofsm.evidence.report.drawing import Sketch
 from evofsm.evidence.studies import STUDIES
-from evofsm.evidence.study import Frame, Study
+from evofsm.evidence.study import Study
 
 
 @dataclass(frozen=True)

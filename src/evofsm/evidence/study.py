@@ -8,49 +8,18 @@ Its fields say how much is done; those made by `evofsm.app.option` are the optio
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, Protocol, Self, TypeVar
 
 from evofsm.app import is_required
-from evofsm.extras import needs
+from evofsm.evidence.frame import Frame, Progress, silent
 
 if TYPE_CHECKING:
     from rich.console import Console
 
     from evofsm.evidence.report.chapter import Chapter
-
-#: Called with the number of tasks done, and of all tasks.
-Progress = Callable[[int, int], None]
-
-
-def silent(done: int, total: int) -> None:
-    """A `Progress` that does nothing."""
-
-
-@dataclass(frozen=True)
-class Frame:
-    """Rows of a study, all of one type: a frozen dataclass, one row a line of one table."""
-
-    rows: Sequence[Any]
-
-    def as_dicts(self) -> list[dict[str, Any]]:
-        """Every row as plain values, for JSON; a row may say by ``as_dict`` what it is."""
-        return [row.as_dict() if hasattr(row, "as_dict") else asdict(row) for row in self.rows]
-
-    def write_parquet(self, path: Path) -> None:
-        """Write all rows as one Parquet file.
-
-        Raises
-        ------
-        ModuleNotFoundError
-            If polars is not installed.
-        """
-        with needs("polars", "tables", "writing rows as Parquet"):
-            import polars
-        # An absolute path, for polars takes others for addresses on the network.
-        polars.DataFrame(self.as_dicts(), infer_schema_length=None).write_parquet(path.absolute())
 
 
 class Findings(Protocol):

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 
 from evofsm.app import split_names
 from evofsm.evidence.closed_loop.amounts import Amounts
-from evofsm.evidence.study import Progress, Study, silent
+from evofsm.evidence.frame import Progress, silent
+from evofsm.evidence.study import Study
 
 if TYPE_CHECKING:
     from rich.console import Console

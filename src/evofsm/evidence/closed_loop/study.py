@@ -52,7 +52,7 @@ from evofsm.evidence.closed_loop.beside import (
     run_two_worlds,
 )
 from evofsm.evidence.closed_loop.calibration import Reliability, run_calibration
-from evofsm.evidence.study import Frame
+from evofsm.evidence.frame import Frame
 from evofsm.fleet import in_order
 from evofsm.guard import ActionReviser, Guard, Reviser
 

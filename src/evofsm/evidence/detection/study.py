@@ -14,6 +14,7 @@ from itertools import islice, product
 from typing import Any, NamedTuple
 
 from evofsm.driving import Group, ResponsibilitySensitiveSafety
+from evofsm.evidence.detection.amounts import Amounts
 from evofsm.evidence.detection.measures import (
     Detector,
     Ours,
@@ -23,7 +24,6 @@ from evofsm.evidence.detection.measures import (
     fixed,
     tuned,
 )
-from evofsm.evidence.detection.plan import Plan
 from evofsm.evidence.detection.rows import Judged, Reliable, Row, Scored, judge
 from evofsm.evidence.detection.watch import (
     Exposure,
@@ -34,8 +34,8 @@ from evofsm.evidence.detection.watch import (
     watch,
 )
 from evofsm.evidence.detection.worlds import World, grid_world, world
+from evofsm.evidence.frame import Frame, Progress, silent
 from evofsm.evidence.scores import auroc
-from evofsm.evidence.study import Frame, Progress, silent
 from evofsm.fleet import in_order
 
 #: Limits that are told to the safe distance of the grid that is wrong almost everywhere [m/s²].
@@ -48,7 +48,7 @@ IN_GRID = (Ours.DEFAULT, Ours.PAPER, "rss-r157", "rss-assumed", "rss-matched")
 class Detection:
     """All that the study measured."""
 
-    plan: Plan
+    plan: Amounts
     families: tuple[str, ...]
     rows: list[Row]
     grid: list[Row] = field(default_factory=list)
@@ -65,7 +65,9 @@ class Detection:
         return next((r for r in self.rows if (r.family, r.measure, r.target) == wanted), None)
 
 
-def run_detection(plan: Plan, progress: Progress = silent, workers: int | None = None) -> Detection:
+def run_detection(
+    plan: Amounts, progress: Progress = silent, workers: int | None = None
+) -> Detection:
     """Judge every measure in every world; see `Study.run`.
 
     Raises
@@ -117,7 +119,7 @@ class _Cell(NamedTuple):
     rows: list[Row]
 
 
-def _judge_world(name: str, plan: Plan) -> list[Judged]:
+def _judge_world(name: str, plan: Amounts) -> list[Judged]:
     here = world(name, plan)
     hours = plan.hours_of(name)
     watcher = Watcher(here.watched).watch(here.training(plan, 0))
@@ -140,13 +142,13 @@ def _judge_world(name: str, plan: Plan) -> list[Judged]:
     ]
 
 
-def _first_watched(here: World, plan: Plan) -> Exposure:
+def _first_watched(here: World, plan: Amounts) -> Exposure:
     """What baselines are tuned on: the world that is watched first, before any shift."""
     draws = islice(here.training(plan, 0), plan.train)
     return Exposure(here.watched, tuple(watch(family, draw) for family, draw in draws))
 
 
-def _other_seed(name: str, plan: Plan, seed: int) -> _Areas:
+def _other_seed(name: str, plan: Amounts, seed: int) -> _Areas:
     """How far what is learnt depends on what happened to be watched."""
     here = world(name, plan)
     watcher = Watcher(here.watched).watch(here.training(plan, seed))
@@ -167,7 +169,7 @@ def _with_seeds(row: Row, areas: Sequence[_Area]) -> Row:
     return replace(row, auroc_seeds=tuple(one.auroc for one in areas if one[:3] == mine))
 
 
-def _judge_cell(decel: float, leader_decel: float, plan: Plan) -> _Cell:
+def _judge_cell(decel: float, leader_decel: float, plan: Amounts) -> _Cell:
     """One world of the grid, by dead ends alone."""
     here = grid_world(decel, leader_decel, plan)
     watcher = Watcher(here.watched).watch(here.training(plan, 0))

@@ -8,7 +8,7 @@ from itertools import chain
 from pathlib import Path
 
 from evofsm.driving import Draw, Family, load_family, merge, training
-from evofsm.evidence.detection.plan import Plan
+from evofsm.evidence.detection.amounts import Amounts
 
 #: Name of the worlds of the grid, in which nobody knows the limits: see `grid_world`.
 GRID = "grid"
@@ -27,7 +27,7 @@ class World:
     since: int  #: episodes of ``family`` that are watched after that
     settled: Family  #: on which thresholds are chosen
 
-    def training(self, plan: Plan, learning_seed: int) -> Iterator[tuple[Family, Draw]]:
+    def training(self, plan: Amounts, learning_seed: int) -> Iterator[tuple[Family, Draw]]:
         """What one learner watches, with the family that each draw is of."""
         train = plan.grid_train if self.name == GRID else plan.train
         first = training(self.watched, plan.seed, learning_seed, train)
@@ -37,7 +37,7 @@ class World:
         )
 
 
-def world(name: str, plan: Plan) -> World:
+def world(name: str, plan: Amounts) -> World:
     """A world by its name.
 
     ``emergency+noise`` is a family with a switch on. A family that shifts is judged after its
@@ -51,7 +51,7 @@ def world(name: str, plan: Plan) -> World:
 
     Examples
     --------
-    >>> at_once = world("shift-at-once", Plan())
+    >>> at_once = world("shift-at-once", Amounts())
     >>> at_once.watched.decel, at_once.family.decel, at_once.since
     (4.5, 2.5, 0)
     """
@@ -72,18 +72,18 @@ def _family(name: str) -> Family:
     return replace(load_family(_PAPER), name=name) if name == "paper" else load_family(name)
 
 
-def grid_world(decel: float, leader_decel: float, plan: Plan) -> World:
+def grid_world(decel: float, leader_decel: float, plan: Amounts) -> World:
     """As `emergency`, but with brakes of anyone's choice; commands always reach further.
 
     Parameters
     ----------
     decel, leader_decel : float
         Hardest braking of the follower, and of leaders, who draw theirs from 2.5 m/s² on [m/s²].
-    plan : Plan
+    plan : Amounts
 
     Examples
     --------
-    >>> cell = grid_world(3.0, 6.0, Plan()).family
+    >>> cell = grid_world(3.0, 6.0, Amounts()).family
     >>> cell.decel, cell.leader_decel, cell.actions.low
     (3.0, 6.0, -6.0)
     """

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from evofsm.evidence.frame import Frame
 from evofsm.evidence.paper.runs import PaperStudy, Run
-from evofsm.evidence.study import Frame
 
 #: In which cases the paper saw a collision.
 _COLLIDES = {1: True, 2: False, 3: False, 4: True}

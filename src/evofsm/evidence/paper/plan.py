@@ -6,7 +6,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from evofsm.evidence.study import Progress, Study, silent
+from evofsm.evidence.frame import Progress, silent
+from evofsm.evidence.study import Study
 
 if TYPE_CHECKING:
     from evofsm.evidence.paper.claims import Reproduction

@@ -14,6 +14,8 @@ from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple
 
+from evofsm.evidence.frame import Frame, Progress, silent
+from evofsm.evidence.prediction.amounts import Amounts
 from evofsm.evidence.prediction.forecasters import (
     REFERENCES,
     Method,
@@ -23,7 +25,6 @@ from evofsm.evidence.prediction.forecasters import (
     ablate,
     compare,
 )
-from evofsm.evidence.prediction.plan import Plan
 from evofsm.evidence.prediction.scoring import Row, Sums, row, score
 from evofsm.evidence.prediction.sources import (
     FAMILIES,
@@ -34,7 +35,6 @@ from evofsm.evidence.prediction.sources import (
     read,
     split_logs,
 )
-from evofsm.evidence.study import Frame, Progress, silent
 from evofsm.fleet import in_order
 
 # More than there are test episodes in one part of the logs.
@@ -45,7 +45,7 @@ _APART = 1_000_000
 class Prediction:
     """All that was found."""
 
-    plan: Plan
+    plan: Amounts
     rows: list[Row]
     ablation: list[Row]  #: one learning seed, or one part of the runs; methods are `Variant`s
     logs: tuple[LogSource, ...] = ()
@@ -77,7 +77,7 @@ class _Scored(NamedTuple):
 
 
 def run_prediction(
-    plan: Plan,
+    plan: Amounts,
     logs: Sequence[LogSource] = (),
     progress: Progress = silent,
     workers: int | None = None,
@@ -87,7 +87,7 @@ def run_prediction(
 
     Parameters
     ----------
-    plan : Plan
+    plan : Amounts
     logs : sequence of LogSource
         Real drives; none if empty.
     progress, workers
@@ -130,7 +130,7 @@ def _at_most(source: LogSource, most: int | None) -> LogSource:
 
 
 def _rows(
-    plan: Plan, found: Sequence[Sequence[_Scored]], *, ablation: bool = False
+    plan: Amounts, found: Sequence[Sequence[_Scored]], *, ablation: bool = False
 ) -> Iterator[Row]:
     """A row for each method at each horizon of each source, in the order in which they came."""
     rounds: dict[tuple[str, float, str], list[_Scored]] = defaultdict(list)
@@ -153,29 +153,29 @@ def _rows(
 # -- Tasks ----------------------------------------------------------------------------------------
 
 
-def _family_task(plan: Plan, name: str, pace: Pace, learning_seed: int) -> list[_Scored]:
+def _family_task(plan: Amounts, name: str, pace: Pace, learning_seed: int) -> list[_Scored]:
     return _scored(_drawn(plan, name, pace, learning_seed))
 
 
-def _log_task(plan: Plan, logs: LogSource, part: int) -> list[_Scored]:
+def _log_task(plan: Amounts, logs: LogSource, part: int) -> list[_Scored]:
     return _scored(_part_of(plan, logs, part))
 
 
-def _ablated_family(plan: Plan, name: str) -> list[_Scored]:
+def _ablated_family(plan: Amounts, name: str) -> list[_Scored]:
     return _scored_ablation(_drawn(plan, name, Pace.DECISIONS, 0))
 
 
-def _ablated_logs(plan: Plan, logs: LogSource) -> list[_Scored]:
+def _ablated_logs(plan: Amounts, logs: LogSource) -> list[_Scored]:
     return _scored_ablation(_part_of(plan, logs, 0))
 
 
-def _drawn(plan: Plan, name: str, pace: Pace, learning_seed: int) -> Source:
+def _drawn(plan: Amounts, name: str, pace: Pace, learning_seed: int) -> Source:
     fine = pace is Pace.STEPS
     train, test = (plan.fine_train, plan.fine_test) if fine else (plan.train, plan.test)
     return drive(name, pace, plan.seed, learning_seed, train, test)
 
 
-def _part_of(plan: Plan, logs: LogSource, part: int) -> Source:
+def _part_of(plan: Amounts, logs: LogSource, part: int) -> Source:
     parts = min(plan.parts, len(logs.files))
     train, test = split_logs(logs, plan.seed, part, parts)
     return read(logs, train, test, first=part * _APART)

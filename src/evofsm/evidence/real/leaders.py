@@ -14,8 +14,8 @@ from typing import NamedTuple, TypeVar
 
 from evofsm.core import IntervalActions
 from evofsm.driving import REAL_DRIVES, LatentRisk, LeaderBrakes
+from evofsm.evidence.frame import Progress, silent
 from evofsm.evidence.real.cases import runs_in
-from evofsm.evidence.study import Progress, silent
 from evofsm.fleet import in_order
 from evofsm.guard import ActionReviser, Guard, Mode, speaks
 from evofsm.io import Episode, Layout, find_checksums, read_episodes

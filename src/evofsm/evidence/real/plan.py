@@ -1,13 +1,13 @@
-"""How much is learnt and judged."""
+"""The study as a command: what it does, and what is told of it."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from evofsm.app import option
-from evofsm.evidence.study import Progress, Study, silent
+from evofsm.evidence.frame import Progress, silent
+from evofsm.evidence.real.amounts import Amounts
+from evofsm.evidence.study import Study
 
 if TYPE_CHECKING:
     from evofsm.evidence.real.study import RealStudy
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Plan(Study["RealStudy"]):
+class Plan(Amounts, Study["RealStudy"]):
     """Whether what was learnt on some real drives foretells danger in others.
 
     Events are a time to collision below 3, 2 and 1.5 s, and braking harder than 3 m/s², within 1,
@@ -24,30 +24,8 @@ class Plan(Study["RealStudy"]):
     SHA256SUMS are held against the files.
     """
 
-    id = "real"
-    question = "Does what was learnt on some real drives foretell danger in others?"
     doing = "Learning and judging"
     short = "Ten runs: a look, not evidence."
-
-    data: Path | None = option(
-        None,
-        "Folder of runs, a CSV file each (gzipped or not): pair, segment, time, gap, "
-        "v_follower, v_leader, a_follower. See docs/real-data.md.",
-        required=True,
-    )
-    train: Path | None = option(
-        None,
-        "Another folder of runs: all that is learnt from, and all of --data is judged. "
-        "Without it the runs of --data are dealt to folds.",
-    )
-    folds: int = option(5, "Each run is judged by what the other folds taught (no --train).", min=2)
-    seed: int = option(0, "Of the folds and the intervals.", min=0)
-    rounds: int = 500  #: of the bootstrap
-    most_runs: int | None = None  #: as many runs at most, drawn with the seed; None for all
-
-    def shortened(self) -> Plan:
-        """A few runs: a look, not evidence."""
-        return replace(self, folds=2, rounds=100, most_runs=10)
 
     def run(self, progress: Progress = silent, workers: int | None = None) -> RealStudy:
         """Learn on some runs of ``data``, or on those of ``train``, and judge on the others.

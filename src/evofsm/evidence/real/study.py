@@ -14,6 +14,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from evofsm.evidence.frame import Frame, Progress, silent
+from evofsm.evidence.real.amounts import Amounts
 from evofsm.evidence.real.cases import INTERVAL, QUESTIONS, Case, Question, case_of, runs_in
 from evofsm.evidence.real.measures import (
     MEASURES,
@@ -26,10 +28,8 @@ from evofsm.evidence.real.measures import (
     score_fixed,
 )
 from evofsm.evidence.real.moments import Moment, Warned, alarm_threshold, leads, telling_moments
-from evofsm.evidence.real.plan import Plan
 from evofsm.evidence.real.targets import Target
 from evofsm.evidence.scores import Ranked, interval, resampled
-from evofsm.evidence.study import Frame, Progress, silent
 from evofsm.fleet import in_order
 from evofsm.io import Layout, find_checksums, read_episodes
 
@@ -82,7 +82,7 @@ class Drives(NamedTuple):
 class RealStudy:
     """All that was measured."""
 
-    plan: Plan
+    plan: Amounts
     runs: tuple[str, ...]
     verified: int  #: files whose checksum was held against a list
     episodes: int
@@ -117,7 +117,7 @@ class RealStudy:
         return next(row for row in self.of(target, horizon) if row.measure == measure)
 
 
-def read_folder(folder: Path, plan: Plan, *, dealt: bool = True) -> tuple[list[Case], int]:
+def read_folder(folder: Path, plan: Amounts, *, dealt: bool = True) -> tuple[list[Case], int]:
     """Decisions of all runs in a folder, and how many files were held against a checksum.
 
     Parameters
@@ -125,7 +125,7 @@ def read_folder(folder: Path, plan: Plan, *, dealt: bool = True) -> tuple[list[C
     folder : Path
         Holds ``*.csv`` or ``*.csv.gz`` in the layout `evofsm.io.Layout.PAIRS`, one file
         a run; lists of checksums and of segments in capital letters are no runs.
-    plan : Plan
+    plan : Amounts
         Tells how many runs at most.
     dealt : bool
         Whether its runs will be dealt to folds, each of which needs one.
@@ -169,7 +169,7 @@ def fold_of_runs(runs: Sequence[str], folds: int, seed: int) -> dict[str, int]:
 
 def run_real(
     cases: Sequence[Case],
-    plan: Plan,
+    plan: Amounts,
     verified: int = 0,
     progress: Progress = silent,
     workers: int | None = None,
@@ -180,7 +180,7 @@ def run_real(
     Parameters
     ----------
     cases : sequence of Case
-    plan : Plan
+    plan : Amounts
     verified : int
         Files whose checksum was held against a list; told on, no more.
     progress, workers
@@ -267,7 +267,7 @@ class _Part(NamedTuple):
     judged: list[int]
 
 
-def _folds(cases: Sequence[Case], runs: Sequence[str], plan: Plan) -> list[_Part]:
+def _folds(cases: Sequence[Case], runs: Sequence[str], plan: Amounts) -> list[_Part]:
     """Each fold judged by what the others taught."""
     if not 2 <= plan.folds <= len(runs):
         raise ValueError(f"{len(runs)} runs cannot be dealt to {plan.folds} folds")
@@ -298,7 +298,7 @@ def _rows(
     runs: Sequence[str],
     question: Question,
     asked: dict[tuple[str, Question], list[NDArray[np.float64]]],
-    plan: Plan,
+    plan: Amounts,
 ) -> Iterable[Row]:
     """All measures, asked one question, with the same draws of runs."""
     place = {run: k for k, run in enumerate(runs)}

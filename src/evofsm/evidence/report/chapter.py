@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from evofsm.app import Column, Table
+from evofsm.evidence.frame import Progress, silent
 from evofsm.evidence.report.drawing import Drawing, Sketch, draw_all
 from evofsm.evidence.report.html import Setting, versions, write_html
-from evofsm.evidence.study import Progress, silent
 
 
 class Source(NamedTuple):

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from evofsm.evidence.study import Progress, silent
+from evofsm.evidence.frame import Progress, silent
 from evofsm.extras import needs
 
 with needs("matplotlib", "plot", "drawing figures"):

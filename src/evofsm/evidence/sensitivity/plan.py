@@ -1,12 +1,13 @@
-"""How much is tried."""
+"""The study as a command: what it does, and what is told of it."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from evofsm.app import option
-from evofsm.evidence.study import Progress, Study, silent
+from evofsm.evidence.frame import Progress, silent
+from evofsm.evidence.sensitivity.amounts import Amounts
+from evofsm.evidence.study import Study
 
 if TYPE_CHECKING:
     from evofsm.evidence.report.chapter import Chapter
@@ -14,42 +15,15 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Plan(Study["Sensitivity"]):
+class Plan(Amounts, Study["Sensitivity"]):
     """In what share of settings each claim of the paper holds.
 
     The paper leaves open how fast the leader gets, how hard it brakes, the gap at the start, and
     more. Each setting drives the paper's 80 runs and is judged by the checks of `evofsm paper`.
     """
 
-    id = "sensitivity"
-    question = "Do the paper's claims depend on what it leaves open?"
     doing = "Driving and learning"
     short = "A twentieth of everything: a look, not evidence."
-
-    settings: int = option(
-        2000, "Drawn over everything; sweeps, maps and other draws come on top.", min=4
-    )
-    seed: int = option(0, "Of the draws and of the noise.", min=0)
-    levels: int = 33  #: of each parameter in its sweep
-    side: int = 15  #: of a map
-    halvings: int = 7  #: of the last step of a sweep, in search of where a claim breaks
-    rounds: int = 20  #: in which the four cases are driven; fewer are not the paper's study
-
-    def __post_init__(self) -> None:
-        least_of = {"settings": 4, "levels": 2, "side": 2, "halvings": 0, "rounds": 1}
-        for name, least in least_of.items():
-            if getattr(self, name) < least:
-                raise ValueError(f"{name} is {getattr(self, name)}; it must be {least} or more")
-
-    def shortened(self) -> Plan:
-        """About a twentieth of everything: a look, not evidence."""
-        return replace(
-            self,
-            settings=min(self.settings, 80),
-            levels=min(self.levels, 7),
-            side=min(self.side, 3),
-            halvings=min(self.halvings, 2),
-        )
 
     def run(self, progress: Progress = silent, workers: int | None = None) -> Sensitivity:
         """Try all settings."""

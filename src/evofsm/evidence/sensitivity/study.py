@@ -8,10 +8,11 @@ from functools import partial
 from typing import NamedTuple
 
 from evofsm.driving import KinematicWorld
+from evofsm.evidence.frame import Frame, Progress, silent
 from evofsm.evidence.paper.claims import Claim, check_claims
+from evofsm.evidence.sensitivity.amounts import Amounts
 from evofsm.evidence.sensitivity.designs import Design, Trial, filling, maps, sweeps
 from evofsm.evidence.sensitivity.parameters import PARAMETERS, Parameter
-from evofsm.evidence.sensitivity.plan import Plan
 from evofsm.evidence.sensitivity.setting import (
     Remembering,
     Row,
@@ -19,7 +20,6 @@ from evofsm.evidence.sensitivity.setting import (
     recovered,
     study_of,
 )
-from evofsm.evidence.study import Frame, Progress, silent
 from evofsm.fleet import in_order
 
 # Settings a worker tries in one go: worth crossing a process boundary.
@@ -42,7 +42,7 @@ class Reach(NamedTuple):
 class Sensitivity:
     """What became of the claims with every setting."""
 
-    plan: Plan
+    plan: Amounts
     claims: tuple[Claim, ...]  #: with the recovered setting
     rows: tuple[Row, ...]
     reaches: tuple[Reach, ...]
@@ -63,7 +63,7 @@ class Sensitivity:
 
 
 def run_sensitivity(
-    plan: Plan,
+    plan: Amounts,
     progress: Progress = silent,
     workers: int | None = None,
 ) -> Sensitivity:
@@ -97,7 +97,7 @@ def run_sensitivity(
     return Sensitivity(plan, claims, tuple(rows), tuple(reach for reach, _ in edges))
 
 
-def _trials(plan: Plan) -> Iterator[Trial]:
+def _trials(plan: Amounts) -> Iterator[Trial]:
     yield Trial(Design.RECOVERED, (), recovered())
     yield from sweeps(plan.levels, plan.seed)
     yield from maps(plan.side, plan.seed)
@@ -105,7 +105,7 @@ def _trials(plan: Plan) -> Iterator[Trial]:
         yield from filling(design, number, plan.seed)
 
 
-def _sizes(plan: Plan) -> dict[Design, int]:
+def _sizes(plan: Amounts) -> dict[Design, int]:
     """How many points each design that fills a space has."""
     return {
         Design.ALL: plan.settings,
@@ -128,7 +128,7 @@ def _sweep(rows: Sequence[Row], one: Parameter) -> list[Row]:
 # -- Where the first claim breaks -----------------------------------------------------------------
 
 
-def _reach(one: Parameter, sweep: Sequence[Row], plan: Plan) -> tuple[Reach, list[Row]]:
+def _reach(one: Parameter, sweep: Sequence[Row], plan: Amounts) -> tuple[Reach, list[Row]]:
     """Halve the steps of the sweep between which a claim breaks, below and above."""
     here = [_value(one, row) for row in sweep].index(one.recovered)
     below, tried_below = _edge(one, sweep[here::-1], plan)
@@ -147,7 +147,7 @@ class _Edge(NamedTuple):
     broken: tuple[str, ...]  #: claims that do not with the next one; none at the end of the range
 
 
-def _edge(one: Parameter, outward: Sequence[Row], plan: Plan) -> tuple[_Edge, list[Row]]:
+def _edge(one: Parameter, outward: Sequence[Row], plan: Amounts) -> tuple[_Edge, list[Row]]:
     """From the recovered setting outward, to where all claims hold for the last time."""
     if not outward[0].holds:  # not even there: nowhere to go from
         return _Edge(_value(one, outward[0]), outward[0].broken), []
