@@ -538,7 +538,7 @@ def _score_ahead(n: int, scores: _Scores, room: _Room) -> None:
 def _look_ahead(
     buffer: NDArray[np.float64], action: int, steps: int, scores: _Scores, room: _Room
 ) -> None:
-    """Forecast as `evofsm.core.transitions.propagate` does, under each policy."""
+    """Forecast as `FSMModel.propagate` does, under each policy."""
     now = open_memory(buffer).learnt
     n = int(now.n_states[0])
     scores.waiting[0] = True

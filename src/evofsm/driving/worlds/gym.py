@@ -48,7 +48,7 @@ class CarFollowing(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
     time is up. ``info`` holds ``time`` [s], ``gap`` [m] as it truly is, ``distance`` [m]
     travelled in the step, ``failed``, whether the follower ran into its leader, and
     ``rear_ended``, whether the car behind, if there is one, ran into the follower. Both terminate
-    and both cost, but only the first is a failure, as in `evofsm.guard.oversight`. ``split`` and
+    and both cost, but only the first is a failure, as in `evofsm.guard.Guard`. ``split`` and
     ``index`` say which scenario it is.
 
     Parameters

@@ -198,7 +198,7 @@ def evaluate(
     varied: tuple[str, ...] = (),
     rounds: int = ROUNDS,
 ) -> Row:
-    """The paper's own verdicts (`evofsm.evidence.paper.check_claims`) on one setting.
+    """The paper's own verdicts (`evofsm.evidence.paper.claims.check_claims`) on one setting.
 
     Parameters
     ----------
