@@ -18,6 +18,8 @@ from table import Row, duration, judged, shown, worsened
 from turns import compare
 from vectorised import NumpyFleet
 
+pytestmark = pytest.mark.slow
+
 VEHICLES = 6
 
 

@@ -217,6 +217,7 @@ def test_every_link_of_the_site_leads_somewhere(site):
     assert looked_at > 1000
 
 
+@pytest.mark.slow
 def test_the_site_loads_nothing_from_elsewhere(site):
     folder, pages = site
     for path, page in pages.items():
@@ -225,6 +226,7 @@ def test_the_site_loads_nothing_from_elsewhere(site):
         assert not re.search(r"(url\(|@import )['\"]?(https?:)?//", style.read_text()), style
 
 
+@pytest.mark.slow
 def test_formulas_are_there_without_a_script(site):
     folder, _ = site
     text = (folder / "equations" / "states.html").read_text()
@@ -242,6 +244,7 @@ def test_a_line_of_code_is_where_its_link_leads(site):
     assert there == ["def judge", "return MOVED if exceeds"]
 
 
+@pytest.mark.slow
 def test_every_public_module_is_in_the_reference(site):
     folder, _ = site
     reference = "".join(path.read_text() for path in (folder / "reference").glob("*.html"))

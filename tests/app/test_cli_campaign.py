@@ -24,6 +24,8 @@ from evofsm.driving.worlds import open_world
 from evofsm.fleet.executors import Here, Processes
 from evofsm.guard.reviser import Mode
 
+pytestmark = pytest.mark.slow
+
 EMERGENCY = load_family("emergency")
 EPISODES = 400
 

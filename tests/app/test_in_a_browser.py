@@ -9,6 +9,8 @@ from evofsm.evidence.report.chapter import Chapter, write_chapters
 from evofsm.evidence.report.drawing import Drawing
 from evofsm.evidence.report.html import Setting
 
+pytestmark = pytest.mark.slow
+
 SVG = '<svg xmlns="http://www.w3.org/2000/svg" width="{}" height="200"><path d="M0 0h90"/></svg>'
 # Where the image of the dialog lies.
 IMAGE = "document.querySelector('dialog img').getBoundingClientRect()"

@@ -5,6 +5,8 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.slow
+
 pytest.importorskip("typer")
 pytest.importorskip("matplotlib")
 pytest.importorskip("polars")

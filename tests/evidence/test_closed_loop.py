@@ -24,6 +24,8 @@ from evofsm.evidence.closed_loop.plan import Plan
 from evofsm.evidence.closed_loop.study import run_closed_loop
 from evofsm.evidence.scores import auroc
 
+pytestmark = pytest.mark.slow
+
 EMERGENCY = load_family("emergency")
 TINY = Plan(
     train=10,

@@ -26,6 +26,8 @@ from evofsm.evidence.paper.settings import Settings
 from evofsm.evidence.report.drawing import Drawing, draw_all
 from evofsm.plot.style import house_style
 
+pytestmark = pytest.mark.slow
+
 _NAMES = [
     *(f"case-{case}" for case in (1, 2, 3, 4)),
     "divergence",

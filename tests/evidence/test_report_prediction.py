@@ -6,8 +6,9 @@ from html import unescape
 import pytest
 
 from evofsm.evidence.prediction.forecasters import Method, Variant
+from evofsm.evidence.prediction.plan import Plan
 from evofsm.evidence.prediction.scoring import Row
-from evofsm.evidence.prediction.study import Plan, Prediction
+from evofsm.evidence.prediction.study import Prediction
 from evofsm.evidence.report.chapter import write_chapters
 
 

@@ -13,6 +13,8 @@ from evofsm.evidence.sensitivity.plan import Plan
 from evofsm.evidence.sensitivity.spaces import short_name
 from evofsm.evidence.sensitivity.study import Sensitivity, run_sensitivity
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def study():

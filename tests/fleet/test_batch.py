@@ -102,6 +102,7 @@ def test_an_episode_may_be_started_for_some():
     assert fleet[0].state is None
 
 
+@pytest.mark.slow
 def test_single_precision_is_close_and_saves_memory():
     Z, A = walks(20, 500)
     machine = EvolvingFSM(Q, rule=Novelty(radius=0.8))
@@ -117,6 +118,7 @@ def test_single_precision_is_close_and_saves_memory():
         )
 
 
+@pytest.mark.slow
 def test_a_machine_out_of_a_fleet_in_single_precision_can_be_kept(tmp_path):
     machine = EvolvingFSM(1, learning_rate=1e-4, rule=Novelty(radius=0.5))
     fleet = Fleet(machine, 1, dtype=np.float32)

@@ -206,6 +206,10 @@ class Guard:
         failed, seed, audit, explaining, missing
             As in `Guard`.
 
+        Returns
+        -------
+        Guard
+
         Examples
         --------
         >>> from evofsm import IntervalActions
@@ -288,6 +292,14 @@ class Guard:
 
         The same episode is then decided the same again, bit for bit. An episode that is under way
         is broken off: nothing more is learnt from it.
+
+        Examples
+        --------
+        >>> from evofsm.driving import guard_for_cars
+        >>> guard = guard_for_cars(low=-2.5, high=2.5)
+        >>> guard.freeze()
+        >>> guard.decide([9.0, 20.0, 20.0], 1.0).executed, guard.machine.n_states
+        (-2.5, 0)
         """
         self.learn = False
 
@@ -297,7 +309,14 @@ class Guard:
         return self._senses.held.copy()
 
     def begin(self) -> None:
-        """Begin an episode; one that is under way is broken off, and nothing follows from it."""
+        """Begin an episode; one that is under way is broken off, and nothing follows from it.
+
+        Examples
+        --------
+        >>> from evofsm.driving import guard_for_cars
+        >>> guard = guard_for_cars(low=-2.5, high=2.5)
+        >>> guard.begin()
+        """
         self._senses = Senses(self.missing, self.interval)
         self._latest: Situation | None = None
         self._decisions = 0
@@ -338,6 +357,14 @@ class Guard:
         ------
         TypeError, ValueError
             If observation or proposal are not real numbers, or an entry is infinite or too large.
+
+        Examples
+        --------
+        >>> from evofsm.driving import guard_for_cars
+        >>> guard = guard_for_cars(low=-2.5, high=2.5)
+        >>> revision = guard.decide([9.0, 20.0, 20.0], proposal=1.0)
+        >>> revision.executed, revision.risk_proposed
+        (-2.5, 1.0)
         """
         if isinstance(proposal, Proposal):
             others = tuple(float(candidate) for candidate in proposal.candidates)
@@ -354,6 +381,24 @@ class Guard:
 
         The machine learns the transition to it. An observation that is no newer than the one
         before changes nothing: the situation is still that one.
+
+        Parameters
+        ----------
+        observation : (m,) array_like
+            NaN where a variable was not observed.
+        time : float
+            Of the observation, in this episode [s].
+
+        Returns
+        -------
+        Situation
+
+        Examples
+        --------
+        >>> from evofsm.driving import guard_for_cars
+        >>> guard = guard_for_cars(low=-2.5, high=2.5)
+        >>> guard.recognise([9.0, 20.0, 20.0], time=0.0).state
+        0
         """
         z = self._checked(observation)
         if not self._under_way:
@@ -403,7 +448,27 @@ class Guard:
         return Situation(z, belief, int(belief.argmax()), math.nan, time, intake)
 
     def revise(self, situation: Situation, proposal: Proposal) -> Revision:
-        """The second half of `decide`: what to execute; machine and judge learn from it."""
+        """The second half of `decide`: what to execute; machine and judge learn from it.
+
+        Parameters
+        ----------
+        situation : Situation
+            What `recognise` returned.
+        proposal : Proposal
+            What the controller wants.
+
+        Returns
+        -------
+        Revision
+
+        Examples
+        --------
+        >>> from evofsm.driving import guard_for_cars
+        >>> guard = guard_for_cars(low=-2.5, high=2.5)
+        >>> here = guard.recognise([9.0, 20.0, 20.0], time=0.0)
+        >>> guard.revise(here, Proposal(1.0)).executed
+        -2.5
+        """
         revision = self._explained(situation, self.reviser.revise(situation, proposal))
         if self.audit is not None:
             self.audit.decided(situation, proposal, revision)
@@ -447,6 +512,15 @@ class Guard:
             observation.
         observation : (m,) array_like, optional
             The last one, on which nothing was decided any more.
+
+        Examples
+        --------
+        >>> from evofsm.driving import guard_for_cars
+        >>> guard = guard_for_cars(low=-2.5, high=2.5)
+        >>> revision = guard.decide([9.0, 20.0, 20.0], proposal=1.0)
+        >>> guard.end(failed=True, observation=[-0.1, 20.0, 12.0])
+        >>> guard.machine.endings
+        array([0., 1.])
         """
         z = None if observation is None else self._checked(observation)
         if not self._under_way:
@@ -480,6 +554,19 @@ class Guard:
         states : bool
             Whether it has the machine too. Without it the same is decided, unless the judge asks
             the states, and nothing is recognised.
+
+        Returns
+        -------
+        Guard
+
+        Examples
+        --------
+        >>> from evofsm.driving import guard_for_cars
+        >>> guard = guard_for_cars(low=-2.5, high=2.5)
+        >>> twin = guard.copy()
+        >>> revision = twin.decide([9.0, 20.0, 20.0], proposal=1.0)
+        >>> twin.machine.n_states, guard.machine.n_states
+        (1, 0)
         """
         machine = None if self.machine is None else self.machine.copy()
         reviser, judge = copy.deepcopy(
@@ -513,6 +600,16 @@ class Guard:
             If it cannot be written.
         ValueError
             If the reviser is of someone's own class, so that no file can say what it is.
+
+        Examples
+        --------
+        >>> from io import BytesIO
+        >>> from evofsm.driving import guard_for_cars
+        >>> guard, file = guard_for_cars(low=-2.5, high=2.5), BytesIO()
+        >>> guard.save(file, provenance={"drive": "Monday"})
+        >>> again = Guard.load(BytesIO(file.getvalue()))
+        >>> again.decide([9.0, 20.0, 20.0], 1.0).executed
+        -2.5
         """
         described = outline(self._participants)
         reviser = described["reviser"]
@@ -549,12 +646,25 @@ class Guard:
             As in `Guard`; needed where the guard had one.
         audit : Witness, optional
 
+        Returns
+        -------
+        Guard
+
         Raises
         ------
         OSError
             If there is no such file, or it may not be read.
         ValueError
             If the file holds something else or is damaged, or judge or ``failed`` are needed.
+
+        Examples
+        --------
+        >>> from io import BytesIO
+        >>> from evofsm.driving import guard_for_cars
+        >>> guard, file = guard_for_cars(low=-2.5, high=2.5), BytesIO()
+        >>> guard.save(file)
+        >>> Guard.load(BytesIO(file.getvalue())).interval
+        0.25
         """
         kept, files = storage.read(path, _KIND)
         if kept["failed"] and failed is None:

@@ -136,7 +136,7 @@ def graph(
     ax : matplotlib.axes.Axes, optional
         Where to plot; without it on new axes of pyplot.
     policy : {"observed", "marginal"}
-        How actions are weighed, as in `FSMModel.averaged_matrix`.
+        How actions are weighed, as in ``averaged_matrix``.
     dead_ends : collection of int
         Indices of states to mark by a hexagon and in words.
 

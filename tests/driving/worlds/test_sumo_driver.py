@@ -110,6 +110,7 @@ def test_in_sumo_and_in_closed_form_the_same_idm_drives_the_same_way(world):
     assert np.abs(in_sumo.observations - closed_form.observations).max() < 1e-9
 
 
+@pytest.mark.slow
 def test_under_a_reviser_what_is_executed_is_carried_out_exactly(world):
     actions = IntervalActions(low=-2.5, high=2.5, width=0.3, outside="clip")
     hasty = {"accel": 2.25, "decel": 2.0, "tau": 0.3, "minGap": 0.8, "maxSpeed": 28.0}
