@@ -45,7 +45,16 @@ from evofsm.driving import (
 )
 from evofsm.extras import needs
 from evofsm.files import Checkpoint, Kept, storage
-from evofsm.guard import AuditLog, Controller, Explain, Guard, LearningJudge, Mode, Reviser
+from evofsm.guard import (
+    TOLERANCE,
+    AuditLog,
+    Controller,
+    Explain,
+    Guard,
+    LearningJudge,
+    Mode,
+    Reviser,
+)
 
 #: Controllers by name; ``family`` is the family's own.
 CONTROLLERS = ("family", "aggressive", "normal", "acc", "sumo")
@@ -64,7 +73,7 @@ class Setup:
     controller: str = "family"
     reviser: str = "least-risk"
     mode: Mode = Mode.ACT
-    tolerance: float = 0.02
+    tolerance: float = TOLERANCE
     episodes: int = 100
     seed: int = 0
     learn: bool = True

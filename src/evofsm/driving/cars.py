@@ -15,13 +15,20 @@ from evofsm.driving.revisers import Unrevised
 from evofsm.driving.risk.outcome import LatentRisk
 from evofsm.driving.worlds.kinematic import KinematicWorld
 from evofsm.driving.worlds.road import World
-from evofsm.guard import ActionReviser, Controller, Guard, LearningJudge, Mode
+from evofsm.guard import (
+    BELIEF_TOLERANCE,
+    TOLERANCE,
+    ActionReviser,
+    Controller,
+    Guard,
+    LearningJudge,
+    Mode,
+)
 
 #: The state rule for safety work: fine enough to steer by. The study compares the rules.
 SAFETY_RULE = Novelty(radius=1.0, scales=(4.0, 2.0, 2.0))
 
 # With hundreds of states this makes a step several times as quick.
-_BELIEF_TOLERANCE = 1e-6
 # What a machine's explanations call soon [s].
 _SOON = 5.0
 _MACHINE, _RISK = "machine.evofsm", "risk.evofsm"
@@ -34,7 +41,7 @@ def guard_for_cars(
     *,
     width: float = 0.3,
     closed: Literal["left", "right"] = "left",
-    tolerance: float = 0.02,
+    tolerance: float = TOLERANCE,
     mode: Mode = Mode.ACT,
     rule: StateRule | None = SAFETY_RULE,
     machine: EvolvingFSM | None = None,
@@ -78,7 +85,7 @@ def guard_for_cars(
     machine = machine or EvolvingFSM(
         actions.n_actions,
         rule=rule,
-        belief_tolerance=_BELIEF_TOLERANCE,
+        belief_tolerance=BELIEF_TOLERANCE,
         failure_horizon=round(_SOON / interval),
     )
     reviser = ActionReviser(judge, actions, tolerance=tolerance, mode=mode)

@@ -8,6 +8,8 @@ from .auditing.replay import Difference as Difference
 from .auditing.replay import Field as Field
 from .auditing.replay import Replay as Replay
 from .auditing.replay import audit as audit
+from .defaults import BELIEF_TOLERANCE as BELIEF_TOLERANCE
+from .defaults import TOLERANCE as TOLERANCE
 from .guard import Explain as Explain
 from .guard import Guard as Guard
 from .gym import RevisedActions as RevisedActions

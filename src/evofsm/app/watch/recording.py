@@ -26,11 +26,10 @@ from evofsm.app.watch.shown import (
 from evofsm.app.watch.story import Chronicle
 from evofsm.core import FSMModel
 from evofsm.driving import VARIABLES, time_headway, time_to_collision
-from evofsm.guard import RECORD
+from evofsm.guard import RECORD, TOLERANCE
 from evofsm.io import RecordedEpisode, Run, read_run
 
 # What is accepted where a log does not say.
-_TOLERANCE = 0.02
 # So many of a log's episodes can be chosen among.
 _MOST_EPISODES = 500
 _NONE = -1
@@ -77,7 +76,7 @@ class Recording:
         self._episodes = [one for one in self._run.episodes if len(one.columns["time"])]
         if not self._episodes:
             raise ValueError(f"{path} holds no episode with a decision")
-        self._tolerance = _number(self._run.about.get("tolerance"), _TOLERANCE)
+        self._tolerance = _number(self._run.about.get("tolerance"), TOLERANCE)
         self.revising = self._run.about.get("mode", "act") == "act"
         self.start = self.restart(0)
 

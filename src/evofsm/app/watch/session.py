@@ -43,6 +43,7 @@ from evofsm.driving import (
 )
 from evofsm.guard import (
     RECORD,
+    TOLERANCE,
     Explain,
     Guard,
     Judgement,
@@ -88,7 +89,7 @@ class Watching:
     case: int = 0
     controller: str = "family"
     reviser: str = "least-risk"
-    tolerance: float = 0.02
+    tolerance: float = TOLERANCE
     seed: int = 0
 
     @property
