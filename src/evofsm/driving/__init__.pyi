@@ -54,12 +54,12 @@ from .risk.drac import deceleration_to_avoid_collision as deceleration_to_avoid_
 from .risk.fuzzy import FuzzySafety as FuzzySafety
 from .risk.headway import TimeHeadway as TimeHeadway
 from .risk.headway import time_headway as time_headway
+from .risk.latent import LatentRisk as LatentRisk
 from .risk.leaders import REAL_DRIVES as REAL_DRIVES
 from .risk.leaders import LeaderBrakes as LeaderBrakes
 from .risk.leaders import needed as needed
 from .risk.manoeuvres import BrakeWatch as BrakeWatch
 from .risk.mttc import ModifiedTimeToCollision as ModifiedTimeToCollision
-from .risk.outcome import LatentRisk as LatentRisk
 from .risk.picud import Picud as Picud
 from .risk.picud import picud as picud
 from .risk.r157 import PerformanceModel as PerformanceModel

@@ -12,7 +12,7 @@ from evofsm.driving.families.family import Draw, Family
 from evofsm.driving.framework import Drive, Framework
 from evofsm.driving.outcomes import Outcome, Reference, outcome, reference
 from evofsm.driving.revisers import Unrevised
-from evofsm.driving.risk.outcome import LatentRisk
+from evofsm.driving.risk.latent import LatentRisk
 from evofsm.driving.worlds.kinematic import KinematicWorld
 from evofsm.driving.worlds.road import World
 from evofsm.guard import (

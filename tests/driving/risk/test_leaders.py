@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from evofsm.driving.risk.latent import LatentRisk
 from evofsm.driving.risk.leaders import REAL_DRIVES, LeaderBrakes, needed
-from evofsm.driving.risk.outcome import LatentRisk
 from evofsm.guard.protocols import Situation
 
 DT = 0.25
