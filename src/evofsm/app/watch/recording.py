@@ -10,6 +10,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from evofsm.app.watch.chronicle import Chronicle
 from evofsm.app.watch.shown import (
     CAR_LENGTH,
     HEADWAY,
@@ -23,7 +24,6 @@ from evofsm.app.watch.shown import (
     most_believed,
     usual_ways,
 )
-from evofsm.app.watch.story import Chronicle
 from evofsm.core import FSMModel
 from evofsm.driving import VARIABLES, time_headway, time_to_collision
 from evofsm.guard import RECORD, TOLERANCE

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Self
 
 from evofsm.app.driving import Setup, make_controller, make_guard
+from evofsm.app.watch.chronicle import Chronicle
 from evofsm.app.watch.shown import (
     CAR_LENGTH,
     HEADWAY,
@@ -21,7 +22,6 @@ from evofsm.app.watch.shown import (
     graph_of,
     most_believed,
 )
-from evofsm.app.watch.story import Chronicle
 from evofsm.core import IntervalActions, Novelty
 from evofsm.driving import (
     GAP,
