@@ -39,7 +39,7 @@ from .policies import FIXED_MEASURES as FIXED_MEASURES
 from .policies import TUNED_MEASURES as TUNED_MEASURES
 from .policies import Group as Group
 from .policies import fixed_policies as fixed_policies
-from .record import COLUMNS as COLUMNS
+from .record import DECISION_COLUMNS as DECISION_COLUMNS
 from .revisers import GENTLE_BRAKE as GENTLE_BRAKE
 from .revisers import AlwaysBrake as AlwaysBrake
 from .revisers import EnvelopeReviser as EnvelopeReviser
