@@ -1,7 +1,7 @@
 from .auditing.form import Misfit as Misfit
 from .auditing.log import AuditLog as AuditLog
-from .auditing.participants import known as known
-from .auditing.participants import known_name as known_name
+from .auditing.participants import participant_class as participant_class
+from .auditing.participants import participant_name as participant_name
 from .auditing.replay import Audit as Audit
 from .auditing.replay import Contents as Contents
 from .auditing.replay import Difference as Difference
