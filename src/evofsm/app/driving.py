@@ -36,11 +36,11 @@ from evofsm.driving import (
     drive,
     guard_for_family,
     learnt_by,
-    outcome,
-    reference,
+    outcome_of,
+    reference_of,
     save_learnt,
     summarise,
-    unrevised,
+    unrevised_guard,
 )
 from evofsm.extras import needs
 from evofsm.files import Checkpoint, Kept, storage
@@ -168,7 +168,7 @@ def drive_family(
         driven = drive(guard, draw, world, controller)
         if record is not None:
             record(driven)
-        done.add(driven, outcome(driven, alone, family.interval), setup.tolerance)
+        done.add(driven, outcome_of(driven, alone, family.interval), setup.tolerance)
         if checkpoint is not None:
             checkpoint.offer(partial(done.keep, guard))
         progress(len(done.outcomes), sum(o.collided for o in done.outcomes))
@@ -185,8 +185,8 @@ def drive_family(
 
 def drive_alone(family: Family, draw: Draw, world: World, controller: Controller) -> Reference:
     """How far the controller comes by itself."""
-    alone = drive(unrevised(family), draw, world, controller)
-    return reference(alone, draw.scenario.leader.brake_decel)
+    alone = drive(unrevised_guard(family), draw, world, controller)
+    return reference_of(alone, draw.scenario.leader.brake_decel)
 
 
 def draws(setup: Setup, done: int = 0) -> Iterator[Draw]:

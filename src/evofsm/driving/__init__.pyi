@@ -5,13 +5,13 @@ from .cars import guard_for_family as guard_for_family
 from .cars import held_out as held_out
 from .cars import learnt_by as learnt_by
 from .cars import load_learnt as load_learnt
-from .cars import references as references
+from .cars import references_of as references_of
 from .cars import save_learnt as save_learnt
 from .cars import score as score
 from .cars import teach as teach
 from .cars import training as training
 from .cars import try_out as try_out
-from .cars import unrevised as unrevised
+from .cars import unrevised_guard as unrevised_guard
 from .drivers.acc import AdaptiveCruise as AdaptiveCruise
 from .drivers.function import FunctionController as FunctionController
 from .drivers.idm import IDM as IDM
@@ -20,7 +20,7 @@ from .families.family import FAMILIES as FAMILIES
 from .families.family import Draw as Draw
 from .families.family import Family as Family
 from .families.family import load_family as load_family
-from .families.tables import merge as merge
+from .families.tables import merge_tables as merge_tables
 from .framework import Decision as Decision
 from .framework import Drive as Drive
 from .framework import Framework as Framework
@@ -32,8 +32,8 @@ from .naming import name_states as name_states
 from .outcomes import Outcome as Outcome
 from .outcomes import Reference as Reference
 from .outcomes import Row as Row
-from .outcomes import outcome as outcome
-from .outcomes import reference as reference
+from .outcomes import outcome_of as outcome_of
+from .outcomes import reference_of as reference_of
 from .outcomes import summarise as summarise
 from .policies import FIXED_MEASURES as FIXED_MEASURES
 from .policies import TUNED_MEASURES as TUNED_MEASURES
@@ -57,7 +57,7 @@ from .risk.headway import time_headway as time_headway
 from .risk.latent import LatentRisk as LatentRisk
 from .risk.leaders import REAL_DRIVES as REAL_DRIVES
 from .risk.leaders import LeaderBrakes as LeaderBrakes
-from .risk.leaders import needed as needed
+from .risk.leaders import brakes_needed as brakes_needed
 from .risk.manoeuvres import BrakeWatch as BrakeWatch
 from .risk.mttc import ModifiedTimeToCollision as ModifiedTimeToCollision
 from .risk.picud import Picud as Picud

@@ -10,7 +10,7 @@ from typing import Any, Literal
 from evofsm.core import EvolvingFSM, IntervalActions, Novelty, StateRule
 from evofsm.driving.families.family import Draw, Family
 from evofsm.driving.framework import Drive, Framework
-from evofsm.driving.outcomes import Outcome, Reference, outcome, reference
+from evofsm.driving.outcomes import Outcome, Reference, outcome_of, reference_of
 from evofsm.driving.revisers import Unrevised
 from evofsm.driving.risk.latent import LatentRisk
 from evofsm.driving.worlds.kinematic import KinematicWorld
@@ -138,15 +138,15 @@ def teach(guard: Guard, draws: Iterable[Draw]) -> list[Drive]:
     return [drive(guard, draw) for draw in draws]
 
 
-def unrevised(family: Family) -> Guard:
+def unrevised_guard(family: Family) -> Guard:
     """A guard that executes whatever is proposed, and learns nothing."""
     return Guard.of(Unrevised(family.actions), interval=family.interval, learn=False)
 
 
-def references(family: Family, draws: Sequence[Draw]) -> list[Reference]:
+def references_of(family: Family, draws: Sequence[Draw]) -> list[Reference]:
     """How far the controller comes by itself in each draw."""
     return [
-        reference(drive(unrevised(family), draw), draw.scenario.leader.brake_decel)
+        reference_of(drive(unrevised_guard(family), draw), draw.scenario.leader.brake_decel)
         for draw in draws
     ]
 
@@ -154,7 +154,8 @@ def references(family: Family, draws: Sequence[Draw]) -> list[Reference]:
 def score(family: Family, alone: Sequence[Reference], drives: Iterable[Drive]) -> list[Outcome]:
     """Outcomes of driven draws, against the controller alone."""
     return [
-        outcome(driven, base, family.interval) for base, driven in zip(alone, drives, strict=True)
+        outcome_of(driven, base, family.interval)
+        for base, driven in zip(alone, drives, strict=True)
     ]
 
 
@@ -182,7 +183,7 @@ def try_out(
     """
     frozen = guard.copy(states=False)
     frozen.freeze()
-    return score(family, alone or references(family, draws), teach(frozen, draws))
+    return score(family, alone or references_of(family, draws), teach(frozen, draws))
 
 
 def learnt_by(guard: Guard) -> tuple[EvolvingFSM, LatentRisk]:

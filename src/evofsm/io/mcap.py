@@ -173,9 +173,9 @@ def write_run(
     --------
     >>> import tempfile
     >>> from pathlib import Path
-    >>> from evofsm.driving import drive, load_family, unrevised
+    >>> from evofsm.driving import drive, load_family, unrevised_guard
     >>> family = load_family("emergency")
-    >>> driven = drive(unrevised(family), family.draw(seed=0, index=0))
+    >>> driven = drive(unrevised_guard(family), family.draw(seed=0, index=0))
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     write_run(Path(folder) / "run.mcap", [driven], about={"controller": "hasty"})
     ...     run = read_run(Path(folder) / "run.mcap")

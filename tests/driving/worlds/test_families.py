@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from evofsm.driving.cars import drive, unrevised
+from evofsm.driving.cars import drive, unrevised_guard
 from evofsm.driving.drivers.idm import IDM, ChangingIDM
 from evofsm.driving.families.family import FAMILIES, SWITCHES, load_family
 from evofsm.driving.families.numbers import Numbers
@@ -75,7 +75,8 @@ def own(tmp_path):
 
 def drive_many(family, count):
     return [
-        drive(unrevised(family), family.draw(1, index, "test")).episode for index in range(count)
+        drive(unrevised_guard(family), family.draw(1, index, "test")).episode
+        for index in range(count)
     ]
 
 
@@ -379,7 +380,7 @@ def test_both_worlds_agree(name):
         for index in range(2):
             draw = family.draw(2, index)
             closed_form = drive(family, draw).episode
-            episode = drive(unrevised(family), draw, sumo).episode
+            episode = drive(unrevised_guard(family), draw, sumo).episode
             assert episode.observations.shape == closed_form.observations.shape
             assert np.abs(episode.observations - closed_form.observations).max() < 1e-9
 

@@ -56,10 +56,10 @@ class Recording:
     Examples
     --------
     >>> import tempfile
-    >>> from evofsm.driving import drive, load_family, unrevised
+    >>> from evofsm.driving import drive, load_family, unrevised_guard
     >>> from evofsm.io import write_run
     >>> family = load_family("paper")
-    >>> driven = drive(unrevised(family), family.draw(0, 0))
+    >>> driven = drive(unrevised_guard(family), family.draw(0, 0))
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     write_run(Path(folder) / "run.mcap", [driven], about={"family": "paper"})
     ...     recording = Recording(Path(folder) / "run.mcap")

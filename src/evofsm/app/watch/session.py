@@ -39,7 +39,7 @@ from evofsm.driving import (
     teach,
     time_headway,
     time_to_collision,
-    unrevised,
+    unrevised_guard,
 )
 from evofsm.guard import (
     RECORD,
@@ -325,7 +325,7 @@ class Session:
         if self.watching.controller == "sumo":  # which drives in SUMO only, where a run is open
             return math.nan
         controller = make_controller(self.watching.setup, draw, self.world)
-        episode = drive(unrevised(self.watching.family), draw, controller=controller).episode
+        episode = drive(unrevised_guard(self.watching.family), draw, controller=controller).episode
         return float(episode.time[-1]) if episode.collided else math.inf
 
     def _decide(self) -> Frame:
