@@ -37,7 +37,7 @@ from evofsm.core.actions import IntervalActions
 from evofsm.core.machine import EvolvingFSM
 from evofsm.core.model import FSMModel
 from evofsm.driving.families.family import load_family
-from evofsm.driving.risk.outcome import LatentRisk
+from evofsm.driving.risk.latent import LatentRisk
 from evofsm.driving.worlds.kinematic import KinematicWorld
 from evofsm.files import storage
 from evofsm.files.checkpoint import Checkpoint, fingerprints

@@ -20,7 +20,7 @@ import numpy as np
 
 from evofsm.core.actions import IntervalActions
 from evofsm.core.machine import EvolvingFSM
-from evofsm.driving.risk.outcome import LatentRisk
+from evofsm.driving.risk.latent import LatentRisk
 from evofsm.files.sealed import NOTHING, ChainedFile, Head, Sync, records, seal, verify
 from evofsm.guard.auditing.log import AuditLog
 from evofsm.guard.auditing.replay import audit

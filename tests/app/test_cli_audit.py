@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from evofsm.__main__ import application
 from evofsm.core.actions import IntervalActions
-from evofsm.driving.risk.outcome import LatentRisk
+from evofsm.driving.risk.latent import LatentRisk
 from evofsm.files.sealed import NOTHING, Head, seal, unseal
 from evofsm.guard.auditing.log import AuditLog
 from evofsm.guard.guard import Guard

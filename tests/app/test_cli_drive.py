@@ -4,6 +4,8 @@ import sys
 
 import pytest
 
+from evofsm.app.driving import DECISION_TABLE
+
 pytest.importorskip("typer")
 pytest.importorskip("scipy")
 
@@ -30,6 +32,14 @@ def test_drive_learns_saves_and_drives_frozen(tmp_path):
     again = evofsm("drive", "emergency", "--episodes", 2, "--learn", learnt, "--out", further)
     assert again.returncode == 0, again.stderr
     assert json.loads((further / "summary.json").read_text())["episodes_learnt"] == 14
+
+
+def test_the_table_of_decisions_has_its_columns_in_their_order():
+    assert DECISION_TABLE == (
+        *("episode", "time", "gap", "v_follower", "v_leader", "intake", "state", "n_states"),
+        *("surprise", "proposed", "executed", "advised", "risk_proposed", "risk_executed"),
+        *("risk_low", "risk_high", "evidence", "seen", "realised", "reason"),
+    )
 
 
 @pytest.mark.slow

@@ -16,7 +16,7 @@ from evofsm.__main__ import application
 from evofsm.app.text.table import Table
 from evofsm.core.actions import IntervalActions
 from evofsm.core.machine import EvolvingFSM
-from evofsm.driving.risk.outcome import LatentRisk
+from evofsm.driving.risk.latent import LatentRisk
 from evofsm.guard.auditing.log import AuditLog
 from evofsm.guard.guard import Guard
 from evofsm.guard.protocols import Proposal

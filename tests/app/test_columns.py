@@ -8,8 +8,8 @@ import pytest
 from rich.console import Console
 
 from evofsm.app.text.columns import console, print_columns, print_facts, print_table, print_words
+from evofsm.app.text.numbers import count, percent, span
 from evofsm.app.text.table import Column, Table
-from evofsm.app.text.words import count, percent, span
 
 HEADER = ("name", "gap [m]", "a long header of many words", *(f"column {c}" for c in range(6)))
 ROWS = [[f"row {r}", *(f"{r}.{c}5" for c in range(8))] for r in range(3)]

@@ -28,8 +28,8 @@ from evofsm.driving.risk.by_state import RiskByState
 from evofsm.driving.risk.drac import DecelerationToAvoidCollision
 from evofsm.driving.risk.fuzzy import FuzzySafety
 from evofsm.driving.risk.headway import TimeHeadway
+from evofsm.driving.risk.latent import LatentRisk
 from evofsm.driving.risk.mttc import ModifiedTimeToCollision
-from evofsm.driving.risk.outcome import LatentRisk
 from evofsm.driving.risk.picud import Picud
 from evofsm.driving.risk.r157 import PerformanceModel
 from evofsm.driving.risk.rss import ResponsibilitySensitiveSafety

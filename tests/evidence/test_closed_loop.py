@@ -8,9 +8,16 @@ import pytest
 
 pytest.importorskip("scipy")
 
-from evofsm.driving.cars import drive, guard_for_family, load_learnt, save_learnt, teach, unrevised
+from evofsm.driving.cars import (
+    drive,
+    guard_for_family,
+    load_learnt,
+    save_learnt,
+    teach,
+    unrevised_guard,
+)
 from evofsm.driving.families.family import load_family
-from evofsm.driving.outcomes import bootstrap, outcome, reference
+from evofsm.driving.outcomes import bootstrap, outcome_of, reference_of
 from evofsm.driving.policies import fixed_policies
 from evofsm.evidence.closed_loop.amounts import ShiftPlan
 from evofsm.evidence.closed_loop.beside import (
@@ -163,9 +170,9 @@ def test_a_driver_who_proposes_nothing_usable_is_replaced_and_counted():
             raise RuntimeError("no")
 
     draw = EMERGENCY.draw(0, 0, split="test")
-    none = unrevised(EMERGENCY)
-    base = reference(drive(none, draw), draw.scenario.leader.brake_decel)
-    found = outcome(drive(none, draw, controller=Broken()), base, EMERGENCY.interval)
+    none = unrevised_guard(EMERGENCY)
+    base = reference_of(drive(none, draw), draw.scenario.leader.brake_decel)
+    found = outcome_of(drive(none, draw, controller=Broken()), base, EMERGENCY.interval)
     assert found.changed == found.decisions
     assert found.change == 0.0
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from evofsm.driving.cars import drive, unrevised
+from evofsm.driving.cars import drive, unrevised_guard
 from evofsm.driving.families.family import load_family
 from evofsm.driving.policies import Group
 from evofsm.driving.risk.rss import ResponsibilitySensitiveSafety
@@ -183,7 +183,7 @@ def test_lead_time_is_that_of_the_alarm_that_stays_on() -> None:
 def test_watching_is_driving_unrevised() -> None:
     family = load_family("rare").with_switches(["noise"])
     draw = family.draw(1, 2, split="test")
-    one, driven = watch(family, draw), drive(unrevised(family), draw)
+    one, driven = watch(family, draw), drive(unrevised_guard(family), draw)
     seen = [decision.situation.observation for decision in driven.decisions]
     assert np.array_equal(one.seen, seen)
     assert np.array_equal(one.commands, driven.executed)

@@ -12,7 +12,7 @@ import pytest
 from rich.console import Console
 
 from evofsm.app.text.documents import to_json
-from evofsm.app.text.words import percent
+from evofsm.app.text.numbers import percent
 from evofsm.driving.families.family import load_family
 from evofsm.driving.outcomes import Row
 from evofsm.driving.policies import Group

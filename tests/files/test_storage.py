@@ -25,7 +25,7 @@ from evofsm.core.model import FSMModel
 from evofsm.core.states.ets import Paper
 from evofsm.core.states.failure import FailureSplit
 from evofsm.core.states.novelty import Novelty
-from evofsm.driving.risk.outcome import LatentRisk
+from evofsm.driving.risk.latent import LatentRisk
 from evofsm.driving.risk.ranges import hardest_seen
 from evofsm.driving.risk.rehearsal import HARDEST
 from evofsm.files import ranges, storage

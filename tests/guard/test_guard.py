@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from evofsm import EvolvingFSM, Guard, IntervalActions, Labels
 from evofsm.driving.cars import guard_for_cars
 from evofsm.driving.revisers import Unrevised
-from evofsm.driving.risk.outcome import LatentRisk
+from evofsm.driving.risk.latent import LatentRisk
 from evofsm.files import storage
 from evofsm.guard.auditing.log import AuditLog
 from evofsm.guard.auditing.replay import audit

@@ -15,7 +15,7 @@ from evofsm.core.machine import EvolvingFSM  # noqa: E402
 from evofsm.driving.families.family import load_family  # noqa: E402
 from evofsm.driving.framework import Framework  # noqa: E402
 from evofsm.driving.revisers import Unrevised  # noqa: E402
-from evofsm.driving.risk.outcome import LatentRisk  # noqa: E402
+from evofsm.driving.risk.latent import LatentRisk  # noqa: E402
 from evofsm.driving.worlds.gym import CarFollowing  # noqa: E402
 from evofsm.driving.worlds.kinematic import KinematicWorld  # noqa: E402
 from evofsm.guard.guard import Guard  # noqa: E402

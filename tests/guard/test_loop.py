@@ -11,7 +11,7 @@ from evofsm.core.machine import EvolvingFSM
 from evofsm.driving.drivers.idm import IDM
 from evofsm.driving.framework import Framework
 from evofsm.driving.revisers import AlwaysBrake, Unrevised
-from evofsm.driving.risk.outcome import LatentRisk
+from evofsm.driving.risk.latent import LatentRisk
 from evofsm.driving.worlds.kinematic import KinematicWorld
 from evofsm.driving.worlds.motion import COMMANDED, SPEED
 from evofsm.driving.worlds.scenario import Body, Leader, Scenario, Sensors

@@ -11,7 +11,7 @@ from evofsm.driving.drivers.idm import IDM
 from evofsm.driving.framework import Decision, Drive, Framework
 from evofsm.driving.naming import VARIABLES
 from evofsm.driving.risk.headway import time_headway
-from evofsm.driving.risk.outcome import LatentRisk
+from evofsm.driving.risk.latent import LatentRisk
 from evofsm.driving.risk.ttc import time_to_collision
 from evofsm.driving.worlds.kinematic import KinematicWorld
 from evofsm.driving.worlds.scenario import Leader, Scenario

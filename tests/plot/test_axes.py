@@ -15,7 +15,7 @@ from evofsm.core.machine import EvolvingFSM
 from evofsm.core.states.novelty import Novelty
 from evofsm.driving.drivers.idm import IDM
 from evofsm.driving.framework import Framework
-from evofsm.driving.risk.outcome import LatentRisk
+from evofsm.driving.risk.latent import LatentRisk
 from evofsm.driving.worlds.kinematic import KinematicWorld
 from evofsm.driving.worlds.scenario import Leader, Scenario
 from evofsm.guard.guard import Guard

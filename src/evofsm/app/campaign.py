@@ -36,7 +36,7 @@ from evofsm.driving import (
     World,
     drive,
     open_world,
-    outcome,
+    outcome_of,
     summarise,
 )
 from evofsm.files import Journal, Record, room_needed, versions
@@ -187,6 +187,6 @@ def _drive(campaign: Campaign, guard: Guard, episode: int) -> Record:
     has_lead = driven.episode.collided and is_judged(driven)
     return {
         "variant": draw.variant,
-        **outcome(driven, alone, family.interval)._asdict(),
+        **outcome_of(driven, alone, family.interval)._asdict(),
         "lead_time": lead_time(driven, setup.tolerance) if has_lead else None,
     }

@@ -17,10 +17,9 @@ from numpy.typing import NDArray
 
 from evofsm.core import EvolvingFSM
 from evofsm.driving import (
-    COLUMNS,
+    DECISION_COLUMNS,
     FIXED_MEASURES,
     IDM,
-    VARIABLES,
     AdaptiveCruise,
     Draw,
     Drive,
@@ -37,15 +36,24 @@ from evofsm.driving import (
     drive,
     guard_for_family,
     learnt_by,
-    outcome,
-    reference,
+    outcome_of,
+    reference_of,
     save_learnt,
     summarise,
-    unrevised,
+    unrevised_guard,
 )
 from evofsm.extras import needs
 from evofsm.files import Checkpoint, Kept, storage
-from evofsm.guard import AuditLog, Controller, Explain, Guard, LearningJudge, Mode, Reviser
+from evofsm.guard import (
+    TOLERANCE,
+    AuditLog,
+    Controller,
+    Explain,
+    Guard,
+    LearningJudge,
+    Mode,
+    Reviser,
+)
 
 #: Controllers by name; ``family`` is the family's own.
 CONTROLLERS = ("family", "aggressive", "normal", "acc", "sumo")
@@ -64,7 +72,7 @@ class Setup:
     controller: str = "family"
     reviser: str = "least-risk"
     mode: Mode = Mode.ACT
-    tolerance: float = 0.02
+    tolerance: float = TOLERANCE
     episodes: int = 100
     seed: int = 0
     learn: bool = True
@@ -160,7 +168,7 @@ def drive_family(
         driven = drive(guard, draw, world, controller)
         if record is not None:
             record(driven)
-        done.add(driven, outcome(driven, alone, family.interval), setup.tolerance)
+        done.add(driven, outcome_of(driven, alone, family.interval), setup.tolerance)
         if checkpoint is not None:
             checkpoint.offer(partial(done.keep, guard))
         progress(len(done.outcomes), sum(o.collided for o in done.outcomes))
@@ -177,8 +185,8 @@ def drive_family(
 
 def drive_alone(family: Family, draw: Draw, world: World, controller: Controller) -> Reference:
     """How far the controller comes by itself."""
-    alone = drive(unrevised(family), draw, world, controller)
-    return reference(alone, draw.scenario.leader.brake_decel)
+    alone = drive(unrevised_guard(family), draw, world, controller)
+    return reference_of(alone, draw.scenario.leader.brake_decel)
 
 
 def draws(setup: Setup, done: int = 0) -> Iterator[Draw]:
@@ -277,10 +285,10 @@ def episodes_learnt(folder: Path) -> int:
 
 # -- What has been driven so far ------------------------------------------------------------------
 
-_COLUMNS = (
-    *("episode", "time", *VARIABLES, "intake", "state", "n_states", "surprise"),
-    *("proposed", "executed", "advised", "risk_proposed", "risk_executed", "risk_low"),
-    *("risk_high", "evidence", "seen", "realised", "reason"),
+#: The columns of ``decisions.parquet``; `driving/record.py` says which they are.
+DECISION_TABLE = (
+    "episode",
+    *(name for name, column in DECISION_COLUMNS.items() if column.in_table),
 )
 # Where there is no state.
 _NONE = -1
@@ -292,13 +300,13 @@ class Driven:
     def __init__(self) -> None:
         self.outcomes: list[Outcome] = []
         self.lead_times: list[float] = []
-        self.decisions: dict[str, list[Any]] = {name: [] for name in _COLUMNS}
+        self.decisions: dict[str, list[Any]] = {name: [] for name in DECISION_TABLE}
 
     def add(self, drive: Drive, came_of_it: Outcome, tolerance: float) -> None:
         """Take in the next episode."""
         self.decisions["episode"] += [len(self.outcomes)] * len(drive.decisions)
-        for name in _COLUMNS[1:]:
-            self.decisions[name] += map(COLUMNS[name].read, drive.decisions)
+        for name in DECISION_TABLE[1:]:
+            self.decisions[name] += map(DECISION_COLUMNS[name].read, drive.decisions)
         self.outcomes.append(came_of_it)
         if drive.episode.collided and is_judged(drive):
             self.lead_times.append(lead_time(drive, tolerance))
@@ -327,7 +335,9 @@ class Driven:
     def keep(self, guard: Guard, finished: bool = False) -> Kept:
         """All of it and what was learnt, for a checkpoint."""
         machine, risk = _files(guard)
-        columns = {f"decided_{name}": _column(name, self.decisions[name]) for name in _COLUMNS}
+        columns = {
+            f"decided_{name}": _column(name, self.decisions[name]) for name in DECISION_TABLE
+        }
         return Kept(
             {"episodes": len(self.outcomes)},
             {
@@ -345,14 +355,14 @@ class Driven:
         for row in arrays["outcomes"].tolist():
             self.outcomes.append(Outcome(*(kind(v) for kind, v in zip(kinds, row, strict=True))))
         self.lead_times = arrays["lead_times"].tolist()
-        for name in _COLUMNS:
+        for name in DECISION_TABLE:
             self.decisions[name] = _values(name, arrays[f"decided_{name}"])
         if len({len(column) for column in self.decisions.values()}) != 1:
             raise ValueError("columns of decisions are of different lengths")
 
 
 def _kind(name: str) -> type:
-    return int if name == "episode" else COLUMNS[name].kind
+    return int if name == "episode" else DECISION_COLUMNS[name].kind
 
 
 def _column(name: str, values: Sequence[Any]) -> NDArray[Any]:

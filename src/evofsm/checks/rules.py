@@ -13,7 +13,7 @@ import numpy as np
 
 from evofsm.checks.contracts import Contract, insist
 from evofsm.checks.kinds import Make
-from evofsm.core import EvolvingFSM, RuleSettings, describe, restore
+from evofsm.core import EvolvingFSM, RuleSettings, describe_rule, restore_rule
 
 CONTRACT = Contract()
 
@@ -87,10 +87,10 @@ def a_file_keeps_it(make: Make) -> None:
     """As plain JSON and back it is the same rule."""
     rule = make()
     try:
-        text: Any = json.dumps(describe(rule))
+        text: Any = json.dumps(describe_rule(rule))
     except (TypeError, StopIteration) as error:
         insist(False, f"a file cannot hold its settings: {error!r} (numbers and tuples only?)")
     insist(
-        restore(json.loads(text)) == rule,
-        f"from a file it comes back as {restore(json.loads(text))}",
+        restore_rule(json.loads(text)) == rule,
+        f"from a file it comes back as {restore_rule(json.loads(text))}",
     )

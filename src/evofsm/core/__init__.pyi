@@ -47,9 +47,9 @@ from .observations import Missing as Missing
 from .observations import ObservationEncoder as ObservationEncoder
 from .proportions import wilson_bounds as wilson_bounds
 from .reference import Reference as Reference
-from .states.dispatch import describe as describe
+from .states.dispatch import describe_rule as describe_rule
 from .states.dispatch import register_rule as register_rule
-from .states.dispatch import restore as restore
+from .states.dispatch import restore_rule as restore_rule
 from .states.edges import Edges as Edges
 from .states.ets import Paper as Paper
 from .states.failure import FailureSplit as FailureSplit

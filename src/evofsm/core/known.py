@@ -17,7 +17,7 @@ from evofsm.core.kernels import kernel
 from evofsm.core.layout import Floats
 from evofsm.core.learnt import Clusters, Counts, Transitions
 from evofsm.core.states.clusters import measure_distances, nearest_center
-from evofsm.core.states.dispatch import reach, restore, weights
+from evofsm.core.states.dispatch import reach, restore_rule, weights
 from evofsm.core.states.ets import Paper
 from evofsm.core.states.rule import StateRule
 from evofsm.core.states.spread import recognise
@@ -552,7 +552,7 @@ class Known(Counts):
         content, arrays = storage.read(path, cls._kind.name)
         with storage.explained(path):
             refuse_unless_told(content.setdefault("failures_told", False))
-            return cls._restored({**content, "rule": restore(content["rule"])}, arrays)
+            return cls._restored({**content, "rule": restore_rule(content["rule"])}, arrays)
 
     # -- Inside ---------------------------------------------------------------------------------
 

@@ -52,7 +52,7 @@ from evofsm.core.model import FSMModel
 from evofsm.core.naming import Labels
 from evofsm.core.notebook import machine_html
 from evofsm.core.observations import Missing
-from evofsm.core.states.dispatch import check_rule, describe, reach, weights, width
+from evofsm.core.states.dispatch import check_rule, describe_rule, reach, weights, width
 from evofsm.core.states.ets import Paper
 from evofsm.core.states.rule import RuleSettings, StateRule
 from evofsm.core.step import (
@@ -888,7 +888,7 @@ prior_frequency=0.001, spread=3.0)
     def _content(self) -> dict[str, Any]:
         """The settings, and whether failures were told, for JSON."""
         told = {"failures_told": True} if self.failures_told else {}
-        return {**self.settings, "rule": describe(self._rule), **told}
+        return {**self.settings, "rule": describe_rule(self._rule), **told}
 
     def _kept(self) -> dict[str, NDArray[Any]]:
         # Without spare room the shapes of the arrays tell the sizes, and nothing else is stored.

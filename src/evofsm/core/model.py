@@ -16,7 +16,7 @@ from evofsm.core.layout import Array
 from evofsm.core.learnt import MODEL
 from evofsm.core.naming import Labels
 from evofsm.core.notebook import model_html
-from evofsm.core.states.dispatch import describe
+from evofsm.core.states.dispatch import describe_rule
 from evofsm.core.validation import (
     check_action,
     check_state,
@@ -230,7 +230,7 @@ class FSMModel(Known):
             "units": self.units,
             "dt": self.dt,
             "settings": dict(self.settings),
-            "rule": describe(self.rule),
+            "rule": describe_rule(self.rule),
             "failures_told": self.failures_told,
         }
 

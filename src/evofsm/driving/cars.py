@@ -10,18 +10,25 @@ from typing import Any, Literal
 from evofsm.core import EvolvingFSM, IntervalActions, Novelty, StateRule
 from evofsm.driving.families.family import Draw, Family
 from evofsm.driving.framework import Drive, Framework
-from evofsm.driving.outcomes import Outcome, Reference, outcome, reference
+from evofsm.driving.outcomes import Outcome, Reference, outcome_of, reference_of
 from evofsm.driving.revisers import Unrevised
-from evofsm.driving.risk.outcome import LatentRisk
+from evofsm.driving.risk.latent import LatentRisk
 from evofsm.driving.worlds.kinematic import KinematicWorld
 from evofsm.driving.worlds.road import World
-from evofsm.guard import ActionReviser, Controller, Guard, LearningJudge, Mode
+from evofsm.guard import (
+    BELIEF_TOLERANCE,
+    TOLERANCE,
+    ActionReviser,
+    Controller,
+    Guard,
+    LearningJudge,
+    Mode,
+)
 
 #: The state rule for safety work: fine enough to steer by. The study compares the rules.
 SAFETY_RULE = Novelty(radius=1.0, scales=(4.0, 2.0, 2.0))
 
 # With hundreds of states this makes a step several times as quick.
-_BELIEF_TOLERANCE = 1e-6
 # What a machine's explanations call soon [s].
 _SOON = 5.0
 _MACHINE, _RISK = "machine.evofsm", "risk.evofsm"
@@ -34,7 +41,7 @@ def guard_for_cars(
     *,
     width: float = 0.3,
     closed: Literal["left", "right"] = "left",
-    tolerance: float = 0.02,
+    tolerance: float = TOLERANCE,
     mode: Mode = Mode.ACT,
     rule: StateRule | None = SAFETY_RULE,
     machine: EvolvingFSM | None = None,
@@ -78,7 +85,7 @@ def guard_for_cars(
     machine = machine or EvolvingFSM(
         actions.n_actions,
         rule=rule,
-        belief_tolerance=_BELIEF_TOLERANCE,
+        belief_tolerance=BELIEF_TOLERANCE,
         failure_horizon=round(_SOON / interval),
     )
     reviser = ActionReviser(judge, actions, tolerance=tolerance, mode=mode)
@@ -131,15 +138,15 @@ def teach(guard: Guard, draws: Iterable[Draw]) -> list[Drive]:
     return [drive(guard, draw) for draw in draws]
 
 
-def unrevised(family: Family) -> Guard:
+def unrevised_guard(family: Family) -> Guard:
     """A guard that executes whatever is proposed, and learns nothing."""
     return Guard.of(Unrevised(family.actions), interval=family.interval, learn=False)
 
 
-def references(family: Family, draws: Sequence[Draw]) -> list[Reference]:
+def references_of(family: Family, draws: Sequence[Draw]) -> list[Reference]:
     """How far the controller comes by itself in each draw."""
     return [
-        reference(drive(unrevised(family), draw), draw.scenario.leader.brake_decel)
+        reference_of(drive(unrevised_guard(family), draw), draw.scenario.leader.brake_decel)
         for draw in draws
     ]
 
@@ -147,7 +154,8 @@ def references(family: Family, draws: Sequence[Draw]) -> list[Reference]:
 def score(family: Family, alone: Sequence[Reference], drives: Iterable[Drive]) -> list[Outcome]:
     """Outcomes of driven draws, against the controller alone."""
     return [
-        outcome(driven, base, family.interval) for base, driven in zip(alone, drives, strict=True)
+        outcome_of(driven, base, family.interval)
+        for base, driven in zip(alone, drives, strict=True)
     ]
 
 
@@ -175,7 +183,7 @@ def try_out(
     """
     frozen = guard.copy(states=False)
     frozen.freeze()
-    return score(family, alone or references(family, draws), teach(frozen, draws))
+    return score(family, alone or references_of(family, draws), teach(frozen, draws))
 
 
 def learnt_by(guard: Guard) -> tuple[EvolvingFSM, LatentRisk]:

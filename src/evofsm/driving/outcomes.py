@@ -37,15 +37,15 @@ class Outcome(NamedTuple):
     speed: float  #: mean [m/s]
 
 
-def reference(drive: Drive, brake_decel: float) -> Reference:
-    """Of an unrevised run, whose leader's full brake is ``brake_decel`` [m/s²]."""
+def reference_of(drive: Drive, brake_decel: float) -> Reference:
+    """What an unrevised run is compared by, whose leader's full brake is ``brake_decel`` [m/s²]."""
     braking = np.flatnonzero(drive.episode.record[:, LEADER_ACCELERATION] == -brake_decel)
     until = int(braking[0]) if len(braking) else len(drive.episode.time) - 1
     return Reference(_distance(drive, until), until)
 
 
-def outcome(drive: Drive, unrevised: Reference, interval: float) -> Outcome:
-    """Of a run, against that of the unrevised controller in the same draw."""
+def outcome_of(drive: Drive, unrevised: Reference, interval: float) -> Outcome:
+    """What came of a run, against the unrevised controller in the same draw."""
     change = np.abs(drive.executed - drive.proposed)
     jerk = np.diff([d.realised for d in drive.decisions if np.isfinite(d.realised)]) / interval
     return Outcome(

@@ -9,9 +9,10 @@ from evofsm.driving.risk.headway import time_headway
 from evofsm.driving.risk.ttc import time_to_collision
 from evofsm.guard import RECORD, Column
 
-#: By name in tables.
-COLUMNS: Mapping[str, Column] = {
-    **RECORD,
+#: By name, in the order of ``decisions.parquet``, which has those that are `Column.in_table`: what
+#: was observed, the numbers of every decision, what came of it, and texts.
+DECISION_COLUMNS: Mapping[str, Column] = {
+    "time": RECORD["time"],
     "gap": Column(
         float,
         "from bumper to bumper, as observed [m]; left out where missing",
@@ -31,15 +32,19 @@ COLUMNS: Mapping[str, Column] = {
         float,
         "[s]; left out where the gap does not close",
         lambda one: float(time_to_collision(one.situation.observation)),
+        in_table=False,
     ),
     "time_headway": Column(
         float,
         "[s]; left out where the follower stands",
         lambda one: float(time_headway(one.situation.observation)),
+        in_table=False,
     ),
+    **{name: column for name, column in RECORD.items() if column.kind is not str},
     "realised": Column(
         float,
         "what the body did until the next decision [m/s²]; left out where there is none",
         attrgetter("realised"),
     ),
+    **RECORD,
 }

@@ -18,9 +18,9 @@ from evofsm.guard import (
     Revision,
     RiskMeasure,
     Situation,
-    known,
-    known_name,
     make_usable,
+    participant_class,
+    participant_name,
     unjudged,
     unseen,
 )
@@ -79,7 +79,7 @@ class EnvelopeReviser:
 
     def described(self) -> dict[str, Any] | None:
         """What it takes to make it again; None where its measure is someone's own."""
-        name = known_name(self.measure)
+        name = participant_name(self.measure)
         if name is None:
             return None
         return {"dt": self.dt, "measure": {"class": name, **asdict(self.measure)}}  # type: ignore[call-overload]
@@ -88,7 +88,7 @@ class EnvelopeReviser:
     def restored(cls, described: Mapping[str, Any], actions: IntervalActions) -> Self:
         """The one that was `described`."""
         given = dict(described["measure"])
-        return cls(known(given.pop("class"))(**given), actions, described["dt"])
+        return cls(participant_class(given.pop("class"))(**given), actions, described["dt"])
 
 
 class Unrevised:

@@ -43,8 +43,8 @@ from evofsm.files import ranges
 Place: TypeAlias = str | os.PathLike[str] | BinaryIO
 
 _FORMAT = "evofsm"
-# A kind with a newer array makes a newer version.
-_LEAST_VERSION = 5
+# Of a format whose arrays are all older; a newer array makes a newer version.
+_BASE_VERSION = 5
 _HEADER = "header"
 #: No file holds more, unpacked [bytes].
 LARGEST = 1 << 32
@@ -93,10 +93,10 @@ class Header(NamedTuple):
     provenance: dict[str, Any]  #: what it learnt from, as far as it was told
 
 
-def newest() -> int:
+def format_version() -> int:
     """The newest version of the format, which files are written in."""
     members = [member for kind in ranges.KINDS.values() for member in (kind.members or {}).values()]
-    return max([_LEAST_VERSION, *(member.since for member in members)])
+    return max([_BASE_VERSION, *(member.since for member in members)])
 
 
 # -- Writing --------------------------------------------------------------------------------------
@@ -139,14 +139,14 @@ def write(
     plain = {name: _plain(name, array) for name, array in arrays.items()}
     header = {
         "format": _FORMAT,
-        "version": newest(),
+        "version": format_version(),
         "library": __version__,
         "kind": kind,
         "content": dict(content),
         "provenance": dict(provenance or {}),
     }
     header = json.loads(json.dumps(header))  # as it will be read: a tuple is a list there
-    _refuse_unfit(kind, header["content"], newest(), {n: a.shape for n, a in plain.items()})
+    _refuse_unfit(kind, header["content"], format_version(), {n: a.shape for n, a in plain.items()})
     ranges.refuse_others(kind, header["content"], plain)
     header["sha256"] = _sha256(header, plain)
     encoded = np.frombuffer(json.dumps(header).encode(), np.uint8)
@@ -526,9 +526,9 @@ def _header(encoded: bytes) -> dict[str, Any]:
     version = header["version"]
     if type(version) is not int or version < 1:
         raise ValueError(f"its version is {version!r}, which is none")
-    if version > newest():
+    if version > format_version():
         raise ValueError(
-            f"its version {version} is newer than this library's {newest()}; "
+            f"its version {version} is newer than this library's {format_version()}; "
             "a newer evofsm reads it"
         )
     needed = {"kind", "content"} | ({"library", "provenance", "sha256"} if version >= 4 else set())

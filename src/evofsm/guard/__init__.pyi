@@ -1,13 +1,15 @@
 from .auditing.form import Misfit as Misfit
 from .auditing.log import AuditLog as AuditLog
-from .auditing.participants import known as known
-from .auditing.participants import known_name as known_name
+from .auditing.participants import participant_class as participant_class
+from .auditing.participants import participant_name as participant_name
 from .auditing.replay import Audit as Audit
 from .auditing.replay import Contents as Contents
 from .auditing.replay import Difference as Difference
 from .auditing.replay import Field as Field
 from .auditing.replay import Replay as Replay
 from .auditing.replay import audit as audit
+from .defaults import BELIEF_TOLERANCE as BELIEF_TOLERANCE
+from .defaults import TOLERANCE as TOLERANCE
 from .guard import Explain as Explain
 from .guard import Guard as Guard
 from .gym import RevisedActions as RevisedActions

@@ -29,6 +29,7 @@ from evofsm.core import (
 )
 from evofsm.files import Place, ranges, storage
 from evofsm.guard.auditing.participants import outline, rebuild
+from evofsm.guard.defaults import BELIEF_TOLERANCE, TOLERANCE
 from evofsm.guard.protocols import (
     INCOMPLETE,
     STALE,
@@ -50,9 +51,8 @@ from evofsm.guard.senses import Senses
 
 # Intervals that a range of actions is divided into for the machine, unless a width is given.
 _INTERVALS = 17
-# States of the machine that is made where none is given: no more than this, and recognised by
-# similarities that add up to all but this share.
-_MOST_STATES, _BELIEF_TOLERANCE = 200, 1e-6
+# States of the machine that is made where none is given.
+_MOST_STATES = 200
 
 
 class Explain(Enum):
@@ -150,7 +150,7 @@ class Guard:
         judge: ActionJudge | None = None,
         failed: Callable[[NDArray[np.float64]], bool] | None = None,
         horizon: float | None = None,
-        tolerance: float = 0.02,
+        tolerance: float = TOLERANCE,
         mode: Mode = Mode.ACT,
         seed: int = 0,
         machine: EvolvingFSM | None = None,
@@ -174,7 +174,7 @@ class Guard:
             or EvolvingFSM(
                 actions.n_actions,
                 max_states=_MOST_STATES,
-                belief_tolerance=_BELIEF_TOLERANCE,
+                belief_tolerance=BELIEF_TOLERANCE,
                 failure_horizon=soon,
             ),
             failed=failed,

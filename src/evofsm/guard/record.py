@@ -27,6 +27,7 @@ class Column(NamedTuple):
     about: str  #: with its unit in brackets, and where it is not known
     read: Callable[[Any], Any]  #: from a decision
     info: str = ""  #: its name in Gymnasium's ``info``, after ``reviser/``; empty where it is not
+    in_table: bool = True  #: whether ``decisions.parquet`` has it
 
 
 def _seen(kind: type[int] | type[float] | type[str], name: str, about: str) -> Column:
@@ -75,7 +76,9 @@ RECORD: Mapping[str, Column] = {
     "evidence": _decided(float, "evidence", "braking manoeuvres of leaders that it rests on"),
     "seen": _decided(float, "seen", "time spent in states like this one before [s]"),
     "reason": _decided(str, "reason", "why, in a few words", "reason"),
-    "explanation": _decided(str, "explanation", "why, in detail; empty where nothing was said"),
+    "explanation": _decided(
+        str, "explanation", "why, in detail; empty where nothing was said"
+    )._replace(in_table=False),
 }
 
 

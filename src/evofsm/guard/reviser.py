@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evofsm.core import compiled
+from evofsm.guard.defaults import TOLERANCE
 from evofsm.guard.protocols import (
     STALE,
     ActionJudge,
@@ -130,7 +131,7 @@ class ActionReviser:
         risk: ActionJudge,
         actions: ActionSet,
         *,
-        tolerance: float = 0.02,
+        tolerance: float = TOLERANCE,
         release: float = 0.9,
         mode: Mode = Mode.ACT,
         way: Way = Way.IMPROVE,

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from evofsm import __version__
 from evofsm.core import FSMModel
-from evofsm.driving import COLUMNS, VARIABLES, Decision, Drive
+from evofsm.driving import DECISION_COLUMNS, VARIABLES, Decision, Drive
 from evofsm.extras import needs
 from evofsm.files import storage
 
@@ -76,7 +76,7 @@ def _schema(name: str) -> dict[str, Any]:
     if name == "belief":
         items = _of("number", "probability")
         return {**_of("array", "probability of each state, from 0"), "items": items}
-    return _of(_JSON_TYPES[COLUMNS[name].kind], COLUMNS[name].about)
+    return _of(_JSON_TYPES[DECISION_COLUMNS[name].kind], DECISION_COLUMNS[name].about)
 
 
 _CHANNELS: dict[str, dict[str, dict[str, Any]]] = {
@@ -173,9 +173,9 @@ def write_run(
     --------
     >>> import tempfile
     >>> from pathlib import Path
-    >>> from evofsm.driving import drive, load_family, unrevised
+    >>> from evofsm.driving import drive, load_family, unrevised_guard
     >>> family = load_family("emergency")
-    >>> driven = drive(unrevised(family), family.draw(seed=0, index=0))
+    >>> driven = drive(unrevised_guard(family), family.draw(seed=0, index=0))
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     write_run(Path(folder) / "run.mcap", [driven], about={"controller": "hasty"})
     ...     run = read_run(Path(folder) / "run.mcap")
@@ -314,7 +314,9 @@ def _messages(decision: Decision) -> Iterator[tuple[str, dict[str, Any]]]:
     known = decision.situation.state is not None
     belief = decision.situation.belief.tolist() if known else []
     for topic, names in _OF_DECISIONS.items():
-        read = (belief if name == "belief" else COLUMNS[name].read(decision) for name in names)
+        read = (
+            belief if name == "belief" else DECISION_COLUMNS[name].read(decision) for name in names
+        )
         yield topic, dict(zip((_field(topic, name) for name in names), read, strict=True))
 
 
@@ -504,7 +506,7 @@ def _column(name: str, field: str, messages: list[dict[str, Any]]) -> NDArray[An
         for row, belief in zip(beliefs, rows, strict=True):
             row[: len(belief)] = belief
         return beliefs
-    kind = COLUMNS[name].kind
+    kind = DECISION_COLUMNS[name].kind
     if kind is str:
         return np.array([str(message[field]) for message in messages], dtype=object)
     if kind is int:

@@ -1,4 +1,4 @@
-from .axes import COLORS as COLORS
+from .axes import HEAT_MAP as HEAT_MAP
 from .axes import MOST_VALUES as MOST_VALUES
 from .axes import accelerations as accelerations
 from .axes import belief as belief
@@ -30,15 +30,15 @@ from .placing import Rows as Rows
 from .placing import around as around
 from .placing import in_points as in_points
 from .placing import place_labels as place_labels
-from .style import COLLISION as COLLISION
+from .style import COLLISION_MARK as COLLISION_MARK
 from .style import DEAD_END as DEAD_END
-from .style import FIRST as FIRST
 from .style import FOLLOWER as FOLLOWER
 from .style import INK as INK
 from .style import LEADER as LEADER
 from .style import LEADER_DASHES as LEADER_DASHES
 from .style import MOST_DISCS as MOST_DISCS
 from .style import SOFT as SOFT
+from .style import THIRD as THIRD
 from .style import WIDTH as WIDTH
 from .style import Look as Look
 from .style import draw_collision as draw_collision

@@ -46,7 +46,7 @@ if TYPE_CHECKING:
     from matplotlib.image import AxesImage
 
 #: Of probabilities, from 0 on.
-COLORS = "Blues"
+HEAT_MAP = "Blues"
 #: Up to so many states a matrix has room for its values.
 MOST_VALUES = 8
 # Up to so many states each has its number on an axis, beyond about 8 have.
@@ -318,7 +318,7 @@ def _plot_beliefs(
     n = rows.shape[1]
     scale = Normalize(0.0, 1.0)
     mesh = ax.pcolormesh(
-        when, range(n), rows.T, cmap=COLORS, norm=scale, shading="nearest", rasterized=True
+        when, range(n), rows.T, cmap=HEAT_MAP, norm=scale, shading="nearest", rasterized=True
     )
     ax.grid(False)
     if n <= MOST_DISCS:  # among more it would hide the belief
@@ -587,7 +587,7 @@ def draw_matrix(
     axes: Axes, matrix: NDArray[np.float64], scale: Normalize, size: float
 ) -> AxesImage:
     """Draw a transition matrix, its values in type of this ``size`` where there is room."""
-    image = axes.imshow(matrix, cmap=COLORS, norm=scale, interpolation="nearest")
+    image = axes.imshow(matrix, cmap=HEAT_MAP, norm=scale, interpolation="nearest")
     axes.grid(False)
     axes.spines[:].set_visible(False)
     if len(matrix) <= MOST_VALUES:

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from evofsm.extras import needs
-from evofsm.plot.style import DEAD_END, FIRST, FOLLOWER, INK, LEADER, SOFT, WIDTH, Look
+from evofsm.plot.style import DEAD_END, FOLLOWER, INK, LEADER, SOFT, THIRD, WIDTH, Look
 
 with needs("matplotlib", "plot", "plotting"):
     from matplotlib import colormaps
@@ -30,7 +30,7 @@ with needs("matplotlib", "plot", "plotting"):
 OURS: Look = {"color": FOLLOWER, "marker": "o"}
 FIXED: Look = {"color": DEAD_END, "marker": "s"}
 TOLD: Look = {"color": LEADER, "marker": "D"}
-OTHER: Look = {"color": FIRST, "marker": "^"}
+OTHER: Look = {"color": THIRD, "marker": "^"}
 PLAIN: Look = {"color": SOFT, "marker": "X"}
 
 _PALE = "#F4F4F4"

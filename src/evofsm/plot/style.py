@@ -1,4 +1,7 @@
-"""What all figures share: size, type, colours, and how a state looks."""
+"""What all figures share: size, type, colours, and how a state looks.
+
+The same colours stand in ``io/graphs.py``, ``io/sumo_gui.py`` and ``app/watch/live/page.css``.
+"""
 
 from __future__ import annotations
 
@@ -29,12 +32,12 @@ SOFT = "#777777"
 FOLLOWER = "#0072B2"
 LEADER = "#009E73"
 DEAD_END = "#D55E00"
-FIRST = "#CC79A7"
+THIRD = "#CC79A7"
 #: Dashes of the leader's lines; the follower's are solid.
 LEADER_DASHES = (0, (4, 1.6))
 
 #: How a collision is marked.
-COLLISION: Mapping[str, Any] = {
+COLLISION_MARK: Mapping[str, Any] = {
     "marker": "X",
     "markersize": 8,
     "markeredgecolor": "white",
@@ -191,7 +194,7 @@ def draw_state(
 
 def draw_collision(axes: Axes, x: float, y: float) -> None:
     """Mark where a run ended in a collision."""
-    mark(axes, x, y, color=INK, zorder=7, **COLLISION)
+    mark(axes, x, y, color=INK, zorder=7, **COLLISION_MARK)
 
 
 def stretches(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from evofsm.core.machine import EvolvingFSM
 from evofsm.core.model import FSMModel
-from evofsm.core.states.dispatch import describe, register_rule, restore
+from evofsm.core.states.dispatch import describe_rule, register_rule, restore_rule
 from evofsm.core.states.edges import Edges
 from evofsm.core.states.ets import Paper
 from evofsm.core.states.failure import FailureSplit
@@ -168,14 +168,15 @@ def test_rules_are_frozen(rule):
 
 
 def test_a_rule_is_plain_json_in_a_file(rule):
-    assert restore(json.loads(json.dumps(describe(rule)))) == rule
+    assert restore_rule(json.loads(json.dumps(describe_rule(rule)))) == rule
 
 
 def test_the_names_and_settings_in_a_file_are_these():
     rule = FailureSplit(Novelty(2.0, (1.0, 4.0)), share=0.25, distance=0.5)
     base = {"name": "novelty", "radius": 2.0, "scales": (1.0, 4.0), "spread": 1.0}
-    assert describe(rule) == {"name": "failure", "base": base, "share": 0.25, "distance": 0.5}
-    assert (describe(Paper()), describe(Edges())) == ({"name": "paper"}, {"name": "edges"})
+    assert describe_rule(rule) == {"name": "failure", "base": base, "share": 0.25, "distance": 0.5}
+    assert describe_rule(Paper()) == {"name": "paper"}
+    assert describe_rule(Edges()) == {"name": "edges"}
 
 
 @pytest.mark.parametrize("rule", [Novelty, "novelty", 1, object()])

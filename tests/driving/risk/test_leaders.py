@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from evofsm.driving.risk.leaders import REAL_DRIVES, LeaderBrakes, needed
-from evofsm.driving.risk.outcome import LatentRisk
+from evofsm.driving.risk.latent import LatentRisk
+from evofsm.driving.risk.leaders import REAL_DRIVES, LeaderBrakes, brakes_needed
 from evofsm.guard.protocols import Situation
 
 DT = 0.25
@@ -44,7 +44,7 @@ def learnt(risk):
 
 def test_by_assumption_alone_49_are_needed_for_two_percent():
     table, risk = LatentRisk(-8.0).manoeuvres, 1.0
-    for seen in range(1, needed(0.02) + 1):
+    for seen in range(1, brakes_needed(0.02) + 1):
         assert risk > 0.02
         table.remember(3.0)
         risk = float(table.harder(9.0))

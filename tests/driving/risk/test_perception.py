@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from evofsm.driving.risk.brakes import Latest, OwnBrakes, Sample
+from evofsm.driving.risk.latent import LatentRisk
 from evofsm.driving.risk.manoeuvres import BrakeWatch
-from evofsm.driving.risk.outcome import LatentRisk
 from evofsm.driving.risk.perception import Perception
 from evofsm.guard.protocols import Situation
 

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from evofsm.driving.cars import drive, unrevised
+from evofsm.driving.cars import drive, unrevised_guard
 from evofsm.driving.drivers.idm import IDM, ChangingIDM
 from evofsm.driving.families.family import FAMILIES, SWITCHES, load_family
 from evofsm.driving.families.numbers import Numbers
@@ -75,7 +75,8 @@ def own(tmp_path):
 
 def drive_many(family, count):
     return [
-        drive(unrevised(family), family.draw(1, index, "test")).episode for index in range(count)
+        drive(unrevised_guard(family), family.draw(1, index, "test")).episode
+        for index in range(count)
     ]
 
 
@@ -103,7 +104,7 @@ def test_every_family_drives(name):
     assert family.interval == 0.25
     assert family.actions.outside == "clip"
     for index in range(20):
-        drive(unrevised(family), family.draw(3, index))
+        drive(unrevised_guard(family), family.draw(3, index))
 
 
 @pytest.mark.parametrize("name", FAMILIES)
@@ -114,7 +115,7 @@ def test_every_family_drives_with_every_switch(name, switch):
     assert switched.controller == plain.controller
     assert switched.scenario.leader == plain.scenario.leader
     assert switched.scenario != plain.scenario
-    drive(unrevised(family), switched)
+    drive(unrevised_guard(family), switched)
 
 
 @pytest.mark.parametrize("name", FAMILIES)
@@ -348,7 +349,7 @@ def test_paper_is_what_the_study_drives():
         assert controller == settings.drivers[case]
         sensors = settings.scenario.sensors
         assert replace(scenario, duration=35.0, sensors=sensors) == settings.scenario
-        driven = drive(unrevised(family), family.draw(0, case - 1))
+        driven = drive(unrevised_guard(family), family.draw(0, case - 1))
         assert driven.episode.collided == (case in (1, 4))
     assert family.decel == settings.decel
     wider = asdict(settings.actions) | {"low": -settings.decel}
@@ -379,8 +380,8 @@ def test_both_worlds_agree(name):
     with SumoWorld() as sumo:
         for index in range(2):
             draw = family.draw(2, index)
-            closed_form = drive(unrevised(family), draw).episode
-            episode = drive(unrevised(family), draw, sumo).episode
+            closed_form = drive(unrevised_guard(family), draw).episode
+            episode = drive(unrevised_guard(family), draw, sumo).episode
             assert episode.observations.shape == closed_form.observations.shape
             assert np.abs(episode.observations - closed_form.observations).max() < 1e-9
 
@@ -396,7 +397,7 @@ def test_a_file_of_ones_own_is_a_family(own):
     assert variant == "mine"
     assert scenario.initial_speed == scenario.leader.initial_speed
     assert 1.0 <= (scenario.initial_gap - 2.0) / scenario.initial_speed <= 2.0
-    drive(unrevised(family), family.draw(1, 2))
+    drive(unrevised_guard(family), family.draw(1, 2))
 
 
 def test_a_driver_changes_and_lapses_and_then_drives_as_is_due(own):

@@ -7,7 +7,7 @@ from evofsm.core.actions import IntervalActions
 from evofsm.driving.drivers.idm import IDM
 from evofsm.driving.framework import Framework
 from evofsm.driving.revisers import Unrevised
-from evofsm.driving.risk.outcome import LatentRisk
+from evofsm.driving.risk.latent import LatentRisk
 from evofsm.driving.worlds.kinematic import KinematicWorld
 from evofsm.driving.worlds.scenario import CutIn, Leader, Scenario, Sensors
 from evofsm.driving.worlds.sumo import SumoWorld

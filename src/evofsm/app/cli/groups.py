@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from evofsm.app.cli.common import chosen_mode, split_names
 from evofsm.app.cli.declared import Command, argument, option
+from evofsm.guard import TOLERANCE
 
 if TYPE_CHECKING:
     from evofsm.app.driving import Setup
@@ -55,7 +56,7 @@ class Revised(InWorld):
         "least-risk",
         "Who revises: least-risk (what was learnt), none, rss, aeb, or another measure.",
     )
-    tolerance: float = option(0.02, "Share of leaders' hard brakes that need not be survived.")
+    tolerance: float = option(TOLERANCE, "Share of leaders' hard brakes that need not be survived.")
     switches: tuple[str, ...] = option(
         (),
         "noise, delay, actuator, jerk, third_car; with commas.",

@@ -152,7 +152,7 @@ class Learn(WithJson):
     def run(self) -> None:
         """Learn, save and print."""
         from evofsm.app.learning import learn_traces
-        from evofsm.app.text import terminal
+        from evofsm.app.text.learning import console, learning_document, print_learning
         from evofsm.driving import UNITS, VARIABLES
         from evofsm.files import Checkpoint, duration, fingerprints, result_kept
         from evofsm.io import Noted, VehicleLengths, read_traces
@@ -201,25 +201,25 @@ class Learn(WithJson):
             with result_kept(keeper):
                 learning.model.save(self.out, provenance)
         if self.as_json:
-            document = terminal.learning_document(learning)
+            document = learning_document(learning)
             document["model"]["provenance"] = provenance
             apart = {"noted": asdict(noted), "warnings": warnings}
             saved = self.out and str(self.out)
             print_json({"files": self.files, "saved": saved, **document, **apart})
             return
-        console = terminal.console()
-        terminal.print_learning(
-            console,
+        screen = console()
+        print_learning(
+            screen,
             learning,
             action=self.action,
             lengths=_assumed(lengths, keeper),
             further=_read_otherwise(noted, self.failed, learning),
         )
-        console.print()
+        screen.print()
         if self.out is None:
-            console.print("Nothing was saved; --out MODEL keeps the model.", soft_wrap=True)
+            screen.print("Nothing was saved; --out MODEL keeps the model.", soft_wrap=True)
         else:
-            console.print(
+            screen.print(
                 f"Saved to {self.out}. Look at it again: evofsm inspect {self.out}", soft_wrap=True
             )
 
@@ -334,19 +334,19 @@ class Inspect(WithJson):
 
     def run(self) -> None:
         """Print the model, and what its file says of itself."""
-        from evofsm.app.text import terminal
+        from evofsm.app.text.learning import console, model_document, print_model
 
         model, header = load_model(self.file)
         provenance = {} if header is None else header.provenance
         if self.as_json:
-            document = terminal.model_document(model)
+            document = model_document(model)
             print_json({"file": str(self.file), **document, "provenance": provenance})
             return
         facts = [("file", str(self.file))]
         if header is not None:
             goes_on = ", a machine that can go on learning" if header.kind == "machine" else ""
             facts = [("file", f"{self.file}{goes_on}"), ("written by", _writer(header))]
-        terminal.print_model(terminal.console(), model, [*facts, *_learnt_from(provenance)])
+        print_model(console(), model, [*facts, *_learnt_from(provenance)])
 
 
 def _writer(header: Header) -> str:

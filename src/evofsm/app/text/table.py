@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from operator import attrgetter
 from typing import Any, Generic, TypeVar
 
-from evofsm.app.text.words import NONE
+from evofsm.app.text.numbers import NONE
 
 R = TypeVar("R")
 

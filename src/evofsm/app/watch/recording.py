@@ -10,6 +10,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from evofsm.app.watch.chronicle import Chronicle
 from evofsm.app.watch.shown import (
     CAR_LENGTH,
     HEADWAY,
@@ -23,14 +24,12 @@ from evofsm.app.watch.shown import (
     most_believed,
     usual_ways,
 )
-from evofsm.app.watch.story import Chronicle
 from evofsm.core import FSMModel
 from evofsm.driving import VARIABLES, time_headway, time_to_collision
-from evofsm.guard import RECORD
+from evofsm.guard import RECORD, TOLERANCE
 from evofsm.io import RecordedEpisode, Run, read_run
 
 # What is accepted where a log does not say.
-_TOLERANCE = 0.02
 # So many of a log's episodes can be chosen among.
 _MOST_EPISODES = 500
 _NONE = -1
@@ -57,10 +56,10 @@ class Recording:
     Examples
     --------
     >>> import tempfile
-    >>> from evofsm.driving import drive, load_family, unrevised
+    >>> from evofsm.driving import drive, load_family, unrevised_guard
     >>> from evofsm.io import write_run
     >>> family = load_family("paper")
-    >>> driven = drive(unrevised(family), family.draw(0, 0))
+    >>> driven = drive(unrevised_guard(family), family.draw(0, 0))
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     write_run(Path(folder) / "run.mcap", [driven], about={"family": "paper"})
     ...     recording = Recording(Path(folder) / "run.mcap")
@@ -77,7 +76,7 @@ class Recording:
         self._episodes = [one for one in self._run.episodes if len(one.columns["time"])]
         if not self._episodes:
             raise ValueError(f"{path} holds no episode with a decision")
-        self._tolerance = _number(self._run.about.get("tolerance"), _TOLERANCE)
+        self._tolerance = _number(self._run.about.get("tolerance"), TOLERANCE)
         self.revising = self._run.about.get("mode", "act") == "act"
         self.start = self.restart(0)
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Self
 
 from evofsm.app.driving import Setup, make_controller, make_guard
+from evofsm.app.watch.chronicle import Chronicle
 from evofsm.app.watch.shown import (
     CAR_LENGTH,
     HEADWAY,
@@ -21,7 +22,6 @@ from evofsm.app.watch.shown import (
     graph_of,
     most_believed,
 )
-from evofsm.app.watch.story import Chronicle
 from evofsm.core import IntervalActions, Novelty
 from evofsm.driving import (
     GAP,
@@ -39,10 +39,11 @@ from evofsm.driving import (
     teach,
     time_headway,
     time_to_collision,
-    unrevised,
+    unrevised_guard,
 )
 from evofsm.guard import (
     RECORD,
+    TOLERANCE,
     Explain,
     Guard,
     Judgement,
@@ -88,7 +89,7 @@ class Watching:
     case: int = 0
     controller: str = "family"
     reviser: str = "least-risk"
-    tolerance: float = 0.02
+    tolerance: float = TOLERANCE
     seed: int = 0
 
     @property
@@ -324,7 +325,7 @@ class Session:
         if self.watching.controller == "sumo":  # which drives in SUMO only, where a run is open
             return math.nan
         controller = make_controller(self.watching.setup, draw, self.world)
-        episode = drive(unrevised(self.watching.family), draw, controller=controller).episode
+        episode = drive(unrevised_guard(self.watching.family), draw, controller=controller).episode
         return float(episode.time[-1]) if episode.collided else math.inf
 
     def _decide(self) -> Frame:

@@ -156,23 +156,23 @@ def weights(rule: StateRule, m: int) -> NDArray[np.float64]:
     return 1.0 / scales
 
 
-def describe(rule: StateRule) -> dict[str, Any]:
+def describe_rule(rule: StateRule) -> dict[str, Any]:
     """A rule in plain JSON: its name and its settings, but for those that are None."""
     name, kind = next(item for item in _RULES.items() if item[1] is type(rule))
     given = {entry.name: getattr(rule, entry.name) for entry in fields(kind)}
     settings = {name: value for name, value in given.items() if value is not None}
     if "base" in settings:
-        settings["base"] = describe(settings["base"])
+        settings["base"] = describe_rule(settings["base"])
     return {"name": name, **settings}
 
 
-def restore(description: Mapping[str, Any]) -> StateRule:
-    """The rule that `describe` put into words."""
+def restore_rule(description: Mapping[str, Any]) -> StateRule:
+    """The rule that `describe_rule` put into words."""
     settings = dict(description)
     name = settings.pop("name")
     if name not in _RULES:
         raise ValueError(f"there is no state rule {name!r}, only {', '.join(_RULES)}")
     if "base" in settings:
-        settings["base"] = restore(settings["base"])
+        settings["base"] = restore_rule(settings["base"])
     rule: StateRule = _RULES[name](**settings)
     return rule

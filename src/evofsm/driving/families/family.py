@@ -20,7 +20,7 @@ from evofsm.driving.families.tables import (
     NEEDED,
     SWITCH_LAYOUT,
     Table,
-    merge,
+    merge_tables,
     parse,
 )
 from evofsm.driving.naming import UNITS, VARIABLES
@@ -196,7 +196,7 @@ class Family:
         tables = self.tables
         own = () if variant is None else (tables["variant"][variant],)
         for changes in (*own, *self.added):
-            tables = merge(tables, changes)
+            tables = merge_tables(tables, changes)
         numbers = Numbers(tables.get("values", {}), seed, index, split)
         builder = _Builder(self.source, tables, numbers)
         try:

@@ -130,13 +130,13 @@ def _check(tables: Table, layout: Table, source: str, prefix: str) -> None:
                 known(value, f"{source}: {key}")
 
 
-def merge(tables: Table, changes: Table) -> dict[str, Any]:
+def merge_tables(tables: Table, changes: Table) -> dict[str, Any]:
     """Put changes over tables: tables are merged, all else is replaced."""
     merged = dict(tables)
     for name, value in changes.items():
         before = merged.get(name)
         if _is_table(before) and _is_table(value):
-            merged[name] = merge(before, value)
+            merged[name] = merge_tables(before, value)
         else:
             merged[name] = value
     return merged

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from evofsm.core import EvolvingFSM, FSMModel
-from evofsm.driving.risk.outcome import LatentRisk
+from evofsm.driving.risk.latent import LatentRisk
 from evofsm.guard import Judgement, Situation, Trial
 
 # States of a smaller belief are left out.

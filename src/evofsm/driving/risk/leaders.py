@@ -55,7 +55,7 @@ class LeaderBrakes(NamedTuple):
     def hours_until(self, tolerance: float) -> float:
         """Hours of driving until so many are seen that a tolerance can be met without a table."""
         seen = sum(self.counts)
-        return needed(tolerance) * self.hours / seen if seen else math.inf
+        return brakes_needed(tolerance) * self.hours / seen if seen else math.inf
 
     @property
     def at_most_harder(self) -> float:
@@ -67,12 +67,12 @@ class LeaderBrakes(NamedTuple):
         return 1.0 - 0.05 ** (1.0 / seen) if seen else 1.0
 
 
-def needed(tolerance: float) -> int:
+def brakes_needed(tolerance: float) -> int:
     """Hard brakes to be seen until the assumed one weighs no more than the tolerance.
 
     Examples
     --------
-    >>> needed(0.02)
+    >>> brakes_needed(0.02)
     49
     """
     return max(math.ceil(1.0 / tolerance - 1e-9) - 1, 0)

@@ -1,6 +1,6 @@
 """How the cars move: compiled once, and the same in every world.
 
-A run is recorded in rows, one every ``dt``; the columns are those of `COLUMNS`.
+A run is recorded in rows, one every ``dt``; the columns are those of `RUN_COLUMNS`.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from evofsm.driving.drivers.idm import idm_kernel
 from evofsm.driving.worlds.scenario import Scenario
 
 #: What a row of the record holds.
-COLUMNS = (
+RUN_COLUMNS = (
     *("gap", "v_follower", "v_leader", "gap_behind", "v_behind"),
     *("commanded", "realised", "a_leader", "a_behind"),
 )

@@ -12,12 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evofsm.driving.worlds.motion import (
-    COLUMNS,
     COMMANDED,
     GAP,
     GAP_BEHIND,
     LEADER_ACCELERATION,
     LEADER_SPEED,
+    RUN_COLUMNS,
     SPEED,
     SPEED_BEHIND,
     is_over,
@@ -32,7 +32,7 @@ class Episode:
     """One run, a row every ``dt``; the last row of a collision is the first gap of 0 or less."""
 
     time: NDArray[np.float64]  #: (T,) [s]
-    record: NDArray[np.float64]  #: (T, 9) the columns of `evofsm.driving.worlds.motion.COLUMNS`
+    record: NDArray[np.float64]  #: (T, 9) the columns of `evofsm.driving.worlds.motion.RUN_COLUMNS`
 
     @property
     def observations(self) -> NDArray[np.float64]:
@@ -81,7 +81,7 @@ class Road(ABC):
         self.scenario = scenario
         self.row = 0
         self._plan = plan_of(scenario)
-        self._record = np.zeros((len(self._plan.times), len(COLUMNS)))
+        self._record = np.zeros((len(self._plan.times), len(RUN_COLUMNS)))
         self._noise = _noise(scenario, len(self._record))
         self._delay = scenario.steps(scenario.sensors.delay)
         behind = scenario.behind

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from typing import ClassVar
 
 from evofsm.app import option
+from evofsm.guard import TOLERANCE
 
 
 @dataclass(frozen=True)
@@ -31,7 +32,7 @@ class Amounts:
     test: int = option(1000, "Held-out episodes of every policy.", min=1)
     seeds: int = option(20, "Learning seeds.", min=1)
     seed: int = option(0, "Of everything.", min=0)
-    tolerance: float = option(0.02, "Share of leaders' hard brakes that need not be survived.")
+    tolerance: float = option(TOLERANCE, "Share of leaders' hard brakes that need not be survived.")
     switches: str = option(
         "", "noise, delay, actuator, jerk, third_car; with commas.", name="--with"
     )

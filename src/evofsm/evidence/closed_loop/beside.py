@@ -30,7 +30,7 @@ from evofsm.driving import (
     open_world,
     teach,
     training,
-    unrevised,
+    unrevised_guard,
 )
 from evofsm.evidence.closed_loop.amounts import Amounts
 from evofsm.evidence.scores import Ranked, bootstrap
@@ -80,7 +80,7 @@ def _braking_at(draw: Draw, time: float) -> Draw:
 
 
 def _case(family: Family, guard: Guard, name: str, draw: Draw) -> CaseResult:
-    revised, alone = drive(guard, draw), drive(unrevised(family), draw)
+    revised, alone = drive(guard, draw), drive(unrevised_guard(family), draw)
     changed = revised.changed
     late = np.array([decision.situation.time for decision in revised.decisions]) >= _SETTLED
     return CaseResult(
@@ -157,7 +157,7 @@ def run_separation(family: Family, plan: Amounts) -> dict[str, list[Any]]:
         **{(name, Group.FIXED): measure for name, measure in FIXED_MEASURES.items()},
     }
     test = plan.side_test
-    alone = teach(unrevised(family), held_out(family, plan.seed, test))
+    alone = teach(unrevised_guard(family), held_out(family, plan.seed, test))
     seen = [np.array([one.situation.observation for one in run.decisions]) for run in alone]
     truth = is_dead_end(np.concatenate(seen), family.decel, family.leader_decel)
     episode = np.repeat(np.arange(test), [len(rows) for rows in seen])

@@ -26,7 +26,7 @@ from evofsm.driving import (
     held_out,
     learnt_by,
     training,
-    unrevised,
+    unrevised_guard,
 )
 from evofsm.evidence.closed_loop.amounts import Amounts
 from evofsm.evidence.scores import brier
@@ -95,7 +95,7 @@ def _as_driven(
     predicted: list[float] = []
     came: list[bool] = []
     for draw in draws:
-        driven = drive(unrevised(family), draw)
+        driven = drive(unrevised_guard(family), draw)
         end = driven.episode.time[-1]
         for decision in driven.decisions:
             left = end - decision.situation.time

@@ -32,7 +32,7 @@ from evofsm.driving import (
     guard_for_family,
     held_out,
     learnt_by,
-    references,
+    references_of,
     score,
     summarise,
     teach,
@@ -187,7 +187,7 @@ class _Course(NamedTuple):
     @classmethod
     def of(cls, family: Family, draws: Iterable[Draw]) -> Self:
         every = list(draws)
-        return cls(family, every, references(family, every))
+        return cls(family, every, references_of(family, every))
 
     def first(self, n: int) -> Self:
         return self._replace(draws=self.draws[:n], alone=self.alone[:n])

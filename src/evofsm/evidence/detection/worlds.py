@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
 
-from evofsm.driving import Draw, Family, load_family, merge, training
+from evofsm.driving import Draw, Family, load_family, merge_tables, training
 from evofsm.evidence.detection.amounts import Amounts
 
 #: Name of the worlds of the grid, in which nobody knows the limits: see `grid_world`.
@@ -96,5 +96,5 @@ def grid_world(decel: float, leader_decel: float, plan: Amounts) -> World:
         "leader": {"brake_decel": [2.5, leader_decel]},
         "drivers": {"aggressive": {"lowest": lowest}},
     }
-    family = replace(emergency, name=GRID, tables=merge(emergency.tables, changes))
+    family = replace(emergency, name=GRID, tables=merge_tables(emergency.tables, changes))
     return World(GRID, family, family, 0, family)

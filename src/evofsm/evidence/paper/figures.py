@@ -25,7 +25,7 @@ with needs("matplotlib", "plot", "drawing figures"):
 
     from evofsm import plot
     from evofsm.evidence.report.drawing import Sketch
-    from evofsm.plot import DEAD_END, FIRST, FOLLOWER, INK, LEADER, SOFT, WIDTH, Look
+    from evofsm.plot import DEAD_END, FOLLOWER, INK, LEADER, SOFT, THIRD, WIDTH, Look
 
 # Height of a line of text [point].
 _ROW = 10.0
@@ -314,7 +314,7 @@ def _draw_surprise(axes: Axes, run: Run) -> None:
         plot.mark(axes, x, y, markersize=5, label="largest of them", **hollow)
         side = 1.0 if row < 0.9 * len(time) else -1.0
         plot.write(axes, f"{y:.3f}", (x, y), (6.0 * side, 0.0), ha="left" if side > 0 else "right")
-    filled: Look = {"marker": "D", "markerfacecolor": FIRST, "markeredgecolor": INK, "zorder": 4}
+    filled: Look = {"marker": "D", "markerfacecolor": THIRD, "markeredgecolor": INK, "zorder": 4}
     name = "the run's first forecast"
     plot.mark(
         axes, time[0], run.first_surprise, markersize=5, markeredgewidth=0.6, label=name, **filled
@@ -440,7 +440,7 @@ def _explain_space(figure: Figure, study: PaperStudy) -> None:
     if study.dead_ends:
         veil: Look = {"linestyle": "-", "linewidth": 5.0, "alpha": _VEIL, "color": DEAD_END}
         looks |= {
-            "collision": {"color": INK, **plot.COLLISION},
+            "collision": {"color": INK, **plot.COLLISION_MARK},
             "the dead end": {"marker": "h", "color": DEAD_END, "markersize": 7.0},
             "recognised as the dead end": {**veil, "solid_capstyle": "butt"},
         }
@@ -485,7 +485,7 @@ def draw_matrices(study: PaperStudy) -> Figure:
         axes.set(xlabel="to state" if lowest else "", ylabel="from state" if leftmost else "")
     written = ", written in the cells in %" if model.n_states <= plot.MOST_VALUES else ""
     figure.colorbar(
-        ScalarMappable(scale, plot.COLORS),
+        ScalarMappable(scale, plot.HEAT_MAP),
         ax=figure.axes,
         location="top",
         shrink=0.5,

@@ -14,9 +14,9 @@ from evofsm.driving import SAFETY_RULE
 from evofsm.evidence.prediction.scoring import Forecaster
 from evofsm.evidence.prediction.sources import Episode, Source
 from evofsm.extras import needs
+from evofsm.guard import BELIEF_TOLERANCE
 
 # Beliefs that are exact to the last digit would cost most of the time.
-_BELIEF_TOLERANCE = 1e-6
 # Training episodes from which the blend is tuned.
 _FOR_TUNING = 40
 _BLENDS = np.array([0.0, 0.003, 0.01, 0.03, 0.1, 0.2, 0.4, 0.7, 1.0])
@@ -88,7 +88,7 @@ def teach(
 ) -> Taught:
     """Teach a machine, and forecasts beside it, one training episode after another."""
     machine = EvolvingFSM(
-        source.n_actions, rule=rule, belief_tolerance=0.0 if rule is None else _BELIEF_TOLERANCE
+        source.n_actions, rule=rule, belief_tolerance=0.0 if rule is None else BELIEF_TOLERANCE
     )
     beside = beside or {}
     for episode in source.train:

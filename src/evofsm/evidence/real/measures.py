@@ -28,7 +28,7 @@ from evofsm.driving import (
     TimeToCollision,
 )
 from evofsm.evidence.real.cases import INTERVAL, QUESTIONS, Case, Question, recent_acceleration
-from evofsm.guard import RiskMeasure
+from evofsm.guard import BELIEF_TOLERANCE, RiskMeasure
 
 #: Hardest braking taken as possible; what cars could do was never shown [m/s²].
 LOWEST = -6.0
@@ -36,7 +36,6 @@ LOWEST = -6.0
 _EVERYDAY = 0.9
 # Cases of the overall share that are added to those of a state, as `OutcomeCounts` does.
 _LEAN = 2.0
-_BELIEF_TOLERANCE = 1e-6
 # Closing rate [1/s], leader's acceleration [m/s²] and logarithm of the time headway in which a
 # situation differs so much that it is another one.
 _APPROACH_RULE = Novelty(radius=1.0, scales=(0.05, 0.7, 0.4))
@@ -273,7 +272,7 @@ def learn_states(
     training, held_out : sequence of Case
     """
     observe, rule = OBSERVERS[name]
-    machine = EvolvingFSM(n_actions=1, rule=rule, belief_tolerance=_BELIEF_TOLERANCE)
+    machine = EvolvingFSM(n_actions=1, rule=rule, belief_tolerance=BELIEF_TOLERANCE)
     for case in training:
         seen = observe(case)
         machine.learn_many(seen, np.full(len(seen), NO_ACTION), [0])

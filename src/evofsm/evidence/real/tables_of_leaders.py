@@ -7,11 +7,11 @@ from collections.abc import Callable, Iterator
 from itertools import zip_longest
 
 from evofsm.app import Column, Table, count, decimals
-from evofsm.driving import REAL_DRIVES, LeaderBrakes, needed
+from evofsm.driving import REAL_DRIVES, LeaderBrakes, brakes_needed
 from evofsm.evidence.real.leaders import TOLD, Alarms, Braked, LeaderStudy, Limits
+from evofsm.guard import TOLERANCE
 
 # The reviser's own.
-_TOLERANCE = 0.02
 _BRAKES: tuple[Column[Braked], ...] = (
     Column("drives", "source"),
     Column("runs", "runs", count),
@@ -22,8 +22,8 @@ _BRAKES: tuple[Column[Braked], ...] = (
     Column("hardest", lambda one: one.hardest if one.seen else None, decimals(1), "m/s²"),
     Column("hard an hour", lambda one: one.seen / one.brakes.hours, decimals(1)),
     Column(
-        f"hours to {needed(_TOLERANCE)}",
-        lambda one: one.brakes.hours_until(_TOLERANCE),
+        f"hours to {brakes_needed(TOLERANCE)}",
+        lambda one: one.brakes.hours_until(TOLERANCE),
         decimals(1),
     ),
 )
@@ -36,8 +36,8 @@ def leader_tables(study: LeaderStudy, limits: Limits) -> tuple[Table, ...]:
         "Hard brakes of leaders, 2.5 m/s² and more",
         _BRAKES,
         study.braked,
-        f"With {needed(_TOLERANCE)} remembered, a leader who is only assumed weighs no more "
-        f"than {_TOLERANCE:.0%}. Waves: hard brakes less than 10 s apart in a run count once. "
+        f"With {brakes_needed(TOLERANCE)} remembered, a leader who is only assumed weighs no more "
+        f"than {TOLERANCE:.0%}. Waves: hard brakes less than 10 s apart in a run count once. "
         f"{_unseen(every)}",
     )
     bins: tuple[Column[tuple[float, int, int]], ...] = (
@@ -84,7 +84,7 @@ def _alarms(study: LeaderStudy, limits: Limits) -> Iterator[Table]:
             ),
             [one for one in study.alarms if one.told == TOLD[0]],
             f"The driver's own acceleration is the proposal, every row a decision, the tolerance "
-            f"{_TOLERANCE:.0%}. Own brakes: {limits.decel:g} m/s² of {-limits.lowest:g} that can "
+            f"{TOLERANCE:.0%}. Own brakes: {limits.decel:g} m/s² of {-limits.lowest:g} that can "
             "be commanded; untold, 60 % are assumed. The shipped table may come from these very "
             "drives; leaders of the other runs leave out the run that is judged.",
         )

@@ -16,7 +16,7 @@ from evofsm.files import ABOUT, SealedRecord
 from evofsm.guard.record import RECORD
 
 #: Of what is written now; every version from 1 on is read.
-VERSION = 2
+LOG_VERSION = 2
 #: The version from which on a decision holds what was not in it from the first.
 SINCE = {"explanation": 2}
 

@@ -35,7 +35,7 @@ from numpy.typing import NDArray
 
 from evofsm.core import Missing
 from evofsm.files import ABOUT, ChainedFile, Head, Sync, records
-from evofsm.guard.auditing.form import TOLD, VERSION
+from evofsm.guard.auditing.form import LOG_VERSION, TOLD
 from evofsm.guard.auditing.participants import describe, learnt, settings
 from evofsm.guard.protocols import Participants, Proposal, Reviser, Revision, Situation
 from evofsm.guard.record import RECORD, Pair
@@ -185,7 +185,7 @@ class AuditLog:
             self._begin_anew()
         if not self._know(who):
             self._write(
-                {**ABOUT, "kind": "start", "version": VERSION, "cut_off": self.cut_off}
+                {**ABOUT, "kind": "start", "version": LOG_VERSION, "cut_off": self.cut_off}
                 | describe(who)
             )
             self._settings = settings(who.reviser)

@@ -44,7 +44,7 @@ def _entry_points() -> Mapping[str, EntryPoint]:
     return {point.name: point for point in entry_points(group="evofsm.participants")}
 
 
-def known(name: str) -> Any:
+def participant_class(name: str) -> Any:
     """The class that a name stands for.
 
     Raises
@@ -57,10 +57,10 @@ def known(name: str) -> Any:
     return _entry_points()[name].load()
 
 
-def known_name(one: object) -> str | None:
+def participant_name(one: object) -> str | None:
     """The name of a thing's class, if that stands for this very class."""
     name = type(one).__name__
-    return name if name in _entry_points() and known(name) is type(one) else None
+    return name if name in _entry_points() and participant_class(name) is type(one) else None
 
 
 class CannotBeReplayedError(Exception):
@@ -141,13 +141,13 @@ def _reviser(who: Participants) -> dict[str, Any]:
         described |= {"judge": _judge(reviser.risk, who), "settings": settings(reviser)}
         described["known"] = described["judge"] is not None and reviser.actions == who.actions
         return described
-    made_of = reviser.described() if known_name(reviser) else None  # type: ignore[attr-defined]
+    made_of = reviser.described() if participant_name(reviser) else None  # type: ignore[attr-defined]
     return described | (made_of or {}) | {"known": made_of is not None}
 
 
 def _judge(judge: ActionJudge, who: Participants) -> dict[str, Any] | None:
     """Whom the reviser asks, if those who learn are whom it asks."""
-    name = known_name(judge)
+    name = participant_name(judge)
     if name is None:
         return None
     if judge is who.risk:
@@ -204,7 +204,7 @@ def rebuild(
         kind = judge if isinstance(judge, type) else _kind_of_judge(reviser)
         risk = kind.load(BytesIO(judge_file))
     if reviser["class"] != "ActionReviser":
-        again: Reviser = known(reviser["class"]).restored(reviser, actions)
+        again: Reviser = participant_class(reviser["class"]).restored(reviser, actions)
         return Participants(actions, again, machine, risk)
     if judge is None:
         asked = _restored_judge(reviser["judge"], machine, risk)
@@ -229,8 +229,8 @@ def _kind_of_judge(reviser: Mapping[str, Any]) -> Any:
     described = reviser.get("judge", {"class": _JUDGE})
     if described is None:
         raise ValueError("no installed package declares its judge; give the judge's class")
-    kind = known(described["class"])
-    return kind if hasattr(kind, "load") else known(_JUDGE)
+    kind = participant_class(described["class"])
+    return kind if hasattr(kind, "load") else participant_class(_JUDGE)
 
 
 def _data(kept: Mapping[str, Any] | None) -> bytes:
@@ -248,7 +248,7 @@ def _restored_judge(
 ) -> ActionJudge:
     if risk is None:
         raise ValueError("the reviser asks a judge, but none is there; give it")
-    kind = known(described["class"])
+    kind = participant_class(described["class"])
     if kind is type(risk):
         return risk
     if machine is None:

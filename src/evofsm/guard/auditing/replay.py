@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from evofsm.core import Missing
 from evofsm.files import Chain, Head, SealedRecord, canonical, number, records, verify
-from evofsm.guard.auditing.form import SINCE, VERSION, Form, Misfit
+from evofsm.guard.auditing.form import LOG_VERSION, SINCE, Form, Misfit
 from evofsm.guard.auditing.log import told
 from evofsm.guard.auditing.participants import (
     CannotBeReplayedError,
@@ -145,10 +145,10 @@ def _survey(path: Path, count: int) -> tuple[Contents, Form]:
 
 
 def _refuse_newer(path: Path, record: SealedRecord) -> None:
-    version = record.content.get("version", VERSION)
-    if isinstance(version, int) and version > VERSION:
+    version = record.content.get("version", LOG_VERSION)
+    if isinstance(version, int) and version > LOG_VERSION:
         raise ValueError(
-            f"{path}: its version {version} is newer than this library's {VERSION}; "
+            f"{path}: its version {version} is newer than this library's {LOG_VERSION}; "
             "a newer evofsm reads it"
         )
 
@@ -182,7 +182,7 @@ class _Player:
     _who: Participants | None = None
     _guard: Guard | None = None
     _is_known: bool = True
-    _version: int = VERSION
+    _version: int = LOG_VERSION
 
     def play(self, record: SealedRecord) -> Difference | None:
         """What differs; None where it comes out as it was recorded."""

@@ -37,7 +37,7 @@ from evofsm.driving.risk.perception import Estimate, Perception, is_whole
 from evofsm.driving.risk.ranges import RISK
 from evofsm.driving.risk.rehearsal import Body, Three, critical_decelerations
 from evofsm.files import LARGEST_OBSERVATION, ranges, storage
-from evofsm.guard import Judgement, Situation, Trial
+from evofsm.guard import TOLERANCE, Judgement, Situation, Trial
 
 # Pseudo-evidence for the pooled rate of manoeuvres, against that of a state [s].
 _POOLED = 20.0
@@ -498,7 +498,7 @@ class LatentRisk:
         return Body(self.brakes.decel, self.brakes.lag, self.margin)
 
     def score(
-        self, observations: NDArray[np.float64], dt: float = 0.25, tolerance: float = 0.02
+        self, observations: NDArray[np.float64], dt: float = 0.25, tolerance: float = TOLERANCE
     ) -> NDArray[np.float64]:
         """How surely each row is a dead end if the leader brakes now, as a `RiskMeasure` [m/s²].
 

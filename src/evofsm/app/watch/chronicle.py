@@ -1,4 +1,7 @@
-"""What has happened in a run so far: when danger began, why, and what was done about it."""
+"""As numbers; ``live/words.py`` tells it in sentences: what has happened in a run so far.
+
+When danger began, why, and what was done about it.
+"""
 
 from __future__ import annotations
 
