@@ -20,8 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evofsm.core.machine import EvolvingFSM
-from evofsm.core.states.ets import Paper
 from evofsm.core.states.novelty import Novelty
+from evofsm.core.states.paper import Paper
 from evofsm.core.states.rule import StateRule
 from streams import paper_stream
 

@@ -5,8 +5,12 @@ import subprocess
 import sys
 import textwrap
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
+
+from evofsm.driving import DECISION_COLUMNS
+from evofsm.guard import Column
 
 ROOT = Path(__file__).parents[1]
 
@@ -50,6 +54,16 @@ def test_a_state_rule(tmp_path):
 
 def test_a_judge(tmp_path):
     python(tmp_path, "-c", write("Add a judge", tmp_path))
+
+
+def test_a_column():
+    [(_, line)] = blocks("Add a column to decisions.parquet")
+    [(name, column)] = eval(f"{{{line}}}", {"Column": Column}).items()
+    assert name not in DECISION_COLUMNS
+    decision = SimpleNamespace(situation=SimpleNamespace(observation=(20.0, 15.0, 12.0)))
+    assert column.kind is float
+    assert column.in_table
+    assert column.read(decision) == 3.0
 
 
 @pytest.mark.slow

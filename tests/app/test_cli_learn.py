@@ -12,9 +12,9 @@ import pytest
 from evofsm.core.machine import EvolvingFSM
 from evofsm.core.model import FSMModel
 from evofsm.core.states.edges import Edges
-from evofsm.core.states.ets import Paper
 from evofsm.core.states.failure import FailureSplit
 from evofsm.core.states.novelty import Novelty
+from evofsm.core.states.paper import Paper
 
 pytest.importorskip("typer")
 pytest.importorskip("rich")

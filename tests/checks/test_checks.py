@@ -16,9 +16,9 @@ from evofsm.core.actions import IntervalActions
 from evofsm.core.machine import EvolvingFSM
 from evofsm.core.model import FSMModel
 from evofsm.core.states.edges import Edges
-from evofsm.core.states.ets import Paper
 from evofsm.core.states.failure import FailureSplit
 from evofsm.core.states.novelty import Novelty
+from evofsm.core.states.paper import Paper
 from evofsm.driving.drivers.acc import AdaptiveCruise
 from evofsm.driving.drivers.function import FunctionController
 from evofsm.driving.drivers.idm import IDM, ChangingIDM

@@ -20,9 +20,9 @@ from evofsm.core.crowding import WhenFull
 from evofsm.core.machine import EvolvingFSM
 from evofsm.core.memory import leaves
 from evofsm.core.model import FSMModel
-from evofsm.core.states.ets import Paper
 from evofsm.core.states.failure import FailureSplit
 from evofsm.core.states.novelty import Novelty
+from evofsm.core.states.paper import Paper
 
 M, Q = 2, 3
 ROUNDING = 1e-9

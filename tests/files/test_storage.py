@@ -22,9 +22,9 @@ from evofsm.core.actions import IntervalActions
 from evofsm.core.crowding import WhenFull
 from evofsm.core.machine import EvolvingFSM
 from evofsm.core.model import FSMModel
-from evofsm.core.states.ets import Paper
 from evofsm.core.states.failure import FailureSplit
 from evofsm.core.states.novelty import Novelty
+from evofsm.core.states.paper import Paper
 from evofsm.driving.risk.latent import LatentRisk
 from evofsm.driving.risk.ranges import hardest_seen
 from evofsm.driving.risk.rehearsal import HARDEST

@@ -6,9 +6,9 @@ from hypothesis import strategies as st
 from evofsm.core.crowding import WhenFull
 from evofsm.core.machine import EvolvingFSM
 from evofsm.core.states.edges import Edges
-from evofsm.core.states.ets import Paper
 from evofsm.core.states.failure import FailureSplit
 from evofsm.core.states.novelty import Novelty
+from evofsm.core.states.paper import Paper
 from evofsm.fleet.batch import Fleet
 
 Q = 4

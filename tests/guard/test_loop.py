@@ -17,7 +17,7 @@ from evofsm.driving.worlds.motion import COMMANDED, SPEED
 from evofsm.driving.worlds.scenario import Body, Leader, Scenario, Sensors
 from evofsm.guard.guard import Guard
 from evofsm.guard.protocols import Proposal
-from evofsm.guard.reviser import ActionReviser, Mode, speaks
+from evofsm.guard.reviser import ActionReviser, Mode, is_spoken
 
 ACTIONS = IntervalActions(low=-2.5, high=2.5, width=0.3, outside="clip")
 LEADER = Leader(IDM(1.2, 25.0, 1.0, 1.0, 2.5), brake_decel=4.0, brake_time=6.0)
@@ -248,7 +248,7 @@ def test_ordinary_driving_raises_few_alarms_and_none_that_speaks_of_braking_not_
     unlearnt = LatentRisk(-8.0, dt=0.1)
     for risk, least, most in ((told, 0.0, 0.05), (unlearnt, 0.05, 1.0)):
         reviser, said = shadowed(risk)
-        alarms = [revision for revision in said if speaks(reviser, revision)]
+        alarms = [revision for revision in said if is_spoken(reviser, revision)]
         assert least * len(said) <= len(alarms) <= most * len(said)
         assert not [revision.reason for revision in alarms if "in full" in revision.reason]
     assert unlearnt.brakes.decel == pytest.approx(0.6 * 8.0)  # no harder braking was shown

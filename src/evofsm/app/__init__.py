@@ -1,4 +1,4 @@
-"""The programs: the command line, the live page, and long work that can be gone on with."""
+"""The programs: the command line, the live page, drives that can be resumed, what they print."""
 
 from __future__ import annotations
 

@@ -51,9 +51,9 @@ from .states.dispatch import describe_rule as describe_rule
 from .states.dispatch import register_rule as register_rule
 from .states.dispatch import restore_rule as restore_rule
 from .states.edges import Edges as Edges
-from .states.ets import Paper as Paper
 from .states.failure import FailureSplit as FailureSplit
 from .states.novelty import Novelty as Novelty
+from .states.paper import Paper as Paper
 from .states.rule import RuleSettings as RuleSettings
 from .states.rule import StateRule as StateRule
 from .step import FULL as FULL

@@ -18,7 +18,7 @@ from evofsm.core.layout import Floats
 from evofsm.core.learnt import Clusters, Counts, Transitions
 from evofsm.core.states.clusters import measure_distances, nearest_center
 from evofsm.core.states.dispatch import reach, restore_rule, weights
-from evofsm.core.states.ets import Paper
+from evofsm.core.states.paper import Paper
 from evofsm.core.states.rule import StateRule
 from evofsm.core.states.spread import recognise
 from evofsm.core.validation import (

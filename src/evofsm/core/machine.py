@@ -53,7 +53,7 @@ from evofsm.core.naming import Labels
 from evofsm.core.notebook import machine_html
 from evofsm.core.observations import Missing
 from evofsm.core.states.dispatch import check_rule, describe_rule, reach, weights, width
-from evofsm.core.states.ets import Paper
+from evofsm.core.states.paper import Paper
 from evofsm.core.states.rule import RuleSettings, StateRule
 from evofsm.core.step import (
     DECLINED,

@@ -1,6 +1,6 @@
 """One observation through the machine: the paper's Section 2 on one screen.
 
-An observation may create a state (`states.ets`, or another rule), is recognised as a distribution
+An observation may create a state (`states.paper`, or another rule), is recognised as a distribution
 over states (`states.spread`), and, where an action was taken after the observation before it,
 teaches that action's transition matrix (`transitions`). An episode may end in failure, which is no
 state of the machine: it is counted, and the next observation begins another episode.

@@ -77,7 +77,7 @@ class Row:
     learning_seed: int | None
     train_episodes: int
     episodes: int
-    collisions: int
+    collisions: int  #: with the leader; not `rear_ends`
     collision_rate: float
     collision_low: float  #: 95 % interval (Clopper and Pearson 1934)
     collision_high: float

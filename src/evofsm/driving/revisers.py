@@ -21,8 +21,8 @@ from evofsm.guard import (
     make_usable,
     participant_class,
     participant_name,
-    unjudged,
-    unseen,
+    unjudged_revision,
+    unseen_text,
 )
 
 #: Without a usable proposal a car brakes gently [m/s²].
@@ -70,12 +70,14 @@ class EnvelopeReviser:
         self._seen = [*self._seen[-1:], situation.observation.copy()]
         danger = float(self.measure.score(np.array(self._seen), self.dt)[-1])
         if math.isnan(danger):
-            return unjudged(
-                self.actions.low, proposal, unseen(situation, VARIABLES) or "danger unknown"
+            return unjudged_revision(
+                self.actions.low, proposal, unseen_text(situation, VARIABLES) or "danger unknown"
             )
         if danger <= 0.0:
-            return unjudged(wanted, proposal, remark or "measure calls for nothing")
-        return unjudged(self.actions.low, proposal, remark or f"measure calls for it: {danger:.3g}")
+            return unjudged_revision(wanted, proposal, remark or "measure calls for nothing")
+        return unjudged_revision(
+            self.actions.low, proposal, remark or f"measure calls for it: {danger:.3g}"
+        )
 
     def described(self) -> dict[str, Any] | None:
         """What it takes to make it again; None where its measure is someone's own."""
@@ -117,7 +119,7 @@ class Unrevised:
     def revise(self, situation: Situation, proposal: Proposal) -> Revision:
         """The proposal, made usable."""
         wanted, remark = make_usable(proposal, self.actions, self.fallback)
-        return unjudged(wanted, proposal, remark or "not revised")
+        return unjudged_revision(wanted, proposal, remark or "not revised")
 
     def described(self) -> dict[str, Any]:
         """Nothing: its class says all."""
@@ -134,4 +136,4 @@ class AlwaysBrake(Unrevised):
 
     def revise(self, situation: Situation, proposal: Proposal) -> Revision:
         """Full braking."""
-        return unjudged(self.actions.low, proposal, "always brakes")
+        return unjudged_revision(self.actions.low, proposal, "always brakes")

@@ -1,4 +1,4 @@
-"""Studies: each makes numbers and draws nothing."""
+"""The studies: what is claimed, what was measured, and the pages that say so."""
 
 from __future__ import annotations
 

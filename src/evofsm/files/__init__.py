@@ -1,4 +1,4 @@
-"""Files that last: read and written whole or not at all, and checked before they are believed."""
+"""Files that last, checkpoints and sealed logs: written whole or not at all, checked when read."""
 
 from __future__ import annotations
 

@@ -10,7 +10,7 @@ from .journal import Journal as Journal
 from .journal import Record as Record
 from .journal import room_needed as room_needed
 from .ranges import LARGEST_OBSERVATION as LARGEST_OBSERVATION
-from .sealed import ABOUT as ABOUT
+from .sealed import LOG_HEADER as LOG_HEADER
 from .sealed import Chain as Chain
 from .sealed import ChainedFile as ChainedFile
 from .sealed import Fault as Fault

@@ -34,7 +34,7 @@ _SEAL = b',"hash":"'
 _END = b'"}\n'
 _HEX = 64
 #: How the first record of a log begins: so a half-written one is told from other people's files.
-ABOUT = {"about": "evofsm audit log"}
+LOG_HEADER = {"about": "evofsm audit log"}
 _OPENING = b'{"about":"evofsm audit log",'
 #: What the first record has as the hash of the one before it.
 NOTHING = "0" * _HEX

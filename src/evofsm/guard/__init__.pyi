@@ -35,8 +35,8 @@ from .record import Pair as Pair
 from .reviser import ActionReviser as ActionReviser
 from .reviser import Mode as Mode
 from .reviser import Way as Way
+from .reviser import is_spoken as is_spoken
 from .reviser import make_usable as make_usable
-from .reviser import speaks as speaks
-from .reviser import unjudged as unjudged
-from .reviser import unseen as unseen
+from .reviser import unjudged_revision as unjudged_revision
+from .reviser import unseen_text as unseen_text
 from .senses import Senses as Senses

@@ -46,7 +46,7 @@ from evofsm.guard.protocols import (
     Situation,
     Witness,
 )
-from evofsm.guard.reviser import NOTHING, ActionReviser, Mode, speaks
+from evofsm.guard.reviser import NOTHING, ActionReviser, Mode, is_spoken
 from evofsm.guard.senses import Senses
 
 # Intervals that a range of actions is divided into for the machine, unless a width is given.
@@ -492,7 +492,7 @@ class Guard:
         explaining = self.explaining or (Explain.NONE if self.audit is None else Explain.SPOKEN)
         if explaining is Explain.NONE or self.machine is None or situation.state is None:
             return revision
-        if explaining is Explain.SPOKEN and not speaks(self.reviser, revision):
+        if explaining is Explain.SPOKEN and not is_spoken(self.reviser, revision):
             return revision
         action = self.actions.encode(revision.executed)
         if self._frozen is None:

@@ -18,7 +18,7 @@ from evofsm.extras import needs
 from evofsm.guard.guard import Guard
 from evofsm.guard.protocols import Proposal, Revision
 from evofsm.guard.record import info_of
-from evofsm.guard.reviser import make_usable, unjudged
+from evofsm.guard.reviser import make_usable, unjudged_revision
 
 with needs("gymnasium", "gym", "a wrapper for Gymnasium"):
     import gymnasium
@@ -134,7 +134,9 @@ class RevisedActions(gymnasium.Wrapper[Any, Any, Any, Any]):
     def _decide(self, proposal: Proposal) -> Revision:
         if self._seen is None:
             wanted, remark = make_usable(proposal, self.guard.actions, self.guard.fallback)
-            return unjudged(wanted, proposal, f"nothing is ahead; {remark or 'not revised'}")
+            return unjudged_revision(
+                wanted, proposal, f"nothing is ahead; {remark or 'not revised'}"
+            )
         if not self._is_judged:
             self.guard.begin()
             self._is_judged = True

@@ -196,7 +196,7 @@ class ActionReviser:
         if not self.acts:
             self._trial = 0
         if self.mode is Mode.OFF:
-            return unjudged(wanted, proposal, remark or "reviser is off")
+            return unjudged_revision(wanted, proposal, remark or "reviser is off")
         options = self._options(wanted, proposal)
         if not self.acts and self.way is Way.IMPROVE:
             options = self.risk.effective(situation, options)
@@ -216,7 +216,7 @@ class ActionReviser:
                 part
                 for part in (
                     remark,
-                    unseen(situation, self.risk.labels.names),
+                    unseen_text(situation, self.risk.labels.names),
                     _novelty(judged),
                     reason,
                 )
@@ -288,7 +288,7 @@ def _closest_to(action: float, options: NDArray[np.float64]) -> int:
     return int(np.abs(options - action).argmin())
 
 
-def unseen(situation: Situation, variables: Sequence[str]) -> str:
+def unseen_text(situation: Situation, variables: Sequence[str]) -> str:
     """What is said of a situation that was not seen whole, or not in time."""
     if not situation.intake:
         return ""
@@ -307,7 +307,7 @@ def _novelty(judged: Judgement) -> str:
     return "never seen before" if judged.seen < _NEW else ""
 
 
-def speaks(reviser: Reviser, revision: Revision) -> bool:
+def is_spoken(reviser: Reviser, revision: Revision) -> bool:
     """Whether a decision changed something, would have, or raised an alarm."""
     proposed = revision.proposed
     if revision.executed != proposed or revision.advised != proposed:  # NaN differs
@@ -329,7 +329,7 @@ def _bounds(actions: ActionSet) -> tuple[NDArray[np.float64], NDArray[np.float64
     return np.array([low, *lowest, low, high]), np.array([high, *highest, low, high])
 
 
-def unjudged(executed: float, proposal: Proposal, reason: str) -> Revision:
+def unjudged_revision(executed: float, proposal: Proposal, reason: str) -> Revision:
     """A revision without a probability."""
     return Revision(
         executed=executed,

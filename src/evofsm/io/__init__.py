@@ -1,4 +1,4 @@
-"""Readers of traces: logs in CSV and Parquet, and the FCD output of SUMO."""
+"""Formats of others: logs are read, runs and machines are written."""
 
 from __future__ import annotations
 

@@ -6,8 +6,8 @@ from .datasets.layouts import Layout as Layout
 from .datasets.layouts import read_episodes as read_episodes
 from .fcd import ACTION as ACTION
 from .fcd import VehicleLengths as VehicleLengths
-from .files import ignore as ignore
-from .files import kind_of as kind_of
+from .files import file_kind as file_kind
+from .files import silent as silent
 from .graphs import to_mermaid as to_mermaid
 from .mcap import RecordedEpisode as RecordedEpisode
 from .mcap import Run as Run

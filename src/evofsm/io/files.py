@@ -23,7 +23,7 @@ _NEWLINE = ord("\n")
 _log = logging.getLogger(__name__)
 
 
-def ignore(count: int) -> None:
+def silent(count: int) -> None:
     """Nobody wants to know how much was read."""
 
 
@@ -64,7 +64,7 @@ class _WatchedFile(io.FileIO):
 
 
 @contextmanager
-def open_unpacked(path: str, on_read: OnRead = ignore) -> Iterator[BinaryIO]:
+def open_unpacked(path: str, on_read: OnRead = silent) -> Iterator[BinaryIO]:
     """Open a file for reading bytes; one that is gzipped is unpacked on the way.
 
     Of one that grows meanwhile no more is read than was there at first, and its last line; with
@@ -82,7 +82,7 @@ def open_unpacked(path: str, on_read: OnRead = ignore) -> Iterator[BinaryIO]:
                 yield cast(BinaryIO, unpacked)
         else:
             yield file
-        if on_read is not ignore and watched.growth:
+        if on_read is not silent and watched.growth:
             _log.warning(
                 "%s grew by %s bytes while it was read; rows that came meanwhile are left out",
                 path,
@@ -90,7 +90,7 @@ def open_unpacked(path: str, on_read: OnRead = ignore) -> Iterator[BinaryIO]:
             )
 
 
-def kind_of(path: str) -> Kind:
+def file_kind(path: str) -> Kind:
     """What the file holds, judged by how it begins."""
     with open_unpacked(path) as file, damage_explained(path):
         beginning = file.read(64).removeprefix(BYTE_ORDER_MARK).lstrip()

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from evofsm.extras import needs
 from evofsm.files import LARGEST_OBSERVATION
 from evofsm.io.dates import looks_like_a_date, microseconds
-from evofsm.io.files import BYTE_ORDER_MARK, OnRead, damage_explained, ignore, open_unpacked
+from evofsm.io.files import BYTE_ORDER_MARK, OnRead, damage_explained, open_unpacked, silent
 from evofsm.io.plain import Texts, number_or_gap, parse_plain
 
 # At once: enough that what Python does in between hardly counts.
@@ -83,7 +83,7 @@ class CsvTable:
     does: it knows all that a CSV file may be, and what to say of one that is none.
     """
 
-    def __init__(self, path: str, on_read: OnRead = ignore) -> None:
+    def __init__(self, path: str, on_read: OnRead = silent) -> None:
         self.path = path
         self._on_read = on_read
         header: list[str] = []
@@ -196,7 +196,7 @@ class CsvTable:
 class ParquetTable:
     """A Parquet file; read with polars because pyarrow cannot be imported beside libsumo."""
 
-    def __init__(self, path: str, on_read: OnRead = ignore) -> None:
+    def __init__(self, path: str, on_read: OnRead = silent) -> None:
         with needs("polars", "tables", f"{path}: Parquet"):
             import polars
         self.path = path

@@ -16,7 +16,7 @@ from evofsm.io import fcd
 from evofsm.io.blocks import Blocks
 from evofsm.io.conditions import Condition
 from evofsm.io.fcd import VehicleLengths
-from evofsm.io.files import OnRead, ignore, kind_of
+from evofsm.io.files import OnRead, file_kind, silent
 from evofsm.io.tables import CsvTable, ParquetTable, Piece, Table, refuse_unusable
 from evofsm.io.units import KNOWN, of_columns
 
@@ -130,7 +130,7 @@ def read_traces(
     paths: Iterable[str],
     columns: LogColumns | None = None,
     lengths: VehicleLengths | None = None,
-    on_read: OnRead = ignore,
+    on_read: OnRead = silent,
     noted: Noted | None = None,
 ) -> Iterator[Chunk]:
     """Read logs (CSV, Parquet) and FCD output of SUMO (XML, CSV, Parquet), gzipped or not.
@@ -192,7 +192,7 @@ def _read_file(
     on_read: OnRead,
     noted: Noted,
 ) -> Iterator[Chunk]:
-    kind = kind_of(path)
+    kind = file_kind(path)
     if kind == "xml":
         timesteps = fcd.xml_timesteps(path, on_read)
     else:

@@ -1,4 +1,4 @@
-"""Pictures of models, runs and beliefs, on axes of matplotlib."""
+"""Pictures of models, runs and beliefs, and the marks that figures of studies are made of."""
 
 from __future__ import annotations
 

@@ -2,9 +2,9 @@ import numpy as np
 import pytest
 
 from evofsm.core.machine import EvolvingFSM
-from evofsm.core.states.ets import Paper
 from evofsm.core.states.failure import FailureSplit
 from evofsm.core.states.novelty import Novelty
+from evofsm.core.states.paper import Paper
 from evofsm.core.step import Event
 
 

@@ -5,8 +5,8 @@ import pytest
 
 from evofsm.core.machine import EvolvingFSM
 from evofsm.core.states.edges import Edges
-from evofsm.core.states.ets import Paper
 from evofsm.core.states.failure import FailureSplit
+from evofsm.core.states.paper import Paper
 from evofsm.fleet.batch import Fleet
 from evofsm.fleet.merging import merge
 

@@ -14,9 +14,9 @@ from evofsm.core.machine import EvolvingFSM
 from evofsm.core.model import FSMModel
 from evofsm.core.states.dispatch import describe_rule, register_rule, restore_rule
 from evofsm.core.states.edges import Edges
-from evofsm.core.states.ets import Paper
 from evofsm.core.states.failure import FailureSplit
 from evofsm.core.states.novelty import Novelty
+from evofsm.core.states.paper import Paper
 from evofsm.core.step import Event
 from evofsm.files import storage
 

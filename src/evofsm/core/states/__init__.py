@@ -5,9 +5,9 @@ one it follows the paper.
 """
 
 from evofsm.core.states.edges import Edges
-from evofsm.core.states.ets import Paper
 from evofsm.core.states.failure import FailureSplit
 from evofsm.core.states.novelty import Novelty
+from evofsm.core.states.paper import Paper
 from evofsm.core.states.rule import StateRule
 
 __all__ = ["Edges", "FailureSplit", "Novelty", "Paper", "StateRule"]

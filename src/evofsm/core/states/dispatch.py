@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from evofsm.core.kernels import inner_kernel, kernel, lanes
 from evofsm.core.learnt import Clusters
-from evofsm.core.states import edges, ets, novelty
+from evofsm.core.states import edges, novelty, paper
 from evofsm.core.states.clusters import (
     CREATED,
     MOVED,
@@ -24,9 +24,9 @@ from evofsm.core.states.clusters import (
     update_potentials,
 )
 from evofsm.core.states.edges import Edges
-from evofsm.core.states.ets import Paper
 from evofsm.core.states.failure import FailureSplit
 from evofsm.core.states.novelty import Novelty
+from evofsm.core.states.paper import Paper
 from evofsm.core.states.rule import RuleSettings, StateRule
 
 # By name in files.
@@ -119,7 +119,7 @@ def _judge(
         return edges.judge(clusters, n, potential, highest, squared_distance, radius)
     if settings.code == novelty.CODE:
         return novelty.judge(squared_distance, radius)
-    return ets.judge(potential, highest, squared_distance, radius)
+    return paper.judge(potential, highest, squared_distance, radius)
 
 
 @kernel
@@ -127,7 +127,7 @@ def width(settings: RuleSettings, variance: float) -> float:
     """Width of recognition, where observations so far have this total variance."""
     if settings.code == novelty.CODE:
         return novelty.width(settings.spread, settings.radius)
-    return ets.width(settings.spread, variance)
+    return paper.width(settings.spread, variance)
 
 
 def reach(rule: StateRule, width: float) -> float:

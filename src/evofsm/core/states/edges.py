@@ -13,7 +13,7 @@ from typing import ClassVar
 
 from evofsm.core.kernels import inner_kernel
 from evofsm.core.learnt import Clusters
-from evofsm.core.states import ets
+from evofsm.core.states import paper
 from evofsm.core.states.clusters import CREATED, UNCHANGED, exceeds
 
 CODE = 1
@@ -43,7 +43,7 @@ class Edges:
     scales: ClassVar[Sequence[float]] = ()
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "memory", ets.check_memory(self.memory))
+        object.__setattr__(self, "memory", paper.check_memory(self.memory))
 
     @property
     def table(self) -> Mapping[str, float]:
@@ -61,7 +61,7 @@ def judge(
     radius: float,
 ) -> int:
     """Judge as the paper does, and create a state at an edge."""
-    event = ets.judge(potential, highest, squared_distance, radius)
+    event = paper.judge(potential, highest, squared_distance, radius)
     if event != UNCHANGED or not exceeds(squared_distance, radius * radius):
         return event
     for i in range(n):

@@ -1,7 +1,8 @@
 """Another rule, and a state wherever a failure happened amid a state that was mostly safe.
 
 A state that holds both safe situations and failures says little about either. A *stay* in a
-state is a run of observations of one episode that are all recognised as it.
+state is a run of observations of one episode that are all recognised as it. Observations are
+judged by the other rule (``dispatch.py``); at a failure, ``core/step.py`` calls `splits`.
 """
 
 from __future__ import annotations

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from evofsm.core import NO_ACTION, IntervalActions
 from evofsm.driving import VARIABLES, Draw, Family, KinematicWorld, held_out, load_family, training
-from evofsm.io import ACTION, CsvTable, ParquetTable, ignore, kind_of, read_traces
+from evofsm.io import ACTION, CsvTable, ParquetTable, file_kind, read_traces, silent
 
 #: Families that are driven.
 FAMILIES = ("emergency", "stop_and_go", "cut_in", "rare")
@@ -125,7 +125,7 @@ def log_sources(folder: Path) -> list[LogSource]:
 
 
 def _is_log(path: str) -> bool:
-    table = CsvTable(path, ignore) if kind_of(path) == "csv" else ParquetTable(path, ignore)
+    table = CsvTable(path, silent) if file_kind(path) == "csv" else ParquetTable(path, silent)
     return {"time", ACTION, *VARIABLES} <= set(table.columns)
 
 

@@ -17,7 +17,7 @@ from evofsm.driving import REAL_DRIVES, LatentRisk, LeaderBrakes
 from evofsm.evidence.frame import Progress, silent
 from evofsm.evidence.real.cases import runs_in
 from evofsm.fleet import in_order
-from evofsm.guard import ActionReviser, Guard, Mode, speaks
+from evofsm.guard import ActionReviser, Guard, Mode, is_spoken
 from evofsm.io import Episode, Layout, find_checksums, read_episodes
 
 #: What is taken to be known in shadow mode, in the order in which it is reported.
@@ -174,7 +174,7 @@ def _shadow(path: Path, limits: Limits | None, leaders: LeaderBrakes | None) -> 
             guard.begin()
             rows = (episode.times.tolist(), episode.observations, episode.accelerations.tolist())
             for time, row, did in zip(*rows, strict=True):
-                alarms += speaks(reviser, guard.decide(row, did, time))
+                alarms += is_spoken(reviser, guard.decide(row, did, time))
             guard.end()
             decisions += len(episode.times)
     return decisions, alarms

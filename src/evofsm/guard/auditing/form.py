@@ -12,7 +12,7 @@ from contextlib import suppress
 from datetime import UTC, datetime, timedelta
 from typing import Any, NamedTuple
 
-from evofsm.files import ABOUT, SealedRecord
+from evofsm.files import LOG_HEADER, SealedRecord
 from evofsm.guard.record import RECORD
 
 #: Of what is written now; every version from 1 on is read.
@@ -143,7 +143,7 @@ class Form:
         """What must fit the records before."""
         content = record.content
         self._see(record.number, content["clock"])
-        if kind == "start" and content["about"] != ABOUT["about"]:
+        if kind == "start" and content["about"] != LOG_HEADER["about"]:
             raise ValueError(f"it is about {content['about']!r}")
         if kind == "begin":
             self._episodes += 1

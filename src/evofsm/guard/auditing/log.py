@@ -34,12 +34,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evofsm.core import Missing
-from evofsm.files import ABOUT, ChainedFile, Head, Sync, records
+from evofsm.files import LOG_HEADER, ChainedFile, Head, Sync, records
 from evofsm.guard.auditing.form import LOG_VERSION, TOLD
 from evofsm.guard.auditing.participants import describe, learnt, settings
 from evofsm.guard.protocols import Participants, Proposal, Reviser, Revision, Situation
 from evofsm.guard.record import RECORD, Pair
-from evofsm.guard.reviser import speaks
+from evofsm.guard.reviser import is_spoken
 
 _log = logging.getLogger(__name__)
 
@@ -185,7 +185,7 @@ class AuditLog:
             self._begin_anew()
         if not self._know(who):
             self._write(
-                {**ABOUT, "kind": "start", "version": LOG_VERSION, "cut_off": self.cut_off}
+                {**LOG_HEADER, "kind": "start", "version": LOG_VERSION, "cut_off": self.cut_off}
                 | describe(who)
             )
             self._settings = settings(who.reviser)
@@ -218,7 +218,7 @@ class AuditLog:
             raise ValueError("decided before begin: no episode is overseen")
         self._follow(self._who.reviser)
         (time, observation), self._seen = self._seen, []
-        if speaks(self._who.reviser, revision):
+        if is_spoken(self._who.reviser, revision):
             came_in = {"time": time, "observation": observation}
             decision = told(situation, proposal, revision)
             self._write({"kind": "decision", **self._take_before(), **came_in, **decision})

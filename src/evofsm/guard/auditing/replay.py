@@ -30,7 +30,7 @@ from evofsm.guard.auditing.participants import (
 )
 from evofsm.guard.guard import Explain, Guard
 from evofsm.guard.protocols import Participants, Proposal, Revision, Situation
-from evofsm.guard.reviser import speaks
+from evofsm.guard.reviser import is_spoken
 
 # What a record that someone made up may run into.
 _NONSENSE = (
@@ -259,7 +259,7 @@ class _Player:
             return
         proposal = _proposal(*proposed)
         situation, revision = self._decide(time, observation, proposal)
-        if speaks(self._present().reviser, revision):
+        if is_spoken(self._present().reviser, revision):
             is_told = told(situation, proposal, revision)
             raise _DiffersError(
                 f"the decision at {situation.time:g} s was recorded as nothing to speak of, but "
@@ -276,7 +276,7 @@ class _Player:
         fields = _differing(content, recorded)
         if fields:
             raise _DiffersError(f"the decision at {situation.time:g} s comes out otherwise", fields)
-        if not speaks(self._present().reviser, revision):
+        if not is_spoken(self._present().reviser, revision):
             raise _DiffersError(f"the decision at {situation.time:g} s changed nothing")
         self.decisions += 1
 

@@ -1,5 +1,5 @@
 from evofsm.core.machine import EvolvingFSM
-from evofsm.core.states.ets import Paper
+from evofsm.core.states.paper import Paper
 
 
 def test_the_papers_rule_is_the_default(walk, snapshot):
