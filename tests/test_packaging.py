@@ -133,11 +133,13 @@ def fresh(wheel, tmp_path_factory):
     return folder / "bin"
 
 
+@pytest.mark.slow
 def test_the_core_depends_on_numpy_numba_and_the_loader_of_its_faces_alone(wheel):
     needed = {"numpy", "numba", "llvmlite", "lazy-loader", "packaging"}
     assert core_dependencies(wheel).keys() == needed
 
 
+@pytest.mark.slow
 def test_the_wheel_holds_every_source_file_and_nothing_else(wheel):
     with zipfile.ZipFile(wheel) as archive:
         held = {name for name in archive.namelist() if ".dist-info/" not in name}
@@ -174,6 +176,7 @@ print(machine.n_states, sys.modules["evofsm"].__file__)
     assert Path(origin).is_relative_to(fresh.parent)
 
 
+@pytest.mark.slow
 def test_without_the_cli_extra_the_command_names_it_in_one_line(fresh):
     environment = {**os.environ, "PYTHONPATH": ""}
     finished = subprocess.run(

@@ -12,6 +12,8 @@ import pytest
 from evofsm.driving import DECISION_COLUMNS
 from evofsm.guard import Column
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).parents[1]
 
 

@@ -641,6 +641,7 @@ def test_what_breaks_a_contract_is_caught_by_the_check_for_it(kind, name, thing)
     assert "evofsm/checks/" not in result.message  # a clause said it, and no error happened to
 
 
+@pytest.mark.slow
 def test_a_driver_without_a_fault_passes_what_it_has():
     outcomes = {result.check: result.outcome for result in check(Driver)}
     assert outcomes.pop("its_kernel_agrees") is Outcome.SKIPPED
@@ -725,6 +726,7 @@ def run(tmp_path, monkeypatch):
     return lambda *arguments: CliRunner().invoke(application(), ["check", *arguments])
 
 
+@pytest.mark.slow
 def test_the_command_checks_a_class_in_the_folder(run):
     result = run("own_driver:Hasty")
     assert result.exit_code == 0, result.output

@@ -10,6 +10,8 @@ from evofsm.__main__ import application
 from evofsm.evidence.real.leaders import TOLD, Limits, run_leaders
 from evofsm.evidence.real.tables_of_leaders import leader_tables
 
+pytestmark = pytest.mark.slow
+
 # When leaders of the pairs brake [s], and how hard [m/s²].
 BRAKES = {"a_1": [(3.0, 4.2)], "a_2": [], "b_1": [(3.0, 3.1), (6.0, 2.9)]}
 SECONDS = 12.0

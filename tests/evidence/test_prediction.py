@@ -20,6 +20,8 @@ from evofsm.evidence.prediction.sources import (
 )
 from evofsm.evidence.prediction.study import run_prediction as run
 
+pytestmark = pytest.mark.slow
+
 TINY = Plan(
     train=10, test=4, fine_train=1, fine_test=1, seeds=2, fine_seeds=1, parts=2, ablation=(),
     rounds=50,

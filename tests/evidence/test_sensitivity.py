@@ -27,6 +27,8 @@ from evofsm.evidence.sensitivity.shares import first_order, worst_sweeps
 from evofsm.evidence.sensitivity.study import _reach, _try_all, run_sensitivity
 from evofsm.fleet.executors import in_order
 
+pytestmark = pytest.mark.slow
+
 TINY = Plan(settings=8, levels=3, side=2, halvings=1, rounds=1)
 
 

@@ -73,6 +73,7 @@ def test_learning_that_is_stopped_goes_on_bit_for_bit(after, chunks, tmp_path):
     assert everything(learn(chunks, tmp_path / "kept")) == everything(learn(chunks))
 
 
+@pytest.mark.slow
 def test_learning_goes_on_however_often_it_is_stopped(chunks, tmp_path):
     for after in (2, 3, 3, 7):
         with pytest.raises(StoppedError):

@@ -581,6 +581,7 @@ def test_a_model_of_format_3_is_read():
     np.testing.assert_array_equal(model.transition_matrices, machine.transition_matrices)
 
 
+@pytest.mark.slow
 def test_a_machine_of_format_4_goes_on_and_counts_episodes_from_then_on(spiral):
     rule = FailureSplit(Novelty(radius=2.0, scales=(1.0, 2.0)), distance=0.1)
     new = EvolvingFSM(4, rule=rule, max_states=12, belief_tolerance=1e-9)

@@ -271,6 +271,7 @@ def test_it_is_saved_and_loaded_and_goes_on_learning(rule, tmp_path):
     assert merged._buffer.tobytes() == again._buffer.tobytes()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
 def test_the_vehicles_of_a_fleet_become_one_machine(dtype):
     random = np.random.default_rng(3)

@@ -305,6 +305,7 @@ def test_all_of_sumo_s_formats_tell_the_same(sumo, ending):
             assert a == pytest.approx(b, abs=2e-5, nan_ok=True)
 
 
+@pytest.mark.slow
 def test_sumo_without_lanes_is_refused_with_the_option(sumo):
     for name in ("bare.xml", "bare.csv"):
         path = sumo(name, "--fcd-output.attributes", "speed,pos")

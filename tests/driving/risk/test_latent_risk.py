@@ -94,6 +94,7 @@ def test_the_critical_deceleration_agrees_with_driving_it_out(
         assert left(hardest + DECEL_TOLERANCE) < kept + GAP_TOLERANCE
 
 
+@pytest.mark.slow
 @given(GAPS, SPEEDS, SPEEDS, ACTIONS, ACTIONS, DECELS, LAGS, ONSETS, st.floats(0.0, 20.0))
 def test_the_critical_deceleration_is_monotonic(
     gap, speed, leader_speed, action, before, decel, lag, onset, more
@@ -601,6 +602,7 @@ EPISODES = st.lists(
 )
 
 
+@pytest.mark.slow
 @given(EPISODES, st.integers(1, 5))
 def test_counts_agree_with_looking_ahead(episodes, steps):
     counts = OutcomeCounts(n_actions=2, horizon=steps * DT, dt=DT)
