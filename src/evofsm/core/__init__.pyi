@@ -36,7 +36,6 @@ from .memory import tell_of_failures as tell_of_failures
 from .model import FSMModel as FSMModel
 from .naming import Labels as Labels
 from .naming import Words as Words
-from .naming import use_words as use_words
 from .naming import visible as visible
 from .notebook import model_html as model_html
 from .notebook import variable_label as variable_label

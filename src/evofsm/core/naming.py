@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from functools import cache
+from importlib.metadata import entry_points
 from typing import NamedTuple
 
 import numpy as np
@@ -37,13 +39,17 @@ class Words(NamedTuple):
     unit: str  #: of an action
 
 
-# By the names of the variables.
-_WORDS: dict[tuple[str, ...], Words] = {}
+@cache
+def _words_of(names: tuple[str, ...]) -> Words | None:
+    """The words for variables of these names, if an installed package declares some.
 
-
-def use_words(names: tuple[str, ...], words: Words) -> None:
-    """Let every place with variables of these ``names`` be told in ``words``."""
-    _WORDS[names] = words
+    It does so by an entry point of the group ``evofsm.words``: the names with commas, and where
+    the `Words` are.
+    """
+    for point in entry_points(group="evofsm.words", name=",".join(names)):
+        words: Words = point.load()
+        return words
+    return None
 
 
 class Labels(NamedTuple):
@@ -61,7 +67,7 @@ class Labels(NamedTuple):
     dt: float | None = None  #: time between two observations [s]
 
     def place(self, center: ArrayLike) -> str:
-        """Where a centre lies: in words where there are some (`use_words`), else by its numbers.
+        """Where a centre lies: in words where a package declares some, else by its numbers.
 
         Parameters
         ----------
@@ -79,8 +85,8 @@ class Labels(NamedTuple):
         >>> Labels().place([9.2, 4.1])
         '(9.2, 4.1)'
         """
-        if self.names in _WORDS:
-            return _WORDS[self.names].place(center)
+        if words := _words_of(self.names):
+            return words.place(center)
         values = [f"{value:.3g}" for value in np.asarray(center, np.float64).tolist()]
         if not self.names:
             return f"({', '.join(values)})"
@@ -109,8 +115,8 @@ class Labels(NamedTuple):
         name = action_name(index)
         if self.actions is None:
             return name
-        unit = f" {_WORDS[self.names].unit}" if self.names in _WORDS else ""
-        return f"{name} {self.actions.label(index)}{unit}"
+        words = _words_of(self.names)
+        return f"{name} {self.actions.label(index)}{f' {words.unit}' if words else ''}"
 
     def duration(self, observations: int) -> str:
         """How long so many observations last.

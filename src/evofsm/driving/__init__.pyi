@@ -27,6 +27,7 @@ from .framework import Framework as Framework
 from .naming import LABELS as LABELS
 from .naming import UNITS as UNITS
 from .naming import VARIABLES as VARIABLES
+from .naming import WORDS as WORDS
 from .naming import name_state as name_state
 from .naming import name_states as name_states
 from .outcomes import Outcome as Outcome

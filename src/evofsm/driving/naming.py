@@ -8,7 +8,7 @@ from itertools import groupby
 import numpy as np
 from numpy.typing import ArrayLike
 
-from evofsm.core import Labels, Words, real_array, use_words
+from evofsm.core import Labels, Words, real_array
 
 #: What is observed of car following, and its units.
 VARIABLES, UNITS = ("gap", "v_follower", "v_leader"), ("m", "m/s", "m/s")
@@ -126,6 +126,7 @@ def _change(closing: float, decimals: int) -> str:
     return f"{'closing' if closing > 0.0 else 'opening'} at {abs(closing):.{decimals}f} m/s"
 
 
-use_words(VARIABLES, Words(name_state, "m/s²"))
+#: How places and actions of car following are told: an entry point of ``evofsm.words``.
+WORDS = Words(name_state, "m/s²")
 #: Of car following.
 LABELS = Labels(names=VARIABLES, units=UNITS)
