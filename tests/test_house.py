@@ -39,3 +39,8 @@ def test_the_top_offers_nothing_that_a_room_does_not():
     for name in evofsm.__all__:
         home = getattr(evofsm, name).__module__
         assert home.startswith("evofsm."), name
+
+
+def test_every_folder_with_modules_says_what_it_is_for():
+    for folder in {path.parent for path in PACKAGE.rglob("*.py")}:
+        assert (folder / "__init__.py").read_text("utf-8").startswith('"""'), folder

@@ -118,7 +118,7 @@ def test_an_independent_writing_of_the_equations_agrees(seed, m, q, radius, lear
     I = rng.integers(-1, q, 300)
     starts = {0, 100, 101}
     machine = EvolvingFSM(q, radius, learning_rate=learning_rate)
-    reference = NumpyFSM(q, radius, learning_rate=learning_rate)
+    reference = NumpyFSM(q, radius=radius, learning_rate=learning_rate)
     trace = machine.learn_many(Z, I, sorted(starts), belief=True)
     for row in range(300):
         if row in starts:

@@ -1,0 +1,1 @@
+"""What the programs print: tables, numbers and documents, for people and for other programs."""
