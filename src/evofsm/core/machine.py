@@ -370,7 +370,7 @@ prior_frequency=0.001, spread=3.0)
         Returns
         -------
         Step
-            What `observe` answers; the action shows in the next step.
+            What `observe` returns; the action shows in the next step.
 
         Raises
         ------
@@ -386,10 +386,10 @@ prior_frequency=0.001, spread=3.0)
         return self._step(z, check_action(i, self.n_actions), False)
 
     def update(self, z: NDArray[np.float64], i: int) -> float:
-        """Observe ``z``, then act with ``i``, and answer with nothing but the surprise.
+        """Observe ``z``, then act with ``i``, and return nothing but the surprise.
 
         The same step as `learn_one`, for those who count nanoseconds: most of the time of that
-        goes into the arrays of its answer. What they say can still be asked of the machine.
+        goes into the arrays of what that returns. What they say can still be asked of the machine.
 
         Parameters
         ----------
@@ -586,7 +586,7 @@ prior_frequency=0.001, spread=3.0)
         -------
         (n,) ndarray
             Distribution over states: ``belief @ P[i] @ P*^(horizon - 1)``. At the start of an
-            episode the belief is uniform; before any observation the answer is empty.
+            episode the belief is uniform; before any observation it is empty.
 
         Raises
         ------
@@ -982,7 +982,7 @@ prior_frequency=0.001, spread=3.0)
         return Nearest(state, float(np.sqrt(now.clusters.squared_distances[state])), beyond)
 
     def _step(self, z: ArrayLike, action: int, failed: bool) -> Step:
-        """Observe, then act; the whole answer."""
+        """Observe, then act; return the whole step."""
         event, state, surprise = self._take(z, action, failed)
         memory = self._held.memory
         parameters, now, scratch = memory.parameters, memory.learnt, memory.scratch
