@@ -2,6 +2,14 @@ from .actions import IntervalActions as IntervalActions
 from .crowding import WhenFull as WhenFull
 from .divergence import jensen_shannon as jensen_shannon
 from .divergence import jensen_shannon_kernel as jensen_shannon_kernel
+from .dynamics.consequents import Consequents as Consequents
+from .dynamics.consequents import Disturbances as Disturbances
+from .dynamics.consequents import Here as Here
+from .dynamics.consequents import Scratch as Scratch
+from .dynamics.consequents import follow_policy as follow_policy
+from .dynamics.consequents import replay as replay
+from .dynamics.consequents import scratch as scratch
+from .dynamics.dynamics import Dynamics as Dynamics
 from .elementary import fetch_ahead as fetch_ahead
 from .explanation import Explanation as Explanation
 from .explanation import Tally as Tally

@@ -1,0 +1,388 @@
+"""How a system moves, what disturbs it and where it fails: learnt online beside the states."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from evofsm.core.dynamics.consequents import (
+    KNOTS,
+    Consequents,
+    Disturbances,
+    Here,
+    n_features,
+    residuals,
+)
+from evofsm.core.dynamics.failures import explain_failures, probe
+from evofsm.core.dynamics.regression import Sums, learn_transition, solve, take_in
+
+_Floats = NDArray[np.float64]
+
+#: Parts that can be left out, to see what each is worth.
+PARTS = ("stretches", "memory", "products", "lags", "jumps", "carried")
+
+# Transitions before anything is expected.
+_FIRST = 15
+# Of what was learnt so far, what still counts an episode later.
+_KEPT = 0.97
+# Steps, and between how many of them weights are solved for again.
+_SCHEDULE = ((300, 5), (1500, 20))
+# Residuals of so many scales are the onset of a stretch; at most so many an episode, so far apart.
+_ONSET, _ONSETS, _APART = 4.0, 3, 3
+# A stretch has at least so many steps.
+_SHORTEST = 4
+# An episode that goes on for so many steps is studied, and goes on.
+_LONGEST = 1024
+# An extreme is a saturation if it was reached, by moving, in so many episodes.
+_REACHED = 2
+_MOST_KEPT = 200
+
+
+class Stretch(NamedTuple):
+    """What happened for a while, as it was observed: residuals follow from it at any time."""
+
+    observations: _Floats  #: (L + 2, m), the first one step before it began
+    actions: _Floats  #: (L + 1, a), the first one step before it began
+    episode: int  #: in which it was seen, from 0
+
+
+class Episode(NamedTuple):
+    """An episode that is over, without the transition that failed."""
+
+    observations: _Floats  #: (T + 1, m)
+    actions: _Floats  #: (T, a)
+    residuals: _Floats  #: (T - 1, m) what was not expected, from the second observation on
+    failed: bool
+
+
+class Dynamics:
+    """Learns how a system moves under actions, what disturbs it for a while, and where it fails.
+
+    Parameters
+    ----------
+    low, high : array_like, optional
+        Range of the action, where that is one number or several.
+    n_actions : int, optional
+        Number of actions, where they are told apart by their index alone.
+    horizon : int
+        Steps of a stretch.
+    stretches : int
+        Number of stretches that are kept.
+    without : sequence of str
+        Parts of `PARTS` that are left out.
+    """
+
+    def __init__(
+        self,
+        low: ArrayLike | None = None,
+        high: ArrayLike | None = None,
+        *,
+        n_actions: int | None = None,
+        horizon: int = 48,
+        stretches: int = 16,
+        without: Sequence[str] = (),
+    ) -> None:
+        self.choices = n_actions or 0
+        self.low = np.zeros(0) if low is None else np.atleast_1d(np.asarray(low, np.float64))
+        self.high = np.zeros(0) if high is None else np.atleast_1d(np.asarray(high, np.float64))
+        self.size = self.choices or len(self.low)
+        self.horizon = horizon
+        self.n_stretches = stretches
+        self.without = frozenset(without)
+        self.n_variables = 0
+        self.told: Callable[[_Floats], bool] | None = None
+        self.stretches: list[Stretch] = []
+        self.n_episodes = 0
+        self.latest: Episode | None = None
+        self.used = np.zeros((self.size, 2))
+        self._begin()
+
+    # -- Actions --------------------------------------------------------------------------------
+
+    def encode(self, action: Any) -> _Floats:
+        """(a,) what kernels call an action."""
+        if self.choices:
+            return np.eye(self.choices)[int(action)]
+        middle, half = 0.5 * (self.low + self.high), 0.5 * (self.high - self.low)
+        scaled: _Floats = (np.atleast_1d(np.asarray(action, np.float64)) - middle) / half
+        return scaled
+
+    def decode(self, inner: _Floats) -> _Floats:
+        """(d,) the action itself; the index of a choice."""
+        if self.choices:
+            return np.array([float(inner.argmax())])
+        middle, half = 0.5 * (self.low + self.high), 0.5 * (self.high - self.low)
+        return np.asarray(np.clip(middle + half * inner, self.low, self.high))
+
+    # -- Learning -------------------------------------------------------------------------------
+
+    def _begin(self) -> None:
+        self._Z: list[_Floats] = []
+        self._U: list[_Floats] = []
+
+    def _start(self, z: _Floats) -> None:
+        """The first observation of all."""
+        m, a = len(z), self.size
+        p = n_features(m, a, box=not self.choices)
+        self.n_variables = m
+        self.origin = z.copy()
+        self.sums = Sums(
+            counts=np.zeros(2),
+            squares=np.zeros((p, p)),
+            products=np.zeros((p, m)),
+            mean=np.zeros(m),
+            scatter=np.zeros(m),
+            variance=np.zeros(m),
+            unit=np.zeros(m),
+            early=np.zeros((200, m)),
+            least=np.zeros(m),
+            most=np.zeros(m),
+            scale=np.zeros(m),
+        )
+        self.lowest, self.highest = np.full(m, np.inf), np.full(m, -np.inf)
+        self.reached = np.zeros((m, 2))
+        self.failures: list[_Floats] = []
+        self.jumps: list[list[tuple[float, float]]] = [[] for _ in range(m)]
+        self.sides: list[tuple[int, float, float]] = []
+        self.weights = np.zeros((p, m))
+        self.ready = False
+        self._left_out = np.zeros(p)
+        k = 1 + 2 * m + 2 * a + (0 if self.choices else len(KNOTS) * a)
+        if "products" in self.without:
+            self._left_out[k:] = 1.0
+        if "lags" in self.without:
+            self._left_out[1 + m : 1 + 2 * m] = 1.0
+            self._left_out[1 + 2 * m + a : 1 + 2 * m + 2 * a] = 1.0
+        self._jumped = np.zeros(m)
+        self._rebuild()
+
+    def observe(self, z: _Floats) -> None:
+        """Take in an observation, and learn the transition before the one to it."""
+        if not self.n_variables:
+            self._start(z)
+        if len(self._Z) >= _LONGEST:
+            self._study(failed=False)
+            self._Z, self._U = self._Z[-2:], self._U[-1:]
+        self._Z.append(z.copy())
+        take_in(self.sums, z, self.origin)
+        if self.told is not None and not self.sides and self.sums.counts[1] >= 1.0:
+            self.sides = probe(self.told, z, np.maximum(self.sums.unit, 1e-9))
+            self._rebuild()
+        if len(self._Z) >= 3:
+            self._learn(len(self._Z) - 3)
+        n = self.sums.counts[0]
+        if not self.ready:
+            if n % 20 == 0:
+                self._solve()
+            return
+        for until, every in _SCHEDULE:
+            if n < until:
+                if n % every == 0:
+                    self._solve()
+                break
+
+    def act(self, action: _Floats) -> None:
+        """What was done after the latest observation, as `encode` returns it."""
+        del self._U[len(self._Z) - 1 :]
+        self._U.append(action)
+        self.used[:, 0] += action < (-0.6 if not self.choices else -1.0)
+        self.used[:, 1] += action > 0.6
+
+    def end(self, *, failed: bool) -> None:
+        """The episode is over; its last observation was taken in."""
+        if self.n_variables:
+            if not failed and len(self._Z) > 2 and len(self._U) >= len(self._Z) - 1:
+                self._learn(len(self._Z) - 2)
+            self._study(failed=failed)
+        self._begin()
+
+    def break_off(self) -> None:
+        """What comes does not follow from what was."""
+        if self.n_variables and len(self._Z) > 2:
+            self._study(failed=False)
+        self._begin()
+
+    def _learn(self, i: int) -> None:
+        """From the transition i -> i + 1."""
+        Z, last = self._Z, i + 2 >= len(self._Z)
+        first = i == 0
+        four = np.array([Z[max(i - 1, 0)], Z[i], Z[i + 1], Z[i + 1 if last else i + 2]])
+        two = np.array([self._U[max(i - 1, 0)], self._U[i]])
+        jumped = self._jumped
+        if learn_transition(
+            self.sums, self.consequents, self.origin, four, two, first, last, jumped
+        ):
+            if first:
+                return
+            for j in np.flatnonzero(jumped):
+                self.jumps[j] = [*self.jumps[j][1 - _MOST_KEPT :], (four[1, j], four[2, j])]
+
+    def _solve(self) -> None:
+        if self.sums.counts[0] < _FIRST:
+            return
+        self.weights = solve(self.sums, self.n_variables, self.size, self._left_out)
+        self.ready = True
+        self._rebuild()
+
+    def _rebuild(self) -> None:
+        sums, m = self.sums, self.n_variables
+        reach = 1.5 * np.maximum(np.abs(sums.least), np.abs(sums.most))
+        lowest = np.where(self.reached[:, 0] >= _REACHED, self.lowest, -np.inf)
+        highest = np.where(self.reached[:, 1] >= _REACHED, self.highest, np.inf)
+        for j, sign, _ in self.sides:  # one does not saturate where one fails
+            (lowest if sign < 0.0 else highest)[j] = sign * np.inf
+        variance = sums.scatter / max(1.0, sums.counts[0] - 1.0)
+        worth = 1.0 / (1.25 * sums.unit + 1e-300)
+        self.consequents = Consequents(
+            weights=self.weights,
+            origin=self.origin,
+            reach=reach,
+            lowest=lowest,
+            highest=highest,
+            least=sums.least.copy(),
+            most=sums.most.copy(),
+            sides=np.array(
+                [[j, sign, at, worth[j]] for j, sign, at in self.sides], np.float64
+            ).reshape(-1, 4),
+            mean=self.origin + sums.mean,
+            inverse=1.0 / np.sqrt(np.where(variance > 0.0, variance, 1.0)),
+            choices=self.choices,
+        )
+
+    def _study(self, *, failed: bool) -> None:
+        """Learn from an episode as a whole."""
+        Z, U = np.array(self._Z), np.array(self._U).reshape(-1, self.size)
+        safe = Z[:-1] if failed else Z
+        self._extremes(safe)
+        if failed:
+            self.failures = [*self.failures[1 - _MOST_KEPT :], Z[-1]]
+        self._solve()
+        if self.told is None:
+            self.sides = explain_failures(
+                np.array(self.failures).reshape(-1, self.n_variables),
+                self.lowest,
+                self.highest,
+                np.maximum(self.sums.unit, 1e-300),
+            )
+        self._rebuild()
+        self.sums.squares[:] *= _KEPT
+        self.sums.products[:] *= _KEPT
+        self.latest = None
+        T = len(safe) - 1
+        if self.ready and T > 4:
+            found = np.zeros((T - 1, self.n_variables))
+            residuals(self.consequents, Z, U, T - 1, False, found)
+            self._rescale(found)
+            self.latest = Episode(safe, U[:T], found, failed)
+            if "stretches" not in self.without:
+                self.remember(self._onsets(found))
+        self.n_episodes += 1
+
+    def _extremes(self, safe: _Floats) -> None:
+        """How far variables went, and whether they stay there."""
+        if not len(safe):
+            return
+        low, high = safe.min(0), safe.max(0)
+        for j in range(self.n_variables):
+            close = 1e-9 * max(1.0, abs(high[j] - low[j]))
+            if low[j] < self.lowest[j] - close:
+                self.lowest[j], self.reached[j, 0] = low[j], 0.0
+            if high[j] > self.highest[j] + close:
+                self.highest[j], self.reached[j, 1] = high[j], 0.0
+            moving = (
+                np.abs(np.diff(safe[:, j])) > close
+            )  # it arrived there, and did not start there
+            self.reached[j, 0] += ((safe[1:, j] <= self.lowest[j] + close) & moving).any()
+            self.reached[j, 1] += ((safe[1:, j] >= self.highest[j] - close) & moving).any()
+
+    def _rescale(self, found: _Floats) -> None:
+        scale = 1.4826 * np.median(np.abs(found), 0)
+        known = self.sums.scale[0] > 0.0
+        new = 0.8 * self.sums.scale + 0.2 * scale if known else scale
+        self.sums.scale[:] = np.maximum(new, 1e-3 * np.sqrt(self.sums.variance) + 1e-300)
+
+    def _onsets(self, found: _Floats) -> list[int]:
+        """Steps of an episode at which something large began."""
+        size, starts = np.abs(found / self.sums.scale).max(1), []
+        while len(starts) < _ONSETS and size.max() >= _ONSET:
+            t = int(size.argmax())
+            starts.append(t)
+            size[max(0, t - _APART) : t + _APART + 1] = 0.0
+        return starts
+
+    def remember(self, starts: Sequence[int]) -> None:
+        """Keep the stretches of the latest episode that begin at these steps of its residuals."""
+        assert self.latest is not None
+        Z, U = self.latest.observations, self.latest.actions
+        for t in starts:
+            L = min(self.horizon, len(U) - 1 - t)
+            if L >= _SHORTEST:
+                self.stretches.append(
+                    Stretch(Z[t : t + L + 2].copy(), U[t : t + L + 1].copy(), self.n_episodes)
+                )
+
+    def keep(self, which: Sequence[int]) -> None:
+        """Forget all stretches but these."""
+        self.stretches = [self.stretches[k] for k in which]
+
+    # -- What it says ---------------------------------------------------------------------------
+
+    @property
+    def here(self) -> Here:
+        """Where one is."""
+        z = self._Z[-1]
+        change = z - self._Z[-2] if len(self._Z) > 1 else np.zeros(len(z))
+        before = self._U[len(self._Z) - 2] if len(self._Z) > 1 else np.zeros(self.size)
+        return Here(z, change, before)
+
+    def disturbances(self) -> Disturbances:
+        """Residuals of what is remembered, as they are seen now; number 0 is none at all."""
+        m, count = self.n_variables, 1 + len(self.stretches)
+        found = Disturbances(
+            np.zeros((count, self.horizon, m)),
+            np.full((count, m), -1.0),
+            np.zeros((count, m)),
+            np.zeros((count, m)),
+        )
+        carried = "carried" not in self.without
+        for k, (Z, U, _) in enumerate(self.stretches, 1):
+            L = min(len(U) - 1, self.horizon)
+            residuals(self.consequents, Z, U, L, carried, found.residuals[k])
+        if "jumps" not in self.without:
+            self._find_jumps(found)
+        return found
+
+    def _find_jumps(self, found: Disturbances) -> None:
+        """What stretches jump to: for each variable and direction, after on before."""
+        for j in range(self.n_variables):
+            seen = np.array(self.jumps[j]).reshape(-1, 2)
+            if not len(seen):
+                continue
+            for k, (Z, _, _) in enumerate(self.stretches, 1):
+                d = np.append(np.abs(np.diff(Z[:, j])), 0.0)
+                around = np.maximum(np.maximum(d[:-2], d[2:]), self.sums.unit[j])
+                at = np.flatnonzero(d[1:-1] > 8.0 * around)
+                if not len(at) or at[0] >= self.horizon:
+                    continue
+                t = int(at[0])
+                before, after = Z[t + 1, j], Z[t + 2, j]
+                alike = seen[(seen[:, 1] > seen[:, 0]) == (after > before)]
+                slope = _slope(alike)
+                found.jump_at[k, j] = t
+                found.jump_slope[k, j] = slope
+                found.jump_to[k, j] = after - slope * before
+
+
+def _slope(jumps: _Floats) -> float:
+    """How much of where a variable was remains after a jump, from 0 (nothing) to 1 (all)."""
+    if len(jumps) < 3:
+        return 0.0
+    before, after = jumps.T
+    spread = float(((before - before.mean()) ** 2).sum())
+    if spread <= 0.0:
+        return 0.0
+    both = float(((before - before.mean()) * (after - after.mean())).sum())
+    return min(1.0, max(0.0, both / spread))

@@ -1,0 +1,158 @@
+"""How consequents are learnt: sums that are added to with every transition, and solved now and then.
+
+Sums of two machines add up. A transition is learnt when the one after it is known, for only then
+does it show whether it was a jump: one that is far larger than what came before, what came after
+and what is ordinary. Jumps are no dynamics: they enter neither sums, nor units, nor limits.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evofsm.core.dynamics.consequents import Consequents, expect, fill_features, scratch
+from evofsm.core.kernels import compiled
+
+_Floats = NDArray[np.float64]
+
+# A change so many times those around it, and the ordinary one, is a jump.
+_JUMP = 8.0
+# The ordinary change is the median of so many, then a mean; of what is larger, so much counts.
+_EARLY, _CLIP, _SLOWEST = 200, 6.0, 5000.0
+# Residuals beyond so many of their scale weigh less.
+_OUTLIER = 4.0
+# Of the variance of a feature: what every weight is held to 0 by, and those that are asked only if
+# they have to be.
+_RIDGE, _SHY = 1e-6, 30.0
+_PRIOR, _SHY_PRIOR = 0.01, 20.0
+
+
+class Sums(NamedTuple):
+    """What is learnt with every transition: m variables, p features."""
+
+    counts: _Floats  #: (2,) observations, and transitions
+    squares: _Floats  #: (p, p) sum of products of features
+    products: _Floats  #: (p, m) and of features with changes
+    mean: _Floats  #: (m,) of observations, from the origin
+    scatter: _Floats  #: (m,) sum of squared distances to the mean
+    variance: _Floats  #: (m,) mean square of a change
+    unit: _Floats  #: (m,) ordinary change
+    early: _Floats  #: (200, m) the first changes
+    least: _Floats  #: (m,) most negative change that was no jump
+    most: _Floats  #: (m,) most positive one
+    scale: _Floats  #: (m,) of residuals; 0 as long as it is not known
+
+
+@compiled
+def take_in(sums: Sums, z: _Floats, origin: _Floats) -> None:
+    """Count an observation."""
+    sums.counts[0] += 1.0
+    for j in range(len(z)):
+        off = z[j] - origin[j] - sums.mean[j]
+        sums.mean[j] += off / sums.counts[0]
+        sums.scatter[j] += off * (z[j] - origin[j] - sums.mean[j])
+
+
+@compiled
+def learn_transition(
+    sums: Sums,
+    known: Consequents,
+    origin: _Floats,
+    observations: _Floats,
+    actions: _Floats,
+    first: bool,
+    last: bool,
+    jumped: _Floats,
+) -> bool:
+    """Learn the transition from the second to the third of four observations; whether it jumped.
+
+    ``observations`` (4, m): one before (none if ``first``), from, to, and one after (none if
+    ``last``). ``actions`` (2, a): before, and between. ``jumped`` (m,) gets 1 where a variable
+    jumped.
+    """
+    m, a = observations.shape[1], actions.shape[1]
+    box = known.choices == 0
+    room = scratch(m, a, sums.squares.shape[0])
+    n = sums.counts[1]
+    jump = False
+    for j in range(m):
+        now = observations[2, j] - observations[1, j]
+        before = 0.0 if first else observations[1, j] - observations[0, j]
+        after = 0.0 if last else observations[3, j] - observations[2, j]
+        room.change[j], room.move[j] = before, now
+        sums.variance[j] += (now * now - sums.variance[j]) / (n + 1.0)
+        around = max(max(abs(before), abs(after)), sums.unit[j])
+        jumped[j] = 1.0 if n > 8.0 and abs(now) > _JUMP * around else 0.0
+        jump = jump or jumped[j] > 0.0
+    for j in range(m):
+        now = abs(room.move[j])
+        floor = 1e-3 * np.sqrt(sums.scatter[j] / max(1.0, sums.counts[0]))
+        ordinary = 0.0 if jumped[j] > 0.0 else room.move[j]
+        sums.least[j] = min(sums.least[j], ordinary)
+        sums.most[j] = max(sums.most[j], ordinary)
+        if n < _EARLY:
+            known_now = int(n) + 1
+            sums.early[known_now - 1, j] = now
+            unit = max(1.2 * np.median(sums.early[:known_now, j]), floor)
+            if n >= 20.0:
+                total = 0.0
+                for i in range(known_now):
+                    total += min(sums.early[i, j], _CLIP * unit)
+                unit = max(unit, total / known_now)
+            sums.unit[j] = unit
+        else:
+            grown = (min(now, _CLIP * sums.unit[j]) - sums.unit[j]) / min(n, _SLOWEST)
+            sums.unit[j] = max(sums.unit[j] + grown, floor)
+    sums.counts[1] += 1.0
+    if first or jump:
+        return jump
+    weight = 1.0
+    z, move = observations[1], np.empty(m)
+    if sums.scale[0] > 0.0:
+        expect(known, z, room.change, actions[1], actions[0], room.features, move)
+        worst = 0.0
+        for j in range(m):
+            y, x, close = z[j] + move[j], observations[2, j], 1e-9 / known.inverse[j]
+            low = y < known.lowest[j] and x <= known.lowest[j] + close
+            if low or (y > known.highest[j] and x >= known.highest[j] - close):
+                weight = 0.0  # it cannot be known how far it would have gone
+            else:
+                worst = max(worst, abs(x - y) / sums.scale[j])
+        weight *= min(1.0, _OUTLIER / max(worst, 1e-12)) ** 2
+    for j in range(m):
+        move[j] = 1.5 * max(abs(sums.least[j]), abs(sums.most[j]))
+    fill_features(z, room.change, actions[1], actions[0], origin, move, box, room.features)
+    features = room.features
+    for k in range(len(features)):
+        f = weight * features[k]
+        if f != 0.0:
+            for i in range(len(features)):
+                sums.squares[k, i] += f * features[i]
+            for j in range(m):
+                sums.products[k, j] += f * room.move[j]
+    return jump
+
+
+def solve(sums: Sums, m: int, a: int, without: _Floats) -> _Floats:
+    """(p, m) weights: ridge regression, about 0, in units of each feature's own variance.
+
+    What is true for all times is found soonest if latest changes, bends and products are asked
+    only if they have to be; else the first episodes say that one's own throttle speeds others up.
+    ``without`` (p,) is 1 for features that are left out.
+    """
+    squares, n = sums.squares, max(1.0, float(sums.squares[0, 0]))
+    variance = np.diag(squares) - squares[0] ** 2 / n
+    size = np.diag(squares)
+    variance = np.where(variance > 1e-9 * size, variance, 1e-9 * size)
+    variance[0] = 0.0
+    shy = np.ones(len(size), bool)
+    shy[: 1 + m] = shy[1 + 2 * m : 1 + 2 * m + a] = False
+    held = np.where(shy, _SHY * _RIDGE + _SHY_PRIOR / n, _RIDGE + _PRIOR / n) * variance
+    held += np.where(without > 0.0, 1e12 * np.maximum(size, 1.0), 0.0)
+    scale = 1.0 / np.sqrt(np.where(size > 0.0, size + held, 1.0))
+    scaled = scale[:, None] * (squares + np.diag(held)) * scale
+    scaled[np.diag_indices_from(scaled)] += 1e-13
+    weights: _Floats = scale[:, None] * np.linalg.solve(scaled, scale[:, None] * sums.products)
+    return weights

@@ -1,0 +1,1 @@
+"""A judge that was told nothing but which episodes failed: see `risk.LearntRisk`."""

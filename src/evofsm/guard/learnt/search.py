@@ -1,0 +1,247 @@
+"""Kernels of the learnt judge: which action is survived, whatever of what is remembered begins now.
+
+A predictive safety filter (Wabersich & Zeilinger, "A predictive safety filter for learning-based
+control of constrained nonlinear dynamical systems", Automatica 2021), with a model, disturbances
+and backup policies that are learnt online.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evofsm.core import (
+    Consequents,
+    Disturbances,
+    Here,
+    Scratch,
+    compiled,
+    follow_policy,
+    replay,
+    scratch,
+)
+
+_Floats = NDArray[np.float64]
+_Ints = NDArray[np.int64]
+
+#: What a search found: the proposal passes, another action passes, or nothing does.
+KEPT, CHANGED, NOTHING_PASSES = 0, 1, 2
+
+# Halvings between a proposal and an action that passes.
+_HALVINGS = 4
+# What the least distance counts beside the time survived.
+_DISTANCE, _FAR = 0.05, 0.05
+
+
+@compiled
+def _lost(
+    known: Consequents,
+    here: Here,
+    action: _Floats,
+    policy: _Floats,
+    disturbances: Disturbances,
+    order: _Ints,
+    harder: float,
+    margin: float,
+    allowed: int,
+    room: Scratch,
+) -> int:
+    """Number of disturbances that are not survived by the margin, up to one more than allowed.
+
+    Those that are not come first in ``order`` from then on: they are the quickest to refuse by.
+    """
+    lost, steps = 0, disturbances.residuals.shape[1]
+    for i in range(len(order)):
+        k = order[i]
+        survived, least = replay(known, here, action, policy, disturbances, k, harder, margin, room)
+        if survived < steps or least < margin:
+            lost += 1 if k > 0 else allowed + 1  # without any disturbance it has to go well
+            for l in range(i, 0, -1):
+                order[l] = order[l - 1]
+            order[0] = k
+            if lost > allowed:
+                return lost
+    return lost
+
+
+@compiled
+def search(
+    known: Consequents,
+    here: Here,
+    proposal: _Floats,
+    policies: _Floats,
+    ranks: _Ints,
+    disturbances: Disturbances,
+    order: _Ints,
+    harder: float,
+    margin: float,
+    margin_to_keep: float,
+    allowed: int,
+    best: _Floats,
+) -> tuple[int, int, float]:
+    """Find ``best`` (a,), the closest action to the proposal that passes; how, by which backup.
+
+    The last number is how far apart the backups are where nothing passes: near 0 all are alike.
+    """
+    a = len(proposal)
+    room = scratch(len(here.z), a, known.weights.shape[0])
+    for q in ranks:
+        if (
+            _lost(
+                known,
+                here,
+                proposal,
+                policies[q],
+                disturbances,
+                order,
+                harder,
+                margin_to_keep,
+                allowed,
+                room,
+            )
+            <= allowed
+        ):
+            best[:] = proposal
+            return KEPT, q, 1.0
+    own, middle, closest, which = np.empty(a), np.empty(a), np.inf, -1
+    for enough in (margin_to_keep, margin):
+        for q in ranks:
+            follow_policy(known, policies[q], here.z, own)
+            far = 0.0
+            for i in range(a):
+                far += (own[i] - proposal[i]) ** 2
+            if known.choices > 0 and far == 0.0:
+                continue  # it was refused
+            if known.choices > 0 and which >= 0:
+                break
+            if (
+                _lost(
+                    known,
+                    here,
+                    own,
+                    policies[q],
+                    disturbances,
+                    order,
+                    harder,
+                    enough,
+                    allowed,
+                    room,
+                )
+                > allowed
+            ):
+                continue
+            share, step = 1.0, 0.5
+            if known.choices == 0:
+                low = 0.0
+                for _ in range(_HALVINGS):
+                    half = 0.5 * (low + share)
+                    if half * half * far >= closest:
+                        low = half
+                        continue
+                    for i in range(a):
+                        middle[i] = proposal[i] + half * (own[i] - proposal[i])
+                    if (
+                        _lost(
+                            known,
+                            here,
+                            middle,
+                            policies[q],
+                            disturbances,
+                            order,
+                            harder,
+                            enough,
+                            allowed,
+                            room,
+                        )
+                        <= allowed
+                    ):
+                        share = half
+                    else:
+                        low = half
+            if share * share * far < closest:
+                closest, which = share * share * far, q
+                for i in range(a):
+                    best[i] = proposal[i] + share * (own[i] - proposal[i])
+        if which >= 0 or margin_to_keep == margin:
+            break
+    if which >= 0:
+        return CHANGED, which, 1.0
+    longest, shortest = -np.inf, np.inf
+    nothing = np.empty(0)
+    for q in ranks:
+        total = 0.0
+        for k in range(len(order)):
+            total += lasting(known, here, nothing, policies[q], disturbances, k, harder, room)
+        shortest = min(shortest, total)
+        if total > longest:
+            longest, which = total, q
+            follow_policy(known, policies[q], here.z, best)
+    return NOTHING_PASSES, which, (longest - shortest) / (abs(longest) + 1e-12)
+
+
+@compiled
+def lasting(
+    known: Consequents,
+    here: Here,
+    action: _Floats,
+    policy: _Floats,
+    disturbances: Disturbances,
+    k: int,
+    harder: float,
+    room: Scratch,
+) -> float:
+    """Share of the horizon that is survived, and a little for the least distance to failure."""
+    steps = disturbances.residuals.shape[1]
+    survived, least = replay(known, here, action, policy, disturbances, k, harder, 0.0, room)
+    return survived / steps + _DISTANCE * min(1.0, max(-1.0, _FAR * least))
+
+
+@compiled
+def harm(
+    known: Consequents,
+    z: _Floats,
+    change: _Floats,
+    before: _Floats,
+    policies: _Floats,
+    disturbances: Disturbances,
+    harder: float,
+    found: _Floats,
+) -> None:
+    """For each disturbance (row) and situation (column) how well the best of the policies ends.
+
+    The steps left where it fails, negative, less 1; else the least distance.
+    """
+    a, p = before.shape[1], known.weights.shape[0]
+    room, nothing = scratch(z.shape[1], a, p), np.empty(0)
+    steps = disturbances.residuals.shape[1]
+    for r in range(len(z)):
+        here = Here(z[r], change[r], before[r])
+        for k in range(len(found)):
+            best = -np.inf
+            for q in range(len(policies)):
+                t, least = replay(
+                    known, here, nothing, policies[q], disturbances, k, harder, 0.0, room
+                )
+                best = max(best, least if t == steps else -1.0 - (steps - t))
+            found[k, r] = best
+
+
+@compiled
+def worth(
+    known: Consequents,
+    z: _Floats,
+    change: _Floats,
+    before: _Floats,
+    policy: _Floats,
+    disturbances: Disturbances,
+    which: _Ints,
+    harder: float,
+) -> float:
+    """How well a policy ends, over all situations and the disturbances ``which``."""
+    room, nothing = scratch(z.shape[1], before.shape[1], known.weights.shape[0]), np.empty(0)
+    total = 0.0
+    for r in range(len(z)):
+        here = Here(z[r], change[r], before[r])
+        for k in which:
+            total += lasting(known, here, nothing, policy, disturbances, k, harder, room)
+    return total / (len(z) * len(which))
