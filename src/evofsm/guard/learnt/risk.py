@@ -334,4 +334,12 @@ class LearntRisk:
 
 def _disturbances(residuals: _Floats) -> Disturbances:
     k, _, m = residuals.shape
-    return Disturbances(residuals, np.full((k, m), -1.0), np.zeros((k, m)), np.zeros((k, m)))
+    nothing = np.zeros((k, m))
+    return Disturbances(
+        residuals,
+        nothing - 1.0,
+        nothing,
+        np.zeros((k, m, m)),
+        np.zeros((k, m, m, 2)),
+        np.zeros((k, m, 2)),
+    )
