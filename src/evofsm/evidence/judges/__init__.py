@@ -1,0 +1,1 @@
+"""Does the learnt judge keep any system from failing, and which of its parts is that owed to?"""
