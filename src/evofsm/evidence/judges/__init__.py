@@ -1,1 +1,1 @@
-"""Does the learnt judge keep any system from failing, and which of its parts is that owed to?"""
+"""Whether the learnt judge keeps systems from failing, and to which of its parts that is owed."""

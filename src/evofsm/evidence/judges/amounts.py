@@ -36,6 +36,11 @@ class Amounts:
     without: str = option(
         ALL, "Parts that are taken away, each by itself, with commas; all, or none."
     )
+    all_controllers: bool = option(
+        True,
+        "Every controller of a system, or the first alone.",
+        name="--all-controllers/--first-controller",
+    )
     seeds: int = option(5, "Learning seeds.", min=1)
     train: int | None = option(
         None, "Training episodes. [default: as many as suit the system]", min=1
@@ -48,7 +53,8 @@ class Amounts:
         return replace(
             self,
             without=NONE_AWAY if self.without == ALL else self.without,
-            seeds=min(self.seeds, 1),
+            all_controllers=False,
+            seeds=1,
             train=min(self.train or 30, 30),
             test=min(self.test, 20),
         )

@@ -16,7 +16,7 @@ with needs("gymnasium", "gym", "CartPole-v1"):
 _TIPS_LEFT = -0.1
 # Gains of the bad one: far too much for the angle's rate and the place.
 _BAD_GAIN = np.array([1.0, 1.0, 8.0, 0.5])
-# How likely a push begins in a step, how long it lasts (the last is left out), how strong it is [N].
+# A push: how likely it begins in a step, for how many (the last is left out), and how strong [N].
 _PUSH_BEGINS = 0.01
 _PUSH_STEPS = (5, 16)
 _PUSH_FORCE = (2.0, 5.0)

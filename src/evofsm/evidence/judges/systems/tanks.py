@@ -18,8 +18,8 @@ _DRY, _FULL = 0.1, 2.0  # levels that fail [m]
 _MIDDLE = 1.0  # level at which an episode starts, about [m]
 _OUTLET = 0.03  # outflow at a level of 1 m [m/s of level]
 _PIPE = 0.02  # flow through the pipe at a difference of 1 m [m/s of level]
-_PUMP = 0.09  # largest flow of a pump [m/s of level]
-_LAG = 8.0  # time constant of a pump [s]
+_PUMP = 0.15  # largest flow of a pump [m/s of level]
+_LAG = 25.0  # time constant of a pump [s]
 _SUBSTEPS = 4
 # A tap: how likely one is opened in a step, for how many steps (the last is left out), and how much
 # more leaves its tank, as a share of the outlet.
@@ -27,7 +27,7 @@ _TAP_OPENS = 0.02
 _TAP_STEPS = (20, 60)
 _TAP_FLOW = (0.3, 1.0)
 # The one that wanders: how likely it sets each pump anew in a step.
-_CHANGES = 0.02
+_CHANGES = 0.05
 # Feedback of the one whose sensors are exchanged, on the level above the middle.
 _GAIN = 2.0
 
