@@ -188,7 +188,7 @@ def trial(
     make = JUDGES[judge] if isinstance(judge, str) else judge
     name = judge if isinstance(judge, str) else getattr(judge, "__name__", "own")
     learner = make(controlled, without, seed)
-    starts = (Start.training(base, seed, index) for index in range(train))
+    starts = (Start.training(base, seed, episode) for episode in range(train))
     learnt = [run(controlled, learner, start).failed for start in starts]
     learner.freeze()
     tried = [run(controlled, learner, start) for start in _held_out(base, test)]
@@ -239,7 +239,7 @@ def run(system: System, judge: Judge, start: Start) -> Ended:
 
 
 def _held_out(base: int, test: int) -> Iterable[Start]:
-    return (Start.held_out(base, index) for index in range(test))
+    return (Start.held_out(base, episode) for episode in range(test))
 
 
 @lru_cache

@@ -49,7 +49,7 @@ class Cars(System):
 
     def _driver(self, observation: Vector) -> float:
         wanted = self._draw.controller.propose(observation, self._road.time).action
-        return float(np.clip(wanted, self.actions.low[0], self.actions.high[0]))
+        return float(np.clip(wanted, self.family.actions.low, self.family.actions.high))
 
     def _begin(self, start: Start) -> None:
         self._start = start
@@ -78,7 +78,7 @@ class Cars(System):
 
 
 def _draw(family: Family, start: Start) -> Draw:
-    return family.draw(start.seed, start.index, split=start.split)
+    return family.draw(start.seed, start.episode, split=start.split)
 
 
 @lru_cache

@@ -20,27 +20,27 @@ class Start(NamedTuple):
 
     Examples
     --------
-    >>> Start.held_out(seed=0, index=3) == Start.training(seed=0, learning_seed=0, index=3)
+    >>> Start.held_out(seed=0, episode=3) == Start.training(seed=0, learning_seed=0, episode=3)
     False
     """
 
     split: Literal["train", "test"]
     seed: int
-    index: int
+    episode: int
 
     @classmethod
-    def training(cls, seed: int, learning_seed: int, index: int) -> Start:
+    def training(cls, seed: int, learning_seed: int, episode: int) -> Start:
         """One to learn from; other ones for every learning seed."""
-        return cls("train", seed * 1000 + learning_seed, index)
+        return cls("train", seed * 1000 + learning_seed, episode)
 
     @classmethod
-    def held_out(cls, seed: int, index: int) -> Start:
+    def held_out(cls, seed: int, episode: int) -> Start:
         """One that nothing learns from."""
-        return cls("test", seed, index)
+        return cls("test", seed, episode)
 
     def rng(self, stream: int) -> np.random.Generator:
         """Random numbers of this episode; each stream has its own."""
-        return np.random.default_rng([self.split == "test", self.seed, self.index, stream])
+        return np.random.default_rng([self.split == "test", self.seed, self.episode, stream])
 
 
 class Step(NamedTuple):
