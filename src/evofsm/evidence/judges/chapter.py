@@ -256,10 +256,10 @@ def _worth(every: Sequence[Effect]) -> Iterator[Table]:
             (Column[str]("part", lambda part: part), *map(where, _WORTH)),
             parts,
             "The part is taken away, all else being the same; runs are compared one by one. "
-            "Systems without a name here show nothing that is clear. The first of these that differs by "
-            "more than a little, and by more than chance (Student's t over runs, 99 %), decides: "
-            "failures held out, failures while learning, score, proposals kept, change. Of so many "
-            "comparisons a few are beyond that by chance.",
+            "Systems without a name here show nothing that is clear. The first of these that "
+            "differs by more than a little, and by more than chance (Student's t over runs, 99 %), "
+            "decides: failures held out, failures while learning, score, proposals kept, change. "
+            "Of so many comparisons a few are beyond that by chance.",
             in_words=True,
         )
 
