@@ -37,8 +37,8 @@ def sketches(found: Judges) -> Iterator[Sketch]:
         "Held-out episodes that failed, of all controllers and learning seeds; linear up to 1 %, "
         "logarithmic beyond. Bars: 95 %, as if all episodes were independent; seeds share their "
         "draws. The broken line is the whole judge.",
-        "Dots with intervals by system: the controller alone fails nearly always, the whole judge "
-        "seldom, and without some of its parts it fails again.",
+        "Dots with intervals, a panel for each system: from above the controller alone, the whole "
+        "judge, and the judge without each of its parts.",
         partial(draw, found, _failed, "failed [%]"),
     )
     yield Sketch(
