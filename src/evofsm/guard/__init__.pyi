@@ -18,6 +18,7 @@ from .defaults import TOLERANCE as TOLERANCE
 from .guard import Explain as Explain
 from .guard import Guard as Guard
 from .gym import RevisedActions as RevisedActions
+from .gym import RevisedVectorActions as RevisedVectorActions
 from .protocols import ActionJudge as ActionJudge
 from .protocols import AsksMachine as AsksMachine
 from .protocols import Controller as Controller

@@ -28,7 +28,7 @@ from evofsm.core import (
     refuse_unusable,
 )
 from evofsm.files import Place, ranges, storage
-from evofsm.guard.actions import Action, ActionSet, BoxActions, Choices, no_action
+from evofsm.guard.actions import Action, ActionSet, BoxActions, Choices, fixed, no_action
 from evofsm.guard.auditing.participants import outline, rebuild
 from evofsm.guard.defaults import BELIEF_TOLERANCE, TOLERANCE
 from evofsm.guard.protocols import (
@@ -493,7 +493,40 @@ class Guard:
         revision = self._explained(situation, self.reviser.revise(situation, proposal))
         if self.audit is not None:
             self.audit.decided(situation, proposal, revision)
-        executed = revision.executed
+        self._take_in(situation, revision.executed)
+        if isinstance(self.actions, Choices):
+            return revision._replace(executed=int(revision.executed), advised=int(revision.advised))
+        return revision
+
+    def take_in(self, situation: Situation, executed: Action) -> None:
+        """Instead of `revise`, where it was decided elsewhere: learn from what was executed.
+
+        Parameters
+        ----------
+        situation : Situation
+            What `recognise` returned.
+        executed : float or (d,) array_like
+            An action of the set.
+
+        Raises
+        ------
+        ValueError
+            If there is an audit log, which could not be replayed then.
+
+        Examples
+        --------
+        >>> from evofsm.driving import guard_for_cars
+        >>> guard = guard_for_cars(low=-2.5, high=2.5)
+        >>> for k in range(2):
+        ...     guard.take_in(guard.recognise([9.0 - k, 20.0, 20.0], time=0.25 * k), -1.0)
+        >>> guard.machine.model().uses.sum()
+        np.float64(1.0)
+        """
+        if self.audit is not None:
+            raise ValueError("with an audit log a guard decides itself: call revise")
+        self._take_in(situation, fixed(executed))
+
+    def _take_in(self, situation: Situation, executed: Action) -> None:
         self._decisions += 1
         if self.machine is not None and self.learn and self.machine.state is not None:
             self.machine.act(self.actions.encode(executed), executed)
@@ -504,9 +537,6 @@ class Guard:
                 watched = isinstance(self.reviser, ActionReviser) and not self.reviser.acts
                 take_in = self.judge.watch if watched else self.judge.learn
                 take_in(situation.observation, executed, situation.belief)
-        if isinstance(self.actions, Choices):
-            return revision._replace(executed=int(executed), advised=int(revision.advised))
-        return revision
 
     def _explained(self, situation: Situation, revision: Revision) -> Revision:
         """With what the machine has seen come of what is executed, where that is asked for."""
