@@ -324,7 +324,7 @@ prior_frequency=0.001, spread=3.0)
         return step._replace(explanation=text)
 
     @_alone
-    def act(self, i: SupportsIndex) -> None:
+    def act(self, i: SupportsIndex, executed: ArrayLike | None = None) -> None:
         """Say which action was commanded after the latest observation.
 
         It labels exactly one transition, the one to the next observation; a second call
@@ -334,6 +334,8 @@ prior_frequency=0.001, spread=3.0)
         ----------
         i : int
             Index of the action, from 0; `IntervalActions.encode` gives it for a number.
+        executed : float or (d,) array_like, optional
+            The action itself, where it is more than its index.
 
         Raises
         ------
