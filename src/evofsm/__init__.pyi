@@ -1,4 +1,5 @@
 from .core import Category as Category
+from .core import Dynamics as Dynamics
 from .core import Edges as Edges
 from .core import Event as Event
 from .core import EvolvingFSM as EvolvingFSM

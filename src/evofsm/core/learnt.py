@@ -71,6 +71,8 @@ class Counts:
     (array([[2., 0.],
            [0., 0.]]), array([[1., 0.],
            [0., 0.]]))
+    >>> machine.onsets  # it was not asked to learn how its system moves
+    array([0., 0.])
     """
 
     #: (n,) observations in which each state was the most probable
@@ -95,6 +97,8 @@ class Counts:
     tried: Floats = _of_actions(since=5, latest="latest_try")
     #: (q, n) those of `tried` that failed soon after they did
     failed_after: Floats = _of_actions(since=5)
+    #: (n,) times that something unexpected began in each state, where the machine has `dynamics`
+    onsets: Floats = _of_states(since=6)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -190,11 +194,15 @@ def _upgrade_machine(
 
 
 def _upgrade_model(version: int, settings: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> None:
-    """Version 1 knew one rule."""
+    """Version 1 knew one rule; up to version 5 nobody learnt how systems move."""
     if version < 2:
         settings["rule"] = {"name": "paper"}
+    if version < 6:
+        arrays["dynamics"] = np.zeros(0, np.uint8)
 
 
+#: The file of `Dynamics` within a file, as bytes; empty where there are none.
+_WITHIN = {"dynamics": ranges.Member(("bytes",), ranges.Range(0.0, 255.0, whole=True), since=6)}
 _RULE: dict[str, Any] = {
     "memory": ranges.Range(2.0, ranges.MOST_COUNTED, whole=True),
     **dict.fromkeys(("radius", "spread", "distance"), ranges.SIZE),
@@ -216,25 +224,25 @@ _SETTINGS: dict[str, Any] = {
 MACHINE = ranges.register(
     ranges.Kind(
         "machine",
-        {array.name: _member(array) for array in arrays_of(Learnt)},
+        {array.name: _member(array) for array in arrays_of(Learnt)} | _WITHIN,
         _SETTINGS,
         upgrade=_upgrade_machine,
     )
 )
-#: What a model has beside its `Counts`, centres by state.
-_OF_MODEL = cast(
+# What a model has beside its `Counts`, centres by state.
+_CENTRAL = cast(
     tuple[Array, ...], (Clusters.potentials, Transitions.uses, Transitions.origin_frequency)
 )
+#: The arrays of a model.
+OF_MODEL = {
+    "centers": ranges.Member(("n", "m"), _OBSERVED),
+    "transition_matrices": ranges.Member(("q", "n", "n"), ranges.SHARE),
+    **{array.name: _member(array, places="q") for array in (*_CENTRAL, *arrays_of(Counts))},
+}
 MODEL = ranges.register(
     ranges.Kind(
         "model",
-        {
-            "centers": ranges.Member(("n", "m"), _OBSERVED),
-            "transition_matrices": ranges.Member(("q", "n", "n"), ranges.SHARE),
-            **{
-                array.name: _member(array, places="q") for array in (*_OF_MODEL, *arrays_of(Counts))
-            },
-        },
+        OF_MODEL | _WITHIN,
         {
             "width": ranges.Range(0.0, 1e308),
             "dt": ranges.SIZE,

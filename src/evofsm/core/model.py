@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
-from typing import Any, Self, cast
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,7 +13,7 @@ from evofsm.core.actions import IntervalActions
 from evofsm.core.explanation import Explanation, explain
 from evofsm.core.known import Known
 from evofsm.core.layout import Array
-from evofsm.core.learnt import MODEL
+from evofsm.core.learnt import MODEL, OF_MODEL
 from evofsm.core.naming import Labels
 from evofsm.core.notebook import model_html
 from evofsm.core.states.dispatch import describe_rule
@@ -64,7 +64,7 @@ class FSMModel(Known):
         m, q = self.n_variables, self.n_actions
         sizes: dict[int | str, int] = {"n": self.n_states, "m": m, "q": q}
         arrays = {}
-        for name, member in cast(Mapping[str, ranges.Member], MODEL.members).items():
+        for name, member in OF_MODEL.items():
             shape = tuple(sizes[letter] for letter in member.shape)
             given = getattr(self, name)
             array = np.zeros(shape) if isinstance(given, Array) else np.array(given, np.float64)
@@ -208,7 +208,7 @@ class FSMModel(Known):
         if len(set(chosen)) < len(chosen):
             raise ValueError(f"states are {chosen}; each may be named once")
         parts: dict[str, Any] = {}
-        for name, member in cast(Mapping[str, ranges.Member], MODEL.members).items():
+        for name, member in OF_MODEL.items():
             part = getattr(self, name)
             for axis, letter in enumerate(member.shape):
                 part = part.take(chosen, axis) if letter == "n" else part
@@ -235,7 +235,7 @@ class FSMModel(Known):
         }
 
     def _kept(self) -> dict[str, NDArray[Any]]:
-        return {name: getattr(self, name) for name in cast(Any, MODEL.members)}
+        return {name: getattr(self, name) for name in OF_MODEL}
 
     @classmethod
     def _restored(cls, content: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> Self:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from contextlib import suppress
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -18,6 +19,8 @@ from evofsm.core.dynamics.consequents import (
 )
 from evofsm.core.dynamics.failures import explain_failures, probe
 from evofsm.core.dynamics.regression import Sums, learn_transition, solve, take_in
+from evofsm.core.dynamics.undoing import held
+from evofsm.core.validation import real_array, refuse_unusable, whole
 
 _Floats = NDArray[np.float64]
 
@@ -31,7 +34,7 @@ _KEPT = 0.97
 # Steps, and between how many of them weights are solved for again.
 _SCHEDULE = ((300, 5), (1500, 20))
 # Residuals of so many scales are the onset of a stretch; at most so many an episode, so far apart.
-_ONSET, _ONSETS, _APART = 4.0, 3, 3
+ONSET, _ONSETS, APART = 4.0, 3, 3
 # A stretch has at least so many steps.
 _SHORTEST = 4
 # An episode that goes on for so many steps is studied, and goes on.
@@ -41,6 +44,8 @@ _REACHED = 2
 _MOST_KEPT = 200
 # Jumps that would have shown no dependence, for each variable.
 _JUMP_PRIOR = 3.0
+# So many times the stretches that are kept there may be until somebody chooses.
+_SPARE = 4
 
 
 class Stretch(NamedTuple):
@@ -63,18 +68,50 @@ class Episode(NamedTuple):
 class Dynamics:
     """Learns how a system moves under actions, what disturbs it for a while, and where it fails.
 
+    It is told nothing of the system but observations, actions and which episodes failed. Give one
+    to `EvolvingFSM`, which feeds it; by itself it is fed by `observe`, `act` and `end`.
+
     Parameters
     ----------
     low, high : array_like, optional
-        Range of the action, where that is one number or several.
+        Range of the action, where that is one number or several, in the unit of the action.
     n_actions : int, optional
         Number of actions, where they are told apart by their index alone.
     horizon : int
         Steps of a stretch.
     stretches : int
-        Number of stretches that are kept.
+        Number of stretches that are kept where somebody chooses among them (`keep`); of those that
+        nobody has chosen yet, the newest, so that there are at most four times as many.
     without : sequence of str
         Parts of `PARTS` that are left out.
+
+    Raises
+    ------
+    ValueError
+        If not one of a range and ``n_actions`` is given, ``low`` is not below ``high`` or not
+        finite, a number is no whole number of at least 1, or ``without`` names no part.
+
+    Notes
+    -----
+    Each variable's change is linear in the observation, its latest change, the action, the one
+    before, bends of the action and products of variables (the consequents of eTS, Angelov & Filev
+    2004), learnt by sums that machines can add up. Where a system fails is known only after it
+    failed there once, or where it is told; nothing here says that something is safe.
+
+    Examples
+    --------
+    A cart that is pushed by the action, to the left, not at all or to the right:
+
+    >>> from evofsm import EvolvingFSM
+    >>> machine = EvolvingFSM(n_actions=3, radius=0.5, dynamics=Dynamics(n_actions=3))
+    >>> draw, speed = np.random.default_rng(0), 0.0
+    >>> for t in range(80):
+    ...     i = int(draw.integers(3))
+    ...     step = machine.learn_one([speed], i)
+    ...     speed += 0.1 * (i - 1) - 0.1 * speed
+    >>> machine.start_episode()
+    >>> machine.dynamics.n_episodes, machine.dynamics.ready
+    (1, True)
     """
 
     def __init__(
@@ -87,12 +124,13 @@ class Dynamics:
         stretches: int = 16,
         without: Sequence[str] = (),
     ) -> None:
-        self.choices = n_actions or 0
-        self.low = np.zeros(0) if low is None else np.atleast_1d(np.asarray(low, np.float64))
-        self.high = np.zeros(0) if high is None else np.atleast_1d(np.asarray(high, np.float64))
+        self.choices = 0 if n_actions is None else whole("n_actions", n_actions)
+        self.low, self.high = _range(low, high, is_none=n_actions is not None)
         self.size = self.choices or len(self.low)
-        self.horizon = horizon
-        self.n_stretches = stretches
+        self.horizon = whole("horizon", horizon)
+        self.n_stretches = whole("stretches", stretches)
+        if unknown := set(without) - set(PARTS):
+            raise ValueError(f"without names {sorted(unknown)}; there are {', '.join(PARTS)}")
         self.without = frozenset(without)
         self.n_variables = 0
         self.told: Callable[[_Floats], bool] | None = None
@@ -100,14 +138,47 @@ class Dynamics:
         self.n_episodes = 0
         self.latest: Episode | None = None
         self.used = np.zeros((self.size, 2))
+        self.clock = 0.0  # of the machine that feeds it, at the latest observation
+        self.quiet = 0.0  # observations since one that was not expected
         self._begin()
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """What it was made with, by name."""
+        told: dict[str, Any] = {"horizon": self.horizon, "stretches": self.n_stretches}
+        if self.choices:
+            told["n_actions"] = self.choices
+        else:
+            told |= {"low": self.low.tolist(), "high": self.high.tolist()}
+        return told | {"without": sorted(self.without)}
+
+    def copy(self) -> Self:
+        """One of its own in the same state; ``told``, which is code, is shared."""
+        twin = object.__new__(type(self))
+        twin.__dict__.update(held(self))
+        return twin
+
+    def __deepcopy__(self, memo: Any) -> Self:
+        return self.copy()
+
+    def __getstate__(self) -> dict[str, Any]:
+        return held(self) | {"told": None}  # code is told again
+
+    def __repr__(self) -> str:
+        actions = f"n_actions={self.choices}"
+        if not self.choices:
+            low, high = (edge.tolist() for edge in (self.low, self.high))
+            actions = f"low={low[0]}, high={high[0]}" if self.size == 1 else f"{low=}, {high=}"
+        counts = {"episode": self.n_episodes, "variable": self.n_variables}
+        counts["stretch"] = len(self.stretches)
+        return f"{type(self).__name__}({actions}, {', '.join(map(_some, counts, counts.values()))})"
 
     # -- Actions --------------------------------------------------------------------------------
 
     def encode(self, action: Any) -> _Floats:
         """(a,) what kernels call an action."""
         if self.choices:
-            return np.eye(self.choices)[int(action)]
+            return np.asarray(np.eye(self.choices)[int(action)])
         middle, half = 0.5 * (self.low + self.high), 0.5 * (self.high - self.low)
         scaled: _Floats = (np.atleast_1d(np.asarray(action, np.float64)) - middle) / half
         return scaled
@@ -125,8 +196,8 @@ class Dynamics:
         self._Z: list[_Floats] = []
         self._U: list[_Floats] = []
 
-    def _start(self, z: _Floats) -> None:
-        """The first observation of all."""
+    def begin(self, z: _Floats) -> None:
+        """Make room for what is learnt; variables are counted from the first observation on."""
         m, a = len(z), self.size
         p = n_features(m, a, box=not self.choices)
         self.n_variables = m
@@ -164,7 +235,7 @@ class Dynamics:
     def observe(self, z: _Floats) -> None:
         """Take in an observation, and learn the transition before the one to it."""
         if not self.n_variables:
-            self._start(z)
+            self.begin(z)
         if len(self._Z) >= _LONGEST:
             self._study(failed=False)
             self._Z, self._U = self._Z[-2:], self._U[-1:]
@@ -225,12 +296,14 @@ class Dynamics:
     def _solve(self) -> None:
         if self.sums.counts[0] < _FIRST:
             return
-        self.weights = solve(self.sums, self.n_variables, self.size, self._left_out)
-        self.ready = True
+        with suppress(np.linalg.LinAlgError):  # numbers of sizes that have nothing in common
+            weights = solve(self.sums, self.n_variables, self.size, self._left_out)
+            if np.isfinite(weights).all():
+                self.weights, self.ready = weights, True
         self._rebuild()
 
     def _rebuild(self) -> None:
-        sums, m = self.sums, self.n_variables
+        sums = self.sums
         reach = 1.5 * np.maximum(np.abs(sums.least), np.abs(sums.most))
         lowest = np.where(self.reached[:, 0] >= _REACHED, self.lowest, -np.inf)
         highest = np.where(self.reached[:, 1] >= _REACHED, self.highest, np.inf)
@@ -308,11 +381,12 @@ class Dynamics:
 
     def _onsets(self, found: _Floats) -> list[int]:
         """Steps of an episode at which something large began."""
-        size, starts = np.abs(found / self.sums.scale).max(1), []
-        while len(starts) < _ONSETS and size.max() >= _ONSET:
+        size = np.abs(found / self.sums.scale).max(1)
+        starts: list[int] = []
+        while len(starts) < _ONSETS and size.max() >= ONSET:
             t = int(size.argmax())
             starts.append(t)
-            size[max(0, t - _APART) : t + _APART + 1] = 0.0
+            size[max(0, t - APART) : t + APART + 1] = 0.0
         return starts
 
     def remember(self, starts: Sequence[int]) -> None:
@@ -325,6 +399,7 @@ class Dynamics:
                 self.stretches.append(
                     Stretch(Z[t : t + L + 2].copy(), U[t : t + L + 1].copy(), self.n_episodes)
                 )
+        self.stretches = self.stretches[-_SPARE * self.n_stretches :]
 
     def keep(self, which: Sequence[int]) -> None:
         """Forget all stretches but these."""
@@ -339,6 +414,39 @@ class Dynamics:
         change = z - self._Z[-2] if len(self._Z) > 1 else np.zeros(len(z))
         before = self._U[len(self._Z) - 2] if len(self._Z) > 1 else np.zeros(self.size)
         return Here(z, change, before)
+
+    @property
+    def under_way(self) -> tuple[_Floats, _Floats]:
+        """(T, m) observations and (T or T - 1, a) actions of the episode that is going on."""
+        Z, U = np.array(self._Z), np.array(self._U)
+        return Z.reshape(-1, self.n_variables), U.reshape(-1, self.size)
+
+    def go_on(self, observations: _Floats, actions: _Floats) -> None:
+        """Be in an episode of which this was observed and done."""
+        self._Z, self._U = list(observations), list(actions)
+
+    @property
+    def is_under_way(self) -> bool:
+        """Whether something was observed in this episode."""
+        return bool(self._Z)
+
+    @property
+    def has_acted(self) -> bool:
+        """Whether it is known what was done after the latest observation."""
+        return len(self._U) >= len(self._Z) > 0
+
+    @property
+    def before(self) -> _Floats:
+        """(m,) the last but one observation of this episode."""
+        return self._Z[-2]
+
+    @property
+    def latest_change(self) -> tuple[_Floats, _Floats] | None:
+        """(3, m) latest observations and (2, a) actions between them; None if there are fewer."""
+        n = len(self._Z)
+        if n < 3:
+            return None
+        return np.array(self._Z[-3:]), np.array(self._U[n - 3 : n - 1])
 
     def disturbances(self) -> Disturbances:
         """Residuals of what is remembered, as they are seen now; number 0 is none at all."""
@@ -397,3 +505,24 @@ def _slopes(before: _Floats, after: _Floats) -> _Floats:
     held = _JUMP_PRIOR / len(after) * size + 1e-9 * size.max()
     found: _Floats = np.linalg.solve(squares + np.diag(held), off.T @ (after - after.mean()))
     return found
+
+
+def _range(
+    low: ArrayLike | None, high: ArrayLike | None, *, is_none: bool
+) -> tuple[_Floats, _Floats]:
+    """The ends of the range of actions, (d,) each; empty where there is to be none."""
+    if is_none != (low is None) or (low is None) != (high is None):
+        raise ValueError("give either low and high, or n_actions")
+    if low is None or high is None:
+        return np.zeros(0), np.zeros(0)
+    ends = [real_array(name, np.atleast_1d(end), 1) for name, end in (("low", low), ("high", high))]
+    for name, end in zip(("low", "high"), ends, strict=True):
+        refuse_unusable(name, end)
+    if ends[0].shape != ends[1].shape or not (ends[0] < ends[1]).all():
+        raise ValueError(f"low is {low} and high is {high}; low must be below high")
+    return ends[0], ends[1]
+
+
+def _some(thing: str, number: int) -> str:
+    plural = "stretches" if thing == "stretch" else f"{thing}s"
+    return f"{number:,} {thing if number == 1 else plural}"

@@ -64,8 +64,9 @@ def probe(
 
     Examples
     --------
-    >>> probe(lambda z: z[0] <= 0.0, np.array([5.0, 1.0]), np.ones(2))
-    [(0, -1.0, 0.0)]
+    >>> [(j, sign, at)] = probe(lambda z: z[0] <= 0.0, np.array([5.0, 1.0]), np.ones(2))
+    >>> j, sign, round(at, 9)
+    (0, -1.0, 0.0)
     """
     found: list[tuple[int, float, float]] = []
     for j in range(len(safe)):

@@ -1,4 +1,4 @@
-"""How consequents are learnt: sums that are added to with every transition, and solved now and then.
+"""How consequents are learnt: sums that every transition adds to, and that are solved now and then.
 
 Sums of two machines add up. A transition is learnt when the one after it is known, for only then
 does it show whether it was a jump: one that is far larger than what came before, what came after

@@ -1,0 +1,213 @@
+"""Dynamics in files: a file of their own, which stands within that of a machine or a model.
+
+It holds what the next step needs and all that was learnt; not `Dynamics.latest`, from which a judge
+learns as an episode ends, nor `Dynamics.told`, which is code.
+"""
+
+from __future__ import annotations
+
+import math
+from io import BytesIO
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evofsm.core.dynamics.consequents import Consequents, n_features
+from evofsm.core.dynamics.dynamics import Dynamics, Stretch
+from evofsm.core.dynamics.following import LARGEST
+from evofsm.core.dynamics.regression import Sums
+from evofsm.files import ranges, storage
+
+_Shape: TypeAlias = tuple[int | str, ...]
+
+_SOME = ranges.Range(-1e300, 1e300)
+_NOT_NEGATIVE = ranges.Range(0.0, 1e308)
+_OBSERVED = ranges.Range(-LARGEST, LARGEST)
+# The first ones to come are infinitely far out.
+_EXTREME = ranges.Range(-math.inf, math.inf)
+_KNOWN = "known_"
+# Of consequents: what they were made of may have changed since.
+_CONSEQUENTS: dict[str, _Shape] = {
+    "weights": ("p", "m"),
+    "reach": ("m",),
+    "lowest": ("m",),
+    "highest": ("m",),
+    "least": ("m",),
+    "most": ("m",),
+    "sides": ("s", 4),
+    "mean": ("m",),
+    "inverse": ("m",),
+}
+_SUMS: dict[str, tuple[_Shape, ranges.Range]] = {
+    "counts": ((2,), ranges.COUNT),
+    "squares": (("p", "p"), _SOME),
+    "products": (("p", "m"), _SOME),
+    "mean": (("m",), _SOME),
+    "scatter": (("m",), _NOT_NEGATIVE),
+    "variance": (("m",), _NOT_NEGATIVE),
+    "unit": (("m",), _NOT_NEGATIVE),
+    "early": ((200, "m"), _NOT_NEGATIVE),
+    "least": (("m",), _SOME),
+    "most": (("m",), _SOME),
+    "scale": (("m",), _NOT_NEGATIVE),
+}
+# Arrays of dynamics under their own names.
+_OWN: dict[str, tuple[_Shape, ranges.Range]] = {
+    "origin": (("m",), _OBSERVED),
+    "lowest": (("m",), _EXTREME),
+    "highest": (("m",), _EXTREME),
+    "reached": (("m", 2), ranges.COUNT),
+}
+_ARRAYS: dict[str, tuple[_Shape, ranges.Range]] = {
+    **{f"sum_{name}": told for name, told in _SUMS.items()},
+    **{_KNOWN + name: (shape, _EXTREME) for name, shape in _CONSEQUENTS.items()},
+    **_OWN,
+    "used": (("a", 2), ranges.COUNT),
+    "failures": (("failures", "m"), _OBSERVED),
+    "jumps": (("jumps", 2), _OBSERVED),  # variable, and where it landed
+    "jumps_from": (("jumps", "m"), _OBSERVED),
+    "stretches": (("stretches", 2), ranges.COUNT),  # numbers of actions, and episodes
+    "stretch_observations": (("stretched", "m"), _OBSERVED),
+    "stretch_actions": (("acted", "a"), _SOME),
+    "observations": (("observed", "m"), _OBSERVED),
+    "actions": (("done", "a"), _SOME),
+}
+_KIND = ranges.register(
+    ranges.Kind(
+        "dynamics",
+        {name: ranges.Member(*told) for name, told in _ARRAYS.items()},
+        {
+            **dict.fromkeys(("horizon", "stretches", "n_actions"), ranges.FROM_1),
+            **dict.fromkeys(("n_episodes", "clock", "quiet"), ranges.COUNT),
+            **dict.fromkeys(("low", "high"), ranges.Range(-1e100, 1e100)),
+        },
+    )
+).name
+
+
+def to_bytes(dynamics: Dynamics | None) -> NDArray[np.uint8]:
+    """A file of dynamics, as bytes; none for None.
+
+    Examples
+    --------
+    >>> dynamics = from_bytes(to_bytes(Dynamics(n_actions=2)))
+    >>> dynamics
+    Dynamics(n_actions=2, 0 episodes, 0 variables, 0 stretches)
+    >>> from_bytes(to_bytes(None)) is None
+    True
+    """
+    file = BytesIO()
+    if dynamics is not None:
+        storage.write(file, _KIND, _content(dynamics), _arrays(dynamics))
+    return np.frombuffer(file.getvalue(), np.uint8)
+
+
+def from_bytes(encoded: NDArray[Any]) -> Dynamics | None:
+    """Dynamics that go on as if they had never been kept.
+
+    Raises
+    ------
+    ValueError
+        If it is no such file, or a damaged one.
+    """
+    if not len(encoded):
+        return None
+    content, arrays = storage.read(BytesIO(encoded.tobytes()), _KIND)
+    numbers = {name: content.pop(name) for name in ("n_episodes", "clock", "quiet", "ready")}
+    dynamics = Dynamics(**content)
+    dynamics.n_episodes = int(numbers["n_episodes"])
+    dynamics.clock, dynamics.quiet = float(numbers["clock"]), float(numbers["quiet"])
+    if not isinstance(numbers["ready"], bool):
+        raise ValueError(f"ready is {numbers['ready']!r}; it must be true or false")
+    _refuse_impossible(dynamics, arrays)
+    if len(arrays["origin"]):
+        dynamics.begin(arrays["origin"])
+        dynamics.ready = numbers["ready"]
+        _restore(dynamics, arrays)
+    return dynamics
+
+
+def _content(dynamics: Dynamics) -> dict[str, Any]:
+    return dynamics.settings | {
+        "n_episodes": dynamics.n_episodes,
+        "clock": dynamics.clock,
+        "quiet": dynamics.quiet,
+        "ready": bool(dynamics.n_variables and dynamics.ready),
+    }
+
+
+def _arrays(dynamics: Dynamics) -> dict[str, NDArray[np.float64]]:
+    m, a = dynamics.n_variables, dynamics.size
+    if not m:  # nothing was observed: all that depends on it is empty
+        sizes = {"a": a}
+        return {
+            name: np.zeros([n if isinstance(n, int) else sizes.get(n, 0) for n in shape])
+            for name, (shape, _) in _ARRAYS.items()
+        }
+    jumps = [(j, jump) for j, one in enumerate(dynamics.jumps) for jump in one]
+    stretches = dynamics.stretches
+    observations, actions = dynamics.under_way
+    return {
+        **{f"sum_{name}": array for name, array in dynamics.sums._asdict().items()},
+        **{_KNOWN + name: getattr(dynamics.consequents, name) for name in _CONSEQUENTS},
+        **{name: getattr(dynamics, name) for name in _OWN},
+        "used": dynamics.used,
+        "failures": np.array(dynamics.failures).reshape(-1, m),
+        "jumps": np.array([(j, jump[-1]) for j, jump in jumps], np.float64).reshape(-1, 2),
+        "jumps_from": np.array([jump[:-1] for _, jump in jumps], np.float64).reshape(-1, m),
+        "stretches": np.array(
+            [(len(one.actions), one.episode) for one in stretches], np.float64
+        ).reshape(-1, 2),
+        "stretch_observations": np.concatenate(
+            [np.empty((0, m)), *(one.observations for one in stretches)]
+        ),
+        "stretch_actions": np.concatenate([np.empty((0, a)), *(one.actions for one in stretches)]),
+        "observations": observations,
+        "actions": actions,
+    }
+
+
+def _refuse_impossible(dynamics: Dynamics, arrays: dict[str, NDArray[Any]]) -> None:
+    """Raise where arrays contradict each other, or the settings; kernels trust their sizes."""
+    m, a = len(arrays["origin"]), dynamics.size
+    if len(arrays["used"]) != a:
+        raise ValueError(f"used has {len(arrays['used'])} rows, but an action has {a} numbers")
+    if m and len(arrays["sum_squares"]) != n_features(m, a, box=not dynamics.choices):
+        raise ValueError(f"squares has {len(arrays['sum_squares'])} rows, which {m} variables lack")
+    for name, sides in (("jumps", arrays["jumps"]), ("sides", arrays[f"{_KNOWN}sides"])):
+        if len(sides) and not np.isin(sides[:, 0], np.arange(m)).all():
+            raise ValueError(f"{name} are of variables that there are not")
+    lengths = arrays["stretches"][:, 0]
+    expected = lengths.sum() + len(lengths), lengths.sum()
+    have = len(arrays["stretch_observations"]), len(arrays["stretch_actions"])
+    if expected != have or (len(lengths) and lengths.min() < 2):
+        raise ValueError(f"stretches have {have} observations and actions, not {expected}")
+    observed, done = len(arrays["observations"]), len(arrays["actions"])
+    if not max(observed - 1, 0) <= done <= observed:
+        raise ValueError(f"there are {done} actions after {observed} observations")
+
+
+def _restore(dynamics: Dynamics, arrays: dict[str, NDArray[Any]]) -> None:
+    dynamics.sums = Sums(**{name: arrays[f"sum_{name}"] for name in _SUMS})
+    for name in _OWN:
+        setattr(dynamics, name, arrays[name])
+    dynamics.used = arrays["used"]
+    known: dict[str, Any] = {name: arrays[_KNOWN + name] for name in _CONSEQUENTS}
+    dynamics.consequents = Consequents(**known, origin=arrays["origin"], choices=dynamics.choices)
+    dynamics.weights = known["weights"]
+    dynamics.sides = [(int(j), float(sign), float(at)) for j, sign, at, _ in known["sides"]]
+    dynamics.failures = list(arrays["failures"])
+    for (j, after), before in zip(arrays["jumps"], arrays["jumps_from"], strict=True):
+        dynamics.jumps[int(j)].append(np.append(before, after))
+    ends = np.cumsum(arrays["stretches"][:, 0]).astype(int)
+    begins = ends - arrays["stretches"][:, 0].astype(int)
+    for k, (begin, end) in enumerate(zip(begins.tolist(), ends.tolist(), strict=True)):
+        dynamics.stretches.append(
+            Stretch(
+                arrays["stretch_observations"][begin + k : end + k + 1].copy(),
+                arrays["stretch_actions"][begin:end].copy(),
+                int(arrays["stretches"][k, 1]),
+            )
+        )
+    dynamics.go_on(arrays["observations"], arrays["actions"])
