@@ -9,7 +9,9 @@ from .dynamics.consequents import Scratch as Scratch
 from .dynamics.consequents import follow_policy as follow_policy
 from .dynamics.consequents import replay as replay
 from .dynamics.consequents import scratch as scratch
+from .dynamics.dynamics import DYNAMICS_PARTS as DYNAMICS_PARTS
 from .dynamics.dynamics import Dynamics as Dynamics
+from .dynamics.dynamics import Episode as Episode
 from .elementary import fetch_ahead as fetch_ahead
 from .explanation import Explanation as Explanation
 from .explanation import Tally as Tally
@@ -52,6 +54,7 @@ from .numbering import state_name as state_name
 from .observations import Category as Category
 from .observations import Missing as Missing
 from .observations import ObservationEncoder as ObservationEncoder
+from .proportions import poisson_bounds as poisson_bounds
 from .proportions import wilson_bounds as wilson_bounds
 from .reference import Reference as Reference
 from .states.dispatch import describe_rule as describe_rule

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import cache
 
 from evofsm.core.kernels import compiled
 
@@ -37,6 +38,49 @@ def wilson_bounds(share: float, count: float) -> tuple[float, float]:
     centre = (share + 0.5 * spread) / (1.0 + spread)
     reach = math.sqrt(spread * (share * (1.0 - share) + 0.25 * spread)) / (1.0 + spread)
     return max(centre - reach, 0.0), min(centre + reach, 1.0)
+
+
+@cache
+def poisson_bounds(count: int) -> tuple[float, float]:
+    """90 % interval of the number of events to be expected where ``count`` were seen.
+
+    Exact (Garwood 1936): the bounds are where as few, and as many, are seen in 5 % of cases.
+
+    Parameters
+    ----------
+    count : int
+        At least 0.
+
+    Returns
+    -------
+    (float, float)
+        Lower and upper bound.
+
+    Examples
+    --------
+    >>> [round(bound, 3) for bound in poisson_bounds(0) + poisson_bounds(3)]
+    [0.0, 2.996, 0.818, 7.754]
+    """
+    most = 10.0 + 2.0 * count
+    low = 0.0 if count == 0 else _bisect(lambda mean: 1.0 - _at_most(count - 1, mean), 0.0, most)
+    return low, _bisect(lambda mean: 1.0 - _at_most(count, mean) - 0.9, 0.0, 2.0 * most)
+
+
+def _at_most(count: int, mean: float) -> float:
+    """Probability of so many events, or fewer (Poisson)."""
+    term = total = math.exp(-mean)
+    for k in range(1, count + 1):
+        term *= mean / k
+        total += term
+    return total
+
+
+def _bisect(rising: Callable[[float], float], low: float, high: float) -> float:
+    """Where a function that rises comes to 0.05."""
+    for _ in range(100):
+        middle = 0.5 * (low + high)
+        low, high = (low, middle) if rising(middle) > 0.05 else (middle, high)
+    return high
 
 
 def bounds_text(low: float, high: float) -> str:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from enum import Enum
 from io import BytesIO
 from typing import Any, Self
@@ -17,6 +17,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from evofsm.core import (
+    DYNAMICS_PARTS,
+    Dynamics,
     EvolvingFSM,
     FSMModel,
     IntervalActions,
@@ -31,6 +33,8 @@ from evofsm.files import Place, ranges, storage
 from evofsm.guard.actions import Action, ActionSet, BoxActions, Choices, fixed, no_action
 from evofsm.guard.auditing.participants import outline, rebuild
 from evofsm.guard.defaults import BELIEF_TOLERANCE, TOLERANCE
+from evofsm.guard.learnt.actions import dynamics_for
+from evofsm.guard.learnt.risk import JUDGE_PARTS, LearntRisk
 from evofsm.guard.protocols import (
     INCOMPLETE,
     STALE,
@@ -94,13 +98,16 @@ class Guard:
         Number of actions, where an action is an index from 0.
     interval : float
         Time between two decisions [s].
-    judge : ActionJudge
-        Says how dangerous an action is. There is no default yet; for cars
-        `evofsm.driving.guard_for_cars` brings one.
+    judge : ActionJudge, optional
+        Says how dangerous an action is. Without one it is learnt from what happens
+        (`LearntRisk`); for cars `evofsm.driving.guard_for_cars` brings one that is told how cars
+        move.
     failed : callable, optional
-        From an observation to whether it is a failure; asked as an episode ends.
+        From an observation to whether it is a failure; asked as an episode ends. A learnt judge
+        also asks it beforehand, along each variable: so it knows of failures before the first.
     horizon : float, optional
-        What the machine's explanations call soon [s].
+        How far ahead a learnt judge looks, and what the machine's explanations call soon [s].
+        Without it a learnt judge looks as far as it finds that it has to.
     tolerance : float
         Highest risk that is accepted, in (0, 1).
     mode : Mode
@@ -123,8 +130,8 @@ class Guard:
     Raises
     ------
     ValueError
-        If there is no judge, neither a range of actions nor a number of them (or both), a number
-        is out of its range, or judge and machine were made for other actions or another interval.
+        If there is neither a range of actions nor a number of them (or both), a number is out of
+        its range, or judge and machine were made for other actions or another interval.
 
     Notes
     -----
@@ -162,24 +169,18 @@ class Guard:
         explaining: Explain | None = None,
         missing: Missing = Missing.PARTIAL,
     ) -> None:
-        if judge is None:
-            raise ValueError(
-                "a guard needs a judge that says how dangerous an action is: give judge=, an "
-                "ActionJudge (for cars: evofsm.driving.guard_for_cars)"
-            )
         actions = _actions(low, high, n_actions, width)
         interval = positive("interval", interval)
         soon = None if horizon is None else max(1, round(positive("horizon", horizon) / interval))
+        if judge is None:
+            judge = LearntRisk(interval, seed=seed)
+        dynamics = None
+        if machine is None and isinstance(judge, LearntRisk):
+            dynamics = dynamics_for(actions, soon)
         self._set_up(
             ActionReviser(judge, actions, tolerance=tolerance, mode=mode),
             interval=interval,
-            machine=machine
-            or EvolvingFSM(
-                actions.n_actions,
-                max_states=_MOST_STATES,
-                belief_tolerance=BELIEF_TOLERANCE,
-                failure_horizon=soon,
-            ),
+            machine=machine or _machine(actions, soon, dynamics),
             failed=failed,
             seed=seed,
             audit=audit,
@@ -280,6 +281,8 @@ class Guard:
             actions=self.actions if isinstance(self.actions, IntervalActions) else None,
             dt=interval,
         )
+        if machine is not None and machine.dynamics is not None:
+            machine.dynamics.told = failed
         self._frozen: FSMModel | None = None
         self._senses = Senses(missing, interval)
         self._under_way = False
@@ -296,6 +299,8 @@ class Guard:
     def learn(self, learn: bool) -> None:
         self._learn = learn
         self._under_way = False
+        if self.machine is not None and not learn:
+            self.machine.start_episode()
         self._frozen = None if learn or self.machine is None else self.machine.model()
 
     def freeze(self) -> None:
@@ -585,6 +590,8 @@ class Guard:
             elif failed and self.machine.state is not None:
                 self.machine.fail()
             self.machine.tell_of_failures()
+            if not failed:
+                self.machine.start_episode()
         if self.judge is not None and self.learn:
             self.judge.end(z, failed=failed)
         elif self.judge is not None:
@@ -737,6 +744,58 @@ class Guard:
                 missing=Missing(kept["missing"]),
                 **{name: kept[name] for name in ("interval", "learn", "seed")},
             )
+
+
+def learnt_guard(
+    low: ArrayLike | None = None,
+    high: ArrayLike | None = None,
+    *,
+    n_actions: int | None = None,
+    interval: float,
+    horizon: float | None = None,
+    seed: int = 0,
+    without: Sequence[str] = (),
+) -> Guard:
+    """A guard with the learnt judge, of which parts may be left out: to see what they are worth.
+
+    Parameters
+    ----------
+    low, high, n_actions, interval, horizon, seed
+        As in `Guard`.
+    without : sequence of str
+        Names of `JUDGE_PARTS` and of `evofsm.core.DYNAMICS_PARTS`.
+
+    Raises
+    ------
+    ValueError
+        If a part is of another name, or as in `Guard`.
+
+    Examples
+    --------
+    >>> guard = learnt_guard(low=-2.0, high=2.0, interval=0.02, without=("margin",))
+    >>> guard.judge.margin
+    0.0
+    """
+    if unknown := set(without) - {*JUDGE_PARTS, *DYNAMICS_PARTS}:
+        raise ValueError(f"there are no parts {sorted(unknown)}")
+    actions = _actions(low, high, n_actions, None)
+    soon = None if horizon is None else max(1, round(positive("horizon", horizon) / interval))
+    judge = LearntRisk(interval, seed=seed, without=[p for p in without if p in JUDGE_PARTS])
+    machine = _machine(actions, soon, dynamics_for(actions, soon, without))
+    return Guard(
+        low, high, n_actions=n_actions, interval=interval, seed=seed, judge=judge, machine=machine
+    )
+
+
+def _machine(actions: ActionSet, soon: int | None, dynamics: Dynamics | None) -> EvolvingFSM:
+    """With recommended settings."""
+    return EvolvingFSM(
+        actions.n_actions,
+        max_states=_MOST_STATES,
+        belief_tolerance=BELIEF_TOLERANCE,
+        failure_horizon=soon,
+        dynamics=dynamics,
+    )
 
 
 def _actions(

@@ -76,7 +76,9 @@ def n_features(m: int, a: int, *, box: bool) -> int:
 @compiled
 def scratch(m: int, a: int, p: int) -> Scratch:
     """Room for m variables, a numbers of an action and p features."""
-    return Scratch(np.empty(m), np.empty(m), np.empty(m), np.empty(m), np.empty(a), np.empty(a), np.empty(p))
+    return Scratch(
+        np.empty(m), np.empty(m), np.empty(m), np.empty(m), np.empty(a), np.empty(a), np.empty(p)
+    )
 
 
 @inner_kernel

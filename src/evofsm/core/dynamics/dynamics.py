@@ -25,7 +25,7 @@ from evofsm.core.validation import real_array, refuse_unusable, whole
 _Floats = NDArray[np.float64]
 
 #: Parts that can be left out, to see what each is worth.
-PARTS = ("stretches", "memory", "products", "lags", "jumps", "carried")
+DYNAMICS_PARTS = ("stretches", "memory", "products", "lags", "jumps", "carried")
 
 # Transitions before anything is expected.
 _FIRST = 15
@@ -83,7 +83,7 @@ class Dynamics:
         Number of stretches that are kept where somebody chooses among them (`keep`); of those that
         nobody has chosen yet, the newest, so that there are at most four times as many.
     without : sequence of str
-        Parts of `PARTS` that are left out.
+        Parts of `DYNAMICS_PARTS` that are left out.
 
     Raises
     ------
@@ -129,8 +129,10 @@ class Dynamics:
         self.size = self.choices or len(self.low)
         self.horizon = whole("horizon", horizon)
         self.n_stretches = whole("stretches", stretches)
-        if unknown := set(without) - set(PARTS):
-            raise ValueError(f"without names {sorted(unknown)}; there are {', '.join(PARTS)}")
+        if unknown := set(without) - set(DYNAMICS_PARTS):
+            raise ValueError(
+                f"without names {sorted(unknown)}; there are {', '.join(DYNAMICS_PARTS)}"
+            )
         self.without = frozenset(without)
         self.n_variables = 0
         self.told: Callable[[_Floats], bool] | None = None
@@ -353,7 +355,7 @@ class Dynamics:
             self._rescale(found)
             self.latest = Episode(safe, U[:T], found, failed)
             if "stretches" not in self.without:
-                self.remember(self._onsets(found))
+                self.remember(self.onsets(found))
         self.n_episodes += 1
 
     def _extremes(self, safe: _Floats) -> None:
@@ -379,7 +381,7 @@ class Dynamics:
         new = 0.8 * self.sums.scale + 0.2 * scale if known else scale
         self.sums.scale[:] = np.maximum(new, 1e-3 * np.sqrt(self.sums.variance) + 1e-300)
 
-    def _onsets(self, found: _Floats) -> list[int]:
+    def onsets(self, found: _Floats) -> list[int]:
         """Steps of an episode at which something large began."""
         size = np.abs(found / self.sums.scale).max(1)
         starts: list[int] = []
