@@ -295,7 +295,7 @@ class Guard:
     @learn.setter
     def learn(self, learn: bool) -> None:
         self._learn = learn
-        if hasattr(self.judge, "learning"):
+        if self.judge is not None and hasattr(self.judge, "learning"):
             self.judge.learning = learn
         self._under_way = False
         self._frozen = None if learn or self.machine is None else self.machine.model()
