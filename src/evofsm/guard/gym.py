@@ -127,6 +127,8 @@ class RevisedActions(gymnasium.Wrapper[Any, Any, Any, Any]):
             _both(to_acceleration, to_action) or _conversions(env.action_space, guard.actions),
             penalty,
         )
+        self.observe, self.failed = self._terms.observe, failed
+        self.to_acceleration, self.to_action = self._terms.to_guard, self._terms.to_env
         self.revision: Revision | None = None  #: the latest decision
         self._stream = _Stream(guard)
 
@@ -413,12 +415,12 @@ class _Terms:
         self.guard = guard
         self.observe = _flat(observe) if isinstance(observe, gymnasium.Space) else observe
         self._failed = failed
-        self._to_guard, self._to_env = conversions
+        self.to_guard, self.to_env = conversions
         self.penalty = penalty
 
     def proposal(self, action: Any) -> Proposal:
         """What was proposed, as the guard takes it."""
-        wanted = self._to_guard(action)
+        wanted = self.to_guard(action)
         if isinstance(self.guard.actions, BoxActions):
             return Proposal(self.guard.actions.checked("proposal", wanted))
         return Proposal(float(wanted))
@@ -427,7 +429,7 @@ class _Terms:
         """What is executed, as the environment takes it: the very proposal where it is kept."""
         if same_action(revision.executed, revision.proposed):
             return action
-        return self._to_env(revision.executed)
+        return self.to_env(revision.executed)
 
     def failed(self, info: dict[str, Any], terminated: bool) -> bool:
         """Whether a step ended in failure, but for what the guard finds itself."""
