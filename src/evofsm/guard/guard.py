@@ -298,6 +298,8 @@ class Guard:
     @learn.setter
     def learn(self, learn: bool) -> None:
         self._learn = learn
+        if self.judge is not None and hasattr(self.judge, "learning"):
+            self.judge.learning = learn
         self._under_way = False
         if self.machine is not None and not learn:
             self.machine.start_episode()
@@ -503,13 +505,18 @@ class Guard:
             return revision._replace(executed=int(revision.executed), advised=int(revision.advised))
         return revision
 
-    def take_in(self, situation: Situation, executed: Action) -> None:
+    def take_in(self, situation: Situation, proposal: Proposal, executed: Action) -> None:
         """Instead of `revise`, where it was decided elsewhere: learn from what was executed.
+
+        The reviser is asked all the same, as a judge may learn from that too; what it says is
+        not executed.
 
         Parameters
         ----------
         situation : Situation
             What `recognise` returned.
+        proposal : Proposal
+            What the controller wanted.
         executed : float or (d,) array_like
             An action of the set.
 
@@ -523,12 +530,14 @@ class Guard:
         >>> from evofsm.driving import guard_for_cars
         >>> guard = guard_for_cars(low=-2.5, high=2.5)
         >>> for k in range(2):
-        ...     guard.take_in(guard.recognise([9.0 - k, 20.0, 20.0], time=0.25 * k), -1.0)
+        ...     here = guard.recognise([9.0 - k, 20.0, 20.0], time=0.25 * k)
+        ...     guard.take_in(here, Proposal(1.0), executed=-1.0)
         >>> guard.machine.model().uses.sum()
         np.float64(1.0)
         """
         if self.audit is not None:
             raise ValueError("with an audit log a guard decides itself: call revise")
+        self.reviser.revise(situation, proposal)
         self._take_in(situation, fixed(executed))
 
     def _take_in(self, situation: Situation, executed: Action) -> None:
