@@ -543,7 +543,8 @@ class Guard:
     def _take_in(self, situation: Situation, executed: Action) -> None:
         self._decisions += 1
         if self.machine is not None and self.learn and self.machine.state is not None:
-            self.machine.act(self.actions.encode(executed), executed)
+            index = self.actions.encode(executed)
+            self.machine.act(index, index if isinstance(self.actions, Choices) else executed)
         if self.judge is not None and not (situation.intake and situation.intake & STALE):
             if not self.learn:
                 self.judge.follow(situation.observation, executed)
