@@ -455,11 +455,18 @@ class Dynamics:
             return None
         return np.array(self._Z[-3:]), np.array(self._U[n - 3 : n - 1])
 
-    def disturbances(self) -> Disturbances:
-        """Residuals of what is remembered, as they are seen now; number 0 is none at all."""
+    def disturbances(self, steps: int | None = None) -> Disturbances:
+        """Residuals of what is remembered, as they are seen now; number 0 is none at all.
+
+        Parameters
+        ----------
+        steps : int, optional
+            Of each of them; without it all that a stretch may have.
+        """
         m, count = self.n_variables, 1 + len(self.stretches)
+        steps = steps or self.horizon
         found = Disturbances(
-            np.zeros((count, self.horizon, m)),
+            np.zeros((count, steps, m)),
             np.full((count, m), -1.0),
             np.zeros((count, m)),
             np.zeros((count, m, m)),
@@ -468,7 +475,7 @@ class Dynamics:
         )
         carried = "carried" not in self.without
         for k, (Z, U, _) in enumerate(self.stretches, 1):
-            L = min(len(U) - 1, self.horizon)
+            L = min(len(U) - 1, steps)
             residuals(self.consequents, Z, U, L, carried, found.residuals[k])
         if "jumps" not in self.without:
             self._find_jumps(found)

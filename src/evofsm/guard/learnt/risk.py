@@ -26,9 +26,10 @@ from evofsm.core import (
     positive,
 )
 from evofsm.files import Place, storage
+from evofsm.guard.learnt.actions import LONGEST_STRETCH
 from evofsm.guard.learnt.backups import Backups
 from evofsm.guard.learnt.keeping import KIND, content_of, restore
-from evofsm.guard.learnt.remembering import Situations, choose
+from evofsm.guard.learnt.remembering import Situations, choose, failing_after
 from evofsm.guard.learnt.search import CHANGED, KEPT, NOTHING_PASSES, escapes, search, worth
 from evofsm.guard.protocols import Fallback, Judgement, Search, Situation, Trial
 
@@ -46,6 +47,9 @@ _MARGIN, _LARGEST, _FADES, _ADDED, _RATE = 3.0, 8.0, 0.9, 0.25, 0.001
 _RELEASE = 0.0
 # Disturbances are taken to be harder than they were by so many over the number of episodes.
 _CAUTION = 4.0
+# Steps that are looked ahead: at first, at least, at most; times those that it takes to fail, of
+# which so much is left an episode later.
+_HORIZON, _SHORTEST, _FARTHEST, _AHEAD, _LATEST = 64, 32, LONGEST_STRETCH, 1.5, 0.9
 # Backups closer than this are alike; an action that was used less often is tried.
 _ALIKE, _TRIES = 0.02, 8
 
@@ -60,6 +64,9 @@ class LearntRisk:
     ----------
     dt : float
         Time between two decisions [s].
+    horizon : float, optional
+        How far it looks ahead [s]. Without it, half as far again as it takes to fail where failure
+        can no longer be avoided, from 32 to 144 steps.
     seed : int
         Of the draws with which backups evolve and situations are chosen.
     without : sequence of str
@@ -91,8 +98,18 @@ class LearntRisk:
     LearntRisk(dt=0.02, seed=0)
     """
 
-    def __init__(self, dt: float, *, seed: int = 0, without: Sequence[str] = ()) -> None:
+    def __init__(
+        self,
+        dt: float,
+        *,
+        horizon: float | None = None,
+        seed: int = 0,
+        without: Sequence[str] = (),
+    ) -> None:
         self.dt = positive("dt", dt)
+        self.told_horizon = None if horizon is None else positive("horizon", horizon)
+        #: Steps that it looks ahead.
+        self.horizon = _HORIZON if horizon is None else max(1, round(horizon / self.dt))
         self.seed = operator.index(seed)
         if unknown := set(without) - set(JUDGE_PARTS):
             raise ValueError(f"without names {sorted(unknown)}; there are {', '.join(JUDGE_PARTS)}")
@@ -107,6 +124,7 @@ class LearntRisk:
         self.broken = 0
         self.n_studied = 0
         self.n_scanned = 0
+        self._takes = _HORIZON / _AHEAD
         self.situations = Situations()
         self.backups: Backups | None = None
         self.disturbances: Disturbances | None = None
@@ -201,7 +219,9 @@ class LearntRisk:
         self._ranks = np.array([backup, *(q for q in self._ranks if q != backup)])
         self._tight = how != KEPT
         tried = (
-            self._untried(best) if self.learning and how == NOTHING_PASSES and apart < _ALIKE else None
+            self._untried(best)
+            if self.learning and how == NOTHING_PASSES and apart < _ALIKE
+            else None
         )
         self._holds = how != NOTHING_PASSES
         if not self._holds and self._certified:
@@ -214,7 +234,8 @@ class LearntRisk:
         if tried is not None:
             best = tried
         action = np.reshape(dynamics.decode(best), np.shape(wanted))
-        judged = self._judged(situation, here, np.stack([proposal, best]))
+        certain = how == CHANGED and allowed == 0
+        judged = self._judged(situation, here, np.stack([proposal, best]), sure=int(certain))
         why = self.why(judged)
         if tried is not None:
             how_so = "what this does is hardly known, so it is tried"
@@ -252,11 +273,14 @@ class LearntRisk:
         be = "is" if self._lost == 1 else "are"
         return f"{self._lost} of {self._number} {be} survived by no backup"
 
-    def _judged(self, situation: Situation, here: Here, actions: _Floats) -> Judgement:
+    def _judged(
+        self, situation: Situation, here: Here, actions: _Floats, sure: int = 0
+    ) -> Judgement:
         assert self.disturbances is not None and self.backups is not None
         found = np.empty(len(self.disturbances.residuals))
         lost, left = np.zeros(len(actions)), np.zeros(len(actions))
-        for i, action in enumerate(actions):
+        left[len(actions) - sure :] = self.margin  # those that were found to pass
+        for i, action in enumerate(actions[: len(actions) - sure]):
             escapes(
                 self.dynamics.consequents,
                 here,
@@ -286,13 +310,13 @@ class LearntRisk:
         """Probability, with its interval, that something begins that is lost."""
         if math.isinf(lost):
             return 1.0, 0.0, 1.0
-        soon = self.dynamics.horizon * self.dt / max(self.exposure, 1e-300)
+        soon = self.horizon * self.dt / max(self.exposure, 1e-300)
         low, high = poisson_bounds(int(lost))
         return _within(lost * soon), _within(low * soon), _within(high * soon)
 
     def _allowed(self, tolerance: float) -> int:
         """How many of the disturbances need not be survived: their bound is within the tolerance."""
-        soon = self.dynamics.horizon * self.dt / max(self.exposure, 1e-300)
+        soon = self.horizon * self.dt / max(self.exposure, 1e-300)
         allowed = 0
         while allowed < 4 and _within(poisson_bounds(allowed + 1)[1] * soon) <= tolerance:
             allowed += 1
@@ -413,16 +437,28 @@ class LearntRisk:
                 evolving="backups" not in self.without,
             )
         best = self.backups.policies[self.backups.ranks]
-        self.situations.add(episode, self._tights, dynamics.horizon, random)
+        self.situations.add(episode, self._tights, self.horizon, random)
         known, enough = dynamics.consequents, len(self.situations)
         if "stretches" not in dynamics.without and len(known.sides) and enough > 3:
-            self.situations.scan(dynamics, best[:1], random)
+            self.situations.scan(dynamics, self.horizon, best[:1], random)
             self.n_scanned += 1
-        self.disturbances = choose(dynamics, self.situations, best[:2], self.harder, random)
+        if self.told_horizon is None and self.disturbances is not None and enough:
+            self._look_ahead(best[:_ASKED])
+        self.disturbances = choose(
+            dynamics, self.situations, self.horizon, best[:2], self.harder, random
+        )
         if len(known.sides) and enough >= 3:
             self._evolve(random)
         self._ranks = self.backups.ranks.copy()
         self._order = np.arange(len(self.disturbances.residuals))
+
+    def _look_ahead(self, policies: _Floats) -> None:
+        """As far as it takes to fail where nothing helps, and half as far again."""
+        assert self.disturbances is not None
+        if len(self.dynamics.consequents.sides):
+            after = failing_after(self.dynamics, self.situations, policies, self.disturbances)
+            self._takes = max(float(after), _LATEST * self._takes)
+            self.horizon = int(min(max(_AHEAD * self._takes, _SHORTEST), _FARTHEST))
 
     def _evolve(self, random: np.random.Generator) -> None:
         assert self.disturbances is not None and self.backups is not None
@@ -475,7 +511,12 @@ class LearntRisk:
         """
         content, arrays = storage.read(path, KIND.name)
         with storage.explained(path):
-            judge = cls(content["dt"], seed=content["seed"], without=content["without"])
+            judge = cls(
+                content["dt"],
+                horizon=content["told_horizon"],
+                seed=content["seed"],
+                without=content["without"],
+            )
             restore(judge, content, arrays)
         judge._forget()
         return judge
