@@ -614,7 +614,7 @@ def test_a_file_says_who_wrote_it_and_what_it_learnt_from(grown, tmp_path):
     for item, kind in ((grown, "machine"), (grown.model(), "model")):
         item.save(tmp_path / kind, provenance)
         header = storage.read_header(tmp_path / kind)
-        assert (header.kind, header.version) == (kind, 5)
+        assert (header.kind, header.version) == (kind, 6)
         assert header.library == __version__
         assert header.provenance == provenance
 
