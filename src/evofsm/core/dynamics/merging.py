@@ -2,8 +2,8 @@
 
 Features of an observation are counted from the first one, which is another one in each part. From
 another origin they are ``T phi``, with a matrix T of the shift d of variables: z_i becomes
-z_i + d_i and z_i z_j becomes (z_i + d_i) (z_j + d_j). So the sums of products of features, and of those with
-changes, become ``T A T'`` and ``T B``, exactly.
+z_i + d_i and z_i z_j becomes (z_i + d_i) (z_j + d_j). So the sums of products of features, and of
+those with changes, become ``T A T'`` and ``T B``, exactly.
 """
 
 from __future__ import annotations
