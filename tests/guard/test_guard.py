@@ -13,12 +13,15 @@ from evofsm import EvolvingFSM, Guard, IntervalActions, Labels
 from evofsm.driving.cars import guard_for_cars
 from evofsm.driving.revisers import Unrevised
 from evofsm.driving.risk.latent import LatentRisk
+from evofsm.files import sealed as chain
 from evofsm.files import storage
+from evofsm.guard.actions import BoxActions, Choices, same_action
+from evofsm.guard.auditing import participants
 from evofsm.guard.auditing.log import AuditLog
 from evofsm.guard.auditing.replay import audit
 from evofsm.guard.guard import Explain
-from evofsm.guard.protocols import Choices, Fallback, Judgement, Proposal
-from evofsm.guard.reviser import Mode
+from evofsm.guard.protocols import Fallback, Judgement, Proposal, Search
+from evofsm.guard.reviser import Mode, Way
 
 DT = 0.1
 PUSHES = (-4.0, -1.0, 0.0, 1.0, 4.0)
@@ -76,6 +79,9 @@ class Balance:
     def start_episode(self, *, learn=True):
         self._before = None
 
+    def end(self, observation, *, failed):
+        self.start_episode()
+
     def sums(self, n_states):
         return {"gust": self.gust}
 
@@ -88,12 +94,41 @@ class Balance:
         return cls(float(dt), bool(int(index)), float(gust))
 
 
+class Shares(Balance):
+    """Whose actions are vectors, of which the first component is a fourth of the push."""
+
+    def _push(self, actions):
+        return 4.0 * np.asarray(actions)[..., 0]
+
+
+class Searching(Shares):
+    """Looks for an action itself, in small steps towards the other side."""
+
+    def search(self, situation, wanted, /, *, tolerance, revising):
+        away = np.stack([np.linspace(wanted[0], side, 41) for side in (-1.0, 1.0)], axis=1).ravel()
+        options = np.column_stack([away, np.full(82, wanted[1])])
+        judged = self.judge(situation, options)
+        best = int(np.argmax(judged.risk <= tolerance))
+        if judged.risk[best] > tolerance:
+            best = int(judged.risk.argmin())
+        return Search(options, judged, best, "kept" if best == 0 else f"it would fall, {revising=}")
+
+
+def searching(**others):
+    return Guard(low=[-1.0, 0.0], high=[1.0, 9.0], interval=DT, judge=Searching(), **others)
+
+
 def continuous(**others):
     return Guard(low=-4.0, high=4.0, interval=DT, judge=Balance(), **others)
 
 
 def discrete(**others):
     return Guard(n_actions=len(PUSHES), interval=DT, judge=Balance(index=True), **others)
+
+
+def of_vectors(**others):
+    """Actions are a share of the push and something that has no effect."""
+    return Guard(low=[-1.0, 0.0], high=[1.0, 9.0], interval=DT, judge=Shares(), **others)
 
 
 def balance(guard, proposals, gusts=(), missing=()):
@@ -104,8 +139,13 @@ def balance(guard, proposals, gusts=(), missing=()):
         seen[[k in missing, False]] = math.nan
         revision = guard.decide(seen, proposal)
         said.append(revision)
-        push = revision.executed if isinstance(guard.actions, IntervalActions) else None
-        push = PUSHES[revision.executed] if push is None else push
+        match guard.actions:
+            case Choices():
+                push = PUSHES[revision.executed]
+            case BoxActions():
+                push = 4.0 * revision.executed[0]
+            case _:
+                push = revision.executed
         rate += (5.0 * math.sin(angle) + push) * DT + (gusts[k] if k < len(gusts) else 0.0)
         angle += rate * DT
         if abs(angle) > 0.8:
@@ -114,16 +154,20 @@ def balance(guard, proposals, gusts=(), missing=()):
     return said, abs(angle) > 0.8
 
 
-@pytest.fixture(params=[continuous, discrete])
+@pytest.fixture(params=[continuous, discrete, of_vectors, searching])
 def make(request):
     return request.param
 
 
 def pushes(make, count, seed=0):
     rng = np.random.default_rng(seed)
+    if make in (of_vectors, searching):
+        return list(rng.uniform([0.4, 2.0], [1.0, 3.0], (count, 2)))
     high = len(PUSHES) - 1 if make is discrete else 4.0
     return [int(p) if make is discrete else float(p) for p in rng.uniform(0.4 * high, high, count)]
 
+
+SMALL = {continuous: 1, discrete: 1, of_vectors: [0.25, 1.0], searching: [0.25, 1.0]}
 
 # -- What it decides ----------------------------------------------------------------------------
 
@@ -133,15 +177,16 @@ def test_it_holds_off_what_would_fall_without_it(make):
     assert balance(make(mode=Mode.OFF), wishes)[1]
     said, fell = balance(make(), wishes)
     assert not fell
-    assert any(one.executed != one.proposed for one in said)
+    assert any(not same_action(one.executed, one.proposed) for one in said)
     assert any("it would fall" in one.reason for one in said)
 
 
 @pytest.mark.parametrize("mode", [Mode.OFF, Mode.SHADOW, Mode.ADVISE])
 def test_looking_on_it_executes_what_is_proposed(make, mode):
     said, _ = balance(make(mode=mode), pushes(make, 10))
-    assert [one.executed for one in said] == [one.proposed for one in said]
-    assert any(one.advised != one.executed for one in said) == (mode is not Mode.OFF)
+    assert all(same_action(one.executed, one.proposed) for one in said)
+    advised = [not same_action(one.advised, one.executed) for one in said]
+    assert any(advised) == (mode is not Mode.OFF)
 
 
 @settings(max_examples=40, deadline=None)
@@ -248,7 +293,7 @@ def test_a_copy_goes_its_own_way(make, snapshot):
     first = balance(twin, pushes(make, 20, 2), gusts=[0.19])[0]
     assert (snapshot(guard.machine), guard.judge.gust) == before
     again = balance(bare, pushes(make, 20, 2), gusts=[0.19])[0]
-    assert [one.executed for one in first] == [one.executed for one in again]
+    assert repr([one.executed for one in first]) == repr([one.executed for one in again])
     assert bare.machine is None
 
 
@@ -260,7 +305,7 @@ def test_what_was_saved_goes_on_bit_for_bit(make, snapshot):
     balance(guard, pushes(make, 20))
     guard.save(file)
     file.seek(0)
-    again = Guard.load(file, judge=Balance)
+    again = Guard.load(file, judge=type(guard.judge))
     assert (again.reviser.tolerance, again.reviser.mode, again.seed) == (0.05, Mode.ADVISE, 7)
     assert (again.interval, again.actions) == (guard.interval, guard.actions)
     future = [repr(balance(one, pushes(make, 30, 3), gusts=[0.1])) for one in (guard, again)]
@@ -333,6 +378,198 @@ def test_choices_are_audited_and_replayed(tmp_path):
     assert audit(tmp_path / "other").replay == (3, (), (), None)
 
 
+def known(monkeypatch, *judges):
+    """As if an installed package declared these judges."""
+    points = dict(participants._entry_points())
+    for judge in judges:
+        points[judge.__name__] = SimpleNamespace(load=lambda judge=judge: judge)
+    monkeypatch.setattr(participants, "_entry_points", lambda: points)
+
+
+@pytest.mark.parametrize("vectors", [of_vectors, searching])
+def test_vectors_are_audited_and_replayed(tmp_path, monkeypatch, vectors):
+    known(monkeypatch, Shares, Searching)
+    path = tmp_path / "log"
+    with AuditLog(path) as log:
+        guard = vectors(audit=log)
+        for seed in range(2):
+            balance(guard, [*pushes(vectors, 12, seed), [math.nan, 1.0], [9.0, 1.0]])
+        guard.decide([0.0, 0.0], Proposal([0.1, 1.0], ([0.2, 1.0],)))
+        guard.decide([0.3, 0.3], Proposal([0.9, 1.0], ([0.2, 1.0],)))
+        guard.end(failed=True)
+    found = audit(path)
+    assert found.is_good, found
+    assert found.replay.decisions == found.contents.decisions == 30
+    assert not found.replay.not_replayed
+    assert 0 < found.contents.spoke < 30
+    older, head = [], chain.Head(0, chain.NOTHING)
+    for line in path.read_bytes().splitlines(keepends=True):
+        content = dict(chain.unseal(line).content)
+        content |= {"version": 2} if content["kind"] == "start" else {}
+        sealed, head = chain.seal(content, head)
+        older.append(sealed)
+    path.write_bytes(b"".join(older))
+    assert "in version 2 is '[" in audit(path).misfit.explanation  # which held numbers alone
+
+
+# -- Vectors ------------------------------------------------------------------------------------
+
+
+def test_an_array_of_length_one_is_a_vector_too():
+    guard = Guard(low=[-1.0], high=1.0, interval=DT, judge=Shares())
+    revision = guard.decide([0.1, 0.0], [0.1])
+    assert revision.executed.shape == revision.proposed.shape == revision.advised.shape == (1,)
+    assert Guard(low=np.float32(-1.0), high=1.0, interval=DT, judge=Balance()).actions.n_actions
+
+
+def test_of_a_vector_what_need_not_change_does_not():
+    revision = of_vectors().decide([0.2, 0.3], [0.9, 2.5])
+    assert revision.executed[0] < 0.9
+    assert revision.executed[1] == 2.5  # has no effect
+    assert revision.risk_executed <= 0.02 < revision.risk_proposed
+
+
+def test_vectors_of_a_revision_are_its_own():
+    wanted = np.array([0.1, 1.0])
+    revision = of_vectors().decide([0.0, 0.0], wanted)
+    wanted[:] = 9.0
+    assert revision.proposed.tolist() == revision.executed.tolist() == [0.1, 1.0]
+    for one in (revision.proposed, revision.executed, revision.advised):
+        with pytest.raises(ValueError, match="read-only"):
+            one[0] = 0.0
+
+
+@pytest.mark.parametrize("vectors", [of_vectors, searching])
+@pytest.mark.parametrize("mode", list(Mode))
+@settings(max_examples=15)
+@given(proposals=st.lists(st.none() | st.tuples(st.floats(), st.floats()), min_size=1, max_size=8))
+def test_whatever_vector_is_proposed_what_is_executed_can_be(vectors, mode, proposals):
+    guard = vectors(mode=mode)
+    for revision in balance(guard, proposals)[0]:
+        assert revision.executed in guard.actions
+        assert revision.advised in guard.actions
+        assert revision.reason
+
+
+def test_the_fallback_may_be_a_vector_or_a_number_for_all():
+    guard = of_vectors()
+    for fallback, executed in ((0.5, [0.5, 0.5]), ((-0.25, 7.0), [-0.25, 7.0]), (99.0, [1.0, 9.0])):
+        guard.judge.fallback = Fallback(fallback, "falling back")
+        guard.reviser.mode = Mode.OFF
+        revision = guard.decide([0.0, 0.0], [math.nan, 0.0])
+        assert revision.executed.tolist() == executed
+        assert (
+            revision.reason
+            == "no usable proposal (nan, 0)".replace("(", "((", 1) + "): falling back"
+        )
+
+
+def test_the_machine_is_told_the_cell(monkeypatch):
+    guard, told = of_vectors(mode=Mode.OFF), []
+    monkeypatch.setattr(
+        guard.machine, "act", lambda index, executed: told.append((index, executed.tolist()))
+    )
+    guard.decide([0.0, 0.0], [-1.0, 0.0])
+    guard.decide([0.0, 0.0], [1.0, 9.0])
+    assert told == [(0, [-1.0, 0.0]), (80, [1.0, 9.0])]
+
+
+# -- A judge's own search -----------------------------------------------------------------------
+
+
+def test_where_a_judge_searches_that_is_what_is_executed():
+    guard = searching()
+    first, second = (guard.decide([0.2, 0.3], [0.9, 2.5]) for _ in range(2))
+    assert "it would fall, revising=False" in first.reason
+    assert "it would fall, revising=True" in second.reason
+    assert first.risk_executed <= 0.02 < first.risk_proposed
+    assert "kept" in guard.decide([0.0, 0.0], [0.0, 2.5]).reason
+    assert "revising=False" in guard.decide([0.2, 0.3], [0.9, 2.5]).reason
+    guard.begin()
+    assert "revising=False" in guard.decide([0.2, 0.3], [0.9, 2.5]).reason
+
+
+@pytest.mark.parametrize("mode", [Mode.SHADOW, Mode.ADVISE, Mode.ACT])
+def test_in_every_mode_the_same_is_advised(mode):
+    guard = searching(mode=mode)
+    if mode is Mode.ACT:
+        guard.reviser.take_over()
+    revision = guard.decide([0.2, 0.3], [0.9, 2.5])
+    assert revision.executed.tolist() == [0.9, 2.5]
+    assert revision.advised.tolist() == searching().decide([0.2, 0.3], [0.9, 2.5]).advised.tolist()
+    assert revision.risk_executed == revision.risk_proposed
+
+
+def test_among_candidates_it_only_judges():
+    guard = searching()
+    guard.reviser.way = Way.CHOOSE
+    wanted = Proposal([0.9, 2.5], ([-0.9, 2.5], [-0.8, 1.0]))
+    assert guard.decide([0.2, 0.3], wanted).executed.tolist() == [-0.8, 1.0]
+
+
+def test_what_it_finds_outside_the_set_is_put_into_it():
+    class Bold(Searching):
+        def search(self, situation, wanted, /, **how):
+            return (
+                super()
+                .search(situation, wanted, **how)
+                ._replace(options=np.array([wanted, [-5.0, 20.0]]), best=1)
+            )
+
+    guard = Guard(low=[-1.0, 0.0], high=[1.0, 9.0], interval=DT, judge=Bold())
+    assert guard.decide([0.0, 0.0], [0.0, 2.0]).executed.tolist() == [-1.0, 9.0]
+
+
+# -- What a judge is told -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("learn", [True, False])
+def test_a_judge_is_told_how_an_episode_ended_where_it_learns(learn):
+    class Told(Balance):
+        ends = ()
+
+        def end(self, observation, *, failed):
+            self.ends += ((None if observation is None else observation.tolist(), failed),)
+            super().end(observation, failed=failed)
+
+    guard = Guard(low=-4.0, high=4.0, interval=DT, judge=Told(), failed=lambda z: abs(z[0]) > 0.8)
+    guard.learn = learn
+    for how in ({}, {"failed": True}, {"observation": [0.9, 0.0]}):
+        guard.decide([0.1, 0.0], 0.0)
+        guard.end(**how)
+        assert guard.judge._before is None
+    assert guard.judge.ends == ((None, False), (None, True), ([0.9, 0.0], True)) * learn
+
+
+def test_a_judge_that_cannot_learn_all_the_way_is_refused():
+    class Half(Balance):
+        end = None
+
+    with pytest.raises(ValueError, match=r"it lacks \['end'\]"):
+        Guard(low=-4.0, high=4.0, interval=DT, judge=Half())
+
+
+def test_a_judge_that_asks_the_machine_is_told_which_it_is(monkeypatch, tmp_path):
+    class Asking(Balance):
+        machine = None
+
+        def bind(self, machine):
+            self.machine = machine
+
+    known(monkeypatch, Asking)
+    guard = Guard(low=-4.0, high=4.0, interval=DT, judge=Asking())
+    assert guard.judge.machine is guard.machine
+    twin = guard.copy()
+    assert twin.judge.machine is twin.machine is not guard.machine
+    guard.save(tmp_path / "guard")
+    for again in (Guard.load(tmp_path / "guard"), Guard.load(tmp_path / "guard", judge=Asking)):
+        assert again.judge.machine is again.machine
+    with AuditLog(tmp_path / "log") as log:
+        guard.audit = log
+        balance(guard, pushes(continuous, 5))
+    assert audit(tmp_path / "log").replay.decisions == 5
+
+
 # -- What is refused ----------------------------------------------------------------------------
 
 
@@ -342,7 +579,10 @@ def test_choices_are_audited_and_replayed(tmp_path):
         ({"low": -1.0, "high": 1.0}, "needs a judge"),
         ({"judge": Balance()}, "give low and high of the action, or n_actions"),
         ({"low": -1.0, "high": 1.0, "n_actions": 3, "judge": Balance()}, "not both"),
-        ({"low": [-1.0, -1.0], "high": [1.0, 1.0], "judge": Balance()}, "several dimensions"),
+        ({"low": [-1.0, -1.0], "high": [1.0], "judge": Balance()}, "high has 1"),
+        ({"low": [-1.0], "high": [1.0], "width": 0.1, "judge": Balance()}, "width is of"),
+        ({"low": [-1.0], "high": [math.inf], "judge": Balance()}, "must be finite"),
+        ({"low": [-1.0], "high": [1.0], "judge": LatentRisk(-1.0, DT)}, "a vector of 1"),
         ({"low": 1.0, "high": -1.0, "judge": Balance()}, "low must be below high"),
         ({"n_actions": 0, "judge": Balance()}, "n_actions"),
         ({"n_actions": 4, "judge": Balance(index=True)}, "5 pushes"),
@@ -375,12 +615,13 @@ def test_what_is_refused_leaves_it_as_it_was(make, observation, proposal, snapsh
     guard, twin = make(), make()
     for one in (guard, twin):
         balance(one, pushes(make, 10))
-        one.decide([0.1, 0.0], 1)
+        one.decide([0.1, 0.0], SMALL[make])
     with pytest.raises((TypeError, ValueError)):
         guard.decide(observation, proposal)
     with pytest.raises((TypeError, ValueError)):
         guard.end(observation=[0.0])
-    assert repr(guard.decide([0.2, 0.1], 1)) == repr(twin.decide([0.2, 0.1], 1))
+    said = [repr(one.decide([0.2, 0.1], SMALL[make])) for one in (guard, twin)]
+    assert said[0] == said[1]
     assert snapshot(guard.machine) == snapshot(twin.machine)
     assert guard.judge.gust == twin.judge.gust
 

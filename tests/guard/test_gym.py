@@ -7,19 +7,23 @@ import pytest
 
 gymnasium = pytest.importorskip("gymnasium")
 
-from gymnasium.spaces import Box, MultiBinary  # noqa: E402
+from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete  # noqa: E402
 from gymnasium.utils.env_checker import check_env  # noqa: E402
 
 from evofsm.core.actions import IntervalActions  # noqa: E402
 from evofsm.core.machine import EvolvingFSM  # noqa: E402
+from evofsm.core.naming import Labels  # noqa: E402
+from evofsm.driving.cars import guard_for_cars  # noqa: E402
 from evofsm.driving.families.family import load_family  # noqa: E402
 from evofsm.driving.framework import Framework  # noqa: E402
 from evofsm.driving.revisers import Unrevised  # noqa: E402
 from evofsm.driving.risk.latent import LatentRisk  # noqa: E402
 from evofsm.driving.worlds.gym import CarFollowing  # noqa: E402
 from evofsm.driving.worlds.kinematic import KinematicWorld  # noqa: E402
+from evofsm.guard.auditing.log import AuditLog  # noqa: E402
 from evofsm.guard.guard import Guard  # noqa: E402
-from evofsm.guard.gym import RevisedActions  # noqa: E402
+from evofsm.guard.gym import RevisedActions, RevisedVectorActions  # noqa: E402
+from evofsm.guard.protocols import Fallback, Judgement, Search  # noqa: E402
 from evofsm.guard.reviser import ActionReviser, Mode  # noqa: E402
 
 FAMILY = load_family("emergency")
@@ -27,7 +31,7 @@ ACTIONS = FAMILY.actions
 EXAMPLES = Path(__file__).parents[2] / "examples"
 KEYS = {
     *("reviser/proposed_action", "reviser/executed_action", "reviser/reason"),
-    *("reviser/risk", "reviser/risk_proposed"),
+    *("reviser/risk", "reviser/risk_proposed", "reviser/penalty"),
 }
 FAR, NEAR, HIT = [90.0, 10.0, 10.0], [4.0, 20.0, 10.0], [-0.1, 18.0, 8.0]
 
@@ -325,6 +329,419 @@ def test_the_set_of_actions_may_be_coarser_than_the_environments():
     env = revise(Script(NEAR, NEAR), ActionReviser(LatentRisk(-2.0), actions))
     env.reset()
     assert env.step(np.array([2.5]))[-1]["reviser/executed_action"] == [-2.0]
+
+
+# -- Any other environment ---------------------------------------------------------------------
+
+
+class Spy:
+    """A judge of any system: some actions are dangerous, and what it is told it remembers."""
+
+    labels, fallback, dt = Labels(), Fallback(0.0, "nothing"), 0.1
+
+    def __init__(self, dangerous=lambda action: False):
+        self.dangerous = dangerous
+        self.rows, self.episodes, self.followed = [], [], 0
+
+    def judge(self, situation, actions):
+        risk = np.array([float(self.dangerous(action)) for action in actions])
+        return Judgement(risk, risk, risk, risk, 1.0)
+
+    def why(self, judged):
+        return "dangerous"
+
+    def trial(self):
+        return None
+
+    def effective(self, situation, actions):
+        return actions
+
+    def refuse_unfit(self, low, high):
+        pass
+
+    def learn(self, observation, action, belief):
+        action = np.atleast_1d(np.float32(action))  # as an environment takes it
+        self.rows.append((tuple(observation), tuple(action)))
+
+    watch = learn
+
+    def follow(self, observation, action):
+        self.followed += 1
+
+    def start_episode(self, *, learn=True):
+        self.rows = []
+
+    def end(self, observation, *, failed):
+        self.episodes.append(
+            (self.rows, None if observation is None else tuple(observation), failed)
+        )
+        self.rows = []
+
+    def sums(self, n_states):
+        return {}
+
+    def save(self, path, provenance=None):
+        pass
+
+    @classmethod
+    def load(cls, path):
+        return cls()
+
+
+def guard_for(space, judge, **others):
+    if isinstance(space, Discrete):
+        return Guard(n_actions=int(space.n), interval=0.1, judge=judge, **others)
+    return Guard(
+        low=space.low.ravel(), high=space.high.ravel(), interval=0.1, judge=judge, **others
+    )
+
+
+@pytest.mark.parametrize(
+    "space",
+    [
+        Box(-2.0, 2.0, (1,), np.float32),
+        Box(np.array([-1.0, 0.0]), np.array([1.0, 4.0]), dtype=np.float64),
+        Box(-1.0, 1.0, (2, 3), np.float32),
+        Discrete(3),
+        Discrete(3, start=-1),
+    ],
+)
+def test_actions_of_a_box_and_discrete_ones_need_nothing(space):
+    env = RevisedActions(Script(FAR, FAR, FAR, action_space=space), guard_for(space, Spy()))
+    env.reset()
+    space.seed(1)
+    for _ in range(2):
+        action = space.sample()
+        *_, info = env.step(action)
+        assert info["reviser/executed_action"] is not None
+        assert np.array_equal(env.env.executed[-1], action)
+        assert info["reviser/penalty"] == 0.0
+    assert len(env.guard.judge.episodes[0][0]) == 2
+
+
+@pytest.mark.parametrize(
+    ("space", "proposed", "executed", "size"),
+    [
+        (Discrete(3, start=-1), 1, 0, 1.0),
+        (Box(-2.0, 2.0, (1,), np.float32), [1.0], [0.5], 0.25),
+        (Box(-2.0, 2.0, (2, 1), np.float32), [[1.0], [2.0]], [[0.5], [0.5]], 10.0**0.5 / 4.0),
+        (Box(-2.0, 2.0, (1,), np.float32), [9.0], [0.5], 0.75),
+        (Box(-2.0, 2.0, (1,), np.float32), [math.nan], [0.0], 1.0),
+    ],
+)
+def test_a_change_is_executed_and_can_be_taken_off_the_reward(space, proposed, executed, size):
+    def dangerous(action):
+        return action == 2 if isinstance(space, Discrete) else (np.asarray(action) > 0.5).any()
+
+    class Half(Spy):  # finds what is nearest itself
+        def search(self, situation, wanted, *, tolerance, revising):
+            options = np.array([wanted, 1.0 if np.ndim(wanted) == 0 else np.minimum(wanted, 0.5)])
+            best = int(bool(dangerous(wanted)))
+            return Search(options, self.judge(situation, options), best, "nearest")
+
+    for penalty in (0.0, 3.0):
+        env = RevisedActions(
+            Script(FAR, FAR, FAR, action_space=space),
+            guard_for(space, Half(dangerous)),
+            penalty=penalty,
+        )
+        env.reset()
+        action = np.int64(proposed) if isinstance(space, Discrete) else np.array(proposed, "f4")
+        _, reward, _, _, info = env.step(action)
+        assert info["reviser/executed_action"] in space
+        assert np.array_equal(info["reviser/executed_action"], executed)
+        assert info["reviser/penalty"] == pytest.approx(size)
+        assert reward == pytest.approx(1.5 - penalty * size)
+
+
+@pytest.mark.parametrize(
+    ("space", "guarded"),
+    [
+        (MultiDiscrete([2, 2]), Discrete(4)),
+        (Discrete(3), Discrete(2)),
+        (Discrete(3), Box(0.0, 2.0, (1,))),
+        (Box(-1.0, 1.0, (2,)), Box(-1.0, 1.0, (3,))),
+        (Box(-1.0, 1.0, (1,)), Discrete(2)),
+    ],
+)
+def test_actions_that_are_not_the_guards_need_a_conversion(space, guarded):
+    env = Script(FAR, action_space=space)
+    with pytest.raises(ValueError, match=r"the environment's actions are .*, but the guard's are"):
+        RevisedActions(env, guard_for(guarded, Spy()))
+
+
+@pytest.mark.parametrize("penalty", [-1.0, math.nan, math.inf])
+def test_a_penalty_is_no_reward(penalty):
+    with pytest.raises(ValueError, match="penalty"):
+        revise(Script(FAR), penalty=penalty)
+
+
+@pytest.mark.parametrize(
+    ("space", "observation", "seen"),
+    [
+        (Box(0.0, 9.0, (2, 2)), np.array([[1.0, 2.0], [3.0, 4.0]]), (1.0, 2.0, 3.0, 4.0)),
+        (Box(0.0, 9.0, ()), np.array(2.0), (2.0,)),
+        (Box(0, 9, (2,), np.uint8), np.array([1, 2], np.uint8), (1.0, 2.0)),
+        (Discrete(3), 2, (0.0, 0.0, 1.0)),
+        (Discrete(3, start=5), 5, (1.0, 0.0, 0.0)),
+    ],
+)
+def test_observations_become_a_vector(space, observation, seen):
+    script = Script(observation, observation)
+    script.observation_space = space
+    env = RevisedActions(script, guard_for(script.action_space, Spy()))
+    env.reset()
+    env.step(np.array([0.0]))
+    assert env.guard.judge.episodes == [([(seen, (0.0,))], seen, True)]
+
+
+def test_observations_of_other_kinds_need_a_function():
+    script = Script({"a": 3.0}, {"a": 4.0})
+    script.observation_space = Dict({"a": Box(0.0, 9.0, ())})
+    guard = guard_for(script.action_space, Spy())
+    with pytest.raises(ValueError, match="give observe"):
+        RevisedActions(script, guard)
+    env = RevisedActions(script, guard, lambda observation: [observation["a"]])
+    env.reset()
+    env.step(np.array([0.0]))
+    assert guard.judge.episodes == [([((3.0,), (0.0,))], (4.0,), True)]
+
+
+@pytest.mark.parametrize(
+    ("settings", "own", "terminates", "failed"),
+    [
+        ({}, None, True, True),  # nobody says otherwise
+        ({}, None, False, False),
+        ({}, lambda z: z[0] < 0.0, True, False),  # the guard knows
+        ({}, lambda z: z[0] > 0.0, True, True),
+        ({"failed": lambda info: False}, None, True, False),
+        ({"failed": lambda info: info["of"] == "step"}, None, False, True),
+    ],
+)
+def test_what_is_terminated_has_failed_unless_somebody_says_otherwise(
+    settings, own, terminates, failed
+):
+    script = Script(FAR, FAR, terminates=terminates)
+    guard = guard_for(script.action_space, Spy(), failed=own)
+    env = RevisedActions(script, guard, **settings)
+    env.reset()
+    env.step(np.array([0.0]))
+    env.reset()
+    assert [ended[-1] for ended in guard.judge.episodes] == [failed]
+    assert guard.machine.endings.sum() == failed
+
+
+@pytest.mark.parametrize("name", ["CartPole-v1", "Pendulum-v1", "FrozenLake-v1"])
+def test_environments_of_gymnasium_need_nothing_else(name):
+    inner = gymnasium.make(name, max_episode_steps=30)
+    guard = guard_for(inner.action_space, Spy())
+    env = RevisedActions(inner, guard)
+    env.action_space.seed(0)
+    for seed in range(2):
+        drive(env, lambda *_: env.action_space.sample(), seed=seed)
+    assert len(guard.judge.episodes) == 2
+    assert guard.machine.endings.sum() == (0 if name == "Pendulum-v1" else 2)
+
+
+# -- Many at once ------------------------------------------------------------------------------
+
+
+class Recorder(gymnasium.Wrapper):
+    """Writes down each episode as it ends, as the environment itself knows it."""
+
+    ended = None  # of all recorders of a test
+
+    def reset(self, **how):
+        observation, info = self.env.reset(**how)
+        self.last, self.rows = observation, []
+        return observation, info
+
+    def step(self, action):
+        answer = self.env.step(action)
+        observation, _, terminated, truncated, info = answer
+        self.rows.append((tuple(map(float, self.last)), tuple(np.atleast_1d(action).tolist())))
+        self.last = observation
+        if terminated or truncated:
+            self.ended.append((self.rows, tuple(map(float, observation)), terminated))
+        info["length"] = len(self.rows)
+        return answer
+
+
+MODES = NEXT_STEP, SAME_STEP, DISABLED = list(gymnasium.vector.AutoresetMode)
+
+
+def recorded(name, count, mode, steps):
+    """A vector of environments, and the list of the episodes that ended in it."""
+    ended = []
+
+    def make():
+        recorder = Recorder(gymnasium.make(name, max_episode_steps=steps))
+        recorder.ended = ended
+        return recorder
+
+    return gymnasium.vector.SyncVectorEnv([make] * count, autoreset_mode=mode), ended
+
+
+def drive_all(envs, steps, seed=0, reset=True):
+    """Random actions; where nothing resets by itself, what is over is reset."""
+    envs.action_space.seed(seed)
+    if reset:
+        envs.reset(seed=seed)
+    said = []
+    for _ in range(steps):
+        _, _, terminated, truncated, infos = envs.step(envs.action_space.sample())
+        over = terminated | truncated
+        said.append((over, infos))
+        if (
+            envs.metadata["autoreset_mode"] is gymnasium.vector.AutoresetMode.DISABLED
+            and over.any()
+        ):
+            envs.reset(options={"reset_mask": over})
+    return said
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize(("name", "steps"), [("CartPole-v1", 15), ("Pendulum-v1", 7)])
+def test_what_each_meets_is_learnt_whole_and_nothing_across_a_reset(name, steps, mode):
+    envs, ended = recorded(name, 3, mode, steps)
+    guard = guard_for(envs.single_action_space, Spy(lambda action: np.max(action) > 0.5))
+    revised = RevisedVectorActions(envs, guard)
+    drive_all(revised, 43)
+    assert len(ended) > 6
+    assert guard.judge.episodes == ended
+    assert guard.machine.endings.sum() == sum(failed for *_, failed in ended)
+    assert guard.machine.model().uses.sum() == sum(len(rows) for rows, *_ in ended)
+    before = len(ended)
+    revised.reset(seed=9)  # those under way end as they are
+    assert len(guard.judge.episodes) == before + 3
+    envs.close()
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_infos_are_arrays_with_masks(mode):
+    envs, _ = recorded("Pendulum-v1", 2, mode, 5)
+    guard = guard_for(envs.single_action_space, Spy(lambda action: np.max(action) > 0.5))
+    revised = RevisedVectorActions(envs, guard)
+    resets = 0
+    for over, infos in drive_all(revised, 13):
+        assert KEYS | {f"_{key}" for key in KEYS} <= infos.keys()
+        resets += not infos["_reviser/reason"].any()
+        assert all(len(set(infos[f"_{key}"].tolist())) == 1 for key in KEYS)
+        for key in ("proposed", "executed"):
+            assert infos[f"reviser/{key}_action"].shape == (2, 1)
+            assert infos[f"reviser/{key}_action"].dtype == np.float32
+        assert infos["reviser/risk"].shape == infos["reviser/penalty"].shape == (2,)
+        assert infos["reviser/reason"].dtype == object
+        assert over.shape == (2,)
+    assert resets == (2 if mode is NEXT_STEP else 0)
+    assert all(revision.executed[0] <= 0.5 for revision in revised.revisions)
+    envs.close()
+
+
+def test_a_step_that_only_resets_is_no_decision():
+    envs, _ = recorded("Pendulum-v1", 1, NEXT_STEP, 3)
+    guard = guard_for(envs.single_action_space, Spy(lambda action: np.max(action) > 0.5))
+    revised = RevisedVectorActions(envs, guard, penalty=2.0)
+    revised.reset(seed=0)
+    wanted = np.array([[2.0]], np.float32)
+    for step in range(1, 9):
+        _, rewards, _, _, infos = revised.step(wanted)
+        resets = step in (4, 8)
+        assert infos["_reviser/executed_action"].tolist() == [not resets]
+        executed = 2.0 if resets else 6.0 / 17.0  # the end of an interval of actions
+        assert infos["reviser/executed_action"] == pytest.approx(executed)
+        assert infos["reviser/penalty"] == pytest.approx((2.0 - executed) / 2.0)
+        assert not resets or rewards == [0.0]
+    envs.close()
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_a_failure_is_told_by_its_own_info(mode):
+    envs, ended = recorded("CartPole-v1", 3, mode, 12)
+    guard = guard_for(envs.single_action_space, Spy())
+    asked = []
+
+    def failed(info):
+        asked.append(info)
+        return info["length"] == 12
+
+    drive_all(RevisedVectorActions(envs, guard, failed=failed), 60)
+    assert [failed for *_, failed in guard.judge.episodes] == [
+        len(rows) == 12 for rows, *_ in ended
+    ]
+    assert {type(info["length"]) for info in asked} <= {int, np.int64}
+    assert all("_length" not in info for info in asked)
+    envs.close()
+
+
+def test_an_episode_is_decided_by_what_was_learnt_before_it_began():
+    class Once(Spy):
+        def judge(self, situation, actions):
+            self.dangerous = lambda action: bool(self.episodes) and action > 0.5
+            return super().judge(situation, actions)
+
+    envs, _ = recorded("Pendulum-v1", 2, SAME_STEP, 4)
+    guard = Guard(low=-2.0, high=2.0, interval=0.1, judge=Once())
+    revised = RevisedVectorActions(envs, guard)
+    revised.reset(seed=0)
+    full = np.full((2, 1), 2.0, np.float32)
+    executed = [revised.step(full)[-1]["reviser/executed_action"].ravel() for _ in range(8)]
+    assert (np.array(executed[:4]) == 2.0).all()
+    assert (np.array(executed[4:]) <= 0.5).all()
+    assert guard.judge.followed == 0  # the twins followed
+    envs.close()
+
+
+def test_frozen_many_decide_as_one_does():
+    guard = guard_for_cars(-2.5, 2.5)
+    drive(RevisedActions(CarFollowing(FAMILY), guard), full_throttle, seed=5)
+    guard.freeze()
+    machine = guard.machine.model().uses.sum()
+    envs = gymnasium.vector.SyncVectorEnv([lambda: CarFollowing(FAMILY)] * 2)
+    revised = RevisedVectorActions(envs, guard)
+    revised.reset(seed=3)
+    told = [revised.step(np.full((2, 1), 2.5))[-1]["reviser/executed_action"] for _ in range(40)]
+    for k in range(2):
+        env = RevisedActions(CarFollowing(FAMILY), guard)
+        alone = [i["reviser/executed_action"] for i in drive(env, full_throttle, seed=3 + k)]
+        count = min(len(alone), 40)
+        assert [one[k].tolist() for one in told][:count] == [one.tolist() for one in alone][:count]
+    assert guard.machine.model().uses.sum() == machine
+    envs.close()
+
+
+def test_cars_are_kept_from_colliding_in_many_environments():
+    envs = gymnasium.vector.SyncVectorEnv([lambda: CarFollowing(FAMILY)] * 3)
+    guard = guard_for_cars(FAMILY.actions.low, FAMILY.actions.high, FAMILY.interval)
+    revised = RevisedVectorActions(envs, guard, failed=lambda info: bool(info["failed"]))
+    collisions = 0
+    revised.reset(seed=1)
+    for _ in range(400):
+        *_, infos = revised.step(np.full((3, 1), 2.5))
+        collisions += infos["failed"].sum()
+    assert collisions == guard.machine.endings.sum() <= 1
+    assert guard.judge.brakes.known
+    envs.close()
+
+
+def test_environments_that_are_a_vector_by_themselves_are_driven_too():
+    envs = gymnasium.make_vec("CartPole-v1", num_envs=3, vectorization_mode="vector_entry_point")
+    guard = guard_for(envs.single_action_space, Spy())
+    ended = [over.copy() for over, _ in drive_all(RevisedVectorActions(envs, guard), 60)]
+    assert len(guard.judge.episodes) == np.sum(ended)
+    assert all(failed for *_, failed in guard.judge.episodes)
+    assert all(abs(last[0]) > 2.4 or abs(last[2]) > 0.2 for _, last, _ in guard.judge.episodes)
+    envs.close()
+
+
+def test_a_guard_with_an_audit_log_is_not_shared(tmp_path):
+    envs, _ = recorded("CartPole-v1", 2, NEXT_STEP, 12)
+    with AuditLog(tmp_path / "log") as log:
+        guard = guard_for(envs.single_action_space, Spy(), audit=log)
+        with pytest.raises(ValueError, match="one episode at a time"):
+            RevisedVectorActions(envs, guard)
+        with pytest.raises(ValueError, match="call revise"):
+            guard.take_in(guard.recognise([0.0], 0.0), 0)
 
 
 # -- The examples ------------------------------------------------------------------------------

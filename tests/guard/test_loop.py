@@ -192,14 +192,19 @@ def test_machine_and_risk_are_told_what_was_executed(learn, monkeypatch):
     machine.learn_many([[8.0, 0.0, 0.0]], [0])
     acted = []
     act = EvolvingFSM.act
-    monkeypatch.setattr(EvolvingFSM, "act", lambda self, i: (acted.append(i), act(self, i))[1])
+
+    def listen(machine, i, executed):
+        acted.append((i, executed))
+        act(machine, i, executed)
+
+    monkeypatch.setattr(EvolvingFSM, "act", listen)
     risk = Listening(lowest=-2.5)
     told = drive(Script(1.0), AlwaysBrake(ACTIONS), machine=machine, judge=risk, learn=learn)
     heard, deaf = (risk.learnt, risk.followed) if learn else (risk.followed, risk.learnt)
     assert [acceleration for _, acceleration in heard] == told.executed.tolist()
     assert [seen for seen, _ in heard] == [d.situation.observation.tolist() for d in told.decisions]
     assert deaf == []
-    assert acted == ([0] * len(told.decisions) if learn else [])
+    assert acted == ([(0, -2.5)] * len(told.decisions) if learn else [])
     assert (told.executed == -2.5).all()
 
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from evofsm.driving.worlds.road import Episode, World
 from evofsm.driving.worlds.scenario import Scenario
-from evofsm.guard import Controller, Guard, Proposal, Revision, Situation
+from evofsm.guard import BoxActions, Controller, Guard, Proposal, Revision, Situation, make_usable
 
 _log = logging.getLogger(__name__)
 
@@ -71,7 +71,7 @@ class Framework:
     Raises
     ------
     ValueError
-        If the guard has no interval.
+        If the guard has no interval, or its actions are vectors.
 
     Examples
     --------
@@ -90,6 +90,8 @@ class Framework:
     def __init__(self, controller: Controller, guard: Guard) -> None:
         if guard.interval is None:
             raise ValueError("the guard was made without an interval, the time between decisions")
+        if isinstance(guard.actions, BoxActions):
+            raise ValueError("the guard's actions are vectors, but a car is driven by one number")
         self.interval: float = guard.interval
         self.controller = controller
         self.guard = guard
@@ -122,7 +124,6 @@ class Framework:
 
     def _ask(self, situation: Situation) -> Proposal:
         """What the controller proposes, seeing the latest values; NaN where it fails to."""
-        actions = self.guard.actions
         try:
             proposal = self.controller.propose(self.guard.held, situation.time)
             action = float(proposal.action)
@@ -132,7 +133,7 @@ class Framework:
             return Proposal(math.nan)
         if not math.isfinite(action):
             _log.warning("controller proposed %g at %g s", action, situation.time)
-        elif not actions.low <= action <= actions.high:
+        elif make_usable(Proposal(action), self.guard.actions).remark:
             _log.info("controller proposed %g at %g s, outside the set", action, situation.time)
         return Proposal(action, candidates)
 

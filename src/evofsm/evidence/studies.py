@@ -6,6 +6,7 @@ from typing import Any
 
 from evofsm.evidence.closed_loop.plan import Plan as ClosedLoop
 from evofsm.evidence.detection.plan import Plan as Detection
+from evofsm.evidence.judges.plan import Plan as Judges
 from evofsm.evidence.paper.plan import Plan as Paper
 from evofsm.evidence.prediction.plan import Plan as Prediction
 from evofsm.evidence.real.plan import Plan as Real
@@ -14,5 +15,6 @@ from evofsm.evidence.study import Study
 
 #: By id. The paper's is a command of its own, ``evofsm paper``.
 STUDIES: dict[str, type[Study[Any]]] = {
-    study.id: study for study in (Paper, ClosedLoop, Detection, Prediction, Sensitivity, Real)
+    study.id: study
+    for study in (Paper, ClosedLoop, Judges, Detection, Prediction, Sensitivity, Real)
 }

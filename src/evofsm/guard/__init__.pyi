@@ -1,3 +1,8 @@
+from .actions import Action as Action
+from .actions import ActionSet as ActionSet
+from .actions import BoxActions as BoxActions
+from .actions import Choices as Choices
+from .actions import same_action as same_action
 from .auditing.form import Misfit as Misfit
 from .auditing.log import AuditLog as AuditLog
 from .auditing.participants import participant_class as participant_class
@@ -13,9 +18,9 @@ from .defaults import TOLERANCE as TOLERANCE
 from .guard import Explain as Explain
 from .guard import Guard as Guard
 from .gym import RevisedActions as RevisedActions
+from .gym import RevisedVectorActions as RevisedVectorActions
 from .protocols import ActionJudge as ActionJudge
-from .protocols import ActionSet as ActionSet
-from .protocols import Choices as Choices
+from .protocols import AsksMachine as AsksMachine
 from .protocols import Controller as Controller
 from .protocols import Fallback as Fallback
 from .protocols import Intake as Intake
@@ -26,6 +31,8 @@ from .protocols import Proposal as Proposal
 from .protocols import Reviser as Reviser
 from .protocols import Revision as Revision
 from .protocols import RiskMeasure as RiskMeasure
+from .protocols import Search as Search
+from .protocols import SearchingJudge as SearchingJudge
 from .protocols import Situation as Situation
 from .protocols import Trial as Trial
 from .protocols import Witness as Witness

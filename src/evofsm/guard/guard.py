@@ -28,14 +28,14 @@ from evofsm.core import (
     refuse_unusable,
 )
 from evofsm.files import Place, ranges, storage
+from evofsm.guard.actions import Action, ActionSet, BoxActions, Choices, fixed, no_action
 from evofsm.guard.auditing.participants import outline, rebuild
 from evofsm.guard.defaults import BELIEF_TOLERANCE, TOLERANCE
 from evofsm.guard.protocols import (
     INCOMPLETE,
     STALE,
     ActionJudge,
-    ActionSet,
-    Choices,
+    AsksMachine,
     Fallback,
     Intake,
     LearningJudge,
@@ -63,6 +63,8 @@ class Explain(Enum):
     ALL = "all"
 
 
+# What a judge has that learns.
+_LEARNS = ("dt", "learn", "watch", "follow", "start_episode", "end", "sums", "save", "load")
 # The files of the machine and of the judge, as bytes.
 _BYTE = ranges.Range(0.0, 255.0, whole=True)
 _KIND = ranges.register(
@@ -85,8 +87,9 @@ class Guard:
 
     Parameters
     ----------
-    low, high : float, optional
-        Range of the action, where that is one number.
+    low, high : float or (d,) array_like, optional
+        Range of the action, where that is one number; of each component where they are arrays:
+        then actions are vectors, also of length 1.
     n_actions : int, optional
         Number of actions, where an action is an index from 0.
     interval : float
@@ -107,7 +110,8 @@ class Guard:
     machine : EvolvingFSM, optional
         Recognises and learns; without it one with recommended settings is made.
     width : float, optional
-        Width of an interval of actions, for the machine; without it a 17th of the range.
+        Width of an interval of actions, for the machine; without it a 17th of the range. Vectors
+        lie in the cells of a grid instead (`BoxActions`).
     audit : Witness, optional
         Records what is decided: an `AuditLog`.
     explaining : Explain, optional
@@ -119,9 +123,8 @@ class Guard:
     Raises
     ------
     ValueError
-        If there is no judge, neither a range of actions nor a number of them (or both), an action
-        has several dimensions, a number is out of its range, or judge and machine were made for
-        other actions or another interval.
+        If there is no judge, neither a range of actions nor a number of them (or both), a number
+        is out of its range, or judge and machine were made for other actions or another interval.
 
     Notes
     -----
@@ -142,8 +145,8 @@ class Guard:
 
     def __init__(
         self,
-        low: float | None = None,
-        high: float | None = None,
+        low: ArrayLike | None = None,
+        high: ArrayLike | None = None,
         *,
         n_actions: int | None = None,
         interval: float,
@@ -192,7 +195,7 @@ class Guard:
         ----------
         reviser : Reviser
             Any; what it returns is executed.
-        actions : IntervalActions or Choices, optional
+        actions : IntervalActions, Choices or BoxActions, optional
             The set of actions; without it the reviser's own.
         interval : float, optional
             Time between decisions [s]; an observation that comes later than 1.5 of them begins an
@@ -243,6 +246,11 @@ class Guard:
         asked = reviser.risk if isinstance(reviser, ActionReviser) else judge
         if judge is None and isinstance(asked, LearningJudge):
             judge = asked
+        elif judge is None and hasattr(asked, "learn"):
+            lacks = [name for name in _LEARNS if getattr(asked, name, None) is None]
+            raise ValueError(
+                f"the judge has a method learn, but not all of a LearningJudge: it lacks {lacks}"
+            )
         if judge and self.interval and not math.isclose(judge.dt, self.interval):
             raise ValueError(
                 f"interval is {interval} s, but the judge was made for decisions every {judge.dt} s"
@@ -252,6 +260,9 @@ class Guard:
                 f"the machine has {machine.n_actions} actions, but the set has "
                 f"{self.actions.n_actions}"
             )
+        for one in (asked, judge):
+            if machine is not None and isinstance(one, AsksMachine):
+                one.bind(machine)
         self.reviser = reviser
         self.machine = machine
         #: Learns from what happens; None where nothing but the machine does.
@@ -333,7 +344,7 @@ class Guard:
     def decide(
         self,
         observation: ArrayLike,
-        proposal: Proposal | float | None,
+        proposal: Proposal | ArrayLike | None,
         time: float | None = None,
     ) -> Revision:
         """What to execute instead of a proposal; the proposal itself where that will do.
@@ -342,8 +353,9 @@ class Guard:
         ----------
         observation : (m,) array_like
             NaN where a variable was not observed.
-        proposal : float, Proposal or None
-            What the controller wants; None, or NaN, where it has nothing.
+        proposal : float, (d,) array_like, Proposal or None
+            What the controller wants; None, or NaN, where it has nothing. A vector where the set
+            of actions is a box.
         time : float, optional
             Of the observation, in this episode [s]; without it decisions are counted, one every
             `interval`.
@@ -351,7 +363,8 @@ class Guard:
         Returns
         -------
         Revision
-            What is executed is a whole number, of type int, where actions are `Choices`.
+            What is executed is a whole number, of type int, where actions are `Choices`, and an
+            array that is read only where they are `BoxActions`.
 
         Raises
         ------
@@ -367,14 +380,22 @@ class Guard:
         (-2.5, 1.0)
         """
         if isinstance(proposal, Proposal):
-            others = tuple(float(candidate) for candidate in proposal.candidates)
-            proposal = Proposal(float(proposal.action), others)
+            others = tuple(self._proposed(candidate) for candidate in proposal.candidates)
+            proposal = Proposal(self._proposed(proposal.action), others)
+        elif proposal is None:
+            proposal = Proposal(no_action(self.actions))
         else:
-            proposal = Proposal(math.nan if proposal is None else float(proposal))
+            proposal = Proposal(self._proposed(proposal))
         if time is None:
             count = self._decisions if self._under_way else 0
             time = math.nan if self.interval is None else count * self.interval
         return self.revise(self.recognise(observation, time), proposal)
+
+    def _proposed(self, action: ArrayLike) -> Action:
+        """An action of the right type, whatever its values."""
+        if isinstance(self.actions, BoxActions):
+            return self.actions.checked("proposal", action)
+        return float(action)  # type: ignore[arg-type]
 
     def recognise(self, observation: ArrayLike, time: float) -> Situation:
         """The first half of `decide`: where the system is at ``time`` [s].
@@ -472,10 +493,43 @@ class Guard:
         revision = self._explained(situation, self.reviser.revise(situation, proposal))
         if self.audit is not None:
             self.audit.decided(situation, proposal, revision)
-        executed = revision.executed
+        self._take_in(situation, revision.executed)
+        if isinstance(self.actions, Choices):
+            return revision._replace(executed=int(revision.executed), advised=int(revision.advised))
+        return revision
+
+    def take_in(self, situation: Situation, executed: Action) -> None:
+        """Instead of `revise`, where it was decided elsewhere: learn from what was executed.
+
+        Parameters
+        ----------
+        situation : Situation
+            What `recognise` returned.
+        executed : float or (d,) array_like
+            An action of the set.
+
+        Raises
+        ------
+        ValueError
+            If there is an audit log, which could not be replayed then.
+
+        Examples
+        --------
+        >>> from evofsm.driving import guard_for_cars
+        >>> guard = guard_for_cars(low=-2.5, high=2.5)
+        >>> for k in range(2):
+        ...     guard.take_in(guard.recognise([9.0 - k, 20.0, 20.0], time=0.25 * k), -1.0)
+        >>> guard.machine.model().uses.sum()
+        np.float64(1.0)
+        """
+        if self.audit is not None:
+            raise ValueError("with an audit log a guard decides itself: call revise")
+        self._take_in(situation, fixed(executed))
+
+    def _take_in(self, situation: Situation, executed: Action) -> None:
         self._decisions += 1
         if self.machine is not None and self.learn and self.machine.state is not None:
-            self.machine.act(self.actions.encode(executed))
+            self.machine.act(self.actions.encode(executed), executed)
         if self.judge is not None and not (situation.intake and situation.intake & STALE):
             if not self.learn:
                 self.judge.follow(situation.observation, executed)
@@ -483,9 +537,6 @@ class Guard:
                 watched = isinstance(self.reviser, ActionReviser) and not self.reviser.acts
                 take_in = self.judge.watch if watched else self.judge.learn
                 take_in(situation.observation, executed, situation.belief)
-        if isinstance(self.actions, Choices):
-            return revision._replace(executed=int(executed), advised=int(revision.advised))
-        return revision
 
     def _explained(self, situation: Situation, revision: Revision) -> Revision:
         """With what the machine has seen come of what is executed, where that is asked for."""
@@ -534,8 +585,10 @@ class Guard:
             elif failed and self.machine.state is not None:
                 self.machine.fail()
             self.machine.tell_of_failures()
-        if self.judge is not None:
-            self.judge.start_episode(learn=self.learn)
+        if self.judge is not None and self.learn:
+            self.judge.end(z, failed=failed)
+        elif self.judge is not None:
+            self.judge.start_episode(learn=False)
         self._under_way = False
         if self.audit is not None:
             self.audit.ended(z, failed=failed)
@@ -687,7 +740,7 @@ class Guard:
 
 
 def _actions(
-    low: float | None, high: float | None, n_actions: int | None, width: float | None
+    low: ArrayLike | None, high: ArrayLike | None, n_actions: int | None, width: float | None
 ) -> ActionSet:
     if n_actions is not None:
         if (low, high, width) != (None, None, None):
@@ -695,11 +748,21 @@ def _actions(
         return Choices(n_actions)
     if low is None or high is None:
         raise ValueError("give low and high of the action, or n_actions")
-    if np.size(low) != 1 or np.size(high) != 1:
-        raise ValueError("an action of several dimensions cannot be guarded yet; low is one number")
+    if np.ndim(low) or np.ndim(high):
+        if width is not None:
+            raise ValueError("width is of an action that is one number; leave it out")
+        return BoxActions(*_as_long(low, high))
     least, most = np.asarray(low, np.float64).item(), np.asarray(high, np.float64).item()
     width = (most - least) / _INTERVALS if width is None and least < most else width
     return IntervalActions(least, most, width or 1.0, outside="clip")
+
+
+def _as_long(low: ArrayLike, high: ArrayLike) -> tuple[Any, Any]:
+    """Both limits; one that is a number is that of each component."""
+    if np.ndim(low) and np.ndim(high):
+        return low, high
+    either = np.broadcast(low, high).shape
+    return np.broadcast_to(low, either), np.broadcast_to(high, either)
 
 
 def _bytes(saved: EvolvingFSM | LearningJudge | None) -> NDArray[np.uint8]:

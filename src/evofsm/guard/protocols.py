@@ -4,62 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 from enum import IntFlag
-from typing import Any, NamedTuple, Protocol, Self, TypeAlias, runtime_checkable
+from typing import Any, NamedTuple, Protocol, Self, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from evofsm.core import EvolvingFSM, IntervalActions, Labels, Missing, whole
+from evofsm.core import EvolvingFSM, Labels, Missing
 from evofsm.files import Place
-
-
-@dataclass(frozen=True)
-class Choices:
-    """A set of actions that are told apart by their index alone: none is nearer than another.
-
-    Parameters
-    ----------
-    n_actions : int
-
-    Raises
-    ------
-    ValueError
-        If ``n_actions`` is no whole number of at least 1.
-
-    Examples
-    --------
-    >>> actions = Choices(3)
-    >>> actions.encode(2.0), 1.0 in actions, 0.5 in actions, 3.0 in actions
-    (2, True, False, False)
-    """
-
-    n_actions: int
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "n_actions", whole("n_actions", self.n_actions))
-
-    @property
-    def low(self) -> float:
-        """The first index."""
-        return 0.0
-
-    @property
-    def high(self) -> float:
-        """The last index."""
-        return self.n_actions - 1.0
-
-    def __contains__(self, action: float) -> bool:
-        return self.low <= action <= self.high and action == int(action)
-
-    def encode(self, action: float) -> int:
-        """The action itself, as an index."""
-        return int(action)
-
-
-#: What can be executed: an interval of numbers, or one of a few things.
-ActionSet: TypeAlias = IntervalActions | Choices
+from evofsm.guard.actions import Action, ActionSet
 
 
 class Proposal(NamedTuple):
@@ -71,8 +24,9 @@ class Proposal(NamedTuple):
     Proposal(action=1.2, candidates=())
     """
 
-    action: float  #: of a car the acceleration [m/s²]; of `Choices` an index
-    candidates: tuple[float, ...] = ()  #: others it could do as well
+    #: of a car the acceleration [m/s²]; of `Choices` an index, of `BoxActions` a (d,) array
+    action: Action
+    candidates: tuple[Action, ...] = ()  #: others it could do as well
 
 
 class Intake(IntFlag):
@@ -102,17 +56,21 @@ class Situation(NamedTuple):
 
 
 class Revision(NamedTuple):
-    """What a reviser made of a proposal, and why."""
+    """What a reviser made of a proposal, and why.
 
-    executed: float  #: action to execute; of a car the acceleration [m/s²]
-    proposed: float  #: action that the controller wanted; NaN where it had none
+    Its actions are floats, of `Choices` whole numbers, of `BoxActions` (d,) arrays that are read
+    only: compare them by `same_action`.
+    """
+
+    executed: Action  #: action to execute; of a car the acceleration [m/s²]
+    proposed: Action  #: action that the controller wanted; NaN where it had none
     risk_proposed: float  #: probability of failure under the proposal; NaN where not judged
     risk_executed: float  #: the same for what is executed
     interval: tuple[float, float]  #: 90 % interval of `risk_executed`
     reason: str  #: in a few words
     evidence: float  #: number of disturbances that the risks rest on
     seen: float  #: time spent in states like this one before [s]; NaN where that is not known
-    advised: float  #: what the reviser would execute, whether or not it may act
+    advised: Action  #: what the reviser would execute, whether or not it may act
     explanation: str = ""  #: what a machine's experience says of it, where that was asked for
 
 
@@ -158,14 +116,15 @@ class Judgement(NamedTuple):
 class Fallback(NamedTuple):
     """What is done where a controller proposes nothing that can be executed."""
 
-    action: float  #: put at the edge of the set of actions where it lies outside
+    #: put at the edge of the set where it lies outside; a number stands for every component
+    action: Action
     doing: str  #: in words
 
 
 class Trial(NamedTuple):
     """An action that has to be tried, because the judge does not know yet what it brings."""
 
-    action: float
+    action: Action
     unknown: str  #: what is not known, such as "own brakes not known yet"
     how: str  #: such as "in full"
     doing: str  #: such as "braking in full to learn them"
@@ -173,7 +132,10 @@ class Trial(NamedTuple):
 
 
 class ActionJudge(Protocol):
-    """Anything that can be asked how dangerous an action is, whatever system it knows."""
+    """Anything that can be asked how dangerous an action is, whatever system it knows.
+
+    Actions come as a (k,) array, of `BoxActions` as a (k, d) one.
+    """
 
     #: What it calls the variables of an observation.
     labels: Labels
@@ -198,8 +160,32 @@ class ActionJudge(Protocol):
         """What actions come to here, where some of them would change nothing."""
         ...
 
-    def refuse_unfit(self, low: float, high: float, /) -> None:
+    def refuse_unfit(self, low: Action, high: Action, /) -> None:
         """Raise a ValueError if it counts on actions outside ``low`` to ``high``."""
+        ...
+
+
+class Search(NamedTuple):
+    """What a judge found that looks for an action itself."""
+
+    options: NDArray[np.float64]  #: (k,) or (k, d), in the set of actions; the proposal first
+    judged: Judgement  #: with an entry for each of them
+    best: int  #: index of what should be executed; 0 where the proposal will do
+    reason: str  #: in a few words
+
+
+@runtime_checkable
+class SearchingJudge(ActionJudge, Protocol):
+    """A judge that looks for the best action itself, instead of judging those that it is given."""
+
+    def search(
+        self, situation: Situation, wanted: Action, /, *, tolerance: float, revising: bool
+    ) -> Search:
+        """The action to execute instead of ``wanted``, the closest that is within the tolerance.
+
+        ``wanted`` lies in the set of actions. ``revising`` says that the proposal before, in this
+        episode, was not kept.
+        """
         ...
 
 
@@ -209,20 +195,27 @@ class LearningJudge(ActionJudge, Protocol):
 
     dt: float  #: time between decisions [s]
 
-    def learn(self, observation: ArrayLike, action: float, belief: ArrayLike, /) -> None:
+    def learn(self, observation: ArrayLike, action: Action, belief: ArrayLike, /) -> None:
         """Take in an observation, recognised as ``belief``, and the action executed after it."""
         ...
 
-    def watch(self, observation: ArrayLike, action: float, belief: ArrayLike, /) -> None:
+    def watch(self, observation: ArrayLike, action: Action, belief: ArrayLike, /) -> None:
         """Learn where someone else acts."""
         ...
 
-    def follow(self, observation: ArrayLike, action: float, /) -> None:
+    def follow(self, observation: ArrayLike, action: Action, /) -> None:
         """Keep up with what happens, without learning from it."""
         ...
 
     def start_episode(self, *, learn: bool = True) -> None:
         """What comes is not a consequence of what was."""
+        ...
+
+    def end(self, observation: NDArray[np.float64] | None, *, failed: bool) -> None:
+        """Learn how an episode ended, with the last observation if there is one.
+
+        After it nothing is under way, as after `start_episode`.
+        """
         ...
 
     def sums(self, n_states: int, /) -> dict[str, float]:
@@ -236,6 +229,18 @@ class LearningJudge(ActionJudge, Protocol):
     @classmethod
     def load(cls, path: Place) -> Self:
         """Read what was learnt, between two episodes."""
+        ...
+
+
+@runtime_checkable
+class AsksMachine(Protocol):
+    """A judge that asks the machine beside it, and is told which that is."""
+
+    def bind(self, machine: EvolvingFSM, /) -> None:
+        """Ask this machine from now on.
+
+        A guard says so as it is made, copied or read from a file; it may say the same again.
+        """
         ...
 
 

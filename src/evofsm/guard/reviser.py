@@ -17,17 +17,31 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evofsm.core import compiled
+from evofsm.guard.actions import (
+    Action,
+    ActionSet,
+    BoxActions,
+    Choices,
+    action_text,
+    distances,
+    fixed,
+    is_usable,
+    limits,
+    nearest_bounds,
+    put_into,
+    same_action,
+)
 from evofsm.guard.defaults import TOLERANCE
 from evofsm.guard.protocols import (
     STALE,
     ActionJudge,
-    ActionSet,
-    Choices,
     Fallback,
     Judgement,
     Proposal,
     Reviser,
     Revision,
+    Search,
+    SearchingJudge,
     Situation,
 )
 
@@ -58,7 +72,7 @@ class Way(Enum):
 class Usable(NamedTuple):
     """A proposal that can be executed, and what had to be done to it."""
 
-    action: float  #: [m/s²]
+    action: Action  #: of a car the acceleration [m/s²]
     remark: str  #: empty where it is what the controller proposed
 
 
@@ -77,15 +91,14 @@ def make_usable(proposal: Proposal, actions: ActionSet, fallback: Fallback = NOT
     >>> make_usable(Proposal(float("nan")), actions)
     Usable(action=0.0, remark='no usable proposal (nan): doing nothing')
     """
-    low, high = actions.low, actions.high
-    is_none = isinstance(actions, Choices) and proposal.action not in actions
-    if not math.isfinite(proposal.action) or is_none:
-        action = min(max(fallback.action, low), high)
-        return Usable(action, f"no usable proposal ({proposal.action:g}): {fallback.doing}")
-    if not low <= proposal.action <= high:
-        action = min(max(proposal.action, low), high)
-        return Usable(action, f"proposal {proposal.action:g} is outside [{low:g}, {high:g}]")
-    return Usable(float(proposal.action), "")
+    if not is_usable(actions, proposal.action):
+        nothing = f"no usable proposal ({action_text(proposal.action)}): {fallback.doing}"
+        return Usable(put_into(actions, fallback.action), nothing)
+    action = put_into(actions, proposal.action)
+    if same_action(action, proposal.action):
+        return Usable(action, "")
+    low, high = (action_text(limit) for limit in limits(actions))
+    return Usable(action, f"proposal {action_text(proposal.action)} is outside [{low}, {high}]")
 
 
 class ActionReviser:
@@ -97,6 +110,9 @@ class ActionReviser:
     has begun to revise, it keeps on until the proposal is safe by a margin, so that it does not
     chatter.
 
+    A judge that looks for an action itself (`protocols.SearchingJudge`) is asked for it where any
+    action of the set will do (`Way.IMPROVE`); how it goes about that is its own.
+
     Where nothing of what it decides is executed (any mode but `Mode.ACT`, or the driver has taken
     over), nothing is tried, and nothing is asked that would change nothing.
 
@@ -104,9 +120,10 @@ class ActionReviser:
     ----------
     risk : ActionJudge
         Usually a `LatentRisk`.
-    actions : IntervalActions or Choices
+    actions : IntervalActions, Choices or BoxActions
         The set of actions. Nothing outside it is ever executed. Of `Choices` none is closer than
-        another: a proposal is kept, or replaced by the least risky one.
+        another: a proposal is kept, or replaced by the least risky one. In a box the closest is
+        that of the least change in half ranges, of each cell the point that is nearest.
     tolerance : float
         Highest latent risk that is accepted, in (0, 1).
     release : float
@@ -140,7 +157,7 @@ class ActionReviser:
             raise ValueError(f"tolerance is {tolerance}; it is a probability, between 0 and 1")
         if not 0.0 < release <= 1.0:
             raise ValueError(f"release is {release}; it must lie in (0, 1]")
-        risk.refuse_unfit(actions.low, actions.high)
+        risk.refuse_unfit(*limits(actions))
         self.risk = risk
         self.actions = actions
         self.tolerance = tolerance
@@ -148,7 +165,8 @@ class ActionReviser:
         self.mode = mode
         self.way = way
         self._overridden = False
-        self._lowest, self._highest = _bounds(actions)
+        self._searches = isinstance(risk, SearchingJudge)
+        self._lowest, self._highest = nearest_bounds(actions)
         self.start_episode()
 
     def start_episode(self) -> None:
@@ -197,18 +215,14 @@ class ActionReviser:
             self._trial = 0
         if self.mode is Mode.OFF:
             return unjudged_revision(wanted, proposal, remark or "reviser is off")
-        options = self._options(wanted, proposal)
-        if not self.acts and self.way is Way.IMPROVE:
-            options = self.risk.effective(situation, options)
-        judged = self.risk.judge(situation, options)
-        best, reason = self._decide(options, judged)
+        options, judged, best, reason = self._search(situation, wanted, proposal)
         executed = best if self.acts else 0
         if not self.acts and best != 0:
             who = "driver has taken over" if self._overridden else self.mode.value
             reason = f"{who}: {reason}"
         return Revision(
-            executed=float(options[executed]),
-            proposed=float(proposal.action),
+            executed=fixed(options[executed]),
+            proposed=fixed(proposal.action),
             risk_proposed=float(judged.risk[0]),
             risk_executed=float(judged.risk[executed]),
             interval=(float(judged.low[executed]), float(judged.high[executed])),
@@ -224,10 +238,24 @@ class ActionReviser:
             ),
             evidence=judged.evidence,
             seen=judged.seen,
-            advised=float(options[best]),
+            advised=fixed(options[best]),
         )
 
-    def _options(self, wanted: float, proposal: Proposal) -> NDArray[np.float64]:
+    def _search(self, situation: Situation, wanted: Action, proposal: Proposal) -> Search:
+        """Which option should be executed: the judge's own, or the best of those it is given."""
+        if self.way is Way.IMPROVE and self._searches:
+            found: Search = self.risk.search(  # type: ignore[attr-defined]
+                situation, wanted, tolerance=self.tolerance, revising=self._revising
+            )
+            self._revising = found.best != 0
+            return found._replace(options=np.clip(found.options, *limits(self.actions)))
+        options = self._options(wanted, proposal)
+        if not self.acts and self.way is Way.IMPROVE:
+            options = self.risk.effective(situation, options)
+        judged = self.risk.judge(situation, options)
+        return Search(options, judged, *self._decide(options, judged))
+
+    def _options(self, wanted: Action, proposal: Proposal) -> NDArray[np.float64]:
         """What could be executed, the proposal first."""
         if self.way is Way.IMPROVE:
             return np.minimum(np.maximum(wanted, self._lowest), self._highest)
@@ -240,7 +268,7 @@ class ActionReviser:
         trial = self.risk.trial()
         if self._trial > 0 and trial is not None:
             self._trial -= 1
-            return _closest_to(trial.action, options), f"{trial.unknown}: {trial.doing}"
+            return self._closest_to(trial.action, options), f"{trial.unknown}: {trial.doing}"
         if judged.risk[0] <= limit:
             self._revising = False
             return 0, "risk is within the tolerance"
@@ -249,43 +277,47 @@ class ActionReviser:
         if trial is not None:
             if self.acts:
                 self._trial = _TRIAL
-                return _closest_to(trial.action, options), f"{why}; {trial.unknown}, so {trial.how}"
+                tried = self._closest_to(trial.action, options)
+                return tried, f"{why}; {trial.unknown}, so {trial.how}"
             why = f"{why}; {trial.unknown}, {trial.assumed}"
         # Once revising, what is safe by the margin; else whatever is tolerable.
-        least = _least_risky(options, judged.risk)
+        change = distances(self.actions, options, options[0])
+        # Of several that are least risky the lowest, in a box that of the least change.
+        least = _least_risky(
+            change if isinstance(self.actions, BoxActions) else options, judged.risk
+        )
         if isinstance(self.actions, Choices) and judged.risk[least] <= self.tolerance:
             return least, f"{why}; the least risky that can"
         for tolerated in (limit, self.tolerance):
-            closest = _closest_within(options, judged.risk, tolerated)
+            closest = _closest_within(change, judged.risk, tolerated)
             if closest >= 0:
                 return closest, f"{why}; the closest that can"
         return least, f"{why}; nothing can, the least risky"
 
+    def _closest_to(self, action: Action, options: NDArray[np.float64]) -> int:
+        return int(distances(self.actions, options, action).argmin())
+
 
 @compiled
 def _closest_within(
-    options: NDArray[np.float64], risk: NDArray[np.float64], tolerated: float
+    change: NDArray[np.float64], risk: NDArray[np.float64], tolerated: float
 ) -> int:
-    """Index of the tolerable option that is closest to the first; -1 where none is."""
-    best, change = -1, np.inf
-    for k in range(len(options)):
-        if risk[k] <= tolerated and abs(options[k] - options[0]) < change:
-            best, change = k, abs(options[k] - options[0])
+    """Index of the tolerable option of the least change; -1 where none is."""
+    best, least = -1, np.inf
+    for k in range(len(change)):
+        if risk[k] <= tolerated and change[k] < least:
+            best, least = k, change[k]
     return best
 
 
 @compiled
-def _least_risky(options: NDArray[np.float64], risk: NDArray[np.float64]) -> int:
-    """Index of the option of the lowest risk; of several the lowest one."""
+def _least_risky(rank: NDArray[np.float64], risk: NDArray[np.float64]) -> int:
+    """Index of the option of the lowest risk; of several that of the lowest rank."""
     best = 0
-    for k in range(len(options)):
-        if risk[k] < risk[best] or (risk[k] == risk[best] and options[k] < options[best]):
+    for k in range(len(rank)):
+        if risk[k] < risk[best] or (risk[k] == risk[best] and rank[k] < rank[best]):
             best = k
     return best
-
-
-def _closest_to(action: float, options: NDArray[np.float64]) -> int:
-    return int(np.abs(options - action).argmin())
 
 
 def unseen_text(situation: Situation, variables: Sequence[str]) -> str:
@@ -309,31 +341,18 @@ def _novelty(judged: Judgement) -> str:
 
 def is_spoken(reviser: Reviser, revision: Revision) -> bool:
     """Whether a decision changed something, would have, or raised an alarm."""
-    proposed = revision.proposed
-    if revision.executed != proposed or revision.advised != proposed:  # NaN differs
+    proposed = revision.proposed  # NaN differs
+    if not (same_action(revision.executed, proposed) and same_action(revision.advised, proposed)):
         return True
     return isinstance(reviser, ActionReviser) and revision.risk_proposed > reviser.tolerance
 
 
-def _bounds(actions: ActionSet) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Lowest and highest value of the whole set, of each interval, and of both limits alone."""
-    if isinstance(actions, Choices):
-        every = np.arange(actions.n_actions, dtype=np.float64)
-        return np.append(0.0, every), np.append(actions.high, every)
-    lowest, highest = actions.edges[:-1].copy(), actions.edges[1:].copy()
-    if actions.closed == "left":
-        highest[:-1] = np.nextafter(highest[:-1], -math.inf)
-    else:
-        lowest[1:] = np.nextafter(lowest[1:], math.inf)
-    low, high = actions.low, actions.high
-    return np.array([low, *lowest, low, high]), np.array([high, *highest, low, high])
-
-
-def unjudged_revision(executed: float, proposal: Proposal, reason: str) -> Revision:
+def unjudged_revision(executed: Action, proposal: Proposal, reason: str) -> Revision:
     """A revision without a probability."""
+    executed = fixed(executed)
     return Revision(
         executed=executed,
-        proposed=float(proposal.action),
+        proposed=fixed(proposal.action),
         risk_proposed=math.nan,
         risk_executed=math.nan,
         interval=(math.nan, math.nan),

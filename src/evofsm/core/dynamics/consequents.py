@@ -51,13 +51,16 @@ class Disturbances(NamedTuple):
     residuals: _Floats  #: (K, H, m)
     jump_at: _Floats  #: (K, m) step at which a variable jumps; -1: at none
     jump_to: _Floats  #: (K, m) to where, from 0
-    jump_slope: _Floats  #: (K, m) and so much of where it was
+    jump_slope: _Floats  #: (K, m, m) and so much of where each variable was
+    jump_from: _Floats  #: (K, m, m, 2) least and most from which such jumps were seen
+    landing: _Floats  #: (K, m, 2) least and most to which such jumps led
 
 
 class Scratch(NamedTuple):
     """Room to work in."""
 
     z: _Floats
+    was: _Floats
     change: _Floats
     move: _Floats
     action: _Floats
@@ -73,7 +76,8 @@ def n_features(m: int, a: int, *, box: bool) -> int:
 @compiled
 def scratch(m: int, a: int, p: int) -> Scratch:
     """Room for m variables, a numbers of an action and p features."""
-    return Scratch(np.empty(m), np.empty(m), np.empty(m), np.empty(a), np.empty(a), np.empty(p))
+    z, was, change, move = np.empty(m), np.empty(m), np.empty(m), np.empty(m)
+    return Scratch(z, was, change, move, np.empty(a), np.empty(a), np.empty(p))
 
 
 @inner_kernel
@@ -152,6 +156,39 @@ def follow_policy(known: Consequents, policy: _Floats, z: _Floats, action: _Floa
 
 
 @inner_kernel
+def advance(
+    known: Consequents,
+    disturbances: Disturbances,
+    k: int,
+    t: int,
+    harder: float,
+    room: Scratch,
+) -> None:
+    """Take the action in ``room`` there, amid step t of disturbance k."""
+    m, a = len(room.z), len(room.action)
+    expect(known, room.z, room.change, room.action, room.before, room.features, room.move)
+    for j in range(m):
+        room.was[j] = room.z[j]
+    for j in range(m):
+        x = room.move[j] + harder * disturbances.residuals[k, t, j]
+        x = min(max(x, harder * known.least[j]), harder * known.most[j])
+        y = room.z[j] + x
+        if disturbances.jump_at[k, j] == t:
+            y = disturbances.jump_to[k, j]
+            for i in range(m):
+                seen = disturbances.jump_from[k, j, i]
+                was = min(max(room.was[i], seen[0]), seen[1])
+                y += disturbances.jump_slope[k, j, i] * was
+            landing = disturbances.landing[k, j]
+            y = min(max(y, landing[0]), landing[1])
+        y = min(max(y, known.lowest[j]), known.highest[j])
+        room.change[j] = y - room.z[j]
+        room.z[j] = y
+    for i in range(a):
+        room.before[i] = room.action[i]
+
+
+@inner_kernel
 def replay(
     known: Consequents,
     here: Here,
@@ -182,18 +219,7 @@ def replay(
                 room.action[i] = first[i]
         else:
             follow_policy(known, policy, room.z, room.action)
-        expect(known, room.z, room.change, room.action, room.before, room.features, room.move)
-        for j in range(m):
-            x = room.move[j] + harder * disturbances.residuals[k, t, j]
-            x = min(max(x, harder * known.least[j]), harder * known.most[j])
-            y = room.z[j] + x
-            if disturbances.jump_at[k, j] == t:
-                y = disturbances.jump_to[k, j] + disturbances.jump_slope[k, j] * room.z[j]
-            y = min(max(y, known.lowest[j]), known.highest[j])
-            room.change[j] = y - room.z[j]
-            room.z[j] = y
-        for i in range(a):
-            room.before[i] = room.action[i]
+        advance(known, disturbances, k, t, harder, room)
         for s in range(len(known.sides)):
             side = known.sides[s]
             left = side[1] * (side[2] - room.z[int(side[0])]) * side[3]

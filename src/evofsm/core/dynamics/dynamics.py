@@ -42,6 +42,8 @@ _LONGEST = 1024
 # An extreme is a saturation if it was reached, by moving, in so many episodes.
 _REACHED = 2
 MOST_KEPT = 200
+# Jumps that would have shown no dependence, for each variable.
+_JUMP_PRIOR = 3.0
 # So many times the stretches that are kept there may be until somebody chooses.
 _SPARE = 4
 
@@ -243,7 +245,7 @@ class Dynamics:
         self.lowest, self.highest = np.full(m, np.inf), np.full(m, -np.inf)
         self.reached = np.zeros((m, 2))
         self.failures: list[_Floats] = []
-        self.jumps: list[list[tuple[float, float]]] = [[] for _ in range(m)]
+        self.jumps: list[list[_Floats]] = [[] for _ in range(m)]
         self.sides: list[tuple[int, float, float]] = []
         self.weights = np.zeros((p, m))
         self.ready = False
@@ -316,7 +318,7 @@ class Dynamics:
             if first:
                 return
             for j in np.flatnonzero(jumped):
-                self.jumps[j] = [*self.jumps[j][1 - MOST_KEPT :], (four[1, j], four[2, j])]
+                self.jumps[j] = [*self.jumps[j][1 - MOST_KEPT :], np.append(four[1], four[2, j])]
 
     def _solve(self) -> None:
         if self.sums.counts[0] < _FIRST:
@@ -370,7 +372,7 @@ class Dynamics:
             self._rescale(found)
             self.latest = Episode(safe, U[:T], found, failed)
             if "stretches" not in self.without:
-                self.remember(self._onsets(found))
+                self.remember(self.onsets(found))
         self.n_episodes += 1
 
     def settle(self) -> None:
@@ -408,7 +410,7 @@ class Dynamics:
         new = 0.8 * self.sums.scale + 0.2 * scale if known else scale
         self.sums.scale[:] = np.maximum(new, 1e-3 * np.sqrt(self.sums.variance) + 1e-300)
 
-    def _onsets(self, found: _Floats) -> list[int]:
+    def onsets(self, found: _Floats) -> list[int]:
         """Steps of an episode at which something large began."""
         size = np.abs(found / self.sums.scale).max(1)
         starts: list[int] = []
@@ -484,7 +486,9 @@ class Dynamics:
             np.zeros((count, self.horizon, m)),
             np.full((count, m), -1.0),
             np.zeros((count, m)),
-            np.zeros((count, m)),
+            np.zeros((count, m, m)),
+            np.zeros((count, m, m, 2)),
+            np.zeros((count, m, 2)),
         )
         carried = "carried" not in self.without
         for k, (Z, U, _) in enumerate(self.stretches, 1):
@@ -497,34 +501,41 @@ class Dynamics:
     def _find_jumps(self, found: Disturbances) -> None:
         """What stretches jump to: for each variable and direction, after on before."""
         for j in range(self.n_variables):
-            seen = np.array(self.jumps[j]).reshape(-1, 2)
+            seen = np.array(self.jumps[j]).reshape(-1, self.n_variables + 1)
             if not len(seen):
                 continue
             for k, (Z, _, _) in enumerate(self.stretches, 1):
                 d = np.append(np.abs(np.diff(Z[:, j])), 0.0)
                 around = np.maximum(np.maximum(d[:-2], d[2:]), self.sums.unit[j])
-                at = np.flatnonzero(d[1:-1] > 8.0 * around)
-                if not len(at) or at[0] >= self.horizon:
+                left = np.abs(found.residuals[k, : len(d) - 2, j])
+                n = len(left)
+                at = np.flatnonzero((d[1:-1] > 8.0 * around)[:n] & (left > 0.5 * d[1:-1][:n]))
+                if not len(at):
                     continue
                 t = int(at[0])
-                before, after = Z[t + 1, j], Z[t + 2, j]
-                alike = seen[(seen[:, 1] > seen[:, 0]) == (after > before)]
-                slope = _slope(alike)
+                before, after = Z[t + 1], Z[t + 2, j]
+                alike = seen[(seen[:, -1] > seen[:, j]) == (after > before[j])]
+                if not len(alike):
+                    continue
+                slopes = _slopes(alike[:, :-1], alike[:, -1])
                 found.jump_at[k, j] = t
-                found.jump_slope[k, j] = slope
-                found.jump_to[k, j] = after - slope * before
+                found.jump_slope[k, j] = slopes
+                found.jump_to[k, j] = after - slopes @ before
+                seen_from = alike[:, :-1]
+                found.jump_from[k, j] = np.stack([seen_from.min(0), seen_from.max(0)], 1)
+                found.landing[k, j] = alike[:, -1].min(), alike[:, -1].max()
 
 
-def _slope(jumps: _Floats) -> float:
-    """How much of where a variable was remains after a jump, from 0 (nothing) to 1 (all)."""
-    if len(jumps) < 3:
-        return 0.0
-    before, after = jumps.T
-    spread = float(((before - before.mean()) ** 2).sum())
-    if spread <= 0.0:
-        return 0.0
-    both = float(((before - before.mean()) * (after - after.mean())).sum())
-    return min(1.0, max(0.0, both / spread))
+def _slopes(before: _Floats, after: _Floats) -> _Floats:
+    """(m,) how where a variable lands depends on where all were, as far as jumps tell."""
+    off = before - before.mean(0)
+    squares = off.T @ off
+    size = np.diag(squares)
+    if len(after) < 3 or not size.any():
+        return np.zeros(len(size))
+    held = _JUMP_PRIOR / len(after) * size + 1e-9 * size.max()
+    found: _Floats = np.linalg.solve(squares + np.diag(held), off.T @ (after - after.mean()))
+    return found
 
 
 def _range(

@@ -32,8 +32,10 @@ def encoded(dynamics: Dynamics, i: int, executed: ArrayLike | None) -> _Floats:
         If it is no action.
     """
     if dynamics.choices:
-        given: Any = i if executed is None else executed
-        return dynamics.encode(check_action(given, dynamics.choices))
+        number = real_array("executed", np.atleast_1d(i if executed is None else executed), 1)
+        if len(number) != 1 or not float(number[0]).is_integer():
+            raise ValueError(f"executed is {executed!r}; it must be the index of an action")
+        return dynamics.encode(check_action(int(number[0]), dynamics.choices))
     if executed is None:
         raise ValueError(
             "executed is missing: dynamics with a range of actions have to be told the number, or "

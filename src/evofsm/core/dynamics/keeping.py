@@ -66,7 +66,8 @@ _ARRAYS: dict[str, tuple[_Shape, ranges.Range]] = {
     **_OWN,
     "used": (("a", 2), ranges.COUNT),
     "failures": (("failures", "m"), _OBSERVED),
-    "jumps": (("jumps", 3), _OBSERVED),  # variable, before and after
+    "jumps": (("jumps", 2), _OBSERVED),  # variable, and where it landed
+    "jumps_from": (("jumps", "m"), _OBSERVED),
     "stretches": (("stretches", 2), ranges.COUNT),  # numbers of actions, and episodes
     "stretch_observations": (("stretched", "m"), _OBSERVED),
     "stretch_actions": (("acted", "a"), _SOME),
@@ -145,7 +146,7 @@ def _arrays(dynamics: Dynamics) -> dict[str, NDArray[np.float64]]:
             name: np.zeros([n if isinstance(n, int) else sizes.get(n, 0) for n in shape])
             for name, (shape, _) in _ARRAYS.items()
         }
-    rows = [(j, *jump) for j, jumps in enumerate(dynamics.jumps) for jump in jumps]
+    jumps = [(j, jump) for j, one in enumerate(dynamics.jumps) for jump in one]
     stretches = dynamics.stretches
     observations, actions = dynamics.under_way
     return {
@@ -154,7 +155,8 @@ def _arrays(dynamics: Dynamics) -> dict[str, NDArray[np.float64]]:
         **{name: getattr(dynamics, name) for name in _OWN},
         "used": dynamics.used,
         "failures": np.array(dynamics.failures).reshape(-1, m),
-        "jumps": np.array(rows, np.float64).reshape(-1, 3),
+        "jumps": np.array([(j, jump[-1]) for j, jump in jumps], np.float64).reshape(-1, 2),
+        "jumps_from": np.array([jump[:-1] for _, jump in jumps], np.float64).reshape(-1, m),
         "stretches": np.array(
             [(len(one.actions), one.episode) for one in stretches], np.float64
         ).reshape(-1, 2),
@@ -197,8 +199,8 @@ def _restore(dynamics: Dynamics, arrays: dict[str, NDArray[Any]]) -> None:
     dynamics.weights = known["weights"]
     dynamics.sides = [(int(j), float(sign), float(at)) for j, sign, at, _ in known["sides"]]
     dynamics.failures = list(arrays["failures"])
-    for j, before, after in arrays["jumps"]:
-        dynamics.jumps[int(j)].append((float(before), float(after)))
+    for (j, after), before in zip(arrays["jumps"], arrays["jumps_from"], strict=True):
+        dynamics.jumps[int(j)].append(np.append(before, after))
     ends = np.cumsum(arrays["stretches"][:, 0]).astype(int)
     begins = ends - arrays["stretches"][:, 0].astype(int)
     for k, (begin, end) in enumerate(zip(begins.tolist(), ends.tolist(), strict=True)):

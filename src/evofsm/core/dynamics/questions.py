@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from evofsm.core.dynamics.consequents import Consequents, Disturbances, Here, expect, scratch
+from evofsm.core.dynamics.consequents import Consequents, Disturbances, Here, advance, scratch
 from evofsm.core.dynamics.dynamics import Dynamics
 from evofsm.core.dynamics.following import encoded
 from evofsm.core.kernels import compiled
@@ -56,6 +56,8 @@ def look_ahead(
         raise ValueError("nothing was observed yet in this episode; give an observation")
     actions = _held(dynamics, action, steps)
     found = dynamics.disturbances()
+    missing = max(0, len(actions) - dynamics.horizon)
+    found = found._replace(residuals=np.pad(found.residuals, [(0, 0), (0, missing), (0, 0)]))
     path = np.empty((len(found.residuals), len(actions), dynamics.n_variables))
     _foresee(dynamics.consequents, here, actions, found, path)
     ordinary = dynamics.sums.scale * np.sqrt(np.arange(1.0, len(actions) + 1.0))[:, None]
@@ -101,25 +103,13 @@ def _held(dynamics: Dynamics, action: ArrayLike, steps: int | None) -> _Floats:
 def _foresee(
     known: Consequents, here: Here, actions: _Floats, disturbances: Disturbances, path: _Floats
 ) -> None:
-    """Replay actions under each disturbance, into ``path`` (K, steps, m): as `replay` does."""
-    m, a = len(here.z), actions.shape[1]
-    room = scratch(m, a, known.weights.shape[0])
-    length = disturbances.residuals.shape[1]
+    """Replay actions under each disturbance, into ``path`` (K, steps, m)."""
+    room = scratch(len(here.z), actions.shape[1], known.weights.shape[0])
     for k in range(len(path)):
         room.z[:] = here.z
         room.change[:] = here.change
         room.before[:] = here.action
         for t in range(len(actions)):
-            expect(known, room.z, room.change, actions[t], room.before, room.features, room.move)
-            for j in range(m):
-                x = room.move[j]
-                if t < length:
-                    x += disturbances.residuals[k, t, j]
-                y = room.z[j] + min(max(x, known.least[j]), known.most[j])
-                if disturbances.jump_at[k, j] == t:
-                    y = disturbances.jump_to[k, j] + disturbances.jump_slope[k, j] * room.z[j]
-                y = min(max(y, known.lowest[j]), known.highest[j])
-                room.change[j] = y - room.z[j]
-                room.z[j] = y
-                path[k, t, j] = y
-            room.before[:] = actions[t]
+            room.action[:] = actions[t]
+            advance(known, disturbances, k, t, 1.0, room)
+            path[k, t] = room.z

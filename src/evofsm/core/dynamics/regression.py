@@ -77,14 +77,19 @@ def learn_transition(
     room = scratch(m, a, sums.squares.shape[0])
     n = sums.counts[1]
     jump = False
+    z, move = observations[1], np.zeros(m)
+    for j in range(m):
+        room.change[j] = 0.0 if first else observations[1, j] - observations[0, j]
+    if sums.scale[0] > 0.0 and not first:
+        expect(known, z, room.change, actions[1], actions[0], room.features, move)
     for j in range(m):
         now = observations[2, j] - observations[1, j]
-        before = 0.0 if first else observations[1, j] - observations[0, j]
         after = 0.0 if last else observations[3, j] - observations[2, j]
-        room.change[j], room.move[j] = before, now
+        room.move[j] = now
         sums.variance[j] += (now * now - sums.variance[j]) / (n + 1.0)
-        around = max(max(abs(before), abs(after)), sums.unit[j])
-        jumped[j] = 1.0 if n > 8.0 and abs(now) > _JUMP * around else 0.0
+        around = max(max(abs(room.change[j]), abs(after)), sums.unit[j])
+        unforeseen = abs(now - move[j]) > 0.5 * abs(now)
+        jumped[j] = 1.0 if n > 8.0 and abs(now) > _JUMP * around and unforeseen else 0.0
         jump = jump or jumped[j] > 0.0
     for j in range(m):
         now = abs(room.move[j])
@@ -109,9 +114,7 @@ def learn_transition(
     if first or jump:
         return jump
     weight = 1.0
-    z, move = observations[1], np.empty(m)
     if sums.scale[0] > 0.0:
-        expect(known, z, room.change, actions[1], actions[0], room.features, move)
         worst = 0.0
         for j in range(m):
             y, x, close = z[j] + move[j], observations[2, j], 1e-9 / known.inverse[j]

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from evofsm.core import EvolvingFSM, FSMModel
 from evofsm.driving.risk.latent import LatentRisk
-from evofsm.guard import Judgement, Situation, Trial
+from evofsm.guard import Action, Judgement, Situation, Trial
 
 # States of a smaller belief are left out.
 _LEAST_BELIEF = 1e-3
@@ -54,7 +54,7 @@ class RiskByState:
         """What actions come to here."""
         return self.risk.effective(situation, actions)
 
-    def refuse_unfit(self, low: float, high: float) -> None:
+    def refuse_unfit(self, low: Action, high: Action) -> None:
         """Raise a ValueError if the risk counts on harder braking than there is."""
         self.risk.refuse_unfit(low, high)
 

@@ -37,7 +37,7 @@ from evofsm.driving.risk.perception import Estimate, Perception, is_whole
 from evofsm.driving.risk.ranges import RISK
 from evofsm.driving.risk.rehearsal import Body, Three, critical_decelerations
 from evofsm.files import LARGEST_OBSERVATION, ranges, storage
-from evofsm.guard import TOLERANCE, Judgement, Situation, Trial
+from evofsm.guard import TOLERANCE, Action, Judgement, Situation, Trial
 
 # Pseudo-evidence for the pooled rate of manoeuvres, against that of a state [s].
 _POOLED = 20.0
@@ -230,6 +230,10 @@ class LatentRisk:
         self.perception.clear()
         self._commands = (0.0, 0.0)
 
+    def end(self, observation: ArrayLike | None, *, failed: bool) -> None:
+        """What comes is not a consequence of what was; how it ended teaches nothing."""
+        self.start_episode(learn=True)
+
     def _perceive(self, seen: Three, *, learn: bool) -> Estimate:
         return self.perception.see(seen, self._expected, sure=self.brakes.known, learn=learn)
 
@@ -379,8 +383,13 @@ class LatentRisk:
             return np.maximum(actions, min(float(actions[0]), 0.0))
         return actions
 
-    def refuse_unfit(self, low: float, high: float) -> None:
+    def refuse_unfit(self, low: Action, high: Action) -> None:
         """Raise a ValueError if it counts on harder braking than there is."""
+        if np.ndim(low):
+            raise ValueError(
+                f"the risk judges one acceleration, but an action is a vector of {np.size(low)}; "
+                "give low and high as numbers"
+            )
         if self.lowest < low:
             raise ValueError(
                 f"the risk counts on braking down to {self.lowest:g}, but the set of "

@@ -48,7 +48,8 @@ class Evidence(InWorld):
 
     def packages(self) -> dict[str, str]:
         """What all studies need, and their page."""
-        return {"scipy": "study", "deeptime": "dev", **PAGE} | super().packages()
+        needed = {"scipy": "study", "deeptime": "dev", "gymnasium": "gym"}
+        return {**needed, **PAGE} | super().packages()
 
     def run(self) -> None:
         """Run every study, and write the page."""

@@ -16,9 +16,12 @@ from evofsm.files import LOG_HEADER, SealedRecord
 from evofsm.guard.record import RECORD
 
 #: Of what is written now; every version from 1 on is read.
-LOG_VERSION = 2
+LOG_VERSION = 3
 #: The version from which on a decision holds what was not in it from the first.
 SINCE = {"explanation": 2}
+# The version from which on actions may be vectors.
+_VECTORS = 3
+_ACTIONS = ("proposed", "executed", "advised")
 
 _NOTHING = type(None)
 _Types = tuple[type, ...]
@@ -132,6 +135,8 @@ class Form:
             for name, types in _KINDS[kind].items()
             if SINCE.get(name, 1) <= self._version
         }
+        if kind == "decision" and self._version >= _VECTORS:
+            held |= {name: (*held[name], list) for name in _ACTIONS}
         what = f"a record of kind {kind!r} in version {self._version}"
         _refuse_others(content, {**_ALWAYS, **held}, what)
         for name in _WITHIN.keys() & content.keys():

@@ -15,6 +15,8 @@ Records of a log, by their ``kind``:
 ``settings``
     The reviser's were changed, or the driver took over or handed back.
 
+An action is a number, or a list of them where the set of actions is a box.
+
 ``before`` holds what happened since the last record, where the proposal was executed as it was:
 ``[time, observation, proposal]``, with the candidates after that if there were any, and without a
 proposal where none was made. Times and observations are those that came in, whatever was made of
@@ -35,6 +37,7 @@ from numpy.typing import NDArray
 
 from evofsm.core import Missing
 from evofsm.files import LOG_HEADER, ChainedFile, Head, Sync, records
+from evofsm.guard.actions import written
 from evofsm.guard.auditing.form import LOG_VERSION, TOLD
 from evofsm.guard.auditing.participants import describe, learnt, settings
 from evofsm.guard.protocols import Participants, Proposal, Reviser, Revision, Situation
@@ -224,7 +227,7 @@ class AuditLog:
             self._write({"kind": "decision", **self._take_before(), **came_in, **decision})
             return
         candidates = _candidates(proposal)
-        row = [time, observation, float(proposal.action)]
+        row = [time, observation, written(proposal.action)]
         self._before.append([*row, candidates] if candidates else row)
         if len(self._before) >= self.most_quiet:
             self._flush()
@@ -341,11 +344,13 @@ def told(situation: Situation, proposal: Proposal, revision: Revision) -> dict[s
 
 
 def _plain(kind: type, value: Any) -> Any:
+    if isinstance(value, np.ndarray):
+        return written(value)
     return None if value is None else kind(value)
 
 
-def _candidates(proposal: Proposal) -> list[float]:
-    return [float(candidate) for candidate in proposal.candidates]
+def _candidates(proposal: Proposal) -> list[Any]:
+    return [written(candidate) for candidate in proposal.candidates]
 
 
 def _floats(observation: NDArray[np.float64]) -> list[float]:

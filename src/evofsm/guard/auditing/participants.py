@@ -25,10 +25,9 @@ import numpy as np
 
 import evofsm
 from evofsm.core import EvolvingFSM, IntervalActions
+from evofsm.guard.actions import ActionSet, BoxActions, Choices
 from evofsm.guard.protocols import (
     ActionJudge,
-    ActionSet,
-    Choices,
     LearningJudge,
     Participants,
     Reviser,
@@ -193,11 +192,7 @@ def rebuild(
     ``judge`` is the judge's class, or a judge as it is, where its name is not known.
     """
     reviser = described["reviser"]
-    actions: ActionSet
-    if "n_actions" in described["actions"]:
-        actions = Choices(**described["actions"])
-    else:
-        actions = IntervalActions(**described["actions"])
+    actions = _actions(described["actions"])
     machine = EvolvingFSM.load(BytesIO(machine_file)) if machine_file else None
     risk: LearningJudge | None = None
     if judge_file:
@@ -215,6 +210,13 @@ def rebuild(
     again = ActionReviser(asked, actions)
     set_again(again, reviser["settings"])
     return Participants(actions, again, machine, risk)
+
+
+def _actions(described: Mapping[str, Any]) -> ActionSet:
+    """Of the class that has these fields."""
+    if "n_actions" in described:
+        return Choices(**described)
+    return BoxActions(**described) if "levels" in described else IntervalActions(**described)
 
 
 def _names(described: Any) -> Any:

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from evofsm.core import Missing
 from evofsm.files import Chain, Head, SealedRecord, canonical, number, records, verify
+from evofsm.guard.actions import Action
 from evofsm.guard.auditing.form import LOG_VERSION, SINCE, Form, Misfit
 from evofsm.guard.auditing.log import told
 from evofsm.guard.auditing.participants import (
@@ -264,7 +265,7 @@ class _Player:
             raise _DiffersError(
                 f"the decision at {situation.time:g} s was recorded as nothing to speak of, but "
                 f"{revision.reason}",
-                [Field("executed", canonical(proposal.action), canonical(is_told["executed"]))],
+                [Field("executed", canonical(is_told["proposed"]), canonical(is_told["executed"]))],
             )
         self.decisions += 1
 
@@ -307,7 +308,11 @@ def _observation(values: Sequence[Any]) -> NDArray[np.float64]:
 
 
 def _proposal(action: Any, candidates: Sequence[Any] = ()) -> Proposal:
-    return Proposal(number(action), tuple(number(candidate) for candidate in candidates))
+    return Proposal(_action(action), tuple(_action(candidate) for candidate in candidates))
+
+
+def _action(action: Any) -> Action:
+    return _observation(action) if isinstance(action, list) else number(action)
 
 
 def _differing(recorded: Mapping[str, Any], replayed: Mapping[str, Any]) -> list[Field]:

@@ -207,7 +207,7 @@ class LearntRisk:
             windows = np.array([padded[t : t + H] for t in ts])
             found = np.empty((len(ts), len(ok)))
             harm(known, *self._arrays(ok), best, _disturbances(windows), 1.0, found)
-            taken = [s for s in dynamics._onsets(episode.residuals)]
+            taken = dynamics.onsets(episode.residuals)
             starts: list[int] = []
             for c in range(len(ok)):
                 t = int(ts[found[:, c].argmin()])
@@ -334,4 +334,12 @@ class LearntRisk:
 
 def _disturbances(residuals: _Floats) -> Disturbances:
     k, _, m = residuals.shape
-    return Disturbances(residuals, np.full((k, m), -1.0), np.zeros((k, m)), np.zeros((k, m)))
+    nothing = np.zeros((k, m))
+    return Disturbances(
+        residuals,
+        nothing - 1.0,
+        nothing,
+        np.zeros((k, m, m)),
+        np.zeros((k, m, m, 2)),
+        np.zeros((k, m, 2)),
+    )

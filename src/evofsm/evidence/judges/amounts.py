@@ -1,0 +1,77 @@
+"""How much is controlled, learnt and tried."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import ClassVar, Self
+
+from evofsm.app import option, split_names
+
+#: Parts of the learnt judge that can be taken away, each with what is left then.
+PARTS: dict[str, str] = {
+    "stretches": "no disturbances at all",
+    "memory": "independent residuals in place of remembered stretches",
+    "products": "no products of variables and actions",
+    "lags": "no latest change and previous action",
+    "jumps": "jumps are learnt like all else",
+    "carried": "no residual is carried on where a variable saturates",
+    "margin": "no margin",
+    "backups": "constant backups alone",
+    "states": "no state decides anything",
+}
+#: A value of the options that stands for all there is, and one for nothing.
+ALL, NONE_AWAY = "all", "none"
+
+
+@dataclass(frozen=True)
+class Amounts:
+    """All that the study is told."""
+
+    id: ClassVar[str] = "judges"
+    question: ClassVar[str] = (
+        "Does the learnt judge keep any system from failing, and which of its parts does that?"
+    )
+
+    systems: str = option(ALL, "Systems with commas, or all.")
+    without: str = option(
+        ALL, "Parts that are taken away, each by itself, with commas; all, or none."
+    )
+    all_controllers: bool = option(
+        True,
+        "Every controller of a system, or the first alone.",
+        name="--all-controllers/--first-controller",
+    )
+    seeds: int = option(5, "Learning seeds.", min=1)
+    train: int | None = option(
+        None, "Training episodes. [default: as many as suit the system]", min=1
+    )
+    test: int = option(100, "Held-out episodes.", min=1)
+    seed: int = option(0, "Of everything.", min=0)
+
+    def shortened(self) -> Self:
+        """A look, not evidence."""
+        return replace(
+            self,
+            without=NONE_AWAY if self.without == ALL else self.without,
+            all_controllers=False,
+            seeds=1,
+            train=min(self.train or 30, 30),
+            test=min(self.test, 20),
+        )
+
+    @property
+    def parts(self) -> tuple[str, ...]:
+        """Parts that are taken away.
+
+        Raises
+        ------
+        ValueError
+            If there is no such part.
+        """
+        if self.without in (ALL, NONE_AWAY):
+            return tuple(PARTS) if self.without == ALL else ()
+        named = tuple(split_names(self.without))
+        for part in named:
+            if part not in PARTS:
+                raise ValueError(f"there is no part {part!r}; there are {', '.join(PARTS)}")
+        return named

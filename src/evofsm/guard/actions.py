@@ -1,0 +1,368 @@
+"""What can be executed: a number in an interval, a vector in a box, or one of a few things.
+
+An action is a float, or a (d,) array where the set is a `BoxActions`. The functions here are all
+that has to know which of them it is.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from evofsm.core import IntervalActions, real_array, whole
+
+# Cells that a box is divided into for the machine, at most, unless levels are given: 9 x 9.
+_CELLS = 81
+# Levels of a box of one dimension, as many as an interval has.
+_LEVELS = 17
+# More cells would be a mistake: a machine counts all of them in each state.
+_MOST = 10_000
+
+#: One action: a float, or a (d,) array where the set is a `BoxActions`.
+Action: TypeAlias = Any
+
+
+@dataclass(frozen=True)
+class Choices:
+    """A set of actions that are told apart by their index alone: none is nearer than another.
+
+    Parameters
+    ----------
+    n_actions : int
+
+    Raises
+    ------
+    ValueError
+        If ``n_actions`` is no whole number of at least 1.
+
+    Examples
+    --------
+    >>> actions = Choices(3)
+    >>> actions.encode(2.0), 1.0 in actions, 0.5 in actions, 3.0 in actions
+    (2, True, False, False)
+    """
+
+    n_actions: int
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "n_actions", whole("n_actions", self.n_actions))
+
+    @property
+    def low(self) -> float:
+        """The first index."""
+        return 0.0
+
+    @property
+    def high(self) -> float:
+        """The last index."""
+        return self.n_actions - 1.0
+
+    def __contains__(self, action: float) -> bool:
+        return self.low <= action <= self.high and action == int(action)
+
+    def encode(self, action: float) -> int:
+        """The action itself, as an index."""
+        return int(action)
+
+
+@dataclass(frozen=True)
+class BoxActions:
+    """A set of actions that are vectors; the machine tells them apart by the cells of a grid.
+
+    Parameters
+    ----------
+    low, high : tuple of d floats
+        Range of each component of the action, in its own unit.
+    levels : tuple of d ints, optional
+        Cells along each component. Without them there are as many along each as make 81 at most in
+        all (17 where there is one component, 9 by 9 where there are two), and of more than six
+        components the first six are divided in two.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If a number is not finite, ``low`` is not below ``high``, the lengths differ, or there are
+        more than 10,000 cells.
+
+    Examples
+    --------
+    >>> actions = BoxActions((-1.0, 0.0), (1.0, 4.0))
+    >>> actions.n_actions, actions.encode([-1.0, 0.0]), actions.encode([1.0, 4.0])
+    (81, 0, 80)
+    >>> [0.0, 5.0] in actions, actions.clip([0.0, 5.0])
+    (False, array([0., 4.]))
+    """
+
+    low: tuple[float, ...]
+    high: tuple[float, ...]
+    levels: tuple[int, ...] = ()
+
+    def __post_init__(self) -> None:
+        for name in ("low", "high"):
+            object.__setattr__(self, name, _finite(name, getattr(self, name)))
+        if len(self.low) != len(self.high):
+            raise ValueError(
+                f"low has {len(self.low)} components and high has {len(self.high)}; an action has "
+                "as many of both"
+            )
+        for k, (low, high) in enumerate(zip(self.low, self.high, strict=True)):
+            if not low < high:
+                raise ValueError(
+                    f"low is {low:g} and high is {high:g} in component {k}; low must be below high"
+                )
+        if not math.isfinite(
+            sum(high - low for high, low in zip(self.high, self.low, strict=True))
+        ):
+            raise ValueError("high - low is too large to compute with; use a larger unit")
+        levels = tuple(self.levels) or _levels(len(self.low))
+        if len(levels) != len(self.low):
+            raise ValueError(
+                f"levels has {len(levels)} entries, but an action has {len(self.low)} components"
+            )
+        object.__setattr__(self, "levels", tuple(whole("levels", each) for each in levels))
+        if self.n_actions > _MOST:
+            raise ValueError(
+                f"levels make {self.n_actions:,} cells, more than {_MOST:,}; give fewer"
+            )
+
+    @property
+    def n_actions(self) -> int:
+        """Number of cells."""
+        return math.prod(self.levels)
+
+    @cached_property
+    def bounds(self) -> NDArray[np.float64]:
+        """(2, d) ndarray: the lowest and the highest value of each component."""
+        bounds = np.array([self.low, self.high])
+        bounds.setflags(write=False)
+        return bounds
+
+    @cached_property
+    def half(self) -> NDArray[np.float64]:
+        """(d,) ndarray: half the range of each component."""
+        half: NDArray[np.float64] = 0.5 * (self.bounds[1] - self.bounds[0])
+        half.setflags(write=False)
+        return half
+
+    @cached_property
+    def cells(self) -> NDArray[np.float64]:
+        """(2, n, d) ndarray: the lowest and the highest corner of each cell, in their order.
+
+        After them stand the corners of the whole box, cells of no width.
+        """
+        edges = [
+            np.linspace(low, high, count + 1).tolist()
+            for low, high, count in zip(self.low, self.high, self.levels, strict=True)
+        ]
+        sides = [list(itertools.pairwise(each)) for each in edges]
+        ends = [
+            [(each[0], each[0]), (each[-1], each[-1])] if len(each) > 2 else [(each[0], each[-1])]
+            for each in edges
+        ]
+        both = [*itertools.product(*sides), *itertools.product(*ends)]
+        cells = np.ascontiguousarray(np.moveaxis(np.array(both), 2, 0))
+        cells.setflags(write=False)
+        return cells
+
+    def __contains__(self, action: ArrayLike) -> bool:
+        values = np.asarray(action, dtype=np.float64)
+        inside = (self.bounds[0] <= values) & (values <= self.bounds[1])
+        return values.shape == self.half.shape and bool(inside.all())
+
+    def clip(self, action: ArrayLike) -> NDArray[np.float64]:
+        """The action of the set that is closest in every component.
+
+        Parameters
+        ----------
+        action : (..., d) array_like
+
+        Returns
+        -------
+        ndarray
+            Of the shape of ``action``; NaN stays.
+        """
+        return np.asarray(np.clip(np.asarray(action, dtype=np.float64), *self.bounds))
+
+    def encode(self, action: ArrayLike) -> int:
+        """Index of the cell in which an action lies; beyond the box, of the cell at its edge.
+
+        Parameters
+        ----------
+        action : (d,) array_like
+
+        Returns
+        -------
+        int
+            From 0; the last component counts fastest.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If ``action`` has another length, or does not hold real numbers.
+        """
+        values = self.checked("action", action)
+        if np.isnan(values).any():
+            raise ValueError("action holds NaN; it lies in no cell")
+        share = (self.clip(values) - self.bounds[0]) / (2.0 * self.half)
+        index = 0
+        for part, count in zip(share.tolist(), self.levels, strict=True):
+            index = index * count + min(int(part * count), count - 1)
+        return index
+
+    def checked(self, name: str, action: ArrayLike) -> NDArray[np.float64]:
+        """A new (d,) array of an action, whatever its values; another length is refused."""
+        values = real_array(name, action, 1)
+        if len(values) != len(self.low):
+            raise ValueError(f"{name} has {len(values)} components; it must have {len(self.low)}")
+        return values
+
+
+#: What can be executed: an interval of numbers, one of a few things, or a box of vectors.
+ActionSet: TypeAlias = IntervalActions | Choices | BoxActions
+
+
+def fixed(action: Action) -> Action:
+    """An action that nobody can change any more: a float, or an array that is read only."""
+    if isinstance(action, float | int) or np.ndim(action) == 0:
+        return float(action)
+    values = np.array(action, dtype=np.float64)
+    values.setflags(write=False)
+    return values
+
+
+def same_action(one: Action, other: Action) -> bool:
+    """Whether two actions are the same; NaN is no action, and the same as none.
+
+    Examples
+    --------
+    >>> same_action(0.5, 0.5), same_action(np.array([0.5, 1.0]), np.array([0.5, 2.0]))
+    (True, False)
+    """
+    same = one == other
+    return bool(same.all()) if isinstance(same, np.ndarray) else bool(same)
+
+
+def no_action(actions: ActionSet) -> Action:
+    """What stands where nothing is proposed: NaN, in a box a vector of it."""
+    return np.full(len(actions.low), math.nan) if isinstance(actions, BoxActions) else math.nan
+
+
+def put_into(actions: ActionSet, action: Action) -> Action:
+    """The action of a set that is closest to one; a number stands for every component of a box."""
+    if isinstance(actions, BoxActions):
+        return actions.clip(np.broadcast_to(action, actions.half.shape))
+    return min(max(float(action), actions.low), actions.high)
+
+
+def is_usable(actions: ActionSet, action: Action) -> bool:
+    """Whether an action is finite, and one of a few where there are only those."""
+    if isinstance(actions, BoxActions):
+        return np.shape(action) == actions.half.shape and bool(np.isfinite(action).all())
+    return math.isfinite(action) and not (isinstance(actions, Choices) and action not in actions)
+
+
+def limits(actions: ActionSet) -> tuple[Action, Action]:
+    """Lowest and highest action: floats, or (d,) arrays."""
+    if isinstance(actions, BoxActions):
+        return actions.bounds[0], actions.bounds[1]
+    return actions.low, actions.high
+
+
+def written(action: Action) -> Any:
+    """An action as JSON holds it: a number, or a list of them.
+
+    Examples
+    --------
+    >>> written(1), written(np.array([0.5, 1.0]))
+    (1.0, [0.5, 1.0])
+    """
+    return float(action) if np.ndim(action) == 0 else np.asarray(action, np.float64).tolist()
+
+
+def action_text(action: Action) -> str:
+    """An action as people read it.
+
+    Examples
+    --------
+    >>> action_text(9.0), action_text(np.array([0.5, 1.0]))
+    ('9', '(0.5, 1)')
+    """
+    if np.ndim(action) == 0:
+        return f"{action:g}"
+    return f"({', '.join(f'{each:g}' for each in action)})"
+
+
+def distances(
+    actions: ActionSet, options: NDArray[np.float64], action: Action
+) -> NDArray[np.float64]:
+    """(k,) ndarray: how far each option is from an action, for comparing them.
+
+    In the unit of the action; in a box in half ranges of the components, the root of the sum of
+    their squares.
+    """
+    if isinstance(actions, BoxActions):
+        return np.asarray(np.sqrt((((options - action) / actions.half) ** 2).sum(axis=-1)))
+    return np.asarray(np.abs(options - action))
+
+
+def change(actions: ActionSet, one: Action, other: Action) -> float:
+    """How far apart two actions are, in half ranges of the set; of `Choices` 1 if they differ.
+
+    Examples
+    --------
+    >>> change(IntervalActions(low=-2.0, high=2.0, width=0.5), 1.0, -1.0), change(Choices(5), 0, 4)
+    (1.0, 1.0)
+    >>> change(BoxActions((-1.0, 0.0), (1.0, 4.0)), [0.0, 2.0], [0.0, 4.0])
+    1.0
+    """
+    if same_action(one, other):
+        return 0.0
+    if isinstance(actions, Choices):
+        return 1.0
+    apart = distances(actions, np.asarray(one, np.float64), other)
+    if isinstance(actions, BoxActions):
+        return float(apart)
+    return float(apart) / (0.5 * (actions.high - actions.low))
+
+
+def nearest_bounds(actions: ActionSet) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Between which values the nearest ones to a proposal are options: first the whole set.
+
+    Then each interval or cell, and last the limits alone: where the nearest is not enough.
+    """
+    if isinstance(actions, BoxActions):
+        lowest, highest = actions.cells
+        return np.vstack([actions.bounds[:1], lowest]), np.vstack([actions.bounds[1:], highest])
+    if isinstance(actions, Choices):
+        every = np.arange(actions.n_actions, dtype=np.float64)
+        return np.append(0.0, every), np.append(actions.high, every)
+    lowest, highest = actions.edges[:-1].copy(), actions.edges[1:].copy()
+    if actions.closed == "left":
+        highest[:-1] = np.nextafter(highest[:-1], -math.inf)
+    else:
+        lowest[1:] = np.nextafter(lowest[1:], math.inf)
+    low, high = actions.low, actions.high
+    return np.array([low, *lowest, low, high]), np.array([high, *highest, low, high])
+
+
+def _finite(name: str, values: Sequence[float]) -> tuple[float, ...]:
+    array = real_array(name, values, 1)
+    if not np.isfinite(array).all():
+        raise ValueError(f"{name} is {tuple(array.tolist())}; it must be finite")
+    return tuple(array.tolist())
+
+
+def _levels(dimensions: int) -> tuple[int, ...]:
+    """Cells along each component that make few enough in all."""
+    if dimensions == 1:
+        return (_LEVELS,)
+    count = max(2, int(_CELLS ** (1.0 / dimensions) + 1e-9))
+    divided = min(dimensions, int(math.log2(_CELLS)))
+    return (count,) * divided + (1,) * (dimensions - divided)

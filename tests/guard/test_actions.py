@@ -1,0 +1,175 @@
+"""Sets of actions: what lies in them, what is put into them, and how far apart two actions are."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from evofsm import IntervalActions
+from evofsm.guard.actions import (
+    BoxActions,
+    Choices,
+    action_text,
+    change,
+    distances,
+    fixed,
+    is_usable,
+    nearest_bounds,
+    put_into,
+    same_action,
+    written,
+)
+
+BOX = BoxActions((-1.0, 0.0), (1.0, 4.0))
+
+
+@st.composite
+def boxes(draw):
+    low = draw(st.lists(st.floats(-100.0, 100.0), min_size=1, max_size=5))
+    ranges = [draw(st.floats(0.01, 50.0)) for _ in low]
+    return BoxActions(tuple(low), tuple(a + b for a, b in zip(low, ranges, strict=True)))
+
+
+@st.composite
+def boxes_and_actions(draw):
+    box = draw(boxes())
+    shares = np.array([draw(st.floats(0.0, 1.0)) for _ in box.low])
+    return box, box.clip(box.bounds[0] + shares * 2.0 * box.half)
+
+
+# -- A box --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("dimensions", "levels"),
+    [(1, (17,)), (2, (9, 9)), (3, (4,) * 3), (4, (3,) * 4), (5, (2,) * 5), (6, (2,) * 6)],
+)
+def test_a_grid_has_as_many_levels_as_make_81_cells_at_most(dimensions, levels):
+    box = BoxActions((0.0,) * dimensions, (1.0,) * dimensions)
+    assert box.levels == levels
+    assert box.n_actions == math.prod(levels) <= 81
+
+
+def test_of_many_dimensions_only_six_are_divided():
+    box = BoxActions((0.0,) * 17, (1.0,) * 17)
+    assert box.n_actions == 64
+    assert box.encode(np.ones(17)) == 63
+    assert nearest_bounds(box)[0].shape == (1 + 64 + 64, 17)
+
+
+@given(boxes_and_actions())
+def test_an_action_lies_in_the_cell_that_it_is_encoded_as(given_):
+    box, action = given_
+    index = box.encode(action)
+    lowest, highest = box.cells[:, index]
+    slack = 1e-9 * np.abs(box.bounds).max()
+    assert (lowest - slack <= action).all()
+    assert (action <= highest + slack).all()
+    assert action in box
+
+
+def test_every_cell_is_encoded_by_its_middle_and_beyond_lies_the_edge():
+    middles = BOX.cells[:, : BOX.n_actions].mean(axis=0)
+    assert [BOX.encode(middle) for middle in middles] == list(range(81))
+    assert BOX.encode([-9.0, -9.0]) == 0
+    assert BOX.encode([9.0, math.inf]) == 80
+    with pytest.raises(ValueError, match="NaN"):
+        BOX.encode([0.0, math.nan])
+
+
+def test_the_corners_are_options_too():
+    lowest, highest = nearest_bounds(BOX)
+    nearest = np.minimum(np.maximum([0.3, 1.0], lowest), highest)
+    assert nearest[0].tolist() == [0.3, 1.0]
+    assert nearest[-4:].tolist() == [[-1.0, 0.0], [-1.0, 4.0], [1.0, 0.0], [1.0, 4.0]]
+    assert all(one in BOX for one in nearest)
+
+
+def test_it_is_a_value_with_plain_fields():
+    same = BoxActions(np.array([-1, 0]), [1, 4], levels=[9, 9])
+    assert same == BOX
+    assert hash(same) == hash(BOX)
+    assert same.low == (-1.0, 0.0)
+    assert BoxActions((0.0,), (1.0,), levels=(3,)).n_actions == 3
+    with pytest.raises(ValueError, match="read-only"):
+        BOX.bounds[0, 0] = 5.0
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"low": (0.0,), "high": (1.0, 2.0)}, "1 components and high has 2"),
+        ({"low": (0.0, 2.0), "high": (1.0, 2.0)}, "in component 1; low must be below high"),
+        ({"low": (-math.inf,), "high": (1.0,)}, "low is .* must be finite"),
+        ({"low": (0.0,), "high": (math.nan,)}, "high is .* must be finite"),
+        ({"low": (-1.7e308,), "high": (1.7e308,)}, "too large"),
+        ({"low": (), "high": ()}, "not empty"),
+        ({"low": 0.0, "high": 1.0}, "low has shape"),
+        ({"low": [[0.0]], "high": [[1.0]]}, "low has shape"),
+        ({"low": (0.0,), "high": (1.0,), "levels": (2, 2)}, "levels has 2 entries"),
+        ({"low": (0.0,), "high": (1.0,), "levels": (0,)}, "levels"),
+        ({"low": (0.0,), "high": (1.0,), "levels": (10_001,)}, "10,001 cells"),
+    ],
+)
+def test_what_is_no_box_is_refused(settings, message):
+    with np.errstate(over="ignore"), pytest.raises(ValueError, match=message):
+        BoxActions(**settings)
+
+
+def test_numbers_in_words_are_refused():
+    with pytest.raises(TypeError, match="low"):
+        BoxActions(("a",), (1.0,))
+    with pytest.raises(ValueError, match="it must have 2"):
+        BOX.encode([0.0])
+
+
+# -- What is done with the actions of any set ---------------------------------------------------
+
+
+def test_actions_are_compared_as_a_whole():
+    assert same_action(0.5, np.float64(0.5))
+    assert same_action(np.array([0.5, 1.0]), np.array([0.5, 1.0]))
+    assert not same_action(np.array([0.5, 1.0]), np.array([0.5, 2.0]))
+    assert not same_action(math.nan, math.nan)
+    assert not same_action(np.array([math.nan, 1.0]), np.array([math.nan, 1.0]))
+
+
+@pytest.mark.parametrize("action", [0.5, [0.5, 1.0]])
+def test_what_is_kept_of_an_action_cannot_be_changed(action):
+    given_ = np.array(action)
+    kept = fixed(given_)
+    given_ += 1.0
+    assert written(kept) == action
+    assert isinstance(kept, float) or not kept.flags.writeable
+
+
+@given(boxes(), st.data())
+def test_whatever_is_finite_is_put_into_a_box(box, data):
+    action = np.array([data.draw(st.floats()) for _ in box.low])
+    assert is_usable(box, action) == np.isfinite(action).all()
+    if is_usable(box, action):
+        inside = put_into(box, action)
+        assert inside in box
+        assert same_action(inside, action) == (action in box)
+
+
+def test_of_other_shapes_none_is_usable():
+    assert not is_usable(BOX, np.zeros(3))
+    assert not is_usable(BOX, 0.0)
+    assert [0.0] not in BOX
+    assert put_into(BOX, 9.0).tolist() == [1.0, 4.0]
+    assert put_into(BOX, (0.0, -1.0)).tolist() == [0.0, 0.0]
+
+
+def test_how_far_apart_actions_are():
+    assert distances(BOX, np.array([[0.0, 0.0], [0.0, 4.0]]), [0.0, 2.0]).tolist() == [1.0, 1.0]
+    assert change(BOX, np.array([-1.0, 0.0]), np.array([1.0, 4.0])) == pytest.approx(8.0**0.5)
+    assert change(IntervalActions(0.0, 4.0, 1.0), 1.0, 2.0) == 0.5
+    assert [change(Choices(9), 1, other) for other in (1, 2, 8)] == [0.0, 1.0, 1.0]
+
+
+def test_an_action_is_told():
+    assert action_text(-2.50) == "-2.5"
+    assert action_text(np.array([0.1, math.nan])) == "(0.1, nan)"
