@@ -212,8 +212,8 @@ def test_a_header_that_makes_no_sense_is_refused_by_name(content, tmp_path):
 
 def test_a_file_of_a_newer_version_asks_for_a_newer_library(tmp_path):
     path = tmp_path / "newer"
-    path.write_bytes(npz({**HEADER, "version": 6}))
-    with pytest.raises(ValueError, match=r"version 6 is newer.*a newer evofsm reads it"):
+    path.write_bytes(npz({**HEADER, "version": 7}))
+    with pytest.raises(ValueError, match=r"version 7 is newer.*a newer evofsm reads it"):
         EvolvingFSM.load(path)
 
 
