@@ -167,6 +167,9 @@ class Dynamics:
         twin.latest = None
         return twin
 
+    def __copy__(self) -> Self:
+        return self.copy()
+
     def __deepcopy__(self, memo: Any) -> Self:
         return self.copy()
 
