@@ -54,7 +54,9 @@ def _copied(value: Any) -> Any:
 
 
 def _is_side_by_side(value: object) -> bool:
-    return isinstance(value, tuple) and bool(value) and getattr(value[0], "base", None) is not None
+    return isinstance(value, tuple) and all(
+        isinstance(part, np.ndarray) and part.base is not None for part in value
+    )
 
 
 class Whole:
