@@ -85,12 +85,14 @@ def compare(
     speed: Callable[[Any], float],
 ) -> tuple[Result, Result]:
     """Drive held-out episodes without the reviser, then, when it has learnt, with it."""
-    without = drive(revised.env, policy, held_out, revised.failed, speed)
+    failed = revised.failed
+    assert failed is not None
+    without = drive(revised.env, policy, held_out, failed, speed)
     print(f"unrevised      {without}")
-    learning = drive(revised, policy, training, revised.failed, speed)
+    learning = drive(revised, policy, training, failed, speed)
     print(f"while learning {learning}")
     revised.guard.freeze()
-    under = drive(revised, policy, held_out, revised.failed, speed)
+    under = drive(revised, policy, held_out, failed, speed)
     print(f"revised        {under}")
     print(
         f"until the unrevised episodes ended they drove at {_mean(without.speeds):.1f} m/s, of "

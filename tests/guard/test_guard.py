@@ -541,6 +541,22 @@ def test_a_judge_is_told_how_an_episode_ended_where_it_learns(learn):
     assert guard.judge.ends == ((None, False), (None, True), ([0.9, 0.0], True)) * learn
 
 
+def test_a_judge_that_wants_to_know_is_told_whether_it_may_learn(tmp_path):
+    class Asked(Balance):
+        learning = None
+
+    guard = Guard(low=-4.0, high=4.0, interval=DT, judge=Asked())
+    assert guard.judge.learning is True
+    guard.freeze()
+    assert guard.judge.learning is False
+    guard.save(tmp_path / "guard")
+    assert Guard.load(tmp_path / "guard", judge=Asked).judge.learning is False
+    assert guard.copy().judge.learning is False
+    guard.learn = True
+    assert guard.judge.learning is True
+    assert not hasattr(continuous().judge, "learning")
+
+
 def test_a_judge_that_cannot_learn_all_the_way_is_refused():
     class Half(Balance):
         end = None

@@ -23,7 +23,7 @@ from evofsm.driving.worlds.kinematic import KinematicWorld  # noqa: E402
 from evofsm.guard.auditing.log import AuditLog  # noqa: E402
 from evofsm.guard.guard import Guard  # noqa: E402
 from evofsm.guard.gym import RevisedActions, RevisedVectorActions  # noqa: E402
-from evofsm.guard.protocols import Fallback, Judgement, Search  # noqa: E402
+from evofsm.guard.protocols import Fallback, Judgement, Proposal, Search  # noqa: E402
 from evofsm.guard.reviser import ActionReviser, Mode  # noqa: E402
 
 FAMILY = load_family("emergency")
@@ -341,7 +341,7 @@ class Spy:
 
     def __init__(self, dangerous=lambda action: False):
         self.dangerous = dangerous
-        self.rows, self.episodes, self.followed = [], [], 0
+        self.rows, self.episodes = [], []
 
     def judge(self, situation, actions):
         risk = np.array([float(self.dangerous(action)) for action in actions])
@@ -366,7 +366,7 @@ class Spy:
     watch = learn
 
     def follow(self, observation, action):
-        self.followed += 1
+        pass
 
     def start_episode(self, *, learn=True):
         self.rows = []
@@ -582,14 +582,16 @@ def recorded(name, count, mode, steps):
     return gymnasium.vector.SyncVectorEnv([make] * count, autoreset_mode=mode), ended
 
 
-def drive_all(envs, steps, seed=0, reset=True):
-    """Random actions; where nothing resets by itself, what is over is reset."""
+def drive_all(envs, steps, seed=0, wish=None):
+    """Random actions, or one; where nothing resets by itself, what is over is reset."""
     envs.action_space.seed(seed)
-    if reset:
-        envs.reset(seed=seed)
+    envs.reset(seed=seed)
     said = []
     for _ in range(steps):
-        _, _, terminated, truncated, infos = envs.step(envs.action_space.sample())
+        actions = envs.action_space.sample()
+        if wish is not None:
+            actions[:] = wish
+        _, _, terminated, truncated, infos = envs.step(actions)
         over = terminated | truncated
         said.append((over, infos))
         if (
@@ -688,8 +690,51 @@ def test_an_episode_is_decided_by_what_was_learnt_before_it_began():
     executed = [revised.step(full)[-1]["reviser/executed_action"].ravel() for _ in range(8)]
     assert (np.array(executed[:4]) == 2.0).all()
     assert (np.array(executed[4:]) <= 0.5).all()
-    assert guard.judge.followed == 0  # the twins followed
     envs.close()
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_with_one_environment_it_comes_to_the_same_bit_for_bit(mode, snapshot):
+    guards = [guard_for_cars(-2.5, 2.5, FAMILY.interval) for _ in range(2)]
+    envs = gymnasium.vector.SyncVectorEnv([lambda: CarFollowing(FAMILY)], autoreset_mode=mode)
+    many = RevisedVectorActions(envs, guards[0], failed=lambda info: bool(info["failed"]))
+    one = RevisedActions(CarFollowing(FAMILY), guards[1], failed=lambda info: info["failed"])
+    alone = drive(one, full_throttle, seed=1)
+    alone += drive(one, full_throttle) + drive(one, full_throttle)
+    said = drive_all(many, len(alone) + (2 if mode is NEXT_STEP else 0), seed=1, wish=2.5)
+    told = [infos for _, infos in said if infos["_reviser/reason"][0]]
+    assert len(told) == len(alone)
+    for name in KEYS:
+        many_said = [np.asarray(infos[name][0]).tolist() for infos in told]
+        assert repr(many_said) == repr([np.asarray(info[name]).tolist() for info in alone]), name
+    assert snapshot(guards[0].machine) == snapshot(guards[1].machine)
+    assert repr(guards[0].judge._learnt()) == repr(guards[1].judge._learnt())
+    envs.close()
+
+
+def test_what_a_judge_learns_from_being_asked_is_learnt_as_well():
+    class Asked(Spy):  # allows less the more often it was asked
+        times = 0
+
+        def search(self, situation, wanted, *, tolerance, revising):
+            self.times += 1
+            options = np.array([wanted, np.clip(wanted, -1.0 / self.times, 1.0 / self.times)])
+            return Search(options, self.judge(situation, options), 1, "asked")
+
+    judges = []
+    for many in (False, True):
+        inner = gymnasium.make("Pendulum-v1", max_episode_steps=6)
+        guard = guard_for(inner.action_space, Asked())
+        judges.append(guard.judge)
+        if many:
+            envs, _ = recorded("Pendulum-v1", 1, SAME_STEP, 6)
+            drive_all(RevisedVectorActions(envs, guard), 18, wish=2.0)
+        else:
+            env = RevisedActions(inner, guard)
+            for seed in (0, None, None):
+                drive(env, lambda *_: np.full(1, 2.0, np.float32), seed=seed)
+    assert judges[0].times == judges[1].times == 18
+    assert judges[0].episodes == judges[1].episodes
 
 
 def test_frozen_many_decide_as_one_does():
@@ -741,7 +786,7 @@ def test_a_guard_with_an_audit_log_is_not_shared(tmp_path):
         with pytest.raises(ValueError, match="one episode at a time"):
             RevisedVectorActions(envs, guard)
         with pytest.raises(ValueError, match="call revise"):
-            guard.take_in(guard.recognise([0.0], 0.0), 0)
+            guard.take_in(guard.recognise([0.0], 0.0), Proposal(0), 0)
 
 
 # -- The examples ------------------------------------------------------------------------------

@@ -9,7 +9,9 @@ from .dynamics.consequents import Scratch as Scratch
 from .dynamics.consequents import follow_policy as follow_policy
 from .dynamics.consequents import replay as replay
 from .dynamics.consequents import scratch as scratch
+from .dynamics.dynamics import DYNAMICS_PARTS as DYNAMICS_PARTS
 from .dynamics.dynamics import Dynamics as Dynamics
+from .dynamics.dynamics import Episode as Episode
 from .dynamics.following import encoded_rows as encoded_rows
 from .dynamics.following import follow as follow
 from .dynamics.following import follow_end as follow_end
@@ -62,6 +64,7 @@ from .numbering import state_name as state_name
 from .observations import Category as Category
 from .observations import Missing as Missing
 from .observations import ObservationEncoder as ObservationEncoder
+from .proportions import poisson_bounds as poisson_bounds
 from .proportions import wilson_bounds as wilson_bounds
 from .rates import OnsetRates as OnsetRates
 from .rates import Rate as Rate

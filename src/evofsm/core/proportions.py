@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import cache
 
 from evofsm.core.kernels import compiled
 
 # Two-sided 90 %.
 _WIDTH = 1.645
+# From this shape on a gamma distribution is taken to be a power of a normal one.
+_LARGE = 50.0
+_HALVINGS = 60
 
 
 @compiled
@@ -37,6 +41,62 @@ def wilson_bounds(share: float, count: float) -> tuple[float, float]:
     centre = (share + 0.5 * spread) / (1.0 + spread)
     reach = math.sqrt(spread * (share * (1.0 - share) + 0.25 * spread)) / (1.0 + spread)
     return max(centre - reach, 0.0), min(centre + reach, 1.0)
+
+
+@cache
+def poisson_bounds(count: int) -> tuple[float, float]:
+    """90 % interval of the number of events to be expected where ``count`` were seen.
+
+    Exact (Garwood 1936): the bounds are where as few, and as many, are seen in 5 % of cases.
+
+    Parameters
+    ----------
+    count : int
+        At least 0.
+
+    Returns
+    -------
+    (float, float)
+        Lower and upper bound.
+
+    Examples
+    --------
+    >>> [round(bound, 3) for bound in poisson_bounds(0) + poisson_bounds(3)]
+    [0.0, 2.996, 0.818, 7.754]
+    """
+    low = gamma_quantile(0.05, count) if count else 0.0
+    return low, gamma_quantile(0.95, count + 1.0)
+
+
+def gamma_quantile(share: float, shape: float) -> float:
+    """Below which a gamma variable of scale 1 lies with this probability, 0.05 or 0.95.
+
+    Examples
+    --------
+    >>> round(gamma_quantile(0.95, 1.0), 3), round(gamma_quantile(0.05, 3.0), 3)  # - log 0.05
+    (2.996, 0.818)
+    """
+    if shape > _LARGE:  # Wilson & Hilferty 1931
+        width = _WIDTH if share > 0.5 else -_WIDTH
+        return float(shape * (1.0 - 1.0 / (9.0 * shape) + width / (3.0 * math.sqrt(shape))) ** 3)
+    low, high = 0.0, shape + 10.0 * math.sqrt(shape) + 10.0
+    for _ in range(_HALVINGS):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if _gamma_below(middle, shape) < share else (low, middle)
+    return high
+
+
+def _gamma_below(x: float, shape: float) -> float:
+    """Probability that a gamma variable of scale 1 lies below x: the series of its density."""
+    if x <= 0.0:
+        return 0.0
+    term = total = 1.0 / shape
+    k = shape
+    while term > 1e-15 * total:
+        k += 1.0
+        term *= x / k
+        total += term
+    return total * math.exp(shape * math.log(x) - x - math.lgamma(shape))
 
 
 def bounds_text(low: float, high: float) -> str:

@@ -20,11 +20,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-# Two-sided 90 %, and the normal distribution's quantile for it.
-_TAIL, _WIDTH = 0.05, 1.6448536269514722
-# From this shape on a gamma distribution is taken to be a power of a normal one.
-_LARGE = 50.0
-_HALVINGS = 60
+from evofsm.core.proportions import gamma_quantile, poisson_bounds
+
+# Two-sided 90 %.
+_TAILS = (0.05, 0.95)
 
 
 class Rate(NamedTuple):
@@ -49,9 +48,8 @@ class Rate(NamedTuple):
         """The rate of what was counted, with its interval (Garwood 1936)."""
         if exposure <= 0.0:
             return cls(int(onsets), 0.0, math.nan, 0.0, math.inf)
-        low = gamma_quantile(_TAIL, onsets) / exposure if onsets else 0.0
-        high = gamma_quantile(1.0 - _TAIL, onsets + 1.0) / exposure
-        return cls(int(onsets), float(exposure), onsets / exposure, low, high)
+        low, high = poisson_bounds(int(onsets))
+        return cls(int(onsets), float(exposure), onsets / exposure, low / exposure, high / exposure)
 
     def __repr__(self) -> str:
         return (
@@ -96,38 +94,6 @@ def shrunk_rates(counts: NDArray[np.float64], exposure: NDArray[np.float64]) -> 
     b = mean / variance
     shapes, times = mean * b + counts, b + exposure
     low, high = (
-        np.array([gamma_quantile(share, shape) for shape in shapes]) / times
-        for share in (_TAIL, 1.0 - _TAIL)
+        np.array([gamma_quantile(share, shape) for shape in shapes]) / times for share in _TAILS
     )
     return OnsetRates(shapes / times, low, high, pooled)
-
-
-def gamma_quantile(share: float, shape: float) -> float:
-    """Below which a gamma variable of scale 1 lies with this probability.
-
-    Examples
-    --------
-    >>> round(gamma_quantile(0.95, 1.0), 3), round(gamma_quantile(0.05, 3.0), 3)  # - log 0.05
-    (2.996, 0.818)
-    """
-    if shape > _LARGE:  # Wilson & Hilferty 1931
-        width = _WIDTH if share > 0.5 else -_WIDTH
-        return float(shape * (1.0 - 1.0 / (9.0 * shape) + width / (3.0 * math.sqrt(shape))) ** 3)
-    low, high = 0.0, shape + 10.0 * math.sqrt(shape) + 10.0
-    for _ in range(_HALVINGS):
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if _gamma_below(middle, shape) < share else (low, middle)
-    return high
-
-
-def _gamma_below(x: float, shape: float) -> float:
-    """Probability that a gamma variable of scale 1 lies below x: the series of its density."""
-    if x <= 0.0:
-        return 0.0
-    term = total = 1.0 / shape
-    k = shape
-    while term > 1e-15 * total:
-        k += 1.0
-        term *= x / k
-        total += term
-    return total * math.exp(shape * math.log(x) - x - math.lgamma(shape))

@@ -17,8 +17,11 @@ from .defaults import BELIEF_TOLERANCE as BELIEF_TOLERANCE
 from .defaults import TOLERANCE as TOLERANCE
 from .guard import Explain as Explain
 from .guard import Guard as Guard
+from .guard import learnt_guard as learnt_guard
 from .gym import RevisedActions as RevisedActions
 from .gym import RevisedVectorActions as RevisedVectorActions
+from .learnt.risk import JUDGE_PARTS as JUDGE_PARTS
+from .learnt.risk import LearntRisk as LearntRisk
 from .protocols import ActionJudge as ActionJudge
 from .protocols import AsksMachine as AsksMachine
 from .protocols import Controller as Controller

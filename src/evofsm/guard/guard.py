@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from enum import Enum
 from io import BytesIO
 from typing import Any, Self
@@ -17,6 +17,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from evofsm.core import (
+    DYNAMICS_PARTS,
+    Dynamics,
     EvolvingFSM,
     FSMModel,
     IntervalActions,
@@ -31,6 +33,8 @@ from evofsm.files import Place, ranges, storage
 from evofsm.guard.actions import Action, ActionSet, BoxActions, Choices, fixed, no_action
 from evofsm.guard.auditing.participants import outline, rebuild
 from evofsm.guard.defaults import BELIEF_TOLERANCE, TOLERANCE
+from evofsm.guard.learnt.actions import dynamics_for
+from evofsm.guard.learnt.risk import JUDGE_PARTS, LearntRisk
 from evofsm.guard.protocols import (
     INCOMPLETE,
     STALE,
@@ -94,13 +98,16 @@ class Guard:
         Number of actions, where an action is an index from 0.
     interval : float
         Time between two decisions [s].
-    judge : ActionJudge
-        Says how dangerous an action is. There is no default yet; for cars
-        `evofsm.driving.guard_for_cars` brings one.
+    judge : ActionJudge, optional
+        Says how dangerous an action is. Without one it is learnt from what happens
+        (`LearntRisk`); for cars `evofsm.driving.guard_for_cars` brings one that is told how cars
+        move.
     failed : callable, optional
-        From an observation to whether it is a failure; asked as an episode ends.
+        From an observation to whether it is a failure; asked as an episode ends. A learnt judge
+        also asks it beforehand, along each variable: so it knows of failures before the first.
     horizon : float, optional
-        What the machine's explanations call soon [s].
+        How far ahead a learnt judge looks, and what the machine's explanations call soon [s].
+        Without it a learnt judge looks as far as it finds that it has to.
     tolerance : float
         Highest risk that is accepted, in (0, 1).
     mode : Mode
@@ -123,8 +130,8 @@ class Guard:
     Raises
     ------
     ValueError
-        If there is no judge, neither a range of actions nor a number of them (or both), a number
-        is out of its range, or judge and machine were made for other actions or another interval.
+        If there is neither a range of actions nor a number of them (or both), a number is out of
+        its range, or judge and machine were made for other actions or another interval.
 
     Notes
     -----
@@ -162,24 +169,18 @@ class Guard:
         explaining: Explain | None = None,
         missing: Missing = Missing.PARTIAL,
     ) -> None:
-        if judge is None:
-            raise ValueError(
-                "a guard needs a judge that says how dangerous an action is: give judge=, an "
-                "ActionJudge (for cars: evofsm.driving.guard_for_cars)"
-            )
         actions = _actions(low, high, n_actions, width)
         interval = positive("interval", interval)
         soon = None if horizon is None else max(1, round(positive("horizon", horizon) / interval))
+        if judge is None:
+            judge = LearntRisk(interval, seed=seed)
+        dynamics = None
+        if machine is None and isinstance(judge, LearntRisk):
+            dynamics = dynamics_for(actions, soon)
         self._set_up(
             ActionReviser(judge, actions, tolerance=tolerance, mode=mode),
             interval=interval,
-            machine=machine
-            or EvolvingFSM(
-                actions.n_actions,
-                max_states=_MOST_STATES,
-                belief_tolerance=BELIEF_TOLERANCE,
-                failure_horizon=soon,
-            ),
+            machine=machine or _machine(actions, soon, dynamics),
             failed=failed,
             seed=seed,
             audit=audit,
@@ -280,6 +281,8 @@ class Guard:
             actions=self.actions if isinstance(self.actions, IntervalActions) else None,
             dt=interval,
         )
+        if machine is not None and machine.dynamics is not None:
+            machine.dynamics.told = failed
         self._frozen: FSMModel | None = None
         self._senses = Senses(missing, interval)
         self._under_way = False
@@ -295,7 +298,11 @@ class Guard:
     @learn.setter
     def learn(self, learn: bool) -> None:
         self._learn = learn
+        if self.judge is not None and hasattr(self.judge, "learning"):
+            self.judge.learning = learn
         self._under_way = False
+        if self.machine is not None and not learn:
+            self.machine.start_episode()
         self._frozen = None if learn or self.machine is None else self.machine.model()
 
     def freeze(self) -> None:
@@ -498,13 +505,18 @@ class Guard:
             return revision._replace(executed=int(revision.executed), advised=int(revision.advised))
         return revision
 
-    def take_in(self, situation: Situation, executed: Action) -> None:
+    def take_in(self, situation: Situation, proposal: Proposal, executed: Action) -> None:
         """Instead of `revise`, where it was decided elsewhere: learn from what was executed.
+
+        The reviser is asked all the same, as a judge may learn from that too; what it says is
+        not executed.
 
         Parameters
         ----------
         situation : Situation
             What `recognise` returned.
+        proposal : Proposal
+            What the controller wanted.
         executed : float or (d,) array_like
             An action of the set.
 
@@ -518,18 +530,21 @@ class Guard:
         >>> from evofsm.driving import guard_for_cars
         >>> guard = guard_for_cars(low=-2.5, high=2.5)
         >>> for k in range(2):
-        ...     guard.take_in(guard.recognise([9.0 - k, 20.0, 20.0], time=0.25 * k), -1.0)
+        ...     here = guard.recognise([9.0 - k, 20.0, 20.0], time=0.25 * k)
+        ...     guard.take_in(here, Proposal(1.0), executed=-1.0)
         >>> guard.machine.model().uses.sum()
         np.float64(1.0)
         """
         if self.audit is not None:
             raise ValueError("with an audit log a guard decides itself: call revise")
+        self.reviser.revise(situation, proposal)
         self._take_in(situation, fixed(executed))
 
     def _take_in(self, situation: Situation, executed: Action) -> None:
         self._decisions += 1
         if self.machine is not None and self.learn and self.machine.state is not None:
-            self.machine.act(self.actions.encode(executed), executed)
+            index = self.actions.encode(executed)
+            self.machine.act(index, index if isinstance(self.actions, Choices) else executed)
         if self.judge is not None and not (situation.intake and situation.intake & STALE):
             if not self.learn:
                 self.judge.follow(situation.observation, executed)
@@ -585,6 +600,8 @@ class Guard:
             elif failed and self.machine.state is not None:
                 self.machine.fail()
             self.machine.tell_of_failures()
+            if not failed:
+                self.machine.start_episode()
         if self.judge is not None and self.learn:
             self.judge.end(z, failed=failed)
         elif self.judge is not None:
@@ -737,6 +754,58 @@ class Guard:
                 missing=Missing(kept["missing"]),
                 **{name: kept[name] for name in ("interval", "learn", "seed")},
             )
+
+
+def learnt_guard(
+    low: ArrayLike | None = None,
+    high: ArrayLike | None = None,
+    *,
+    n_actions: int | None = None,
+    interval: float,
+    horizon: float | None = None,
+    seed: int = 0,
+    without: Sequence[str] = (),
+) -> Guard:
+    """A guard with the learnt judge, of which parts may be left out: to see what they are worth.
+
+    Parameters
+    ----------
+    low, high, n_actions, interval, horizon, seed
+        As in `Guard`.
+    without : sequence of str
+        Names of `JUDGE_PARTS` and of `evofsm.core.DYNAMICS_PARTS`.
+
+    Raises
+    ------
+    ValueError
+        If a part is of another name, or as in `Guard`.
+
+    Examples
+    --------
+    >>> guard = learnt_guard(low=-2.0, high=2.0, interval=0.02, without=("margin",))
+    >>> guard.judge.margin
+    0.0
+    """
+    if unknown := set(without) - {*JUDGE_PARTS, *DYNAMICS_PARTS}:
+        raise ValueError(f"there are no parts {sorted(unknown)}")
+    actions = _actions(low, high, n_actions, None)
+    soon = None if horizon is None else max(1, round(positive("horizon", horizon) / interval))
+    judge = LearntRisk(interval, seed=seed, without=[p for p in without if p in JUDGE_PARTS])
+    machine = _machine(actions, soon, dynamics_for(actions, soon, without))
+    return Guard(
+        low, high, n_actions=n_actions, interval=interval, seed=seed, judge=judge, machine=machine
+    )
+
+
+def _machine(actions: ActionSet, soon: int | None, dynamics: Dynamics | None) -> EvolvingFSM:
+    """With recommended settings."""
+    return EvolvingFSM(
+        actions.n_actions,
+        max_states=_MOST_STATES,
+        belief_tolerance=BELIEF_TOLERANCE,
+        failure_horizon=soon,
+        dynamics=dynamics,
+    )
 
 
 def _actions(

@@ -127,6 +127,8 @@ class RevisedActions(gymnasium.Wrapper[Any, Any, Any, Any]):
             _both(to_acceleration, to_action) or _conversions(env.action_space, guard.actions),
             penalty,
         )
+        self.observe, self.failed = self._terms.observe, failed
+        self.to_acceleration, self.to_action = self._terms.to_guard, self._terms.to_env
         self.revision: Revision | None = None  #: the latest decision
         self._stream = _Stream(guard)
 
@@ -161,10 +163,11 @@ class RevisedVectorActions(VectorWrapper[Any, Any, Any, Any, Any]):
     What any of them meets, all profit from: the guard learns each environment's episode **as a
     whole when it ends**, one after another, those that end in the same step in the order of the
     environments. So no transition of one is ever taken for one of another, nor one across a
-    reset. In an episode it is a frozen twin of the guard (`Guard.copy`) that decides, made as the
-    episode begins: it knows what was learnt from all episodes that had ended by then, and nothing
-    of those that run beside it. What is changed about the guard meanwhile, its mode for example,
-    counts in each environment from its next episode on.
+    reset. In an episode a twin of the guard (`Guard.copy`) decides, made as the episode begins: it
+    knows all episodes that had ended by then and learns from its own, but knows nothing of those
+    that run beside it. With one environment that comes to the same as `RevisedActions`, bit for
+    bit. What is changed about the guard meanwhile, its mode for example, counts in each
+    environment from its next episode on.
 
     Parameters
     ----------
@@ -190,8 +193,8 @@ class RevisedVectorActions(VectorWrapper[Any, Any, Any, Any, Any]):
     episode that was not reset (``DISABLED``). With ``SAME_STEP`` they are about the step that
     ended the episode. `revisions` holds the latest decisions.
 
-    A guard that learns in one environment uses what it learns at once; here only from one episode
-    to the next. With one environment that is the difference between the two wrappers.
+    All that begin together know equally little: with nothing learnt yet, each of them may fail
+    where one environment after another would have failed once.
 
     Examples
     --------
@@ -370,29 +373,29 @@ class _Stream:
 
 
 class _Lane(_Stream):
-    """A stream beside others: a frozen twin decides, the shared guard learns it as it ends."""
+    """A stream beside others: a twin decides, and the shared guard learns it all as it ends."""
 
     def __init__(self, shared: Guard) -> None:
         super().__init__(shared)
         self._shared = shared
-        self._driven: list[tuple[NDArray[np.float64], float, Action]] = []
+        self._driven: list[tuple[NDArray[np.float64], float, Proposal, Action]] = []
 
     def _begin(self) -> None:
         self.guard, self._driven = self._shared.copy(), []
-        self.guard.freeze()
         self.guard.begin()
 
     def _decide(self, seen: NDArray[np.float64], proposal: Proposal, time: float) -> Revision:
         revision = self.guard.decide(seen, proposal, time)
-        self._driven.append((seen, time, revision.executed))
+        self._driven.append((seen, time, proposal, revision.executed))
         return revision
 
     def _end(self, seen: _Seen, *, failed: bool) -> None:
         if not self._shared.learn:
             return
         self._shared.begin()
-        for observation, time, executed in self._driven:
-            self._shared.take_in(self._shared.recognise(observation, time), executed)
+        for observation, time, proposal, executed in self._driven:
+            situation = self._shared.recognise(observation, time)
+            self._shared.take_in(situation, proposal, executed)
         self._shared.end(failed, seen)
 
 
@@ -412,12 +415,12 @@ class _Terms:
         self.guard = guard
         self.observe = _flat(observe) if isinstance(observe, gymnasium.Space) else observe
         self._failed = failed
-        self._to_guard, self._to_env = conversions
+        self.to_guard, self.to_env = conversions
         self.penalty = penalty
 
     def proposal(self, action: Any) -> Proposal:
         """What was proposed, as the guard takes it."""
-        wanted = self._to_guard(action)
+        wanted = self.to_guard(action)
         if isinstance(self.guard.actions, BoxActions):
             return Proposal(self.guard.actions.checked("proposal", wanted))
         return Proposal(float(wanted))
@@ -426,7 +429,7 @@ class _Terms:
         """What is executed, as the environment takes it: the very proposal where it is kept."""
         if same_action(revision.executed, revision.proposed):
             return action
-        return self._to_env(revision.executed)
+        return self.to_env(revision.executed)
 
     def failed(self, info: dict[str, Any], terminated: bool) -> bool:
         """Whether a step ended in failure, but for what the guard finds itself."""

@@ -191,7 +191,11 @@ class SearchingJudge(ActionJudge, Protocol):
 
 @runtime_checkable
 class LearningJudge(ActionJudge, Protocol):
-    """A judge that learns from what happens, and can be kept in a file."""
+    """A judge that learns from what happens, and can be kept in a file.
+
+    One that also learns from being asked, or tries actions, may have an attribute ``learning``: the
+    guard sets it to whether anything may be learnt.
+    """
 
     dt: float  #: time between decisions [s]
 

@@ -25,7 +25,7 @@ from evofsm.core.validation import real_array, refuse_unusable, whole
 _Floats = NDArray[np.float64]
 
 #: Parts that can be left out, to see what each is worth.
-PARTS = ("stretches", "memory", "products", "lags", "jumps", "carried")
+DYNAMICS_PARTS = ("stretches", "memory", "products", "lags", "jumps", "carried")
 
 # Transitions before anything is expected.
 _FIRST = 15
@@ -83,7 +83,7 @@ class Dynamics:
         Number of stretches that are kept where somebody chooses among them (`keep`); of those that
         nobody has chosen yet, the newest, so that there are at most four times as many.
     without : sequence of str
-        Parts of `PARTS` that are left out.
+        Parts of `DYNAMICS_PARTS` that are left out.
 
     Raises
     ------
@@ -131,8 +131,10 @@ class Dynamics:
         self.size = self.choices or len(self.low)
         self.horizon = whole("horizon", horizon)
         self.n_stretches = whole("stretches", stretches)
-        if unknown := set(without) - set(PARTS):
-            raise ValueError(f"without names {sorted(unknown)}; there are {', '.join(PARTS)}")
+        if unknown := set(without) - set(DYNAMICS_PARTS):
+            raise ValueError(
+                f"without names {sorted(unknown)}; there are {', '.join(DYNAMICS_PARTS)}"
+            )
         self.without = frozenset(without)
         self.n_variables = 0
         self.told: Callable[[_Floats], bool] | None = None

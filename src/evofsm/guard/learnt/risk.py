@@ -1,345 +1,491 @@
-"""The learnt judge: it is told nothing but which episodes failed."""
+"""The learnt judge: told nothing but which episodes failed, it judges by replays of what may begin.
+
+An action passes if after it some backup policy survives everything that is remembered, whichever of
+it begins now, by a margin. What failure is, how the system moves, what disturbs it and for how long
+is all learnt by the machine (`evofsm.core.Dynamics`); backups, margin and the situations on which
+they are tried are learnt here.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from itertools import product
-from typing import Any, NamedTuple
+import math
+import operator
+from collections.abc import Mapping, Sequence
+from typing import Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from evofsm.core import Disturbances, Dynamics, Here
-from evofsm.guard.learnt.search import CHANGED, KEPT, NOTHING_PASSES, harm, search, worth
+from evofsm.core import (
+    Disturbances,
+    Dynamics,
+    EvolvingFSM,
+    Here,
+    Labels,
+    poisson_bounds,
+    positive,
+)
+from evofsm.files import Place, storage
+from evofsm.guard.learnt.backups import Backups
+from evofsm.guard.learnt.keeping import KIND, content_of, restore
+from evofsm.guard.learnt.remembering import Situations, choose
+from evofsm.guard.learnt.search import CHANGED, KEPT, NOTHING_PASSES, escapes, search, worth
+from evofsm.guard.protocols import Fallback, Judgement, Search, Situation, Trial
 
 _Floats = NDArray[np.float64]
 
-PARTS = ("margin", "backups", "states")
+#: Parts that can be left out, to see what each is worth; others are those of `Dynamics`.
+JUDGE_PARTS = ("margin", "backups")
 
-# Backups that are asked in a decision, and linear ones that evolve.
-_ASKED, _LINEAR = 3, 3
-# Mutants an episode; disturbances that they are tried on, beside none.
-_MUTANTS, _TRIED_ON = 40, 5
-# Situations that are remembered; of those as many are asked for what harms.
-_SITUATIONS, _SCANNED = 32, 8
-_MOST_STARTS = 160
+# Backups that are asked in a decision, and disturbances that mutants are tried on, beside none.
+_ASKED, _TRIED_ON = 3, 5
 # The margin [ordinary changes]: at first, at most, what is left of it an episode later, and what a
-# broken certificate adds, for a rate of those of.
+# broken certificate adds, for so many that may be.
 _MARGIN, _LARGEST, _FADES, _ADDED, _RATE = 3.0, 8.0, 0.9, 0.25, 0.001
+# By so much more a proposal has to pass once one was refused.
 _RELEASE = 0.0
-# Disturbances are taken to be harder by so many of the number of episodes, and at most.
+# Disturbances are taken to be harder than they were by so many over the number of episodes.
 _CAUTION = 4.0
 # Backups closer than this are alike; an action that was used less often is tried.
 _ALIKE, _TRIES = 0.02, 8
 
 
-class Found(NamedTuple):
-    """What a search came to."""
-
-    action: _Floats
-    how: int
-    backup: int
-
-
 class LearntRisk:
-    """Judges actions by replays of what may begin here."""
+    """Judges actions by what the machine beside it has learnt of how the system moves and fails.
 
-    def __init__(self, dynamics: Dynamics, *, seed: int = 0, without: Sequence[str] = ()) -> None:
-        self.dynamics = dynamics
-        self.seed = seed
+    It is told neither what variables mean nor how they move. Before the first failure of an episode
+    there is nothing that it could prevent, unless failure was told as a function; then all is kept.
+
+    Parameters
+    ----------
+    dt : float
+        Time between two decisions [s].
+    seed : int
+        Of the draws with which backups evolve and situations are chosen.
+    without : sequence of str
+        Parts of `JUDGE_PARTS` that are left out.
+
+    Raises
+    ------
+    ValueError
+        If ``dt`` is not positive and finite, or ``without`` names no part.
+
+    Notes
+    -----
+    The risk of an action is the probability that within the horizon something begins that no
+    backup survives after it: ``1 - exp(-lost / exposure * horizon)``, from the number of remembered
+    disturbances that are lost and the time in which they were seen; 1 where not even an
+    undisturbed future is survived. Its 90 % interval is that of a Poisson count (Garwood 1936).
+    It speaks of what was seen: what never began is not in it.
+
+    A predictive safety filter as of Wabersich & Zeilinger (Automatica 2021), with model,
+    disturbances and backups learnt online. The margin follows adaptive conformal control (Gibbs &
+    Candes 2021): each broken certificate (a step ago some backup survived all, now none does even
+    without a margin) adds to it, and it fades else.
+
+    Examples
+    --------
+    >>> from evofsm.guard import Guard
+    >>> guard = Guard(low=-2.0, high=2.0, interval=0.02)
+    >>> guard.judge
+    LearntRisk(dt=0.02, seed=0)
+    """
+
+    def __init__(self, dt: float, *, seed: int = 0, without: Sequence[str] = ()) -> None:
+        self.dt = positive("dt", dt)
+        self.seed = operator.index(seed)
+        if unknown := set(without) - set(JUDGE_PARTS):
+            raise ValueError(f"without names {sorted(unknown)}; there are {', '.join(JUDGE_PARTS)}")
         self.without = frozenset(without)
-        self.margin = 0.0 if "margin" in self.without else _MARGIN
-        self.broken = 0
-        self.studied = 0
+        self.labels = Labels(dt=self.dt)
+        self.machine: EvolvingFSM | None = None
+        #: Whether it may try actions to learn what they do.
         self.learning = True
-        self.explored = 0
-        self.counts = np.zeros(3, int)
-        self.policies = np.zeros((0, 0, 0))
-        self.ranks = np.zeros(0, int)
-        self.base = np.zeros(0, int)
-        self.situations: list[Here] = []
+        #: What has to be left of the distance to failure [ordinary changes].
+        self.margin = 0.0 if "margin" in self.without else _MARGIN
+        #: Certificates that were broken.
+        self.broken = 0
+        self.n_studied = 0
+        self.n_scanned = 0
+        self.situations = Situations()
+        self.backups: Backups | None = None
         self.disturbances: Disturbances | None = None
-        self.start()
+        self._forget()
 
-    def start(self) -> None:
-        """Nothing is certified yet."""
-        self._certified = False
-        self._tight: list[bool] = []
-        self.ranks = self.base.copy()
-        self._order = np.arange(
-            0 if self.disturbances is None else len(self.disturbances.residuals)
-        )
-        self._revising = False
+    def bind(self, machine: EvolvingFSM) -> None:
+        """Ask this machine from now on.
+
+        Raises
+        ------
+        ValueError
+            If it learns no dynamics.
+        """
+        if machine.dynamics is None:
+            raise ValueError("the machine learns no dynamics; make it with dynamics=Dynamics(...)")
+        self.machine = machine
+
+    @property
+    def dynamics(self) -> Dynamics:
+        """What the machine has learnt of how the system moves."""
+        if self.machine is None or self.machine.dynamics is None:
+            raise ValueError("the judge was not told which machine to ask: bind it")
+        return self.machine.dynamics
+
+    @property
+    def fallback(self) -> Fallback:
+        """What is done without a usable proposal, and then revised like any."""
+        if self.machine is None:
+            return Fallback(0.0, "doing nothing")
+        dynamics = self.dynamics
+        if dynamics.choices:
+            return Fallback(0.0, "the first action")
+        middle = dynamics.decode(np.zeros(dynamics.size))
+        return Fallback(middle if len(middle) > 1 else float(middle[0]), "the middle of the range")
+
+    def trial(self) -> Trial | None:
+        """None: what it has to try, its search tries."""
+        return None
+
+    def effective(self, situation: Situation, actions: NDArray[np.float64]) -> NDArray[np.float64]:
+        """All actions as they are."""
+        return actions
+
+    def refuse_unfit(self, low: Any, high: Any) -> None:
+        """Nothing: it counts on no action."""
+
+    # -- Deciding -------------------------------------------------------------------------------
 
     @property
     def harder(self) -> float:
-        """By how much more than they were disturbances are taken to be."""
-        return 1.0 + min(0.5 * _CAUTION, _CAUTION / max(1, self.studied))
+        """How much harder than they were disturbances are taken to be, while little was seen."""
+        return 1.0 + min(0.5 * _CAUTION, _CAUTION / max(1, self.n_scanned))
 
-    def decide(self, here: Here, proposal: _Floats) -> Found:
-        """The closest action that passes."""
-        known = self.dynamics.consequents
-        if self.disturbances is None or not len(known.sides):
-            self._tight.append(False)
-            return Found(proposal, KEPT, -1)
-        best, d = np.empty(len(proposal)), self.disturbances
-        ranks = self.ranks[:_ASKED]
-        keep = self.margin + (_RELEASE if self._revising else 0.0)
-        how, backup, apart = search(
-            known,
-            here,
-            proposal,
-            self.policies,
-            ranks,
-            d,
-            self._order,
-            self.harder,
-            self.margin,
-            keep,
-            0,
-            best,
+    @property
+    def exposure(self) -> float:
+        """Time in which all that is remembered was seen [s]."""
+        dynamics = self.dynamics
+        return float(dynamics.sums.counts[0]) * self.dt if dynamics.n_variables else 0.0
+
+    def search(
+        self, situation: Situation, wanted: Any, *, tolerance: float, revising: bool
+    ) -> Search:
+        """The closest action to ``wanted`` that passes, or else that of the longest-lasting backup.
+
+        Parameters
+        ----------
+        situation : Situation
+        wanted : float or (d,) array
+        tolerance : float
+            So much risk may be accepted, where so much was seen that its upper bound is known to
+            be smaller.
+        revising : bool
+            Whether the proposal before was not kept.
+
+        Returns
+        -------
+        Search
+        """
+        dynamics, here = self.dynamics, self._here(situation)
+        one = np.array([wanted])
+        if here is None or self.disturbances is None or self.backups is None:
+            return Search(one, _unjudged(1), 0, "nothing was learnt yet")
+        known = dynamics.consequents
+        if not len(known.sides):
+            return Search(one, _unjudged(1), 0, "no failure is known yet")
+        proposal, best = dynamics.encode(wanted), np.empty(dynamics.size)
+        allowed = self._allowed(tolerance)
+        keep = self.margin + (_RELEASE if revising else 0.0)
+        asked = self._ranks[:_ASKED]
+        world = (self.backups.policies, asked, self.disturbances, self._order, self.harder)
+        how, backup, apart = search(known, here, proposal, *world, self.margin, keep, allowed, best)
+        self._ranks = np.array([backup, *(q for q in self._ranks if q != backup)])
+        self._tight = how != KEPT
+        tried = (
+            self._untried(best) if self.learning and how == NOTHING_PASSES and apart < _ALIKE else None
         )
-        self.counts[how] += 1
-        self._revising = how != KEPT
-        self._tight.append(how != KEPT)
-        self.ranks = np.array([backup, *(q for q in self.ranks if q != backup)])
-        if not self.learning:
-            return Found(best, how, backup)
-        if how == NOTHING_PASSES and apart < _ALIKE:
-            best = self._untried(best)
-        broken = False
-        if how == NOTHING_PASSES and self._certified:
-            trial = np.empty(len(proposal))
-            again, _, _ = search(
-                known,
-                here,
-                best,
-                self.policies,
-                ranks,
-                d,
-                self._order,
-                self.harder,
-                0.0,
-                0.0,
-                0,
-                trial,
-            )
-            broken = again == NOTHING_PASSES
-        if "margin" not in self.without:
-            self.broken += broken
-            self.margin = min(_LARGEST, max(0.0, self.margin + _ADDED * (broken - _RATE)))
-        self._certified = how != NOTHING_PASSES or (self._certified and not broken)
-        return Found(best, how, backup)
+        self._holds = how != NOTHING_PASSES
+        if not self._holds and self._certified:
+            again = search(known, here, best, *world, 0.0, 0.0, allowed, np.empty_like(best))
+            self._holds = again[0] != NOTHING_PASSES
+        then = f"then {self._backup_text(backup)}"
+        if how == KEPT:
+            judged = self._judgement(np.zeros(1), np.full(1, self.margin), situation)
+            return Search(one, judged, 0, f"all {self._number} are survived, {then}")
+        if tried is not None:
+            best = tried
+        action = np.reshape(dynamics.decode(best), np.shape(wanted))
+        judged = self._judged(situation, here, np.stack([proposal, best]))
+        why = self.why(judged)
+        if tried is not None:
+            how_so = "what this does is hardly known, so it is tried"
+        elif how == CHANGED:
+            how_so = f"the closest that passes, {then}"
+        else:
+            how_so = f"nothing passes, what lasts longest is {self._backup_text(backup)}"
+        return Search(np.stack([one[0], action]), judged, 1, f"{why}; {how_so}")
 
-    def _untried(self, best: _Floats) -> _Floats:
+    def judge(self, situation: Situation, actions: ArrayLike) -> Judgement:
+        """Risk of each action.
+
+        Parameters
+        ----------
+        situation : Situation
+        actions : (k,) or (k, d) array_like
+
+        Returns
+        -------
+        Judgement
+            NaN as long as nothing can be said.
+        """
+        given, here = np.asarray(actions, np.float64), self._here(situation)
+        if here is None or self.disturbances is None or not len(self.dynamics.consequents.sides):
+            return _unjudged(len(given))
+        inner = np.array([self.dynamics.encode(one) for one in given])
+        return self._judged(situation, here, inner)
+
+    def why(self, judged: Judgement) -> str:
+        """Why the first action that was judged is dangerous, in a few words."""
+        if self._lost < 0:
+            return "failure follows even if nothing begins"
+        if self._lost == 0:
+            return f"within the margin of {self.margin:.2g} ordinary changes"
+        be = "is" if self._lost == 1 else "are"
+        return f"{self._lost} of {self._number} {be} survived by no backup"
+
+    def _judged(self, situation: Situation, here: Here, actions: _Floats) -> Judgement:
+        assert self.disturbances is not None and self.backups is not None
+        found = np.empty(len(self.disturbances.residuals))
+        lost, left = np.zeros(len(actions)), np.zeros(len(actions))
+        for i, action in enumerate(actions):
+            escapes(
+                self.dynamics.consequents,
+                here,
+                action,
+                self.backups.policies,
+                self._ranks[:_ASKED],
+                self.disturbances,
+                found,
+            )
+            lost[i] = math.inf if found[0] < 0.0 else np.count_nonzero(found < 0.0)
+            left[i] = found.min()
+        self._lost = -1 if math.isinf(lost[0]) else int(lost[0])
+        return self._judgement(lost, left, situation)
+
+    def _judgement(self, lost: _Floats, left: _Floats, situation: Situation) -> Judgement:
+        risk, low, high = (np.array(each) for each in zip(*map(self._risk, lost), strict=True))
+        seen, machine = math.nan, self.machine
+        if (
+            machine is not None
+            and situation.state is not None
+            and situation.state < machine.n_states
+        ):
+            seen = float(machine.visits[situation.state]) * self.dt
+        return Judgement(risk, low, high, left, float(len(self.dynamics.stretches)), seen)
+
+    def _risk(self, lost: float) -> tuple[float, float, float]:
+        """Probability, with its interval, that something begins that is lost."""
+        if math.isinf(lost):
+            return 1.0, 0.0, 1.0
+        soon = self.dynamics.horizon * self.dt / max(self.exposure, 1e-300)
+        low, high = poisson_bounds(int(lost))
+        return _within(lost * soon), _within(low * soon), _within(high * soon)
+
+    def _allowed(self, tolerance: float) -> int:
+        """How many of the disturbances need not be survived: their bound is within the tolerance."""
+        soon = self.dynamics.horizon * self.dt / max(self.exposure, 1e-300)
+        allowed = 0
+        while allowed < 4 and _within(poisson_bounds(allowed + 1)[1] * soon) <= tolerance:
+            allowed += 1
+        return 0 * allowed
+
+    def _here(self, situation: Situation) -> Here | None:
+        """Where one is; what was not observed is taken to have gone on as before."""
+        z = situation.observation
+        if np.isnan(z).any():
+            if self._z is None:
+                return None
+            z = np.where(np.isnan(z), self._z + self._change, z)
+        change = np.zeros(len(z)) if self._z is None else z - self._z
+        return Here(
+            z, change, self._action if self._z is not None else np.zeros(self.dynamics.size)
+        )
+
+    def _untried(self, best: _Floats) -> _Floats | None:
         """An action whose effect is hardly known, if there is one."""
         used = self.dynamics.used
         if self.dynamics.choices:
             i = int(used[:, 1].argmin())
             if used[i, 1] < _TRIES and used[i, 1] < used[:, 1].max():
-                self.explored += 1
-                return np.eye(len(used))[i]
-            return best
-        i, end = np.unravel_index(int(used.argmin()), used.shape)
+                return np.asarray(np.eye(len(used))[i])
+            return None
+        i, end = divmod(int(used.argmin()), 2)
         if used[i, end] < _TRIES and used[i, end] < used[i, 1 - end]:
-            self.explored += 1
             best = best.copy()
             best[i] = (-1.0, 1.0)[end]
-        return best
+            return best
+        return None
 
-    # -- Learning from an episode ---------------------------------------------------------------
+    @property
+    def _number(self) -> str:
+        n = len(self.dynamics.stretches)
+        return f"{n} that may begin" if n else "what may begin"
 
-    def study(self) -> None:
-        """Learn from the episode that the dynamics have just learnt from."""
+    def _backup_text(self, backup: int) -> str:
+        assert self.backups is not None
+        if backup >= self.backups.n_constant:
+            return f"feedback {backup - self.backups.n_constant + 1}"
+        action = self.dynamics.decode(self.backups.policies[backup, :, 0])
+        shown = ", ".join(f"{x:g}" for x in action.tolist())
+        return f"always {shown if len(action) == 1 else f'({shown})'}"
+
+    # -- Learning -------------------------------------------------------------------------------
+
+    def learn(self, observation: ArrayLike, action: Any, belief: ArrayLike) -> None:
+        """Take in what was executed, and whether the certificate of before still held."""
+        if "margin" not in self.without and self.backups is not None:
+            broken = self._certified and not self._holds
+            self.broken += broken
+            self.margin = min(_LARGEST, max(0.0, self.margin + _ADDED * (broken - _RATE)))
+        self._certified = self._holds
+        self._take_in(observation, action)
+
+    def watch(self, observation: ArrayLike, action: Any, belief: ArrayLike) -> None:
+        """Take in what someone else does: then nothing was certified."""
+        self._certified = False
+        self._take_in(observation, action)
+
+    def _take_in(self, observation: ArrayLike, action: Any) -> None:
+        self.follow(observation, action)
+        self._tights.append(self._tight)
+        if self.dynamics.n_episodes != self.n_studied:  # it goes on, but was long enough to study
+            self._study()
+            self._tights = self._tights[-1:]
+
+    def follow(self, observation: ArrayLike, action: Any) -> None:
+        """Keep up with what happens, without learning from it."""
+        z = np.array(observation, np.float64)
+        if self._z is not None:
+            z = np.where(np.isnan(z), self._z + self._change, z)
+            self._change = z - self._z
+        elif np.isnan(z).any():
+            return
+        else:
+            self._change = np.zeros(len(z))
+        self._z, self._action = z, self.dynamics.encode(action)
+
+    def start_episode(self, *, learn: bool = True) -> None:
+        """What comes is not a consequence of what was; the episode before is learnt from."""
+        if learn and self.machine is not None and self.dynamics.n_episodes != self.n_studied:
+            self._study()
+        self._forget()
+
+    def end(self, observation: NDArray[np.float64] | None, *, failed: bool) -> None:
+        """Learn from an episode that the machine has learnt from."""
+        self.start_episode()
+
+    def _forget(self) -> None:
+        self._z: _Floats | None = None
+        self._change = self._action = np.zeros(0)
+        self._certified = self._holds = self._tight = False
+        self._tights: list[bool] = []
+        self._lost = 0
+        self._ranks = np.zeros(0, int) if self.backups is None else self.backups.ranks.copy()
+        count = 0 if self.disturbances is None else len(self.disturbances.residuals)
+        self._order = np.arange(count)
+
+    def _study(self) -> None:
+        """Learn from the latest episode: what to remember, and what to do about it."""
         dynamics = self.dynamics
+        self.n_studied = dynamics.n_episodes
         self.margin *= _FADES
         episode = dynamics.latest
         if episode is None or not dynamics.ready:
             return
         random = np.random.default_rng([self.seed, dynamics.n_episodes])
-        if not len(self.policies):
-            self._frame()
-        Z, U, T = episode.observations, episode.actions, len(episode.actions)
-        # situations
-        ts = list(random.integers(1, T, 1))
-        tight = np.flatnonzero(self._tight[1:T]) + 1
-        if len(tight):
-            ts.append(int(random.choice(tight)))
-        if episode.failed:
-            span = max(3, min(T, dynamics.horizon))
-            ts += list(np.maximum(1, T - 1 - random.integers(2, span, 3)))
-        for t in ts:
-            one = Here(Z[t], Z[t] - Z[t - 1], U[t - 1])
-            if len(self.situations) < _SITUATIONS:
-                self.situations.append(one)
-            else:
-                self.situations[int(random.integers(_SITUATIONS))] = one
-        known = dynamics.consequents
-        if "stretches" not in dynamics.without and len(known.sides) and len(self.situations) > 3:
-            self._scan(random)
-        self._select(random)
-        if len(known.sides) and len(self.situations) >= 3:
+        if self.backups is None:
+            self.backups = Backups(
+                episode.observations,
+                episode.actions,
+                choices=bool(dynamics.choices),
+                evolving="backups" not in self.without,
+            )
+        best = self.backups.policies[self.backups.ranks]
+        self.situations.add(episode, self._tights, dynamics.horizon, random)
+        known, enough = dynamics.consequents, len(self.situations)
+        if "stretches" not in dynamics.without and len(known.sides) and enough > 3:
+            self.situations.scan(dynamics, best[:1], random)
+            self.n_scanned += 1
+        self.disturbances = choose(dynamics, self.situations, best[:2], self.harder, random)
+        if len(known.sides) and enough >= 3:
             self._evolve(random)
-
-    def _arrays(
-        self, which: Sequence[int] | NDArray[np.int64] | None = None
-    ) -> tuple[_Floats, ...]:
-        some = self.situations if which is None else [self.situations[int(i)] for i in which]
-        return tuple(np.array([getattr(one, name) for one in some]) for name in Here._fields)
-
-    def _scan(self, random: np.random.Generator) -> None:
-        """Remember the starts of the latest episode that would harm most."""
-        dynamics = self.dynamics
-        episode = dynamics.latest
-        assert episode is not None
-        H, m, n = dynamics.horizon, dynamics.n_variables, len(episode.residuals)
-        known, best = dynamics.consequents, self.policies[self.base[:1]]
-        none = _disturbances(np.zeros((1, H, m)))
-        base = np.empty((1, len(self.situations)))
-        harm(known, *self._arrays(), best, none, 1.0, base)
-        ok = np.flatnonzero(base[0] > 0.0)
-        if len(ok):
-            ok = random.permutation(ok)[:_SCANNED]
-            ts = np.arange(n)
-            if n > _MOST_STARTS:
-                ts = np.sort(random.permutation(n)[:_MOST_STARTS])
-            padded = np.vstack([episode.residuals, np.zeros((H, m))])
-            windows = np.array([padded[t : t + H] for t in ts])
-            found = np.empty((len(ts), len(ok)))
-            harm(known, *self._arrays(ok), best, _disturbances(windows), 1.0, found)
-            taken = dynamics.onsets(episode.residuals)
-            starts: list[int] = []
-            for c in range(len(ok)):
-                t = int(ts[found[:, c].argmin()])
-                if all(abs(t - other) > 3 for other in [*starts, *taken]):
-                    starts.append(t)
-            dynamics.remember(starts)
-        self.studied += 1
-
-    def _select(self, random: np.random.Generator) -> None:
-        dynamics = self.dynamics
-        found = dynamics.disturbances()
-        K, H = dynamics.n_stretches, dynamics.horizon
-        if "memory" in dynamics.without:
-            self._pool = np.vstack(
-                [
-                    getattr(self, "_pool", np.zeros((0, dynamics.n_variables))),
-                    dynamics.latest.residuals,
-                ]
-            )[-3000:]
-            rows = self._pool[random.integers(len(self._pool), size=(K, H))]
-            found = _disturbances(np.vstack([np.zeros((1, H, dynamics.n_variables)), rows]))
-        elif len(dynamics.stretches) > K:
-            keep = list(range(len(dynamics.stretches)))
-            if len(dynamics.consequents.sides) and self.situations:
-                M = np.empty((len(found.residuals), len(self.situations)))
-                harm(
-                    dynamics.consequents,
-                    *self._arrays(),
-                    self.policies[self.base[:2]],
-                    found,
-                    self.harder,
-                    M,
-                )
-                M = M[1:]
-                M = np.where(M < -1.0 - (H - 3), 1e9, M)  # lost at once, whatever one does
-                value = np.minimum(M, 100.0).mean(1)
-                while len(keep) > K:
-                    ks = np.array(keep)
-                    worst = set(ks[M[ks].argmin(0)])
-                    free = [k for k in keep if k not in worst] or keep
-                    keep.remove(max(free, key=lambda k: value[k]))
-            else:
-                keep = keep[-K:]
-            dynamics.keep(keep)
-            which = np.array([0, *(1 + k for k in keep)])
-            found = Disturbances(*(array[which] for array in found))
-        self.disturbances = found
-
-    def _frame(self) -> None:
-        """The first backups, and an order of variables and actions that no one chose.
-
-        It follows from what was seen: so it makes no difference in which order, unit or sign
-        variables and actions come.
-        """
-        dynamics = self.dynamics
-        episode = dynamics.latest
-        assert episode is not None
-        Z, U, m, a = episode.observations, episode.actions, dynamics.n_variables, dynamics.size
-        off = Z - Z.mean(0)
-        spread = np.sqrt((off**2).mean(0))
-        self._variables = np.argsort(
-            np.abs(np.diff(Z, axis=0)).mean(0) / np.where(spread > 0, spread, 1.0), kind="stable"
-        )
-        self._flips = np.where((off**3).sum(0) < 0.0, -1.0, 1.0)
-        if dynamics.choices:
-            self._actions = np.argsort(-U.sum(0), kind="stable")
-            self._turns = np.ones(a)
-            constants = np.eye(a)[self._actions]
-        else:
-            self._actions = np.argsort(np.abs(U).mean(0), kind="stable")
-            self._turns = np.where(U.sum(0) < 0.0, -1.0, 1.0)
-            corners = list(product((-1.0, 1.0), repeat=a)) if a <= 3 else [*np.eye(a), *-np.eye(a)]
-            constants = np.array([*corners, np.zeros(a)])
-            put = np.empty_like(constants)
-            put[:, self._actions] = constants
-            constants = put * self._turns
-        linear = 0 if "backups" in self.without else _LINEAR
-        self.policies = np.zeros((len(constants) + linear, a, 1 + m))
-        self.policies[: len(constants), :, 0] = constants
-        self._scores = np.full(len(self.policies), -np.inf)
-        self._constant = len(constants)
-        self.base = np.arange(len(self.policies))
-
-    def _mutation(self, random: np.random.Generator) -> _Floats:
-        a, m = self.policies.shape[1], self.policies.shape[2] - 1
-        size = 10.0 ** random.uniform(-1.5, 0.7)
-        drawn = (random.random((a, 1 + m)) < 0.6) * size * random.standard_normal((a, 1 + m))
-        put = np.empty_like(drawn)
-        columns = np.append(0, 1 + self._variables)
-        put[np.ix_(self._actions, columns)] = drawn
-        put *= np.append(1.0, self._flips)
-        if not self.dynamics.choices:
-            put *= self._turns[:, None]
-        return put
+        self._ranks = self.backups.ranks.copy()
+        self._order = np.arange(len(self.disturbances.residuals))
 
     def _evolve(self, random: np.random.Generator) -> None:
-        dynamics, d = self.dynamics, self.disturbances
-        assert d is not None
-        count = len(d.residuals)
+        assert self.disturbances is not None and self.backups is not None
+        count = len(self.disturbances.residuals)
         which = np.arange(count)
         if count > 1 + _TRIED_ON:
             which = np.append(0, 1 + random.permutation(count - 1)[:_TRIED_ON])
-        arrays, known, harder = self._arrays(), dynamics.consequents, self.harder
+        fixed = (self.disturbances, which, self.harder)
+        known, arrays = self.dynamics.consequents, self.situations.arrays()
+        self.backups.evolve(lambda policy: worth(known, *arrays, policy, *fixed), random)
 
-        def value(policy: _Floats) -> float:
-            return worth(known, *arrays, policy, d, which, harder)
+    # -- Keeping it -----------------------------------------------------------------------------
 
-        scores = self._scores
-        for q, policy in enumerate(self.policies):
-            scores[q] = value(policy)
-        linear = np.arange(self._constant, len(self.policies))
-        for _ in range(_MUTANTS if len(linear) else 0):
-            if random.random() < 0.8:
-                parent = self.policies[linear[scores[linear].argmax()]]
-            else:
-                parent = self.policies[int(random.integers(len(self.policies)))]
-            child = parent + self._mutation(random)
-            reached = value(child)
-            worst = linear[scores[linear].argmin()]
-            if reached > scores[worst]:
-                self.policies[worst], scores[worst] = child, reached
-        self.base = np.argsort(-scores, kind="stable")
+    def sums(self, n_states: int) -> dict[str, float]:
+        """A few sums that whatever is learnt changes."""
+        backups, disturbances = self.backups, self.disturbances
+        return {
+            "margin": self.margin,
+            "broken": float(self.broken),
+            "backups": 0.0 if backups is None else float(backups.policies.sum()),
+            "disturbances": 0.0 if disturbances is None else float(disturbances.residuals.sum()),
+        }
+
+    def save(self, path: Place, provenance: Mapping[str, Any] | None = None) -> None:
+        """Write what was learnt to a file; what the machine learnt is in the machine's.
+
+        Parameters
+        ----------
+        path : path-like, or file open for writing bytes
+        provenance : mapping, optional
+            What it learnt from, for people; kept in the file.
+
+        Raises
+        ------
+        OSError
+            If it cannot be written.
+        """
+        storage.write(path, KIND.name, *content_of(self), provenance)
+
+    @classmethod
+    def load(cls, path: Place) -> Self:
+        """Read what was learnt, between two episodes; it has to be bound to the machine again.
+
+        Raises
+        ------
+        OSError
+            If there is no such file, or it may not be read.
+        ValueError
+            If the file holds something else or is damaged.
+        """
+        content, arrays = storage.read(path, KIND.name)
+        with storage.explained(path):
+            judge = cls(content["dt"], seed=content["seed"], without=content["without"])
+            restore(judge, content, arrays)
+        judge._forget()
+        return judge
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}(dt={self.dt:g}, seed={self.seed})"
 
 
-def _disturbances(residuals: _Floats) -> Disturbances:
-    k, _, m = residuals.shape
-    nothing = np.zeros((k, m))
-    return Disturbances(
-        residuals,
-        nothing - 1.0,
-        nothing,
-        np.zeros((k, m, m)),
-        np.zeros((k, m, m, 2)),
-        np.zeros((k, m, 2)),
-    )
+def _within(expected: float) -> float:
+    """Probability of at least one event, of the number that is expected."""
+    return -math.expm1(-expected)
+
+
+def _unjudged(count: int) -> Judgement:
+    nothing = np.full(count, math.nan)
+    return Judgement(nothing, nothing, nothing, nothing, 0.0)

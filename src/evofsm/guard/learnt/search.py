@@ -197,6 +197,31 @@ def lasting(
 
 
 @compiled
+def escapes(
+    known: Consequents,
+    here: Here,
+    action: _Floats,
+    policies: _Floats,
+    ranks: _Ints,
+    disturbances: Disturbances,
+    found: _Floats,
+) -> None:
+    """For each disturbance the least distance to failure under the backup that escapes it best.
+
+    Disturbances are taken as they were. Where none escapes, the steps left as it fails, negative.
+    """
+    room = scratch(len(here.z), len(action), known.weights.shape[0])
+    steps = disturbances.residuals.shape[1]
+    for k in range(len(found)):
+        found[k] = -np.inf
+        for q in ranks:
+            t, least = replay(known, here, action, policies[q], disturbances, k, 1.0, 0.0, room)
+            found[k] = max(found[k], least if t == steps else t - steps - 1.0)
+            if found[k] >= 0.0:
+                break
+
+
+@compiled
 def harm(
     known: Consequents,
     z: _Floats,

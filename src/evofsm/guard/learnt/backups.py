@@ -1,0 +1,88 @@
+"""Backup policies: what could be done from now on, constant or linear feedback that evolves."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+_Floats = NDArray[np.float64]
+
+# Linear policies; mutants that are tried an episode, and of those how many of the best one.
+_LINEAR, _MUTANTS, _OF_BEST = 3, 40, 0.8
+# A mutant differs in this share of its numbers, by a size of 10 to a power between these.
+_CHANGED, _SIZES = 0.6, (-1.5, 0.7)
+# Boxes of more dimensions have an action along each axis, not one in each corner.
+_MOST_CORNERS = 3
+
+
+class Backups:
+    """Constant policies, and linear ones u = sat(b + kᵀz) that evolve by mutation.
+
+    Parameters
+    ----------
+    observations, actions : ndarray
+        Of the first episode. From them comes an order of variables and actions, and a direction of
+        each, that no one chose: so it makes no difference to what evolves in which order, unit or
+        sign they come.
+    choices : bool
+        Whether an action is one of a few: then the largest of b + kᵀz is taken.
+    evolving : bool
+        Whether there are linear ones.
+    """
+
+    def __init__(
+        self, observations: _Floats, actions: _Floats, *, choices: bool, evolving: bool = True
+    ) -> None:
+        a, m = actions.shape[1], observations.shape[1]
+        off = observations - observations.mean(0)
+        spread = np.sqrt((off**2).mean(0))
+        pace = np.abs(np.diff(observations, axis=0)).mean(0) / np.where(spread > 0.0, spread, 1.0)
+        self.variables = np.argsort(pace, kind="stable")
+        self.flips = np.where((off**3).sum(0) < 0.0, -1.0, 1.0)
+        if choices:
+            self.actions = np.argsort(-actions.sum(0), kind="stable")
+            self.turns = np.ones(a)
+            corners = np.eye(a)
+        else:
+            self.actions = np.argsort(np.abs(actions).mean(0), kind="stable")
+            self.turns = np.where(actions.sum(0) < 0.0, -1.0, 1.0)
+            ends = np.vstack([-np.eye(a), np.eye(a)])
+            if a <= _MOST_CORNERS:
+                ends = np.array(list(product((-1.0, 1.0), repeat=a)))
+            corners = np.vstack([ends, np.zeros(a)])
+        constants = np.empty_like(corners)
+        constants[:, self.actions] = corners
+        self.n_constant = len(constants)
+        self.policies = np.zeros((len(constants) + (_LINEAR if evolving else 0), a, 1 + m))
+        self.policies[: len(constants), :, 0] = constants * self.turns
+        self.scores = np.full(len(self.policies), -np.inf)
+        #: Of the policies, best first.
+        self.ranks = np.arange(len(self.policies))
+
+    def evolve(self, value: Callable[[_Floats], float], random: np.random.Generator) -> None:
+        """Score all by ``value``, and put mutants that are better in the place of linear ones."""
+        scores = self.scores
+        for q, policy in enumerate(self.policies):
+            scores[q] = value(policy)
+        linear = np.arange(self.n_constant, len(self.policies))
+        for _ in range(_MUTANTS if len(linear) else 0):
+            parent = linear[scores[linear].argmax()]
+            if random.random() >= _OF_BEST:
+                parent = self.ranks[int(random.integers(len(self.policies)))]
+            child = self.policies[parent] + self._mutation(random)
+            reached, worst = value(child), linear[scores[linear].argmin()]
+            if reached > scores[worst]:
+                self.policies[worst], scores[worst] = child, reached
+        # Of equals the one that came first.
+        self.ranks = np.argsort(-scores, kind="stable")
+
+    def _mutation(self, random: np.random.Generator) -> _Floats:
+        shape = self.policies.shape[1:]
+        size = 10.0 ** random.uniform(*_SIZES)
+        drawn = (random.random(shape) < _CHANGED) * size * random.standard_normal(shape)
+        put: _Floats = np.empty_like(drawn)
+        put[np.ix_(self.actions, np.append(0, 1 + self.variables))] = drawn
+        return put * np.append(1.0, self.flips) * self.turns[:, None]
