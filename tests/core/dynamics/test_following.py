@@ -110,7 +110,7 @@ def test_another_process_goes_on_alike(cart):
 
 def test_onsets_are_counted_where_they_began(cart):
     machine, Z, I, U = cart(rows=150)
-    calm, *rest = cart(rows=95, seed=1)
+    _calm, *rest = cart(rows=95, seed=1)
     machine.learn_many(rest[0], rest[1], executed=rest[2])
     machine.start_episode()
     assert machine.onsets.sum() == 0  # it was not known what is ordinary

@@ -65,7 +65,7 @@ def merge_dynamics(parts: Sequence[Dynamics]) -> Dynamics:
                 f"dynamics of machine {number} are {part.settings}, but {parts[0].settings} of "
                 "machine 0; machines to merge must have the same settings"
             )
-    told = next((part.told for part in parts if part.told is not None), None)
+    told = next((part for part in parts if part.told is not None), None)
     whole = []
     for part in sorted(parts, key=lambda part: to_bytes(part).tobytes()):
         over = part.copy()
@@ -77,7 +77,9 @@ def merge_dynamics(parts: Sequence[Dynamics]) -> Dynamics:
     if len({part.n_variables for part in whole}) > 1:
         raise ValueError("dynamics to merge have different numbers of variables")
     merged = whole[0].copy()
-    merged.told, merged.latest, merged.clock = told, None, 0.0
+    merged.latest, merged.clock = None, 0.0
+    if told is not None:
+        merged.told, merged.sides = told.told, list(getattr(told, "sides", ()))
     if len(whole) > 1:
         _add_up(merged, whole)
         _join(merged, whole)
