@@ -36,7 +36,7 @@ _SHAPES: dict[str, tuple[int | str, ...]] = {
 _NUMBERS = ("margin", "broken", "horizon", "n_studied", "n_scanned")
 KIND = ranges.register(
     ranges.Kind(
-        "learnt_risk",
+        "learntrisk",
         {name: ranges.Member(shape, _SOME) for name, shape in _SHAPES.items()},
         {
             "dt": ranges.SIZE,

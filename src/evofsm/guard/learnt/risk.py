@@ -336,16 +336,19 @@ class LearntRisk:
 
     def _untried(self, best: _Floats) -> _Floats | None:
         """An action whose effect is hardly known, if there is one."""
-        used = self.dynamics.used
+        assert self.backups is not None
+        used, order = self.dynamics.used, self.backups.actions  # of equals the first in that order
         if self.dynamics.choices:
-            i = int(used[:, 1].argmin())
+            i = int(order[used[order, 1].argmin()])
             if used[i, 1] < _TRIES and used[i, 1] < used[:, 1].max():
                 return np.asarray(np.eye(len(used))[i])
             return None
-        i, end = divmod(int(used.argmin()), 2)
-        if used[i, end] < _TRIES and used[i, end] < used[i, 1 - end]:
-            best = best.copy()
-            best[i] = (-1.0, 1.0)[end]
+        # The end that the controller seldom went to comes first.
+        turned = np.where(self.backups.turns[:, None] > 0.0, used, used[:, ::-1])[order]
+        k, end = divmod(int(turned.argmin()), 2)
+        if turned[k, end] < _TRIES and turned[k, end] < turned[k, 1 - end]:
+            best, i = best.copy(), order[k]
+            best[i] = (-1.0, 1.0)[end] * self.backups.turns[i]
             return best
         return None
 
