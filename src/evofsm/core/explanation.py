@@ -143,6 +143,7 @@ def explain(
         _of_place(known, belief, state, labels),
         _of_episodes(here, visits, soon, asked, "" if action is None else labels.action(action)),
         "" if better is None else f"Better after {labels.action(better)}: {after_better}",
+        _of_onsets(known, state, labels),
         "" if is_exact else "States were joined here, so an episode may count twice",
         _of_origin(arrivals, came_from),
     ]
@@ -217,6 +218,14 @@ def _of_episodes(here: Tally, visits: int, soon: str, asked: Tally | None, actio
     if not asked.episodes:
         return f"{text}; none of them is known to have tried {action} here"
     return f"{text}, and {asked} after {action}"
+
+
+def _of_onsets(known: Known, state: int, labels: Labels) -> str:
+    """How often something unexpected began here, if the machine looked for that."""
+    if not known.onsets.any():
+        return ""
+    began, time = int(known.onsets[state]), labels.duration(int(known.visits[state]))
+    return f"{_count(began, 'disturbance') if began else 'No disturbance'} began here in {time}"
 
 
 def _of_origin(arrivals: NDArray[np.float64], came_from: int | None) -> str:

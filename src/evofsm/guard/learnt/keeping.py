@@ -73,6 +73,7 @@ def content_of(judge: LearntRisk) -> tuple[dict[str, Any], dict[str, NDArray[Any
         for name in ("dt", "seed", "margin", "broken", "n_studied", "n_scanned")
     }
     content |= {"without": sorted(judge.without)}
+    content |= {"names": list(judge.labels.names), "units": list(judge.labels.units)}
     return content | {"n_constant": 0 if backups is None else backups.n_constant}, arrays
 
 
