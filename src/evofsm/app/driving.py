@@ -413,8 +413,9 @@ def _values(name: str, column: NDArray[Any]) -> list[Any]:
 def _files(guard: Guard) -> tuple[bytes, bytes]:
     """The files of its machine and of its judge."""
     files = io.BytesIO(), io.BytesIO()
-    for learner, file in zip(learners_of(guard), files, strict=True):
-        learner.save(file)
+    machine, judge = learners_of(guard)
+    machine.save(files[0])
+    judge.save(files[1])
     return files[0].getvalue(), files[1].getvalue()
 
 

@@ -295,7 +295,7 @@ def load_judge(file: Place, machine: EvolvingFSM) -> LatentRisk | LearntRisk:
     ValueError
         If the file holds something else or is damaged.
     """
-    if storage.read_header(file).kind != "learnt_risk":
+    if storage.read_header(file).kind != "learntrisk":
         return LatentRisk.load(file)
     judge = LearntRisk.load(file)
     judge.bind(machine)

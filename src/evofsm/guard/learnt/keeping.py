@@ -35,7 +35,7 @@ _SHAPES: dict[str, tuple[int | str, ...]] = {
 }
 KIND = ranges.register(
     ranges.Kind(
-        "learnt_risk",
+        "learntrisk",
         {name: ranges.Member(shape, _SOME) for name, shape in _SHAPES.items()},
         {
             "dt": ranges.SIZE,
