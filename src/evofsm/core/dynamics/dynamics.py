@@ -19,7 +19,7 @@ from evofsm.core.dynamics.consequents import (
 )
 from evofsm.core.dynamics.failures import explain_failures, probe
 from evofsm.core.dynamics.regression import Sums, learn_transition, solve, take_in
-from evofsm.core.dynamics.undoing import held
+from evofsm.core.dynamics.undoing import Whole, held, side_by_side
 from evofsm.core.validation import real_array, refuse_unusable, whole
 
 _Floats = NDArray[np.float64]
@@ -41,7 +41,7 @@ _SHORTEST = 4
 _LONGEST = 1024
 # An extreme is a saturation if it was reached, by moving, in so many episodes.
 _REACHED = 2
-_MOST_KEPT = 200
+MOST_KEPT = 200
 # Jumps that would have shown no dependence, for each variable.
 _JUMP_PRIOR = 3.0
 # So many times the stretches that are kept there may be until somebody chooses.
@@ -114,6 +114,8 @@ class Dynamics:
     (1, True)
     """
 
+    sums: Sums
+
     def __init__(
         self,
         low: ArrayLike | None = None,
@@ -160,11 +162,38 @@ class Dynamics:
         twin.__dict__.update(held(self))
         return twin
 
+    def frozen(self) -> Self:
+        """A copy to be asked, of which nobody learns any more: of the episode it has the end."""
+        twin = self.copy()
+        twin._Z, twin._U = twin._Z[-2:], twin._U[max(0, len(twin._Z) - 2) :]
+        twin.latest = None
+        return twin
+
+    def __copy__(self) -> Self:
+        return self.copy()
+
     def __deepcopy__(self, memo: Any) -> Self:
         return self.copy()
 
     def __getstate__(self) -> dict[str, Any]:
         return held(self) | {"told": None}  # code is told again
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        if self.n_variables:
+            self.sums = side_by_side(self.sums)
+
+    @property
+    def most_stretches(self) -> int:
+        """Number of stretches up to which nobody has to choose."""
+        return _SPARE * self.n_stretches
+
+    @property
+    def whole(self) -> Whole:
+        """A context in which all is learnt, or nothing where it is broken off."""
+        if not self.n_variables:
+            return Whole(self)
+        return Whole(self, self.sums.counts.base, self.lowest, self.highest, self.reached)
 
     def __repr__(self) -> str:
         actions = f"n_actions={self.choices}"
@@ -204,7 +233,7 @@ class Dynamics:
         p = n_features(m, a, box=not self.choices)
         self.n_variables = m
         self.origin = z.copy()
-        self.sums = Sums(
+        sums = Sums(
             counts=np.zeros(2),
             squares=np.zeros((p, p)),
             products=np.zeros((p, m)),
@@ -217,6 +246,7 @@ class Dynamics:
             most=np.zeros(m),
             scale=np.zeros(m),
         )
+        self.sums = side_by_side(sums)
         self.lowest, self.highest = np.full(m, np.inf), np.full(m, -np.inf)
         self.reached = np.zeros((m, 2))
         self.failures: list[_Floats] = []
@@ -298,7 +328,7 @@ class Dynamics:
             if first:
                 return
             for j in np.flatnonzero(jumped):
-                self.jumps[j] = [*self.jumps[j][1 - _MOST_KEPT :], np.append(four[1], four[2, j])]
+                self.jumps[j] = [*self.jumps[j][1 - MOST_KEPT :], np.append(four[1], four[2, j])]
 
     def _solve(self) -> None:
         if self.sums.counts[0] < _FIRST:
@@ -340,16 +370,8 @@ class Dynamics:
         safe = Z[:-1] if failed else Z
         self._extremes(safe)
         if failed:
-            self.failures = [*self.failures[1 - _MOST_KEPT :], Z[-1]]
-        self._solve()
-        if self.told is None:
-            self.sides = explain_failures(
-                np.array(self.failures).reshape(-1, self.n_variables),
-                self.lowest,
-                self.highest,
-                np.maximum(self.sums.unit, 1e-300),
-            )
-        self._rebuild()
+            self.failures = [*self.failures[1 - MOST_KEPT :], Z[-1]]
+        self.settle()
         self.sums.squares[:] *= _KEPT
         self.sums.products[:] *= _KEPT
         self.latest = None
@@ -362,6 +384,18 @@ class Dynamics:
             if "stretches" not in self.without:
                 self.remember(self.onsets(found))
         self.n_episodes += 1
+
+    def settle(self) -> None:
+        """Make of all sums what is known: weights, and where it fails."""
+        self._solve()
+        if self.told is None:
+            self.sides = explain_failures(
+                np.array(self.failures).reshape(-1, self.n_variables),
+                self.lowest,
+                self.highest,
+                np.maximum(self.sums.unit, 1e-300),
+            )
+        self._rebuild()
 
     def _extremes(self, safe: _Floats) -> None:
         """How far variables went, and whether they stay there."""
@@ -406,7 +440,7 @@ class Dynamics:
                 self.stretches.append(
                     Stretch(Z[t : t + L + 2].copy(), U[t : t + L + 1].copy(), self.n_episodes)
                 )
-        self.stretches = self.stretches[-_SPARE * self.n_stretches :]
+        self.stretches = self.stretches[-self.most_stretches :]
 
     def keep(self, which: Sequence[int]) -> None:
         """Forget all stretches but these."""

@@ -74,6 +74,7 @@ def content_of(judge: LearntRisk) -> tuple[dict[str, Any], dict[str, NDArray[Any
         }
     content = {name: getattr(judge, name) for name in ("dt", "seed", "told_horizon", *_NUMBERS)}
     content |= {"without": sorted(judge.without), "takes": judge._takes}
+    content |= {"names": list(judge.labels.names), "units": list(judge.labels.units)}
     return content | {"n_constant": 0 if backups is None else backups.n_constant}, arrays
 
 

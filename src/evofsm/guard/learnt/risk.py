@@ -22,15 +22,18 @@ from evofsm.core import (
     EvolvingFSM,
     Here,
     Labels,
+    action_name,
     poisson_bounds,
     positive,
 )
 from evofsm.files import Place, storage
 from evofsm.guard.learnt.actions import LONGEST_STRETCH
+from evofsm.guard.learnt import words
 from evofsm.guard.learnt.backups import Backups
 from evofsm.guard.learnt.keeping import KIND, content_of, restore
 from evofsm.guard.learnt.remembering import Situations, choose, failing_after
 from evofsm.guard.learnt.search import CHANGED, KEPT, NOTHING_PASSES, escapes, search, worth
+from evofsm.guard.learnt.words import Remembered
 from evofsm.guard.protocols import Fallback, Judgement, Search, Situation, Trial
 
 _Floats = NDArray[np.float64]
@@ -71,6 +74,8 @@ class LearntRisk:
         Of the draws with which backups evolve and situations are chosen.
     without : sequence of str
         Parts of `JUDGE_PARTS` that are left out.
+    names, units : sequence of str
+        Of the variables, for what people read; nothing is decided by them.
 
     Raises
     ------
@@ -105,6 +110,8 @@ class LearntRisk:
         horizon: float | None = None,
         seed: int = 0,
         without: Sequence[str] = (),
+        names: Sequence[str] = (),
+        units: Sequence[str] = (),
     ) -> None:
         self.dt = positive("dt", dt)
         self.told_horizon = None if horizon is None else positive("horizon", horizon)
@@ -114,7 +121,7 @@ class LearntRisk:
         if unknown := set(without) - set(JUDGE_PARTS):
             raise ValueError(f"without names {sorted(unknown)}; there are {', '.join(JUDGE_PARTS)}")
         self.without = frozenset(without)
-        self.labels = Labels(dt=self.dt)
+        self.labels = Labels(names=tuple(names), units=tuple(units), dt=self.dt)
         self.machine: EvolvingFSM | None = None
         #: Whether it may try actions to learn what they do.
         self.learning = True
@@ -184,6 +191,22 @@ class LearntRisk:
         dynamics = self.dynamics
         return float(dynamics.sums.counts[0]) * self.dt if dynamics.n_variables else 0.0
 
+    @property
+    def remembered(self) -> Remembered:
+        """Disturbances that it counts on, and the time in which they were seen."""
+        return Remembered(len(self.dynamics.stretches), self.exposure)
+
+    @property
+    def told_by_experience(self) -> str:
+        """What was learnt so far, in words."""
+        sides = self.dynamics.consequents.sides if self.dynamics.n_variables else ()
+        names = self.labels.names
+        fails = [
+            (names[int(j)] if names else f"variable {int(j) + 1}", sign < 0.0, at)
+            for j, sign, at, _ in sides
+        ]
+        return words.experience(fails, self.remembered, self.margin)
+
     def search(
         self, situation: Situation, wanted: Any, *, tolerance: float, revising: bool
     ) -> Search:
@@ -206,44 +229,44 @@ class LearntRisk:
         dynamics, here = self.dynamics, self._here(situation)
         one = np.array([wanted])
         if here is None or self.disturbances is None or self.backups is None:
-            return Search(one, _unjudged(1), 0, "nothing was learnt yet")
+            return Search(one, _unjudged(1), 0, words.NOTHING_LEARNT)
         known = dynamics.consequents
         if not len(known.sides):
-            return Search(one, _unjudged(1), 0, "no failure is known yet")
+            return Search(one, _unjudged(1), 0, words.NO_FAILURE)
         proposal, best = dynamics.encode(wanted), np.empty(dynamics.size)
         allowed = self._allowed(tolerance)
         keep = self.margin + (_RELEASE if revising else 0.0)
         asked = self._ranks[:_ASKED]
         world = (self.backups.policies, asked, self.disturbances, self._order, self.harder)
-        how, backup, apart = search(known, here, proposal, *world, self.margin, keep, allowed, best)
+        how, backup, left = search(known, here, proposal, *world, self.margin, keep, allowed, best)
         self._ranks = np.array([backup, *(q for q in self._ranks if q != backup)])
         self._tight = how != KEPT
         tried = (
             self._untried(best)
-            if self.learning and how == NOTHING_PASSES and apart < _ALIKE
+            if self.learning and how == NOTHING_PASSES and left < _ALIKE
             else None
         )
         self._holds = how != NOTHING_PASSES
         if not self._holds and self._certified:
             again = search(known, here, best, *world, 0.0, 0.0, allowed, np.empty_like(best))
             self._holds = again[0] != NOTHING_PASSES
-        then = f"then {self._backup_text(backup)}"
+        then = self._backup_text(backup)
         if how == KEPT:
-            judged = self._judgement(np.zeros(1), np.full(1, self.margin), situation)
-            return Search(one, judged, 0, f"all {self._number} are survived, {then}")
+            judged = self._judgement(np.zeros(1), np.full(1, left), situation)
+            return Search(one, judged, 0, words.kept(then, self.remembered, left))
         if tried is not None:
             best = tried
         action = np.reshape(dynamics.decode(best), np.shape(wanted))
-        certain = how == CHANGED and allowed == 0
-        judged = self._judged(situation, here, np.stack([proposal, best]), sure=int(certain))
-        why = self.why(judged)
+        judged = self._judged(
+            situation, here, np.stack([proposal, best]), left if how == CHANGED else None
+        )
         if tried is not None:
-            how_so = "what this does is hardly known, so it is tried"
+            instead = words.tried()
         elif how == CHANGED:
-            how_so = f"the closest that passes, {then}"
+            instead = words.changed(then, float(judged.critical[1]))
         else:
-            how_so = f"nothing passes, what lasts longest is {self._backup_text(backup)}"
-        return Search(np.stack([one[0], action]), judged, 1, f"{why}; {how_so}")
+            instead = words.lasting(then)
+        return Search(np.stack([one[0], action]), judged, 1, f"{self.why(judged)}; {instead}")
 
     def judge(self, situation: Situation, actions: ArrayLike) -> Judgement:
         """Risk of each action.
@@ -266,32 +289,23 @@ class LearntRisk:
 
     def why(self, judged: Judgement) -> str:
         """Why the first action that was judged is dangerous, in a few words."""
-        if self._lost < 0:
-            return "failure follows even if nothing begins"
-        if self._lost == 0:
-            return f"within the margin of {self.margin:.2g} ordinary changes"
-        be = "is" if self._lost == 1 else "are"
-        return f"{self._lost} of {self._number} {be} survived by no backup"
+        return words.refused(self._lost, self.remembered, self.margin, self.harder)
 
     def _judged(
-        self, situation: Situation, here: Here, actions: _Floats, sure: int = 0
+        self, situation: Situation, here: Here, actions: _Floats, passes: float | None = None
     ) -> Judgement:
-        assert self.disturbances is not None and self.backups is not None
+        """Of some actions; ``passes`` is what is left after the last, if that is known to pass."""
+        assert self.disturbances is not None
+        assert self.backups is not None
         found = np.empty(len(self.disturbances.residuals))
         lost, left = np.zeros(len(actions)), np.zeros(len(actions))
-        left[len(actions) - sure :] = self.margin  # those that were found to pass
-        for i, action in enumerate(actions[: len(actions) - sure]):
-            escapes(
-                self.dynamics.consequents,
-                here,
-                action,
-                self.backups.policies,
-                self._ranks[:_ASKED],
-                self.disturbances,
-                found,
-            )
+        world = (self.backups.policies, self._ranks[:_ASKED], self.disturbances, found)
+        for i, action in enumerate(actions if passes is None else actions[:-1]):
+            escapes(self.dynamics.consequents, here, action, *world)
             lost[i] = math.inf if found[0] < 0.0 else np.count_nonzero(found < 0.0)
             left[i] = found.min()
+        if passes is not None:
+            left[-1] = passes
         self._lost = -1 if math.isinf(lost[0]) else int(lost[0])
         return self._judgement(lost, left, situation)
 
@@ -352,18 +366,14 @@ class LearntRisk:
             return best
         return None
 
-    @property
-    def _number(self) -> str:
-        n = len(self.dynamics.stretches)
-        return f"{n} that may begin" if n else "what may begin"
-
     def _backup_text(self, backup: int) -> str:
         assert self.backups is not None
         if backup >= self.backups.n_constant:
-            return f"feedback {backup - self.backups.n_constant + 1}"
+            return words.feedback(backup - self.backups.n_constant)
         action = self.dynamics.decode(self.backups.policies[backup, :, 0])
-        shown = ", ".join(f"{x:g}" for x in action.tolist())
-        return f"always {shown if len(action) == 1 else f'({shown})'}"
+        if self.dynamics.choices:
+            return words.choice(action_name(int(action[0])))
+        return words.constant(action.tolist())
 
     # -- Learning -------------------------------------------------------------------------------
 
@@ -511,12 +521,8 @@ class LearntRisk:
         """
         content, arrays = storage.read(path, KIND.name)
         with storage.explained(path):
-            judge = cls(
-                content["dt"],
-                horizon=content["told_horizon"],
-                seed=content["seed"],
-                without=content["without"],
-            )
+            told = {name: content[name] for name in ("seed", "without", "names", "units")}
+            judge = cls(content["dt"], horizon=content["told_horizon"], **told)
             restore(judge, content, arrays)
         judge._forget()
         return judge
