@@ -27,8 +27,8 @@ _OUTLIER = 4.0
 # they have to be.
 _RIDGE, _SHY = 1e-6, 30.0
 _PRIOR, _SHY_PRIOR = 0.01, 20.0
-# The least variance of a feature, and what all weights are held to 0 by, of its mean square: far more
-# than rounding, so that features that did not vary yet share what they explain the same way always.
+# The least variance of a feature, and what all weights are held to 0 by, of its mean square: far
+# more than rounding, so that features that did not vary yet always share what they explain alike.
 _LEAST, _ALL_ALIKE = 1e-6, 1e-10
 
 
