@@ -30,7 +30,6 @@ from evofsm.app.driving import (
     make_guard,
 )
 from evofsm.driving import (
-    LatentRisk,
     Outcome,
     Row,
     World,
@@ -41,7 +40,7 @@ from evofsm.driving import (
 )
 from evofsm.files import Journal, Record, room_needed, versions
 from evofsm.fleet import Batch, run_campaign
-from evofsm.guard import Guard
+from evofsm.guard import Guard, LearningJudge, LearntRisk
 
 #: The journal in the folder of a campaign.
 JOURNAL = "journal.jsonl"
@@ -53,12 +52,12 @@ class Campaign:
     """What is driven."""
 
     setup: Setup  #: which does not learn
-    risk: LatentRisk  #: what was learnt before
+    judge: LearningJudge  #: with what was learnt before
     world: str = "kinematic"
 
     def guard(self) -> Guard:
-        """Who revises; no states are asked."""
-        return make_guard(self.setup, judge=self.risk)
+        """Who revises; no states decide."""
+        return make_guard(self.setup, judge=self.judge)
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -66,7 +65,7 @@ class Campaign:
         return {
             **self.setup.told,
             "world": self.world,
-            "learnt": _digest(self.risk),
+            "learnt": _digest(self.judge),
             "versions": _versions(self.world),
         }
 
@@ -126,10 +125,12 @@ def _write(result: Result, records: list[Record], out: Path) -> None:
         (out / _SUMMARY).write_text(json.dumps(summary, indent=2), encoding="utf-8")
 
 
-def _digest(risk: LatentRisk) -> str:
-    """Of all that was learnt: of what saving it writes."""
+def _digest(judge: LearningJudge) -> str:
+    """Of all that is asked: of what saving it writes, and the machine where the judge asks one."""
     file = io.BytesIO()
-    risk.save(file)
+    judge.save(file)
+    if isinstance(judge, LearntRisk) and judge.machine is not None:
+        judge.machine.save(file)
     return hashlib.sha256(file.getvalue()).hexdigest()
 
 

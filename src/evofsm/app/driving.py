@@ -20,6 +20,7 @@ from evofsm.driving import (
     DECISION_COLUMNS,
     FIXED_MEASURES,
     IDM,
+    TOLD,
     AdaptiveCruise,
     Draw,
     Drive,
@@ -35,7 +36,9 @@ from evofsm.driving import (
     assess_states,
     drive,
     guard_for_family,
-    learnt_by,
+    learners_of,
+    load_judge,
+    name_judge,
     outcome_of,
     reference_of,
     save_learnt,
@@ -57,6 +60,8 @@ from evofsm.guard import (
 
 #: Controllers by name; ``family`` is the family's own.
 CONTROLLERS = ("family", "aggressive", "normal", "acc", "sumo")
+#: Judges by name; `evofsm.driving.TOLD` says what each was told.
+JUDGES: tuple[str, ...] = tuple(TOLD)
 #: Revisers by name: none, ours, and the classic measures.
 REVISERS = ("least-risk", "none", "rss", "aeb", *FIXED_MEASURES)
 
@@ -71,6 +76,7 @@ class Setup:
     family: Family
     controller: str = "family"
     reviser: str = "least-risk"
+    judge: str = "kinematic"
     mode: Mode = Mode.ACT
     tolerance: float = TOLERANCE
     episodes: int = 100
@@ -89,6 +95,7 @@ class Setup:
             },
             "controller": self.controller,
             "reviser": self.reviser,
+            "judge": self.judge,
             "mode": self.mode.value,
             "tolerance": self.tolerance,
             "seed": self.seed,
@@ -177,10 +184,22 @@ def drive_family(
     return Driving(
         summarise(family.name, setup.reviser, "", done.outcomes, family.interval),
         tuple(done.lead_times),
-        assess_states(*learnt_by(guard)),
+        _assessed(guard),
         guard,
         done.decisions,
     )
+
+
+def _assessed(guard: Guard) -> list[StateRisk]:
+    """The states; how dangerous each is by itself is known to a judge of leaders alone."""
+    machine, judge = learners_of(guard)
+    if isinstance(judge, LatentRisk):
+        return assess_states(machine, judge)
+    nan, seconds = math.nan, machine.visits * judge.dt
+    return [
+        StateRisk(state, nan, nan, nan, float(seen), float(failures))
+        for state, (seen, failures) in enumerate(zip(seconds, machine.endings, strict=True))
+    ]
 
 
 def drive_alone(family: Family, draw: Draw, world: World, controller: Controller) -> Reference:
@@ -199,14 +218,23 @@ def draws(setup: Setup, done: int = 0) -> Iterator[Draw]:
 def make_guard(
     setup: Setup, machine: EvolvingFSM | None = None, judge: LearningJudge | None = None
 ) -> Guard:
-    """A guard whose reviser has the setup's name, with what was learnt before."""
+    """A guard whose reviser and judge have the setup's names, with what was learnt before.
+
+    Raises
+    ------
+    ValueError
+        If there is no such reviser or judge, or what was learnt is of another judge.
+    """
     family, name = setup.family, _ALIASES.get(setup.reviser, setup.reviser)
+    if judge is not None and (found := name_judge(judge)) != setup.judge:
+        raise ValueError(f"what was learnt is of the judge {found!r}, not of {setup.judge!r}")
     ours = guard_for_family(
         family,
         tolerance=setup.tolerance,
         mode=setup.mode,
         machine=machine,
-        judge=judge,
+        judge=judge or setup.judge,
+        seed=setup.seed,
         learn=setup.learn,
     )
     if name == "least-risk":
@@ -323,8 +351,8 @@ class Driven:
         with storage.explained(checkpoint.path):
             done._restore(kept.arrays)
             files = (io.BytesIO(kept.arrays[name].tobytes()) for name in ("machine", "risk"))
-            machine, risk = files
-            guard = make_guard(setup, EvolvingFSM.load(machine), LatentRisk.load(risk))
+            machine = EvolvingFSM.load(next(files))
+            guard = make_guard(setup, machine, load_judge(next(files), machine))
         if len(done.outcomes) > setup.episodes:
             raise ValueError(
                 f"{checkpoint.path} has driven {len(done.outcomes)} episodes, more than "
@@ -385,9 +413,9 @@ def _values(name: str, column: NDArray[Any]) -> list[Any]:
 def _files(guard: Guard) -> tuple[bytes, bytes]:
     """The files of its machine and of its judge."""
     files = io.BytesIO(), io.BytesIO()
-    machine, risk = learnt_by(guard)
+    machine, judge = learners_of(guard)
     machine.save(files[0])
-    risk.save(files[1])
+    judge.save(files[1])
     return files[0].getvalue(), files[1].getvalue()
 
 

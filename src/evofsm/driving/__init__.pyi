@@ -1,10 +1,14 @@
 from .cars import SAFETY_RULE as SAFETY_RULE
+from .cars import TOLD as TOLD
 from .cars import drive as drive
 from .cars import guard_for_cars as guard_for_cars
 from .cars import guard_for_family as guard_for_family
 from .cars import held_out as held_out
+from .cars import learners_of as learners_of
 from .cars import learnt_by as learnt_by
+from .cars import load_judge as load_judge
 from .cars import load_learnt as load_learnt
+from .cars import name_judge as name_judge
 from .cars import references_of as references_of
 from .cars import save_learnt as save_learnt
 from .cars import score as score

@@ -7,14 +7,16 @@ from dataclasses import astuple
 from pathlib import Path
 from typing import Any, Literal
 
-from evofsm.core import EvolvingFSM, IntervalActions, Novelty, StateRule
+from evofsm.core import Dynamics, EvolvingFSM, IntervalActions, Novelty, StateRule
 from evofsm.driving.families.family import Draw, Family
 from evofsm.driving.framework import Drive, Framework
+from evofsm.driving.naming import UNITS, VARIABLES
 from evofsm.driving.outcomes import Outcome, Reference, outcome_of, reference_of
 from evofsm.driving.revisers import Unrevised
 from evofsm.driving.risk.latent import LatentRisk
 from evofsm.driving.worlds.kinematic import KinematicWorld
 from evofsm.driving.worlds.road import World
+from evofsm.files import Place, storage
 from evofsm.guard import (
     BELIEF_TOLERANCE,
     TOLERANCE,
@@ -22,13 +24,19 @@ from evofsm.guard import (
     Controller,
     Guard,
     LearningJudge,
+    LearntRisk,
     Mode,
 )
+
+#: What each judge is told, by its name.
+TOLD: dict[str, str] = {
+    "kinematic": "how cars follow each other",
+    "learnt": "nothing but failures",
+}
 
 #: The state rule for safety work: fine enough to steer by. The study compares the rules.
 SAFETY_RULE = Novelty(radius=1.0, scales=(4.0, 2.0, 2.0))
 
-# With hundreds of states this makes a step several times as quick.
 # What a machine's explanations call soon [s].
 _SOON = 5.0
 _MACHINE, _RISK = "machine.evofsm", "risk.evofsm"
@@ -45,12 +53,14 @@ def guard_for_cars(
     mode: Mode = Mode.ACT,
     rule: StateRule | None = SAFETY_RULE,
     machine: EvolvingFSM | None = None,
-    judge: LearningJudge | None = None,
+    judge: LearningJudge | str = "kinematic",
     **settings: Any,
 ) -> Guard:
-    """A guard that knows how cars follow each other, and learns how hard they brake.
+    """A guard for a car that follows another.
 
     It observes gap [m], own speed and the leader's speed [m/s], and decides on the acceleration.
+    Unless told otherwise its judge knows how cars follow each other, and learns how hard they
+    brake.
 
     Parameters
     ----------
@@ -63,33 +73,61 @@ def guard_for_cars(
     closed : {"left", "right"}
         Which edge belongs to an interval.
     tolerance : float
-        Highest latent risk that is accepted, in (0, 1).
+        Highest risk that is accepted, in (0, 1).
     mode : Mode
     rule : StateRule, optional
         Of the machine that is made; None for the paper's.
     machine : EvolvingFSM, optional
-        One that has learnt; without it a new one.
-    judge : LearningJudge, optional
-        One that has learnt; without it a new `LatentRisk`.
+        One that has learnt; without it the judge's own, or a new one.
+    judge : LearningJudge, "kinematic" or "learnt"
+        One that has learnt, or which to make: a `LatentRisk`, which is told how cars follow each
+        other, or a `LearntRisk`, which is told nothing but which episodes failed, and prevents
+        nothing before the first of them.
     **settings
         As in `Guard.of`: ``failed``, ``seed``, ``learn``, ``audit``, ``explaining``, ``missing``.
+
+    Raises
+    ------
+    ValueError
+        If there is no judge of that name.
 
     Examples
     --------
     >>> guard = guard_for_cars(low=-4.0, high=2.5)
     >>> guard.decide([150.0, 20.0, 20.0], proposal=0.5).reason
     'never seen before; risk is within the tolerance'
+    >>> guard = guard_for_cars(low=-4.0, high=2.5, judge="learnt")
+    >>> guard.decide([9.0, 20.0, 20.0], proposal=0.5).reason
+    'nothing was learnt yet'
     """
     actions = IntervalActions(low, high, width, closed, outside="clip")
-    judge = LatentRisk(actions.low, interval) if judge is None else judge
+    if isinstance(judge, str):
+        judge = _judge(judge, actions, interval, settings.get("seed", 0))
+    if machine is None and isinstance(judge, LearntRisk):
+        machine = judge.machine
     machine = machine or EvolvingFSM(
         actions.n_actions,
         rule=rule,
         belief_tolerance=BELIEF_TOLERANCE,
         failure_horizon=round(_SOON / interval),
+        dynamics=_dynamics(actions, interval) if isinstance(judge, LearntRisk) else None,
     )
     reviser = ActionReviser(judge, actions, tolerance=tolerance, mode=mode)
     return Guard.of(reviser, interval=interval, machine=machine, judge=judge, **settings)
+
+
+def _judge(name: str, actions: IntervalActions, interval: float, seed: int) -> LearningJudge:
+    if name == "kinematic":
+        return LatentRisk(actions.low, interval)
+    if name == "learnt":
+        return LearntRisk(interval, seed=seed, names=VARIABLES, units=UNITS)
+    raise ValueError(f"there is no judge {name!r}; there are {', '.join(TOLD)}")
+
+
+def _dynamics(actions: IntervalActions, interval: float) -> Dynamics | None:
+    """Those that a guard of any system has."""
+    any_system = Guard(actions.low, actions.high, interval=interval).machine
+    return None if any_system is None else any_system.dynamics
 
 
 def guard_for_family(family: Family, **settings: Any) -> Guard:
@@ -194,19 +232,71 @@ def learnt_by(guard: Guard) -> tuple[EvolvingFSM, LatentRisk]:
     TypeError
         If it has others.
     """
-    if guard.machine is None or not isinstance(guard.judge, LatentRisk):
-        raise TypeError("the guard has no machine, or its judge is no LatentRisk")
+    machine, judge = learners_of(guard)
+    if not isinstance(judge, LatentRisk):
+        raise TypeError("the guard's judge is no LatentRisk")
+    return machine, judge
+
+
+def learners_of(guard: Guard) -> tuple[EvolvingFSM, LearningJudge]:
+    """The machine and the judge of a guard, whichever judge it has.
+
+    Raises
+    ------
+    TypeError
+        If it lacks one of them.
+    """
+    if guard.machine is None or guard.judge is None:
+        raise TypeError("the guard has no machine, or its judge does not learn")
     return guard.machine, guard.judge
+
+
+def name_judge(judge: LearningJudge) -> str:
+    """Which of the judges for cars it is.
+
+    Raises
+    ------
+    TypeError
+        If it is another one.
+    """
+    if isinstance(judge, LatentRisk):
+        return "kinematic"
+    if isinstance(judge, LearntRisk):
+        return "learnt"
+    raise TypeError(f"a {type(judge).__name__} is none of the judges for cars: {', '.join(TOLD)}")
 
 
 def save_learnt(guard: Guard, folder: Path, provenance: Mapping[str, Any] | None = None) -> None:
     """Write what a guard learnt, machine and judge in a file each, and what it learnt from."""
     folder.mkdir(parents=True, exist_ok=True)
-    machine, risk = learnt_by(guard)
+    machine, judge = learners_of(guard)
     machine.save(folder / _MACHINE, provenance)
-    risk.save(folder / _RISK, provenance)
+    judge.save(folder / _RISK, provenance)
 
 
-def load_learnt(folder: Path) -> tuple[EvolvingFSM, LatentRisk]:
-    """The machine and the latent risk that `save_learnt` wrote."""
-    return EvolvingFSM.load(folder / _MACHINE), LatentRisk.load(folder / _RISK)
+def load_learnt(folder: Path) -> tuple[EvolvingFSM, LatentRisk | LearntRisk]:
+    """The machine and the judge that `save_learnt` wrote."""
+    machine = EvolvingFSM.load(folder / _MACHINE)
+    return machine, load_judge(folder / _RISK, machine)
+
+
+def load_judge(file: Place, machine: EvolvingFSM) -> LatentRisk | LearntRisk:
+    """One of the judges for cars, whichever was saved, beside its machine.
+
+    Parameters
+    ----------
+    file : path-like, or file open for reading bytes
+    machine : EvolvingFSM
+
+    Raises
+    ------
+    OSError
+        If there is no such file, or it may not be read.
+    ValueError
+        If the file holds something else or is damaged.
+    """
+    if storage.read_header(file).kind != "learntrisk":
+        return LatentRisk.load(file)
+    judge = LearntRisk.load(file)
+    judge.bind(machine)
+    return judge

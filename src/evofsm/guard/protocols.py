@@ -139,8 +139,11 @@ class ActionJudge(Protocol):
 
     #: What it calls the variables of an observation.
     labels: Labels
-    #: What is done without a usable proposal.
-    fallback: Fallback
+
+    @property
+    def fallback(self) -> Fallback:
+        """What is done without a usable proposal."""
+        ...
 
     def judge(self, situation: Situation, actions: ArrayLike, /) -> Judgement:
         """How dangerous each action is."""

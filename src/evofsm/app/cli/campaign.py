@@ -107,9 +107,9 @@ class Campaign(Driven):
     ) -> Result | None:
         """With a bar; an interruption says how far it came, and returns None."""
         from evofsm.app import campaign
-        from evofsm.driving import learnt_by
+        from evofsm.driving import learners_of
 
-        driven = campaign.Campaign(setup, learnt_by(guard)[1], self.world.value)
+        driven = campaign.Campaign(setup, learners_of(guard)[1], self.world.value)
         reached = 0
         with progress("episodes") as bars:
             task = bars.add_task("Driving", total=self.episodes, start=False)

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 class Drive(Driven):
     """Drive scenarios under a reviser; learn on the way.
 
-    A machine and its latent risk learn from every episode, from the first on, unless --frozen.
+    A machine and its judge learn from every episode, from the first on, unless --frozen.
     The summary compares with the controller left to itself in the same draws.
 
     With --checkpoint, the same command goes on where it was stopped, whatever stopped it, and comes
@@ -60,7 +60,7 @@ class Drive(Driven):
         from evofsm.app.driving import episodes_learnt, make_guard, write_driving
         from evofsm.app.text.columns import console
         from evofsm.app.text.driving import driving_document, print_driving
-        from evofsm.driving import learnt_by, load_learnt, open_world
+        from evofsm.driving import learners_of, load_learnt, open_world
         from evofsm.files import Checkpoint, duration, result_kept
         from evofsm.guard import AuditLog
 
@@ -88,7 +88,7 @@ class Drive(Driven):
         ):
             driving = _drive(setup, guard, place, keeper, log, run)
             if run is not None:
-                run.attach(learnt_by(driving.guard)[0].model(**setup.family.labels._asdict()))
+                run.attach(learners_of(driving.guard)[0].model(**setup.family.labels._asdict()))
         if self.out is not None:
             with result_kept(keeper):
                 write_driving(driving, setup, self.out)

@@ -128,9 +128,10 @@ def _refuse_learnt(out: Path | None) -> None:
 def _learnt(file: Path) -> tuple[FSMModel, list[int] | None]:
     """The model, and its dead ends where the risk that was learnt with it is known."""
     from evofsm.driving import LatentRisk, assess_states
+    from evofsm.files import storage
 
     model, _ = load_model(file)
-    if not (file / _RISK).exists():
+    if not (file / _RISK).exists() or storage.read_header(file / _RISK).kind != "risk":
         return model, None
     assessed = assess_states(model, LatentRisk.load(file / _RISK))
     return model, [one.state for one in assessed if one.is_dead_end]

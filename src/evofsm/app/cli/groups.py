@@ -22,6 +22,13 @@ class WorldName(StrEnum):
     KINEMATIC = "kinematic"
 
 
+class JudgeName(StrEnum):
+    """What a judge was told."""
+
+    KINEMATIC = "kinematic"
+    LEARNT = "learnt"
+
+
 @dataclass(frozen=True, kw_only=True)
 class WithJson(Command):
     """A command that prints one JSON document where it is asked to."""
@@ -55,6 +62,11 @@ class Revised(InWorld):
     reviser: str = option(
         "least-risk",
         "Who revises: least-risk (what was learnt), none, rss, aeb, or another measure.",
+    )
+    judge: JudgeName = option(
+        JudgeName.KINEMATIC,
+        "Who judges for least-risk: kinematic (told how cars follow each other) or learnt (told "
+        "nothing but which episodes failed).",
     )
     tolerance: float = option(TOLERANCE, "Share of leaders' hard brakes that need not be survived.")
     switches: tuple[str, ...] = option(
@@ -93,6 +105,7 @@ class Driven(Revised, WithJson):
             self.load_family(self.family),
             self.controller,
             self.reviser,
+            self.judge.value,
             chosen_mode(self.mode),
             self.tolerance,
             episodes,

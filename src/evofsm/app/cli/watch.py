@@ -25,7 +25,7 @@ Opening = Callable[[], "AbstractContextManager[Watched]"]
 class Watch(Revised):
     """Watch a run in the browser while it is driven, and act on it; or one that was recorded.
 
-    The page shows the cars, what the machine believes, latent risk beside time to collision, and
+    The page shows the cars, what the machine believes, risk beside time to collision, and
     what was done about it. It is served to this computer only, at the address that is printed, and
     the run begins when the page is first opened. Ctrl-C ends it.
     """
@@ -104,6 +104,7 @@ class Watch(Revised):
             self.reviser,
             self.tolerance,
             self.seed,
+            self.judge.value,
         )
         if watching.case >= (cases := len(watching.cases)):
             raise ValueError(f"--case is {self.case}; {family.name} has 1 to {cases}")
@@ -132,7 +133,7 @@ class Watch(Revised):
             machine, judge = load_learnt(self.learn)
             guard = guard_for_family(watching.family, machine=machine, judge=judge)
             return guard, episodes_learnt(self.learn)
-        guard = watched_guard(watching.family)
+        guard = watched_guard(watching.family, watching.judge)
         episodes = 0 if self.fresh else self.learn_first
         with progress() as bars:
             task = bars.add_task("Learning first", total=episodes)

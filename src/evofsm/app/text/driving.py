@@ -10,8 +10,8 @@ from rich.console import Console
 
 from evofsm.app.driving import Driving, Setup
 from evofsm.app.text.columns import print_columns, print_facts
-from evofsm.driving import Row, learnt_by
-from evofsm.guard import Guard
+from evofsm.driving import TOLD, LatentRisk, Row, learners_of
+from evofsm.guard import Guard, LearntRisk
 
 # More states than these are not listed.
 _MOST = 8
@@ -35,6 +35,7 @@ def print_outcome(
         ("family", f"{row.family}, {row.episodes:,} {_kind(setup)} episodes"),
         ("controller", setup.controller),
         ("reviser", f"{setup.reviser}, {setup.mode.value}"),
+        ("judge", f"{setup.judge}, told {TOLD[setup.judge]}"),
         (
             "collisions",
             f"{row.collisions:,} of {row.episodes:,}: {row.collision_rate:.1%} "
@@ -66,17 +67,26 @@ def _lead_times(times: Sequence[float]) -> list[tuple[str, str]]:
 
 
 def _learnt(guard: Guard) -> str:
-    machine, risk = learnt_by(guard)
-    brakes = risk.brakes
+    machine, judge = learners_of(guard)
+    states = f"{machine.n_states} states"
+    if isinstance(judge, LearntRisk):
+        return f"{states}; {judge.told_by_experience}"
+    if not isinstance(judge, LatentRisk):
+        return states
+    brakes = judge.brakes
     own = f"{brakes.decel:.1f} m/s²" if brakes.known else "not known yet"
     return (
-        f"{machine.n_states} states; {len(risk.manoeuvres)} manoeuvres of leaders, "
-        f"1 % brake harder than {risk.manoeuvres.exceeded_by(0.01):.1f} m/s²; own brakes: {own}"
+        f"{states}; {len(judge.manoeuvres)} manoeuvres of leaders, "
+        f"1 % brake harder than {judge.manoeuvres.exceeded_by(0.01):.1f} m/s²; own brakes: {own}"
     )
 
 
 def _print_dead_ends(out: Console, driving: Driving) -> None:
     """Those that were seen longest, and what could still be survived in them."""
+    machine, judge = learners_of(driving.guard)
+    if not isinstance(judge, LatentRisk):
+        _print_failures(out, driving)
+        return
     dead_ends = sorted(
         (state for state in driving.states if state.is_dead_end), key=lambda state: -state.seconds
     )
@@ -84,7 +94,7 @@ def _print_dead_ends(out: Console, driving: Driving) -> None:
         out.print(f"No dead ends among the {len(driving.states)} states.")
         return
     out.print(f"Dead ends: {len(dead_ends)} of {len(driving.states)} states; seen longest:")
-    centers = learnt_by(driving.guard)[0].centers
+    centers = machine.centers
     rows = [
         (
             f"#{state.state + 1}",
@@ -103,6 +113,33 @@ def _print_dead_ends(out: Console, driving: Driving) -> None:
         "survives: the hardest braking of a leader that braking in full now still survives; "
         "escape margin: how much lower the risk then is than if speed is kept; ended here: "
         "collisions.",
+        style="dim",
+    )
+
+
+def _print_failures(out: Console, driving: Driving) -> None:
+    """States in which episodes failed, where no judge says which are dead ends."""
+    machine, _ = learners_of(driving.guard)
+    failed = [state for state in driving.states if state.failures]
+    if not failed:
+        out.print(f"No episode ended in failure in any of the {len(driving.states)} states.")
+        return
+    header = (*_DEAD_END_HEADER[:4], "seen [s]", "began\nhere", "ended\nhere")
+    rows = [
+        (
+            f"#{one.state + 1}",
+            *(f"{value:.1f}" for value in machine.centers[one.state]),
+            f"{one.seconds:.1f}",
+            f"{machine.onsets[one.state]:g}",
+            f"{one.failures:g}",
+        )
+        for one in sorted(failed, key=lambda one: -one.failures)[:_MOST]
+    ]
+    out.print(f"Collisions ended in {len(failed)} of {len(driving.states)} states:")
+    print_columns(out, header, rows)
+    out.print(
+        "\nbegan here: disturbances, that is, what was not expected and went on for a while; "
+        "ended here: collisions.",
         style="dim",
     )
 

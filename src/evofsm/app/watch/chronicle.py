@@ -23,7 +23,7 @@ class Chronicle:
     Parameters
     ----------
     tolerance : float
-        Highest latent risk that is accepted.
+        Highest risk that is accepted.
     thresholds : (float, float)
         Below which time to collision and time headway warn [s].
     alone : float
@@ -95,6 +95,7 @@ def _began(frame: Frame) -> Danger:
         decel=frame.decel,
         proposed=frame.proposed,
         advised=frame.advised,
+        why=frame.why,
     )
 
 

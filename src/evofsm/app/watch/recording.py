@@ -20,11 +20,10 @@ from evofsm.app.watch.shown import (
     Graph,
     Judged,
     Start,
-    StateShown,
     most_believed,
+    states_of,
     usual_ways,
 )
-from evofsm.core import FSMModel
 from evofsm.driving import VARIABLES, time_headway, time_to_collision
 from evofsm.guard import RECORD, TOLERANCE
 from evofsm.io import RecordedEpisode, Run, read_run
@@ -124,7 +123,7 @@ class Recording:
         model = self._run.model
         if model is None:
             return Graph(self._number, (), ())
-        return Graph(self._number, _states(model), tuple(usual_ways(model)))
+        return Graph(self._number, states_of(model), tuple(usual_ways(model)))
 
     def __enter__(self) -> Self:
         return self
@@ -152,6 +151,7 @@ class Recording:
             ttc_threshold=TTC.threshold,
             headway_threshold=HEADWAY.threshold,
             learnt=0,
+            judge=about.get("judge", "kinematic"),
         )
 
     def _moved(self, number: int) -> Frame:
@@ -226,20 +226,6 @@ def _held(rows: NDArray[np.float64]) -> NDArray[np.float64]:
             latest = np.searchsorted(known, np.arange(len(column)), side="right") - 1
             column[:] = column[known[np.maximum(latest, 0)]]
     return rows
-
-
-def _states(model: FSMModel) -> tuple[StateShown, ...]:
-    return tuple(
-        StateShown(
-            state,
-            tuple(center),
-            float(model.visits[state]),
-            math.nan,
-            bool(model.endings[state] > 0.0),
-            float(model.endings[state]),
-        )
-        for state, center in enumerate(model.centers.tolist())
-    )
 
 
 def _number(text: str | None, default: float) -> float:

@@ -6,7 +6,9 @@ import math
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
-from typing import Self
+from typing import Any, Self
+
+import numpy as np
 
 from evofsm.app.driving import Setup, make_controller, make_guard
 from evofsm.app.watch.chronicle import Chronicle
@@ -35,7 +37,7 @@ from evofsm.driving import (
     World,
     drive,
     guard_for_family,
-    learnt_by,
+    learners_of,
     teach,
     time_headway,
     time_to_collision,
@@ -44,6 +46,7 @@ from evofsm.driving import (
 from evofsm.guard import (
     RECORD,
     TOLERANCE,
+    ActionJudge,
     Explain,
     Guard,
     Judgement,
@@ -79,9 +82,11 @@ class Watching:
         By name, as `evofsm.app.driving` knows them. Without a reviser (``none``) ours judges
         and is off.
     tolerance : float
-        Highest latent risk that is accepted.
+        Highest risk that is accepted.
     seed : int
         Of the draws.
+    judge : str
+        A name of `evofsm.driving.TOLD`, which says what it was told.
     """
 
     family: Family
@@ -91,6 +96,7 @@ class Watching:
     reviser: str = "least-risk"
     tolerance: float = TOLERANCE
     seed: int = 0
+    judge: str = "kinematic"
 
     @property
     def cases(self) -> tuple[str, ...]:
@@ -104,13 +110,18 @@ class Watching:
         """The same for `evofsm.app.driving`."""
         reviser = "least-risk" if self.reviser == "none" else self.reviser
         return Setup(
-            self.family, self.controller, reviser, tolerance=self.tolerance, seed=self.seed
+            self.family,
+            self.controller,
+            reviser,
+            self.judge,
+            tolerance=self.tolerance,
+            seed=self.seed,
         )
 
 
-def watched_guard(family: Family) -> Guard:
-    """A guard that has seen nothing, with few enough states to look at."""
-    return guard_for_family(family, rule=WATCHED_RULE)
+def watched_guard(family: Family, judge: str = "kinematic") -> Guard:
+    """A guard that has seen nothing, with few enough states to look at; its judge by name."""
+    return guard_for_family(family, rule=WATCHED_RULE, judge=judge)
 
 
 def learn_first(
@@ -131,8 +142,9 @@ def learn_first(
     progress : callable
         Told how many episodes are done, of how many.
     """
+    machine, judge = learners_of(guard)
     teacher = guard_for_family(
-        watching.family, tolerance=watching.tolerance, machine=guard.machine, judge=guard.judge
+        watching.family, tolerance=watching.tolerance, machine=machine, judge=judge
     )
     for index in range(episodes):
         teach(teacher, [watching.family.draw(watching.seed + 1, index)])  # none that is watched
@@ -146,8 +158,9 @@ class Switchable:
     ----------
     reviser : Reviser
     actions : IntervalActions
-    risk : LatentRisk
-        Judges what is wanted, what is executed, and full braking, whoever revises.
+    judge : ActionJudge
+        Judges what is wanted, what is executed, and full braking, whoever revises; one that knows
+        no leaders, instead of full braking, what is advised.
     on : bool
 
     Examples
@@ -163,11 +176,11 @@ class Switchable:
     """
 
     def __init__(
-        self, reviser: Reviser, actions: IntervalActions, risk: LatentRisk, on: bool = True
+        self, reviser: Reviser, actions: IntervalActions, judge: ActionJudge, on: bool = True
     ) -> None:
         self.reviser = reviser
         self.actions = actions
-        self.risk = risk
+        self.judge = judge
         self.on = on
         self.judged: Judgement | None = None  #: of the latest decision
 
@@ -181,8 +194,9 @@ class Switchable:
         wanted = make_usable(proposal, self.actions).action
         if not self.on:
             revision = revision._replace(executed=wanted, advised=revision.executed)
-        options = [wanted, revision.executed, self.actions.low]
-        self.judged = self.risk.judge(situation, options)
+        safest = self.actions.low if isinstance(self.judge, LatentRisk) else revision.advised
+        options = np.array([wanted, revision.executed, safest])
+        self.judged = self.judge.judge(situation, options)
         return revision
 
 
@@ -211,18 +225,18 @@ class Session:
 
     def __init__(self, watching: Watching, guard: Guard, world: World, learnt: int = 0) -> None:
         self.watching = watching
-        self.machine, self.risk = learnt_by(guard)
+        self.machine, self.judge = learners_of(guard)
         self.world = world
         self.learnt = learnt
         self.case = watching.case
         family = watching.family
-        ours = make_guard(watching.setup, self.machine, self.risk).reviser
-        self._reviser = Switchable(ours, family.actions, self.risk, watching.reviser != "none")
+        ours = make_guard(watching.setup, self.machine, self.judge).reviser
+        self._reviser = Switchable(ours, family.actions, self.judge, watching.reviser != "none")
         self._guard = Guard.of(
             self._reviser,
             interval=family.interval,
             machine=self.machine,
-            judge=self.risk,
+            judge=self.judge,
             explaining=Explain.ALL,
         )
         self._closing = ExitStack()
@@ -288,7 +302,7 @@ class Session:
 
     def graph(self) -> Graph:
         """The states found so far."""
-        return graph_of(self.machine, self.risk, self._number)
+        return graph_of(self.machine, self.judge, self._number)
 
     def close(self) -> None:
         """Leave the road."""
@@ -318,6 +332,7 @@ class Session:
             ttc_threshold=TTC.threshold,
             headway_threshold=HEADWAY.threshold,
             learnt=self.learnt,
+            judge=watching.judge,
         )
 
     def _alone(self, draw: Draw) -> float:
@@ -334,18 +349,32 @@ class Session:
         revision = guard.revise(situation, self._controller.propose(guard.held, road.time))
         judged = self._reviser.judged
         assert judged is not None
-        wanted, does, braking = range(3)
+        wanted, does, safest = range(3)
         frame = self._seen()._replace(
             **{name: RECORD[name].read(Pair(situation, revision)) for name in RECORDED},
             belief=most_believed(situation.belief),
             event=self._event(situation.state, self.machine.n_states > known),
             proposed_risk=_judged(judged, wanted),
             executed_risk=_judged(judged, does),
-            braking_risk=float(judged.risk[braking]),
-            critical=float(judged.critical[wanted]),
+            braking_risk=float(judged.risk[safest]),
+            **self._said(judged),
         )
         self._state = situation.state
         return frame
+
+    def _said(self, judged: Judgement) -> dict[str, Any]:
+        """What only one kind of judge says of what the driver wants."""
+        if isinstance(self.judge, LatentRisk):
+            return {"critical": float(judged.critical[0])}
+        risky = judged.risk[0] > self.watching.tolerance
+        return {"why": self.judge.why(judged) if risky else ""}
+
+    def _leaders(self) -> dict[str, Any]:
+        """What a judge of leaders knows of them and of the own brakes."""
+        if not isinstance(self.judge, LatentRisk):
+            return {}
+        known = self.judge.manoeuvres.exceeded_by(self.watching.tolerance)
+        return {"decel": self.judge.brakes.decel, "brakes_to": known}
 
     def _end(self) -> Frame:
         self._over = True
@@ -381,12 +410,11 @@ class Session:
             gap_behind=float(now[GAP_BEHIND]),
             observation=tuple(observation.tolist()),
             n_states=self.machine.n_states,
-            decel=self.risk.brakes.decel,
-            brakes_to=self.risk.manoeuvres.exceeded_by(self.watching.tolerance),
             time_to_collision=float(time_to_collision(observation)),
             time_headway=float(time_headway(observation)),
             revising=self.revising,
             story=self._chronicle.story,
+            **self._leaders(),
         )
 
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from evofsm.core import EvolvingFSM, FSMModel
 from evofsm.driving import LatentRisk, TimeHeadway, TimeToCollision, assess_states
+from evofsm.guard import LearningJudge
 
 #: What is drawn of a car; worlds need no length [m].
 CAR_LENGTH = 5.0
@@ -30,11 +31,14 @@ class Danger(NamedTuple):
     speed: float  #: the follower's, then [m/s]
     closing: float  #: the follower's speed less the leader's, then [m/s]
     risk: float  #: of what the driver then wanted
-    critical: float  #: hardest braking of the leader that was then survived [m/s²]
+    #: hardest braking of the leader that was then survived [m/s²]; NaN, as the next two, where the
+    #: judge knows no leaders
+    critical: float
     brakes_to: float  #: how hard leaders were then known to brake [m/s²]
     decel: float  #: how hard the follower was then known to brake in full [m/s²]
     proposed: float  #: what the driver then wanted [m/s²]
     advised: float  #: what the reviser then found better [m/s²]
+    why: str = ""  #: what a judge then said that knows no leaders
     stepped_in: float = math.nan  #: when the reviser first changed something in it [s]
     wished: float = math.nan  #: what the driver wanted then [m/s²]
     instead: float = math.nan  #: and what was executed [m/s²]
@@ -65,7 +69,7 @@ class Story(NamedTuple):
 
 
 class Judged(NamedTuple):
-    """Latent risk of an action, with its 90 % interval."""
+    """Risk of an action, with its 90 % interval."""
 
     risk: float
     low: float
@@ -86,7 +90,7 @@ class Start(NamedTuple):
     world: str
     controller: str
     reviser: str
-    tolerance: float  #: highest latent risk that is accepted
+    tolerance: float  #: highest risk that is accepted
     interval: float  #: time between decisions [s]
     duration: float  #: time that is driven at most [s]
     actions: tuple[float, float]  #: lowest and highest acceleration [m/s²]
@@ -94,6 +98,7 @@ class Start(NamedTuple):
     ttc_threshold: float  #: time to collision below which it is said to warn [s]
     headway_threshold: float  #: the same of time headway [s]
     learnt: int  #: episodes learnt from before
+    judge: str = "kinematic"  #: by what it was told, a name of `evofsm.driving.TOLD`
 
 
 class Frame(NamedTuple):
@@ -127,9 +132,11 @@ class Frame(NamedTuple):
     surprise: float = math.nan  #: [bit]
     proposed_risk: Judged = UNJUDGED  #: of what the driver wants
     executed_risk: Judged = UNJUDGED  #: of what is executed
-    braking_risk: float = math.nan  #: of full braking at once: high in a dead end
+    #: of full braking at once, or of the best that a learnt judge knows: high in a dead end
+    braking_risk: float = math.nan
     #: hardest braking of the leader that is survived if the driver has its way [m/s²]
     critical: float = math.nan
+    why: str = ""  #: why a learnt judge finds dangerous what the driver wants; empty of another
     proposed: float = math.nan  #: [m/s²]
     executed: float = math.nan  #: [m/s²]
     advised: float = math.nan  #: what the reviser would execute, on or off [m/s²]
@@ -150,8 +157,8 @@ class StateShown(NamedTuple):
     state: int
     center: tuple[float, ...]  #: gap [m], v_follower [m/s], v_leader [m/s]
     visits: float
-    risk: float  #: latent risk if one brakes in full at once
-    is_dead_end: bool
+    risk: float  #: latent risk if one brakes in full at once; NaN where it is not known
+    is_dead_end: bool  #: or where that is not known, whether a collision ended in it
     failures: float  #: collisions that ended in it
 
 
@@ -171,14 +178,14 @@ class Graph(NamedTuple):
     transitions: tuple[Transition, ...]
 
 
-def graph_of(known: EvolvingFSM | FSMModel, risk: LatentRisk, number: int = 0) -> Graph:
+def graph_of(known: EvolvingFSM | FSMModel, judge: LearningJudge, number: int = 0) -> Graph:
     """The states of a machine or a model, and their usual ways out.
 
     Parameters
     ----------
     known : EvolvingFSM or FSMModel
-    risk : LatentRisk
-        Says which states are dead ends.
+    judge : LearningJudge
+        A `LatentRisk` says which states are dead ends.
     number : int
         Of the frame from which on it holds.
 
@@ -190,6 +197,9 @@ def graph_of(known: EvolvingFSM | FSMModel, risk: LatentRisk, number: int = 0) -
     >>> graph_of(machine, LatentRisk(lowest=-4.0)).transitions
     ()
     """
+    ways = tuple(usual_ways(known))
+    if not isinstance(judge, LatentRisk):
+        return Graph(number, states_of(known), ways)
     centers, visits = known.centers, known.visits
     states = tuple(
         StateShown(
@@ -200,9 +210,19 @@ def graph_of(known: EvolvingFSM | FSMModel, risk: LatentRisk, number: int = 0) -
             one.is_dead_end,
             one.failures,
         )
-        for one in assess_states(known, risk)
+        for one in assess_states(known, judge)
     )
-    return Graph(number, states, tuple(usual_ways(known)))
+    return Graph(number, states, ways)
+
+
+def states_of(known: EvolvingFSM | FSMModel) -> tuple[StateShown, ...]:
+    """The states, those marked in which a collision ended: how dangerous each is nobody says."""
+    return tuple(
+        StateShown(state, tuple(center), float(visits), math.nan, bool(ended > 0.0), float(ended))
+        for state, (center, visits, ended) in enumerate(
+            zip(known.centers.tolist(), known.visits, known.endings, strict=True)
+        )
+    )
 
 
 def usual_ways(known: EvolvingFSM | FSMModel) -> list[Transition]:

@@ -270,7 +270,7 @@ class Dynamics:
             self.begin(z)
         if len(self._Z) >= _LONGEST:
             self._study(failed=False)
-            self._Z, self._U = self._Z[-2:], self._U[-1:]
+            self._Z, self._U = self._Z[-3:], self._U[-3:]  # the last transition is learnt next
         self._Z.append(z.copy())
         take_in(self.sums, z, self.origin)
         if self.told is not None and not self.sides and self.sums.counts[1] >= 1.0:
@@ -291,10 +291,15 @@ class Dynamics:
 
     def act(self, action: _Floats) -> None:
         """What was done after the latest observation, as `encode` returns it."""
+        for replaced in self._U[len(self._Z) - 1 :]:
+            self.used -= self._ends(replaced)
         del self._U[len(self._Z) - 1 :]
         self._U.append(action)
-        self.used[:, 0] += action < (-0.6 if not self.choices else -1.0)
-        self.used[:, 1] += action > 0.6
+        self.used += self._ends(action)
+
+    def _ends(self, action: _Floats) -> NDArray[np.bool_]:
+        """(a, 2) whether each number of an action is near an end of its range."""
+        return np.stack([action < (-0.6 if not self.choices else -1.0), action > 0.6], 1)
 
     def end(self, *, failed: bool) -> None:
         """The episode is over; its last observation was taken in."""
@@ -398,7 +403,7 @@ class Dynamics:
             return
         low, high = safe.min(0), safe.max(0)
         for j in range(self.n_variables):
-            close = 1e-9 * max(1.0, abs(high[j] - low[j]))
+            close = 1e-9 * (high[j] - low[j])
             if low[j] < self.lowest[j] - close:
                 self.lowest[j], self.reached[j, 0] = low[j], 0.0
             if high[j] > self.highest[j] + close:
@@ -484,11 +489,18 @@ class Dynamics:
             return None
         return np.array(self._Z[-3:]), np.array(self._U[n - 3 : n - 1])
 
-    def disturbances(self) -> Disturbances:
-        """Residuals of what is remembered, as they are seen now; number 0 is none at all."""
+    def disturbances(self, steps: int | None = None) -> Disturbances:
+        """Residuals of what is remembered, as they are seen now; number 0 is none at all.
+
+        Parameters
+        ----------
+        steps : int, optional
+            Of each of them; without it all that a stretch may have.
+        """
         m, count = self.n_variables, 1 + len(self.stretches)
+        steps = steps or self.horizon
         found = Disturbances(
-            np.zeros((count, self.horizon, m)),
+            np.zeros((count, steps, m)),
             np.full((count, m), -1.0),
             np.zeros((count, m)),
             np.zeros((count, m, m)),
@@ -497,7 +509,7 @@ class Dynamics:
         )
         carried = "carried" not in self.without
         for k, (Z, U, _) in enumerate(self.stretches, 1):
-            L = min(len(U) - 1, self.horizon)
+            L = min(len(U) - 1, steps)
             residuals(self.consequents, Z, U, L, carried, found.residuals[k])
         if "jumps" not in self.without:
             self._find_jumps(found)
@@ -538,8 +550,9 @@ def _slopes(before: _Floats, after: _Floats) -> _Floats:
     size = np.diag(squares)
     if len(after) < 3 or not size.any():
         return np.zeros(len(size))
-    held = _JUMP_PRIOR / len(after) * size + 1e-9 * size.max()
-    found: _Floats = np.linalg.solve(squares + np.diag(held), off.T @ (after - after.mean()))
+    scale = np.sqrt(np.where(size > 0.0, size, 1.0))  # variables have units of their own
+    held = squares / np.outer(scale, scale) + (_JUMP_PRIOR / len(after) + 1e-9) * np.eye(len(size))
+    found: _Floats = np.linalg.solve(held, off.T @ (after - after.mean()) / scale) / scale
     return found
 
 

@@ -22,14 +22,18 @@ from evofsm.core import (
     EvolvingFSM,
     Here,
     Labels,
+    action_name,
     poisson_bounds,
     positive,
 )
 from evofsm.files import Place, storage
+from evofsm.guard.learnt.actions import LONGEST_STRETCH
+from evofsm.guard.learnt import words
 from evofsm.guard.learnt.backups import Backups
 from evofsm.guard.learnt.keeping import KIND, content_of, restore
-from evofsm.guard.learnt.remembering import Situations, choose
+from evofsm.guard.learnt.remembering import Situations, choose, failing_after
 from evofsm.guard.learnt.search import CHANGED, KEPT, NOTHING_PASSES, escapes, search, worth
+from evofsm.guard.learnt.words import Remembered
 from evofsm.guard.protocols import Fallback, Judgement, Search, Situation, Trial
 
 _Floats = NDArray[np.float64]
@@ -46,6 +50,9 @@ _MARGIN, _LARGEST, _FADES, _ADDED, _RATE = 3.0, 8.0, 0.9, 0.25, 0.001
 _RELEASE = 0.0
 # Disturbances are taken to be harder than they were by so many over the number of episodes.
 _CAUTION = 4.0
+# Steps that are looked ahead: at first, at least, at most; times those that it takes to fail, of
+# which so much is left an episode later.
+_HORIZON, _SHORTEST, _FARTHEST, _AHEAD, _LATEST = 64, 32, LONGEST_STRETCH, 1.5, 0.9
 # Backups closer than this are alike; an action that was used less often is tried.
 _ALIKE, _TRIES = 0.02, 8
 
@@ -60,10 +67,15 @@ class LearntRisk:
     ----------
     dt : float
         Time between two decisions [s].
+    horizon : float, optional
+        How far it looks ahead [s]. Without it, half as far again as it takes to fail where failure
+        can no longer be avoided, from 32 to 144 steps.
     seed : int
         Of the draws with which backups evolve and situations are chosen.
     without : sequence of str
         Parts of `JUDGE_PARTS` that are left out.
+    names, units : sequence of str
+        Of the variables, for what people read; nothing is decided by them.
 
     Raises
     ------
@@ -91,13 +103,25 @@ class LearntRisk:
     LearntRisk(dt=0.02, seed=0)
     """
 
-    def __init__(self, dt: float, *, seed: int = 0, without: Sequence[str] = ()) -> None:
+    def __init__(
+        self,
+        dt: float,
+        *,
+        horizon: float | None = None,
+        seed: int = 0,
+        without: Sequence[str] = (),
+        names: Sequence[str] = (),
+        units: Sequence[str] = (),
+    ) -> None:
         self.dt = positive("dt", dt)
+        self.told_horizon = None if horizon is None else positive("horizon", horizon)
+        #: Steps that it looks ahead.
+        self.horizon = _HORIZON if horizon is None else max(1, round(horizon / self.dt))
         self.seed = operator.index(seed)
         if unknown := set(without) - set(JUDGE_PARTS):
             raise ValueError(f"without names {sorted(unknown)}; there are {', '.join(JUDGE_PARTS)}")
         self.without = frozenset(without)
-        self.labels = Labels(dt=self.dt)
+        self.labels = Labels(names=tuple(names), units=tuple(units), dt=self.dt)
         self.machine: EvolvingFSM | None = None
         #: Whether it may try actions to learn what they do.
         self.learning = True
@@ -107,6 +131,7 @@ class LearntRisk:
         self.broken = 0
         self.n_studied = 0
         self.n_scanned = 0
+        self._takes = _HORIZON / _AHEAD
         self.situations = Situations()
         self.backups: Backups | None = None
         self.disturbances: Disturbances | None = None
@@ -166,6 +191,22 @@ class LearntRisk:
         dynamics = self.dynamics
         return float(dynamics.sums.counts[0]) * self.dt if dynamics.n_variables else 0.0
 
+    @property
+    def remembered(self) -> Remembered:
+        """Disturbances that it counts on, and the time in which they were seen."""
+        return Remembered(len(self.dynamics.stretches), self.exposure)
+
+    @property
+    def told_by_experience(self) -> str:
+        """What was learnt so far, in words."""
+        sides = self.dynamics.consequents.sides if self.dynamics.n_variables else ()
+        names = self.labels.names
+        fails = [
+            (names[int(j)] if names else f"variable {int(j) + 1}", sign < 0.0, at)
+            for j, sign, at, _ in sides
+        ]
+        return words.experience(fails, self.remembered, self.margin)
+
     def search(
         self, situation: Situation, wanted: Any, *, tolerance: float, revising: bool
     ) -> Search:
@@ -188,41 +229,44 @@ class LearntRisk:
         dynamics, here = self.dynamics, self._here(situation)
         one = np.array([wanted])
         if here is None or self.disturbances is None or self.backups is None:
-            return Search(one, _unjudged(1), 0, "nothing was learnt yet")
+            return Search(one, _unjudged(1), 0, words.NOTHING_LEARNT)
         known = dynamics.consequents
         if not len(known.sides):
-            return Search(one, _unjudged(1), 0, "no failure is known yet")
+            return Search(one, _unjudged(1), 0, words.NO_FAILURE)
         proposal, best = dynamics.encode(wanted), np.empty(dynamics.size)
         allowed = self._allowed(tolerance)
         keep = self.margin + (_RELEASE if revising else 0.0)
         asked = self._ranks[:_ASKED]
         world = (self.backups.policies, asked, self.disturbances, self._order, self.harder)
-        how, backup, apart = search(known, here, proposal, *world, self.margin, keep, allowed, best)
+        how, backup, left = search(known, here, proposal, *world, self.margin, keep, allowed, best)
         self._ranks = np.array([backup, *(q for q in self._ranks if q != backup)])
         self._tight = how != KEPT
         tried = (
-            self._untried(best) if self.learning and how == NOTHING_PASSES and apart < _ALIKE else None
+            self._untried(best)
+            if self.learning and how == NOTHING_PASSES and left < _ALIKE
+            else None
         )
         self._holds = how != NOTHING_PASSES
         if not self._holds and self._certified:
             again = search(known, here, best, *world, 0.0, 0.0, allowed, np.empty_like(best))
             self._holds = again[0] != NOTHING_PASSES
-        then = f"then {self._backup_text(backup)}"
+        then = self._backup_text(backup)
         if how == KEPT:
-            judged = self._judgement(np.zeros(1), np.full(1, self.margin), situation)
-            return Search(one, judged, 0, f"all {self._number} are survived, {then}")
+            judged = self._judgement(np.zeros(1), np.full(1, left), situation)
+            return Search(one, judged, 0, words.kept(then, self.remembered, left))
         if tried is not None:
             best = tried
         action = np.reshape(dynamics.decode(best), np.shape(wanted))
-        judged = self._judged(situation, here, np.stack([proposal, best]))
-        why = self.why(judged)
+        judged = self._judged(
+            situation, here, np.stack([proposal, best]), left if how == CHANGED else None
+        )
         if tried is not None:
-            how_so = "what this does is hardly known, so it is tried"
+            instead = words.tried()
         elif how == CHANGED:
-            how_so = f"the closest that passes, {then}"
+            instead = words.changed(then, float(judged.critical[1]))
         else:
-            how_so = f"nothing passes, what lasts longest is {self._backup_text(backup)}"
-        return Search(np.stack([one[0], action]), judged, 1, f"{why}; {how_so}")
+            instead = words.lasting(then)
+        return Search(np.stack([one[0], action]), judged, 1, f"{self.why(judged)}; {instead}")
 
     def judge(self, situation: Situation, actions: ArrayLike) -> Judgement:
         """Risk of each action.
@@ -245,29 +289,23 @@ class LearntRisk:
 
     def why(self, judged: Judgement) -> str:
         """Why the first action that was judged is dangerous, in a few words."""
-        if self._lost < 0:
-            return "failure follows even if nothing begins"
-        if self._lost == 0:
-            return f"within the margin of {self.margin:.2g} ordinary changes"
-        be = "is" if self._lost == 1 else "are"
-        return f"{self._lost} of {self._number} {be} survived by no backup"
+        return words.refused(self._lost, self.remembered, self.margin, self.harder)
 
-    def _judged(self, situation: Situation, here: Here, actions: _Floats) -> Judgement:
-        assert self.disturbances is not None and self.backups is not None
+    def _judged(
+        self, situation: Situation, here: Here, actions: _Floats, passes: float | None = None
+    ) -> Judgement:
+        """Of some actions; ``passes`` is what is left after the last, if that is known to pass."""
+        assert self.disturbances is not None
+        assert self.backups is not None
         found = np.empty(len(self.disturbances.residuals))
         lost, left = np.zeros(len(actions)), np.zeros(len(actions))
-        for i, action in enumerate(actions):
-            escapes(
-                self.dynamics.consequents,
-                here,
-                action,
-                self.backups.policies,
-                self._ranks[:_ASKED],
-                self.disturbances,
-                found,
-            )
+        world = (self.backups.policies, self._ranks[:_ASKED], self.disturbances, found)
+        for i, action in enumerate(actions if passes is None else actions[:-1]):
+            escapes(self.dynamics.consequents, here, action, *world)
             lost[i] = math.inf if found[0] < 0.0 else np.count_nonzero(found < 0.0)
             left[i] = found.min()
+        if passes is not None:
+            left[-1] = passes
         self._lost = -1 if math.isinf(lost[0]) else int(lost[0])
         return self._judgement(lost, left, situation)
 
@@ -286,13 +324,13 @@ class LearntRisk:
         """Probability, with its interval, that something begins that is lost."""
         if math.isinf(lost):
             return 1.0, 0.0, 1.0
-        soon = self.dynamics.horizon * self.dt / max(self.exposure, 1e-300)
+        soon = self.horizon * self.dt / max(self.exposure, 1e-300)
         low, high = poisson_bounds(int(lost))
         return _within(lost * soon), _within(low * soon), _within(high * soon)
 
     def _allowed(self, tolerance: float) -> int:
         """How many of the disturbances need not be survived: their bound is within the tolerance."""
-        soon = self.dynamics.horizon * self.dt / max(self.exposure, 1e-300)
+        soon = self.horizon * self.dt / max(self.exposure, 1e-300)
         allowed = 0
         while allowed < 4 and _within(poisson_bounds(allowed + 1)[1] * soon) <= tolerance:
             allowed += 1
@@ -312,31 +350,30 @@ class LearntRisk:
 
     def _untried(self, best: _Floats) -> _Floats | None:
         """An action whose effect is hardly known, if there is one."""
-        used = self.dynamics.used
+        assert self.backups is not None
+        used, order = self.dynamics.used, self.backups.actions  # of equals the first in that order
         if self.dynamics.choices:
-            i = int(used[:, 1].argmin())
+            i = int(order[used[order, 1].argmin()])
             if used[i, 1] < _TRIES and used[i, 1] < used[:, 1].max():
                 return np.asarray(np.eye(len(used))[i])
             return None
-        i, end = divmod(int(used.argmin()), 2)
-        if used[i, end] < _TRIES and used[i, end] < used[i, 1 - end]:
-            best = best.copy()
-            best[i] = (-1.0, 1.0)[end]
+        # The end that the controller seldom went to comes first.
+        turned = np.where(self.backups.turns[:, None] > 0.0, used, used[:, ::-1])[order]
+        k, end = divmod(int(turned.argmin()), 2)
+        if turned[k, end] < _TRIES and turned[k, end] < turned[k, 1 - end]:
+            best, i = best.copy(), order[k]
+            best[i] = (-1.0, 1.0)[end] * self.backups.turns[i]
             return best
         return None
-
-    @property
-    def _number(self) -> str:
-        n = len(self.dynamics.stretches)
-        return f"{n} that may begin" if n else "what may begin"
 
     def _backup_text(self, backup: int) -> str:
         assert self.backups is not None
         if backup >= self.backups.n_constant:
-            return f"feedback {backup - self.backups.n_constant + 1}"
+            return words.feedback(backup - self.backups.n_constant)
         action = self.dynamics.decode(self.backups.policies[backup, :, 0])
-        shown = ", ".join(f"{x:g}" for x in action.tolist())
-        return f"always {shown if len(action) == 1 else f'({shown})'}"
+        if self.dynamics.choices:
+            return words.choice(action_name(int(action[0])))
+        return words.constant(action.tolist())
 
     # -- Learning -------------------------------------------------------------------------------
 
@@ -410,16 +447,28 @@ class LearntRisk:
                 evolving="backups" not in self.without,
             )
         best = self.backups.policies[self.backups.ranks]
-        self.situations.add(episode, self._tights, dynamics.horizon, random)
+        self.situations.add(episode, self._tights, self.horizon, random)
         known, enough = dynamics.consequents, len(self.situations)
         if "stretches" not in dynamics.without and len(known.sides) and enough > 3:
-            self.situations.scan(dynamics, best[:1], random)
+            self.situations.scan(dynamics, self.horizon, best[:1], random)
             self.n_scanned += 1
-        self.disturbances = choose(dynamics, self.situations, best[:2], self.harder, random)
+        if self.told_horizon is None and self.disturbances is not None and enough:
+            self._look_ahead(best[:_ASKED])
+        self.disturbances = choose(
+            dynamics, self.situations, self.horizon, best[:2], self.harder, random
+        )
         if len(known.sides) and enough >= 3:
             self._evolve(random)
         self._ranks = self.backups.ranks.copy()
         self._order = np.arange(len(self.disturbances.residuals))
+
+    def _look_ahead(self, policies: _Floats) -> None:
+        """As far as it takes to fail where nothing helps, and half as far again."""
+        assert self.disturbances is not None
+        if len(self.dynamics.consequents.sides):
+            after = failing_after(self.dynamics, self.situations, policies, self.disturbances)
+            self._takes = max(float(after), _LATEST * self._takes)
+            self.horizon = int(min(max(_AHEAD * self._takes, _SHORTEST), _FARTHEST))
 
     def _evolve(self, random: np.random.Generator) -> None:
         assert self.disturbances is not None and self.backups is not None
@@ -472,7 +521,8 @@ class LearntRisk:
         """
         content, arrays = storage.read(path, KIND.name)
         with storage.explained(path):
-            judge = cls(content["dt"], seed=content["seed"], without=content["without"])
+            told = {name: content[name] for name in ("seed", "without", "names", "units")}
+            judge = cls(content["dt"], horizon=content["told_horizon"], **told)
             restore(judge, content, arrays)
         judge._forget()
         return judge

@@ -50,13 +50,15 @@ function showStart(start) {
   at("case").replaceChildren(...start.cases.map((name, k) => new Option(name, k, false, k === start.case)));
   at("speed").replaceChildren(...start.speeds.map((speed) => new Option(`${speed} ×`, speed)));
   for (const element of document.querySelectorAll("[data-live]")) element.hidden = !start.live;
+  for (const element of document.querySelectorAll("[data-judge]")) element.hidden = element.dataset.judge !== start.judge;
   at("learnt").textContent = learnt(start);
 }
 
 function learnt(start) {
   if (!start.live) return "Recorded: the states as they were at its end. ⬢ a collision ended there, + the car now, blue: its way.";
   const before = start.learnt ? `It had learnt from ${start.learnt} episodes before this run` : "It began from empty";
-  return `${before}, and goes on learning. ⬢ dead end, + the car now, blue: its way.`;
+  const marked = start.judge === "learnt" ? "a collision ended there" : "dead end";
+  return `${before}, and goes on learning. ⬢ ${marked}, + the car now, blue: its way.`;
 }
 
 function showControls() {

@@ -11,7 +11,7 @@ function panels(start) {
   const { follower, leader, danger, third, soft } = colour;
   return [
     {
-      title: "Risk", about: "of collision if the leader brakes now",
+      title: "Risk", about: start.judge === "learnt" ? "that something begins which nothing it knows survives" : "of collision if the leader brakes now",
       low: 0, high: 1, ticks: [0, 0.5, 1], show: percent,
       lines: [
         { label: "driver's wish", ink: danger, width: 2.5, dash: [], value: (f) => f.proposed_risk.risk, band: (f) => f.proposed_risk },

@@ -9,6 +9,7 @@ export function drawBelief(list, run) {
   const decision = run.decision, graph = run.graph;
   if (!decision || !graph) return;
   const likely = decision.belief.slice(0, MOST_BARS);
+  const marked = run.start.live && run.start.judge !== "learnt" ? "dead end" : "a collision ended here";
   while (list.children.length < MOST_BARS) list.append(bar());
   [...list.children].forEach((item, k) => {
     const [state, share] = likely[k] ?? [null, 0];
@@ -19,7 +20,7 @@ export function drawBelief(list, run) {
     item.querySelector(".bar").style.width = `${100 * share}%`;
     item.querySelector(".share").textContent = `${Math.round(100 * share)} %`;
     const name = known ? known.name : "new";
-    const words = `#${state + 1} ${known && known.is_dead_end ? "⬢ dead end: " : ""}${name}`;
+    const words = `#${state + 1} ${known && known.is_dead_end ? `⬢ ${marked}: ` : ""}${name}`;
     item.querySelector(".name").textContent = words;
     item.title = words;
   });

@@ -38,10 +38,10 @@ def tell(frame: Frame, start: Start) -> Told:
     status = _status(frame, start)
     told = Told(
         status,
-        _HEADLINES[status],
-        "No danger so far." if danger is None else _when(story, danger),
-        _no_danger(frame) if danger is None else _why(danger),
-        _quiet(story) if danger is None else _done(danger, frame),
+        _headline(status, start),
+        "No danger so far." if danger is None else _when(story, danger, start),
+        _no_danger(frame, start) if danger is None else _why(danger),
+        _quiet(story, start) if danger is None else _done(danger, frame),
         _others(story, start),
         _outcome(story, frame),
         _alone(story, frame),
@@ -61,15 +61,31 @@ _HEADLINES = {
 }
 
 
-def _quiet(story: Story) -> str:
-    """What was done where latent risk saw no danger; classic measures may have."""
+def _knows_leaders(start: Start) -> bool:
+    """Whether the judge was told how cars follow each other."""
+    return start.judge != "learnt"
+
+
+def _headline(status: str, start: Start) -> str:
+    if status == "dead end" and not _knows_leaders(start):
+        return "Dead end, as far as it has learnt"
+    return _HEADLINES[status]
+
+
+def _quiet(story: Story, start: Start) -> str:
+    """What was done where the judge saw no danger; classic measures may have."""
     if story.revised == 0:
         return "Nothing had to be done: every wish of the driver was carried out."
     plural = "decision" if story.revised == 1 else "decisions"
-    return f"The reviser changed {story.revised} {plural}, though latent risk saw no danger."
+    changed = f"The reviser changed {story.revised} {plural}"
+    if not _knows_leaders(start):
+        return f"{changed}, to survive all that it remembers by a margin."
+    return f"{changed}, though latent risk saw no danger."
 
 
-def _no_danger(frame: Frame) -> str:
+def _no_danger(frame: Frame, start: Start) -> str:
+    if not _knows_leaders(start) and math.isnan(frame.proposed_risk.risk) and not frame.over:
+        return "Nothing was judged: no failure is known yet."
     if math.isnan(frame.brakes_to):  # which recordings do not hold
         return "No wish of the driver was judged to be too risky."
     return (
@@ -101,12 +117,17 @@ def _status(frame: Frame, start: Start) -> str:
     return "averted" if frame.revising and is_held_off else "danger"
 
 
-def _when(story: Story, danger: Danger) -> str:
+def _when(story: Story, danger: Danger, start: Start) -> str:
     text = f"Danger began at {_seconds(danger.since)}"
     if danger.since > story.first:
         text += f" (and before, at {_seconds(story.first)})"
     if not story.in_danger:
         return f"{text}; it was over at {_seconds(danger.last)}."
+    if not math.isnan(danger.dead_end) and not _knows_leaders(start):
+        return (
+            f"{text}, in what the driver wanted. From {_seconds(danger.dead_end)} on it was a dead "
+            "end: nothing that it knows to do would most likely have been enough."
+        )
     if not math.isnan(danger.dead_end):
         return (
             f"{text}, in what the driver wanted. From {_seconds(danger.dead_end)} on it was a dead "
@@ -125,6 +146,8 @@ def _why(danger: Danger) -> str:
     else:
         where += ", as fast as it"
     wanted = f"{where[0].upper()}{where[1:]}, the driver wanted to {_wish(danger.proposed)}"
+    if danger.why:
+        return f"{wanted}: a risk of {danger.risk:.0%}. After that {danger.why}."
     if math.isnan(danger.critical):  # which recordings do not hold
         return f"{wanted}: a risk of {danger.risk:.0%}."
     return (
