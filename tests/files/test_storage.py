@@ -212,8 +212,8 @@ def test_a_header_that_makes_no_sense_is_refused_by_name(content, tmp_path):
 
 def test_a_file_of_a_newer_version_asks_for_a_newer_library(tmp_path):
     path = tmp_path / "newer"
-    path.write_bytes(npz({**HEADER, "version": 6}))
-    with pytest.raises(ValueError, match=r"version 6 is newer.*a newer evofsm reads it"):
+    path.write_bytes(npz({**HEADER, "version": 7}))
+    with pytest.raises(ValueError, match=r"version 7 is newer.*a newer evofsm reads it"):
         EvolvingFSM.load(path)
 
 
@@ -595,6 +595,20 @@ def test_a_machine_of_format_4_goes_on_and_counts_episodes_from_then_on(spiral):
     assert 0 < old.failed_soon.sum() == old.episodes.sum() <= old.n_states
 
 
+def test_files_of_format_5_knew_no_dynamics(spiral):
+    rule = FailureSplit(Novelty(radius=2.0, scales=(1.0, 2.0)), distance=0.1)
+    new = EvolvingFSM(4, rule=rule, max_states=12, belief_tolerance=1e-9)
+    new.learn_many(spiral(40)[:24], np.arange(24) % 3, [0, 9], failures=[15])
+    old = EvolvingFSM.load(FILES / "machine-format-5.evofsm")
+    model = FSMModel.load(FILES / "model-format-5.evofsm")
+    assert repr(old) == repr(new)
+    assert old.dynamics is model.dynamics is None
+    assert not old.onsets.any()
+    assert not model.onsets.any()
+    np.testing.assert_array_equal(model.tried, old.tried)
+    assert_go_on_alike(old, new, spiral(40)[24:], [0, 1, 2, 3] * 4)
+
+
 def test_a_risk_of_format_3_is_read():
     risk = LatentRisk.load(FILES / "risk-format-3.evofsm")
     assert (len(risk.manoeuvres), len(risk.brakes.samples)) == (3, 80)
@@ -614,7 +628,7 @@ def test_a_file_says_who_wrote_it_and_what_it_learnt_from(grown, tmp_path):
     for item, kind in ((grown, "machine"), (grown.model(), "model")):
         item.save(tmp_path / kind, provenance)
         header = storage.read_header(tmp_path / kind)
-        assert (header.kind, header.version) == (kind, 5)
+        assert (header.kind, header.version) == (kind, 6)
         assert header.library == __version__
         assert header.provenance == provenance
 

@@ -12,6 +12,14 @@ from .dynamics.consequents import scratch as scratch
 from .dynamics.dynamics import DYNAMICS_PARTS as DYNAMICS_PARTS
 from .dynamics.dynamics import Dynamics as Dynamics
 from .dynamics.dynamics import Episode as Episode
+from .dynamics.following import encoded_rows as encoded_rows
+from .dynamics.following import follow as follow
+from .dynamics.following import follow_end as follow_end
+from .dynamics.following import refuse_too_large as refuse_too_large
+from .dynamics.merging import merge_dynamics as merge_dynamics
+from .dynamics.questions import Ahead as Ahead
+from .dynamics.questions import MayBegin as MayBegin
+from .dynamics.questions import Remembered as Remembered
 from .elementary import fetch_ahead as fetch_ahead
 from .explanation import Explanation as Explanation
 from .explanation import Tally as Tally
@@ -26,7 +34,9 @@ from .kernels import inner_kernel as inner_kernel
 from .kernels import kernel as kernel
 from .kernels import parallel_kernel as parallel_kernel
 from .known import Known as Known
+from .known import Nearest as Nearest
 from .known import Policy as Policy
+from .known import Unseen as Unseen
 from .learnt import NO_ACTION as NO_ACTION
 from .learnt import NOT_OPEN as NOT_OPEN
 from .learnt import Counts as Counts
@@ -56,6 +66,8 @@ from .observations import Missing as Missing
 from .observations import ObservationEncoder as ObservationEncoder
 from .proportions import poisson_bounds as poisson_bounds
 from .proportions import wilson_bounds as wilson_bounds
+from .rates import OnsetRates as OnsetRates
+from .rates import Rate as Rate
 from .reference import Reference as Reference
 from .states.dispatch import describe_rule as describe_rule
 from .states.dispatch import register_rule as register_rule

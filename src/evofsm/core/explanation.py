@@ -221,11 +221,13 @@ def _of_episodes(here: Tally, visits: int, soon: str, asked: Tally | None, actio
 
 
 def _of_onsets(known: Known, state: int, labels: Labels) -> str:
-    """How often something unexpected began here, if the machine looked for that."""
-    if not known.onsets.any():
+    if known.dynamics is None or not known.visits[state]:
         return ""
-    began, time = int(known.onsets[state]), labels.duration(int(known.visits[state]))
-    return f"{_count(began, 'disturbance') if began else 'No disturbance'} began here in {time}"
+    number, while_there = int(known.onsets[state]), labels.duration(int(known.visits[state]))
+    if not number:
+        return f"No disturbance was noticed to begin here, in {while_there}"
+    times = "once" if number == 1 else f"{number:,} times"
+    return f"A disturbance began here {times} in {while_there}"
 
 
 def _of_origin(arrivals: NDArray[np.float64], came_from: int | None) -> str:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from evofsm.core.dynamics.dynamics import Dynamics
 from evofsm.core.learnt import Learnt
 from evofsm.core.machine import EvolvingFSM
 from evofsm.core.memory import Memory
@@ -68,6 +69,15 @@ class Inside:
     def use(self, buffer: NDArray[np.float64]) -> None:
         """Go on with another buffer."""
         self.machine._use(buffer)
+
+    @property
+    def dynamics(self) -> Dynamics | None:
+        """What the machine learns of how its system moves."""
+        return self.machine.dynamics
+
+    @dynamics.setter
+    def dynamics(self, dynamics: Dynamics | None) -> None:
+        self.machine._dynamics = dynamics
 
     def trimmed(self) -> Learnt:
         """A copy of all that was learnt, without spare room."""

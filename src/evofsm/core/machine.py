@@ -702,6 +702,10 @@ prior_frequency=0.001, spread=3.0)
     committor_forward = _alone(Known.committor_forward)
     mfpt = _alone(Known.mfpt)
     simulate = _alone(Known.simulate)
+    what_next = _alone(Known.what_next)
+    may_begin = _alone(Known.may_begin)
+    onset_rates = _alone(Known.onset_rates)
+    never_seen = _alone(Known.never_seen)
     joint_frequency = property(_alone(cast(Any, Known.joint_frequency).fget))
 
     # -- What it was told -----------------------------------------------------------------------

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from evofsm.core.actions import IntervalActions
+from evofsm.core.dynamics.keeping import from_bytes, to_bytes
 from evofsm.core.explanation import Explanation, explain
 from evofsm.core.known import Known
 from evofsm.core.layout import Array
@@ -73,6 +74,8 @@ class FSMModel(Known):
             array.setflags(write=False)
             object.__setattr__(self, name, array)
             arrays[name] = array
+        if self.dynamics is not None:
+            object.__setattr__(self, "dynamics", self.dynamics.frozen())
         ranges.refuse_others(MODEL.name, self._content, arrays)
         refuse_more_failures(self)
         counted = self.failures, self.endings, self.failed_soon
@@ -235,7 +238,8 @@ class FSMModel(Known):
         }
 
     def _kept(self) -> dict[str, NDArray[Any]]:
-        return {name: getattr(self, name) for name in OF_MODEL}
+        arrays = {name: getattr(self, name) for name in OF_MODEL}
+        return {**arrays, "dynamics": to_bytes(self.dynamics)}
 
     @classmethod
     def _restored(cls, content: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> Self:
@@ -243,7 +247,8 @@ class FSMModel(Known):
             content["actions"] = _actions(content["actions"], len(arrays["uses"]))
         for name in ("names", "units"):
             content[name] = tuple(content[name])
-        values: dict[str, Any] = {**content, **arrays}
+        dynamics = from_bytes(arrays.pop("dynamics"))
+        values: dict[str, Any] = {**content, **arrays, "dynamics": dynamics}
         if lacking := {entry.name for entry in fields(cls)} - set(values):
             raise ValueError(f"it lacks {', '.join(sorted(lacking))}")
         return cls(**values)

@@ -10,6 +10,9 @@ from evofsm.core.kernels import compiled
 
 # Two-sided 90 %.
 _WIDTH = 1.645
+# From this shape on a gamma distribution is taken to be a power of a normal one.
+_LARGE = 50.0
+_HALVINGS = 60
 
 
 @compiled
@@ -61,26 +64,39 @@ def poisson_bounds(count: int) -> tuple[float, float]:
     >>> [round(bound, 3) for bound in poisson_bounds(0) + poisson_bounds(3)]
     [0.0, 2.996, 0.818, 7.754]
     """
-    most = 10.0 + 2.0 * count
-    low = 0.0 if count == 0 else _bisect(lambda mean: 1.0 - _at_most(count - 1, mean), 0.0, most)
-    return low, _bisect(lambda mean: 1.0 - _at_most(count, mean) - 0.9, 0.0, 2.0 * most)
+    low = gamma_quantile(0.05, count) if count else 0.0
+    return low, gamma_quantile(0.95, count + 1.0)
 
 
-def _at_most(count: int, mean: float) -> float:
-    """Probability of so many events, or fewer (Poisson)."""
-    term = total = math.exp(-mean)
-    for k in range(1, count + 1):
-        term *= mean / k
-        total += term
-    return total
+def gamma_quantile(share: float, shape: float) -> float:
+    """Below which a gamma variable of scale 1 lies with this probability, 0.05 or 0.95.
 
-
-def _bisect(rising: Callable[[float], float], low: float, high: float) -> float:
-    """Where a function that rises comes to 0.05."""
-    for _ in range(100):
+    Examples
+    --------
+    >>> round(gamma_quantile(0.95, 1.0), 3), round(gamma_quantile(0.05, 3.0), 3)  # - log 0.05
+    (2.996, 0.818)
+    """
+    if shape > _LARGE:  # Wilson & Hilferty 1931
+        width = _WIDTH if share > 0.5 else -_WIDTH
+        return float(shape * (1.0 - 1.0 / (9.0 * shape) + width / (3.0 * math.sqrt(shape))) ** 3)
+    low, high = 0.0, shape + 10.0 * math.sqrt(shape) + 10.0
+    for _ in range(_HALVINGS):
         middle = 0.5 * (low + high)
-        low, high = (low, middle) if rising(middle) > 0.05 else (middle, high)
+        low, high = (middle, high) if _gamma_below(middle, shape) < share else (low, middle)
     return high
+
+
+def _gamma_below(x: float, shape: float) -> float:
+    """Probability that a gamma variable of scale 1 lies below x: the series of its density."""
+    if x <= 0.0:
+        return 0.0
+    term = total = 1.0 / shape
+    k = shape
+    while term > 1e-15 * total:
+        k += 1.0
+        term *= x / k
+        total += term
+    return total * math.exp(shape * math.log(x) - x - math.lgamma(shape))
 
 
 def bounds_text(low: float, high: float) -> str:

@@ -19,13 +19,17 @@ from evofsm.core import (
     LINE,
     NO_ACTION,
     NOT_OPEN,
+    Dynamics,
     EvolvingFSM,
     Inside,
     Limit,
     Memory,
     check_actions,
     check_rows,
+    encoded_rows,
     fetch_ahead,
+    follow,
+    follow_end,
     inner_kernel,
     kernel,
     lengths,
@@ -34,6 +38,7 @@ from evofsm.core import (
     open_apart,
     parallel_kernel,
     real_rows,
+    refuse_too_large,
     refuse_unusable,
     room_for,
     step_and_act,
@@ -70,7 +75,8 @@ class Fleet:
     Parameters
     ----------
     machine : EvolvingFSM
-        Each vehicle starts with a copy of it: its settings, and all that it has learnt.
+        Each vehicle starts with a copy of it: its settings, and all that it has learnt. If it has
+        `dynamics`, each vehicle has its own; they learn one after another, in Python.
     n_vehicles : int
         Number V of vehicles.
     dtype : float64 or float32
@@ -110,6 +116,10 @@ class Fleet:
         self._n_vehicles = whole("n_vehicles", n_vehicles)
         self._dtype = np.dtype(dtype)
         self._everyone = np.arange(self._n_vehicles)
+        moves = self._machine.dynamics
+        self._dynamics: list[Dynamics] = (
+            [] if moves is None else [moves.copy() for _ in self._everyone]
+        )
         self._fill(Inside(machine).buffer)
 
     def __len__(self) -> int:
@@ -117,12 +127,15 @@ class Fleet:
 
     def __getitem__(self, vehicle: int) -> EvolvingFSM:
         """A copy of one vehicle's machine."""
-        at, at_matrices = self._at[range(len(self))[vehicle]]
+        vehicle = range(len(self))[vehicle]
+        at, at_matrices = self._at[vehicle]
         machine = self._machine.copy()
         length, of_matrices = lengths(*self._small[at : at + 4].astype(int).tolist())
         small = self._small[at : at + length]
         matrices = self._matrices[at_matrices : at_matrices + of_matrices]
         Inside(machine).use(np.concatenate([small, matrices]))
+        if self._dynamics:
+            Inside(machine).dynamics = self._dynamics[vehicle].copy()
         if self._dtype == _SINGLE:
             _sum_to_1(machine)
         return machine
@@ -136,7 +149,7 @@ class Fleet:
 
     @property
     def nbytes(self) -> int:
-        """Memory that holds what was learnt, with room for the next states [byte]."""
+        """Memory of states and transitions, with room for the next states [byte]."""
         return self._small.nbytes + self._matrices.nbytes
 
     def observe(
@@ -147,6 +160,7 @@ class Fleet:
         vehicles: Sequence[int] | NDArray[np.integer] | None = None,
         episode_starts: Sequence[int] | NDArray[np.integer] = (),
         failures: Sequence[int] | NDArray[np.integer] | None = None,
+        executed: ArrayLike | None = None,
     ) -> FleetStep:
         """One observation of each vehicle, then the action commanded after it.
 
@@ -164,6 +178,8 @@ class Fleet:
         failures : array_like of int, optional
             Rows whose vehicle's episode ended in failure with this observation; an empty one tells
             that none did.
+        executed : (K,) or (K, d) array_like, optional
+            The actions themselves, as `EvolvingFSM.act` takes them.
 
         Returns
         -------
@@ -191,6 +207,10 @@ class Fleet:
             actions = check_actions(A, len(rows), self._machine.n_actions)
         starts = check_rows("episode_starts", episode_starts, len(rows))
         ends = check_rows("failures", () if failures is None else failures, len(rows))
+        inner: list[NDArray[np.float64] | None] = []
+        if self._dynamics:
+            refuse_too_large(rows)
+            inner = encoded_rows(self._dynamics[0], actions, executed)
         # The number of variables is known from the first observation on.
         if len(rows) and self._small[self._at[0, 0]] == 0:
             Inside(self._machine).check(rows[:1])
@@ -203,11 +223,14 @@ class Fleet:
             np.full(len(rows), FULL, np.int8),
             np.empty(len(rows)),
         )
+        before = self._look_at(chosen)
         given = chosen, rows, actions, starts, ends
         while _step_all(
             self._small, self._matrices, self._at, *given, *answer, Inside(self._machine).limit
         ):
             self._grow(chosen[answer.event == FULL])
+        if self._dynamics:
+            self._follow(chosen, rows, inner, starts, ends, before)
         return answer
 
     def start_episode(self, vehicles: Sequence[int] | NDArray[np.integer] | None = None) -> None:
@@ -225,8 +248,41 @@ class Fleet:
         """
         chosen = self._everyone if vehicles is None else self._vehicles(vehicles)
         _start_episodes(self._small, self._matrices, self._at, chosen)
+        for vehicle in chosen.tolist() if self._dynamics else ():
+            follow_end(self._dynamics[vehicle], 0.0, failed=False)
 
     # -- Inside ---------------------------------------------------------------------------------
+
+    def _look_at(self, vehicles: NDArray[np.int64]) -> NDArray[np.float64]:
+        """(K, 4) for dynamics: whether in an episode, state, its identity, and the clock."""
+        found = np.zeros((len(vehicles), 4))
+        if self._dynamics:
+            _look_at_all(self._small, self._matrices, self._at, vehicles, found)
+        return found
+
+    def _follow(
+        self,
+        vehicles: NDArray[np.int64],
+        rows: NDArray[np.float64],
+        inner: Sequence[NDArray[np.float64] | None],
+        starts: NDArray[np.bool_],
+        ends: NDArray[np.bool_],
+        before: NDArray[np.float64],
+    ) -> None:
+        """Have the dynamics of each vehicle learn from its row, as those of a machine do."""
+        clocks = self._look_at(vehicles)[:, 3]
+        onsets = np.full(len(vehicles), -1)
+        for row, vehicle in enumerate(vehicles.tolist()):
+            dynamics = self._dynamics[vehicle]
+            chained, failed = bool(before[row, 0]) and not starts[row], bool(ends[row])
+            now = float(clocks[row])
+            acted = None if failed else inner[row]
+            if follow(dynamics, rows[row], now, chained=chained, failed=failed, action=acted):
+                state, identity = before[row, 1:3].astype(int).tolist()
+                if self[vehicle].state_ids[state] != identity:  # it was given up for another one
+                    state = self[vehicle].nearest(dynamics.before).state
+                onsets[row] = state
+        _count_onsets(self._small, self._matrices, self._at, vehicles, onsets)
 
     def _fill(self, buffer: NDArray[np.float64]) -> None:
         """Every vehicle gets a copy of one machine's buffer."""
@@ -415,6 +471,35 @@ def _count_states(
 ) -> None:
     for vehicle in range(len(at)):
         found[vehicle] = int(_open(small, matrices, at[vehicle]).learnt.n_states[0])
+
+
+@kernel
+def _look_at_all(
+    small: NDArray[np.float64],
+    matrices: NDArray[Any],
+    at: NDArray[np.int64],
+    vehicles: NDArray[np.int64],
+    found: NDArray[np.float64],
+) -> None:
+    for row in range(len(vehicles)):
+        now = _open(small, matrices, at[vehicles[row]]).learnt
+        found[row, 0], found[row, 1] = now.chained[0], now.state[0]
+        if now.n_states[0] > 0.0:
+            found[row, 2] = now.ids[int(now.state[0])]
+        found[row, 3] = now.outcomes.clock[0]
+
+
+@kernel
+def _count_onsets(
+    small: NDArray[np.float64],
+    matrices: NDArray[Any],
+    at: NDArray[np.int64],
+    vehicles: NDArray[np.int64],
+    states: NDArray[np.int64],
+) -> None:
+    for row in range(len(vehicles)):
+        if states[row] >= 0:
+            _open(small, matrices, at[vehicles[row]]).learnt.outcomes.onsets[states[row]] += 1.0
 
 
 @kernel

@@ -30,6 +30,7 @@ from evofsm.core import (
     Parameters,
     arrays_of,
     leaves,
+    merge_dynamics,
     positive,
 )
 
@@ -102,7 +103,8 @@ def merge(machines: Sequence[EvolvingFSM], *, radius: float | None = None) -> Ev
     *Further*: mean and scatter are pooled exactly [1]_. A centre's potential is what the recursion
     would have made of it, had it seen the data of all other parts since; ``founded`` is one more
     than the observations that were made before, in the parts that created it. An episode that came
-    to two states of one part that are joined is counted twice.
+    to two states of one part that are joined is counted twice. Sums of `dynamics` add up, from one
+    origin; of stretches, failures and jumps the newest of all parts are kept.
 
     References
     ----------
@@ -137,6 +139,8 @@ def merge(machines: Sequence[EvolvingFSM], *, radius: float | None = None) -> Ev
             **_transitions(learnt, match, parameters),
         }
     )
+    if moves := [part.dynamics for part in experienced if part.dynamics is not None]:
+        Inside(merged).dynamics = merge_dynamics(moves)
     if all(part.failures_told for part in experienced):
         merged.tell_of_failures()
     return merged
@@ -157,9 +161,16 @@ def _refuse_unlike(machines: Iterable[EvolvingFSM]) -> list[EvolvingFSM]:
             f"machine {one} has {m} variables, and machine {other} has {other_m}; "
             "machines to merge must have observed the same"
         )
+    moves = [None if part.dynamics is None else part.dynamics.settings for part in parts]
+    for number, its in enumerate(moves):
+        if its != moves[0]:
+            raise ValueError(
+                f"dynamics of machine {number} are {its}, but {moves[0]} of machine 0; machines to "
+                "merge must have the same settings"
+            )
     settings = [part.settings | {"rule": part.rule} for part in parts]
-    for number, its in enumerate(settings):
-        for name in sorted(its.keys() | settings[0].keys()):
+    for number, own in enumerate(settings):
+        for name in sorted(own.keys() | settings[0].keys()):
             given, expected = getattr(parts[number], name), getattr(parts[0], name)
             if given != expected:
                 raise ValueError(

@@ -173,7 +173,7 @@ class Guard:
         interval = positive("interval", interval)
         soon = None if horizon is None else max(1, round(positive("horizon", horizon) / interval))
         if judge is None:
-            judge = LearntRisk(interval, seed=seed)
+            judge = LearntRisk(interval, horizon=horizon, seed=seed)
         dynamics = None
         if machine is None and isinstance(judge, LearntRisk):
             dynamics = dynamics_for(actions, soon)
@@ -790,7 +790,9 @@ def learnt_guard(
         raise ValueError(f"there are no parts {sorted(unknown)}")
     actions = _actions(low, high, n_actions, None)
     soon = None if horizon is None else max(1, round(positive("horizon", horizon) / interval))
-    judge = LearntRisk(interval, seed=seed, without=[p for p in without if p in JUDGE_PARTS])
+    judge = LearntRisk(
+        interval, horizon=horizon, seed=seed, without=[p for p in without if p in JUDGE_PARTS]
+    )
     machine = _machine(actions, soon, dynamics_for(actions, soon, without))
     return Guard(
         low, high, n_actions=n_actions, interval=interval, seed=seed, judge=judge, machine=machine

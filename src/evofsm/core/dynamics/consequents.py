@@ -76,9 +76,8 @@ def n_features(m: int, a: int, *, box: bool) -> int:
 @compiled
 def scratch(m: int, a: int, p: int) -> Scratch:
     """Room for m variables, a numbers of an action and p features."""
-    return Scratch(
-        np.empty(m), np.empty(m), np.empty(m), np.empty(m), np.empty(a), np.empty(a), np.empty(p)
-    )
+    z, was, change, move = np.empty(m), np.empty(m), np.empty(m), np.empty(m)
+    return Scratch(z, was, change, move, np.empty(a), np.empty(a), np.empty(p))
 
 
 @inner_kernel
@@ -157,6 +156,39 @@ def follow_policy(known: Consequents, policy: _Floats, z: _Floats, action: _Floa
 
 
 @inner_kernel
+def advance(
+    known: Consequents,
+    disturbances: Disturbances,
+    k: int,
+    t: int,
+    harder: float,
+    room: Scratch,
+) -> None:
+    """Take the action in ``room`` there, amid step t of disturbance k."""
+    m, a = len(room.z), len(room.action)
+    expect(known, room.z, room.change, room.action, room.before, room.features, room.move)
+    for j in range(m):
+        room.was[j] = room.z[j]
+    for j in range(m):
+        x = room.move[j] + harder * disturbances.residuals[k, t, j]
+        x = min(max(x, harder * known.least[j]), harder * known.most[j])
+        y = room.z[j] + x
+        if disturbances.jump_at[k, j] == t:
+            y = disturbances.jump_to[k, j]
+            for i in range(m):
+                seen = disturbances.jump_from[k, j, i]
+                was = min(max(room.was[i], seen[0]), seen[1])
+                y += disturbances.jump_slope[k, j, i] * was
+            landing = disturbances.landing[k, j]
+            y = min(max(y, landing[0]), landing[1])
+        y = min(max(y, known.lowest[j]), known.highest[j])
+        room.change[j] = y - room.z[j]
+        room.z[j] = y
+    for i in range(a):
+        room.before[i] = room.action[i]
+
+
+@inner_kernel
 def replay(
     known: Consequents,
     here: Here,
@@ -187,26 +219,7 @@ def replay(
                 room.action[i] = first[i]
         else:
             follow_policy(known, policy, room.z, room.action)
-        expect(known, room.z, room.change, room.action, room.before, room.features, room.move)
-        for j in range(m):
-            room.was[j] = room.z[j]
-        for j in range(m):
-            x = room.move[j] + harder * disturbances.residuals[k, t, j]
-            x = min(max(x, harder * known.least[j]), harder * known.most[j])
-            y = room.z[j] + x
-            if disturbances.jump_at[k, j] == t:
-                y = disturbances.jump_to[k, j]
-                for i in range(m):
-                    seen = disturbances.jump_from[k, j, i]
-                    was = min(max(room.was[i], seen[0]), seen[1])
-                    y += disturbances.jump_slope[k, j, i] * was
-                landing = disturbances.landing[k, j]
-                y = min(max(y, landing[0]), landing[1])
-            y = min(max(y, known.lowest[j]), known.highest[j])
-            room.change[j] = y - room.z[j]
-            room.z[j] = y
-        for i in range(a):
-            room.before[i] = room.action[i]
+        advance(known, disturbances, k, t, harder, room)
         for s in range(len(known.sides)):
             side = known.sides[s]
             left = side[1] * (side[2] - room.z[int(side[0])]) * side[3]

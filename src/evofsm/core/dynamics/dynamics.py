@@ -19,7 +19,7 @@ from evofsm.core.dynamics.consequents import (
 )
 from evofsm.core.dynamics.failures import explain_failures, probe
 from evofsm.core.dynamics.regression import Sums, learn_transition, solve, take_in
-from evofsm.core.dynamics.undoing import held
+from evofsm.core.dynamics.undoing import Whole, held, side_by_side
 from evofsm.core.validation import real_array, refuse_unusable, whole
 
 _Floats = NDArray[np.float64]
@@ -41,7 +41,7 @@ _SHORTEST = 4
 _LONGEST = 1024
 # An extreme is a saturation if it was reached, by moving, in so many episodes.
 _REACHED = 2
-_MOST_KEPT = 200
+MOST_KEPT = 200
 # Jumps that would have shown no dependence, for each variable.
 _JUMP_PRIOR = 3.0
 # So many times the stretches that are kept there may be until somebody chooses.
@@ -114,6 +114,8 @@ class Dynamics:
     (1, True)
     """
 
+    sums: Sums
+
     def __init__(
         self,
         low: ArrayLike | None = None,
@@ -160,11 +162,38 @@ class Dynamics:
         twin.__dict__.update(held(self))
         return twin
 
+    def frozen(self) -> Self:
+        """A copy to be asked, of which nobody learns any more: of the episode it has the end."""
+        twin = self.copy()
+        twin._Z, twin._U = twin._Z[-2:], twin._U[max(0, len(twin._Z) - 2) :]
+        twin.latest = None
+        return twin
+
+    def __copy__(self) -> Self:
+        return self.copy()
+
     def __deepcopy__(self, memo: Any) -> Self:
         return self.copy()
 
     def __getstate__(self) -> dict[str, Any]:
         return held(self) | {"told": None}  # code is told again
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        if self.n_variables:
+            self.sums = side_by_side(self.sums)
+
+    @property
+    def most_stretches(self) -> int:
+        """Number of stretches up to which nobody has to choose."""
+        return _SPARE * self.n_stretches
+
+    @property
+    def whole(self) -> Whole:
+        """A context in which all is learnt, or nothing where it is broken off."""
+        if not self.n_variables:
+            return Whole(self)
+        return Whole(self, self.sums.counts.base, self.lowest, self.highest, self.reached)
 
     def __repr__(self) -> str:
         actions = f"n_actions={self.choices}"
@@ -204,7 +233,7 @@ class Dynamics:
         p = n_features(m, a, box=not self.choices)
         self.n_variables = m
         self.origin = z.copy()
-        self.sums = Sums(
+        sums = Sums(
             counts=np.zeros(2),
             squares=np.zeros((p, p)),
             products=np.zeros((p, m)),
@@ -217,6 +246,7 @@ class Dynamics:
             most=np.zeros(m),
             scale=np.zeros(m),
         )
+        self.sums = side_by_side(sums)
         self.lowest, self.highest = np.full(m, np.inf), np.full(m, -np.inf)
         self.reached = np.zeros((m, 2))
         self.failures: list[_Floats] = []
@@ -240,7 +270,7 @@ class Dynamics:
             self.begin(z)
         if len(self._Z) >= _LONGEST:
             self._study(failed=False)
-            self._Z, self._U = self._Z[-2:], self._U[-1:]
+            self._Z, self._U = self._Z[-3:], self._U[-3:]  # the last transition is learnt next
         self._Z.append(z.copy())
         take_in(self.sums, z, self.origin)
         if self.told is not None and not self.sides and self.sums.counts[1] >= 1.0:
@@ -261,10 +291,15 @@ class Dynamics:
 
     def act(self, action: _Floats) -> None:
         """What was done after the latest observation, as `encode` returns it."""
+        for replaced in self._U[len(self._Z) - 1 :]:
+            self.used -= self._ends(replaced)
         del self._U[len(self._Z) - 1 :]
         self._U.append(action)
-        self.used[:, 0] += action < (-0.6 if not self.choices else -1.0)
-        self.used[:, 1] += action > 0.6
+        self.used += self._ends(action)
+
+    def _ends(self, action: _Floats) -> NDArray[np.bool_]:
+        """(a, 2) whether each number of an action is near an end of its range."""
+        return np.stack([action < (-0.6 if not self.choices else -1.0), action > 0.6], 1)
 
     def end(self, *, failed: bool) -> None:
         """The episode is over; its last observation was taken in."""
@@ -293,7 +328,7 @@ class Dynamics:
             if first:
                 return
             for j in np.flatnonzero(jumped):
-                self.jumps[j] = [*self.jumps[j][1 - _MOST_KEPT :], np.append(four[1], four[2, j])]
+                self.jumps[j] = [*self.jumps[j][1 - MOST_KEPT :], np.append(four[1], four[2, j])]
 
     def _solve(self) -> None:
         if self.sums.counts[0] < _FIRST:
@@ -335,16 +370,8 @@ class Dynamics:
         safe = Z[:-1] if failed else Z
         self._extremes(safe)
         if failed:
-            self.failures = [*self.failures[1 - _MOST_KEPT :], Z[-1]]
-        self._solve()
-        if self.told is None:
-            self.sides = explain_failures(
-                np.array(self.failures).reshape(-1, self.n_variables),
-                self.lowest,
-                self.highest,
-                np.maximum(self.sums.unit, 1e-300),
-            )
-        self._rebuild()
+            self.failures = [*self.failures[1 - MOST_KEPT :], Z[-1]]
+        self.settle()
         self.sums.squares[:] *= _KEPT
         self.sums.products[:] *= _KEPT
         self.latest = None
@@ -358,13 +385,25 @@ class Dynamics:
                 self.remember(self.onsets(found))
         self.n_episodes += 1
 
+    def settle(self) -> None:
+        """Make of all sums what is known: weights, and where it fails."""
+        self._solve()
+        if self.told is None:
+            self.sides = explain_failures(
+                np.array(self.failures).reshape(-1, self.n_variables),
+                self.lowest,
+                self.highest,
+                np.maximum(self.sums.unit, 1e-300),
+            )
+        self._rebuild()
+
     def _extremes(self, safe: _Floats) -> None:
         """How far variables went, and whether they stay there."""
         if not len(safe):
             return
         low, high = safe.min(0), safe.max(0)
         for j in range(self.n_variables):
-            close = 1e-9 * max(1.0, abs(high[j] - low[j]))
+            close = 1e-9 * (high[j] - low[j])
             if low[j] < self.lowest[j] - close:
                 self.lowest[j], self.reached[j, 0] = low[j], 0.0
             if high[j] > self.highest[j] + close:
@@ -401,7 +440,7 @@ class Dynamics:
                 self.stretches.append(
                     Stretch(Z[t : t + L + 2].copy(), U[t : t + L + 1].copy(), self.n_episodes)
                 )
-        self.stretches = self.stretches[-_SPARE * self.n_stretches :]
+        self.stretches = self.stretches[-self.most_stretches :]
 
     def keep(self, which: Sequence[int]) -> None:
         """Forget all stretches but these."""
@@ -450,11 +489,18 @@ class Dynamics:
             return None
         return np.array(self._Z[-3:]), np.array(self._U[n - 3 : n - 1])
 
-    def disturbances(self) -> Disturbances:
-        """Residuals of what is remembered, as they are seen now; number 0 is none at all."""
+    def disturbances(self, steps: int | None = None) -> Disturbances:
+        """Residuals of what is remembered, as they are seen now; number 0 is none at all.
+
+        Parameters
+        ----------
+        steps : int, optional
+            Of each of them; without it all that a stretch may have.
+        """
         m, count = self.n_variables, 1 + len(self.stretches)
+        steps = steps or self.horizon
         found = Disturbances(
-            np.zeros((count, self.horizon, m)),
+            np.zeros((count, steps, m)),
             np.full((count, m), -1.0),
             np.zeros((count, m)),
             np.zeros((count, m, m)),
@@ -463,7 +509,7 @@ class Dynamics:
         )
         carried = "carried" not in self.without
         for k, (Z, U, _) in enumerate(self.stretches, 1):
-            L = min(len(U) - 1, self.horizon)
+            L = min(len(U) - 1, steps)
             residuals(self.consequents, Z, U, L, carried, found.residuals[k])
         if "jumps" not in self.without:
             self._find_jumps(found)
@@ -504,8 +550,9 @@ def _slopes(before: _Floats, after: _Floats) -> _Floats:
     size = np.diag(squares)
     if len(after) < 3 or not size.any():
         return np.zeros(len(size))
-    held = _JUMP_PRIOR / len(after) * size + 1e-9 * size.max()
-    found: _Floats = np.linalg.solve(squares + np.diag(held), off.T @ (after - after.mean()))
+    scale = np.sqrt(np.where(size > 0.0, size, 1.0))  # variables have units of their own
+    held = squares / np.outer(scale, scale) + (_JUMP_PRIOR / len(after) + 1e-9) * np.eye(len(size))
+    found: _Floats = np.linalg.solve(held, off.T @ (after - after.mean()) / scale) / scale
     return found
 
 

@@ -40,7 +40,8 @@ def explain_failures(
     m = len(unit)
     if not len(failures):
         return []
-    beyond = np.hstack([lowest - failures, failures - highest]) / np.tile(unit, 2)
+    with np.errstate(over="ignore"):  # of a variable that never changed it is far enough
+        beyond = np.hstack([lowest - failures, failures - highest]) / np.tile(unit, 2)
     left = np.ones(len(failures), bool)
     found: list[int] = []
     while (explained := (beyond > 1e-12) & left[:, None]).any():

@@ -13,7 +13,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from evofsm.core.dynamics.consequents import residuals
 from evofsm.core.dynamics.dynamics import APART, ONSET, Dynamics
-from evofsm.core.dynamics.undoing import Whole
 from evofsm.core.validation import check_action, real_array, refuse_unusable
 
 #: Fourth powers of larger observations, summed over a long run, would lose all others.
@@ -33,8 +32,10 @@ def encoded(dynamics: Dynamics, i: int, executed: ArrayLike | None) -> _Floats:
         If it is no action.
     """
     if dynamics.choices:
-        given: Any = i if executed is None else executed
-        return dynamics.encode(check_action(given, dynamics.choices))
+        number = real_array("executed", np.atleast_1d(i if executed is None else executed), 1)
+        if len(number) != 1 or not float(number[0]).is_integer():
+            raise ValueError(f"executed is {executed!r}; it must be the index of an action")
+        return dynamics.encode(check_action(int(number[0]), dynamics.choices))
     if executed is None:
         raise ValueError(
             "executed is missing: dynamics with a range of actions have to be told the number, or "
@@ -89,7 +90,7 @@ def follow(
     ``chained`` says whether it follows from the one before. Returns whether something that was
     not expected began with the action before it.
     """
-    with Whole(dynamics):
+    with dynamics.whole:
         if not (chained and is_at(dynamics, clock - 1.0) and dynamics.has_acted):
             dynamics.break_off()
         dynamics.observe(z)
@@ -105,13 +106,12 @@ def follow(
 def follow_act(dynamics: Dynamics, clock: float, action: _Floats) -> None:
     """Learn what was done, unless the latest observation was not learnt from."""
     if is_at(dynamics, clock):
-        with Whole(dynamics):
-            dynamics.act(action)
+        dynamics.act(action)
 
 
 def follow_end(dynamics: Dynamics, clock: float, *, failed: bool) -> None:
     """Learn that the episode is over."""
-    with Whole(dynamics):
+    with dynamics.whole:
         if failed and is_at(dynamics, clock):
             dynamics.end(failed=True)
         else:

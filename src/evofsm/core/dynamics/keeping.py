@@ -17,6 +17,7 @@ from evofsm.core.dynamics.consequents import Consequents, n_features
 from evofsm.core.dynamics.dynamics import Dynamics, Stretch
 from evofsm.core.dynamics.following import LARGEST
 from evofsm.core.dynamics.regression import Sums
+from evofsm.core.dynamics.undoing import side_by_side
 from evofsm.files import ranges, storage
 
 _Shape: TypeAlias = tuple[int | str, ...]
@@ -189,7 +190,7 @@ def _refuse_impossible(dynamics: Dynamics, arrays: dict[str, NDArray[Any]]) -> N
 
 
 def _restore(dynamics: Dynamics, arrays: dict[str, NDArray[Any]]) -> None:
-    dynamics.sums = Sums(**{name: arrays[f"sum_{name}"] for name in _SUMS})
+    dynamics.sums = side_by_side(Sums(**{name: arrays[f"sum_{name}"] for name in _SUMS}))
     for name in _OWN:
         setattr(dynamics, name, arrays[name])
     dynamics.used = arrays["used"]

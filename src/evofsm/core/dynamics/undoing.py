@@ -3,15 +3,37 @@
 from __future__ import annotations
 
 from types import TracebackType
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
+_Arrays = TypeVar("_Arrays", bound=tuple[Any, ...])
+
+
+def side_by_side(arrays: _Arrays) -> _Arrays:
+    """The same named tuple of arrays, which are now parts of one: that is copied at once.
+
+    Examples
+    --------
+    >>> from typing import NamedTuple
+    >>> Pair = NamedTuple("Pair", [("one", object), ("two", object)])
+    >>> pair = side_by_side(Pair(np.zeros(2), np.ones((1, 2))))
+    >>> pair.one.base
+    array([0., 0., 1., 1.])
+    """
+    together = np.concatenate([np.ravel(array) for array in arrays])
+    ends = np.cumsum([array.size for array in arrays]).tolist()
+    parts = (
+        together[end - array.size : end].reshape(array.shape)
+        for array, end in zip(arrays, ends, strict=True)
+    )
+    return type(arrays)(*parts)
+
 
 def held(thing: object) -> dict[str, Any]:
-    """All that an object holds, by name; what is changed in place as it learns is copied.
+    """All that an object holds, by name, with arrays and lists of its own.
 
-    That are arrays, lists (but not what is in them), and named tuples of arrays.
+    What is in a list, or in other things, never changes in place.
 
     Examples
     --------
@@ -19,8 +41,8 @@ def held(thing: object) -> dict[str, Any]:
     >>> dynamics = Dynamics(n_actions=2)
     >>> before = held(dynamics)
     >>> dynamics.used[0, 0] = 7.0
-    >>> before["used"][0, 0]
-    np.float64(0.0)
+    >>> before["used"].tolist()
+    [[0.0, 0.0], [0.0, 0.0]]
     """
     return {name: _copied(value) for name, value in vars(thing).items()}
 
@@ -28,9 +50,13 @@ def held(thing: object) -> dict[str, Any]:
 def _copied(value: Any) -> Any:
     if isinstance(value, np.ndarray | list):
         return value.copy()
-    if isinstance(value, tuple) and value and isinstance(value[0], np.ndarray):
-        return type(value)(*(v.copy() if isinstance(v, np.ndarray) else v for v in value))
-    return value
+    return side_by_side(value) if _is_side_by_side(value) else value
+
+
+def _is_side_by_side(value: object) -> bool:
+    return isinstance(value, tuple) and all(
+        isinstance(part, np.ndarray) and part.base is not None for part in value
+    )
 
 
 class Whole:
@@ -39,19 +65,29 @@ class Whole:
     Parameters
     ----------
     thing : object
-        Holds what `held` copies.
+        What changes in place in it, is in lists and in the arrays that are named.
+    arrays : sequence of ndarray
+        Some of its arrays.
     """
 
-    __slots__ = ("_before", "_thing")
+    __slots__ = ("_arrays", "_before", "_numbers", "_thing")
 
-    def __init__(self, thing: object) -> None:
+    def __init__(self, thing: object, *arrays: Any) -> None:
         self._thing = thing
+        self._arrays = arrays
 
     def __enter__(self) -> None:
-        self._before = held(self._thing)
+        self._numbers = [array.copy() for array in self._arrays]
+        before = dict(vars(self._thing))
+        for name, value in before.items():
+            if type(value) is list:
+                before[name] = value.copy()
+        self._before = before
 
     def __exit__(
         self, kind: type[BaseException] | None, error: object, where: TracebackType | None
     ) -> None:
         if kind is not None:
+            for array, numbers in zip(self._arrays, self._numbers, strict=True):
+                array[:] = numbers
             self._thing.__dict__ = self._before

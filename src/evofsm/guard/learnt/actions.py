@@ -8,6 +8,8 @@ from typing import Any
 from evofsm.core import DYNAMICS_PARTS, Dynamics
 from evofsm.guard.actions import ActionSet, Choices, limits
 
+#: Steps of a stretch where nobody says how far ahead to look.
+LONGEST_STRETCH = 144
 # Stretches that are remembered.
 _STRETCHES = 10
 
@@ -25,7 +27,7 @@ def dynamics_for(
     without : sequence of str
         Parts that are left out.
     """
-    told: dict[str, Any] = {} if horizon is None else {"horizon": horizon}
+    told: dict[str, Any] = {"horizon": LONGEST_STRETCH if horizon is None else horizon}
     told |= {
         "stretches": _STRETCHES,
         "without": [part for part in without if part in DYNAMICS_PARTS],

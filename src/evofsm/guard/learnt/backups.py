@@ -14,6 +14,8 @@ _Floats = NDArray[np.float64]
 _LINEAR, _MUTANTS, _OF_BEST = 3, 40, 0.8
 # A mutant differs in this share of its numbers, by a size of 10 to a power between these.
 _CHANGED, _SIZES = 0.6, (-1.5, 0.7)
+# Digits of actions that units and directions of theirs do not change by rounding.
+_ROUNDED = 9
 # Boxes of more dimensions have an action along each axis, not one in each corner.
 _MOST_CORNERS = 3
 
@@ -43,11 +45,11 @@ class Backups:
         self.variables = np.argsort(pace, kind="stable")
         self.flips = np.where((off**3).sum(0) < 0.0, -1.0, 1.0)
         if choices:
-            self.actions = np.argsort(-actions.sum(0), kind="stable")
+            self.actions = _order(-actions)
             self.turns = np.ones(a)
             corners = np.eye(a)
         else:
-            self.actions = np.argsort(np.abs(actions).mean(0), kind="stable")
+            self.actions = _order(np.abs(actions))
             self.turns = np.where(actions.sum(0) < 0.0, -1.0, 1.0)
             ends = np.vstack([-np.eye(a), np.eye(a)])
             if a <= _MOST_CORNERS:
@@ -86,3 +88,9 @@ class Backups:
         put: _Floats = np.empty_like(drawn)
         put[np.ix_(self.actions, np.append(0, 1 + self.variables))] = drawn
         return put * np.append(1.0, self.flips) * self.turns[:, None]
+
+
+def _order(rows: _Floats) -> NDArray[np.int64]:
+    """Of columns by their mean, of equals by the first rows in which they differ."""
+    exact = rows.round(_ROUNDED)
+    return np.lexsort((*exact[::-1], exact.mean(0).round(_ROUNDED)))

@@ -33,6 +33,7 @@ _SHAPES: dict[str, tuple[int | str, ...]] = {
     "actions": ("c",),
     "turns": ("c",),
 }
+_NUMBERS = ("margin", "broken", "horizon", "n_studied", "n_scanned")
 KIND = ranges.register(
     ranges.Kind(
         "learntrisk",
@@ -42,6 +43,9 @@ KIND = ranges.register(
             "margin": ranges.Range(0.0, 1e6),
             **dict.fromkeys(("seed", "broken", "n_studied", "n_scanned"), ranges.COUNT),
             "n_constant": ranges.COUNT,
+            "horizon": ranges.FROM_1,
+            "told_horizon": ranges.SIZE,
+            "takes": ranges.Range(0.0, 1e6),
         },
     )
 )
@@ -68,11 +72,8 @@ def content_of(judge: LearntRisk) -> tuple[dict[str, Any], dict[str, NDArray[Any
             "actions": backups.actions.astype(np.float64),
             "turns": backups.turns,
         }
-    content = {
-        name: getattr(judge, name)
-        for name in ("dt", "seed", "margin", "broken", "n_studied", "n_scanned")
-    }
-    content |= {"without": sorted(judge.without)}
+    content = {name: getattr(judge, name) for name in ("dt", "seed", "told_horizon", *_NUMBERS)}
+    content |= {"without": sorted(judge.without), "takes": judge._takes}
     content |= {"names": list(judge.labels.names), "units": list(judge.labels.units)}
     return content | {"n_constant": 0 if backups is None else backups.n_constant}, arrays
 
@@ -85,7 +86,8 @@ def restore(judge: LearntRisk, content: dict[str, Any], arrays: dict[str, NDArra
     ValueError
         If arrays contradict each other.
     """
-    for name in ("margin", "broken", "n_studied", "n_scanned"):
+    judge._takes = content["takes"]
+    for name in _NUMBERS:
         setattr(judge, name, content[name])
     if len(arrays["residuals"]):
         judge.disturbances = Disturbances(*(arrays[name] for name in Disturbances._fields))

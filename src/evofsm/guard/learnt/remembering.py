@@ -65,13 +65,15 @@ class Situations:
             else:
                 self.kept[int(random.integers(_KEPT))] = one
 
-    def scan(self, dynamics: Dynamics, policies: _Floats, random: np.random.Generator) -> None:
+    def scan(
+        self, dynamics: Dynamics, horizon: int, policies: _Floats, random: np.random.Generator
+    ) -> None:
         """Remember those starts of the latest episode that would harm most in a few situations."""
         episode, known = dynamics.latest, dynamics.consequents
         assert episode is not None
-        H, n = dynamics.horizon, len(episode.residuals)
+        n = len(episode.residuals)
         alone = np.empty((1, len(self)))
-        harm(known, *self.arrays(), policies, undisturbed(1, dynamics), 1.0, alone)
+        harm(known, *self.arrays(), policies, undisturbed(1, dynamics, horizon), 1.0, alone)
         safe = np.flatnonzero(alone[0] > 0.0)
         if not len(safe):
             return
@@ -79,10 +81,10 @@ class Situations:
         steps = np.arange(n)
         if n > _MOST_STARTS:
             steps = np.sort(random.permutation(n)[:_MOST_STARTS])
-        rest = np.vstack([episode.residuals, np.zeros((H, dynamics.n_variables))])
-        begun = undisturbed(len(steps), dynamics)
+        rest = np.vstack([episode.residuals, np.zeros((horizon, dynamics.n_variables))])
+        begun = undisturbed(len(steps), dynamics, horizon)
         for row, t in zip(begun.residuals, steps, strict=True):
-            row[:] = rest[t : t + H]
+            row[:] = rest[t : t + horizon]
         found = np.empty((len(steps), len(safe)))
         harm(known, *self.arrays(safe), policies, begun, 1.0, found)
         taken, starts = dynamics.onsets(episode.residuals), list[int]()
@@ -96,14 +98,15 @@ class Situations:
 def choose(
     dynamics: Dynamics,
     situations: Situations,
+    horizon: int,
     policies: _Floats,
     harder: float,
     random: np.random.Generator,
 ) -> Disturbances:
     """Keep the most harmful stretches of all that are remembered; return their residuals."""
-    found, K = dynamics.disturbances(), dynamics.n_stretches
+    found, K = dynamics.disturbances(horizon), dynamics.n_stretches
     if "memory" in dynamics.without:
-        return _shuffled(dynamics, situations, random)
+        return _shuffled(dynamics, situations, horizon, random)
     n = len(dynamics.stretches)
     if n <= K:
         return found
@@ -111,7 +114,7 @@ def choose(
     if len(dynamics.consequents.sides) and len(situations):
         ends = np.empty((1 + n, len(situations)))
         harm(dynamics.consequents, *situations.arrays(), policies, found, harder, ends)
-        ends = np.where(ends[1:] < _AT_ONCE - 1.0 - dynamics.horizon, 1e9, ends[1:])
+        ends = np.where(ends[1:] < _AT_ONCE - 1.0 - horizon, 1e9, ends[1:])
         value = np.minimum(ends, 100.0).mean(1)
         while len(keep) > K:
             worst = {keep[i] for i in ends[keep].argmin(0)}
@@ -125,24 +128,34 @@ def choose(
 
 
 def _shuffled(
-    dynamics: Dynamics, situations: Situations, random: np.random.Generator
+    dynamics: Dynamics, situations: Situations, horizon: int, random: np.random.Generator
 ) -> Disturbances:
     """As many disturbances whose steps have nothing to do with each other."""
     assert dynamics.latest is not None
     pool = np.vstack([*situations.pool, dynamics.latest.residuals])[-_POOL:]
     situations.pool = [pool]
-    made = undisturbed(1 + dynamics.n_stretches, dynamics)
+    made = undisturbed(1 + dynamics.n_stretches, dynamics, horizon)
     for row in made.residuals[1:]:
         row[:] = pool[random.integers(len(pool), size=len(row))]
     return made
 
 
-def undisturbed(count: int, dynamics: Dynamics) -> Disturbances:
+def failing_after(
+    dynamics: Dynamics, situations: Situations, policies: _Floats, disturbances: Disturbances
+) -> int:
+    """Steps after which it fails at the latest where it does, under the best of the policies."""
+    steps = disturbances.residuals.shape[1]
+    ends = np.empty((len(disturbances.residuals), len(situations)))
+    harm(dynamics.consequents, *situations.arrays(), policies, disturbances, 1.0, ends)
+    return int(ends[ends < 0.0].max(initial=-1.0 - steps) + 1 + steps)
+
+
+def undisturbed(count: int, dynamics: Dynamics, horizon: int) -> Disturbances:
     """Disturbances that are none."""
     m = dynamics.n_variables
     nothing = np.zeros((count, m))
     return Disturbances(
-        np.zeros((count, dynamics.horizon, m)),
+        np.zeros((count, horizon, m)),
         nothing - 1.0,
         nothing,
         np.zeros((count, m, m)),

@@ -28,9 +28,10 @@ from evofsm.core import (
 )
 from evofsm.files import Place, storage
 from evofsm.guard.learnt import words
+from evofsm.guard.learnt.actions import LONGEST_STRETCH
 from evofsm.guard.learnt.backups import Backups
 from evofsm.guard.learnt.keeping import KIND, content_of, restore
-from evofsm.guard.learnt.remembering import Situations, choose
+from evofsm.guard.learnt.remembering import Situations, choose, failing_after
 from evofsm.guard.learnt.search import CHANGED, KEPT, NOTHING_PASSES, escapes, search, worth
 from evofsm.guard.learnt.words import Remembered
 from evofsm.guard.protocols import Fallback, Judgement, Search, Situation, Trial
@@ -49,6 +50,9 @@ _MARGIN, _LARGEST, _FADES, _ADDED, _RATE = 3.0, 8.0, 0.9, 0.25, 0.001
 _RELEASE = 0.0
 # Disturbances are taken to be harder than they were by so many over the number of episodes.
 _CAUTION = 4.0
+# Steps that are looked ahead: at first, at least, at most; times those that it takes to fail, of
+# which so much is left an episode later.
+_HORIZON, _SHORTEST, _FARTHEST, _AHEAD, _LATEST = 64, 32, LONGEST_STRETCH, 1.5, 0.9
 # Backups closer than this are alike; an action that was used less often is tried.
 _ALIKE, _TRIES = 0.02, 8
 
@@ -63,6 +67,9 @@ class LearntRisk:
     ----------
     dt : float
         Time between two decisions [s].
+    horizon : float, optional
+        How far it looks ahead [s]. Without it, half as far again as it takes to fail where failure
+        can no longer be avoided, from 32 to 144 steps.
     seed : int
         Of the draws with which backups evolve and situations are chosen.
     without : sequence of str
@@ -100,12 +107,16 @@ class LearntRisk:
         self,
         dt: float,
         *,
+        horizon: float | None = None,
         seed: int = 0,
         without: Sequence[str] = (),
         names: Sequence[str] = (),
         units: Sequence[str] = (),
     ) -> None:
         self.dt = positive("dt", dt)
+        self.told_horizon = None if horizon is None else positive("horizon", horizon)
+        #: Steps that it looks ahead.
+        self.horizon = _HORIZON if horizon is None else max(1, round(horizon / self.dt))
         self.seed = operator.index(seed)
         if unknown := set(without) - set(JUDGE_PARTS):
             raise ValueError(f"without names {sorted(unknown)}; there are {', '.join(JUDGE_PARTS)}")
@@ -120,6 +131,7 @@ class LearntRisk:
         self.broken = 0
         self.n_studied = 0
         self.n_scanned = 0
+        self._takes = _HORIZON / _AHEAD
         self.situations = Situations()
         self.backups: Backups | None = None
         self.disturbances: Disturbances | None = None
@@ -245,11 +257,12 @@ class LearntRisk:
         if tried is not None:
             best = tried
         action = np.reshape(dynamics.decode(best), np.shape(wanted))
-        judged = self._judged(situation, here, np.stack([proposal, best]))
+        certain = how == CHANGED and allowed == 0
+        judged = self._judged(situation, here, np.stack([proposal, best]), sure=int(certain))
         if tried is not None:
             instead = words.tried()
         elif how == CHANGED:
-            instead = words.changed(then, float(judged.critical[1]))
+            instead = words.changed(then, self.remembered, self.margin)
         else:
             instead = words.lasting(then)
         return Search(np.stack([one[0], action]), judged, 1, f"{self.why(judged)}; {instead}")
@@ -277,11 +290,14 @@ class LearntRisk:
         """Why the first action that was judged is dangerous, in a few words."""
         return words.refused(self._lost, self.remembered, self.margin, self.harder)
 
-    def _judged(self, situation: Situation, here: Here, actions: _Floats) -> Judgement:
+    def _judged(
+        self, situation: Situation, here: Here, actions: _Floats, sure: int = 0
+    ) -> Judgement:
         assert self.disturbances is not None and self.backups is not None
         found = np.empty(len(self.disturbances.residuals))
         lost, left = np.zeros(len(actions)), np.zeros(len(actions))
-        for i, action in enumerate(actions):
+        left[len(actions) - sure :] = self.margin  # those that were found to pass
+        for i, action in enumerate(actions[: len(actions) - sure]):
             escapes(
                 self.dynamics.consequents,
                 here,
@@ -311,13 +327,13 @@ class LearntRisk:
         """Probability, with its interval, that something begins that is lost."""
         if math.isinf(lost):
             return 1.0, 0.0, 1.0
-        soon = self.dynamics.horizon * self.dt / max(self.exposure, 1e-300)
+        soon = self.horizon * self.dt / max(self.exposure, 1e-300)
         low, high = poisson_bounds(int(lost))
         return _within(lost * soon), _within(low * soon), _within(high * soon)
 
     def _allowed(self, tolerance: float) -> int:
         """How many of the disturbances need not be survived: their bound is within the tolerance."""
-        soon = self.dynamics.horizon * self.dt / max(self.exposure, 1e-300)
+        soon = self.horizon * self.dt / max(self.exposure, 1e-300)
         allowed = 0
         while allowed < 4 and _within(poisson_bounds(allowed + 1)[1] * soon) <= tolerance:
             allowed += 1
@@ -337,16 +353,19 @@ class LearntRisk:
 
     def _untried(self, best: _Floats) -> _Floats | None:
         """An action whose effect is hardly known, if there is one."""
-        used = self.dynamics.used
+        assert self.backups is not None
+        used, order = self.dynamics.used, self.backups.actions  # of equals the first in that order
         if self.dynamics.choices:
-            i = int(used[:, 1].argmin())
+            i = int(order[used[order, 1].argmin()])
             if used[i, 1] < _TRIES and used[i, 1] < used[:, 1].max():
                 return np.asarray(np.eye(len(used))[i])
             return None
-        i, end = divmod(int(used.argmin()), 2)
-        if used[i, end] < _TRIES and used[i, end] < used[i, 1 - end]:
-            best = best.copy()
-            best[i] = (-1.0, 1.0)[end]
+        # The end that the controller seldom went to comes first.
+        turned = np.where(self.backups.turns[:, None] > 0.0, used, used[:, ::-1])[order]
+        k, end = divmod(int(turned.argmin()), 2)
+        if turned[k, end] < _TRIES and turned[k, end] < turned[k, 1 - end]:
+            best, i = best.copy(), order[k]
+            best[i] = (-1.0, 1.0)[end] * self.backups.turns[i]
             return best
         return None
 
@@ -431,16 +450,28 @@ class LearntRisk:
                 evolving="backups" not in self.without,
             )
         best = self.backups.policies[self.backups.ranks]
-        self.situations.add(episode, self._tights, dynamics.horizon, random)
+        self.situations.add(episode, self._tights, self.horizon, random)
         known, enough = dynamics.consequents, len(self.situations)
         if "stretches" not in dynamics.without and len(known.sides) and enough > 3:
-            self.situations.scan(dynamics, best[:1], random)
+            self.situations.scan(dynamics, self.horizon, best[:1], random)
             self.n_scanned += 1
-        self.disturbances = choose(dynamics, self.situations, best[:2], self.harder, random)
+        if self.told_horizon is None and self.disturbances is not None and enough:
+            self._look_ahead(best[:_ASKED])
+        self.disturbances = choose(
+            dynamics, self.situations, self.horizon, best[:2], self.harder, random
+        )
         if len(known.sides) and enough >= 3:
             self._evolve(random)
         self._ranks = self.backups.ranks.copy()
         self._order = np.arange(len(self.disturbances.residuals))
+
+    def _look_ahead(self, policies: _Floats) -> None:
+        """As far as it takes to fail where nothing helps, and half as far again."""
+        assert self.disturbances is not None
+        if len(self.dynamics.consequents.sides):
+            after = failing_after(self.dynamics, self.situations, policies, self.disturbances)
+            self._takes = max(float(after), _LATEST * self._takes)
+            self.horizon = int(min(max(_AHEAD * self._takes, _SHORTEST), _FARTHEST))
 
     def _evolve(self, random: np.random.Generator) -> None:
         assert self.disturbances is not None and self.backups is not None
@@ -493,8 +524,9 @@ class LearntRisk:
         """
         content, arrays = storage.read(path, KIND.name)
         with storage.explained(path):
-            told = {name: content[name] for name in ("seed", "without", "names", "units")}
-            judge = cls(content["dt"], **told)
+            names = ("seed", "without", "names", "units")
+            told = {name: content[name] for name in names}
+            judge = cls(content["dt"], horizon=content["told_horizon"], **told)
             restore(judge, content, arrays)
         judge._forget()
         return judge

@@ -103,7 +103,7 @@ def search(
         ):
             best[:] = proposal
             return KEPT, q, 1.0
-    own, middle, closest, which = np.empty(a), np.empty(a), np.inf, -1
+    own, middle, which = np.empty(a), np.empty(a), -1
     for enough in (margin_to_keep, margin):
         for q in ranks:
             follow_policy(known, policies[q], here.z, own)
@@ -112,8 +112,6 @@ def search(
                 far += (own[i] - proposal[i]) ** 2
             if known.choices > 0 and far == 0.0:
                 continue  # it was refused
-            if known.choices > 0 and which >= 0:
-                break
             if (
                 _lost(
                     known,
@@ -130,14 +128,11 @@ def search(
                 > allowed
             ):
                 continue
-            share, step = 1.0, 0.5
+            share = 1.0
             if known.choices == 0:
                 low = 0.0
                 for _ in range(_HALVINGS):
                     half = 0.5 * (low + share)
-                    if half * half * far >= closest:
-                        low = half
-                        continue
                     for i in range(a):
                         middle[i] = proposal[i] + half * (own[i] - proposal[i])
                     if (
@@ -158,10 +153,10 @@ def search(
                         share = half
                     else:
                         low = half
-            if share * share * far < closest:
-                closest, which = share * share * far, q
-                for i in range(a):
-                    best[i] = proposal[i] + share * (own[i] - proposal[i])
+            which = q
+            for i in range(a):
+                best[i] = proposal[i] + share * (own[i] - proposal[i])
+            break
         if which >= 0 or margin_to_keep == margin:
             break
     if which >= 0:

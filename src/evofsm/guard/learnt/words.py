@@ -90,23 +90,16 @@ that are asked for'
     return f"no backup survives {'any of ' if lost > 1 else ''}the {remembered}"
 
 
-def changed(backup: str, left: float) -> str:
+def changed(backup: str, remembered: Remembered, margin: float) -> str:
     """What is done instead, where another action passes.
-
-    Parameters
-    ----------
-    backup : str
-    left : float
-        Distance to failure that is left after the worst disturbance [ordinary changes]; negative
-        where that is lost.
 
     Examples
     --------
-    >>> changed("feedback 2", left=1.25)
-    'the closest action after which feedback 2 does, with 1.2 ordinary changes left'
+    >>> changed("feedback 2", Remembered(10, 305.0), margin=0.4)
+    'the closest action after which feedback 2 survives all of them, by 0.4 ordinary changes or more'
     """
-    spare = f", with {changes(left)} left" if left >= 0.0 else ""
-    return f"the closest action after which {backup} does{spare}"
+    them = "all of them" if remembered.count > 1 else "it"
+    return f"the closest action after which {backup} survives {them}, by {changes(margin)} or more"
 
 
 def lasting(backup: str) -> str:

@@ -1,0 +1,99 @@
+"""How often something begins: counted over time, and how well that is known.
+
+Of all states together the count is Poisson's, with Garwood's interval (1936). A state by itself has
+too few; its rate is shrunk towards that of all, as empirical Bayes has it (Clayton & Kaldor,
+"Empirical Bayes estimates of age-standardized relative risks for use in disease mapping",
+Biometrics 43, 1987, with the moments of Marshall, "Mapping disease and mortality rates using
+empirical Bayes estimators", Applied Statistics 40, 1991). With k_i onsets in a time e_i, ::
+
+    r = sum k / sum e        v = sum e_i (k_i / e_i - r)^2 / sum e  -  r / mean e
+    rate_i ~ Gamma(a + k_i, b + e_i),        b = r / v,  a = r b
+
+Where states differ by no more than chance (v <= 0), all have the rate of all.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evofsm.core.proportions import gamma_quantile, poisson_bounds
+
+# Two-sided 90 %.
+_TAILS = (0.05, 0.95)
+
+
+class Rate(NamedTuple):
+    """How often something began.
+
+    Examples
+    --------
+    >>> Rate.of(3, 40.0)
+    Rate(onsets=3, exposure=40.0, rate=0.075, low=0.0204, high=0.194)
+    >>> print(Rate.of(0, 40.0))
+    0 times in 40: at most 0.075
+    """
+
+    onsets: int  #: number of times
+    exposure: float  #: in so much time [s], or so many observations
+    rate: float  #: one by the other; NaN without exposure
+    low: float  #: 90 % interval of the rate
+    high: float
+
+    @classmethod
+    def of(cls, onsets: float, exposure: float) -> Rate:
+        """The rate of what was counted, with its interval (Garwood 1936)."""
+        if exposure <= 0.0:
+            return cls(int(onsets), 0.0, math.nan, 0.0, math.inf)
+        low, high = poisson_bounds(int(onsets))
+        return cls(int(onsets), float(exposure), onsets / exposure, low / exposure, high / exposure)
+
+    def __repr__(self) -> str:
+        return (
+            f"{type(self).__name__}(onsets={self.onsets}, exposure={self.exposure}, "
+            f"rate={self.rate:.3g}, low={self.low:.3g}, high={self.high:.3g})"
+        )
+
+    def __str__(self) -> str:
+        bounds = f"{self.low:.2g} to {self.high:.2g}" if self.onsets else f"at most {self.high:.2g}"
+        times = "once" if self.onsets == 1 else f"{self.onsets:,} times"
+        return f"{times} in {self.exposure:.4g}: {bounds}"
+
+
+class OnsetRates(NamedTuple):
+    """How often something unexpected began in each of n states, shrunk towards all of them."""
+
+    rate: NDArray[np.float64]  #: (n,) [1/s], or for each observation
+    low: NDArray[np.float64]  #: (n,) 90 % interval
+    high: NDArray[np.float64]  #: (n,)
+    pooled: Rate  #: of all states together
+
+
+def shrunk_rates(counts: NDArray[np.float64], exposure: NDArray[np.float64]) -> OnsetRates:
+    """Rates of n states, by counts and exposures (n,) of each.
+
+    Examples
+    --------
+    >>> found = shrunk_rates(np.array([0.0, 0.0, 20.0]), np.array([100.0, 1.0, 100.0]))
+    >>> found.rate.round(3), round(found.pooled.rate, 3)
+    (array([0.01 , 0.092, 0.189]), 0.1)
+    """
+    pooled = Rate.of(float(counts.sum()), float(exposure.sum()))
+    mean = pooled.rate
+    seen = exposure > 0.0
+    variance = 0.0
+    if pooled.onsets and seen.sum() > 1:
+        k, e = counts[seen], exposure[seen]
+        variance = float((e * (k / e - mean) ** 2).sum() / e.sum() - mean / e.mean())
+    if not variance > 0.0:
+        same = np.ones(len(counts))
+        return OnsetRates(mean * same, pooled.low * same, pooled.high * same, pooled)
+    b = mean / variance
+    shapes, times = mean * b + counts, b + exposure
+    low, high = (
+        np.array([gamma_quantile(share, shape) for shape in shapes]) / times for share in _TAILS
+    )
+    return OnsetRates(shapes / times, low, high, pooled)

@@ -1,0 +1,39 @@
+"""What was learnt is kept in a file, and goes on from there as if nothing had happened."""
+
+from io import BytesIO
+
+import numpy as np
+import pytest
+
+from evofsm import Guard
+from evofsm.files import storage
+from evofsm.guard.learnt.risk import LearntRisk
+
+
+@pytest.mark.parametrize("episodes", [0, 1, 3])
+def test_saved_and_loaded_it_goes_on_learning_bit_for_bit(point, exactly, content, episodes):
+    guard, file = point.taught(episodes), BytesIO()
+    guard.save(file)
+    again = Guard.load(BytesIO(file.getvalue()))
+    assert content(again) == content(guard)
+    for episode in range(40, 43):
+        assert exactly(point.play(again, episode)[0]) == exactly(point.play(guard, episode)[0])
+        assert content(again) == content(guard)
+    again.freeze()
+    guard.freeze()
+    assert exactly(point.play(again, 50)[0]) == exactly(point.play(guard, 50)[0])
+
+
+def test_a_file_that_contradicts_itself_is_refused(points):
+    file = BytesIO()
+    points["box"].taught(3).judge.save(file)
+    content, arrays = storage.read(BytesIO(file.getvalue()), "learntrisk")
+    for told, spoilt, what in (
+        (content, {"variables": np.zeros(2)}, "variables of the backups"),
+        (content | {"n_constant": 99}, {}, "not 99 constant ones"),
+        (content | {"without": ["luck"]}, {}, "without names"),
+    ):
+        bad = BytesIO()
+        storage.write(bad, "learntrisk", told, arrays | spoilt)
+        with pytest.raises(ValueError, match=what):
+            LearntRisk.load(BytesIO(bad.getvalue()))

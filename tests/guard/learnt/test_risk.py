@@ -1,0 +1,221 @@
+"""The learnt judge in a guard: told nothing but which episodes failed, it keeps from failing."""
+
+import copy
+import math
+import pickle
+
+import numpy as np
+import pytest
+
+from evofsm.guard import Mode, same_action
+from evofsm.guard.auditing.log import AuditLog
+from evofsm.guard.auditing.replay import audit
+from evofsm.guard.learnt.risk import LearntRisk
+
+
+def kept(said):
+    return [same_action(one.executed, one.proposed) for one in said]
+
+
+# -- What it learns -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", [0, *(pytest.param(k, marks=pytest.mark.slow) for k in (1, 2))])
+def test_after_a_failure_or_two_it_keeps_a_bad_controller_from_failing(point, seed):
+    guard = point.guard(seed=seed)
+    assert 1 <= sum(point.play(guard, 1000 * seed + k)[1] for k in range(6)) <= 2
+    guard.freeze()
+    held_out = [point.play(guard, 90_000 + k) for k in range(10)]
+    assert not any(failed for _, failed in held_out)
+    assert 0.25 < np.mean([one for said, _ in held_out for one in kept(said)]) < 0.95
+    alone = point.guard(mode=Mode.OFF)
+    assert all(point.play(alone, 90_000 + k)[1] for k in range(10))
+
+
+def test_nothing_is_revised_before_the_first_failure_and_it_says_why(point):
+    guard = point.guard()
+    said = [one for k in range(3) for one in point.play(guard, k, steps=10)[0]]
+    assert not guard.machine.endings.any()
+    assert all(kept(said))
+    assert "nothing was learnt yet" in said[0].reason
+    assert "no failure is known yet" in said[-1].reason
+    assert all(math.isnan(one.risk_proposed) for one in said)
+
+
+def test_told_what_failure_is_it_keeps_from_the_first_one(point):
+    guard = point.guard(failed=lambda z: z[0] >= 1.0)
+    assert sum(point.play(guard, k)[1] for k in range(6)) <= 1
+    assert not any(point.play(guard, 100 + k)[1] for k in range(5))
+
+
+def test_reasons_tell_what_may_begin_and_what_is_done_about_it(point):
+    guard = point.taught(4)
+    said = [one for one in point.play(guard, 9)[0]]
+    revised = next(one for one in said if not same_action(one.executed, one.proposed))
+    as_it_was = next(one for one in said if same_action(one.executed, one.proposed))
+    assert "are survived, then" in as_it_was.reason
+    assert any(part in revised.reason for part in ("closest that passes", "nothing passes"))
+    assert 0.0 <= as_it_was.interval[0] <= as_it_was.risk_executed <= as_it_was.interval[1] <= 1.0
+    assert as_it_was.evidence > 0.0  # of what is remembered
+
+
+def test_an_episode_that_goes_on_and_on_is_studied_and_goes_on(points):
+    """What is remembered of it is bounded, and what was learnt is used before its end."""
+    point, guard = points["box"], points["box"].taught(2)
+    before = guard.judge.n_studied
+    z, said = np.zeros(2), []
+    rng = np.random.default_rng(0)
+    for _ in range(1100):
+        said.append(guard.decide(z, float(rng.uniform(-0.2, 1.0))))
+        speed = 0.9 * z[1] + 0.02 * said[-1].executed + 0.002 * rng.normal()
+        z = np.array([z[0] + speed, speed])
+    assert z[0] < 1.0
+    assert guard.judge.n_studied == guard.machine.dynamics.n_episodes == before + 1
+    assert not all(kept(said[1030:]))
+    guard.end(False, z)
+    assert not point.play(guard, 7)[1]
+
+
+# -- Bit for bit --------------------------------------------------------------------------------
+
+
+def test_the_same_seed_learns_the_same_and_another_one_something_else(point, exactly, content):
+    one, same, other = point.taught(3), point.taught(3), point.taught(3, seed=1)
+    assert content(one) == content(same) != content(other)
+    assert exactly(point.play(one, 50)[0]) == exactly(point.play(same, 50)[0])
+
+
+def test_frozen_it_repeats_its_decisions_and_learns_nothing(point, exactly, content):
+    guard = point.taught(3)
+    guard.freeze()
+    before = content(guard)
+    first = point.play(guard, 50)[0]
+    point.play(guard, 51)
+    assert exactly(point.play(guard, 50)[0]) == exactly(first)
+    assert content(guard) == before
+
+
+@pytest.mark.parametrize("how", [lambda guard: guard.copy(), copy.deepcopy, pickle.dumps])
+def test_a_copy_goes_on_the_same_and_by_itself(point, exactly, content, how):
+    guard = point.taught(3)
+    before = content(guard)
+    twin = how(guard)
+    twin = pickle.loads(twin) if isinstance(twin, bytes) else twin
+    assert content(twin) == before
+    ahead = [exactly(point.play(twin, 60 + k)[0]) for k in range(2)]
+    assert content(guard) == before
+    assert [exactly(point.play(guard, 60 + k)[0]) for k in range(2)] == ahead
+    assert content(guard) == content(twin)
+
+
+def test_a_log_is_replayed_learning_and_frozen(point, tmp_path):
+    with AuditLog(tmp_path / "log") as log:
+        guard = point.guard(audit=log)
+        for episode in range(4):
+            point.play(guard, episode)
+        guard.freeze()
+        for episode in range(2):
+            point.play(guard, 70 + episode)
+    found = audit(tmp_path / "log", log.head)
+    assert found.is_good, found.replay
+    assert found.replay.decisions == found.contents.decisions > 150
+    assert not found.replay.not_replayed
+    assert found.contents.spoke > 20
+
+
+# -- Looking on ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("mode", [Mode.SHADOW, Mode.ADVISE])
+def test_looking_on_it_changes_nothing_and_learns_no_margin(point, mode):
+    guard = point.guard(mode=mode)
+    said = [one for k in range(4) for one in point.play(guard, k)[0]]
+    assert all(kept(said))
+    assert any(not same_action(one.advised, one.executed) for one in said)
+    assert guard.judge.broken == 0
+    assert guard.judge.margin == pytest.approx(3.0 * 0.9**4)  # it fades, and nothing adds to it
+    assert guard.machine.dynamics.n_episodes == 4
+
+
+# -- Observations as they come in life ----------------------------------------------------------
+
+
+def test_what_is_not_seen_now_and_then_does_not_keep_it_from_deciding(point, exactly):
+    def seen(k, z):
+        return np.where([k % 7 == 3, *[False] * (len(z) - 1)], math.nan, z)
+
+    guard = point.taught(4)
+    said, failed = point.play(guard, 30, seen=seen)
+    assert not failed
+    assert not all(kept(said))
+    assert all(np.isfinite(one.executed).all() for one in said)
+    guard.freeze()
+    nothing = guard.decide(np.full(2 * point.places, math.nan), point.propose(guard_rng()))
+    assert same_action(nothing.executed, nothing.proposed)
+    assert math.isnan(nothing.risk_proposed)
+    guard.begin()
+    again = [exactly(point.play(guard, 31, seen=seen)[0]) for _ in range(2)]
+    assert again[0] == again[1]
+
+
+def guard_rng():
+    return np.random.default_rng(0)
+
+
+def test_after_a_gap_in_time_nothing_follows_from_what_was(points):
+    point = points["box"]
+    one, other = point.taught(3), point.taught(3)
+    for guard in (one, other):
+        guard.freeze()
+    one.decide([-0.5, 0.0], 1.0, time=0.0)
+    after = one.decide([0.5, 0.05], 1.0, time=9.0)
+    fresh = other.decide([0.5, 0.05], 1.0, time=0.0)
+    assert (after.executed, after.risk_proposed) == (fresh.executed, fresh.risk_proposed)
+    learning = point.taught(3)
+    episodes = learning.machine.dynamics.n_episodes
+    for k in range(20):
+        learning.decide([0.01 * k, 0.01], 0.1, time=0.1 * k)
+    learning.decide([0.9, 0.01], 0.1, time=60.0)
+    assert learning.machine.dynamics.n_episodes == learning.judge.n_studied == episodes + 1
+    assert learning.machine.dynamics.sums.most[0] < 0.3  # the leap was not learnt
+
+
+def test_an_observation_that_comes_twice_is_taken_in_once(points, content):
+    point = points["box"]
+    once, twice = point.taught(3), point.taught(3)
+    for k in range(10):
+        z = [0.05 * k, 0.05]
+        for guard in (once, twice):
+            said = guard.decide(z, 1.0, time=0.1 * k)
+        assert twice.decide(z, 1.0, time=0.1 * k).executed == said.executed
+    for guard in (once, twice):
+        guard.end(False, [0.5, 0.0])
+    one, other = content(once)["machine"][1], content(twice)["machine"][1]
+    assert one["dynamics"] == other["dynamics"]
+
+
+def test_a_refused_input_leaves_it_as_it_was(point, exactly, content):
+    guard, other = point.taught(3), point.taught(3)
+    m, proposal = 2 * point.places, point.propose(guard_rng())
+    for observation, wanted in (
+        (np.zeros(m + 1), proposal),
+        (np.full(m, math.inf), proposal),
+        (np.full(m, 1e200), proposal),
+        (np.zeros((1, m)), proposal),
+        (["a"] * m, proposal),
+        (np.zeros(m), "push"),
+    ):
+        with pytest.raises((TypeError, ValueError)):
+            guard.decide(observation, wanted)
+    assert content(guard) == content(other)
+    assert exactly(point.play(guard, 5)[0]) == exactly(point.play(other, 5)[0])
+    assert content(guard) == content(other)
+
+
+def test_by_itself_it_says_what_it_lacks():
+    with pytest.raises(ValueError, match="bind it"):
+        _ = LearntRisk(0.1).dynamics
+    with pytest.raises(ValueError, match="without names"):
+        LearntRisk(0.1, without=("luck",))
+    with pytest.raises(ValueError, match="dt"):
+        LearntRisk(0.0)
