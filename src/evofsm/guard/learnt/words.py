@@ -96,7 +96,8 @@ def changed(backup: str, remembered: Remembered, margin: float) -> str:
     Examples
     --------
     >>> changed("feedback 2", Remembered(10, 305.0), margin=0.4)
-    'the closest action after which feedback 2 survives all of them, by 0.4 ordinary changes or more'
+    'the closest action after which feedback 2 survives all of them, by 0.4 ordinary changes or \
+more'
     """
     them = "all of them" if remembered.count > 1 else "it"
     return f"the closest action after which {backup} survives {them}, by {changes(margin)} or more"
