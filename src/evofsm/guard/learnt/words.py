@@ -77,13 +77,13 @@ def refused(lost: int, remembered: Remembered, margin: float, harder: float) -> 
     >>> refused(-1, Remembered(10, 305.0), 0.4, 1.0)
     'no backup prevents failure, even if nothing disturbs it'
     >>> refused(0, Remembered(10, 305.0), 0.4, 1.0)
-    'no backup survives all 10 disturbances remembered from 305 s by the 0.4 ordinary changes \
-that are asked for'
+    'no backup survives all 10 disturbances remembered from 305 s by the margin of 0.4 ordinary \
+changes'
     """
     if lost < 0:
         return "no backup prevents failure, even if nothing disturbs it"
     if lost == 0:
-        what = f"no backup survives {remembered.all} by the {changes(margin)} that are asked for"
+        what = f"no backup survives {remembered.all} by the margin of {changes(margin)}"
         return what if harder < _HARDER else f"{what}, were they {harder:.2g} times as hard"
     if lost < remembered.count:
         return f"no backup survives {lost} of the {remembered}"
