@@ -260,7 +260,7 @@ class LearntRisk:
         if tried is not None:
             instead = words.tried()
         elif how == CHANGED:
-            instead = words.changed(then, float(judged.critical[1]))
+            instead = words.changed(then, self.remembered, self.margin)
         else:
             instead = words.lasting(then)
         return Search(np.stack([one[0], action]), judged, 1, f"{self.why(judged)}; {instead}")
