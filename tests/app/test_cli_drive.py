@@ -34,6 +34,31 @@ def test_drive_learns_saves_and_drives_frozen(tmp_path):
     assert json.loads((further / "summary.json").read_text())["episodes_learnt"] == 14
 
 
+@pytest.mark.slow
+def test_a_judge_that_is_told_nothing_but_failures_is_driven_kept_and_gone_on_with(tmp_path):
+    polars = pytest.importorskip("polars")
+    drive, out = ("drive", "emergency", "--judge", "learnt"), tmp_path / "learnt"
+    keeping = ("--checkpoint", tmp_path / "checkpoint", "--every", "0s")
+    first = evofsm(*drive, "--episodes", 6, "--out", out, "--audit", tmp_path / "log", *keeping)
+    assert first.returncode == 0, first.stderr
+    assert "learnt, told nothing but failures" in first.stdout
+    assert "fails where gap is below" in first.stdout
+    assert "disturbances remembered" in " ".join(first.stdout.split())
+    reasons = polars.read_parquet(out / "decisions.parquet")["reason"]
+    assert reasons[0].endswith("nothing was learnt yet")
+    assert reasons.str.contains("no backup survives").any()
+    assert evofsm("audit", tmp_path / "log").returncode == 0
+    whole = json.loads(evofsm(*drive, "--episodes", 8, "--json").stdout)
+    again = json.loads(evofsm(*drive, "--episodes", 8, "--json", *keeping).stdout)
+    assert again == whole
+    frozen = evofsm(*drive, "--episodes", 3, "--frozen", out)
+    assert "held-out episodes" in frozen.stdout, frozen.stderr
+    wrong = evofsm("drive", "emergency", "--episodes", 3, "--frozen", out)
+    assert "of the judge 'learnt', not of 'kinematic'" in wrong.stderr
+    graph = evofsm("export", out, "--to", "dot")
+    assert graph.returncode == 0, graph.stderr
+
+
 def test_the_table_of_decisions_has_its_columns_in_their_order():
     assert DECISION_TABLE == (
         *("episode", "time", "gap", "v_follower", "v_leader", "intake", "state", "n_states"),

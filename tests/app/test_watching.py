@@ -3,10 +3,12 @@
 import math
 import threading
 from contextlib import contextmanager
+from dataclasses import replace
 from itertools import pairwise
 
 import pytest
 
+from evofsm.app.watch.live.words import tell
 from evofsm.app.watch.player import Player
 from evofsm.app.watch.session import Session, Watching, learn_first, watched_guard
 from evofsm.driving.cars import guard_for_family, learnt_by, load_learnt, save_learnt, teach
@@ -313,3 +315,44 @@ def test_it_ends_at_once_when_closed():
 def test_no_speed_of_nothing():
     with pytest.raises(ValueError, match="speed is 0"):
         played(Told(), speed=0.0)
+
+
+# -- A judge that was told nothing but which episodes failed --------------------------------------
+
+LEARNING = Watching(load_family("emergency"), judge="learnt", case=1)
+LEADERS = ("leader brake", "leaders", "latent risk", "braking in full")
+
+
+def told_over(watching, episodes):
+    """Frames of a run under a learnt judge, each with its story in words."""
+    guard = watched_guard(watching.family, "learnt")
+    learn_first(watching, guard, episodes)
+    with opened(watching, guard) as session:
+        return [(frame, tell(frame, session.start)) for frame in drive(session)]
+
+
+def test_before_the_first_failure_nothing_is_called_safe():
+    for frame, told in told_over(LEARNING, 0)[:-1]:
+        assert math.isnan(frame.proposed_risk.risk)
+        assert (told.status, told.headline) == ("unjudged", "Nothing is judged yet")
+        assert told.why == "Nothing was judged, for no failure was known yet."
+        assert frame.reason == "nothing was learnt yet"
+
+
+@pytest.mark.slow
+def test_a_learnt_judge_is_not_said_to_know_how_leaders_brake():
+    alone = replace(LEARNING, reviser="none")
+    frames = [*told_over(LEARNING, 12), *told_over(alone, 12)]
+    for frame, told in frames:
+        assert math.isnan(frame.brakes_to)
+        assert math.isnan(frame.critical)
+        said = " ".join((told.headline, told.when, told.why, told.done)).lower()
+        assert not any(words in said for words in LEADERS), said
+    assert any("disturbances remembered from" in told.why for _, told in frames)
+    assert {"dead end", "collision"} <= {told.status for _, told in frames}
+    assert "by a margin" in frames[0][1].done or frames[0][0].executed == frames[0][0].proposed
+
+
+def test_what_was_learnt_is_of_the_judge_that_is_asked_for():
+    with pytest.raises(ValueError, match="of the judge 'kinematic', not of 'learnt'"):
+        opened(LEARNING, watched_guard(LEARNING.family))

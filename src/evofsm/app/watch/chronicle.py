@@ -40,7 +40,10 @@ class Chronicle:
     def tell(self, frame: Frame) -> Story:
         """The story with one more frame."""
         story = self._warnings(frame, self._leader(frame, self.story))
-        story = story._replace(revised=story.revised + _is_revised(frame))
+        story = story._replace(
+            revised=story.revised + _is_revised(frame),
+            judged=story.judged or not math.isnan(frame.proposed_risk.risk),
+        )
         if frame.over:
             story = story._replace(ended=frame.time)
             if frame.collided:

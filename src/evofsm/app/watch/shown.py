@@ -56,6 +56,7 @@ class Story(NamedTuple):
 
     danger: Danger | None = None  #: the present or the latest one
     in_danger: bool = False
+    judged: bool = False  #: whether any wish of the driver was judged
     first: float = math.nan  #: when danger began for the first time [s]
     time_to_collision: float = math.nan  #: when it first fell below its threshold [s]
     time_headway: float = math.nan  #: the same of time headway [s]

@@ -27,8 +27,8 @@ from evofsm.core import (
     positive,
 )
 from evofsm.files import Place, storage
-from evofsm.guard.learnt.actions import LONGEST_STRETCH
 from evofsm.guard.learnt import words
+from evofsm.guard.learnt.actions import LONGEST_STRETCH
 from evofsm.guard.learnt.backups import Backups
 from evofsm.guard.learnt.keeping import KIND, content_of, restore
 from evofsm.guard.learnt.remembering import Situations, choose, failing_after
@@ -46,8 +46,6 @@ _ASKED, _TRIED_ON = 3, 5
 # The margin [ordinary changes]: at first, at most, what is left of it an episode later, and what a
 # broken certificate adds, for so many that may be.
 _MARGIN, _LARGEST, _FADES, _ADDED, _RATE = 3.0, 8.0, 0.9, 0.25, 0.001
-# By so much more a proposal has to pass once one was refused.
-_RELEASE = 0.0
 # Disturbances are taken to be harder than they were by so many over the number of episodes.
 _CAUTION = 4.0
 # Steps that are looked ahead: at first, at least, at most; times those that it takes to fail, of
@@ -217,10 +215,10 @@ class LearntRisk:
         situation : Situation
         wanted : float or (d,) array
         tolerance : float
-            So much risk may be accepted, where so much was seen that its upper bound is known to
-            be smaller.
+            Share of the disturbances that need not be survived, where so much was seen that the
+            upper bound of the risk is within it as well.
         revising : bool
-            Whether the proposal before was not kept.
+            Not used: a band in which a proposal is refused longer was tried, and gained nothing.
 
         Returns
         -------
@@ -235,10 +233,9 @@ class LearntRisk:
             return Search(one, _unjudged(1), 0, words.NO_FAILURE)
         proposal, best = dynamics.encode(wanted), np.empty(dynamics.size)
         allowed = self._allowed(tolerance)
-        keep = self.margin + (_RELEASE if revising else 0.0)
         asked = self._ranks[:_ASKED]
         world = (self.backups.policies, asked, self.disturbances, self._order, self.harder)
-        how, backup, left = search(known, here, proposal, *world, self.margin, keep, allowed, best)
+        how, backup, left = search(known, here, proposal, *world, self.margin, allowed, best)
         self._ranks = np.array([backup, *(q for q in self._ranks if q != backup)])
         self._tight = how != KEPT
         tried = (
@@ -248,7 +245,7 @@ class LearntRisk:
         )
         self._holds = how != NOTHING_PASSES
         if not self._holds and self._certified:
-            again = search(known, here, best, *world, 0.0, 0.0, allowed, np.empty_like(best))
+            again = search(known, here, best, *world, 0.0, allowed, np.empty_like(best))
             self._holds = again[0] != NOTHING_PASSES
         then = self._backup_text(backup)
         if how == KEPT:
@@ -263,7 +260,7 @@ class LearntRisk:
         if tried is not None:
             instead = words.tried()
         elif how == CHANGED:
-            instead = words.changed(then, float(judged.critical[1]))
+            instead = words.changed(then, self.remembered, self.margin)
         else:
             instead = words.lasting(then)
         return Search(np.stack([one[0], action]), judged, 1, f"{self.why(judged)}; {instead}")
@@ -329,12 +326,16 @@ class LearntRisk:
         return _within(lost * soon), _within(low * soon), _within(high * soon)
 
     def _allowed(self, tolerance: float) -> int:
-        """How many of the disturbances need not be survived: their bound is within the tolerance."""
+        """How many of the disturbances need not be survived.
+
+        No larger share of them than the tolerance, and no more than keep the upper bound of the
+        risk within it.
+        """
         soon = self.horizon * self.dt / max(self.exposure, 1e-300)
-        allowed = 0
-        while allowed < 4 and _within(poisson_bounds(allowed + 1)[1] * soon) <= tolerance:
+        most, allowed = tolerance * len(self.dynamics.stretches), 0
+        while allowed + 1 <= most and _within(poisson_bounds(allowed + 1)[1] * soon) <= tolerance:
             allowed += 1
-        return 0 * allowed
+        return allowed
 
     def _here(self, situation: Situation) -> Here | None:
         """Where one is; what was not observed is taken to have gone on as before."""

@@ -80,7 +80,6 @@ def search(
     order: _Ints,
     harder: float,
     margin: float,
-    margin_to_keep: float,
     allowed: int,
     best: _Floats,
 ) -> tuple[int, int, float]:
@@ -93,33 +92,30 @@ def search(
     room = scratch(len(here.z), a, known.weights.shape[0])
     world = (known, here, disturbances, order, harder, allowed, room)
     for q in ranks:
-        lost, left = _lost(proposal, policies[q], margin_to_keep, *world)
+        lost, left = _lost(proposal, policies[q], margin, *world)
         if lost <= allowed:
             best[:] = proposal
             return KEPT, q, left
     own, middle = np.empty(a), np.empty(a)
-    for enough in (margin_to_keep, margin):
-        for q in ranks:
-            follow_policy(known, policies[q], here.z, own)
-            if known.choices > 0 and (own == proposal).all():
-                continue  # it was refused
-            lost, left = _lost(own, policies[q], enough, *world)
-            if lost > allowed:
-                continue
-            best[:] = own
-            share, refused = 1.0, 0.0
-            for _ in range(_HALVINGS if known.choices == 0 else 0):
-                half = 0.5 * (refused + share)
-                middle[:] = proposal + half * (own - proposal)
-                lost, closer = _lost(middle, policies[q], enough, *world)
-                if lost <= allowed:
-                    share, left = half, closer
-                    best[:] = middle
-                else:
-                    refused = half
-            return CHANGED, q, left
-        if margin_to_keep == margin:
-            break
+    for q in ranks:
+        follow_policy(known, policies[q], here.z, own)
+        if known.choices > 0 and (own == proposal).all():
+            continue  # it was refused
+        lost, left = _lost(own, policies[q], margin, *world)
+        if lost > allowed:
+            continue
+        best[:] = own
+        share, refused = 1.0, 0.0
+        for _ in range(_HALVINGS if known.choices == 0 else 0):
+            half = 0.5 * (refused + share)
+            middle[:] = proposal + half * (own - proposal)
+            lost, closer = _lost(middle, policies[q], margin, *world)
+            if lost <= allowed:
+                share, left = half, closer
+                best[:] = middle
+            else:
+                refused = half
+        return CHANGED, q, left
     which = -1
     longest, shortest = -np.inf, np.inf
     nothing = np.empty(0)

@@ -76,36 +76,30 @@ def refused(lost: int, remembered: Remembered, margin: float, harder: float) -> 
     >>> refused(-1, Remembered(10, 305.0), 0.4, 1.0)
     'no backup prevents failure, even if nothing disturbs it'
     >>> refused(0, Remembered(10, 305.0), 0.4, 1.0)
-    'no backup survives all 10 disturbances remembered from 305 s by the 0.4 ordinary changes \
-that are asked for'
+    'no backup survives all 10 disturbances remembered from 305 s by the margin of 0.4 ordinary \
+changes'
     """
     if lost < 0:
         return "no backup prevents failure, even if nothing disturbs it"
     if lost == 0:
-        what = f"no backup survives {remembered.all} by the {changes(margin)} that are asked for"
+        what = f"no backup survives {remembered.all} by the margin of {changes(margin)}"
         return what if harder < _HARDER else f"{what}, were they {harder:.2g} times as hard"
     if lost < remembered.count:
         return f"no backup survives {lost} of the {remembered}"
     return f"no backup survives {'any of ' if lost > 1 else ''}the {remembered}"
 
 
-def changed(backup: str, left: float) -> str:
+def changed(backup: str, remembered: Remembered, margin: float) -> str:
     """What is done instead, where another action passes.
-
-    Parameters
-    ----------
-    backup : str
-    left : float
-        Distance to failure that is left after the worst disturbance [ordinary changes]; negative
-        where that is lost.
 
     Examples
     --------
-    >>> changed("feedback 2", left=1.25)
-    'the closest action after which feedback 2 does, with 1.2 ordinary changes left'
+    >>> changed("feedback 2", Remembered(10, 305.0), margin=0.4)
+    'the closest action after which feedback 2 survives all of them, by 0.4 ordinary changes or \
+more'
     """
-    spare = f", with {changes(left)} left" if left >= 0.0 else ""
-    return f"the closest action after which {backup} does{spare}"
+    them = "all of them" if remembered.count > 1 else "it"
+    return f"the closest action after which {backup} survives {them}, by {changes(margin)} or more"
 
 
 def lasting(backup: str) -> str:

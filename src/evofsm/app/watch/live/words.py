@@ -15,7 +15,7 @@ _EQUAL, _HARDLY = 0.5, 0.3
 class Told(NamedTuple):
     """A story as it is read."""
 
-    status: str  #: ``safe``, ``averted``, ``danger``, ``dead end``, ``collision`` or ``ended``
+    status: str  #: ``unjudged``, ``safe``, ``averted``, ``danger``, ``dead end``, ``collision`` or ``ended``
     headline: str
     when: str
     why: str
@@ -52,6 +52,7 @@ def tell(frame: Frame, start: Start) -> Told:
 # A number and its unit stay on one line.
 _UNIT = re.compile(r"(?<=\d) (?=(?:s|m|m/s|m/s²)\b)")
 _HEADLINES = {
+    "unjudged": "Nothing is judged yet",
     "safe": "Safe",
     "danger": "Danger",
     "averted": "Danger, held off",
@@ -74,6 +75,8 @@ def _headline(status: str, start: Start) -> str:
 
 def _quiet(story: Story, start: Start) -> str:
     """What was done where the judge saw no danger; classic measures may have."""
+    if story.revised == 0 and not (story.judged or _knows_leaders(start)):
+        return "Nothing: every wish of the driver was carried out."
     if story.revised == 0:
         return "Nothing had to be done: every wish of the driver was carried out."
     plural = "decision" if story.revised == 1 else "decisions"
@@ -84,8 +87,8 @@ def _quiet(story: Story, start: Start) -> str:
 
 
 def _no_danger(frame: Frame, start: Start) -> str:
-    if not _knows_leaders(start) and math.isnan(frame.proposed_risk.risk) and not frame.over:
-        return "Nothing was judged: no failure is known yet."
+    if not _knows_leaders(start) and not frame.story.judged:
+        return "Nothing was judged, for no failure was known yet."
     if math.isnan(frame.brakes_to):  # which recordings do not hold
         return "No wish of the driver was judged to be too risky."
     return (
@@ -110,7 +113,7 @@ def _status(frame: Frame, start: Start) -> str:
     if frame.over:
         return "ended"
     if not story.in_danger or story.danger is None:
-        return "safe"
+        return "safe" if story.judged or _knows_leaders(start) else "unjudged"
     if not math.isnan(story.danger.dead_end):
         return "dead end"
     is_held_off = frame.executed_risk.risk <= start.tolerance
