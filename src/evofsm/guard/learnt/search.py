@@ -29,6 +29,8 @@ KEPT, CHANGED, NOTHING_PASSES = 0, 1, 2
 
 # Halvings between a proposal and an action that passes.
 _HALVINGS = 4
+# Of two that last as long up to so much the first is taken.
+_EQUAL = 1e-9
 # What the least distance counts beside the time survived.
 _DISTANCE, _FAR = 0.05, 0.05
 
@@ -122,7 +124,7 @@ def search(
         for k in range(len(order)):
             total += lasting(known, here, nothing, policies[q], disturbances, k, harder, room)
         shortest = min(shortest, total)
-        if total > longest:
+        if total > longest + _EQUAL:
             longest, which = total, q
             follow_policy(known, policies[q], here.z, best)
     return NOTHING_PASSES, which, (longest - shortest) / (abs(longest) + 1e-12)
