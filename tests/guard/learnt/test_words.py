@@ -17,7 +17,7 @@ _REMEMBERED = (
     r"(all \d+ disturbances|the 1 disturbance) remembered from [\d,.]+ s|what [\d.]+ s brought"
 )
 _KEPT = re.compile(
-    rf"(.*; )?then {_BACKUP} survives ({_REMEMBERED}), by [\d.]+ ordinary changes? or more"
+    rf"(.*; )?then {_BACKUP} survives ({_REMEMBERED}), by [\d.]+ ordinary changes?"
 )
 
 

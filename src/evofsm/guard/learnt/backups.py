@@ -91,7 +91,8 @@ class Backups:
         drawn = (random.random(shape) < _CHANGED) * size * random.standard_normal(shape)
         put: _Floats = np.empty_like(drawn)
         put[np.ix_(self.actions, np.append(0, 1 + self.variables))] = drawn
-        return put * np.append(1.0, self.flips) * self.turns[:, None]
+        put *= np.append(1.0, self.flips) * self.turns[:, None]
+        return put
 
 
 def _order(rows: _Floats) -> NDArray[np.int64]:

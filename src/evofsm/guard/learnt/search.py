@@ -144,7 +144,8 @@ def lasting(
     """Share of the horizon that is survived, and a little for the least distance to failure."""
     steps = disturbances.residuals.shape[1]
     survived, least = replay(known, here, action, policy, disturbances, k, harder, 0.0, room)
-    return survived / steps + _DISTANCE * min(1.0, max(-1.0, _FAR * least))
+    share: float = survived / steps
+    return share + _DISTANCE * min(1.0, max(-1.0, _FAR * least))
 
 
 @compiled

@@ -27,21 +27,21 @@ class Remembered(NamedTuple):
     10 disturbances remembered from 305 s | 1 disturbance remembered from 12 s | what 4.2 s brought
     """
 
-    count: int
+    number: int
     seconds: float  #: of observation that they come from
 
     def __str__(self) -> str:
         time = f"{self.seconds:,.0f} s" if self.seconds >= 10.0 else f"{self.seconds:.1f} s"
-        if not self.count:
+        if not self.number:
             return f"what {time} brought"
-        return f"{self.count} disturbance{'s' * (self.count != 1)} remembered from {time}"
+        return f"{self.number} disturbance{'s' * (self.number != 1)} remembered from {time}"
 
     @property
     def all(self) -> str:
         """All of them, as an object."""
-        if self.count == 0:
+        if self.number == 0:
             return str(self)
-        return f"{'all' if self.count > 1 else 'the'} {self}"
+        return f"{'all' if self.number > 1 else 'the'} {self}"
 
 
 def kept(backup: str, remembered: Remembered, left: float) -> str:
@@ -84,7 +84,7 @@ changes'
     if lost == 0:
         what = f"no backup survives {remembered.all} by the margin of {changes(margin)}"
         return what if harder < _HARDER else f"{what}, were they {harder:.2g} times as hard"
-    if lost < remembered.count:
+    if lost < remembered.number:
         return f"no backup survives {lost} of the {remembered}"
     return f"no backup survives {'any of ' if lost > 1 else ''}the {remembered}"
 
@@ -98,7 +98,7 @@ def changed(backup: str, remembered: Remembered, margin: float) -> str:
     'the closest action after which feedback 2 survives all of them, by 0.4 ordinary changes or \
 more'
     """
-    them = "all of them" if remembered.count > 1 else "it"
+    them = "all of them" if remembered.number > 1 else "it"
     return f"the closest action after which {backup} survives {them}, by {changes(margin)} or more"
 
 
