@@ -13,6 +13,7 @@ from evofsm.checks.contracts import Broken
 from evofsm.checks.kinds import Kind, kind_of, maker
 from evofsm.checks.running import Case, Outcome, all_checks, cases, check
 from evofsm.core.actions import IntervalActions
+from evofsm.core.dynamics.dynamics import Dynamics
 from evofsm.core.machine import EvolvingFSM
 from evofsm.core.model import FSMModel
 from evofsm.core.states.edges import Edges
@@ -58,7 +59,12 @@ OURS = {
     "machine that has learnt": grown(),
     "machine with few states": EvolvingFSM(2, max_states=4),
     "machine that leaves out": EvolvingFSM(2, belief_tolerance=1e-6),
+    "machine with a range": EvolvingFSM(3, dynamics=Dynamics(-1.0, 1.0)),
+    "machine with choices": EvolvingFSM(2, max_states=4, dynamics=Dynamics(n_actions=2)),
+    "machine with two numbers": EvolvingFSM(3, dynamics=Dynamics([-1.0, 0.0], [1.0, 5.0])),
     "fleet": Fleet(EvolvingFSM(3), 3),
+    "fleet with a range": Fleet(EvolvingFSM(3, dynamics=Dynamics(-1.0, 1.0, stretches=2)), 2),
+    "model with choices": grown(dynamics=Dynamics(n_actions=2)).model(),
     "model": grown().model(names=["x", "y", "z"], dt=0.1),
     "paper": Paper(),
     "edges": Edges(),
@@ -189,6 +195,33 @@ class Endless(EvolvingFSM):
 class Forgetful(EvolvingFSM):
     def start_episode(self):
         self._use(EvolvingFSM(self.n_actions)._buffer)
+
+
+class Moving(EvolvingFSM):
+    """A machine that learns how its system moves."""
+
+    def __init__(self, n_actions):
+        super().__init__(n_actions, dynamics=Dynamics(n_actions=n_actions))
+
+
+class ForeseesNothing(Moving):
+    def what_next(self, *arguments, **options):
+        ahead = super().what_next(*arguments, **options)
+        return ahead._replace(mean=np.nan * ahead.mean)
+
+
+class MovesOn(Moving):
+    def start_episode(self):
+        super().start_episode()
+        self._dynamics.observe(np.zeros(3))
+        self._dynamics.act(self._dynamics.encode(0))
+
+    def observe(self, z, **options):
+        if self.state is None and self._dynamics.is_under_way:
+            for _ in range(2):
+                self._dynamics.observe(np.asarray(z))
+                self._dynamics.act(self._dynamics.encode(0))
+        return super().observe(z, **options)
 
 
 class BatchBegins(EvolvingFSM):
@@ -554,6 +587,8 @@ BROKEN = {
         "steps_are_sound": [SurpriseInNats, StateOfLeast],
         "is_deterministic": [Drawn],
         "an_episode_starts_anew": [Endless, Forgetful],
+        "what_comes_next_is_told_in_numbers": [ForeseesNothing],
+        "motion_is_not_learnt_across_episodes": [MovesOn],
         "a_batch_is_the_loop": [BatchBegins],
         "a_copy_is_independent": [CopyIsItself, CopyBegins],
         "a_file_keeps_it": [FileForgetsAction],

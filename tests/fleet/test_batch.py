@@ -1,9 +1,12 @@
+import io
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from evofsm.core.crowding import WhenFull
+from evofsm.core.dynamics.dynamics import Dynamics
 from evofsm.core.machine import EvolvingFSM
 from evofsm.core.states.edges import Edges
 from evofsm.core.states.failure import FailureSplit
@@ -178,3 +181,55 @@ def test_a_fleet_needs_a_machine_vehicles_and_a_known_precision():
         Fleet(EvolvingFSM(Q), 2, dtype=np.float16)
     with pytest.raises(IndexError):
         Fleet(EvolvingFSM(Q), 2)[2]
+
+
+def moving(actions=3, **settings):
+    return EvolvingFSM(actions, radius=1.0, max_states=5, dynamics=Dynamics(-1.0, 1.0, **settings))
+
+
+def test_a_fleet_with_dynamics_is_its_machines():
+    draw = np.random.default_rng(0)
+    fleet, alone = Fleet(moving(), 3), [moving() for _ in range(3)]
+    Z = np.cumsum(draw.normal(size=(90, 3, 2)), axis=0)
+    Z[70:75, 1] += 40.0
+    I, U = draw.integers(0, 3, (90, 3)), draw.uniform(-1.0, 1.0, (90, 3))
+    for t in range(90):
+        who = [v for v in range(3) if (t + v) % 7]
+        starts = [k for k, v in enumerate(who) if t in (30, 60) and v != 2]
+        failures = [k for k, v in enumerate(who) if t == 50 and v == 1]
+        fleet.observe(
+            Z[t, who],
+            I[t, who],
+            vehicles=who,
+            episode_starts=starts,
+            failures=failures,
+            executed=U[t, who],
+        )
+        for k, v in enumerate(who):
+            if k in starts:
+                alone[v].start_episode()
+            alone[v].observe(Z[t, v], failed=k in failures)
+            if k not in failures:
+                alone[v].act(int(I[t, v]), U[t, v])
+    fleet.start_episode([2])
+    alone[2].start_episode()
+    assert sum(machine.onsets.sum() for machine in alone) > 0
+    for v, machine in enumerate(alone):
+        files = []
+        for one in (machine, fleet[v]):
+            file = io.BytesIO()
+            one.save(file)
+            files.append(file.getvalue())
+        assert files[0] == files[1]
+
+
+def test_what_a_fleet_with_dynamics_refuses_changes_none():
+    fleet = Fleet(moving(), 2)
+    for told, why in (({}, "executed is missing"), ({"executed": [0.0]}, "rows")):
+        with pytest.raises(ValueError, match=why):
+            fleet.observe([[0.0], [1.0]], [0, 1], **told)
+    with pytest.raises(ValueError, match=r"at most 1e.30"):
+        fleet.observe([[0.0], [1e31]], [0, 1], executed=[0.0, 0.0])
+    assert not fleet.n_states.any()
+    fleet.observe([[0.0], [1.0]])  # nobody acted
+    assert fleet[0].dynamics.n_variables == 1

@@ -25,8 +25,10 @@ CONTRACT = Contract()
 # What is looked at to see whether two machines hold the same.
 _HELD = (
     *("n_states", "state", "belief", "centers", "potentials", "transition_matrices"),
-    *("marginal_matrix", "origin_frequency", "decisions", "failures", "endings"),
+    *("marginal_matrix", "origin_frequency", "decisions", "failures", "endings", "onsets"),
 )
+# The same of its dynamics, where it has some.
+_MOVING = ("n_episodes", "used", "lowest", "highest", "reached", "weights", "clock")
 _ROWS = 60
 # With this exactness beliefs and rows of matrices sum to 1.
 _EXACT = 1e-9
@@ -49,13 +51,28 @@ def teach(machine: Any, Z: NDArray[np.float64], actions: NDArray[np.int64]) -> l
     steps = []
     for z, i in zip(Z, actions.tolist(), strict=True):
         steps.append(machine.observe(z))
-        machine.act(i)
+        machine.act(i, **executed(machine, i))
     return steps
+
+
+def executed(machine: Any, actions: Any) -> dict[str, Any]:
+    """What a machine has to be told of actions beside their indices: their numbers, if any."""
+    moves = getattr(machine, "dynamics", None)
+    if moves is None or moves.choices:
+        return {}
+    share = (np.asarray(actions)[..., None] + 0.5) / machine.n_actions
+    return {"executed": moves.low + share * (moves.high - moves.low)}
 
 
 def held(machine: Any) -> dict[str, Any]:
     """What a machine holds, as far as it can be looked at."""
-    return {name: np.copy(getattr(machine, name)) for name in _HELD if hasattr(machine, name)}
+    found = {name: np.copy(getattr(machine, name)) for name in _HELD if hasattr(machine, name)}
+    moves = getattr(machine, "dynamics", None)
+    if moves is not None and moves.n_variables:
+        parts = {name: getattr(moves, name) for name in _MOVING} | moves.sums._asdict()
+        parts["stretches"] = len(moves.stretches)
+        found |= {f"dynamics.{name}": np.copy(part) for name, part in parts.items()}
+    return found
 
 
 def difference(one: dict[str, Any], other: dict[str, Any]) -> str:
@@ -87,11 +104,11 @@ def inputs_not_changed(make: Make) -> None:
     given = Z.copy()
     for z, i in zip(given, actions.tolist(), strict=True):
         machine.observe(z)
-        machine.act(i)
+        machine.act(i, **executed(machine, i))
     insist(same(given, Z), "observe changed the array it was given (work in place? copy it first)")
     if hasattr(machine, "learn_many"):
         rows, kept = Z.copy(), actions.copy()
-        machine.learn_many(rows, kept)
+        machine.learn_many(rows, kept, **executed(machine, kept))
         insist(same(rows, Z), "learn_many changed the observations it was given")
         insist(same(kept, actions), "learn_many changed the actions it was given")
 
@@ -105,7 +122,7 @@ def inputs_not_kept(make: Make) -> None:
     for z, i in zip(Z, actions.tolist(), strict=True):
         buffer[:] = z
         machine.observe(buffer)
-        machine.act(i)
+        machine.act(i, **executed(machine, i))
         buffer[:] = 1e6
     teach(other, Z, actions)
     wrong = difference(held(other), held(machine))
@@ -259,13 +276,62 @@ def an_episode_starts_anew(make: Make) -> None:
         )
 
 
+@CONTRACT.clause("what_next")
+def what_comes_next_is_told_in_numbers(make: Make) -> None:
+    """What is expected next is finite, has a spread, and asking for it changes nothing."""
+    machine = _taught(make)
+    moves = getattr(machine, "dynamics", None)
+    if moves is None:
+        return  # nobody asked it to learn that
+    before = held(machine)
+    action = 0 if moves.choices else moves.high
+    for steps in (1, 5):
+        mean, spread = machine.what_next(action, steps)
+        insist(
+            np.shape(mean) == np.shape(spread) == (steps, stream(machine)[0].shape[1]),
+            f"what_next of {steps} steps has a mean of shape {np.shape(mean)}; there must be a row "
+            "for each step",
+        )
+        insist(
+            np.isfinite(mean).all() and (spread >= 0.0).all() and np.isfinite(spread).all(),
+            f"what_next expects {mean} with a spread of {spread}; both must be finite, and the "
+            "spread not below 0 (does an expectation run away?)",
+        )
+    machine.may_begin()
+    machine.onset_rates()
+    machine.never_seen()
+    wrong = difference(before, held(machine))
+    insist(not wrong, f"asking what comes next changed {wrong}")
+
+
+@CONTRACT.clause("start_episode")
+def motion_is_not_learnt_across_episodes(make: Make) -> None:
+    """How the system moves is not learnt from the end of one episode to the start of the next."""
+    machine = _taught(make)
+    moves = getattr(machine, "dynamics", None)
+    if moves is None:
+        return
+    Z, _ = stream(machine)
+    machine.start_episode()
+    learnt = float(moves.sums.counts[1])
+    machine.observe(Z[0] + 1e3)
+    machine.act(0, **executed(machine, 0))
+    machine.observe(Z[0] + 1e3)
+    insist(
+        float(moves.sums.counts[1]) == learnt,
+        "the first observations of an episode taught how the system moves from the last ones of "
+        "the episode before (is the stretch broken off in start_episode?)",
+    )
+
+
 @CONTRACT.clause("learn_many")
 def a_batch_is_the_loop(make: Make) -> None:
     """learn_many is observe and act row by row, bit for bit."""
     batch, loop = make(), make()
     Z, actions = stream(batch)
     first, rest = slice(0, 25), slice(25, None)
-    traces = [batch.learn_many(Z[part], actions[part]) for part in (first, rest)]
+    told = [(Z[part], actions[part]) for part in (first, rest)]
+    traces = [batch.learn_many(rows, taken, **executed(batch, taken)) for rows, taken in told]
     steps = teach(loop, Z, actions)
     wrong = difference(held(batch), held(loop))
     insist(
@@ -396,12 +462,26 @@ def _impossible(machine: Any) -> Iterator[tuple[str, Callable[[], object]]]:
     for i in wrong_actions:
         yield f"{i!r} as an action", lambda i=i: machine.act(i)  # type: ignore[misc]
         yield f"a forecast for {i!r} as an action", lambda i=i: machine.predict(i)  # type: ignore[misc]
+    if told := executed(machine, 0):
+        many = np.zeros(len(told["executed"]) + 1)
+        yield "an action without its number", lambda: machine.act(0)
+        yield "NaN as what was executed", lambda: machine.act(0, told["executed"] * np.nan)
+        yield "too many numbers as what was executed", lambda: machine.act(0, many)
     yield "a forecast of 0 steps", lambda: machine.predict(0, 0)
     if hasattr(machine, "learn_many"):
         last = Z.copy()
         last[-1, 0] = np.nan
-        yield "a batch whose last row has NaN", lambda: machine.learn_many(last, actions)
+        yield (
+            "a batch whose last row has NaN",
+            lambda: machine.learn_many(last, actions, **executed(machine, actions)),
+        )
         high = actions.copy()
         high[-1] = machine.n_actions
-        yield "a batch whose last action there is not", lambda: machine.learn_many(Z, high)
-        yield "a batch of fewer actions than rows", lambda: machine.learn_many(Z, actions[:-1])
+        yield (
+            "a batch whose last action there is not",
+            lambda: machine.learn_many(Z, high, **executed(machine, high)),
+        )
+        yield (
+            "a batch of fewer actions than rows",
+            lambda: machine.learn_many(Z, actions[:-1], **executed(machine, actions[:-1])),
+        )

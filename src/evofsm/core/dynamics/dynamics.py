@@ -157,13 +157,37 @@ class Dynamics:
         return told | {"without": sorted(self.without)}
 
     def copy(self) -> Self:
-        """One of its own in the same state; ``told``, which is code, is shared."""
+        """One of its own in the same state; ``told``, which is code, is shared.
+
+        Returns
+        -------
+        Dynamics
+
+        Examples
+        --------
+        >>> Dynamics(n_actions=2).copy()
+        Dynamics(n_actions=2, 0 episodes, 0 variables, 0 stretches)
+        """
         twin = object.__new__(type(self))
         twin.__dict__.update(held(self))
         return twin
 
     def frozen(self) -> Self:
-        """A copy to be asked, of which nobody learns any more: of the episode it has the end."""
+        """A copy to be asked, of which nobody learns any more: of the episode it has the end.
+
+        Returns
+        -------
+        Dynamics
+
+        Examples
+        --------
+        >>> dynamics = Dynamics(n_actions=2)
+        >>> for t in range(40):
+        ...     dynamics.observe(np.array([t % 7.0]))
+        ...     dynamics.act(dynamics.encode(t % 2))
+        >>> len(dynamics.frozen().under_way[0])
+        2
+        """
         twin = self.copy()
         twin._Z, twin._U = twin._Z[-2:], twin._U[max(0, len(twin._Z) - 2) :]
         twin.latest = None
@@ -207,7 +231,23 @@ class Dynamics:
     # -- Actions --------------------------------------------------------------------------------
 
     def encode(self, action: Any) -> _Floats:
-        """(a,) what kernels call an action."""
+        """(a,) what kernels call an action.
+
+        Parameters
+        ----------
+        action : int, float or array_like
+            As it was executed, in its own unit.
+
+        Returns
+        -------
+        (a,) ndarray
+            In [-1, 1], or a one among zeros.
+
+        Examples
+        --------
+        >>> Dynamics(-2.5, 2.5).encode(1.25), Dynamics(n_actions=3).encode(2)
+        (array([0.5]), array([0., 0., 1.]))
+        """
         if self.choices:
             return np.asarray(np.eye(self.choices)[int(action)])
         middle, half = 0.5 * (self.low + self.high), 0.5 * (self.high - self.low)
@@ -215,7 +255,22 @@ class Dynamics:
         return scaled
 
     def decode(self, inner: _Floats) -> _Floats:
-        """(d,) the action itself; the index of a choice."""
+        """(d,) the action itself; the index of a choice.
+
+        Parameters
+        ----------
+        inner : (a,) ndarray
+            As `encode` returns it.
+
+        Returns
+        -------
+        (d,) ndarray
+
+        Examples
+        --------
+        >>> Dynamics(-2.5, 2.5).decode(np.array([0.5]))
+        array([1.25])
+        """
         if self.choices:
             return np.array([float(inner.argmax())])
         middle, half = 0.5 * (self.low + self.high), 0.5 * (self.high - self.low)
@@ -228,7 +283,20 @@ class Dynamics:
         self._U: list[_Floats] = []
 
     def begin(self, z: _Floats) -> None:
-        """Make room for what is learnt; variables are counted from the first observation on."""
+        """Make room for what is learnt; variables are counted from the first observation on.
+
+        Parameters
+        ----------
+        z : (m,) ndarray
+            The first observation.
+
+        Examples
+        --------
+        >>> dynamics = Dynamics(n_actions=2)
+        >>> dynamics.begin(np.zeros(3))
+        >>> dynamics.n_variables
+        3
+        """
         m, a = len(z), self.size
         p = n_features(m, a, box=not self.choices)
         self.n_variables = m
@@ -265,7 +333,20 @@ class Dynamics:
         self._rebuild()
 
     def observe(self, z: _Floats) -> None:
-        """Take in an observation, and learn the transition before the one to it."""
+        """Take in an observation, and learn the transition before the one to it.
+
+        Parameters
+        ----------
+        z : (m,) ndarray
+            Observation, all finite.
+
+        Examples
+        --------
+        >>> dynamics = Dynamics(n_actions=2)
+        >>> dynamics.observe(np.array([1.0]))
+        >>> dynamics.here.z
+        array([1.])
+        """
         if not self.n_variables:
             self.begin(z)
         if len(self._Z) >= _LONGEST:
@@ -290,7 +371,21 @@ class Dynamics:
                 break
 
     def act(self, action: _Floats) -> None:
-        """What was done after the latest observation, as `encode` returns it."""
+        """What was done after the latest observation, as `encode` returns it.
+
+        Parameters
+        ----------
+        action : (a,) ndarray
+            As `encode` returns it; a second one replaces the first.
+
+        Examples
+        --------
+        >>> dynamics = Dynamics(n_actions=2)
+        >>> dynamics.observe(np.array([1.0]))
+        >>> dynamics.act(dynamics.encode(1))
+        >>> dynamics.has_acted
+        True
+        """
         for replaced in self._U[len(self._Z) - 1 :]:
             self.used -= self._ends(replaced)
         del self._U[len(self._Z) - 1 :]
@@ -302,7 +397,24 @@ class Dynamics:
         return np.stack([action < (-0.6 if not self.choices else -1.0), action > 0.6], 1)
 
     def end(self, *, failed: bool) -> None:
-        """The episode is over; its last observation was taken in."""
+        """The episode is over; its last observation was taken in.
+
+        Parameters
+        ----------
+        failed : bool
+            Whether it ended in failure with the latest observation.
+
+        Examples
+        --------
+        >>> dynamics = Dynamics(n_actions=2)
+        >>> for t in range(40):
+        ...     dynamics.observe(np.array([t % 7.0]))
+        ...     dynamics.act(dynamics.encode(t % 2))
+        >>> dynamics.observe(np.array([9.0]))
+        >>> dynamics.end(failed=True)
+        >>> dynamics.sides
+        [(0, 1.0, 6.0)]
+        """
         if self.n_variables:
             if not failed and len(self._Z) > 2 and len(self._U) >= len(self._Z) - 1:
                 self._learn(len(self._Z) - 2)
@@ -310,7 +422,18 @@ class Dynamics:
         self._begin()
 
     def break_off(self) -> None:
-        """What comes does not follow from what was."""
+        """What comes does not follow from what was.
+
+        Examples
+        --------
+        >>> dynamics = Dynamics(n_actions=2)
+        >>> for t in range(40):
+        ...     dynamics.observe(np.array([t % 7.0]))
+        ...     dynamics.act(dynamics.encode(t % 2))
+        >>> dynamics.break_off()
+        >>> dynamics.n_episodes, dynamics.is_under_way
+        (1, False)
+        """
         if self.n_variables and len(self._Z) > 2:
             self._study(failed=False)
         self._begin()
@@ -386,7 +509,18 @@ class Dynamics:
         self.n_episodes += 1
 
     def settle(self) -> None:
-        """Make of all sums what is known: weights, and where it fails."""
+        """Make of all sums what is known: weights, and where it fails.
+
+        Examples
+        --------
+        >>> dynamics = Dynamics(n_actions=2)
+        >>> for t in range(40):
+        ...     dynamics.observe(np.array([t % 7.0]))
+        ...     dynamics.act(dynamics.encode(t % 2))
+        >>> dynamics.settle()
+        >>> dynamics.ready
+        True
+        """
         self._solve()
         if self.told is None:
             self.sides = explain_failures(
@@ -421,7 +555,29 @@ class Dynamics:
         self.sums.scale[:] = np.maximum(new, 1e-3 * np.sqrt(self.sums.variance) + 1e-300)
 
     def onsets(self, found: _Floats) -> list[int]:
-        """Steps of an episode at which something large began."""
+        """Steps of an episode at which something large began.
+
+        Parameters
+        ----------
+        found : (T, m) ndarray
+            What was not expected.
+
+        Returns
+        -------
+        list of int
+
+        Examples
+        --------
+        >>> dynamics = Dynamics(n_actions=2)
+        >>> for t in range(40):
+        ...     dynamics.observe(np.array([t % 7.0]))
+        ...     dynamics.act(dynamics.encode(t % 2))
+        >>> dynamics.end(failed=False)
+        >>> found = np.zeros((20, 1))
+        >>> found[7] = 100.0 * dynamics.sums.scale
+        >>> dynamics.onsets(found)
+        [7]
+        """
         size = np.abs(found / self.sums.scale).max(1)
         starts: list[int] = []
         while len(starts) < _ONSETS and size.max() >= ONSET:
@@ -431,7 +587,25 @@ class Dynamics:
         return starts
 
     def remember(self, starts: Sequence[int]) -> None:
-        """Keep the stretches of the latest episode that begin at these steps of its residuals."""
+        """Keep the stretches of the latest episode that begin at these steps of its residuals.
+
+        Parameters
+        ----------
+        starts : sequence of int
+            From 0.
+
+        Examples
+        --------
+        >>> dynamics = Dynamics(n_actions=2)
+        >>> for t in range(40):
+        ...     dynamics.observe(np.array([t % 7.0]))
+        ...     dynamics.act(dynamics.encode(t % 2))
+        >>> dynamics.end(failed=False)
+        >>> before = len(dynamics.stretches)
+        >>> dynamics.remember([3])
+        >>> len(dynamics.stretches) - before
+        1
+        """
         assert self.latest is not None
         Z, U = self.latest.observations, self.latest.actions
         for t in starts:
@@ -443,7 +617,24 @@ class Dynamics:
         self.stretches = self.stretches[-self.most_stretches :]
 
     def keep(self, which: Sequence[int]) -> None:
-        """Forget all stretches but these."""
+        """Forget all stretches but these.
+
+        Parameters
+        ----------
+        which : sequence of int
+            Numbers of stretches, from 0.
+
+        Examples
+        --------
+        >>> dynamics = Dynamics(n_actions=2)
+        >>> for t in range(40):
+        ...     dynamics.observe(np.array([t % 7.0]))
+        ...     dynamics.act(dynamics.encode(t % 2))
+        >>> dynamics.end(failed=False)
+        >>> dynamics.keep([])
+        >>> dynamics.stretches
+        []
+        """
         self.stretches = [self.stretches[k] for k in which]
 
     # -- What it says ---------------------------------------------------------------------------
@@ -463,7 +654,22 @@ class Dynamics:
         return Z.reshape(-1, self.n_variables), U.reshape(-1, self.size)
 
     def go_on(self, observations: _Floats, actions: _Floats) -> None:
-        """Be in an episode of which this was observed and done."""
+        """Be in an episode of which this was observed and done.
+
+        Parameters
+        ----------
+        observations : (T, m) ndarray
+        actions : (T or T - 1, a) ndarray
+            As `encode` returns them.
+
+        Examples
+        --------
+        >>> dynamics = Dynamics(n_actions=2)
+        >>> dynamics.begin(np.zeros(1))
+        >>> dynamics.go_on(np.zeros((2, 1)), np.eye(2)[:1])
+        >>> dynamics.has_acted
+        False
+        """
         self._Z, self._U = list(observations), list(actions)
 
     @property
@@ -496,6 +702,21 @@ class Dynamics:
         ----------
         steps : int, optional
             Of each of them; without it all that a stretch may have.
+
+        Returns
+        -------
+        Disturbances
+
+        Examples
+        --------
+        >>> dynamics = Dynamics(n_actions=2)
+        >>> for t in range(40):
+        ...     dynamics.observe(np.array([t % 7.0]))
+        ...     dynamics.act(dynamics.encode(t % 2))
+        >>> dynamics.break_off()
+        >>> found = dynamics.disturbances()
+        >>> len(found.residuals) - len(dynamics.stretches)
+        1
         """
         m, count = self.n_variables, 1 + len(self.stretches)
         steps = steps or self.horizon

@@ -46,8 +46,6 @@ _ASKED, _TRIED_ON = 3, 5
 # The margin [ordinary changes]: at first, at most, what is left of it an episode later, and what a
 # broken certificate adds, for so many that may be.
 _MARGIN, _LARGEST, _FADES, _ADDED, _RATE = 3.0, 8.0, 0.9, 0.25, 0.001
-# By so much more a proposal has to pass once one was refused.
-_RELEASE = 0.0
 # Disturbances are taken to be harder than they were by so many over the number of episodes.
 _CAUTION = 4.0
 # Steps that are looked ahead: at first, at least, at most; times those that it takes to fail, of
@@ -217,10 +215,10 @@ class LearntRisk:
         situation : Situation
         wanted : float or (d,) array
         tolerance : float
-            So much risk may be accepted, where so much was seen that its upper bound is known to
-            be smaller.
+            Share of the disturbances that need not be survived, where so much was seen that the
+            upper bound of the risk is within it as well.
         revising : bool
-            Whether the proposal before was not kept.
+            Not used: a band in which a proposal is refused longer was tried, and gained nothing.
 
         Returns
         -------
@@ -235,30 +233,30 @@ class LearntRisk:
             return Search(one, _unjudged(1), 0, words.NO_FAILURE)
         proposal, best = dynamics.encode(wanted), np.empty(dynamics.size)
         allowed = self._allowed(tolerance)
-        keep = self.margin + (_RELEASE if revising else 0.0)
         asked = self._ranks[:_ASKED]
         world = (self.backups.policies, asked, self.disturbances, self._order, self.harder)
-        how, backup, apart = search(known, here, proposal, *world, self.margin, keep, allowed, best)
+        how, backup, left = search(known, here, proposal, *world, self.margin, allowed, best)
         self._ranks = np.array([backup, *(q for q in self._ranks if q != backup)])
         self._tight = how != KEPT
         tried = (
             self._untried(best)
-            if self.learning and how == NOTHING_PASSES and apart < _ALIKE
+            if self.learning and how == NOTHING_PASSES and left < _ALIKE
             else None
         )
         self._holds = how != NOTHING_PASSES
         if not self._holds and self._certified:
-            again = search(known, here, best, *world, 0.0, 0.0, allowed, np.empty_like(best))
+            again = search(known, here, best, *world, 0.0, allowed, np.empty_like(best))
             self._holds = again[0] != NOTHING_PASSES
         then = self._backup_text(backup)
         if how == KEPT:
-            judged = self._judgement(np.zeros(1), np.full(1, self.margin), situation)
-            return Search(one, judged, 0, words.kept(then, self.remembered, self.margin))
+            judged = self._judgement(np.zeros(1), np.full(1, left), situation)
+            return Search(one, judged, 0, words.kept(then, self.remembered, left))
         if tried is not None:
             best = tried
         action = np.reshape(dynamics.decode(best), np.shape(wanted))
-        certain = how == CHANGED and allowed == 0
-        judged = self._judged(situation, here, np.stack([proposal, best]), sure=int(certain))
+        judged = self._judged(
+            situation, here, np.stack([proposal, best]), left if how == CHANGED else None
+        )
         if tried is not None:
             instead = words.tried()
         elif how == CHANGED:
@@ -291,24 +289,20 @@ class LearntRisk:
         return words.refused(self._lost, self.remembered, self.margin, self.harder)
 
     def _judged(
-        self, situation: Situation, here: Here, actions: _Floats, sure: int = 0
+        self, situation: Situation, here: Here, actions: _Floats, passes: float | None = None
     ) -> Judgement:
-        assert self.disturbances is not None and self.backups is not None
+        """Of some actions; ``passes`` is what is left after the last, if that is known to pass."""
+        assert self.disturbances is not None
+        assert self.backups is not None
         found = np.empty(len(self.disturbances.residuals))
         lost, left = np.zeros(len(actions)), np.zeros(len(actions))
-        left[len(actions) - sure :] = self.margin  # those that were found to pass
-        for i, action in enumerate(actions[: len(actions) - sure]):
-            escapes(
-                self.dynamics.consequents,
-                here,
-                action,
-                self.backups.policies,
-                self._ranks[:_ASKED],
-                self.disturbances,
-                found,
-            )
+        world = (self.backups.policies, self._ranks[:_ASKED], self.disturbances, found)
+        for i, action in enumerate(actions if passes is None else actions[:-1]):
+            escapes(self.dynamics.consequents, here, action, *world)
             lost[i] = math.inf if found[0] < 0.0 else np.count_nonzero(found < 0.0)
             left[i] = found.min()
+        if passes is not None:
+            left[-1] = passes
         self._lost = -1 if math.isinf(lost[0]) else int(lost[0])
         return self._judgement(lost, left, situation)
 
@@ -332,12 +326,16 @@ class LearntRisk:
         return _within(lost * soon), _within(low * soon), _within(high * soon)
 
     def _allowed(self, tolerance: float) -> int:
-        """How many of the disturbances need not be survived: their bound is within the tolerance."""
+        """How many of the disturbances need not be survived.
+
+        No larger share of them than the tolerance, and no more than keep the upper bound of the
+        risk within it.
+        """
         soon = self.horizon * self.dt / max(self.exposure, 1e-300)
-        allowed = 0
-        while allowed < 4 and _within(poisson_bounds(allowed + 1)[1] * soon) <= tolerance:
+        most, allowed = tolerance * len(self.dynamics.stretches), 0
+        while allowed + 1 <= most and _within(poisson_bounds(allowed + 1)[1] * soon) <= tolerance:
             allowed += 1
-        return 0 * allowed
+        return allowed
 
     def _here(self, situation: Situation) -> Here | None:
         """Where one is; what was not observed is taken to have gone on as before."""
@@ -524,8 +522,7 @@ class LearntRisk:
         """
         content, arrays = storage.read(path, KIND.name)
         with storage.explained(path):
-            names = ("seed", "without", "names", "units")
-            told = {name: content[name] for name in names}
+            told = {name: content[name] for name in ("seed", "without", "names", "units")}
             judge = cls(content["dt"], horizon=content["told_horizon"], **told)
             restore(judge, content, arrays)
         judge._forget()

@@ -35,33 +35,36 @@ _DISTANCE, _FAR = 0.05, 0.05
 
 @compiled
 def _lost(
-    known: Consequents,
-    here: Here,
     action: _Floats,
     policy: _Floats,
+    margin: float,
+    known: Consequents,
+    here: Here,
     disturbances: Disturbances,
     order: _Ints,
     harder: float,
-    margin: float,
     allowed: int,
     room: Scratch,
-) -> int:
+) -> tuple[int, float]:
     """Number of disturbances that are not survived by the margin, up to one more than allowed.
 
-    Those that are not come first in ``order`` from then on: they are the quickest to refuse by.
+    And the least distance to failure under the others. Those that are not survived come first in
+    ``order`` from then on: they are the quickest to refuse by.
     """
-    lost, steps = 0, disturbances.residuals.shape[1]
+    lost, steps, left = 0, disturbances.residuals.shape[1], np.inf
     for i in range(len(order)):
         k = order[i]
         survived, least = replay(known, here, action, policy, disturbances, k, harder, margin, room)
-        if survived < steps or least < margin:
-            lost += 1 if k > 0 else allowed + 1  # without any disturbance it has to go well
-            for l in range(i, 0, -1):
-                order[l] = order[l - 1]
-            order[0] = k
-            if lost > allowed:
-                return lost
-    return lost
+        if survived == steps and least >= margin:
+            left = min(left, least)
+            continue
+        lost += 1 if k > 0 else allowed + 1  # without any disturbance it has to go well
+        for l in range(i, 0, -1):
+            order[l] = order[l - 1]
+        order[0] = k
+        if lost > allowed:
+            break
+    return lost, left
 
 
 @compiled
@@ -75,92 +78,43 @@ def search(
     order: _Ints,
     harder: float,
     margin: float,
-    margin_to_keep: float,
     allowed: int,
     best: _Floats,
 ) -> tuple[int, int, float]:
     """Find ``best`` (a,), the closest action to the proposal that passes; how, by which backup.
 
-    The last number is how far apart the backups are where nothing passes: near 0 all are alike.
+    The last number is the least distance to failure that is then left [ordinary changes]; where
+    nothing passes, how far apart the backups are: near 0 all are alike.
     """
     a = len(proposal)
     room = scratch(len(here.z), a, known.weights.shape[0])
+    world = (known, here, disturbances, order, harder, allowed, room)
     for q in ranks:
-        if (
-            _lost(
-                known,
-                here,
-                proposal,
-                policies[q],
-                disturbances,
-                order,
-                harder,
-                margin_to_keep,
-                allowed,
-                room,
-            )
-            <= allowed
-        ):
+        lost, left = _lost(proposal, policies[q], margin, *world)
+        if lost <= allowed:
             best[:] = proposal
-            return KEPT, q, 1.0
-    own, middle, which = np.empty(a), np.empty(a), -1
-    for enough in (margin_to_keep, margin):
-        for q in ranks:
-            follow_policy(known, policies[q], here.z, own)
-            far = 0.0
-            for i in range(a):
-                far += (own[i] - proposal[i]) ** 2
-            if known.choices > 0 and far == 0.0:
-                continue  # it was refused
-            if (
-                _lost(
-                    known,
-                    here,
-                    own,
-                    policies[q],
-                    disturbances,
-                    order,
-                    harder,
-                    enough,
-                    allowed,
-                    room,
-                )
-                > allowed
-            ):
-                continue
-            share = 1.0
-            if known.choices == 0:
-                low = 0.0
-                for _ in range(_HALVINGS):
-                    half = 0.5 * (low + share)
-                    for i in range(a):
-                        middle[i] = proposal[i] + half * (own[i] - proposal[i])
-                    if (
-                        _lost(
-                            known,
-                            here,
-                            middle,
-                            policies[q],
-                            disturbances,
-                            order,
-                            harder,
-                            enough,
-                            allowed,
-                            room,
-                        )
-                        <= allowed
-                    ):
-                        share = half
-                    else:
-                        low = half
-            which = q
-            for i in range(a):
-                best[i] = proposal[i] + share * (own[i] - proposal[i])
-            break
-        if which >= 0 or margin_to_keep == margin:
-            break
-    if which >= 0:
-        return CHANGED, which, 1.0
+            return KEPT, q, left
+    own, middle = np.empty(a), np.empty(a)
+    for q in ranks:
+        follow_policy(known, policies[q], here.z, own)
+        if known.choices > 0 and (own == proposal).all():
+            continue  # it was refused
+        lost, left = _lost(own, policies[q], margin, *world)
+        if lost > allowed:
+            continue
+        best[:] = own
+        share, refused = 1.0, 0.0
+        for _ in range(_HALVINGS if known.choices == 0 else 0):
+            half = 0.5 * (refused + share)
+            middle[:] = proposal + half * (own - proposal)
+            lost, closer = _lost(middle, policies[q], margin, *world)
+            if lost <= allowed:
+                share, left = half, closer
+                best[:] = middle
+            else:
+                refused = half
+        return CHANGED, q, left
+    which = -1
     longest, shortest = -np.inf, np.inf
     nothing = np.empty(0)
     for q in ranks:

@@ -44,16 +44,15 @@ class Remembered(NamedTuple):
         return f"{'all' if self.count > 1 else 'the'} {self}"
 
 
-def kept(backup: str, remembered: Remembered, margin: float) -> str:
+def kept(backup: str, remembered: Remembered, left: float) -> str:
     """Why a proposal is kept.
 
     Examples
     --------
-    >>> kept("always -2.5", Remembered(10, 305.0), margin=0.4)
-    'then always -2.5 survives all 10 disturbances remembered from 305 s, by 0.4 ordinary changes \
-or more'
+    >>> kept("always -2.5", Remembered(10, 305.0), left=0.4)
+    'then always -2.5 survives all 10 disturbances remembered from 305 s, by 0.4 ordinary changes'
     """
-    return f"then {backup} survives {remembered.all}, by {changes(margin)} or more"
+    return f"then {backup} survives {remembered.all}, by {changes(left)}"
 
 
 def refused(lost: int, remembered: Remembered, margin: float, harder: float) -> str:
