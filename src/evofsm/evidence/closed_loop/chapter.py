@@ -45,7 +45,8 @@ def closed_loop_chapter(study: ClosedLoop) -> Chapter:
         title=study.plan.question,
         about="A controller proposes an action at every decision; a reviser may execute a more "
         "careful one. Ours is told how cars follow each other: it asks how probable a failure "
-        "still is if this action is taken now and caution follows, and it has learnt that answer from driving alone. It accepts a risk of "
+        "still is if this action is taken now and caution follows, and it has learnt that answer "
+        "from driving alone. It accepts a risk of "
         f"{percent(study.plan.tolerance)}. Held against it stand fixed constants from the "
         "literature and from regulation, measures that were tuned on the same training scenarios, "
         f"and one that was told the true limits. Family {study.family.name}: {study.family.about}",
