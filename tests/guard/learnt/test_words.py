@@ -46,6 +46,16 @@ _KEPT = re.compile(
             "the closest action after which always 1 survives it, by 3 ordinary changes or more",
         ),
         (
+            words.kept("always 1", MANY, 3.0, spared=2),
+            "then always 1 survives all but at most 2 of the 10 disturbances remembered from "
+            "3,050 s, by 3 ordinary changes",
+        ),
+        (
+            words.changed("always 1", MANY, 3.0, spared=2),
+            "the closest action after which always 1 survives all but at most 2 of them, by 3 "
+            "ordinary changes or more",
+        ),
+        (
             words.experience([("gap", True, 0.5), ("variable 2", False, 12.0)], ONE, 1.0),
             "fails where gap is below 0.5 or variable 2 is above 12; 1 disturbance remembered from "
             "61 s, to be survived by 1 ordinary change",
