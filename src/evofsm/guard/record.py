@@ -73,7 +73,9 @@ RECORD: Mapping[str, Column] = {
     "risk_high": Column(
         float, "upper end of its 90 % interval", lambda one: one.revision.interval[1]
     ),
-    "evidence": _decided(float, "evidence", "disturbances that it rests on, such as braking leaders"),
+    "evidence": _decided(
+        float, "evidence", "disturbances that it rests on, such as braking leaders"
+    ),
     "seen": _decided(float, "seen", "time spent in states like this one before [s]"),
     "reason": _decided(str, "reason", "why, in a few words", "reason"),
     "explanation": _decided(

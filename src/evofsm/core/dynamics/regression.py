@@ -27,6 +27,9 @@ _OUTLIER = 4.0
 # they have to be.
 _RIDGE, _SHY = 1e-6, 30.0
 _PRIOR, _SHY_PRIOR = 0.01, 20.0
+# The least variance of a feature, and what all weights are held to 0 by, of its mean square: far
+# more than rounding, so that features that did not vary yet always share what they explain alike.
+_LEAST, _ALL_ALIKE = 1e-6, 1e-10
 
 
 class Sums(NamedTuple):
@@ -148,7 +151,7 @@ def solve(sums: Sums, m: int, a: int, without: _Floats) -> _Floats:
     squares, n = sums.squares, max(1.0, float(sums.squares[0, 0]))
     variance = np.diag(squares) - squares[0] ** 2 / n
     size = np.diag(squares)
-    variance = np.where(variance > 1e-9 * size, variance, 1e-9 * size)
+    variance = np.where(variance > _LEAST * size, variance, _LEAST * size)
     variance[0] = 0.0
     shy = np.ones(len(size), bool)
     shy[: 1 + m] = shy[1 + 2 * m : 1 + 2 * m + a] = False
@@ -156,6 +159,6 @@ def solve(sums: Sums, m: int, a: int, without: _Floats) -> _Floats:
     held += np.where(without > 0.0, 1e12 * np.maximum(size, 1.0), 0.0)
     scale = 1.0 / np.sqrt(np.where(size > 0.0, size + held, 1.0))
     scaled = scale[:, None] * (squares + np.diag(held)) * scale
-    scaled[np.diag_indices_from(scaled)] += 1e-13
+    scaled[np.diag_indices_from(scaled)] += _ALL_ALIKE
     weights: _Floats = scale[:, None] * np.linalg.solve(scaled, scale[:, None] * sums.products)
     return weights

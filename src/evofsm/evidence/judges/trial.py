@@ -121,7 +121,7 @@ def _kinematic(system: System, without: Sequence[str], seed: int) -> Judge:
 
 
 def _learnt(system: System, without: Sequence[str], seed: int) -> Judge:
-    from evofsm.guard import learnt_guard  # type: ignore[attr-defined]
+    from evofsm.guard import learnt_guard
 
     told: dict[str, Any] = {} if system.horizon is None else {"horizon": system.horizon}
     guard: Judge = learnt_guard(

@@ -14,7 +14,9 @@ _Floats = NDArray[np.float64]
 _LINEAR, _MUTANTS, _OF_BEST = 3, 40, 0.8
 # A mutant differs in this share of its numbers, by a size of 10 to a power between these.
 _CHANGED, _SIZES = 0.6, (-1.5, 0.7)
-# Digits of actions that units and directions of theirs do not change by rounding.
+# By so much less a linear policy wants the next of the choices.
+_PREFERRED = 1e-9
+# Digits of actions and scores: what differs by rounding alone is equal, in whatever units it comes.
 _ROUNDED = 9
 # Boxes of more dimensions have an action along each axis, not one in each corner.
 _MOST_CORNERS = 3
@@ -60,6 +62,8 @@ class Backups:
         self.n_constant = len(constants)
         self.policies = np.zeros((len(constants) + (_LINEAR if evolving else 0), a, 1 + m))
         self.policies[: len(constants), :, 0] = constants * self.turns
+        if choices:  # of equals the first in that order, whatever its index
+            self.policies[:, self.actions, 0] -= _PREFERRED * np.arange(a)
         self.scores = np.full(len(self.policies), -np.inf)
         #: Of the policies, best first.
         self.ranks = np.arange(len(self.policies))
@@ -68,14 +72,14 @@ class Backups:
         """Score all by ``value``, and put mutants that are better in the place of linear ones."""
         scores = self.scores
         for q, policy in enumerate(self.policies):
-            scores[q] = value(policy)
+            scores[q] = round(value(policy), _ROUNDED)
         linear = np.arange(self.n_constant, len(self.policies))
         for _ in range(_MUTANTS if len(linear) else 0):
             parent = linear[scores[linear].argmax()]
             if random.random() >= _OF_BEST:
                 parent = self.ranks[int(random.integers(len(self.policies)))]
             child = self.policies[parent] + self._mutation(random)
-            reached, worst = value(child), linear[scores[linear].argmin()]
+            reached, worst = round(value(child), _ROUNDED), linear[scores[linear].argmin()]
             if reached > scores[worst]:
                 self.policies[worst], scores[worst] = child, reached
         # Of equals the one that came first.
@@ -87,7 +91,8 @@ class Backups:
         drawn = (random.random(shape) < _CHANGED) * size * random.standard_normal(shape)
         put: _Floats = np.empty_like(drawn)
         put[np.ix_(self.actions, np.append(0, 1 + self.variables))] = drawn
-        return put * np.append(1.0, self.flips) * self.turns[:, None]
+        put *= np.append(1.0, self.flips) * self.turns[:, None]
+        return put
 
 
 def _order(rows: _Floats) -> NDArray[np.int64]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from evofsm.core import Disturbances, Here
 from evofsm.files import ranges
 from evofsm.guard.learnt.backups import Backups
+from evofsm.guard.learnt.remembering import Situations
 
-if TYPE_CHECKING:
-    from evofsm.guard.learnt.risk import LearntRisk
-
+# Names of the arrays of situations.
+_SITUATIONS = ("situations", "changes", "actions_before")
 _SOME = ranges.Range(-math.inf, math.inf)
 _SHAPES: dict[str, tuple[int | str, ...]] = {
     "residuals": ("k", "h", "m"),
@@ -33,7 +33,8 @@ _SHAPES: dict[str, tuple[int | str, ...]] = {
     "actions": ("c",),
     "turns": ("c",),
 }
-_NUMBERS = ("margin", "broken", "horizon", "n_studied", "n_scanned")
+#: Attributes of the judge that are numbers, which it goes on with.
+NUMBERS = ("margin", "broken", "horizon", "takes", "n_studied", "n_scanned")
 KIND = ranges.register(
     ranges.Kind(
         "learntrisk",
@@ -51,19 +52,25 @@ KIND = ranges.register(
 )
 
 
-def content_of(judge: LearntRisk) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
-    """Settings and counts, and arrays; empty ones stand for what was not learnt yet."""
-    backups, disturbances = judge.backups, judge.disturbances
+class Kept(NamedTuple):
+    """What the judge learnt, but for its numbers; None where that is nothing yet."""
+
+    situations: Situations
+    backups: Backups | None
+    disturbances: Disturbances | None
+
+
+def arrays_of(kept: Kept) -> dict[str, NDArray[Any]]:
+    """All of it as arrays; empty ones stand for what was not learnt yet."""
     arrays: dict[str, NDArray[Any]] = {
         name: np.zeros([n if isinstance(n, int) else 0 for n in shape])
         for name, shape in _SHAPES.items()
     }
-    if disturbances is not None:
-        arrays |= disturbances._asdict()
-    if len(judge.situations):
-        named = ("situations", "changes", "actions_before")
-        arrays |= dict(zip(named, judge.situations.arrays(), strict=True))
-    if backups is not None:
+    if kept.disturbances is not None:
+        arrays |= kept.disturbances._asdict()
+    if len(kept.situations):
+        arrays |= dict(zip(_SITUATIONS, kept.situations.arrays(), strict=True))
+    if (backups := kept.backups) is not None:
         arrays |= {
             "policies": backups.policies,
             "scores": backups.scores,
@@ -72,30 +79,24 @@ def content_of(judge: LearntRisk) -> tuple[dict[str, Any], dict[str, NDArray[Any
             "actions": backups.actions.astype(np.float64),
             "turns": backups.turns,
         }
-    content = {name: getattr(judge, name) for name in ("dt", "seed", "told_horizon", *_NUMBERS)}
-    content |= {"without": sorted(judge.without), "takes": judge._takes}
-    content |= {"names": list(judge.labels.names), "units": list(judge.labels.units)}
-    return content | {"n_constant": 0 if backups is None else backups.n_constant}, arrays
+    return arrays
 
 
-def restore(judge: LearntRisk, content: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> None:
-    """Give a new judge what was learnt.
+def restored(n_constant: int, arrays: dict[str, NDArray[Any]]) -> Kept:
+    """What such arrays hold, with so many constant backups.
 
     Raises
     ------
     ValueError
         If arrays contradict each other.
     """
-    judge._takes = content["takes"]
-    for name in _NUMBERS:
-        setattr(judge, name, content[name])
+    situations, disturbances = Situations(), None
     if len(arrays["residuals"]):
-        judge.disturbances = Disturbances(*(arrays[name] for name in Disturbances._fields))
-    named = ("situations", "changes", "actions_before")
-    for row in zip(*(arrays[name] for name in named), strict=True):
-        judge.situations.kept.append(Here(*(np.array(part) for part in row)))
-    if len(arrays["policies"]):
-        judge.backups = _backups(int(content["n_constant"]), arrays)
+        disturbances = Disturbances(*(arrays[name] for name in Disturbances._fields))
+    for row in zip(*(arrays[name] for name in _SITUATIONS), strict=True):
+        situations.kept.append(Here(*(np.array(part) for part in row)))
+    backups = _backups(n_constant, arrays) if len(arrays["policies"]) else None
+    return Kept(situations, backups, disturbances)
 
 
 def _backups(n_constant: int, arrays: dict[str, NDArray[Any]]) -> Backups:

@@ -48,7 +48,7 @@ class Situations:
         horizon: int,
         random: np.random.Generator,
     ) -> None:
-        """Keep one situation of an episode, a tight one if there was any, and some before failure."""
+        """Keep one situation of an episode, a tight one, and some before failure."""
         Z, U = episode.observations, episode.actions
         T = len(U)
         steps = list(random.integers(1, T, 1))
@@ -83,13 +83,13 @@ class Situations:
             steps = np.sort(random.permutation(n)[:_MOST_STARTS])
         rest = np.vstack([episode.residuals, np.zeros((horizon, dynamics.n_variables))])
         begun = undisturbed(len(steps), dynamics, horizon)
-        for row, t in zip(begun.residuals, steps, strict=True):
-            row[:] = rest[t : t + horizon]
+        for row, begin in zip(begun.residuals, steps, strict=True):
+            row[:] = rest[begin : begin + horizon]
         found = np.empty((len(steps), len(safe)))
         harm(known, *self.arrays(safe), policies, begun, 1.0, found)
         taken, starts = dynamics.onsets(episode.residuals), list[int]()
-        for column in found.T:
-            t = int(steps[column.argmin()])
+        for worst in found.argmin(0).tolist():
+            t = int(steps[worst])
             if all(abs(t - other) > _APART for other in [*starts, *taken]):
                 starts.append(t)
         dynamics.remember(starts)

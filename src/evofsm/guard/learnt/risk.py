@@ -30,7 +30,7 @@ from evofsm.files import Place, storage
 from evofsm.guard.learnt import words
 from evofsm.guard.learnt.actions import LONGEST_STRETCH
 from evofsm.guard.learnt.backups import Backups
-from evofsm.guard.learnt.keeping import KIND, content_of, restore
+from evofsm.guard.learnt.keeping import KIND, NUMBERS, Kept, arrays_of, restored
 from evofsm.guard.learnt.remembering import Situations, choose, failing_after
 from evofsm.guard.learnt.search import CHANGED, KEPT, NOTHING_PASSES, escapes, search, worth
 from evofsm.guard.learnt.words import Remembered
@@ -101,6 +101,18 @@ class LearntRisk:
     LearntRisk(dt=0.02, seed=0)
     """
 
+    # Of the present episode.
+    _z: _Floats | None  # latest observation, with what was missing filled in
+    _change: _Floats
+    _action: _Floats
+    _certified: bool  # whether at the decision before some backup survived all
+    _holds: bool  # and at this one
+    _tight: bool  # whether the latest proposal was refused
+    _tights: list[bool]
+    _lost: int
+    _ranks: NDArray[np.int64]  # of backups, those first that passed last
+    _order: NDArray[np.int64]  # of disturbances, those first that were lost last
+
     def __init__(
         self,
         dt: float,
@@ -129,7 +141,8 @@ class LearntRisk:
         self.broken = 0
         self.n_studied = 0
         self.n_scanned = 0
-        self._takes = _HORIZON / _AHEAD
+        #: Steps that it takes to fail at the latest, where that cannot be avoided.
+        self.takes = _HORIZON / _AHEAD
         self.situations = Situations()
         self.backups: Backups | None = None
         self.disturbances: Disturbances | None = None
@@ -423,10 +436,10 @@ class LearntRisk:
         self.start_episode()
 
     def _forget(self) -> None:
-        self._z: _Floats | None = None
+        self._z = None
         self._change = self._action = np.zeros(0)
         self._certified = self._holds = self._tight = False
-        self._tights: list[bool] = []
+        self._tights = []
         self._lost = 0
         self._ranks = np.zeros(0, int) if self.backups is None else self.backups.ranks.copy()
         count = 0 if self.disturbances is None else len(self.disturbances.residuals)
@@ -469,11 +482,12 @@ class LearntRisk:
         assert self.disturbances is not None
         if len(self.dynamics.consequents.sides):
             after = failing_after(self.dynamics, self.situations, policies, self.disturbances)
-            self._takes = max(float(after), _LATEST * self._takes)
-            self.horizon = int(min(max(_AHEAD * self._takes, _SHORTEST), _FARTHEST))
+            self.takes = max(float(after), _LATEST * self.takes)
+            self.horizon = int(min(max(_AHEAD * self.takes, _SHORTEST), _FARTHEST))
 
     def _evolve(self, random: np.random.Generator) -> None:
-        assert self.disturbances is not None and self.backups is not None
+        assert self.disturbances is not None
+        assert self.backups is not None
         count = len(self.disturbances.residuals)
         which = np.arange(count)
         if count > 1 + _TRIED_ON:
@@ -508,7 +522,12 @@ class LearntRisk:
         OSError
             If it cannot be written.
         """
-        storage.write(path, KIND.name, *content_of(self), provenance)
+        content = {name: getattr(self, name) for name in ("dt", "seed", "told_horizon", *NUMBERS)}
+        content |= {"without": sorted(self.without)}
+        content |= {"names": list(self.labels.names), "units": list(self.labels.units)}
+        content |= {"n_constant": 0 if self.backups is None else self.backups.n_constant}
+        arrays = arrays_of(Kept(self.situations, self.backups, self.disturbances))
+        storage.write(path, KIND.name, content, arrays, provenance)
 
     @classmethod
     def load(cls, path: Place) -> Self:
@@ -525,7 +544,10 @@ class LearntRisk:
         with storage.explained(path):
             told = {name: content[name] for name in ("seed", "without", "names", "units")}
             judge = cls(content["dt"], horizon=content["told_horizon"], **told)
-            restore(judge, content, arrays)
+            kept = restored(int(content["n_constant"]), arrays)
+        for name in NUMBERS:
+            setattr(judge, name, content[name])
+        judge.situations, judge.backups, judge.disturbances = kept
         judge._forget()
         return judge
 

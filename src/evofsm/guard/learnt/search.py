@@ -29,6 +29,8 @@ KEPT, CHANGED, NOTHING_PASSES = 0, 1, 2
 
 # Halvings between a proposal and an action that passes.
 _HALVINGS = 4
+# Of two that last as long up to so much the first is taken.
+_EQUAL = 1e-9
 # What the least distance counts beside the time survived.
 _DISTANCE, _FAR = 0.05, 0.05
 
@@ -122,7 +124,7 @@ def search(
         for k in range(len(order)):
             total += lasting(known, here, nothing, policies[q], disturbances, k, harder, room)
         shortest = min(shortest, total)
-        if total > longest:
+        if total > longest + _EQUAL:
             longest, which = total, q
             follow_policy(known, policies[q], here.z, best)
     return NOTHING_PASSES, which, (longest - shortest) / (abs(longest) + 1e-12)
@@ -142,7 +144,8 @@ def lasting(
     """Share of the horizon that is survived, and a little for the least distance to failure."""
     steps = disturbances.residuals.shape[1]
     survived, least = replay(known, here, action, policy, disturbances, k, harder, 0.0, room)
-    return survived / steps + _DISTANCE * min(1.0, max(-1.0, _FAR * least))
+    share: float = survived / steps
+    return share + _DISTANCE * min(1.0, max(-1.0, _FAR * least))
 
 
 @compiled

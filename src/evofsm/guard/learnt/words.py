@@ -27,22 +27,22 @@ class Remembered(NamedTuple):
     10 disturbances remembered from 305 s | 1 disturbance remembered from 12 s | what 4.2 s brought
     """
 
-    count: int
+    number: int
     seconds: float  #: of observation that they come from
 
     def __str__(self) -> str:
         time = f"{self.seconds:,.0f} s" if self.seconds >= 10.0 else f"{self.seconds:.1f} s"
-        if not self.count:
+        if not self.number:
             return f"what {time} brought"
-        return f"{self.count} disturbance{'s' * (self.count != 1)} remembered from {time}"
+        return f"{self.number} disturbance{'s' * (self.number != 1)} remembered from {time}"
 
     def but(self, spared: int) -> str:
         """All of them, but those that need not be survived."""
-        if self.count == 0:
+        if self.number == 0:
             return str(self)
         if spared:
             return f"all but at most {spared} of the {self}"
-        return f"{'all' if self.count > 1 else 'the'} {self}"
+        return f"{'all' if self.number > 1 else 'the'} {self}"
 
 
 def kept(backup: str, remembered: Remembered, left: float, spared: int = 0) -> str:
@@ -89,7 +89,7 @@ changes'
     if lost == 0:
         what = f"no backup survives {remembered.but(spared)} by the margin of {changes(margin)}"
         return what if harder < _HARDER else f"{what}, were they {harder:.2g} times as hard"
-    if lost < remembered.count:
+    if lost < remembered.number:
         return f"no backup survives {lost} of the {remembered}"
     return f"no backup survives {'any of ' if lost > 1 else ''}the {remembered}"
 
@@ -103,8 +103,8 @@ def changed(backup: str, remembered: Remembered, margin: float, spared: int = 0)
     'the closest action after which feedback 2 survives all of them, by 0.4 ordinary changes or \
 more'
     """
-    them = "all of them" if remembered.count > 1 else "it"
-    if spared and remembered.count > 1:
+    them = "all of them" if remembered.number > 1 else "it"
+    if spared and remembered.number > 1:
         them = f"all but at most {spared} of them"
     return f"the closest action after which {backup} survives {them}, by {changes(margin)} or more"
 

@@ -15,7 +15,8 @@ _EQUAL, _HARDLY = 0.5, 0.3
 class Told(NamedTuple):
     """A story as it is read."""
 
-    status: str  #: ``unjudged``, ``safe``, ``averted``, ``danger``, ``dead end``, ``collision`` or ``ended``
+    #: ``unjudged``, ``safe``, ``averted``, ``danger``, ``dead end``, ``collision`` or ``ended``
+    status: str
     headline: str
     when: str
     why: str
