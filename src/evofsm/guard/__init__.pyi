@@ -22,6 +22,7 @@ from .gym import RevisedActions as RevisedActions
 from .gym import RevisedVectorActions as RevisedVectorActions
 from .learnt.risk import JUDGE_PARTS as JUDGE_PARTS
 from .learnt.risk import LearntRisk as LearntRisk
+from .learnt.risk import Outlook as Outlook
 from .protocols import ActionJudge as ActionJudge
 from .protocols import AsksMachine as AsksMachine
 from .protocols import Controller as Controller

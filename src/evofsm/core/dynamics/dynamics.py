@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple, Self, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -455,7 +455,7 @@ class Dynamics:
         before, after = max(i - 1, 0), i + 1 if last else i + 2
         jumped = self._jumped
         if learn_latest(
-            self.sums.counts.base,
+            cast(_Floats, self.sums.counts.base),
             self._packed,
             self.choices,
             *(Z[before], Z[i], Z[i + 1], Z[after]),

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 import operator
 from collections.abc import Mapping, Sequence
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -53,6 +53,19 @@ _CAUTION = 4.0
 _HORIZON, _SHORTEST, _FARTHEST, _AHEAD, _LATEST = 64, 32, LONGEST_STRETCH, 1.5, 0.9
 # Backups closer than this are alike; an action that was used less often is tried.
 _ALIKE, _TRIES = 0.02, 8
+
+
+class Outlook(NamedTuple):
+    """How it stands somewhere, if the best backup is followed from now on."""
+
+    dead_end: bool  #: no known backup survives it, even if nothing disturbs it
+    lost: int  #: remembered disturbances that no backup survives
+    remembered: int  #: disturbances that were tried
+    margin: float  #: escape margin: distance to failure under the worst of them [ordinary changes]
+    #: probability, with its 90 % interval, that within the horizon one begins that is lost
+    risk: tuple[float, float, float]
+    #: how often such begin [1/h], with its 90 % interval
+    per_hour: tuple[float, float, float]
 
 
 class LearntRisk:
@@ -262,13 +275,16 @@ class LearntRisk:
             self._holds = again[0] != NOTHING_PASSES
         then = self._backup_text(backup)
         if how == KEPT:
-            judged = self._judgement(np.zeros(1), np.full(1, left), situation)
+            judged = self._judged(situation, here, proposal[None], left if not allowed else None)
             return Search(one, judged, 0, words.kept(then, self.remembered, left, allowed))
         if tried is not None:
             best = tried
         action = np.reshape(dynamics.decode(best), np.shape(wanted))
         judged = self._judged(
-            situation, here, np.stack([proposal, best]), left if how == CHANGED else None
+            situation,
+            here,
+            np.stack([proposal, best]),
+            left if how == CHANGED and not allowed else None,
         )
         if tried is not None:
             instead = words.tried()
@@ -293,10 +309,76 @@ class LearntRisk:
             NaN as long as nothing can be said.
         """
         given, here = np.asarray(actions, np.float64), self._here(situation)
-        if here is None or self.disturbances is None or not len(self.dynamics.consequents.sides):
+        if here is None or self.disturbances is None or not self._fails:
             return _unjudged(len(given))
         inner = np.array([self.dynamics.encode(one) for one in given])
         return self._judged(situation, here, inner)
+
+    def assess(self, observation: ArrayLike, change: ArrayLike | None = None) -> Outlook:
+        """How it stands somewhere if the best backup is followed from now on.
+
+        Parameters
+        ----------
+        observation : (m,) array_like
+        change : (m,) array_like, optional
+            Since the observation before; without it nothing moved.
+
+        Returns
+        -------
+        Outlook
+
+        Raises
+        ------
+        ValueError
+            If no failure is known yet, or an array is of another length than observations.
+
+        Examples
+        --------
+        A point that coasts to a wall at 1, and may push back in time:
+
+        >>> from evofsm.guard import Guard
+        >>> guard = Guard(low=-1.0, high=1.0, interval=0.1)
+        >>> for episode in range(8):
+        ...     x, v = -1.0, 0.0
+        ...     for t in range(60):
+        ...         u = guard.decide([x, v], proposal=1.0).executed
+        ...         x, v = x + 0.1 * v, v + 0.1 * u
+        ...         if x >= 1.0:
+        ...             break
+        ...     guard.end(failed=x >= 1.0, observation=[x, v])
+        >>> guard.judge.assess([-1.0, 0.0]).dead_end, guard.judge.assess([0.7, 2.0]).dead_end
+        (False, True)
+        """
+        dynamics = self.dynamics
+        if self.disturbances is None or self.backups is None or not self._fails:
+            raise ValueError("no failure is known yet: there is nothing to judge by")
+        z = np.asarray(observation, np.float64)
+        moved = np.zeros_like(z) if change is None else np.asarray(change, np.float64)
+        if not z.shape == moved.shape == (dynamics.n_variables,):
+            raise ValueError(
+                f"observation and change have shapes {z.shape} and {moved.shape}; both must be "
+                f"({dynamics.n_variables},)"
+            )
+        found = np.empty(len(self.disturbances.residuals))
+        world = (self.backups.policies, self.backups.ranks, self.disturbances, found)
+        here = Here(z, moved, np.zeros(dynamics.size))
+        escapes(dynamics.consequents, here, np.empty(0), *world)
+        lost = math.inf if found[0] < 0.0 else int(np.count_nonzero(found < 0.0))
+        hours = self.exposure / 3600.0
+        count = len(found) - 1 if math.isinf(lost) else int(lost)
+        low, high = poisson_bounds(count)
+        return Outlook(
+            dead_end=bool(found[0] < 0.0),
+            lost=count,
+            remembered=self.remembered.number,
+            margin=float(found.min()),
+            risk=self._risk(lost),
+            per_hour=(count / hours, low / hours, high / hours),
+        )
+
+    @property
+    def _fails(self) -> bool:
+        return self.dynamics.n_variables > 0 and len(self.dynamics.consequents.sides) > 0
 
     def why(self, judged: Judgement) -> str:
         """Why the first action that was judged is dangerous, in a few words."""

@@ -160,9 +160,10 @@ def escapes(
 ) -> None:
     """For each disturbance the least distance to failure under the backup that escapes it best.
 
-    Disturbances are taken as they were. Where none escapes, the steps left as it fails, negative.
+    Disturbances are taken as they were; where ``action`` is empty, the backup begins. Where none
+    escapes, the steps left as it fails, negative.
     """
-    room = scratch(len(here.z), len(action), known.weights.shape[0])
+    room = scratch(len(here.z), policies.shape[1], known.weights.shape[0])
     steps = disturbances.residuals.shape[1]
     for k in range(len(found)):
         found[k] = -np.inf
