@@ -27,6 +27,7 @@ from evofsm.evidence.closed_loop.beside import (
     run_two_worlds,
 )
 from evofsm.evidence.closed_loop.calibration import reliability, run_calibration
+from evofsm.evidence.closed_loop.machine import MACHINE, run_machine_shift
 from evofsm.evidence.closed_loop.plan import Plan
 from evofsm.evidence.closed_loop.study import run_closed_loop
 from evofsm.evidence.scores import auroc
@@ -43,6 +44,7 @@ TINY = Plan(
     side_train=10,
     side_test=10,
     world_test=2,
+    machine_checks=4,
 )
 
 
@@ -63,6 +65,38 @@ def test_the_unrevised_driver_collides_and_ours_does_not(study):
     assert [row.learning_seed for row in ours] == [0, 1]
     assert all(row.collisions == 0 and row.mobility > 0.6 for row in ours)
     assert all(row.train_collisions == 0 for row in ours)
+
+
+@pytest.mark.slow
+def test_the_machine_learns_from_the_same_draws_and_is_tried_on_the_same_ones(study):
+    machine = rows_of(study, MACHINE)
+    assert [row.learning_seed for row in machine] == [0, 1]
+    told = rows_of(study, "evofsm")
+    assert {row.episodes for row in machine} == {row.episodes for row in told} == {20}
+    assert {row.train_episodes for row in machine} == {10}
+    # It knows of no collision before the first, and the driver alone has hardly an episode without.
+    assert all(1 <= row.train_collisions <= 7 for row in machine)
+    assert all(row.collisions <= 2 and row.mobility > 0.5 for row in machine)
+    curve = [point for point in study.curve if point.policy == MACHINE]
+    assert {point.episodes for point in curve} == {0, 2, 5, 10}
+    assert all(point.collisions >= 3 for point in curve if point.episodes == 0)
+    documents = [row for row in study.as_dict()["rows"] if row["policy"] == MACHINE]
+    assert {row["told"] for row in documents} == {"nothing but failures"}
+
+
+@pytest.mark.slow
+def test_the_machine_goes_on_learning_after_a_shift():
+    plan = Plan(shift=ShiftPlan(before=8, after=11, held_out=6))
+    found = run_machine_shift(load_family("shift_leader"), plan, seed=0)
+    (stream,) = found["streams"]
+    assert (stream.policy, len(stream.collided)) == (MACHINE, 19)
+    assert [check.episodes_after for check in found["checks"]] == [-1, 0, 10]
+    assert {check.held_out for check in found["checks"]} == {6}
+
+
+def test_without_training_there_is_no_row_of_the_machine():
+    none = replace(TINY, seeds=1, rule_seeds=0, test=3, train=1, machine_train=0, side_test=4)
+    assert not rows_of(run_closed_loop(EMERGENCY, none, workers=2), MACHINE)
 
 
 def test_every_baseline_stands_in_the_table_once(study):

@@ -27,9 +27,11 @@ from evofsm.evidence.closed_loop.chapter import (
 )
 from evofsm.evidence.closed_loop.comparison import chosen, front, our_lines, ours
 from evofsm.evidence.closed_loop.losses import losses
+from evofsm.evidence.closed_loop.machine import MACHINE
 from evofsm.evidence.closed_loop.over_seeds import along_stream
 from evofsm.evidence.closed_loop.plan import Plan
-from evofsm.evidence.closed_loop.study import ClosedLoop, Point, TradeOff
+from evofsm.evidence.closed_loop.stages import Point
+from evofsm.evidence.closed_loop.study import ClosedLoop, TradeOff
 from evofsm.evidence.closed_loop.tables import side_tables, why_not_by_state
 from evofsm.evidence.report.chapter import write_chapters
 
@@ -189,10 +191,12 @@ def test_every_number_of_the_table_is_there_with_what_its_policy_was_told(
         )
         assert line.replace(" -", " −") in text
     assert (
-        "▸ evofsm, 50 episodes learnt online, median over 3 6.5 % (5.2–8.2) 13 of 200 0.899 "
+        "▸ evofsm, 50 episodes learnt online, median over 3 told: how cars follow each other "
+        "6.5 % (5.2–8.2) 13 of 200 0.899 "
         "0.895–0.904 20.0 % 0.50 1.50 10 8 of 50"
     ) in text
-    assert "learnt online, worst seed of 3 11.0 % (9.7–12.7) 22 of 200 0.898" in text
+    worst = "learnt online, worst seed of 3 told: how cars follow each other 11.0 % (9.7–12.7) 22"
+    assert worst in text
     for table in side_tables(study).values():
         assert table.title in text
         assert table.note in text
@@ -383,3 +387,106 @@ def test_no_setting_of_the_front_is_beaten_on_both_axes() -> None:
     beaten = TradeOff("x", "", 0.2, 0.7)
     assert front([safe, beaten, bold, good]) == [bold, good, safe]
     assert chosen([beaten, safe, bold]) == safe
+
+
+# -- The machine that was told nothing but failures -----------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def beside(study: ClosedLoop) -> ClosedLoop:
+    """The same with rows of the machine, which is worse but not by much."""
+    machine = {"policy": MACHINE, "mobility": 0.88, "train_collisions": 3, "train_episodes": 40}
+    rows = [replace(_learnt(seed, 40, seed), **machine) for seed in range(3)]
+    curve = [
+        Point(seed, k, 10 - 5 * (k > 2) - 5 * (k > 10), 10, 0.8, 5, min(k, 3), MACHINE)
+        for seed in range(3)
+        for k in (0, 10, 30, 40)
+    ]
+    return replace(
+        study,
+        rows=[*study.rows, *rows],
+        curve=[*study.curve, *curve],
+        streams=[*study.streams, Stream(MACHINE, 0, (False,) * 20 + (True,) * 10)],
+        checks=[
+            *study.checks,
+            *(Check(MACHINE, 0, after, hit, 25) for after, hit in ((-1, 0), (0, 9), (10, 1))),
+            Check("evofsm", 0, 10, 0, 50),
+        ],
+    )
+
+
+def test_what_each_of_ours_was_told_stands_beside_it(beside: ClosedLoop, page_of) -> None:
+    text = page_of(beside).text
+    for name, told in (("evofsm", "how cars follow each other"), (MACHINE, "nothing but failures")):
+        assert re.search(
+            rf"▸ {name}, \d+ episodes learnt online, median over 3 told: {told} ", text
+        )
+    assert {(row["policy"], row["told"]) for row in beside.as_dict()["rows"]} >= {
+        ("evofsm", "how cars follow each other"),
+        (MACHINE, "nothing but failures"),
+        ("rss-matched", "told the true limits"),
+    }
+    assert answer(beside)[3] == (
+        "Told nothing but failures, not how cars follow each other, evofsm-machine collides in "
+        "0.5 % of 200 held-out episodes (worst of 3 learning seeds 1.0 %) at mobility 0.880, after "
+        "40 training episodes in which 3 collided (median; at most 3)."
+    )
+
+
+def test_the_machine_is_no_rival_of_ours_and_changes_none_of_its_lines(
+    study: ClosedLoop, beside: ClosedLoop
+) -> None:
+    assert our_lines(beside) == our_lines(study)
+    assert answer(beside)[:3] == answer(study)
+    assert headline(beside) == headline(study)
+    more = [one.what for one in losses(beside) if one not in losses(study)]
+    assert more == [
+        "collisions of evofsm-machine, median",
+        "collisions of evofsm-machine, worst seed",
+        "mobility of evofsm-machine",
+    ]
+
+
+def test_its_learning_and_its_shift_stand_in_tables_and_figures_of_their_own(
+    study: ClosedLoop, beside: ClosedLoop, tmp_path: Path
+) -> None:
+    tables, before = side_tables(beside), side_tables(study)
+    assert set(tables) == {*before, "machine"}
+    assert tables["learning"] == before["learning"]
+    assert [row[0] for row in tables["machine"].rows] == ["0", "10", "30", "40"]
+    assert "nothing but failures" in tables["machine"].note
+    shift = tables["shift"]
+    assert "25 held-out episodes each, 1 learning seed" in shift.note
+    assert {row[0]: row[3] for row in shift.rows}["10 episodes after the shift"] == "4.0"
+    assert {row[0]: row[3] for row in shift.rows}["5 episodes after the shift"] == "–"
+    assert {one.policy for one in along_stream(beside)} == {"evofsm", MACHINE, "rss-unchanged"}
+    closed_loop_chapter(beside).drawn(tmp_path)
+    assert (tmp_path / "stream.png").stat().st_size > 10_000
+
+
+def test_what_was_asked_of_it_is_asked_of_the_family_that_is_driven(beside: ClosedLoop) -> None:
+    def claims(study):
+        return {
+            one.claim.removeprefix(f"{MACHINE}: "): (one.asked, one.measured, one.met)
+            for one in what_was_asked(study)
+            if one.claim.startswith(MACHINE)
+        }
+
+    late = "collisions 10 episodes after the shift, median seed"
+    assert claims(beside) == {late: ("≤ 1.0 %", "4.0 %", False)}
+    still = replace(beside, family=load_family("emergency"), checks=[])
+    assert claims(still) == {
+        "collisions, worst seed": ("≤ 0.5 %", "1.0 %", False),
+        "mobility, median seed": ("≥ 0.910", "0.880", False),
+        "mobility, worst seed": ("≥ 0.890", "0.880", False),
+        "collisions while learning, worst seed": ("≤ 6", "3", True),
+        "those from episode 31 on, worst seed": ("≤ 1", "0", True),
+    }
+    noisy = replace(still, plan=replace(still.plan, switches="noise"))
+    assert claims(noisy) == {
+        "collisions with noise, median seed": ("≤ 1.0 %", "0.5 %", True),
+        "mobility with noise, median seed": ("≥ 0.850", "0.880", True),
+    }
+    rare = claims(replace(still, family=load_family("rare")))
+    assert rare["collisions, median seed"] == ("≤ 1.0 %", "0.5 %", True)
+    assert rare["mobility, median seed"] == ("≥ 0.849", "0.880", True)

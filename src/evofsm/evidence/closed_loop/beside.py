@@ -224,15 +224,15 @@ def run_shift(family: Family, plan: Amounts, learning_seed: int) -> dict[str, li
         held_out(now, plan.seed, plan.shift.held_out) for now in (family, shifted)
     )
     checks = [
-        _check("rss-unchanged", learning_seed, -1, unchanged, held),
-        _check("rss-unchanged", learning_seed, after, unchanged, held_shifted),
+        check("rss-unchanged", learning_seed, -1, unchanged, held),
+        check("rss-unchanged", learning_seed, after, unchanged, held_shifted),
     ]
     collided = []
     for place, draw in enumerate(stream, -before):
         if place == 0:
-            checks.append(_check("evofsm", learning_seed, -1, guard, held))
+            checks.append(check("evofsm", learning_seed, -1, guard, held))
         if place in AFTER:
-            checks.append(_check("evofsm", learning_seed, place, guard, held_shifted))
+            checks.append(check("evofsm", learning_seed, place, guard, held_shifted))
         collided.append(drive(guard, draw).episode.collided)
     theirs = tuple(one.episode.collided for one in teach(unchanged, stream))
     return {
@@ -244,7 +244,7 @@ def run_shift(family: Family, plan: Amounts, learning_seed: int) -> dict[str, li
     }
 
 
-def _check(policy: str, seed: int, after: int, guard: Guard, draws: Sequence[Draw]) -> Check:
-    """Drive held-out draws with what was learnt so far."""
+def check(policy: str, seed: int, after: int, guard: Guard, draws: Sequence[Draw]) -> Check:
+    """Drive held-out draws with what was learnt so far, learning frozen."""
     drives = teach(frozen(guard), draws)
     return Check(policy, seed, after, sum(one.episode.collided for one in drives), len(drives))

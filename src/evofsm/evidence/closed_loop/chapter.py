@@ -16,14 +16,17 @@ from evofsm.evidence.closed_loop.comparison import (
 )
 from evofsm.evidence.closed_loop.figures import sketches
 from evofsm.evidence.closed_loop.losses import RECOVERED_AFTER, Loss, losses
+from evofsm.evidence.closed_loop.machine import MACHINE
 from evofsm.evidence.closed_loop.over_seeds import around_shift
-from evofsm.evidence.closed_loop.study import SAFE_RATE, ClosedLoop
+from evofsm.evidence.closed_loop.stages import SAFE_RATE
+from evofsm.evidence.closed_loop.study import ClosedLoop
 from evofsm.evidence.closed_loop.tables import (
     policy_table,
     side_tables,
     table_of_names,
     why_not_by_state,
 )
+from evofsm.evidence.closed_loop.targets import machine_claims
 from evofsm.evidence.report.asked import Asked, failures, tables_of_asked
 from evofsm.evidence.report.chapter import Chapter, Section
 from evofsm.evidence.report.drawing import Sketch
@@ -41,8 +44,9 @@ def closed_loop_chapter(study: ClosedLoop) -> Chapter:
         id=study.plan.id,
         title=study.plan.question,
         about="A controller proposes an action at every decision; a reviser may execute a more "
-        "careful one. Ours asks how probable a failure still is if this action is taken now and "
-        "caution follows, and it has learnt that answer from driving alone. It accepts a risk of "
+        "careful one. Ours is told how cars follow each other: it asks how probable a failure "
+        "still is if this action is taken now and caution follows, and it has learnt that answer "
+        "from driving alone. It accepts a risk of "
         f"{percent(study.plan.tolerance)}. Held against it stand fixed constants from the "
         "literature and from regulation, measures that were tuned on the same training scenarios, "
         f"and one that was told the true limits. Family {study.family.name}: {study.family.about}",
@@ -73,7 +77,7 @@ def headline(study: ClosedLoop) -> str:
 
 
 def answer(study: ClosedLoop) -> list[str]:
-    """Three sentences: what it does, what that costs, and who does better."""
+    """What it does, what that costs, who does better, and what becomes of it told less."""
     mine, worst, alone = ours(study), ours(study, "worst seed"), unrevised(study)
     if mine is None or worst is None:
         return ["The study has no row of a policy that learnt online."]
@@ -93,7 +97,22 @@ def answer(study: ClosedLoop) -> list[str]:
         f"{percent(mine.intervention_rate)} of the decisions, which are changed, and "
         f"{count(mine.train_collisions)} collisions while learning (medians)."
     )
-    return [does, costs, _who_does_better(study, mine)]
+    return [does, costs, _who_does_better(study, mine), *_told_less(study)]
+
+
+def _told_less(study: ClosedLoop) -> Iterator[str]:
+    """What the machine by itself comes to."""
+    machine, worst = ours(study, policy=MACHINE), ours(study, "worst seed", MACHINE)
+    if machine is None or worst is None:
+        return
+    hit = max(row.train_collisions for row in study.rows if row.policy == MACHINE)
+    yield (
+        f"Told {machine.told}, not how cars follow each other, {MACHINE} collides in "
+        f"{percent(machine.collision_rate)} of {machine.episodes:,} held-out episodes "
+        f"(worst of {seeds_text(machine.seeds)} {percent(worst.collision_rate)}) at mobility "
+        f"{number(machine.mobility, 3)}, after {machine.train_episodes:,} training episodes in "
+        f"which {count(machine.train_collisions)} collided (median; at most {hit:,})."
+    )
 
 
 def _who_does_better(study: ClosedLoop, mine: Line) -> str:
@@ -123,7 +142,7 @@ def _who_does_better(study: ClosedLoop, mine: Line) -> str:
 
 def what_was_asked(study: ClosedLoop) -> list[Asked]:
     """What had to hold, as far as it was driven here."""
-    return [*_asked_of_the_table(study), *_asked_beside(study)]
+    return [*_asked_of_the_table(study), *_asked_beside(study), *machine_claims(study)]
 
 
 def _at_most(what: str, most: float, measured: float) -> Asked:
@@ -215,6 +234,7 @@ def _told(study: ClosedLoop) -> str:
 
 _TITLES = {
     "learning": ("Learning", "learning"),
+    "machine": ("Learning, told nothing but failures", ""),
     "shift": ("When the world shifts", "stream"),
     "calibration": ("Are the probabilities right?", "reliability"),
     "separation": ("Telling dead ends", ""),
@@ -234,6 +254,18 @@ def _sections(study: ClosedLoop, figures: dict[str, Sketch]) -> Iterator[Section
             yield Section(name, title, text, table, sketches=shown)
 
 
+def _plan_of_the_machine(study: ClosedLoop) -> str:
+    machine, plan = ours(study, policy=MACHINE), study.plan
+    if machine is None:
+        return ""
+    streams = len({one.learning_seed for one in study.streams if one.policy == MACHINE})
+    shifted = f"; around the shift {seeds_text(streams)}" if streams else ""
+    return (
+        f"{machine.train_episodes:,} training and {machine.episodes:,} held-out episodes, "
+        f"{plan.machine_checks:,} in tests on the way{shifted}"
+    )
+
+
 def _plan(study: ClosedLoop) -> Iterator[Setting]:
     plan, shift, actions = study.plan, study.plan.shift, study.family.actions
     told = {
@@ -241,6 +273,7 @@ def _plan(study: ClosedLoop) -> Iterator[Setting]:
         "learning seeds": f"{plan.seeds}, from 0",
         "training episodes": f"{plan.train:,} for each learning seed",
         "held-out episodes": f"{plan.test:,}; nothing learns from them",
+        MACHINE: _plan_of_the_machine(study),
         "tolerance": f"{plan.tolerance:g}",
         "studies beside": f"{plan.side_train:,} to learn, {plan.side_test:,} held out",
         "state rules": f"{plan.rule_seeds} seeds, {plan.rule_test:,} held out",

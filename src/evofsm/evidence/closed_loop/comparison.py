@@ -10,8 +10,9 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 
 from evofsm.driving import Group, Row
-from evofsm.evidence.closed_loop.over_seeds import gathered, learning_curve
-from evofsm.evidence.closed_loop.study import ClosedLoop, TradeOff
+from evofsm.evidence.closed_loop.machine import MACHINE
+from evofsm.evidence.closed_loop.over_seeds import OURS, gathered, learning_curve
+from evofsm.evidence.closed_loop.study import ClosedLoop, TradeOff, told
 
 UNREVISED = "unrevised"
 #: Numbers that are equal but for rounding.
@@ -48,6 +49,7 @@ class Line:
     rear_ends: float
     until_safe: float  #: infinite where never reached, NaN for what does not learn
     train_collisions: float  #: NaN for what does not learn
+    told: str  #: what it was told
 
     @property
     def is_ours(self) -> bool:
@@ -64,13 +66,14 @@ _MEASURED = (
 
 def table_groups(study: ClosedLoop) -> list[tuple[str, list[Line]]]:
     """The table's lines in their groups: bounds first, ours last."""
-    lines = gathered([*_baselines(study), *our_lines(study)], lambda line: line.group)
+    every = [*_baselines(study), *our_lines(study, MACHINE), *our_lines(study)]
+    lines = gathered(every, lambda line: line.group)
     return [(str(group), lines[group]) for group in Group if group in lines]
 
 
-def our_lines(study: ClosedLoop) -> list[Line]:
+def our_lines(study: ClosedLoop, policy: str = OURS) -> list[Line]:
     """Median and worst of the learning seeds, for each number of training episodes."""
-    learnt = (row for row in study.rows if row.group == Group.LEARNT)
+    learnt = (row for row in study.rows if row.policy == policy)
     lines = []
     for _, rows in sorted(gathered(learnt, lambda row: row.train_episodes).items()):
         worst = max(rows, key=safest_first)
@@ -78,9 +81,9 @@ def our_lines(study: ClosedLoop) -> list[Line]:
     return lines
 
 
-def ours(study: ClosedLoop, which: str = "median") -> Line | None:
-    """Ours after all training; None where nothing was learnt."""
-    lines = [line for line in our_lines(study) if line.which == which]
+def ours(study: ClosedLoop, which: str = "median", policy: str = OURS) -> Line | None:
+    """Ours after all training, unless another policy is named; None where nothing was learnt."""
+    lines = [line for line in our_lines(study, policy) if line.which == which]
     return lines[-1] if lines else None
 
 
@@ -104,6 +107,7 @@ def _line(rows: Sequence[Row], which: str = "", seeds: int = 0) -> Line:
         seeds,
         first.train_episodes,
         first.episodes,
+        told=told(first.policy, first.group),
         **{name: float(np.median(found)) for name, found in values.items()},
     )
 
@@ -116,7 +120,7 @@ def unrevised(study: ClosedLoop) -> Row | None:
 def never_safe(study: ClosedLoop, mine: Line) -> int:
     """How many learning seeds of all training were never as safe as is asked."""
     return sum(
-        row.group == Group.LEARNT
+        row.policy == mine.policy
         and row.train_episodes == mine.train_episodes
         and row.episodes_until_safe is None
         for row in study.rows

@@ -10,7 +10,7 @@ from itertools import cycle, pairwise
 import numpy as np
 
 from evofsm.app import percent
-from evofsm.driving import Group
+from evofsm.driving import TOLD, Group
 from evofsm.evidence.closed_loop.comparison import (
     Line,
     front,
@@ -19,6 +19,7 @@ from evofsm.evidence.closed_loop.comparison import (
     table_groups,
     unrevised,
 )
+from evofsm.evidence.closed_loop.machine import MACHINE
 from evofsm.evidence.closed_loop.over_seeds import (
     OURS,
     WINDOW,
@@ -26,7 +27,8 @@ from evofsm.evidence.closed_loop.over_seeds import (
     along_stream,
     learning_curve,
 )
-from evofsm.evidence.closed_loop.study import SAFE_RATE, ClosedLoop, TradeOff
+from evofsm.evidence.closed_loop.stages import SAFE_RATE
+from evofsm.evidence.closed_loop.study import ClosedLoop, TradeOff
 from evofsm.evidence.report.drawing import Sketch
 from evofsm.extras import needs
 
@@ -57,6 +59,8 @@ _LOOKS: dict[str, Look] = {
     Group.MATCHED: {**plot.OTHER, "marker": "D", "markersize": 5.0},
     Group.LEARNT: {**plot.OURS, "markersize": 8.0},
 }
+_MACHINE: Look = {**plot.OURS, "marker": "s", "markersize": 7.0}
+_MACHINE_CURVE: Look = {"color": LEADER, "marker": "s", "linestyle": (0, (4, 1.6))}
 _SETTINGS: Look = {**plot.OURS, "linestyle": "-", "linewidth": 1.6, "markersize": 3.0}
 _TUNED: Look = {"color": LEADER, "alpha": 0.8, "zorder": 2.0, "marker": "."}
 _DASHES = ((0, (4, 1.6)), (0, (1, 1.2)), (0, (5, 1.2, 1, 1.2)))
@@ -90,7 +94,13 @@ def sketches(study: ClosedLoop) -> Iterator[Sketch]:
             "Learning curve",
             f"Tests with learning frozen, on {study.curve[0].held_out:,} held-out episodes each. "
             f"Line: median over {len({one.learning_seed for one in study.curve})} learning seeds; "
-            "band: their range. The last panel counts the states of the machine.",
+            "band: their range. The last panel counts the states of the machine."
+            + (
+                f" Dashed: {MACHINE}, told {TOLD['learnt']}, on fewer episodes; its states are "
+                "made by another rule, and decide nothing."
+                if learning_curve(study, MACHINE)
+                else ""
+            ),
             "Collision rate, mobility and number of states over the number of training episodes.",
             partial(draw_learning, study),
         )
@@ -98,11 +108,11 @@ def sketches(study: ClosedLoop) -> Iterator[Sketch]:
         yield Sketch(
             "stream",
             "Collisions along a stream that shifts",
-            f"Mean over the last {WINDOW} episodes and "
+            f"Mean over the last {WINDOW} episodes and at most "
             f"{len({one.learning_seed for one in study.streams})} learning seeds (the mean begins "
             "anew at the shift); band: the middle 80 % of seeds. Nobody is told of the shift. "
             "rss-unchanged is the safe distance, told the limits that were true before it.",
-            "Collision rate over the episodes of the stream, for evofsm and rss-unchanged.",
+            "Collision rate over the episodes of the stream, a curve for each policy.",
             partial(draw_stream, study),
         )
     if study.reliabilities:
@@ -123,12 +133,12 @@ def sketches(study: ClosedLoop) -> Iterator[Sketch]:
 def draw_trade_off(study: ClosedLoop) -> Figure:
     """Every policy in (mobility, collisions), with intervals, and what settings trade."""
     figure, ((axes,),) = panels(1, 1, 5.2)
-    mine = ours(study)
+    mine = (ours(study), ours(study, policy=MACHINE))
     lines = [
         line
         for _, found in table_groups(study)
         for line in found
-        if math.isfinite(line.mobility) and (not line.is_ours or line == mine)
+        if math.isfinite(line.mobility) and (not line.is_ours or line in mine)
     ]
     # What hardly moves is drawn at the left edge.
     values = [line.mobility_low for line in lines if line.mobility > 0.5]
@@ -138,6 +148,8 @@ def draw_trade_off(study: ClosedLoop) -> Figure:
     _scale_collisions(axes)
     axes.set(xlim=(left, right), xlabel="mobility: distance, in that of the unrevised driver")
     looks = {str(one): _LOOKS[one] for one in Group if any(line.group == one for line in lines)}
+    if any(line.policy == MACHINE for line in lines):
+        looks[f"the same, told {TOLD['learnt']}"] = _MACHINE
     dashes = cycle(_DASHES)
     for policy, points in settings(study).items():
         if policy == OURS:
@@ -170,8 +182,12 @@ def _places(points: Iterable[TradeOff | Line]) -> tuple[list[float], list[float]
     return [p.mobility for p in every], [100.0 * p.collision_rate for p in every]
 
 
+def _look(line: Line) -> Look:
+    return _MACHINE if line.policy == MACHINE else _LOOKS[line.group]
+
+
 def _draw_policy(axes: Axes, line: Line, left: float) -> None:
-    look = _LOOKS[line.group]
+    look = _look(line)
     x, y = max(line.mobility, left), 100.0 * line.collision_rate
     if line.mobility >= left:
         bars: Look = {"color": look["color"], "linewidth": 0.8, "alpha": 0.45, "zorder": 2.5}
@@ -207,7 +223,7 @@ def _label_policies(axes: Axes, study: ClosedLoop, lines: Sequence[Line], left: 
     for first, *others in labels:
         line = lines[first]
         same = all(lines[i].group == line.group for i in others)
-        color = _LOOKS[line.group]["color"] if same else INK
+        color = _look(line)["color"] if same else INK
         look: Look = {"color": _GREY if color == SOFT else color, "linespacing": 1.15, "zorder": 7}
         size, weight = (7.5, "bold") if line.is_ours else (7.0, "normal")
         note = write(axes, texts[first], tuple(here[first]), size=size, fontweight=weight, **look)
@@ -253,12 +269,16 @@ def draw_learning(study: ClosedLoop) -> Figure:
     """Collisions, mobility and states over training episodes: median and range over seeds."""
     figure, grid = panels(3, 1, 5.6, sharex=True, height_ratios=(1.3, 1.3, 0.8))
     collisions, mobility, states = grid[:, 0]
-    stages = learning_curve(study)
-    episodes = [stage.episodes for stage in stages]
+    by_policy = [learning_curve(study), learning_curve(study, MACHINE)]
     _scale_collisions(collisions)
-    _draw_band(collisions, episodes, [stage.collision_rate for stage in stages], 100.0)
-    _draw_band(mobility, episodes, [stage.mobility for stage in stages])
-    _draw_band(states, episodes, [stage.states for stage in stages])
+    for mine, look in zip(by_policy, (plot.OURS, _MACHINE_CURVE), strict=True):
+        if mine:
+            at = [stage.episodes for stage in mine]
+            _draw_band(collisions, look, at, [stage.collision_rate for stage in mine], 100.0)
+            _draw_band(mobility, look, at, [stage.mobility for stage in mine])
+            _draw_band(states, look, at, [stage.states for stage in mine])
+    stages = [stage for mine in by_policy for stage in mine]
+    episodes = sorted({stage.episodes for stage in by_policy[0] or stages})
     _name_level(collisions, 100.0 * SAFE_RATE, f"safe: {percent(SAFE_RATE)}")
     if alone := unrevised(study):
         rate = alone.collision_rate
@@ -277,10 +297,12 @@ def draw_learning(study: ClosedLoop) -> Figure:
     return figure
 
 
-def _draw_band(axes: Axes, x: Sequence[int], values: Sequence[Spread], scale: float = 1.0) -> None:
+def _draw_band(
+    axes: Axes, look: Look, x: Sequence[int], values: Sequence[Spread], scale: float = 1.0
+) -> None:
     """Median and range over seeds."""
     low, middle, high = scale * np.array(values).T
-    curves(axes, plot.OURS, x, middle, low, high)
+    curves(axes, look, x, middle, low, high)
 
 
 def _name_level(axes: Axes, y: float, text: str) -> None:
@@ -298,6 +320,7 @@ def draw_stream(study: ClosedLoop) -> Figure:
     before = study.plan.shift.before
     looks: dict[str, Look] = {
         OURS: {"color": FOLLOWER, "linewidth": 1.6},
+        MACHINE: {"color": LEADER, "linewidth": 1.4},
         "rss-unchanged": {"color": DEAD_END, "linestyle": (0, (4, 1.6))},
     }
     streams = along_stream(study)

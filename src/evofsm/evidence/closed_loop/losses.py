@@ -18,8 +18,10 @@ from evofsm.evidence.closed_loop.comparison import (
     standing,
     table_groups,
 )
+from evofsm.evidence.closed_loop.machine import MACHINE
 from evofsm.evidence.closed_loop.over_seeds import around_shift, when
-from evofsm.evidence.closed_loop.study import SAFE_RATE, ClosedLoop
+from evofsm.evidence.closed_loop.stages import SAFE_RATE
+from evofsm.evidence.closed_loop.study import ClosedLoop
 
 #: So many episodes after a shift collisions must be as rare as where it is safe.
 RECOVERED_AFTER = 30
@@ -46,6 +48,7 @@ def losses(study: ClosedLoop) -> list[Loss]:
     """Every row and measure in which ours loses; empty where it is nowhere."""
     return [
         *_in_the_table(study),
+        *_of_the_machine(study),
         *_after_a_shift(study),
         *_in_separation(study),
         *_in_calibration(study),
@@ -94,6 +97,31 @@ def _in_the_table(study: ClosedLoop) -> Iterator[Loss]:
         )
 
 
+def _of_the_machine(study: ClosedLoop) -> Iterator[Loss]:
+    """In what ours that was told nothing but failures falls short of ours that was told more."""
+    told, machine = ours(study), ours(study, policy=MACHINE)
+    worst = ours(study, "worst seed", MACHINE)
+    if told is None or machine is None or worst is None:
+        return
+    who = "evofsm"
+    for what, line in (("median", machine), ("worst seed", worst)):
+        if line.collision_rate > told.collision_rate + ROUNDING:
+            yield Loss(
+                f"collisions of {MACHINE}, {what}",
+                who,
+                percent(told.collision_rate),
+                percent(line.collision_rate),
+                told.collision_high < line.collision_low,
+            )
+    if machine.mobility < told.mobility - ROUNDING:
+        apart = told.mobility_low > machine.mobility_high
+        theirs, own = (number(line.mobility, 3) for line in (told, machine))
+        yield Loss(f"mobility of {MACHINE}", who, theirs, own, apart)
+    if machine.train_collisions > told.train_collisions:
+        theirs, own = (part(one.train_collisions, one.train_episodes) for one in (told, machine))
+        yield Loss(f"collisions while learning of {MACHINE} (median)", who, theirs, own)
+
+
 def _told(one: Line | Separation) -> str:
     return f"{one.policy if isinstance(one, Line) else one.measure} ({one.group})"
 
@@ -113,7 +141,7 @@ def _on_axes(what: str, line: Line, mine: Line, *, apart: bool = False, loud: bo
 
 
 def _after_a_shift(study: ClosedLoop) -> Iterator[Loss]:
-    for after, own, theirs in around_shift(study):
+    for after, own, theirs, _ in around_shift(study):
         if theirs and own.median > theirs.median + ROUNDING:
             yield Loss(
                 f"collisions {when(after)}",

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evofsm.evidence.closed_loop.beside import Check
+from evofsm.evidence.closed_loop.machine import MACHINE
 from evofsm.evidence.closed_loop.study import ClosedLoop
 
 #: The policy that learns, by name.
@@ -51,8 +52,9 @@ class Stage(NamedTuple):
     train_collisions: Spread  #: so far, while learning
 
 
-def learning_curve(study: ClosedLoop) -> list[Stage]:
-    """The tests on the way, in their order."""
+def learning_curve(study: ClosedLoop, policy: str = OURS) -> list[Stage]:
+    """The tests on the way of a policy that learns, in their order."""
+    mine = (point for point in study.curve if point.policy == policy)
     return [
         Stage(
             episodes,
@@ -61,7 +63,7 @@ def learning_curve(study: ClosedLoop) -> list[Stage]:
             spread([float(p.states) for p in points]),
             spread([float(p.train_collisions) for p in points]),
         )
-        for episodes, points in sorted(gathered(study.curve, lambda p: p.episodes).items())
+        for episodes, points in sorted(gathered(mine, lambda p: p.episodes).items())
     ]
 
 
@@ -71,6 +73,7 @@ class AroundShift(NamedTuple):
     after: int  #: episodes; -1 before the shift
     ours: Spread
     theirs: Spread | None  #: of the policy that is never told
+    machine: Spread | None  #: of ours that was told nothing but failures, where it was tried then
 
 
 def when(after: int) -> str:
@@ -89,10 +92,17 @@ def around_shift(study: ClosedLoop) -> list[AroundShift]:
     ever.
     """
     own = gathered((c for c in study.checks if c.policy == OURS), lambda c: c.episodes_after)
-    other = gathered((c for c in study.checks if c.policy != OURS), lambda c: c.episodes_after >= 0)
+    machine = gathered((c for c in study.checks if c.policy == MACHINE), lambda c: c.episodes_after)
+    learn_nothing = (c for c in study.checks if c.policy not in (OURS, MACHINE))
+    other = gathered(learn_nothing, lambda c: c.episodes_after >= 0)
     theirs = {shifted: _rates(checks) for shifted, checks in other.items()}
     return [
-        AroundShift(after, _rates(checks), theirs.get(after >= 0))
+        AroundShift(
+            after,
+            _rates(checks),
+            theirs.get(after >= 0),
+            _rates(machine[after]) if after in machine else None,
+        )
         for after, checks in sorted(own.items())
     ]
 

@@ -42,7 +42,17 @@ class Plan(Amounts, Study["ClosedLoop"]):
             side_train=40,
             side_test=60,
             world_test=5,
-            shift=replace(self.shift, before=60, after=10, held_out=20),
+            machine_train=min(self.machine_train, 40),
+            machine_test=40,
+            machine_checks=10,
+            shift=replace(
+                self.shift,
+                before=60,
+                after=10,
+                held_out=20,
+                machine_seeds=1,
+                machine_held_out=10,
+            ),
         )
 
     def run(self, progress: Progress = silent, workers: int | None = None) -> ClosedLoop:

@@ -1,43 +1,36 @@
 """The closed loop: how many collisions are prevented, and what that costs.
 
-Every policy drives the same held-out draws. Ours learns first, from draws of its own, several
+Every policy drives the same held-out draws. Ours learn first, from draws of its own, several
 times with other seeds; tuned baselines are tuned on the same training draws. Work is split by
 policy and learning seed over the cores, and put together in the order of the tasks.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from importlib.util import find_spec
 from itertools import repeat
-from typing import Any, NamedTuple, Self
-
-import numpy as np
+from typing import Any, NamedTuple
 
 from evofsm.core import Edges, FailureSplit, Novelty, StateRule
 from evofsm.driving import (
+    TOLD,
     TUNED_MEASURES,
-    Draw,
     EnvelopeReviser,
     Family,
     Group,
     Outcome,
-    Reference,
     RiskByState,
     Row,
     drive,
     fixed_policies,
     guard_for_family,
-    held_out,
     learnt_by,
-    references_of,
     score,
-    summarise,
     teach,
     training,
-    try_out,
 )
 from evofsm.evidence.closed_loop.amounts import Amounts
 from evofsm.evidence.closed_loop.beside import (
@@ -52,12 +45,15 @@ from evofsm.evidence.closed_loop.beside import (
     run_two_worlds,
 )
 from evofsm.evidence.closed_loop.calibration import Reliability, run_calibration
+from evofsm.evidence.closed_loop.course import Course, mobility_of
+from evofsm.evidence.closed_loop.machine import MACHINE, run_machine, run_machine_shift
+from evofsm.evidence.closed_loop.stages import Point, until_safe
 from evofsm.evidence.frame import Frame
 from evofsm.fleet import in_order
-from evofsm.guard import ActionReviser, Guard, Reviser
+from evofsm.guard import ActionReviser, Guard
 
-#: Collision rate at most, on so many held-out draws, for `episodes_until_safe`.
-SAFE_RATE, SAFE_EPISODES = 0.01, 200
+#: Held-out draws of the tests on the way.
+SAFE_EPISODES = 200
 #: After so many training episodes the learning curve has a point.
 CHECKPOINTS = (0, 1, 2, 5, 10, 20, 50, 100, 200, 300)
 #: Tolerances of the trade-off.
@@ -71,18 +67,6 @@ RULES: dict[str, StateRule | None] = {
     "novelty": Novelty(radius=1.0, scales=(4.0, 2.0, 2.0)),
     "failure-split": FailureSplit(base=Novelty(radius=2.0, scales=(4.0, 2.0, 2.0))),
 }
-
-
-class Point(NamedTuple):
-    """A point of the learning curve."""
-
-    learning_seed: int
-    episodes: int  #: learnt from
-    collisions: int  #: of `held_out`
-    held_out: int
-    mobility: float
-    states: int
-    train_collisions: int  #: so far, while learning
 
 
 class TradeOff(NamedTuple):
@@ -119,6 +103,7 @@ class ClosedLoop:
     def as_dict(self) -> dict[str, Any]:
         """All of it, for JSON."""
         lists = {name: _plain(one) for name, one in vars(self).items() if isinstance(one, list)}
+        lists["rows"] = [row | {"told": told(row["policy"], row["group"])} for row in lists["rows"]]
         return {"family": self.family.name, "plan": asdict(self.plan), **lists}
 
 
@@ -140,6 +125,7 @@ def run_closed_loop(
         Processes; as many as there are cores unless told.
     """
     names = [policy.name for policy in fixed_policies(family)]
+    machines = plan.seeds if plan.machine_train else 0
     tasks: list[partial[Any]] = [
         *(partial(_test_fixed, family, plan, name) for name in names),
         *(partial(_test_tuned, family, plan, name) for name in TUNED_MEASURES),
@@ -149,6 +135,7 @@ def run_closed_loop(
             for rule in RULES
             for seed in range(min(plan.rule_seeds, plan.seeds))
         ),
+        *(partial(run_machine, family, plan, seed) for seed in range(machines)),
         partial(run_separation, family, plan),
         partial(run_calibration, family, plan),
     ]
@@ -158,11 +145,20 @@ def run_closed_loop(
         tasks.append(partial(run_cases, family, plan))
     if family.shifted is not None:
         tasks += [partial(run_shift, family, plan, seed) for seed in range(plan.seeds)]
+        shifted = range(min(machines, plan.shift.machine_seeds))
+        tasks += [partial(run_machine_shift, family, plan, seed) for seed in shifted]
     study = ClosedLoop(family, plan, [])
     for result in in_order(tasks, workers, progress):
         for name, values in result.items():
             getattr(study, name).extend(values)
     return study
+
+
+def told(policy: str, group: str) -> str:
+    """What a policy was told."""
+    if group != Group.LEARNT:
+        return group
+    return TOLD["learnt" if policy == MACHINE else "kinematic"]
 
 
 def _plain(record: Any) -> Any:
@@ -177,60 +173,21 @@ def _plain(record: Any) -> Any:
 # -- Policies -------------------------------------------------------------------------------------
 
 
-class _Course(NamedTuple):
-    """Draws that policies are tried on, and how the controller comes along in each by itself."""
-
-    family: Family
-    draws: Sequence[Draw]
-    alone: Sequence[Reference]
-
-    @classmethod
-    def of(cls, family: Family, draws: Iterable[Draw]) -> Self:
-        every = list(draws)
-        return cls(family, every, references_of(family, every))
-
-    def first(self, n: int) -> Self:
-        return self._replace(draws=self.draws[:n], alone=self.alone[:n])
-
-    def under(self, revisers: Iterable[Reviser]) -> list[Outcome]:
-        """What comes of the draws, each with its reviser."""
-        drives = (
-            drive(Guard.of(reviser, interval=self.family.interval, learn=False), draw)
-            for draw, reviser in zip(self.draws, revisers, strict=False)
-        )
-        return score(self.family, self.alone, drives)
-
-    def by(self, guard: Guard) -> list[Outcome]:
-        """What comes of the draws by what a guard has learnt so far."""
-        return try_out(guard, self.family, self.draws, self.alone)
-
-    def row(self, policy: str, group: str, outcomes: Sequence[Outcome], **others: Any) -> Row:
-        return summarise(self.family.name, policy, group, outcomes, self.family.interval, **others)
-
-
 def _trade_off(policy: str, setting: str, outcomes: Sequence[Outcome]) -> TradeOff:
     rate = sum(o.collided for o in outcomes) / len(outcomes)
-    return TradeOff(policy, setting, rate, _mobility(outcomes))
-
-
-def _mobility(outcomes: Sequence[Outcome]) -> float:
-    return float(np.mean([o.mobility for o in outcomes]))
-
-
-def _tests(family: Family, plan: Amounts) -> _Course:
-    return _Course.of(family, held_out(family, plan.seed, plan.test))
+    return TradeOff(policy, setting, rate, mobility_of(outcomes))
 
 
 def _test_fixed(family: Family, plan: Amounts, name: str) -> dict[str, list[Any]]:
     policy = next(policy for policy in fixed_policies(family) if policy.name == name)
-    tests = _tests(family, plan)
+    tests = Course.held_out(family, plan.seed, plan.test)
     outcomes = tests.under(policy.make(family, draw) for draw in tests.draws)
     return {"rows": [tests.row(name, policy.group, outcomes)]}
 
 
 def _test_tuned(family: Family, plan: Amounts, name: str) -> dict[str, list[Any]]:
     """Of the settings without a collision in training the fastest, else the safest."""
-    course = _Course.of(family, training(family, plan.seed, 0, min(plan.train, 100)))
+    course = Course.of(family, training(family, plan.seed, 0, min(plan.train, 100)))
     revisers = [
         EnvelopeReviser(measure, family.actions, family.interval)
         for measure in TUNED_MEASURES[name]
@@ -240,7 +197,7 @@ def _test_tuned(family: Family, plan: Amounts, name: str) -> dict[str, list[Any]
         for reviser in revisers
     ]
     best = min(range(len(tried)), key=lambda i: (tried[i].collision_rate, -tried[i].mobility))
-    tests, driven = _tests(family, plan), len(course.draws) * len(tried)
+    tests, driven = Course.held_out(family, plan.seed, plan.test), len(course.draws) * len(tried)
     outcomes = tests.under(repeat(revisers[best]))
     row = tests.row(name, Group.TUNED, outcomes, train_episodes=driven)
     return {"rows": [row], "trade_offs": tried}
@@ -249,7 +206,7 @@ def _test_tuned(family: Family, plan: Amounts, name: str) -> dict[str, list[Any]
 def _test_learner(family: Family, plan: Amounts, seed: int) -> dict[str, list[Any]]:
     """Learn with one seed; test on the way and at the end."""
     guard = guard_for_family(family, tolerance=plan.tolerance)
-    tests = _tests(family, plan)
+    tests = Course.held_out(family, plan.seed, plan.test)
     curve: list[Point] = []
     rows: list[Row] = []
     collisions = 0
@@ -265,20 +222,19 @@ def _test_learner(family: Family, plan: Amounts, seed: int) -> dict[str, list[An
                     episodes,
                     sum(o.collided for o in outcomes),
                     len(outcomes),
-                    _mobility(outcomes),
+                    mobility_of(outcomes),
                     learnt_by(guard)[0].n_states,
                     collisions,
                 )
             )
         if episodes in {min(100, plan.train), plan.train}:
-            safe = (one.episodes for one in curve if one.collisions <= SAFE_RATE * one.held_out)
             row = tests.row(
                 "evofsm",
                 Group.LEARNT,
                 tests.by(guard),
                 learning_seed=seed,
                 train_episodes=episodes,
-                episodes_until_safe=next(safe, None),
+                episodes_until_safe=until_safe(curve),
                 train_collisions=collisions,
             )
             rows.append(row)
@@ -299,7 +255,7 @@ def _test_rule(family: Family, plan: Amounts, rule: str, seed: int) -> dict[str,
     episodes = min(_RULE_TRAIN, plan.train)
     taught = teach(guard, training(family, plan.seed, seed, episodes))
     guard.freeze()
-    tests = _Course.of(family, held_out(family, plan.seed, min(plan.rule_test, plan.test)))
+    tests = Course.held_out(family, plan.seed, min(plan.rule_test, plan.test))
     row = tests.row(
         f"states: {rule} ({machine.n_states})",
         Group.LEARNT,

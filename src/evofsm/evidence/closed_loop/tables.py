@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Iterator
+from typing import Any
 
 from evofsm.app import (
     NONE,
@@ -31,8 +32,17 @@ from evofsm.evidence.closed_loop.comparison import (
     states_alone,
     table_groups,
 )
-from evofsm.evidence.closed_loop.over_seeds import Spread, around_shift, learning_curve, when
-from evofsm.evidence.closed_loop.study import SAFE_RATE, ClosedLoop
+from evofsm.evidence.closed_loop.machine import MACHINE
+from evofsm.evidence.closed_loop.over_seeds import (
+    OURS,
+    AroundShift,
+    Spread,
+    around_shift,
+    learning_curve,
+    when,
+)
+from evofsm.evidence.closed_loop.stages import SAFE_RATE
+from evofsm.evidence.closed_loop.study import ClosedLoop, told
 
 # -- All policies ---------------------------------------------------------------------------------
 
@@ -76,7 +86,8 @@ def _which(line: Line) -> str:
     if not line.is_ours:
         return f"\n{line.group}"
     of_seeds = "of" if line.which == "worst seed" else "over"
-    return f", {line.train_episodes:,} episodes\n{line.group}, {line.which} {of_seeds} {line.seeds}"
+    learnt = f"{line.group}, {line.which} {of_seeds} {line.seeds}"
+    return f", {line.train_episodes:,} episodes\n{learnt}\ntold: {line.told}"
 
 
 def policy_table(study: ClosedLoop) -> Table:
@@ -96,6 +107,13 @@ def _note_on_policies(study: ClosedLoop) -> str:
         if mine
         else ""
     )
+    machine = ours(study, policy=MACHINE)
+    if machine:
+        seeds += (
+            f"{MACHINE} was told nothing but which episodes failed, and drives the first "
+            f"{machine.episodes:,} of these episodes over {seeds_text(machine.seeds)}; its states "
+            "decide nothing. "
+        )
     return (
         f"All policies drive the same {held_out:,} held-out episodes. {seeds}"
         "In brackets 95 % intervals, by Clopper and Pearson for collisions, by bootstrap over "
@@ -103,13 +121,14 @@ def _note_on_policies(study: ClosedLoop) -> str:
         "the leader's brake, in those of the unrevised driver. Interventions: share of decisions "
         "that were changed. Change: mean of |executed − proposed| over all decisions. Until safe: "
         f"training episodes after which, learning frozen, at most {percent(SAFE_RATE)} of "
-        f"{_checked_on(study):,} held-out episodes collide."
+        f"{_checked_on(study, OURS):,} held-out episodes collide"
+        + (f" (of {_checked_on(study, MACHINE):,} for {MACHINE})." if machine else ".")
     )
 
 
-def _checked_on(study: ClosedLoop) -> int:
+def _checked_on(study: ClosedLoop, policy: str) -> int:
     """Held-out episodes of a test on the way."""
-    return study.curve[0].held_out if study.curve else 0
+    return next((point.held_out for point in study.curve if point.policy == policy), 0)
 
 
 def table_of_names(study: ClosedLoop) -> Table:
@@ -144,8 +163,9 @@ def _short(made: str) -> str:
 
 def side_tables(study: ClosedLoop) -> dict[str, Table]:
     """All other tables that apply, by the section in which they stand."""
-    tables = {
+    tables: dict[str, tuple[Any, Callable[[ClosedLoop], Table | None]]] = {
         "learning": (study.curve, _table_of_learning),
+        "machine": (study.curve, _table_of_the_machine),
         "shift": (study.checks, _table_of_checks),
         "calibration": (study.reliabilities, _table_of_calibration),
         "separation": (study.separations, _table_of_separation),
@@ -153,7 +173,8 @@ def side_tables(study: ClosedLoop) -> dict[str, Table]:
         "cases": (study.cases, _table_of_cases),
         "worlds": (study.worlds, _table_of_worlds),
     }
-    return {name: make(study) for name, (found, make) in tables.items() if found}
+    made = {name: make(study) for name, (found, make) in tables.items() if found}
+    return {name: table for name, table in made.items() if table is not None}
 
 
 def _spread(values: Spread, show: Callable[[float], str]) -> str:
@@ -163,9 +184,19 @@ def _spread(values: Spread, show: Callable[[float], str]) -> str:
 
 
 def _table_of_learning(study: ClosedLoop) -> Table:
-    seeds = len({point.learning_seed for point in study.curve})
+    return _learning_of(study, OURS, "Learning: held-out tests on the way")
+
+
+def _table_of_the_machine(study: ClosedLoop) -> Table | None:
+    if not learning_curve(study, MACHINE):
+        return None
+    return _learning_of(study, MACHINE, f"Learning: the same of {MACHINE}")
+
+
+def _learning_of(study: ClosedLoop, policy: str, title: str) -> Table:
+    seeds = len({point.learning_seed for point in study.curve if point.policy == policy})
     return Table.of(
-        "Learning: held-out tests on the way",
+        title,
         (
             Column("episodes", "episodes", count),
             Column("collisions", lambda one: _spread(one.collision_rate, bare_percent), unit="%"),
@@ -173,25 +204,40 @@ def _table_of_learning(study: ClosedLoop) -> Table:
             Column("states", lambda one: _spread(one.states, count)),
             Column("collided while learning", lambda one: _spread(one.train_collisions, count)),
         ),
-        learning_curve(study),
-        f"Median and range over {seeds_text(seeds)}; {_checked_on(study):,} held-out episodes "
-        "each, learning frozen.",
+        learning_curve(study, policy),
+        f"Median and range over {seeds_text(seeds)}; {_checked_on(study, policy):,} held-out "
+        f"episodes each, learning frozen. Told: {told(policy, Group.LEARNT)}.",
     )
 
 
+_MACHINE_CHECKED: tuple[Column[AroundShift], ...] = (
+    Column(f"{MACHINE}, median", lambda one: one.machine and one.machine.median, bare_percent),
+    Column(f"{MACHINE}, worst seed", lambda one: one.machine and one.machine.high, bare_percent),
+)
+
+
 def _table_of_checks(study: ClosedLoop) -> Table:
-    seeds = len({check.learning_seed for check in study.checks})
+    seeds = len({check.learning_seed for check in study.checks if check.policy == OURS})
+    machine = [check for check in study.checks if check.policy == MACHINE]
+    also = (
+        f" {MACHINE}: {machine[0].held_out:,} held-out episodes each, "
+        f"{seeds_text(len({check.learning_seed for check in machine}))}."
+        if machine
+        else ""
+    )
+    tried = next(check.held_out for check in study.checks if check.policy == OURS)
     return Table.of(
         "Held-out tests around the shift: collisions [%]",
         (
             Column("tested", "after", when),
             Column("evofsm, median", "ours.median", bare_percent),
             Column("evofsm, worst seed", "ours.high", bare_percent),
+            *(_MACHINE_CHECKED if machine else ()),
             Column("rss-unchanged", lambda one: one.theirs and one.theirs.median, bare_percent),
         ),
         around_shift(study),
-        f"{study.checks[0].held_out:,} held-out episodes each, learning frozen, "
-        f"{seeds_text(seeds)}. rss-unchanged keeps the constants that were right before; it learns "
+        f"{tried:,} held-out episodes each, learning frozen, {seeds_text(seeds)}.{also} "
+        "rss-unchanged keeps the constants that were right before; it learns "
         "nothing, so one test after the shift stands for all.",
     )
 

@@ -263,7 +263,7 @@ class LearntRisk:
         then = self._backup_text(backup)
         if how == KEPT:
             judged = self._judgement(np.zeros(1), np.full(1, left), situation)
-            return Search(one, judged, 0, words.kept(then, self.remembered, left))
+            return Search(one, judged, 0, words.kept(then, self.remembered, left, allowed))
         if tried is not None:
             best = tried
         action = np.reshape(dynamics.decode(best), np.shape(wanted))
@@ -273,10 +273,11 @@ class LearntRisk:
         if tried is not None:
             instead = words.tried()
         elif how == CHANGED:
-            instead = words.changed(then, self.remembered, self.margin)
+            instead = words.changed(then, self.remembered, self.margin, allowed)
         else:
             instead = words.lasting(then)
-        return Search(np.stack([one[0], action]), judged, 1, f"{self.why(judged)}; {instead}")
+        why = words.refused(self._lost, self.remembered, self.margin, self.harder, allowed)
+        return Search(np.stack([one[0], action]), judged, 1, f"{why}; {instead}")
 
     def judge(self, situation: Situation, actions: ArrayLike) -> Judgement:
         """Risk of each action.

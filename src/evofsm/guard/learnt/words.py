@@ -36,15 +36,16 @@ class Remembered(NamedTuple):
             return f"what {time} brought"
         return f"{self.number} disturbance{'s' * (self.number != 1)} remembered from {time}"
 
-    @property
-    def all(self) -> str:
-        """All of them, as an object."""
+    def but(self, spared: int) -> str:
+        """All of them, but those that need not be survived."""
         if self.number == 0:
             return str(self)
+        if spared:
+            return f"all but at most {spared} of the {self}"
         return f"{'all' if self.number > 1 else 'the'} {self}"
 
 
-def kept(backup: str, remembered: Remembered, left: float) -> str:
+def kept(backup: str, remembered: Remembered, left: float, spared: int = 0) -> str:
     """Why a proposal is kept.
 
     Examples
@@ -52,10 +53,12 @@ def kept(backup: str, remembered: Remembered, left: float) -> str:
     >>> kept("always -2.5", Remembered(10, 305.0), left=0.4)
     'then always -2.5 survives all 10 disturbances remembered from 305 s, by 0.4 ordinary changes'
     """
-    return f"then {backup} survives {remembered.all}, by {changes(left)}"
+    return f"then {backup} survives {remembered.but(spared)}, by {changes(left)}"
 
 
-def refused(lost: int, remembered: Remembered, margin: float, harder: float) -> str:
+def refused(
+    lost: int, remembered: Remembered, margin: float, harder: float, spared: int = 0
+) -> str:
     """Why an action is dangerous.
 
     Parameters
@@ -68,6 +71,8 @@ def refused(lost: int, remembered: Remembered, margin: float, harder: float) -> 
         What has to be left of the distance to failure [ordinary changes].
     harder : float
         How much harder than they were disturbances are taken to be.
+    spared : int
+        Disturbances that need not be survived.
 
     Examples
     --------
@@ -82,14 +87,14 @@ changes'
     if lost < 0:
         return "no backup prevents failure, even if nothing disturbs it"
     if lost == 0:
-        what = f"no backup survives {remembered.all} by the margin of {changes(margin)}"
+        what = f"no backup survives {remembered.but(spared)} by the margin of {changes(margin)}"
         return what if harder < _HARDER else f"{what}, were they {harder:.2g} times as hard"
     if lost < remembered.number:
         return f"no backup survives {lost} of the {remembered}"
     return f"no backup survives {'any of ' if lost > 1 else ''}the {remembered}"
 
 
-def changed(backup: str, remembered: Remembered, margin: float) -> str:
+def changed(backup: str, remembered: Remembered, margin: float, spared: int = 0) -> str:
     """What is done instead, where another action passes.
 
     Examples
@@ -99,6 +104,8 @@ def changed(backup: str, remembered: Remembered, margin: float) -> str:
 more'
     """
     them = "all of them" if remembered.number > 1 else "it"
+    if spared and remembered.number > 1:
+        them = f"all but at most {spared} of them"
     return f"the closest action after which {backup} survives {them}, by {changes(margin)} or more"
 
 
