@@ -42,10 +42,7 @@ def taught(short: bool) -> Taught:
         drive(learnt, family.draw(0, _FIRST_OF_TURN + k)) for k in range(1 if short else _TURN)
     ]
     episodes = [
-        [
-            (one.situation.observation.copy(), float(one.revision.proposed))
-            for one in each.decisions
-        ]
+        [(one.situation.observation.copy(), float(one.revision.proposed)) for one in each.decisions]
         for each in driven
     ]
     return Taught(learnt, kinematic, episodes)
@@ -76,9 +73,7 @@ def step(repeats: int, short: bool) -> Result:
     machine, dynamics = learnt.machine, _dynamics(learnt)
     assert machine is not None
     index = [[learnt.actions.encode(action) for _, action in one] for one in episodes]
-    bare = EvolvingFSM(
-        machine.n_actions, max_states=200, belief_tolerance=machine.belief_tolerance
-    )
+    bare = EvolvingFSM(machine.n_actions, max_states=200, belief_tolerance=machine.belief_tolerance)
     for one, actions in zip(episodes, index, strict=True):
         bare.learn_many(np.array([z for z, _ in one]), actions)
     count = sum(map(len, episodes))
@@ -111,7 +106,9 @@ def step(repeats: int, short: bool) -> Result:
         "machine without them",
         with_machine(bare),
         repeats,
-        beside={"machine with dynamics, and all that it learns of an episode": with_machine(machine)},
+        beside={
+            "machine with dynamics, and all that it learns of an episode": with_machine(machine)
+        },
     )
 
 
