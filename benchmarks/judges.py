@@ -107,7 +107,7 @@ def step(repeats: int, short: bool) -> Result:
         with_machine(bare),
         repeats,
         beside={
-            "machine with dynamics, and all that it learns of an episode": with_machine(machine)
+            "machine with dynamics, with its copy": with_machine(machine)
         },
     )
 

@@ -320,7 +320,4 @@ def is_unforeseen(
     for i in range(a):
         actions[0, i], actions[1, i] = action_before[i], action[i]
     residuals(unpacked(packed, m, choices), observations, actions, 1, False, found)
-    for j in range(m):
-        if abs(found[0, j]) > onset * scale[j]:
-            return True
-    return False
+    return bool((np.abs(found[0]) > onset * scale).any())

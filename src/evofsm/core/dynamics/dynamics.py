@@ -454,8 +454,9 @@ class Dynamics:
         Z, last, first = self._Z, i + 2 >= len(self._Z), i == 0
         before, after = max(i - 1, 0), i + 1 if last else i + 2
         jumped = self._jumped
+        learnt: Any = self.sums.counts.base
         if learn_latest(
-            self.sums.counts.base,
+            learnt,
             self._packed,
             self.choices,
             *(Z[before], Z[i], Z[i + 1], Z[after]),

@@ -49,9 +49,7 @@ class Sums(NamedTuple):
 
 
 @compiled
-def take_in(
-    counts: _Floats, mean: _Floats, scatter: _Floats, z: _Floats, origin: _Floats
-) -> None:
+def take_in(counts: _Floats, mean: _Floats, scatter: _Floats, z: _Floats, origin: _Floats) -> None:
     """Count an observation, in arrays of `Sums`."""
     counts[0] += 1.0
     for j in range(len(z)):
@@ -109,9 +107,7 @@ def learn_latest(
         observations[2, j], observations[3, j] = end[j], after[j]
     for i in range(a):
         actions[0, i], actions[1, i] = action_before[i], action[i]
-    return learn_transition(
-        sums, known, known.origin, observations, actions, first, last, jumped
-    )
+    return learn_transition(sums, known, known.origin, observations, actions, first, last, jumped)
 
 
 @compiled
