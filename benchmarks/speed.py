@@ -17,6 +17,7 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
+import judges
 from clusterers import db_stream, stream_k_means
 from cold import FIRST, first
 from fleets import fleet
@@ -51,6 +52,9 @@ ROWS = {
     "sumo_loop": Row(late("sumo_loop"), "<=", 1.25),
     "csv_learn": Row(late("csv_learn"), "<=", 3.0),
     "states_1024": Row(many_states, "<=", 20.0),
+    "learnt_decision": Row(partial(judges.decision, 0.5), "s", 0.3e-3),
+    "learnt_p99": Row(partial(judges.decision, 0.99), "s", 1.5e-3),
+    "learnt_step": Row(judges.step, "s", 20e-6),
     **{id_: Row(partial(first, id_), "s", most) for id_, (_, _, most) in FIRST.items()},
 }
 

@@ -51,7 +51,7 @@ def judged(id_: str, row: Row, measured: Result) -> Result:
 
 
 def _told(better: str, target: float) -> str:
-    return f"<= {target:g} s" if better == "s" else f"{better} {target:g}"
+    return f"<= {duration(target).strip()}" if better == "s" else f"{better} {target:g}"
 
 
 def worsened(result: Result, last: list[Result]) -> str | None:

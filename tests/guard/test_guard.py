@@ -592,7 +592,6 @@ def test_a_judge_that_asks_the_machine_is_told_which_it_is(monkeypatch, tmp_path
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"low": -1.0, "high": 1.0}, "needs a judge"),
         ({"judge": Balance()}, "give low and high of the action, or n_actions"),
         ({"low": -1.0, "high": 1.0, "n_actions": 3, "judge": Balance()}, "not both"),
         ({"low": [-1.0, -1.0], "high": [1.0], "judge": Balance()}, "high has 1"),

@@ -167,6 +167,7 @@ class ActionReviser:
         self._overridden = False
         self._searches = isinstance(risk, SearchingJudge)
         self._lowest, self._highest = nearest_bounds(actions)
+        self._low, self._high = limits(actions)
         self.start_episode()
 
     def start_episode(self) -> None:
@@ -248,7 +249,8 @@ class ActionReviser:
                 situation, wanted, tolerance=self.tolerance, revising=self._revising
             )
             self._revising = found.best != 0
-            return found._replace(options=np.clip(found.options, *limits(self.actions)))
+            within = np.minimum(np.maximum(found.options, self._low), self._high)
+            return found._replace(options=within)
         options = self._options(wanted, proposal)
         if not self.acts and self.way is Way.IMPROVE:
             options = self.risk.effective(situation, options)

@@ -127,14 +127,11 @@ def expect(
     fill_features(
         z, change, action, before, known.origin, known.reach, known.choices == 0, features
     )
-    m = len(z)
-    for j in range(m):
-        move[j] = 0.0
-    for k in range(len(features)):
-        f = features[k]
-        if f != 0.0:
-            for j in range(m):
-                move[j] += f * known.weights[k, j]
+    for j in range(len(z)):
+        total = 0.0
+        for k in range(len(features)):
+            total += features[k] * known.weights[k, j]
+        move[j] = total
 
 
 @inner_kernel
@@ -323,7 +320,4 @@ def is_unforeseen(
     for i in range(a):
         actions[0, i], actions[1, i] = action_before[i], action[i]
     residuals(unpacked(packed, m, choices), observations, actions, 1, False, found)
-    for j in range(m):
-        if abs(found[0, j]) > onset * scale[j]:
-            return True
-    return False
+    return bool((np.abs(found[0]) > onset * scale).any())

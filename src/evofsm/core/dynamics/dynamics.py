@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from typing import Any, NamedTuple, Self, cast
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -454,8 +454,9 @@ class Dynamics:
         Z, last, first = self._Z, i + 2 >= len(self._Z), i == 0
         before, after = max(i - 1, 0), i + 1 if last else i + 2
         jumped = self._jumped
+        learnt: Any = self.sums.counts.base
         if learn_latest(
-            cast(_Floats, self.sums.counts.base),
+            learnt,
             self._packed,
             self.choices,
             *(Z[before], Z[i], Z[i + 1], Z[after]),

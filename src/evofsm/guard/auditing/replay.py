@@ -9,7 +9,7 @@ behind a chain that was made anew.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -97,7 +97,13 @@ class Audit(NamedTuple):
         return self.chain.finding is None and self.misfit is None and replayed
 
 
-def audit(path: Path, kept: Head | None = None, *, replay: bool = True) -> Audit:
+def audit(
+    path: Path,
+    kept: Head | None = None,
+    *,
+    replay: bool = True,
+    failed: Callable[[NDArray[np.float64]], bool] | None = None,
+) -> Audit:
     """Verify the chain of a log and the form of its records, and replay it where they are whole.
 
     Parameters
@@ -107,6 +113,9 @@ def audit(path: Path, kept: Head | None = None, *, replay: bool = True) -> Audit
     kept : Head, optional
         A head that was kept elsewhere.
     replay : bool
+    failed : callable, optional
+        As the guard had it; no log holds code, and without it a guard that knew failures by a
+        function decides otherwise.
 
     Returns
     -------
@@ -125,7 +134,7 @@ def audit(path: Path, kept: Head | None = None, *, replay: bool = True) -> Audit
     count = chain.head.number or 0
     contents, form = _survey(path, count)
     is_whole = chain.finding is None and form.misfit is None
-    again = _replay(path, count) if replay and is_whole else None
+    again = _replay(path, count, failed) if replay and is_whole else None
     return Audit(chain, contents, again, form.misfit, form.remarks())
 
 
@@ -154,8 +163,8 @@ def _refuse_newer(path: Path, record: SealedRecord) -> None:
         )
 
 
-def _replay(path: Path, count: int) -> Replay:
-    player = _Player()
+def _replay(path: Path, count: int, failed: Callable[[NDArray[np.float64]], bool] | None) -> Replay:
+    player = _Player(failed)
     difference = None
     for record in records(path, count):
         difference = player.play(record)
@@ -177,6 +186,7 @@ class _DiffersError(Exception):
 class _Player:
     """Those who took part, told again what happened."""
 
+    failed: Callable[[NDArray[np.float64]], bool] | None = None
     decisions: int = 0
     not_replayed: list[str] = field(default_factory=list)
     other_makers: dict[str, tuple[str, str]] = field(default_factory=dict)
@@ -242,6 +252,7 @@ class _Player:
             machine=machine,
             judge=risk,
             learn=content["learn"],
+            failed=self.failed,
             missing=Missing(content["missing"]),
             interval=content["interval"],
             explaining=Explain.SPOKEN,

@@ -262,7 +262,8 @@ class LearntRisk:
         asked = self._ranks[:_ASKED]
         world = (self.backups.policies, asked, self.disturbances, self._order, self.harder)
         how, backup, left = search(known, here, proposal, *world, self.margin, allowed, best)
-        self._ranks = np.array([backup, *(q for q in self._ranks if q != backup)])
+        if backup != asked[0]:  # what passed now is asked first the next time
+            self._ranks = np.array([backup, *(q for q in self._ranks if q != backup)])
         self._tight = how != KEPT
         tried = (
             self._untried(best)
@@ -283,7 +284,7 @@ class LearntRisk:
         judged = self._judged(
             situation,
             here,
-            np.stack([proposal, best]),
+            np.array((proposal, best)),
             left if how == CHANGED and not allowed else None,
         )
         if tried is not None:
@@ -293,7 +294,7 @@ class LearntRisk:
         else:
             instead = words.lasting(then)
         why = words.refused(self._lost, self.remembered, self.margin, self.harder, allowed)
-        return Search(np.stack([one[0], action]), judged, 1, f"{why}; {instead}")
+        return Search(np.array((one[0], action)), judged, 1, f"{why}; {instead}")
 
     def judge(self, situation: Situation, actions: ArrayLike) -> Judgement:
         """Risk of each action.
@@ -403,7 +404,7 @@ class LearntRisk:
         return self._judgement(lost, left, situation)
 
     def _judgement(self, lost: _Floats, left: _Floats, situation: Situation) -> Judgement:
-        risk, low, high = (np.array(each) for each in zip(*map(self._risk, lost), strict=True))
+        risk, low, high = np.array([self._risk(each) for each in lost.tolist()]).T.copy()
         seen, machine = math.nan, self.machine
         if (
             machine is not None
@@ -498,13 +499,12 @@ class LearntRisk:
     def follow(self, observation: ArrayLike, action: Any) -> None:
         """Keep up with what happens, without learning from it."""
         z = np.array(observation, np.float64)
-        if self._z is not None:
-            z = np.where(np.isnan(z), self._z + self._change, z)
-            self._change = z - self._z
-        elif np.isnan(z).any():
-            return
-        else:
-            self._change = np.zeros(len(z))
+        absent = np.isnan(z)
+        if absent.any():
+            if self._z is None:
+                return
+            z = np.where(absent, self._z + self._change, z)
+        self._change = np.zeros(len(z)) if self._z is None else z - self._z
         self._z, self._action = z, self.dynamics.encode(action)
 
     def start_episode(self, *, learn: bool = True) -> None:
