@@ -15,6 +15,10 @@ from evofsm.files import LARGEST_OBSERVATION
 _OUTCOMES = (("decisions", "failures"), ("episodes", "failed_soon"), ("tried", "failed_after"))
 
 
+# NumPy is quicker for longer vectors.
+_SHORT = 16
+
+
 def positive(name: str, value: SupportsFloat) -> float:
     """A positive, finite number."""
     try:
@@ -97,10 +101,18 @@ def _masked(values: ArrayLike) -> NDArray[np.bool_] | None:
     return None
 
 
+def is_within(values: NDArray[np.float64], largest: float) -> bool:
+    """Whether this is a short vector of numbers of at most that size: the quick way to ask it."""
+    if values.ndim != 1 or len(values) > _SHORT:
+        return False
+    return all([-largest <= value <= largest for value in values.tolist()])  # noqa: C419
+
+
 def refuse_unusable(name: str, values: NDArray[np.float64]) -> None:
     """Raise for the first entry that is not finite, or too large."""
     if (
         not values.size
+        or is_within(values, LARGEST_OBSERVATION)
         or -LARGEST_OBSERVATION <= values.min() <= values.max() <= LARGEST_OBSERVATION
     ):
         return  # false of NaN

@@ -249,7 +249,7 @@ class Interrupted(BaseException):
     pass
 
 
-@pytest.mark.parametrize("name", ["learn_transition", "solve", "take_in"])
+@pytest.mark.parametrize("name", ["learn_latest", "solve", "take_in"])
 @pytest.mark.parametrize("at", [1, 2, 30])
 def test_an_interrupt_leaves_dynamics_whole(cart, monkeypatch, name, at):
     machine, Z, I, U = cart()

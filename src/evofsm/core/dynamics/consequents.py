@@ -274,3 +274,56 @@ def residuals(
     for t in range(length, len(found)):
         for j in range(m):
             found[t, j] = 0.0
+
+
+def pack(known: Consequents) -> _Floats:
+    """All but the sides and the number of choices, in one array."""
+    parts = (known.weights, known.origin, known.reach, known.lowest, known.highest)
+    return np.concatenate(
+        [np.ravel(part) for part in (*parts, known.least, known.most, known.mean, known.inverse)]
+    )
+
+
+@compiled
+def unpacked(packed: _Floats, m: int, choices: int) -> Consequents:
+    """What was packed, without sides."""
+    at = len(packed) - 8 * m
+    return Consequents(
+        packed[:at].reshape((at // m, m)),
+        packed[at : at + m],
+        packed[at + m : at + 2 * m],
+        packed[at + 2 * m : at + 3 * m],
+        packed[at + 3 * m : at + 4 * m],
+        packed[at + 4 * m : at + 5 * m],
+        packed[at + 5 * m : at + 6 * m],
+        packed[:0].reshape((0, 4)),
+        packed[at + 6 * m : at + 7 * m],
+        packed[at + 7 * m :],
+        choices,
+    )
+
+
+@compiled
+def is_unforeseen(
+    packed: _Floats,
+    choices: int,
+    before: _Floats,
+    start: _Floats,
+    end: _Floats,
+    action_before: _Floats,
+    action: _Floats,
+    scale: _Floats,
+    onset: float,
+) -> bool:
+    """Whether a residual is larger than ``onset`` times its scale (m,)."""
+    m, a = len(start), len(action)
+    observations, actions, found = np.empty((3, m)), np.empty((2, a)), np.empty((1, m))
+    for j in range(m):
+        observations[0, j], observations[1, j], observations[2, j] = before[j], start[j], end[j]
+    for i in range(a):
+        actions[0, i], actions[1, i] = action_before[i], action[i]
+    residuals(unpacked(packed, m, choices), observations, actions, 1, False, found)
+    for j in range(m):
+        if abs(found[0, j]) > onset * scale[j]:
+            return True
+    return False

@@ -14,11 +14,13 @@ from evofsm.core.dynamics.consequents import (
     Consequents,
     Disturbances,
     Here,
+    is_unforeseen,
     n_features,
+    pack,
     residuals,
 )
 from evofsm.core.dynamics.failures import explain_failures, probe
-from evofsm.core.dynamics.regression import Sums, learn_transition, solve, take_in
+from evofsm.core.dynamics.regression import Sums, count_ends, learn_latest, solve, take_in
 from evofsm.core.dynamics.undoing import Whole, held, side_by_side
 from evofsm.core.validation import real_array, refuse_unusable, whole
 
@@ -128,6 +130,7 @@ class Dynamics:
     ) -> None:
         self.choices = 0 if n_actions is None else whole("n_actions", n_actions)
         self.low, self.high = _range(low, high, is_none=n_actions is not None)
+        self._middle, self._half = 0.5 * (self.low + self.high), 0.5 * (self.high - self.low)
         self.size = self.choices or len(self.low)
         self.horizon = whole("horizon", horizon)
         self.n_stretches = whole("stretches", stretches)
@@ -213,11 +216,20 @@ class Dynamics:
         return _SPARE * self.n_stretches
 
     @property
+    def consequents(self) -> Consequents:
+        """What is expected, as kernels see it."""
+        return self._consequents
+
+    @consequents.setter
+    def consequents(self, known: Consequents) -> None:
+        self._consequents, self._packed = known, pack(known)
+
+    @property
     def whole(self) -> Whole:
         """A context in which all is learnt, or nothing where it is broken off."""
         if not self.n_variables:
             return Whole(self)
-        return Whole(self, self.sums.counts.base, self.lowest, self.highest, self.reached)
+        return Whole(self, self.sums.counts.base)
 
     def __repr__(self) -> str:
         actions = f"n_actions={self.choices}"
@@ -249,9 +261,10 @@ class Dynamics:
         (array([0.5]), array([0., 0., 1.]))
         """
         if self.choices:
-            return np.asarray(np.eye(self.choices)[int(action)])
-        middle, half = 0.5 * (self.low + self.high), 0.5 * (self.high - self.low)
-        scaled: _Floats = (np.atleast_1d(np.asarray(action, np.float64)) - middle) / half
+            chosen = np.zeros(self.choices)
+            chosen[int(action)] = 1.0
+            return chosen
+        scaled: _Floats = (np.asarray(action, np.float64) - self._middle) / self._half
         return scaled
 
     def decode(self, inner: _Floats) -> _Floats:
@@ -273,8 +286,8 @@ class Dynamics:
         """
         if self.choices:
             return np.array([float(inner.argmax())])
-        middle, half = 0.5 * (self.low + self.high), 0.5 * (self.high - self.low)
-        return np.asarray(np.clip(middle + half * inner, self.low, self.high))
+        found: _Floats = self._middle + self._half * inner
+        return np.minimum(np.maximum(found, self.low), self.high)
 
     # -- Learning -------------------------------------------------------------------------------
 
@@ -353,13 +366,14 @@ class Dynamics:
             self._study(failed=False)
             self._Z, self._U = self._Z[-3:], self._U[-3:]  # the last transition is learnt next
         self._Z.append(z.copy())
-        take_in(self.sums, z, self.origin)
-        if self.told is not None and not self.sides and self.sums.counts[1] >= 1.0:
-            self.sides = probe(self.told, z, np.maximum(self.sums.unit, 1e-9))
+        sums = self.sums
+        take_in(sums.counts, sums.mean, sums.scatter, z, self.origin)
+        if self.told is not None and not self.sides and sums.counts[1] >= 1.0:
+            self.sides = probe(self.told, z, np.where(sums.unit > 0.0, sums.unit, 1e-9))
             self._rebuild()
         if len(self._Z) >= 3:
             self._learn(len(self._Z) - 3)
-        n = self.sums.counts[0]
+        n = float(sums.counts[0])
         if not self.ready:
             if n % 20 == 0:
                 self._solve()
@@ -386,15 +400,12 @@ class Dynamics:
         >>> dynamics.has_acted
         True
         """
+        lowest = -1.0 if self.choices else -0.6
         for replaced in self._U[len(self._Z) - 1 :]:
-            self.used -= self._ends(replaced)
+            count_ends(self.used, replaced, lowest, -1.0)
         del self._U[len(self._Z) - 1 :]
         self._U.append(action)
-        self.used += self._ends(action)
-
-    def _ends(self, action: _Floats) -> NDArray[np.bool_]:
-        """(a, 2) whether each number of an action is near an end of its range."""
-        return np.stack([action < (-0.6 if not self.choices else -1.0), action > 0.6], 1)
+        count_ends(self.used, action, lowest, 1.0)
 
     def end(self, *, failed: bool) -> None:
         """The episode is over; its last observation was taken in.
@@ -440,18 +451,24 @@ class Dynamics:
 
     def _learn(self, i: int) -> None:
         """From the transition i -> i + 1."""
-        Z, last = self._Z, i + 2 >= len(self._Z)
-        first = i == 0
-        four = np.array([Z[max(i - 1, 0)], Z[i], Z[i + 1], Z[i + 1 if last else i + 2]])
-        two = np.array([self._U[max(i - 1, 0)], self._U[i]])
+        Z, last, first = self._Z, i + 2 >= len(self._Z), i == 0
+        before, after = max(i - 1, 0), i + 1 if last else i + 2
         jumped = self._jumped
-        if learn_transition(
-            self.sums, self.consequents, self.origin, four, two, first, last, jumped
+        if learn_latest(
+            self.sums.counts.base,
+            self._packed,
+            self.choices,
+            *(Z[before], Z[i], Z[i + 1], Z[after]),
+            *(self._U[before], self._U[i]),
+            first,
+            last,
+            jumped,
         ):
             if first:
                 return
             for j in np.flatnonzero(jumped):
-                self.jumps[j] = [*self.jumps[j][1 - MOST_KEPT :], np.append(four[1], four[2, j])]
+                known = self.jumps[j][1 - MOST_KEPT :]
+                self.jumps[j] = [*known, np.append(Z[i], Z[i + 1][j])]
 
     def _solve(self) -> None:
         if self.sums.counts[0] < _FIRST:
@@ -536,6 +553,8 @@ class Dynamics:
         if not len(safe):
             return
         low, high = safe.min(0), safe.max(0)
+        self.lowest, self.highest = self.lowest.copy(), self.highest.copy()
+        self.reached = self.reached.copy()
         for j in range(self.n_variables):
             close = 1e-9 * (high[j] - low[j])
             if low[j] < self.lowest[j] - close:
@@ -688,12 +707,14 @@ class Dynamics:
         return self._Z[-2]
 
     @property
-    def latest_change(self) -> tuple[_Floats, _Floats] | None:
-        """(3, m) latest observations and (2, a) actions between them; None if there are fewer."""
-        n = len(self._Z)
-        if n < 3:
-            return None
-        return np.array(self._Z[-3:]), np.array(self._U[n - 3 : n - 1])
+    def is_surprised(self) -> bool:
+        """Whether something in the latest change was not expected."""
+        Z, U, n = self._Z, self._U, len(self._Z)
+        scale = self.sums.scale
+        if n < 3 or not self.ready or not scale[0] > 0.0:
+            return False
+        latest = Z[-3], Z[-2], Z[-1], U[n - 3], U[n - 2]
+        return bool(is_unforeseen(self._packed, self.choices, *latest, scale, ONSET))
 
     def disturbances(self, steps: int | None = None) -> Disturbances:
         """Residuals of what is remembered, as they are seen now; number 0 is none at all.

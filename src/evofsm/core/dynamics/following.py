@@ -11,9 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from evofsm.core.dynamics.consequents import residuals
-from evofsm.core.dynamics.dynamics import APART, ONSET, Dynamics
-from evofsm.core.validation import check_action, real_array, refuse_unusable
+from evofsm.core.dynamics.dynamics import APART, Dynamics
+from evofsm.core.validation import check_action, is_within, real_array, refuse_unusable
 
 #: Fourth powers of larger observations, summed over a long run, would lose all others.
 LARGEST = 1e30
@@ -32,6 +31,9 @@ def encoded(dynamics: Dynamics, i: int, executed: ArrayLike | None) -> _Floats:
         If it is no action.
     """
     if dynamics.choices:
+        if executed is None or type(executed) is int:
+            index = i if executed is None else executed
+            return dynamics.encode(check_action(index, dynamics.choices))
         number = real_array("executed", np.atleast_1d(i if executed is None else executed), 1)
         if len(number) != 1 or not float(number[0]).is_integer():
             raise ValueError(f"executed is {executed!r}; it must be the index of an action")
@@ -41,6 +43,12 @@ def encoded(dynamics: Dynamics, i: int, executed: ArrayLike | None) -> _Floats:
             "executed is missing: dynamics with a range of actions have to be told the number, or "
             "numbers, that the action was"
         )
+    if (
+        dynamics.size == 1
+        and type(executed) is float
+        and dynamics.low[0] <= executed <= dynamics.high[0]
+    ):
+        return dynamics.encode(executed)
     action = real_array("executed", np.atleast_1d(executed), ndim=1)
     if len(action) != dynamics.size:
         raise ValueError(f"executed has {len(action)} numbers; an action has {dynamics.size}")
@@ -69,7 +77,9 @@ def encoded_rows(
 
 def refuse_too_large(z: _Floats) -> None:
     """Raise for an observation whose powers nobody can add up."""
-    if z.size and not -LARGEST <= z.min() <= z.max() <= LARGEST:
+    if is_within(z, LARGEST):
+        return
+    if z.size and np.abs(z).max() > LARGEST:
         raise ValueError(
             f"observation holds {np.abs(z).max():g}; a machine with dynamics takes numbers of at "
             f"most {LARGEST:g} in size"
@@ -126,12 +136,7 @@ def is_at(dynamics: Dynamics, clock: float) -> bool:
 def _begins(dynamics: Dynamics) -> bool:
     """Whether the latest change is the first for a while that was not expected."""
     dynamics.quiet += 1.0
-    last = dynamics.latest_change
-    if last is None or not dynamics.ready or not dynamics.sums.scale[0] > 0.0:
-        return False
-    found = np.zeros((1, dynamics.n_variables))
-    residuals(dynamics.consequents, *last, 1, False, found)
-    if not (np.abs(found[0]) > ONSET * dynamics.sums.scale).any():
+    if not dynamics.is_surprised:
         return False
     was_quiet, dynamics.quiet = dynamics.quiet > APART, 0.0
     return was_quiet

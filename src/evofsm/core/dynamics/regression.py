@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.core.dynamics.consequents import Consequents, expect, fill_features, scratch
+from evofsm.core.dynamics.consequents import Consequents, expect, fill_features, scratch, unpacked
 from evofsm.core.kernels import compiled
 
 _Floats = NDArray[np.float64]
@@ -49,13 +49,77 @@ class Sums(NamedTuple):
 
 
 @compiled
-def take_in(sums: Sums, z: _Floats, origin: _Floats) -> None:
-    """Count an observation."""
-    sums.counts[0] += 1.0
+def take_in(
+    counts: _Floats, mean: _Floats, scatter: _Floats, z: _Floats, origin: _Floats
+) -> None:
+    """Count an observation, in arrays of `Sums`."""
+    counts[0] += 1.0
     for j in range(len(z)):
-        off = z[j] - origin[j] - sums.mean[j]
-        sums.mean[j] += off / sums.counts[0]
-        sums.scatter[j] += off * (z[j] - origin[j] - sums.mean[j])
+        off = z[j] - origin[j] - mean[j]
+        mean[j] += off / counts[0]
+        scatter[j] += off * (z[j] - origin[j] - mean[j])
+
+
+@compiled
+def _sums_in(flat: _Floats, m: int, p: int) -> Sums:
+    """The sums that stand side by side in one array."""
+    products, mean = 2 + p * p, 2 + p * p + p * m
+    early = mean + 4 * m
+    least = early + _EARLY * m
+    return Sums(
+        flat[:2],
+        flat[2:products].reshape((p, p)),
+        flat[products:mean].reshape((p, m)),
+        flat[mean : mean + m],
+        flat[mean + m : mean + 2 * m],
+        flat[mean + 2 * m : mean + 3 * m],
+        flat[mean + 3 * m : early],
+        flat[early:least].reshape((_EARLY, m)),
+        flat[least : least + m],
+        flat[least + m : least + 2 * m],
+        flat[least + 2 * m : least + 3 * m],
+    )
+
+
+@compiled
+def learn_latest(
+    flat: _Floats,
+    packed: _Floats,
+    choices: int,
+    before: _Floats,
+    start: _Floats,
+    end: _Floats,
+    after: _Floats,
+    action_before: _Floats,
+    action: _Floats,
+    first: bool,
+    last: bool,
+    jumped: _Floats,
+) -> bool:
+    """`learn_transition` for few arrays: each costs as much on the way in as all that is computed.
+
+    ``flat`` holds `Sums` side by side, ``packed`` is what `pack` returns.
+    """
+    m, a = len(start), len(action)
+    known = unpacked(packed, m, choices)
+    sums = _sums_in(flat, m, known.weights.shape[0])
+    observations, actions = np.empty((4, m)), np.empty((2, a))
+    for j in range(m):
+        observations[0, j], observations[1, j] = before[j], start[j]
+        observations[2, j], observations[3, j] = end[j], after[j]
+    for i in range(a):
+        actions[0, i], actions[1, i] = action_before[i], action[i]
+    return learn_transition(
+        sums, known, known.origin, observations, actions, first, last, jumped
+    )
+
+
+@compiled
+def count_ends(used: _Floats, action: _Floats, lowest: float, by: float) -> None:
+    """Add to ``used`` (a, 2) where a number of an action is near an end of its range."""
+    for i in range(len(action)):
+        used[i, 0] += by * (action[i] < lowest)
+        used[i, 1] += by * (action[i] > 0.6)
 
 
 @compiled

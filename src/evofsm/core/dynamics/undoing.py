@@ -78,11 +78,10 @@ class Whole:
 
     def __enter__(self) -> None:
         self._numbers = [array.copy() for array in self._arrays]
-        before = dict(vars(self._thing))
-        for name, value in before.items():
-            if type(value) is list:
-                before[name] = value.copy()
-        self._before = before
+        self._before = {
+            name: value.copy() if type(value) is list else value
+            for name, value in self._thing.__dict__.items()
+        }
 
     def __exit__(
         self, kind: type[BaseException] | None, error: object, where: TracebackType | None
