@@ -474,7 +474,10 @@ def test_what_was_asked_of_it_is_asked_of_the_family_that_is_driven(beside: Clos
 
     late = "collisions 10 episodes after the shift, median seed"
     assert claims(beside) == {late: ("≤ 1.0 %", "4.0 %", False)}
-    still = replace(beside, family=load_family("emergency"), checks=[])
+    short = replace(beside, family=load_family("emergency"), checks=[])
+    assert claims(short) == {}  # it was asked of 100 training episodes
+    rows = [replace(row, train_episodes=max(100, row.train_episodes)) for row in short.rows]
+    still = replace(short, rows=[row for row in rows if row.policy == MACHINE] + short.rows[-9:-3])
     assert claims(still) == {
         "collisions, worst seed": ("≤ 0.5 %", "1.0 %", False),
         "mobility, median seed": ("≥ 0.910", "0.880", False),

@@ -68,7 +68,11 @@ class Revised(InWorld):
         "Who judges for least-risk: kinematic (told how cars follow each other) or learnt (told "
         "nothing but which episodes failed).",
     )
-    tolerance: float = option(TOLERANCE, "Share of leaders' hard brakes that need not be survived.")
+    tolerance: float = option(
+        TOLERANCE,
+        "Share of leaders' hard brakes that need not be survived; for a learnt judge, of what it "
+        "remembers.",
+    )
     switches: tuple[str, ...] = option(
         (),
         "noise, delay, actuator, jerk, third_car; with commas.",

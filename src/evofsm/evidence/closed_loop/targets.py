@@ -21,6 +21,8 @@ _BESIDE, _MORE, _LESS = ("stop_and_go", "rare", "ncap", "weak_brakes"), 0.01, 0.
 _NOISY, _NOISY_MOBILITY = 0.01, 0.85
 # Collisions while learning, of the worst seed: of all episodes, and of the late ones.
 _LEARNING, _LATE = 6, 1
+# It was asked of so many training episodes.
+_TRAINED = 100
 # So many episodes after a shift it must be safe again.
 _RECOVERED = 10
 
@@ -30,14 +32,14 @@ def machine_claims(study: ClosedLoop) -> Iterator[Asked]:
     middle, worst = ours(study, policy=MACHINE), ours(study, "worst seed", MACHINE)
     if middle is None or worst is None:
         return
-    name, is_noisy = study.family.name, bool(study.plan.switches)
-    if is_noisy:
+    name, is_taught = study.family.name, middle.train_episodes >= _TRAINED
+    if is_taught and study.plan.switches:
         if study.plan.switches == "noise":
             yield _at_most("collisions with noise, median seed", middle.collision_rate, _NOISY)
             yield _at_least("mobility with noise, median seed", middle.mobility, _NOISY_MOBILITY)
-    elif name in _ASKED:
+    elif is_taught and name in _ASKED:
         yield from _alone(study, middle, worst, *_ASKED[name])
-    elif name in _BESIDE:
+    elif is_taught and name in _BESIDE:
         yield from _beside(middle, ours(study))
     for one in around_shift(study):
         if one.after == _RECOVERED and one.machine is not None:
