@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.core.kernels import compiled, inner_kernel
+from evofsm.core.kernels import compiled, inner_kernel, rare_kernel
 
 #: Where the effect of an action may bend, in each dimension of a box.
 KNOTS = np.array([-0.5, 0.0, 0.5])
@@ -185,7 +185,7 @@ def advance(
         room.before[i] = room.action[i]
 
 
-@inner_kernel
+@rare_kernel
 def replay(
     known: Consequents,
     here: Here,
