@@ -50,7 +50,7 @@ _MARGIN, _LARGEST, _FADES, _ADDED, _RATE = 3.0, 8.0, 0.9, 0.25, 0.001
 _CAUTION = 4.0
 # Steps that are looked ahead: at first, at least, at most; times those that it takes to fail, of
 # which so much is left an episode later.
-_HORIZON, _SHORTEST, _FARTHEST, _AHEAD, _LATEST = 64, 32, LONGEST_STRETCH, 1.5, 0.9
+_HORIZON, _SHORTEST, _FARTHEST, _AHEAD, _LATEST = 64, 32, LONGEST_STRETCH, 1.5, 0.98
 # Backups closer than this are alike; an action that was used less often is tried.
 _ALIKE, _TRIES = 0.02, 8
 
@@ -119,6 +119,7 @@ class LearntRisk:
     _change: _Floats
     _action: _Floats
     _certified: bool  # whether at the decision before some backup survived all
+    _was_certified: bool  # and at any before
     _holds: bool  # and at this one
     _tight: bool  # whether the latest proposal was refused
     _tights: list[bool]
@@ -482,6 +483,7 @@ class LearntRisk:
             self.broken += broken
             self.margin = min(_LARGEST, max(0.0, self.margin + _ADDED * (broken - _RATE)))
         self._certified = self._holds
+        self._was_certified |= self._holds
         self._take_in(observation, action)
 
     def watch(self, observation: ArrayLike, action: Any, belief: ArrayLike) -> None:
@@ -520,7 +522,7 @@ class LearntRisk:
     def _forget(self) -> None:
         self._z = None
         self._change = self._action = np.zeros(0)
-        self._certified = self._holds = self._tight = False
+        self._certified = self._was_certified = self._holds = self._tight = False
         self._tights = []
         self._lost = 0
         self._ranks = np.zeros(0, int) if self.backups is None else self.backups.ranks.copy()
@@ -550,7 +552,7 @@ class LearntRisk:
             self.situations.scan(dynamics, self.horizon, best[:1], random)
             self.n_scanned += 1
         if self.told_horizon is None and self.disturbances is not None and enough:
-            self._look_ahead(best[:_ASKED])
+            self._look_ahead(best[:_ASKED], failed=episode.failed)
         self.disturbances = choose(
             dynamics, self.situations, self.horizon, best[:2], self.harder, random
         )
@@ -559,12 +561,18 @@ class LearntRisk:
         self._ranks = self.backups.ranks.copy()
         self._order = np.arange(len(self.disturbances.residuals))
 
-    def _look_ahead(self, policies: _Floats) -> None:
-        """As far as it takes to fail where nothing helps, and half as far again."""
+    def _look_ahead(self, policies: _Floats, *, failed: bool) -> None:
+        """As far as it takes to fail where nothing helps, and half as far again.
+
+        Half as far again, too, after an episode that failed although it was certified not to.
+        """
         assert self.disturbances is not None
         if len(self.dynamics.consequents.sides):
             after = failing_after(self.dynamics, self.situations, policies, self.disturbances)
-            self.takes = max(float(after), _LATEST * self.takes)
+            takes = _LATEST * self.takes
+            if failed and self._was_certified:  # it did not look far enough
+                takes = min(_AHEAD * takes, _FARTHEST / _AHEAD)
+            self.takes = max(float(after), takes)
             self.horizon = int(min(max(_AHEAD * self.takes, _SHORTEST), _FARTHEST))
 
     def _evolve(self, random: np.random.Generator) -> None:
