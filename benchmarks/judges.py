@@ -106,9 +106,7 @@ def step(repeats: int, short: bool) -> Result:
         "machine without them",
         with_machine(bare),
         repeats,
-        beside={
-            "machine with dynamics, with its copy": with_machine(machine)
-        },
+        beside={"machine with dynamics, with its copy": with_machine(machine)},
     )
 
 

@@ -773,7 +773,8 @@ def learnt_guard(
     low, high, n_actions, interval, horizon, seed
         As in `Guard`.
     without : sequence of str
-        Names of `JUDGE_PARTS` and of `evofsm.core.DYNAMICS_PARTS`.
+        Names of `JUDGE_PARTS` and of `evofsm.core.DYNAMICS_PARTS`; without ``states`` the machine
+        has a single one.
 
     Raises
     ------
@@ -786,24 +787,27 @@ def learnt_guard(
     >>> guard.judge.margin
     0.0
     """
-    if unknown := set(without) - {*JUDGE_PARTS, *DYNAMICS_PARTS}:
+    if unknown := set(without) - {*JUDGE_PARTS, *DYNAMICS_PARTS, "states"}:
         raise ValueError(f"there are no parts {sorted(unknown)}")
     actions = _actions(low, high, n_actions, None)
     soon = None if horizon is None else max(1, round(positive("horizon", horizon) / interval))
     judge = LearntRisk(
         interval, horizon=horizon, seed=seed, without=[p for p in without if p in JUDGE_PARTS]
     )
-    machine = _machine(actions, soon, dynamics_for(actions, soon, without))
+    most = 1 if "states" in without else _MOST_STATES
+    machine = _machine(actions, soon, dynamics_for(actions, soon, without), most)
     return Guard(
         low, high, n_actions=n_actions, interval=interval, seed=seed, judge=judge, machine=machine
     )
 
 
-def _machine(actions: ActionSet, soon: int | None, dynamics: Dynamics | None) -> EvolvingFSM:
+def _machine(
+    actions: ActionSet, soon: int | None, dynamics: Dynamics | None, most: int = _MOST_STATES
+) -> EvolvingFSM:
     """With recommended settings."""
     return EvolvingFSM(
         actions.n_actions,
-        max_states=_MOST_STATES,
+        max_states=most,
         belief_tolerance=BELIEF_TOLERANCE,
         failure_horizon=soon,
         dynamics=dynamics,
