@@ -44,8 +44,8 @@ def test_scikit_learns_checks_pass(estimator, check):
 def test_settings_have_the_names_and_defaults_of_the_machine():
     of_machine = dict(signature(EvolvingFSM).parameters)
     of_clusterer = dict(signature(EvolvingClusterer).parameters)
-    # A clusterer has one action, and is told of no failure.
-    del of_machine["n_actions"], of_machine["failure_horizon"]
+    # A clusterer has one action, and learns neither failures nor how that moves what it clusters.
+    del of_machine["n_actions"], of_machine["failure_horizon"], of_machine["dynamics"]
     assert of_clusterer.keys() == of_machine.keys()
     for name, setting in of_clusterer.items():
         assert setting.default in (None, of_machine[name].default)
