@@ -296,6 +296,7 @@ STEPS = st.tuples(
 )
 
 
+@pytest.mark.slow
 @settings(max_examples=60)
 @given(steps=st.lists(STEPS, min_size=1, max_size=60), cut=st.integers(0, 60))
 def test_a_file_in_the_midst_of_anything_changes_nothing(steps, cut):

@@ -182,6 +182,7 @@ def careful_feed(z):
     return 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "careful"), [("tanks", careful_pumps), ("reactor", careful_feed)])
 def test_who_is_careful_keeps_it(name, careful):
     system = make_system(name)

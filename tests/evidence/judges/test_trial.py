@@ -141,6 +141,7 @@ def test_a_judge_of_ones_own_is_tried():
 # -- The study ------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_every_judge_part_and_seed_has_a_row(made):
     plan = Plan(systems="acc,emergency", without="margin,states", seeds=2, train=2, test=2)
     done = []

@@ -10,7 +10,9 @@ from evofsm.files import storage
 from evofsm.guard.learnt.risk import LearntRisk
 
 
-@pytest.mark.parametrize("episodes", [0, 1, 3])
+@pytest.mark.parametrize(
+    "episodes", [0, *(pytest.param(k, marks=pytest.mark.slow) for k in (1, 3))]
+)
 def test_saved_and_loaded_it_goes_on_learning_bit_for_bit(point, exactly, content, episodes):
     guard, file = point.taught(episodes), BytesIO()
     guard.save(file)
