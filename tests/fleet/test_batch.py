@@ -187,6 +187,7 @@ def moving(actions=3, **settings):
     return EvolvingFSM(actions, radius=1.0, max_states=5, dynamics=Dynamics(-1.0, 1.0, **settings))
 
 
+@pytest.mark.slow
 def test_a_fleet_with_dynamics_is_its_machines():
     draw = np.random.default_rng(0)
     fleet, alone = Fleet(moving(), 3), [moving() for _ in range(3)]
