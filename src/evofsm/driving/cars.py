@@ -7,7 +7,7 @@ from dataclasses import astuple
 from pathlib import Path
 from typing import Any, Literal
 
-from evofsm.core import Dynamics, EvolvingFSM, IntervalActions, Novelty, StateRule
+from evofsm.core import EvolvingFSM, IntervalActions, Novelty, StateRule
 from evofsm.driving.families.family import Draw, Family
 from evofsm.driving.framework import Drive, Framework
 from evofsm.driving.naming import UNITS, VARIABLES
@@ -26,6 +26,7 @@ from evofsm.guard import (
     LearningJudge,
     LearntRisk,
     Mode,
+    dynamics_for,
 )
 
 #: What each judge is told, by its name.
@@ -110,7 +111,7 @@ def guard_for_cars(
         rule=rule,
         belief_tolerance=BELIEF_TOLERANCE,
         failure_horizon=round(_SOON / interval),
-        dynamics=_dynamics(actions, interval) if isinstance(judge, LearntRisk) else None,
+        dynamics=dynamics_for(actions) if isinstance(judge, LearntRisk) else None,
     )
     reviser = ActionReviser(judge, actions, tolerance=tolerance, mode=mode)
     return Guard.of(reviser, interval=interval, machine=machine, judge=judge, **settings)
@@ -122,12 +123,6 @@ def _judge(name: str, actions: IntervalActions, interval: float, seed: int) -> L
     if name == "learnt":
         return LearntRisk(interval, seed=seed, names=VARIABLES, units=UNITS)
     raise ValueError(f"there is no judge {name!r}; there are {', '.join(TOLD)}")
-
-
-def _dynamics(actions: IntervalActions, interval: float) -> Dynamics | None:
-    """Those that a guard of any system has."""
-    any_system = Guard(actions.low, actions.high, interval=interval).machine
-    return None if any_system is None else any_system.dynamics
 
 
 def guard_for_family(family: Family, **settings: Any) -> Guard:

@@ -171,7 +171,7 @@ class Guard:
     ) -> None:
         actions = _actions(low, high, n_actions, width)
         interval = positive("interval", interval)
-        soon = None if horizon is None else max(1, round(positive("horizon", horizon) / interval))
+        soon = _steps(horizon, interval)
         if judge is None:
             judge = LearntRisk(interval, horizon=horizon, seed=seed)
         dynamics = None
@@ -790,7 +790,7 @@ def learnt_guard(
     if unknown := set(without) - {*JUDGE_PARTS, *DYNAMICS_PARTS, "states"}:
         raise ValueError(f"there are no parts {sorted(unknown)}")
     actions = _actions(low, high, n_actions, None)
-    soon = None if horizon is None else max(1, round(positive("horizon", horizon) / interval))
+    soon = _steps(horizon, positive("interval", interval))
     judge = LearntRisk(
         interval, horizon=horizon, seed=seed, without=[p for p in without if p in JUDGE_PARTS]
     )
@@ -799,6 +799,11 @@ def learnt_guard(
     return Guard(
         low, high, n_actions=n_actions, interval=interval, seed=seed, judge=judge, machine=machine
     )
+
+
+def _steps(horizon: float | None, interval: float) -> int | None:
+    """A time as a number of decisions."""
+    return None if horizon is None else max(1, round(positive("horizon", horizon) / interval))
 
 
 def _machine(

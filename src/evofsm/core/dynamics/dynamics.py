@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from evofsm.core.dynamics.consequents import (
-    KNOTS,
     Consequents,
     Disturbances,
     Here,
@@ -336,9 +335,8 @@ class Dynamics:
         self.weights = np.zeros((p, m))
         self.ready = False
         self._left_out = np.zeros(p)
-        k = 1 + 2 * m + 2 * a + (0 if self.choices else len(KNOTS) * a)
         if "products" in self.without:
-            self._left_out[k:] = 1.0
+            self._left_out[p - m * (m + 1) // 2 :] = 1.0  # they come last
         if "lags" in self.without:
             self._left_out[1 + m : 1 + 2 * m] = 1.0
             self._left_out[1 + 2 * m + a : 1 + 2 * m + 2 * a] = 1.0

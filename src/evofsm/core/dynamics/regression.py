@@ -107,7 +107,7 @@ def learn_latest(
         observations[2, j], observations[3, j] = end[j], after[j]
     for i in range(a):
         actions[0, i], actions[1, i] = action_before[i], action[i]
-    return learn_transition(sums, known, known.origin, observations, actions, first, last, jumped)
+    return learn_transition(sums, known, observations, actions, first, last, jumped)
 
 
 @compiled
@@ -122,7 +122,6 @@ def count_ends(used: _Floats, action: _Floats, lowest: float, by: float) -> None
 def learn_transition(
     sums: Sums,
     known: Consequents,
-    origin: _Floats,
     observations: _Floats,
     actions: _Floats,
     first: bool,
@@ -189,8 +188,8 @@ def learn_transition(
         weight *= min(1.0, _OUTLIER / max(worst, 1e-12)) ** 2
     for j in range(m):
         move[j] = 1.5 * max(abs(sums.least[j]), abs(sums.most[j]))
-    fill_features(z, room.change, actions[1], actions[0], origin, move, box, room.features)
-    features = room.features
+    before, features = actions[0], room.features
+    fill_features(z, room.change, actions[1], before, known.origin, move, box, features)
     for k in range(len(features)):
         f = weight * features[k]
         if f != 0.0:

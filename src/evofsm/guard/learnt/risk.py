@@ -361,19 +361,16 @@ class LearntRisk:
                 f"observation and change have shapes {z.shape} and {moved.shape}; both must be "
                 f"({dynamics.n_variables},)"
             )
-        found = np.empty(len(self.disturbances.residuals))
-        world = (self.backups.policies, self.backups.ranks, self.disturbances, found)
         here = Here(z, moved, np.zeros(dynamics.size))
-        escapes(dynamics.consequents, here, np.empty(0), *world)
-        lost = math.inf if found[0] < 0.0 else int(np.count_nonzero(found < 0.0))
-        hours = self.exposure / 3600.0
-        count = len(found) - 1 if math.isinf(lost) else int(lost)
+        lost, left = self._lost_after(here, np.empty(0), self.backups.ranks)
+        dead_end, hours = math.isinf(lost), self.exposure / 3600.0
+        count = len(self.disturbances.residuals) - 1 if dead_end else int(lost)
         low, high = poisson_bounds(count)
         return Outlook(
-            dead_end=bool(found[0] < 0.0),
+            dead_end=dead_end,
             lost=count,
             remembered=self.remembered.number,
-            margin=float(found.min()),
+            margin=left,
             risk=self._risk(lost),
             per_hour=(count / hours, low / hours, high / hours),
         )
@@ -390,19 +387,33 @@ class LearntRisk:
         self, situation: Situation, here: Here, actions: _Floats, passes: float | None = None
     ) -> Judgement:
         """Of some actions; ``passes`` is what is left after the last, if that is known to pass."""
-        assert self.disturbances is not None
-        assert self.backups is not None
-        found = np.empty(len(self.disturbances.residuals))
         lost, left = np.zeros(len(actions)), np.zeros(len(actions))
-        world = (self.backups.policies, self._ranks[:_ASKED], self.disturbances, found)
         for i, action in enumerate(actions if passes is None else actions[:-1]):
-            escapes(self.dynamics.consequents, here, action, *world)
-            lost[i] = math.inf if found[0] < 0.0 else np.count_nonzero(found < 0.0)
-            left[i] = found.min()
+            lost[i], left[i] = self._lost_after(here, action, self._ranks[:_ASKED])
         if passes is not None:
             left[-1] = passes
         self._lost = -1 if math.isinf(lost[0]) else int(lost[0])
         return self._judgement(lost, left, situation)
+
+    def _lost_after(
+        self, here: Here, action: _Floats, ranks: NDArray[np.int64]
+    ) -> tuple[float, float]:
+        """Disturbances that are lost after an action; infinite if it fails without any.
+
+        And what is left after the worst of them.
+        """
+        assert self.disturbances is not None
+        assert self.backups is not None
+        found = np.empty(len(self.disturbances.residuals))
+        world = (self.backups.policies, ranks, self.disturbances, found)
+        escapes(self.dynamics.consequents, here, action, *world)
+        lost = math.inf if found[0] < 0.0 else float(np.count_nonzero(found < 0.0))
+        return lost, float(found.min())
+
+    @property
+    def _soon(self) -> float:
+        """The horizon, as a share of the time in which all that is remembered was seen."""
+        return self.horizon * self.dt / max(self.exposure, 1e-300)
 
     def _judgement(self, lost: _Floats, left: _Floats, situation: Situation) -> Judgement:
         risk, low, high = np.array([self._risk(each) for each in lost.tolist()]).T.copy()
@@ -419,7 +430,7 @@ class LearntRisk:
         """Probability, with its interval, that something begins that is lost."""
         if math.isinf(lost):
             return 1.0, 0.0, 1.0
-        soon = self.horizon * self.dt / max(self.exposure, 1e-300)
+        soon = self._soon
         low, high = poisson_bounds(int(lost))
         return _within(lost * soon), _within(low * soon), _within(high * soon)
 
@@ -429,7 +440,7 @@ class LearntRisk:
         No larger share of them than the tolerance, and no more than keep the upper bound of the
         risk within it.
         """
-        soon = self.horizon * self.dt / max(self.exposure, 1e-300)
+        soon = self._soon
         most, allowed = tolerance * len(self.dynamics.stretches), 0
         while allowed + 1 <= most and _within(poisson_bounds(allowed + 1)[1] * soon) <= tolerance:
             allowed += 1
