@@ -78,8 +78,8 @@ class Watch(Revised):
             page.player = player
             if self.paused:
                 player.step()
-            _show(page.address, self.no_browser)
-            with suppress(KeyboardInterrupt):
+            with suppress(KeyboardInterrupt):  # as soon as the address is read
+                _show(page.address, self.no_browser)
                 threading.Event().wait()
         print("\nevofsm: the page is closed")
 
