@@ -8,8 +8,8 @@ pytest.importorskip("gymnasium")
 from evofsm.evidence.judges.amounts import PARTS
 from evofsm.evidence.judges.plan import Plan
 from evofsm.evidence.judges.study import Judges
-from evofsm.evidence.judges.trial import Row
 from evofsm.evidence.scores import share_of
+from evofsm.evidence.systems.trial import Row
 
 #: Systems of these rows, with their controllers.
 SYSTEMS = {

@@ -126,8 +126,8 @@ def test_points_are_kept_from_the_wall_however_they_are_written(point, seed, exa
 @pytest.mark.parametrize("name", ["acc", "cartpole", "pendulum", "tanks", "reactor", "emergency"])
 def test_systems_are_learnt_however_they_are_written(name, seed):
     pytest.importorskip("gymnasium")
-    from evofsm.evidence.judges.systems import make_system
-    from evofsm.evidence.judges.systems.system import Start
+    from evofsm.evidence.systems import make_system
+    from evofsm.evidence.systems.system import Start
     from evofsm.guard import Guard
 
     # Pumps that always do the same, or actions that are never taken, as under the first controllers

@@ -21,10 +21,10 @@ from evofsm.evidence.judges.figures import sketches
 from evofsm.evidence.judges.study import Judges
 from evofsm.evidence.judges.summary import Effect, Summary, Worth, effects, summary
 from evofsm.evidence.judges.targets import claims
-from evofsm.evidence.judges.trial import LATE
 from evofsm.evidence.report.asked import failures, tables_of_asked
 from evofsm.evidence.report.chapter import Chapter, Section
 from evofsm.evidence.report.html import Setting
+from evofsm.evidence.systems.trial import LATE
 
 # Fewer proposals kept than this are told among the losses.
 _FEW = 0.25

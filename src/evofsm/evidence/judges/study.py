@@ -12,9 +12,9 @@ from functools import partial
 from evofsm.app import split_names
 from evofsm.evidence.frame import Frame, Progress, silent
 from evofsm.evidence.judges.amounts import ALL, Amounts
-from evofsm.evidence.judges.systems import SYSTEMS, make_system
-from evofsm.evidence.judges.systems.cars import Cars
-from evofsm.evidence.judges.trial import Row, trial
+from evofsm.evidence.systems import SYSTEMS, make_system
+from evofsm.evidence.systems.cars import Cars
+from evofsm.evidence.systems.trial import Row, trial
 from evofsm.fleet import in_order
 
 

@@ -10,8 +10,8 @@ from typing import NamedTuple
 import numpy as np
 
 from evofsm.evidence.judges.study import Judges
-from evofsm.evidence.judges.trial import Row
 from evofsm.evidence.scores import Share, share_of
+from evofsm.evidence.systems.trial import Row
 from evofsm.extras import needs
 
 with needs("scipy", "study", "comparing runs"):

@@ -8,8 +8,8 @@ import numpy as np
 
 from evofsm.app import count, number, percent
 from evofsm.evidence.judges.study import Judges
-from evofsm.evidence.judges.trial import Row
 from evofsm.evidence.report.asked import Asked
+from evofsm.evidence.systems.trial import Row
 
 _PENDULUMS = ("pendulum", "pendulum-cos")
 

@@ -14,10 +14,10 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from evofsm.driving import guard_for_family
-from evofsm.evidence.judges.systems import make_system
-from evofsm.evidence.judges.systems.cars import Cars
-from evofsm.evidence.judges.systems.system import Action, Start, System, Vector
 from evofsm.evidence.scores import share_of
+from evofsm.evidence.systems import make_system
+from evofsm.evidence.systems.cars import Cars
+from evofsm.evidence.systems.system import Action, Start, System, Vector
 
 #: From this episode on, counted from 0, a failure while learning is a late one.
 LATE = 30

@@ -17,7 +17,7 @@ from evofsm.driving import (
     outcome_of,
     references_of,
 )
-from evofsm.evidence.judges.systems.system import Action, Box, Start, System, Vector
+from evofsm.evidence.systems.system import Action, Box, Start, System, Vector
 
 
 class Cars(System):

@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
-from evofsm.evidence.judges.systems.system import Action, Box, Start, System, Vector
+from evofsm.evidence.systems.system import Action, Box, Start, System, Vector
 
 _DT = 0.02  # [s]
 _STEPS = 300

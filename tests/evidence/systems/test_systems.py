@@ -6,8 +6,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from evofsm.evidence.judges.systems import SYSTEMS, make_system
-from evofsm.evidence.judges.systems.system import Box, Discrete, Start
+from evofsm.evidence.systems import SYSTEMS, make_system
+from evofsm.evidence.systems.system import Box, Discrete, Start
 
 EVERY = [(name, controller) for name in SYSTEMS for controller in make_system(name).controllers]
 STARTS = [Start.held_out(11, episode) for episode in range(20)]

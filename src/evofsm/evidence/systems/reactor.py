@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
-from evofsm.evidence.judges.systems.system import Action, Discrete, Start, System, Vector
+from evofsm.evidence.systems.system import Action, Discrete, Start, System, Vector
 
 _FAILS = 100.0  # temperature of the runaway [°C]
 _COOLANT = 20.0  # [°C]

@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
-from evofsm.evidence.judges.systems.system import Action, Box, Start, System, Vector
+from evofsm.evidence.systems.system import Action, Box, Start, System, Vector
 
 _DRY, _FULL = 0.1, 2.0  # levels that fail [m]
 _MIDDLE = 1.0  # level at which an episode starts, about [m]

@@ -9,9 +9,9 @@ import evofsm.guard
 from evofsm.evidence.judges.amounts import PARTS
 from evofsm.evidence.judges.plan import Plan
 from evofsm.evidence.judges.study import run_judges
-from evofsm.evidence.judges.systems import make_system
-from evofsm.evidence.judges.systems.system import Start
-from evofsm.evidence.judges.trial import run, trial
+from evofsm.evidence.systems import make_system
+from evofsm.evidence.systems.system import Start
+from evofsm.evidence.systems.trial import run, trial
 
 
 class Decided(NamedTuple):
@@ -85,7 +85,7 @@ def test_failures_after_episode_30_are_late():
 
 
 def test_a_system_may_tell_its_horizon(made, monkeypatch):
-    monkeypatch.setattr("evofsm.evidence.judges.systems.acc.Acc.horizon", 1.2)
+    monkeypatch.setattr("evofsm.evidence.systems.acc.Acc.horizon", 1.2)
     trial("acc", train=0, test=1)
     assert made[0].told["horizon"] == 1.2
 

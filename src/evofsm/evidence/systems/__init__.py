@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import partial
 
-from evofsm.evidence.judges.systems.acc import Acc
-from evofsm.evidence.judges.systems.cars import Cars
-from evofsm.evidence.judges.systems.cartpole import CartPole
-from evofsm.evidence.judges.systems.pendulum import Pendulum
-from evofsm.evidence.judges.systems.reactor import Reactor
-from evofsm.evidence.judges.systems.system import System
-from evofsm.evidence.judges.systems.tanks import Tanks
+from evofsm.evidence.systems.acc import Acc
+from evofsm.evidence.systems.cars import Cars
+from evofsm.evidence.systems.cartpole import CartPole
+from evofsm.evidence.systems.pendulum import Pendulum
+from evofsm.evidence.systems.reactor import Reactor
+from evofsm.evidence.systems.system import System
+from evofsm.evidence.systems.tanks import Tanks
 
 #: By name: makes the system with the controller of that name, or with its first one.
 SYSTEMS: dict[str, Callable[[str | None], System]] = {

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
-from evofsm.evidence.judges.systems.system import Action, Box, Start, System, Vector
+from evofsm.evidence.systems.system import Action, Box, Start, System, Vector
 from evofsm.extras import needs
 
 with needs("gymnasium", "gym", "Pendulum-v1"):

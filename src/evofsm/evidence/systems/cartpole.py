@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
-from evofsm.evidence.judges.systems.system import Action, Discrete, Start, System, Vector
+from evofsm.evidence.systems.system import Action, Discrete, Start, System, Vector
 from evofsm.extras import needs
 
 with needs("gymnasium", "gym", "CartPole-v1"):
