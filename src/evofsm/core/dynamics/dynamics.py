@@ -19,7 +19,14 @@ from evofsm.core.dynamics.consequents import (
     residuals,
 )
 from evofsm.core.dynamics.failures import explain_failures, probe
-from evofsm.core.dynamics.regression import Sums, count_ends, learn_latest, solve, take_in
+from evofsm.core.dynamics.regression import (
+    MOVING,
+    Sums,
+    count_ends,
+    learn_latest,
+    solve,
+    take_in,
+)
 from evofsm.core.dynamics.undoing import Whole, held, side_by_side
 from evofsm.core.validation import real_array, refuse_unusable, whole
 
@@ -31,7 +38,7 @@ DYNAMICS_PARTS = ("stretches", "memory", "products", "lags", "jumps", "carried")
 # Transitions before anything is expected.
 _FIRST = 15
 # Of what was learnt so far, what still counts an episode later.
-_KEPT = 0.97
+_KEPT = 0.999
 # Steps, and between how many of them weights are solved for again.
 _SCHEDULE = ((300, 5), (1500, 20))
 # Residuals of so many scales are the onset of a stretch; at most so many an episode, so far apart.
@@ -325,6 +332,9 @@ class Dynamics:
             least=np.zeros(m),
             most=np.zeros(m),
             scale=np.zeros(m),
+            low=np.full(m, np.inf),
+            high=np.full(m, -np.inf),
+            moving=np.zeros(m),
         )
         self.sums = side_by_side(sums)
         self.lowest, self.highest = np.full(m, np.inf), np.full(m, -np.inf)
@@ -518,7 +528,7 @@ class Dynamics:
         if self.ready and T > 4:
             found = np.zeros((T - 1, self.n_variables))
             residuals(self.consequents, Z, U, T - 1, False, found)
-            self._rescale(found)
+            self._rescale(found, safe)
             self.latest = Episode(safe, U[:T], found, failed)
             if "stretches" not in self.without:
                 self.remember(self.onsets(found))
@@ -566,11 +576,14 @@ class Dynamics:
             self.reached[j, 0] += ((safe[1:, j] <= self.lowest[j] + close) & moving).any()
             self.reached[j, 1] += ((safe[1:, j] >= self.highest[j] - close) & moving).any()
 
-    def _rescale(self, found: _Floats) -> None:
-        scale = 1.4826 * np.median(np.abs(found), 0)
-        known = self.sums.scale[0] > 0.0
-        new = 0.8 * self.sums.scale + 0.2 * scale if known else scale
-        self.sums.scale[:] = np.maximum(new, 1e-3 * np.sqrt(self.sums.variance) + 1e-300)
+    def _rescale(self, found: _Floats, safe: _Floats) -> None:
+        sums, size = self.sums, np.abs(found)
+        at_end = (safe[2:] == sums.low) | (safe[2:] == sums.high)
+        size[(safe[1:-1] == safe[2:]) & at_end & (sums.moving > MOVING)] = 0.0
+        scale = 1.4826 * np.median(size, 0)
+        known = sums.scale[0] > 0.0
+        new = 0.8 * sums.scale + 0.2 * scale if known else scale
+        sums.scale[:] = np.maximum(new, 1e-3 * np.sqrt(sums.variance) + 1e-300)
 
     def onsets(self, found: _Floats) -> list[int]:
         """Steps of an episode at which something large began.

@@ -133,6 +133,9 @@ def _add_up(merged: Dynamics, parts: Sequence[Dynamics]) -> None:
             least=stacked("least").min(0),
             most=stacked("most").max(0),
             scale=averaged("scale", known),
+            low=stacked("low").min(0),
+            high=stacked("high").max(0),
+            moving=averaged("moving", learnt),
         )
     )
     merged.used = np.sum([part.used for part in parts], axis=0)

@@ -21,6 +21,8 @@ _Floats = NDArray[np.float64]
 _JUMP = 8.0
 # The ordinary change is the median of so many, then a mean; of what is larger, so much counts.
 _EARLY, _CLIP, _SLOWEST = 200, 6.0, 5000.0
+# What changes in more than this share of transitions may have saturated where it rests.
+MOVING = 0.5
 # Residuals beyond so many of their scale weigh less.
 _OUTLIER = 4.0
 # Of the variance of a feature: what every weight is held to 0 by, and those that are asked only if
@@ -46,6 +48,9 @@ class Sums(NamedTuple):
     least: _Floats  #: (m,) most negative change that was no jump
     most: _Floats  #: (m,) most positive one
     scale: _Floats  #: (m,) of residuals; 0 as long as it is not known
+    low: _Floats  #: (m,) least observation
+    high: _Floats  #: (m,) greatest one
+    moving: _Floats  #: (m,) share of transitions in which it changed, but for rests at an extreme
 
 
 @compiled
@@ -76,6 +81,9 @@ def _sums_in(flat: _Floats, m: int, p: int) -> Sums:
         flat[least : least + m],
         flat[least + m : least + 2 * m],
         flat[least + 2 * m : least + 3 * m],
+        flat[least + 3 * m : least + 4 * m],
+        flat[least + 4 * m : least + 5 * m],
+        flat[least + 5 * m : least + 6 * m],
     )
 
 
@@ -173,9 +181,17 @@ def learn_transition(
             grown = (min(now, _CLIP * sums.unit[j]) - sums.unit[j]) / min(n, _SLOWEST)
             sums.unit[j] = max(sums.unit[j] + grown, floor)
     sums.counts[1] += 1.0
+    weight = 1.0
+    for j in range(m):
+        x, now = observations[2, j], room.move[j]
+        sums.low[j] = min(sums.low[j], x, observations[1, j])
+        sums.high[j] = max(sums.high[j], x, observations[1, j])
+        if now == 0.0 and (x == sums.low[j] or x == sums.high[j]) and sums.moving[j] > MOVING:
+            weight = 0.0  # it may have come to its end: what it would have done is not known
+        else:
+            sums.moving[j] += ((now != 0.0) - sums.moving[j]) / min(n + 1.0, _SLOWEST)
     if first or jump:
         return jump
-    weight = 1.0
     if sums.scale[0] > 0.0:
         worst = 0.0
         for j in range(m):

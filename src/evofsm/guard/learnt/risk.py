@@ -408,6 +408,8 @@ class LearntRisk:
         world = (self.backups.policies, ranks, self.disturbances, found)
         escapes(self.dynamics.consequents, here, action, *world)
         lost = math.inf if found[0] < 0.0 else float(np.count_nonzero(found < 0.0))
+        if lost:
+            self._took = max(self._took, float(found[found < 0.0].max()) + 1.0 + self.horizon)
         return lost, float(found.min())
 
     @property
@@ -536,6 +538,7 @@ class LearntRisk:
         self._certified = self._was_certified = self._holds = self._tight = False
         self._tights = []
         self._lost = 0
+        self._took = 0.0
         self._ranks = np.zeros(0, int) if self.backups is None else self.backups.ranks.copy()
         count = 0 if self.disturbances is None else len(self.disturbances.residuals)
         self._order = np.arange(count)
@@ -580,7 +583,7 @@ class LearntRisk:
         assert self.disturbances is not None
         if len(self.dynamics.consequents.sides):
             after = failing_after(self.dynamics, self.situations, policies, self.disturbances)
-            takes = _LATEST * self.takes
+            takes = max(_LATEST * self.takes, self._took)
             if failed and self._was_certified:  # it did not look far enough
                 takes = min(_AHEAD * takes, _FARTHEST / _AHEAD)
             self.takes = max(float(after), takes)
