@@ -26,13 +26,13 @@ def test_features_from_another_origin_are_a_linear_map_of_them():
         told = z, change, action, before
         for row, where in enumerate((origin, other)):
             getattr(fill_features, "py_func", fill_features)(*told, where, reach, box, found[row])
-        np.testing.assert_allclose(moved(origin - other, p) @ found[0], found[1], atol=1e-12)
+        np.testing.assert_allclose(moved(origin - other, 3, p) @ found[0], found[1], atol=1e-12)
 
 
 def test_two_halves_merge_to_the_whole_up_to_rounding_and_forgetting(drive, follow, monkeypatch):
     monkeypatch.setattr(module, "_KEPT", 1.0)
     # In the light of what one half calls ordinary some residuals weigh less: not here.
-    monkeypatch.setattr(Dynamics, "_rescale", lambda self, found: None)
+    monkeypatch.setattr(Dynamics, "_rescale", lambda self, found, safe: None)
     both, *parts = (Dynamics(-2.5, 2.5, without=["stretches"]) for _ in range(3))
     for part, (Z, U) in zip(parts, halves(drive), strict=True):
         follow(part, Z, U)
@@ -41,7 +41,7 @@ def test_two_halves_merge_to_the_whole_up_to_rounding_and_forgetting(drive, foll
     for name in ("counts", "squares", "products", "scatter", "variance", "least", "most"):
         one, other = (getattr(each.sums, name) for each in (merged, both))
         if name in ("squares", "products"):  # counted from the first observation of either
-            T = moved(merged.origin - both.origin, len(both.sums.squares))
+            T = moved(merged.origin - both.origin, 1, len(both.sums.squares))
             one = T @ one @ T.T if name == "squares" else T @ one
         scale = np.abs(other).max()
         np.testing.assert_allclose(one, other, rtol=1e-7, atol=1e-9 * scale, err_msg=name)
@@ -58,7 +58,7 @@ def test_what_merged_dynamics_expect_is_what_the_whole_expects(drive, follow):
     draw = np.random.default_rng(1)
     both, parts = Dynamics(-2.5, 2.5), [Dynamics(-2.5, 2.5) for _ in range(2)]
     for episode in range(12):
-        Z, U = drive(draw, braking=50 if episode % 3 else None)
+        Z, U = drive(draw, braking=50 if episode % 4 < 2 else None)
         follow(parts[episode % 2], Z, U)
         follow(both, Z, U)
     merged = merge_dynamics(parts)

@@ -70,7 +70,12 @@ class Scratch(NamedTuple):
 
 def n_features(m: int, a: int, *, box: bool) -> int:
     """Number of features: 1, z, latest change, action, previous action, bends, products."""
-    return 1 + 2 * m + 2 * a + (len(KNOTS) * a if box else 0) + m * (m + 1) // 2
+    return 1 + 2 * m + 2 * a + (len(KNOTS) * a if box else 0) + n_products(m, a)
+
+
+def n_products(m: int, a: int) -> int:
+    """Number of products: of actions with variables, and of two variables; they come last."""
+    return a * m + m * (m + 1) // 2
 
 
 @compiled
@@ -107,6 +112,10 @@ def fill_features(
             for knot in KNOTS:
                 features[k] = abs(action[i] - knot)
                 k += 1
+    for i in range(a):
+        for j in range(m):
+            features[k] = action[i] * features[1 + j]
+            k += 1
     for i in range(m):
         for j in range(i, m):
             features[k] = features[1 + i] * features[1 + j]

@@ -15,6 +15,7 @@ from evofsm.core.dynamics.consequents import (
     Here,
     is_unforeseen,
     n_features,
+    n_products,
     pack,
     residuals,
 )
@@ -332,8 +333,9 @@ class Dynamics:
             least=np.zeros(m),
             most=np.zeros(m),
             scale=np.zeros(m),
-            low=np.full(m, np.inf),
-            high=np.full(m, -np.inf),
+            noise=np.zeros(m),
+            low=z.copy(),
+            high=z.copy(),
             moving=np.zeros(m),
         )
         self.sums = side_by_side(sums)
@@ -346,7 +348,7 @@ class Dynamics:
         self.ready = False
         self._left_out = np.zeros(p)
         if "products" in self.without:
-            self._left_out[p - m * (m + 1) // 2 :] = 1.0  # they come last
+            self._left_out[p - n_products(m, a) :] = 1.0
         if "lags" in self.without:
             self._left_out[1 + m : 1 + 2 * m] = 1.0
             self._left_out[1 + 2 * m + a : 1 + 2 * m + 2 * a] = 1.0
@@ -584,6 +586,8 @@ class Dynamics:
         known = sums.scale[0] > 0.0
         new = 0.8 * sums.scale + 0.2 * scale if known else scale
         sums.scale[:] = np.maximum(new, 1e-3 * np.sqrt(sums.variance) + 1e-300)
+        square = (size**2).mean(0)
+        sums.noise[:] = 0.8 * sums.noise + 0.2 * square if known else square
 
     def onsets(self, found: _Floats) -> list[int]:
         """Steps of an episode at which something large began.

@@ -52,8 +52,9 @@ _SUMS: dict[str, tuple[_Shape, ranges.Range]] = {
     "least": (("m",), _SOME),
     "most": (("m",), _SOME),
     "scale": (("m",), _NOT_NEGATIVE),
-    "low": (("m",), _EXTREME),
-    "high": (("m",), _EXTREME),
+    "noise": (("m",), _NOT_NEGATIVE),
+    "low": (("m",), _OBSERVED),
+    "high": (("m",), _OBSERVED),
     "moving": (("m",), ranges.SHARE),
 }
 # Arrays of dynamics under their own names.

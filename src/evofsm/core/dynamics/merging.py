@@ -2,8 +2,8 @@
 
 Features of an observation are counted from the first one, which is another one in each part. From
 another origin they are ``T phi``, with a matrix T of the shift d of variables: z_i becomes
-z_i + d_i and z_i z_j becomes (z_i + d_i) (z_j + d_j). So the sums of products of features, and of
-those with changes, become ``T A T'`` and ``T B``, exactly.
+z_i + d_i, u z_i becomes u (z_i + d_i), and z_i z_j becomes (z_i + d_i) (z_j + d_j). So the sums of
+products of features, and of those with changes, become ``T A T'`` and ``T B``, exactly.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from evofsm.core.dynamics.consequents import n_products
 from evofsm.core.dynamics.dynamics import MOST_KEPT, Dynamics
 from evofsm.core.dynamics.keeping import to_bytes
 from evofsm.core.dynamics.undoing import side_by_side
@@ -87,12 +88,15 @@ def merge_dynamics(parts: Sequence[Dynamics]) -> Dynamics:
     return merged
 
 
-def moved(d: _Floats, p: int) -> _Floats:
+def moved(d: _Floats, a: int, p: int) -> _Floats:
     """(p, p) what features become where variables are larger by ``d`` (m,)."""
     m = len(d)
     T = np.eye(p)
     T[1 : 1 + m, 0] = d
-    k = p - m * (m + 1) // 2
+    k = p - n_products(m, a)
+    for i in range(a):
+        T[k : k + m, 1 + 2 * m + i] = d
+        k += m
     for i in range(m):
         for j in range(i, m):
             T[k, 0] = d[i] * d[j]
@@ -105,7 +109,7 @@ def moved(d: _Floats, p: int) -> _Floats:
 def _add_up(merged: Dynamics, parts: Sequence[Dynamics]) -> None:
     """All numbers, into ``merged``, whose origin stays."""
     origin, p = merged.origin, len(merged.sums.squares)
-    shifts = [moved(part.origin - origin, p) for part in parts]
+    shifts = [moved(part.origin - origin, merged.size, p) for part in parts]
     observed, learnt = np.array([part.sums.counts for part in parts]).T
     means = np.array([part.origin - origin + part.sums.mean for part in parts])
     mean = observed @ means / observed.sum()
@@ -133,6 +137,7 @@ def _add_up(merged: Dynamics, parts: Sequence[Dynamics]) -> None:
             least=stacked("least").min(0),
             most=stacked("most").max(0),
             scale=averaged("scale", known),
+            noise=averaged("noise", known),
             low=stacked("low").min(0),
             high=stacked("high").max(0),
             moving=averaged("moving", learnt),

@@ -25,10 +25,11 @@ _EARLY, _CLIP, _SLOWEST = 200, 6.0, 5000.0
 MOVING = 0.5
 # Residuals beyond so many of their scale weigh less.
 _OUTLIER = 4.0
-# Of the variance of a feature: what every weight is held to 0 by, and those that are asked only if
-# they have to be.
-_RIDGE, _SHY = 1e-6, 30.0
-_PRIOR, _SHY_PRIOR = 0.01, 20.0
+# Of the variance of a feature: what every weight is held to 0 by; so many times that holds those
+# that are asked only if they have to be, and the latest changes among them still more.
+_RIDGE, _SHY, _LAGS = 1e-6, 30.0, 10.0
+# The same over the number of transitions, if all is noise; the least share of that.
+_PRIOR, _SHY_PRIOR, _CLEAREST = 0.01, 20.0, 1e-3
 # The least variance of a feature, and what all weights are held to 0 by, of its mean square: far
 # more than rounding, so that features that did not vary yet always share what they explain alike.
 _LEAST, _ALL_ALIKE = 1e-6, 1e-10
@@ -48,6 +49,7 @@ class Sums(NamedTuple):
     least: _Floats  #: (m,) most negative change that was no jump
     most: _Floats  #: (m,) most positive one
     scale: _Floats  #: (m,) of residuals; 0 as long as it is not known
+    noise: _Floats  #: (m,) their mean square; 0 as long as it is not known
     low: _Floats  #: (m,) least observation
     high: _Floats  #: (m,) greatest one
     moving: _Floats  #: (m,) share of transitions in which it changed, but for rests at an extreme
@@ -84,6 +86,7 @@ def _sums_in(flat: _Floats, m: int, p: int) -> Sums:
         flat[least + 3 * m : least + 4 * m],
         flat[least + 4 * m : least + 5 * m],
         flat[least + 5 * m : least + 6 * m],
+        flat[least + 6 * m : least + 7 * m],
     )
 
 
@@ -219,8 +222,9 @@ def learn_transition(
 def solve(sums: Sums, m: int, a: int, without: _Floats) -> _Floats:
     """(p, m) weights: ridge regression, about 0, in units of each feature's own variance.
 
-    What is true for all times is found soonest if latest changes, bends and products are asked
-    only if they have to be; else the first episodes say that one's own throttle speeds others up.
+    What is true for all times is found soonest if bends, products and, last of all, latest changes
+    are asked only if they have to be; else the first episodes say that one's own throttle speeds
+    others up. The less of a variable's changes is noise, the less evidence its weights need.
     ``without`` (p,) is 1 for features that are left out.
     """
     squares, n = sums.squares, max(1.0, float(sums.squares[0, 0]))
@@ -230,10 +234,17 @@ def solve(sums: Sums, m: int, a: int, without: _Floats) -> _Floats:
     variance[0] = 0.0
     shy = np.ones(len(size), bool)
     shy[: 1 + m] = shy[1 + 2 * m : 1 + 2 * m + a] = False
-    held = np.where(shy, _SHY * _RIDGE + _SHY_PRIOR / n, _RIDGE + _PRIOR / n) * variance
-    held += np.where(without > 0.0, 1e12 * np.maximum(size, 1.0), 0.0)
-    scale = 1.0 / np.sqrt(np.where(size > 0.0, size + held, 1.0))
-    scaled = scale[:, None] * (squares + np.diag(held)) * scale
-    scaled[np.diag_indices_from(scaled)] += _ALL_ALIKE
-    weights: _Floats = scale[:, None] * np.linalg.solve(scaled, scale[:, None] * sums.products)
+    times = np.ones(len(size))
+    times[1 + m : 1 + 2 * m] = times[1 + 2 * m + a : 1 + 2 * m + 2 * a] = _LAGS
+    left_out = np.where(without > 0.0, 1e12 * np.maximum(size, 1.0), 0.0)
+    known = sums.noise > 0.0
+    noisy = np.where(known, sums.noise / np.where(known, sums.variance, 1.0), 1.0)
+    weights = np.empty_like(sums.products)
+    for j, share in enumerate(noisy.clip(_CLEAREST, 1.0).tolist()):
+        prior = np.where(shy, _SHY * _RIDGE + share * _SHY_PRIOR / n, _RIDGE + share * _PRIOR / n)
+        held = prior * times * variance + left_out
+        scale = 1.0 / np.sqrt(np.where(size > 0.0, size + held, 1.0))
+        scaled = scale[:, None] * (squares + np.diag(held)) * scale
+        scaled[np.diag_indices_from(scaled)] += _ALL_ALIKE
+        weights[:, j] = scale * np.linalg.solve(scaled, scale * sums.products[:, j])
     return weights

@@ -49,8 +49,9 @@ _MARGIN, _LARGEST, _FADES, _ADDED, _RATE = 3.0, 8.0, 0.9, 0.25, 0.001
 # Disturbances are taken to be harder than they were by so many over the number of episodes.
 _CAUTION = 4.0
 # Steps that are looked ahead: at first, at least, at most; times those that it takes to fail, of
-# which so much is left an episode later.
-_HORIZON, _SHORTEST, _FARTHEST, _AHEAD, _LATEST = 64, 32, LONGEST_STRETCH, 1.5, 0.98
+# which so much is left an episode later, and after one in which a dead end was none.
+_HORIZON, _SHORTEST, _FARTHEST, _AHEAD = 64, 32, LONGEST_STRETCH, 1.5
+_LATEST, _REFUTED = 0.98, 0.8
 # Backups closer than this are alike; an action that was used less often is tried.
 _ALIKE, _TRIES = 0.02, 8
 
@@ -123,6 +124,9 @@ class LearntRisk:
     _holds: bool  # and at this one
     _tight: bool  # whether the latest proposal was refused
     _tights: list[bool]
+    _dead_end: bool  # whether nothing helped, even without any disturbance
+    _dead_ends: list[bool]
+    _took: float  # steps after which what was refused fails, at the latest
     _lost: int
     _ranks: NDArray[np.int64]  # of backups, those first that passed last
     _order: NDArray[np.int64]  # of disturbances, those first that were lost last
@@ -393,6 +397,7 @@ class LearntRisk:
         if passes is not None:
             left[-1] = passes
         self._lost = -1 if math.isinf(lost[0]) else int(lost[0])
+        self._dead_end = passes is None and math.isinf(lost[-1])
         return self._judgement(lost, left, situation)
 
     def _lost_after(
@@ -507,9 +512,10 @@ class LearntRisk:
     def _take_in(self, observation: ArrayLike, action: Any) -> None:
         self.follow(observation, action)
         self._tights.append(self._tight)
+        self._dead_ends.append(self._dead_end)
         if self.dynamics.n_episodes != self.n_studied:  # it goes on, but was long enough to study
             self._study()
-            self._tights = self._tights[-1:]
+            self._tights, self._dead_ends = self._tights[-1:], self._dead_ends[-1:]
 
     def follow(self, observation: ArrayLike, action: Any) -> None:
         """Keep up with what happens, without learning from it."""
@@ -536,7 +542,8 @@ class LearntRisk:
         self._z = None
         self._change = self._action = np.zeros(0)
         self._certified = self._was_certified = self._holds = self._tight = False
-        self._tights = []
+        self._dead_end = False
+        self._tights, self._dead_ends = [], []
         self._lost = 0
         self._took = 0.0
         self._ranks = np.zeros(0, int) if self.backups is None else self.backups.ranks.copy()
@@ -578,16 +585,21 @@ class LearntRisk:
     def _look_ahead(self, policies: _Floats, *, failed: bool) -> None:
         """As far as it takes to fail where nothing helps, and half as far again.
 
-        Half as far again, too, after an episode that failed although it was certified not to.
+        Half as far again, too, after an episode that failed although it was certified not to; less
+        far after one that went on for the whole horizon from where nothing seemed to help.
         """
         assert self.disturbances is not None
-        if len(self.dynamics.consequents.sides):
+        if not len(self.dynamics.consequents.sides):
+            return
+        if not failed and any(self._dead_ends[: -self.horizon]):  # it sees less far than it looks
+            self.takes *= _REFUTED
+        else:
             after = failing_after(self.dynamics, self.situations, policies, self.disturbances)
             takes = max(_LATEST * self.takes, self._took)
             if failed and self._was_certified:  # it did not look far enough
                 takes = min(_AHEAD * takes, _FARTHEST / _AHEAD)
             self.takes = max(float(after), takes)
-            self.horizon = int(min(max(_AHEAD * self.takes, _SHORTEST), _FARTHEST))
+        self.horizon = int(min(max(_AHEAD * self.takes, _SHORTEST), _FARTHEST))
 
     def _evolve(self, random: np.random.Generator) -> None:
         assert self.disturbances is not None
