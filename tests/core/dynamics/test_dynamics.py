@@ -210,3 +210,26 @@ def test_disturbances_replay_what_happened(taught):
     assert not found.residuals[0].any()
     dynamics.observe(np.array([40.0, 15.0, 15.0]))
     assert isinstance(dynamics.here, Here)
+
+
+def test_a_long_rest_at_an_end_teaches_nothing_of_what_an_action_does(taught, follow):
+    dynamics = taught()
+    effect = dynamics.weights[[7, 8], 1].copy()  # of this action and the one before on own speed
+    U = np.full(120, -2.0)
+    own = np.maximum(0.0, 2.0 + 0.25 * np.cumsum(np.append(0.0, U)))
+    Z = np.column_stack([30.0 - 0.25 * np.append(0.0, np.cumsum(own[:-1])), own, np.zeros(121)])
+    follow(dynamics, Z, U)
+    np.testing.assert_allclose(dynamics.weights[[7, 8], 1], effect, atol=0.01)
+    follow(dynamics, Z, U)
+    assert dynamics.consequents.lowest[1] == 0.0
+    np.testing.assert_allclose(dynamics.weights[[7, 8], 1], effect, atol=0.01)
+
+
+def test_what_hardly_ever_changes_is_learnt_at_its_ends_too(follow):
+    draw = np.random.default_rng(0)
+    dynamics = Dynamics(-1.0, 1.0)
+    for _ in range(4):
+        flag = (np.arange(101) // 25 % 2).astype(float)
+        place = np.cumsum(np.append(0.0, draw.uniform(-1.0, 1.0, 100)))
+        follow(dynamics, np.column_stack([place, flag]), np.diff(place))
+    assert dynamics.weights[5, 0] == pytest.approx(1.0, abs=0.01)

@@ -228,3 +228,26 @@ def test_by_itself_it_says_what_it_lacks():
         LearntRisk(0.1, without=("luck",))
     with pytest.raises(ValueError, match="dt"):
         LearntRisk(0.0)
+
+
+@pytest.mark.parametrize(
+    ("dead_ends", "took", "failed", "looks"),
+    [
+        ([True] * 100, 0.0, False, "less far"),  # it went on for the whole horizon
+        ([False] * 80 + [True] * 20, 0.0, False, "as far"),  # nobody knows how those ended
+        ([True] * 100, 0.0, True, "as far"),  # they were dead ends
+        ([False] * 100, 90.0, False, "farther"),  # what was refused would have failed as late
+    ],
+)
+def test_the_horizon_follows_what_became_of_dead_ends(point, dead_ends, took, failed, looks):
+    guard = point.guard(horizon=None)
+    for episode in range(6):
+        point.play(guard, episode)
+    judge = guard.judge
+    judge.takes, judge.horizon = 40.0, 60
+    judge._dead_ends, judge._took = dead_ends, took
+    judge._look_ahead(judge.backups.policies[:1], failed=failed)
+    ratio = judge.takes / 40.0
+    expected = {"less far": ratio < 0.9, "as far": 0.95 < ratio < 1.05, "farther": ratio > 2.0}
+    assert expected[looks]
+    assert judge.horizon == int(min(max(1.5 * judge.takes, 32), 144))
