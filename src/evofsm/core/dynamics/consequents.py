@@ -249,7 +249,8 @@ def residuals(
 
     ``observations`` (length + 2, m) begin one before; ``actions`` (length + 1, a) too. Where a
     variable is expected beyond where it saturates and stays there, its residual is censored; if
-    it is ``carried``, the one before goes on, for its cause may not have ended.
+    it is ``carried``, the one before goes on, for its cause may not have ended. Where nothing moves
+    at all, what was expected is the model's own error: nothing disturbs.
     """
     m, a = observations.shape[1], actions.shape[1]
     room = scratch(m, a, known.weights.shape[0])
@@ -265,13 +266,15 @@ def residuals(
             room.features,
             room.move,
         )
+        still = True
+        for j in range(m):
+            still = still and observations[t + 2, j] == observations[t + 1, j]
         for j in range(m):
             y, x = observations[t + 1, j] + room.move[j], observations[t + 2, j]
             close = 1e-9 / known.inverse[j]
             low, high = x <= known.lowest[j] + close, x >= known.highest[j] - close
-            found[t, j] = (
-                0.0 if (y < known.lowest[j] and low) or (y > known.highest[j] and high) else x - y
-            )
+            beyond = (y < known.lowest[j] and low) or (y > known.highest[j] and high)
+            found[t, j] = 0.0 if still or beyond else x - y
             if carried and t > 0:
                 if low:
                     found[t, j] = min(found[t, j], found[t - 1, j])

@@ -519,7 +519,7 @@ class Dynamics:
         """Learn from an episode as a whole."""
         Z, U = np.array(self._Z), np.array(self._U).reshape(-1, self.size)
         safe = Z[:-1] if failed else Z
-        self._extremes(safe)
+        arrived = self._extremes(safe)
         if failed:
             self.failures = [*self.failures[1 - MOST_KEPT :], Z[-1]]
         self.settle()
@@ -530,6 +530,7 @@ class Dynamics:
         if self.ready and T > 4:
             found = np.zeros((T - 1, self.n_variables))
             residuals(self.consequents, Z, U, T - 1, False, found)
+            self._held(arrived, found, safe)
             self._rescale(found, safe)
             self.latest = Episode(safe, U[:T], found, failed)
             if "stretches" not in self.without:
@@ -559,10 +560,11 @@ class Dynamics:
             )
         self._rebuild()
 
-    def _extremes(self, safe: _Floats) -> None:
-        """How far variables went, and whether they stay there."""
+    def _extremes(self, safe: _Floats) -> NDArray[np.bool_]:
+        """How far variables went; (m, 2) which of those ends they came to by moving."""
+        arrived = np.zeros((self.n_variables, 2), bool)
         if not len(safe):
-            return
+            return arrived
         low, high = safe.min(0), safe.max(0)
         self.lowest, self.highest = self.lowest.copy(), self.highest.copy()
         self.reached = self.reached.copy()
@@ -575,8 +577,25 @@ class Dynamics:
             moving = (
                 np.abs(np.diff(safe[:, j])) > close
             )  # it arrived there, and did not start there
-            self.reached[j, 0] += ((safe[1:, j] <= self.lowest[j] + close) & moving).any()
-            self.reached[j, 1] += ((safe[1:, j] >= self.highest[j] - close) & moving).any()
+            arrived[j, 0] = ((safe[1:, j] <= self.lowest[j] + close) & moving).any()
+            arrived[j, 1] = ((safe[1:, j] >= self.highest[j] - close) & moving).any()
+        self.reached += arrived
+        return arrived
+
+    def _held(self, arrived: NDArray[np.bool_], found: _Floats, safe: _Floats) -> None:
+        """Count ends at which variables rested although they were expected to go on.
+
+        Whoever never leaves an end does not come to it by moving.
+        """
+        rests, far = safe[1:-1] == safe[2:], ONSET * self.sums.scale
+        held = np.column_stack(
+            [
+                (rests & (safe[2:] == self.lowest) & (found > far)).any(0),
+                (rests & (safe[2:] == self.highest) & (found < -far)).any(0),
+            ]
+        )
+        moves = (self.sums.moving > MOVING)[:, None]
+        self.reached += held & moves & ~arrived & (self.sums.scale[0] > 0.0)
 
     def _rescale(self, found: _Floats, safe: _Floats) -> None:
         sums, size = self.sums, np.abs(found)
