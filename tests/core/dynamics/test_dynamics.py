@@ -233,3 +233,19 @@ def test_what_hardly_ever_changes_is_learnt_at_its_ends_too(follow):
         place = np.cumsum(np.append(0.0, draw.uniform(-1.0, 1.0, 100)))
         follow(dynamics, np.column_stack([place, flag]), np.diff(place))
     assert dynamics.weights[5, 0] == pytest.approx(1.0, abs=0.01)
+
+
+def test_whoever_never_leaves_an_end_learns_that_it_is_one(taught, follow):
+    dynamics = taught()
+    leader = 8.0 + np.sin(np.arange(81))
+    gap = 20.0 + np.cumsum(np.append(0.0, 0.25 * leader[:-1]))
+    for episode in range(3):
+        assert (dynamics.consequents.lowest[1] == 0.0) == (episode > 2)
+        follow(dynamics, np.column_stack([gap, np.zeros(81), leader]), np.full(80, -2.0))
+    assert dynamics.consequents.lowest[1] == 0.0
+
+
+def test_where_nothing_moves_nothing_disturbs(taught, follow):
+    dynamics = taught()
+    follow(dynamics, np.tile([300.0, 0.0, 0.0], (60, 1)), np.full(59, -1.0))
+    assert (dynamics.latest.residuals == 0.0).all()

@@ -103,9 +103,9 @@ class Dynamics:
     Notes
     -----
     Each variable's change is linear in the observation, its latest change, the action, the one
-    before, bends of the action and products of variables and actions (the consequents of eTS, Angelov & Filev
-    2004), learnt by sums that machines can add up. Where a system fails is known only after it
-    failed there once, or where it is told; nothing here says that something is safe.
+    before, bends of the action and products of variables and actions (the consequents of eTS,
+    Angelov & Filev 2004), learnt by sums that machines can add up. Where a system fails is known
+    only after it failed there once, or where it is told; nothing here says that something is safe.
 
     Examples
     --------
