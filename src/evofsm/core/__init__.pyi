@@ -66,6 +66,7 @@ from .observations import Missing as Missing
 from .observations import ObservationEncoder as ObservationEncoder
 from .proportions import poisson_bounds as poisson_bounds
 from .proportions import wilson_bounds as wilson_bounds
+from .rates import FailureRecord as FailureRecord
 from .rates import OnsetRates as OnsetRates
 from .rates import Rate as Rate
 from .reference import Reference as Reference
