@@ -6,6 +6,7 @@ from .dynamics.consequents import Consequents as Consequents
 from .dynamics.consequents import Disturbances as Disturbances
 from .dynamics.consequents import Here as Here
 from .dynamics.consequents import Scratch as Scratch
+from .dynamics.consequents import advance as advance
 from .dynamics.consequents import follow_policy as follow_policy
 from .dynamics.consequents import replay as replay
 from .dynamics.consequents import scratch as scratch
