@@ -13,10 +13,18 @@ from evofsm.evidence.systems import make_system
 from evofsm.evidence.systems.system import Action, Box, Start, System, Vector
 from evofsm.guard import ActionSet, BoxActions, Choices
 
-#: Controllers beside those of the system: actions drawn anew in each step, or held for a while.
-RANDOM, WANDER = "random", "wander"
-# How likely the one that wanders takes another action, and how likely any action is drawn instead.
-_CHANGES, _DRAWN = 0.1, 0.1
+#: Controllers beside those of the system: actions drawn anew in each step, or held for a while, and
+#: feedback that would hold the system, were three in ten of its actions not drawn.
+RANDOM, WANDER, HOLDS = "random", "wander", "holds"
+# How likely the one that wanders takes another action, and how likely any action is drawn instead,
+# in general and of the one that holds.
+_CHANGES, _DRAWN, _DRAWN_HOLDING = 0.1, 0.1, 0.3
+# Feedback that holds a task; the controllers of these lose it almost always within a second or two,
+# so that without it there would be nothing to foresee.
+_FEEDBACK: dict[str, Callable[[Vector], Action]] = {
+    "cartpole": lambda z: int(z @ np.array([0.05, 0.1, 1.0, 0.5]) > 0.0),
+    "pendulum": lambda z: float(np.clip(-10.0 * z[0] - 2.0 * z[1], -2.0, 2.0)),
+}
 # Intervals of an action that is one number, for who counts by action.
 _INTERVALS = 5
 
@@ -43,6 +51,10 @@ class Cases(NamedTuple):
     episode: NDArray[np.intp]  #: (n,) from 0
     episodes: int
 
+    def where(self, rows: NDArray[np.bool_]) -> Cases:
+        """Some of them."""
+        return Cases(*(column[rows] for column in self[:-1]), episodes=self.episodes)
+
     def truth(self, steps: int) -> NDArray[np.bool_]:
         """(n,) whether it failed within so many steps."""
         return np.asarray(self.left <= steps)
@@ -53,9 +65,10 @@ class Cases(NamedTuple):
 
 
 def gather(name: str, starts: Sequence[Start]) -> list[Run]:
-    """Run episodes, each with a controller drawn for it: the system's own, random, or wandering."""
+    """Run episodes, each with a controller drawn for it: one of the system's, or of ours here."""
     system = make_system(name)
     kinds = list(dict.fromkeys((*system.controllers, RANDOM, WANDER)))
+    kinds += [HOLDS] if name in _FEEDBACK else []
     return [_run(system, start, kinds) for start in starts]
 
 
@@ -63,10 +76,11 @@ def _run(system: System, start: Start, kinds: Sequence[str]) -> Run:
     draw = start.rng(7)
     kind = kinds[int(draw.integers(len(kinds)))]
     propose = _controller(system, kind, draw)
+    share = _DRAWN_HOLDING if kind == HOLDS else _DRAWN
     observations, executed, over, failed = [system.reset(start)], [], False, False
     while not over:
         action = propose(observations[-1])
-        if draw.random() < _DRAWN:
+        if draw.random() < share:
             action = drawn(system, draw)
         step = system.step(action)
         executed.append(action)
@@ -76,11 +90,11 @@ def _run(system: System, start: Start, kinds: Sequence[str]) -> Run:
     return Run(np.array(observations), actions, tuple(executed), failed)
 
 
-def _controller(
-    system: System, kind: str, draw: np.random.Generator
-) -> Callable[[Vector], Action]:
+def _controller(system: System, kind: str, draw: np.random.Generator) -> Callable[[Vector], Action]:
     if kind in system.controllers:
         return system.controllers[kind]
+    if kind == HOLDS:
+        return _FEEDBACK[system.name]
     held = drawn(system, draw)
 
     def propose(z: Vector) -> Action:

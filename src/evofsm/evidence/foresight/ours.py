@@ -67,7 +67,7 @@ class Learnt:
         self.machine.start_episode()
         self.model = self.machine.model()
         self.beliefs = [self.model.recognise(run.observations) for run in runs]
-        self._replayed: tuple[int, _Floats] | None = None
+        self._replayed: dict[int, _Floats] = {}
 
     def _indices(self, run: Run) -> list[int]:
         """Index of each action; none after the last observation."""
@@ -143,18 +143,14 @@ class Learnt:
         return np.asarray((1.0 - begins) * alone + begins * amid)
 
     def _lasts(self, some: Cases) -> _Floats:
-        """(n, behaviours, disturbances) steps until it fails, in each replay; the latest are kept."""
-        if self._replayed is not None and self._replayed[0] == id(some):
-            return self._replayed[1]
+        """(n, behaviours, disturbances) steps until it fails, in each replay; for all horizons."""
+        if id(some) in self._replayed:
+            return self._replayed[id(some)]
         dynamics = self.machine.dynamics
         assert dynamics is not None
+        lengths = [len(run.actions) for run in self.runs]
         done = np.concatenate([run.actions for run in self.runs])
-        ends = np.concatenate(
-            [np.full(len(run.actions), len(run.actions)) for run in self.runs]
-        ) + np.repeat(
-            np.cumsum([0, *(len(run.actions) for run in self.runs[:-1])]),
-            [len(run.actions) for run in self.runs],
-        )
+        ends = np.repeat(np.cumsum(lengths), lengths)  # of the episode of each action
         at = np.concatenate([run.observations[:-1] for run in self.runs])
         scale = np.maximum(at.std(axis=0), 1e-9)
         tree = KDTree(np.column_stack([at / scale, done]))
@@ -175,7 +171,7 @@ class Learnt:
             ends[near],
             found,
         )
-        self._replayed = id(some), found
+        self._replayed[id(some)] = found
         return found
 
 

@@ -107,8 +107,8 @@ def venn_abers(score: _Floats, came: NDArray[np.bool_], at: float) -> float:
 class Taylor:
     """Time until the state, extrapolated by backward differences, is beyond where it fails.
 
-    As Henzinger et al. (arXiv 2412.16564) extrapolate what is seen of a black box. Where it fails is
-    given to it: the boundaries that ours found in the failures, since no task tells them.
+    As Henzinger et al. (arXiv 2412.16564) extrapolate what is seen of a black box. Where it fails
+    is given to it: the boundaries that ours found in the failures, since no task tells them.
 
     Parameters
     ----------
