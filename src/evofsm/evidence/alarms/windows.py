@@ -74,11 +74,11 @@ def stages(name: str, plan: Amounts, seed: int) -> tuple[dict[str, Windows], lis
 
 def windows(exposure: Exposure, detector: Detector) -> Windows:
     """Cut episodes into windows; those of which it is not known what came are left out."""
-    scores = detector.score(exposure)
-    found = list(_cut(exposure, scores))
-    score, happened, episode = zip(*found, strict=True) if found else ((), (), ())
+    found = list(_cut(exposure, detector.score(exposure)))
     return Windows(
-        np.array(score, np.float64), np.array(happened, np.bool_), np.array(episode, np.intp)
+        np.array([score for score, _, _ in found], np.float64),
+        np.array([happened for _, happened, _ in found], np.bool_),
+        np.array([episode for _, _, episode in found], np.intp),
     )
 
 

@@ -77,7 +77,8 @@ def _run(system: System, start: Start, kinds: Sequence[str]) -> Run:
     kind = kinds[int(draw.integers(len(kinds)))]
     propose = _controller(system, kind, draw)
     share = _DRAWN_HOLDING if kind == HOLDS else _DRAWN
-    observations, executed, over, failed = [system.reset(start)], [], False, False
+    observations, over, failed = [system.reset(start)], False, False
+    executed: list[Action] = []
     while not over:
         action = propose(observations[-1])
         if draw.random() < share:
@@ -129,9 +130,8 @@ def action_set(system: System) -> ActionSet:
     actions = system.actions
     if not isinstance(actions, Box):
         return Choices(actions.n_actions)
-    low, high = np.array(actions.low), np.array(actions.high)
-    if len(low) > 1:
-        return BoxActions(low, high)
+    if len(actions.low) > 1:
+        return BoxActions(actions.low, actions.high)
     (first,), (last,) = actions.low, actions.high
     return IntervalActions(first, last, (last - first) / _INTERVALS, outside="clip")
 

@@ -129,14 +129,15 @@ def leads(one: Scored) -> tuple[_Floats, NDArray[np.intp]]:
     At the threshold that had a false-alarm rate of 5 % on other episodes; 0 where none was on at
     the end. The second array says which episodes these are.
     """
-    found, episodes = [], []
+    found: list[float] = []
+    episodes: list[int] = []
     for episode in np.unique(one.episode[np.isfinite(one.left)]):
         rows = np.flatnonzero(one.episode == episode)
         on = one.score[rows] > one.alarm
         quiet = np.flatnonzero(~on)
         first = quiet[-1] + 1 if len(quiet) else 0
         found.append(float(one.left[rows[first]]) if first < len(rows) else 0.0)
-        episodes.append(episode)
+        episodes.append(int(episode))
     return np.array(found), np.array(episodes, np.intp)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -80,7 +81,7 @@ class Learnt:
         found = []
         for row in some.action:
             one = dynamics.decode(row)
-            action = int(one[0]) if dynamics.choices else one if len(one) > 1 else float(one[0])
+            action: Any = one if len(one) > 1 else float(one[0])
             found.append(int(self.actions.encode(action)))
         return np.array(found, np.intp)
 
@@ -96,7 +97,7 @@ class Learnt:
         Of each state the share of observations at which it had failed is counted; a chain that
         comes there fails with that probability.
         """
-        seen = sum(beliefs.sum(axis=0) for beliefs in self.beliefs)
+        seen = np.sum([beliefs.sum(axis=0) for beliefs in self.beliefs], axis=0)
         ended = np.zeros_like(seen)
         for run, beliefs in zip(self.runs, self.beliefs, strict=True):
             ended += run.failed * beliefs[-1]

@@ -167,7 +167,7 @@ def _row(plan: Amounts, every: list[_Said]) -> Row:
     numbers = measured(said, plan.test, plan.rounds, plan.seed)
     share = float(one.truth.mean())
     interval = make_system(task).interval
-    values = {}
+    values: dict[str, float] = {}
     for name, number in numbers.items():
         unit = interval if name == "lead" else 1.0
         ends = ("", "_low", "_high")
