@@ -4,6 +4,7 @@ from .core import Edges as Edges
 from .core import Event as Event
 from .core import EvolvingFSM as EvolvingFSM
 from .core import Explanation as Explanation
+from .core import FailureRecord as FailureRecord
 from .core import FailureSplit as FailureSplit
 from .core import Forecasts as Forecasts
 from .core import FSMModel as FSMModel

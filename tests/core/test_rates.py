@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from evofsm.core.proportions import gamma_quantile, poisson_bounds
-from evofsm.core.rates import Rate, shrunk_rates
+from evofsm.core.rates import FailureRecord, Rate, shrunk_rates
 
 
 @pytest.mark.parametrize(
@@ -57,3 +57,24 @@ def test_nothing_is_known_without_exposure():
     assert np.isnan(rate.rate)
     assert (rate.low, rate.high) == (0.0, np.inf)
     assert str(Rate.of(1, 2.0)).startswith("once in 2: ")
+
+
+def test_failures_are_told_with_what_they_rest_on():
+    assert str(FailureRecord(0, 12.0)) == "0 failures in 12 h: at most 0.25 per hour, 95 %"
+    assert (
+        str(FailureRecord(1, 0.0, 0.0, 1)) == "1 failure in 1 episode, 0 h, 0 km: nothing is known"
+    )
+    text = str(FailureRecord(2, 120.7, 9000.0, 500))
+    assert text.startswith("2 failures in 500 episodes, 120 h, 9,000 km: 0.017 per hour (0.0029 to")
+    assert text.endswith("0.22 per 1,000 km (0.039 to 0.70), 90 %")
+    assert FailureRecord(2, 1.0).per_1000_km is None
+
+
+def test_bounds_of_failures_are_rounded_outward():
+    for failures in range(12):
+        record = FailureRecord(failures, 7.3)
+        said = str(record).partition(": ")[2]
+        low, high = (0.0, said.split()[2]) if not failures else said.split("(")[1].split()[:3:2]
+        low, high = float(low), float(str(high).rstrip("),"))
+        assert low <= record.per_hour.low <= record.per_hour.high <= high
+        assert high <= 1.11 * record.per_hour.high

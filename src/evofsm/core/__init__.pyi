@@ -6,6 +6,7 @@ from .dynamics.consequents import Consequents as Consequents
 from .dynamics.consequents import Disturbances as Disturbances
 from .dynamics.consequents import Here as Here
 from .dynamics.consequents import Scratch as Scratch
+from .dynamics.consequents import advance as advance
 from .dynamics.consequents import follow_policy as follow_policy
 from .dynamics.consequents import replay as replay
 from .dynamics.consequents import scratch as scratch
@@ -66,6 +67,7 @@ from .observations import Missing as Missing
 from .observations import ObservationEncoder as ObservationEncoder
 from .proportions import poisson_bounds as poisson_bounds
 from .proportions import wilson_bounds as wilson_bounds
+from .rates import FailureRecord as FailureRecord
 from .rates import OnsetRates as OnsetRates
 from .rates import Rate as Rate
 from .reference import Reference as Reference

@@ -15,6 +15,7 @@ Where states differ by no more than chance (v <= 0), all have the rate of all.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -61,6 +62,81 @@ class Rate(NamedTuple):
         bounds = f"{self.low:.2g} to {self.high:.2g}" if self.onsets else f"at most {self.high:.2g}"
         times = "once" if self.onsets == 1 else f"{self.onsets:,} times"
         return f"{times} in {self.exposure:.4g}: {bounds}"
+
+
+class FailureRecord(NamedTuple):
+    """How often it failed, in the words of a safety review, with what that rests on.
+
+    The intervals are Garwood's (1936), exact if failures come at a constant rate and independently
+    of each other (of more than 50 failures they are right to four digits). Each end by itself holds
+    with 95 %. They speak of the conditions in which it was run, and of nothing else.
+
+    Examples
+    --------
+    >>> print(FailureRecord(0, hours=12.0))
+    0 failures in 12 h: at most 0.25 per hour, 95 %
+    >>> record = FailureRecord(3, hours=40.0, kilometres=2500.0, episodes=4000)
+    >>> print(record)  # doctest: +NORMALIZE_WHITESPACE
+    3 failures in 4,000 episodes, 40 h, 2,500 km: 0.075 per hour (0.020 to 0.20),
+    1.2 per 1,000 km (0.32 to 3.2), 90 %
+    >>> record.per_1000_km
+    Rate(onsets=3, exposure=2.5, rate=1.2, low=0.327, high=3.1)
+    """
+
+    failures: int
+    hours: float  #: that were run [h]
+    kilometres: float | None = None  #: that were driven [km]; None where nothing drives
+    episodes: int | None = None
+
+    @property
+    def per_hour(self) -> Rate:
+        """Failures in an hour, with their 90 % interval."""
+        return Rate.of(self.failures, self.hours)
+
+    @property
+    def per_1000_km(self) -> Rate | None:
+        """Failures in 1,000 km, with their 90 % interval; None where nothing drives."""
+        return None if self.kilometres is None else Rate.of(self.failures, self.kilometres / 1000.0)
+
+    def __str__(self) -> str:
+        episodes, km = self.episodes, self.kilometres
+        failures = _counted(self.failures, "failure")
+        ran = [] if episodes is None else [_counted(episodes, "episode")]
+        ran += [f"{_exposure(self.hours)} h", *([] if km is None else [f"{_exposure(km)} km"])]
+        per_km = self.per_1000_km
+        rates = [(self.per_hour, "per hour")] + ([(per_km, "per 1,000 km")] if per_km else [])
+        said = [_bounded(rate, unit) for rate, unit in rates if rate.exposure > 0.0]
+        if not said:
+            return f"{failures} in {', '.join(ran)}: nothing is known"
+        if self.failures == 0:
+            return f"{failures} in {', '.join(ran)}: at most {', '.join(said)}, 95 %"
+        return f"{failures} in {', '.join(ran)}: {', '.join(said)}, 90 %"
+
+
+def _counted(number: int, what: str) -> str:
+    return f"{number:,} {what}" if number == 1 else f"{number:,} {what}s"
+
+
+def _bounded(rate: Rate, unit: str) -> str:
+    """A rate and its bounds, rounded outward."""
+    if rate.onsets == 0:
+        return f"{_two_digits(rate.high, math.ceil)} {unit}"
+    low, high = _two_digits(rate.low, math.floor), _two_digits(rate.high, math.ceil)
+    return f"{_two_digits(rate.rate, round)} {unit} ({low} to {high})"
+
+
+def _two_digits(value: float, rounded: Callable[[float], int]) -> str:
+    """Of a number above 0; what is off by rounding alone is rounded."""
+    places = 1 - math.floor(math.log10(value))
+    digits = rounded(round(value * 10.0**places, 6))
+    return f"{digits / 10.0**places:,.{max(places, 0)}f}"
+
+
+def _exposure(value: float) -> str:
+    """Rounded down: less would not be claimed."""
+    if value < 10.0:
+        return f"{math.floor(round(value * 100.0, 6)) / 100.0:g}"
+    return f"{math.floor(round(value, 6)):,}"
 
 
 class OnsetRates(NamedTuple):

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from evofsm.core import FailureRecord
 from evofsm.driving.framework import Drive
 from evofsm.driving.worlds.motion import LEADER_ACCELERATION, SPEED
 from evofsm.extras import needs
@@ -91,6 +92,13 @@ class Row:
     mean_speed: float  #: [m/s]
     episodes_until_safe: int | None = None
     train_collisions: int = 0
+    hours: float = 0.0  #: driven, to whole decisions [h]
+    kilometres: float = 0.0  #: driven by the follower [km]
+
+    @property
+    def failures(self) -> FailureRecord:
+        """How often it collides, per hour and per 1,000 km, and what that rests on."""
+        return FailureRecord(self.collisions, self.hours, self.kilometres, self.episodes)
 
     def as_dict(self) -> dict[str, Any]:
         """For JSON."""
@@ -137,6 +145,8 @@ def summarise(
         mean_speed=float(np.mean([o.speed for o in outcomes])),
         episodes_until_safe=episodes_until_safe,
         train_collisions=train_collisions,
+        hours=decisions * interval / 3600.0,
+        kilometres=sum(o.speed * o.decisions for o in outcomes) * interval / 1000.0,
     )
 
 

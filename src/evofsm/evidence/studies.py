@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
+from evofsm.evidence.alarms.plan import Plan as Alarms
 from evofsm.evidence.closed_loop.plan import Plan as ClosedLoop
 from evofsm.evidence.detection.plan import Plan as Detection
+from evofsm.evidence.foresight.plan import Plan as Foresight
 from evofsm.evidence.judges.plan import Plan as Judges
 from evofsm.evidence.paper.plan import Plan as Paper
 from evofsm.evidence.prediction.plan import Plan as Prediction
@@ -16,5 +18,15 @@ from evofsm.evidence.study import Study
 #: By id. The paper's is a command of its own, ``evofsm paper``.
 STUDIES: dict[str, type[Study[Any]]] = {
     study.id: study
-    for study in (Paper, ClosedLoop, Judges, Detection, Prediction, Sensitivity, Real)
+    for study in (
+        Paper,
+        ClosedLoop,
+        Judges,
+        Detection,
+        Alarms,
+        Prediction,
+        Foresight,
+        Sensitivity,
+        Real,
+    )
 }

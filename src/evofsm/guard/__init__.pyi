@@ -13,6 +13,9 @@ from .auditing.replay import Difference as Difference
 from .auditing.replay import Field as Field
 from .auditing.replay import Replay as Replay
 from .auditing.replay import audit as audit
+from .conformal import ConformalAlarm as ConformalAlarm
+from .conformal import Errors as Errors
+from .conformal import Held as Held
 from .defaults import BELIEF_TOLERANCE as BELIEF_TOLERANCE
 from .defaults import TOLERANCE as TOLERANCE
 from .guard import Explain as Explain

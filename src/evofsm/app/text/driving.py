@@ -41,6 +41,7 @@ def print_outcome(
             f"{row.collisions:,} of {row.episodes:,}: {row.collision_rate:.1%} "
             f"(95 %: {row.collision_low:.1%} to {row.collision_high:.1%})",
         ),
+        ("rate", str(row.failures)),
         *([("rear-ended", f"{row.rear_ends}")] if row.rear_ends else []),
         ("mobility", f"{row.mobility:.2f} of the way that the controller makes by itself"),
         (

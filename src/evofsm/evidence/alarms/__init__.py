@@ -1,0 +1,1 @@
+"""Alarms that state a rate of errors, adaptive and fixed, before and after a change."""

@@ -1,0 +1,144 @@
+"""An alarm holds the rate of its errors, whatever comes."""
+
+import math
+from io import BytesIO
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from evofsm.files import storage
+from evofsm.guard.conformal import ConformalAlarm
+
+ANY = st.floats(allow_nan=True, allow_infinity=True)
+KINDS = ("false alarms", "misses")
+
+
+@settings(max_examples=200, deadline=None)
+@given(
+    st.lists(st.tuples(ANY, st.booleans()), min_size=1, max_size=300),
+    st.sampled_from([0.02, 0.1, 0.5, 0.9]),
+    st.sampled_from([0.005, 0.1, 2.0]),
+    st.sampled_from(KINDS),
+)
+def test_the_rate_is_held_whatever_comes(came, rate, step, of):
+    alarm = ConformalAlarm(rate, of=of, step=step, memory=50)
+    errors = counted = 0
+    for score, happened in came:
+        counts = happened == (of == "misses")
+        errors += counts and alarm.alarms(score) == (of == "false alarms")
+        counted += counts
+        alarm.update(score, happened)
+        assert (alarm.errors, alarm.counted) == (errors, counted)
+        if counted:
+            assert alarm.held.low - 1e-9 <= alarm.realised <= alarm.held.high + 1e-9
+
+
+@pytest.mark.parametrize("of", KINDS)
+def test_an_adversary_who_knows_the_threshold_gets_no_further_than_the_bound(of):
+    alarm = ConformalAlarm(0.05, of=of, step=0.01, memory=100)
+    for _ in range(3000):
+        worst = math.inf if of == "false alarms" else -math.inf
+        alarm.update(worst, of == "misses")
+    assert alarm.errors <= 0.05 * 3000 + 0.05 / 0.01 + 0.95
+
+
+def test_a_delay_costs_no_more_errors_than_its_length():
+    alarm, delay, said = ConformalAlarm(0.05, step=0.01, memory=100), 30, []
+    for t in range(3000):
+        said.append((float(t), alarm.alarms(float(t))))  # each score is above all before
+        if t >= delay:
+            score, alarmed = said[t - delay]
+            alarm.update(score, False, alarmed=alarmed)
+    assert alarm.errors <= 0.05 * alarm.counted + 0.05 / 0.01 + 1.0 + delay
+
+
+def test_after_a_shift_the_rate_comes_back_and_a_fixed_threshold_loses_it():
+    rng = np.random.default_rng(3)
+    before, after = rng.exponential(size=3000), 2.0 * rng.exponential(size=3000)
+    alarm = ConformalAlarm(0.05, step=0.01, memory=500)
+    for score in before:
+        alarm.update(score, False)
+    fixed, errors = np.quantile(before, 0.95), alarm.errors
+    for score in after:
+        alarm.update(score, False)
+    assert (alarm.errors - errors) / 3000 == pytest.approx(0.05, abs=0.005)
+    assert (after > fixed).mean() > 0.15
+
+
+def test_only_the_order_of_scores_matters():
+    rng = np.random.default_rng(5)
+    scores, happened = rng.normal(size=500), rng.random(500) < 0.3
+    for of in KINDS:
+        one, other = (ConformalAlarm(0.1, of=of, step=0.03, memory=60) for _ in range(2))
+        for score, came in zip(scores, happened, strict=True):
+            assert one.alarms(score) == other.alarms(math.exp(score))
+            one.update(score, came)
+            other.update(math.exp(score), came)
+
+
+def test_what_is_not_known_is_taken_for_the_most_dangerous():
+    for of in KINDS:
+        alarm = ConformalAlarm(0.1, of=of, memory=20)
+        for score in range(20):
+            alarm.update(float(score), of == "misses")
+        assert alarm.alarms(math.nan)
+        assert not alarm.alarms(-math.inf)
+
+
+def test_a_question_changes_nothing_and_the_other_outcome_does_not_count():
+    alarm = ConformalAlarm(0.1)
+    assert not alarm.alarms(5.0)  # too little was seen: silent
+    assert alarm.threshold == math.inf
+    assert ConformalAlarm(0.1, of="misses").alarms(-5.0)  # always on
+    alarm.update(3.0, True)
+    assert (alarm.counted, alarm.held) == (0, (0.0, 1.0))
+    assert math.isnan(alarm.realised)
+
+
+@pytest.mark.parametrize("of", KINDS)
+def test_saved_and_loaded_it_goes_on_the_same(of):
+    rng, file = np.random.default_rng(1), BytesIO()
+    alarm = ConformalAlarm(0.1, of=of, step=0.03, memory=30)
+    for score in rng.normal(size=100):
+        alarm.update(score, of == "misses")
+    alarm.save(file)
+    again = ConformalAlarm.load(BytesIO(file.getvalue()))
+    assert repr(again) == repr(alarm)
+    for score in rng.normal(size=100):
+        assert again.threshold == alarm.threshold
+        again.update(score, of == "misses")
+        alarm.update(score, of == "misses")
+    assert again.errors == alarm.errors
+
+
+def test_a_file_that_contradicts_itself_is_refused():
+    file = BytesIO()
+    ConformalAlarm(0.1).save(file)
+    content, arrays = storage.read(BytesIO(file.getvalue()), "conformalalarm")
+    for told, scores, what in (
+        (content | {"of": "luck"}, [], "of is 'luck'"),
+        (content | {"counted": 2, "errors": 3}, [1.0, 2.0], "3 errors of 2"),
+        (content | {"counted": 2}, [1.0], "1 scores of 2 updates"),
+    ):
+        bad = BytesIO()
+        storage.write(bad, "conformalalarm", told, arrays | {"scores": np.array(scores)})
+        with pytest.raises(ValueError, match=what):
+            ConformalAlarm.load(BytesIO(bad.getvalue()))
+
+
+@pytest.mark.parametrize(
+    ("told", "what"),
+    [
+        ({"rate": 0.0}, "rate is 0.0"),
+        ({"rate": 1.0}, "below 1"),
+        ({"of": "hits"}, "of is 'hits'"),
+        ({"step": -1.0}, "step is -1.0"),
+        ({"rate": 0.001, "memory": 900}, "needs 1,000 scores"),
+        ({"memory": 0}, "memory is 0"),
+    ],
+)
+def test_what_cannot_be_held_is_refused(told, what):
+    with pytest.raises(ValueError, match=what):
+        ConformalAlarm(**told)
