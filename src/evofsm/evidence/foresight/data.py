@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,7 +53,8 @@ class Cases(NamedTuple):
 
     def where(self, rows: NDArray[np.bool_]) -> Cases:
         """Some of them."""
-        return Cases(*(column[rows] for column in self[:-1]), episodes=self.episodes)
+        columns: tuple[Any, ...] = self[:-1]
+        return Cases._make([*(column[rows] for column in columns), self.episodes])
 
     def truth(self, steps: int) -> NDArray[np.bool_]:
         """(n,) whether it failed within so many steps."""
@@ -120,7 +121,7 @@ def encoded(system: System, action: Action) -> NDArray[np.float64]:
     """(a,) of choices a one among zeros, else in [-1, 1]."""
     actions = system.actions
     if not isinstance(actions, Box):
-        return np.eye(actions.n_actions)[int(action)]
+        return np.asarray(np.eye(actions.n_actions)[int(action)])
     low, high = np.array(actions.low), np.array(actions.high)
     return np.asarray(2.0 * (np.atleast_1d(action) - low) / (high - low) - 1.0)
 
@@ -159,4 +160,4 @@ def cases(runs: Sequence[Run], every: int) -> Cases:
             )
         )
     columns = [np.concatenate(column) for column in zip(*parts, strict=True)]
-    return Cases(*columns, episodes=len(runs))
+    return Cases._make([*columns, len(runs)])

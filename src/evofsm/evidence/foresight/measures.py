@@ -194,4 +194,4 @@ def _means(parts: Sequence[_ByEpisode], chosen: NDArray[np.intp]) -> dict[str, f
 
 def _at(one: Scored, rows: NDArray[np.intp]) -> Scored:
     parts = (one.probability, one.score, one.truth, one.episode, one.left)
-    return Scored(*(part[rows] for part in parts), one.alarm, one.calls)
+    return Scored._make([*(part[rows] for part in parts), one.alarm, one.calls])

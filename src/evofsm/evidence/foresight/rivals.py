@@ -86,7 +86,7 @@ class Neighbours:
 
     def __call__(self, some: Cases) -> _Floats:
         """(n,) probability."""
-        return self._probabilities[np.rint(self.share(some) * NEIGHBOURS).astype(int)]
+        return np.asarray(self._probabilities[np.rint(self.share(some) * NEIGHBOURS).astype(int)])
 
 
 def venn_abers(score: _Floats, came: NDArray[np.bool_], at: float) -> float:
