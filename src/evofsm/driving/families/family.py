@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import MISSING, dataclass, fields, replace
-from functools import cached_property
+from functools import cached_property, partial
 from importlib.resources import files
 from os import PathLike
 from pathlib import Path
@@ -13,7 +13,7 @@ from typing import Any, NamedTuple, TypeVar
 
 from evofsm.core import IntervalActions, Labels
 from evofsm.driving.drivers.idm import IDM, ChangingIDM
-from evofsm.driving.families.numbers import Numbers
+from evofsm.driving.families.numbers import Chance, GivenNumbers, Numbers
 from evofsm.driving.families.tables import (
     LAYOUT,
     LONGEST,
@@ -184,20 +184,49 @@ class Family:
         >>> train == family.draw(seed=1, index=0), train == test
         (True, False)
         """
-        variants = self.tables.get("variant", ())
-        if not variants:
-            return self._draw(None, seed, index, split)
+        by_seed = partial(Numbers, seed=seed, index=index, split=split)
+        if not self.variants:
+            return self._draw(None, by_seed)
         if self.cases > 1:
-            return self._draw(index % self.cases, seed, index, split)
-        stream = Numbers({}, seed, index, split).stream("variant")
-        return self._draw(int(stream.integers(len(variants))), seed, index, split)
+            return self._draw(index % self.cases, by_seed)
+        return self._draw(by_seed({}).below(len(self.variants), "variant"), by_seed)
 
-    def _draw(self, variant: int | None, seed: int, index: int, split: str = "train") -> Draw:
+    def draw_by(self, chance: Chance) -> Draw:
+        """The scenario that given chances make, for whoever searches among all there are.
+
+        Parameters
+        ----------
+        chance : callable
+            Says for each place in the file that is drawn from, such as ``scenario.initial_gap``, a
+            number from 0 up to 1: 0 is the lower end of a range, 0.5 its middle. Independent and
+            evenly distributed ones make draws as `draw` does; which of the variants it is, is drawn
+            from ``variant``.
+
+        Returns
+        -------
+        Draw
+
+        Raises
+        ------
+        ValueError
+            If a chance is out of its range, or the file's numbers make no scenario.
+
+        Examples
+        --------
+        >>> draw = load_family("emergency").draw_by(lambda where: 0.5)
+        >>> draw.scenario.initial_gap, draw.scenario.leader.brake_decel
+        (16.0, 3.5)
+        """
+        given = partial(GivenNumbers, chance=chance)
+        n = len(self.variants)
+        return self._draw(given({}).below(n, "variant") if n else None, given)
+
+    def _draw(self, variant: int | None, numbers_of: Callable[[Table], Numbers]) -> Draw:
         tables = self.tables
         own = () if variant is None else (tables["variant"][variant],)
         for changes in (*own, *self.added):
             tables = merge_tables(tables, changes)
-        numbers = Numbers(tables.get("values", {}), seed, index, split)
+        numbers = numbers_of(tables.get("values", {}))
         builder = _Builder(self.source, tables, numbers)
         try:
             draw = Draw(
@@ -300,7 +329,7 @@ def _try_out(family: Family) -> None:
     variants = range(len(family.variants)) if family.variants else [None]
     for one, variant in itertools.product((family, family.shifted), variants):
         if one is not None:
-            one._draw(variant, seed=0, index=0)
+            one._draw(variant, partial(Numbers, seed=0, index=0))
 
 
 class _Builder:
@@ -315,7 +344,8 @@ class _Builder:
         behind = None
         if "behind" in self.tables:
             behind = self._make(Behind, "behind", driver=self._driver("behind"))
-        seed = int(self.numbers.stream("sensors.seed").integers(2**32))
+        told = self.tables.get("sensors", {}).get("seed")
+        seed = self.numbers.below(2**32, "sensors.seed") if told is None else int(told)
         return self._make(
             Scenario,
             "scenario",
