@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from evofsm.evidence.breaks.plan import Plan as Breaks
 from evofsm.evidence.closed_loop.plan import Plan as ClosedLoop
 from evofsm.evidence.detection.plan import Plan as Detection
 from evofsm.evidence.judges.plan import Plan as Judges
@@ -16,5 +17,5 @@ from evofsm.evidence.study import Study
 #: By id. The paper's is a command of its own, ``evofsm paper``.
 STUDIES: dict[str, type[Study[Any]]] = {
     study.id: study
-    for study in (Paper, ClosedLoop, Judges, Detection, Prediction, Sensitivity, Real)
+    for study in (Paper, ClosedLoop, Judges, Breaks, Detection, Prediction, Sensitivity, Real)
 }

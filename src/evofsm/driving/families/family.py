@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, MutableMapping
 from dataclasses import MISSING, dataclass, fields, replace
 from functools import cached_property, partial
 from importlib.resources import files
@@ -191,7 +191,7 @@ class Family:
             return self._draw(index % self.cases, by_seed)
         return self._draw(by_seed({}).below(len(self.variants), "variant"), by_seed)
 
-    def draw_by(self, chance: Chance) -> Draw:
+    def draw_by(self, chance: Chance, drawn: MutableMapping[str, float] | None = None) -> Draw:
         """The scenario that given chances make, for whoever searches among all there are.
 
         Parameters
@@ -201,6 +201,9 @@ class Family:
             number from 0 up to 1: 0 is the lower end of a range, 0.5 its middle. Independent and
             evenly distributed ones make draws as `draw` does; which of the variants it is, is drawn
             from ``variant``.
+        drawn : mapping, optional
+            Where each number that was drawn is put, by its place: from a range the number itself,
+            of several its index, from 0.
 
         Returns
         -------
@@ -217,7 +220,7 @@ class Family:
         >>> draw.scenario.initial_gap, draw.scenario.leader.brake_decel
         (16.0, 3.5)
         """
-        given = partial(GivenNumbers, chance=chance)
+        given = partial(GivenNumbers, chance=chance, drawn=drawn)
         n = len(self.variants)
         return self._draw(given({}).below(n, "variant") if n else None, given)
 

@@ -13,7 +13,7 @@ from evofsm.driving.drivers.idm import IDM, ChangingIDM
 from evofsm.driving.families.family import Draw, Family
 
 
-class Case(NamedTuple):
+class NamedDraw(NamedTuple):
     """A draw that is kept."""
 
     name: str
@@ -21,7 +21,7 @@ class Case(NamedTuple):
     draw: Draw
 
 
-def fixed_family(family: Family, cases: Sequence[Case], about: str) -> str:
+def fixed_family(family: Family, cases: Sequence[NamedDraw], about: str) -> str:
     """Draws of a family as a family of their own, in which nothing is left to chance.
 
     Parameters
@@ -48,7 +48,7 @@ def fixed_family(family: Family, cases: Sequence[Case], about: str) -> str:
     --------
     >>> from evofsm.driving import load_family
     >>> family = load_family("emergency")
-    >>> found = Case("near", "The smallest gap.", family.draw_by(lambda where: 0.0))
+    >>> found = NamedDraw("near", "The smallest gap.", family.draw_by(lambda where: 0.0))
     >>> kept = json.loads(fixed_family(family, [found], "One case."))
     >>> kept["variant"][0]["scenario"]
     {'initial_gap': 2.0, 'duration': 35.0, 'dt': 0.01, 'initial_speed': 0.0}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import operator
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, MutableMapping
 from typing import Any
 from zlib import crc32
 
@@ -152,25 +152,40 @@ class GivenNumbers(Numbers):
     values : mapping of str to value
         What relations relate to.
     chance : callable
+    drawn : mapping, optional
+        Where each number is put, by the place that it is drawn for.
 
     Examples
     --------
-    >>> numbers = GivenNumbers({}, {"gap": 0.25, "leader.one_of": 0.9}.__getitem__)
+    >>> drawn = {}
+    >>> numbers = GivenNumbers({}, {"gap": 0.25, "leader.one_of": 0.9}.__getitem__, drawn)
     >>> numbers.draw([2.0, 30.0], "gap"), numbers.draw({"one_of": [1.0, 2.0, 3.0]}, "leader")
     (9.0, 3.0)
+    >>> drawn
+    {'gap': 9.0, 'leader.one_of': 2}
     """
 
-    def __init__(self, values: Mapping[str, Any], chance: Chance) -> None:
+    def __init__(
+        self,
+        values: Mapping[str, Any],
+        chance: Chance,
+        drawn: MutableMapping[str, float] | None = None,
+    ) -> None:
         super().__init__(values, 0, 0)
         self._chance = chance
+        self._drawn = {} if drawn is None else drawn
 
     def between(self, low: float, high: float, where: str) -> float:
         """A number from a range."""
-        return low + (high - low) * self._checked(where)
+        number = low + (high - low) * self._checked(where)
+        self._drawn[where] = number
+        return number
 
     def below(self, n: int, where: str) -> int:
         """A whole number from 0 to n - 1."""
-        return int(n * self._checked(where))
+        number = int(n * self._checked(where))
+        self._drawn[where] = number
+        return number
 
     def _checked(self, where: str) -> float:
         chance = self._chance(where)

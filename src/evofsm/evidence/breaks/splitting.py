@@ -3,9 +3,9 @@
 A case is made by random numbers, one for each place that asks for one; here they are standard
 normal ones. A score says how close a case came to failing, infinite where it failed. Many cases are
 drawn; those of the lowest scores are given up for copies of others, which are moved at random
-but never below the level that was reached; and so on, until what is left has failed. The shares that
-were kept, multiplied, are the probability (Cérou and Guyader 2007, with the ties of Bréhier et al.
-2016; Au and Beck 2001 is the same with fixed shares).
+but never below the level that was reached; and so on, until what is left has failed. The shares
+that were kept, multiplied, are the probability (Cérou and Guyader 2007; Au and Beck 2001). Cases
+of the same score are kept or given up together.
 
 What moves a case keeps the distribution of ordinary cases (a Metropolis step whose proposals turn
 some of the normal numbers towards fresh ones, by shares from small to large): so nothing has to be
