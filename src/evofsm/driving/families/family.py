@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Iterable, MutableMapping
 from dataclasses import MISSING, dataclass, fields, replace
-from functools import cached_property, partial
+from functools import cache, cached_property, partial
 from importlib.resources import files
 from os import PathLike
 from pathlib import Path
@@ -466,22 +466,34 @@ class _Builder:
         return dict(table)
 
     def _make(self, made: type[Made], key: str, **others: Any) -> Made:
-        known = {part.name for part in fields(made)} - set(others)  # type: ignore[arg-type]
-        table = {name: value for name, value in self._table(key).items() if name in known}
+        known = _parts(made)
+        table = {
+            name: value
+            for name, value in self._table(key).items()
+            if name in known and name not in others
+        }
         drawn = {name: self.numbers.draw(value, f"{key}.{name}") for name, value in table.items()}
         return _make(made, self.source, key, drawn, **others)
 
 
 def _make(made: type[Made], source: str, key: str, table: Table, **others: Any) -> Made:
     """Make something from a table; who gets it wrong is told where."""
-    for part in fields(made):  # type: ignore[arg-type]
-        needed = part.default is MISSING and part.default_factory is MISSING
-        if needed and part.name not in table and part.name not in others:
-            raise ValueError(f"{source}: {key}.{part.name} is missing")
+    for name, is_needed in _parts(made).items():
+        if is_needed and name not in table and name not in others:
+            raise ValueError(f"{source}: {key}.{name} is missing")
     try:
         return made(**table, **others)
     except ValueError as error:
         raise ValueError(f"{source}: {key}: {error}") from None
+
+
+@cache
+def _parts(made: type) -> dict[str, bool]:
+    """The parts of what is made from a table, and whether each is needed."""
+    return {
+        part.name: part.default is MISSING and part.default_factory is MISSING
+        for part in fields(made)
+    }
 
 
 def _naming(source: str, error: ValueError) -> ValueError:
