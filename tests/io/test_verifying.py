@@ -116,6 +116,8 @@ def test_storm_knows_what_we_do_not_and_refuses_what_nobody_knows(model):
     for text in ('P=? [F<=3 "failed"]', "nonsense", 'Pmax=? [F<=3 "nowhere"]'):
         with pytest.raises(ValueError, match="Storm refuses"):
             solve_by_storm(model, text, 1)
+    with pytest.raises(ValueError, match="name the state"):
+        solve_by_storm(model, 'filter(max, Pmin=? [F<=20 "failed"], "state_2")', 1)
     with pytest.raises(ValueError, match="whether, not how likely"):
         solve_by_storm(model, 'Pmax>0.5 [F<=3 "failed"]', 1)
 

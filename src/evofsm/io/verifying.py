@@ -177,8 +177,10 @@ def solve_by_storm(
     ModuleNotFoundError
         If stormpy is not installed.
     ValueError
-        If Storm refuses the property, or answers with no number.
+        If Storm refuses the property, or answers with no number, or the property is filtered.
     """
+    if "filter" in text:
+        raise ValueError(f"{text!r}: what is asked for is one state's probability; name the state")
     with needs("stormpy", "verify", "checking with Storm"):
         import stormpy
     with TemporaryDirectory() as folder:
@@ -190,9 +192,9 @@ def solve_by_storm(
             if len(asked) != 1:
                 raise ValueError(f"{text!r} holds {len(asked)} properties; one is checked")
             process = stormpy.build_model(program, asked)
-            answer = stormpy.model_checking(process, asked[0]).at(process.initial_states[0])
+            answer = stormpy.model_checking(process, asked[0])
         except RuntimeError as error:
             raise ValueError(f"Storm refuses {text!r}: {str(error).splitlines()[0]}") from None
-    if isinstance(answer, bool):
-        raise ValueError(f"{text!r} asks whether, not how likely; Storm answers {answer}")
-    return float(getattr(answer, "value", answer))
+    if not hasattr(answer, "get_value"):  # it holds truth values then
+        raise ValueError(f"{text!r} asks whether, not how likely; write =?")
+    return float(answer.get_value(process.initial_states[0]))

@@ -273,7 +273,7 @@ def load_family(name: str | PathLike[str]) -> Family:
     Parameters
     ----------
     name : str or path
-        One of `FAMILIES`, or the path of a TOML file.
+        One of `FAMILIES`, or the path of a TOML file, or of a JSON file that ends in ``.json``.
 
     Returns
     -------
@@ -282,8 +282,8 @@ def load_family(name: str | PathLike[str]) -> Family:
     Raises
     ------
     ValueError
-        If there is no such family or file, or the file is not TOML, or holds a name or a kind of
-        value that no family knows.
+        If there is no such family or file, or the file is not TOML or JSON, or holds a name or a
+        kind of value that no family knows.
 
     Examples
     --------
@@ -307,7 +307,7 @@ def load_family(name: str | PathLike[str]) -> Family:
         if not path.is_file():
             raise ValueError(
                 f"there is no family {source!r}; there are {', '.join(FAMILIES)}, or name a TOML "
-                "file that exists"
+                "or JSON file that exists"
             )
         with path.open("rb") as file:
             text = file.read(LONGEST + 1)
