@@ -1,22 +1,17 @@
-"""Cases that were found: their numbers with units, how far from ordinary, and files of them."""
+"""Cases that were found: their numbers with units, and how far they are from ordinary."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from evofsm.app import number
-from evofsm.driving import NamedDraw, fixed_family
 from evofsm.evidence.breaks.amounts import TOY
 from evofsm.evidence.breaks.splitting import Case, to_chance
 from evofsm.evidence.breaks.subjects import load
 from evofsm.extras import needs
-
-if TYPE_CHECKING:
-    from evofsm.evidence.breaks.study import Breaks
 
 with needs("scipy", "study", "the study"):
     from scipy.stats import chi2
@@ -88,39 +83,6 @@ def found_case(family: str, switches: tuple[str, ...], case: Case) -> FoundCase:
     )
     degrees = max(len(numbers), 1)
     return FoundCase(numbers, float(chi2.sf(_distance(case), degrees)))
-
-
-def write_cases(found: Breaks, folder: Path, command: str) -> list[Path]:
-    """Write what was found in each row as a family of its own, if anything was.
-
-    Parameters
-    ----------
-    found : Breaks
-    folder : Path
-    command : str
-        What was typed, told in the files.
-
-    Returns
-    -------
-    list of Path
-        The files.
-    """
-    written = []
-    plan = found.plan
-    for row, cases, raw in zip(found.rows, found.cases, found.raw, strict=True):
-        if row.family == TOY or not cases:
-            continue
-        family = load(row.family, plan.switches)
-        kept = [
-            NamedDraw(f"found {k}", one.about, family.draw_by(case.chance))
-            for k, (one, case) in enumerate(zip(cases, raw, strict=True), 1)
-        ]
-        about = f"Collisions of {family.name} that were found (judge: {row.judge}) by: {command}"
-        path = folder / f"found-{family.name}-{row.judge}.json"
-        folder.mkdir(parents=True, exist_ok=True)
-        path.write_text(fixed_family(family, kept, about), encoding="utf-8")
-        written.append(path)
-    return written
 
 
 def odds(share: float) -> str:

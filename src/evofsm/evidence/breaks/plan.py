@@ -43,7 +43,7 @@ class Plan(Amounts, Study["Breaks"]):
         self, found: Breaks, folder: Path, command: str, progress: Progress = silent
     ) -> Chapter:
         """The same with its figures drawn, and the cases that were found as families."""
-        from evofsm.evidence.breaks.cases import write_cases
+        from evofsm.evidence.breaks.regression import write_cases
 
         write_cases(found, folder, command)
         return super().chapter(found, folder, command, progress)
