@@ -44,6 +44,7 @@ def test_every_row_rests_on_splitting_and_on_plain_samples(found):
     assert found.frame.as_dicts()[2]["family"] == "emergency"
 
 
+@pytest.mark.slow
 def test_numbers_do_not_depend_on_the_processes(found):
     plan = replace(found.plan, family="toy,seldom", plain=50)
     assert run_breaks(plan, workers=1).rows == run_breaks(plan, workers=2).rows
