@@ -24,6 +24,8 @@ from .families.family import FAMILIES as FAMILIES
 from .families.family import Draw as Draw
 from .families.family import Family as Family
 from .families.family import load_family as load_family
+from .families.fixed import NamedDraw as NamedDraw
+from .families.fixed import fixed_family as fixed_family
 from .families.tables import merge_tables as merge_tables
 from .framework import Decision as Decision
 from .framework import Drive as Drive

@@ -104,12 +104,7 @@ class Framework:
         ValueError
             If the time between decisions is no whole number of the scenario's steps.
         """
-        steps = scenario.steps(self.interval)
-        if steps < 1 or not math.isclose(steps * scenario.dt, self.interval):
-            raise ValueError(
-                f"interval is {self.interval} s, which is no whole number of the scenario's "
-                f"steps of {scenario.dt} s"
-            )
+        steps = scenario.steps_between(self.interval)
         guard = self.guard
         guard.begin()
         decided: list[tuple[int, Situation, Revision]] = []

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from evofsm.evidence.alarms.plan import Plan as Alarms
+from evofsm.evidence.breaks.plan import Plan as Breaks
 from evofsm.evidence.closed_loop.plan import Plan as ClosedLoop
 from evofsm.evidence.detection.plan import Plan as Detection
 from evofsm.evidence.foresight.plan import Plan as Foresight
@@ -22,6 +23,7 @@ STUDIES: dict[str, type[Study[Any]]] = {
         Paper,
         ClosedLoop,
         Judges,
+        Breaks,
         Detection,
         Alarms,
         Prediction,

@@ -15,6 +15,8 @@ from .mcap import RunWriter as RunWriter
 from .mcap import read_run as read_run
 from .mcap import recording as recording
 from .mcap import write_run as write_run
+from .process import Process as Process
+from .process import process_of as process_of
 from .sumo_gui import write_replay as write_replay
 from .tables import CsvTable as CsvTable
 from .tables import ParquetTable as ParquetTable
@@ -23,3 +25,6 @@ from .traces import LogColumns as LogColumns
 from .traces import Noted as Noted
 from .traces import read_traces as read_traces
 from .units import parse_units as parse_units
+from .verifying import Property as Property
+from .verifying import solve as solve
+from .verifying import solve_by_storm as solve_by_storm

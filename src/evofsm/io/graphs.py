@@ -16,9 +16,9 @@ from typing import NamedTuple
 from xml.etree import ElementTree as ET
 
 import numpy as np
-from numpy.typing import NDArray
 
 from evofsm.core import FSMModel, Policy
+from evofsm.io.process import Command, process_of, refuse_no_probability
 
 # Vermillion of Okabe and Ito's colours; what is marked by it has another shape and words as well.
 _DEAD_END = "#D55E00"
@@ -28,8 +28,6 @@ _DOT_MARK = (
 # Width of the largest node beyond the smallest [inch], and of the line of a certain edge [point].
 _LARGEST_NODE, _WIDEST_LINE = 1.2, 3.0
 _GRAPHML = "http://graphml.graphdrawing.org/xmlns"
-# Probabilities in PRISM's language have so many decimals; those of a command add up to 1 exactly.
-_DECIMALS = 12
 
 
 class _Graph(NamedTuple):
@@ -251,7 +249,7 @@ def _graph(
     self_loops: bool,
     dead_ends: Collection[int] | None,
 ) -> _Graph:
-    _refuse_no_probability(least)
+    refuse_no_probability(least)
     ended = np.flatnonzero(model.endings) if dead_ends is None else dead_ends
     marked = frozenset(int(state) for state in ended)
     if beyond := sorted(state for state in marked if not 0 <= state < model.n_states):
@@ -289,11 +287,6 @@ def _variables(model: FSMModel) -> tuple[Sequence[str], Sequence[str]]:
     return model.names or nothing, model.units or nothing
 
 
-def _refuse_no_probability(least: float) -> None:
-    if not 0.0 <= least <= 1.0:
-        raise ValueError(f"least is {least}; it must be a probability, from 0 to 1")
-
-
 def _counted(number: float, what: str) -> str:
     return f"{number:,.0f} {what}{'' if round(number) == 1 else 's'}"
 
@@ -329,7 +322,9 @@ def _data(element: ET.Element, values: Mapping[str, str | float]) -> None:
 # -- PRISM ----------------------------------------------------------------------------------------
 
 
-def to_prism(model: FSMModel, evidence: float = 1.0, least: float = 0.0) -> str:
+def to_prism(
+    model: FSMModel, evidence: float = 1.0, least: float = 0.0, first: int | None = None
+) -> str:
     """The model as a Markov decision process in the language of PRISM, which Storm reads as well.
 
     In state ``s=i``, which people call #i, every action that was tried there is a command. It ends
@@ -345,20 +340,23 @@ def to_prism(model: FSMModel, evidence: float = 1.0, least: float = 0.0) -> str:
     least : float
         Transitions to states below this probability are left out, and the others made to add up
         to 1; failure is never left out.
+    first : int, optional
+        The state that it begins in, from 1 as people count; the one that was founded first if not
+        given.
 
     Returns
     -------
     str
         The process. ``"failed"`` labels the failure, ``"unknown"`` states without any command,
-        from which nothing leads on (do not take them for safe), ``"state_i"`` each state. It
-        begins in the state that was founded first; ``filter`` asks of others. Comments say how many
-        decisions and failures a command rests on, and what was left out.
+        from which nothing leads on (do not take them for safe), ``"state_i"`` each state.
+        ``filter`` asks of other states than the first. Comments say how many decisions and failures
+        a command rests on, and what was left out.
 
     Raises
     ------
     ValueError
-        If the model has no states or counted no decisions, ``evidence`` is not positive, or
-        ``least`` no probability.
+        If the model has no states or counted no decisions, ``evidence`` is not positive, ``least``
+        no probability, or ``first`` no state.
 
     Examples
     --------
@@ -390,30 +388,23 @@ def to_prism(model: FSMModel, evidence: float = 1.0, least: float = 0.0) -> str:
     label "state_2" = s=2;
     <BLANKLINE>
     """
-    _refuse_no_probability(least)
-    if not evidence > 0.0:
-        raise ValueError(f"evidence is {evidence}; it must be positive")
-    if not model.decisions.any():
-        raise ValueError(
-            "the model counted no decisions, so there is no action to choose "
-            "(has its machine been told its actions, and by evofsm 0.1 or newer?)"
-        )
+    process = process_of(model, evidence, least)
     n = model.n_states
+    begin = process.checked(first)
     body: list[str] = []
-    unknown: list[int] = []
-    for state in range(n):
-        commands = list(_commands(model, state, evidence, least))
+    for state, commands in enumerate(process.commands):
         remark = "" if commands else ": no action has the evidence"
-        body += ["", f"  // {_described(model, state)}{remark}", *commands]
+        body += ["", f"  // {_described(model, state)}{remark}"]
+        for command in commands:
+            body += _written(model, state, command)
         if not commands:
-            unknown.append(state + 1)
             body.append(f"  [unknown] s={state + 1} -> 1:(s'={state + 1});")
-    first = int(np.argmin(model.founded)) + 1
+    unknown = process.unknown
     labels = [f'label "state_{i}" = s={i};' for i in range(1, n + 1)]
     nowhere = " | ".join(f"s={i}" for i in unknown) or "false"
     lines = [
         *_header(model, evidence, least, len(unknown)),
-        *("mdp", "", "module evofsm", f"  s : [0..{n}] init {first};"),
+        *("mdp", "", "module evofsm", f"  s : [0..{n}] init {begin};"),
         *body,
         *("", "  [failed] s=0 -> 1:(s'=0);", "endmodule", ""),
         *('label "failed" = s=0;', f'label "unknown" = {nowhere};', *labels, ""),
@@ -451,28 +442,13 @@ def _described(model: FSMModel, state: int) -> str:
     return ", ".join([f"#{state + 1}", *where, _counted(model.visits[state], "visit")])
 
 
-def _commands(model: FSMModel, state: int, evidence: float, least: float) -> Iterator[str]:
-    """A command for each action that was tried often enough in a state."""
-    for action in np.flatnonzero(model.decisions[:, state] >= evidence).tolist():
-        decided, failed = model.decisions[action, state], model.failures[action, state]
-        share = failed / decided
-        row = model.transition_matrices[action, state]
-        row = np.where(row >= min(least, row.max()), row, 0.0)
-        chances = np.concatenate([[share], (1.0 - share) * row / row.sum()])
-        seen = [f"failed {failed:.4g}", *(f"seen {count:g}" for count in model.changes[state])]
-        rests = f"{decided:.4g} decisions; a{action + 1} was used {model.uses[action]:,.0f} times"
-        updates = list(_decimals(chances))
-        yield f"  [a{action + 1}] s={state + 1} -> // {rests}"
-        for target, probability in updates:
-            end = ";" if target == updates[-1][0] else " +"
-            yield f"    {probability}:(s'={target}){end} // {seen[target]}"
-
-
-def _decimals(chances: NDArray[np.float64]) -> Iterator[tuple[int, str]]:
-    """Places and probabilities as decimals whose sum is 1 to the last digit."""
-    one = 10**_DECIMALS
-    parts: list[int] = np.rint(chances * one).astype(np.int64).tolist()
-    parts[int(np.argmax(parts))] += one - sum(parts)
-    for place, part in enumerate(parts):
-        if part:
-            yield place, "1" if part == one else f"0.{part:0{_DECIMALS}d}"
+def _written(model: FSMModel, state: int, command: Command) -> Iterator[str]:
+    """A command in PRISM's language, with what it rests on."""
+    action, decided, failed, _ = command
+    seen = [f"failed {failed:.4g}", *(f"seen {count:g}" for count in model.changes[state])]
+    rests = f"{decided:.4g} decisions; a{action + 1} was used {model.uses[action]:,.0f} times"
+    updates = command.decimals
+    yield f"  [a{action + 1}] s={state + 1} -> // {rests}"
+    for target, probability in updates:
+        end = ";" if target == updates[-1][0] else " +"
+        yield f"    {probability}:(s'={target}){end} // {seen[target]}"

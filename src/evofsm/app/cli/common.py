@@ -7,6 +7,7 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from importlib.util import find_spec
+from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -36,8 +37,8 @@ def chosen_mode(name: str) -> Mode:
 def load_model(place: Path) -> tuple[FSMModel, Header | None]:
     """A model from wherever one was left, and what its file says of itself, if there is one.
 
-    From a file, from a folder of results, or from a log of runs. A machine that drove a family of
-    scenarios is labelled as that family is.
+    From the file of a machine, a model or a guard, from a folder of results, or from a log of runs.
+    A machine that drove a family of scenarios is labelled as that family is.
     """
     from evofsm.core import FSMModel
     from evofsm.files import storage
@@ -50,6 +51,8 @@ def load_model(place: Path) -> tuple[FSMModel, Header | None]:
     if place.suffix == ".mcap":
         return _model_of_log(place), None
     header = storage.read_header(place)
+    if header.kind == "guard":
+        return _model_of_guard(place), header
     return (_labelled(place, header) if header.kind == "machine" else FSMModel.load(place)), header
 
 
@@ -62,6 +65,18 @@ def _labelled(place: Path, header: Header) -> FSMModel:
     if (name := header.provenance.get("family")) not in FAMILIES:
         return machine.model()
     return machine.model(**load_family(name).labels._asdict())
+
+
+def _model_of_guard(place: Path) -> FSMModel:
+    """Its machine's, whatever its judge is."""
+    from evofsm.core import EvolvingFSM
+    from evofsm.files import storage
+
+    _, files = storage.read(place, "guard")
+    machine = files["machine"].tobytes()
+    if not machine:
+        raise ValueError(f"{place}: this guard has no machine")
+    return EvolvingFSM.load(BytesIO(machine)).model()
 
 
 def _model_of_log(place: Path) -> FSMModel:

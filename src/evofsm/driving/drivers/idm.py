@@ -7,7 +7,7 @@ vehicle can really do is part of the question here, so the bounds are arguments.
 from __future__ import annotations
 
 import math
-from dataclasses import astuple, dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import ClassVar
 
@@ -93,7 +93,7 @@ class IDM:
     @cached_property
     def parameters(self) -> NDArray[np.float64]:
         """(1, 9) ndarray: begin of the phase [s], then the arguments in order."""
-        return np.array([[0.0, *astuple(self)]])
+        return np.array([[0.0, *_numbers(self)]])
 
     def propose(self, observation: NDArray[np.float64], time: float = 0.0) -> Proposal:
         """Acceleration [m/s²] for ``[gap, v_follower, v_leader]``."""
@@ -133,8 +133,16 @@ class ChangingIDM:
     def parameters(self) -> NDArray[np.float64]:
         """(1 + changes, 9) ndarray: a row for each phase, as `IDM.parameters`."""
         phases = ((0.0, self.first), *self.changes)
-        return np.array([[at, *astuple(driver)] for at, driver in phases])
+        return np.array([[at, *_numbers(driver)] for at, driver in phases])
 
     def propose(self, observation: NDArray[np.float64], time: float = 0.0) -> Proposal:
         """Acceleration [m/s²] for ``[gap, v_follower, v_leader]`` at ``time`` [s]."""
         return Proposal(self.kernel(self.parameters, time, *observation))
+
+
+# As astuple does, which copies each of them: made for every draw, that is what takes long.
+_NAMES = tuple(one.name for one in fields(IDM))
+
+
+def _numbers(driver: IDM) -> tuple[float, ...]:
+    return tuple(getattr(driver, name) for name in _NAMES)

@@ -1,6 +1,8 @@
-"""Families of scenarios: data in TOML files, drawn by seed.
+"""Families of scenarios: data in TOML or JSON files, drawn by seed.
 
 Each file of this folder is a family; `load_family` reads them, or one of your own.
+
+A file that ends in ``.json`` is read as JSON, with the same names.
 
 In a file a number is fixed; ``[low, high]`` is drawn evenly from a range; ``{ one_of = [...] }``
 is one of several, each as likely. ``{ of = "speed", times = 1.5, plus = 2.0, least = 0.0 }``
@@ -13,7 +15,8 @@ as well. All are SI units.
 ``[actions]``       the set of actions, as `evofsm.core.actions.IntervalActions`
 ``[limits]``        true hardest braking: ``decel`` of the follower, ``leader_decel`` of any leader
 ``[values]``        numbers that others relate to, by names of your choice
-``[scenario]``      as `Scenario`, and likewise ``[body]``, ``[sensors]``
+``[scenario]``      as `Scenario`, and likewise ``[body]``, ``[sensors]``, whose ``seed`` may be
+                    fixed
 ``[leader]``        as `Leader`; ``driver`` names one of the drivers. ``waves`` holds pairs of a
                     time and an acceleration, ``[leader.traffic]`` makes such waves between a
                     ``fast`` and a ``slow`` speed, and ``[leader.cut_in]`` puts another car in its
@@ -23,8 +26,8 @@ as well. All are SI units.
                     ``duration``, in which another ``driver`` drives
 ``[behind]``        a car behind the follower: its ``driver`` and ``gap``
 ``[drivers.NAME]``  as `evofsm.driving.drivers.idm.IDM`
-``[[variant]]``     a ``name``, and whatever is otherwise in this variant; they are drawn, each as
-                    likely, or taken in turn where ``in_turn = true``
+``[[variant]]``     a ``name``, words ``about`` it, and whatever is otherwise in this variant; they
+                    are drawn, each as likely, or taken in turn where ``in_turn = true``
 ``[shift]``         what is otherwise after the shift
 ==================  ===============================================================================
 """

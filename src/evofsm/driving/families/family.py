@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, MutableMapping
 from dataclasses import MISSING, dataclass, fields, replace
-from functools import cached_property
+from functools import cache, cached_property, partial
 from importlib.resources import files
 from os import PathLike
 from pathlib import Path
@@ -13,7 +13,7 @@ from typing import Any, NamedTuple, TypeVar
 
 from evofsm.core import IntervalActions, Labels
 from evofsm.driving.drivers.idm import IDM, ChangingIDM
-from evofsm.driving.families.numbers import Numbers
+from evofsm.driving.families.numbers import Chance, GivenNumbers, Numbers
 from evofsm.driving.families.tables import (
     LAYOUT,
     LONGEST,
@@ -184,20 +184,52 @@ class Family:
         >>> train == family.draw(seed=1, index=0), train == test
         (True, False)
         """
-        variants = self.tables.get("variant", ())
-        if not variants:
-            return self._draw(None, seed, index, split)
+        by_seed = partial(Numbers, seed=seed, index=index, split=split)
+        if not self.variants:
+            return self._draw(None, by_seed)
         if self.cases > 1:
-            return self._draw(index % self.cases, seed, index, split)
-        stream = Numbers({}, seed, index, split).stream("variant")
-        return self._draw(int(stream.integers(len(variants))), seed, index, split)
+            return self._draw(index % self.cases, by_seed)
+        return self._draw(by_seed({}).below(len(self.variants), "variant"), by_seed)
 
-    def _draw(self, variant: int | None, seed: int, index: int, split: str = "train") -> Draw:
+    def draw_by(self, chance: Chance, drawn: MutableMapping[str, float] | None = None) -> Draw:
+        """The scenario that given chances make, for whoever searches among all there are.
+
+        Parameters
+        ----------
+        chance : callable
+            Says for each place in the file that is drawn from, such as ``scenario.initial_gap``, a
+            number from 0 up to 1: 0 is the lower end of a range, 0.5 its middle. Independent and
+            evenly distributed ones make draws as `draw` does; which of the variants it is, is drawn
+            from ``variant``.
+        drawn : mapping, optional
+            Where each number that was drawn is put, by its place: from a range the number itself,
+            of several its index, from 0.
+
+        Returns
+        -------
+        Draw
+
+        Raises
+        ------
+        ValueError
+            If a chance is out of its range, or the file's numbers make no scenario.
+
+        Examples
+        --------
+        >>> draw = load_family("emergency").draw_by(lambda where: 0.5)
+        >>> draw.scenario.initial_gap, draw.scenario.leader.brake_decel
+        (16.0, 3.5)
+        """
+        given = partial(GivenNumbers, chance=chance, drawn=drawn)
+        n = len(self.variants)
+        return self._draw(given({}).below(n, "variant") if n else None, given)
+
+    def _draw(self, variant: int | None, numbers_of: Callable[[Table], Numbers]) -> Draw:
         tables = self.tables
         own = () if variant is None else (tables["variant"][variant],)
         for changes in (*own, *self.added):
             tables = merge_tables(tables, changes)
-        numbers = Numbers(tables.get("values", {}), seed, index, split)
+        numbers = numbers_of(tables.get("values", {}))
         builder = _Builder(self.source, tables, numbers)
         try:
             draw = Draw(
@@ -241,7 +273,7 @@ def load_family(name: str | PathLike[str]) -> Family:
     Parameters
     ----------
     name : str or path
-        One of `FAMILIES`, or the path of a TOML file.
+        One of `FAMILIES`, or the path of a TOML file, or of a JSON file that ends in ``.json``.
 
     Returns
     -------
@@ -250,8 +282,8 @@ def load_family(name: str | PathLike[str]) -> Family:
     Raises
     ------
     ValueError
-        If there is no such family or file, or the file is not TOML, or holds a name or a kind of
-        value that no family knows.
+        If there is no such family or file, or the file is not TOML or JSON, or holds a name or a
+        kind of value that no family knows.
 
     Examples
     --------
@@ -275,7 +307,7 @@ def load_family(name: str | PathLike[str]) -> Family:
         if not path.is_file():
             raise ValueError(
                 f"there is no family {source!r}; there are {', '.join(FAMILIES)}, or name a TOML "
-                "file that exists"
+                "or JSON file that exists"
             )
         with path.open("rb") as file:
             text = file.read(LONGEST + 1)
@@ -300,7 +332,7 @@ def _try_out(family: Family) -> None:
     variants = range(len(family.variants)) if family.variants else [None]
     for one, variant in itertools.product((family, family.shifted), variants):
         if one is not None:
-            one._draw(variant, seed=0, index=0)
+            one._draw(variant, partial(Numbers, seed=0, index=0))
 
 
 class _Builder:
@@ -315,7 +347,8 @@ class _Builder:
         behind = None
         if "behind" in self.tables:
             behind = self._make(Behind, "behind", driver=self._driver("behind"))
-        seed = int(self.numbers.stream("sensors.seed").integers(2**32))
+        told = self.tables.get("sensors", {}).get("seed")
+        seed = self.numbers.below(2**32, "sensors.seed") if told is None else int(told)
         return self._make(
             Scenario,
             "scenario",
@@ -433,22 +466,34 @@ class _Builder:
         return dict(table)
 
     def _make(self, made: type[Made], key: str, **others: Any) -> Made:
-        known = {part.name for part in fields(made)} - set(others)  # type: ignore[arg-type]
-        table = {name: value for name, value in self._table(key).items() if name in known}
+        known = _parts(made)
+        table = {
+            name: value
+            for name, value in self._table(key).items()
+            if name in known and name not in others
+        }
         drawn = {name: self.numbers.draw(value, f"{key}.{name}") for name, value in table.items()}
         return _make(made, self.source, key, drawn, **others)
 
 
 def _make(made: type[Made], source: str, key: str, table: Table, **others: Any) -> Made:
     """Make something from a table; who gets it wrong is told where."""
-    for part in fields(made):  # type: ignore[arg-type]
-        needed = part.default is MISSING and part.default_factory is MISSING
-        if needed and part.name not in table and part.name not in others:
-            raise ValueError(f"{source}: {key}.{part.name} is missing")
+    for name, is_needed in _parts(made).items():
+        if is_needed and name not in table and name not in others:
+            raise ValueError(f"{source}: {key}.{name} is missing")
     try:
         return made(**table, **others)
     except ValueError as error:
         raise ValueError(f"{source}: {key}: {error}") from None
+
+
+@cache
+def _parts(made: type) -> dict[str, bool]:
+    """The parts of what is made from a table, and whether each is needed."""
+    return {
+        part.name: part.default is MISSING and part.default_factory is MISSING
+        for part in fields(made)
+    }
 
 
 def _naming(source: str, error: ValueError) -> ValueError:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import operator
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, MutableMapping
 from typing import Any
 from zlib import crc32
 
@@ -12,6 +12,10 @@ import numpy as np
 
 #: Where draws come from. What is learnt on one is scored on the other; they never meet.
 SPLITS = ("train", "test")
+
+#: Says by what chance a number falls as it does: for a place in the file, a number from 0 up to 1,
+#: the same whenever the same place is asked for.
+Chance = Callable[[str], float]
 
 # Larger numbers are a mistake, or infinite.
 _LARGEST = 1e100
@@ -109,7 +113,15 @@ class Numbers:
         self._values = values
         self._key = [SPLITS.index(split), int(seed), int(index)]
 
-    def stream(self, where: str) -> np.random.Generator:
+    def between(self, low: float, high: float, where: str) -> float:
+        """A number from a range."""
+        return float(self._stream(where).uniform(low, high))
+
+    def below(self, n: int, where: str) -> int:
+        """A whole number from 0 to n - 1."""
+        return int(self._stream(where).integers(n))
+
+    def _stream(self, where: str) -> np.random.Generator:
         """The random numbers that belong to a place in the file."""
         return np.random.default_rng([*self._key, crc32(where.encode())])
 
@@ -117,10 +129,9 @@ class Numbers:
         """One number; the same whenever the same place is asked for."""
         match value:
             case [low, high]:
-                return float(self.stream(where).uniform(low, high))
+                return self.between(low, high, where)
             case {"one_of": choices}:
-                chosen = int(self.stream(f"{where}.one_of").integers(len(choices)))
-                return self.draw(choices[chosen], where)
+                return self.draw(choices[self.below(len(choices), f"{where}.one_of")], where)
             case {"of": name}:
                 if name not in self._values:
                     known = ", ".join(self._values) or "none"
@@ -131,3 +142,53 @@ class Numbers:
                 least = self.draw(value.get("least", -math.inf), f"{where}.least")
                 return max(least, times * related + plus)
         return float(value)
+
+
+class GivenNumbers(Numbers):
+    """The numbers of a draw that given chances make, in place of a seed's.
+
+    Parameters
+    ----------
+    values : mapping of str to value
+        What relations relate to.
+    chance : callable
+    drawn : mapping, optional
+        Where each number is put, by the place that it is drawn for.
+
+    Examples
+    --------
+    >>> drawn = {}
+    >>> numbers = GivenNumbers({}, {"gap": 0.25, "leader.one_of": 0.9}.__getitem__, drawn)
+    >>> numbers.draw([2.0, 30.0], "gap"), numbers.draw({"one_of": [1.0, 2.0, 3.0]}, "leader")
+    (9.0, 3.0)
+    >>> drawn
+    {'gap': 9.0, 'leader.one_of': 2}
+    """
+
+    def __init__(
+        self,
+        values: Mapping[str, Any],
+        chance: Chance,
+        drawn: MutableMapping[str, float] | None = None,
+    ) -> None:
+        super().__init__(values, 0, 0)
+        self._chance = chance
+        self._drawn = {} if drawn is None else drawn
+
+    def between(self, low: float, high: float, where: str) -> float:
+        """A number from a range."""
+        number = low + (high - low) * self._checked(where)
+        self._drawn[where] = number
+        return number
+
+    def below(self, n: int, where: str) -> int:
+        """A whole number from 0 to n - 1."""
+        number = int(n * self._checked(where))
+        self._drawn[where] = number
+        return number
+
+    def _checked(self, where: str) -> float:
+        chance = self._chance(where)
+        if not 0.0 <= chance < 1.0:
+            raise ValueError(f"the chance of {where} is {chance}; it must be from 0 up to 1")
+        return chance

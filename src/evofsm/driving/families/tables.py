@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import tomllib
 from collections.abc import Callable, Mapping
 from dataclasses import fields
@@ -33,6 +34,11 @@ def _check_text(value: Any, where: str) -> None:
 def _check_flag(value: Any, where: str) -> None:
     if not isinstance(value, bool):
         raise ValueError(f"{where} is {value!r}; it must be true or false")
+
+
+def _check_seed(value: Any, where: str) -> None:
+    if type(value) is not int or not 0 <= value < 2**32:
+        raise ValueError(f"{where} is {value!r}; it must be a whole number from 0 to 2**32 - 1")
 
 
 def _check_pairs(second: Check) -> Check:
@@ -76,7 +82,7 @@ CHANGES: Table = {
         },
     },
     "body": _numbers_of(Body),
-    "sensors": _numbers_of(Sensors, "seed"),
+    "sensors": {**_numbers_of(Sensors), "seed": _check_seed},
     "behind": {"driver": _check_text, **_numbers_of(Behind, "driver")},
     "drivers": {_ANY: _numbers_of(IDM)},
 }
@@ -90,7 +96,7 @@ LAYOUT: Table = {
     },
     **CHANGES,
     "in_turn": _check_flag,
-    "variant": [{"name": _check_text, **CHANGES}],
+    "variant": [{"name": _check_text, "about": _check_text, **CHANGES}],
     "shift": CHANGES,
 }
 #: What it must hold; the rest is asked for by what is made from it.
@@ -98,14 +104,22 @@ NEEDED = ("about", "interval", "actions", "limits", "scenario", "leader", "follo
 SWITCH_LAYOUT: Table = {_ANY: CHANGES}
 
 
+def is_json(source: str) -> bool:
+    """Whether a file of this name is read as JSON, and not as TOML."""
+    return source.lower().endswith(".json")
+
+
 def parse(text: bytes, source: str, layout: Table) -> Table:
     """Read a file's text, and refuse what the layout does not know."""
     if len(text) > LONGEST:
         raise ValueError(f"{source} has more than {LONGEST:,} bytes; this is no family")
+    form, read = ("JSON", json.loads) if is_json(source) else ("TOML", tomllib.loads)
     try:
-        tables = tomllib.loads(text.decode("utf-8"))
+        tables = read(text.decode("utf-8"))
     except (ValueError, RecursionError) as error:  # TOMLDecodeError and others are ValueErrors
-        raise ValueError(f"{source} is not TOML: {error}") from error
+        raise ValueError(f"{source} is not {form}: {error}") from error
+    if not isinstance(tables, dict):
+        raise ValueError(f"{source} holds no table, as a family's file does")
     _check(tables, layout, source, "")
     return tables
 

@@ -51,13 +51,25 @@ class KinematicWorld:
         """Put the cars on a road, for use in a ``with`` statement."""
         return nullcontext(_Road(scenario))
 
-    def run(self, scenario: Scenario, controller: Controller) -> Episode:
-        """Drive the scenario with ``controller`` in the follower, asked at every step."""
+    def run(
+        self, scenario: Scenario, controller: Controller, interval: float | None = None
+    ) -> Episode:
+        """Drive the scenario with ``controller`` in the follower.
+
+        Parameters
+        ----------
+        scenario : Scenario
+        controller : Controller
+        interval : float, optional
+            Time between two decisions [s], a whole number of steps; asked at every step if not
+            given.
+        """
         road = _Road(scenario)
+        steps = 1 if interval is None else scenario.steps_between(interval)
         sees_it_all = road._noise is None and road._delay == 0
         if isinstance(controller, CompiledController) and sees_it_all:
-            return road.run(controller)
-        return drive(road, controller)
+            return road.run(controller, steps)
+        return drive(road, controller, steps)
 
 
 class _Road(Road):
@@ -71,10 +83,15 @@ class _Road(Road):
     def advance(self, command: float, steps: int = 1) -> None:
         self.row = advance(self._plan, self._record, self._positions, self.row, command, steps)
 
-    def run(self, controller: CompiledController) -> Episode:
+    def run(self, controller: CompiledController, steps: int) -> Episode:
         """As `drive`, without leaving compiled code."""
         self.row = _drive_kernel(
-            controller.kernel, controller.parameters, self._plan, self._record, self._positions
+            controller.kernel,
+            controller.parameters,
+            self._plan,
+            self._record,
+            self._positions,
+            steps,
         )
         episode = self.episode()
         refuse_non_number(  # which ended the run
@@ -89,8 +106,9 @@ def _drive(
     plan: Plan,
     record: NDArray[np.float64],
     positions: NDArray[np.float64],
+    steps: int,
 ) -> int:
-    """Ask a compiled driver at every step; returns the row in which it ended."""
+    """Ask a compiled driver every so many steps; returns the row in which it ended."""
     row = 0
     while True:
         now = record[row]
@@ -98,10 +116,10 @@ def _drive(
         if is_over(record, row) or not np.isfinite(command):
             decide(plan, record, row, command)
             return row
-        row = advance(plan, record, positions, row, command, 1)
+        row = advance(plan, record, positions, row, command, steps)
 
 
 # With its signature stated it is compiled once for all drivers.
 _drive_kernel = compiled(
-    _drive, types.int64(types.FunctionType(DRIVER_KERNEL), TABLE, PLAN, TABLE, SERIES)
+    _drive, types.int64(types.FunctionType(DRIVER_KERNEL), TABLE, PLAN, TABLE, SERIES, types.int64)
 )

@@ -149,15 +149,15 @@ class World(Protocol):
         ...
 
 
-def drive(road: Road, controller: Controller) -> Episode:
-    """Ask the controller at every step, until time is up or the cars collide."""
+def drive(road: Road, controller: Controller, steps: int = 1) -> Episode:
+    """Ask the controller every so many steps, until time is up or the cars collide."""
     over = False
     while not over:
         over = road.over
         observation, time = road.observation, road.time
         acceleration = float(controller.propose(observation, time).action)
         refuse_non_number(acceleration, time, observation[0])
-        road.advance(acceleration)
+        road.advance(acceleration, steps)
     return road.episode()
 
 

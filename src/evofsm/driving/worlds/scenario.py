@@ -212,6 +212,22 @@ class Scenario:
         """How many steps that is, rounded."""
         return round(seconds / self.dt)
 
+    def steps_between(self, interval: float) -> int:
+        """How many steps lie between two decisions.
+
+        Raises
+        ------
+        ValueError
+            If the time between decisions is no whole number of them.
+        """
+        steps = self.steps(interval)
+        if steps < 1 or not math.isclose(steps * self.dt, interval):
+            raise ValueError(
+                f"interval is {interval} s, which is no whole number of the scenario's "
+                f"steps of {self.dt} s"
+            )
+        return steps
+
 
 def _require_positive(whose: str, **values: float) -> None:
     for name, value in values.items():

@@ -1,0 +1,1 @@
+"""Broken on purpose: which scenarios of a family end in a collision, and how likely they are."""
