@@ -45,7 +45,7 @@ def tell(found: Tasks) -> Chapter:
         answer=tuple(_answer(found, every)),
         losses=tuple(_losses(found, every)),
         fails=failures(asked),
-        tables=(*tables_of_asked(asked), _table(every), *_policies(found)),
+        tables=(*tables_of_asked(asked), *_tables(every), *_policies(found)),
         sketches=tuple(sketches(found)),
         plan=tuple(_plan(found)),
         packages=("scipy", "gymnasium"),
@@ -58,9 +58,9 @@ _ABOUT = (
     "Tasks as others set them, with their equations, actions and rewards. The learnt judge is told "
     "the range of the action, the time between decisions, and which episodes failed; the same "
     "settings everywhere. What its rivals are told stands beside them. Those that learn do so "
-    "while they decide; then all are tried on the same held-out episodes. An unsafe step ends an episode "
-    "as a failure. A proposal is kept if exactly it is executed. Nothing is safe before the first "
-    "failure of each kind, as long as nobody tells of it."
+    "while they decide; then all are tried on the same held-out episodes. An unsafe step ends an "
+    "episode as a failure. A proposal is kept if exactly it is executed. Nothing is safe before "
+    "the first failure of each kind, as long as nobody tells of it."
 )
 _SOURCES = (
     Source(
@@ -202,39 +202,46 @@ _FAILED: tuple[Column[Summary], ...] = (
         within(1, 1),
     ),
 )
-_COLUMNS: tuple[Column[Summary], ...] = (
-    Column("told", "told"),
+_FAILS: tuple[Column[Summary], ...] = (
     _while("trained"),
     _while("learning"),
     _while("late"),
     *_FAILED,
     Column("worst [%]", "worst", bare_percent),
+)
+_COSTS: tuple[Column[Summary], ...] = (
     Column("return", "score score_low score_high", _return_text),
-    Column("worst return", "score_worst", _score_text),
+    Column("worst", "score_worst", _score_text),
     Column("of told [%]", "of_told", bare_percent),
     Column("kept [%]", "kept", bare_percent),
     Column("change", "change", decimals(2)),
     Column("p50 [ms]", "p50", decimals(2)),
     Column("p99 [ms]", "p99", decimals(2)),
 )
-_NOTE = (
+_ON_FAILS = (
     "Trained: episodes that were learnt from. Learning: failures in them, in the worst run; late: "
     f"of those the ones after episode {LATE}, or in the second half of fewer than {2 * LATE}. "
     "Failed: held-out episodes of all learning seeds, with a 95 % interval as if they were "
-    "independent (Clopper and Pearson); worst: of the worst run. Return: of the run in the middle, "
-    "with its 95 % interval (bootstrap over episodes). Of told: that return, as a share of the "
-    "highest one of those judges that are told more and never failed. Kept, change, p50: median "
-    "over runs; p99: of the worst run, with all cores of the machine at work."
+    "independent (Clopper and Pearson); worst: of the worst run."
+)
+_ON_COSTS = (
+    "Return: of the run in the middle, with its 95 % interval (bootstrap over episodes), and of "
+    "the worst run. Of told: that return, as a share of the highest one of those judges that are "
+    "told more and never failed. Kept, change, p50: median over runs; p99: of the worst run, with "
+    "all cores of the machine at work."
 )
 
 
-def _table(every: Sequence[Summary]) -> Table:
-    columns = (
-        Column[Summary]("task, controller: judge", lambda one: f"{one.who}: {one.judge}"),
-        *_COLUMNS,
-    )
-    title = "Every judge on every task"
-    return Table.of(title, columns, every, _NOTE, ours=lambda one: one.judge == "learnt")
+def _tables(every: Sequence[Summary]) -> Iterator[Table]:
+    for title, columns, note in (
+        ("What fails", _FAILS, _ON_FAILS),
+        ("What it costs", _COSTS, _ON_COSTS),
+    ):
+        who = Column[Summary]("task, controller: judge", lambda one: f"{one.who}: {one.judge}")
+        head = (who, Column[Summary]("told", "told"))
+        yield Table.of(
+            title, (*head, *columns), every, note, ours=lambda one: one.judge == "learnt"
+        )
 
 
 def _policies(found: Tasks) -> Iterator[Table]:

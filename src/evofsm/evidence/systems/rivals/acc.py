@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+import warnings
 from typing import Any
 
 import numpy as np
@@ -14,6 +14,11 @@ from evofsm.extras import needs
 
 # Standard deviations of what the noise adds up to, that are kept away.
 _SURE = 4.0
+# Of cbfpy: how fast its barrier may fall [1/s]. Its program is relaxed, so that even what it does
+# not change comes back a little smaller: within this it counts as kept.
+_CBFPY_RATE, _SOLVED = 2.5, 0.02
+# Its margin is that of this speed always: one that changes with the speed does not hold.
+_FASTEST = 1.5
 
 
 class _Told(Rival):
@@ -39,7 +44,7 @@ class _Told(Rival):
         self._to_place = 0.5 * dt**2 * hold * (hold - 1)  # of an acceleration, in a decision
 
     def _margin(self, speed: float) -> float:
-        """What the noise may add to the way of a decision and the stop after it."""
+        """What the noise may add to the way of a decision, and of the stop after it."""
         faster = _SURE * self._noise * self._dt * math.sqrt(self._hold)
         steps = self._hold + (max(speed, 0.0) + faster) / (self._limit * self._dt)
         drift = _SURE * self._noise * self._dt**2 * math.sqrt(steps**3 / 3.0)
@@ -116,18 +121,24 @@ class CbfPy(_Told):
 
     def __init__(self, *system: Any) -> None:
         super().__init__(*system)
-        self._filter = _cbfpy(self._limit, lambda: self._margin(2.0))
+        self._filter = _cbfpy(self._limit, self._margin(_FASTEST))
 
     def action(self, observation: Vector, proposal: Action) -> Action:
         """The solution of its quadratic program."""
         found = self._filter.safety_filter(np.asarray(observation), np.array([proposal]))
-        return self._clipped(float(np.asarray(found)[0]))
+        action = float(np.asarray(found)[0])
+        return proposal if abs(action - proposal) < _SOLVED else self._clipped(action)
 
 
-def _cbfpy(limit: float, margin: Callable[[], float]) -> Any:
+def _cbfpy(limit: float, margin: float) -> Any:
     with needs("cbfpy", "rivals", "its barrier filter"):
+        import jax
         import jax.numpy as jnp
-        from cbfpy import CBF, CBFConfig
+
+        with warnings.catch_warnings():  # that JAX could be set up to be faster
+            warnings.simplefilter("ignore", UserWarning)
+            from cbfpy import CBF, CBFConfig
+    jax.config.update("jax_enable_x64", True)
 
     class Config(CBFConfig):  # type: ignore[misc]
         def __init__(self) -> None:
@@ -141,6 +152,9 @@ def _cbfpy(limit: float, margin: Callable[[], float]) -> Any:
 
         def h_1(self, z: Any) -> Any:
             closing = jnp.maximum(z[1], 0.0)
-            return jnp.array([-z[0] - 0.5 * closing**2 / limit - margin()])
+            return jnp.array([-z[0] - 0.5 * closing**2 / limit - margin])
+
+        def alpha(self, h: Any) -> Any:
+            return _CBFPY_RATE * h
 
     return CBF.from_config(Config())
