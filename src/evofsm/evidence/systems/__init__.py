@@ -52,8 +52,8 @@ def lacking(name: str) -> str:
     >>> lacking("acc")
     ''
     """
-    package, command = _PACKAGES.get(name, ("numpy", ""))
-    return "" if find_spec(package) else f"it needs {package} ({command})"
+    package, command = _PACKAGES.get(name, ("", ""))
+    return "" if not package or find_spec(package) else f"it needs {package} ({command})"
 
 
 def make_system(name: str, controller: str | None = None) -> System:

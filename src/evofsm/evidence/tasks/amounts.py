@@ -43,7 +43,7 @@ class Amounts:
     acc_train: int = 200  #: training episodes of `ACC`
     rounds: int = 1000  #: of the bootstrap
     generations: int = 12  #: of policies that are trained
-    population: int = 10  #: policies in each
+    population: int = 16  #: policies in each
     penalty: float = 1.0  #: for each action that is changed, where there is one
 
     def shortened(self) -> Self:

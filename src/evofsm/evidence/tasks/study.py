@@ -108,6 +108,8 @@ def run_tasks(plan: Amounts, progress: Progress = silent, workers: int | None = 
     from evofsm.evidence.tasks.policies import trained_policies
 
     names, left_out = _named(plan)
+    if not names:
+        raise ValueError(f"nothing to run: {' '.join(left_out)}")
     trials = list(_trials(plan, names, left_out))
     policies = list(trained_policies(plan)) if plan.policies and "cartpole" in names else []
     found = in_order([*trials, *policies], workers, progress)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -66,7 +67,7 @@ def summary(rows: Sequence[Row], best_told: float | None = None) -> Summary:
         first.trained,
         max(row.failed_while_learning for row in rows),
         max(row.failed_late for row in rows),
-        share_of([True] * failed + [False] * (episodes - failed)),
+        _share(failed, episodes),
         max(row.failed / row.episodes for row in rows),
         middle.score,
         middle.score_low,
@@ -78,6 +79,11 @@ def summary(rows: Sequence[Row], best_told: float | None = None) -> Summary:
         float(np.median([row.p50_ms for row in rows])),
         max(row.p99_ms for row in rows),
     )
+
+
+@lru_cache(maxsize=4096)
+def _share(held: int, tried: int) -> Share:
+    return share_of([True] * held + [False] * (tried - held))
 
 
 def summaries(found: Tasks) -> Iterator[Summary]:
