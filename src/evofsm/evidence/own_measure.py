@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import inspect
+from typing import TYPE_CHECKING
 
 from evofsm.app import imported
-from evofsm.checks import Kind, kind_of
-from evofsm.guard import RiskMeasure
+
+if TYPE_CHECKING:
+    from evofsm.guard import RiskMeasure
 
 #: What the option of every study says that takes one.
 ABOUT = "A measure of your own beside the others, module:Class; evofsm check holds it to its kind."
@@ -25,8 +27,10 @@ def own_measure(name: str) -> RiskMeasure:
     Examples
     --------
     >>> own_measure("evofsm.driving:TimeToCollision")
-    TimeToCollision(threshold=...)
+    TimeToCollision(threshold=1.5)
     """
+    from evofsm.checks import Kind, kind_of
+
     thing = imported(name)
     if (kind := kind_of(thing)) is not Kind.MEASURE:
         raise TypeError(f"{name} is a {kind.value}, not a measure: it has no method score")
