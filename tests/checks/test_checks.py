@@ -781,7 +781,7 @@ def test_the_command_ends_with_1_and_says_what_is_wrong(run):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["own_driver"], "names nothing to check"),
+        (["own_driver"], "names nothing; write module:Name"),
         (["own_driver:Calm"], "own_driver has no 'Calm'"),
         (["not_there:Calm"], "is it in this folder, or installed?"),
         (["own_driver:Hasty", "--kind", "car"], "--kind is 'car'; it must be one of machine"),

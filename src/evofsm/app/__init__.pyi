@@ -14,6 +14,7 @@ from .cli.declared import option as option
 from .cli.groups import InWorld as InWorld
 from .cli.groups import WithJson as WithJson
 from .cli.groups import WorldName as WorldName
+from .cli.imported import imported as imported
 from .text.columns import console as console
 from .text.columns import print_columns as print_columns
 from .text.columns import print_table as print_table

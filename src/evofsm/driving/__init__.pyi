@@ -45,6 +45,8 @@ from .outcomes import summarise as summarise
 from .policies import FIXED_MEASURES as FIXED_MEASURES
 from .policies import TUNED_MEASURES as TUNED_MEASURES
 from .policies import Group as Group
+from .policies import Policy as Policy
+from .policies import envelope as envelope
 from .policies import fixed_policies as fixed_policies
 from .record import DECISION_COLUMNS as DECISION_COLUMNS
 from .revisers import GENTLE_BRAKE as GENTLE_BRAKE

@@ -15,6 +15,7 @@ from evofsm.evidence.prediction.plan import Plan as Prediction
 from evofsm.evidence.real.plan import Plan as Real
 from evofsm.evidence.sensitivity.plan import Plan as Sensitivity
 from evofsm.evidence.study import Study
+from evofsm.evidence.tasks.plan import Plan as Tasks
 
 #: By id. The paper's is a command of its own, ``evofsm paper``.
 STUDIES: dict[str, type[Study[Any]]] = {
@@ -23,6 +24,7 @@ STUDIES: dict[str, type[Study[Any]]] = {
         Paper,
         ClosedLoop,
         Judges,
+        Tasks,
         Breaks,
         Detection,
         Alarms,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import sys
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -10,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from evofsm.app.cli.common import print_json
 from evofsm.app.cli.declared import argument, option
 from evofsm.app.cli.groups import WithJson
+from evofsm.app.cli.imported import imported
 
 if TYPE_CHECKING:
     from evofsm.checks import Kind, Result
@@ -49,24 +49,11 @@ class Check(WithJson):
 
     def _thing(self) -> Any:
         """What the name says, imported; or a function that makes it as told."""
-        module_name, colon, path = self.name.partition(":")
-        if not colon or not path:
-            raise ValueError(f"{self.name!r} names nothing to check; write module:Class")
-        sys.path.insert(0, "")  # as `python -m` does
-        try:
-            module = importlib.import_module(module_name)
-        except ModuleNotFoundError as error:
-            raise ValueError(
-                f"{module_name}: {error} (is it in this folder, or installed?)"
-            ) from error
-        thing: Any = module
-        for part in path.split("."):
-            if not hasattr(thing, part):
-                raise ValueError(f"{module_name} has no {path!r}")
-            thing = getattr(thing, part)
+        thing = imported(self.name)
         if self.make is None:
             return thing
         code = compile(self.make, "--make", "eval")
+        module = sys.modules[self.name.partition(":")[0]]
         return lambda: eval(code, vars(module))
 
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from typing import ClassVar
 
 from evofsm.app import option
+from evofsm.evidence.own_measure import ABOUT
 from evofsm.guard import TOLERANCE
 
 
@@ -43,6 +44,7 @@ class Amounts:
     switches: str = option(
         "", "noise, delay, actuator, jerk, third_car; with commas.", name="--with"
     )
+    measure: str = option("", ABOUT)
     rule_seeds: int = option(2, "Learning seeds in the comparison of state rules; 0: none.", min=0)
     rule_test: int = 100  #: held-out episodes in it, and in the trade-off
     side_train: int = 100  #: training episodes of the studies beside the table

@@ -22,9 +22,11 @@ from evofsm.driving import (
     Family,
     Group,
     Outcome,
+    Policy,
     RiskByState,
     Row,
     drive,
+    envelope,
     fixed_policies,
     guard_for_family,
     learnt_by,
@@ -49,6 +51,7 @@ from evofsm.evidence.closed_loop.course import Course, mobility_of
 from evofsm.evidence.closed_loop.machine import MACHINE, run_machine, run_machine_shift
 from evofsm.evidence.closed_loop.stages import Point, until_safe
 from evofsm.evidence.frame import Frame
+from evofsm.evidence.own_measure import own_measure
 from evofsm.fleet import in_order
 from evofsm.guard import ActionReviser, Guard
 
@@ -124,7 +127,7 @@ def run_closed_loop(
     workers : int, optional
         Processes; as many as there are cores unless told.
     """
-    names = [policy.name for policy in fixed_policies(family)]
+    names = [policy.name for policy in _fixed(family, plan)]
     machines = plan.seeds if plan.machine_train else 0
     tasks: list[partial[Any]] = [
         *(partial(_test_fixed, family, plan, name) for name in names),
@@ -178,8 +181,14 @@ def _trade_off(policy: str, setting: str, outcomes: Sequence[Outcome]) -> TradeO
     return TradeOff(policy, setting, rate, mobility_of(outcomes))
 
 
+def _fixed(family: Family, plan: Amounts) -> list[Policy]:
+    """All that learn nothing; a measure of one's own brakes in full where it calls for it."""
+    own = [envelope(plan.measure, Group.FIXED, own_measure(plan.measure))] if plan.measure else []
+    return [*fixed_policies(family), *own]
+
+
 def _test_fixed(family: Family, plan: Amounts, name: str) -> dict[str, list[Any]]:
-    policy = next(policy for policy in fixed_policies(family) if policy.name == name)
+    policy = next(policy for policy in _fixed(family, plan) if policy.name == name)
     tests = Course.held_out(family, plan.seed, plan.test)
     outcomes = tests.under(policy.make(family, draw) for draw in tests.draws)
     return {"rows": [tests.row(name, policy.group, outcomes)]}

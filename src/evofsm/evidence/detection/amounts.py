@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from typing import ClassVar, Self
 
 from evofsm.app import option, split_names
+from evofsm.evidence.own_measure import ABOUT
 
 #: What is judged if nothing else is asked for; see `evofsm.evidence.detection.worlds.world`.
 FAMILIES = (
@@ -30,6 +31,7 @@ class Amounts:
     with_grid: bool = option(
         True, "Also over brakes that nobody was told of, own and leader's.", name="--grid/--no-grid"
     )
+    measure: str = option("", ABOUT)
     train: int = 100  #: episodes that are watched before anything is judged
     since: int = 20  #: episodes that are watched after a shift
     seeds: int = 20  #: learning seeds; the first one's are the rows, the others their spread

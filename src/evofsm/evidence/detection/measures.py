@@ -31,6 +31,7 @@ from evofsm.driving import (
     learnt_by,
 )
 from evofsm.evidence.detection.watch import HORIZON, Exposure, Target, Watched
+from evofsm.evidence.own_measure import own_measure
 from evofsm.evidence.scores import auroc
 from evofsm.guard import Guard, RiskMeasure
 
@@ -251,6 +252,11 @@ def fixed(family: Family) -> list[Detector]:
         *(classic(name, Group.FIXED, FIXED_MEASURES[key]) for name, key in _SHOWN.items()),
         classic("rss-matched", Group.MATCHED, matched),
     ]
+
+
+def own(name: str) -> list[Detector]:
+    """A measure of one's own, which learns nothing; none where it has no name."""
+    return [classic(name, Group.FIXED, own_measure(name))] if name else []
 
 
 def behind_filter(family: Family, risk: LatentRisk) -> list[Detector]:

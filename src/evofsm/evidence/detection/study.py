@@ -22,6 +22,7 @@ from evofsm.evidence.detection.measures import (
     behind_filter,
     classic,
     fixed,
+    own,
     tuned,
 )
 from evofsm.evidence.detection.rows import Judged, Reliable, Row, Scored, judge
@@ -76,7 +77,8 @@ def run_detection(
         If a name is none.
     """
     families = plan.families
-    for name in families:  # so that a wrong name shows at once
+    own(plan.measure)  # so that a wrong name shows at once
+    for name in families:
         world(name, plan)
     longest = sorted(families, key=lambda name: -plan.hours_of(name))
     tasks: list[partial[Any]] = [partial(_judge_world, name, plan) for name in longest]
@@ -126,7 +128,7 @@ def _judge_world(name: str, plan: Amounts) -> list[Judged]:
     held_out = expose(here.family, held_out_draws(here.family, plan.seed), hours)
     calibration = expose(here.settled, calibration_draws(here.settled, plan.seed), hours)
     training = _first_watched(here, plan)
-    detectors = [*watcher.detectors(), *fixed(here.family)]
+    detectors = [*watcher.detectors(), *fixed(here.family), *own(plan.measure)]
     if any(watcher.risk.perception.noise):
         detectors += behind_filter(here.family, watcher.risk)
 

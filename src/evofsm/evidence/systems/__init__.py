@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
+from importlib.util import find_spec
 
+from evofsm.app import imported
 from evofsm.evidence.systems.acc import Acc
 from evofsm.evidence.systems.cars import Cars
 from evofsm.evidence.systems.cartpole import CartPole
+from evofsm.evidence.systems.masa import INSTALL, MASA, PACKAGE
 from evofsm.evidence.systems.pendulum import Pendulum
 from evofsm.evidence.systems.reactor import Reactor
 from evofsm.evidence.systems.system import System
@@ -27,6 +30,31 @@ SYSTEMS: dict[str, Callable[[str | None], System]] = {
     "cut_in": partial(Cars, family="cut_in"),
 }
 
+#: The same for those that others set, which `evofsm bench tasks` puts side by side.
+TASKS: dict[str, Callable[[str | None], System]] = {
+    **{name: SYSTEMS[name] for name in ("acc", "acc-5", "cartpole", "pendulum", "pendulum-cos")},
+    **MASA,
+}
+
+
+# Packages that no extra brings, or a heavy one, by the tasks and rivals that need them.
+_PACKAGES = {
+    **dict.fromkeys(MASA, (PACKAGE, INSTALL)),
+    "cbfpy": ("cbfpy", "pip install cbfpy"),
+}
+
+
+def lacking(name: str) -> str:
+    """What installs the package that a task or a rival lacks; empty where it lacks none.
+
+    Examples
+    --------
+    >>> lacking("acc")
+    ''
+    """
+    package, command = _PACKAGES.get(name, ("", ""))
+    return "" if not package or find_spec(package) else f"it needs {package} ({command})"
+
 
 def make_system(name: str, controller: str | None = None) -> System:
     """A system by its name.
@@ -34,7 +62,8 @@ def make_system(name: str, controller: str | None = None) -> System:
     Parameters
     ----------
     name : str
-        One of `SYSTEMS`.
+        One of `SYSTEMS` or `TASKS`, or ``module:Name`` of a class derived from `System`, which is
+        looked for in the present folder too.
     controller : str, optional
         One of its controllers; without it the first.
 
@@ -42,6 +71,8 @@ def make_system(name: str, controller: str | None = None) -> System:
     ------
     ValueError
         If there is no such system, or it has no such controller.
+    TypeError
+        If what is named makes no system.
 
     Examples
     --------
@@ -49,6 +80,12 @@ def make_system(name: str, controller: str | None = None) -> System:
     >>> list(system.controllers), system.interval, system.steps
     (['full throttle'], 0.02, 300)
     """
-    if name not in SYSTEMS:
-        raise ValueError(f"there is no system {name!r}; there are {', '.join(SYSTEMS)}")
-    return SYSTEMS[name](controller)
+    if ":" in name:
+        made = imported(name)(controller)
+        if not isinstance(made, System):
+            raise TypeError(f"{name} makes a {type(made).__name__}, which is no System")
+        return made
+    known = SYSTEMS | TASKS
+    if name not in known:
+        raise ValueError(f"there is no system {name!r}; there are {', '.join(known)}")
+    return known[name](controller)

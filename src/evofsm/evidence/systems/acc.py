@@ -10,7 +10,8 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
-from evofsm.evidence.systems.system import Action, Box, Start, System, Vector
+from evofsm.evidence.systems.rivals.acc import Barrier, CbfPy, StoppingDistance
+from evofsm.evidence.systems.system import Action, Box, Judge, Start, System, Vector
 
 _DT = 0.02  # [s]
 _STEPS = 300
@@ -46,6 +47,16 @@ class Acc(System):
     def controllers(self) -> Mapping[str, Callable[[Vector], Action]]:
         """Full throttle alone."""
         return {"full throttle": lambda z: 2.0}
+
+    @property
+    def rivals(self) -> Mapping[str, Callable[[], Judge]]:
+        """Told the equations and the noise."""
+        told = (_DT, self._hold, self.actions.high[0], _NOISE)
+        return {
+            "stopping-distance": lambda: StoppingDistance(*told),
+            "barrier": lambda: Barrier(*told),
+            "cbfpy": lambda: CbfPy(*told),
+        }
 
     def _begin(self, start: Start) -> None:
         self._x = float(self.chance.uniform(-1.1, -0.9))

@@ -6,7 +6,8 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
-from evofsm.evidence.systems.system import Action, Discrete, Start, System, Vector
+from evofsm.evidence.systems.rivals.pole import cart_shield
+from evofsm.evidence.systems.system import Action, Discrete, Judge, Start, System, Vector
 from evofsm.extras import needs
 
 with needs("gymnasium", "gym", "CartPole-v1"):
@@ -53,6 +54,11 @@ class CartPole(System):
             "hasty": lambda z: int(z[2] >= _TIPS_LEFT),
             "badgain": lambda z: int(z @ _BAD_GAIN > 0.0),
         }
+
+    @property
+    def rivals(self) -> Mapping[str, Callable[[], Judge]]:
+        """Told the linear model."""
+        return {"lqr-shield": lambda: cart_shield(self.actions)}
 
     def _begin(self, start: Start) -> None:
         self._seen, _ = self._env.reset(seed=int(self.chance.integers(2**31)))

@@ -7,7 +7,8 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
-from evofsm.evidence.systems.system import Action, Box, Start, System, Vector
+from evofsm.evidence.systems.rivals.pole import pendulum_shield
+from evofsm.evidence.systems.system import Action, Box, Judge, Start, System, Vector
 from evofsm.extras import needs
 
 with needs("gymnasium", "gym", "Pendulum-v1"):
@@ -53,6 +54,11 @@ class Pendulum(System):
             "wander": lambda z: self._wander(),
             "badpd": lambda z: self._bad_feedback(),
         }
+
+    @property
+    def rivals(self) -> Mapping[str, Callable[[], Judge]]:
+        """Told the linear model, and how the angle is seen."""
+        return {"lqr-shield": lambda: pendulum_shield(self.actions, _FAILS, self._circular)}
 
     def _wander(self) -> float:
         if self.whim.random() < _CHANGES:

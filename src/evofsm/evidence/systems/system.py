@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal, NamedTuple
+from typing import Any, ClassVar, Literal, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -88,6 +88,30 @@ class Discrete:
         return float(executed != proposed)
 
 
+class Decided(Protocol):
+    """What a judge decided."""
+
+    @property
+    def executed(self) -> Action:
+        """What is to be done."""
+
+
+class Judge(Protocol):
+    """What is tried: a `Guard`, or anything with these methods of it."""
+
+    def begin(self) -> None:
+        """Begin an episode."""
+
+    def decide(self, observation: Vector, proposal: Action) -> Decided:
+        """What to execute instead of a proposal."""
+
+    def end(self, failed: bool = False, observation: Vector | None = None) -> None:
+        """End the episode, and learn from it unless frozen."""
+
+    def freeze(self) -> None:
+        """Learn nothing from now on."""
+
+
 class System(ABC):
     """A system with one of its controllers.
 
@@ -147,6 +171,11 @@ class System(ABC):
     @abstractmethod
     def controllers(self) -> Mapping[str, Callable[[Vector], Action]]:
         """By name, each from an observation to an action; random ones draw from ``whim``."""
+
+    @property
+    def rivals(self) -> Mapping[str, Callable[[], Judge]]:
+        """Judges by name that know this system, each with what it is ``told``."""
+        return {}
 
     @abstractmethod
     def _begin(self, start: Start) -> None:

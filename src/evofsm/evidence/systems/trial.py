@@ -9,42 +9,22 @@ import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass
 from functools import lru_cache
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from evofsm.driving import guard_for_family
+from evofsm.app import imported
+from evofsm.driving import TOLD, guard_for_family
 from evofsm.evidence.scores import share_of
 from evofsm.evidence.systems import make_system
 from evofsm.evidence.systems.cars import Cars
-from evofsm.evidence.systems.system import Action, Start, System, Vector
+from evofsm.evidence.systems.rivals.counted import Counted
+from evofsm.evidence.systems.rivals.rival import Unrevised
+from evofsm.evidence.systems.system import Judge, Start, System
+from evofsm.guard import Guard
 
 #: From this episode on, counted from 0, a failure while learning is a late one.
 LATE = 30
-
-
-class Decided(Protocol):
-    """What a judge decided."""
-
-    @property
-    def executed(self) -> Action:
-        """What is to be done."""
-
-
-class Judge(Protocol):
-    """What is tried: a `Guard`, or anything with these methods of it."""
-
-    def begin(self) -> None:
-        """Begin an episode."""
-
-    def decide(self, observation: Vector, proposal: Action) -> Decided:
-        """What to execute instead of a proposal."""
-
-    def end(self, failed: bool = False, observation: Vector | None = None) -> None:
-        """End the episode, and learn from it unless frozen."""
-
-    def freeze(self) -> None:
-        """Learn nothing from now on."""
 
 
 @dataclass(frozen=True)
@@ -89,27 +69,6 @@ class Ended(NamedTuple):
     times: list[float]  #: of each decision [s]
 
 
-class Unrevised:
-    """Executes what is proposed."""
-
-    def begin(self) -> None:
-        """Nothing to begin."""
-
-    def decide(self, observation: Vector, proposal: Action) -> _Executed:
-        """The proposal."""
-        return _Executed(proposal)
-
-    def end(self, failed: bool = False, observation: Vector | None = None) -> None:
-        """Nothing to learn."""
-
-    def freeze(self) -> None:
-        """Nothing to freeze."""
-
-
-class _Executed(NamedTuple):
-    executed: Action
-
-
 def _unrevised(system: System, without: Sequence[str], seed: int) -> Judge:
     return Unrevised()
 
@@ -134,12 +93,93 @@ def _learnt(system: System, without: Sequence[str], seed: int) -> Judge:
     return guard
 
 
+def _counted(system: System, without: Sequence[str], seed: int) -> Judge:
+    return Counted(system)
+
+
 #: By name: makes a judge for a system, without some parts, with a seed.
 JUDGES: dict[str, Callable[[System, Sequence[str], int], Judge]] = {
     "learnt": _learnt,
     "unrevised": _unrevised,
     "kinematic": _kinematic,
+    "counted": _counted,
 }
+
+
+def make_judge(name: str, system: System, without: Sequence[str] = (), seed: int = 0) -> Judge:
+    """A judge by its name.
+
+    Parameters
+    ----------
+    name : str
+        One of `JUDGES` or of the system's ``rivals``, or ``module:Name`` of a class that is made
+        with the system and a seed. It has the methods of a `Judge`, or, as an `ActionJudge`, says
+        how dangerous actions are: then a guard is made of it.
+    system : System
+    without : sequence of str
+        Parts of the learnt judge that are taken away.
+    seed : int
+
+    Raises
+    ------
+    ValueError
+        If there is no such judge.
+    TypeError
+        If what is named makes no judge.
+    """
+    if ":" in name:
+        own = imported(name)(system, seed)
+        if hasattr(own, "judge"):
+            return Guard(**system.actions.settings, interval=system.interval, judge=own, seed=seed)
+        if not all(hasattr(own, method) for method in ("begin", "decide", "end", "freeze")):
+            raise TypeError(
+                f"{name} makes a {type(own).__name__}, which is no judge: it has neither judge, "
+                "nor begin, decide, end and freeze"
+            )
+        made: Judge = own
+        return made
+    if name in JUDGES:
+        return JUDGES[name](system, without, seed)
+    rivals = system.rivals
+    if name not in rivals:
+        known = [*JUDGES, *rivals]
+        raise ValueError(f"{system.name} has no judge {name!r}; there are {', '.join(known)}")
+    return rivals[name]()
+
+
+def told_to(judge: Judge) -> str:
+    """What a judge is told, in a few words."""
+    return str(getattr(judge, "told", TOLD["learnt"]))
+
+
+class Tried(NamedTuple):
+    """All that one judge did with one learning seed."""
+
+    learnt: list[Ended]  #: training episodes
+    held_out: list[Ended]
+    told: str
+
+
+def try_judge(system: System, judge: Judge, seed: int, train: int, test: int, base: int) -> Tried:
+    """Let a judge learn a system while controlling it, freeze it, and try it on held-out episodes.
+
+    Parameters
+    ----------
+    system : System
+    judge : Judge
+    seed : int
+        Of the training episodes.
+    train, test : int
+        Episodes to learn from, and held-out ones, which are the same for every seed.
+    base : int
+        Of everything: another one draws other episodes, held-out ones too.
+    """
+    starts = (Start.training(base, seed, episode) for episode in range(train))
+    learnt = [run(system, judge, start) for start in starts]
+    judge.freeze()
+    return Tried(
+        learnt, [run(system, judge, start) for start in _held_out(base, test)], told_to(judge)
+    )
 
 
 def trial(
@@ -157,7 +197,7 @@ def trial(
     Parameters
     ----------
     system : str
-        One of `SYSTEMS`.
+        As `make_system` takes it.
     controller : str, optional
         One of the system's; without it the first.
     without : sequence of str
@@ -169,7 +209,7 @@ def trial(
     test : int
         Held-out episodes, the same for every seed.
     judge : str or callable
-        One of `JUDGES`, or what makes one from the system, ``without`` and ``seed``.
+        As `make_judge` takes it, or what makes one from the system, ``without`` and ``seed``.
     base : int
         Of everything: another one draws other episodes, held-out ones too.
 
@@ -185,16 +225,11 @@ def trial(
     """
     controlled = make_system(system, controller)
     train = controlled.train if train is None else train
-    make = JUDGES[judge] if isinstance(judge, str) else judge
-    name = judge if isinstance(judge, str) else getattr(judge, "__name__", "own")
-    learner = make(controlled, without, seed)
-    starts = (Start.training(base, seed, episode) for episode in range(train))
-    learnt = [run(controlled, learner, start).failed for start in starts]
-    learner.freeze()
-    tried = [run(controlled, learner, start) for start in _held_out(base, test)]
-    share = share_of([one.failed for one in tried])
-    times = 1e3 * np.array([took for one in tried for took in one.times])
-    middle, slow = np.quantile(times, [0.5, 0.99])
+    if isinstance(judge, str):
+        name, learner = judge, make_judge(judge, controlled, without, seed)
+    else:
+        name, learner = getattr(judge, "__name__", "own"), judge(controlled, without, seed)
+    learnt, held_out, _ = try_judge(controlled, learner, seed, train, test, base)
     return Row(
         system=system,
         controller=controlled.controller,
@@ -202,20 +237,30 @@ def trial(
         without="+".join(without),
         seed=seed,
         trained=train,
-        failed_while_learning=sum(learnt),
-        failed_late=sum(learnt[LATE:]),
-        episodes=test,
-        failed=share.held,
-        failed_low=share.low,
-        failed_high=share.high,
-        unrevised_failed=_unrevised_failures(system, controlled.controller, test, base),
-        kept=sum(one.kept for one in tried) / len(times),
-        mean_change=sum(one.changes for one in tried) / len(times),
+        failed_while_learning=sum(one.failed for one in learnt),
+        failed_late=sum(one.failed for one in learnt[LATE:]),
+        unrevised_failed=unrevised_failures(system, controlled.controller, test, base),
+        **counted(held_out),
         measure=controlled.measure,
-        score=float(np.mean([one.score for one in tried])),
-        p50_ms=float(middle),
-        p99_ms=float(slow),
+        score=float(np.mean([one.score for one in held_out])),
     )
+
+
+def counted(held_out: Sequence[Ended]) -> dict[str, Any]:
+    """What is counted in held-out episodes, under the names that it has in a `Row`."""
+    share = share_of([one.failed for one in held_out])
+    times = 1e3 * np.array([took for one in held_out for took in one.times])
+    middle, slow = np.quantile(times, [0.5, 0.99])
+    return {
+        "episodes": len(held_out),
+        "failed": share.held,
+        "failed_low": share.low,
+        "failed_high": share.high,
+        "kept": sum(one.kept for one in held_out) / len(times),
+        "mean_change": sum(one.changes for one in held_out) / len(times),
+        "p50_ms": float(middle),
+        "p99_ms": float(slow),
+    }
 
 
 def run(system: System, judge: Judge, start: Start) -> Ended:
@@ -243,6 +288,7 @@ def _held_out(base: int, test: int) -> Iterable[Start]:
 
 
 @lru_cache
-def _unrevised_failures(system: str, controller: str, test: int, base: int) -> int:
+def unrevised_failures(system: str, controller: str, test: int, base: int) -> int:
+    """Held-out episodes in which a controller alone fails."""
     controlled, alone = make_system(system, controller), Unrevised()
     return sum(run(controlled, alone, start).failed for start in _held_out(base, test))

@@ -1,0 +1,214 @@
+"""The study: every task with every controller, judge and learning seed.
+
+Times of decisions depend on the machine; nothing else does, nor on the number of processes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+
+from evofsm.app import split_names
+from evofsm.evidence.frame import Frame, Progress, silent
+from evofsm.evidence.scores import bootstrap
+from evofsm.evidence.systems import TASKS, lacking, make_system
+from evofsm.evidence.systems.trial import (
+    Ended,
+    counted,
+    make_judge,
+    try_judge,
+    unrevised_failures,
+)
+from evofsm.evidence.tasks.amounts import ALL, Amounts
+from evofsm.fleet import in_order
+
+#: Judges that learn; the others are tried once, and learn nothing.
+LEARNERS = ("learnt", "counted")
+#: A failure after so many training episodes is a late one; after half of them, where they are few.
+LATE = 50
+# Of the training episodes up to then, those whose return is told.
+_LATEST = 10
+
+
+@dataclass(frozen=True)
+class Row:
+    """What came of one judge on one task with one learning seed."""
+
+    task: str
+    controller: str
+    judge: str
+    told: str  #: what the judge was told
+    seed: int  #: learning seed
+    trained: int  #: episodes that were learnt from
+    failed_while_learning: int  #: of those
+    late: int  #: episodes after which a failure is a late one
+    failed_late: int
+    failures: tuple[int, ...]  #: training episodes that failed, from 1
+    score_by_late: float | None  #: mean over the ten training episodes up to `late`
+    episodes: int  #: held out
+    failed: int  #: of the held-out ones
+    failed_low: float  #: 95 % interval of their share (Clopper and Pearson 1934)
+    failed_high: float
+    unrevised_failed: int  #: of the same episodes, the controller alone
+    score: float  #: mean return of held-out episodes
+    score_low: float  #: 95 % interval (bootstrap over episodes)
+    score_high: float
+    kept: float  #: share of proposals that were executed exactly
+    mean_change: float  #: of an action, in halves of its range; of discrete ones the share changed
+    p50_ms: float  #: of a held-out decision
+    p99_ms: float
+
+
+@dataclass(frozen=True)
+class Tasks:
+    """All that was found."""
+
+    plan: Amounts
+    rows: list[Row]  #: of judges
+    policies: list[Row]  #: of policies that were trained; see `evofsm.evidence.tasks.policies`
+    left_out: tuple[str, ...] = ()  #: what could not be run, a sentence each
+
+    @property
+    def frame(self) -> Frame:
+        """Every row, those of policies last."""
+        return Frame([*self.rows, *self.policies])
+
+    def of(self, task: str, controller: str | None = None, judge: str = "learnt") -> list[Row]:
+        """Rows of a judge on a task; of all controllers where none is named."""
+        return [
+            row
+            for row in self.rows
+            if (row.task, row.judge) == (task, judge) and controller in (None, row.controller)
+        ]
+
+    @property
+    def groups(self) -> list[tuple[str, str]]:
+        """Tasks with their controllers, in their order."""
+        return list(dict.fromkeys((row.task, row.controller) for row in self.rows))
+
+    def judges(self, task: str, controller: str) -> list[str]:
+        """That were tried on a task with a controller, in their order."""
+        mine = (task, controller)
+        return list(dict.fromkeys(r.judge for r in self.rows if (r.task, r.controller) == mine))
+
+
+def run_tasks(plan: Amounts, progress: Progress = silent, workers: int | None = None) -> Tasks:
+    """Try all that the plan names; see `Study.run`.
+
+    Raises
+    ------
+    ValueError
+        If there is no such task or judge.
+    TypeError
+        If a class of one's own makes none.
+    """
+    from evofsm.evidence.tasks.policies import trained_policies
+
+    names, left_out = _named(plan)
+    if not names:
+        raise ValueError(f"nothing to run: {' '.join(left_out)}")
+    trials = list(_trials(plan, names, left_out))
+    policies = list(trained_policies(plan)) if plan.policies and "cartpole" in names else []
+    found = in_order([*trials, *policies], workers, progress)
+    judged, of_policies = (
+        [row for rows in some for row in rows]
+        for some in (found[: len(trials)], found[len(trials) :])
+    )
+    return Tasks(plan, judged, of_policies, tuple(left_out))
+
+
+def _named(plan: Amounts) -> tuple[list[str], list[str]]:
+    """Tasks to run, and a sentence on those whose package is missing."""
+    default = "" if plan.task else ALL
+    wanted = plan.tasks or default
+    names = list(TASKS) if wanted == ALL else split_names(wanted)
+    lack = {name: lacking(name) for name in names}
+    without = [name for name in names if lack[name]]
+    left_out = [f"{name} is left out: {lack[name]}." for name in without]
+    own = [plan.task] if plan.task else []
+    return [*own, *(name for name in names if name not in without)], left_out
+
+
+def _trials(
+    plan: Amounts, names: Sequence[str], left_out: list[str]
+) -> Iterator[partial[list[Row]]]:
+    """A trial each, task by task, so that what is told can be drawn in their order."""
+    for name in names:
+        task = make_system(name)
+        rivals = list(task.rivals)
+        for rival in [one for one in rivals if lacking(one)]:
+            rivals.remove(rival)
+            left_out.append(f"{name}: the rival {rival} is left out: {lacking(rival)}.")
+        if plan.judge:
+            make_judge(plan.judge, task)  # so that a wrong one shows at once
+        controllers = list(task.controllers)
+        train = plan.train_of(name) or task.train
+        for controller in controllers if plan.all_controllers else controllers[:1]:
+            one = partial(_trial, plan, name, controller)
+            for judge in ("unrevised", *rivals):
+                yield partial(one, judge, 0, 0)
+            for seed in range(plan.seeds_of(name)):
+                for judge in (*([plan.judge] if plan.judge else []), *LEARNERS):
+                    yield partial(one, judge, seed, train)
+
+
+def _trial(
+    plan: Amounts, name: str, controller: str, judge: str, seed: int, train: int
+) -> list[Row]:
+    task = make_system(name, controller)
+    tried = try_judge(task, make_judge(judge, task, (), seed), seed, train, plan.test, plan.seed)
+    who = (name, controller, judge, tried.told, seed)
+    return [row(plan, *who, tried.learnt, tried.held_out)]
+
+
+def row(
+    plan: Amounts,
+    task: str,
+    controller: str,
+    judge: str,
+    told: str,
+    seed: int,
+    learnt: Sequence[Ended],
+    held_out: Sequence[Ended],
+    unrevised_failed: int | None = None,
+) -> Row:
+    """One line of what is found.
+
+    Parameters
+    ----------
+    plan : Amounts
+    task, controller, judge, told, seed
+        As in `Row`.
+    learnt, held_out : sequence of Ended
+        Episodes.
+    unrevised_failed : int, optional
+        Without it the task's controller is tried alone.
+    """
+    late = min(LATE, len(learnt) // 2)
+    failures = tuple(place for place, one in enumerate(learnt, start=1) if one.failed)
+    by_late = [one.score for one in learnt[max(0, late - _LATEST) : late]]
+    scores = np.array([one.score for one in held_out])
+    low, high = bootstrap(lambda chosen: float(scores[chosen].mean()), len(scores), plan.rounds)
+    if unrevised_failed is None:
+        unrevised_failed = unrevised_failures(task, controller, plan.test, plan.seed)
+    return Row(
+        task=task,
+        controller=controller,
+        judge=judge,
+        told=told,
+        seed=seed,
+        trained=len(learnt),
+        failed_while_learning=len(failures),
+        late=late,
+        failed_late=sum(place > late for place in failures),
+        failures=failures,
+        score_by_late=float(np.mean(by_late)) if by_late else None,
+        unrevised_failed=unrevised_failed,
+        score=float(scores.mean()),
+        score_low=low,
+        score_high=high,
+        **counted(held_out),
+    )

@@ -1,0 +1,117 @@
+"""Rows of several learning seeds as one, and what a judge's return is worth beside the others'."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+
+from evofsm.evidence.scores import Share, share_of
+from evofsm.evidence.tasks.study import Row, Tasks
+
+
+class Summary(NamedTuple):
+    """All learning seeds of one judge on one task with one controller."""
+
+    task: str
+    controller: str
+    judge: str
+    told: str
+    runs: int
+    trained: int
+    learning: int  #: failures while learning in the worst run
+    late: int  #: late ones, in the worst run
+    failed: Share  #: held-out episodes of all runs, which share their draws
+    worst: float  #: share that failed in the worst run
+    score: float  #: of the run in the middle, with its 95 % interval
+    score_low: float
+    score_high: float
+    score_worst: float  #: of the worst run
+    of_told: float | None  #: `score` as a share of the best of those told more; None if not above 0
+    kept: float  #: median over runs
+    change: float  #: median over runs
+    p50: float  #: median over runs [ms]
+    p99: float  #: of the worst run [ms]
+
+    @property
+    def who(self) -> str:
+        """The task and its controller."""
+        return f"{self.task}, {self.controller}"
+
+    @property
+    def learns(self) -> bool:
+        """Whether it was trained."""
+        return self.trained > 0
+
+
+def summary(rows: Sequence[Row], best_told: float | None = None) -> Summary:
+    """Rows of one judge on one task with one controller as one.
+
+    Parameters
+    ----------
+    rows : sequence of Row
+    best_told : float, optional
+        Return that `Summary.of_told` is a share of.
+    """
+    first = rows[0]
+    failed, episodes = sum(row.failed for row in rows), sum(row.episodes for row in rows)
+    middle = sorted(rows, key=lambda row: row.score)[(len(rows) - 1) // 2]
+    return Summary(
+        first.task,
+        first.controller,
+        first.judge,
+        first.told,
+        len(rows),
+        first.trained,
+        max(row.failed_while_learning for row in rows),
+        max(row.failed_late for row in rows),
+        _share(failed, episodes),
+        max(row.failed / row.episodes for row in rows),
+        middle.score,
+        middle.score_low,
+        middle.score_high,
+        min(row.score for row in rows),
+        middle.score / best_told if best_told and min(best_told, middle.score) > 0.0 else None,
+        float(np.median([row.kept for row in rows])),
+        float(np.median([row.mean_change for row in rows])),
+        float(np.median([row.p50_ms for row in rows])),
+        max(row.p99_ms for row in rows),
+    )
+
+
+@lru_cache(maxsize=4096)
+def _share(held: int, tried: int) -> Share:
+    return share_of([True] * held + [False] * (tried - held))
+
+
+def summaries(found: Tasks) -> Iterator[Summary]:
+    """Every judge on every task with every controller."""
+    for task, controller in found.groups:
+        rivals = [one for one in rivals_of(found, task, controller) if not one.failed.held]
+        best = max((one.score for one in rivals), default=None)
+        for judge in found.judges(task, controller):
+            yield summary(found.of(task, controller, judge), best)
+
+
+def rivals_of(found: Tasks, task: str, controller: str) -> list[Summary]:
+    """Those that are told more than failures."""
+    every = [summary(found.of(task, controller, j)) for j in found.judges(task, controller)]
+    return [one for one in every if not one.told.startswith("nothing")]
+
+
+def policies(found: Tasks) -> Iterator[Summary]:
+    """Policies that were trained, with the filter off and on."""
+    for name in dict.fromkeys((row.controller, row.judge) for row in found.policies):
+        yield summary([row for row in found.policies if (row.controller, row.judge) == name])
+
+
+def own_share(found: Tasks, training: str) -> float | None:
+    """Of the episodes that are survived with the filter on, the share without; None without one."""
+    survived = {
+        one.judge: 1.0 - one.failed.value for one in policies(found) if one.controller == training
+    }
+    if "filter on" not in survived:
+        return None
+    return survived["filter off"] / survived["filter on"] if survived["filter on"] else None
