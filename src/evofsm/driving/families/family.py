@@ -466,7 +466,7 @@ class _Builder:
         return dict(table)
 
     def _make(self, made: type[Made], key: str, **others: Any) -> Made:
-        known = _parts(made)
+        known = _parts(made)  # type: ignore[arg-type]
         table = {
             name: value
             for name, value in self._table(key).items()
@@ -478,7 +478,7 @@ class _Builder:
 
 def _make(made: type[Made], source: str, key: str, table: Table, **others: Any) -> Made:
     """Make something from a table; who gets it wrong is told where."""
-    for name, is_needed in _parts(made).items():
+    for name, is_needed in _parts(made).items():  # type: ignore[arg-type]
         if is_needed and name not in table and name not in others:
             raise ValueError(f"{source}: {key}.{name} is missing")
     try:
