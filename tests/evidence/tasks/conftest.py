@@ -9,7 +9,8 @@ pytest.importorskip("gymnasium")
 
 from evofsm.evidence.scores import share_of
 from evofsm.evidence.tasks.plan import Plan
-from evofsm.evidence.tasks.study import Row, Tasks
+from evofsm.evidence.tasks.rows import Row
+from evofsm.evidence.tasks.study import Tasks
 
 SEEDS = range(20)
 

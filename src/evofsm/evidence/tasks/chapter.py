@@ -23,7 +23,8 @@ from evofsm.evidence.report.html import Setting
 from evofsm.evidence.systems import TASKS
 from evofsm.evidence.tasks.amounts import ACC
 from evofsm.evidence.tasks.figures import sketches
-from evofsm.evidence.tasks.study import LATE, Row, Tasks
+from evofsm.evidence.tasks.rows import LATE, Row
+from evofsm.evidence.tasks.study import Tasks
 from evofsm.evidence.tasks.summary import Summary, own_share, policies, summaries
 from evofsm.evidence.tasks.targets import SEEDS, TRAIN, claims
 

@@ -19,7 +19,7 @@ from evofsm.evidence.systems.rivals.rival import Unrevised
 from evofsm.evidence.systems.system import Action, Judge, Start, Vector
 from evofsm.evidence.systems.trial import Ended, run, told_to
 from evofsm.evidence.tasks.amounts import Amounts
-from evofsm.evidence.tasks.study import Row, row
+from evofsm.evidence.tasks.rows import Row, row
 from evofsm.extras import needs
 from evofsm.guard import Guard, RevisedActions
 

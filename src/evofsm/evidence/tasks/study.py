@@ -9,57 +9,20 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 
-import numpy as np
-
 from evofsm.app import split_names
 from evofsm.evidence.frame import Frame, Progress, silent
-from evofsm.evidence.scores import bootstrap
 from evofsm.evidence.systems import TASKS, lacking, make_system
 from evofsm.evidence.systems.trial import (
-    Ended,
-    counted,
     make_judge,
     try_judge,
-    unrevised_failures,
 )
 from evofsm.evidence.tasks.amounts import ALL, Amounts
+from evofsm.evidence.tasks.policies import trained_policies
+from evofsm.evidence.tasks.rows import Row, row
 from evofsm.fleet import in_order
 
 #: Judges that learn; the others are tried once, and learn nothing.
 LEARNERS = ("learnt", "counted")
-#: A failure after so many training episodes is a late one; after half of them, where they are few.
-LATE = 50
-# Of the training episodes up to then, those whose return is told.
-_LATEST = 10
-
-
-@dataclass(frozen=True)
-class Row:
-    """What came of one judge on one task with one learning seed."""
-
-    task: str
-    controller: str
-    judge: str
-    told: str  #: what the judge was told
-    seed: int  #: learning seed
-    trained: int  #: episodes that were learnt from
-    failed_while_learning: int  #: of those
-    late: int  #: episodes after which a failure is a late one
-    failed_late: int
-    failures: tuple[int, ...]  #: training episodes that failed, from 1
-    score_by_late: float | None  #: mean over the ten training episodes up to `late`
-    episodes: int  #: held out
-    failed: int  #: of the held-out ones
-    failed_low: float  #: 95 % interval of their share (Clopper and Pearson 1934)
-    failed_high: float
-    unrevised_failed: int  #: of the same episodes, the controller alone
-    score: float  #: mean return of held-out episodes
-    score_low: float  #: 95 % interval (bootstrap over episodes)
-    score_high: float
-    kept: float  #: share of proposals that were executed exactly
-    mean_change: float  #: of an action, in halves of its range; of discrete ones the share changed
-    p50_ms: float  #: of a held-out decision
-    p99_ms: float
 
 
 @dataclass(frozen=True)
@@ -105,8 +68,6 @@ def run_tasks(plan: Amounts, progress: Progress = silent, workers: int | None = 
     TypeError
         If a class of one's own makes none.
     """
-    from evofsm.evidence.tasks.policies import trained_policies
-
     names, left_out = _named(plan)
     if not names:
         raise ValueError(f"nothing to run: {' '.join(left_out)}")
@@ -162,53 +123,3 @@ def _trial(
     tried = try_judge(task, make_judge(judge, task, (), seed), seed, train, plan.test, plan.seed)
     who = (name, controller, judge, tried.told, seed)
     return [row(plan, *who, tried.learnt, tried.held_out)]
-
-
-def row(
-    plan: Amounts,
-    task: str,
-    controller: str,
-    judge: str,
-    told: str,
-    seed: int,
-    learnt: Sequence[Ended],
-    held_out: Sequence[Ended],
-    unrevised_failed: int | None = None,
-) -> Row:
-    """One line of what is found.
-
-    Parameters
-    ----------
-    plan : Amounts
-    task, controller, judge, told, seed
-        As in `Row`.
-    learnt, held_out : sequence of Ended
-        Episodes.
-    unrevised_failed : int, optional
-        Without it the task's controller is tried alone.
-    """
-    late = min(LATE, len(learnt) // 2)
-    failures = tuple(place for place, one in enumerate(learnt, start=1) if one.failed)
-    by_late = [one.score for one in learnt[max(0, late - _LATEST) : late]]
-    scores = np.array([one.score for one in held_out])
-    low, high = bootstrap(lambda chosen: float(scores[chosen].mean()), len(scores), plan.rounds)
-    if unrevised_failed is None:
-        unrevised_failed = unrevised_failures(task, controller, plan.test, plan.seed)
-    return Row(
-        task=task,
-        controller=controller,
-        judge=judge,
-        told=told,
-        seed=seed,
-        trained=len(learnt),
-        failed_while_learning=len(failures),
-        late=late,
-        failed_late=sum(place > late for place in failures),
-        failures=failures,
-        score_by_late=float(np.mean(by_late)) if by_late else None,
-        unrevised_failed=unrevised_failed,
-        score=float(scores.mean()),
-        score_low=low,
-        score_high=high,
-        **counted(held_out),
-    )

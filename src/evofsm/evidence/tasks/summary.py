@@ -9,7 +9,8 @@ from typing import NamedTuple
 import numpy as np
 
 from evofsm.evidence.scores import Share, share_of
-from evofsm.evidence.tasks.study import Row, Tasks
+from evofsm.evidence.tasks.rows import Row
+from evofsm.evidence.tasks.study import Tasks
 
 
 class Summary(NamedTuple):

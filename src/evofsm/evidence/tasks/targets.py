@@ -8,7 +8,8 @@ import numpy as np
 
 from evofsm.app import count, number
 from evofsm.evidence.report.asked import Asked
-from evofsm.evidence.tasks.study import LATE, Row, Tasks
+from evofsm.evidence.tasks.rows import LATE, Row
+from evofsm.evidence.tasks.study import Tasks
 
 #: So much has to be run before anything of it is judged.
 SEEDS, TRAIN = 20, 200
