@@ -11,6 +11,8 @@ from evofsm.evidence.systems.system import Action, Discrete, System, Vector
 
 # A state reaches so far, in standard deviations of the first episode.
 _RADIUS = 0.5
+# So narrow that what is counted in a state is not spread over its neighbours, and forgotten there.
+_SPREAD = 0.1
 _MOST_STATES = 200
 # Failure is one more state, so far away that nothing else is taken for it [standard deviations].
 _AWAY = 1e3
@@ -99,7 +101,7 @@ class Counted:
         self._failed_at = seen.mean(axis=0) + _AWAY * scales
         return EvolvingFSM(
             len(self._actions),
-            rule=Novelty(_RADIUS, tuple(scales.tolist())),
+            rule=Novelty(_RADIUS, tuple(scales.tolist()), spread=_SPREAD),
             max_states=_MOST_STATES,
         )
 
