@@ -28,13 +28,26 @@ SYSTEMS: dict[str, Callable[[str | None], System]] = {
 }
 
 
+def _highway(controller: str | None, *, task: str) -> System:
+    """Imported where it is asked for: the package that it needs is an extra of its own."""
+    from evofsm.evidence.systems.highway import Highway
+
+    return Highway(controller, task=task)
+
+
+#: The same for the tasks of highway-env, which need a package more, and take long.
+HIGHWAY: dict[str, Callable[[str | None], System]] = {
+    task: partial(_highway, task=task) for task in ("highway-fast", "merge", "intersection")
+}
+
+
 def make_system(name: str, controller: str | None = None) -> System:
     """A system by its name.
 
     Parameters
     ----------
     name : str
-        One of `SYSTEMS`.
+        One of `SYSTEMS` or `HIGHWAY`.
     controller : str, optional
         One of its controllers; without it the first.
 
@@ -49,6 +62,7 @@ def make_system(name: str, controller: str | None = None) -> System:
     >>> list(system.controllers), system.interval, system.steps
     (['full throttle'], 0.02, 300)
     """
-    if name not in SYSTEMS:
-        raise ValueError(f"there is no system {name!r}; there are {', '.join(SYSTEMS)}")
-    return SYSTEMS[name](controller)
+    known = SYSTEMS | HIGHWAY
+    if name not in known:
+        raise ValueError(f"there is no system {name!r}; there are {', '.join(known)}")
+    return known[name](controller)

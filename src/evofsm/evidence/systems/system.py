@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -142,6 +143,11 @@ class System(ABC):
     def score(self) -> float:
         """Of the episode so far: the sum of its rewards, unless `measure` says otherwise."""
         return self._returned
+
+    @property
+    def speed(self) -> float:
+        """Mean speed of the episode so far [m/s]; NaN where nothing drives."""
+        return math.nan
 
     @property
     @abstractmethod

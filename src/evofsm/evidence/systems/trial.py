@@ -5,6 +5,7 @@ Decisions are timed around ``decide`` alone. Times depend on the machine; nothin
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass
@@ -18,6 +19,7 @@ from evofsm.evidence.scores import share_of
 from evofsm.evidence.systems import make_system
 from evofsm.evidence.systems.cars import Cars
 from evofsm.evidence.systems.system import Action, Start, System, Vector
+from evofsm.guard import Guard
 
 #: From this episode on, counted from 0, a failure while learning is a late one.
 LATE = 30
@@ -70,6 +72,7 @@ class Row:
     score: float  #: mean over held-out episodes
     p50_ms: float  #: of a held-out decision
     p99_ms: float
+    speed: float = math.nan  #: mean over held-out episodes [m/s]; NaN where nothing drives
 
     def as_dict(self) -> dict[str, Any]:
         """For JSON: the score under its name, the other one None."""
@@ -87,6 +90,7 @@ class Ended(NamedTuple):
     kept: int  #: proposals that were executed exactly
     changes: float  #: sum over decisions, see `Row.mean_change`
     times: list[float]  #: of each decision [s]
+    speed: float = math.nan  #: mean [m/s]; NaN where nothing drives
 
 
 class Unrevised:
@@ -134,11 +138,22 @@ def _learnt(system: System, without: Sequence[str], seed: int) -> Judge:
     return guard
 
 
+def _scene(system: System, without: Sequence[str], seed: int) -> Judge:
+    from evofsm.guard import SceneRisk
+
+    if not hasattr(system, "columns"):
+        raise ValueError(f"{system.name} shows no objects; the judge of scenes knows nothing else")
+    n_actions, laid_out = system.actions.n_actions, (system.columns, system.relative)  # type: ignore[union-attr]
+    judge = SceneRisk(system.interval, n_actions, columns=laid_out[0], relative=laid_out[1])
+    return Guard(n_actions=n_actions, interval=system.interval, judge=judge, seed=seed)
+
+
 #: By name: makes a judge for a system, without some parts, with a seed.
 JUDGES: dict[str, Callable[[System, Sequence[str], int], Judge]] = {
     "learnt": _learnt,
     "unrevised": _unrevised,
     "kinematic": _kinematic,
+    "scene": _scene,
 }
 
 
@@ -215,6 +230,7 @@ def trial(
         score=float(np.mean([one.score for one in tried])),
         p50_ms=float(middle),
         p99_ms=float(slow),
+        speed=float(np.mean([one.speed for one in tried])),
     )
 
 
@@ -235,7 +251,7 @@ def run(system: System, judge: Judge, start: Start) -> Ended:
         observation = step.observation
         if step.over:
             judge.end(step.failed, observation)
-            return Ended(step.failed, system.score, kept, changes, times)
+            return Ended(step.failed, system.score, kept, changes, times, system.speed)
 
 
 def _held_out(base: int, test: int) -> Iterable[Start]:
