@@ -4,9 +4,9 @@
     python tools/train_dqn.py highway-fast
 
 Weights go to ``src/evofsm/evidence/systems/weights/NAME.npz``; NumPy alone reads them from then on
-(``evofsm.evidence.systems.highway``). Deep Q-learning with a replay memory and a target network (Mnih et
-al., "Human-level control through deep reinforcement learning", Nature 2015), and double Q-learning (van
-Hasselt et al. 2016). Its reward is the environment's own; it knows no guard.
+(``evofsm.evidence.systems.highway``). Deep Q-learning with a replay memory and a target network
+(Mnih et al., "Human-level control through deep reinforcement learning", Nature 2015), and double
+Q-learning (van Hasselt et al. 2016). Its reward is the environment's own; it knows no guard.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ WEIGHTS = Path(__file__).parents[1] / "src/evofsm/evidence/systems/weights"
 TASKS = {"highway-fast": (20_000, 0.8), "merge": (15_000, 0.8), "intersection": (12_000, 0.95)}
 HIDDEN, BATCH, MEMORY = 128, 64, 15_000
 RATE, WARM_UP, TARGET_EVERY = 5e-4, 200, 50
-# Share of random actions: at first, at last, and after which share of all decisions that is reached.
+# Share of random actions: at first, at last, and after which share of all decisions that is so.
 FIRST, LAST, UNTIL = 1.0, 0.05, 0.6
 SEED = 20_000  # of the first episode; those of the study are drawn elsewhere
 

@@ -169,9 +169,9 @@ class Mask(Rival):
             leader, follower = car.road.neighbour_vehicles(car, lane)
             if leader is not None and not self.is_enough(car, leader, speed):
                 return self.index["slower"]
-            if changes and lane == beside and follower is not None:
-                if not self.is_enough(follower, car, follower.speed):
-                    return self.index["slower"]
+            cut_in = changes and lane == beside and follower is not None
+            if cut_in and not self.is_enough(follower, car, follower.speed):
+                return self.index["slower"]
         return proposal
 
     @abstractmethod

@@ -24,10 +24,14 @@ class Contact(NamedTuple):
     closeness: _Floats  #: (n,) rising; 1 is at the side of the box
     risk: _Floats  #: (n,) probability of failure, falling
 
-    def of(self, start: _Floats, end: _Floats) -> _Floats:
-        """Probability of failure in steps between places, (..., p) each."""
-        come = closest(start, end, self.sides)
-        return np.asarray(np.interp(come, self.closeness, self.risk, right=0.0))
+    def of(self, path: _Floats) -> _Floats:
+        """Probability of failure on paths, (..., n + 1, p) places after each of n steps.
+
+        It is that of the closest step: what is not known of how close is too close is not drawn
+        anew in each step.
+        """
+        come = closest(path[..., :-1, :], path[..., 1:, :], self.sides).min(-1)
+        return np.asarray(np.interp(come, self.closeness, self.risk))
 
 
 def closest(start: _Floats, end: _Floats, sides: _Floats) -> _Floats:
@@ -45,8 +49,9 @@ def learn(
     """From steps of objects that were survived, and from those of all objects at each failure.
 
     The shape of the box is the one by which the fewest survived steps came closer than the failed
-    ones. The probability at closeness c is F / (F + S): failures that happened at c or farther
-    away, and steps that were survived at c or closer. So it falls with the distance, whatever else.
+    ones. The probability at closeness c is (F + 1) / (F + 1 + S): failures that happened at c or
+    farther away, one more that might, and steps that were survived at c or closer. So it falls with
+    the distance, and where little was survived it is high although nothing failed.
 
     Parameters
     ----------
@@ -69,7 +74,6 @@ def learn(
     assert best is not None
     _, sides, near, met = best
     at = np.unique(np.concatenate([met, near[:_CLOSEST]]))
-    failures = len(met) - np.searchsorted(met, at, "left")
-    survivals = np.searchsorted(near, at, "right")
-    risk = failures / np.maximum(failures + survivals, 1)
+    failures = 1 + len(met) - np.searchsorted(met, at, "left")
+    risk = failures / (failures + np.searchsorted(near, at, "right"))
     return Contact(sides, np.append(0.0, at), np.append(1.0, risk))

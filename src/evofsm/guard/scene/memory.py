@@ -1,8 +1,8 @@
 """What is remembered of scenes, and what is forecast by it.
 
 The forecast of an object is an analog ensemble (Delle Monache et al., "Probabilistic weather
-prediction with an analog ensemble", Monthly Weather Review 2013): the objects that were most like it
-go on as they did then. All objects are of one kind: what one did another may do.
+prediction with an analog ensemble", Monthly Weather Review 2013): it goes on as the objects did
+that were most like it. All objects are of one kind: what one did another may do.
 """
 
 from __future__ import annotations
@@ -27,9 +27,8 @@ ANALOGS, _OWN_ANALOGS = 20, 3
 _OF_REST, _NEAR_TO = 0.1, 2.0
 # Squared distance from where an object was expected beyond which it is another one.
 _GATE = 0.5
-# Reweightings of a robust fit; squared residuals, of the median, that count half and that are
-# refused; the ridge.
-_FITS, _HALF, _REFUSED, _RIDGE = 4, 9.0, 100.0, 1e-6
+# Reweightings of a robust fit; the squared residual, of the median, that counts half; the ridge.
+_FITS, _HALF, _RIDGE = 4, 9.0, 1e-6
 # Squared residuals are taken to be this large at least, in squared spreads.
 _EXACT = 1e-4
 # Objects that have to be seen twice before anything is learnt, times the numbers of oneself.
@@ -160,7 +159,6 @@ class Memory:
         away, other, _ = self._spreads
         links, ends = np.full(len(episode.away), -1), episode.ends
         gate = np.inf if self._motion is None else _GATE
-        p = episode.away.shape[1]
         for t in range(len(episode.own) - 1):
             now, then = slice(ends[t], ends[t + 1]), slice(ends[t + 1], ends[t + 2])
             if not (episode.counts[t] and episode.counts[t + 1]):
@@ -209,7 +207,6 @@ class Memory:
             middle = max(float(np.median(off)), _EXACT)
             weights = 1.0 / (1.0 + off / (_HALF * middle))
         self._motion = motion
-        flat.links[rows[off > _REFUSED * middle]] = -1
 
     def _moved(self, own: _Floats, other: _Floats, later: _Floats) -> _Floats:
         """(k, p) change of relative places in a step; ``own`` is (2, p + q), before and after."""
@@ -294,7 +291,7 @@ class Memory:
             self.contact = learn(steps, failed, self._spreads[0])
 
     def apart(self, own: _Floats, one: _Floats) -> _Floats:
-        """(k,) squared distance of states of oneself from one of them, each number by its spread."""
+        """(k,) squared distance of states of oneself from one, each number by its spread."""
         return np.asarray((((own - one) / self._spreads[2]) ** 2).sum(1))
 
     # -- Forecasting ----------------------------------------------------------------------------
@@ -315,8 +312,7 @@ class Memory:
             path = self._paths[like] + faster[:, None] * np.arange(1, self.steps + 1)[:, None]
             to = seen.away[i] + path + gone[:, :, None]
             start = np.broadcast_to(seen.away[i], (*to.shape[:3], 1, p))
-            risk = self.contact.of(np.concatenate([start, to[..., :-1, :]], axis=-2), to)
-            safe *= np.prod(1.0 - risk, axis=-1) @ share
+            safe *= (1.0 - self.contact.of(np.concatenate([start, to], axis=-2))) @ share
         risks = ((1.0 - safe) * weights).sum(0)
         return risks.reshape(n, n), after
 
@@ -332,19 +328,19 @@ class Memory:
         gone = np.zeros((r, n * n, self.steps, p))
         shares = np.full((r, n * n), 1.0 / r)
         total = np.zeros((r * n * n, p))
+        course = np.arange(r)[:, None, None]
         for h in range(self.steps):
             to = at.copy()
             for action, (before, change) in enumerate(self._own):
                 rows = np.flatnonzero((then if h else first) == action)
                 if not len(before):
                     continue
-                for k in range(r):
-                    apart = ((at[k, rows][:, None] - before) / self._spreads[2]) ** 2
-                    like, share = _nearest(apart.sum(2), r)
-                    course = np.minimum(k, like.shape[1] - 1)
-                    to[k, rows] += change[like[:, course]]
-                    if h == 0:
-                        shares[k, rows] = share[:, course]
+                apart = ((at[:, rows, None] - before) / self._spreads[2]) ** 2
+                like, share = _nearest(apart.sum(-1), r)
+                which = np.minimum(course, like.shape[-1] - 1)
+                to[:, rows] += change[np.take_along_axis(like, which, -1)[..., 0]]
+                if h == 0:
+                    shares[:, rows] = np.take_along_axis(share, which, -1)[..., 0]
             flat = at.reshape(-1, len(own)), to.reshape(-1, len(own))
             total = total + self._mine(*flat, p)
             gone[:, :, h] = total.reshape(r, n * n, p)
