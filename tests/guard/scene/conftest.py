@@ -6,7 +6,7 @@ import pytest
 from evofsm.guard import Guard, SceneRisk
 
 LEFT, STAY, RIGHT = range(3)
-LANES, THINGS, STEPS = 5, 4, 40
+LANES, THINGS, STEPS = 5, 3, 25
 HALF = np.array([2.0, 0.6])  # of the box around each other that fails
 
 
@@ -78,7 +78,7 @@ def taught():
     """A guard that has learnt from some episodes, and is frozen."""
     world = Rain()
     guard = world.guard()
-    for seed in range(20):
+    for seed in range(12):
         world.play(guard, seed)
     guard.freeze()
     return guard
