@@ -52,6 +52,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     for task in chosen.tasks.split(","):
         system = make_system(task)
         for controller in chosen.controllers.split(","):
+            if controller not in system.controllers:
+                continue
             for judge in chosen.judges.split(","):
                 if judge not in JUDGES and judge not in system.rivals:  # type: ignore[attr-defined]
                     continue

@@ -10,7 +10,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Mapping
 from importlib.resources import as_file, files
-from pathlib import Path
+from importlib.resources.abc import Traversable
 from typing import Any
 
 import numpy as np
@@ -22,8 +22,6 @@ with needs("highway-env", "highway", "a task of highway-env"):
     import gymnasium
     import highway_env  # noqa: F401  (registers its environments)
 
-#: Folder of the weights that tools/train_dqn.py wrote.
-WEIGHTS = files("evofsm.evidence.systems") / "weights"
 # Names of the five actions, and of those of a car that cannot leave its lane.
 _ALL = ("left", "idle", "right", "faster", "slower")
 _ALONG = ("slower", "idle", "faster")
@@ -38,7 +36,7 @@ class Highway(System):
     ----------
     controller : str, optional
         ``random``, ``idle``, ``faster``, or ``dqn``: a deep Q-network that was trained on the task
-        without any guard (``tools/train_dqn.py``).
+        without any guard (``tools/train_dqn.py``), where one was.
     task : str
         ``"highway-fast"``, ``"merge"`` or ``"intersection"``.
 
@@ -75,11 +73,12 @@ class Highway(System):
     def controllers(self) -> Mapping[str, Callable[[Vector], Action]]:
         """Those that act without looking, and one that was trained."""
         idle, faster = self.names.index("idle"), self.names.index("faster")
+        trained = {"dqn": self._trained} if _weights(self.name).is_file() else {}
         return {
             "random": lambda z: int(self.whim.integers(self.actions.n_actions)),
             "idle": lambda z: idle,
             "faster": lambda z: faster,
-            "dqn": self._trained,
+            **trained,
         }
 
     @property
@@ -129,18 +128,14 @@ class Highway(System):
 
 
 def read_weights(task: str) -> list[tuple[Vector, Vector]]:
-    """Weights and biases of each layer of the network that was trained on a task.
-
-    Raises
-    ------
-    ValueError
-        If none was.
-    """
-    place = WEIGHTS / f"{task}.npz"
-    if not place.is_file():
-        raise ValueError(f"no network was trained on {task}: run tools/train_dqn.py {task}")
-    with as_file(place) as path, np.load(Path(path)) as arrays:
+    """Weights and biases of each layer of the network that was trained on a task."""
+    with as_file(_weights(task)) as path, np.load(path) as arrays:
         return [
             (arrays[f"weight{k}"].astype(np.float64), arrays[f"bias{k}"].astype(np.float64))
             for k in range(len(arrays.files) // 2)
         ]
+
+
+def _weights(task: str) -> Traversable:
+    """The file that tools/train_dqn.py wrote, if it did."""
+    return files("evofsm.evidence.systems") / "weights" / f"{task}.npz"
