@@ -51,7 +51,11 @@ class Episode(NamedTuple):
     @classmethod
     def of(cls, seen: Sequence[Seen], actions: Sequence[int], failed: bool) -> Episode:
         """From what was seen at each moment; actions are one fewer."""
-        away, other = (np.concatenate([getattr(s, n) for s in seen]) for n in ("away", "other"))
+        # In the order in which a file holds them: sums are then the same to the last bit.
+        away, other = (
+            np.ascontiguousarray(np.concatenate([getattr(one, name) for one in seen]))
+            for name in ("away", "other")
+        )
         return cls(
             np.array([one.own for one in seen]),
             np.array([*actions, -1]),
