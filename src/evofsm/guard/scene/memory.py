@@ -108,11 +108,12 @@ class Memory:
         """Remember an episode; learn from it at once if it failed, else now and then."""
         self.episodes.append(episode)
         self.failures += episode.failed
+        forgets = False
         while sum(len(one.away) for one in self.episodes) > _MOST and len(self.episodes) > 1:
             del self.episodes[0]
-            self.fitted = 0
+            self.fitted, forgets = max(0, self.fitted - 1), True
         new = len(self.episodes) - self.fitted
-        if episode.failed or new >= max(1, len(self.episodes) // 10):
+        if episode.failed or forgets or new >= max(1, len(self.episodes) // 10):
             self.fit()
 
     # -- Learning -------------------------------------------------------------------------------
