@@ -14,8 +14,8 @@ from collections.abc import Sequence
 from functools import partial
 
 from evofsm.evidence.systems import HIGHWAY, make_system
-from evofsm.evidence.systems.system import Judge, System
-from evofsm.evidence.systems.trial import JUDGES, Row, trial
+from evofsm.evidence.systems.system import System
+from evofsm.evidence.systems.trial import JUDGES, Judge, Row, trial
 
 LEARN = ("scene", "learnt")  #: judges that learn; all others are tried at once
 

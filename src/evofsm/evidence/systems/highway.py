@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Mapping
+from functools import partial
 from importlib.resources import as_file, files
 from importlib.resources.abc import Traversable
 from typing import Any
@@ -75,7 +76,7 @@ class Highway(System):
         idle, faster = self.names.index("idle"), self.names.index("faster")
         trained = {"dqn": self._trained} if _weights(self.name).is_file() else {}
         return {
-            "random": lambda z: int(self.whim.integers(self.actions.n_actions)),
+            "random": lambda z: int(self.whim.integers(len(self.names))),
             "idle": lambda z: idle,
             "faster": lambda z: faster,
             **trained,
@@ -88,7 +89,7 @@ class Highway(System):
 
         along = self.name == "intersection"  # there are no lanes to choose from
         return {
-            name: lambda make=make: make(self)
+            name: partial(make, self)
             for name, make in RIVALS.items()
             if not (along and make.needs_lanes)
         }

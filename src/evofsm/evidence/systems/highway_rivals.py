@@ -7,7 +7,6 @@ lanes, cars behind, target speeds.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -214,7 +213,7 @@ class Barrier(Mask):
 
 
 #: By name.
-RIVALS: dict[str, Callable[[Highway], Rival] | Any] = {
+RIVALS: dict[str, type[Rival]] = {
     "slower": Slower,
     "idm-mobil": CarFollower,
     "ttc-grid": TimeToCollision,

@@ -143,9 +143,10 @@ def _scene(system: System, without: Sequence[str], seed: int) -> Judge:
 
     if not hasattr(system, "columns"):
         raise ValueError(f"{system.name} shows no objects; the judge of scenes knows nothing else")
-    n_actions, laid_out = system.actions.n_actions, (system.columns, system.relative)  # type: ignore[union-attr]
-    judge = SceneRisk(system.interval, n_actions, columns=laid_out[0], relative=laid_out[1])
-    return Guard(n_actions=n_actions, interval=system.interval, judge=judge, seed=seed)
+    shown: Any = system
+    n_actions = shown.actions.n_actions
+    judge = SceneRisk(shown.interval, n_actions, columns=shown.columns, relative=shown.relative)
+    return Guard(n_actions=n_actions, interval=shown.interval, judge=judge, seed=seed)
 
 
 #: By name: makes a judge for a system, without some parts, with a seed.

@@ -42,7 +42,8 @@ _JOINED = ("own", "actions", "counts", "away", "other", "links")
 def arrays_of(episodes: list[Episode]) -> dict[str, NDArray[Any]]:
     """All episodes, one after the other."""
     if not episodes:
-        arrays = {name: np.zeros((0,) * len(KIND.members[name].shape)) for name in _JOINED}
+        flat = ("actions", "counts", "links")
+        arrays = {name: np.zeros((0,) if name in flat else (0, 0)) for name in _JOINED}
     else:
         arrays = {
             name: np.concatenate([getattr(one, name) for one in episodes]) for name in _JOINED

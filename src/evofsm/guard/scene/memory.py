@@ -191,7 +191,7 @@ class Memory:
             moment = moments + np.repeat(np.arange(len(one.own)), one.counts)
             parts.append((one.own, one.actions, one.away, one.other, links, moment, lost))
             objects, moments = objects + len(one.away), moments + len(one.own)
-        return _Flat(*(np.concatenate(column) for column in zip(*parts, strict=True)))  # type: ignore[arg-type]
+        return _Flat(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
     def _move(self, flat: _Flat) -> None:
         """Fit how places change by what oneself and objects were like before and after."""
@@ -211,7 +211,7 @@ class Memory:
             off = (((y - x @ motion) / self._spreads[0]) ** 2).sum(1)
             middle = max(float(np.median(off)), _EXACT)
             weights = 1.0 / (1.0 + off / (_HALF * middle))
-        self._motion = motion
+        self._motion = np.asarray(motion, np.float64)
 
     def _moved(self, own: _Floats, other: _Floats, later: _Floats) -> _Floats:
         """(k, p) change of relative places in a step; ``own`` is (2, p + q), before and after."""
