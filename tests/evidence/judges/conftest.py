@@ -36,6 +36,7 @@ def make_row(system, controller, judge="learnt", without="", seed=0, failed=0, *
         "score": _SCORES[system],
         "p50_ms": 0.25,
         "p99_ms": 1.0,
+        "speed": None,
     }
     return Row(
         system=system,

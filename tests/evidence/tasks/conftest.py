@@ -39,6 +39,7 @@ def make_row(task, controller, judge="learnt", told="nothing but failures", seed
         "mean_change": 0.1,
         "p50_ms": 0.25,
         "p99_ms": 1.0,
+        "speed": None,
     }
     if judge not in ("learnt", "counted"):
         values |= {"trained": 0, "failed_while_learning": 0, "late": 0, "failures": ()}

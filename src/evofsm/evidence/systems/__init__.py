@@ -30,16 +30,32 @@ SYSTEMS: dict[str, Callable[[str | None], System]] = {
     "cut_in": partial(Cars, family="cut_in"),
 }
 
+
+def _highway(controller: str | None, *, task: str) -> System:
+    """Imported where it is asked for: the package that it needs is an extra of its own."""
+    from evofsm.evidence.systems.highway import Highway
+
+    return Highway(controller, task=task)
+
+
+#: Tasks of highway-env; they take long.
+HIGHWAY: dict[str, Callable[[str | None], System]] = {
+    task: partial(_highway, task=task) for task in ("highway-fast", "merge", "intersection")
+}
+
+
 #: The same for those that others set, which `evofsm bench tasks` puts side by side.
 TASKS: dict[str, Callable[[str | None], System]] = {
     **{name: SYSTEMS[name] for name in ("acc", "acc-5", "cartpole", "pendulum", "pendulum-cos")},
     **MASA,
+    **HIGHWAY,
 }
 
 
 # Packages that no extra brings, or a heavy one, by the tasks and rivals that need them.
 _PACKAGES = {
     **dict.fromkeys(MASA, (PACKAGE, INSTALL)),
+    **dict.fromkeys(HIGHWAY, ("highway_env", "pip install 'evofsm[highway]'")),
     "cbfpy": ("cbfpy", "pip install cbfpy"),
 }
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal, NamedTuple, Protocol
 
@@ -168,9 +169,19 @@ class System(ABC):
         return self._returned
 
     @property
+    def speed(self) -> float:
+        """Mean speed of the episode so far [m/s]; NaN where nothing drives."""
+        return math.nan
+
+    @property
     @abstractmethod
     def controllers(self) -> Mapping[str, Callable[[Vector], Action]]:
         """By name, each from an observation to an action; random ones draw from ``whim``."""
+
+    @property
+    def learners(self) -> Sequence[str]:
+        """Judges that are told nothing but failures, and fit what is observed."""
+        return ("learnt", "counted")
 
     @property
     def rivals(self) -> Mapping[str, Callable[[], Judge]]:

@@ -5,6 +5,7 @@ Decisions are timed around ``decide`` alone. Times depend on the machine; nothin
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass
@@ -50,6 +51,7 @@ class Row:
     score: float  #: mean over held-out episodes
     p50_ms: float  #: of a held-out decision
     p99_ms: float
+    speed: float | None  #: mean over held-out episodes [m/s]; None where nothing drives
 
     def as_dict(self) -> dict[str, Any]:
         """For JSON: the score under its name, the other one None."""
@@ -67,6 +69,7 @@ class Ended(NamedTuple):
     kept: int  #: proposals that were executed exactly
     changes: float  #: sum over decisions, see `Row.mean_change`
     times: list[float]  #: of each decision [s]
+    speed: float = math.nan  #: mean [m/s]; NaN where nothing drives
 
 
 def _unrevised(system: System, without: Sequence[str], seed: int) -> Judge:
@@ -97,12 +100,24 @@ def _counted(system: System, without: Sequence[str], seed: int) -> Judge:
     return Counted(system)
 
 
+def _scene(system: System, without: Sequence[str], seed: int) -> Judge:
+    from evofsm.guard import SceneRisk
+
+    if not hasattr(system, "columns"):
+        raise ValueError(f"{system.name} shows no objects; the judge of scenes knows nothing else")
+    shown: Any = system
+    n_actions = shown.actions.n_actions
+    judge = SceneRisk(shown.interval, n_actions, columns=shown.columns, relative=shown.relative)
+    return Guard(n_actions=n_actions, interval=shown.interval, judge=judge, seed=seed)
+
+
 #: By name: makes a judge for a system, without some parts, with a seed.
 JUDGES: dict[str, Callable[[System, Sequence[str], int], Judge]] = {
     "learnt": _learnt,
     "unrevised": _unrevised,
     "kinematic": _kinematic,
     "counted": _counted,
+    "scene": _scene,
 }
 
 
@@ -249,6 +264,7 @@ def trial(
 def counted(held_out: Sequence[Ended]) -> dict[str, Any]:
     """What is counted in held-out episodes, under the names that it has in a `Row`."""
     share = share_of([one.failed for one in held_out])
+    speed = float(np.mean([one.speed for one in held_out]))
     times = 1e3 * np.array([took for one in held_out for took in one.times])
     middle, slow = np.quantile(times, [0.5, 0.99])
     return {
@@ -260,6 +276,7 @@ def counted(held_out: Sequence[Ended]) -> dict[str, Any]:
         "mean_change": sum(one.changes for one in held_out) / len(times),
         "p50_ms": float(middle),
         "p99_ms": float(slow),
+        "speed": None if math.isnan(speed) else speed,
     }
 
 
@@ -280,7 +297,7 @@ def run(system: System, judge: Judge, start: Start) -> Ended:
         observation = step.observation
         if step.over:
             judge.end(step.failed, observation)
-            return Ended(step.failed, system.score, kept, changes, times)
+            return Ended(step.failed, system.score, kept, changes, times, system.speed)
 
 
 def _held_out(base: int, test: int) -> Iterable[Start]:

@@ -41,6 +41,7 @@ class Amounts:
     seed: int = option(0, "Of everything.", min=0)
     acc_seeds: int = 20  #: learning seeds of `ACC`
     acc_train: int = 200  #: training episodes of `ACC`
+    long_tasks: bool = True  #: whether all tasks include those of highway-env, which take hours
     rounds: int = 1000  #: of the bootstrap
     generations: int = 12  #: of policies that are trained
     population: int = 16  #: policies in each
@@ -56,6 +57,7 @@ class Amounts:
             test=min(self.test, 10),
             acc_seeds=1,
             acc_train=20,
+            long_tasks=False,
             rounds=100,
             generations=2,
             population=4,

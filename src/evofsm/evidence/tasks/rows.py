@@ -44,6 +44,7 @@ class Row:
     mean_change: float  #: of an action, in halves of its range; of discrete ones the share changed
     p50_ms: float  #: of a held-out decision
     p99_ms: float
+    speed: float | None  #: mean over held-out episodes [m/s]; None where nothing drives
 
 
 def row(

@@ -11,7 +11,7 @@ from functools import partial
 
 from evofsm.app import split_names
 from evofsm.evidence.frame import Frame, Progress, silent
-from evofsm.evidence.systems import TASKS, lacking, make_system
+from evofsm.evidence.systems import HIGHWAY, TASKS, lacking, make_system
 from evofsm.evidence.systems.trial import (
     make_judge,
     try_judge,
@@ -20,9 +20,6 @@ from evofsm.evidence.tasks.amounts import ALL, Amounts
 from evofsm.evidence.tasks.policies import trained_policies
 from evofsm.evidence.tasks.rows import Row, row
 from evofsm.fleet import in_order
-
-#: Judges that learn; the others are tried once, and learn nothing.
-LEARNERS = ("learnt", "counted")
 
 
 @dataclass(frozen=True)
@@ -85,7 +82,8 @@ def _named(plan: Amounts) -> tuple[list[str], list[str]]:
     """Tasks to run, and a sentence on those whose package is missing."""
     default = "" if plan.task else ALL
     wanted = plan.tasks or default
-    names = list(TASKS) if wanted == ALL else split_names(wanted)
+    every = [name for name in TASKS if plan.long_tasks or name not in HIGHWAY]
+    names = every if wanted == ALL else split_names(wanted)
     lack = {name: lacking(name) for name in names}
     without = [name for name in names if lack[name]]
     left_out = [f"{name} is left out: {lack[name]}." for name in without]
@@ -112,7 +110,7 @@ def _trials(
             for judge in ("unrevised", *rivals):
                 yield partial(one, judge, 0, 0)
             for seed in range(plan.seeds_of(name)):
-                for judge in (*([plan.judge] if plan.judge else []), *LEARNERS):
+                for judge in (*([plan.judge] if plan.judge else []), *task.learners):
                     yield partial(one, judge, seed, train)
 
 

@@ -1,0 +1,59 @@
+"""Tasks of highway-env come as they are, and a judge of scenes lowers their crashes."""
+
+import numpy as np
+import pytest
+
+from evofsm.evidence.systems import HIGHWAY, SYSTEMS, make_system
+from evofsm.evidence.systems.rivals.rival import Unrevised
+from evofsm.evidence.systems.system import Start
+from evofsm.evidence.systems.trial import JUDGES, run, trial
+
+pytest.importorskip("highway_env")
+
+
+def test_they_are_no_part_of_what_every_study_takes():
+    assert not set(HIGHWAY) & set(SYSTEMS)
+
+
+@pytest.mark.parametrize("task", HIGHWAY)
+def test_an_episode_is_drawn_by_its_start_alone(task):
+    system, start = make_system(task), Start.held_out(3, 1)
+    first, again, other = (system.reset(one) for one in (start, start, Start.held_out(3, 2)))
+    assert np.array_equal(first, again)
+    assert not np.array_equal(first, other)
+    assert len(first) == len(system.variables)
+    assert len(first) % system.columns == 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("task", HIGHWAY)
+def test_it_drives_to_the_end_under_each_rival(task):
+    system = make_system(task)
+    for make in [Unrevised, *system.rivals.values()]:
+        ended = run(system, make(), Start.held_out(3, 1))
+        assert 0 < len(ended.times) <= system.steps
+        assert 0.0 <= ended.speed <= 40.0
+        assert np.isfinite(ended.score)
+
+
+@pytest.mark.slow
+def test_the_judge_of_scenes_learns_to_merge():
+    alone = trial("merge", judge="unrevised", train=0, test=15, base=9)
+    guarded = trial("merge", judge="scene", train=40, test=15, base=9)
+    assert alone.failed >= 10
+    assert guarded.failed <= 3
+    assert guarded.speed > 0.85 * alone.speed
+
+
+@pytest.mark.parametrize("task", ["highway-fast", "merge"])
+def test_the_network_that_was_trained_chooses_actions(task):
+    system = make_system(task, "dqn")
+    chosen = {system.propose(system.reset(Start.held_out(3, k))) for k in range(3)}
+    assert chosen <= set(range(system.actions.n_actions))
+
+
+def test_what_is_not_there_is_said():
+    with pytest.raises(ValueError, match="has no controller 'dqn'"):
+        make_system("intersection", "dqn")
+    with pytest.raises(ValueError, match="shows no objects"):
+        JUDGES["scene"](make_system("acc"), (), 0)
