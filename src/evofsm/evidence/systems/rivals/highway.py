@@ -46,7 +46,7 @@ class OnTheRoad(Rival):
     @property
     def car(self) -> Any:
         """The car itself."""
-        return self.system.env.vehicle  # type: ignore[attr-defined]
+        return self.system.env.vehicle
 
     def lane_beside(self, to: int) -> Any | None:
         """Index of the lane by so many to the right of the car's target; None where none is."""
@@ -175,7 +175,7 @@ class Rss(Mask):
         then = now + (react * _THROTTLE if speed > behind.speed else 0.0)
         least = now * react + then**2 / (2.0 * _BRAKES)
         least -= max(float(leader.speed), 0.0) ** 2 / (2.0 * _LEADER_BRAKES)
-        return self.gap(behind, leader) >= max(least, 0.0)
+        return bool(self.gap(behind, leader) >= max(least, 0.0))
 
 
 class Barrier(Mask):
@@ -189,7 +189,7 @@ class Barrier(Mask):
         closing = 0.5 * (now + speed) - float(leader.speed)
         here = gap - _HEADWAY * now
         then = gap - closing * self.system.interval - _HEADWAY * speed
-        return then >= (1.0 - _USED) * min(here, gap)
+        return bool(then >= (1.0 - _USED) * min(here, gap))
 
 
 #: By name.
