@@ -79,3 +79,9 @@ def found():
         for seed in range(5)
     ]
     return Tasks(Plan(), rows, policies, ("masa-road_1d is left out: it needs masa.",))
+
+
+@pytest.fixture(name="make_row")
+def row_maker():
+    """Makes a line of the study."""
+    return make_row

@@ -23,7 +23,7 @@ from evofsm.evidence.report.html import Setting
 from evofsm.evidence.systems import TASKS
 from evofsm.evidence.tasks.amounts import ACC
 from evofsm.evidence.tasks.figures import sketches
-from evofsm.evidence.tasks.rows import LATE, Row
+from evofsm.evidence.tasks.rows import LATE, OURS, Row
 from evofsm.evidence.tasks.study import Tasks
 from evofsm.evidence.tasks.summary import Summary, own_share, policies, summaries
 from evofsm.evidence.tasks.targets import SEEDS, TRAIN, claims
@@ -81,7 +81,7 @@ _SOURCES = (
 
 
 def _headline(every: Sequence[Summary]) -> str:
-    ours = [one for one in every if one.judge == "learnt"]
+    ours = [one for one in every if one.judge in OURS]
     alone = [one for one in every if one.judge == "unrevised"]
     tasks = len({one.task for one in ours})
     return (
@@ -97,7 +97,7 @@ def _share(some: Sequence[Summary]) -> float:
 
 
 def _answer(found: Tasks, every: Sequence[Summary]) -> Iterator[str]:
-    ours = [one for one in every if one.judge == "learnt"]
+    ours = [one for one in every if one.judge in OURS]
     worst = max(ours, key=lambda one: one.learning)
     yield (
         f"While learning at most {count(worst.learning)} of {worst.trained} episodes fail "
@@ -122,7 +122,7 @@ def _answer(found: Tasks, every: Sequence[Summary]) -> Iterator[str]:
 
 def _losses(found: Tasks, every: Sequence[Summary]) -> Iterator[str]:
     """What goes against the learnt judge, the most important first."""
-    ours = [one for one in every if one.judge == "learnt"]
+    ours = [one for one in every if one.judge in OURS]
     for one in ours:
         if one.failed.held:
             yield (
@@ -133,24 +133,24 @@ def _losses(found: Tasks, every: Sequence[Summary]) -> Iterator[str]:
         if one.late:
             yield f"{one.who}: up to {count(one.late)} failures while learning are late ones."
     for one in ours:
-        beside = [r for r in every if r[:2] == one[:2] and r.judge not in ("learnt", "unrevised")]
+        beside = [r for r in every if r[:2] == one[:2] and r.judge not in (*OURS, "unrevised")]
         for other in beside:
             knows = f"{one.who}: {other.judge} (told {other.told})"
             if other.failed.value < one.failed.value:
                 yield (
-                    f"{knows} fails less often ({percent(other.failed.value)}, learnt "
+                    f"{knows} fails less often ({percent(other.failed.value)}, ours "
                     f"{percent(one.failed.value)})."
                 )
             elif other.failed.held or one.failed.held:
                 continue
             elif other.score > one.score + _SAME * abs(one.score):
                 yield (
-                    f"{knows} returns more ({_score_text(other.score)}, learnt "
+                    f"{knows} returns more ({_score_text(other.score)}, ours "
                     f"{_score_text(one.score)})."
                 )
             elif other.kept > one.kept + 0.05 and other.score > one.score - _SAME * abs(one.score):
                 yield (
-                    f"{knows} keeps more proposals ({percent(other.kept)}, learnt "
+                    f"{knows} keeps more proposals ({percent(other.kept)}, ours "
                     f"{percent(one.kept)})."
                 )
     if few := [f"{one.who} ({percent(one.kept)})" for one in ours if one.kept < _FEW]:
@@ -214,6 +214,7 @@ _COSTS: tuple[Column[Summary], ...] = (
     Column("return", "score score_low score_high", _return_text),
     Column("worst", "score_worst", _score_text),
     Column("of told [%]", "of_told", bare_percent),
+    Column("speed [m/s]", "speed", decimals(1)),
     Column("kept [%]", "kept", bare_percent),
     Column("change", "change", decimals(2)),
     Column("p50 [ms]", "p50", decimals(2)),
@@ -240,9 +241,7 @@ def _tables(every: Sequence[Summary]) -> Iterator[Table]:
     ):
         who = Column[Summary]("task, controller: judge", lambda one: f"{one.who}: {one.judge}")
         head = (who, Column[Summary]("told", "told"))
-        yield Table.of(
-            title, (*head, *columns), every, note, ours=lambda one: one.judge == "learnt"
-        )
+        yield Table.of(title, (*head, *columns), every, note, ours=lambda one: one.judge in OURS)
 
 
 def _policies(found: Tasks) -> Iterator[Table]:
@@ -304,7 +303,7 @@ def _plan(found: Tasks) -> Iterator[Setting]:
     plan = found.plan
     yield Setting("seed", str(plan.seed))
     yield Setting("learnt", f"with {seeds_text(plan.seeds)}, acc with {plan.seeds_of('acc')}")
-    trained = {row.task: row.trained for row in found.rows if row.judge == "learnt"}
+    trained = {row.task: row.trained for row in found.rows if row.judge in OURS}
     yield Setting("training episodes", ", ".join(f"{one} {n}" for one, n in trained.items()))
     yield Setting("held-out episodes", count(plan.test))
     if missing := [name for name in TASKS if not found.of(name)]:

@@ -21,9 +21,14 @@ _LOOKS: dict[str, plot.Look] = {
     "told more": plot.TOLD,
     "counted matrices": plot.OTHER,
     "your own": plot.FIXED,
-    "learnt": plot.OURS,
+    "ours": plot.OURS,
 }
-_NAMED = {"unrevised": "controller alone", "counted": "counted matrices", "learnt": "learnt"}
+_NAMED = {
+    "unrevised": "controller alone",
+    "counted": "counted matrices",
+    "learnt": "ours",
+    "scene": "ours",
+}
 # Height of a line, and of what stands around them [inch].
 _LINE, _AROUND = 0.34, 1.0
 

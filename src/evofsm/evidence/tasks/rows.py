@@ -11,6 +11,8 @@ from evofsm.evidence.scores import bootstrap
 from evofsm.evidence.systems.trial import Ended, counted, unrevised_failures
 from evofsm.evidence.tasks.amounts import Amounts
 
+#: Our judges: of variables, and of scenes.
+OURS = ("learnt", "scene")
 #: A failure after so many training episodes is a late one; after half of them, where they are few.
 LATE = 50
 # Of the training episodes up to then, those whose return is told.

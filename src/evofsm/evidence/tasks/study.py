@@ -18,7 +18,7 @@ from evofsm.evidence.systems.trial import (
 )
 from evofsm.evidence.tasks.amounts import ALL, Amounts
 from evofsm.evidence.tasks.policies import trained_policies
-from evofsm.evidence.tasks.rows import Row, row
+from evofsm.evidence.tasks.rows import OURS, Row, row
 from evofsm.fleet import in_order
 
 
@@ -36,12 +36,13 @@ class Tasks:
         """Every row, those of policies last."""
         return Frame([*self.rows, *self.policies])
 
-    def of(self, task: str, controller: str | None = None, judge: str = "learnt") -> list[Row]:
-        """Rows of a judge on a task; of all controllers where none is named."""
+    def of(self, task: str, controller: str | None = None, judge: str = "") -> list[Row]:
+        """Rows of a judge on a task, of ours if none is named; of one controller, or of all."""
+        judges = (judge,) if judge else OURS
         return [
             row
             for row in self.rows
-            if (row.task, row.judge) == (task, judge) and controller in (None, row.controller)
+            if row.task == task and row.judge in judges and controller in (None, row.controller)
         ]
 
     @property

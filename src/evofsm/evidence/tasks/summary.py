@@ -35,6 +35,7 @@ class Summary(NamedTuple):
     change: float  #: median over runs
     p50: float  #: median over runs [ms]
     p99: float  #: of the worst run [ms]
+    speed: float | None  #: median over runs [m/s]; None where nothing drives
 
     @property
     def who(self) -> str:
@@ -58,6 +59,7 @@ def summary(rows: Sequence[Row], best_told: float | None = None) -> Summary:
     """
     first = rows[0]
     failed, episodes = sum(row.failed for row in rows), sum(row.episodes for row in rows)
+    speeds = [row.speed for row in rows if row.speed is not None]
     middle = sorted(rows, key=lambda row: row.score)[(len(rows) - 1) // 2]
     return Summary(
         first.task,
@@ -79,6 +81,7 @@ def summary(rows: Sequence[Row], best_told: float | None = None) -> Summary:
         float(np.median([row.mean_change for row in rows])),
         float(np.median([row.p50_ms for row in rows])),
         max(row.p99_ms for row in rows),
+        float(np.median(speeds)) if speeds else None,
     )
 
 

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from evofsm.app import count, number
+from evofsm.app import count, number, percent
 from evofsm.evidence.report.asked import Asked
 from evofsm.evidence.tasks.rows import LATE, Row
 from evofsm.evidence.tasks.study import Tasks
@@ -16,6 +16,8 @@ SEEDS, TRAIN = 20, 200
 # Failures of a learning seed, seeds without a late one, and return by then, by task.
 _LEARNING, _CLEAN = 2, 0.95
 RETURNS = {"acc": 545.0, "acc-5": 520.0}
+#: Share of crashes that is to be prevented, and of the mean speed that is to be kept.
+CRASHES = {"highway-fast": (0.9, 0.85), "merge": (0.9, 0.85), "intersection": (0.7, 0.85)}
 
 
 def claims(found: Tasks) -> Iterator[Asked]:
@@ -46,6 +48,27 @@ def claims(found: Tasks) -> Iterator[Asked]:
             number(middle, 0),
             middle >= least,
         )
+
+    for task, (fewer, speed) in CRASHES.items():
+        for controller in dict.fromkeys(row.controller for row in found.of(task)):
+            yield from _crashes(found, task, controller, fewer, speed)
+
+
+def _crashes(
+    found: Tasks, task: str, controller: str, fewer: float, speed: float
+) -> Iterator[Asked]:
+    """How many crashes fewer there are than without a guard, and at what speed."""
+    rows = found.of(task, controller)
+    alone = found.of(task, controller, "unrevised")
+    if not alone or min(row.episodes for row in rows) < TRAIN:
+        return
+    crashed = float(np.mean([row.failed / row.episodes for row in rows]))
+    before = alone[0].failed / alone[0].episodes
+    down = 1.0 - crashed / before if before else 0.0
+    kept = float(np.mean([row.speed or 0.0 for row in rows])) / (alone[0].speed or 1.0)
+    who = f"{task}, {controller}"
+    yield Asked(f"{who}: crashes fewer", f"≥ {percent(fewer)}", percent(down), down >= fewer)
+    yield Asked(f"{who}: speed kept", f"≥ {percent(speed)}", percent(kept), kept >= speed)
 
 
 def is_long(rows: list[Row]) -> bool:
