@@ -224,6 +224,7 @@ def test_a_fleet_with_dynamics_is_its_machines():
         assert files[0] == files[1]
 
 
+@pytest.mark.slow
 def test_what_a_fleet_with_dynamics_refuses_changes_none():
     fleet = Fleet(moving(), 2)
     for told, why in (({}, "executed is missing"), ({"executed": [0.0]}, "rows")):

@@ -53,6 +53,7 @@ def test_the_task_and_the_judge_of_the_page_are_tried(in_page):
     assert found.policies == []
 
 
+@pytest.mark.slow
 def test_a_judge_that_says_how_dangerous_actions_are_is_put_into_a_guard(tmp_path, monkeypatch):
     recipe = (PAGE.parents[1] / "CONTRIBUTING.md").read_text("utf-8")
     (text,) = re.findall(r"# my_judge\.py\n(.*?)```", recipe, re.S)

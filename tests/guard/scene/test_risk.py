@@ -21,6 +21,7 @@ def failures(world, guard, seeds):
         pytest.param({"scale": (0.01, 30.0)}, marks=pytest.mark.slow),
     ],
 )
+@pytest.mark.slow
 def test_after_some_failures_it_keeps_a_random_policy_from_failing(rain, kind):
     world = rain(**kind)
     alone = failures(world, world.guard(mode=Mode.OFF), range(500, 515))

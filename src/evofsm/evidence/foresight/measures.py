@@ -89,7 +89,7 @@ def ece(probability: _Floats, truth: _Bools) -> float:
 
     Examples
     --------
-    >>> ece(np.array([0.05, 0.05, 0.95, 0.95]), np.array([False, False, True, False]))
+    >>> round(ece(np.array([0.05, 0.05, 0.95, 0.95]), np.array([False, False, True, False])), 9)
     0.25
     """
     if not len(probability):
