@@ -13,15 +13,8 @@ def failures(world, guard, seeds):
     return sum(world.play(guard, seed)[1] for seed in seeds)
 
 
-@pytest.mark.parametrize(
-    "kind",
-    [
-        {"shuffled": True},
-        pytest.param({"relative": False}, marks=pytest.mark.slow),
-        pytest.param({"scale": (0.01, 30.0)}, marks=pytest.mark.slow),
-    ],
-)
 @pytest.mark.slow
+@pytest.mark.parametrize("kind", [{"shuffled": True}, {"relative": False}, {"scale": (0.01, 30.0)}])
 def test_after_some_failures_it_keeps_a_random_policy_from_failing(rain, kind):
     world = rain(**kind)
     alone = failures(world, world.guard(mode=Mode.OFF), range(500, 515))
