@@ -31,9 +31,9 @@ class Amounts:
         """A look, not evidence."""
         return replace(
             self,
-            train=min(self.train, 40),
-            test=min(self.test, 30),
-            calibration=min(self.calibration, 20),
+            train=min(self.train, 20),
+            test=min(self.test, 15),
+            calibration=min(self.calibration, 10),
             seeds=1,
             rounds=min(self.rounds, 40),
         )

@@ -9,6 +9,8 @@ from evofsm.app import option
 
 #: A value of `Amounts.tasks` that stands for all there are.
 ALL = "all"
+# Those of a shortened run, unless others are named.
+_SHORT = "acc,cartpole,pendulum"
 #: Tasks of which more was asked.
 ACC = ("acc", "acc-5")
 
@@ -41,7 +43,6 @@ class Amounts:
     seed: int = option(0, "Of everything.", min=0)
     acc_seeds: int = 20  #: learning seeds of `ACC`
     acc_train: int = 200  #: training episodes of `ACC`
-    long_tasks: bool = True  #: whether all tasks include those of highway-env, which take hours
     rounds: int = 1000  #: of the bootstrap
     generations: int = 12  #: of policies that are trained
     population: int = 16  #: policies in each
@@ -51,13 +52,13 @@ class Amounts:
         """A look, not evidence."""
         return replace(
             self,
+            tasks=self.tasks or ("" if self.task else _SHORT),
             all_controllers=False,
             seeds=1,
             train=min(self.train or 20, 20),
             test=min(self.test, 10),
             acc_seeds=1,
             acc_train=20,
-            long_tasks=False,
             rounds=100,
             generations=2,
             population=4,

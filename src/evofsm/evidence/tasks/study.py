@@ -11,7 +11,7 @@ from functools import partial
 
 from evofsm.app import split_names
 from evofsm.evidence.frame import Frame, Progress, silent
-from evofsm.evidence.systems import HIGHWAY, TASKS, lacking, make_system
+from evofsm.evidence.systems import TASKS, lacking, make_system
 from evofsm.evidence.systems.trial import (
     make_judge,
     try_judge,
@@ -83,8 +83,7 @@ def _named(plan: Amounts) -> tuple[list[str], list[str]]:
     """Tasks to run, and a sentence on those whose package is missing."""
     default = "" if plan.task else ALL
     wanted = plan.tasks or default
-    every = [name for name in TASKS if plan.long_tasks or name not in HIGHWAY]
-    names = every if wanted == ALL else split_names(wanted)
+    names = list(TASKS) if wanted == ALL else split_names(wanted)
     lack = {name: lacking(name) for name in names}
     without = [name for name in names if lack[name]]
     left_out = [f"{name} is left out: {lack[name]}." for name in without]
