@@ -35,7 +35,7 @@ class Contact(NamedTuple):
 
 
 def closest(start: _Floats, end: _Floats, sides: _Floats) -> _Floats:
-    """How close it comes between two places: the least max |x_i| / side_i on the line."""
+    """How close it comes between two places: the least of ``max(abs(x) / sides)`` on the line."""
     least = np.full(np.broadcast(start, end).shape[:-1], np.inf)
     for share in np.linspace(0.0, 1.0, _POINTS):
         at = np.abs(start + share * (end - start)) / sides
