@@ -72,6 +72,6 @@ def test_the_study_gives_a_row_for_each_alarm_and_the_same_ones_again():
     found = run_alarms(plan, workers=1)
     assert len(found.rows) == 3 * 2 * 2
     assert {row.world for row in found.rows} == {"cut_in"}
-    for row in found.of("adaptive"):
-        assert row.errors <= row.most * row.windows + 1e-9
+    for row in found.of("adaptive"):  # one of which nothing is known has no bound
+        assert row.most is None or row.errors <= row.most * row.windows + 1e-9
     assert run_alarms(plan, workers=1).rows == found.rows
