@@ -3,6 +3,7 @@
 import copy
 import math
 import pickle
+from contextlib import suppress
 
 import numpy as np
 import pytest
@@ -251,3 +252,17 @@ def test_the_horizon_follows_what_became_of_dead_ends(point, dead_ends, took, fa
     expected = {"less far": ratio < 0.9, "as far": 0.95 < ratio < 1.05, "farther": ratio > 2.0}
     assert expected[looks]
     assert judge.horizon == int(min(max(1.5 * judge.takes, 32), 144))
+
+
+def test_a_question_changes_nothing_of_what_is_learnt(point, content):
+    asked, unasked = point.guard(horizon=None), point.guard(horizon=None)
+
+    def ask(k, z):
+        with suppress(ValueError):  # before the first failure there is no answer
+            asked.judge.assess(np.concatenate([z[: len(z) // 2] + 0.5, z[len(z) // 2 :]]))
+        return z
+
+    for episode in range(8):
+        point.play(asked, episode, seen=ask)
+        point.play(unasked, episode)
+    assert content(asked) == content(unasked)

@@ -280,18 +280,18 @@ class LearntRisk:
             again = search(known, here, best, *world, 0.0, allowed, np.empty_like(best))
             self._holds = again[0] != NOTHING_PASSES
         then = self._backup_text(backup)
-        if how == KEPT:
-            judged = self._judged(situation, here, proposal[None], left if not allowed else None)
-            return Search(one, judged, 0, words.kept(then, self.remembered, left, allowed))
         if tried is not None:
             best = tried
-        action = np.reshape(dynamics.decode(best), np.shape(wanted))
-        judged = self._judged(
+        judged, self._dead_end, took = self._judged(
             situation,
             here,
-            np.array((proposal, best)),
-            left if how == CHANGED and not allowed else None,
+            proposal[None] if how == KEPT else np.array((proposal, best)),
+            None if how == NOTHING_PASSES or allowed else left,
         )
+        self._took = max(self._took, took)
+        if how == KEPT:
+            return Search(one, judged, 0, words.kept(then, self.remembered, left, allowed))
+        action = np.reshape(dynamics.decode(best), np.shape(wanted))
         if tried is not None:
             instead = words.tried()
         elif how == CHANGED:
@@ -318,7 +318,7 @@ class LearntRisk:
         if here is None or self.disturbances is None or not self._fails:
             return _unjudged(len(given))
         inner = np.array([self.dynamics.encode(one) for one in given])
-        return self._judged(situation, here, inner)
+        return self._judged(situation, here, inner)[0]
 
     def assess(self, observation: ArrayLike, change: ArrayLike | None = None) -> Outlook:
         """How it stands somewhere if the best backup is followed from now on.
@@ -366,7 +366,7 @@ class LearntRisk:
                 f"({dynamics.n_variables},)"
             )
         here = Here(z, moved, np.zeros(dynamics.size))
-        lost, left = self._lost_after(here, np.empty(0), self.backups.ranks)
+        lost, left, _ = self._lost_after(here, np.empty(0), self.backups.ranks)
         dead_end, hours = math.isinf(lost), self.exposure / 3600.0
         count = len(self.disturbances.residuals) - 1 if dead_end else int(lost)
         low, high = poisson_bounds(count)
@@ -389,23 +389,27 @@ class LearntRisk:
 
     def _judged(
         self, situation: Situation, here: Here, actions: _Floats, passes: float | None = None
-    ) -> Judgement:
-        """Of some actions; ``passes`` is what is left after the last, if that is known to pass."""
-        lost, left = np.zeros(len(actions)), np.zeros(len(actions))
+    ) -> tuple[Judgement, bool, float]:
+        """Of some actions; ``passes`` is what is left after the last, if that is known to pass.
+
+        And whether the last is lost for good, and after how many steps any of them fails at the
+        latest.
+        """
+        lost, left, took = np.zeros((3, len(actions)))
         for i, action in enumerate(actions if passes is None else actions[:-1]):
-            lost[i], left[i] = self._lost_after(here, action, self._ranks[:_ASKED])
+            lost[i], left[i], took[i] = self._lost_after(here, action, self._ranks[:_ASKED])
         if passes is not None:
             left[-1] = passes
         self._lost = -1 if math.isinf(lost[0]) else int(lost[0])
-        self._dead_end = passes is None and math.isinf(lost[-1])
-        return self._judgement(lost, left, situation)
+        judged = self._judgement(lost, left, situation)
+        return judged, math.isinf(lost[-1]), float(took.max())
 
     def _lost_after(
         self, here: Here, action: _Floats, ranks: NDArray[np.int64]
-    ) -> tuple[float, float]:
+    ) -> tuple[float, float, float]:
         """Disturbances that are lost after an action; infinite if it fails without any.
 
-        And what is left after the worst of them.
+        And what is left after the worst of them, and the steps after which it fails at the latest.
         """
         assert self.disturbances is not None
         assert self.backups is not None
@@ -413,9 +417,8 @@ class LearntRisk:
         world = (self.backups.policies, ranks, self.disturbances, found)
         escapes(self.dynamics.consequents, here, action, *world)
         lost = math.inf if found[0] < 0.0 else float(np.count_nonzero(found < 0.0))
-        if lost:
-            self._took = max(self._took, float(found[found < 0.0].max()) + 1.0 + self.horizon)
-        return lost, float(found.min())
+        took = float(found[found < 0.0].max()) + 1.0 + self.horizon if lost else 0.0
+        return lost, float(found.min()), took
 
     @property
     def _soon(self) -> float:
