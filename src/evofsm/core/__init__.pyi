@@ -4,12 +4,13 @@ from .divergence import jensen_shannon as jensen_shannon
 from .divergence import jensen_shannon_kernel as jensen_shannon_kernel
 from .dynamics.consequents import Consequents as Consequents
 from .dynamics.consequents import Disturbances as Disturbances
+from .dynamics.consequents import Futures as Futures
 from .dynamics.consequents import Here as Here
-from .dynamics.consequents import Scratch as Scratch
 from .dynamics.consequents import advance as advance
+from .dynamics.consequents import begin_at as begin_at
 from .dynamics.consequents import follow_policy as follow_policy
+from .dynamics.consequents import futures as futures
 from .dynamics.consequents import replay as replay
-from .dynamics.consequents import scratch as scratch
 from .dynamics.dynamics import DYNAMICS_PARTS as DYNAMICS_PARTS
 from .dynamics.dynamics import Dynamics as Dynamics
 from .dynamics.dynamics import Episode as Episode

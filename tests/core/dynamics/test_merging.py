@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from evofsm.core.dynamics import dynamics as module
-from evofsm.core.dynamics.consequents import fill_features, n_features
+from evofsm.core.dynamics.consequents import Futures, fill_features, n_features
 from evofsm.core.dynamics.dynamics import Dynamics
 from evofsm.core.dynamics.keeping import to_bytes
 from evofsm.core.dynamics.merging import merge_dynamics, moved
@@ -23,9 +23,11 @@ def test_features_from_another_origin_are_a_linear_map_of_them():
         origin, other = draw.normal(size=(2, 3))
         p = n_features(3, 3, box=box)
         reach, found = np.full(3, np.inf), np.empty((2, p))
-        told = z, change, action, before
-        for row, where in enumerate((origin, other)):
-            getattr(fill_features, "py_func", fill_features)(*told, where, reach, box, found[row])
+        none, count = np.empty((3, 1)), np.zeros(1, int)
+        columns = [one[:, None] for one in (z, change, before, action)]
+        for row, where in zip(found, (origin, other), strict=True):
+            room = Futures(count, *columns, none, none, row[:, None], count, none[0])
+            getattr(fill_features, "py_func", fill_features)(room, where, reach, box)
         np.testing.assert_allclose(moved(origin - other, 3, p) @ found[0], found[1], atol=1e-12)
 
 

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.core.kernels import compiled, inner_kernel, rare_kernel
+from evofsm.core.kernels import compiled, inner_kernel, lanes, rare_kernel
 
 #: Where the effect of an action may bend, in each dimension of a box.
 KNOTS = np.array([-0.5, 0.0, 0.5])
@@ -56,16 +56,22 @@ class Disturbances(NamedTuple):
     landing: _Floats  #: (K, m, 2) least and most to which such jumps led
 
 
-class Scratch(NamedTuple):
-    """Room to work in."""
+class Futures(NamedTuple):
+    """Futures side by side, so that loops over them are vector instructions: so many are in use.
 
-    z: _Floats
-    was: _Floats
-    change: _Floats
-    move: _Floats
-    action: _Floats
-    before: _Floats
-    features: _Floats
+    There is room for n, which is `lanes` of those in use.
+    """
+
+    which: NDArray[np.int64]  #: (n,) number of the disturbance of each; 0 where there is none
+    z: _Floats  #: (m, n)
+    change: _Floats  #: (m, n)
+    before: _Floats  #: (a, n)
+    action: _Floats  #: (a, n)
+    move: _Floats  #: (m, n)
+    next: _Floats  #: (m, n)
+    features: _Floats  #: (p, n)
+    survived: NDArray[np.int64]  #: (in use,) steps until failure
+    least: _Floats  #: (in use,) least distance to it in those [ordinary changes]
 
 
 def n_features(m: int, a: int, *, box: bool) -> int:
@@ -79,119 +85,139 @@ def n_products(m: int, a: int) -> int:
 
 
 @compiled
-def scratch(m: int, a: int, p: int) -> Scratch:
-    """Room for m variables, a numbers of an action and p features."""
-    z, was, change, move = np.empty(m), np.empty(m), np.empty(m), np.empty(m)
-    return Scratch(z, was, change, move, np.empty(a), np.empty(a), np.empty(p))
+def futures(known: Consequents, a: int, which: NDArray[np.int64]) -> Futures:
+    """Futures of a situation with ``a`` numbers of an action, one for each disturbance."""
+    m, p, n = len(known.origin), len(known.weights), lanes(len(which))
+    padded = np.zeros(n, np.int64)
+    padded[: len(which)] = which
+    z, change, move, after = np.empty((m, n)), np.empty((m, n)), np.empty((m, n)), np.empty((m, n))
+    before, action, features = np.empty((a, n)), np.empty((a, n)), np.empty((p, n))
+    survived, least = np.empty(len(which), np.int64), np.empty(len(which))
+    return Futures(padded, z, change, before, action, move, after, features, survived, least)
 
 
 @inner_kernel
-def fill_features(
-    z: _Floats,
-    change: _Floats,
-    action: _Floats,
-    before: _Floats,
-    origin: _Floats,
-    reach: _Floats,
-    box: bool,
-    features: _Floats,
-) -> None:
-    """The features of a situation and an action."""
-    m, a = len(z), len(action)
-    features[0] = 1.0
+def begin_at(room: Futures, here: Here) -> None:
+    """All futures begin here."""
+    n = room.z.shape[1]
+    for j in range(len(room.z)):
+        for l in range(n):
+            room.z[j, l] = here.z[j]
+            room.change[j, l] = here.change[j]
+    for i in range(len(room.before)):
+        for l in range(n):
+            room.before[i, l] = here.action[i]
+
+
+@inner_kernel
+def fill_features(room: Futures, origin: _Floats, reach: _Floats, box: bool) -> None:
+    """The features of situations and actions."""
+    z, change, features = room.z, room.change, room.features
+    action, before = room.action, room.before
+    m, a, n = len(z), len(action), z.shape[1]
+    for l in range(n):
+        features[0, l] = 1.0
     for j in range(m):
-        features[1 + j] = z[j] - origin[j]
-        features[1 + m + j] = change[j] if abs(change[j]) <= reach[j] else 0.0
+        for l in range(n):
+            features[1 + j, l] = z[j, l] - origin[j]
+            features[1 + m + j, l] = change[j, l] if abs(change[j, l]) <= reach[j] else 0.0
     k = 1 + 2 * m
     for i in range(a):
-        features[k + i] = action[i]
-        features[k + a + i] = before[i]
+        for l in range(n):
+            features[k + i, l] = action[i, l]
+            features[k + a + i, l] = before[i, l]
     k += 2 * a
     if box:
         for i in range(a):
             for knot in KNOTS:
-                features[k] = abs(action[i] - knot)
+                for l in range(n):
+                    features[k, l] = abs(action[i, l] - knot)
                 k += 1
     for i in range(a):
         for j in range(m):
-            features[k] = action[i] * features[1 + j]
+            for l in range(n):
+                features[k, l] = action[i, l] * features[1 + j, l]
             k += 1
     for i in range(m):
         for j in range(i, m):
-            features[k] = features[1 + i] * features[1 + j]
+            for l in range(n):
+                features[k, l] = features[1 + i, l] * features[1 + j, l]
             k += 1
 
 
 @inner_kernel
-def expect(
-    known: Consequents,
-    z: _Floats,
-    change: _Floats,
-    action: _Floats,
-    before: _Floats,
-    features: _Floats,
-    move: _Floats,
-) -> None:
-    """The change that is expected: ``move``."""
-    fill_features(
-        z, change, action, before, known.origin, known.reach, known.choices == 0, features
-    )
-    for j in range(len(z)):
-        total = 0.0
-        for k in range(len(features)):
-            total += features[k] * known.weights[k, j]
-        move[j] = total
+def expect(known: Consequents, room: Futures) -> None:
+    """The changes that are expected, into ``room.move``."""
+    fill_features(room, known.origin, known.reach, known.choices == 0)
+    move, features = room.move, room.features
+    n = move.shape[1]
+    for j in range(len(move)):
+        for l in range(n):
+            move[j, l] = 0.0
+    for k in range(len(features)):
+        for j in range(len(move)):
+            weight = known.weights[k, j]
+            for l in range(n):
+                move[j, l] += features[k, l] * weight
 
 
 @inner_kernel
 def follow_policy(known: Consequents, policy: _Floats, z: _Floats, action: _Floats) -> None:
-    """The action of a linear policy, (a, 1 + m): saturated, or the largest of a few."""
-    best, largest = 0, -np.inf
-    for i in range(len(action)):
-        s = policy[i, 0]
+    """Actions (a, n) of a linear policy, (a, 1 + m): saturated, or the largest of a few."""
+    a, n = action.shape
+    for i in range(a):
+        for l in range(n):
+            action[i, l] = policy[i, 0]
         for j in range(len(z)):
-            s += policy[i, 1 + j] * (z[j] - known.mean[j]) * known.inverse[j]
+            slope, mean, inverse = policy[i, 1 + j], known.mean[j], known.inverse[j]
+            for l in range(n):
+                action[i, l] += slope * (z[j, l] - mean) * inverse
         if known.choices == 0:
-            action[i] = min(1.0, max(-1.0, s))
-        else:
-            action[i] = 0.0
-            if s > largest:
-                best, largest = i, s
+            for l in range(n):
+                action[i, l] = min(1.0, max(-1.0, action[i, l]))
     if known.choices > 0:
-        action[best] = 1.0
+        for l in range(n):
+            best = 0
+            for i in range(1, a):
+                if action[i, l] > action[best, l]:
+                    best = i
+            for i in range(a):
+                action[i, l] = 1.0 if i == best else 0.0
 
 
 @inner_kernel
 def advance(
-    known: Consequents,
-    disturbances: Disturbances,
-    k: int,
-    t: int,
-    harder: float,
-    room: Scratch,
+    known: Consequents, disturbances: Disturbances, t: int, harder: float, room: Futures
 ) -> None:
-    """Take the action in ``room`` there, amid step t of disturbance k."""
-    m, a = len(room.z), len(room.action)
-    expect(known, room.z, room.change, room.action, room.before, room.features, room.move)
+    """Take the actions in ``room`` there, each amid step t of its disturbance."""
+    which, z, after, move = room.which, room.z, room.next, room.move
+    m, n = z.shape
+    expect(known, room)
     for j in range(m):
-        room.was[j] = room.z[j]
+        for l in range(n):
+            move[j, l] += harder * disturbances.residuals[which[l], t, j]
+        least, most = harder * known.least[j], harder * known.most[j]
+        for l in range(n):
+            after[j, l] = z[j, l] + min(max(move[j, l], least), most)
     for j in range(m):
-        x = room.move[j] + harder * disturbances.residuals[k, t, j]
-        x = min(max(x, harder * known.least[j]), harder * known.most[j])
-        y = room.z[j] + x
-        if disturbances.jump_at[k, j] == t:
-            y = disturbances.jump_to[k, j]
-            for i in range(m):
-                seen = disturbances.jump_from[k, j, i]
-                was = min(max(room.was[i], seen[0]), seen[1])
-                y += disturbances.jump_slope[k, j, i] * was
-            landing = disturbances.landing[k, j]
-            y = min(max(y, landing[0]), landing[1])
-        y = min(max(y, known.lowest[j]), known.highest[j])
-        room.change[j] = y - room.z[j]
-        room.z[j] = y
-    for i in range(a):
-        room.before[i] = room.action[i]
+        for l in range(n):
+            k = which[l]
+            if disturbances.jump_at[k, j] == t:
+                y = disturbances.jump_to[k, j]
+                for i in range(m):
+                    seen = disturbances.jump_from[k, j, i]
+                    y += disturbances.jump_slope[k, j, i] * min(max(z[i, l], seen[0]), seen[1])
+                landing = disturbances.landing[k, j]
+                after[j, l] = min(max(y, landing[0]), landing[1])
+    for j in range(m):
+        lowest, highest = known.lowest[j], known.highest[j]
+        for l in range(n):
+            y = min(max(after[j, l], lowest), highest)
+            room.change[j, l] = y - z[j, l]
+            z[j, l] = y
+    for i in range(len(room.action)):
+        for l in range(n):
+            room.before[i, l] = room.action[i, l]
 
 
 @rare_kernel
@@ -201,39 +227,47 @@ def replay(
     first: _Floats,
     policy: _Floats,
     disturbances: Disturbances,
-    k: int,
     harder: float,
     enough: float,
-    room: Scratch,
-) -> tuple[int, float]:
-    """Steps survived, and the least distance to failure in those [ordinary changes].
+    allowed: int,
+    room: Futures,
+) -> int:
+    """Replay disturbances side by side, into ``room``; returns how many are not survived.
 
     The action ``first`` is taken, then what the policy says; where ``first`` is empty, that from
-    the beginning. It ends where the distance falls below ``enough``.
+    the beginning. One ends where the distance to failure falls below ``enough``. All end as soon as
+    more than ``allowed`` did, or number 0 did, that is no disturbance at all; if ``allowed`` is
+    negative, all go on as far as they can.
     """
-    m, a = len(here.z), len(room.action)
-    steps = disturbances.residuals.shape[1]
-    for j in range(m):
-        room.z[j] = here.z[j]
-        room.change[j] = here.change[j]
-    for i in range(a):
-        room.before[i] = here.action[i]
-    least = np.inf
+    survived, least = room.survived, room.least
+    count, steps = len(survived), disturbances.residuals.shape[1]
+    begin_at(room, here)
+    lost = 0
+    for l in range(count):
+        survived[l], least[l] = steps, np.inf
     for t in range(steps):
         if t == 0 and len(first) > 0:
-            for i in range(a):
-                room.action[i] = first[i]
+            for i in range(len(first)):
+                room.action[i, :] = first[i]
         else:
             follow_policy(known, policy, room.z, room.action)
-        advance(known, disturbances, k, t, harder, room)
-        for s in range(len(known.sides)):
-            side = known.sides[s]
-            left = side[1] * (side[2] - room.z[int(side[0])]) * side[3]
-            if left < least:
-                least = left
-        if least < enough:
-            return t, least
-    return steps, least
+        advance(known, disturbances, t, harder, room)
+        for l in range(count):
+            if survived[l] < steps:
+                continue
+            for s in range(len(known.sides)):
+                side = known.sides[s]
+                left = side[1] * (side[2] - room.z[int(side[0]), l]) * side[3]
+                if left < least[l]:
+                    least[l] = left
+            if least[l] < enough:
+                survived[l] = t
+                lost += 1
+                if allowed >= 0 and room.which[l] == 0:
+                    return count
+        if lost == count or 0 <= allowed < lost:
+            break
+    return lost
 
 
 @compiled
@@ -252,25 +286,22 @@ def residuals(
     it is ``carried``, the one before goes on, for its cause may not have ended. Where nothing moves
     at all, what was expected is the model's own error: nothing disturbs.
     """
-    m, a = observations.shape[1], actions.shape[1]
-    room = scratch(m, a, known.weights.shape[0])
+    m = observations.shape[1]
+    room = futures(known, actions.shape[1], np.arange(length))
+    for j in range(m):
+        for t in range(length):
+            room.z[j, t] = observations[t + 1, j]
+            room.change[j, t] = observations[t + 1, j] - observations[t, j]
+    for i in range(len(room.action)):
+        for t in range(length):
+            room.before[i, t], room.action[i, t] = actions[t, i], actions[t + 1, i]
+    expect(known, room)
     for t in range(length):
-        for j in range(m):
-            room.change[j] = observations[t + 1, j] - observations[t, j]
-        expect(
-            known,
-            observations[t + 1],
-            room.change,
-            actions[t + 1],
-            actions[t],
-            room.features,
-            room.move,
-        )
         still = True
         for j in range(m):
             still = still and observations[t + 2, j] == observations[t + 1, j]
         for j in range(m):
-            y, x = observations[t + 1, j] + room.move[j], observations[t + 2, j]
+            y, x = observations[t + 1, j] + room.move[j, t], observations[t + 2, j]
             close = 1e-9 / known.inverse[j]
             low, high = x <= known.lowest[j] + close, x >= known.highest[j] - close
             beyond = (y < known.lowest[j] and low) or (y > known.highest[j] and high)

@@ -7,7 +7,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from evofsm.core.dynamics.consequents import Consequents, Disturbances, Here, advance, scratch
+from evofsm.core.dynamics.consequents import (
+    Consequents,
+    Disturbances,
+    Here,
+    advance,
+    begin_at,
+    futures,
+)
 from evofsm.core.dynamics.dynamics import Dynamics
 from evofsm.core.dynamics.following import encoded
 from evofsm.core.kernels import compiled
@@ -104,12 +111,10 @@ def _foresee(
     known: Consequents, here: Here, actions: _Floats, disturbances: Disturbances, path: _Floats
 ) -> None:
     """Replay actions under each disturbance, into ``path`` (K, steps, m)."""
-    room = scratch(len(here.z), actions.shape[1], known.weights.shape[0])
-    for k in range(len(path)):
-        room.z[:] = here.z
-        room.change[:] = here.change
-        room.before[:] = here.action
-        for t in range(len(actions)):
-            room.action[:] = actions[t]
-            advance(known, disturbances, k, t, 1.0, room)
-            path[k, t] = room.z
+    room = futures(known, actions.shape[1], np.arange(len(path)))
+    begin_at(room, here)
+    for t in range(len(actions)):
+        for i in range(actions.shape[1]):
+            room.action[i] = actions[t, i]
+        advance(known, disturbances, t, 1.0, room)
+        path[:, t] = room.z[:, : len(path)].T

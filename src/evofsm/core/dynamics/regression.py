@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.core.dynamics.consequents import Consequents, expect, fill_features, scratch, unpacked
+from evofsm.core.dynamics.consequents import Consequents, expect, fill_features, futures, unpacked
 from evofsm.core.kernels import compiled
 
 _Floats = NDArray[np.float64]
@@ -147,27 +147,30 @@ def learn_transition(
     """
     m, a = observations.shape[1], actions.shape[1]
     box = known.choices == 0
-    room = scratch(m, a, sums.squares.shape[0])
+    room = futures(known, a, np.arange(1))
     n = sums.counts[1]
     jump = False
-    z, move = observations[1], np.zeros(m)
+    z, change, features = observations[1], room.change[:, 0], room.features[:, 0]
+    move, moved = np.zeros(m), np.empty(m)
+    room.before[:, 0], room.action[:, 0], room.z[:, 0] = actions[0], actions[1], z
     for j in range(m):
-        room.change[j] = 0.0 if first else observations[1, j] - observations[0, j]
+        change[j] = 0.0 if first else observations[1, j] - observations[0, j]
     if sums.scale[0] > 0.0 and not first:
-        expect(known, z, room.change, actions[1], actions[0], room.features, move)
+        expect(known, room)
+        move[:] = room.move[:, 0]
     for j in range(m):
         now = observations[2, j] - observations[1, j]
         after = 0.0 if last else observations[3, j] - observations[2, j]
-        room.move[j] = now
+        moved[j] = now
         sums.variance[j] += (now * now - sums.variance[j]) / (n + 1.0)
-        around = max(max(abs(room.change[j]), abs(after)), sums.unit[j])
+        around = max(max(abs(change[j]), abs(after)), sums.unit[j])
         unforeseen = abs(now - move[j]) > 0.5 * abs(now)
         jumped[j] = 1.0 if n > 8.0 and abs(now) > _JUMP * around and unforeseen else 0.0
         jump = jump or jumped[j] > 0.0
     for j in range(m):
-        now = abs(room.move[j])
+        now = abs(moved[j])
         floor = 1e-3 * np.sqrt(sums.scatter[j] / max(1.0, sums.counts[0]))
-        ordinary = 0.0 if jumped[j] > 0.0 else room.move[j]
+        ordinary = 0.0 if jumped[j] > 0.0 else moved[j]
         sums.least[j] = min(sums.least[j], ordinary)
         sums.most[j] = max(sums.most[j], ordinary)
         if n < _EARLY:
@@ -186,7 +189,7 @@ def learn_transition(
     sums.counts[1] += 1.0
     weight = 1.0
     for j in range(m):
-        x, now = observations[2, j], room.move[j]
+        x, now = observations[2, j], moved[j]
         sums.low[j] = min(sums.low[j], x, observations[1, j])
         sums.high[j] = max(sums.high[j], x, observations[1, j])
         if now == 0.0 and (x == sums.low[j] or x == sums.high[j]) and sums.moving[j] > MOVING:
@@ -207,15 +210,14 @@ def learn_transition(
         weight *= min(1.0, _OUTLIER / max(worst, 1e-12)) ** 2
     for j in range(m):
         move[j] = 1.5 * max(abs(sums.least[j]), abs(sums.most[j]))
-    before, features = actions[0], room.features
-    fill_features(z, room.change, actions[1], before, known.origin, move, box, features)
+    fill_features(room, known.origin, move, box)
     for k in range(len(features)):
         f = weight * features[k]
         if f != 0.0:
             for i in range(len(features)):
                 sums.squares[k, i] += f * features[i]
             for j in range(m):
-                sums.products[k, j] += f * room.move[j]
+                sums.products[k, j] += f * moved[j]
     return jump
 
 

@@ -13,10 +13,12 @@ from evofsm.core import (
     Consequents,
     Disturbances,
     EvolvingFSM,
+    Here,
     Novelty,
     advance,
+    begin_at,
     compiled,
-    scratch,
+    futures,
 )
 from evofsm.driving import OutcomeCounts
 from evofsm.evidence.foresight.amounts import HORIZONS
@@ -190,22 +192,18 @@ def _replay_all(
     found: _Floats,
 ) -> None:
     """Steps until failure, into ``found``; recorded actions go on from ``begin`` up to ``end``."""
-    room = scratch(z.shape[1], action.shape[1], known.weights.shape[0])
+    count = found.shape[2]
+    room = futures(known, action.shape[1], np.arange(count))
     for r in range(len(z)):
         for s in range(begin.shape[1]):
-            for k in range(found.shape[2]):
-                room.z[:] = z[r]
-                room.change[:] = change[r]
-                room.before[:] = before[r]
-                for t in range(disturbances.residuals.shape[1]):
-                    at = min(begin[r, s] + t, end[r, s] - 1)
-                    for i in range(action.shape[1]):
-                        room.action[i] = action[r, i] if t == 0 else done[at, i]
-                    advance(known, disturbances, k, t, 1.0, room)
-                    beyond = False
-                    for side in range(len(known.sides)):
-                        one = known.sides[side]
-                        beyond |= one[1] * (room.z[int(one[0])] - one[2]) >= 0.0
-                    if beyond:
-                        found[r, s, k] = t + 1.0
-                        break
+            begin_at(room, Here(z[r], change[r], before[r]))
+            for t in range(disturbances.residuals.shape[1]):
+                at = min(begin[r, s] + t, end[r, s] - 1)
+                for i in range(action.shape[1]):
+                    room.action[i] = action[r, i] if t == 0 else done[at, i]
+                advance(known, disturbances, t, 1.0, room)
+                for side in range(len(known.sides)):
+                    one = known.sides[side]
+                    for k in range(count):
+                        if one[1] * (room.z[int(one[0]), k] - one[2]) >= 0.0:
+                            found[r, s, k] = min(found[r, s, k], t + 1.0)

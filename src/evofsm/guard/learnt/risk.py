@@ -32,7 +32,7 @@ from evofsm.guard.learnt.actions import LONGEST_STRETCH
 from evofsm.guard.learnt.backups import Backups
 from evofsm.guard.learnt.keeping import KIND, NUMBERS, Kept, arrays_of, restored
 from evofsm.guard.learnt.remembering import Situations, choose, failing_after
-from evofsm.guard.learnt.search import CHANGED, KEPT, NOTHING_PASSES, escapes, search, worth
+from evofsm.guard.learnt.search import CHANGED, KEPT, NOTHING_PASSES, ends, search, worth
 from evofsm.guard.learnt.words import Remembered
 from evofsm.guard.protocols import Fallback, Judgement, Search, Situation, Trial
 
@@ -129,7 +129,6 @@ class LearntRisk:
     _took: float  # steps after which what was refused fails, at the latest
     _lost: int
     _ranks: NDArray[np.int64]  # of backups, those first that passed last
-    _order: NDArray[np.int64]  # of disturbances, those first that were lost last
 
     def __init__(
         self,
@@ -265,7 +264,7 @@ class LearntRisk:
         proposal, best = dynamics.encode(wanted), np.empty(dynamics.size)
         allowed = self._allowed(tolerance)
         asked = self._ranks[:_ASKED]
-        world = (self.backups.policies, asked, self.disturbances, self._order, self.harder)
+        world = (self.backups.policies, asked, self.disturbances, self.harder)
         how, backup, left = search(known, here, proposal, *world, self.margin, allowed, best)
         if backup != asked[0]:  # what passed now is asked first the next time
             self._ranks = np.array([backup, *(q for q in self._ranks if q != backup)])
@@ -414,8 +413,8 @@ class LearntRisk:
         assert self.disturbances is not None
         assert self.backups is not None
         found = np.empty(len(self.disturbances.residuals))
-        world = (self.backups.policies, ranks, self.disturbances, found)
-        escapes(self.dynamics.consequents, here, action, *world)
+        policies, known = self.backups.policies[ranks], self.dynamics.consequents
+        ends(known, here, action, policies, self.disturbances, 1.0, 0.0, found)
         lost = math.inf if found[0] < 0.0 else float(np.count_nonzero(found < 0.0))
         took = float(found[found < 0.0].max()) + 1.0 + self.horizon if lost else 0.0
         return lost, float(found.min()), took
@@ -550,8 +549,6 @@ class LearntRisk:
         self._lost = 0
         self._took = 0.0
         self._ranks = np.zeros(0, int) if self.backups is None else self.backups.ranks.copy()
-        count = 0 if self.disturbances is None else len(self.disturbances.residuals)
-        self._order = np.arange(count)
 
     def _study(self) -> None:
         """Learn from the latest episode: what to remember, and what to do about it."""
@@ -583,7 +580,6 @@ class LearntRisk:
         if len(known.sides) and enough >= 3:
             self._evolve(random)
         self._ranks = self.backups.ranks.copy()
-        self._order = np.arange(len(self.disturbances.residuals))
 
     def _look_ahead(self, policies: _Floats, *, failed: bool) -> None:
         """As far as it takes to fail where nothing helps, and half as far again.

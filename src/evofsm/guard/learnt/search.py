@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 from evofsm.core import (
     Consequents,
     Disturbances,
+    Futures,
     Here,
-    Scratch,
     compiled,
     follow_policy,
+    futures,
     replay,
-    scratch,
 )
 
 _Floats = NDArray[np.float64]
@@ -43,30 +43,20 @@ def _lost(
     known: Consequents,
     here: Here,
     disturbances: Disturbances,
-    order: _Ints,
     harder: float,
     allowed: int,
-    room: Scratch,
-) -> tuple[int, float]:
-    """Number of disturbances that are not survived by the margin, up to one more than allowed.
+    room: Futures,
+) -> tuple[bool, float]:
+    """Whether more than allowed are not survived by the margin, or not even that nothing happens.
 
-    And the least distance to failure under the others. Those that are not survived come first in
-    ``order`` from then on: they are the quickest to refuse by.
+    And the least distance to failure under the others.
     """
-    lost, steps, left = 0, disturbances.residuals.shape[1], np.inf
-    for i in range(len(order)):
-        k = order[i]
-        survived, least = replay(known, here, action, policy, disturbances, k, harder, margin, room)
-        if survived == steps and least >= margin:
-            left = min(left, least)
-            continue
-        lost += 1 if k > 0 else allowed + 1  # without any disturbance it has to go well
-        for l in range(i, 0, -1):
-            order[l] = order[l - 1]
-        order[0] = k
-        if lost > allowed:
-            break
-    return lost, left
+    lost = replay(known, here, action, policy, disturbances, harder, margin, allowed, room)
+    left = np.inf
+    for x in room.least:
+        if x >= margin:
+            left = min(left, x)
+    return lost > allowed, left
 
 
 @compiled
@@ -77,7 +67,6 @@ def search(
     policies: _Floats,
     ranks: _Ints,
     disturbances: Disturbances,
-    order: _Ints,
     harder: float,
     margin: float,
     allowed: int,
@@ -89,89 +78,87 @@ def search(
     nothing passes, how far apart the backups are: near 0 all are alike.
     """
     a = len(proposal)
-    room = scratch(len(here.z), a, known.weights.shape[0])
-    world = (known, here, disturbances, order, harder, allowed, room)
+    room = futures(known, a, np.arange(len(disturbances.residuals)))
+    world = (known, here, disturbances, harder, allowed, room)
     for q in ranks:
-        lost, left = _lost(proposal, policies[q], margin, *world)
-        if lost <= allowed:
+        is_lost, left = _lost(proposal, policies[q], margin, *world)
+        if not is_lost:
             best[:] = proposal
             return KEPT, q, left
-    own, middle = np.empty(a), np.empty(a)
+    own, middle, z = np.empty(a), np.empty(a), here.z.reshape((len(here.z), 1))
     for q in ranks:
-        follow_policy(known, policies[q], here.z, own)
+        follow_policy(known, policies[q], z, own.reshape((a, 1)))
         if known.choices > 0 and (own == proposal).all():
             continue  # it was refused
-        lost, left = _lost(own, policies[q], margin, *world)
-        if lost > allowed:
+        is_lost, left = _lost(own, policies[q], margin, *world)
+        if is_lost:
             continue
         best[:] = own
         share, refused = 1.0, 0.0
         for _ in range(_HALVINGS if known.choices == 0 else 0):
             half = 0.5 * (refused + share)
             middle[:] = proposal + half * (own - proposal)
-            lost, closer = _lost(middle, policies[q], margin, *world)
-            if lost <= allowed:
+            is_lost, closer = _lost(middle, policies[q], margin, *world)
+            if is_lost:
+                refused = half
+            else:
                 share, left = half, closer
                 best[:] = middle
-            else:
-                refused = half
         return CHANGED, q, left
     which = -1
     longest, shortest = -np.inf, np.inf
-    nothing = np.empty(0)
     for q in ranks:
-        total = 0.0
-        for k in range(len(order)):
-            total += lasting(known, here, nothing, policies[q], disturbances, k, harder, room)
+        total = _lasting(known, here, policies[q], disturbances, harder, room)
         shortest = min(shortest, total)
         if total > longest + _EQUAL:
             longest, which = total, q
-            follow_policy(known, policies[q], here.z, best)
+            follow_policy(known, policies[q], z, best.reshape((a, 1)))
     return NOTHING_PASSES, which, (longest - shortest) / (abs(longest) + 1e-12)
 
 
 @compiled
-def lasting(
+def _lasting(
     known: Consequents,
     here: Here,
-    action: _Floats,
     policy: _Floats,
     disturbances: Disturbances,
-    k: int,
     harder: float,
-    room: Scratch,
+    room: Futures,
 ) -> float:
-    """Share of the horizon that is survived, and a little for the least distance to failure."""
-    steps = disturbances.residuals.shape[1]
-    survived, least = replay(known, here, action, policy, disturbances, k, harder, 0.0, room)
-    share: float = survived / steps
-    return share + _DISTANCE * min(1.0, max(-1.0, _FAR * least))
+    """Shares of the horizon that are survived, and a little for the least distances, summed."""
+    replay(known, here, np.empty(0), policy, disturbances, harder, 0.0, -1, room)
+    steps, total = disturbances.residuals.shape[1], 0.0
+    for l in range(len(room.least)):
+        near = min(1.0, max(-1.0, _FAR * room.least[l]))
+        total += room.survived[l] / steps + _DISTANCE * near
+    return total
 
 
 @compiled
-def escapes(
+def ends(
     known: Consequents,
     here: Here,
     action: _Floats,
     policies: _Floats,
-    ranks: _Ints,
     disturbances: Disturbances,
+    harder: float,
+    enough: float,
     found: _Floats,
 ) -> None:
-    """For each disturbance the least distance to failure under the backup that escapes it best.
+    """For each disturbance how well it ends under the best of the policies, into ``found``.
 
-    Disturbances are taken as they were; where ``action`` is empty, the backup begins. Where none
-    escapes, the steps left as it fails, negative.
+    The least distance to failure; where none escapes, the steps left as it fails, negative, less 1.
+    The first policy after which it is ``enough`` will do. Where ``action`` is empty, the policy
+    begins.
     """
-    room = scratch(len(here.z), policies.shape[1], known.weights.shape[0])
-    steps = disturbances.residuals.shape[1]
-    for k in range(len(found)):
-        found[k] = -np.inf
-        for q in ranks:
-            t, least = replay(known, here, action, policies[q], disturbances, k, 1.0, 0.0, room)
-            found[k] = max(found[k], least if t == steps else t - steps - 1.0)
-            if found[k] >= 0.0:
-                break
+    every, steps = np.arange(len(found)), disturbances.residuals.shape[1]
+    found[:] = -np.inf
+    for policy in policies:
+        room = futures(known, policies.shape[1], every[found < enough])
+        replay(known, here, action, policy, disturbances, harder, 0.0, -1, room)
+        for l in range(len(room.least)):
+            t, k = room.survived[l], room.which[l]
+            found[k] = max(found[k], room.least[l] if t == steps else t - steps - 1.0)
 
 
 @compiled
@@ -185,23 +172,12 @@ def harm(
     harder: float,
     found: _Floats,
 ) -> None:
-    """For each disturbance (row) and situation (column) how well the best of the policies ends.
-
-    The steps left where it fails, negative, less 1; else the least distance.
-    """
-    a, p = before.shape[1], known.weights.shape[0]
-    room, nothing = scratch(z.shape[1], a, p), np.empty(0)
-    steps = disturbances.residuals.shape[1]
+    """`ends` of each disturbance (row) in each situation (column), if a policy begins."""
+    nothing, column = np.empty(0), np.empty(len(found))
     for r in range(len(z)):
         here = Here(z[r], change[r], before[r])
-        for k in range(len(found)):
-            best = -np.inf
-            for q in range(len(policies)):
-                t, least = replay(
-                    known, here, nothing, policies[q], disturbances, k, harder, 0.0, room
-                )
-                best = max(best, least if t == steps else -1.0 - (steps - t))
-            found[k, r] = best
+        ends(known, here, nothing, policies, disturbances, harder, np.inf, column)
+        found[:, r] = column
 
 
 @compiled
@@ -216,10 +192,8 @@ def worth(
     harder: float,
 ) -> float:
     """How well a policy ends, over all situations and the disturbances ``which``."""
-    room, nothing = scratch(z.shape[1], before.shape[1], known.weights.shape[0]), np.empty(0)
-    total = 0.0
+    room, total = futures(known, before.shape[1], which), 0.0
     for r in range(len(z)):
         here = Here(z[r], change[r], before[r])
-        for k in which:
-            total += lasting(known, here, nothing, policy, disturbances, k, harder, room)
+        total += _lasting(known, here, policy, disturbances, harder, room)
     return total / (len(z) * len(which))
