@@ -36,6 +36,7 @@ from evofsm.driving.risk.r157 import PerformanceModel
 from evofsm.driving.risk.rss import ResponsibilitySensitiveSafety
 from evofsm.driving.risk.ttc import TimeToCollision
 from evofsm.fleet.batch import Fleet
+from evofsm.guard.learnt.risk import LearntRisk
 from evofsm.guard.protocols import Proposal
 from evofsm.guard.reviser import ActionReviser, Mode, Way
 
@@ -79,6 +80,7 @@ OURS = {
     "r157": PerformanceModel.regulation(),
     "fuzzy": FuzzySafety(),
     "latent risk": LatentRisk(lowest=-2.5),
+    "learnt risk": LearntRisk(0.25),
     "least risk": revising(),
     "least risk, in the shadow": revising(mode=Mode.SHADOW),
     "least risk of candidates": revising(way=Way.CHOOSE),
@@ -452,6 +454,67 @@ class ScoreDiary(TimeToCollision):
         return super().score(observations, dt)
 
 
+class BrokenJudge(LatentRisk):
+    def __init__(self):
+        super().__init__(lowest=-2.5)
+
+
+class RiskInPercent(BrokenJudge):
+    def judge(self, situation, actions):
+        judged = super().judge(situation, actions)
+        return judged._replace(risk=100.0 * judged.risk, high=100.0 * judged.high)
+
+
+class OneForAll(BrokenJudge):
+    def judge(self, situation, actions):
+        judged = super().judge(situation, actions)
+        return judged._replace(risk=judged.risk[:1])
+
+
+class RoundsObservation(BrokenJudge):
+    def judge(self, situation, actions):
+        situation.observation[:] = np.round(situation.observation)
+        return super().judge(situation, actions)
+
+
+class LearnsFromQuestions(BrokenJudge):
+    asked = 0.0
+
+    def judge(self, situation, actions):
+        self.asked += len(actions) == 5  # not what a decision asks
+        return super().judge(situation, actions)
+
+    def sums(self, n_states):
+        return super().sums(n_states) | {"asked": self.asked}
+
+
+class DiceJudge(BrokenJudge):
+    def sums(self, n_states):
+        return super().sums(n_states) | {"dice": random.random()}
+
+
+class LearnsFrozen(BrokenJudge):
+    seen = 0.0
+
+    def follow(self, observation, action):
+        self.seen += 1.0
+        super().follow(observation, action)
+
+    def sums(self, n_states):
+        return super().sums(n_states) | {"seen": self.seen}
+
+
+class FileForgetsLearnt(BrokenJudge):
+    def save(self, path, provenance=None):
+        LatentRisk(lowest=-2.5).save(path, provenance)
+
+
+class JudgeDiary(BrokenJudge):
+    def judge(self, situation, actions):
+        self.__dict__.setdefault("diary", []).append(np.array(actions))
+        return super().judge(situation, actions)
+
+
 class Driver:
     """Nothing is wrong with it."""
 
@@ -618,6 +681,15 @@ BROKEN = {
         "a_machine_takes_it": [Unlisted],
         "a_file_keeps_it": [Unlisted],
     },
+    Kind.JUDGE: {
+        "judges_each_action": [RiskInPercent, OneForAll],
+        "inputs_not_changed": [RoundsObservation],
+        "asking_changes_nothing": [LearnsFromQuestions],
+        "is_deterministic": [DiceJudge],
+        "following_learns_nothing": [LearnsFrozen],
+        "a_file_keeps_it": [FileForgetsLearnt],
+        "memory_is_bounded": [JudgeDiary],
+    },
     Kind.MEASURE: {
         "one_score_a_row": [LastOnly],
         "inputs_not_changed": [ShiftsGaps],
@@ -693,7 +765,7 @@ def test_a_driver_without_a_fault_passes_what_it_has():
         (Fleet, Kind.FLEET),
         (FSMModel, Kind.MODEL),
         (Paper, Kind.RULE),
-        (LatentRisk, Kind.MEASURE),
+        (LatentRisk, Kind.JUDGE),
         (ActionReviser, Kind.REVISER),
         (CALM, Kind.CONTROLLER),
         (lambda: CALM, Kind.CONTROLLER),

@@ -21,6 +21,7 @@ class Kind(Enum):
     RULE = "rule"  #: how states are determined, as `evofsm.core.states.rule.StateRule`
     REVISER = "reviser"  #: keeps a proposal or replaces it, as `evofsm.guard.protocols.Reviser`
     CONTROLLER = "controller"  #: proposes, as `evofsm.guard.protocols.Controller`
+    JUDGE = "judge"  #: says how dangerous actions are, as `evofsm.guard.protocols.LearningJudge`
     MEASURE = "measure"  #: how dangerous a situation is, as `evofsm.guard.protocols.RiskMeasure`
 
 
@@ -32,10 +33,14 @@ _METHODS = {
     Kind.RULE: ("table", "scales"),
     Kind.REVISER: ("revise", "start_episode"),
     Kind.CONTROLLER: ("propose",),
+    Kind.JUDGE: ("judge", "learn", "sums"),
     Kind.MEASURE: ("score",),
 }
-# What a class of a kind is made with where it is given as a class; a machine needs its actions.
-_ARGUMENTS: dict[Kind, dict[str, object]] = {Kind.MACHINE: {"n_actions": 3}}
+# What a class of a kind is made with where it is given as a class and has no such defaults.
+_ARGUMENTS: dict[Kind, dict[str, object]] = {
+    Kind.MACHINE: {"n_actions": 3},
+    Kind.JUDGE: {"lowest": -2.5, "dt": 0.25},
+}
 
 
 def kind_of(thing: object) -> Kind:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import NamedTuple
 
-from evofsm.checks import controllers, fleets, machines, measures, models, revisers, rules
+from evofsm.checks import controllers, fleets, judges, machines, measures, models, revisers, rules
 from evofsm.checks.contracts import Broken, Check, Contract
 from evofsm.checks.kinds import Kind, Make, kind_of, maker
 
@@ -18,6 +18,7 @@ _CONTRACTS: dict[Kind, Contract] = {
     Kind.RULE: rules.CONTRACT,
     Kind.REVISER: revisers.CONTRACT,
     Kind.CONTROLLER: controllers.CONTRACT,
+    Kind.JUDGE: judges.CONTRACT,
     Kind.MEASURE: measures.CONTRACT,
 }
 
@@ -147,6 +148,8 @@ def cases(thing: object, kind: Kind | None = None) -> list[Case]:
     if kind is Kind.RULE:  # what it does shows in a machine
         machine = rules.machine_of(make)
         found += [Case(one, machine, f"machine: {one.name}") for one in all_checks(Kind.MACHINE)]
+    if kind is Kind.JUDGE and hasattr(make(), "score"):
+        found += [Case(one, make, f"measure: {one.name}") for one in all_checks(Kind.MEASURE)]
     return found
 
 

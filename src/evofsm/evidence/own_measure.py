@@ -32,7 +32,8 @@ def own_measure(name: str) -> RiskMeasure:
     from evofsm.checks import Kind, kind_of
 
     thing = imported(name)
-    if (kind := kind_of(thing)) is not Kind.MEASURE:
+    kind = kind_of(thing)
+    if kind is not Kind.MEASURE and not (kind is Kind.JUDGE and hasattr(thing, "score")):
         raise TypeError(f"{name} is a {kind.value}, not a measure: it has no method score")
     is_made = hasattr(thing, "score") and not inspect.isclass(thing)
     try:

@@ -26,8 +26,8 @@ class Check(WithJson):
     name: str = argument("module:Class, module:instance, or module:function that makes one.")
     kind: str | None = option(
         None,
-        "machine, fleet, model, rule, reviser, controller or measure; without it, what its methods "
-        "tell.",
+        "machine, fleet, model, rule, reviser, controller, judge or measure; without it, what its "
+        "methods tell.",
     )
     make: str | None = option(
         None, "How to make it, in Python with the module's names: 'MyRule(radius=2.0)'."
