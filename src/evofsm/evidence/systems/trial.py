@@ -162,9 +162,18 @@ def make_judge(name: str, system: System, without: Sequence[str] = (), seed: int
     return rivals[name]()
 
 
+# What judges of ours are told that stand in a guard.
+_TOLD = {
+    "LearntRisk": TOLD["learnt"],
+    "LatentRisk": TOLD["kinematic"],
+    "SceneRisk": f"{TOLD['learnt']}, and how a row is laid out",
+}
+
+
 def told_to(judge: Judge) -> str:
-    """What a judge is told, in a few words."""
-    return str(getattr(judge, "told", TOLD["learnt"]))
+    """What a judge is told, in a few words: as it says itself in ``told``, if it is not ours."""
+    inside = judge.judge if isinstance(judge, Guard) else judge
+    return str(getattr(inside, "told", _TOLD.get(type(inside).__name__, "not said")))
 
 
 class Tried(NamedTuple):
