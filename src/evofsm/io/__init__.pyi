@@ -4,10 +4,10 @@ from .datasets.episodes import Episode as Episode
 from .datasets.episodes import as_chunks as as_chunks
 from .datasets.layouts import Layout as Layout
 from .datasets.layouts import read_episodes as read_episodes
-from .fcd import ACTION as ACTION
 from .fcd import VehicleLengths as VehicleLengths
 from .files import file_kind as file_kind
 from .files import silent as silent
+from .following import ACTION as ACTION
 from .graphs import to_mermaid as to_mermaid
 from .mcap import RecordedEpisode as RecordedEpisode
 from .mcap import Run as Run
@@ -17,6 +17,7 @@ from .mcap import recording as recording
 from .mcap import write_run as write_run
 from .process import Process as Process
 from .process import process_of as process_of
+from .rosbag import Topics as Topics
 from .sumo_gui import write_replay as write_replay
 from .tables import CsvTable as CsvTable
 from .tables import ParquetTable as ParquetTable

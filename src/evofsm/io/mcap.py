@@ -372,32 +372,52 @@ def read_run(path: str | os.PathLike[str]) -> Run:
     ...     read_run(Path(folder) / "run.mcap").about["seed"]
     '3'
     """
-    with open(path, "rb") as file, _explained(path):
+    with _explained(path, "a run in MCAP (damaged, cut off, or not written by evofsm?)"):
+        return _read(_unpacked(path, _LARGEST_CHUNK))
+
+
+def records(path: str | os.PathLike[str], largest: int) -> Iterator[McapRecord]:
+    """All records of any MCAP file, in their order, none of whose chunks is larger than so [byte].
+
+    Raises
+    ------
+    OSError
+        If there is no such file, or it may not be read.
+    ValueError
+        If it is damaged.
+    """
+    with _explained(path, "MCAP (damaged, cut off, or still being written?)"):
+        yield from _unpacked(path, largest)
+
+
+def _unpacked(path: str | os.PathLike[str], largest: int) -> Iterator[McapRecord]:
+    """All records, those in chunks among them."""
+    with open(path, "rb") as file:
         size = file.seek(0, os.SEEK_END)
         file.seek(0)
         reader = StreamReader(file, emit_chunks=True, validate_crcs=True, record_size_limit=size)
-        return _read(_unpacked(reader, size))
+        yield from _unpacked_records(reader, size, largest)
 
 
-def _unpacked(reader: StreamReader, size: int) -> Iterator[McapRecord]:
-    """All records, those in chunks among them, of a file of so many bytes."""
-    room = _DENSEST * size + _LARGEST_CHUNK
+def _unpacked_records(reader: StreamReader, size: int, largest: int) -> Iterator[McapRecord]:
+    """The same of a file of so many bytes."""
+    room = _DENSEST * size + largest
     for record in reader.records:
         if not isinstance(record, Chunk):
             yield record
             continue
-        data = _unpacked_chunk(record)
+        data = _unpacked_chunk(record, largest)
         room -= len(data)
-        if len(data) > _LARGEST_CHUNK or room < 0:
+        if len(data) > largest or room < 0:
             raise ValueError(f"it unpacks to more than was ever packed in {size:,} bytes")
         yield from breakup_chunk(replace(record, compression="", data=data), validate_crc=True)
 
 
-def _unpacked_chunk(chunk: Chunk) -> bytes:
+def _unpacked_chunk(chunk: Chunk, largest: int) -> bytes:
     """What is in a chunk, or at least the beginning of what is too large."""
-    most = _LARGEST_CHUNK + 1
+    most = largest + 1
     if chunk.compression == "zstd":
-        unpacker = ZstdDecompressor(max_window_size=_LARGEST_CHUNK)
+        unpacker = ZstdDecompressor(max_window_size=largest)
         with unpacker.stream_reader(chunk.data) as stream:
             return bytes(stream.read(most))
     if chunk.compression == "lz4":
@@ -522,7 +542,7 @@ def _restore_infinities(columns: dict[str, NDArray[Any]]) -> None:
 
 
 @contextmanager
-def _explained(path: str | os.PathLike[str]) -> Iterator[None]:
+def _explained(path: str | os.PathLike[str], kind: str) -> Iterator[None]:
     """Turn whatever reading a damaged file runs into into one error that names the file."""
     try:
         yield
@@ -530,7 +550,4 @@ def _explained(path: str | os.PathLike[str]) -> Iterator[None]:
         raise
     except Exception as error:  # of the MCAP reader, of what unpacks for it, or ours
         why = str(error)[:300] or type(error).__name__
-        raise ValueError(
-            f"{os.fspath(path)} cannot be read as a run in MCAP (damaged, cut off, or not written "
-            f"by evofsm?): {why}"
-        ) from error
+        raise ValueError(f"{os.fspath(path)} cannot be read as {kind}: {why}") from error
