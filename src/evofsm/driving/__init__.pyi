@@ -77,6 +77,7 @@ from .risk.rss import ResponsibilitySensitiveSafety as ResponsibilitySensitiveSa
 from .risk.rss import safe_distance as safe_distance
 from .risk.ttc import TimeToCollision as TimeToCollision
 from .risk.ttc import time_to_collision as time_to_collision
+from .shadow import shadow_drive as shadow_drive
 from .worlds import WORLDS as WORLDS
 from .worlds import open_world as open_world
 from .worlds.gym import CarFollowing as CarFollowing

@@ -23,8 +23,10 @@ from .tables import CsvTable as CsvTable
 from .tables import ParquetTable as ParquetTable
 from .traces import Chunk as Chunk
 from .traces import LogColumns as LogColumns
+from .traces import LoggedRow as LoggedRow
 from .traces import Noted as Noted
 from .traces import read_traces as read_traces
+from .traces import rows_of as rows_of
 from .units import parse_units as parse_units
 from .verifying import Property as Property
 from .verifying import solve as solve

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import BinaryIO, Literal, cast
 
-Kind = Literal["csv", "parquet", "xml", "osi", "mcap", "bag"]
+Kind = Literal["csv", "parquet", "xml", "osi", "mcap", "bag", "run"]
 #: Called with the number of bytes each time some were read from a file.
 OnRead = Callable[[int], object]
 
@@ -20,7 +20,8 @@ BYTE_ORDER_MARK = b"\xef\xbb\xbf"
 _GZIP, _PARQUET = b"\x1f\x8b", b"PAR1"
 _SQLITE, _MCAP = b"SQLite format 3\0", b"\x89MCAP0\r\n"
 # Where an MCAP file says what it was written by, behind the mark, an opcode and two lengths.
-_PROFILE = slice(len(_MCAP) + 1 + 8 + 4, len(_MCAP) + 1 + 8 + 4 + 4)
+_PROFILE = len(_MCAP) + 1 + 8 + 4
+_ROS, _OURS = b"ros2", b"evofsm "
 _NEWLINE = ord("\n")
 
 _log = logging.getLogger(__name__)
@@ -97,7 +98,7 @@ def file_kind(path: str) -> Kind:
     """What the file holds, judged by how it begins.
 
     A trace of OSI begins with nothing of its own and is known by its name, ``.osi``. The folder of
-    a bag of ROS 2 is ``"bag"``, as its files are.
+    a bag of ROS 2 is ``"bag"``, as its files are; ``"run"`` is a log that evofsm wrote.
     """
     if os.path.isfile(os.path.join(path, "metadata.yaml")):
         return "bag"
@@ -110,7 +111,10 @@ def file_kind(path: str) -> Kind:
     if beginning.startswith(_PARQUET):
         return "parquet"
     if beginning.startswith(_MCAP):
-        return "bag" if beginning[_PROFILE] == b"ros2" else "mcap"
+        if beginning[_PROFILE:].startswith(_ROS):
+            return "bag"
+        # Ours has no profile, so that the length of what it was written by comes first.
+        return "run" if beginning[_PROFILE + 4 :].startswith(_OURS) else "mcap"
     if beginning.startswith(_SQLITE):
         return "bag"
     return "xml" if beginning.startswith(b"<") else "csv"

@@ -226,6 +226,11 @@ def _open(
                 "topic is which variable (docs/logs.md has one)"
             )
         return BagTable(path, topics, on_read)
+    if kind == "run":
+        raise ValueError(
+            f"{path} is a run that evofsm drove and learnt from: evofsm watch replays it, and "
+            "evofsm inspect prints its model"
+        )
     if kind in ("osi", "mcap"):
         scenes = (osi_scenes if kind == "osi" else mcap_scenes)(path, on_read)
         return PairTable(path, objects.pairs_of_scenes(path, scenes))
@@ -245,6 +250,50 @@ def _pairs_of_fcd(
     path: str, timesteps: Iterator[fcd.Timestep], lengths: VehicleLengths
 ) -> PairTable:
     return PairTable(path, fcd.pairs_on_lanes(fcd.not_empty(path, timesteps), lengths))
+
+
+class LoggedRow(NamedTuple):
+    """A row of a log, whatever kind of file it comes from."""
+
+    begins: bool  #: an episode
+    time: float  #: [s]
+    values: dict[str, float]  #: of the variables by name; of a discrete one its codes
+    action: float  #: done from this row to the next; NaN where none is known
+    failed: bool  #: it ends its episode in failure
+
+
+def rows_of(chunks: Iterable[Chunk], names: Sequence[str] = VARIABLES) -> Iterator[LoggedRow]:
+    r"""The rows of traces, one by one, for whoever decides on each.
+
+    Parameters
+    ----------
+    chunks : iterable of Chunk
+        As `read_traces` yields them.
+    names : sequence of str
+        Of the variables: ``columns.observe.names``.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = Path(folder) / "a.csv"
+    ...     _ = path.write_text("time,gap,v_follower,v_leader,a_follower\n0,9,20,19,-1\n")
+    ...     row = next(rows_of(read_traces([str(path)])))
+    >>> row.begins, row.values, row.action
+    (True, {'gap': 9.0, 'v_follower': 20.0, 'v_leader': 19.0}, -1.0)
+    """
+    for chunk in chunks:
+        begins = np.zeros(len(chunk.times), np.bool_)
+        begins[chunk.starts] = True
+        fails = np.zeros(len(chunk.times), np.bool_)
+        if chunk.failures is not None:
+            fails[chunk.failures] = True
+        columns = (begins, chunk.times, chunk.observations, chunk.actions, fails)
+        for first, time, values, action, failed in zip(
+            *(column.tolist() for column in columns), strict=True
+        ):
+            yield LoggedRow(first, time, dict(zip(names, values, strict=True)), action, failed)
 
 
 # -- Time -----------------------------------------------------------------------------------------
