@@ -8,6 +8,8 @@ from .fcd import VehicleLengths as VehicleLengths
 from .files import file_kind as file_kind
 from .files import silent as silent
 from .following import ACTION as ACTION
+from .foxglove import LAYOUT as LAYOUT
+from .foxglove import FoxgloveSink as FoxgloveSink
 from .graphs import to_mermaid as to_mermaid
 from .mcap import RecordedEpisode as RecordedEpisode
 from .mcap import Run as Run
