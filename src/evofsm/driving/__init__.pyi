@@ -87,6 +87,7 @@ from .worlds.motion import GAP_BEHIND as GAP_BEHIND
 from .worlds.motion import LEADER_ACCELERATION as LEADER_ACCELERATION
 from .worlds.motion import LEADER_SPEED as LEADER_SPEED
 from .worlds.motion import SPEED as SPEED
+from .worlds.platoon import Platoon as Platoon
 from .worlds.road import Episode as Episode
 from .worlds.road import Road as Road
 from .worlds.road import World as World
