@@ -17,7 +17,7 @@ with needs("pettingzoo", "pettingzoo", "a wrapper for PettingZoo"):
     from pettingzoo.utils.wrappers import BaseParallelWrapper
 
 
-class RevisedAgents(BaseParallelWrapper[Any, Any, Any]):
+class RevisedAgents(BaseParallelWrapper[Any, Any, Any]):  # type: ignore[misc]
     """Executes what a guard makes of the actions of each agent, and forwards all else as it is.
 
     What any agent meets, all profit from: the guard learns each agent's episode **as a whole when

@@ -29,7 +29,7 @@ _INDICES = 2**31
 _Told = dict[str, dict[str, Any]]
 
 
-class Platoon(ParallelEnv[str, NDArray[np.float64], NDArray[np.float64]]):
+class Platoon(ParallelEnv[str, NDArray[np.float64], NDArray[np.float64]]):  # type: ignore[misc]
     """Drive a platoon behind a leader who may brake, in scenarios of a family.
 
     The agents are ``car_1``, the first behind the leader of the scenario, ``car_2`` behind it, and
