@@ -131,3 +131,34 @@ def test_bench_prints_rows_as_json():
     assert {"unrevised", "evofsm", "aeb-ttc", "rss-r157", "rss-matched"} <= {
         row["policy"] for row in rows
     }
+
+
+@pytest.mark.slow
+def test_a_run_waits_for_whoever_looks_on_in_foxglove():
+    pytest.importorskip("foxglove")
+    connect = pytest.importorskip("websockets.sync.client").connect
+    refused = evofsm("drive", "emergency", "--foxglove", 0, "--audit", "log")
+    assert "exclude each other" in refused.stderr
+    command = ("drive", "emergency", "--episodes", "1", "--foxglove", "0", "--json")
+    process = subprocess.Popen(
+        [sys.executable, "-m", "evofsm", *command],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    line = ""
+    while "Open ws://" not in line:  # it may say first that it compiles
+        line = process.stderr.readline()
+    address = line.split()[1]
+    with connect(address, subprotocols=["foxglove.sdk.v1"], proxy=None) as client:
+        topics = {}
+        while "/risk" not in topics:
+            told = json.loads(client.recv(timeout=30))
+            topics |= {one["topic"]: one["id"] for one in told.get("channels", [])}
+        asked = {"op": "subscribe", "subscriptions": [{"id": 1, "channelId": topics["/risk"]}]}
+        client.send(json.dumps(asked))
+        while not isinstance(data := client.recv(timeout=60), bytes):
+            pass
+    process.terminate()
+    process.communicate(timeout=30)
+    assert "proposed" in json.loads(data[13:])

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from evofsm.core.observations import ObservationEncoder
-from evofsm.io import fcd
+from evofsm.io import following
 from evofsm.io.fcd import VehicleLengths
 from evofsm.io.traces import LogColumns, read_traces
 
@@ -138,7 +138,7 @@ def test_variables_may_be_chosen_and_ordered(tmp_path):
 
 
 def test_so_many_waiting_rows_are_handed_on_before_the_pairs_part(tmp_path, monkeypatch):
-    monkeypatch.setattr(fcd, "_MOST_WAITING", 100)
+    monkeypatch.setattr(following, "_MOST_WAITING", 100)
     pair = [("a", "e_0", 90.0, 1.0), ("b", "e_0", 10.0, 1.0)]
     path = write(tmp_path / "a.xml", xml({k / 10: pair for k in range(250)}))
     (chunk,) = read_traces([path])

@@ -77,6 +77,7 @@ from .risk.rss import ResponsibilitySensitiveSafety as ResponsibilitySensitiveSa
 from .risk.rss import safe_distance as safe_distance
 from .risk.ttc import TimeToCollision as TimeToCollision
 from .risk.ttc import time_to_collision as time_to_collision
+from .shadow import shadow_drive as shadow_drive
 from .worlds import WORLDS as WORLDS
 from .worlds import open_world as open_world
 from .worlds.gym import CarFollowing as CarFollowing
@@ -86,6 +87,7 @@ from .worlds.motion import GAP_BEHIND as GAP_BEHIND
 from .worlds.motion import LEADER_ACCELERATION as LEADER_ACCELERATION
 from .worlds.motion import LEADER_SPEED as LEADER_SPEED
 from .worlds.motion import SPEED as SPEED
+from .worlds.platoon import Platoon as Platoon
 from .worlds.road import Episode as Episode
 from .worlds.road import Road as Road
 from .worlds.road import World as World

@@ -32,6 +32,8 @@ _KIND = ranges.register(ranges.Kind("checkpoint", None, {})).name
 _SECONDS = {"s": 1.0, "m": 60.0, "h": 3600.0}
 # Of a file so much at its beginning and at its end tells it from others [bytes].
 _END = 1 << 16
+# So many files of a folder tell it from others.
+_MOST_FILES = 1000
 # So many settings that differ are named in an error.
 _NAMED = 4
 
@@ -197,8 +199,12 @@ def fingerprints(files: Iterable[str | os.PathLike[str]]) -> list[dict[str, Any]
 
 
 def _fingerprint(path: str) -> dict[str, Any]:
+    if os.path.isdir(path):  # a bag of ROS 2; of another one, who reads it will say what is wrong
+        within = sorted(entry.path for entry in os.scandir(path) if entry.is_file())
+        files = [_fingerprint(file) for file in within[:_MOST_FILES]]
+        return {"name": path, "bytes": sum(file["bytes"] for file in files), "files": files}
     if os.path.exists(path) and not os.path.isfile(path):
-        return {"name": path}  # a folder or a pipe: who reads it will say what is wrong with it
+        return {"name": path}  # a pipe: who reads it will say what is wrong with it
     with open(path, "rb") as file:
         size = file.seek(0, os.SEEK_END)
         file.seek(0)

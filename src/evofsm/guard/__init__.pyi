@@ -27,6 +27,7 @@ from .learnt.actions import dynamics_for as dynamics_for
 from .learnt.risk import JUDGE_PARTS as JUDGE_PARTS
 from .learnt.risk import LearntRisk as LearntRisk
 from .learnt.risk import Outlook as Outlook
+from .pettingzoo import RevisedAgents as RevisedAgents
 from .protocols import ActionJudge as ActionJudge
 from .protocols import AsksMachine as AsksMachine
 from .protocols import Controller as Controller

@@ -120,11 +120,11 @@ class RevisedActions(gymnasium.Wrapper[Any, Any, Any, Any]):
     ) -> None:
         super().__init__(env)
         self.guard = guard
-        self._terms = _Terms(
+        self._terms = Terms(
             guard,
             env.observation_space if observe is None else observe,
             failed,
-            _both(to_acceleration, to_action) or _conversions(env.action_space, guard.actions),
+            _both(to_acceleration, to_action) or conversions(env.action_space, guard.actions),
             penalty,
         )
         self.observe, self.failed = self._terms.observe, failed
@@ -150,10 +150,10 @@ class RevisedActions(gymnasium.Wrapper[Any, Any, Any, Any]):
         failed = self._terms.failed(info, bool(terminated))
         over = failed or terminated or truncated
         self._stream.follow(self._terms.look(observation), over=over, failed=failed)
-        size = _size(self.guard.actions, revision)
+        size = size_of(self.guard.actions, revision)
         if self._terms.penalty:
             reward = float(reward) - self._terms.penalty * size
-        said = _told(action, executed, revision, size)
+        said = told(action, executed, revision, size)
         return observation, reward, terminated, truncated, {**info, **said}
 
 
@@ -229,19 +229,19 @@ class RevisedVectorActions(VectorWrapper[Any, Any, Any, Any, Any]):
                 "each environment by itself"
             )
         self.guard = guard
-        self._terms = _Terms(
+        self._terms = Terms(
             guard,
             env.single_observation_space if observe is None else observe,
             failed,
             _both(to_acceleration, to_action)
-            or _conversions(env.single_action_space, guard.actions),
+            or conversions(env.single_action_space, guard.actions),
             penalty,
         )
         # Gymnasium 1.0 has no other mode, and names none.
         mode = env.metadata.get("autoreset_mode", "NextStep")
         self._resets_at_once = getattr(mode, "value", mode) == "SameStep"
         self._resets_next = getattr(mode, "value", mode) == "NextStep"
-        self._lanes = [_Lane(guard) for _ in range(self.num_envs)]
+        self._lanes = [Lane(guard) for _ in range(self.num_envs)]
         #: The latest decision in each environment.
         self.revisions: list[Revision | None] = [None] * self.num_envs
 
@@ -273,12 +273,12 @@ class RevisedVectorActions(VectorWrapper[Any, Any, Any, Any, Any]):
         ]
         observations, rewards, terminated, truncated, infos = self.env.step(self._batch(executed))
         self._learn(observations, terminated, truncated, infos)
-        sizes = np.array([_size(self.guard.actions, revision) for revision in revisions])
+        sizes = np.array([size_of(self.guard.actions, revision) for revision in revisions])
         sizes[~np.array(decided)] = 0.0
         if self._terms.penalty:
             rewards = rewards - self._terms.penalty * sizes
         for k, revision in enumerate(revisions):
-            said = _told(proposed[k], executed[k], revision, sizes[k])
+            said = told(proposed[k], executed[k], revision, sizes[k])
             infos = self._add_info(infos, said, k)
             if decided[k]:
                 self.revisions[k] = revision
@@ -372,7 +372,7 @@ class _Stream:
         self.guard.end(failed, seen)
 
 
-class _Lane(_Stream):
+class Lane(_Stream):
     """A stream beside others: a twin decides, and the shared guard learns it all as it ends."""
 
     def __init__(self, shared: Guard) -> None:
@@ -399,7 +399,7 @@ class _Lane(_Stream):
         self._shared.end(failed, seen)
 
 
-class _Terms:
+class Terms:
     """How actions and observations of an environment are told to a guard, and failures."""
 
     def __init__(
@@ -452,7 +452,7 @@ class _Terms:
         return seen
 
 
-def _told(action: Any, executed: Any, revision: Revision, size: float) -> dict[str, Any]:
+def told(action: Any, executed: Any, revision: Revision, size: float) -> dict[str, Any]:
     """What stands in ``info`` of a step."""
     return {
         "reviser/proposed_action": deepcopy(action),
@@ -462,7 +462,7 @@ def _told(action: Any, executed: Any, revision: Revision, size: float) -> dict[s
     }
 
 
-def _size(actions: ActionSet, revision: Revision) -> float:
+def size_of(actions: ActionSet, revision: Revision) -> float:
     """How much was changed, in half ranges of the action."""
     if not is_usable(actions, revision.proposed):
         return 1.0
@@ -504,7 +504,7 @@ def _both(to_acceleration: _To | None, to_action: _To | None) -> tuple[_To, _To]
     raise ValueError("of to_acceleration and to_action there is one; give both or neither")
 
 
-def _conversions(space: gymnasium.Space[Any], actions: ActionSet) -> tuple[_To, _To]:
+def conversions(space: gymnasium.Space[Any], actions: ActionSet) -> tuple[_To, _To]:
     """To an action of the guard and back."""
     if isinstance(space, Discrete) and actions == Choices(int(space.n)):
         first = int(space.start)

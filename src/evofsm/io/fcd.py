@@ -9,32 +9,22 @@ a leader beyond the end of the lane is not seen.
 
 from __future__ import annotations
 
-import math
-from array import array
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
-from itertools import chain, pairwise
+from itertools import pairwise
 from typing import NamedTuple, Self
 from xml.parsers import expat
 
-import numpy as np
-from numpy.typing import NDArray
-
 from evofsm.core import positive
-from evofsm.driving import VARIABLES
 from evofsm.files import LARGEST_OBSERVATION
 from evofsm.io.files import OnRead, damage_explained, open_unpacked
-from evofsm.io.tables import Piece, Table, explain_text
+from evofsm.io.following import Following, Moment
+from evofsm.io.tables import Table, explain_text
 
-#: The action of a pair of vehicles: what the follower did until the next timestep.
-ACTION = "a_follower"
-#: What is known of a pair at one time.
-COLUMNS = ("time", *VARIABLES, ACTION)
 #: The column by which an FCD table is known.
 TIME = "timestep_time"
 
 _BYTES_AT_ONCE = 1 << 16
-_ROWS_AT_ONCE = 8192
 # Those that the parser knows itself; for any other it would ask Python's codecs.
 _ENCODINGS = ("utf-8", "us-ascii", "iso-8859-1", "utf-16")
 # What SUMO writes stays far below these, which bound what a file can make of memory: bytes of a tag
@@ -44,9 +34,6 @@ _DEEPEST = 16
 _LONGEST_NAME = 256
 _MOST_VEHICLES = 250_000
 _MOST_TYPES = 1000
-# Rows that pairs on the road may have waiting before all are handed on, each of 32 bytes. It
-# bounds memory, at the price of one transition for each pair cut.
-_MOST_WAITING = 1_000_000
 
 
 @dataclass
@@ -129,108 +116,24 @@ class Timestep(NamedTuple):
     vehicles: list[Vehicle]
 
 
-class Episode(NamedTuple):
-    """A pair for as long as it stays one: T timesteps."""
-
-    rows: NDArray[np.float64]  #: (T, 5) `COLUMNS`; the action is NaN in the last row
-    was_cut: bool  #: the pair went on, in an episode of its own
-
-
-class PairTable:
-    """The pairs in FCD output, as a table with a row for each pair and time.
-
-    Parameters
-    ----------
-    path : str
-        For messages.
-    timesteps : iterable of Timestep
-    lengths : VehicleLengths
-    """
-
-    columns: tuple[str, ...] = COLUMNS
-
-    def __init__(self, path: str, timesteps: Iterable[Timestep], lengths: VehicleLengths) -> None:
-        self.path = path
-        self._episodes = pair_episodes(checked(path, timesteps), lengths)
-
-    def holds_dates(self, name: str) -> bool:
-        """Never: SUMO's clock counts seconds."""
-        return False
-
-    def pieces(self, *_: Sequence[str]) -> Iterator[Piece]:
-        """All columns, whichever are asked for; episodes end to end, some thousand rows at once."""
-        reached, waiting, count = 0, list[Episode](), 0
-        for episode in chain(self._episodes, [None]):
-            if episode is not None:
-                waiting.append(episode)
-                count += len(episode.rows)
-            if count >= (_ROWS_AT_ONCE if episode is not None else 1):
-                for piece in self._joined(waiting, reached):
-                    reached += len(piece.places)
-                    yield piece
-                waiting, count = [], 0
-        if reached == 0:
-            raise ValueError(f"{self.path}: no vehicle ever follows another one on the same lane")
-
-    def _joined(self, episodes: Sequence[Episode], reached: int) -> Iterator[Piece]:
-        table = np.concatenate([episode.rows for episode in episodes])
-        starts = np.cumsum([0, *(len(episode.rows) for episode in episodes[:-1])])
-        cuts = sum(episode.was_cut for episode in episodes)
-        for first in range(0, len(table), _ROWS_AT_ONCE):
-            part = table[first : first + _ROWS_AT_ONCE]
-            places = np.arange(reached + first + 1, reached + first + len(part) + 1)
-            within = starts[(starts >= first) & (starts < first + len(part))] - first
-            numbers = dict(zip(COLUMNS, part.T, strict=True))
-            yield Piece(self.path, "row", places, numbers, {}, within, 0 if first else cuts)
-
-
-def pair_episodes(timesteps: Iterable[Timestep], lengths: VehicleLengths) -> Iterator[Episode]:
-    """Follow every pair through time; an episode comes out when it ends."""
-    open_pairs: dict[tuple[str, str, str], array[float]] = {}
-    waiting = 0
+def pairs_on_lanes(timesteps: Iterable[Timestep], lengths: VehicleLengths) -> Iterator[Moment]:
+    """At each time, the vehicles of which one follows the other."""
     for timestep in timesteps:
-        present: dict[tuple[str, str, str], array[float]] = {}
-        for follower, leader in pairwise(sorted(timestep.vehicles)):
-            if follower.lane != leader.lane:
-                continue
-            pair = (follower.lane, follower.id, leader.id)
-            rows = open_pairs.pop(pair, None) or array("d")
+        yield Moment(timestep.time, timestep.place, list(_neighbours(timestep, lengths)))
+
+
+def _neighbours(timestep: Timestep, lengths: VehicleLengths) -> Iterator[Following]:
+    for follower, leader in pairwise(sorted(timestep.vehicles)):
+        if follower.lane == leader.lane:
             gap = leader.position - lengths.of(leader.kind) - follower.position
-            rows.extend((timestep.time, gap, follower.speed, leader.speed))
-            present[pair] = rows
-            waiting += 1
-        for rows in open_pairs.values():
-            waiting -= len(rows) // 4
-            yield _episode(rows)
-        open_pairs = present
-        if waiting > _MOST_WAITING:
-            for rows in open_pairs.values():
-                yield _episode(rows, was_cut=True)
-            open_pairs, waiting = {}, 0
-    for rows in open_pairs.values():
-        yield _episode(rows)
+            who = (follower.lane, follower.id, leader.id)
+            yield Following(who, gap, follower.speed, leader.speed)
 
 
-def _episode(rows: array[float], was_cut: bool = False) -> Episode:
-    table = np.array(rows).reshape(-1, 4)
-    times, speeds = table[:, 0], table[:, 2]
-    with np.errstate(over="ignore"):
-        actions = np.append(np.diff(speeds) / np.diff(times), np.nan)
-    actions[np.isinf(actions)] = np.nan  # beyond any number: none is known
-    return Episode(np.column_stack([table, actions]), was_cut)
-
-
-def checked(path: str, timesteps: Iterable[Timestep]) -> Iterator[Timestep]:
-    """The same timesteps, once it is seen that time runs forward and vehicles are on lanes."""
-    before = -math.inf
+def not_empty(path: str, timesteps: Iterable[Timestep]) -> Iterator[Timestep]:
+    """The same timesteps, once it is seen that vehicles are on lanes."""
     lanes = False
     for timestep in timesteps:
-        if not timestep.time > before:
-            raise ValueError(
-                f"{timestep.place}: time goes from {before:g} to {timestep.time:g}; it must run "
-                "forward (outputs of two simulations in one file?)"
-            )
-        before = timestep.time
         lanes = lanes or bool(timestep.vehicles)
         yield timestep
     if not lanes:

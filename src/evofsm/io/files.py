@@ -12,12 +12,16 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import BinaryIO, Literal, cast
 
-Kind = Literal["csv", "parquet", "xml"]
+Kind = Literal["csv", "parquet", "xml", "osi", "mcap", "bag", "run"]
 #: Called with the number of bytes each time some were read from a file.
 OnRead = Callable[[int], object]
 
 BYTE_ORDER_MARK = b"\xef\xbb\xbf"
 _GZIP, _PARQUET = b"\x1f\x8b", b"PAR1"
+_SQLITE, _MCAP = b"SQLite format 3\0", b"\x89MCAP0\r\n"
+# Where an MCAP file says what it was written by, behind the mark, an opcode and two lengths.
+_PROFILE = len(_MCAP) + 1 + 8 + 4
+_ROS, _OURS = b"ros2", b"evofsm "
 _NEWLINE = ord("\n")
 
 _log = logging.getLogger(__name__)
@@ -91,13 +95,28 @@ def open_unpacked(path: str, on_read: OnRead = silent) -> Iterator[BinaryIO]:
 
 
 def file_kind(path: str) -> Kind:
-    """What the file holds, judged by how it begins."""
+    """What the file holds, judged by how it begins.
+
+    A trace of OSI begins with nothing of its own and is known by its name, ``.osi``. The folder of
+    a bag of ROS 2 is ``"bag"``, as its files are; ``"run"`` is a log that evofsm wrote.
+    """
+    if os.path.isfile(os.path.join(path, "metadata.yaml")):
+        return "bag"
+    if path.removesuffix(".gz").endswith(".osi"):
+        return "osi"
     with open_unpacked(path) as file, damage_explained(path):
         beginning = file.read(64).removeprefix(BYTE_ORDER_MARK).lstrip()
     if not beginning:
         raise ValueError(f"{path} is empty")
     if beginning.startswith(_PARQUET):
         return "parquet"
+    if beginning.startswith(_MCAP):
+        if beginning[_PROFILE:].startswith(_ROS):
+            return "bag"
+        # Ours has no profile, so that the length of what it was written by comes first.
+        return "run" if beginning[_PROFILE + 4 :].startswith(_OURS) else "mcap"
+    if beginning.startswith(_SQLITE):
+        return "bag"
     return "xml" if beginning.startswith(b"<") else "csv"
 
 

@@ -25,9 +25,22 @@ from numpy.typing import NDArray
 
 from evofsm import __version__
 from evofsm.core import FSMModel
-from evofsm.driving import DECISION_COLUMNS, VARIABLES, Decision, Drive
+from evofsm.driving import DECISION_COLUMNS, VARIABLES, Drive
 from evofsm.extras import needs
 from evofsm.files import storage
+from evofsm.io.channels import (
+    ERROR,
+    INFO,
+    OF_DECISIONS,
+    WARNING,
+    encoded,
+    field_of,
+    is_same,
+    log_message,
+    messages_of,
+    said,
+    schemas_of,
+)
 
 with needs("mcap", "mcap", "reading and writing MCAP"):
     from lz4.frame import LZ4FrameDecompressor
@@ -41,79 +54,12 @@ MODEL, METADATA = "model.evofsm", "evofsm"
 _FORMAT = "1"
 # Time from the end of an episode to the start of the next [ns].
 _PAUSE = 1_000_000_000
-# Levels of foxglove.Log.
-_INFO, _WARNING, _ERROR = 2, 3, 4
-_SAME = 1e-9
+_SCHEMAS = schemas_of()
 # Where there is no state.
 _NONE = -1
 # No chunk is larger than this, unpacked, nor all of them together than so many times the file and
 # one chunk more [bytes]; and no episode's beliefs are more numbers than the last.
 _LARGEST_CHUNK, _DENSEST, _MOST_BELIEFS = 1 << 24, 1000, 1 << 27
-
-
-def _of(kind: str, description: str) -> dict[str, Any]:
-    return {"type": kind, "description": description}
-
-
-# The columns of an episode, by channel; the channel of risks has them without ``risk_``.
-_OF_DECISIONS = {
-    "/observation": ("time", *VARIABLES, "intake"),
-    "/belief": ("state", "belief", "surprise", "n_states"),
-    "/risk": (
-        *("risk_proposed", "risk_executed", "risk_low", "risk_high", "evidence", "seen"),
-        *("time_to_collision", "time_headway"),
-    ),
-    "/decision": ("proposed", "executed", "advised", "realised", "reason", "explanation"),
-}
-_JSON_TYPES = {float: "number", int: "integer", str: "string"}
-
-
-def _field(topic: str, name: str) -> str:
-    return name.removeprefix("risk_") if topic == "/risk" else name
-
-
-def _schema(name: str) -> dict[str, Any]:
-    if name == "belief":
-        items = _of("number", "probability")
-        return {**_of("array", "probability of each state, from 0"), "items": items}
-    return _of(_JSON_TYPES[DECISION_COLUMNS[name].kind], DECISION_COLUMNS[name].about)
-
-
-_CHANNELS: dict[str, dict[str, dict[str, Any]]] = {
-    **{
-        topic: {_field(topic, name): _schema(name) for name in names}
-        for topic, names in _OF_DECISIONS.items()
-    },
-    "/event": {
-        "kind": _of("string", "episode started, collision, rear-end collision or episode ended"),
-        "episode": _of("integer", "number of the episode, from 0"),
-        "time": _of("number", "since the start of the episode [s]"),
-        "gap": _of("number", "from bumper to bumper, as it truly was [m]"),
-        "v_follower": _of("number", "speed of the follower [m/s]"),
-        "v_leader": _of("number", "speed of the leader [m/s]"),
-    },
-    # As Foxglove knows it, which is by its name.
-    "/log": {
-        "timestamp": {
-            **_of("object", "when"),
-            "properties": {"sec": {"type": "integer"}, "nsec": {"type": "integer"}},
-        },
-        "level": {
-            "description": "how grave",
-            "oneOf": [
-                {"title": name, "const": level}
-                for level, name in enumerate(
-                    ("UNKNOWN", "DEBUG", "INFO", "WARNING", "ERROR", "FATAL")
-                )
-            ],
-        },
-        "message": _of("string", "what happened"),
-        "name": _of("string", "who says so"),
-        "file": _of("string", "empty"),
-        "line": _of("integer", "0"),
-    },
-}
-_SCHEMA_NAMES = {"/log": "foxglove.Log"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -238,13 +184,13 @@ class RunWriter:
         self._begin = 0  # of the episode, on the axis of time [ns]
         self._mcap = Writer(file, enable_data_crcs=True)
         self._mcap.start(profile="", library=f"evofsm {__version__}")
-        self._channels = {topic: self._channel(topic) for topic in _CHANNELS}
+        self._channels = {topic: self._channel(topic) for topic in _SCHEMAS}
         told = {"library": f"evofsm {__version__}", **about, "format": _FORMAT}
         self._mcap.add_metadata(METADATA, {name: _text(value) for name, value in told.items()})
 
     def _channel(self, topic: str) -> int:
-        name = _SCHEMA_NAMES.get(topic, f"evofsm.{topic[1:].capitalize()}")
-        schema = {"title": name, "type": "object", "properties": _CHANNELS[topic]}
+        schema = _SCHEMAS[topic]
+        name = schema["title"]
         number = self._mcap.register_schema(name, "jsonschema", json.dumps(schema).encode())
         return self._mcap.register_channel(topic, "json", number)
 
@@ -262,17 +208,18 @@ class RunWriter:
             zip(drive.decisions, drive.changed.tolist(), strict=True)
         ):
             time = decision.situation.time
-            for topic, message in _messages(decision):
+            for topic, message in messages_of(decision):
                 self._send(topic, time, message, number)
-            if changed or abs(decision.revision.advised - decision.revision.executed) > _SAME:
-                self._log(_WARNING if changed else _INFO, time, _said(decision))
+            revision = decision.revision
+            if changed or not is_same(revision.advised, revision.executed):
+                self._log(WARNING if changed else INFO, time, said(revision))
         for happened, kind in (
             (episode.collided, "collision"),
             (episode.rear_ended, "rear-end collision"),
         ):
             if happened:
                 self._event(kind, end, episode.observations[-1])
-                self._log(_ERROR, end, kind)
+                self._log(ERROR, end, kind)
         self._event("episode ended", end, episode.observations[-1])
         self._begin += _nanoseconds(end) + _PAUSE
         self._episodes += 1
@@ -298,38 +245,11 @@ class RunWriter:
         self._send("/event", time, about, 0)
 
     def _log(self, level: int, time: float, message: str) -> None:
-        sec, nsec = divmod(self._begin + _nanoseconds(time), 1_000_000_000)
-        about = {"timestamp": {"sec": sec, "nsec": nsec}, "level": level, "message": message}
-        self._send("/log", time, {**about, "name": "evofsm", "file": "", "line": 0}, 0)
+        self._send("/log", time, log_message(level, self._begin + _nanoseconds(time), message), 0)
 
     def _send(self, topic: str, time: float, message: Mapping[str, Any], number: int) -> None:
-        known = {name: value for name, value in message.items() if _is_known(value)}
         at = self._begin + _nanoseconds(time)
-        encoded = json.dumps(known, ensure_ascii=False, allow_nan=False).encode()
-        self._mcap.add_message(self._channels[topic], at, encoded, at, number)
-
-
-def _messages(decision: Decision) -> Iterator[tuple[str, dict[str, Any]]]:
-    """What a decision says on each channel."""
-    known = decision.situation.state is not None
-    belief = decision.situation.belief.tolist() if known else []
-    for topic, names in _OF_DECISIONS.items():
-        read = (
-            belief if name == "belief" else DECISION_COLUMNS[name].read(decision) for name in names
-        )
-        yield topic, dict(zip((_field(topic, name) for name in names), read, strict=True))
-
-
-def _said(decision: Decision) -> str:
-    """A decision that was changed, or would have been, in a line."""
-    revision = decision.revision
-    kept = abs(revision.executed - revision.proposed) <= _SAME
-    what = f"would advise {revision.advised:+.2f}" if kept else f"executed {revision.executed:+.2f}"
-    return f"proposed {revision.proposed:+.2f}, {what} m/s²: {revision.reason}"
-
-
-def _is_known(value: Any) -> bool:
-    return value is not None and not (isinstance(value, float) and not math.isfinite(value))
+        self._mcap.add_message(self._channels[topic], at, encoded(message), at, number)
 
 
 def _text(value: Any) -> str:
@@ -372,32 +292,52 @@ def read_run(path: str | os.PathLike[str]) -> Run:
     ...     read_run(Path(folder) / "run.mcap").about["seed"]
     '3'
     """
-    with open(path, "rb") as file, _explained(path):
+    with _explained(path, "a run in MCAP (damaged, cut off, or not written by evofsm?)"):
+        return _read(_unpacked(path, _LARGEST_CHUNK))
+
+
+def records(path: str | os.PathLike[str], largest: int) -> Iterator[McapRecord]:
+    """All records of any MCAP file, in their order, none of whose chunks is larger than so [byte].
+
+    Raises
+    ------
+    OSError
+        If there is no such file, or it may not be read.
+    ValueError
+        If it is damaged.
+    """
+    with _explained(path, "MCAP (damaged, cut off, or still being written?)"):
+        yield from _unpacked(path, largest)
+
+
+def _unpacked(path: str | os.PathLike[str], largest: int) -> Iterator[McapRecord]:
+    """All records, those in chunks among them."""
+    with open(path, "rb") as file:
         size = file.seek(0, os.SEEK_END)
         file.seek(0)
         reader = StreamReader(file, emit_chunks=True, validate_crcs=True, record_size_limit=size)
-        return _read(_unpacked(reader, size))
+        yield from _unpacked_records(reader, size, largest)
 
 
-def _unpacked(reader: StreamReader, size: int) -> Iterator[McapRecord]:
-    """All records, those in chunks among them, of a file of so many bytes."""
-    room = _DENSEST * size + _LARGEST_CHUNK
+def _unpacked_records(reader: StreamReader, size: int, largest: int) -> Iterator[McapRecord]:
+    """The same of a file of so many bytes."""
+    room = _DENSEST * size + largest
     for record in reader.records:
         if not isinstance(record, Chunk):
             yield record
             continue
-        data = _unpacked_chunk(record)
+        data = _unpacked_chunk(record, largest)
         room -= len(data)
-        if len(data) > _LARGEST_CHUNK or room < 0:
+        if len(data) > largest or room < 0:
             raise ValueError(f"it unpacks to more than was ever packed in {size:,} bytes")
         yield from breakup_chunk(replace(record, compression="", data=data), validate_crc=True)
 
 
-def _unpacked_chunk(chunk: Chunk) -> bytes:
+def _unpacked_chunk(chunk: Chunk, largest: int) -> bytes:
     """What is in a chunk, or at least the beginning of what is too large."""
-    most = _LARGEST_CHUNK + 1
+    most = largest + 1
     if chunk.compression == "zstd":
-        unpacker = ZstdDecompressor(max_window_size=_LARGEST_CHUNK)
+        unpacker = ZstdDecompressor(max_window_size=largest)
         with unpacker.stream_reader(chunk.data) as stream:
             return bytes(stream.read(most))
     if chunk.compression == "lz4":
@@ -422,7 +362,7 @@ def _read(records: Iterable[McapRecord]) -> Run:
         elif isinstance(record, Channel):
             topics[record.id] = record.topic
         elif isinstance(record, Message):
-            if about is None and topics[record.channel_id] in _CHANNELS:
+            if about is None and topics[record.channel_id] in _SCHEMAS:
                 raise ValueError("its messages come before what it is about; was it rewritten?")
             episodes.take(topics[record.channel_id], record.data)
     if about is None:
@@ -447,7 +387,7 @@ class _Episodes:
         """The next message."""
         if topic in self._messages:
             self._messages[topic].append(json.loads(encoded))
-        elif topic in _OF_DECISIONS:
+        elif topic in OF_DECISIONS:
             raise ValueError("a decision is outside of every episode")
         elif topic == "/event":
             self._happened(json.loads(encoded))
@@ -456,7 +396,7 @@ class _Episodes:
         if (event["kind"] == "episode started") == bool(self._messages):
             raise ValueError("an episode has no end, or no beginning")
         if event["kind"] == "episode started":
-            self._messages, self._events = {topic: [] for topic in _OF_DECISIONS}, []
+            self._messages, self._events = {topic: [] for topic in OF_DECISIONS}, []
         elif event["kind"] == "episode ended":
             self._whole.append(_episode(self._messages, self._events, event))
             self._messages = {}
@@ -478,8 +418,8 @@ def _episode(
     if len(set(counts.values())) != 1:
         raise ValueError(f"its channels hold different numbers of decisions: {counts}")
     columns = {
-        name: _column(name, _field(topic, name), messages[topic])
-        for topic, names in _OF_DECISIONS.items()
+        name: _column(name, field_of(topic, name), messages[topic])
+        for topic, names in OF_DECISIONS.items()
         for name in names
     }
     _restore_infinities(columns)
@@ -522,7 +462,7 @@ def _restore_infinities(columns: dict[str, NDArray[Any]]) -> None:
 
 
 @contextmanager
-def _explained(path: str | os.PathLike[str]) -> Iterator[None]:
+def _explained(path: str | os.PathLike[str], kind: str) -> Iterator[None]:
     """Turn whatever reading a damaged file runs into into one error that names the file."""
     try:
         yield
@@ -530,7 +470,4 @@ def _explained(path: str | os.PathLike[str]) -> Iterator[None]:
         raise
     except Exception as error:  # of the MCAP reader, of what unpacks for it, or ours
         why = str(error)[:300] or type(error).__name__
-        raise ValueError(
-            f"{os.fspath(path)} cannot be read as a run in MCAP (damaged, cut off, or not written "
-            f"by evofsm?): {why}"
-        ) from error
+        raise ValueError(f"{os.fspath(path)} cannot be read as {kind}: {why}") from error

@@ -12,11 +12,14 @@ from numpy.typing import NDArray
 
 from evofsm.core import Category, ObservationEncoder
 from evofsm.driving import VARIABLES
-from evofsm.io import fcd
+from evofsm.io import fcd, objects
 from evofsm.io.blocks import Blocks
 from evofsm.io.conditions import Condition
 from evofsm.io.fcd import VehicleLengths
 from evofsm.io.files import OnRead, file_kind, silent
+from evofsm.io.following import ACTION, PairTable
+from evofsm.io.osi import mcap_scenes, osi_scenes
+from evofsm.io.rosbag import BagTable, Topics
 from evofsm.io.tables import CsvTable, ParquetTable, Piece, Table, refuse_unusable
 from evofsm.io.units import KNOWN, of_columns
 
@@ -117,7 +120,7 @@ class LogColumns:
     """
 
     observe: ObservationEncoder = field(default_factory=lambda: ObservationEncoder(*VARIABLES))
-    action: str = fcd.ACTION
+    action: str = ACTION
     time: str = "time"
     episode: Sequence[str] | None = None
     dt: float | None = None
@@ -132,21 +135,29 @@ def read_traces(
     lengths: VehicleLengths | None = None,
     on_read: OnRead = silent,
     noted: Noted | None = None,
+    topics: Topics | None = None,
 ) -> Iterator[Chunk]:
-    """Read logs (CSV, Parquet) and FCD output of SUMO (XML, CSV, Parquet), gzipped or not.
+    """Read logs (CSV, Parquet), and recordings in which many vehicles follow each other.
+
+    These are FCD output of SUMO (XML, CSV, Parquet), tables of objects (CSV, Parquet; see
+    `evofsm.io.objects`) and traces of ASAM OSI (``.osi``, MCAP). All but Parquet and MCAP may be
+    gzipped. Bags of ROS 2 (a folder, or a single ``.mcap`` or ``.db3``) are read as a log is.
 
     Parameters
     ----------
     paths : iterable of str
         Files, in the order in which they are learnt.
     columns : LogColumns, optional
-        What the columns of a log mean. FCD gives gap, v_follower, v_leader and a_follower.
+        What the columns of a log mean. Recordings of many vehicles give gap, v_follower, v_leader
+        and a_follower.
     lengths : VehicleLengths, optional
         Lengths assumed for vehicles in FCD.
     on_read : callable, optional
         Called with the number of bytes whenever some were read.
     noted : Noted, optional
         Collects what is noticed in reading.
+    topics : Topics, optional
+        What the topics of bags mean.
 
     Yields
     ------
@@ -171,7 +182,7 @@ def read_traces(
     for path in paths:
         clock.open(path)
         rows, left_out = 0, noted.leaderless
-        for chunk in _read_file(path, columns, lengths, clock, on_read, noted):
+        for chunk in _read_file(path, columns, lengths, clock, on_read, noted, topics):
             rows += len(chunk.times)
             noted.see(chunk, columns.observe.names)
             yield chunk
@@ -191,17 +202,98 @@ def _read_file(
     clock: _Clock,
     on_read: OnRead,
     noted: Noted,
+    topics: Topics | None,
 ) -> Iterator[Chunk]:
+    table = _open(path, columns, lengths, on_read, topics)
+    if isinstance(table, PairTable):
+        columns = _columns_of_pairs(path, columns)
+    return _read_table(table, columns, clock, noted)
+
+
+def _open(
+    path: str,
+    columns: LogColumns,
+    lengths: VehicleLengths,
+    on_read: OnRead,
+    topics: Topics | None,
+) -> Table:
+    """The rows of a file, whatever it holds."""
     kind = file_kind(path)
+    if kind == "bag":
+        if topics is None:
+            raise ValueError(
+                f"{path} is a bag of ROS 2; --topics names a file that says which field of which "
+                "topic is which variable (docs/logs.md has one)"
+            )
+        return BagTable(path, topics, on_read)
+    if kind == "run":
+        raise ValueError(
+            f"{path} is a run that evofsm drove and learnt from: evofsm watch replays it, and "
+            "evofsm inspect prints its model"
+        )
+    if kind in ("osi", "mcap"):
+        scenes = (osi_scenes if kind == "osi" else mcap_scenes)(path, on_read)
+        return PairTable(path, objects.pairs_of_scenes(path, scenes))
     if kind == "xml":
-        timesteps = fcd.xml_timesteps(path, on_read)
-    else:
-        table: Table = CsvTable(path, on_read) if kind == "csv" else ParquetTable(path, on_read)
-        if fcd.TIME not in table.columns:
-            return _read_table(table, columns, clock, noted)
-        timesteps = fcd.table_timesteps(table)
-    pairs = fcd.PairTable(path, timesteps, lengths)
-    return _read_table(pairs, _columns_of_fcd(path, columns), clock, noted)
+        return _pairs_of_fcd(path, fcd.xml_timesteps(path, on_read), lengths)
+    table: Table = CsvTable(path, on_read) if kind == "csv" else ParquetTable(path, on_read)
+    if fcd.TIME in table.columns:
+        return _pairs_of_fcd(path, fcd.table_timesteps(table), lengths)
+    if objects.holds_objects(table.columns) and not set(columns.observe.names) <= set(
+        table.columns
+    ):
+        return PairTable(path, objects.pairs_of_scenes(path, objects.scenes_of(table)))
+    return table
+
+
+def _pairs_of_fcd(
+    path: str, timesteps: Iterator[fcd.Timestep], lengths: VehicleLengths
+) -> PairTable:
+    return PairTable(path, fcd.pairs_on_lanes(fcd.not_empty(path, timesteps), lengths))
+
+
+class LoggedRow(NamedTuple):
+    """A row of a log, whatever kind of file it comes from."""
+
+    begins: bool  #: an episode
+    time: float  #: [s]
+    values: dict[str, float]  #: of the variables by name; of a discrete one its codes
+    action: float  #: done from this row to the next; NaN where none is known
+    failed: bool  #: it ends its episode in failure
+
+
+def rows_of(chunks: Iterable[Chunk], names: Sequence[str] = VARIABLES) -> Iterator[LoggedRow]:
+    r"""The rows of traces, one by one, for whoever decides on each.
+
+    Parameters
+    ----------
+    chunks : iterable of Chunk
+        As `read_traces` yields them.
+    names : sequence of str
+        Of the variables: ``columns.observe.names``.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = Path(folder) / "a.csv"
+    ...     _ = path.write_text("time,gap,v_follower,v_leader,a_follower\n0,9,20,19,-1\n")
+    ...     row = next(rows_of(read_traces([str(path)])))
+    >>> row.begins, row.values, row.action
+    (True, {'gap': 9.0, 'v_follower': 20.0, 'v_leader': 19.0}, -1.0)
+    """
+    for chunk in chunks:
+        begins = np.zeros(len(chunk.times), np.bool_)
+        begins[chunk.starts] = True
+        fails = np.zeros(len(chunk.times), np.bool_)
+        if chunk.failures is not None:
+            fails[chunk.failures] = True
+        columns = (begins, chunk.times, chunk.observations, chunk.actions, fails)
+        for first, time, values, action, failed in zip(
+            *(column.tolist() for column in columns), strict=True
+        ):
+            yield LoggedRow(first, time, dict(zip(names, values, strict=True)), action, failed)
 
 
 # -- Time -----------------------------------------------------------------------------------------
@@ -358,7 +450,8 @@ def _read_table(table: Table, columns: LogColumns, clock: _Clock, noted: Noted) 
         if not kept.any():
             continue
         for name in gaps:
-            refuse_unusable(piece, name, np.where(kept, piece.numbers[name], 0.0))
+            if piece.starts is None or name in observed:  # else the action may be derived
+                refuse_unusable(piece, name, np.where(kept, piece.numbers[name], 0.0))
         for name in only_compared:
             lacks = kept & np.isnan(piece.numbers[name])
             refuse_unusable(piece, name, np.where(lacks, np.nan, 0.0))
@@ -437,8 +530,8 @@ def _encode(piece: Piece, variable: str | Category) -> NDArray[np.float64]:
     return np.repeat([codes[value] for value in texts.values], texts.lengths, axis=0)
 
 
-def _columns_of_fcd(path: str, columns: LogColumns) -> LogColumns:
-    """What is read of FCD output, which has a clock and episodes of its own.
+def _columns_of_pairs(path: str, columns: LogColumns) -> LogColumns:
+    """What is read of a recording of many vehicles, with a clock and episodes of its own.
 
     Raises
     ------
@@ -446,17 +539,17 @@ def _columns_of_fcd(path: str, columns: LogColumns) -> LogColumns:
         If something else was asked for.
     """
     asked = [f"--observe {name}" for name in columns.observe.names if name not in VARIABLES]
-    asked += [f"--action {columns.action}"] if columns.action != fcd.ACTION else []
+    asked += [f"--action {columns.action}"] if columns.action != ACTION else []
     asked += ["--episode"] if columns.episode is not None else []
     asked += ["--dt"] if columns.dt is not None else []
     asked += ["--unit"] if columns.units else []
     failed = columns.failed
-    if failed is not None and not (failed.sign and failed.column in (*VARIABLES, fcd.ACTION)):
+    if failed is not None and not (failed.sign and failed.column in (*VARIABLES, ACTION)):
         asked += [f"--failed {failed} (but with 'gap<=0')"]
     if asked:
         raise ValueError(
-            f"{path} is FCD output of SUMO, with a clock and episodes of its own; it gives "
-            f"{', '.join(VARIABLES)} and the action {fcd.ACTION}, and cannot be read with "
-            f"{', '.join(asked)}"
+            f"{path} holds many vehicles (FCD of SUMO, objects, OSI), with a clock and episodes of "
+            f"their own; it gives {', '.join(VARIABLES)} and the action {ACTION}, and cannot be "
+            f"read with {', '.join(asked)}"
         )
     return replace(columns, time="time", leader_may_lack=False)

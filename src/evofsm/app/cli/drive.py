@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from contextlib import AbstractContextManager, nullcontext
+import sys
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -15,8 +17,8 @@ if TYPE_CHECKING:
     from evofsm.app.driving import Driving, Setup
     from evofsm.driving import World
     from evofsm.files import Checkpoint
-    from evofsm.guard import AuditLog, Guard
-    from evofsm.io import RunWriter
+    from evofsm.guard import Guard, Witness
+    from evofsm.io import FoxgloveSink, RunWriter
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,11 +51,19 @@ class Drive(Driven):
     mcap: Path | None = option(
         None, "Write every episode to this log, for Foxglove and evofsm export."
     )
+    foxglove: int | None = option(
+        None,
+        "Serve every decision at this port (8765 is usual) to Foxglove or Lichtblick on this "
+        "computer, in real time; it begins when somebody looks on.",
+        min=0,
+        max=65535,
+    )
 
     def packages(self) -> dict[str, str]:
         """What the files that are asked for need as well."""
         written = {"polars": "tables"} if self.out else {}
-        return super().packages() | written | ({"mcap": "mcap"} if self.mcap else {})
+        live = {} if self.foxglove is None else {"foxglove": "foxglove"}
+        return super().packages() | written | ({"mcap": "mcap"} if self.mcap else {}) | live
 
     def run(self) -> None:
         """Drive, and print what came of it."""
@@ -70,6 +80,8 @@ class Drive(Driven):
             raise ValueError(
                 "--mcap and --checkpoint exclude each other: a log holds what one run has driven"
             )
+        if self.foxglove is not None and self.audit is not None:
+            raise ValueError("--foxglove and --audit exclude each other: a guard has one witness")
         interval = duration(self.every)
         first = episodes_learnt(self.learn) if self.learn else 0
         setup = self.setup(self.episodes, learn=self.frozen is None, first=first)
@@ -85,8 +97,9 @@ class Drive(Driven):
             AuditLog(self.audit) if self.audit else nullcontext() as log,
             open_world(self.world.value) as place,
             self._recording(setup) as run,
+            self._live() as live,
         ):
-            driving = _drive(setup, guard, place, keeper, log, run)
+            driving = _drive(setup, guard, place, keeper, log or live, run)
             if run is not None:
                 run.attach(learners_of(driving.guard)[0].model(**setup.family.labels._asdict()))
         if self.out is not None:
@@ -114,13 +127,28 @@ class Drive(Driven):
         told |= {"first": setup.first, "episodes": setup.episodes, "world": self.world.value}
         return recording(self.mcap, told)
 
+    @contextmanager
+    def _live(self) -> Iterator[FoxgloveSink | None]:
+        """A view in Foxglove, where one is asked for, once somebody looks on."""
+        if self.foxglove is None:
+            yield None
+            return
+        from evofsm.io import LAYOUT, FoxgloveSink
+
+        with FoxgloveSink(self.foxglove, speed=1.0) as sink:
+            told = f"Open {sink.address} in Foxglove or Lichtblick (Ctrl-C ends it)"
+            print(f"{told}; a layout to import: {LAYOUT}", file=sys.stderr, flush=True)
+            while not sink.await_someone(1.0):  # as Ctrl-C would not end a wait without an end
+                pass
+            yield sink
+
 
 def _drive(
     setup: Setup,
     guard: Guard,
     place: World,
     checkpoint: Checkpoint | None,
-    audit: AuditLog | None,
+    audit: Witness | None,
     run: RunWriter | None,
 ) -> Driving:
     """With a bar that shows the collisions so far."""

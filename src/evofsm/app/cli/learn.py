@@ -57,7 +57,10 @@ class Learn(WithJson):
     In FCD output of SUMO, a vehicle and the next one ahead of it on the same lane are a pair (a
     leader beyond the end of the lane is not seen). A pair is observed by gap (bumper to bumper),
     v_follower and v_leader; its action a_follower is what the follower did until the next time
-    step. SUMO rounds to 2 decimals unless told --precision 6.
+    step. SUMO rounds to 2 decimals unless told --precision 6. So are tables of objects (id, t, x,
+    y, vx, vy, length, lane) and traces of ASAM OSI read.
+
+    Of a bag of ROS 2, --topics says which field of which topic is which variable.
 
     The time may be seconds, or dates of ISO 8601. Without --failed a log tells nothing of failures,
     and evofsm explain says so.
@@ -67,7 +70,8 @@ class Learn(WithJson):
     """
 
     files: tuple[str, ...] = argument(
-        "Logs (CSV, Parquet) or FCD output of SUMO (XML, CSV, Parquet); gzipped or not.",
+        "Logs or tables of objects (CSV, Parquet), FCD output of SUMO (XML, CSV, Parquet), traces "
+        "of ASAM OSI (.osi, MCAP), bags of ROS 2 (folder, MCAP, db3).",
         is_setting=False,  # a checkpoint tells files apart by what is in them
     )
     observe: str = option(
@@ -97,6 +101,11 @@ class Learn(WithJson):
         None,
         "Unit of a column, or of all read that begin so: v=km/h, time=ms. May be repeated. Learnt "
         "are s, m, m/s, m/s².",
+    )
+    topics: Path | None = option(
+        None,
+        "File in TOML that says which field of which topic of a bag is which variable.",
+        is_setting=False,  # what is in it is one
     )
     no_leader: NoLeader = option(
         NoLeader.REFUSE,
@@ -155,7 +164,7 @@ class Learn(WithJson):
         from evofsm.app.text.learning import console, learning_document, print_learning
         from evofsm.driving import UNITS, VARIABLES
         from evofsm.files import Checkpoint, duration, fingerprints, result_kept
-        from evofsm.io import Noted, VehicleLengths, read_traces
+        from evofsm.io import Noted, Topics, VehicleLengths, read_traces
 
         _check_out(self.out)
         interval = duration(self.every)
@@ -163,14 +172,17 @@ class Learn(WithJson):
         lengths, noted = VehicleLengths.parse(self.vehicle_length or ()), Noted()
         machine = self._machine(actions.n_actions, columns)
         names = columns.observe.names
+        topics = None if self.topics is None else Topics.load(self.topics)
         known = fingerprints(self.files)
         keeper = None
         if self.checkpoint is not None:
             _check_apart(self.checkpoint, self.out, self.files)
             resolved = {"radius": self._radius, "spread": self._spread, "files": known}
+            resolved |= {} if topics is None else {"topics": repr(topics)}
             keeper = Checkpoint(self.checkpoint, settings(self) | resolved, interval)
         with progress() as bars:
-            chunks = read_traces(self.files, columns, lengths, _bytes_read(bars, self.files), noted)
+            on_read = _bytes_read(bars, self.files)
+            chunks = read_traces(self.files, columns, lengths, on_read, noted, topics)
             learning = learn_traces(
                 _noting(chunks, lengths, noted, keeper),
                 machine,
@@ -446,5 +458,8 @@ def _variable(text: str, distance: float) -> str | Category:
 
 def _bytes_read(bars: Progress, files: Sequence[str]) -> Callable[[int], None]:
     """A bar that grows with the bytes read of some files."""
-    task = bars.add_task("Learning", total=sum(os.path.getsize(file) for file in files))
+    within = (
+        entry.path for file in files for entry in (os.scandir(file) if os.path.isdir(file) else ())
+    )
+    task = bars.add_task("Learning", total=sum(map(os.path.getsize, [*files, *within])))
     return lambda count: bars.advance(task, count)

@@ -9,12 +9,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from evofsm.app.cli.common import progress
+from evofsm.app.cli.common import progress, say
 from evofsm.app.cli.declared import argument, option
 from evofsm.app.cli.groups import Revised
 
 if TYPE_CHECKING:
     from evofsm.app.watch.player import Watched
+    from evofsm.app.watch.recording import Recording
     from evofsm.app.watch.session import Session, Watching
     from evofsm.guard import Guard
 
@@ -31,8 +32,8 @@ class Watch(Revised):
     """
 
     what: str = argument(
-        "Family of scenarios: paper, emergency, ..., or a TOML file of your own; or a run that "
-        "drive --mcap recorded, to be replayed.",
+        "Family of scenarios: paper, emergency, ..., or a TOML file of your own; a run that "
+        "drive --mcap recorded; or a log, as evofsm learn reads them, watched in shadow mode.",
         "paper",
         metavar="FAMILY|FILE",
     )
@@ -42,6 +43,9 @@ class Watch(Revised):
     learn: Path | None = option(
         None, "Begin with what this folder of an earlier drive --out holds."
     )
+    topics: Path | None = option(
+        None, "Of a bag of ROS 2: which field of which topic is which variable, in TOML."
+    )
     speed: float = option(1.0, "At first, as a multiple of real time.")
     paused: bool = option(False, "Show the first frame, and wait.")
     port: int = option(0, "Of the page; 0 for any that is free.", min=0, max=65535)
@@ -49,8 +53,22 @@ class Watch(Revised):
 
     @property
     def is_recorded(self) -> bool:
-        """Whether a recorded run is replayed."""
-        return self.what.endswith(".mcap")
+        """Whether something recorded is replayed: a run, or a log."""
+        return self.what.endswith(".mcap") or self.is_log
+
+    @property
+    def is_log(self) -> bool:
+        """Whether it is a log that others wrote."""
+        from evofsm.driving import FAMILIES
+        from evofsm.io import file_kind
+
+        place = Path(self.what)
+        if self.what in FAMILIES or place.suffix in (".toml", ".json"):
+            return False
+        if not (place.is_file() or (place / "metadata.yaml").is_file()):
+            return False
+        # What is damaged is no kind of MCAP: whoever reads runs says so.
+        return place.suffix != ".mcap" or file_kind(self.what) in ("mcap", "bag")
 
     def packages(self) -> dict[str, str]:
         """What the page needs, and what is shown in it."""
@@ -87,9 +105,33 @@ class Watch(Revised):
         """A run that was recorded, read before the page is opened."""
         from evofsm.app.watch.recording import Recording
 
-        recording = Recording(self.what)
+        recording = self._shadowed() if self.is_log else Recording(self.what)
         recording.restart(self.case - 1)
         return lambda: recording
+
+    def _shadowed(self) -> Recording:
+        """A log, with what a guard would have said of it."""
+        from tempfile import TemporaryDirectory
+
+        from evofsm.app.watch.logged import MOST_ROWS, record_log
+        from evofsm.app.watch.recording import Recording
+        from evofsm.io import Topics
+
+        with TemporaryDirectory() as folder, progress() as bars:
+            task = bars.add_task("Reading", total=MOST_ROWS)
+            topics = None if self.topics is None else Topics.load(self.topics)
+            run = Path(folder) / "run.mcap"
+            left_out = record_log(
+                self.what,
+                run,
+                topics=topics,
+                judge=self.judge.value,
+                tolerance=self.tolerance,
+                progress=lambda rows: bars.update(task, completed=rows),
+            )
+            if left_out:
+                say(f"Watched are the first {MOST_ROWS:,} rows; the log has more.")
+            return Recording(run)
 
     def _session(self) -> Opening:
         """A session in a world of its own, once something was learnt."""

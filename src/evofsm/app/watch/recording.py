@@ -70,8 +70,8 @@ class Recording:
     """
 
     def __init__(self, path: str | PathLike[str]) -> None:
-        self._name = Path(path).name
         self._run: Run = read_run(path)
+        self._name = self._run.about.get("source", Path(path).name)
         self._episodes = [one for one in self._run.episodes if len(one.columns["time"])]
         if not self._episodes:
             raise ValueError(f"{path} holds no episode with a decision")

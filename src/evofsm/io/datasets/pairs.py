@@ -10,7 +10,7 @@ import numpy as np
 from evofsm.driving import VARIABLES
 from evofsm.io.datasets.columns import name_of
 from evofsm.io.datasets.episodes import Episode, cut
-from evofsm.io.fcd import ACTION
+from evofsm.io.following import ACTION
 from evofsm.io.tables import CsvTable, Piece
 
 _NUMBERS = ("time", *VARIABLES, ACTION)
