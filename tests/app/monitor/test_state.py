@@ -1,0 +1,183 @@
+import pytest
+
+from evofsm.app.monitor.decider import Decider
+from evofsm.app.monitor.defaults import guard_of_monitor
+from evofsm.app.monitor.state import State
+from evofsm.guard.guard import Guard
+from monitor_rows import JUNK, line, traffic
+
+SETTINGS = {"learn": True, "guard": None}
+
+
+def made(learn=True):
+    guard = guard_of_monitor(0.1, 6.0)
+    guard.learn = learn
+    return guard
+
+
+def opened(path, settings=SETTINGS, episode=700, learn=True):
+    state = State(path, settings)
+    guard = state.guard(lambda: made(learn))
+    guard.learn = learn
+    decider = Decider(guard, episode=episode)
+    state.begin(decider)
+    decider.keeper = state
+    return decider, state
+
+
+def abandoned(state):
+    """As the death of the process leaves it: nothing is written, the lock is gone."""
+    if state._journal is not None:
+        state._journal._file.close()
+
+
+@pytest.mark.parametrize("learn", [True, False])
+def test_it_goes_on_bit_for_bit_wherever_it_is_killed(tmp_path, learn):
+    plain = Decider(made(learn), episode=700)
+    decider, state = opened(tmp_path / "state.evofsm", learn=learn)
+    for k, row in enumerate(traffic(1600)):
+        if k in (3, 4, 690, 701, 1399, 1400, 1402):
+            abandoned(state)
+            decider, state = opened(tmp_path / "state.evofsm", learn=learn)
+        if k % 50 == 0:
+            assert decider.answer(JUNK[k // 50 % len(JUNK)])["kind"] == "error"
+        assert decider.answer(line(row)) == plain.answer(line(row)), k
+    state.close()
+
+
+def test_a_row_that_was_taken_in_but_not_answered_is_answered_when_it_is_sent_again(tmp_path):
+    rows = [line(row) for row in traffic(30)]
+    plain = Decider(made())
+    expected = [plain.answer(row) for row in rows]
+    decider, state = opened(tmp_path / "state.evofsm")
+    for row in rows[:20]:
+        decider.answer(row)
+    state.before(decider.form.read(rows[20]))  # and then it is killed
+    abandoned(state)
+    decider, state = opened(tmp_path / "state.evofsm")
+    assert decider.n == 21
+    assert [decider.answer(row) for row in rows[20:]] == expected[20:]
+    state.close()
+
+
+def test_it_remembers_the_latest_answer_over_a_save(tmp_path):
+    rows = [line(row) for row in traffic(701)]
+    decider, state = opened(tmp_path / "state.evofsm")
+    answers = [decider.answer(row) for row in rows[:700]]
+    assert decider.rows == 0  # the episode has just ended, and the guard was saved
+    abandoned(state)
+    decider, state = opened(tmp_path / "state.evofsm")
+    assert decider.answer(rows[699]) == answers[699]
+    assert decider.answer(rows[700])["n"] == 701
+    state.close()
+
+
+def test_what_is_kept_is_a_guard_that_has_learnt_and_one_journal(tmp_path):
+    path = tmp_path / "state.evofsm"
+    decider, state = opened(path)
+    for row in traffic(1500):
+        decider.answer(line(row))
+    state.close()
+    assert Guard.load(path).machine.n_states == decider.guard.machine.n_states > 1
+    assert len([*tmp_path.iterdir()]) == 2
+
+
+def test_a_saved_guard_is_gone_on_from_and_keeps_where_it_came_from(tmp_path):
+    path = tmp_path / "guard.evofsm"
+    made().save(path, {"drive": "Monday"})
+    decider, state = opened(path)
+    decider.answer(line(next(traffic(1))))
+    state.close()
+    from evofsm.files import read_header
+
+    assert read_header(path).provenance["drive"] == "Monday"
+    decider, state = opened(path)
+    assert decider.n == 1
+    state.close()
+
+
+@pytest.mark.parametrize("left", [b"", b'{"num', b'{"number":1,"pre'])
+def test_a_journal_whose_first_record_was_half_written_is_empty(tmp_path, left):
+    decider, state = opened(tmp_path / "state.evofsm")
+    decider.answer(line(next(traffic(1))))
+    journal = state._journal.path
+    abandoned(state)
+    journal.write_bytes(left)
+    decider, state = opened(tmp_path / "state.evofsm")
+    assert decider.n == 0
+    state.close()
+
+
+def test_a_last_record_that_was_half_written_is_left_out(tmp_path):
+    decider, state = opened(tmp_path / "state.evofsm")
+    for row in traffic(5):
+        decider.answer(line(row))
+    journal = state._journal.path
+    abandoned(state)
+    journal.write_bytes(journal.read_bytes()[:-10])
+    decider, state = opened(tmp_path / "state.evofsm")
+    assert decider.n == 4
+    state.close()
+
+
+def test_a_journal_that_was_lost_is_begun_anew(tmp_path):
+    decider, state = opened(tmp_path / "state.evofsm")
+    decider.answer(line(next(traffic(1))))
+    state.close()
+    state._journal.path.unlink()
+    decider, state = opened(tmp_path / "state.evofsm")
+    assert decider.n == 0
+    state.close()
+
+
+def test_a_journal_that_was_changed_is_refused(tmp_path):
+    decider, state = opened(tmp_path / "state.evofsm")
+    for row in traffic(5):
+        decider.answer(line(row))
+    state.close()
+    journal = state._journal.path
+    journal.write_bytes(journal.read_bytes().replace(b"0.1", b"0.2", 1))
+    with pytest.raises(ValueError, match="was tampered with"):
+        opened(tmp_path / "state.evofsm")
+
+
+def test_other_settings_are_refused(tmp_path):
+    _, state = opened(tmp_path / "state.evofsm")
+    state.close()
+    with pytest.raises(ValueError, match="learn was True and is False"):
+        opened(tmp_path / "state.evofsm", {"learn": False, "guard": None})
+
+
+def test_two_monitors_do_not_keep_themselves_in_one_place(tmp_path):
+    _, state = opened(tmp_path / "state.evofsm")
+    with pytest.raises(ValueError, match="is being written by another process"):
+        opened(tmp_path / "state.evofsm")
+    state.close()
+
+
+def test_where_it_can_not_be_kept_it_goes_on_and_says_so(tmp_path, monkeypatch):
+    decider, state = opened(tmp_path / "state.evofsm")
+
+    def full(_):
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(state._journal, "append", full)
+        first, second = (line(row) for row in traffic(2))
+        assert decider.answer(first)["kind"] == "decision"
+    assert decider.answer(second)["kind"] == "decision"
+    assert "No space left" in state.failure
+    state.close()
+
+
+def test_scenes_and_ends_are_kept(tmp_path):
+    from monitor_rows import scenes
+
+    plain = Decider(made())
+    messages = [*scenes(5), b'{"end": true}', *scenes(9)][:12]
+    decider, state = opened(tmp_path / "state.evofsm")
+    for message in messages:
+        abandoned(state)
+        decider, state = opened(tmp_path / "state.evofsm")
+        assert decider.answer(message) == plain.answer(message)
+    state.close()
