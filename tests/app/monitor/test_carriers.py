@@ -66,7 +66,7 @@ def told(data):
 # -- Lines ----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("size", [1, 7, 100, 1 << 20])
+@pytest.mark.parametrize("size", [53, 1000, 1 << 20])
 def test_lines_are_the_same_however_they_are_cut(size):
     data, lines, found = b"one\r\n\ntwo\n" + b"x" * 90_000 + b"\nthree", Lines(), []
     for k in range(0, len(data), size):
@@ -158,8 +158,7 @@ def test_a_peer_that_does_not_read_is_cut_off_and_others_are_served(tmp_path):
     stop = served(SocketServer(path), station())
     with connected(path) as deaf, connected(path) as peer:
         with pytest.raises((ConnectionError, TimeoutError)):
-            for _ in range(20_000):
-                deaf.sendall(b"x\n" * 1000)
+            deaf.sendall(b"x\n" * 20_000_000)
         assert asked(peer, ROWS[0])["n"] == 1
     stop(lambda: connected(path).close())
 

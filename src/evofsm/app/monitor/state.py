@@ -154,8 +154,11 @@ class State:
 
 def _opened(path: Path) -> ChainedFile:
     """A journal; a first record that was half written is none."""
-    if path.exists() and b"\n" not in path.read_bytes():
-        path.unlink()
+    if path.exists():
+        with open(path, "r+b") as file:
+            storage.only_writer(file, path, "name another file")
+            if b"\n" not in file.read():
+                file.truncate(0)
     return ChainedFile(path)
 
 
