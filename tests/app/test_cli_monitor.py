@@ -86,9 +86,10 @@ def test_a_saved_guard_in_another_mode(tmp_path):
     guard = guard_of_monitor(0.1, 6.0)
     guard.reviser.mode = Mode.ACT
     guard.save(tmp_path / "guard.evofsm")
-    shadow = told(evofsm("--guard", tmp_path / "guard.evofsm", lines=ROWS))
+    rows = [line(row) for row in closing_in(80)]
+    shadow = told(evofsm("--guard", tmp_path / "guard.evofsm", lines=rows))
     assert {one["executed"] for one in shadow} == {0.5}
-    act = told(evofsm("--guard", tmp_path / "guard.evofsm", "--mode", "act", lines=ROWS))
+    act = told(evofsm("--guard", tmp_path / "guard.evofsm", "--mode", "act", lines=rows))
     assert act[-1]["executed"] < 0.0
     assert act[-1]["mode"] == "act"
 

@@ -56,7 +56,9 @@ def nearest_ahead(
         between = away - 0.5 * (ego["length"] + one["length"])
         if found is None or between < gap:
             found, gap = one, between
-    return None if found is None else Ahead(found["id"], gap, ego["vx"], found["vx"])
+    if found is None:
+        return None
+    return Ahead(found["id"], float(gap), float(ego["vx"]), float(found["vx"]))
 
 
 def _in_lane(ego: Mapping[str, Any], one: Mapping[str, Any]) -> bool:

@@ -16,7 +16,7 @@ import numpy as np
 from evofsm.app.monitor.objects import Ahead, nearest_ahead
 from evofsm.core import visible
 from evofsm.driving import VARIABLES
-from evofsm.files import LARGEST_OBSERVATION
+from evofsm.files import LARGEST_OBSERVATION as _LARGEST
 from evofsm.guard import BoxActions, Choices, Guard
 
 #: The version of the messages.
@@ -27,7 +27,7 @@ LONGEST = 1 << 16
 _SHOWN = 40
 _LARGEST_ID = 1 << 63
 _OBSERVATION = "observation"
-_EGO = frozenset({"id", "s", "x", "y", "lane", "vx", "vy", "length", "width"})
+_KEYS = frozenset({"id", "s", "x", "y", "lane", "vx", "vy", "length", "width"})
 _REQUIRED = ("vx", "length")
 
 Number = float | None
@@ -138,7 +138,7 @@ class Form:
         try:
             return self._read(told)
         except MessageError as refused:
-            if isinstance(time, int | float) and abs(time) <= LARGEST_OBSERVATION:
+            if isinstance(time, int | float) and abs(time) <= _LARGEST:
                 refused.time = float(time)
             raise
 
@@ -292,7 +292,7 @@ def _seen(told: Any, key: str | int, about: str) -> Number:
 
 def _finite(about: str, value: Any, rule: str) -> float:
     # A truth value is no number; NaN and what overflows fail the comparison.
-    if type(value) not in (int, float) or not abs(value) <= LARGEST_OBSERVATION:
+    if type(value) not in (int, float) or not abs(value) <= _LARGEST:
         raise MessageError(about, f"is {_shown(value)}; {rule}")
     return float(value)
 
@@ -301,23 +301,26 @@ def _placed(one: Any, where: str, along: str) -> dict[str, Any]:
     """An object with its numbers checked."""
     if not isinstance(one, dict):
         raise MessageError(where, f"is {_shown(one)}; it must be an object")
-    _refuse_unknown(one, f"{where}.", _EGO)
-    placed: dict[str, Any] = {}
+    if not one.keys() <= _KEYS:
+        _refuse_unknown(one, f"{where}.", _KEYS)
     for key, value in one.items():
+        # Nearly all are plain numbers: they are not looked at for long.
+        if type(value) is float and key != "id" and -_LARGEST <= value <= _LARGEST:
+            continue
         if key == "id" or (key == "lane" and isinstance(value, str)):
-            placed[key] = _label(value, f"{where}.{key}")
+            _refuse_unlabelled(value, f"{where}.{key}")
         else:
-            placed[key] = _finite(f"{where}.{key}", value, "it must be a finite number")
+            _finite(f"{where}.{key}", value, "it must be a finite number")
     for key in (along, *_REQUIRED):
-        if key not in placed:
+        if key not in one:
             raise MessageError(f"{where}.{key}", "is missing; it must be a finite number")
-    if along == "s" and "lane" not in placed:
+    if along == "s" and "lane" not in one:
         raise MessageError(
             f"{where}.lane", "is missing: without it s does not say who follows whom"
         )
-    if "lane" not in placed and "y" not in placed:
+    if "lane" not in one and "y" not in one:
         raise MessageError(f"{where}.y", "is missing, and so is lane; one of them is needed")
-    return placed
+    return one
 
 
 def _named(one: Any, where: str, along: str, ego: Mapping[str, Any]) -> dict[str, Any]:
@@ -329,11 +332,11 @@ def _named(one: Any, where: str, along: str, ego: Mapping[str, Any]) -> dict[str
     return placed
 
 
-def _label(value: Any, about: str) -> str | int:
+def _refuse_unlabelled(value: Any, about: str) -> None:
     if (type(value) is int and abs(value) < _LARGEST_ID) or (
         isinstance(value, str) and len(value) <= _SHOWN
     ):
-        return value
+        return
     raise MessageError(
         about, f"is {_shown(value)}; it must be a whole number, or a text of {_SHOWN} letters"
     )
