@@ -102,9 +102,9 @@ class Form:
     Row(time=1.5, observation=(30.0, 20.0, None), proposal=0.5, ahead=None)
     >>> form.read(b'{"end": true, "failed": true}')
     End(failed=True, observation=None)
-    >>> form.read(b'{"time": 1.5, "gaap": 3}')
+    >>> form.read(b'{"schema": 2}')
     Traceback (most recent call last):
-    evofsm.app.monitor.schema.MessageError: is not known; known are gap, ...
+    evofsm.app.monitor.schema.MessageError: is 2; this monitor knows version 1 alone
     """
 
     variables: tuple[str, ...]
