@@ -35,7 +35,7 @@ def traffic(count: int, dt: float = 0.1, seed: int = 0) -> Iterator[dict[str, fl
     for k in range(count):
         t = k * dt
         wave = math.sin(t / 7.0)
-        gap = 19.0 + 11.0 * math.sin(t / 41.0) + 9.0 * math.sin(t / 97.0)
+        gap = 15.0 + 11.0 * math.sin(t / 41.0) + 6.0 * math.sin(t / 97.0)
         yield {
             "time": round(t, 9),
             "gap": max(0.5, gap + noise[k, 0]),

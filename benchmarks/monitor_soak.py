@@ -22,7 +22,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-from evofsm.app.monitor.decider import Answer, Decider
+from evofsm.app.monitor.decider import EPISODE, Answer, Decider
 from evofsm.app.monitor.defaults import guard_of_monitor
 from evofsm.app.monitor.schema import Row
 from evofsm.app.monitor.state import State
@@ -32,7 +32,6 @@ from monitor_rows import JUNK, line, traffic
 _DT = 0.1
 #: Chances of each, at a row.
 _JUNK, _TWICE, _LATE, _GAP, _LOSS, _END, _RESTART = 0.02, 0.01, 0.01, 5e-4, 5e-3, 2e-4, 8e-4
-_EPISODE = 6000
 
 
 class Found(NamedTuple):
@@ -51,9 +50,9 @@ class Found(NamedTuple):
 class Place:
     """Where a monitor keeps itself, and the one that is there now."""
 
-    def __init__(self, folder: Path, learn: bool) -> None:
+    def __init__(self, folder: Path, learn: bool, episode: int) -> None:
         self._path = folder / "state.evofsm"
-        self._learn = learn
+        self._learn, self._episode = learn, episode
         self.restarts = self.again = 0
         self._begin()
 
@@ -61,7 +60,7 @@ class Place:
         self._state = State(self._path, {"learn": self._learn})
         guard = self._state.guard(lambda: guard_of_monitor(_DT, 6.0))
         guard.learn = self._learn
-        self.decider = Decider(guard, episode=_EPISODE)
+        self.decider = Decider(guard, episode=self._episode)
         self.again += self._state.begin(self.decider)
         self.decider.keeper = self._state
 
@@ -77,6 +76,10 @@ class Place:
                 file.write(b'{"number":1,"row":[0.')
         self.restarts += 1
         self._begin()
+
+    def close(self) -> None:
+        """Let go of the files."""
+        self._state.close()
 
 
 def plain_answer(guard: Guard, row: dict[str, float]) -> tuple[object, ...]:
@@ -111,7 +114,7 @@ def good_rows(hours: float, rng: random.Random) -> Iterator[dict[str, float]]:
             yield row
 
 
-def soak(hours: float, seed: int = 0, learn: bool = False) -> Found:
+def soak(hours: float, seed: int = 0, learn: bool = False, episode: int = EPISODE) -> Found:
     """Feed both, and compare."""
     rng, begun = random.Random(seed), time.perf_counter()
     guard = guard_of_monitor(_DT, 6.0)
@@ -119,7 +122,7 @@ def soak(hours: float, seed: int = 0, learn: bool = False) -> Found:
     count = junk = wrong = alarms = length = 0
     last: tuple[bytes, Answer] | None = None
     with tempfile.TemporaryDirectory() as folder:
-        place = Place(Path(folder), learn)
+        place = Place(Path(folder), learn, episode)
         for row in good_rows(hours, rng):
             message = line(row)
             if rng.random() < _RESTART:
@@ -145,9 +148,10 @@ def soak(hours: float, seed: int = 0, learn: bool = False) -> Found:
                 place.decider.answer(b'{"end": true}')
                 guard.end()
                 length = 0
-            elif length >= _EPISODE and (not answer.get("alarm") or length >= 2 * _EPISODE):
+            elif length >= episode and (not answer.get("alarm") or length >= 2 * episode):
                 guard.end()
                 length = 0
+        place.close()
     took = time.perf_counter() - begun
     return Found(count, junk, place.restarts, place.again, wrong, alarms, hours, took)
 

@@ -1,3 +1,4 @@
+import numpy as np
 import pytest
 
 from evofsm.app.monitor.decider import Decider
@@ -5,20 +6,21 @@ from evofsm.app.monitor.defaults import guard_of_monitor
 from evofsm.app.monitor.state import State
 from evofsm.files.storage import read_header
 from evofsm.guard.guard import Guard
+from evofsm.guard.reviser import Mode
 from monitor_rows import JUNK, line, scenes, traffic
 
 SETTINGS = {"learn": True, "guard": None}
 
 
-def made(learn=True):
+def made(learn=True, mode=Mode.SHADOW):
     guard = guard_of_monitor(0.1, 6.0)
-    guard.learn = learn
+    guard.learn, guard.reviser.mode = learn, mode
     return guard
 
 
-def opened(path, settings=SETTINGS, episode=700, learn=True):
+def opened(path, settings=SETTINGS, episode=700, learn=True, fresh=made):
     state = State(path, settings)
-    guard = state.guard(lambda: made(learn))
+    guard = state.guard(fresh)
     guard.learn = learn
     decider = Decider(guard, episode=episode)
     state.begin(decider)
@@ -32,10 +34,12 @@ def abandoned(state):
         state._journal._file.close()
 
 
-@pytest.mark.parametrize("learn", [True, False])
-def test_it_goes_on_bit_for_bit_wherever_it_is_killed(tmp_path, learn):
-    plain = Decider(made(learn), episode=700)
-    decider, state = opened(tmp_path / "state.evofsm", learn=learn)
+@pytest.mark.parametrize(
+    ("learn", "mode"), [(True, Mode.SHADOW), (False, Mode.SHADOW), (True, Mode.ACT)]
+)
+def test_it_goes_on_bit_for_bit_wherever_it_is_killed(tmp_path, learn, mode):
+    plain = Decider(made(learn, mode), episode=700)
+    decider, state = opened(tmp_path / "state.evofsm", learn=learn, fresh=lambda: made(learn, mode))
     for k, row in enumerate(traffic(1600)):
         if k in (3, 4, 690, 701, 1399, 1400, 1402):
             abandoned(state)
@@ -43,6 +47,38 @@ def test_it_goes_on_bit_for_bit_wherever_it_is_killed(tmp_path, learn):
         if k % 50 == 0:
             assert decider.answer(JUNK[k // 50 % len(JUNK)])["kind"] == "error"
         assert decider.answer(line(row)) == plain.answer(line(row)), k
+    state.close()
+
+
+@pytest.mark.slow
+def test_a_learnt_judge_goes_on_bit_for_bit(tmp_path):
+    """One that is told nothing but failures, and draws random numbers as it learns."""
+
+    def fresh():
+        return Guard(low=-1.0, high=1.0, interval=0.1)
+
+    def messages():
+        rng = np.random.default_rng(0)
+        for k in range(8):
+            x = v = 0.0
+            for j in range(60):
+                push = float(rng.uniform(-1.0, 1.0))
+                seen = {"observation": [x, v], "proposal": push}
+                yield line({"time": 100.0 * k + 0.1 * j, **seen})
+                v += 0.1 * (push + 2.0 * x)
+                x += 0.1 * v
+                if abs(x) > 1.0:
+                    break
+            yield line({"end": True, "failed": abs(x) > 1.0, "observation": [x, v]})
+
+    plain = Decider(fresh())
+    decider, state = opened(tmp_path / "state.evofsm", fresh=fresh)
+    for k, message in enumerate(messages()):
+        if k % 37 == 20:
+            abandoned(state)
+            decider, state = opened(tmp_path / "state.evofsm", fresh=fresh)
+        assert decider.answer(message) == plain.answer(message), k
+    assert decider.n > 200
     state.close()
 
 
