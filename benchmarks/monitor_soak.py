@@ -33,6 +33,9 @@ _DT = 0.1
 #: Chances of each, at a row.
 _JUNK, _TWICE, _LATE, _GAP, _LOSS, _END, _RESTART = 0.02, 0.01, 0.01, 5e-4, 5e-3, 2e-4, 8e-4
 
+# So often it says how far it is [rows].
+_SAID = 36_000
+
 
 class Found(NamedTuple):
     """What came of it."""
@@ -144,6 +147,10 @@ def soak(hours: float, seed: int = 0, learn: bool = False, episode: int = EPISOD
                 wrong += 1
             alarms += bool(answer.get("alarm"))
             last = message, answer
+            if count % _SAID == 0:
+                print(
+                    f"{row['time'] / 3600.0:.0f} h: {count:,} rows, {wrong} wrong", file=sys.stderr
+                )
             if rng.random() < _END:
                 place.decider.answer(b'{"end": true}')
                 guard.end()
