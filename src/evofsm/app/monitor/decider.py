@@ -94,7 +94,7 @@ class Decider:
         self.refused = 0  #: messages that were refused, since the process began
         self.rows = 0  #: of the episode under way; 0 where none is
         self._latest: tuple[Row, Answer] | None = None
-        self._told_often = False
+        self._told_often = self._has_failed = False
 
     @property
     def mode(self) -> Mode:
@@ -175,7 +175,9 @@ class Decider:
         try:
             revision = self._revision(row)
         except Exception as error:  # whatever a judge of somebody's own raises
-            _log.exception("the guard failed at %s s", row.time)
+            if not self._has_failed:  # once, as it may fail at each row
+                _log.exception("the guard failed at %s s", row.time)
+            self._has_failed = True
             self.rows += 1
             self.refused += 1
             what = f"failed: {type(error).__name__}: {error}"
