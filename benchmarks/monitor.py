@@ -132,7 +132,9 @@ def by_zenoh(dt: float) -> Iterator[Ask]:
         session.declare_subscriber(
             f"{_KEY}/decision", lambda sample: came.put(sample.payload.to_bytes())
         )
-        rows = session.declare_publisher(f"{_KEY}/row")
+        rows = session.declare_publisher(
+            f"{_KEY}/row", express=True, priority=zenoh.Priority.REAL_TIME
+        )
 
         def ask(scene: bytes) -> bytes:
             rows.put(scene)

@@ -4,7 +4,7 @@ Usage: python benchmarks/monitor_soak.py [--hours 24] [--seed 0] [--learn]
 
 The time is that of the rows; it goes as fast as it runs. Between rows comes what is no message, and
 rows that are late, that come twice, or that are from another schema. Rows are missing for seconds
-and for minutes. Every two minutes or so the monitor is abandoned, as by the death of its process:
+and for minutes. Every eight minutes or so the monitor is abandoned, as by the death of its process:
 between two rows, after a row was taken in and before it was decided on, or with the last record of
 its journal half written; another one goes on from its files. A plain `Guard` is fed the rows that
 are good, and told where an episode ends; every decision has to be its decision, to the last bit,
@@ -31,7 +31,7 @@ from monitor_rows import JUNK, line, traffic
 
 _DT = 0.1
 #: Chances of each, at a row.
-_JUNK, _TWICE, _LATE, _GAP, _LOSS, _END, _RESTART = 0.02, 0.01, 0.01, 5e-4, 5e-3, 2e-4, 8e-4
+_JUNK, _TWICE, _LATE, _GAP, _LOSS, _END, _RESTART = 0.02, 0.01, 0.01, 5e-4, 5e-3, 2e-4, 2e-4
 
 # So often it says how far it is [rows].
 _SAID = 36_000

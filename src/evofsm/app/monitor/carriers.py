@@ -402,7 +402,9 @@ class ZenohServer:
         except zenoh.ZError as error:
             raise ValueError(f"Zenoh: {error}") from None
         try:
-            self._publisher = self._session.declare_publisher(f"{key}/decision")
+            self._publisher = self._session.declare_publisher(
+                f"{key}/decision", express=True, priority=zenoh.Priority.REAL_TIME
+            )
             self._subscriber = self._session.declare_subscriber(f"{key}/row", self._take)
         except zenoh.ZError as error:
             self.close()
