@@ -1,6 +1,8 @@
 import json
 
+import hypothesis.strategies as st
 import pytest
+from hypothesis import given
 
 from evofsm.app.monitor.schema import LONGEST, End, Form, MessageError, Row
 from evofsm.driving.cars import guard_for_cars
@@ -200,3 +202,33 @@ def test_fifty_objects_fit_on_a_line():
         for k in range(50)
     ]
     assert len(scene(*objects)) < LONGEST / 4
+
+
+# -- Anything at all ------------------------------------------------------------------------------
+
+SOME = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=3), inner),
+    max_leaves=5,
+)
+KEYS = st.sampled_from([*ROW, "schema", "ego", "objects", "end", "failed", "x", "lane", "id"])
+
+
+def understood(message):
+    try:
+        return isinstance(FORM.read(message), Row | End)
+    except MessageError as error:
+        return bool(error.about) and "\n" not in str(error)
+
+
+@given(st.binary(max_size=60))
+def test_any_bytes_are_refused_or_understood(junk):
+    assert understood(junk)
+
+
+@given(st.dictionaries(KEYS, SOME))
+def test_any_json_is_refused_or_understood(changed):
+    assert understood(json.dumps(ROW | changed).encode())
+    assert understood(json.dumps(changed).encode())
+    told = {"time": 0, "proposal": 0, "ego": EGO | changed, "objects": [TRUCK, TRUCK | changed]}
+    assert understood(json.dumps(told).encode())
