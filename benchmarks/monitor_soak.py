@@ -154,7 +154,7 @@ def soak(hours: float, seed: int = 0, learn: bool = False, episode: int = EPISOD
             if rng.random() < _END:
                 place.decider.answer(b'{"end": true}')
                 guard.end()
-                length = 0
+                last, length = None, 0
             elif length >= episode and (not answer.get("alarm") or length >= 2 * episode):
                 guard.end()
                 length = 0

@@ -112,6 +112,16 @@ def test_an_episode_ends_where_it_is_told_to_and_learns_of_it():
     assert decider.answer(b'{"end": true}')["kind"] == "end"  # nothing is under way: nothing to do
 
 
+def test_after_an_end_time_may_begin_anew():
+    decider = Decider(made())
+    row = next(iter(rows(1)))
+    assert [decider.answer(line(row | {"time": t}))["n"] for t in (0.1, 0.2)] == [1, 2]
+    decider.answer(b'{"end": true}')
+    again = decider.answer(line(row | {"time": 0.1}))
+    assert (again["kind"], again["n"]) == ("decision", 3)
+    assert "note" not in again
+
+
 def test_an_episode_ends_by_itself_while_there_is_no_alarm():
     decider = Decider(made(), episode=10)
     calm = next(iter(rows(1)))

@@ -114,9 +114,13 @@ class Station:
 
     @contextmanager
     def stoppable(self) -> Iterator[Self]:
-        """Let SIGTERM and Ctrl-C end it while it waits, never while it decides."""
+        """Let SIGTERM and Ctrl-C end it while it waits, never while it decides.
+
+        What whoever started it let it ignore, as nohup does, it ignores.
+        """
         names = ("SIGTERM", "SIGINT", "SIGHUP")
         signals = [getattr(signal, name) for name in names if hasattr(signal, name)]
+        signals = [one for one in signals if signal.getsignal(one) is not signal.SIG_IGN]
         if threading.current_thread() is not threading.main_thread():
             signals = []
         before = {one: signal.signal(one, self._asked) for one in signals}

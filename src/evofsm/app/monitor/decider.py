@@ -165,6 +165,7 @@ class Decider:
         seen = None if told.observation is None else as_floats(told.observation)
         if self.rows or told.failed:
             self.end(told.failed, seen)
+        self._latest = None  # whatever time comes next is that of a new episode
         return self._of("end", failed=told.failed)
 
     def _decided(self, row: Row) -> Answer:
