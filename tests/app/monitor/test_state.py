@@ -35,7 +35,12 @@ def abandoned(state):
 
 
 @pytest.mark.parametrize(
-    ("learn", "mode"), [(True, Mode.SHADOW), (False, Mode.SHADOW), (True, Mode.ACT)]
+    ("learn", "mode"),
+    [
+        (True, Mode.SHADOW),
+        pytest.param(False, Mode.SHADOW, marks=pytest.mark.slow),
+        pytest.param(True, Mode.ACT, marks=pytest.mark.slow),
+    ],
 )
 def test_it_goes_on_bit_for_bit_wherever_it_is_killed(tmp_path, learn, mode):
     plain = Decider(made(learn, mode), episode=700)
