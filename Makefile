@@ -41,8 +41,9 @@ evidence: .venv/installed       ## all studies in short, on one page; DATA=folde
 docs: .venv/installed           ## the documentation's site: results/docs/index.html
 	@$(BIN)/python -m sphinx -W --keep-going -n -q docs results/docs
 
-soak: .venv/installed           ## do the numbers hold for a thousand million steps? some 15 minutes
+soak: .venv/installed           ## do the numbers hold for a thousand million steps, a monitor for a day? some 40 minutes
 	@$(BIN)/python benchmarks/soak.py
+	@$(BIN)/python benchmarks/monitor_soak.py
 
 lock: .venv/installed           ## pin what development needs anew, with hashes
 	@$(BIN)/uv pip compile --quiet --universal --generate-hashes --extra dev --upgrade \

@@ -32,8 +32,8 @@ def commands(group, path=()):
             yield " ".join((*path, name)), command
 
 
-# These answer with a page that lives, and in formats of others.
-ELSEWISE = ("watch", "export")
+# These answer with a page that lives, in formats of others, and in lines of JSON whatever is asked.
+ELSEWISE = ("watch", "export", "monitor")
 COMMANDS = dict(commands(typer.main.get_command(application())))
 
 

@@ -39,12 +39,13 @@ def application(*others: type[Command] | typer.Typer) -> typer.Typer:
     from evofsm.app.cli.explain import Explain
     from evofsm.app.cli.export import Export
     from evofsm.app.cli.learn import Inspect, Learn
+    from evofsm.app.cli.monitor import Monitor
     from evofsm.app.cli.verify import Verify
     from evofsm.app.cli.watch import Watch
 
     app = group("evofsm", options.__doc__ or "")
     app.callback()(options)
-    ours = (Learn, Inspect, Explain, Drive, Watch, Campaign, Export, Verify, Audit, Check)
+    ours = (Learn, Inspect, Explain, Drive, Watch, Monitor, Campaign, Export, Verify, Audit, Check)
     for command in (*ours, *others):
         if isinstance(command, typer.Typer):
             app.add_typer(command)

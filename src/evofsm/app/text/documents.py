@@ -24,6 +24,16 @@ def to_json(document: Any) -> str:
     return visible(json.dumps(_known(document), allow_nan=False, ensure_ascii=False, indent=2))
 
 
+def to_json_line(document: Any) -> str:
+    r"""The same on one line, without spaces.
+
+    >>> to_json_line({"lead": [1.5, float("inf")], "name": "a\nb"})
+    '{"lead":[1.5,null],"name":"a\\nb"}'
+    """
+    known = _known(document)
+    return visible(json.dumps(known, allow_nan=False, ensure_ascii=False, separators=(",", ":")))
+
+
 def spelled_out(value: Any) -> Any:
     """The same, with named tuples as dictionaries and members of enumerations as their values.
 

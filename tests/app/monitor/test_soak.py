@@ -1,0 +1,29 @@
+"""Some minutes of junk and restarts here; `benchmarks/monitor_soak.py` takes a day."""
+
+import pytest
+
+import monitor
+import monitor_soak
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.mark.parametrize("learn", [True, False])
+def test_no_decision_is_lost_or_wrong(learn):
+    found = monitor_soak.soak(0.15, seed=1, learn=learn, episode=900)
+    assert found.wrong == 0
+    assert found.rows > 2000
+    assert min(found.alarms, found.junk, found.restarts) > 0
+
+
+def test_a_wrong_decision_would_be_found(monkeypatch):
+    monkeypatch.setattr(monitor_soak, "answered", lambda answer: ())
+    found = monitor_soak.soak(0.005)
+    assert found.wrong == found.rows
+
+
+def test_the_time_of_an_answer_is_measured():
+    with monitor.CARRIERS["pipe"](0.01) as ask:
+        took = monitor.latencies(ask, seconds=1.0, objects=50, rate=100.0)
+    assert len(took) == 100
+    assert min(took) > 0.0
