@@ -159,7 +159,9 @@ class Guarding:
         """See what is around; without anybody, a guard of one leader has nothing to decide on."""
         ahead = self._seeing.ahead(one.id, speed)
         scene = isinstance(one.guard.reviser.risk, TrafficRisk)  # type: ignore[attr-defined]
-        behind = self._seeing.behind(one.id, speed) if scene else None
+        # Who is behind matters only where one brakes: if acting, because somebody is ahead.
+        alone = ahead is None and self._acts
+        behind = self._seeing.behind(one.id, speed) if scene and not alone else None
         one.around = ahead, behind
         leader = "" if ahead is None else ahead.id
         if leader != one.leader:  # what is known of the one before does not hold of this one

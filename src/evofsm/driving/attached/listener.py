@@ -79,6 +79,7 @@ class Attachment:
                 tell=tell,
             )
         self._colors: dict[str, tuple[int, ...]] | None = {} if color else None
+        self._now = -math.inf
         self._known: set[str] = set()
         self._met: dict[tuple[str, str], float] = {}
         self._listener: int | None = None
@@ -96,8 +97,7 @@ class Attachment:
         base = getattr(self._sumo, "StepListener", None) or import_module("traci").StepListener
 
         def step(_: Any, __: float) -> bool:
-            self.step()
-            return True
+            return self.step()
 
         listener = type("Listener", (base,), {"step": step})()
         self._listener = self._sumo.addStepListener(listener)
@@ -110,10 +110,18 @@ class Attachment:
         for car in self.cars:
             self._cars.remove(car)
 
-    def step(self) -> None:
-        """Take in a step of the simulation that is over, and decide on the next."""
+    def step(self) -> bool:
+        """Take in a step of the simulation that is over, and decide on the next.
+
+        Returns False, and does nothing, in another simulation: SUMO keeps its listeners when one is
+        closed.
+        """
         begin = clock.perf_counter()
         now = float(self._sumo.simulation.getTime())
+        if now <= self._now:
+            self._listener = None
+            return False
+        self._now = now
         self._count_cars()
         self._count_collisions(now)
         self.looked += len(self._cars)
@@ -124,6 +132,7 @@ class Attachment:
         if self._colors is not None:
             self._paint()
         self.seconds += clock.perf_counter() - begin
+        return True
 
     def _count_cars(self) -> None:
         """Cars that are inserted, or come back from a teleport; and those that leave."""

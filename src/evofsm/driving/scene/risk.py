@@ -1,8 +1,8 @@
 """A judge among many cars: an action is as dangerous as the worst of its pairs.
 
-Who is ahead, cuts in or crosses is a leader, and each is rehearsed as the one leader of `LatentRisk`.
-Who is behind makes oneself the leader: by the same rehearsal, in which it keeps its speed until it has
-reacted, braking harder than it survives ends in a collision that one has caused.
+Who is ahead, cuts in or crosses is a leader, and each is rehearsed as the one leader of
+`LatentRisk`. Who is behind makes oneself the leader: by the same rehearsal, in which it keeps its
+speed until it has reacted, braking harder than it survives ends in a collision that one has caused.
 """
 
 from __future__ import annotations
@@ -144,20 +144,18 @@ class TrafficRisk:
 
     def _judge(self, pairs: list[Pair], actions: _Floats) -> tuple[Judgement, _Floats]:
         """Of all pairs; and the risk from behind alone."""
-        nothing = np.zeros(len(actions))
-        worst, behind = Judgement(nothing, nothing, nothing, nothing + math.inf, 0.0), nothing
+        worst, behind = None, np.zeros(len(actions))
         self.worst = None
         for pair in pairs:
             judged = (self._from_behind if pair.role is Role.BEHIND else self._ahead)(pair, actions)
-            if self.worst is None or judged.risk[0] > worst.risk[0]:
-                self.worst = pair
             if pair.role is Role.BEHIND:
                 behind = np.maximum(behind, judged.risk)
-            worst = Judgement(
-                *(np.maximum(a, b) for a, b in zip(worst[:3], judged[:3], strict=True)),
-                np.minimum(worst.critical, judged.critical),
-                max(worst.evidence, judged.evidence),
-            )
+            if worst is None or judged.risk[0] > worst.risk[0]:
+                self.worst = pair
+            worst = judged if worst is None else _worse(worst, judged)
+        if worst is None:
+            nothing = np.zeros(len(actions))
+            worst = Judgement(nothing, nothing, nothing, nothing + math.inf, 0.0)
         return worst, behind
 
     def _ahead(self, pair: Pair, actions: _Floats) -> Judgement:
@@ -165,9 +163,11 @@ class TrafficRisk:
         return self.ahead.judge(here, actions)
 
     def _from_behind(self, pair: Pair, actions: _Floats) -> Judgement:
-        survived = self._survived(pair)
-        hit = np.where(actions < -survived, 1.0, 0.0)
-        return Judgement(hit, hit, hit, np.full(len(actions), math.inf), 0.0)
+        nothing = np.zeros(len(actions))
+        hit = nothing
+        if actions.min() < 0.0:
+            hit = np.where(actions < -self._survived(pair), 1.0, 0.0)
+        return Judgement(hit, hit, hit, nothing + math.inf, 0.0)
 
     def _survived(self, pair: Pair) -> float:
         """The hardest braking of oneself that who is behind survives [m/s²]."""
@@ -267,6 +267,17 @@ class TrafficRisk:
                 f"the judge looks at accelerations from {self.low:g} to {self.high:g}, but the set "
                 f"of actions is [{low}, {high}]"
             )
+
+
+def _worse(one: Judgement, other: Judgement) -> Judgement:
+    """The higher risk of each action."""
+    return Judgement(
+        np.maximum(one.risk, other.risk),
+        np.maximum(one.low, other.low),
+        np.maximum(one.high, other.high),
+        np.minimum(one.critical, other.critical),
+        max(one.evidence, other.evidence),
+    )
 
 
 def _best(
