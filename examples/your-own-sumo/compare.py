@@ -1,6 +1,6 @@
 """Collisions and speeds with and without guards in the hasty cars, and what guarding costs.
 
-    python compare.py --seeds 3
+python compare.py --seeds 3
 """
 
 from __future__ import annotations

@@ -35,7 +35,7 @@ def choose(vehicles: str | float | Iterable[str], seed: int = 0) -> Callable[[An
     --------
     >>> chosen = choose(0.5)
     >>> [chosen(None, car) for car in ("a", "b", "c", "d")]
-    [True, False, True, False]
+    [False, True, True, False]
     """
     if isinstance(vehicles, str):
         return _named(vehicles, seed)

@@ -1,12 +1,13 @@
 """Cars that are guarded in a simulation of someone else's.
 
-SUMO goes on driving them. A guard says how hard a car may accelerate in the next step, at most; where
-that is less than its own driver might want, the speed is set, and SUMO still minds all else: red
-lights, right of way, stops. What the driver wanted SUMO tells only after the step.
+SUMO goes on driving them. A guard says how hard a car may accelerate in the next step, at most;
+where that is less than its own driver might want, the speed is set, and SUMO still minds all else:
+red lights, right of way, stops. What the driver wanted SUMO tells only after the step.
 """
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -182,7 +183,7 @@ class Guarding:
         self.decisions += 1
         judge = one.guard.reviser.risk  # type: ignore[attr-defined]
         if isinstance(judge, TrafficRisk) and judge.worst is not None:
-            other = one.around[judge.worst.index - 1]
+            other = one.around[judge.worst.number - 1]
             one.about = ("" if other is None else other.id, judge.worst.role)
         else:
             one.about = one.leader, Role.AHEAD if one.leader else None
@@ -279,13 +280,15 @@ def _leaders_of(guard: Guard | None) -> Manoeuvres:
         raise TypeError(f"the guard has a {type(guard.reviser).__name__}; it needs a judge")
     judge = guard.reviser.risk
     if isinstance(judge, TrafficRisk):
-        return judge.ahead.manoeuvres
+        return copy.deepcopy(judge.ahead.manoeuvres)
     if judge.labels.names != VARIABLES:
         raise ValueError(
             f"the guard's judge observes {judge.labels.names or 'unnamed variables'}; it must be a "
             f"TrafficRisk, or observe {', '.join(VARIABLES)}"
         )
-    return judge.manoeuvres if isinstance(judge, LatentRisk) else Manoeuvres(_LEADER_DECEL)
+    if isinstance(judge, LatentRisk):
+        return copy.deepcopy(judge.manoeuvres)
+    return Manoeuvres(_LEADER_DECEL)
 
 
 def _steps(interval: float, dt: float) -> int:
@@ -293,7 +296,7 @@ def _steps(interval: float, dt: float) -> int:
     steps = round(interval / dt)
     if steps < 1 or abs(steps * dt - interval) > 1e-9 * steps:
         raise ValueError(
-            f"the guard decides every {interval:g} s, which is no multiple of the simulation's step "
-            f"of {dt:g} s"
+            f"the guard decides every {interval:g} s, which is no multiple of the simulation's "
+            f"step of {dt:g} s"
         )
     return steps

@@ -153,7 +153,7 @@ class Attachment:
             self._met[pair] = now
 
     def _paint(self) -> None:
-        """By how it stands: green, amber where it is held back or close, red where it may be lost."""
+        """Green, amber where it is held back or close, red where it may be lost."""
         assert self._colors is not None
         for car, urgency in self._cars.urgency().items():
             color = (_GREEN, _AMBER, _RED)[urgency]
@@ -176,9 +176,9 @@ def attach(
 ) -> Attachment:
     """Guard, or watch, cars of a SUMO simulation that runs.
 
-    From then on each ``simulationStep`` does the rest. A guarded car is driven by SUMO as before, but
-    no faster than its guard allows. It minds the cars ahead and behind in its lane; right of way, red
-    lights and lane changes stay SUMO's.
+    From then on each ``simulationStep`` does the rest. SUMO drives a guarded car as before, but no
+    faster than its guard allows. The guard minds who is ahead and behind in its lane; right of way,
+    red lights and lane changes stay SUMO's.
 
     Parameters
     ----------
@@ -191,15 +191,15 @@ def attach(
         (`guard_for_cars`). Without one, each is told the car's own limits: it counts on SUMO's
         ``decel`` and brakes up to ``emergencyDecel`` where it has to.
     mode : {"revise", "shadow", "watch"}
-        Whether guards act, only say what they would do, or there are none: then only time to collision
-        and needed deceleration are measured.
+        Whether guards act, only say what they would do, or there are none: then only time to
+        collision and needed deceleration are measured.
     tolerance : float
-        Highest risk that is accepted; of a ``guard`` its own.
+        Highest risk that is accepted; a ``guard`` has its own.
     learn : bool
-        Whether the guards learn how hard leaders brake, all from what each sees.
+        Whether the guards learn how hard leaders brake, all of them from what each sees.
     color : bool
-        Whether cars are painted: green, amber where one is held back (or brakes are needed), red where
-        its risk is not tolerable (or hard brakes are needed).
+        Whether cars are painted: green; amber where one is held back, red where its risk is not
+        tolerable. Those that are only watched by the deceleration that they need.
     seed : int
         Of the share.
     tell : callable, optional
@@ -212,25 +212,32 @@ def attach(
     Raises
     ------
     ValueError
-        If mode or vehicles are none of these, or the guard decides at other times than steps.
+        If there is no such mode or choice of vehicles, or the guard decides at other times than
+        those of steps, or observes something else.
     TypeError
         If the guard has no judge.
 
     Notes
     -----
-    The wish of a driver is what SUMO's ``getSpeedWithoutTraCI`` says after the step: ``getAcceleration``
-    is the deed. Where a guard acts, the speed mode has "safe speed" and the acceleration limit on and
-    the braking limit off; it is put back as it was with ``setSpeed(-1)`` as soon as the guard allows
-    all that the car can do. Cars whose speed you set yourself are not for this: ask a `Guard` first.
+    What a driver wants is what SUMO's ``getSpeedWithoutTraCI`` says after the step, while
+    ``getAcceleration`` is what was done. Where a guard acts, the speed mode has "safe speed" and
+    the limit of acceleration on and that of braking off. It is put back as it was, with
+    ``setSpeed(-1)``, as soon as the guard allows all that the car can do. Where you set a car's
+    speed yourself, ask a `Guard` before you do instead.
+
+    A simulation in which time does not go on, as after ``close`` and another ``start``, is
+    another one: attach anew.
 
     Examples
     --------
-    >>> import libsumo  # doctest: +SKIP
-    >>> libsumo.start(["sumo", "-c", "my.sumocfg"])  # doctest: +SKIP
-    >>> guards = attach(libsumo, 0.1)  # doctest: +SKIP
-    >>> while libsumo.simulation.getMinExpectedNumber():  # doctest: +SKIP
-    ...     libsumo.simulationStep()
-    >>> print(guards.guarding.revised, len(guards.collisions))  # doctest: +SKIP
+    >>> import libsumo
+    >>> from evofsm.driving import SumoWorld, load_family
+    >>> scenario = load_family("emergency").draw(seed=0, index=0).scenario
+    >>> with SumoWorld() as world, world.open(scenario) as road:  # or your own simulation
+    ...     watch = attach(libsumo, "all", mode="watch")
+    ...     road.advance(0.0, steps=25)
+    >>> watch.looked
+    50
     """
     if mode not in ATTACH_MODES:
         raise ValueError(f"there is no mode {mode!r}; there are {', '.join(ATTACH_MODES)}")

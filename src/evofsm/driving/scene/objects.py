@@ -56,7 +56,7 @@ class Pair(NamedTuple):
     """Two that may meet if neither does anything about it."""
 
     role: Role
-    index: int  #: of the object in its scene; 0 is oneself
+    number: int  #: of the object in its scene; 0 is oneself
     gap: float  #: from bumper to bumper [m]; 0 or less where they touch
     v_follower: float  #: [m/s]
     v_leader: float  #: [m/s]
@@ -83,13 +83,14 @@ class Scene:
     >>> far = Object("bus", x=0.0, y=3.5, vx=20.0)  # in the lane beside
     >>> scene = Scene(own, [slow, fast, far])
     >>> for pair in scene.pairs():
-    ...     print(scene.objects[pair.index].id, pair.role.value, pair.gap)
-    lorry ahead 31.5
+    ...     print(scene.objects[pair.number].id, pair.role.value, pair.gap)
     van behind 15.0
+    lorry ahead 31.5
     """
 
     def __init__(self, own: Object, others: Sequence[Object] = ()) -> None:
-        self.objects = (own, *others)
+        #: Oneself, then the others, the closest along the road first.
+        self.objects = (own, *sorted(others, key=lambda each: abs(each.x - own.x)))
 
     def pairs(self) -> list[Pair]:
         """With whom one may meet, the closest first."""
@@ -106,13 +107,10 @@ class Scene:
         Returns
         -------
         ((most + 1) * 7,) ndarray
-            A row of `COLUMNS` for oneself, then for each object, the closest first; zeros where
-            there is none.
+            A row of `COLUMNS` for each of `objects`, oneself first; zeros where there is none.
         """
-        own = self.objects[0]
-        nearest = sorted(self.objects[1:], key=lambda each: abs(each.x - own.x))[:most]
         rows = np.zeros((most + 1, len(COLUMNS)))
-        for row, each in zip(rows, (own, *nearest), strict=False):
+        for row, each in zip(rows, self.objects, strict=False):
             row[:] = 1.0, *each[1:7]
         return rows.ravel()
 
@@ -134,7 +132,7 @@ def pairs_of(rows: ArrayLike) -> list[Pair]:
     <Role.CUTTING_IN: 'cutting in'>
     """
     flat = real_array("rows", rows, 1)
-    if not len(flat) or len(flat) % len(COLUMNS):
+    if len(flat) % len(COLUMNS):
         raise ValueError(f"{len(flat)} numbers are no rows of {len(COLUMNS)}: {', '.join(COLUMNS)}")
     own, *others = flat.reshape(-1, len(COLUMNS)).tolist()
     found = []
