@@ -43,10 +43,12 @@ class Attachment:
         None where they are guarded.
     collisions : list of Collision
         Of the whole simulation, other cars included.
+    ever : set of str
+        Vehicles that were guarded, or watched, at any time.
     looked : int
         Cars that were looked at, summed over the steps.
     seconds : float
-        Time that the attachment took [s].
+        Processor time that the attachment took [s].
     """
 
     def __init__(
@@ -84,6 +86,7 @@ class Attachment:
         self._met: dict[tuple[str, str], float] = {}
         self._listener: int | None = None
         self.collisions: list[Collision] = []
+        self.ever: set[str] = set()
         self.looked = 0
         self.seconds = 0.0
 
@@ -116,7 +119,7 @@ class Attachment:
         Returns False, and does nothing, in another simulation: SUMO keeps its listeners when one is
         closed.
         """
-        begin = clock.perf_counter()
+        begin = clock.thread_time()
         now = float(self._sumo.simulation.getTime())
         if now <= self._now:
             self._listener = None
@@ -131,7 +134,7 @@ class Attachment:
             self.watching.step()
         if self._colors is not None:
             self._paint()
-        self.seconds += clock.perf_counter() - begin
+        self.seconds += clock.thread_time() - begin
         return True
 
     def _count_cars(self) -> None:
@@ -140,6 +143,7 @@ class Attachment:
         for car in sorted(here - self._known):
             if self._chosen(self._sumo, car):
                 self._cars.add(car)
+                self.ever.add(car)
         for car in self._known - here:
             self._cars.leave(car)
             self._seeing.forget(car)

@@ -26,7 +26,8 @@ _STEP = 0.25
 _RELEASE = 0.9
 # Who is behind after a lane change has to survive that one brakes so hard in front of it [m/s²].
 _IN_FRONT = 2.0
-_COASTING = np.zeros(1)
+_KEPT = "risk is within the tolerance"
+_COASTING, _ONE = np.zeros(1), np.ones(1)
 
 
 class TrafficRisk:
@@ -147,30 +148,31 @@ class TrafficRisk:
 
     def _judge(self, pairs: list[Pair], actions: _Floats) -> tuple[Judgement, _Floats]:
         """Of all pairs; and the risk from behind alone."""
-        worst, behind = None, np.zeros(len(actions))
-        self.worst = None
+        nothing = np.zeros(len(actions))
+        worst: Judgement | None = None
+        self.worst, hardest, survived = None, -float(actions.min()), math.inf
+        follower = None
         for pair in pairs:
-            judged = (self._from_behind if pair.role is Role.BEHIND else self._ahead)(pair, actions)
             if pair.role is Role.BEHIND:
-                behind = np.maximum(behind, judged.risk)
+                # Who does not brake is hit by nobody that it has to mind.
+                its = self._survived(pair) if hardest > 0.0 else math.inf
+                if its < survived:
+                    survived, follower = its, pair
+                continue
+            judged = self.ahead.judge(
+                Situation(pair.observation, _ONE, None, math.nan, 0.0), actions
+            )
             if worst is None or judged.risk[0] > worst.risk[0]:
                 self.worst = pair
             worst = judged if worst is None else _worse(worst, judged)
         if worst is None:
-            nothing = np.zeros(len(actions))
             worst = Judgement(nothing, nothing, nothing, nothing + math.inf, 0.0)
-        return worst, behind
-
-    def _ahead(self, pair: Pair, actions: _Floats) -> Judgement:
-        here = Situation(pair.observation, np.ones(1), None, math.nan, 0.0)
-        return self.ahead.judge(here, actions)
-
-    def _from_behind(self, pair: Pair, actions: _Floats) -> Judgement:
-        nothing = np.zeros(len(actions))
-        hit = nothing
-        if actions.min() < 0.0:
-            hit = np.where(actions < -self._survived(pair), 1.0, 0.0)
-        return Judgement(hit, hit, hit, nothing + math.inf, 0.0)
+        if hardest <= survived:
+            return worst, nothing
+        hit = np.where(actions < -survived, 1.0, 0.0)
+        if self.worst is None or hit[0] > worst.risk[0]:
+            self.worst = follower
+        return _worse(worst, Judgement(hit, hit, hit, nothing + math.inf, 0.0)), hit
 
     def _survived(self, pair: Pair) -> float:
         """The hardest braking of oneself that who is behind survives [m/s²]."""
@@ -234,13 +236,15 @@ class TrafficRisk:
         Search
         """
         pairs = pairs_of(situation.observation)
-        proposal = np.array([float(wanted)])
+        options = np.concatenate([[wanted], self._grid])
         limit = tolerance * (_RELEASE if revising else 1.0)
-        judged, _ = self._judge(pairs, proposal)
-        if judged.risk[0] <= limit:
-            return Search(proposal, judged, 0, "risk is within the tolerance")
-        options = np.concatenate([proposal, self._grid])
+        if not revising:  # most proposals are kept: look at this one first
+            judged, _ = self._judge(pairs, options[:1])
+            if judged.risk[0] <= limit:
+                return Search(options[:1], judged, 0, _KEPT)
         judged, behind = self._judge(pairs, options)
+        if judged.risk[0] <= limit:
+            return Search(options, judged, 0, _KEPT)
         best, what = _best(options, judged, behind, limit, tolerance)
         return Search(options, judged, best, f"{self.why(judged)}; {what}")
 
