@@ -2,7 +2,8 @@
 
 SUMO goes on driving them. A guard says how hard a car may accelerate in the next step, at most;
 where that is less than its own driver might want, the speed is set, and SUMO still minds all else:
-red lights, right of way, stops. What the driver wanted SUMO tells only after the step.
+red lights, right of way, stops. What a driver wanted shows in what SUMO does; only where it is held
+back, its car-following model is asked.
 """
 
 from __future__ import annotations
@@ -53,6 +54,8 @@ class _Car:
     mode: int | None = None  # SUMO's speed mode before it was taken over
     leader: str = ""
     speed: float = 0.0
+    limit: float = 0.0  # the speed that was set
+    wish: float = 0.0  # the speed that its model wants instead
     time: float = 0.0
     seen: NDArray[np.float64] | None = None  # what is decided on
     around: tuple[Neighbour | None, Neighbour | None] = (None, None)
@@ -199,7 +202,9 @@ class Guarding:
             self._vehicle.setSpeedMode(one.id, one.mode & ~_OFF | _ON)
         reached = max(0.0, speed + float(revision.executed) * self._seeing.dt)
         # Nor faster than it would drive on a free road.
-        self._vehicle.setSpeed(one.id, min(reached, self._vehicle.getAllowedSpeed(one.id)))
+        one.limit = min(reached, self._vehicle.getAllowedSpeed(one.id))
+        one.wish = self._seeing.wish(one.id, speed, one.around[0])
+        self._vehicle.setSpeed(one.id, one.limit)
 
     def _hand_back(self, one: _Car) -> None:
         if one.mode is not None:
@@ -208,8 +213,11 @@ class Guarding:
             one.mode = None
 
     def _look_back(self, one: _Car, speed: float) -> None:
-        """What the driver wanted, now that SUMO tells; in shadow it is what is judged."""
-        wanted = self._vehicle.getSpeedWithoutTraCI(one.id)
+        """What the driver wanted, now that it shows; in shadow it is what is judged."""
+        wanted = speed
+        # Slower than the limit is what SUMO itself wanted, such as to stop at a red light.
+        if one.mode is not None and speed >= one.limit - _SAME:
+            wanted = max(one.wish, speed)
         wish, deed = ((each - one.speed) / self._seeing.dt for each in (wanted, speed))
         if not self._acts and one.revision is None:
             self._decide(one, wish)

@@ -223,11 +223,12 @@ def attach(
 
     Notes
     -----
-    What a driver wants is what SUMO's ``getSpeedWithoutTraCI`` says after the step, while
-    ``getAcceleration`` is what was done. Where a guard acts, the speed mode has "safe speed" and
-    the limit of acceleration on and that of braking off. It is put back as it was, with
-    ``setSpeed(-1)``, as soon as the guard allows all that the car can do. Where you set a car's
-    speed yourself, ask a `Guard` before you do instead.
+    What a driver wants is what its car does, unless it is held back: then it is what SUMO's
+    ``getFollowSpeed`` said before the step. (``getAcceleration`` is the deed, and so is
+    ``getSpeedWithoutTraCI`` of a car whose speed was set.) Where a guard acts, the speed mode has
+    "safe speed" and the limit of acceleration on and that of braking off. It is put back as it was,
+    with ``setSpeed(-1)``, as soon as the guard allows all that the car can do. Where you set a
+    car's speed yourself, ask a `Guard` before you do instead.
 
     A simulation in which time does not go on, as after ``close`` and another ``start``, is
     another one: attach anew.

@@ -34,6 +34,7 @@ class Body(NamedTuple):
 
     length: float  #: [m]
     min_gap: float  #: [m]
+    decel: float  #: [m/s²]
 
 
 class Seeing:
@@ -53,9 +54,12 @@ class Seeing:
         #: Time of a step [s].
         self.dt = float(sumo.simulation.getDeltaT())
         ballistic = str(sumo.simulation.getOption("step-method.ballistic")).lower() in ("true", "1")
-        # In SUMO's Euler step a car drives all of it at the speed of its end, so that whoever
-        # brakes gets less far: by half a step's worth of the speed it loses.
-        self._early = 0.0 if ballistic else 0.5 * self.dt
+        # In SUMO's Euler step a car drives all of it at the speed of its end. Against what is
+        # rehearsed, a slower follower is nearer by half a step's worth of the difference; and
+        # whoever brakes to a standstill within a step gets further by up to an eighth of its
+        # braking over the square of the step. What the Euler step adds to the gap is not counted:
+        # with an actionStepLength in any type SUMO steps ballistically, and no option says so.
+        self._euler = 0.0 if ballistic else self.dt
         self._bodies: dict[str, Body] = {}
 
     def forget(self, car: str) -> None:
@@ -67,7 +71,8 @@ class Seeing:
         body = self._bodies.get(car)
         if body is None:
             vehicle = self._vehicle
-            body = self._bodies[car] = Body(vehicle.getLength(car), vehicle.getMinGap(car))
+            facts = vehicle.getLength(car), vehicle.getMinGap(car), vehicle.getDecel(car)
+            body = self._bodies[car] = Body(*facts)
         return body
 
     def ahead(self, car: str, speed: float) -> Neighbour | None:
@@ -76,19 +81,37 @@ class Seeing:
         if not found or not found[0]:
             return None
         leader, gap = found
-        its, min_gap = self._vehicle.getSpeed(leader), self.body(car).min_gap
-        return Neighbour(leader, gap + min_gap, self._room(gap, min_gap, speed - its), its)
+        its, body = self._vehicle.getSpeed(leader), self.body(car)
+        return Neighbour(leader, gap + body.min_gap, self._room(gap, body, speed - its), its)
 
     def behind(self, car: str, speed: float) -> Neighbour | None:
         """Whoever is behind."""
         follower, gap = self._vehicle.getFollower(car, _far(speed))
         if not follower:
             return None
-        its, min_gap = self._vehicle.getSpeed(follower), self.body(follower).min_gap
-        return Neighbour(follower, gap + min_gap, self._room(gap, min_gap, its - speed), its)
+        its, body = self._vehicle.getSpeed(follower), self.body(follower)
+        return Neighbour(follower, gap + body.min_gap, self._room(gap, body, its - speed), its)
 
-    def _room(self, gap: float, min_gap: float, closing: float) -> float:
-        return gap + (1.0 - self._factor) * min_gap + self._early * closing
+    def wish(self, car: str, speed: float, ahead: Neighbour | None) -> float:
+        """The speed that a car's own model wants after the next step [m/s].
+
+        By whoever is ahead, the limit and what the car can do. Red lights and right of way may make
+        it lower, dawdling too.
+        """
+        vehicle = self._vehicle
+        fastest = min(vehicle.getAllowedSpeed(car), speed + vehicle.getAccel(car) * self.dt)
+        if ahead is None:
+            return float(fastest)
+        gap = ahead.gap - self.body(car).min_gap  # as SUMO's models take it
+        decel = vehicle.getApparentDecel(ahead.id)
+        wanted = vehicle.getFollowSpeed(car, speed, gap, ahead.speed, decel, ahead.id)
+        slowest = speed - vehicle.getEmergencyDecel(car) * self.dt
+        return float(max(min(wanted, fastest), slowest, 0.0))
+
+    def _room(self, gap: float, follower: Body, closing: float) -> float:
+        euler = self._euler
+        late = 0.125 * follower.decel * euler * euler - 0.5 * euler * min(0.0, closing)
+        return gap + (1.0 - self._factor) * follower.min_gap - late
 
     def rows(
         self, car: str, speed: float, ahead: Neighbour | None, behind: Neighbour | None

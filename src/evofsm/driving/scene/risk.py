@@ -34,7 +34,7 @@ class TrafficRisk:
     """Judges accelerations among any number of objects, as the worst of the pairs with them.
 
     An observation is that of `Scene.rows`: a row for oneself, then one for each object. It learns
-    nothing itself; what leaders do can be taught to ``ahead`` (`LatentRisk.manoeuvres`).
+    nothing itself; what leaders do can be taught to ``ahead.manoeuvres``.
 
     Parameters
     ----------
