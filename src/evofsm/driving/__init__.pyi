@@ -1,3 +1,11 @@
+from .attached.chosen import choose as choose
+from .attached.guarded import Guarding as Guarding
+from .attached.guarded import Told as Told
+from .attached.listener import ATTACH_MODES as ATTACH_MODES
+from .attached.listener import Attachment as Attachment
+from .attached.listener import Collision as Collision
+from .attached.listener import attach as attach
+from .attached.watched import Watching as Watching
 from .cars import SAFETY_RULE as SAFETY_RULE
 from .cars import TOLD as TOLD
 from .cars import drive as drive
@@ -78,6 +86,13 @@ from .risk.rss import safe_distance as safe_distance
 from .risk.ttc import TimeToCollision as TimeToCollision
 from .risk.ttc import time_to_collision as time_to_collision
 from .shadow import shadow_drive as shadow_drive
+from .scene.guarding import guard_for_traffic as guard_for_traffic
+from .scene.objects import Object as Object
+from .scene.objects import Pair as Pair
+from .scene.objects import Role as Role
+from .scene.objects import Scene as Scene
+from .scene.objects import pairs_of as pairs_of
+from .scene.risk import TrafficRisk as TrafficRisk
 from .worlds import WORLDS as WORLDS
 from .worlds import open_world as open_world
 from .worlds.gym import CarFollowing as CarFollowing

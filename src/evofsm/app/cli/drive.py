@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from evofsm.app.cli.common import print_json, progress
+from evofsm.app.cli.common import print_json, progress, split_names
 from evofsm.app.cli.declared import option
 from evofsm.app.cli.groups import Driven
 
@@ -30,6 +30,9 @@ class Drive(Driven):
 
     With --checkpoint, the same command goes on where it was stopped, whatever stopped it, and comes
     to the same result; with more --episodes, it goes on to these.
+
+    A SUMO configuration (my.sumocfg) is run as it is, once, with guards in the cars that --vehicles
+    names; of all else only --mode (act or shadow), --tolerance and --json hold then.
     """
 
     episodes: int = option(100, "How many are driven.", min=1)
@@ -48,6 +51,10 @@ class Drive(Driven):
         "Append to this log what the reviser changed or warned of, to be verified and replayed by "
         "evofsm audit.",
     )
+    vehicles: str = option(
+        "10%",
+        "Of a SUMO configuration the guarded cars: all, a share, type:NAME, or ids with commas.",
+    )
     mcap: Path | None = option(
         None, "Write every episode to this log, for Foxglove and evofsm export."
     )
@@ -61,12 +68,17 @@ class Drive(Driven):
 
     def packages(self) -> dict[str, str]:
         """What the files that are asked for need as well."""
+        if self._is_configuration:
+            return {"libsumo": "sumo"}
         written = {"polars": "tables"} if self.out else {}
         live = {} if self.foxglove is None else {"foxglove": "foxglove"}
         return super().packages() | written | ({"mcap": "mcap"} if self.mcap else {}) | live
 
     def run(self) -> None:
         """Drive, and print what came of it."""
+        if self._is_configuration:
+            self._run_configuration()
+            return
         from evofsm.app.driving import episodes_learnt, make_guard, write_driving
         from evofsm.app.text.columns import console
         from evofsm.app.text.driving import driving_document, print_driving
@@ -116,6 +128,39 @@ class Drive(Driven):
             screen.print(f"Every episode, for Foxglove: {self.mcap}", soft_wrap=True)
         if log is not None:
             screen.print(f"Head of {self.audit}, to be kept elsewhere: {log.head}", soft_wrap=True)
+
+    @property
+    def _is_configuration(self) -> bool:
+        return self.family.endswith(".sumocfg")
+
+    def _run_configuration(self) -> None:
+        from evofsm.app.configuration import drive_configuration
+        from evofsm.app.text.columns import console
+        from evofsm.app.text.configuration import print_attached
+
+        for name in ("learn", "frozen", "out", "checkpoint", "audit", "mcap"):
+            if getattr(self, name) is not None:
+                raise ValueError(f"--{name} is for families of scenarios, not for a configuration")
+        modes = {"act": "revise", "shadow": "shadow"}
+        if self.mode not in modes:
+            raise ValueError(f"--mode is {self.mode!r}; for a configuration it is act or shadow")
+        named = self.vehicles.startswith("type:") or self.vehicles == "all"
+        ids = not named and not self.vehicles.endswith("%")
+        chosen = split_names(self.vehicles) if ids else self.vehicles
+        with progress() as bars:
+            task = bars.add_task("Driving", total=None)
+
+            def show(time: float, collisions: int) -> None:
+                if time == int(time):
+                    text = f"Driving ({time:,.0f} s, {collisions} collisions)"
+                    bars.update(task, description=text)
+
+            file, mode = Path(self.family), modes[self.mode]
+            came = drive_configuration(file, chosen, mode, self.tolerance, show)
+        if self.as_json:
+            print_json(came.document())
+        else:
+            print_attached(console(), came)
 
     def _recording(self, setup: Setup) -> AbstractContextManager[RunWriter | None]:
         """A log of the run, where one is asked for."""

@@ -1,0 +1,12 @@
+"""A SUMO script of one's own, with two lines more: the import and the one after ``start``."""
+
+import libsumo
+
+from evofsm.driving import attach
+
+libsumo.start(["sumo", "-c", "grid.sumocfg"])
+guards = attach(libsumo, "type:hasty")
+while libsumo.simulation.getTime() < 400.0:
+    libsumo.simulationStep()
+print(f"{len(guards.collisions)} collisions")
+libsumo.close()

@@ -1,0 +1,1 @@
+"""Guards in a SUMO simulation of someone else's: chosen cars are guarded, or only watched."""

@@ -1,0 +1,262 @@
+"""Attach guards to a running SUMO simulation: which cars come and go, and what it took."""
+
+from __future__ import annotations
+
+import math
+import time as clock
+from collections.abc import Callable, Iterable
+from importlib import import_module
+from typing import Any, NamedTuple
+
+from evofsm.driving.attached.chosen import choose
+from evofsm.driving.attached.guarded import Guarding, Told
+from evofsm.driving.attached.seen import Seeing
+from evofsm.driving.attached.watched import Watching
+from evofsm.guard import TOLERANCE, Guard
+
+#: What is done with the chosen cars.
+ATTACH_MODES = ("revise", "shadow", "watch")
+
+_GREEN, _AMBER, _RED = (40, 160, 70, 255), (240, 160, 0, 255), (215, 40, 40, 255)
+# Two that touched within this time before still do [s].
+_SAME_COLLISION = 5.0
+
+
+class Collision(NamedTuple):
+    """A collision, told once for the two."""
+
+    time: float  #: [s]
+    collider: str  #: of two in a lane the one behind
+    victim: str
+    kind: str  #: as SUMO calls it
+
+
+class Attachment:
+    """What `attach` returns: which cars it is, and what came of them.
+
+    Attributes
+    ----------
+    mode : str
+    guarding : Guarding or None
+        None where cars are only watched.
+    watching : Watching or None
+        None where they are guarded.
+    collisions : list of Collision
+        Of the whole simulation, other cars included.
+    ever : set of str
+        Vehicles that were guarded, or watched, at any time.
+    looked : int
+        Cars that were looked at, summed over the steps.
+    seconds : float
+        Processor time that the attachment took [s].
+    """
+
+    def __init__(
+        self,
+        sumo: Any,
+        chosen: Callable[[Any, str], bool],
+        mode: str,
+        guard: Guard | None,
+        *,
+        tolerance: float,
+        learn: bool,
+        color: bool,
+        tell: Callable[[Told], None] | None,
+    ) -> None:
+        self._sumo, self._chosen, self.mode = sumo, chosen, mode
+        seeing = self._seeing = Seeing(sumo)
+        self.guarding: Guarding | None = None
+        self.watching: Watching | None = None
+        if mode == "watch":
+            self._cars: Guarding | Watching = Watching(sumo, seeing)
+            self.watching = self._cars
+        else:
+            self._cars = self.guarding = Guarding(
+                sumo,
+                seeing,
+                guard,
+                acts=mode == "revise",
+                tolerance=tolerance,
+                learn=learn,
+                tell=tell,
+            )
+        self._colors: dict[str, tuple[int, ...]] | None = {} if color else None
+        self._now = -math.inf
+        self._known: set[str] = set()
+        self._met: dict[tuple[str, str], float] = {}
+        self._listener: int | None = None
+        self.collisions: list[Collision] = []
+        self.ever: set[str] = set()
+        self.looked = 0
+        self.seconds = 0.0
+
+    @property
+    def cars(self) -> list[str]:
+        """Vehicles that are guarded, or watched, now."""
+        return list(self._cars)
+
+    def listen(self) -> None:
+        """Have SUMO call `step` after each of its own."""
+        base = getattr(self._sumo, "StepListener", None) or import_module("traci").StepListener
+
+        def step(_: Any, __: float) -> bool:
+            return self.step()
+
+        listener = type("Listener", (base,), {"step": step})()
+        self._listener = self._sumo.addStepListener(listener)
+
+    def detach(self) -> None:
+        """Hand every car back to SUMO, and listen no longer."""
+        if self._listener is not None:
+            self._sumo.removeStepListener(self._listener)
+            self._listener = None
+        for car in self.cars:
+            self._cars.remove(car)
+
+    def step(self) -> bool:
+        """Take in a step of the simulation that is over, and decide on the next.
+
+        Returns False, and does nothing, in another simulation: SUMO keeps its listeners when one is
+        closed.
+        """
+        begin = clock.thread_time()
+        now = float(self._sumo.simulation.getTime())
+        if now <= self._now:
+            self._listener = None
+            return False
+        self._now = now
+        self._count_cars()
+        self._count_collisions(now)
+        self.looked += len(self._cars)
+        if self.guarding is not None:
+            self.guarding.step(now)
+        if self.watching is not None:
+            self.watching.step()
+        if self._colors is not None:
+            self._paint()
+        self.seconds += clock.thread_time() - begin
+        return True
+
+    def _count_cars(self) -> None:
+        """Cars that are inserted, or come back from a teleport; and those that leave."""
+        here = set(self._sumo.vehicle.getIDList())
+        for car in sorted(here - self._known):
+            if self._chosen(self._sumo, car):
+                self._cars.add(car)
+                self.ever.add(car)
+        for car in self._known - here:
+            self._cars.leave(car)
+            self._seeing.forget(car)
+        self._known = here
+
+    def _count_collisions(self, now: float) -> None:
+        for each in self._sumo.simulation.getCollisions():
+            pair = each.collider, each.victim
+            if now - self._met.get(pair, -math.inf) > _SAME_COLLISION:
+                self.collisions.append(Collision(now, *pair, each.type))
+            self._met[pair] = now
+
+    def _paint(self) -> None:
+        """Green, amber where it is held back or close, red where it may be lost."""
+        assert self._colors is not None
+        for car, urgency in self._cars.urgency().items():
+            color = (_GREEN, _AMBER, _RED)[urgency]
+            if self._colors.get(car) is not color:
+                self._colors[car] = color
+                self._sumo.vehicle.setColor(car, color)
+
+
+def attach(
+    sumo: Any,
+    vehicles: str | float | Iterable[str] = "all",
+    *,
+    guard: Guard | None = None,
+    mode: str = "revise",
+    tolerance: float = TOLERANCE,
+    learn: bool = True,
+    color: bool = False,
+    seed: int = 0,
+    tell: Callable[[Told], None] | None = None,
+) -> Attachment:
+    """Guard, or watch, cars of a SUMO simulation that runs.
+
+    From then on each ``simulationStep`` does the rest. SUMO drives a guarded car as before, but no
+    faster than its guard allows. The guard minds who is ahead and behind in its lane; right of way,
+    red lights and lane changes stay SUMO's.
+
+    Parameters
+    ----------
+    sumo : module or connection
+        libsumo, or traci, with a simulation started.
+    vehicles : str, float or iterable of str
+        ``"all"``, ``"type:NAME"``, a share such as 0.1 or ``"10%"``, or ids; those to come as well.
+    guard : Guard, optional
+        Each car gets a copy, frozen. It observes scenes (`guard_for_traffic`) or gap and speeds
+        (`guard_for_cars`). Without one, each is told the car's own limits: it counts on SUMO's
+        ``decel`` and brakes up to ``emergencyDecel`` where it has to.
+    mode : {"revise", "shadow", "watch"}
+        Whether guards act, only say what they would do, or there are none: then only time to
+        collision and needed deceleration are measured.
+    tolerance : float
+        Highest risk that is accepted; a ``guard`` has its own.
+    learn : bool
+        Whether the guards learn how hard leaders brake, all of them from what each sees.
+    color : bool
+        Whether cars are painted: green; amber where one is held back, red where its risk is not
+        tolerable. Those that are only watched by the deceleration that they need.
+    seed : int
+        Of the share.
+    tell : callable, optional
+        Called with each `Told`.
+
+    Returns
+    -------
+    Attachment
+
+    Raises
+    ------
+    ValueError
+        If there is no such mode or choice of vehicles, or the guard decides at other times than
+        those of steps, or observes something else.
+    TypeError
+        If the guard has no judge.
+
+    Notes
+    -----
+    What a driver wants is what its car does, unless it is held back: then it is what SUMO's
+    ``getFollowSpeed`` said before the step. (``getAcceleration`` is the deed, and so is
+    ``getSpeedWithoutTraCI`` of a car whose speed was set.) Where a guard acts, the speed mode has
+    "safe speed" and the limit of acceleration on and that of braking off. It is put back as it was,
+    with ``setSpeed(-1)``, as soon as the guard allows all that the car can do. Where you set a
+    car's speed yourself, ask a `Guard` before you do instead.
+
+    A simulation in which time does not go on, as after ``close`` and another ``start``, is
+    another one: attach anew.
+
+    Examples
+    --------
+    >>> import libsumo
+    >>> from evofsm.driving import SumoWorld, load_family
+    >>> scenario = load_family("emergency").draw(seed=0, index=0).scenario
+    >>> with SumoWorld() as world, world.open(scenario) as road:  # or your own simulation
+    ...     watch = attach(libsumo, "all", mode="watch")
+    ...     road.advance(0.0, steps=25)
+    >>> watch.looked
+    50
+    """
+    if mode not in ATTACH_MODES:
+        raise ValueError(f"there is no mode {mode!r}; there are {', '.join(ATTACH_MODES)}")
+    if mode == "watch" and guard is not None:
+        raise ValueError("mode 'watch' asks no guard; use mode 'shadow'")
+    attachment = Attachment(
+        sumo,
+        choose(vehicles, seed),
+        mode,
+        guard,
+        tolerance=tolerance,
+        learn=learn,
+        color=color,
+        tell=tell,
+    )
+    attachment.listen()
+    return attachment

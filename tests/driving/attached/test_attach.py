@@ -1,0 +1,222 @@
+"""Guards attached to a SUMO simulation of someone else's."""
+
+import xml.etree.ElementTree as ElementTree
+
+import numpy as np
+import pytest
+
+from evofsm.driving import (
+    LatentRisk,
+    Role,
+    attach,
+    deceleration_to_avoid_collision,
+    guard_for_cars,
+    guard_for_traffic,
+    time_to_collision,
+)
+
+from .conftest import drive
+
+NO_GAP = ("--collision.mingap-factor", "0")
+
+
+def test_shadow_changes_nothing(road):
+    alone = drive(road(*NO_GAP), 25.0)
+    sumo = road(*NO_GAP)
+    told = []
+    guards = attach(sumo, ["ego"], mode="shadow", tell=told.append)
+    assert drive(sumo, 25.0) == alone
+    assert guards.guarding.revised > 0
+    assert [each.collider for each in guards.collisions] == ["ego"]
+    np.testing.assert_allclose([one.wish for one in told], [one.deed for one in told], atol=1e-9)
+
+
+@pytest.mark.parametrize("ballistic", ["true", "false"])
+@pytest.mark.parametrize("options", [NO_GAP, ()])
+def test_a_guarded_car_does_not_collide(road, options, ballistic):
+    sumo = road(*options, "--step-method.ballistic", ballistic)
+    told = []
+    guards = attach(sumo, ["ego"], tell=told.append)
+    speeds = drive(sumo, 25.0)
+    assert guards.collisions == []
+    assert speeds[-1] == 0.0
+    assert 0 < guards.guarding.revised < guards.guarding.decisions
+    held = [one for one in told if one.deed < one.wish - 1e-6]
+    assert {(one.other, one.role) for one in held} == {("lead", Role.AHEAD)}
+    for one in held:
+        stands = speeds[round(one.time / 0.1)] == 0.0
+        assert stands or one.deed <= one.revision.executed + 1e-6
+
+
+def test_a_guard_never_asks_for_more_than_the_driver_wants(road):
+    sumo = road(*NO_GAP)
+    told = []
+    attach(sumo, ["ego"], tell=told.append)
+    drive(sumo, 25.0)
+    assert all(one.deed <= one.wish + 1e-6 for one in told)
+
+
+def test_a_car_is_taken_over_only_where_it_has_to_be_and_handed_back(road):
+    sumo = road(*NO_GAP)
+    guards = attach(sumo, ["ego"])
+    modes = set()
+    for _ in range(160):
+        drive(sumo, 0.1)
+        modes.add(sumo.vehicle.getSpeedMode("ego"))
+    assert modes == {31, 31 & ~4}  # as SUMO has it, and with harder braking allowed
+    assert sumo.vehicle.getSpeedMode("ego") != 31
+    guards.detach()
+    assert sumo.vehicle.getSpeedMode("ego") == 31
+    assert guards.cars == []
+    decisions = guards.guarding.decisions
+    drive(sumo, 1.0)
+    assert guards.guarding.decisions == decisions
+
+
+def test_stops_and_limits_stay_the_drivers(road):
+    stop = (
+        '<vehicle id="third" type="hasty" route="along" depart="0" departPos="10">'
+        '<stop lane="road_0" endPos="300" duration="5"/></vehicle>'
+    )
+    sumo = road(*NO_GAP, others=stop)
+    attach(sumo, "all")
+    stood = False
+    for _ in range(600):
+        drive(sumo, 0.1, brakes_at=np.inf)
+        stood |= sumo.vehicle.getStopState("third") == 1
+        for car in sumo.vehicle.getIDList():
+            assert sumo.vehicle.getSpeed(car) <= sumo.vehicle.getAllowedSpeed(car) + 1e-6
+    assert stood
+
+
+def test_cars_come_and_go(road):
+    later = '<vehicle id="late" type="hasty" route="along" depart="5" departPos="0"/>'
+    sumo = road(*NO_GAP, others=later)
+    guards = attach(sumo, "type:hasty")
+    drive(sumo, 0.2)
+    assert guards.cars == ["ego"]
+    drive(sumo, 6.0)
+    assert guards.cars == ["ego", "late"]
+    sumo.vehicle.remove("ego")
+    drive(sumo, 0.2)
+    assert guards.cars == ["late"]
+
+
+def test_what_leaders_do_is_shared_and_learnt(road):
+    sumo = road(*NO_GAP)
+    guards = attach(sumo, ["ego"])
+    drive(sumo, 25.0)
+    (decel,) = guards.guarding.leaders.decels
+    assert decel == pytest.approx(8.0, abs=0.1)
+
+
+def test_a_guard_of_ones_own_is_copied_and_left_as_it_was(road):
+    sumo = road(*NO_GAP)
+    mine = guard_for_traffic(-9.0, 3.5, 4.5, interval=0.2)
+    guards = attach(sumo, ["ego"], guard=mine)
+    drive(sumo, 25.0)
+    assert guards.collisions == []
+    assert guards.guarding.decisions <= 125
+    assert len(mine.reviser.risk.ahead.manoeuvres) == 0
+
+
+def test_a_guard_that_knows_one_leader_will_do(road):
+    sumo = road(*NO_GAP)
+    mine = guard_for_cars(-4.5, 3.5, interval=0.1, judge=LatentRisk.told(-4.5, 4.5, 9.0, 0.1))
+    guards = attach(sumo, ["ego"], guard=mine)
+    drive(sumo, 25.0)
+    assert guards.collisions == []
+    assert mine.machine.n_states == 0
+
+
+def test_another_simulation_is_left_alone(road):
+    sumo = road(*NO_GAP)
+    first = attach(sumo, ["ego"])
+    drive(sumo, 5.0)
+    sumo = road(*NO_GAP)
+    second = attach(sumo, ["ego"], mode="shadow")
+    decisions = first.guarding.decisions
+    drive(sumo, 25.0)
+    assert first.guarding.decisions == decisions
+    assert second.collisions
+
+
+def test_cars_are_painted_by_how_they_stand(road):
+    sumo = road(*NO_GAP)
+    attach(sumo, ["ego"], color=True)
+    colors = []
+    for _ in range(200):
+        drive(sumo, 0.1)
+        colors.append(sumo.vehicle.getColor("ego")[:3])
+    assert colors[5] == (40, 160, 70)
+    assert (240, 160, 0) in colors
+
+
+# -- Watching --------------------------------------------------------------------------------------
+
+
+def test_sumo_as_referee_measures_the_same(road, tmp_path):
+    """SUMO's SSM device, at every step and online."""
+    given = {
+        "has.ssm.device": "true",
+        "device.ssm.measures": "TTC DRAC",
+        "device.ssm.thresholds": "100 0.0",
+        "device.ssm.range": "150",
+        "device.ssm.extratime": "0",
+        "device.ssm.trajectories": "true",
+        "device.ssm.file": tmp_path / "ssm.xml",
+    }
+    ssm = "".join(f'<param key="{key}" value="{value}"/>' for key, value in given.items())
+    sumo = road(*NO_GAP, "--precision", "6", ssm=ssm)
+    watch = attach(sumo, ["ego"], mode="watch").watching
+    rows, online = [], 0
+    for _ in range(170):
+        drive(sumo, 0.1)
+        rows.append(watch.observations[0])
+        told = sumo.vehicle.getParameter("ego", "device.ssm.minTTC")
+        if told and "ego" in watch.lowest_ttc:
+            assert float(told) == pytest.approx(watch.lowest_ttc["ego"], abs=1e-5)
+            drac = float(sumo.vehicle.getParameter("ego", "device.ssm.maxDRAC"))
+            assert drac == pytest.approx(watch.highest_drac["ego"], abs=1e-5)
+            online += 1
+    sumo.close()
+    assert online > 100
+    (conflict,) = ElementTree.parse(tmp_path / "ssm.xml").getroot()
+    for tag, ours in (
+        ("TTCSpan", time_to_collision(np.array(rows))),
+        ("DRACSpan", deceleration_to_avoid_collision(np.array(rows))),
+    ):
+        theirs = conflict.find(tag).get("values").split()
+        answered = [k for k, each in enumerate(theirs) if each != "NA"]
+        assert len(answered) > 100
+        both = np.array([(float(theirs[k]), ours[k]) for k in answered])
+        np.testing.assert_allclose(both[:, 0], both[:, 1], rtol=1e-5, atol=2e-6)
+
+
+def test_watching_measures_every_car_with_one_ahead(road):
+    sumo = road(*NO_GAP)
+    watch = attach(sumo, "all", mode="watch")
+    drive(sumo, 10.0)
+    assert watch.cars == ["ego", "lead"]
+    assert watch.watching.ids == ["ego"]
+    assert watch.looked == 2 * 100
+    front = sumo.vehicle.getLanePosition("lead") - sumo.vehicle.getLength("lead")
+    gap, speed, leader = watch.watching.observations[0]
+    assert gap == pytest.approx(front - sumo.vehicle.getLanePosition("ego"))
+    assert (speed, leader) == (sumo.vehicle.getSpeed("ego"), sumo.vehicle.getSpeed("lead"))
+
+
+# -- What is refused -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ({"mode": "brake"}, "no mode 'brake'"),
+        ({"guard": guard_for_traffic(-9.0, 3.5, 4.5, 0.25)}, "no multiple"),
+        ({"mode": "watch", "guard": guard_for_traffic(-9.0, 3.5, 4.5, 0.1)}, "asks no guard"),
+    ],
+)
+def test_what_cannot_be_is_refused(road, given, said):
+    with pytest.raises(ValueError, match=said):
+        attach(road(*NO_GAP), "all", **given)
