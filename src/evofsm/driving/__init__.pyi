@@ -85,7 +85,6 @@ from .risk.rss import ResponsibilitySensitiveSafety as ResponsibilitySensitiveSa
 from .risk.rss import safe_distance as safe_distance
 from .risk.ttc import TimeToCollision as TimeToCollision
 from .risk.ttc import time_to_collision as time_to_collision
-from .shadow import shadow_drive as shadow_drive
 from .scene.guarding import guard_for_traffic as guard_for_traffic
 from .scene.objects import Object as Object
 from .scene.objects import Pair as Pair
@@ -93,6 +92,7 @@ from .scene.objects import Role as Role
 from .scene.objects import Scene as Scene
 from .scene.objects import pairs_of as pairs_of
 from .scene.risk import TrafficRisk as TrafficRisk
+from .shadow import shadow_drive as shadow_drive
 from .worlds import WORLDS as WORLDS
 from .worlds import open_world as open_world
 from .worlds.gym import CarFollowing as CarFollowing
