@@ -32,7 +32,9 @@ class Amounts:
         "Does the learnt judge keep any system from failing, and which of its parts does that?"
     )
 
-    systems: str = option(ALL, "Systems with commas, or all.")
+    systems: str = option(
+        ALL, "Systems with commas, or families of scenarios; all is the ten of the page."
+    )
     without: str = option(
         ALL, "Parts that are taken away, each by itself, with commas; all, or none."
     )

@@ -7,6 +7,7 @@ from functools import partial
 from importlib.util import find_spec
 
 from evofsm.app import imported
+from evofsm.driving import FAMILIES
 from evofsm.evidence.systems.acc import Acc
 from evofsm.evidence.systems.cars import Cars
 from evofsm.evidence.systems.cartpole import CartPole
@@ -78,8 +79,8 @@ def make_system(name: str, controller: str | None = None) -> System:
     Parameters
     ----------
     name : str
-        One of `SYSTEMS` or `TASKS`, or ``module:Name`` of a class derived from `System`, which is
-        looked for in the present folder too.
+        One of `SYSTEMS` or `TASKS`, a family of scenarios, or ``module:Name`` of a class derived
+        from `System`, which is looked for in the present folder too.
     controller : str, optional
         One of its controllers; without it the first.
 
@@ -101,7 +102,8 @@ def make_system(name: str, controller: str | None = None) -> System:
         if not isinstance(made, System):
             raise TypeError(f"{name} makes a {type(made).__name__}, which is no System")
         return made
-    known = SYSTEMS | TASKS
+    families = {family: partial(Cars, family=family) for family in FAMILIES}
+    known = families | SYSTEMS | TASKS
     if name not in known:
         raise ValueError(f"there is no system {name!r}; there are {', '.join(known)}")
     return known[name](controller)
