@@ -74,3 +74,19 @@ def test_what_cannot_be_watched_is_said_in_a_line(arguments, error, capfd):
     )
     assert result.exit_code == 2
     assert error in result.output + capfd.readouterr().err
+
+
+@pytest.mark.slow
+def test_a_log_of_others_is_watched(tmp_path):
+    lines = ["id,t,x,y,vx,vy,length,lane"]
+    for k in range(20):
+        for name, x in (("a", 0), ("b", 30)):
+            lines.append(f"{name},{0.1 * k:.1f},{x + 2.0 * k},0,20,0,4,1")
+    (tmp_path / "objects.csv").write_text("\n".join(lines) + "\n")
+    with watch(str(tmp_path / "objects.csv"), "--no-browser") as process:
+        assert "steer the run" in process.stdout.readline()
+        with urlopen(process.stdout.readline().strip(), timeout=10) as answer:
+            assert b"<!doctype html>" in answer.read()
+        process.send_signal(signal.SIGINT)
+        process.communicate(timeout=20)
+    assert process.returncode == 0

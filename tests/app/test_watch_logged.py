@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+from importlib.util import find_spec
 
 import numpy as np
 import pytest
@@ -51,6 +52,33 @@ def bag(path):
         'v_leader = {field = "/scene.data[2]", unit = "km/h"}\n'
     )
     return str(path), str(told)
+
+
+# Two cars on lane 7 of OSI's ground truth, the one behind 2 m/s faster.
+OSI_WRITER = """
+import sys
+import betterosi as osi
+
+def moving(name, x, v):
+    return osi.MovingObject(
+        id=osi.Identifier(value=name),
+        base=osi.BaseMoving(
+            dimension=osi.Dimension3d(length=4.0, width=2.0, height=1.5),
+            position=osi.Vector3d(x=x, y=0.0, z=0.0),
+            orientation=osi.Orientation3d(yaw=0.0),
+            velocity=osi.Vector3d(x=v, y=0.0, z=0.0),
+        ),
+        assigned_lane_id=[osi.Identifier(value=7)],
+    )
+
+with osi.Writer(sys.argv[1]) as writer:
+    for k in range(50):
+        writer.add(osi.GroundTruth(
+            version=osi.InterfaceVersion(version_major=3, version_minor=8, version_patch=0),
+            timestamp=osi.Timestamp(seconds=k // 10, nanos=k % 10 * 100_000_000),
+            moving_object=[moving(1, 2.0 * k, 20.0), moving(2, 50.0 + 1.8 * k, 18.0)],
+        ))
+"""
 
 
 def learn(*arguments):
@@ -112,3 +140,17 @@ def test_the_command_learns_a_bag_and_a_table_of_objects(tmp_path):
     code, printed, errors = learn(objects(tmp_path / "objects.csv"))
     assert code == 0, errors
     assert json.loads(printed)["episodes"] == 1
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(find_spec("betterosi") is None, reason="betterosi is not installed")
+@pytest.mark.parametrize("name", ["trace.osi", "trace.mcap"])
+def test_a_trace_of_osi_that_its_library_wrote_is_learnt_from_and_watched(tmp_path, name):
+    path = str(tmp_path / name)
+    subprocess.run([sys.executable, "-c", OSI_WRITER, path], check=True)
+    code, printed, errors = learn(path)
+    assert code == 0, errors
+    assert json.loads(printed)["rows"] == 50
+    record_log(path, tmp_path / "run.mcap")
+    recording = Recording(tmp_path / "run.mcap")
+    assert recording.step().gap == pytest.approx(46.0)

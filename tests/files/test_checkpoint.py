@@ -375,3 +375,15 @@ def test_a_little_torture_harms_nothing():
     assert "15 kills" in result.stdout
     assert "200 damaged files" in result.stdout
     assert "36 forged logs" in result.stdout
+
+
+def test_a_folder_is_known_by_its_files(tmp_path):
+    folder = tmp_path / "bag"
+    folder.mkdir()
+    (folder / "metadata.yaml").write_text("version: 9")
+    (folder / "bag.db3").write_text("1234")
+    (before,) = fingerprints([folder])
+    assert before["bytes"] == 14
+    assert [Path(one["name"]).name for one in before["files"]] == ["bag.db3", "metadata.yaml"]
+    (folder / "bag.db3").write_text("1235")
+    assert fingerprints([folder]) != [before]

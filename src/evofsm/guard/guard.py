@@ -120,7 +120,7 @@ class Guard:
         Width of an interval of actions, for the machine; without it a 17th of the range. Vectors
         lie in the cells of a grid instead (`BoxActions`).
     audit : Witness, optional
-        Records what is decided: an `AuditLog`.
+        Records what is decided: an `AuditLog`, or `evofsm.io.FoxgloveSink`, which shows it.
     explaining : Explain, optional
         For which decisions the machine's experience is looked up; without it for none, and with
         an audit log for those that speak.

@@ -223,7 +223,7 @@ def _open(
         if topics is None:
             raise ValueError(
                 f"{path} is a bag of ROS 2; --topics names a file that says which field of which "
-                "topic is which variable (docs/logs.md has one)"
+                "topic is which variable (docs/how-to/logs-of-others.md has one)"
             )
         return BagTable(path, topics, on_read)
     if kind == "run":
