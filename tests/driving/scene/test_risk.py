@@ -90,6 +90,23 @@ def test_what_is_sure_ahead_weighs_more_than_who_is_behind():
     assert guard.decide(rows, 1.0).executed == LOW
 
 
+def test_where_who_is_behind_cannot_be_spared_one_brakes_as_softly_as_one_can():
+    guard = guard_for_traffic(LOW, HIGH, DECEL, INTERVAL)
+    rows = Scene(ME, [ahead(27.0, 0.0), behind(0.5, 15)]).rows(2)
+    revision = guard.decide(rows, 1.0)
+    assert -DECEL <= revision.executed < 0.0
+    assert "the softest for ahead" in revision.reason
+    here = Situation(rows, np.ones(1), None, np.nan, 0.0)
+    assert (
+        judge()
+        .ahead.judge(
+            here._replace(observation=np.array([27.0, 15.0, 0.0])), [revision.executed + 0.25]
+        )
+        .risk[0]
+        > 0.02
+    )
+
+
 def test_hard_braking_of_the_driver_is_softened_for_who_is_behind():
     guard = guard_for_traffic(LOW, HIGH, DECEL, INTERVAL)
     revision = guard.decide(Scene(ME, [behind(12.0, 15)]).rows(1), -9.0)

@@ -90,10 +90,12 @@ class Guarding:
     ) -> None:
         self._vehicle, self._seeing, self._acts, self._tell = sumo.vehicle, seeing, acts, tell
         self._template, self._tolerance, self._learn = guard, tolerance, learn
-        self._judges: dict[str, TrafficRisk] = {}
+        self._judges: dict[tuple[float, float, float], TrafficRisk] = {}
         self._cars: dict[str, _Car] = {}
         self._watches: dict[str, BrakeWatch] = {}
         self.leaders = _leaders_of(guard)
+        if guard is not None:
+            self._tolerance = guard.reviser.tolerance  # type: ignore[attr-defined]
         self.interval = seeing.dt if guard is None or guard.interval is None else guard.interval
         self._every = _steps(self.interval, seeing.dt)
         self._steps = 0
@@ -251,23 +253,13 @@ class Guarding:
     def _guard_for(self, car: str, high: float) -> Guard:
         mode = Mode.ACT if self._acts else Mode.SHADOW
         if self._template is None:
-            kind, vehicle = self._vehicle.getTypeID(car), self._vehicle
-            low = -max(vehicle.getEmergencyDecel(car), vehicle.getDecel(car))
-            judge = self._judges.get(kind)
-            if judge is None:
-                judge = TrafficRisk.told(
-                    low, high, vehicle.getDecel(car), self.interval, leader_decel=_LEADER_DECEL
-                )
-                judge.ahead.manoeuvres = self.leaders
-                self._judges[kind] = judge
+            vehicle = self._vehicle
+            decel = vehicle.getDecel(car)
+            low = -max(vehicle.getEmergencyDecel(car), decel)
+            judge = self._judge_for(low, high, decel)
+            dt, tolerated = self.interval, self._tolerance
             return guard_for_traffic(
-                low,
-                high,
-                -judge.ahead.lowest,
-                self.interval,
-                judge=judge,
-                tolerance=self._tolerance,
-                mode=mode,
+                low, high, decel, dt, judge=judge, tolerance=tolerated, mode=mode
             )
         guard = self._template.copy()
         guard.freeze()
@@ -278,6 +270,15 @@ class Guarding:
         if isinstance(latent, LatentRisk):
             latent.manoeuvres = self.leaders
         return guard
+
+    def _judge_for(self, low: float, high: float, decel: float) -> TrafficRisk:
+        """One for all cars that can do the same: it remembers nothing of any."""
+        judge = self._judges.get((low, high, decel))
+        if judge is None:
+            judge = TrafficRisk.told(low, high, decel, self.interval, leader_decel=_LEADER_DECEL)
+            judge.ahead.manoeuvres = self.leaders
+            self._judges[low, high, decel] = judge
+        return judge
 
 
 def _leaders_of(guard: Guard | None) -> Manoeuvres:

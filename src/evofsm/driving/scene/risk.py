@@ -55,9 +55,9 @@ class TrafficRisk:
 
     Notes
     -----
-    Where no action is tolerable for all, the one that the car behind survives and that is least
-    risky ahead is taken; and the hardest braking where a leader who merely keeps its speed would be
-    hit otherwise.
+    Where no action is tolerable for all, it is the one that the car behind survives and that is
+    least risky ahead. Where a leader who merely keeps its speed would be hit then, it is the
+    softest braking that is tolerable ahead; the hardest if none is.
 
     Examples
     --------
@@ -146,8 +146,8 @@ class TrafficRisk:
         given = np.ascontiguousarray(actions, np.float64)
         return self._judge(pairs_of(situation.observation), given)[0]
 
-    def _judge(self, pairs: list[Pair], actions: _Floats) -> tuple[Judgement, _Floats]:
-        """Of all pairs; and the risk from behind alone."""
+    def _judge(self, pairs: list[Pair], actions: _Floats) -> tuple[Judgement, _Floats, _Floats]:
+        """Of all pairs; and the risk ahead and that from behind alone."""
         nothing = np.zeros(len(actions))
         worst: Judgement | None = None
         self.worst, hardest, survived = None, -float(actions.min()), math.inf
@@ -168,11 +168,12 @@ class TrafficRisk:
         if worst is None:
             worst = Judgement(nothing, nothing, nothing, nothing + math.inf, 0.0)
         if hardest <= survived:
-            return worst, nothing
+            return worst, worst.risk, nothing
         hit = np.where(actions < -survived, 1.0, 0.0)
         if self.worst is None or hit[0] > worst.risk[0]:
             self.worst = follower
-        return _worse(worst, Judgement(hit, hit, hit, nothing + math.inf, 0.0)), hit
+        from_behind = Judgement(hit, hit, hit, nothing + math.inf, 0.0)
+        return _worse(worst, from_behind), worst.risk, hit
 
     def _survived(self, pair: Pair) -> float:
         """The hardest braking of oneself that who is behind survives [m/s²]."""
@@ -207,7 +208,7 @@ class TrafficRisk:
         rows = np.array(situation.observation)
         rows[COLUMNS.index("y")] += to
         pairs = pairs_of(rows)
-        judged, _ = self._judge(pairs, np.array([float(action)]))
+        judged, _, _ = self._judge(pairs, np.array([float(action)]))
         behind = [pair for pair in pairs if pair.role is Role.BEHIND]
         if any(pair.gap <= 0.0 or self._survived(pair) < _IN_FRONT for pair in behind):
             sure = np.ones(1)
@@ -239,13 +240,13 @@ class TrafficRisk:
         options = np.concatenate([[wanted], self._grid])
         limit = tolerance * (_RELEASE if revising else 1.0)
         if not revising:  # most proposals are kept: look at this one first
-            judged, _ = self._judge(pairs, options[:1])
+            judged, _, _ = self._judge(pairs, options[:1])
             if judged.risk[0] <= limit:
                 return Search(options[:1], judged, 0, _KEPT)
-        judged, behind = self._judge(pairs, options)
+        judged, ahead, behind = self._judge(pairs, options)
         if judged.risk[0] <= limit:
             return Search(options, judged, 0, _KEPT)
-        best, what = _best(options, judged, behind, limit, tolerance)
+        best, what = _best(options, judged, ahead, behind, limit, tolerance)
         return Search(options, judged, best, f"{self.why(judged)}; {what}")
 
     def why(self, judged: Judgement) -> str:
@@ -288,7 +289,12 @@ def _worse(one: Judgement, other: Judgement) -> Judgement:
 
 
 def _best(
-    options: _Floats, judged: Judgement, behind: _Floats, limit: float, tolerance: float
+    options: _Floats,
+    judged: Judgement,
+    ahead: _Floats,
+    behind: _Floats,
+    limit: float,
+    tolerance: float,
 ) -> tuple[int, str]:
     """Index of the best option, and what it is; the first option is the proposal."""
     change = np.abs(options - options[0])
@@ -299,6 +305,9 @@ def _best(
     survived = np.flatnonzero(behind <= tolerance)
     if len(survived) and judged.critical[survived].max() > 0.0:
         # Of several that are least risky the hardest braking.
-        rank = np.lexsort((options[survived], judged.risk[survived]))
+        rank = np.lexsort((options[survived], ahead[survived]))
         return int(survived[rank[0]]), "nothing can, the least risky that who is behind survives"
+    tolerable = np.flatnonzero(ahead <= tolerance)
+    if len(tolerable):
+        return int(tolerable[options[tolerable].argmax()]), "nothing can, the softest for ahead"
     return int(options.argmin()), "nothing can, the hardest braking"
