@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from evofsm.app.monitor.decider import Decider
-from evofsm.app.monitor.defaults import guard_of_monitor
+from evofsm.app.monitor.defaults import guard_of_monitor, guard_of_traffic
 from evofsm.driving.cars import guard_for_cars
 from evofsm.driving.revisers import AlwaysBrake
 from evofsm.guard.auditing.log import AuditLog
@@ -234,3 +234,33 @@ def test_answers_are_json():
 def test_an_episode_has_a_row_at_least():
     with pytest.raises(ValueError, match="episode is 0"):
         Decider(made(), episode=0)
+
+
+def test_in_traffic_the_worst_object_is_named_and_who_is_behind_counts():
+    decider = Decider(guard_of_traffic(interval=0.1, brakes=6.0))
+    ego = {"x": 0.0, "y": 0.0, "vx": 14.0, "length": 5.0}
+    ahead = {"id": "lorry", "x": 16.0, "y": 0.2, "vx": 9.0, "length": 10.0, "width": 2.5}
+    beside = ahead | {"id": "bus", "y": 3.5}
+    close = {"id": 7, "x": -7.0, "y": 0.0, "vx": 16.0, "length": 4.0}
+
+    def seen(time, *objects, proposal=0.5):
+        told = {"time": time, "ego": ego, "objects": objects, "proposal": proposal}
+        return decider.answer(json.dumps(told).encode())
+
+    free = seen(0.0, beside)
+    assert (free["alarm"], free["object"], free["role"]) == (False, None, None)
+    stuck = seen(0.1, beside, ahead)
+    assert (stuck["alarm"], stuck["object"], stuck["role"]) == (True, "lorry", "ahead")
+    braking = seen(0.2, close, proposal=-6.0)
+    assert (braking["alarm"], braking["object"], braking["role"]) == (True, "7", "behind")
+    assert braking["executed"] == -6.0  # in the shadow
+    flat = {key: value for key, value in ahead.items() if key != "y"}
+    refused = seen(0.3, flat | {"lane": 1}, ahead)
+    assert (refused["kind"], refused["about"]) == ("error", "objects[0].lane")
+    assert seen(0.4)["alarm"] is False
+
+
+def test_a_guard_of_traffic_takes_scenes_alone():
+    decider = Decider(guard_of_traffic(interval=0.1, brakes=6.0))
+    answer = decider.answer(b'{"time": 0, "gap": 9, "v_follower": 9, "v_leader": 9, "proposal": 0}')
+    assert (answer["kind"], answer["about"]) == ("error", "gap")

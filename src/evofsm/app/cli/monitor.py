@@ -40,6 +40,9 @@ class Monitor(Command):
     brakes: float = option(
         6.0, "Hardest braking of the own car [m/s²], if no guard is given.", min=0.5, max=20.0
     )
+    traffic: bool = option(
+        False, "Judge all objects of scenes, who is behind included; nothing of it is learnt."
+    )
     mode: str = option(
         "shadow", "How far it goes: shadow (it executes what is proposed), advise, or act."
     )
@@ -83,6 +86,10 @@ class Monitor(Command):
             > 1
         ):
             raise ValueError("give one of FILE, --socket, --udp and --zenoh")
+        if self.traffic and (self.guard or self.state or self.learn):
+            raise ValueError(
+                "--traffic learns nothing: it goes with none of --guard, --state and --learn"
+            )
         heartbeat = None if self.heartbeat is None else positive("--heartbeat", self.heartbeat)
         with ExitStack() as stack:
             state = None
@@ -119,9 +126,11 @@ class Monitor(Command):
     # -- The guard ------------------------------------------------------------------------------
 
     def _fresh(self) -> Guard:
-        from evofsm.app.monitor.defaults import guard_of_monitor
+        from evofsm.app.monitor.defaults import guard_of_monitor, guard_of_traffic
         from evofsm.guard import Guard
 
+        if self.traffic:
+            return guard_of_traffic(self.interval, self.brakes)
         if self.guard is not None:
             return Guard.load(self.guard)
         return guard_of_monitor(self.interval, self.brakes)
@@ -190,9 +199,15 @@ def _compile(guard: Guard) -> None:
     """Decide a few times on a copy, which then is thrown away."""
     import numpy as np
 
+    from evofsm.app.monitor.schema import Form
+    from evofsm.driving import Object, Scene
+
     twin = guard.copy()
     count = len(twin.variables) or (0 if twin.machine is None else twin.machine.n_variables)
     seen = np.array([30.0, 20.0, 20.0]) if count == 3 else np.ones(max(1, count))
+    if Form.of(guard).scenes:
+        own, other = Object("", 0.0, 0.0, 20.0), Object("", 30.0, 0.0, 10.0)
+        seen = Scene(own, [other, other._replace(x=-20.0)]).rows(2)
     for k in range(4):
         twin.decide(seen + 0.1 * k, None)
     twin.end(observation=seen)

@@ -189,11 +189,21 @@ class Decider:
             "decision",
             time=row.time,
             **({} if row.ahead is None else {"ahead": row.ahead}),
+            **self._worst(row),
             **{name: _plain(RECORD[name].read(said)) for name in SAID},
             alarm=self._is_alarm(revision),
             mode=self.mode.value,
             **({"note": "; ".join(notes)} if notes else {}),
         )
+
+    def _worst(self, row: Row) -> Answer:
+        """Who of a scene the proposal is most dangerous with."""
+        if not self.form.scenes:
+            return {}
+        pair = self.guard.reviser.risk.worst  # type: ignore[attr-defined]
+        if pair is None:
+            return {"object": None, "role": None}
+        return {"object": row.objects[pair.number - 1], "role": pair.role.value}
 
     def _kept(self, row: Row, notes: list[str]) -> Answer:
         """Nothing is ahead: whatever is wanted is done."""

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from evofsm.core import positive
-from evofsm.driving import REAL_DRIVES, LatentRisk, guard_for_cars
+from evofsm.driving import REAL_DRIVES, LatentRisk, TrafficRisk, guard_for_cars, guard_for_traffic
 from evofsm.guard import Guard, Mode
 
 # The strongest acceleration that may be proposed [m/s²].
 _HIGHEST = 2.5
 # The weight of one brake so hard that is taken to have been seen beside those of the table [m/s²].
 _HARDEST = 10.0
+_QUIET = Mode.SHADOW
 
 
 def guard_of_monitor(interval: float, brakes: float) -> Guard:
@@ -30,11 +31,33 @@ def guard_of_monitor(interval: float, brakes: float) -> Guard:
     >>> guard.decide([60.0, 20.0, 20.0], proposal=0.0).reason
     'never seen before; risk is within the tolerance'
     """
-    judge = LatentRisk.told(
+    return guard_for_cars(-brakes, _HIGHEST, interval, judge=_ahead(interval, brakes), mode=_QUIET)
+
+
+def guard_of_traffic(interval: float, brakes: float) -> Guard:
+    """The same among any number of objects, who is behind included; it learns nothing.
+
+    Parameters
+    ----------
+    interval : float
+        Time between two scenes [s].
+    brakes : float
+        Hardest braking of the own car [m/s²].
+
+    Examples
+    --------
+    >>> guard_of_traffic(interval=0.1, brakes=6.0).reviser.mode
+    <Mode.SHADOW: 'shadow'>
+    """
+    judge = TrafficRisk(_ahead(interval, brakes), -brakes, _HIGHEST)
+    return guard_for_traffic(-brakes, _HIGHEST, brakes, interval, judge=judge, mode=_QUIET)
+
+
+def _ahead(interval: float, brakes: float) -> LatentRisk:
+    return LatentRisk.told(
         -positive("brakes", brakes),
         brakes,
         _HARDEST,
         positive("interval", interval),
         leaders=REAL_DRIVES,
     )
-    return guard_for_cars(-brakes, _HIGHEST, interval, judge=judge, mode=Mode.SHADOW)

@@ -15,14 +15,16 @@ import numpy as np
 
 from evofsm.app.monitor.objects import Ahead, nearest_ahead
 from evofsm.core import visible
-from evofsm.driving import VARIABLES
+from evofsm.driving import VARIABLES, Object, Scene, TrafficRisk
 from evofsm.files import LARGEST_OBSERVATION as _LARGEST
-from evofsm.guard import BoxActions, Choices, Guard
+from evofsm.guard import ActionReviser, BoxActions, Choices, Guard
 
 #: The version of the messages.
 SCHEMA = 1
 #: A longer line is refused unread [byte].
 LONGEST = 1 << 16
+# Objects that a guard of whole scenes has room for; of more the closest along the road count.
+_MOST = 64
 # So much of what is refused is shown [letters].
 _SHOWN = 40
 _LARGEST_ID = 1 << 63
@@ -61,13 +63,16 @@ class Row(NamedTuple):
     observation: tuple[Number, ...] | None
     proposal: Action  #: None where nothing was proposed
     ahead: str | int | None = None  #: id of the object that is followed, in a scene
+    #: ids of all objects, where all are judged: number 1 first
+    objects: tuple[str, ...] = ()
 
     @classmethod
     def kept(cls, values: Sequence[Any]) -> Self:
         """The row that JSON has kept as a list."""
-        time, observation, proposal, ahead = values
+        time, observation, proposal, ahead, *others = values
         seen = None if observation is None else tuple(observation)
-        return cls(time, seen, tuple(proposal) if isinstance(proposal, list) else proposal, ahead)
+        wanted = tuple(proposal) if isinstance(proposal, list) else proposal
+        return cls(time, seen, wanted, ahead, *map(tuple, others))
 
 
 class End(NamedTuple):
@@ -93,13 +98,15 @@ class Form:
         Where an action is an index; else 0.
     proposal : float, optional
         Taken where a row has none; without it such a row is refused.
+    scenes : bool
+        Whether the guard observes whole scenes.
 
     Examples
     --------
     >>> form = Form(("gap", "v_follower", "v_leader"), 3)
     >>> line = b'{"time": 1.5, "gap": 30, "v_follower": 20, "v_leader": null, "proposal": 0.5}'
     >>> form.read(line)
-    Row(time=1.5, observation=(30.0, 20.0, None), proposal=0.5, ahead=None)
+    Row(time=1.5, observation=(30.0, 20.0, None), proposal=0.5, ahead=None, objects=())
     >>> form.read(b'{"end": true, "failed": true}')
     End(failed=True, observation=None)
     >>> form.read(b'{"schema": 2}')
@@ -112,6 +119,7 @@ class Form:
     components: int = 0
     n_actions: int = 0
     proposal: float | None = None
+    scenes: bool = False
 
     @classmethod
     def of(cls, guard: Guard, proposal: float | None = None) -> Self:
@@ -123,6 +131,8 @@ class Form:
             np.size(actions.low) if isinstance(actions, BoxActions) else 0,
             actions.n_actions if isinstance(actions, Choices) else 0,
             proposal,
+            isinstance(guard.reviser, ActionReviser)
+            and isinstance(guard.reviser.risk, TrafficRisk),
         )
 
     def read(self, line: bytes) -> Row | End:
@@ -150,7 +160,7 @@ class Form:
             )
         if "end" in told:
             return self._end(told)
-        if "objects" in told or "ego" in told:
+        if self.scenes or "objects" in told or "ego" in told:
             return self._scene(told)
         _refuse_unknown(told, "", {"schema", "time", "proposal", *self._keys})
         return Row(_number(told, "time"), self._observation(told), self._action(told))
@@ -206,7 +216,7 @@ class Form:
 
     def _scene(self, told: Mapping[str, Any]) -> Row:
         _refuse_unknown(told, "", {"schema", "time", "proposal", "ego", "objects"})
-        if self.variables != VARIABLES:
+        if self.variables != VARIABLES and not self.scenes:
             raise MessageError(
                 "objects", "are for guards of car following; send a row of this guard's variables"
             )
@@ -218,8 +228,15 @@ class Form:
         along = "s" if "s" in ego else "x"
         mine = _placed(ego, "ego", along)
         others = [_named(one, f"objects[{k}]", along, mine) for k, one in enumerate(objects)]
-        ahead: Ahead | None = nearest_ahead(mine, others, along)
         time, proposal = _number(told, "time"), self._action(told)
+        if self.scenes:
+            scene = Scene(
+                _object(mine, "ego", along),
+                [_object(one, f"objects[{k}]", along) for k, one in enumerate(others)],
+            )
+            names = tuple(each.id for each in scene.objects[1 : _MOST + 1])
+            return Row(time, tuple(scene.rows(_MOST).tolist()), proposal, objects=names)
+        ahead: Ahead | None = nearest_ahead(mine, others, along)
         if ahead is None:
             return Row(time, None, proposal)
         return Row(time, ahead[1:], proposal, ahead.name)
@@ -321,6 +338,15 @@ def _placed(one: Any, where: str, along: str) -> dict[str, Any]:
     if "lane" not in one and "y" not in one:
         raise MessageError(f"{where}.y", "is missing, and so is lane; one of them is needed")
     return one
+
+
+def _object(placed: Mapping[str, Any], where: str, along: str) -> Object:
+    """An object whose sides are known, so that it can be told who is in whose way."""
+    if "y" not in placed:
+        raise MessageError(f"{where}.y", "is missing; who is in whose way is told from it")
+    told = {key: placed[key] for key in ("vy", "width") if key in placed}
+    name = str(placed.get("id", where))
+    return Object(name, placed[along], placed["y"], placed["vx"], length=placed["length"], **told)
 
 
 def _named(one: Any, where: str, along: str, ego: Mapping[str, Any]) -> dict[str, Any]:
