@@ -1,7 +1,7 @@
 """Decisions of any guard live in Foxglove or Lichtblick, or as a file for it.
 
-The channels are those of logs in MCAP (`evofsm.io.write_run`), and `FOXGLOVE_LAYOUT` shows both. Foxglove's
-own library serves and writes; nothing leaves this computer unless it is told another host.
+The channels are those of logs in MCAP (`evofsm.io.write_run`), and `FOXGLOVE_LAYOUT` shows both.
+Foxglove's own library serves and writes; nothing leaves this computer unless another host is told.
 """
 
 from __future__ import annotations
