@@ -71,19 +71,24 @@ def stored(data):
             raise AssertionError(f"rows of the loaded matrices are no distributions: {matrices}")
 
 
-TARGETS = {target.__name__: target for target in (csv, fcd, gzipped, parquet, stored)}
+def osi(data):
+    """A trace of OSI, which is known by its name."""
+    _outcome(data, _FILE.with_suffix(".osi"))
 
 
-def _outcome(data):
+TARGETS = {target.__name__: target for target in (csv, fcd, gzipped, parquet, stored, osi)}
+
+
+def _outcome(data, path=_FILE):
     """The chunks that are read, as bytes, or what was said against them."""
     from evofsm.io.traces import read_traces
 
-    _FILE.write_bytes(data)
+    path.write_bytes(data)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error")
             warnings.simplefilter("ignore", ResourceWarning)  # of what an error still holds
-            chunks = list(read_traces([str(_FILE)]))
+            chunks = list(read_traces([str(path)]))
     except ValueError as error:
         _must_name_the_file(error)
         return str(error)
@@ -214,7 +219,8 @@ def main():
         done, findings = at_random(name, asked.seconds, asked.found, asked.seed)
         print(f"{name}: {done:,} executions in {asked.seconds} s, {findings} findings")
         total += findings
-    _FILE.unlink(missing_ok=True)
+    for path in (_FILE, _FILE.with_suffix(".osi")):
+        path.unlink(missing_ok=True)
     sys.exit(total > 0)
 
 

@@ -32,7 +32,7 @@ def test_what_is_in_the_corpus_is_read_or_refused(name):
         fuzz.TARGETS[name](path.read_bytes())
 
 
-@pytest.mark.parametrize("name", ["csv", "fcd", "gzipped"])
+@pytest.mark.parametrize("name", ["csv", "fcd", "gzipped", "osi"])
 def test_a_little_fuzzing_finds_nothing(name, tmp_path):
     done, findings = fuzz.at_random(name, 0.5, tmp_path)
     assert done

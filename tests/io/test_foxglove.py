@@ -17,7 +17,7 @@ from mcap.reader import make_reader
 from evofsm.driving import DECISION_COLUMNS, guard_for_cars
 from evofsm.guard import Guard
 from evofsm.io import channels, read_run, write_run
-from evofsm.io.foxglove import LAYOUT, FoxgloveSink
+from evofsm.io.foxglove import FOXGLOVE_LAYOUT, FoxgloveSink
 
 pytestmark = pytest.mark.usefixtures("compiled")
 
@@ -109,7 +109,7 @@ def test_whoever_connects_sees_the_decisions_as_they_are_made():
 
 
 def test_the_layout_names_only_what_there_is():
-    layout = json.loads(LAYOUT.read_text())
+    layout = json.loads(FOXGLOVE_LAYOUT.read_text())
     schemas = channels.schemas_of()
     text = json.dumps(layout)
     paths = re.findall(r'"value": "(/\w+)\.(\w+)"', text)

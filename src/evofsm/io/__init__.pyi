@@ -8,7 +8,7 @@ from .fcd import VehicleLengths as VehicleLengths
 from .files import file_kind as file_kind
 from .files import silent as silent
 from .following import ACTION as ACTION
-from .foxglove import LAYOUT as LAYOUT
+from .foxglove import FOXGLOVE_LAYOUT as FOXGLOVE_LAYOUT
 from .foxglove import FoxgloveSink as FoxgloveSink
 from .graphs import to_mermaid as to_mermaid
 from .mcap import RecordedEpisode as RecordedEpisode

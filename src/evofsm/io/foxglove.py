@@ -1,7 +1,7 @@
 """Decisions of any guard live in Foxglove or Lichtblick, or as a file for it.
 
-The channels are those of logs in MCAP (`evofsm.io.write_run`), and `LAYOUT` shows both. Foxglove's
-own library serves and writes; nothing leaves this computer unless it is told another host.
+The channels are those of logs in MCAP (`evofsm.io.write_run`), and `FOXGLOVE_LAYOUT` shows both.
+Foxglove's own library serves and writes; nothing leaves this computer unless another host is told.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ with needs("foxglove-sdk", "foxglove", "a live view in Foxglove"):
     from foxglove.websocket import ServerListener
 
 #: A layout of cars, to be imported: *Layouts, Import from file*.
-LAYOUT = Path(__file__).with_name("foxglove_layout.json")
+FOXGLOVE_LAYOUT = Path(__file__).with_name("foxglove_layout.json")
 
 _SECOND = 1_000_000_000  # [ns]
 # Between two episodes [s].

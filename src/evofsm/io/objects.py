@@ -128,7 +128,7 @@ def pairs_of_scenes(path: str, scenes: Iterable[Scene]) -> Iterator[Moment]:
 
 def _pointing(one: Object, pointed: dict[str, float]) -> Object:
     """The same object with a heading, if it is known from now or before."""
-    heading = one.heading
+    heading = one.heading if np.isfinite(one.heading) else np.nan
     if np.isnan(heading) and np.hypot(one.vx, one.vy) >= _STANDING:
         heading = float(np.arctan2(one.vy, one.vx))
     if np.isnan(heading):

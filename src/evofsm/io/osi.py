@@ -16,6 +16,7 @@ from contextlib import contextmanager
 from typing import BinaryIO
 
 from evofsm.extras import needs
+from evofsm.files import LARGEST_OBSERVATION
 from evofsm.io.files import OnRead, damage_explained, open_unpacked
 from evofsm.io.objects import Object, Scene
 
@@ -170,7 +171,8 @@ def _object(place: str, moving: _Parts) -> Object:
     length = _number(_within(base, _DIMENSION), 1)
     x, y, vx, vy = (_number(part, axis) for part in (position, velocity) for axis in (1, 2))
     heading = _number(_within(base, _ORIENTATION), _YAW) if base[_ORIENTATION] else math.nan
-    if not (math.isfinite(x + y + vx + vy) and 0.0 < length < math.inf):
+    usable = all(abs(number) <= LARGEST_OBSERVATION for number in (x, y, vx, vy, length))
+    if not (usable and length > 0.0):
         raise ValueError(
             f"{place}: object {name} is {length:g} m long, at ({x:g}, {y:g}) m, with "
             f"({vx:g}, {vy:g}) m/s; it needs a length, and numbers"

@@ -178,11 +178,11 @@ class Drive(Driven):
         if self.foxglove is None:
             yield None
             return
-        from evofsm.io import LAYOUT, FoxgloveSink
+        from evofsm.io import FOXGLOVE_LAYOUT, FoxgloveSink
 
         with FoxgloveSink(self.foxglove, speed=1.0) as sink:
             told = f"Open {sink.address} in Foxglove or Lichtblick (Ctrl-C ends it)"
-            print(f"{told}; a layout to import: {LAYOUT}", file=sys.stderr, flush=True)
+            print(f"{told}; a layout to import: {FOXGLOVE_LAYOUT}", file=sys.stderr, flush=True)
             while not sink.await_someone(1.0):  # as Ctrl-C would not end a wait without an end
                 pass
             yield sink
