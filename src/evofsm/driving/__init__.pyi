@@ -1,4 +1,3 @@
-from .attached.chosen import choose as choose
 from .attached.guarded import Guarding as Guarding
 from .attached.guarded import Told as Told
 from .attached.listener import ATTACH_MODES as ATTACH_MODES

@@ -129,6 +129,26 @@ def test_a_guard_that_knows_one_leader_will_do(road):
     assert mine.machine.n_states == 0
 
 
+def test_a_guard_that_knows_gentler_cars_does_not_hold_back_on_a_free_road(road):
+    sumo = road(*NO_GAP)
+    mine = guard_for_traffic(-9.0, 1.0, 4.5, interval=0.1)
+    guards = attach(sumo, ["lead"], guard=mine)
+    drive(sumo, 5.0, brakes_at=np.inf)
+    assert sumo.vehicle.getSpeedMode("lead") == 31
+    assert guards.guarding.revised == 0
+
+
+def test_two_runs_are_the_same(road):
+    runs = []
+    for _ in range(2):
+        sumo = road(*NO_GAP)
+        told = []
+        attach(sumo, "all", tell=told.append)
+        drive(sumo, 20.0)
+        runs.append([(one.car, one.wish, one.deed, one.revision.reason) for one in told])
+    assert runs[0] == runs[1]
+
+
 def test_another_simulation_is_left_alone(road):
     sumo = road(*NO_GAP)
     first = attach(sumo, ["ego"])

@@ -4,7 +4,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from evofsm.driving import choose
+from evofsm.driving.attached.chosen import choose
 
 CARS = [str(k) for k in range(2000)]
 TYPES = SimpleNamespace(vehicle=SimpleNamespace(getTypeID=lambda car: "bus" if car == "7" else "x"))

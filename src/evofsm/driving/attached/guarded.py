@@ -111,7 +111,9 @@ class Guarding:
     def add(self, car: str) -> None:
         """Guard it from now on."""
         high = self._vehicle.getAccel(car)
-        self._cars[car] = _Car(car, self._guard_for(car, high), high)
+        guard = self._guard_for(car, high)
+        # What a guard cannot allow either way it does not forbid.
+        self._cars[car] = _Car(car, guard, min(high, guard.actions.high))
 
     def remove(self, car: str) -> None:
         """Guard it no longer: it is handed back."""
@@ -241,7 +243,7 @@ class Guarding:
             if watch is None:
                 watch = self._watches[leader] = BrakeWatch(self.interval)
             self._remember(watch.see(0.0, speed, speed))
-        for leader in self._watches.keys() - speeds.keys():
+        for leader in sorted(self._watches.keys() - speeds.keys()):
             self._remember(self._watches.pop(leader).end())
 
     def _remember(self, decel: float | None) -> None:
