@@ -102,8 +102,8 @@ def make_system(name: str, controller: str | None = None) -> System:
         if not isinstance(made, System):
             raise TypeError(f"{name} makes a {type(made).__name__}, which is no System")
         return made
-    families = {family: partial(Cars, family=family) for family in FAMILIES}
-    known = families | SYSTEMS | TASKS
+    known = SYSTEMS | TASKS
+    known |= {name: partial(Cars, family=name) for name in FAMILIES if name not in known}
     if name not in known:
         raise ValueError(f"there is no system {name!r}; there are {', '.join(known)}")
     return known[name](controller)
