@@ -48,7 +48,7 @@ class Attachment:
     looked : int
         Cars that were looked at, summed over the steps.
     seconds : float
-        Processor time that the attachment took [s].
+        Time that the attachment took [s].
     """
 
     def __init__(
@@ -68,7 +68,7 @@ class Attachment:
         self.guarding: Guarding | None = None
         self.watching: Watching | None = None
         if mode == "watch":
-            self._cars: Guarding | Watching = Watching(sumo, seeing)
+            self._cars: Guarding | Watching = Watching(seeing)
             self.watching = self._cars
         else:
             self._cars = self.guarding = Guarding(
@@ -119,7 +119,7 @@ class Attachment:
         Returns False, and does nothing, in another simulation: SUMO keeps its listeners when one is
         closed.
         """
-        begin = clock.thread_time()
+        begin = clock.perf_counter()
         now = float(self._sumo.simulation.getTime())
         if now <= self._now:
             self._listener = None
@@ -134,7 +134,7 @@ class Attachment:
             self.watching.step()
         if self._colors is not None:
             self._paint()
-        self.seconds += clock.thread_time() - begin
+        self.seconds += clock.perf_counter() - begin
         return True
 
     def _count_cars(self) -> None:

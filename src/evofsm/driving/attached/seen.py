@@ -75,6 +75,14 @@ class Seeing:
             body = self._bodies[car] = Body(*facts)
         return body
 
+    def pair(self, car: str) -> tuple[float, float, float] | None:
+        """Gap from bumper to bumper [m], its speed and that of whoever is ahead [m/s]."""
+        speed = self._vehicle.getSpeed(car)
+        found = self._vehicle.getLeader(car, _far(speed))
+        if not found or not found[0]:
+            return None
+        return found[1] + self.body(car).min_gap, speed, self._vehicle.getSpeed(found[0])
+
     def ahead(self, car: str, speed: float) -> Neighbour | None:
         """Whoever is ahead on its route, if near enough to matter."""
         found = self._vehicle.getLeader(car, _far(speed))

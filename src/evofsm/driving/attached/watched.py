@@ -31,8 +31,8 @@ class Watching:
         Of each car that ever closed in, so far.
     """
 
-    def __init__(self, sumo: Any, seeing: Seeing) -> None:
-        self._vehicle, self._seeing = sumo.vehicle, seeing
+    def __init__(self, seeing: Seeing) -> None:
+        self._seeing = seeing
         self._cars: dict[str, None] = {}
         self.ids: list[str] = []
         self.observations: NDArray[np.float64] = _NONE
@@ -66,14 +66,12 @@ class Watching:
 
     def step(self) -> int:
         """Look at every car; returns how many there are."""
-        ids, rows = [], []
-        speed_of, ahead_of = self._vehicle.getSpeed, self._seeing.ahead
+        ids, rows, pair_of = [], [], self._seeing.pair
         for car in self._cars:
-            speed = speed_of(car)
-            ahead = ahead_of(car, speed)
-            if ahead is not None:
+            pair = pair_of(car)
+            if pair is not None:
                 ids.append(car)
-                rows.append((ahead.gap, speed, ahead.speed))
+                rows.append(pair)
         self.ids, self.observations = ids, np.array(rows) if rows else _NONE
         self.ttc = time_to_collision(self.observations)
         self.drac = deceleration_to_avoid_collision(self.observations)
