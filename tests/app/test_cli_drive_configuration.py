@@ -10,6 +10,10 @@ pytest.importorskip("libsumo")
 from typer.testing import CliRunner
 
 from evofsm.__main__ import application
+from evofsm.app.cli.watch import Watch
+from evofsm.app.configuration import trace_configuration
+from evofsm.app.watch.logged import record_log
+from evofsm.app.watch.recording import Recording
 
 NET = """<net version="1.20">
     <location netOffset="0,0" convBoundary="0,0,1500,0" origBoundary="0,0,1500,0"
@@ -89,3 +93,19 @@ def test_a_configuration_that_sumo_refuses_is_one_line(configuration):
     assert result.exit_code == 2
     assert "SUMO refuses it" in result.output
     assert evofsm("drive", configuration.parent / "none.sumocfg").exit_code == 2
+
+
+def test_what_a_configuration_drives_is_watched_in_shadow_mode(configuration, tmp_path):
+    log, run = tmp_path / "my.xml", tmp_path / "run.mcap"
+    trace_configuration(configuration, log, seconds=30.0)
+    assert not record_log(str(log), run)
+    recorded = Recording(run)
+    recorded.restart(0)
+    frames = [recorded.step() for _ in range(20)]
+    assert frames[-1].time > frames[0].time
+    assert Watch(what=str(configuration)).is_log
+
+
+def test_a_configuration_that_is_not_there_is_named(tmp_path):
+    with pytest.raises(FileNotFoundError, match="no such file"):
+        trace_configuration(tmp_path / "none.sumocfg", tmp_path / "my.xml", seconds=1.0)

@@ -58,14 +58,7 @@ def drive_configuration(
     ValueError
         If SUMO refuses it.
     """
-    if not file.is_file():
-        raise FileNotFoundError(2, "no such file", str(file))
-    with needs("libsumo", "sumo", "a SUMO configuration"):
-        sumo: Any = import_module("libsumo")
-    try:
-        sumo.start(["sumo", "-c", str(file), "--no-step-log", "true"])
-    except sumo.TraCIException as error:
-        raise ValueError(f"{file}: SUMO refuses it: {str(error).strip()}") from error
+    sumo = _started(file)
     try:
         guards = attach(sumo, vehicles, mode=mode, tolerance=tolerance)
         end, distance, drives = sumo.simulation.getEndTime(), 0.0, 0
@@ -94,6 +87,43 @@ def drive_configuration(
         guarding.revised,
         1e6 * guards.seconds / max(1, guarding.decisions),
     )
+
+
+def trace_configuration(file: Path, out: Path, *, seconds: float) -> None:
+    """Run a configuration as it is, and write where its cars were as an FCD file.
+
+    Parameters
+    ----------
+    file : path
+    out : path
+        Of the FCD file; it ends in ``.xml``.
+    seconds : float
+        Of the simulation that are enough [s].
+
+    Raises
+    ------
+    OSError, ValueError
+        As in `drive_configuration`.
+    """
+    sumo = _started(file, "--fcd-output", str(out))
+    try:
+        end, begin = sumo.simulation.getEndTime(), sumo.simulation.getTime()
+        while _goes_on(sumo, end) and sumo.simulation.getTime() < begin + seconds:
+            sumo.simulationStep()
+    finally:
+        sumo.close()
+
+
+def _started(file: Path, *options: str) -> Any:
+    if not file.is_file():
+        raise FileNotFoundError(2, "no such file", str(file))
+    with needs("libsumo", "sumo", "a SUMO configuration"):
+        sumo: Any = import_module("libsumo")
+    try:
+        sumo.start(["sumo", "-c", str(file), "--no-step-log", "true", *options])
+    except sumo.TraCIException as error:
+        raise ValueError(f"{file}: SUMO refuses it: {str(error).strip()}") from error
+    return sumo
 
 
 def _goes_on(sumo: Any, end: float) -> bool:

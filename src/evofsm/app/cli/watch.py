@@ -19,6 +19,9 @@ if TYPE_CHECKING:
     from evofsm.app.watch.session import Session, Watching
     from evofsm.guard import Guard
 
+# Of a simulation of somebody else's that are watched [s].
+_SECONDS = 600.0
+
 Opening = Callable[[], "AbstractContextManager[Watched]"]
 
 
@@ -33,7 +36,8 @@ class Watch(Revised):
 
     what: str = argument(
         "Family of scenarios: paper, emergency, ..., or a TOML file of your own; a run that "
-        "drive --mcap recorded; or a log, as evofsm learn reads them, watched in shadow mode.",
+        "drive --mcap recorded; a log, as evofsm learn reads them, or what a SUMO configuration "
+        "drives (.sumocfg), watched in shadow mode.",
         "paper",
         metavar="FAMILY|FILE",
     )
@@ -113,6 +117,7 @@ class Watch(Revised):
         """A log, with what a guard would have said of it."""
         from tempfile import TemporaryDirectory
 
+        from evofsm.app.configuration import trace_configuration
         from evofsm.app.watch.logged import MOST_ROWS, record_log
         from evofsm.app.watch.recording import Recording
         from evofsm.io import Topics
@@ -120,9 +125,12 @@ class Watch(Revised):
         with TemporaryDirectory() as folder, progress() as bars:
             task = bars.add_task("Reading", total=MOST_ROWS)
             topics = None if self.topics is None else Topics.load(self.topics)
-            run = Path(folder) / "run.mcap"
+            run, log = Path(folder) / "run.mcap", self.what
+            if log.endswith(".sumocfg"):
+                log = str(Path(folder) / f"{Path(self.what).stem}.xml")
+                trace_configuration(Path(self.what), Path(log), seconds=_SECONDS)
             left_out = record_log(
-                self.what,
+                log,
                 run,
                 topics=topics,
                 judge=self.judge.value,
