@@ -322,7 +322,7 @@ def _is_free(machine: EvolvingFSM) -> bool:
     return got[0]
 
 
-def interrupts(_folder: Path, _random: np.random.Generator) -> Counter[str]:
-    """An interrupt at every line of all that makes a machine grow or changes it."""
-    found = Counter(harm for deed in DEEDS.values() for harm in harms(deed))
+def interrupts(_folder: Path, _random: np.random.Generator, *, every: int = 1) -> Counter[str]:
+    """An interrupt at so many of the lines of all that makes a machine grow or changes it."""
+    found = Counter(harm for deed in DEEDS.values() for harm in harms(deed, every))
     return Counter({"interrupts": found.total(), **{k: n for k, n in found.items() if k}})

@@ -69,7 +69,7 @@ def test_guards_act_where_they_are_told_to(configuration):
 def test_what_came_of_it_is_said(configuration):
     result = evofsm("drive", configuration, "--vehicles", "ego,lead")
     assert result.exit_code == 0
-    assert "2 cars (ego,lead), revise" in result.output
+    assert "2 cars (ego,lead), act" in result.output
     assert "0 by guarded cars" in result.output
 
 
@@ -93,6 +93,11 @@ def test_a_configuration_that_sumo_refuses_is_one_line(configuration):
     assert result.exit_code == 2
     assert "SUMO refuses it" in result.output
     assert evofsm("drive", configuration.parent / "none.sumocfg").exit_code == 2
+
+
+def test_a_choice_of_no_car_is_said(configuration):
+    result = evofsm("drive", configuration, "--vehicles", "type:hatsy")
+    assert "no car was type:hatsy: is it the name of a type or car?" in result.output
 
 
 def test_what_a_configuration_drives_is_watched_in_shadow_mode(configuration, tmp_path):

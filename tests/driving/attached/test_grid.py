@@ -31,7 +31,7 @@ def test_collisions_of_hasty_cars_are_prevented_and_none_is_caused_behind_them(t
     made = runpy.run_path(str(EXAMPLE / "make.py"))
     configuration = made["write_cars"](tmp_path, seed=0)
     alone, speed_alone = drive(configuration, "shadow")
-    guarded, speed = drive(configuration, "revise")
+    guarded, speed = drive(configuration, "act")
     hasty = alone.ever
     before = sum(each.collider in hasty for each in alone.collisions)
     after = sum(each.collider in hasty for each in guarded.collisions)

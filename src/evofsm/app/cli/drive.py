@@ -141,8 +141,7 @@ class Drive(Driven):
         for name in ("learn", "frozen", "out", "checkpoint", "audit", "mcap"):
             if getattr(self, name) is not None:
                 raise ValueError(f"--{name} is for families of scenarios, not for a configuration")
-        modes = {"act": "revise", "shadow": "shadow"}
-        if self.mode not in modes:
+        if self.mode not in ("act", "shadow"):
             raise ValueError(f"--mode is {self.mode!r}; for a configuration it is act or shadow")
         named = self.vehicles.startswith("type:") or self.vehicles == "all"
         ids = not named and not self.vehicles.endswith("%")
@@ -155,8 +154,8 @@ class Drive(Driven):
                     text = f"Driving ({time:,.0f} s, {collisions} collisions)"
                     bars.update(task, description=text)
 
-            file, mode = Path(self.family), modes[self.mode]
-            came = drive_configuration(file, chosen, mode, self.tolerance, show)
+            file = Path(self.family)
+            came = drive_configuration(file, chosen, self.mode, self.tolerance, show)
         if self.as_json:
             print_json(came.document())
         else:

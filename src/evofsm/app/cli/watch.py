@@ -138,7 +138,7 @@ class Watch(Revised):
                 progress=lambda rows: bars.update(task, completed=rows),
             )
             if left_out:
-                say(f"Watched are the first {MOST_ROWS:,} rows; the log has more.")
+                say(f"Watched are the first {MOST_ROWS:,} rows; there are more.")
             return Recording(run)
 
     def _session(self) -> Opening:

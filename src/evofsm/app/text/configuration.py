@@ -10,7 +10,7 @@ from evofsm.app.text.columns import print_facts
 
 def print_attached(out: Console, came: Attached) -> None:
     """Print collisions, speed, and what guarding did."""
-    what = "held back" if came.mode == "revise" else "would have held back"
+    what = "held back" if came.mode == "act" else "would have held back"
     share = came.revised / max(1, came.decisions)
     facts = [
         ("simulation", f"{came.configuration}, {came.seconds:,.0f} s"),
@@ -24,4 +24,6 @@ def print_attached(out: Console, came: Attached) -> None:
         ("guards", f"{what} {share:.1%} of {came.decisions:,} decisions"),
         ("overhead", f"{came.microseconds:.0f} µs a decision"),
     ]
+    if not came.guarded:
+        facts.insert(2, ("note", f"no car was {came.vehicles}: is it the name of a type or car?"))
     print_facts(out, "What came of the simulation", facts)

@@ -15,7 +15,7 @@ from evofsm.driving.attached.watched import Watching
 from evofsm.guard import TOLERANCE, Guard
 
 #: What is done with the chosen cars.
-ATTACH_MODES = ("revise", "shadow", "watch")
+ATTACH_MODES = ("act", "shadow", "watch")
 
 _GREEN, _AMBER, _RED = (40, 160, 70, 255), (240, 160, 0, 255), (215, 40, 40, 255)
 # Two that touched within this time before still do [s].
@@ -75,7 +75,7 @@ class Attachment:
                 sumo,
                 seeing,
                 guard,
-                acts=mode == "revise",
+                acts=mode == "act",
                 tolerance=tolerance,
                 learn=learn,
                 tell=tell,
@@ -171,7 +171,7 @@ def attach(
     vehicles: str | float | Iterable[str] = "all",
     *,
     guard: Guard | None = None,
-    mode: str = "revise",
+    mode: str = "act",
     tolerance: float = TOLERANCE,
     learn: bool = True,
     color: bool = False,
@@ -194,7 +194,7 @@ def attach(
         Each car gets a copy, frozen. It observes scenes (`guard_for_traffic`) or gap and speeds
         (`guard_for_cars`). Without one, each is told the car's own limits: it counts on SUMO's
         ``decel`` and brakes up to ``emergencyDecel`` where it has to.
-    mode : {"revise", "shadow", "watch"}
+    mode : {"act", "shadow", "watch"}
         Whether guards act, only say what they would do, or there are none: then only time to
         collision and needed deceleration are measured.
     tolerance : float
