@@ -27,6 +27,28 @@ def spiral():
 
 
 @pytest.fixture(scope="session")
+def drive_agents():
+    """Plays an episode of a parallel environment; returns what each step returned."""
+
+    def play(env, policy, **options):
+        observations, _ = env.reset(options=options or None)
+        steps = []
+        while env.agents:
+            actions = {agent: [policy(agent, observations[agent])] for agent in env.agents}
+            steps.append(env.step(actions))
+            observations = steps[-1][0]
+        return steps
+
+    return play
+
+
+@pytest.fixture(scope="session")
+def throttle():
+    """A policy of agents that always accelerate."""
+    return lambda agent, observation: 2.5
+
+
+@pytest.fixture(scope="session")
 def compiled():
     """All that a watched run needs is compiled, for tests that wait for some seconds only."""
     from evofsm.app.watch.session import Session, Watching, learn_first, watched_guard

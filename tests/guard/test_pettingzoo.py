@@ -15,39 +15,24 @@ with warnings.catch_warnings():  # its tests import what it has deprecated itsel
     from pettingzoo.test import parallel_api_test
 
 
-def drive(env, policy, **options):
-    """The steps of an episode: what each returned."""
-    observations, _ = env.reset(options=options or None)
-    steps = []
-    while env.agents:
-        actions = {agent: [policy(agent, observations[agent])] for agent in env.agents}
-        steps.append(env.step(actions))
-        observations = steps[-1][0]
-    return steps
-
-
-def throttle(agent, observation):
-    return 2.5
-
-
-def test_under_guards_that_share_what_they_learn_nobody_collides():
+def test_under_guards_that_share_what_they_learn_nobody_collides(drive_agents, throttle):
     platoon = Platoon(n_cars=3)
-    unrevised = [drive(platoon, throttle, index=k)[-1][4] for k in range(3)]
+    unrevised = [drive_agents(platoon, throttle, index=k)[-1][4] for k in range(3)]
     assert any(info["failed"] for infos in unrevised for info in infos.values())
     guard = guard_for_family(platoon.family)
     env = RevisedAgents(platoon, guard, failed=lambda info: info["failed"])
-    revised = [drive(env, throttle, index=k)[-1][4] for k in range(3)]
+    revised = [drive_agents(env, throttle, index=k)[-1][4] for k in range(3)]
     assert not any(info["failed"] for infos in revised for info in infos.values())
     assert guard.machine.n_states > 0
     assert set(env.revisions) == {"car_1", "car_2", "car_3"}
 
 
-def test_info_says_what_was_executed_and_the_penalty_is_taken_off():
+def test_info_says_what_was_executed_and_the_penalty_is_taken_off(drive_agents, throttle):
     def steps(penalty):
         platoon = Platoon(n_cars=2)
         guard = guard_for_family(platoon.family)
         env = RevisedAgents(platoon, guard, failed=lambda info: info["failed"], penalty=penalty)
-        return drive(env, throttle, index=0)
+        return drive_agents(env, throttle, index=0)
 
     changed = 0
     for free, paid in zip(steps(0.0), steps(2.0), strict=True):
@@ -59,13 +44,13 @@ def test_info_says_what_was_executed_and_the_penalty_is_taken_off():
     assert changed > 0
 
 
-def test_with_one_agent_it_comes_to_the_same_as_with_gymnasium():
+def test_with_one_agent_it_comes_to_the_same_as_with_gymnasium(drive_agents, throttle):
     platoon, single = Platoon(n_cars=1), CarFollowing()
     one, other = guard_for_family(platoon.family), guard_for_family(platoon.family)
     agents = RevisedAgents(platoon, one, failed=lambda info: info["failed"])
     env = RevisedActions(single, other, failed=lambda info: info["failed"])
     for index in range(2):
-        steps = drive(agents, throttle, index=index)
+        steps = drive_agents(agents, throttle, index=index)
         env.reset(options={"index": index})
         for observations, *_ in steps:
             observation, *_ = env.step(np.array([2.5]))

@@ -17,28 +17,13 @@ with warnings.catch_warnings():  # its tests import what it has deprecated itsel
     from pettingzoo.test import parallel_api_test
 
 
-def drive(env, policy, **options):
-    """The steps of an episode: what each returned."""
-    observations, _ = env.reset(options=options or None)
-    steps = []
-    while env.agents:
-        actions = {agent: [policy(agent, observations[agent])] for agent in env.agents}
-        steps.append(env.step(actions))
-        observations = steps[-1][0]
-    return steps
-
-
-def throttle(agent, observation):
-    return 2.5
-
-
 def test_pettingzoo_finds_nothing_to_complain_of():
     parallel_api_test(Platoon(n_cars=3), num_cycles=200)
 
 
-def test_a_platoon_of_one_is_car_following():
+def test_a_platoon_of_one_is_car_following(drive_agents, throttle):
     platoon, single = Platoon(n_cars=1), CarFollowing()
-    steps = drive(platoon, throttle, index=3)
+    steps = drive_agents(platoon, throttle, index=3)
     single.reset(options={"index": 3})
     for observations, rewards, terminations, truncations, infos in steps:
         observation, reward, terminated, truncated, info = single.step([2.5])
@@ -81,11 +66,11 @@ def test_gaps_are_what_lies_between_the_cars():
         assert observations[agent][2] == observations[ahead][1]
 
 
-def test_a_collision_ends_the_run_and_is_of_whoever_ran_into_the_one_ahead():
+def test_a_collision_ends_the_run_and_is_of_whoever_ran_into_the_one_ahead(drive_agents):
     def policy(agent, observation):
         return 2.5 if agent == "car_2" else 0.0
 
-    steps = drive(Platoon(n_cars=3), policy, index=0)
+    steps = drive_agents(Platoon(n_cars=3), policy, index=0)
     _, rewards, terminations, truncations, infos = steps[-1]
     assert terminations == {"car_1": False, "car_2": True, "car_3": False}
     assert truncations == {"car_1": True, "car_2": False, "car_3": True}
@@ -103,10 +88,10 @@ def test_the_same_seed_drives_the_same_scenarios():
     assert len(set(indices(Platoon()))) == 3
 
 
-def test_after_the_end_and_before_the_beginning_there_are_no_agents():
+def test_after_the_end_and_before_the_beginning_there_are_no_agents(drive_agents, throttle):
     platoon = Platoon(n_cars=1)
     assert platoon.step({}) == ({}, {}, {}, {}, {})
-    drive(platoon, throttle, index=0)
+    drive_agents(platoon, throttle, index=0)
     assert platoon.step({"car_1": [0.0]}) == ({}, {}, {}, {}, {})
     platoon.close()
 

@@ -170,9 +170,10 @@ class Decider:
 
     def _decided(self, row: Row) -> Answer:
         notes = self._notes(row)
+        note = {"note": "; ".join(notes)} if notes else {}
         self.n += 1
         if row.observation is None:
-            return self._kept(row, notes)
+            return self._kept(row, note)
         try:
             revision = self._revision(row)
         except Exception as error:  # whatever a judge of somebody's own raises
@@ -193,7 +194,7 @@ class Decider:
             **{name: _plain(RECORD[name].read(said)) for name in SAID},
             alarm=self._is_alarm(revision),
             mode=self.mode.value,
-            **({"note": "; ".join(notes)} if notes else {}),
+            **note,
         )
 
     def _worst(self, row: Row) -> Answer:
@@ -205,7 +206,7 @@ class Decider:
             return {"object": None, "role": None}
         return {"object": row.objects[pair.number - 1], "role": pair.role.value}
 
-    def _kept(self, row: Row, notes: list[str]) -> Answer:
+    def _kept(self, row: Row, note: Answer) -> Answer:
         """Nothing is ahead: whatever is wanted is done."""
         wanted = _plain(row.proposal)
         unknown = dict.fromkeys(SAID[3:-1])
@@ -218,7 +219,7 @@ class Decider:
             reason="nothing is ahead in the lane",
             alarm=False,
             mode=self.mode.value,
-            **({"note": "; ".join(notes)} if notes else {}),
+            **note,
         )
 
     def _notes(self, row: Row) -> list[str]:
