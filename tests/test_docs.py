@@ -5,6 +5,7 @@ All others are doctests. A block that is not run says why, in a comment before i
 """
 
 import doctest
+import fcntl
 import os
 import re
 import shlex
@@ -186,12 +187,20 @@ class Page(HTMLParser):
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory):
-    """All pages of the site, built with warnings as errors."""
-    folder = tmp_path_factory.mktemp("site")
+    """All pages of the site, built with warnings as errors, once for all processes of pytest."""
+    run = tmp_path_factory.getbasetemp()
+    shared = run.parent if "PYTEST_XDIST_WORKER" in os.environ else run
+    folder, built = shared / "site", shared / "site-is-built"
     build = (sys.executable, "-m", "sphinx", "-W", "--keep-going", "-n", "-q", DOCS, folder)
     environment = {**os.environ, "PYTHONPATH": ""}
-    done = subprocess.run(build, capture_output=True, text=True, check=False, env=environment)
-    assert done.returncode == 0, done.stdout + done.stderr
+    with (shared / "site-lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not built.exists():
+            done = subprocess.run(
+                build, capture_output=True, text=True, check=False, env=environment
+            )
+            assert done.returncode == 0, done.stdout + done.stderr
+            built.touch()
     return folder, {path: Page(path) for path in folder.rglob("*.html")}
 
 

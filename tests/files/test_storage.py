@@ -20,6 +20,7 @@ import pytest
 from evofsm import __version__
 from evofsm.core.actions import IntervalActions
 from evofsm.core.crowding import WhenFull
+from evofsm.core.dynamics.dynamics import Dynamics
 from evofsm.core.machine import EvolvingFSM
 from evofsm.core.model import FSMModel
 from evofsm.core.states.failure import FailureSplit
@@ -212,8 +213,8 @@ def test_a_header_that_makes_no_sense_is_refused_by_name(content, tmp_path):
 
 def test_a_file_of_a_newer_version_asks_for_a_newer_library(tmp_path):
     path = tmp_path / "newer"
-    path.write_bytes(npz({**HEADER, "version": 7}))
-    with pytest.raises(ValueError, match=r"version 7 is newer.*a newer evofsm reads it"):
+    path.write_bytes(npz({**HEADER, "version": 8}))
+    with pytest.raises(ValueError, match=r"version 8 is newer.*a newer evofsm reads it"):
         EvolvingFSM.load(path)
 
 
@@ -609,6 +610,21 @@ def test_files_of_format_5_knew_no_dynamics(spiral):
     assert_go_on_alike(old, new, spiral(40)[24:], [0, 1, 2, 3] * 4)
 
 
+def test_a_machine_of_format_6_goes_on_and_follows_changes_from_then_on():
+    draw = np.random.default_rng(0)
+    Z, U = draw.normal(size=(64, 2)).cumsum(0), draw.uniform(-1, 1, 64)
+    old = EvolvingFSM.load(FILES / "machine-format-6.evofsm")
+    new = EvolvingFSM(2, radius=0.5, dynamics=Dynamics(-1.0, 1.0))
+    I = (U > 0).astype(int)
+    new.learn_many(Z, I, [0, 40], executed=U)
+    assert repr(old) == repr(new)
+    assert old.dynamics.drifts == []
+    assert not old.dynamics.recent.squares.any()
+    for machine in (old, new):
+        machine.learn_many(Z, I, [0, 40], executed=U)
+    np.testing.assert_allclose(old.dynamics.weights, new.dynamics.weights, rtol=1e-6, atol=1e-9)
+
+
 def test_a_risk_of_format_3_is_read():
     risk = LatentRisk.load(FILES / "risk-format-3.evofsm")
     assert (len(risk.manoeuvres), len(risk.brakes.samples)) == (3, 80)
@@ -628,7 +644,7 @@ def test_a_file_says_who_wrote_it_and_what_it_learnt_from(grown, tmp_path):
     for item, kind in ((grown, "machine"), (grown.model(), "model")):
         item.save(tmp_path / kind, provenance)
         header = storage.read_header(tmp_path / kind)
-        assert (header.kind, header.version) == (kind, 6)
+        assert (header.kind, header.version) == (kind, 7)
         assert header.library == __version__
         assert header.provenance == provenance
 

@@ -137,7 +137,8 @@ def test_a_damaged_file_within_a_machines_file_is_refused(cart, where, tmp_path)
     machine.learn_many(Z, I, executed=U)
     content, arrays = machine._content, machine._kept()
     arrays["dynamics"] = arrays["dynamics"].copy()
-    arrays["dynamics"][int(where * len(arrays["dynamics"]))] ^= 0x55
+    begin = int(where * len(arrays["dynamics"]))
+    arrays["dynamics"][begin : begin + 100] ^= 0x55  # more than a local header of the archive
     storage.write(tmp_path / "machine", "machine", content, arrays)
     with pytest.raises(ValueError, match=str(tmp_path / "machine")):
         EvolvingFSM.load(tmp_path / "machine")

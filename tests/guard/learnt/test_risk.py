@@ -8,6 +8,7 @@ from contextlib import suppress
 import numpy as np
 import pytest
 
+from evofsm.core.dynamics.drift import Drift
 from evofsm.guard import Mode, same_action
 from evofsm.guard.auditing.log import AuditLog
 from evofsm.guard.auditing.replay import audit
@@ -266,3 +267,22 @@ def test_a_question_changes_nothing_of_what_is_learnt(point, content):
         point.play(asked, episode, seen=ask)
         point.play(unasked, episode)
     assert content(asked) == content(unasked)
+
+
+def test_after_a_drift_the_margin_begins_anew(point, monkeypatch):
+    guard = point.taught(4)
+    judge, dynamics = guard.judge, guard.machine.dynamics
+    judge.margin = 0.1
+    study = type(dynamics)._study
+
+    def drifting(self, *, failed):
+        self.drifts = [Drift(0, self.n_episodes, self.n_episodes)]
+        study(self, failed=failed)
+
+    monkeypatch.setattr(type(dynamics), "_study", drifting)
+    point.play(guard, 50)
+    assert judge.margin > 2.0
+    assert "since episode 5 variable 1 moves otherwise" in judge.told_by_experience
+    monkeypatch.undo()
+    point.play(guard, 51)
+    assert judge.margin < 3.0

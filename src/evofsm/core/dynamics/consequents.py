@@ -45,6 +45,14 @@ class Here(NamedTuple):
     action: _Floats  #: (a,) latest one
 
 
+class Stretch(NamedTuple):
+    """What happened for a while, as it was observed: residuals follow from it at any time."""
+
+    observations: _Floats  #: (L + 2, m), the first one step before it began
+    actions: _Floats  #: (L + 1, a), the first one step before it began
+    episode: int  #: in which it was seen, from 0
+
+
 class Disturbances(NamedTuple):
     """K stretches of what was not expected, H steps each; number 0 is none at all."""
 
@@ -82,6 +90,11 @@ def n_features(m: int, a: int, *, box: bool) -> int:
 def n_products(m: int, a: int) -> int:
     """Number of products: of actions with variables, and of two variables; they come last."""
     return a * m + m * (m + 1) // 2
+
+
+def lags(m: int, a: int) -> NDArray[np.int64]:
+    """Indices of features that say what was just before: latest changes, and the action before."""
+    return np.append(np.arange(1 + m, 1 + 2 * m), np.arange(1 + 2 * m + a, 1 + 2 * m + 2 * a))
 
 
 @compiled
@@ -271,6 +284,25 @@ def replay(
 
 
 @compiled
+def along(known: Consequents, observations: _Floats, actions: _Floats, length: int) -> Futures:
+    """Features, and moves that were expected, from each observation but the first.
+
+    ``observations`` (length + 1 or more, m) begin one before; ``actions`` (length + 1, a) too.
+    """
+    m = observations.shape[1]
+    room = futures(known, actions.shape[1], np.arange(length))
+    for j in range(m):
+        for t in range(length):
+            room.z[j, t] = observations[t + 1, j]
+            room.change[j, t] = observations[t + 1, j] - observations[t, j]
+    for i in range(len(room.action)):
+        for t in range(length):
+            room.before[i, t], room.action[i, t] = actions[t, i], actions[t + 1, i]
+    expect(known, room)
+    return room
+
+
+@compiled
 def residuals(
     known: Consequents,
     observations: _Floats,
@@ -286,16 +318,7 @@ def residuals(
     it is ``carried``, the one before goes on, for its cause may not have ended. Where nothing moves
     at all, what was expected is the model's own error: nothing disturbs.
     """
-    m = observations.shape[1]
-    room = futures(known, actions.shape[1], np.arange(length))
-    for j in range(m):
-        for t in range(length):
-            room.z[j, t] = observations[t + 1, j]
-            room.change[j, t] = observations[t + 1, j] - observations[t, j]
-    for i in range(len(room.action)):
-        for t in range(length):
-            room.before[i, t], room.action[i, t] = actions[t, i], actions[t + 1, i]
-    expect(known, room)
+    m, room = observations.shape[1], along(known, observations, actions, length)
     for t in range(length):
         still = True
         for j in range(m):

@@ -13,11 +13,22 @@ from evofsm.core.dynamics.consequents import (
     Consequents,
     Disturbances,
     Here,
+    Stretch,
     is_unforeseen,
+    lags,
     n_features,
     n_products,
     pack,
     residuals,
+)
+from evofsm.core.dynamics.drift import (
+    LEARNT,
+    PAST,
+    Drift,
+    Recent,
+    compared,
+    correction,
+    rewritten,
 )
 from evofsm.core.dynamics.failures import explain_failures, probe
 from evofsm.core.dynamics.regression import (
@@ -34,7 +45,7 @@ from evofsm.core.validation import real_array, refuse_unusable, whole
 _Floats = NDArray[np.float64]
 
 #: Parts that can be left out, to see what each is worth.
-DYNAMICS_PARTS = ("stretches", "memory", "products", "lags", "jumps", "carried")
+DYNAMICS_PARTS = ("stretches", "memory", "products", "lags", "jumps", "carried", "drift")
 
 # Transitions before anything is expected.
 _FIRST = 15
@@ -55,14 +66,6 @@ MOST_KEPT = 200
 _JUMP_PRIOR = 3.0
 # So many times the stretches that are kept there may be until somebody chooses.
 _SPARE = 4
-
-
-class Stretch(NamedTuple):
-    """What happened for a while, as it was observed: residuals follow from it at any time."""
-
-    observations: _Floats  #: (L + 2, m), the first one step before it began
-    actions: _Floats  #: (L + 1, a), the first one step before it began
-    episode: int  #: in which it was seen, from 0
 
 
 class Episode(NamedTuple):
@@ -344,14 +347,16 @@ class Dynamics:
         self.failures: list[_Floats] = []
         self.jumps: list[list[_Floats]] = [[] for _ in range(m)]
         self.sides: list[tuple[int, float, float]] = []
+        #: What the last episodes say of the model, and where it was corrected, by time.
+        self.recent = Recent.nothing(p, m, self.n_episodes)
+        self.drifts: list[Drift] = []
         self.weights = np.zeros((p, m))
         self.ready = False
         self._left_out = np.zeros(p)
         if "products" in self.without:
             self._left_out[p - n_products(m, a) :] = 1.0
         if "lags" in self.without:
-            self._left_out[1 + m : 1 + 2 * m] = 1.0
-            self._left_out[1 + 2 * m + a : 1 + 2 * m + 2 * a] = 1.0
+            self._left_out[lags(m, a)] = 1.0
         self._jumped = np.zeros(m)
         self._rebuild()
 
@@ -528,6 +533,8 @@ class Dynamics:
         self.latest = None
         T = len(safe) - 1
         if self.ready and T > 4:
+            if self.sums.scale[0] > 0.0 and "drift" not in self.without:
+                self._follow_drift(safe, U[:T])
             found = np.zeros((T - 1, self.n_variables))
             residuals(self.consequents, Z, U, T - 1, False, found)
             self._held(arrived, found, safe)
@@ -536,6 +543,29 @@ class Dynamics:
             if "stretches" not in self.without:
                 self.remember(self.onsets(found))
         self.n_episodes += 1
+
+    def _follow_drift(self, Z: _Floats, U: _Floats) -> None:
+        """Correct the model of what moves otherwise than it did, and rewrite what was learnt."""
+        sums, before = self.sums, self.consequents
+        self.recent = recent = compared(self.recent, before, sums, Z, U, self.n_episodes)
+        moved = recent.overthrown(self.n_episodes)
+        if not len(moved):
+            return
+        self.weights = self.weights.copy()
+        self.weights[:, moved] += correction(recent, before.weights, sums, self.size)[:, moved]
+        sums.products[:, moved] = sums.squares @ self.weights[:, moved]
+        share = min(1.0, PAST / sums.squares[0, 0])  # what comes shall tell the rest
+        sums.squares[:] *= share
+        sums.products[:] *= share
+        self._solve()
+        left = np.zeros((len(U) - 1, self.n_variables))
+        residuals(self.consequents, Z, U, len(left), False, left)
+        size = np.sqrt((left**2).mean(0))
+        sums.scale[moved] = np.maximum(sums.scale, size)[moved]
+        self.stretches = [rewritten(one, before, self.consequents, moved) for one in self.stretches]
+        self.drifts += [Drift(int(j), int(recent.since[j]), self.n_episodes) for j in moved]
+        begun = Recent.nothing(*self.weights.shape, self.n_episodes)
+        self.recent = recent._replace(doubt=begun.doubt, since=begun.since)
 
     def settle(self) -> None:
         """Make of all sums what is known: weights, and where it fails.
@@ -604,8 +634,10 @@ class Dynamics:
         scale = 1.4826 * np.median(size, 0)
         known = sums.scale[0] > 0.0
         new = 0.8 * sums.scale + 0.2 * scale if known else scale
-        sums.scale[:] = np.maximum(new, 1e-3 * np.sqrt(sums.variance) + 1e-300)
         square = (size**2).mean(0)
+        young = [one.variable for one in self.drifts if self.n_episodes - one.noticed < LEARNT]
+        new[young] = np.maximum(new, np.sqrt(square))[young]  # what is learnt anew is no outlier
+        sums.scale[:] = np.maximum(new, 1e-3 * np.sqrt(sums.variance) + 1e-300)
         sums.noise[:] = 0.8 * sums.noise + 0.2 * square if known else square
 
     def onsets(self, found: _Floats) -> list[int]:

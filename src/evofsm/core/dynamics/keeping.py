@@ -13,8 +13,9 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.core.dynamics.consequents import Consequents, n_features
-from evofsm.core.dynamics.dynamics import Dynamics, Stretch
+from evofsm.core.dynamics.consequents import Consequents, Stretch, n_features
+from evofsm.core.dynamics.drift import Drift, Recent
+from evofsm.core.dynamics.dynamics import Dynamics
 from evofsm.core.dynamics.following import LARGEST
 from evofsm.core.dynamics.regression import Sums
 from evofsm.core.dynamics.undoing import side_by_side
@@ -78,15 +79,35 @@ _ARRAYS: dict[str, tuple[_Shape, ranges.Range]] = {
     "observations": (("observed", "m"), _OBSERVED),
     "actions": (("done", "a"), _SOME),
 }
+# Of whether the model still holds; files of before version 7 have none of it.
+_RECENT: dict[str, tuple[_Shape, ranges.Range]] = {
+    "squares": (("p", "p"), _SOME),
+    "products": (("p", "m"), _SOME),
+    "doubt": (("m",), _NOT_NEGATIVE),
+    "since": (("m",), ranges.COUNT),
+}
+_NEW: dict[str, tuple[_Shape, ranges.Range]] = {
+    **{f"recent_{name}": told for name, told in _RECENT.items()},
+    "drifts": (("drifts", 3), ranges.COUNT),
+}
+
+
+def _upgrade(version: int, settings: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> None:
+    """No model was corrected before version 7."""
+    arrays.setdefault("drifts", np.zeros((0, 3)))
+
+
 _KIND = ranges.register(
     ranges.Kind(
         "dynamics",
-        {name: ranges.Member(*told) for name, told in _ARRAYS.items()},
+        {name: ranges.Member(*told) for name, told in _ARRAYS.items()}
+        | {name: ranges.Member(*told, since=7) for name, told in _NEW.items()},
         {
             **dict.fromkeys(("horizon", "stretches", "n_actions"), ranges.FROM_1),
             **dict.fromkeys(("n_episodes", "clock", "quiet"), ranges.COUNT),
             **dict.fromkeys(("low", "high"), ranges.Range(-1e100, 1e100)),
         },
+        upgrade=_upgrade,
     )
 ).name
 
@@ -148,7 +169,7 @@ def _arrays(dynamics: Dynamics) -> dict[str, NDArray[np.float64]]:
         sizes = {"a": a}
         return {
             name: np.zeros([n if isinstance(n, int) else sizes.get(n, 0) for n in shape])
-            for name, (shape, _) in _ARRAYS.items()
+            for name, (shape, _) in (_ARRAYS | _NEW).items()
         }
     jumps = [(j, jump) for j, one in enumerate(dynamics.jumps) for jump in one]
     stretches = dynamics.stretches
@@ -157,6 +178,8 @@ def _arrays(dynamics: Dynamics) -> dict[str, NDArray[np.float64]]:
         **{f"sum_{name}": array for name, array in dynamics.sums._asdict().items()},
         **{_KNOWN + name: getattr(dynamics.consequents, name) for name in _CONSEQUENTS},
         **{name: getattr(dynamics, name) for name in _OWN},
+        **{f"recent_{name}": array for name, array in dynamics.recent._asdict().items()},
+        "drifts": np.array(dynamics.drifts, np.float64).reshape(-1, 3),
         "used": dynamics.used,
         "failures": np.array(dynamics.failures).reshape(-1, m),
         "jumps": np.array([(j, jump[-1]) for j, jump in jumps], np.float64).reshape(-1, 2),
@@ -180,8 +203,9 @@ def _refuse_impossible(dynamics: Dynamics, arrays: dict[str, NDArray[Any]]) -> N
         raise ValueError(f"used has {len(arrays['used'])} rows, but an action has {a} numbers")
     if m and len(arrays["sum_squares"]) != n_features(m, a, box=not dynamics.choices):
         raise ValueError(f"squares has {len(arrays['sum_squares'])} rows, which {m} variables lack")
-    for name, sides in (("jumps", arrays["jumps"]), ("sides", arrays[f"{_KNOWN}sides"])):
-        if len(sides) and not np.isin(sides[:, 0], np.arange(m)).all():
+    of_variables = {name: arrays[name] for name in ("jumps", "drifts", f"{_KNOWN}sides")}
+    for name, rows in of_variables.items():
+        if len(rows) and not np.isin(rows[:, 0], np.arange(m)).all():
             raise ValueError(f"{name} are of variables that there are not")
     lengths = arrays["stretches"][:, 0]
     expected = lengths.sum() + len(lengths), lengths.sum()
@@ -202,6 +226,8 @@ def _restore(dynamics: Dynamics, arrays: dict[str, NDArray[Any]]) -> None:
     dynamics.consequents = Consequents(**known, origin=arrays["origin"], choices=dynamics.choices)
     dynamics.weights = known["weights"]
     dynamics.sides = [(int(j), float(sign), float(at)) for j, sign, at, _ in known["sides"]]
+    dynamics.recent = Recent(**{name: arrays[f"recent_{name}"] for name in _RECENT})
+    dynamics.drifts = [Drift(*row) for row in arrays["drifts"].astype(int).tolist()]
     dynamics.failures = list(arrays["failures"])
     for (j, after), before in zip(arrays["jumps"], arrays["jumps_from"], strict=True):
         dynamics.jumps[int(j)].append(np.append(before, after))

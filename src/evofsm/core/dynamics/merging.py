@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evofsm.core.dynamics.consequents import n_products
+from evofsm.core.dynamics.drift import Recent
 from evofsm.core.dynamics.dynamics import MOST_KEPT, Dynamics
 from evofsm.core.dynamics.keeping import to_bytes
 from evofsm.core.dynamics.undoing import side_by_side
@@ -28,7 +29,7 @@ def merge_dynamics(parts: Sequence[Dynamics]) -> Dynamics:
     """Merge dynamics that were learnt apart, between episodes; in any order, the same bit for bit.
 
     Sums add up: what came of two halves of a stream is what comes of all of it, but for what was
-    forgotten between episodes, and for residuals that weighed less because they were large in the
+    forgotten between episodes, and for residuals that compared less because they were large in the
     light of one half. Ordinary changes and residuals are means by transitions. Of stretches,
     failures and jumps the newest of all parts are kept.
 
@@ -190,6 +191,13 @@ def _join(merged: Dynamics, parts: Sequence[Dynamics]) -> None:
             for part in parts
         ],
         merged.most_stretches,
+    )
+    merged.recent = Recent.nothing(*merged.weights.shape, merged.n_episodes)
+    merged.drifts = sorted(
+        one._replace(since=one.since + earlier, noticed=one.noticed + earlier)
+        for part in parts
+        for earlier in [merged.n_episodes - part.n_episodes]
+        for one in part.drifts
     )
     merged.failures = _newest([part.failures for part in parts], MOST_KEPT)
     merged.jumps = [

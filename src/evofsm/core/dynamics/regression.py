@@ -12,7 +12,14 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.core.dynamics.consequents import Consequents, expect, fill_features, futures, unpacked
+from evofsm.core.dynamics.consequents import (
+    Consequents,
+    expect,
+    fill_features,
+    futures,
+    lags,
+    unpacked,
+)
 from evofsm.core.kernels import compiled
 
 _Floats = NDArray[np.float64]
@@ -237,7 +244,7 @@ def solve(sums: Sums, m: int, a: int, without: _Floats) -> _Floats:
     shy = np.ones(len(size), bool)
     shy[: 1 + m] = shy[1 + 2 * m : 1 + 2 * m + a] = False
     times = np.ones(len(size))
-    times[1 + m : 1 + 2 * m] = times[1 + 2 * m + a : 1 + 2 * m + 2 * a] = _LAGS
+    times[lags(m, a)] = _LAGS
     left_out = np.where(without > 0.0, 1e12 * np.maximum(size, 1.0), 0.0)
     known = sums.noise > 0.0
     noisy = np.where(known, sums.noise / np.where(known, sums.variance, 1.0), 1.0)
@@ -245,8 +252,15 @@ def solve(sums: Sums, m: int, a: int, without: _Floats) -> _Floats:
     for j, share in enumerate(noisy.clip(_CLEAREST, 1.0).tolist()):
         prior = np.where(shy, _SHY * _RIDGE + share * _SHY_PRIOR / n, _RIDGE + share * _PRIOR / n)
         held = prior * times * variance + left_out
-        scale = 1.0 / np.sqrt(np.where(size > 0.0, size + held, 1.0))
-        scaled = scale[:, None] * (squares + np.diag(held)) * scale
-        scaled[np.diag_indices_from(scaled)] += _ALL_ALIKE
-        weights[:, j] = scale * np.linalg.solve(scaled, scale * sums.products[:, j])
+        weights[:, j] = ridge(squares, sums.products[:, j], held)
     return weights
+
+
+def ridge(squares: _Floats, products: _Floats, held: _Floats) -> _Floats:
+    """(p,) weights that are held to 0 by ``held`` (p,), as much as so many squares would."""
+    size = np.diag(squares)
+    scale = 1.0 / np.sqrt(np.where(size > 0.0, size + held, 1.0))
+    scaled = scale[:, None] * (squares + np.diag(held)) * scale
+    scaled[np.diag_indices_from(scaled)] += _ALL_ALIKE
+    found: _Floats = scale * np.linalg.solve(scaled, scale * products)
+    return found

@@ -15,6 +15,7 @@ PARTS: dict[str, str] = {
     "lags": "no latest change and previous action",
     "jumps": "jumps are learnt like all else",
     "carried": "no residual is carried on where a variable saturates",
+    "drift": "the model is not corrected where the system has changed",
     "margin": "no margin",
     "backups": "constant backups alone",
     "states": "no state decides anything",

@@ -227,13 +227,17 @@ class LearntRisk:
     @property
     def told_by_experience(self) -> str:
         """What was learnt so far, in words."""
-        sides = self.dynamics.consequents.sides if self.dynamics.n_variables else ()
-        names = self.labels.names
-        fails = [
-            (names[int(j)] if names else f"variable {int(j) + 1}", sign < 0.0, at)
-            for j, sign, at, _ in sides
-        ]
-        return words.experience(fails, self.remembered, self.margin)
+        dynamics, names = self.dynamics, self.labels.names
+        if not dynamics.n_variables:
+            return words.experience((), self.remembered, self.margin)
+
+        def called(j: float) -> str:
+            return names[int(j)] if names else f"variable {int(j) + 1}"
+
+        fails = [(called(j), sign < 0.0, at) for j, sign, at, _ in dynamics.consequents.sides]
+        latest = {one.variable: one.since + 1 for one in dynamics.drifts}
+        drifts = [(called(j), since) for j, since in latest.items()]
+        return words.experience(fails, self.remembered, self.margin, drifts)
 
     def search(
         self, situation: Situation, wanted: Any, *, tolerance: float, revising: bool
@@ -555,6 +559,8 @@ class LearntRisk:
         dynamics = self.dynamics
         self.n_studied = dynamics.n_episodes
         self.margin *= _FADES
+        if any(one.noticed == dynamics.n_episodes - 1 for one in dynamics.drifts):
+            self._begin_anew()
         episode = dynamics.latest
         if episode is None or not dynamics.ready:
             return
@@ -580,6 +586,12 @@ class LearntRisk:
         if len(known.sides) and enough >= 3:
             self._evolve(random)
         self._ranks = self.backups.ranks.copy()
+
+    def _begin_anew(self) -> None:
+        """The model was corrected: how far it is to be trusted is not known yet."""
+        self.takes = max(self.takes, _HORIZON / _AHEAD)
+        if "margin" not in self.without:
+            self.margin = max(self.margin, _MARGIN)
 
     def _look_ahead(self, policies: _Floats, *, failed: bool) -> None:
         """As far as it takes to fail where nothing helps, and half as far again.

@@ -126,7 +126,10 @@ def tried() -> str:
 
 
 def experience(
-    fails: Sequence[tuple[str, bool, float]], remembered: Remembered, margin: float
+    fails: Sequence[tuple[str, bool, float]],
+    remembered: Remembered,
+    margin: float,
+    drifts: Sequence[tuple[str, int]] = (),
 ) -> str:
     """What was learnt so far.
 
@@ -136,21 +139,24 @@ def experience(
         Variables that lead to failure, whether below a threshold, and which.
     remembered : Remembered
     margin : float
+    drifts : sequence of (str, int)
+        Variables that do not move any more as they did, and since which episode, from 1.
 
     Examples
     --------
-    >>> experience([], Remembered(0, 12.0), 3.0)
-    'no failure is known yet, so nothing is refused'
+    >>> experience([], Remembered(0, 12.0), 3.0, [("speed", 101)])
+    'no failure is known yet, so nothing is refused; since episode 101 speed moves otherwise'
     >>> experience([("gap", True, 0.05)], Remembered(10, 305.0), 0.4)
     'fails where gap is below 0.05; 10 disturbances remembered from 305 s, to be survived by 0.4 \
 ordinary changes'
     """
+    since = "".join(f"; since episode {first} {name} moves otherwise" for name, first in drifts)
     if not fails:
-        return NO_FAILURE
+        return NO_FAILURE + since
     where = " or ".join(
         f"{name} is {'below' if low else 'above'} {at:.3g}" for name, low, at in fails
     )
-    return f"fails where {where}; {remembered}, to be survived by {changes(margin)}"
+    return f"fails where {where}; {remembered}, to be survived by {changes(margin)}{since}"
 
 
 def constant(values: Sequence[float]) -> str:
