@@ -1,4 +1,4 @@
-"""A system that changes is noticed, followed, and what was remembered is rewritten."""
+"""A system that changes is noticed and followed; what was unforeseen before stays what it was."""
 
 import numpy as np
 import pytest

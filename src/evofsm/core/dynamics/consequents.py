@@ -46,11 +46,15 @@ class Here(NamedTuple):
 
 
 class Stretch(NamedTuple):
-    """What happened for a while, as it was observed: residuals follow from it at any time."""
+    """What happened for a while, as it was observed: residuals follow from it at any time.
+
+    Unless it was observed of a system that moves otherwise now: then they are kept with it.
+    """
 
     observations: _Floats  #: (L + 2, m), the first one step before it began
     actions: _Floats  #: (L + 1, a), the first one step before it began
     episode: int  #: in which it was seen, from 0
+    unforeseen: _Floats  #: (L, m) residuals of then; (0, m) where they follow from the rest
 
 
 class Disturbances(NamedTuple):

@@ -4,11 +4,12 @@ What a hundred episodes taught outweighs ten, and what contradicts it counts as 
 correction of the model is learnt beside it, from the last few episodes alone. Where that would have
 foreseen, an episode ahead, what surprised the model, the doubt grows (a cumulative sum, Page,
 "Continuous inspection schemes", Biometrika 1954). Once it is large enough the model is corrected,
-and what was learnt before is rewritten as it would have been under the new one.
+and what was unforeseen before stays what it was.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -27,15 +28,13 @@ from evofsm.core.dynamics.regression import Sums, ridge
 _Floats = NDArray[np.float64]
 
 # Of what the last episodes said since a doubt began, what still counts an episode later.
-_FADES = 0.8
+_FADES = 0.95
 # What is unforeseen counts from this share of an ordinary change on; a correction has to halve it.
 _MATTERS, _HALVES = 0.5, 2.0
 # Doubt, as the logarithm of a likelihood ratio, from which on a model is corrected; and the number
 # of episodes before which it is still being learnt.
 _DOUBT = 30.0
 LEARNT = 20
-#: What was learnt before, once it is rewritten, counts as so many transitions.
-PAST = 300.0
 # What corrections are held to 0 by: as many transitions, of products more; and how many there have
 # to be.
 _PRIOR, _SHY, _FIRST = 0.3, 30.0, 15
@@ -54,9 +53,9 @@ class Recent(NamedTuple):
         """Before anything was seen, in this episode."""
         return cls(np.zeros((p, p)), np.zeros((p, m)), np.zeros(m), np.full(m, float(episode)))
 
-    def overthrown(self, episode: int) -> NDArray[np.int64]:
+    def overthrown(self, episode: int) -> list[int]:
         """Variables that do not move any more as was learnt."""
-        return np.flatnonzero((self.doubt > _DOUBT) & (episode >= LEARNT))
+        return np.flatnonzero((self.doubt > _DOUBT) & (episode >= LEARNT)).tolist()
 
 
 class Drift(NamedTuple):
@@ -74,6 +73,7 @@ def compared(
     Z: _Floats,
     U: _Floats,
     episode: int,
+    young: bool,
 ) -> Recent:
     """Take in an episode: T + 1 observations (T + 1, m), and actions (T, a).
 
@@ -93,7 +93,7 @@ def compared(
     left = missed - features @ correction(recent, known.weights, sums, U.shape[1])
     gained = np.log1p((missed / size) ** 2) - _HALVES * np.log1p((left / size) ** 2)
     doubt = np.maximum(recent.doubt + gained.sum(0), 0.0)
-    fades = _FADES if doubt.any() else 0.0  # before a doubt it moved as ever
+    fades = _FADES if young or doubt.any() else 0.0  # before a doubt it moved as ever
     return Recent(
         fades * recent.squares + features.T @ features,
         fades * recent.products + features.T @ change,
@@ -125,21 +125,17 @@ def correction(recent: Recent, weights: _Floats, sums: Sums, a: int) -> _Floats:
     return found
 
 
-def rewritten(
-    one: Stretch, before: Consequents, after: Consequents, moved: NDArray[np.int64]
+def as_it_was(
+    one: Stretch, before: Consequents, after: Consequents, moved: Sequence[int], carried: bool
 ) -> Stretch:
-    """A stretch as it would have been under another model, amid the same that was unforeseen.
+    """A stretch with what was unforeseen in it by the model of then, if it is of then.
 
-    As it is, where the new model foresees better what those variables did that moved otherwise.
+    It is not if the new model foresees better what those variables did that moved otherwise.
     """
-    Z, U = one.observations.copy(), one.actions
-    old, new = np.zeros((2, len(U) - 1, Z.shape[1]))
-    for known, missed in ((before, old), (after, new)):
-        residuals(known, Z, U, len(missed), False, missed)
-    was, now = (np.abs(each[:, moved] * after.inverse[moved]).sum() for each in (old, new))
-    if now <= was:
+    if len(one.unforeseen):
         return one
-    for t, miss in enumerate(old):
-        move = along(after, Z[t : t + 3], U[t : t + 2], 1).move[:, 0]
-        Z[t + 2] = np.clip(Z[t + 1] + move + miss, after.lowest, after.highest)
-    return one._replace(observations=Z)
+    was, now = np.zeros((2, len(one.actions) - 1, one.observations.shape[1]))
+    for known, missed in ((before, was), (after, now)):
+        residuals(known, one.observations, one.actions, len(missed), carried, missed)
+    larger = np.abs(now[:, moved]).sum(0) > np.abs(was[:, moved]).sum(0)
+    return one._replace(unforeseen=was) if larger.any() else one

@@ -23,12 +23,11 @@ from evofsm.core.dynamics.consequents import (
 )
 from evofsm.core.dynamics.drift import (
     LEARNT,
-    PAST,
     Drift,
     Recent,
+    as_it_was,
     compared,
     correction,
-    rewritten,
 )
 from evofsm.core.dynamics.failures import explain_failures, probe
 from evofsm.core.dynamics.regression import (
@@ -545,27 +544,31 @@ class Dynamics:
         self.n_episodes += 1
 
     def _follow_drift(self, Z: _Floats, U: _Floats) -> None:
-        """Correct the model of what moves otherwise than it did, and rewrite what was learnt."""
-        sums, before = self.sums, self.consequents
-        self.recent = recent = compared(self.recent, before, sums, Z, U, self.n_episodes)
-        moved = recent.overthrown(self.n_episodes)
-        if not len(moved):
+        """Correct the model of what moves otherwise; what was unforeseen before stays so."""
+        sums, before, young = self.sums, self.consequents, self._young
+        self.recent = compared(self.recent, before, sums, Z, U, self.n_episodes, bool(young))
+        begun = self.recent.overthrown(self.n_episodes)
+        self.drifts += [Drift(j, int(self.recent.since[j]), self.n_episodes) for j in begun]
+        moved = sorted({*begun, *young})
+        if not moved:
             return
         self.weights = self.weights.copy()
-        self.weights[:, moved] += correction(recent, before.weights, sums, self.size)[:, moved]
+        self.weights[:, moved] += correction(self.recent, before.weights, sums, self.size)[:, moved]
         sums.products[:, moved] = sums.squares @ self.weights[:, moved]
-        share = min(1.0, PAST / sums.squares[0, 0])  # what comes shall tell the rest
-        sums.squares[:] *= share
-        sums.products[:] *= share
         self._solve()
-        left = np.zeros((len(U) - 1, self.n_variables))
-        residuals(self.consequents, Z, U, len(left), False, left)
-        size = np.sqrt((left**2).mean(0))
-        sums.scale[moved] = np.maximum(sums.scale, size)[moved]
-        self.stretches = [rewritten(one, before, self.consequents, moved) for one in self.stretches]
-        self.drifts += [Drift(int(j), int(recent.since[j]), self.n_episodes) for j in moved]
-        begun = Recent.nothing(*self.weights.shape, self.n_episodes)
-        self.recent = recent._replace(doubt=begun.doubt, since=begun.since)
+        self.stretches = [
+            as_it_was(one, before, self.consequents, moved, self._carried) for one in self.stretches
+        ]
+        self.recent.doubt[moved] = 0.0
+
+    @property
+    def _carried(self) -> bool:
+        return "carried" not in self.without
+
+    @property
+    def _young(self) -> list[int]:
+        """Variables of which the model was corrected a short while ago."""
+        return [one.variable for one in self.drifts if self.n_episodes - one.noticed < LEARNT]
 
     def settle(self) -> None:
         """Make of all sums what is known: weights, and where it fails.
@@ -635,7 +638,7 @@ class Dynamics:
         known = sums.scale[0] > 0.0
         new = 0.8 * sums.scale + 0.2 * scale if known else scale
         square = (size**2).mean(0)
-        young = [one.variable for one in self.drifts if self.n_episodes - one.noticed < LEARNT]
+        young = self._young
         new[young] = np.maximum(new, np.sqrt(square))[young]  # what is learnt anew is no outlier
         sums.scale[:] = np.maximum(new, 1e-3 * np.sqrt(sums.variance) + 1e-300)
         sums.noise[:] = 0.8 * sums.noise + 0.2 * square if known else square
@@ -697,9 +700,9 @@ class Dynamics:
         for t in starts:
             L = min(self.horizon, len(U) - 1 - t)
             if L >= _SHORTEST:
-                self.stretches.append(
-                    Stretch(Z[t : t + L + 2].copy(), U[t : t + L + 1].copy(), self.n_episodes)
-                )
+                observed, done = Z[t : t + L + 2].copy(), U[t : t + L + 1].copy()
+                nothing = np.empty((0, self.n_variables))
+                self.stretches.append(Stretch(observed, done, self.n_episodes, nothing))
         self.stretches = self.stretches[-self.most_stretches :]
 
     def keep(self, which: Sequence[int]) -> None:
@@ -816,10 +819,12 @@ class Dynamics:
             np.zeros((count, m, m, 2)),
             np.zeros((count, m, 2)),
         )
-        carried = "carried" not in self.without
-        for k, (Z, U, _) in enumerate(self.stretches, 1):
+        for k, (Z, U, _, unforeseen) in enumerate(self.stretches, 1):
             L = min(len(U) - 1, steps)
-            residuals(self.consequents, Z, U, L, carried, found.residuals[k])
+            if len(unforeseen):
+                found.residuals[k, :L] = unforeseen[:L]
+            else:
+                residuals(self.consequents, Z, U, L, self._carried, found.residuals[k])
         if "jumps" not in self.without:
             self._find_jumps(found)
         return found
@@ -830,7 +835,7 @@ class Dynamics:
             seen = np.array(self.jumps[j]).reshape(-1, self.n_variables + 1)
             if not len(seen):
                 continue
-            for k, (Z, _, _) in enumerate(self.stretches, 1):
+            for k, (Z, *_) in enumerate(self.stretches, 1):
                 d = np.append(np.abs(np.diff(Z[:, j])), 0.0)
                 around = np.maximum(np.maximum(d[:-2], d[2:]), self.sums.unit[j])
                 left = np.abs(found.residuals[k, : len(d) - 2, j])

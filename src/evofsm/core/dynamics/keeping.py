@@ -89,12 +89,15 @@ _RECENT: dict[str, tuple[_Shape, ranges.Range]] = {
 _NEW: dict[str, tuple[_Shape, ranges.Range]] = {
     **{f"recent_{name}": told for name, told in _RECENT.items()},
     "drifts": (("drifts", 3), ranges.COUNT),
+    "stretch_unforeseen": (("unforeseen", "m"), _SOME),
+    "stretch_is_of_then": (("stretches",), ranges.FLAG),
 }
 
 
 def _upgrade(version: int, settings: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> None:
     """No model was corrected before version 7."""
     arrays.setdefault("drifts", np.zeros((0, 3)))
+    arrays.setdefault("stretch_unforeseen", np.zeros((0, len(arrays["origin"]))))
 
 
 _KIND = ranges.register(
@@ -191,6 +194,10 @@ def _arrays(dynamics: Dynamics) -> dict[str, NDArray[np.float64]]:
             [np.empty((0, m)), *(one.observations for one in stretches)]
         ),
         "stretch_actions": np.concatenate([np.empty((0, a)), *(one.actions for one in stretches)]),
+        "stretch_unforeseen": np.concatenate(
+            [np.empty((0, m)), *(one.unforeseen for one in stretches)]
+        ),
+        "stretch_is_of_then": np.array([len(one.unforeseen) > 0 for one in stretches], np.float64),
         "observations": observations,
         "actions": actions,
     }
@@ -212,6 +219,12 @@ def _refuse_impossible(dynamics: Dynamics, arrays: dict[str, NDArray[Any]]) -> N
     have = len(arrays["stretch_observations"]), len(arrays["stretch_actions"])
     if expected != have or (len(lengths) and lengths.min() < 2):
         raise ValueError(f"stretches have {have} observations and actions, not {expected}")
+    missed = int(((lengths - 1.0) * arrays["stretch_is_of_then"]).sum())
+    if missed != len(arrays["stretch_unforeseen"]):
+        raise ValueError(
+            f"stretches have {len(arrays['stretch_unforeseen'])} rows of what was unforeseen, not "
+            f"{missed}"
+        )
     observed, done = len(arrays["observations"]), len(arrays["actions"])
     if not max(observed - 1, 0) <= done <= observed:
         raise ValueError(f"there are {done} actions after {observed} observations")
@@ -233,12 +246,16 @@ def _restore(dynamics: Dynamics, arrays: dict[str, NDArray[Any]]) -> None:
         dynamics.jumps[int(j)].append(np.append(before, after))
     ends = np.cumsum(arrays["stretches"][:, 0]).astype(int)
     begins = ends - arrays["stretches"][:, 0].astype(int)
+    of_then = arrays["stretch_is_of_then"] > 0.0
+    rows = np.cumsum((ends - begins - 1)[of_then])
+    unforeseen = iter(np.split(arrays["stretch_unforeseen"], rows))
     for k, (begin, end) in enumerate(zip(begins.tolist(), ends.tolist(), strict=True)):
         dynamics.stretches.append(
             Stretch(
                 arrays["stretch_observations"][begin + k : end + k + 1].copy(),
                 arrays["stretch_actions"][begin:end].copy(),
                 int(arrays["stretches"][k, 1]),
+                next(unforeseen) if of_then[k] else np.empty((0, dynamics.n_variables)),
             )
         )
     dynamics.go_on(arrays["observations"], arrays["actions"])
