@@ -53,7 +53,7 @@ def test_the_network_that_was_trained_chooses_actions(task):
 
 
 def test_what_is_not_there_is_said():
-    with pytest.raises(ValueError, match="has no controller 'dqn'"):
-        make_system("intersection", "dqn")
+    with pytest.raises(ValueError, match="has no controller 'pilot'"):
+        make_system("intersection", "pilot")
     with pytest.raises(ValueError, match="shows no objects"):
         JUDGES["scene"](make_system("acc"), (), 0)

@@ -37,7 +37,7 @@ class Highway(System):
     ----------
     controller : str, optional
         ``random``, ``idle``, ``faster``, or ``dqn``: a deep Q-network that was trained on the task
-        without any guard (``tools/train_dqn.py``), where one was.
+        without any guard (``tools/train_dqn.py``).
     task : str
         ``"highway-fast"``, ``"merge"`` or ``"intersection"``.
 
@@ -74,12 +74,11 @@ class Highway(System):
     def controllers(self) -> Mapping[str, Callable[[Vector], Action]]:
         """Those that act without looking, and one that was trained."""
         idle, faster = self.names.index("idle"), self.names.index("faster")
-        trained = {"dqn": self._trained} if _weights(self.name).is_file() else {}
         return {
             "random": lambda z: int(self.whim.integers(len(self.names))),
             "idle": lambda z: idle,
             "faster": lambda z: faster,
-            **trained,
+            "dqn": self._trained,
         }
 
     @property
@@ -143,5 +142,5 @@ def read_weights(task: str) -> list[tuple[Vector, Vector]]:
 
 
 def _weights(task: str) -> Traversable:
-    """The file that tools/train_dqn.py wrote, if it did."""
+    """The file that tools/train_dqn.py wrote."""
     return files("evofsm.evidence.systems") / "weights" / f"{task}.npz"
