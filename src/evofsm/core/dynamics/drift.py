@@ -10,6 +10,7 @@ and what was unforeseen before stays what it was.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from typing import NamedTuple
 
 import numpy as np
@@ -120,9 +121,10 @@ def correction(recent: Recent, weights: _Floats, sums: Sums, a: int) -> _Floats:
     latest = lags(m, a)
     held[latest] = 1e12 * np.maximum(size[latest], 1e-12)
     missed = recent.products - recent.squares @ weights
-    for j, missing in enumerate(missed.T):
-        found[:, j] = ridge(recent.squares, missing, held)
-    return found
+    with suppress(np.linalg.LinAlgError):  # numbers of sizes that have nothing in common
+        for j, missing in enumerate(missed.T):
+            found[:, j] = ridge(recent.squares, missing, held)
+    return found if np.isfinite(found).all() else np.zeros_like(found)
 
 
 def as_it_was(

@@ -559,7 +559,7 @@ class Dynamics:
         self.stretches = [
             as_it_was(one, before, self.consequents, moved, self._carried) for one in self.stretches
         ]
-        self.recent.doubt[moved] = 0.0
+        self.recent.doubt[moved], self.recent.since[moved] = 0.0, float(self.n_episodes)
 
     @property
     def _carried(self) -> bool:
