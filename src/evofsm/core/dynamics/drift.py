@@ -122,8 +122,7 @@ def correction(recent: Recent, weights: _Floats, sums: Sums, a: int) -> _Floats:
     held[latest] = 1e12 * np.maximum(size[latest], 1e-12)
     missed = recent.products - recent.squares @ weights
     with suppress(np.linalg.LinAlgError):  # numbers of sizes that have nothing in common
-        for j, missing in enumerate(missed.T):
-            found[:, j] = ridge(recent.squares, missing, held)
+        found = ridge(recent.squares, missed, held)
     return found if np.isfinite(found).all() else np.zeros_like(found)
 
 

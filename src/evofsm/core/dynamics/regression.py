@@ -257,10 +257,10 @@ def solve(sums: Sums, m: int, a: int, without: _Floats) -> _Floats:
 
 
 def ridge(squares: _Floats, products: _Floats, held: _Floats) -> _Floats:
-    """(p,) weights that are held to 0 by ``held`` (p,), as much as so many squares would."""
+    """(p,) or (p, k) weights that are held to 0 by ``held`` (p,), as by so many squares more."""
     size = np.diag(squares)
     scale = 1.0 / np.sqrt(np.where(size > 0.0, size + held, 1.0))
     scaled = scale[:, None] * (squares + np.diag(held)) * scale
     scaled[np.diag_indices_from(scaled)] += _ALL_ALIKE
-    found: _Floats = scale * np.linalg.solve(scaled, scale * products)
+    found: _Floats = (scale * np.linalg.solve(scaled, (scale * products.T).T).T).T
     return found
