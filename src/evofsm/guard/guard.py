@@ -51,7 +51,7 @@ from evofsm.guard.protocols import (
     Witness,
 )
 from evofsm.guard.reviser import NOTHING, ActionReviser, Mode, is_spoken
-from evofsm.guard.senses import Senses
+from evofsm.guard.senses import Senses, has_gaps
 
 # Intervals that a range of actions is divided into for the machine, unless a width is given.
 _INTERVALS = 17
@@ -470,7 +470,7 @@ class Guard:
                 policy = self.missing if self.machine.state is not None else Missing.PARTIAL
             step = self.machine.observe(z, missing=policy)
             return Situation(z, step.belief, step.state, step.surprise, time, intake)
-        if self._frozen.n_states == 0 or np.isnan(self._senses.held).any():
+        if self._frozen.n_states == 0 or has_gaps(self._senses.held):
             return nothing
         belief = self._frozen.recognise(self._senses.held)
         return Situation(z, belief, int(belief.argmax()), math.nan, time, intake)
@@ -595,7 +595,7 @@ class Guard:
         if self.failed is not None and last is not None:
             failed = failed or bool(self.failed(last))
         if self.machine is not None and self.learn:
-            if z is not None and (self.machine.n_states or not np.isnan(z).any()):
+            if z is not None and (self.machine.n_states or not has_gaps(z)):
                 self.machine.observe(z, failed=failed, missing=Missing.PARTIAL)
             elif failed and self.machine.state is not None:
                 self.machine.fail()

@@ -75,6 +75,8 @@ class Futures(NamedTuple):
     """
 
     which: NDArray[np.int64]  #: (n,) number of the disturbance of each; 0 where there is none
+    residuals: _Floats  #: (H, m, n) of those
+    jumps: NDArray[np.bool_]  #: (H,) steps at which some of those jump
     z: _Floats  #: (m, n)
     change: _Floats  #: (m, n)
     before: _Floats  #: (a, n)
@@ -84,6 +86,8 @@ class Futures(NamedTuple):
     features: _Floats  #: (p, n)
     survived: NDArray[np.int64]  #: (in use,) steps until failure
     least: _Floats  #: (in use,) least distance to it in those [ordinary changes]
+    steps: NDArray[np.int64]  #: (n,) of which the first are `survived`
+    near: _Floats  #: (n,) of which the first are `least`
 
 
 def n_features(m: int, a: int, *, box: bool) -> int:
@@ -102,15 +106,36 @@ def lags(m: int, a: int) -> NDArray[np.int64]:
 
 
 @compiled
-def futures(known: Consequents, a: int, which: NDArray[np.int64]) -> Futures:
-    """Futures of a situation with ``a`` numbers of an action, one for each disturbance."""
+def futures(
+    known: Consequents,
+    a: int,
+    which: NDArray[np.int64],
+    disturbances: Disturbances | None = None,
+) -> Futures:
+    """Futures of a situation with ``a`` numbers of an action, one for each disturbance.
+
+    Without disturbances they cannot advance.
+    """
     m, p, n = len(known.origin), len(known.weights), lanes(len(which))
     padded = np.zeros(n, np.int64)
     padded[: len(which)] = which
+    steps = 0 if disturbances is None else disturbances.residuals.shape[1]
+    unforeseen, jumps = np.empty((steps, m, n)), np.zeros(steps, np.bool_)
+    if disturbances is not None:
+        for l in range(n):
+            for t in range(steps):
+                for j in range(m):
+                    unforeseen[t, j, l] = disturbances.residuals[padded[l], t, j]
+            for j in range(m):
+                t = int(disturbances.jump_at[padded[l], j])
+                if 0 <= t < steps:
+                    jumps[t] = True
     z, change, move, after = np.empty((m, n)), np.empty((m, n)), np.empty((m, n)), np.empty((m, n))
     before, action, features = np.empty((a, n)), np.empty((a, n)), np.empty((p, n))
-    survived, least = np.empty(len(which), np.int64), np.empty(len(which))
-    return Futures(padded, z, change, before, action, move, after, features, survived, least)
+    survived, least = np.empty(n, np.int64), np.empty(n)
+    ends = survived[: len(which)], least[: len(which)], survived, least
+    room = z, change, before, action, move, after, features
+    return Futures(padded, unforeseen, jumps, *room, *ends)
 
 
 @inner_kernel
@@ -166,14 +191,21 @@ def fill_features(room: Futures, origin: _Floats, reach: _Floats, box: bool) -> 
 def expect(known: Consequents, room: Futures) -> None:
     """The changes that are expected, into ``room.move``."""
     fill_features(room, known.origin, known.reach, known.choices == 0)
-    move, features = room.move, room.features
-    n = move.shape[1]
+    move, features, weights = room.move, room.features, known.weights
+    n, p = move.shape[1], len(features)
+    whole = p - p % 4
     for j in range(len(move)):
         for l in range(n):
             move[j, l] = 0.0
-    for k in range(len(features)):
+    for k in range(0, whole, 4):  # four at once: the sums are the same, and written less often
         for j in range(len(move)):
-            weight = known.weights[k, j]
+            u, v, w, x = weights[k, j], weights[k + 1, j], weights[k + 2, j], weights[k + 3, j]
+            for l in range(n):
+                y = move[j, l] + features[k, l] * u + features[k + 1, l] * v
+                move[j, l] = y + features[k + 2, l] * w + features[k + 3, l] * x
+    for k in range(whole, p):
+        for j in range(len(move)):
+            weight = weights[k, j]
             for l in range(n):
                 move[j, l] += features[k, l] * weight
 
@@ -212,11 +244,11 @@ def advance(
     expect(known, room)
     for j in range(m):
         for l in range(n):
-            move[j, l] += harder * disturbances.residuals[which[l], t, j]
+            move[j, l] += harder * room.residuals[t, j, l]
         least, most = harder * known.least[j], harder * known.most[j]
         for l in range(n):
             after[j, l] = z[j, l] + min(max(move[j, l], least), most)
-    for j in range(m):
+    for j in range(m if room.jumps[t] else 0):
         for l in range(n):
             k = which[l]
             if disturbances.jump_at[k, j] == t:
@@ -256,12 +288,12 @@ def replay(
     more than ``allowed`` did, or number 0 did, that is no disturbance at all; if ``allowed`` is
     negative, all go on as far as they can.
     """
-    survived, least = room.survived, room.least
-    count, steps = len(survived), disturbances.residuals.shape[1]
+    survived, least = room.steps, room.near
+    count, steps, n = len(room.survived), disturbances.residuals.shape[1], len(least)
     begin_at(room, here)
     lost = 0
-    for l in range(count):
-        survived[l], least[l] = steps, np.inf
+    for l in range(n):
+        survived[l], least[l] = steps if l < count else -1, np.inf
     for t in range(steps):
         if t == 0 and len(first) > 0:
             for i in range(len(first)):
@@ -269,15 +301,20 @@ def replay(
         else:
             follow_policy(known, policy, room.z, room.action)
         advance(known, disturbances, t, harder, room)
+        for s in range(len(known.sides)):
+            side = known.sides[s]
+            j, sign, threshold, worth = int(side[0]), side[1], side[2], side[3]
+            for l in range(n):
+                left = sign * (threshold - room.z[j, l]) * worth
+                nearer = left if left < least[l] else least[l]
+                least[l] = nearer if survived[l] == steps else least[l]
+        fails = 0
+        for l in range(n):
+            fails += 1 if (survived[l] == steps) & (least[l] < enough) else 0
+        if fails == 0:
+            continue
         for l in range(count):
-            if survived[l] < steps:
-                continue
-            for s in range(len(known.sides)):
-                side = known.sides[s]
-                left = side[1] * (side[2] - room.z[int(side[0]), l]) * side[3]
-                if left < least[l]:
-                    least[l] = left
-            if least[l] < enough:
+            if survived[l] == steps and least[l] < enough:
                 survived[l] = t
                 lost += 1
                 if allowed >= 0 and room.which[l] == 0:

@@ -111,7 +111,7 @@ def _foresee(
     known: Consequents, here: Here, actions: _Floats, disturbances: Disturbances, path: _Floats
 ) -> None:
     """Replay actions under each disturbance, into ``path`` (K, steps, m)."""
-    room = futures(known, actions.shape[1], np.arange(len(path)))
+    room = futures(known, actions.shape[1], np.arange(len(path)), disturbances)
     begin_at(room, here)
     for t in range(len(actions)):
         for i in range(actions.shape[1]):

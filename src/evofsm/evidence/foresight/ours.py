@@ -193,7 +193,7 @@ def _replay_all(
 ) -> None:
     """Steps until failure, into ``found``; recorded actions go on from ``begin`` up to ``end``."""
     count = found.shape[2]
-    room = futures(known, action.shape[1], np.arange(count))
+    room = futures(known, action.shape[1], np.arange(count), disturbances)
     for r in range(len(z)):
         for s in range(begin.shape[1]):
             begin_at(room, Here(z[r], change[r], before[r]))

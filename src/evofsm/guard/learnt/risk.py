@@ -32,9 +32,10 @@ from evofsm.guard.learnt.actions import LONGEST_STRETCH
 from evofsm.guard.learnt.backups import Backups
 from evofsm.guard.learnt.keeping import KIND, NUMBERS, Kept, arrays_of, restored
 from evofsm.guard.learnt.remembering import Situations, choose, failing_after
-from evofsm.guard.learnt.search import CHANGED, KEPT, NOTHING_PASSES, ends, search, worth
+from evofsm.guard.learnt.search import CHANGED, KEPT, NOTHING_PASSES, outcomes, search, worth
 from evofsm.guard.learnt.words import Remembered
 from evofsm.guard.protocols import Fallback, Judgement, Search, Situation, Trial
+from evofsm.guard.senses import has_gaps
 
 _Floats = NDArray[np.float64]
 
@@ -369,7 +370,9 @@ class LearntRisk:
                 f"({dynamics.n_variables},)"
             )
         here = Here(z, moved, np.zeros(dynamics.size))
-        lost, left, _ = self._lost_after(here, np.empty(0), self.backups.ranks)
+        found = np.empty((3, 1))
+        self._foresee(here, np.empty((1, 0)), self.backups.ranks, found)
+        lost, left, _ = found[:, 0].tolist()
         dead_end, hours = math.isinf(lost), self.exposure / 3600.0
         count = len(self.disturbances.residuals) - 1 if dead_end else int(lost)
         low, high = poisson_bounds(count)
@@ -378,7 +381,7 @@ class LearntRisk:
             lost=count,
             remembered=self.remembered.number,
             margin=left,
-            risk=self._risk(lost),
+            risk=_risk(lost, self._soon),
             per_hour=(count / hours, low / hours, high / hours),
         )
 
@@ -398,30 +401,23 @@ class LearntRisk:
         And whether the last is lost for good, and after how many steps any of them fails at the
         latest.
         """
-        lost, left, took = np.zeros((3, len(actions)))
-        for i, action in enumerate(actions if passes is None else actions[:-1]):
-            lost[i], left[i], took[i] = self._lost_after(here, action, self._ranks[:_ASKED])
+        found = np.zeros((3, len(actions)))
+        asked = actions if passes is None else actions[:-1]
+        if len(asked):
+            self._foresee(here, asked, self._ranks[:_ASKED], found)
+        lost, left, took = found
         if passes is not None:
             left[-1] = passes
         self._lost = -1 if math.isinf(lost[0]) else int(lost[0])
         judged = self._judgement(lost, left, situation)
         return judged, math.isinf(lost[-1]), float(took.max())
 
-    def _lost_after(
-        self, here: Here, action: _Floats, ranks: NDArray[np.int64]
-    ) -> tuple[float, float, float]:
-        """Disturbances that are lost after an action; infinite if it fails without any.
-
-        And what is left after the worst of them, and the steps after which it fails at the latest.
-        """
+    def _foresee(self, here: Here, actions: _Floats, ranks: NDArray[np.int64], to: _Floats) -> None:
+        """What comes of actions, as `outcomes` has it."""
         assert self.disturbances is not None
         assert self.backups is not None
-        found = np.empty(len(self.disturbances.residuals))
-        policies, known = self.backups.policies[ranks], self.dynamics.consequents
-        ends(known, here, action, policies, self.disturbances, 1.0, 0.0, found)
-        lost = math.inf if found[0] < 0.0 else float(np.count_nonzero(found < 0.0))
-        took = float(found[found < 0.0].max()) + 1.0 + self.horizon if lost else 0.0
-        return lost, float(found.min()), took
+        known, policies = self.dynamics.consequents, self.backups.policies
+        outcomes(known, here, actions, policies, ranks, self.disturbances, to)
 
     @property
     def _soon(self) -> float:
@@ -429,7 +425,8 @@ class LearntRisk:
         return self.horizon * self.dt / max(self.exposure, 1e-300)
 
     def _judgement(self, lost: _Floats, left: _Floats, situation: Situation) -> Judgement:
-        risk, low, high = np.array([self._risk(each) for each in lost.tolist()]).T.copy()
+        soon = self._soon
+        risk, low, high = np.array([_risk(each, soon) for each in lost.tolist()]).T.copy()
         seen, machine = math.nan, self.machine
         if (
             machine is not None
@@ -438,14 +435,6 @@ class LearntRisk:
         ):
             seen = float(machine.visits[situation.state]) * self.dt
         return Judgement(risk, low, high, left, float(len(self.dynamics.stretches)), seen)
-
-    def _risk(self, lost: float) -> tuple[float, float, float]:
-        """Probability, with its interval, that something begins that is lost."""
-        if math.isinf(lost):
-            return 1.0, 0.0, 1.0
-        soon = self._soon
-        low, high = poisson_bounds(int(lost))
-        return _within(lost * soon), _within(low * soon), _within(high * soon)
 
     def _allowed(self, tolerance: float) -> int:
         """How many of the disturbances need not be survived.
@@ -462,7 +451,7 @@ class LearntRisk:
     def _here(self, situation: Situation) -> Here | None:
         """Where one is; what was not observed is taken to have gone on as before."""
         z = situation.observation
-        if np.isnan(z).any():
+        if has_gaps(z):
             if self._z is None:
                 return None
             z = np.where(np.isnan(z), self._z + self._change, z)
@@ -680,6 +669,17 @@ class LearntRisk:
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}(dt={self.dt:g}, seed={self.seed})"
+
+
+def _risk(lost: float, soon: float) -> tuple[float, float, float]:
+    """Probability, with its interval, that something begins that is lost.
+
+    ``soon`` is the horizon, as a share of the time in which all that is remembered was seen.
+    """
+    if math.isinf(lost):
+        return 1.0, 0.0, 1.0
+    low, high = poisson_bounds(int(lost))
+    return _within(lost * soon), _within(low * soon), _within(high * soon)
 
 
 def _within(expected: float) -> float:

@@ -78,7 +78,7 @@ def search(
     nothing passes, how far apart the backups are: near 0 all are alike.
     """
     a = len(proposal)
-    room = futures(known, a, np.arange(len(disturbances.residuals)))
+    room = futures(known, a, np.arange(len(disturbances.residuals)), disturbances)
     world = (known, here, disturbances, harder, allowed, room)
     for q in ranks:
         is_lost, left = _lost(proposal, policies[q], margin, *world)
@@ -154,11 +154,40 @@ def ends(
     every, steps = np.arange(len(found)), disturbances.residuals.shape[1]
     found[:] = -np.inf
     for policy in policies:
-        room = futures(known, policies.shape[1], every[found < enough])
+        room = futures(known, policies.shape[1], every[found < enough], disturbances)
         replay(known, here, action, policy, disturbances, harder, 0.0, -1, room)
         for l in range(len(room.least)):
             t, k = room.survived[l], room.which[l]
             found[k] = max(found[k], room.least[l] if t == steps else t - steps - 1.0)
+
+
+@compiled
+def outcomes(
+    known: Consequents,
+    here: Here,
+    actions: _Floats,
+    policies: _Floats,
+    ranks: _Ints,
+    disturbances: Disturbances,
+    found: _Floats,
+) -> None:
+    """What comes of each action (k, a) if the best policy follows, into ``found`` (3, k).
+
+    How many disturbances are lost, infinite if it fails without any; the least distance to failure
+    under the worst of them, as `ends` has it; and the steps after which it fails at the latest.
+    """
+    steps, asked = disturbances.residuals.shape[1], policies[ranks]
+    each = np.empty(len(disturbances.residuals))
+    for i in range(len(actions)):
+        ends(known, here, actions[i], asked, disturbances, 1.0, 0.0, each)
+        lost, worst, took = 0.0, np.inf, 0.0
+        for x in each:
+            worst = min(worst, x)
+            if x < 0.0:
+                lost += 1.0
+                took = max(took, x + 1.0 + steps)
+        found[0, i] = np.inf if each[0] < 0.0 else lost
+        found[1, i], found[2, i] = worst, took
 
 
 @compiled
@@ -192,7 +221,7 @@ def worth(
     harder: float,
 ) -> float:
     """How well a policy ends, over all situations and the disturbances ``which``."""
-    room, total = futures(known, before.shape[1], which), 0.0
+    room, total = futures(known, before.shape[1], which, disturbances), 0.0
     for r in range(len(z)):
         here = Here(z[r], change[r], before[r])
         total += _lasting(known, here, policy, disturbances, harder, room)
