@@ -26,7 +26,9 @@ def test_features_from_another_origin_are_a_linear_map_of_them():
         none, count = np.empty((3, 1)), np.zeros(1, int)
         columns = [one[:, None] for one in (z, change, before, action)]
         for row, where in zip(found, (origin, other), strict=True):
-            room = Futures(count, *columns, none, none, row[:, None], count, none[0])
+            unused = count, none[None], count > 0
+            ends = count, none[0], count, none[0]
+            room = Futures(*unused, *columns, none, none, row[:, None], *ends)
             getattr(fill_features, "py_func", fill_features)(room, where, reach, box)
         np.testing.assert_allclose(moved(origin - other, 3, p) @ found[0], found[1], atol=1e-12)
 

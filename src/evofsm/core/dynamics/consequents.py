@@ -32,6 +32,7 @@ class Consequents(NamedTuple):
     least: _Floats  #: (m,) most negative ordinary change there was
     most: _Floats  #: (m,) most positive one
     sides: _Floats  #: (k, 4) failure: variable, its sign, threshold, and what a change is worth
+    anew: _Floats  #: (m,) 1 of a variable that moves otherwise than it did, else 0
     mean: _Floats  #: (m,) of what policies take for their middle
     inverse: _Floats  #: (m,) and one over their spread
     choices: int  #: number of actions; 0 where the action is a box
@@ -243,6 +244,9 @@ def advance(
     m, n = z.shape
     expect(known, room)
     for j in range(m):
+        if known.anew[j] > 0.0:  # little was seen of it: no more is foreseen than there was
+            for l in range(n):
+                move[j, l] = min(max(move[j, l], known.least[j]), known.most[j])
         for l in range(n):
             move[j, l] += harder * room.residuals[t, j, l]
         least, most = harder * known.least[j], harder * known.most[j]
@@ -383,15 +387,14 @@ def residuals(
 def pack(known: Consequents) -> _Floats:
     """All but the sides and the number of choices, in one array."""
     parts = (known.weights, known.origin, known.reach, known.lowest, known.highest)
-    return np.concatenate(
-        [np.ravel(part) for part in (*parts, known.least, known.most, known.mean, known.inverse)]
-    )
+    more = (known.least, known.most, known.anew, known.mean, known.inverse)
+    return np.concatenate([np.ravel(part) for part in (*parts, *more)])
 
 
 @compiled
 def unpacked(packed: _Floats, m: int, choices: int) -> Consequents:
     """What was packed, without sides."""
-    at = len(packed) - 8 * m
+    at = len(packed) - 9 * m
     return Consequents(
         packed[:at].reshape((at // m, m)),
         packed[at : at + m],
@@ -402,7 +405,8 @@ def unpacked(packed: _Floats, m: int, choices: int) -> Consequents:
         packed[at + 5 * m : at + 6 * m],
         packed[:0].reshape((0, 4)),
         packed[at + 6 * m : at + 7 * m],
-        packed[at + 7 * m :],
+        packed[at + 7 * m : at + 8 * m],
+        packed[at + 8 * m :],
         choices,
     )
 

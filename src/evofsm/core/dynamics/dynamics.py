@@ -514,6 +514,7 @@ class Dynamics:
             sides=np.array(
                 [[j, sign, at, worth[j]] for j, sign, at in self.sides], np.float64
             ).reshape(-1, 4),
+            anew=self.anew,
             mean=self.origin + sums.mean,
             inverse=1.0 / np.sqrt(np.where(variance > 0.0, variance, 1.0)),
             choices=self.choices,
@@ -552,6 +553,8 @@ class Dynamics:
         moved = sorted({*begun, *young})
         if not moved:
             return
+        change = np.diff(Z, axis=0)
+        sums.least[begun], sums.most[begun] = change.min(0)[begun], change.max(0)[begun]
         self.weights = self.weights.copy()
         self.weights[:, moved] += correction(self.recent, before.weights, sums, self.size)[:, moved]
         sums.products[:, moved] = sums.squares @ self.weights[:, moved]
@@ -560,6 +563,13 @@ class Dynamics:
             as_it_was(one, before, self.consequents, moved, self._carried) for one in self.stretches
         ]
         self.recent.doubt[moved], self.recent.since[moved] = 0.0, float(self.n_episodes)
+
+    @property
+    def anew(self) -> _Floats:
+        """(m,) 1 of a variable that moves otherwise than it did, else 0."""
+        found = np.zeros(self.n_variables)
+        found[[one.variable for one in self.drifts]] = 1.0
+        return found
 
     @property
     def _carried(self) -> bool:

@@ -236,11 +236,12 @@ def _restore(dynamics: Dynamics, arrays: dict[str, NDArray[Any]]) -> None:
         setattr(dynamics, name, arrays[name])
     dynamics.used = arrays["used"]
     known: dict[str, Any] = {name: arrays[_KNOWN + name] for name in _CONSEQUENTS}
-    dynamics.consequents = Consequents(**known, origin=arrays["origin"], choices=dynamics.choices)
+    dynamics.drifts = [Drift(*row) for row in arrays["drifts"].astype(int).tolist()]
+    fixed = {"origin": arrays["origin"], "anew": dynamics.anew, "choices": dynamics.choices}
+    dynamics.consequents = Consequents(**known, **fixed)
     dynamics.weights = known["weights"]
     dynamics.sides = [(int(j), float(sign), float(at)) for j, sign, at, _ in known["sides"]]
     dynamics.recent = Recent(**{name: arrays[f"recent_{name}"] for name in _RECENT})
-    dynamics.drifts = [Drift(*row) for row in arrays["drifts"].astype(int).tolist()]
     dynamics.failures = list(arrays["failures"])
     for (j, after), before in zip(arrays["jumps"], arrays["jumps_from"], strict=True):
         dynamics.jumps[int(j)].append(np.append(before, after))

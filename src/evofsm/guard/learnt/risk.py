@@ -577,8 +577,13 @@ class LearntRisk:
         self._ranks = self.backups.ranks.copy()
 
     def _begin_anew(self) -> None:
-        """The model was corrected: how far it is to be trusted is not known yet."""
-        self.takes = max(self.takes, _HORIZON / _AHEAD)
+        """The model was corrected: how far it is to be trusted is not known yet.
+
+        What was seen before counts little: disturbances are taken to be harder again, and it may
+        take longer to fail.
+        """
+        self.takes = min(_AHEAD * max(self.takes, _HORIZON / _AHEAD), _FARTHEST / _AHEAD)
+        self.n_scanned = 0
         if "margin" not in self.without:
             self.margin = max(self.margin, _MARGIN)
 
