@@ -153,12 +153,12 @@ def test_a_run_waits_for_whoever_looks_on_in_foxglove():
     with connect(address, subprotocols=["foxglove.sdk.v1"], proxy=None) as client:
         topics = {}
         while "/risk" not in topics:
-            told = json.loads(client.recv(timeout=30))
+            told = json.loads(client.recv(timeout=60))
             topics |= {one["topic"]: one["id"] for one in told.get("channels", [])}
         asked = {"op": "subscribe", "subscriptions": [{"id": 1, "channelId": topics["/risk"]}]}
         client.send(json.dumps(asked))
         while not isinstance(data := client.recv(timeout=60), bytes):
             pass
     process.terminate()
-    process.communicate(timeout=30)
+    process.communicate(timeout=60)
     assert "proposed" in json.loads(data[13:])

@@ -25,10 +25,10 @@ def test_it_prints_an_address_that_answers_and_ends_with_control_c():
     with process:
         assert "steer the run" in process.stdout.readline()
         address = process.stdout.readline().strip()
-        with urlopen(address, timeout=10) as answer:
+        with urlopen(address, timeout=60) as answer:
             assert b"<!doctype html>" in answer.read()
         process.send_signal(signal.SIGINT)
-        rest, errors = process.communicate(timeout=20)
+        rest, errors = process.communicate(timeout=60)
     assert process.returncode == 0
     assert rest == "\nevofsm: the page is closed\n"
     assert errors == ""
@@ -43,10 +43,10 @@ def test_paused_shows_the_first_frame():
         with connect(socket, origin=f"http://{address.netloc}", proxy=None) as client:
             shown = []
             while "frame" not in {part["kind"] for part in shown}:
-                message = json.loads(client.recv(timeout=30))
+                message = json.loads(client.recv(timeout=60))
                 shown += message.get("parts", [message])
         process.send_signal(signal.SIGINT)
-        process.communicate(timeout=20)
+        process.communicate(timeout=60)
     assert process.returncode == 0
     (frame,) = [part for part in shown if part["kind"] == "frame"]
     (*_, clock) = [part for part in shown if part["kind"] == "clock"]
@@ -85,8 +85,8 @@ def test_a_log_of_others_is_watched(tmp_path):
     (tmp_path / "objects.csv").write_text("\n".join(lines) + "\n")
     with watch(str(tmp_path / "objects.csv"), "--no-browser") as process:
         assert "steer the run" in process.stdout.readline()
-        with urlopen(process.stdout.readline().strip(), timeout=10) as answer:
+        with urlopen(process.stdout.readline().strip(), timeout=60) as answer:
             assert b"<!doctype html>" in answer.read()
         process.send_signal(signal.SIGINT)
-        process.communicate(timeout=20)
+        process.communicate(timeout=60)
     assert process.returncode == 0

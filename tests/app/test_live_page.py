@@ -44,7 +44,7 @@ def seen(browser):
             live.player = player
             contexts.append(browser.new_context(viewport={"width": width, "height": height}))
             page = contexts[-1].new_page()
-            page.set_default_timeout(15_000)
+            page.set_default_timeout(60_000)
             page.on("console", lambda message: wrong.append(message.text))
             page.on("pageerror", lambda error: wrong.append(str(error)))
             page.on("request", lambda request: asked(request.url))
@@ -69,7 +69,7 @@ def text(page, name):
 
 
 def shows(page, name, words):
-    playwright.expect(page.locator(f"#{name}")).to_contain_text(words, timeout=15_000)
+    playwright.expect(page.locator(f"#{name}")).to_contain_text(words, timeout=60_000)
 
 
 def time_shown(page):

@@ -44,7 +44,7 @@ def page():
 
 def get(page, path, host=None, **headers):
     """Status, headers and body of a request."""
-    connection = HTTPConnection("127.0.0.1", page.port, timeout=10)
+    connection = HTTPConnection("127.0.0.1", page.port, timeout=60)
     try:
         connection.putrequest("GET", path, skip_host=True)
         connection.putheader("Host", host or f"127.0.0.1:{page.port}")
@@ -63,14 +63,14 @@ def looking_on(page, *, origin=None, token=None, sock=None):
         origin=origin or f"http://127.0.0.1:{page.port}",
         sock=sock,
         proxy=None,
-        open_timeout=10,
+        open_timeout=60,
     )
 
 
 def told(client, kind):
     """The next message of a kind."""
     while True:
-        message = json.loads(client.recv(timeout=10))
+        message = json.loads(client.recv(timeout=60))
         for part in message.get("parts", [message]):
             if part["kind"] == kind:
                 return part
@@ -168,7 +168,7 @@ def test_who_comes_late_is_shown_all_of_it(page):
             page.player.step()
             assert told(first, "frame")["number"] == number
     with looking_on(page) as later:
-        whole = json.loads(later.recv(timeout=10))
+        whole = json.loads(later.recv(timeout=60))
     kinds = [part["kind"] for part in whole["parts"]]
     assert kinds[0] == "start"
     assert kinds.count("frame") == 3
@@ -359,7 +359,7 @@ def messages_of_runs(client, runs):
     """All messages up to the end of the last run."""
     learnt = ends = 0
     while not (learnt == runs - 1 and ends):
-        message = json.loads(client.recv(timeout=10))
+        message = json.loads(client.recv(timeout=60))
         yield message
         for part in message.get("parts", [message]):
             if part["kind"] == "start":

@@ -227,7 +227,7 @@ class Told:
 
     def wait(self, holds):
         with self.news:
-            assert self.news.wait_for(lambda: holds(self), timeout=20.0), self.events[-3:]
+            assert self.news.wait_for(lambda: holds(self), timeout=60.0), self.events[-3:]
 
 
 def ends(told):

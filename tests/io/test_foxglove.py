@@ -92,16 +92,16 @@ def test_whoever_connects_sees_the_decisions_as_they_are_made():
         with connect(sink.address, subprotocols=["foxglove.sdk.v1"], proxy=None) as client:
             channel = None
             while channel is None:
-                told = json.loads(client.recv(timeout=10))
+                told = json.loads(client.recv(timeout=60))
                 for one in told.get("channels", []):
                     channel = one["id"] if one["topic"] == "/decision" else channel
             asked = {"op": "subscribe", "subscriptions": [{"id": 7, "channelId": channel}]}
             client.send(json.dumps(asked))
             assert sink.await_someone(10.0)
             threading.Thread(target=drive, args=[guard]).start()
-            data = client.recv(timeout=10)
+            data = client.recv(timeout=60)
             while not isinstance(data, bytes):
-                data = client.recv(timeout=10)
+                data = client.recv(timeout=60)
     opcode, subscription, at = struct.unpack("<BIQ", data[:13])
     assert (opcode, subscription) == (1, 7)
     assert abs(at - time.time_ns()) < 60e9

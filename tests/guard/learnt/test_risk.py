@@ -12,6 +12,7 @@ from evofsm.core.dynamics.drift import Drift
 from evofsm.guard import Mode, same_action
 from evofsm.guard.auditing.log import AuditLog
 from evofsm.guard.auditing.replay import audit
+from evofsm.guard.learnt.breaks import Breaks
 from evofsm.guard.learnt.risk import LearntRisk
 
 
@@ -286,3 +287,25 @@ def test_after_a_drift_the_margin_begins_anew(point, monkeypatch):
     monkeypatch.undo()
     point.play(guard, 51)
     assert judge.margin < 3.0
+
+
+def test_where_certificates_break_in_every_episode_disturbances_are_harder_again(
+    point, monkeypatch
+):
+    monkeypatch.setattr("evofsm.guard.learnt.breaks._LEARNT", 0)
+    guard = point.taught(4)
+    judge = guard.judge
+    judge.breaks, judge.margin = Breaks(share=0.0), 0.1
+    harder, learn = judge.harder, type(judge).learn
+
+    def broken(self, *given):
+        learn(self, *given)
+        self._broke = True  # as by what was never seen before
+
+    monkeypatch.setattr(type(judge), "learn", broken)
+    for episode in range(40, 43):
+        point.play(guard, episode)
+    assert judge.breaks.worse == 4
+    assert "since episode 5 disturbances are worse" in judge.told_by_experience
+    assert judge.harder > harder
+    assert judge.margin > 2.0

@@ -237,8 +237,8 @@ def _restore(dynamics: Dynamics, arrays: dict[str, NDArray[Any]]) -> None:
     dynamics.used = arrays["used"]
     known: dict[str, Any] = {name: arrays[_KNOWN + name] for name in _CONSEQUENTS}
     dynamics.drifts = [Drift(*row) for row in arrays["drifts"].astype(int).tolist()]
-    fixed = {"origin": arrays["origin"], "anew": dynamics.anew, "choices": dynamics.choices}
-    dynamics.consequents = Consequents(**known, **fixed)
+    known |= {"origin": arrays["origin"], "anew": dynamics.anew, "choices": dynamics.choices}
+    dynamics.consequents = Consequents(**known)
     dynamics.weights = known["weights"]
     dynamics.sides = [(int(j), float(sign), float(at)) for j, sign, at, _ in known["sides"]]
     dynamics.recent = Recent(**{name: arrays[f"recent_{name}"] for name in _RECENT})

@@ -18,6 +18,7 @@ PARTS: dict[str, str] = {
     "drift": "the model is not corrected where the system has changed",
     "margin": "no margin",
     "backups": "constant backups alone",
+    "breaks": "it is not noticed where disturbances get worse",
     "states": "no state decides anything",
 }
 #: A value of the options that stands for all there is, and one for nothing.

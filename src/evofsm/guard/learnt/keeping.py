@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from evofsm.core import Disturbances, Here
 from evofsm.files import ranges
 from evofsm.guard.learnt.backups import Backups
+from evofsm.guard.learnt.breaks import Breaks
 from evofsm.guard.learnt.remembering import Situations
 
 # Names of the arrays of situations.
@@ -35,6 +36,14 @@ _SHAPES: dict[str, tuple[int | str, ...]] = {
 }
 #: Attributes of the judge that are numbers, which it goes on with.
 NUMBERS = ("margin", "broken", "horizon", "takes", "n_studied", "n_scanned")
+
+
+def _upgrade(version: int, settings: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> None:
+    """At first it was not asked whether disturbances get worse."""
+    for name, value in Breaks()._asdict().items():
+        settings.setdefault(name, value)
+
+
 KIND = ranges.register(
     ranges.Kind(
         "learntrisk",
@@ -47,7 +56,12 @@ KIND = ranges.register(
             "horizon": ranges.FROM_1,
             "told_horizon": ranges.SIZE,
             "takes": ranges.Range(0.0, 1e6),
+            "share": ranges.Range(0.0, 1.0),
+            "doubt": ranges.Range(0.0, 1e6),
+            "since": ranges.COUNT,
+            "worse": ranges.Range(-1.0, 1e15),
         },
+        upgrade=_upgrade,
     )
 )
 

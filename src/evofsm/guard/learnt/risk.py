@@ -30,6 +30,7 @@ from evofsm.files import Place, storage
 from evofsm.guard.learnt import words
 from evofsm.guard.learnt.actions import LONGEST_STRETCH
 from evofsm.guard.learnt.backups import Backups
+from evofsm.guard.learnt.breaks import Breaks
 from evofsm.guard.learnt.keeping import KIND, NUMBERS, Kept, arrays_of, restored
 from evofsm.guard.learnt.remembering import Situations, choose, failing_after
 from evofsm.guard.learnt.search import CHANGED, KEPT, NOTHING_PASSES, outcomes, search, worth
@@ -40,7 +41,7 @@ from evofsm.guard.senses import has_gaps
 _Floats = NDArray[np.float64]
 
 #: Parts that can be left out, to see what each is worth; others are those of `Dynamics`.
-JUDGE_PARTS = ("margin", "backups")
+JUDGE_PARTS = ("margin", "backups", "breaks")
 
 # Backups that are asked in a decision, and disturbances that mutants are tried on, beside none.
 _ASKED, _TRIED_ON = 3, 5
@@ -123,6 +124,7 @@ class LearntRisk:
     _certified: bool  # whether at the decision before some backup survived all
     _was_certified: bool  # and at any before
     _holds: bool  # and at this one
+    _broke: bool  # whether a certificate was broken
     _tight: bool  # whether the latest proposal was refused
     _tights: list[bool]
     _dead_end: bool  # whether nothing helped, even without any disturbance
@@ -157,6 +159,8 @@ class LearntRisk:
         self.margin = 0.0 if "margin" in self.without else _MARGIN
         #: Certificates that were broken.
         self.broken = 0
+        #: Whether they break more often than they used to.
+        self.breaks = Breaks()
         self.n_studied = 0
         self.n_scanned = 0
         #: Steps that it takes to fail at the latest, where that cannot be avoided.
@@ -238,7 +242,7 @@ class LearntRisk:
         fails = [(called(j), sign < 0.0, at) for j, sign, at, _ in dynamics.consequents.sides]
         latest = {one.variable: one.since + 1 for one in dynamics.drifts}
         drifts = [(called(j), since) for j, since in latest.items()]
-        return words.experience(fails, self.remembered, self.margin, drifts)
+        return words.experience(fails, self.remembered, self.margin, drifts, self.breaks.worse + 1)
 
     def search(
         self, situation: Situation, wanted: Any, *, tolerance: float, revising: bool
@@ -494,6 +498,7 @@ class LearntRisk:
         if "margin" not in self.without and self.backups is not None:
             broken = self._certified and not self._holds
             self.broken += broken
+            self._broke |= broken
             self.margin = min(_LARGEST, max(0.0, self.margin + _ADDED * (broken - _RATE)))
         self._certified = self._holds
         self._was_certified |= self._holds
@@ -537,6 +542,7 @@ class LearntRisk:
         self._z = None
         self._change = self._action = np.zeros(0)
         self._certified = self._was_certified = self._holds = self._tight = False
+        self._broke = False
         self._dead_end = False
         self._tights, self._dead_ends = [], []
         self._lost = 0
@@ -548,7 +554,8 @@ class LearntRisk:
         dynamics = self.dynamics
         self.n_studied = dynamics.n_episodes
         self.margin *= _FADES
-        if any(one.noticed == dynamics.n_episodes - 1 for one in dynamics.drifts):
+        moved = any(one.noticed == dynamics.n_episodes - 1 for one in dynamics.drifts)
+        if moved or self._is_worse():
             self._begin_anew()
         episode = dynamics.latest
         if episode is None or not dynamics.ready:
@@ -576,12 +583,20 @@ class LearntRisk:
             self._evolve(random)
         self._ranks = self.backups.ranks.copy()
 
-    def _begin_anew(self) -> None:
-        """The model was corrected: how far it is to be trusted is not known yet.
+    def _is_worse(self) -> bool:
+        """Whether disturbances got worse than those that are remembered."""
+        if "breaks" in self.without:
+            return False
+        before, broke = self.breaks, self._broke
+        self.breaks, self._broke = before.after(self.n_studied - 1, broke=broke), False
+        return self.breaks.worse != before.worse
 
-        What was seen before counts little: disturbances are taken to be harder again, and it may
-        take longer to fail.
+    def _begin_anew(self) -> None:
+        """How far model and memory are to be trusted is not known yet.
+
+        Disturbances are taken to be harder again than they were, and it may take longer to fail.
         """
+        self.breaks = Breaks(worse=self.breaks.worse)
         self.takes = min(_AHEAD * max(self.takes, _HORIZON / _AHEAD), _FARTHEST / _AHEAD)
         self.n_scanned = 0
         if "margin" not in self.without:
@@ -646,6 +661,7 @@ class LearntRisk:
         content = {name: getattr(self, name) for name in ("dt", "seed", "told_horizon", *NUMBERS)}
         content |= {"without": sorted(self.without)}
         content |= {"names": list(self.labels.names), "units": list(self.labels.units)}
+        content |= self.breaks._asdict()
         content |= {"n_constant": 0 if self.backups is None else self.backups.n_constant}
         arrays = arrays_of(Kept(self.situations, self.backups, self.disturbances))
         storage.write(path, KIND.name, content, arrays, provenance)
@@ -668,6 +684,7 @@ class LearntRisk:
             kept = restored(int(content["n_constant"]), arrays)
         for name in NUMBERS:
             setattr(judge, name, content[name])
+        judge.breaks = Breaks(*(content[name] for name in Breaks._fields))
         judge.situations, judge.backups, judge.disturbances = kept
         judge._forget()
         return judge

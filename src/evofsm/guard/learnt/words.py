@@ -130,6 +130,7 @@ def experience(
     remembered: Remembered,
     margin: float,
     drifts: Sequence[tuple[str, int]] = (),
+    worse: int = 0,
 ) -> str:
     """What was learnt so far.
 
@@ -141,6 +142,8 @@ def experience(
     margin : float
     drifts : sequence of (str, int)
         Variables that do not move any more as they did, and since which episode, from 1.
+    worse : int
+        Since which episode, from 1, disturbances are worse than those of before; 0: since none.
 
     Examples
     --------
@@ -151,6 +154,8 @@ def experience(
 ordinary changes'
     """
     since = "".join(f"; since episode {first} {name} moves otherwise" for name, first in drifts)
+    if worse:
+        since += f"; since episode {worse} disturbances are worse than those of before"
     if not fails:
         return NO_FAILURE + since
     where = " or ".join(
