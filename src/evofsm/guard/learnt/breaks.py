@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 # Of the share of episodes with a broken certificate: what it is at first, how much more it may be
 # than of late, what would be worse, and from where on nothing is told apart from that.
-_FIRST, _MORE, _WORSE, _USUAL = 0.5, 0.05, 0.5, 0.4
+_FIRST, _MORE, _WORSE, _USUAL = 0.5, 0.05, 0.5, 0.2
 # Weight of an episode in that share; log likelihood ratio from which on it is believed; the number
 # of episodes before which all is still being learnt.
 _WEIGHT, _DOUBT, _LEARNT = 0.05, 6.0, 20

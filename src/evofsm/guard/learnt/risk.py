@@ -48,8 +48,9 @@ _ASKED, _TRIED_ON = 3, 5
 # The margin [ordinary changes]: at first, at most, what is left of it an episode later, and what a
 # broken certificate adds, for so many that may be.
 _MARGIN, _LARGEST, _FADES, _ADDED, _RATE = 3.0, 8.0, 0.9, 0.25, 0.001
-# Disturbances are taken to be harder than they were by so many over the number of episodes.
-_CAUTION = 4.0
+# Disturbances are taken to be harder than they were by so many over the number of episodes; by so
+# much at most after a change: a change half as large again as any there was has no sequel.
+_CAUTION, _AGAIN = 4.0, 0.44
 # Steps that are looked ahead: at first, at least, at most; times those that it takes to fail, of
 # which so much is left an episode later, and after one in which a dead end was none.
 _HORIZON, _SHORTEST, _FARTHEST, _AHEAD = 64, 32, LONGEST_STRETCH, 1.5
@@ -216,7 +217,8 @@ class LearntRisk:
     @property
     def harder(self) -> float:
         """How much harder than they were disturbances are taken to be, while little was seen."""
-        return 1.0 + min(0.5 * _CAUTION, _CAUTION / max(1, self.n_scanned))
+        most = _AGAIN if self._began_anew else 0.5 * _CAUTION
+        return 1.0 + min(most, _CAUTION / max(1, self.n_scanned))
 
     @property
     def exposure(self) -> float:
@@ -590,6 +592,11 @@ class LearntRisk:
         before, broke = self.breaks, self._broke
         self.breaks, self._broke = before.after(self.n_studied - 1, broke=broke), False
         return self.breaks.worse != before.worse
+
+    @property
+    def _began_anew(self) -> bool:
+        dynamics = self.dynamics
+        return self.breaks.worse >= 0 or (dynamics.n_variables > 0 and bool(dynamics.drifts))
 
     def _begin_anew(self) -> None:
         """How far model and memory are to be trusted is not known yet.
