@@ -95,6 +95,6 @@ def test_it_is_kept_in_files_and_merges(changed, drive, follow):
 def test_no_larger_change_is_foreseen_than_was_seen_since(changed):
     """Where the effect of the action bends is known only nearly."""
     dynamics = changed()
-    assert dynamics.consequents.anew.tolist() == [0.0, 1.0, 0.0]
+    assert dynamics.consequents.anew.tolist() == [-1.0, 1.0, -1.0]
     assert dynamics.sums.least[1] == pytest.approx(0.25 * WEAK)
     assert max(slows_by(dynamics, action) for action in np.linspace(-2.5, 0.0, 11)) <= 1.0 + 1e-9

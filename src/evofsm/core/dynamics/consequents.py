@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 
 from evofsm.core.kernels import compiled, inner_kernel, lanes, rare_kernel
 
+# After a change, so many times the largest change there was may be foreseen.
+_FARTHER = 3.0
 #: Where the effect of an action may bend, in each dimension of a box.
 KNOTS = np.array([-0.5, 0.0, 0.5])
 
@@ -32,7 +34,7 @@ class Consequents(NamedTuple):
     least: _Floats  #: (m,) most negative ordinary change there was
     most: _Floats  #: (m,) most positive one
     sides: _Floats  #: (k, 4) failure: variable, its sign, threshold, and what a change is worth
-    anew: _Floats  #: (m,) 1 of a variable that moves otherwise than it did, else 0
+    anew: _Floats  #: (m,) 1 of a variable that moves otherwise than it did, -1 of others then, or 0
     mean: _Floats  #: (m,) of what policies take for their middle
     inverse: _Floats  #: (m,) and one over their spread
     choices: int  #: number of actions; 0 where the action is a box
@@ -244,14 +246,21 @@ def advance(
     m, n = z.shape
     expect(known, room)
     for j in range(m):
+        least, most = harder * known.least[j], harder * known.most[j]
         if known.anew[j] > 0.0:  # little was seen of it: no more is foreseen than there was
             for l in range(n):
                 move[j, l] = min(max(move[j, l], known.least[j]), known.most[j])
-        for l in range(n):
-            move[j, l] += harder * room.residuals[t, j, l]
-        least, most = harder * known.least[j], harder * known.most[j]
-        for l in range(n):
-            after[j, l] = z[j, l] + min(max(move[j, l], least), most)
+        if known.anew[j] < 0.0:  # it moves as ever, but may have to go farther than it ever did
+            for l in range(n):
+                low = min(least, max(move[j, l], _FARTHER * known.least[j]))
+                high = max(most, min(move[j, l], _FARTHER * known.most[j]))
+                y = move[j, l] + harder * room.residuals[t, j, l]
+                after[j, l] = z[j, l] + min(max(y, low), high)
+        else:
+            for l in range(n):
+                move[j, l] += harder * room.residuals[t, j, l]
+            for l in range(n):
+                after[j, l] = z[j, l] + min(max(move[j, l], least), most)
     for j in range(m if room.jumps[t] else 0):
         for l in range(n):
             k = which[l]

@@ -566,8 +566,8 @@ class Dynamics:
 
     @property
     def anew(self) -> _Floats:
-        """(m,) 1 of a variable that moves otherwise than it did, else 0."""
-        found = np.zeros(self.n_variables)
+        """(m,) 1 of variables that move otherwise than they did, -1 of others then; 0 without."""
+        found = np.full(self.n_variables, -1.0 if self.drifts else 0.0)
         found[[one.variable for one in self.drifts]] = 1.0
         return found
 
