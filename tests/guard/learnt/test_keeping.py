@@ -7,6 +7,7 @@ import pytest
 
 from evofsm import Guard
 from evofsm.files import storage
+from evofsm.guard.learnt.breaks import Breaks
 from evofsm.guard.learnt.risk import LearntRisk
 
 
@@ -39,3 +40,13 @@ def test_a_file_that_contradicts_itself_is_refused(points):
         storage.write(bad, "learntrisk", told, arrays | spoilt)
         with pytest.raises(ValueError, match=what):
             LearntRisk.load(BytesIO(bad.getvalue()))
+
+
+def test_a_file_of_before_breaks_were_counted_is_read(points):
+    file = BytesIO()
+    points["box"].taught(3).judge.save(file)
+    content, arrays = storage.read(BytesIO(file.getvalue()), "learntrisk")
+    kept = {name: value for name, value in content.items() if name not in Breaks._fields}
+    old = BytesIO()
+    storage.write(old, "learntrisk", kept, arrays)
+    assert LearntRisk.load(BytesIO(old.getvalue())).breaks == Breaks()
