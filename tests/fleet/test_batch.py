@@ -36,7 +36,7 @@ def settings():
 
 
 @pytest.mark.slow
-@hypothesis.settings(max_examples=30)
+@hypothesis.settings(max_examples=15)
 @given(settings=settings(), seed=st.integers(0, 100))
 def test_each_vehicle_is_the_machine_alone_bit_for_bit(settings, seed):
     """With vehicles that enter late, are silent now and then, begin episodes, and fail."""
