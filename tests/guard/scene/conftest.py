@@ -1,4 +1,4 @@
-"""A scene made up for these tests: things come towards one on a road of five lanes."""
+"""A scene made up for these tests: things come towards one on a road of a few lanes."""
 
 import numpy as np
 import pytest
@@ -6,7 +6,7 @@ import pytest
 from evofsm.guard import Guard, SceneRisk
 
 LEFT, STAY, RIGHT = range(3)
-LANES, THINGS, STEPS = 5, 3, 25
+THINGS, STEPS = 3, 25
 HALF = np.array([2.0, 0.6])  # of the box around each other that fails
 
 
@@ -15,9 +15,10 @@ class Rain:
 
     columns = 4
 
-    def __init__(self, *, relative=True, shuffled=False, scale=(1.0, 1.0), steps=STEPS):
+    def __init__(self, *, relative=True, shuffled=False, scale=(1.0, 1.0), steps=STEPS, **rest):
         self.relative, self.shuffled, self.scale = relative, shuffled, np.array(scale)
         self.steps = steps
+        self.moves, self.lanes = rest.get("moves", 1.0), rest.get("lanes", 5)
 
     def judge(self, **told):
         return SceneRisk(1.0, 3, columns=self.columns, relative=self.relative, **told)
@@ -26,19 +27,19 @@ class Rain:
         return Guard(n_actions=3, interval=1.0, judge=self.judge(), **told)
 
     def play(self, guard, seed):
-        """Revisions of an episode under a random policy, and whether it failed."""
-        random = np.random.default_rng(seed)
-        lane, said = 2, []
+        """Revisions of an episode under a policy that moves now and then, and whether it failed."""
+        random, whim = np.random.default_rng(seed), np.random.default_rng([seed, 1])
+        lane, said = self.lanes // 2, []
         place = np.column_stack(
-            [random.uniform(20, 60, THINGS), random.integers(LANES, size=THINGS)]
+            [random.uniform(20, 60, THINGS), random.integers(self.lanes, size=THINGS)]
         )
         speed = random.uniform(4.0, 8.0, THINGS)
         failed = False
         for _ in range(self.steps):
-            said.append(
-                guard.decide(self.seen(lane, place, speed, random), int(random.integers(3)))
-            )
-            then = int(np.clip(lane + said[-1].executed - 1, 0, LANES - 1))
+            row = self.seen(lane, place, speed, random)
+            wanted = int(random.integers(3)) if whim.random() < self.moves else STAY
+            said.append(guard.decide(row, wanted))
+            then = int(np.clip(lane + said[-1].executed - 1, 0, self.lanes - 1))
             start, end = place - [0.0, lane], place - [0.0, then]
             end[:, 0] -= speed
             place[:, 0] -= speed
@@ -49,7 +50,7 @@ class Rain:
                 break
             gone = place[:, 0] < -10.0
             place[gone] = np.column_stack(
-                [random.uniform(40, 70, gone.sum()), random.integers(LANES, size=gone.sum())]
+                [random.uniform(40, 70, gone.sum()), random.integers(self.lanes, size=gone.sum())]
             )
             speed[gone] = random.uniform(4.0, 8.0, gone.sum())
         guard.end(failed, self.seen(lane, place, speed, random))

@@ -8,6 +8,8 @@ import pytest
 from evofsm.guard import Guard, Layout, Mode, SceneRisk, same_action
 from evofsm.guard.scene.contact import closest, learn
 
+LEFT, STAY = 0, 1
+
 
 def failures(world, guard, seeds):
     return sum(world.play(guard, seed)[1] for seed in seeds)
@@ -44,6 +46,18 @@ def test_what_is_harmless_is_kept_and_what_is_changed_is_changed_for_a_reason(ra
         assert one.risk_executed <= one.risk_proposed
         if not is_kept:
             assert "an object is met within 5 s" in one.reason
+
+
+def test_what_oneself_never_did_at_first_is_learnt_too(rain):
+    world = rain(moves=0.0, lanes=3)
+    judge = world.judge()
+    guard = Guard(n_actions=3, interval=1.0, judge=judge, mode=Mode.OFF)
+    failures(world, guard, range(8))
+    world.moves = 0.3
+    failures(world, guard, range(8, 20))
+    abreast_soon = np.array([1.0, 0.0, 1.0, 0.0, 1.0, 5.0, -1.0, -6.0] + [0.0] * 8)
+    risks, _ = judge.memory.risks(judge.layout.read(abreast_soon))
+    assert risks.min(1)[LEFT] > 0.5 > 0.2 > risks.min(1)[STAY]
 
 
 def test_the_order_of_objects_makes_no_difference(taught):

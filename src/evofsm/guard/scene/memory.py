@@ -168,10 +168,8 @@ class Memory:
             now, then = slice(ends[t], ends[t + 1]), slice(ends[t + 1], ends[t + 2])
             if not (episode.counts[t] and episode.counts[t + 1]):
                 continue
-            expected = episode.away[now]
             own = episode.own[t : t + 2]
-            if self._motion is not None:
-                expected = expected + self._moved(own, episode.other[now], episode.other[now])
+            expected = episode.away[now] + self._moved(own, episode.other[now], episode.other[now])
             off = (expected[:, None] - episode.away[then]) / away
             change = (episode.other[now][:, None] - episode.other[then]) / other
             apart = (off**2).sum(2) + _OF_REST * (change**2).sum(2)
@@ -203,11 +201,12 @@ class Memory:
         mine = self._terms(flat.own[now], flat.own[now + 1], p)
         x = np.hstack([mine, flat.other[rows], flat.other[then], np.ones((len(rows), 1))])
         y = flat.away[then] - flat.away[rows]
+        before = _begun(x.shape[1], p)
         weights = np.ones(len(rows))
         ridge = _RIDGE * len(rows) * np.diag(x.var(0) + 1e-12)
         for _ in range(_FITS):
             weighed = x * weights[:, None]
-            motion = np.linalg.solve(weighed.T @ x + ridge, weighed.T @ y)
+            motion = np.linalg.solve(weighed.T @ x + ridge, weighed.T @ y + ridge @ before)
             off = (((y - x @ motion) / self._spreads[0]) ** 2).sum(1)
             middle = max(float(np.median(off)), _EXACT)
             weights = 1.0 / (1.0 + off / (_HALF * middle))
@@ -215,10 +214,12 @@ class Memory:
 
     def _moved(self, own: _Floats, other: _Floats, later: _Floats) -> _Floats:
         """(k, p) change of relative places in a step; ``own`` is (2, p + q), before and after."""
-        assert self._motion is not None
         mine = self._terms(own[:1], own[1:], own.shape[1] - other.shape[1])
-        x = np.hstack([np.repeat(mine, len(other), axis=0), other, later])
-        return np.asarray(x @ self._motion[:-1] + self._motion[-1])
+        x = np.hstack([np.repeat(mine, len(other), axis=0), other, later, np.ones((len(other), 1))])
+        motion = self._motion
+        if motion is None:
+            motion = _begun(x.shape[1], own.shape[1] - other.shape[1])
+        return np.asarray(x @ motion)
 
     def _terms(self, before: _Floats, after: _Floats, p: int) -> _Floats:
         """(k, p + 2 q) what of oneself moves all relative places in a step."""
@@ -353,6 +354,17 @@ class Memory:
                 after = to[0, ::n]
             at = to
         return gone, shares / shares.sum(0), after
+
+
+def _begun(terms: int, p: int) -> _Floats:
+    """What is taken before anything is learnt: by what one moves, all places move back.
+
+    Without it one's own moves, if they are rare, are never learnt: the right links are then far
+    from where objects are expected.
+    """
+    motion = np.zeros((terms, p))
+    motion[:p] = -np.eye(p)
+    return motion
 
 
 def _nearest(apart: _Floats, most: int) -> tuple[_Ints, _Floats]:
