@@ -7,6 +7,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from evofsm.core import compiled
+
 _Floats = NDArray[np.float64]
 
 # Points of a step at which the distance is taken, its two ends included.
@@ -36,11 +38,24 @@ class Contact(NamedTuple):
 
 def closest(start: _Floats, end: _Floats, sides: _Floats) -> _Floats:
     """How close it comes between two places: the least of ``max(abs(x) / sides)`` on the line."""
-    least = np.full(np.broadcast(start, end).shape[:-1], np.inf)
-    for share in np.linspace(0.0, 1.0, _POINTS):
-        at = np.abs(start + share * (end - start)) / sides
-        np.minimum(least, at.max(-1), out=least)
+    start, end = np.broadcast_arrays(start, end)
+    least = np.empty(start.shape[:-1])
+    first, last = (np.ascontiguousarray(of).reshape(-1, len(sides)) for of in (start, end))
+    _closest(first, last, sides, least.reshape(-1))
     return least
+
+
+@compiled
+def _closest(start: _Floats, end: _Floats, sides: _Floats, least: _Floats) -> None:
+    for k in range(len(least)):
+        least[k] = np.inf
+        for point in range(_POINTS):
+            share = point / (_POINTS - 1)
+            far = 0.0
+            for i in range(len(sides)):
+                at = start[k, i] + share * (end[k, i] - start[k, i])
+                far = max(far, abs(at) / sides[i])
+            least[k] = min(least[k], far)
 
 
 def learn(

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from evofsm.core import compiled
 from evofsm.guard.scene.contact import Contact, learn
 from evofsm.guard.scene.seeing import Seen
 
@@ -267,13 +268,13 @@ class Memory:
         )
 
     def _follow_oneself(self, flat: _Flat) -> None:
-        """What each action brought oneself."""
+        """What each action brought oneself, from states in units of their spreads."""
         known = np.flatnonzero((flat.actions >= 0) & ~flat.lost)
         self._own = []
         for action in range(self.n_actions):
             rows = known[flat.actions[known] == action]
             before = flat.own[rows]
-            self._own.append((before, flat.own[rows + 1] - before))
+            self._own.append((before / self._spreads[2], flat.own[rows + 1] - before))
 
     def _meet(self, flat: _Flat) -> None:
         """How close is too close."""
@@ -312,8 +313,8 @@ class Memory:
         gone, weights, after = self._gone(seen.own, p)
         safe = np.ones(gone.shape[:2])
         own = np.repeat(seen.own[None], len(seen.away), axis=0)
-        for i, one in enumerate(self._features(own, seen.away, seen.other)):
-            like, share = _nearest(((self._objects - one) ** 2).sum(1), ANALOGS)
+        analogs = _nearest(self._objects, self._features(own, seen.away, seen.other), ANALOGS)
+        for i, (like, share) in enumerate(zip(*analogs, strict=True)):
             faster = (seen.other[i] - self._others[like]) @ self._steady
             path = self._paths[like] + faster[:, None] * np.arange(1, self.steps + 1)[:, None]
             to = seen.away[i] + path + gone[:, :, None]
@@ -330,7 +331,7 @@ class Memory:
         """
         n, r = self.n_actions, _OWN_ANALOGS
         first, then = np.repeat(np.arange(n), n), np.tile(np.arange(n), n)
-        at = np.broadcast_to(own, (r, n * n, len(own))).copy()
+        at = np.broadcast_to(own, (r, n * n, len(own)))
         gone = np.zeros((r, n * n, self.steps, p))
         shares = np.full((r, n * n), 1.0 / r)
         total = np.zeros((r * n * n, p))
@@ -341,8 +342,8 @@ class Memory:
                 rows = np.flatnonzero((then if h else first) == action)
                 if not len(before):
                     continue
-                apart = ((at[:, rows, None] - before) / self._spreads[2]) ** 2
-                like, share = _nearest(apart.sum(-1), r)
+                here = (at[:, rows] / self._spreads[2]).reshape(-1, len(own))
+                like, share = (of.reshape(r, len(rows), -1) for of in _nearest(before, here, r))
                 which = np.minimum(course, like.shape[-1] - 1)
                 to[:, rows] += change[np.take_along_axis(like, which, -1)[..., 0]]
                 if h == 0:
@@ -367,11 +368,30 @@ def _begun(terms: int, p: int) -> _Floats:
     return motion
 
 
-def _nearest(apart: _Floats, most: int) -> tuple[_Ints, _Floats]:
-    """Indices of the nearest along the last axis, nearest first, and how much each counts."""
-    most = min(most, apart.shape[-1])
-    like = np.argpartition(apart, most - 1, axis=-1)[..., :most]
-    order = np.argsort(np.take_along_axis(apart, like, -1), axis=-1, kind="stable")
-    like = np.take_along_axis(like, order, -1)
-    weight = 1.0 / (_ALIKE + np.take_along_axis(apart, like, -1)) ** 2
+def _nearest(points: _Floats, around: _Floats, most: int) -> tuple[_Ints, _Floats]:
+    """(k, most) indices of the points nearest to each of k, nearest first, and what each counts."""
+    most = min(most, len(points))
+    like = np.empty((len(around), most), np.int64)
+    apart = np.full((len(around), most), np.inf)
+    _look(points, around, like, apart)
+    weight = 1.0 / (_ALIKE + apart) ** 2
     return like, weight / weight.sum(-1, keepdims=True)
+
+
+@compiled
+def _look(points: _Floats, around: _Floats, like: _Ints, apart: _Floats) -> None:
+    """The nearest points and their squared distances; of two equally near ones the first."""
+    last = apart.shape[1] - 1
+    for k in range(len(around)):
+        for j in range(len(points)):
+            far = 0.0
+            for i in range(points.shape[1]):
+                off = points[j, i] - around[k, i]
+                far += off * off
+            at = last
+            if far >= apart[k, at]:
+                continue
+            while at and apart[k, at - 1] > far:
+                apart[k, at], like[k, at] = apart[k, at - 1], like[k, at - 1]
+                at -= 1
+            apart[k, at], like[k, at] = far, j

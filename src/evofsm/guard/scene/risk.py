@@ -119,7 +119,8 @@ class SceneRisk:
     ) -> Search:
         """The action within the tolerance that is closest to ``wanted`` in what it brings oneself.
 
-        Where none is within the tolerance, the least risky one.
+        Where none is within the tolerance, it is the closest of those that are as little risky as
+        any, up to the tolerance: the proposal is kept unless another action is less dangerous.
 
         Parameters
         ----------
@@ -142,13 +143,14 @@ class SceneRisk:
         if risks[proposed] <= tolerance:
             said = f"risk {ahead} is within the tolerance"
             return Search(np.array([wanted]), self._judged(risks[[proposed]]), 0, said)
-        why = self.why(self._judged(risks[[proposed]]))
-        tolerable = np.flatnonzero(risks <= tolerance)
-        if len(tolerable):
-            apart = self.memory.apart(after[tolerable], after[proposed])
-            best, what = int(tolerable[apart.argmin()]), "the closest in effect that can"
+        why, least = self.why(self._judged(risks[[proposed]])), float(risks.min())
+        some_can = least <= tolerance
+        good = np.flatnonzero(risks <= (tolerance if some_can else least + tolerance))
+        if proposed in good:
+            best, what = proposed, "nothing can, nor is anything less dangerous"
         else:
-            best, what = int(risks.argmin()), "nothing can, the least risky"
+            best = int(good[self.memory.apart(after[good], after[proposed]).argmin()])
+            what = "the closest in effect that can" if some_can else "nothing can, the least risky"
         judged = self._judged(risks[[proposed, best]])
         options = np.array([wanted, float(best)])
         return Search(options, judged, int(best != proposed), f"{why}; {what}")
