@@ -67,6 +67,7 @@ from .observations import Category as Category
 from .observations import Missing as Missing
 from .observations import ObservationEncoder as ObservationEncoder
 from .proportions import poisson_bounds as poisson_bounds
+from .proportions import two_digits as two_digits
 from .proportions import wilson_bounds as wilson_bounds
 from .rates import FailureRecord as FailureRecord
 from .rates import OnsetRates as OnsetRates

@@ -127,6 +127,22 @@ def bounds_text(low: float, high: float) -> str:
     return f"{_rounded_down(low)} to {_rounded_up(high)} %"
 
 
+def two_digits(value: float, rounded: Callable[[float], int]) -> float:
+    """A number from 0 on with two significant digits, rounded by ``math.floor`` or ``math.ceil``.
+
+    What is off such a number by rounding alone is that number.
+
+    Examples
+    --------
+    >>> two_digits(0.000184, math.ceil), two_digits(0.000184, math.floor)
+    (0.00019, 0.00018)
+    """
+    if not 0.0 < value < math.inf:
+        return value
+    scale = 10.0 ** (1 - math.floor(math.log10(value)))
+    return rounded(round(value * scale, 6)) / scale
+
+
 def _rounded_up(share: float) -> str:
     decimals = _decimals(share)
     return f"{min(_outward(math.ceil, share, decimals), 100.0):.{decimals}f}"

@@ -21,7 +21,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.core.proportions import gamma_quantile, poisson_bounds
+from evofsm.core.proportions import gamma_quantile, poisson_bounds, two_digits
 
 # Two-sided 90 %.
 _TAILS = (0.05, 0.95)
@@ -59,7 +59,8 @@ class Rate(NamedTuple):
         )
 
     def __str__(self) -> str:
-        bounds = f"{self.low:.2g} to {self.high:.2g}" if self.onsets else f"at most {self.high:.2g}"
+        low, high = two_digits(self.low, math.floor), two_digits(self.high, math.ceil)
+        bounds = f"{low:.2g} to {high:.2g}" if self.onsets else f"at most {high:.2g}"
         times = "once" if self.onsets == 1 else f"{self.onsets:,} times"
         return f"{times} in {self.exposure:.4g}: {bounds}"
 
@@ -126,10 +127,9 @@ def _bounded(rate: Rate, unit: str) -> str:
 
 
 def _two_digits(value: float, rounded: Callable[[float], int]) -> str:
-    """Of a number above 0; what is off by rounding alone is rounded."""
-    places = 1 - math.floor(math.log10(value))
-    digits = rounded(round(value * 10.0**places, 6))
-    return f"{digits / 10.0**places:,.{max(places, 0)}f}"
+    """Of a number above 0."""
+    places = max(1 - math.floor(math.log10(value)), 0)
+    return f"{two_digits(value, rounded):,.{places}f}"
 
 
 def _exposure(value: float) -> str:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 from evofsm.app import NONE, Column, Table, bare_percent, count, listed, number
+from evofsm.core import two_digits
 from evofsm.evidence.breaks.amounts import NOBODY, TOY
 from evofsm.evidence.breaks.cases import FoundCase, odds
 from evofsm.evidence.breaks.figures import sketches
@@ -63,15 +64,17 @@ _SOURCES = (
 # -- Words ----------------------------------------------------------------------------------------
 
 
-def small(value: float) -> str:
-    """A probability, which may be small."""
+def small(value: float, rounded: Callable[[float], int] = round) -> str:
+    """A probability, which may be small; a bound is rounded outward."""
     if not math.isfinite(value):
         return NONE
-    return f"{value:.2g}" if 0.0 < value < 0.01 else number(value, 4 if value else 0)
+    if 0.0 < value < 0.01:
+        return f"{two_digits(value, rounded):.2g}"
+    return number(rounded(round(1e4 * value, 6)) / 1e4, 4 if value else 0)
 
 
 def _between(low: float, high: float) -> str:
-    return f"{small(low)}–{small(high)}"
+    return f"{small(low, math.floor)}–{small(high, math.ceil)}"
 
 
 def _headline(found: Breaks) -> str:
@@ -106,7 +109,7 @@ def _sentence(row: Row) -> str:
     seen = (
         f"{count(row.plain_failed)} of {count(row.plain)} plain samples failed" if row.plain else ""
     )
-    bound = f" (at most {small(row.plain_high)}, 95 %)" if row.plain else ""
+    bound = f" (at most {small(row.plain_high, math.ceil)}, 95 %)" if row.plain else ""
     return (
         f"{text}. {seen}{bound}{'. ' if seen else ''}This is no proof: failures to which no "
         "close case leads would be missed."
