@@ -25,6 +25,24 @@ def test_an_episode_is_drawn_by_its_start_alone(task):
     assert len(first) % system.columns == 0
 
 
+def test_an_episode_does_not_hang_on_what_the_process_ran_before():
+    """The intersection sets how cars drive, for every environment there is."""
+
+    def passed(system):
+        return [step.observation for step in (system.step(1) for _ in range(3))]
+
+    merge, start = make_system("merge", "idle"), Start.held_out(3, 1)
+    merge.reset(start)
+    before = passed(merge)
+    merge.reset(start)
+    make_system("intersection").reset(start)
+    amid = passed(merge)
+    merge.reset(start)
+    after = passed(merge)
+    assert np.array_equal(before, amid)
+    assert np.array_equal(before, after)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("task", HIGHWAY)
 def test_it_drives_to_the_end_under_each_rival(task):

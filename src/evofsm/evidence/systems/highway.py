@@ -21,7 +21,7 @@ from evofsm.extras import needs
 
 with needs("highway-env", "highway", "a task of highway-env"):
     import gymnasium
-    import highway_env  # noqa: F401  (registers its environments)
+    from highway_env.vehicle.behavior import IDMVehicle  # registers environments, too
 
 # Names of the five actions, and of those of a car that cannot leave its lane.
 _ALL = ("left", "idle", "right", "faster", "slower")
@@ -115,7 +115,9 @@ class Highway(System):
         return int(value.argmax())
 
     def _begin(self, start: Start) -> None:
+        _set_habits(_HABITS)
         self._seen, _ = self.env.reset(seed=int(self.chance.integers(2**31)))
+        self._habits = _habits()
         self._ended = False
         self._speeds: list[float] = []
 
@@ -123,6 +125,7 @@ class Highway(System):
         return np.asarray(self._seen, dtype=np.float64).ravel()
 
     def _advance(self, action: Action) -> tuple[float, bool]:
+        _set_habits(self._habits)
         self._seen, reward, terminated, truncated, info = self.env.step(int(action))
         self._speeds.append(float(info["speed"]))
         self._ended = bool(terminated or truncated)
@@ -130,6 +133,21 @@ class Highway(System):
 
     def _is_over(self) -> bool:
         return self._ended or super()._is_over()
+
+
+def _habits() -> dict[str, Any]:
+    """How other cars drive; an environment may set it for all that the process has."""
+    return {name: getattr(IDMVehicle, name) for name in dir(IDMVehicle) if name.isupper()}
+
+
+def _set_habits(habits: Mapping[str, Any]) -> None:
+    for name, value in habits.items():
+        setattr(IDMVehicle, name, value)
+
+
+# Before any environment did. Those of the intersection stay set when it is left, and a row would
+# depend on what its process had run before.
+_HABITS = _habits()
 
 
 def read_weights(task: str) -> list[tuple[Vector, Vector]]:

@@ -7,6 +7,7 @@ lanes, cars behind, target speeds.
 from __future__ import annotations
 
 from abc import abstractmethod
+from copy import deepcopy
 from typing import Any, ClassVar
 
 import numpy as np
@@ -22,6 +23,8 @@ _HALF_WAY = 0.5
 # Brakes of who follows, at least, of who leads, at most, and throttle while reacting [m/s²]; the
 # reaction takes a decision. Those are what cars of highway-env keep to.
 _BRAKES, _LEADER_BRAKES, _THROTTLE = 5.0, 5.0, 3.0
+# Steps after an action in which a copy of the environment tells what happens.
+_FORESEEN = 4
 # The barrier's time headway [s], and the share of what is left of it that may be used in a step.
 _HEADWAY, _USED = 1.0, 0.5
 
@@ -192,6 +195,36 @@ class Barrier(Mask):
         return bool(then >= (1.0 - _USED) * min(here, gap))
 
 
+class Simulated(OnTheRoad):
+    """Tries on copies of the environment, which draw the same chances: the most that can be known.
+
+    A proposal is kept where some action that follows for good is survived. Otherwise the first
+    action is taken of which that is true: the same speed, slower, faster, a lane change.
+    """
+
+    told = "the future, by copies of the simulator"
+    needs_lanes = False
+
+    def chosen(self, proposal: int) -> int:
+        """The proposal, or the first action that is survived."""
+        order = [self.index[name] for name in ("idle", "slower", "faster")]
+        order += sorted(set(self.index.values()) - set(order))
+        for action in (proposal, *order):
+            if any(self._is_survived(action, then) for then in order):
+                return action
+        return proposal
+
+    def _is_survived(self, action: int, then: int) -> bool:
+        env = deepcopy(self.system.env)
+        for each in (action, *[then] * _FORESEEN):
+            _, _, terminated, truncated, info = env.step(each)
+            if info["crashed"]:
+                return False
+            if terminated or truncated:
+                break
+        return True
+
+
 #: By name.
 RIVALS: dict[str, type[OnTheRoad]] = {
     "slower": Slower,
@@ -199,4 +232,5 @@ RIVALS: dict[str, type[OnTheRoad]] = {
     "ttc-grid": TimeToCollision,
     "rss": Rss,
     "barrier": Barrier,
+    "simulated": Simulated,
 }
