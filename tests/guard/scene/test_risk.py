@@ -7,6 +7,7 @@ import pytest
 
 from evofsm.guard import Guard, Layout, Mode, SceneRisk, same_action
 from evofsm.guard.scene.contact import closest, learn
+from evofsm.guard.scene.memory import Foreseen, Memory
 
 LEFT, STAY = 0, 1
 
@@ -56,8 +57,37 @@ def test_what_oneself_never_did_at_first_is_learnt_too(rain):
     world.moves = 0.3
     failures(world, guard, range(8, 20))
     abreast_soon = np.array([1.0, 0.0, 1.0, 0.0, 1.0, 5.0, -1.0, -6.0] + [0.0] * 8)
-    risks, _ = judge.memory.risks(judge.layout.read(abreast_soon))
+    risks = judge.memory.foresee(judge.layout.read(abreast_soon)).risks
     assert risks.min(1)[LEFT] > 0.5 > 0.2 > risks.min(1)[STAY]
+
+
+def test_an_object_that_was_taken_for_another_one_is_no_forecast(taught):
+    memory = taught.judge.memory
+    episode = memory.episodes[0]
+    now, then = episode.links[:2], episode.away[episode.links[:2], 0]
+    assert (now >= 0).all()
+    assert abs(then[0] - then[1]) > 10.0
+    links = episode.links.copy()
+    links[:2] = now[::-1]
+    again = Memory(memory.n_actions, memory.steps)
+    episodes = [episode._replace(links=links), *memory.episodes[1:]]
+    again.restore(episodes, memory.failures, memory.fitted)
+    assert len(again._paths) == len(memory._paths) - 2
+    assert np.abs(again._paths[:, 0, 0]).max() < 8.5
+
+
+def test_where_nothing_can_it_takes_what_lasts_longest(taught, monkeypatch):
+    row, after = [1.0, 0, 2.0, 0.0] + [0.0] * 12, np.eye(3)
+
+    def executed(lasting):
+        foreseen = Foreseen(np.ones((3, 3)), np.tile(lasting, (3, 1)).T, after)
+        monkeypatch.setattr(taught.judge.memory, "foresee", lambda seen: foreseen)
+        return taught.decide(row, STAY)
+
+    assert executed([0.6, 0.2, 0.2]).executed == LEFT
+    kept = executed([0.2, 0.19, 0.2])
+    assert kept.executed == STAY
+    assert "nothing can, nor does anything last longer" in kept.reason
 
 
 def test_the_order_of_objects_makes_no_difference(taught):
@@ -110,10 +140,12 @@ def test_the_shape_of_what_is_too_close_is_learnt():
     contact = learn((start[~met], end[~met]), failed, np.array([5.0, 5.0]))
     assert contact.sides[0] / contact.sides[1] == pytest.approx(4.0, rel=0.4)
     at = np.array([[0.0, 0.0], [3.0, 0.0], [0.0, 0.7], [6.0, 0.0], [0.0, 1.6]])
-    risk = contact.of(np.repeat(at[:, None], 3, axis=1))
+    risk = contact.of(np.repeat(at[:, None], 3, axis=1))[:, -1]
     assert (risk[:3] > 0.3).all()
     assert (risk[3:] < 0.05).all()
     assert (np.diff(contact.risk) <= 0.0).all()
+    coming = contact.of(np.array([[9.0, 0.0], [6.0, 0.0], [2.0, 0.0], [9.0, 0.0]]))
+    assert coming[0] < 0.05 < 0.3 < coming[1] == coming[2]
 
 
 def test_rows_that_are_not_in_use_or_not_seen_are_no_objects():

@@ -25,15 +25,17 @@ class Contact(NamedTuple):
     sides: _Floats  #: (p,) half sides of the box in which closeness is counted
     closeness: _Floats  #: (n,) rising; 1 is at the side of the box
     risk: _Floats  #: (n,) probability of failure, falling
+    met: float  #: median closeness of what failed
 
     def of(self, path: _Floats) -> _Floats:
-        """Probability of failure on paths, (..., n + 1, p) places after each of n steps.
+        """Probability of failure by each step of paths, (..., n + 1, p) places: (..., n).
 
-        It is that of the closest step: what is not known of how close is too close is not drawn
-        anew in each step.
+        It is that of the closest step so far: what is not known of how close is too close is not
+        drawn anew in each step.
         """
-        come = closest(path[..., :-1, :], path[..., 1:, :], self.sides).min(-1)
-        return np.asarray(np.interp(come, self.closeness, self.risk))
+        come = closest(path[..., :-1, :], path[..., 1:, :], self.sides)
+        so_far = np.minimum.accumulate(come, axis=-1)
+        return np.asarray(np.interp(so_far, self.closeness, self.risk))
 
 
 def closest(start: _Floats, end: _Floats, sides: _Floats) -> _Floats:
@@ -91,4 +93,4 @@ def learn(
     at = np.unique(np.concatenate([met, near[:_CLOSEST]]))
     failures = 1 + len(met) - np.searchsorted(met, at, "left")
     risk = failures / (failures + np.searchsorted(near, at, "right"))
-    return Contact(sides, np.append(0.0, at), np.append(1.0, risk))
+    return Contact(sides, np.append(0.0, at), np.append(1.0, risk), float(np.median(met)))

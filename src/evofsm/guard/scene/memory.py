@@ -28,6 +28,8 @@ ANALOGS, _OWN_ANALOGS = 20, 3
 _OF_REST, _NEAR_TO = 0.1, 2.0
 # Squared distance from where an object was expected beyond which it is another one.
 _GATE = 0.5
+# Nothing is forecast by an object that went so many times as far astray as is too close.
+_ASTRAY = 2.5
 # Reweightings of a robust fit; the squared residual, of the median, that counts half; the ridge.
 _FITS, _HALF, _RIDGE = 4, 9.0, 1e-6
 # Squared residuals are taken to be this large at least, in squared spreads.
@@ -83,6 +85,14 @@ class _Flat(NamedTuple):
     links: _Ints
     moment: _Ints
     lost: NDArray[np.bool_]  #: whether failure came in the step from this moment
+
+
+class Foreseen(NamedTuple):
+    """What comes of each of n actions, if each action follows it for good."""
+
+    risks: _Floats  #: (n, n) probability of failure within the horizon
+    lasting: _Floats  #: (n, n) expected share of the horizon that is survived
+    after: _Floats  #: (n, p + q) oneself a step later
 
 
 class Memory:
@@ -146,9 +156,9 @@ class Memory:
     def _conclude(self) -> None:
         flat = self._flat()
         self._move(flat)
-        self._go_on(flat)
         self._follow_oneself(flat)
         self._meet(flat)
+        self._go_on(flat)
 
     def _scale(self) -> None:
         away, other, own = (
@@ -173,8 +183,9 @@ class Memory:
             expected = episode.away[now] + self._moved(own, episode.other[now], episode.other[now])
             off = (expected[:, None] - episode.away[then]) / away
             change = (episode.other[now][:, None] - episode.other[then]) / other
-            apart = (off**2).sum(2) + _OF_REST * (change**2).sum(2)
-            nearest, back = apart.argmin(1), apart.argmin(0)
+            apart = (off**2).sum(2)
+            unlike = apart + _OF_REST * (change**2).sum(2)
+            nearest, back = unlike.argmin(1), unlike.argmin(0)
             each = np.arange(len(nearest))
             mutual = (back[nearest] == each) & (apart[each, nearest] < gate)
             links[ends[t] + each[mutual]] = ends[t + 1] + nearest[mutual]
@@ -243,6 +254,12 @@ class Memory:
         known = np.hstack([flat.other, np.ones((len(flat.other), 1))])
         steady = np.linalg.lstsq(known[rows], went[rows], rcond=None)[0]
         self._steady = steady[:-1]
+        links = flat.links.copy()
+        if self.contact is not None:
+            off = np.abs((went[rows] - known[rows] @ steady) / self.contact.sides).max(1)
+            astray = rows[off > _ASTRAY * self.contact.met]
+            links[astray], went[astray] = -1, np.nan
+            rows = np.flatnonzero(links >= 0)
         step, total, at = known @ steady, np.zeros_like(flat.away), np.arange(len(flat.away))
         paths = np.empty((len(flat.away), self.steps, p))
         for h in range(self.steps):
@@ -250,7 +267,7 @@ class Memory:
             step = np.where(np.isnan(here), step, here)
             total = total + step
             paths[:, h] = total
-            at = np.where(at >= 0, flat.links[at], -1)
+            at = np.where(at >= 0, links[at], -1)
         self._objects = self._features(flat.own[flat.moment], flat.away, flat.other)[rows]
         self._paths, self._others = paths[rows], flat.other[rows]
 
@@ -303,15 +320,12 @@ class Memory:
 
     # -- Forecasting ----------------------------------------------------------------------------
 
-    def risks(self, seen: Seen) -> tuple[_Floats, _Floats]:
-        """Of each action, then followed by each action for good: (n, n) probabilities of failure.
-
-        And the (n, p + q) state of oneself after each action.
-        """
+    def foresee(self, seen: Seen) -> Foreseen:
+        """What comes of each action."""
         assert self.contact is not None
         n, p = self.n_actions, seen.away.shape[1]
         gone, weights, after = self._gone(seen.own, p)
-        safe = np.ones(gone.shape[:2])
+        safe = np.ones(gone.shape[:3])
         own = np.repeat(seen.own[None], len(seen.away), axis=0)
         analogs = _nearest(self._objects, self._features(own, seen.away, seen.other), ANALOGS)
         for i, (like, share) in enumerate(zip(*analogs, strict=True)):
@@ -319,9 +333,9 @@ class Memory:
             path = self._paths[like] + faster[:, None] * np.arange(1, self.steps + 1)[:, None]
             to = seen.away[i] + path + gone[:, :, None]
             start = np.broadcast_to(seen.away[i], (*to.shape[:3], 1, p))
-            safe *= (1.0 - self.contact.of(np.concatenate([start, to], axis=-2))) @ share
-        risks = ((1.0 - safe) * weights).sum(0)
-        return risks.reshape(n, n), after
+            safe *= share @ (1.0 - self.contact.of(np.concatenate([start, to], axis=-2)))
+        lost = ((1.0 - safe) * weights[:, :, None]).sum(0).reshape(n, n, self.steps)
+        return Foreseen(lost[:, :, -1], 1.0 - lost.mean(-1), after)
 
     def _gone(self, own: _Floats, p: int) -> tuple[_Floats, _Floats, _Floats]:
         """How oneself moves relative places, for each action and each that follows for good.

@@ -20,7 +20,7 @@ from evofsm.files import Place, storage
 from evofsm.guard.actions import Action
 from evofsm.guard.protocols import Fallback, Judgement, Search, Situation, Trial
 from evofsm.guard.scene.keeping import KIND, arrays_of, episodes_of
-from evofsm.guard.scene.memory import ANALOGS, Episode, Memory
+from evofsm.guard.scene.memory import ANALOGS, Episode, Foreseen, Memory
 from evofsm.guard.scene.seeing import Layout, Seen
 
 _Floats = NDArray[np.float64]
@@ -119,8 +119,8 @@ class SceneRisk:
     ) -> Search:
         """The action within the tolerance that is closest to ``wanted`` in what it brings oneself.
 
-        Where none is within the tolerance, it is the closest of those that are as little risky as
-        any, up to the tolerance: the proposal is kept unless another action is less dangerous.
+        Where none is within the tolerance, it is the closest of those after which it lasts as long
+        as after any, up to that share of the horizon.
 
         Parameters
         ----------
@@ -135,22 +135,25 @@ class SceneRisk:
         -------
         Search
         """
-        found = self._risks(situation)
+        found = self._foreseen(situation)
         if found is None:
             return Search(np.array([wanted]), self._unjudged(1), 0, self._nothing)
-        (risks, after), proposed = found, int(wanted)
+        risks, proposed = found.risks.min(1), int(wanted)
         ahead = f"within {self.memory.steps * self.dt:g} s"
         if risks[proposed] <= tolerance:
             said = f"risk {ahead} is within the tolerance"
             return Search(np.array([wanted]), self._judged(risks[[proposed]]), 0, said)
-        why, least = self.why(self._judged(risks[[proposed]])), float(risks.min())
-        some_can = least <= tolerance
-        good = np.flatnonzero(risks <= (tolerance if some_can else least + tolerance))
+        why, after = self.why(self._judged(risks[[proposed]])), found.after
+        good, what = np.flatnonzero(risks <= tolerance), "the closest in effect that can"
+        if not len(good):
+            good = np.flatnonzero(risks <= risks.min() + tolerance)
+            lasting = found.lasting[good].max(1)
+            good = good[lasting >= lasting.max() - tolerance]
+            what = "nothing can, the one that lasts longest"
         if proposed in good:
-            best, what = proposed, "nothing can, nor is anything less dangerous"
+            best, what = proposed, "nothing can, nor does anything last longer"
         else:
             best = int(good[self.memory.apart(after[good], after[proposed]).argmin()])
-            what = "the closest in effect that can" if some_can else "nothing can, the least risky"
         judged = self._judged(risks[[proposed, best]])
         options = np.array([wanted, float(best)])
         return Search(options, judged, int(best != proposed), f"{why}; {what}")
@@ -168,10 +171,10 @@ class SceneRisk:
         Judgement
             NaN as long as nothing can be said.
         """
-        given, found = np.asarray(actions, np.float64), self._risks(situation)
+        given, found = np.asarray(actions, np.float64), self._foreseen(situation)
         if found is None:
             return self._unjudged(len(given))
-        return self._judged(found[0][given.astype(int)])
+        return self._judged(found.risks.min(1)[given.astype(int)])
 
     def why(self, judged: Judgement) -> str:
         """Why the first action that was judged is dangerous, in a few words.
@@ -191,13 +194,12 @@ class SceneRisk:
             return "no failure is known yet, so nothing is refused"
         return "own row is not seen"
 
-    def _risks(self, situation: Situation) -> tuple[_Floats, _Floats] | None:
-        """(n,) risk of each action, and what it brings oneself; None where nothing can be said."""
+    def _foreseen(self, situation: Situation) -> Foreseen | None:
+        """What comes of each action; None where nothing can be said."""
         seen = self.layout.read(situation.observation)
         if self.memory.contact is None or not np.isfinite(seen.own).all():
             return None
-        risks, after = self.memory.risks(seen)
-        return risks.min(1), after
+        return self.memory.foresee(seen)
 
     def _judged(self, risks: _Floats) -> Judgement:
         low, high = np.transpose([wilson_bounds(float(risk), ANALOGS) for risk in risks])
