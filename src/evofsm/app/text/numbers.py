@@ -13,9 +13,11 @@ def percent(share: float | None, sign: str = " %") -> str:
     """A share; one that is small but not 0 is not shown as 0."""
     if share is None or not math.isfinite(share):
         return NONE
-    value = 100.0 * share
-    decimals = 2 if 0.0 < value < 0.05 else 1
-    return f"{value:.{decimals}f}{sign}"
+    return f"{100.0 * share:.{_places(share)}f}{sign}"
+
+
+def _places(share: float) -> int:
+    return 2 if 0.0 < share < 0.0005 else 1
 
 
 def bare_percent(share: float | None) -> str:
@@ -52,26 +54,44 @@ def interval(low: float | None, high: float | None, show: Callable[[float], str]
 
 
 def span(n: int) -> Callable[[float | None, float | None], str]:
-    """How a column writes intervals, with ``n`` decimals.
+    """How a column writes intervals: rounded outward, to ``n`` decimals.
 
-    >>> span(1)(0.25, 2.0)
-    '0.2–2.0'
+    >>> span(1)(0.27, 2.0), span(1)(0.0, 0.71)
+    ('0.2–2.0', '0.0–0.8')
     """
-    return lambda low, high: interval(low, high, decimals(n))
+    return lambda low, high: interval(
+        _rounded(math.floor, low, n), _rounded(math.ceil, high, n), decimals(n)
+    )
+
+
+def _rounded(to: Callable[[float], int], value: float | None, n: int) -> float | None:
+    """What is off ``n`` decimals by rounding alone is that number."""
+    if value is None or not math.isfinite(value):
+        return value
+    return to(round(value * 10.0**n, 6)) / 10.0**n
 
 
 def within(n: int, ends: int) -> Callable[[float, float, float], str]:
-    """How a column writes a number and, in brackets, its interval, with so many decimals each.
+    """How a column writes a number and, in brackets, its `span`, with so many decimals each.
 
     >>> within(3, 2)(0.5, 0.25, 0.75)
     '0.500 (0.25–0.75)'
     """
-    return lambda value, low, high: f"{number(value, n)} ({interval(low, high, decimals(ends))})"
+    return lambda value, low, high: f"{number(value, n)} ({span(ends)(low, high)})"
 
 
 def percents(low: float, high: float) -> str:
-    """From and to, in percent; the sign stands elsewhere."""
-    return interval(low, high, bare_percent)
+    """From and to, in percent, rounded outward; the sign stands elsewhere.
+
+    >>> percents(0.0, 0.00735), percents(0.00012, 0.5)
+    ('0.0–0.8', '0.01–50.0')
+    """
+    ends = [
+        f"{_rounded(to, 100.0 * share, _places(share)):.{_places(share)}f}"
+        for to, share in ((math.floor, low), (math.ceil, high))
+        if math.isfinite(share)
+    ]
+    return "–".join(ends) if len(ends) == 2 else NONE
 
 
 def listed(names: Iterable[str]) -> str:

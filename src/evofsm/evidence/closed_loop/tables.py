@@ -14,7 +14,6 @@ from evofsm.app import (
     bare_percent,
     count,
     decimals,
-    interval,
     number,
     part,
     percent,
@@ -289,9 +288,7 @@ def _table_of_rules(study: ClosedLoop) -> Table:
             Column(
                 "collisions [%] (95 %)",
                 "collision_rate collision_low collision_high",
-                lambda rate, low, high: (
-                    f"{bare_percent(rate)} ({interval(low, high, bare_percent)})"
-                ),
+                lambda rate, low, high: f"{bare_percent(rate)} ({percents(low, high)})",
             ),
             Column("mobility", "mobility", decimals(3)),
             Column("interventions", "intervention_rate", bare_percent, "%"),

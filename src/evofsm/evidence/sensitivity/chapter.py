@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from evofsm.app import NONE, Column, Table, count, listed, number, percent
+from evofsm.app import NONE, Column, Table, count, listed, number, percent, percents
 from evofsm.evidence.paper.runs import CASES
 from evofsm.evidence.report.asked import Asked, failures, tables_of_asked
 from evofsm.evidence.report.chapter import Chapter
@@ -66,7 +66,7 @@ def _about(study: Sensitivity) -> str:
 
 
 def _interval(share: Share) -> str:
-    return f"95 %: {percent(share.low, '')} to {percent(share.high)}"
+    return f"95 %: {percents(share.low, share.high)} %"
 
 
 def _what_was_asked(study: Sensitivity) -> Iterator[Asked]:
