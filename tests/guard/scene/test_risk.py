@@ -76,6 +76,27 @@ def test_an_object_that_was_taken_for_another_one_is_no_forecast(taught):
     assert np.abs(again._paths[:, 0, 0]).max() < 8.5
 
 
+def test_what_fails_only_in_one_and_the_same_place_is_learnt(rain):
+    """As in a world of cells: how close is too close is then 0."""
+    guard, random = rain().guard(), np.random.default_rng(0)
+
+    def row(lane, place):
+        return [1.0, 0, lane, 0.0, 1.0, place[0], place[1] - lane, -1.0] + [0.0] * 8
+
+    for _ in range(12):
+        lane, place = 1, [float(random.integers(4, 8)), float(random.integers(3))]
+        while place[0] >= 0.0:
+            wanted = int(random.integers(3))
+            did = guard.decide(row(lane, place), wanted).executed
+            lane, place[0] = int(np.clip(lane + did - 1, 0, 2)), place[0] - 1.0
+            if place == [0.0, lane]:
+                break
+        guard.end(place == [0.0, lane], row(lane, place))
+    guard.freeze()
+    assert guard.judge.memory.contact.met == 0.0
+    assert guard.decide(row(1, [1.0, 1.0]), STAY).executed != STAY
+
+
 def test_where_nothing_can_it_takes_what_lasts_longest(taught, monkeypatch):
     row, after = [1.0, 0, 2.0, 0.0] + [0.0] * 12, np.eye(3)
 

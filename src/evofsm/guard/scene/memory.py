@@ -32,6 +32,8 @@ _GATE = 0.5
 _ASTRAY = 2.5
 # Reweightings of a robust fit; the squared residual, of the median, that counts half; the ridge.
 _FITS, _HALF, _RIDGE = 4, 9.0, 1e-6
+# A number varies by so much of its mean square at least, so that two that never change differ.
+_CONSTANT = 1e-6
 # Squared residuals are taken to be this large at least, in squared spreads.
 _EXACT = 1e-4
 # Objects that have to be seen twice before anything is learnt, times the numbers of oneself.
@@ -215,7 +217,8 @@ class Memory:
         y = flat.away[then] - flat.away[rows]
         before = _begun(x.shape[1], p)
         weights = np.ones(len(rows))
-        ridge = _RIDGE * len(rows) * np.diag(x.var(0) + 1e-12)
+        spread = np.maximum(x.var(0), _CONSTANT * (x**2).mean(0)) + 1e-12
+        ridge = _RIDGE * len(rows) * np.diag(spread)
         for _ in range(_FITS):
             weighed = x * weights[:, None]
             motion = np.linalg.solve(weighed.T @ x + ridge, weighed.T @ y + ridge @ before)
@@ -258,8 +261,9 @@ class Memory:
         if self.contact is not None:
             off = np.abs((went[rows] - known[rows] @ steady) / self.contact.sides).max(1)
             astray = rows[off > _ASTRAY * self.contact.met]
-            links[astray], went[astray] = -1, np.nan
-            rows = np.flatnonzero(links >= 0)
+            if 2 * len(astray) < len(rows):  # else what failed met in one point, as in cells
+                links[astray], went[astray] = -1, np.nan
+                rows = np.flatnonzero(links >= 0)
         step, total, at = known @ steady, np.zeros_like(flat.away), np.arange(len(flat.away))
         paths = np.empty((len(flat.away), self.steps, p))
         for h in range(self.steps):
