@@ -66,6 +66,7 @@ from .numbering import state_name as state_name
 from .observations import Category as Category
 from .observations import Missing as Missing
 from .observations import ObservationEncoder as ObservationEncoder
+from .proportions import outward as outward
 from .proportions import poisson_bounds as poisson_bounds
 from .proportions import two_digits as two_digits
 from .proportions import wilson_bounds as wilson_bounds

@@ -128,9 +128,7 @@ def bounds_text(low: float, high: float) -> str:
 
 
 def two_digits(value: float, rounded: Callable[[float], int]) -> float:
-    """A number from 0 on with two significant digits, rounded by ``math.floor`` or ``math.ceil``.
-
-    What is off such a number by rounding alone is that number.
+    """A number from 0 on with two significant digits, rounded as `outward` rounds.
 
     Examples
     --------
@@ -139,24 +137,31 @@ def two_digits(value: float, rounded: Callable[[float], int]) -> float:
     """
     if not 0.0 < value < math.inf:
         return value
-    scale = 10.0 ** (1 - math.floor(math.log10(value)))
+    return outward(rounded, value, 1 - math.floor(math.log10(value)))
+
+
+def outward(rounded: Callable[[float], int], value: float, decimals: int) -> float:
+    """A number with so many decimals, rounded by ``math.floor`` or ``math.ceil``.
+
+    What is off such a number by rounding alone is that number.
+
+    Examples
+    --------
+    >>> outward(math.ceil, 0.71, 1), outward(math.floor, 0.71, 1), outward(math.ceil, 0.1 + 0.2, 1)
+    (0.8, 0.7, 0.3)
+    """
+    scale = 10.0**decimals
     return rounded(round(value * scale, 6)) / scale
 
 
 def _rounded_up(share: float) -> str:
     decimals = _decimals(share)
-    return f"{min(_outward(math.ceil, share, decimals), 100.0):.{decimals}f}"
+    return f"{min(outward(math.ceil, 100.0 * share, decimals), 100.0):.{decimals}f}"
 
 
 def _rounded_down(share: float) -> str:
     decimals = _decimals(share)
-    return f"{max(_outward(math.floor, share, decimals), 0.0):.{decimals}f}"
-
-
-def _outward(round_: Callable[[float], int], share: float, decimals: int) -> float:
-    """In percent; what is off a round number by rounding only is that number."""
-    scale = 10.0**decimals
-    return round_(round(100.0 * share * scale, 6)) / scale
+    return f"{max(outward(math.floor, 100.0 * share, decimals), 0.0):.{decimals}f}"
 
 
 def _decimals(share: float) -> int:

@@ -21,7 +21,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.core.proportions import gamma_quantile, poisson_bounds, two_digits
+from evofsm.core.proportions import gamma_quantile, outward, poisson_bounds, two_digits
 
 # Two-sided 90 %.
 _TAILS = (0.05, 0.95)
@@ -135,7 +135,7 @@ def _two_digits(value: float, rounded: Callable[[float], int]) -> str:
 def _exposure(value: float) -> str:
     """Rounded down: less would not be claimed."""
     if value < 10.0:
-        return f"{math.floor(round(value * 100.0, 6)) / 100.0:g}"
+        return f"{outward(math.floor, value, 2):g}"
     return f"{math.floor(round(value, 6)):,}"
 
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable
 
+from evofsm.core import outward
+
 #: Where a number does not apply.
 NONE = "–"
 
@@ -13,11 +15,12 @@ def percent(share: float | None, sign: str = " %") -> str:
     """A share; one that is small but not 0 is not shown as 0."""
     if share is None or not math.isfinite(share):
         return NONE
-    return f"{100.0 * share:.{_places(share)}f}{sign}"
+    value = 100.0 * share
+    return f"{value:.{_places(value)}f}{sign}"
 
 
-def _places(share: float) -> int:
-    return 2 if 0.0 < share < 0.0005 else 1
+def _places(percentage: float) -> int:
+    return 2 if 0.0 < percentage < 0.05 else 1
 
 
 def bare_percent(share: float | None) -> str:
@@ -59,16 +62,16 @@ def span(n: int) -> Callable[[float | None, float | None], str]:
     >>> span(1)(0.27, 2.0), span(1)(0.0, 0.71)
     ('0.2–2.0', '0.0–0.8')
     """
-    return lambda low, high: interval(
-        _rounded(math.floor, low, n), _rounded(math.ceil, high, n), decimals(n)
-    )
+    return lambda low, high: _outward(low, high, lambda end: n)
 
 
-def _rounded(to: Callable[[float], int], value: float | None, n: int) -> float | None:
-    """What is off ``n`` decimals by rounding alone is that number."""
-    if value is None or not math.isfinite(value):
-        return value
-    return to(round(value * 10.0**n, 6)) / 10.0**n
+def _outward(low: float | None, high: float | None, places: Callable[[float], int]) -> str:
+    """From and to, rounded outward to as many decimals as ``places`` says of each."""
+    known = [end for end in (low, high) if end is not None and math.isfinite(end)]
+    if len(known) < 2:
+        return NONE
+    ends = zip((math.floor, math.ceil), known, strict=True)
+    return "–".join(f"{outward(to, end, places(end)):.{places(end)}f}" for to, end in ends)
 
 
 def within(n: int, ends: int) -> Callable[[float, float, float], str]:
@@ -86,12 +89,7 @@ def percents(low: float, high: float) -> str:
     >>> percents(0.0, 0.00735), percents(0.00012, 0.5)
     ('0.0–0.8', '0.01–50.0')
     """
-    ends = [
-        f"{_rounded(to, 100.0 * share, _places(share)):.{_places(share)}f}"
-        for to, share in ((math.floor, low), (math.ceil, high))
-        if math.isfinite(share)
-    ]
-    return "–".join(ends) if len(ends) == 2 else NONE
+    return _outward(100.0 * low, 100.0 * high, _places)
 
 
 def listed(names: Iterable[str]) -> str:

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Iterator
 
 from evofsm.app import NONE, Column, Table, bare_percent, count, listed, number
-from evofsm.core import two_digits
+from evofsm.core import outward, two_digits
 from evofsm.evidence.breaks.amounts import NOBODY, TOY
 from evofsm.evidence.breaks.cases import FoundCase, odds
 from evofsm.evidence.breaks.figures import sketches
@@ -70,7 +70,7 @@ def small(value: float, rounded: Callable[[float], int] = round) -> str:
         return NONE
     if 0.0 < value < 0.01:
         return f"{two_digits(value, rounded):.2g}"
-    return number(rounded(round(1e4 * value, 6)) / 1e4, 4 if value else 0)
+    return number(outward(rounded, value, 4), 4 if value else 0)
 
 
 def _between(low: float, high: float) -> str:

@@ -137,7 +137,7 @@ class Highway(System):
 
 def _habits() -> dict[str, Any]:
     """How other cars drive; an environment may set it for all that the process has."""
-    return {name: getattr(IDMVehicle, name) for name in dir(IDMVehicle) if name.isupper()}
+    return {name: value for name, value in vars(IDMVehicle).items() if name.isupper()}
 
 
 def _set_habits(habits: Mapping[str, Any]) -> None:

@@ -257,14 +257,14 @@ class Memory:
         known = np.hstack([flat.other, np.ones((len(flat.other), 1))])
         steady = np.linalg.lstsq(known[rows], went[rows], rcond=None)[0]
         self._steady = steady[:-1]
-        links = flat.links.copy()
+        step, links = known @ steady, flat.links.copy()
         if self.contact is not None:
-            off = np.abs((went[rows] - known[rows] @ steady) / self.contact.sides).max(1)
+            off = np.abs((went[rows] - step[rows]) / self.contact.sides).max(1)
             astray = rows[off > _ASTRAY * self.contact.met]
             if 2 * len(astray) < len(rows):  # else what failed met in one point, as in cells
                 links[astray], went[astray] = -1, np.nan
                 rows = np.flatnonzero(links >= 0)
-        step, total, at = known @ steady, np.zeros_like(flat.away), np.arange(len(flat.away))
+        total, at = np.zeros_like(flat.away), np.arange(len(flat.away))
         paths = np.empty((len(flat.away), self.steps, p))
         for h in range(self.steps):
             here = np.where((at >= 0)[:, None], went[at], np.nan)

@@ -119,8 +119,8 @@ class SceneRisk:
     ) -> Search:
         """The action within the tolerance that is closest to ``wanted`` in what it brings oneself.
 
-        Where none is within the tolerance, it is the closest of those after which it lasts as long
-        as after any, up to that share of the horizon.
+        Where none is within the tolerance, it is one of those that are as little risky as any, and
+        of these one after which it lasts as long as after any, both up to the tolerance.
 
         Parameters
         ----------

@@ -209,7 +209,7 @@ class Simulated(OnTheRoad):
         """The proposal, or the first action that is survived."""
         order = [self.index[name] for name in ("idle", "slower", "faster")]
         order += sorted(set(self.index.values()) - set(order))
-        for action in (proposal, *order):
+        for action in dict.fromkeys((proposal, *order)):
             if any(self._is_survived(action, then) for then in order):
                 return action
         return proposal
