@@ -75,6 +75,25 @@ def test_nothing_is_a_change_as_long_as_all_is_being_learnt(drive, follow):
     assert dynamics.drifts == []
 
 
+def test_what_was_doubted_while_all_was_being_learnt_is_no_doubt_later(drive, follow):
+    draw, dynamics = np.random.default_rng(3), Dynamics(-2.5, 2.5)
+    for episode in range(20):
+        follow(dynamics, *braked(*drive(draw), WEAK if episode >= 16 else -2.5))
+        assert not dynamics.recent.doubt.any()
+
+
+def test_cars_that_cut_in_are_jumps_after_a_change_too(drive, follow):
+    draw, dynamics = np.random.default_rng(3), Dynamics(-2.5, 2.5)
+    for episode in range(BEFORE + 12):
+        Z, U = drive(draw, start=(160.0, 15.0, 15.0), braking=60 if episode % 2 else None)
+        Z, U = braked(Z, U, WEAK if episode >= BEFORE else -2.5)
+        Z[40:, 0] -= 120.0
+        follow(dynamics, Z, U)
+    assert {one.variable for one in dynamics.drifts} == {1}
+    assert dynamics.sums.least[0] > -10.0
+    assert dynamics.sums.scale[0] < 1.0
+
+
 def test_it_is_kept_in_files_and_merges(changed, drive, follow):
     dynamics = changed(after=1)  # in doubt
     again = from_bytes(to_bytes(dynamics))

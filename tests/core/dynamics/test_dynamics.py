@@ -9,6 +9,7 @@ import pytest
 from evofsm.core.dynamics.consequents import Disturbances, Here, residuals
 from evofsm.core.dynamics.dynamics import Dynamics
 from evofsm.core.dynamics.questions import look_ahead
+from evofsm.guard.learnt.search import harm
 
 
 def sums_of(dynamics):
@@ -74,6 +75,19 @@ def test_one_jump_of_130_m_changes_model_and_units_by_less_than_1_percent(taught
     np.testing.assert_allclose(ahead[1], ahead[0], rtol=0.01, atol=0.01 * one.sums.unit.max())
 
 
+@pytest.mark.parametrize("at", [2, 5, 8, 20])
+def test_a_jump_among_the_first_steps_there_are_is_one(follow, drive, at):
+    """It would stand in the sums, and in the limits of what is ordinary, for ever."""
+    dynamics = Dynamics(-2.5, 2.5)
+    Z, U = drive(np.random.default_rng(5), noise=0.001)
+    Z[at:, 0] -= 130.0
+    follow(dynamics, Z, U)
+    assert len(dynamics.jumps[0]) == 1
+    assert dynamics.consequents.least[0] > -10.0
+    ahead = look_ahead_from(dynamics, [40.0, 15.0, 14.5], 0.0)
+    assert np.diff(ahead[:, 0]) == pytest.approx(-0.125, abs=0.03)
+
+
 def look_ahead_from(dynamics, z, action, steps=4):
     return look_ahead(dynamics, action, steps, np.array(z)).mean
 
@@ -130,15 +144,15 @@ def test_a_side_on_which_episodes_fail_is_never_a_saturation(taught, follow, dri
     assert dynamics.consequents.lowest[0] == -np.inf
 
 
-def test_of_two_sides_that_explain_the_first_failure_alike_both_hold_until_told_apart():
+def test_of_two_sides_that_explain_the_first_failures_alike_both_hold_until_told_apart():
     dynamics = Dynamics(n_actions=2)
-    draw = np.random.default_rng(0)
-    for t in range(40):
-        dynamics.observe(np.array([np.sin(t), -np.sin(t)]) + 0.0 * draw.normal(size=2))
-        dynamics.act(dynamics.encode(t % 2))
-    dynamics.observe(np.array([4.0, -4.0]))
-    dynamics.end(failed=True)
-    assert sorted((j, sign) for j, sign, _ in dynamics.sides) == [(0, 1.0), (1, -1.0)]
+    for _ in range(2):
+        for t in range(40):
+            dynamics.observe(np.array([np.sin(t), -np.sin(t)]))
+            dynamics.act(dynamics.encode(t % 2))
+        dynamics.observe(np.array([4.0, -4.0]))
+        dynamics.end(failed=True)
+        assert sorted((j, sign) for j, sign, _ in dynamics.sides) == [(0, 1.0), (1, -1.0)]
     for t in range(40):
         dynamics.observe(np.array([np.sin(t), -np.sin(t)]))
         dynamics.act(dynamics.encode(t % 2))
@@ -239,10 +253,42 @@ def test_whoever_never_leaves_an_end_learns_that_it_is_one(taught, follow):
     dynamics = taught()
     leader = 8.0 + np.sin(np.arange(81))
     gap = 20.0 + np.cumsum(np.append(0.0, 0.25 * leader[:-1]))
-    for episode in range(3):
-        assert (dynamics.consequents.lowest[1] == 0.0) == (episode > 2)
-        follow(dynamics, np.column_stack([gap, np.zeros(81), leader]), np.full(80, -2.0))
+    assert dynamics.consequents.lowest[1] == -np.inf
+    follow(dynamics, np.column_stack([gap, np.zeros(81), leader]), np.full(80, -2.0))
     assert dynamics.consequents.lowest[1] == 0.0
+
+
+def test_whoever_comes_to_an_end_once_and_stays_learns_that_it_is_one(taught, follow, drive):
+    dynamics = taught()
+    Z, U = drive(np.random.default_rng(2), start=(90.0, 4.0, 9.0))
+    own = np.maximum(0.0, 4.0 - 0.5 * np.arange(len(Z)))  # brakes for good, and stands
+    follow(dynamics, np.column_stack([Z[:, 0], own, Z[:, 2]]), np.full(len(U), -2.0))
+    assert dynamics.consequents.lowest[1] == 0.0
+
+
+def test_a_disturbance_that_is_taken_to_be_harder_than_ever_still_has_a_sequel(follow):
+    """What coasts goes on as it did; a push beyond all that there were would end at once."""
+    draw, dynamics = np.random.default_rng(0), Dynamics(-1.0, 1.0)
+    for _ in range(6):
+        U = draw.uniform(-1.0, 1.0, 80)
+        speed = np.zeros(81)
+        for t, u in enumerate(U):
+            speed[t + 1] = 0.95 * speed[t] + 0.1 * u
+        follow(dynamics, np.cumsum(speed)[:, None], U)
+    known, none = dynamics.consequents, np.zeros((1, 1))
+    once = np.zeros((1, 4, 1))
+    once[0, 0] = 0.9 * known.most
+    nowhere = np.zeros((1, 1, 1)), np.zeros((1, 1, 1, 2)), np.zeros((1, 1, 2))
+    pushed = Disturbances(once, none - 1.0, none, *nowhere)
+    known = known._replace(sides=np.array([[0.0, 1.0, known.mean[0] + 1000.0, 1.0]]))
+    where = known.mean[None], none, none, np.zeros((1, 1, 2))
+    left = np.empty((1, 1))
+    gone = []
+    for harder in (1.0, 3.0):
+        harm(known, *where, pushed, harder, left)
+        gone.append(1000.0 - left[0, 0])
+    assert gone[0] > 3.0 * once[0, 0, 0]  # it goes on for four steps
+    assert gone[1] == pytest.approx(3.0 * gone[0], rel=0.1)
 
 
 def test_where_nothing_moves_nothing_disturbs(taught, follow):

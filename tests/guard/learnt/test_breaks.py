@@ -31,3 +31,14 @@ def test_what_gets_worse_is_noticed_within_ten_episodes():
 
 def test_nothing_is_worse_as_long_as_all_is_being_learnt():
     assert not any(alarms([0.0] * 15 + [1.0] * 5, 0))
+
+
+def test_failures_under_a_certificate_are_noticed_sooner():
+    breaks = Breaks()
+    for episode in range(60):
+        breaks = breaks.after(episode, broke=False)
+    broken, failed = breaks, breaks
+    for episode in range(60, 62):
+        broken = broken.after(episode, broke=True)
+        failed = failed.after(episode, broke=True, failed=True)
+    assert (broken.worse, failed.worse) == (-1, 60)

@@ -155,7 +155,9 @@ def begin_at(room: Futures, here: Here) -> None:
 
 
 @inner_kernel
-def fill_features(room: Futures, origin: _Floats, reach: _Floats, box: bool) -> None:
+def fill_features(
+    room: Futures, origin: _Floats, reach: _Floats, box: bool, harder: float = 1.0
+) -> None:
     """The features of situations and actions."""
     z, change, features = room.z, room.change, room.features
     action, before = room.action, room.before
@@ -165,7 +167,7 @@ def fill_features(room: Futures, origin: _Floats, reach: _Floats, box: bool) -> 
     for j in range(m):
         for l in range(n):
             features[1 + j, l] = z[j, l] - origin[j]
-            features[1 + m + j, l] = change[j, l] if abs(change[j, l]) <= reach[j] else 0.0
+            features[1 + m + j, l] = change[j, l] if abs(change[j, l]) <= harder * reach[j] else 0.0
     k = 1 + 2 * m
     for i in range(a):
         for l in range(n):
@@ -191,9 +193,9 @@ def fill_features(room: Futures, origin: _Floats, reach: _Floats, box: bool) -> 
 
 
 @inner_kernel
-def expect(known: Consequents, room: Futures) -> None:
+def expect(known: Consequents, room: Futures, harder: float = 1.0) -> None:
     """The changes that are expected, into ``room.move``."""
-    fill_features(room, known.origin, known.reach, known.choices == 0)
+    fill_features(room, known.origin, known.reach, known.choices == 0, harder)
     move, features, weights = room.move, room.features, known.weights
     n, p = move.shape[1], len(features)
     whole = p - p % 4
@@ -244,7 +246,7 @@ def advance(
     """Take the actions in ``room`` there, each amid step t of its disturbance."""
     which, z, after, move = room.which, room.z, room.next, room.move
     m, n = z.shape
-    expect(known, room)
+    expect(known, room, harder)
     for j in range(m):
         least, most = harder * known.least[j], harder * known.most[j]
         if known.anew[j] > 0.0:  # little was seen of it: no more is foreseen than there was

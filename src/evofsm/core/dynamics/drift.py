@@ -56,7 +56,7 @@ class Recent(NamedTuple):
 
     def overthrown(self, episode: int) -> list[int]:
         """Variables that do not move any more as was learnt."""
-        return np.flatnonzero((self.doubt > _DOUBT) & (episode >= LEARNT)).tolist()
+        return np.flatnonzero(self.doubt > _DOUBT).tolist()
 
 
 class Drift(NamedTuple):
@@ -93,7 +93,7 @@ def compared(
     size = np.maximum(np.maximum(sums.scale, _MATTERS * sums.unit), 1e-300)
     left = missed - features @ correction(recent, known.weights, sums, U.shape[1])
     gained = np.log1p((missed / size) ** 2) - _HALVES * np.log1p((left / size) ** 2)
-    doubt = np.maximum(recent.doubt + gained.sum(0), 0.0)
+    doubt = np.maximum(recent.doubt + gained.sum(0), 0.0) * (episode >= LEARNT)
     fades = _FADES if young or doubt.any() else 0.0  # before a doubt it moved as ever
     return Recent(
         fades * recent.squares + features.T @ features,

@@ -34,6 +34,7 @@ from evofsm.core.dynamics.regression import (
     MOVING,
     Sums,
     count_ends,
+    have_jumped,
     learn_latest,
     solve,
     take_in,
@@ -58,8 +59,9 @@ ONSET, _ONSETS, APART = 4.0, 3, 3
 _SHORTEST = 4
 # An episode that goes on for so many steps is studied, and goes on.
 _LONGEST = 1024
-# An extreme is a saturation if it was reached, by moving, in so many episodes.
-_REACHED = 2
+# An extreme is a saturation if it was reached, by moving, in so many episodes, or if a variable
+# rested there for so many steps of one although it was expected to go on.
+_REACHED, _RESTED = 2, 4
 MOST_KEPT = 200
 # Jumps that would have shown no dependence, for each variable.
 _JUMP_PRIOR = 3.0
@@ -554,6 +556,7 @@ class Dynamics:
         if not moved:
             return
         change = np.diff(Z, axis=0)
+        change[have_jumped(change, sums.unit)] = 0.0
         sums.least[begun], sums.most[begun] = change.min(0)[begun], change.max(0)[begun]
         self.weights = self.weights.copy()
         self.weights[:, moved] += correction(self.recent, before.weights, sums, self.size)[:, moved]
@@ -633,12 +636,14 @@ class Dynamics:
         rests, far = safe[1:-1] == safe[2:], ONSET * self.sums.scale
         held = np.column_stack(
             [
-                (rests & (safe[2:] == self.lowest) & (found > far)).any(0),
-                (rests & (safe[2:] == self.highest) & (found < -far)).any(0),
+                (rests & (safe[2:] == self.lowest) & (found > far)).sum(0),
+                (rests & (safe[2:] == self.highest) & (found < -far)).sum(0),
             ]
         )
-        moves = (self.sums.moving > MOVING)[:, None]
-        self.reached += held & moves & ~arrived & (self.sums.scale[0] > 0.0)
+        held[(self.sums.moving <= MOVING) | (self.sums.scale[0] == 0.0)] = 0
+        self.reached += (held > 0) & ~arrived
+        self.reached[held >= _RESTED] = np.maximum(self.reached, _REACHED)[held >= _RESTED]
+        self._rebuild()
 
     def _rescale(self, found: _Floats, safe: _Floats) -> None:
         sums, size = self.sums, np.abs(found)
@@ -648,8 +653,9 @@ class Dynamics:
         known = sums.scale[0] > 0.0
         new = 0.8 * sums.scale + 0.2 * scale if known else scale
         square = (size**2).mean(0)
-        young = self._young
-        new[young] = np.maximum(new, np.sqrt(square))[young]  # what is learnt anew is no outlier
+        young, jumped = self._young, have_jumped(np.diff(safe[1:], axis=0), sums.unit)
+        ordinary = np.where(jumped, 0.0, size**2).mean(0)
+        new[young] = np.maximum(new, np.sqrt(ordinary))[young]  # what is learnt anew is no outlier
         sums.scale[:] = np.maximum(new, 1e-3 * np.sqrt(sums.variance) + 1e-300)
         sums.noise[:] = 0.8 * sums.noise + 0.2 * square if known else square
 

@@ -50,7 +50,7 @@ def explain_failures(
         depth = [float(np.median(beyond[explained[:, k], k])) for k in tied]
         best = int(tied[int(np.argmax(depth))])
         left &= ~explained[:, best]
-        undecided = len(failures) == 1 and len(tied) == 2
+        undecided = len(failures) <= 2 and len(tied) == 2
         found += [int(k) for k in tied] if undecided else [best]
     return [
         (k % m, -1.0 if k < m else 1.0, float(lowest[k % m] if k < m else highest[k % m]))

@@ -24,8 +24,9 @@ from evofsm.core.kernels import compiled
 
 _Floats = NDArray[np.float64]
 
-# A change so many times those around it, and the ordinary one, is a jump.
-_JUMP = 8.0
+# A change so many times those around it, and the ordinary one, is a jump; so many more of the first
+# ones, of which it is not known what is ordinary.
+_JUMP, _FIRST_JUMP, _FIRST = 8.0, 32.0, 8.0
 # The ordinary change is the median of so many, then a mean; of what is larger, so much counts.
 _EARLY, _CLIP, _SLOWEST = 200, 6.0, 5000.0
 # What changes in more than this share of transitions may have saturated where it rests.
@@ -172,7 +173,8 @@ def learn_transition(
         sums.variance[j] += (now * now - sums.variance[j]) / (n + 1.0)
         around = max(max(abs(change[j]), abs(after)), sums.unit[j])
         unforeseen = abs(now - move[j]) > 0.5 * abs(now)
-        jumped[j] = 1.0 if n > 8.0 and abs(now) > _JUMP * around and unforeseen else 0.0
+        alone = abs(now) > (_JUMP if n > _FIRST else _FIRST_JUMP) * around
+        jumped[j] = 1.0 if n > 0.0 and alone and unforeseen else 0.0
         jump = jump or jumped[j] > 0.0
     for j in range(m):
         now = abs(moved[j])
@@ -226,6 +228,13 @@ def learn_transition(
             for j in range(m):
                 sums.products[k, j] += f * moved[j]
     return jump
+
+
+def have_jumped(change: _Floats, unit: _Floats) -> NDArray[np.bool_]:
+    """(T, m) which changes (T, m) are far larger than those around them and the ordinary ones."""
+    size = np.abs(change)
+    around = np.maximum(np.vstack([size[:1], size[:-1]]), np.vstack([size[1:], 0.0 * size[-1:]]))
+    return size > _JUMP * np.maximum(around, unit)
 
 
 def solve(sums: Sums, m: int, a: int, without: _Floats) -> _Floats:

@@ -38,11 +38,13 @@ class Breaks(NamedTuple):
     since: int = 0  #: the episode that brought it up, from 0
     worse: int = -1  #: since which episode disturbances are worse, from 0; -1: since none
 
-    def after(self, episode: int, *, broke: bool) -> Breaks:
+    def after(self, episode: int, *, broke: bool, failed: bool = False) -> Breaks:
         """What it is after an episode, whose number is from 0."""
         share = self.share + _MORE
         likelier = _WORSE / share if broke else (1.0 - _WORSE) / (1.0 - share)
-        doubt = max(0.0, self.doubt + math.log(likelier)) if share < _USUAL else 0.0
+        doubt = (
+            max(0.0, self.doubt + (1.0 + failed) * math.log(likelier)) if share < _USUAL else 0.0
+        )
         since = self.since if self.doubt > 0.0 else episode
         if doubt > _DOUBT and episode >= _LEARNT:
             return Breaks(worse=since)

@@ -590,7 +590,12 @@ class LearntRisk:
         if "breaks" in self.without:
             return False
         before, broke = self.breaks, self._broke
-        self.breaks, self._broke = before.after(self.n_studied - 1, broke=broke), False
+        episode = self.dynamics.latest
+        failed = broke and episode is not None and episode.failed
+        self.breaks, self._broke = (
+            before.after(self.n_studied - 1, broke=broke, failed=failed),
+            False,
+        )
         return self.breaks.worse != before.worse
 
     @property
