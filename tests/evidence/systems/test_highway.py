@@ -54,6 +54,19 @@ def test_it_drives_to_the_end_under_each_rival(task):
         assert np.isfinite(ended.score)
 
 
+def test_the_driver_of_the_environment_is_not_in_its_own_way():
+    """Else it changes lanes with every decision, away from itself."""
+    system = make_system("highway-fast", "idle")
+    driver = system.rivals["idm-mobil"]()
+    observation, lanes = system.reset(Start.held_out(3, 1)), []
+    for _ in range(12):
+        step = system.step(driver.decide(observation, 1).executed)
+        observation = step.observation
+        lanes.append(system.env.vehicle.target_lane_index[2])
+        assert not step.failed
+    assert np.count_nonzero(np.diff(lanes)) <= 3
+
+
 @pytest.mark.slow
 def test_the_judge_of_scenes_learns_to_merge():
     alone = trial("merge", judge="unrevised", train=0, test=10, base=9)

@@ -1,7 +1,7 @@
 """Where a system fails, from where it did: sides of the box of all that was survived.
 
-The fewest sides that explain the failures; of two that explain the first one alike, both hold until
-another failure tells them apart.
+The fewest sides that explain the failures; of two that explain the first ones alike, both hold
+until another failure tells them apart.
 """
 
 from __future__ import annotations
@@ -15,6 +15,8 @@ _Floats = NDArray[np.float64]
 
 # How far from a safe observation a failure is looked for, in halvings and doublings.
 _FARTHEST, _HALVINGS = 40, 60
+# So many failures may leave two sides undecided.
+_FIRST = 2
 
 
 def explain_failures(
@@ -50,7 +52,7 @@ def explain_failures(
         depth = [float(np.median(beyond[explained[:, k], k])) for k in tied]
         best = int(tied[int(np.argmax(depth))])
         left &= ~explained[:, best]
-        undecided = len(failures) <= 2 and len(tied) == 2
+        undecided = len(failures) <= _FIRST and len(tied) == 2
         found += [int(k) for k in tied] if undecided else [best]
     return [
         (k % m, -1.0 if k < m else 1.0, float(lowest[k % m] if k < m else highest[k % m]))

@@ -234,7 +234,8 @@ def have_jumped(change: _Floats, unit: _Floats) -> NDArray[np.bool_]:
     """(T, m) which changes (T, m) are far larger than those around them and the ordinary ones."""
     size = np.abs(change)
     around = np.maximum(np.vstack([size[:1], size[:-1]]), np.vstack([size[1:], 0.0 * size[-1:]]))
-    return size > _JUMP * np.maximum(around, unit)
+    jumped: NDArray[np.bool_] = size > _JUMP * np.maximum(around, unit)
+    return jumped
 
 
 def solve(sums: Sums, m: int, a: int, without: _Floats) -> _Floats:

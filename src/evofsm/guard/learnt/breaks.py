@@ -39,7 +39,10 @@ class Breaks(NamedTuple):
     worse: int = -1  #: since which episode disturbances are worse, from 0; -1: since none
 
     def after(self, episode: int, *, broke: bool, failed: bool = False) -> Breaks:
-        """What it is after an episode, whose number is from 0."""
+        """What it is after an episode, whose number is from 0.
+
+        One in which a certificate broke and which ``failed`` says twice as much.
+        """
         share = self.share + _MORE
         likelier = _WORSE / share if broke else (1.0 - _WORSE) / (1.0 - share)
         doubt = (

@@ -589,13 +589,10 @@ class LearntRisk:
         """Whether disturbances got worse than those that are remembered."""
         if "breaks" in self.without:
             return False
-        before, broke = self.breaks, self._broke
-        episode = self.dynamics.latest
-        failed = broke and episode is not None and episode.failed
-        self.breaks, self._broke = (
-            before.after(self.n_studied - 1, broke=broke, failed=failed),
-            False,
-        )
+        before, broke, latest = self.breaks, self._broke, self.dynamics.latest
+        failed = broke and latest is not None and latest.failed
+        self.breaks = before.after(self.n_studied - 1, broke=broke, failed=failed)
+        self._broke = False
         return self.breaks.worse != before.worse
 
     @property

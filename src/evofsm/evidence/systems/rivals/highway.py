@@ -7,7 +7,7 @@ lanes, cars behind, target speeds.
 from __future__ import annotations
 
 from abc import abstractmethod
-from copy import deepcopy
+from copy import copy, deepcopy
 from typing import Any, ClassVar
 
 import numpy as np
@@ -85,7 +85,9 @@ class CarFollower(OnTheRoad):
         car = self.car
         driver = IDMVehicle.create_from(car)
         driver.target_speed = float(car.target_speeds[-1])
-        if "left" in self.index:
+        driver.road = copy(car.road)  # where the car itself is not in its way
+        driver.road.vehicles = [one for one in car.road.vehicles if one is not car]
+        if "left" in self.index and car.lane_index == car.target_lane_index:
             for to, name in ((-1, "left"), (1, "right")):
                 beside = self.lane_beside(to)
                 if beside is not None and driver.mobil(beside):
