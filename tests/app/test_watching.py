@@ -350,7 +350,9 @@ def test_a_learnt_judge_is_not_said_to_know_how_leaders_brake():
         assert not any(words in said for words in LEADERS), said
     assert any("disturbances remembered from" in told.why for _, told in frames)
     assert {"dead end", "collision"} <= {told.status for _, told in frames}
-    assert "by a margin" in frames[0][1].done or frames[0][0].executed == frames[0][0].proposed
+    for frame, told in frames:  # what it changes where it sees no danger, it changes for the margin
+        story = frame.story
+        assert ("by a margin" in told.done) == (story.danger is None and story.revised > 0)
 
 
 def test_what_was_learnt_is_of_the_judge_that_is_asked_for():
