@@ -355,6 +355,14 @@ def test_a_learnt_judge_is_not_said_to_know_how_leaders_brake():
         assert ("by a margin" in told.done) == (story.danger is None and story.revised > 0)
 
 
+def test_what_a_learnt_judge_changes_where_it_sees_no_danger_it_changes_for_the_margin():
+    with opened(LEARNING, watched_guard(LEARNING.family, "learnt")) as session:
+        frame = session.step()
+        quiet = frame._replace(story=frame.story._replace(danger=None, revised=2))
+        done = tell(quiet, session.start).done
+    assert done == "The reviser changed 2 decisions, to survive all that it remembers by a margin."
+
+
 def test_what_was_learnt_is_of_the_judge_that_is_asked_for():
     with pytest.raises(ValueError, match="of the judge 'kinematic', not of 'learnt'"):
         opened(LEARNING, watched_guard(LEARNING.family))

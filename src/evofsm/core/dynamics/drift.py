@@ -54,7 +54,7 @@ class Recent(NamedTuple):
         """Before anything was seen, in this episode."""
         return cls(np.zeros((p, p)), np.zeros((p, m)), np.zeros(m), np.full(m, float(episode)))
 
-    def overthrown(self, episode: int) -> list[int]:
+    def overthrown(self) -> list[int]:
         """Variables that do not move any more as was learnt."""
         return np.flatnonzero(self.doubt > _DOUBT).tolist()
 

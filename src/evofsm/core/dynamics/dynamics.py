@@ -550,7 +550,7 @@ class Dynamics:
         """Correct the model of what moves otherwise; what was unforeseen before stays so."""
         sums, before, young = self.sums, self.consequents, self._young
         self.recent = compared(self.recent, before, sums, Z, U, self.n_episodes, bool(young))
-        begun = self.recent.overthrown(self.n_episodes)
+        begun = self.recent.overthrown()
         self.drifts += [Drift(j, int(self.recent.since[j]), self.n_episodes) for j in begun]
         moved = sorted({*begun, *young})
         if not moved:
@@ -641,9 +641,10 @@ class Dynamics:
             ]
         )
         held[(self.sums.moving <= MOVING) | (self.sums.scale[0] == 0.0)] = 0
-        self.reached += (held > 0) & ~arrived
-        self.reached[held >= _RESTED] = np.maximum(self.reached, _REACHED)[held >= _RESTED]
-        self._rebuild()
+        if held.any():
+            self.reached += (held > 0) & ~arrived
+            np.maximum(self.reached, _REACHED, out=self.reached, where=held >= _RESTED)
+            self._rebuild()
 
     def _rescale(self, found: _Floats, safe: _Floats) -> None:
         sums, size = self.sums, np.abs(found)
@@ -653,9 +654,10 @@ class Dynamics:
         known = sums.scale[0] > 0.0
         new = 0.8 * sums.scale + 0.2 * scale if known else scale
         square = (size**2).mean(0)
-        young, jumped = self._young, have_jumped(np.diff(safe[1:], axis=0), sums.unit)
-        ordinary = np.where(jumped, 0.0, size**2).mean(0)
-        new[young] = np.maximum(new, np.sqrt(ordinary))[young]  # what is learnt anew is no outlier
+        if young := self._young:  # what is learnt anew is no outlier
+            jumped = have_jumped(np.diff(safe[1:], axis=0), sums.unit)
+            ordinary = np.where(jumped, 0.0, size**2).mean(0)
+            new[young] = np.maximum(new, np.sqrt(ordinary))[young]
         sums.scale[:] = np.maximum(new, 1e-3 * np.sqrt(sums.variance) + 1e-300)
         sums.noise[:] = 0.8 * sums.noise + 0.2 * square if known else square
 

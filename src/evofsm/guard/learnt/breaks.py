@@ -45,9 +45,8 @@ class Breaks(NamedTuple):
         """
         share = self.share + _MORE
         likelier = _WORSE / share if broke else (1.0 - _WORSE) / (1.0 - share)
-        doubt = (
-            max(0.0, self.doubt + (1.0 + failed) * math.log(likelier)) if share < _USUAL else 0.0
-        )
+        times = 2.0 if failed else 1.0
+        doubt = max(0.0, self.doubt + times * math.log(likelier)) if share < _USUAL else 0.0
         since = self.since if self.doubt > 0.0 else episode
         if doubt > _DOUBT and episode >= _LEARNT:
             return Breaks(worse=since)
