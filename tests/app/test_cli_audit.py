@@ -124,3 +124,20 @@ def test_drive_writes_a_log(tmp_path):
     result = evofsm("audit", path, "--json")
     assert result.exit_code == 0, result.output
     assert json.loads(result.stdout)["contents"]["episodes"] == 2
+
+
+def is_too_close(z):
+    return bool(z[0] <= 6.0)
+
+
+def test_what_told_the_guard_where_it_fails_is_named_by_its_module(tmp_path):
+    path = tmp_path / "log.jsonl"
+    with AuditLog(path) as written:
+        guard = Guard(low=-2.5, high=2.5, interval=0.25, failed=is_too_close, audit=written)
+        for step in range(5):
+            guard.decide([20.0 - step, 15.0], 1.0)
+        guard.end(observation=[15.0, 15.0])
+    assert "5 decisions compared with nothing" in evofsm("audit", path).output
+    again = evofsm("audit", path, "--failed", f"{__name__}:is_too_close")
+    assert again.exit_code == 0, again.output
+    assert "5 decisions as recorded" in again.output

@@ -38,6 +38,7 @@ from evofsm.files.sealed import (
     unseal,
     verify,
 )
+from evofsm.guard.auditing.form import SINCE
 from evofsm.guard.auditing.log import AuditLog
 from evofsm.guard.auditing.participants import describe, restore
 from evofsm.guard.auditing.replay import audit
@@ -559,7 +560,7 @@ FORGERIES = {
 MISFITS = {
     **{f"version {one!r}": ("start", with_other("version", one)) for one in (0, -7, 0.5, False)},
     "version 'two'": ("start", with_other("version", "2")),
-    "an explanation in version 1": ("start", with_other("version", 1)),
+    "a name that version 1 has not": ("start", with_other("version", 1)),
     "no version": ("start", lambda content: content.pop("version")),
     "another kind": ("end", with_other("kind", "nonsense")),
     "no explanation in version 2": ("decision", lambda content: content.pop("explanation")),
@@ -600,8 +601,8 @@ def test_what_no_log_holds_is_a_forgery(driven, tmp_path, name):
     kind, change = MISFITS[name]
     number = forge(driven, tmp_path / "forged", kind, 0, change)
     result = audit(tmp_path / "forged", replay=False)
-    if name == "an explanation in version 1":  # it stands in the first decision
-        number = 1 + next(k for k, one in enumerate(contents(driven)) if one["kind"] == "decision")
+    if name == "a name that version 1 has not":  # it stands where the first episode begins
+        number = 1 + next(k for k, one in enumerate(contents(driven)) if one["kind"] == "begin")
     assert result.misfit.record == number
     assert not result.is_good
     assert audit(tmp_path / "forged").replay is None
@@ -621,11 +622,12 @@ def test_a_name_given_twice_is_found_behind_its_own_hash(driven, tmp_path):
 
 
 def as_version_1(driven, target, change=lambda content: None):
-    """The log as it was written before decisions were explained."""
+    """The log as it was written at first: without explanations, among others."""
     head, lines = Head(0, NOTHING), []
     for line in driven.read_bytes().splitlines(keepends=True):
         content = unseal(line).content
-        content.pop("explanation", None)
+        for name in SINCE:
+            content.pop(name, None)
         content |= {"version": 1} if "version" in content else {}
         change(content)
         line, head = seal(content, head)
@@ -984,3 +986,30 @@ def test_a_wrapped_environment_is_audited(tmp_path):
     assert result.is_good
     assert result.replay.decisions == steps
     assert result.contents.episodes == 2
+
+
+def _is_too_close(z):
+    return bool(z[0] <= 6.0)
+
+
+def test_a_guard_that_was_told_where_it_fails_is_replayed_with_that_function_alone(tmp_path):
+    path = tmp_path / "log"
+    with AuditLog(path) as log:
+        guard = Guard(low=-2.5, high=2.5, interval=0.25, failed=_is_too_close, audit=log)
+        for _ in range(6):
+            gap, speed = 30.0, 10.0
+            while gap > 6.0:
+                speed = max(0.0, speed + 0.25 * guard.decide([gap, speed], 1.0).executed)
+                gap += 0.25 * (8.0 - speed)
+                if speed < 8.0:
+                    break
+            guard.end(observation=[gap, speed])
+    without, with_it = audit(path), audit(path, failed=_is_too_close)
+    assert without.is_good
+    assert without.replay.decisions == 0
+    assert "--failed MODULE:FUNCTION" in without.replay.not_replayed[0]
+    assert with_it.is_good
+    assert with_it.replay.decisions == with_it.contents.decisions > 20
+    assert with_it.replay.not_replayed == ()
+    wrong = audit(path, failed=lambda z: bool(z[0] <= 20.0))
+    assert wrong.replay.difference is not None

@@ -345,7 +345,13 @@ class Guard:
             self.machine.start_episode()
         if self.audit is not None:
             who = self._participants
-            self.audit.begin(who, interval=self.interval, learn=self.learn, missing=self.missing)
+            self.audit.begin(
+                who,
+                interval=self.interval,
+                learn=self.learn,
+                missing=self.missing,
+                failure_told=self.failed is not None,
+            )
         self._under_way = True
 
     def decide(

@@ -264,7 +264,13 @@ class Witness(Protocol):
     """Anything that records what happens in an episode, such as an audit log."""
 
     def begin(
-        self, who: Participants, *, interval: float | None, learn: bool, missing: Missing
+        self,
+        who: Participants,
+        *,
+        interval: float | None,
+        learn: bool,
+        missing: Missing,
+        failure_told: bool,
     ) -> None:
         """An episode begins."""
         ...

@@ -168,7 +168,13 @@ class FoxgloveSink:
     # -- As the witness of a guard ----------------------------------------------------------------
 
     def begin(
-        self, who: Participants, *, interval: float | None, learn: bool, missing: Missing
+        self,
+        who: Participants,
+        *,
+        interval: float | None,
+        learn: bool,
+        missing: Missing,
+        failure_told: bool,
     ) -> None:
         """An episode begins."""
         if self._episodes >= 0:

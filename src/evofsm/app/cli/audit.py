@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from evofsm.app.cli.common import print_json
 from evofsm.app.cli.declared import argument, option
 from evofsm.app.cli.groups import WithJson
+from evofsm.app.cli.imported import imported
 
 if TYPE_CHECKING:
     from evofsm.files import Chain
@@ -43,6 +44,10 @@ class Audit(WithJson):
         "off, and a log that was written anew.",
     )
     replay: bool = option(True, "Whether to drive again, and compare every decision.")
+    failed: str | None = option(
+        None,
+        "MODULE:FUNCTION that told the guard where it fails, if one did: no log holds code.",
+    )
 
     def run(self) -> int:
         """Print what was found."""
@@ -52,7 +57,10 @@ class Audit(WithJson):
         from evofsm.guard import audit
 
         found = audit(
-            self.file, None if self.head is None else Head.parse(self.head), replay=self.replay
+            self.file,
+            None if self.head is None else Head.parse(self.head),
+            replay=self.replay,
+            failed=None if self.failed is None else imported(self.failed),
         )
         if self.as_json:
             chain = found.chain

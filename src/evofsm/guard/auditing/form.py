@@ -16,9 +16,9 @@ from evofsm.files import LOG_HEADER, SealedRecord
 from evofsm.guard.record import RECORD
 
 #: Of what is written now; every version from 1 on is read.
-LOG_VERSION = 3
-#: The version from which on a decision holds what was not in it from the first.
-SINCE = {"explanation": 2}
+LOG_VERSION = 4
+#: The version from which on a record holds what was not in it from the first.
+SINCE = {"explanation": 2, "failure_told": 4}
 # The version from which on actions may be vectors.
 _VECTORS = 3
 _ACTIONS = ("proposed", "executed", "advised")
@@ -45,6 +45,7 @@ _KINDS: Mapping[str, Mapping[str, _Types]] = {
     },
     "begin": {
         "episode": (int,),
+        "failure_told": (bool,),
         "interval": (int, float, _NOTHING),
         "learn": (bool, int),
         "missing": (str,),

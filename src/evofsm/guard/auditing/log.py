@@ -177,9 +177,15 @@ class AuditLog:
     # -- What it is told by whoever oversees an episode -------------------------------------------
 
     def begin(
-        self, who: Participants, *, interval: float | None, learn: bool, missing: Missing
+        self,
+        who: Participants,
+        *,
+        interval: float | None,
+        learn: bool,
+        missing: Missing,
+        failure_told: bool,
     ) -> None:
-        """An episode begins."""
+        """An episode begins; ``failure_told`` if a function says where it fails."""
         self._raise()
         was_broken_off, self._broken_off = self._broken_off, True  # until it has begun
         self._flush()  # of one that was broken off
@@ -199,6 +205,7 @@ class AuditLog:
             {
                 "kind": "begin",
                 "episode": self._episodes,
+                "failure_told": failure_told,
                 "interval": interval,
                 "learn": learn,
                 "missing": missing.value,

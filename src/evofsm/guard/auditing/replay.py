@@ -44,6 +44,11 @@ _NONSENSE = (
     OSError,
     MemoryError,
 )
+# Why what follows is not replayed.
+_NO_FUNCTION = (
+    "a function told the guard where it fails, and no log holds code; give it as failed "
+    "(--failed MODULE:FUNCTION)"
+)
 
 
 class Field(NamedTuple):
@@ -114,8 +119,8 @@ def audit(
         A head that was kept elsewhere.
     replay : bool
     failed : callable, optional
-        As the guard had it; no log holds code, and without it a guard that knew failures by a
-        function decides otherwise.
+        As the guard had it. No log holds code: without it episodes of a guard that was told by a
+        function where it fails are not replayed, which is said.
 
     Returns
     -------
@@ -246,6 +251,10 @@ class _Player:
 
     def _begin(self, content: Mapping[str, Any]) -> None:
         actions, reviser, machine, risk = self._present()
+        if content.get("failure_told", False) and self.failed is None:
+            self._who, self._is_known = None, False
+            self.not_replayed.append(_NO_FUNCTION)
+            return
         self._guard = Guard.of(
             reviser,
             actions=actions,
