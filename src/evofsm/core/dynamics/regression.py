@@ -202,7 +202,10 @@ def learn_transition(
         sums.low[j] = min(sums.low[j], x, observations[1, j])
         sums.high[j] = max(sums.high[j], x, observations[1, j])
         if now == 0.0 and (x == sums.low[j] or x == sums.high[j]) and sums.moving[j] > MOVING:
-            weight = 0.0  # it may have come to its end: what it would have done is not known
+            y = z[j] + move[j]
+            stayed = (x == known.lowest[j] and y > x) or (x == known.highest[j] and y < x)
+            if not stayed:
+                weight = 0.0  # it may have come to its end: what it would have done is not known
         else:
             sums.moving[j] += ((now != 0.0) - sums.moving[j]) / min(n + 1.0, _SLOWEST)
     if first or jump:

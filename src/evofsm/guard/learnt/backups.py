@@ -14,6 +14,8 @@ _Floats = NDArray[np.float64]
 _LINEAR, _MUTANTS, _OF_BEST = 3, 40, 0.8
 # A mutant differs in this share of its numbers, by a size of 10 to a power between these.
 _CHANGED, _SIZES = 0.6, (-1.5, 0.7)
+# What a policy is worth by itself counts so much beside what it adds to the others.
+_BY_ITSELF = 0.01
 # By so much less a linear policy wants the next of the choices.
 _PREFERRED = 1e-9
 # Digits of actions and scores: what differs by rounding alone is equal, in whatever units it comes.
@@ -64,26 +66,41 @@ class Backups:
         self.policies[: len(constants), :, 0] = constants * self.turns
         if choices:  # of equals the first in that order, whatever its index
             self.policies[:, self.actions, 0] -= _PREFERRED * np.arange(a)
+        #: What each adds to those before it.
         self.scores = np.full(len(self.policies), -np.inf)
-        #: Of the policies, best first.
+        #: Of the policies, those first that add most to the ones before them.
         self.ranks = np.arange(len(self.policies))
 
-    def evolve(self, value: Callable[[_Floats], float], random: np.random.Generator) -> None:
-        """Score all by ``value``, and put mutants that are better in the place of linear ones."""
-        scores = self.scores
-        for q, policy in enumerate(self.policies):
-            scores[q] = round(value(policy), _ROUNDED)
+    def evolve(self, value: Callable[[_Floats], _Floats], random: np.random.Generator) -> None:
+        """Put mutants in the place of linear ones where all together are worth more then.
+
+        ``value`` says how well a policy ends in each of some situations. Together they are worth
+        what the best of them is in each situation: one that is like another adds nothing.
+        """
+        values = np.array([value(policy) for policy in self.policies])
         linear = np.arange(self.n_constant, len(self.policies))
         for _ in range(_MUTANTS if len(linear) else 0):
-            parent = linear[scores[linear].argmax()]
+            parent = linear[values[linear].mean(1).round(_ROUNDED).argmax()]
             if random.random() >= _OF_BEST:
                 parent = self.ranks[int(random.integers(len(self.policies)))]
             child = self.policies[parent] + self._mutation(random)
-            reached, worst = round(value(child), _ROUNDED), linear[scores[linear].argmin()]
-            if reached > scores[worst]:
-                self.policies[worst], scores[worst] = child, reached
-        # Of equals the one that came first.
-        self.ranks = np.argsort(-scores, kind="stable")
+            reached = value(child)
+            worth = [_together(np.vstack([reached, np.delete(values, q, 0)])) for q in linear]
+            if max(worth) > _together(values):
+                replaced = linear[int(np.argmax(worth))]
+                self.policies[replaced], values[replaced] = child, reached
+        self._rank(values)
+
+    def _rank(self, values: _Floats) -> None:
+        """First the one that is worth most, then whichever adds most to those before it."""
+        left, best = list(range(len(values))), np.full(values.shape[1], -1.0)
+        while left:
+            adds = np.maximum(values[left] - best, 0.0).mean(1)
+            adds = (adds + _BY_ITSELF * values[left].mean(1)).round(_ROUNDED)
+            q = left.pop(int(adds.argmax()))
+            self.scores[q] = adds.max()  # never more than that of the one before
+            best = np.maximum(best, values[q])
+        self.ranks = np.argsort(-self.scores, kind="stable")
 
     def _mutation(self, random: np.random.Generator) -> _Floats:
         shape = self.policies.shape[1:]
@@ -93,6 +110,11 @@ class Backups:
         put[np.ix_(self.actions, np.append(0, 1 + self.variables))] = drawn
         put *= np.append(1.0, self.flips) * self.turns[:, None]
         return put
+
+
+def _together(values: _Floats) -> float:
+    """Worth of policies in situations (q, r): the best in each, and a little of all by themselves."""
+    return round(float(values.max(0).mean() + _BY_ITSELF * values.mean(1).sum()), _ROUNDED)
 
 
 def _order(rows: _Floats) -> NDArray[np.int64]:

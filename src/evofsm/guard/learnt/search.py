@@ -219,10 +219,10 @@ def worth(
     disturbances: Disturbances,
     which: _Ints,
     harder: float,
-) -> float:
-    """How well a policy ends, over all situations and the disturbances ``which``."""
-    room, total = futures(known, before.shape[1], which, disturbances), 0.0
+) -> _Floats:
+    """How well a policy ends in each situation, over the disturbances ``which``."""
+    room, found = futures(known, before.shape[1], which, disturbances), np.empty(len(z))
     for r in range(len(z)):
         here = Here(z[r], change[r], before[r])
-        total += _lasting(known, here, policy, disturbances, harder, room)
-    return total / (len(z) * len(which))
+        found[r] = _lasting(known, here, policy, disturbances, harder, room) / len(which)
+    return found
