@@ -113,7 +113,7 @@ class Backups:
 
 
 def _together(values: _Floats) -> float:
-    """Worth of policies in situations (q, r): the best in each, and a little of all by themselves."""
+    """Worth of policies in situations (q, r): the best in each, and a little of each by itself."""
     return round(float(values.max(0).mean() + _BY_ITSELF * values.mean(1).sum()), _ROUNDED)
 
 
