@@ -27,7 +27,7 @@ from evofsm.evidence.closed_loop.beside import (
     run_two_worlds,
 )
 from evofsm.evidence.closed_loop.calibration import reliability, run_calibration
-from evofsm.evidence.closed_loop.machine import MACHINE, run_machine_shift
+from evofsm.evidence.closed_loop.machine import MACHINE, run_machine, run_machine_shift
 from evofsm.evidence.closed_loop.plan import Plan
 from evofsm.evidence.closed_loop.study import run_closed_loop
 from evofsm.evidence.scores import auroc
@@ -141,6 +141,15 @@ def test_the_papers_cases_are_driven_without_a_collision_and_left_alone_where_sa
     assert {"brake at 11 s", "brake at 15 s"} <= set(by_name)
     assert by_name["case 2"].changed <= 0.05
     assert by_name["case 3"].changed_late <= 0.05
+
+
+@pytest.mark.slow
+def test_the_machine_learns_the_papers_cases_from_nothing_but_failures():
+    found = run_machine(load_family("paper"), Plan(train=12, test=4, machine_checks=4), 0)
+    by_name = {case.name: case for case in found["machine_cases"]}
+    assert set(by_name) == {f"case {n}" for n in (1, 2, 3, 4)} | {"brake at 11 s", "brake at 15 s"}
+    assert 1 <= found["rows"][0].train_collisions <= 4  # what failure is has to happen
+    assert not any(by_name[f"case {n}"].collided for n in (1, 2, 3, 4))
 
 
 @pytest.mark.slow

@@ -22,6 +22,7 @@ from evofsm.guard import (
     Mode,
     Pair,
     Revision,
+    SearchingJudge,
     is_spoken,
 )
 
@@ -262,9 +263,9 @@ class Decider:
         self.guard.audit = None
 
     def _is_alarm(self, revision: Revision) -> bool:
-        """Whether the proposal is too risky; of a reviser without risks, whether it differs."""
+        """Whether the proposal is too risky, or, where that alone does not decide, is not kept."""
         reviser = self.guard.reviser
-        if isinstance(reviser, ActionReviser):
+        if isinstance(reviser, ActionReviser) and not isinstance(reviser.risk, SearchingJudge):
             return revision.risk_proposed > reviser.tolerance
         return is_spoken(reviser, revision)
 

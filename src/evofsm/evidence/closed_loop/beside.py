@@ -61,17 +61,26 @@ class CaseResult(NamedTuple):
     changed: float  #: share of decisions in which the proposal was not executed
     changed_late: float  #: the same from 16.5 s on
     unrevised_collided: bool
+    learning_seed: int = 0
 
 
 def run_cases(family: Family, plan: Amounts) -> dict[str, list[Any]]:
     """Learn from each case once, while revising; then drive all again with learning frozen."""
     guard = guard_for_family(family, tolerance=plan.tolerance)
-    cases = [family.draw(plan.seed, index) for index in range(family.cases)]
-    teach(guard, cases)
+    teach(guard, _cases(family, plan))
+    return {"cases": revised_cases(family, plan, guard)}
+
+
+def _cases(family: Family, plan: Amounts) -> list[Draw]:
+    return [family.draw(plan.seed, index) for index in range(family.cases)]
+
+
+def revised_cases(family: Family, plan: Amounts, guard: Guard, seed: int = 0) -> list[CaseResult]:
+    """Each case, and two later brakes, under a guard that learns no more."""
+    cases, tested = _cases(family, plan), frozen(guard)
     runs = {f"case {number}": draw for number, draw in enumerate(cases, 1)}
     runs |= {f"brake at {time:g} s": _braking_at(cases[0], time) for time in UNSEEN_BRAKES}
-    tested = frozen(guard)
-    return {"cases": [_case(family, tested, name, draw) for name, draw in runs.items()]}
+    return [_case(family, tested, name, draw, seed) for name, draw in runs.items()]
 
 
 def _braking_at(draw: Draw, time: float) -> Draw:
@@ -79,7 +88,7 @@ def _braking_at(draw: Draw, time: float) -> Draw:
     return draw._replace(scenario=replace(draw.scenario, leader=leader))
 
 
-def _case(family: Family, guard: Guard, name: str, draw: Draw) -> CaseResult:
+def _case(family: Family, guard: Guard, name: str, draw: Draw, seed: int) -> CaseResult:
     revised, alone = drive(guard, draw), drive(unrevised_guard(family), draw)
     changed = revised.changed
     late = np.array([decision.situation.time for decision in revised.decisions]) >= _SETTLED
@@ -90,6 +99,7 @@ def _case(family: Family, guard: Guard, name: str, draw: Draw) -> CaseResult:
         float(changed.mean()),
         float(changed[late].mean()) if late.any() else 0.0,
         alone.episode.collided,
+        seed,
     )
 
 

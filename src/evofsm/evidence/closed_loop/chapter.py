@@ -240,6 +240,7 @@ _TITLES = {
     "separation": ("Telling dead ends", ""),
     "states": ("States alone", ""),
     "cases": ("The paper's cases", ""),
+    "machine_cases": ("The paper's cases, told nothing but failures", ""),
     "worlds": ("Both worlds", ""),
 }
 

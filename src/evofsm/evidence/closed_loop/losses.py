@@ -19,7 +19,7 @@ from evofsm.evidence.closed_loop.comparison import (
     table_groups,
 )
 from evofsm.evidence.closed_loop.machine import MACHINE
-from evofsm.evidence.closed_loop.over_seeds import around_shift, when
+from evofsm.evidence.closed_loop.over_seeds import around_shift, cases_over_seeds, when
 from evofsm.evidence.closed_loop.stages import SAFE_RATE
 from evofsm.evidence.closed_loop.study import ClosedLoop
 
@@ -179,6 +179,10 @@ def _in_cases(study: ClosedLoop) -> Iterator[Loss]:
                 f"{percent(case.changed)} of decisions changed ({percent(case.changed_late)} late)"
             )
             yield Loss(what, "the driver alone, who does not collide", percent(0.0), own)
+    for one in cases_over_seeds(study):
+        if one.collided:
+            own = f"{MACHINE} collides with {part(one.collided, one.seeds)} learning seeds"
+            yield Loss(f"the paper's {one.name}", "no collision", "0", own, loud=True)
 
 
 def _between_worlds(study: ClosedLoop) -> Iterator[Loss]:

@@ -11,7 +11,7 @@ from typing import Any
 
 from evofsm.driving import Family, Group, drive, guard_for_family, held_out, learners_of, training
 from evofsm.evidence.closed_loop.amounts import Amounts
-from evofsm.evidence.closed_loop.beside import Check, Stream, check
+from evofsm.evidence.closed_loop.beside import Check, Stream, check, revised_cases
 from evofsm.evidence.closed_loop.course import Course, mobility_of
 from evofsm.evidence.closed_loop.stages import Point, until_safe
 from evofsm.guard import Guard
@@ -66,7 +66,8 @@ def run_machine(family: Family, plan: Amounts, seed: int) -> dict[str, list[Any]
         episodes_until_safe=until_safe(curve),
         train_collisions=collisions,
     )
-    return {"rows": [row], "curve": curve}
+    cases = revised_cases(family, plan, guard, seed) if family.name == "paper" else []
+    return {"rows": [row], "curve": curve, "machine_cases": cases}
 
 
 def run_machine_shift(family: Family, plan: Amounts, seed: int) -> dict[str, list[Any]]:

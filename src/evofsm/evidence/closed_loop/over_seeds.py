@@ -67,6 +67,32 @@ def learning_curve(study: ClosedLoop, policy: str = OURS) -> list[Stage]:
     ]
 
 
+class CaseOverSeeds(NamedTuple):
+    """One of the paper's cases under the machine that was told nothing but failures."""
+
+    name: str
+    unrevised_collided: bool
+    collided: int  #: learning seeds with which it collides
+    seeds: int
+    changed: Spread
+    changed_late: Spread
+
+
+def cases_over_seeds(study: ClosedLoop) -> list[CaseOverSeeds]:
+    """The paper's cases in their order."""
+    return [
+        CaseOverSeeds(
+            name,
+            runs[0].unrevised_collided,
+            sum(run.collided for run in runs),
+            len(runs),
+            spread([run.changed for run in runs]),
+            spread([run.changed_late for run in runs]),
+        )
+        for name, runs in gathered(study.machine_cases, lambda run: run.name).items()
+    ]
+
+
 class AroundShift(NamedTuple):
     """Collision rates of a test before or after the shift."""
 

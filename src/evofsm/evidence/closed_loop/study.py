@@ -94,6 +94,7 @@ class ClosedLoop:
     separations: list[Separation] = field(default_factory=list)
     reliabilities: list[Reliability] = field(default_factory=list)
     cases: list[CaseResult] = field(default_factory=list)  #: of the family `paper`
+    machine_cases: list[CaseResult] = field(default_factory=list)  #: the same of `evofsm-machine`
     worlds: list[InWorld] = field(default_factory=list)  #: empty without SUMO
     streams: list[Stream] = field(default_factory=list)  #: of families that shift
     checks: list[Check] = field(default_factory=list)
