@@ -31,7 +31,7 @@ KEPT, CHANGED, NOTHING_PASSES = 0, 1, 2
 _HALVINGS = 4
 # Of two that last as long up to so much the first is taken.
 _EQUAL = 1e-9
-# What the least distance counts beside the time survived.
+# What the distance counts beside the time survived.
 _DISTANCE, _FAR = 0.05, 0.05
 
 
@@ -125,12 +125,21 @@ def _lasting(
     harder: float,
     room: Futures,
 ) -> float:
-    """Shares of the horizon that are survived, and a little for the least distances, summed."""
+    """Shares of the horizon that are survived, and a little for the distances to failure, summed.
+
+    The least distance, and, where all of the horizon is survived, that at its end as well: who
+    comes back does better than who hovers beside failure.
+    """
     replay(known, here, np.empty(0), policy, disturbances, harder, 0.0, -1, room)
     steps, total = disturbances.residuals.shape[1], 0.0
     for l in range(len(room.least)):
-        near = min(1.0, max(-1.0, _FAR * room.least[l]))
-        total += room.survived[l] / steps + _DISTANCE * near
+        left = room.least[l]
+        if room.survived[l] == steps:
+            end = np.inf
+            for side in known.sides:
+                end = min(end, side[1] * (side[2] - room.z[int(side[0]), l]) * side[3])
+            left = 0.5 * (left + end)
+        total += room.survived[l] / steps + _DISTANCE * min(1.0, max(-1.0, _FAR * left))
     return total
 
 
