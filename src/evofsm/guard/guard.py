@@ -459,11 +459,14 @@ class Guard:
         return z
 
     def _begin_anew(self) -> None:
-        """What comes after a gap in time does not follow from what was before it."""
-        if self.judge is not None:
-            self.judge.start_episode(learn=self.learn)
+        """What comes after a gap in time does not follow from what was before it.
+
+        The machine first, as at an end: a judge learns from what the machine made of it.
+        """
         if self.machine is not None and self.learn:
             self.machine.start_episode()
+        if self.judge is not None:
+            self.judge.start_episode(learn=self.learn)
 
     def _recognised(self, z: NDArray[np.float64], time: float, intake: Intake) -> Situation:
         nothing = Situation(z, np.ones(1), None, math.nan, time, intake)

@@ -94,7 +94,7 @@ def compare(told, walk, make, otherwise, episodes, exact=False):
         back = otherwise.back(told, again.executed)
         if exact:
             np.testing.assert_array_equal(back, said.executed)
-            assert again.risk_executed == said.risk_executed or np.isnan(said.risk_executed)
+            np.testing.assert_array_equal(again.risk_executed, said.risk_executed)
         else:
             np.testing.assert_allclose(back, said.executed, rtol=0, atol=1e-5, err_msg=said.reason)
         changed.append(not np.array_equal(said.executed, said.proposed))

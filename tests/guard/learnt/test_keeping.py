@@ -40,6 +40,26 @@ def test_a_file_that_contradicts_itself_is_refused(points):
         storage.write(bad, "learntrisk", told, arrays | spoilt)
         with pytest.raises(ValueError, match=what):
             LearntRisk.load(BytesIO(bad.getvalue()))
+    others = {"variables": np.arange(3.0), "policies": np.zeros((6, 1, 4))}
+    with pytest.raises(ValueError, match="variables has shape"):
+        storage.write(BytesIO(), "learntrisk", content, arrays | others)
+
+
+def test_what_was_learnt_of_another_system_is_put_beside_no_machine(points):
+    box, plane = (points[name].taught(3) for name in ("box", "plane"))
+    files = []
+    for guard in (box, plane):
+        files.append(BytesIO())
+        guard.save(files[-1])
+    (content, own), (_, others) = (
+        storage.read(BytesIO(file.getvalue()), "guard") for file in files
+    )
+    mixed = BytesIO()
+    storage.write(mixed, "guard", content, own | {"judge": others["judge"]})
+    with pytest.raises(ValueError, match="they do not belong together"):
+        Guard.load(BytesIO(mixed.getvalue()))
+    with pytest.raises(ValueError, match="from 4 variables and actions of 2 numbers, the machine"):
+        Guard(low=-1.0, high=1.0, interval=0.1, judge=plane.judge, machine=box.machine)
 
 
 def test_a_file_of_before_breaks_were_counted_is_read(points):

@@ -13,6 +13,7 @@ from evofsm.guard import Mode, same_action
 from evofsm.guard.auditing.log import AuditLog
 from evofsm.guard.auditing.replay import audit
 from evofsm.guard.learnt.breaks import Breaks
+from evofsm.guard.learnt.remembering import Situations
 from evofsm.guard.learnt.risk import LearntRisk
 
 
@@ -194,6 +195,27 @@ def test_after_a_gap_in_time_nothing_follows_from_what_was(points):
     assert learning.machine.dynamics.sums.most[0] < 0.3  # the leap was not learnt
 
 
+def test_what_came_before_a_gap_in_time_is_learnt_from_as_at_an_end(points, monkeypatch):
+    """With all that the judge noted on the way, such as which proposals were refused."""
+    noted, add = [], Situations.add
+
+    def listen(self, episode, tight, horizon, random):
+        noted.append((len(episode.actions), list(tight)))
+        add(self, episode, tight, horizon, random)
+
+    guards = [points["box"].taught(4) for _ in range(2)]
+    monkeypatch.setattr(Situations, "add", listen)
+    for guard in guards:
+        for k in range(40):
+            guard.decide([0.024 * k, 0.08], 1.0, time=0.1 * k)
+    guards[0].decide([0.0, 0.0], 1.0, time=60.0)
+    guards[1].end(False)
+    (steps, tight), ended = noted
+    assert (steps, tight) == ended
+    assert len(tight) == steps + 1 == 40
+    assert any(tight)
+
+
 def test_an_observation_that_comes_twice_is_taken_in_once(points, content):
     point = points["box"]
     once, twice = point.taught(3), point.taught(3)
@@ -272,6 +294,14 @@ def test_a_question_changes_nothing_of_what_is_learnt(point, content):
     assert content(asked) == content(unasked)
 
 
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_where_nobody_knows_where_one_is_nothing_is_said(points, value):
+    judge = points["box"].taught(3).judge
+    for z, moved in (([value, 0.0], None), ([0.0, value], None), ([0.0, 0.0], [value, 0.0])):
+        with pytest.raises(ValueError, match=r"observation|change"):
+            judge.assess(z, moved)
+
+
 def test_after_a_drift_the_margin_begins_anew(point, monkeypatch):
     guard = point.taught(4)
     judge, dynamics = guard.judge, guard.machine.dynamics
@@ -294,7 +324,6 @@ def test_after_a_drift_the_margin_begins_anew(point, monkeypatch):
 def test_where_certificates_break_in_every_episode_disturbances_are_harder_again(
     point, monkeypatch
 ):
-    monkeypatch.setattr("evofsm.guard.learnt.breaks._LEARNT", 0)
     guard = point.taught(4)
     judge = guard.judge
     judge.breaks, judge.margin = Breaks(share=0.0), 0.1

@@ -14,9 +14,8 @@ from typing import NamedTuple
 # Of the share of episodes with a broken certificate: what it is at first, how much more it may be
 # than of late, what would be worse, and from where on nothing is told apart from that.
 _FIRST, _MORE, _WORSE, _USUAL = 0.5, 0.05, 0.5, 0.2
-# Weight of an episode in that share; log likelihood ratio from which on it is believed; the number
-# of episodes before which all is still being learnt.
-_WEIGHT, _DOUBT, _LEARNT = 0.05, 6.0, 20
+# Weight of an episode in that share; log likelihood ratio from which on it is believed.
+_WEIGHT, _DOUBT = 0.05, 6.0
 
 
 class Breaks(NamedTuple):
@@ -48,7 +47,7 @@ class Breaks(NamedTuple):
         times = 2.0 if failed else 1.0
         doubt = max(0.0, self.doubt + times * math.log(likelier)) if share < _USUAL else 0.0
         since = self.since if self.doubt > 0.0 else episode
-        if doubt > _DOUBT and episode >= _LEARNT:
+        if doubt > _DOUBT:
             return Breaks(worse=since)
         if doubt > 0.0:  # before a doubt it was as ever
             return Breaks(self.share, doubt, since, self.worse)

@@ -29,10 +29,10 @@ _SHAPES: dict[str, tuple[int | str, ...]] = {
     "actions_before": ("s", "a"),
     "policies": ("b", "a", "f"),
     "scores": ("b",),
-    "variables": ("v",),
-    "flips": ("v",),
-    "actions": ("c",),
-    "turns": ("c",),
+    "variables": ("m",),
+    "flips": ("m",),
+    "actions": ("a",),
+    "turns": ("a",),
 }
 #: Attributes of the judge that are numbers, which it goes on with.
 NUMBERS = ("margin", "broken", "horizon", "takes", "n_studied", "n_scanned")

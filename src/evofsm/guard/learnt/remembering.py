@@ -103,10 +103,10 @@ def choose(
     harder: float,
     random: np.random.Generator,
 ) -> Disturbances:
-    """Keep the most harmful stretches of all that are remembered; return their residuals."""
-    found, K = dynamics.disturbances(horizon), dynamics.n_stretches
+    """Keep the most harmful stretches of all that are remembered; return what is kept."""
     if "memory" in dynamics.without:
         return _shuffled(dynamics, situations, horizon, random)
+    found, K = dynamics.disturbances(horizon), dynamics.n_stretches
     n = len(dynamics.stretches)
     if n <= K:
         return found

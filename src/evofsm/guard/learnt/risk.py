@@ -25,6 +25,7 @@ from evofsm.core import (
     action_name,
     poisson_bounds,
     positive,
+    refuse_unusable,
 )
 from evofsm.files import Place, storage
 from evofsm.guard.learnt import words
@@ -177,10 +178,19 @@ class LearntRisk:
         Raises
         ------
         ValueError
-            If it learns no dynamics.
+            If it learns no dynamics, or the judge has learnt from other variables or actions.
         """
-        if machine.dynamics is None:
+        dynamics = machine.dynamics
+        if dynamics is None:
             raise ValueError("the machine learns no dynamics; make it with dynamics=Dynamics(...)")
+        if self.backups is not None:  # kernels, which check no index, are given both
+            _, size, features = self.backups.policies.shape
+            if (dynamics.n_variables, dynamics.size) != (features - 1, size):
+                raise ValueError(
+                    f"the judge has learnt from {features - 1} variables and actions of {size} "
+                    f"numbers, the machine from {dynamics.n_variables} and {dynamics.size}: they "
+                    "do not belong together"
+                )
         self.machine = machine
 
     @property
@@ -346,7 +356,8 @@ class LearntRisk:
         Raises
         ------
         ValueError
-            If no failure is known yet, or an array is of another length than observations.
+            If no failure is known yet, or an array is of another length than observations, or
+            holds NaN or infinity.
 
         Examples
         --------
@@ -375,6 +386,8 @@ class LearntRisk:
                 f"observation and change have shapes {z.shape} and {moved.shape}; both must be "
                 f"({dynamics.n_variables},)"
             )
+        refuse_unusable("observation", z)
+        refuse_unusable("change", moved)
         here = Here(z, moved, np.zeros(dynamics.size))
         found = np.empty((3, 1))
         self._foresee(here, np.empty((1, 0)), self.backups.ranks, found)
