@@ -107,6 +107,14 @@ def test_controllers_and_seeds_are_pooled(found):
     assert of_both.name == "without memory"
 
 
+def test_a_single_part_stands_in_the_legend(found):
+    rows = [row for row in found.rows if row.system == "acc" and row.without in ("", "margin")]
+    sketch = tell(replace(found, rows=rows)).sketches[0]
+    (legend,) = sketch.figure().legends
+    names = [text.get_text() for text in legend.get_texts()]
+    assert names == ["controller alone", "learnt, whole", "without one part"]
+
+
 def test_without_parts_and_cars_there_is_a_chapter_too(found, tmp_path):
     rows = [r for r in found.rows if not r.without and r.system == "acc"]
     told = tell(replace(found, rows=rows))

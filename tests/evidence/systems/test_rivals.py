@@ -119,6 +119,18 @@ def test_a_shield_by_counts_learns_which_rung_breaks():
     assert sum(one.kept for one in tested) > 0.4 * sum(len(one.times) for one in tested)
 
 
+@pytest.mark.parametrize("size", [1, 2, 3])
+def test_actions_that_are_counted_reach_every_end_of_a_box(size):
+    """Both ends of each number, whatever the others are."""
+    ladder = Ladder()
+    ladder.actions = Box((-1.0,) * size, (1.0,) * size)
+    judge, seen = Counted(ladder), np.array([8.0])
+    for sign in np.ndindex(*(2,) * size):
+        corner = 2.0 * np.array(sign) - 1.0
+        judge.decide(seen, corner if size > 1 else float(corner[0]))
+        assert np.array_equal(judge._actions[judge._done[-1]], corner)
+
+
 MASA = ["cont_cartpole", "disc_cartpole", "road_1d", "road_2d", "obstacle"]
 
 

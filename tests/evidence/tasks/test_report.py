@@ -71,17 +71,29 @@ def test_a_shortened_run_is_not_judged_and_says_so(found):
     assert "Nothing was judged: that takes 20 learning seeds of 200 episodes" in told.answer[-1]
 
 
+def test_what_is_asked_of_many_seeds_is_what_is_judged(found, make_row):
+    rows = [make_row("acc", "full throttle", seed=k, failed_late=int(k < 2)) for k in range(31)]
+    _, clean, _ = claims(replace(found, rows=rows))
+    assert (clean.asked, clean.measured, clean.met) == ("≥ 30 of 31", "29", False)
+
+
+def test_a_task_that_none_of_ours_learns_is_told_too(found):
+    rows = [row for row in found.rows if row.judge != "learnt"]
+    assert tell(replace(found, rows=rows)).headline.startswith("0 of 0 held-out episodes")
+
+
 def test_every_row_says_what_the_judge_was_told(found):
     told = tell(found)
-    for table in told.tables:
-        if table.title in ("What fails", "What it costs"):
-            assert table.header[1] == "told"
-            assert {row[1] for row in table.rows} == {
-                "nothing",
-                "dynamics and noise",
-                "nothing but failures",
-            }
-            assert len(table.rows) == 8
+    by_title = {table.title: table for table in told.tables}
+    for title in ("What fails", "What it costs"):
+        table = by_title[title]
+        assert table.header[1] == "told"
+        assert {row[1] for row in table.rows} == {
+            "nothing",
+            "dynamics and noise",
+            "nothing but failures",
+        }
+        assert len(table.rows) == 8
 
 
 def test_a_return_is_told_as_a_share_of_the_best_that_never_failed(found):

@@ -11,7 +11,7 @@ import pytest
 import evofsm.evidence.systems as systems
 from evofsm.evidence.systems import TASKS, make_system
 from evofsm.evidence.systems.rivals.rival import Rival
-from evofsm.evidence.systems.trial import make_judge
+from evofsm.evidence.systems.trial import make_judge, told_to
 from evofsm.evidence.tasks import study
 from evofsm.evidence.tasks.plan import Plan
 from evofsm.evidence.tasks.policies import search
@@ -60,13 +60,27 @@ def test_a_judge_that_says_how_dangerous_actions_are_is_put_into_a_guard(tmp_pat
     text = (
         re.sub(r"^   ", "", text, flags=re.M) + "\ndef kettle(system, seed):\n    return Kettle()\n"
     )
+    text += "Kettle.told = 'where it boils'\n"
     (tmp_path / "danger.py").write_text(text, encoding="utf-8")
     (tmp_path / "half.py").write_text("def made(system, seed):\n    return 3\n", encoding="utf-8")
     monkeypatch.chdir(tmp_path)
     judge = make_judge("danger:kettle", make_system("acc"))
     assert judge.decide([50.0], 1.0).executed == 1.0
+    assert told_to(judge) == "where it boils"
     with pytest.raises(TypeError, match="half:made makes a int, which is no judge"):
         make_judge("half:made", make_system("acc"))
+
+
+def test_a_guard_of_ones_own_is_tried_as_it_is(tmp_path, monkeypatch):
+    text = (
+        "from evofsm.guard import Guard\n\ndef timid(system, seed):\n    "
+        "return Guard(**system.actions.settings, interval=system.interval, tolerance=0.01)\n"
+    )
+    (tmp_path / "guards.py").write_text(text, encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    judge = make_judge("guards:timid", make_system("acc"))
+    assert judge.reviser.tolerance == 0.01
+    assert told_to(judge) == "nothing but failures"
 
 
 @pytest.mark.parametrize(
@@ -93,6 +107,15 @@ def test_what_lacks_its_package_is_left_out_and_told(no_packages, monkeypatch):
         "masa-obstacle is left out: it needs masa (pip install --no-deps masa-safe-rl).",
         "acc: the rival cbfpy is left out: it needs cbfpy (pip install cbfpy).",
     )
+
+
+def test_nothing_is_tried_twice(monkeypatch):
+    monkeypatch.setattr(study, "_trial", lambda plan, *who: [who])
+    twice = Plan(tasks="acc,acc", task="acc", seeds=1, acc_seeds=2, policies=False)
+    for judge in ("", "learnt", "barrier", "unrevised"):
+        tried = run_tasks(replace(twice, judge=judge), workers=1).rows
+        assert len(tried) == len(set(tried))
+        assert {who[2] for who in tried} >= {"unrevised", "barrier", "learnt", "counted"}
 
 
 def test_amounts_of_the_short_form_are_small():

@@ -27,7 +27,7 @@ from evofsm.evidence.closed_loop.tables import (
     why_not_by_state,
 )
 from evofsm.evidence.closed_loop.targets import machine_claims
-from evofsm.evidence.report.asked import Asked, failures, tables_of_asked
+from evofsm.evidence.report.asked import Asked, at_most, failures, tables_of_asked
 from evofsm.evidence.report.chapter import Chapter, Section
 from evofsm.evidence.report.drawing import Sketch
 from evofsm.evidence.report.html import Setting
@@ -145,10 +145,6 @@ def what_was_asked(study: ClosedLoop) -> list[Asked]:
     return [*_asked_of_the_table(study), *_asked_beside(study), *machine_claims(study)]
 
 
-def _at_most(what: str, most: float, measured: float) -> Asked:
-    return Asked(what, f"≤ {percent(most)}", percent(measured), measured <= most)
-
-
 def _none(what: str, found: Sequence[str]) -> Asked:
     return Asked(what, "none", listed(found) if found else "none", not found)
 
@@ -164,8 +160,10 @@ def _asked_of_the_table(study: ClosedLoop) -> Iterator[Asked]:
             number(mine.mobility, 3),
             mine.mobility >= _LEAST_MOBILITY,
         )
-        yield _at_most("Collisions, median over seeds", _MOST_COLLISIONS, mine.collision_rate)
-    yield _at_most("Collisions, worst seed", study.plan.tolerance, worst.collision_rate)
+        what = "Collisions, median over seeds"
+        yield at_most(what, mine.collision_rate, _MOST_COLLISIONS, percent)
+    most = study.plan.tolerance
+    yield at_most("Collisions, worst seed", worst.collision_rate, most, percent)
     better = standing(study, mine).better
     fixed = [line.policy for line in better if line.group == Group.FIXED]
     yield _none("Fixed constants with no more collisions at no less mobility", fixed)
@@ -180,7 +178,7 @@ def _asked_beside(study: ClosedLoop) -> Iterator[Asked]:
     for one in around_shift(study):
         if one.after == RECOVERED_AFTER:
             what = f"Collisions {RECOVERED_AFTER} episodes after the shift, median over seeds"
-            yield _at_most(what, SAFE_RATE, one.ours.median)
+            yield at_most(what, one.ours.median, SAFE_RATE, percent)
     if study.cases:
         collided = [case.name for case in study.cases if case.collided]
         yield _none("Collisions in the paper's cases, revised", collided)

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 
-from evofsm.app import count, number, percent
+from evofsm.app import count, decimals, percent
 from evofsm.evidence.closed_loop.comparison import Line, ours
 from evofsm.evidence.closed_loop.machine import LATE, MACHINE
 from evofsm.evidence.closed_loop.over_seeds import around_shift
 from evofsm.evidence.closed_loop.stages import SAFE_RATE
 from evofsm.evidence.closed_loop.study import ClosedLoop
-from evofsm.evidence.report.asked import Asked
+from evofsm.evidence.report.asked import Asked, at_least, at_most
 
 # Of these families: collisions of the worst seed at most, and mobility at least, of the median and
 # of the worst seed.
@@ -81,8 +81,8 @@ def _beside(middle: Line, told: Line | None) -> Iterator[Asked]:
 
 
 def _at_most(what: str, value: float, most: float, show: Callable[[float], str] = percent) -> Asked:
-    return Asked(f"{MACHINE}: {what}", f"≤ {show(most)}", show(value), value <= most)
+    return at_most(f"{MACHINE}: {what}", value, most, show)
 
 
 def _at_least(what: str, value: float, least: float) -> Asked:
-    return Asked(f"{MACHINE}: {what}", f"≥ {number(least, 3)}", number(value, 3), value >= least)
+    return at_least(f"{MACHINE}: {what}", value, least, decimals(3))

@@ -28,7 +28,7 @@ from evofsm.evidence.detection.rows import Row
 from evofsm.evidence.detection.study import ASSUMED, IN_GRID, Detection
 from evofsm.evidence.detection.watch import HORIZON, WHAT, Target
 from evofsm.evidence.report.against import ahead
-from evofsm.evidence.report.asked import Asked, failures, tables_of_asked
+from evofsm.evidence.report.asked import Asked, at_least, failures, tables_of_asked
 from evofsm.evidence.report.chapter import Chapter
 from evofsm.evidence.report.html import Setting
 
@@ -83,10 +83,11 @@ def claims(study: Detection) -> Iterator[Asked]:
 
     for family, least in (("emergency", 0.97), ("rare", 0.9)):
         if row := of(family):
-            yield _at_least(f"AUROC on {family}", row.auroc, least)
+            yield at_least(f"AUROC on {family}", row.auroc, least, decimals(4))
     for family in ("weak_brakes", "shift"):
         if (row := of(family)) and (other := of(family, "rss-r157")):
-            yield _at_least(f"AUROC on {family}: at least rss-r157's", row.auroc, other.auroc)
+            what = f"AUROC on {family}: at least rss-r157's"
+            yield at_least(what, row.auroc, other.auroc, decimals(4))
     for target in Target:
         if leads := _against_ttc(study, target):
             longer = leads[0] - leads[1]
@@ -99,11 +100,7 @@ def claims(study: Detection) -> Iterator[Asked]:
     for measure in (Ours.DEFAULT, Ours.STATES):
         if (row := of("rare", measure)) and (paper := of("rare", Ours.PAPER)):
             what = f"AUROC on rare, {measure}: {Ours.PAPER}'s + {_ASKED_MARGIN:g}"
-            yield _at_least(what, row.auroc, paper.auroc + _ASKED_MARGIN)
-
-
-def _at_least(what: str, measured: float, least: float) -> Asked:
-    return Asked(what, f"≥ {number(least, 4)}", number(measured, 4), measured >= least)
+            yield at_least(what, row.auroc, paper.auroc + _ASKED_MARGIN, decimals(4))
 
 
 def _against_ttc(study: Detection, target: Target) -> tuple[float, float] | None:

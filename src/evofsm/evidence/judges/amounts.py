@@ -74,7 +74,7 @@ class Amounts:
         """
         if self.without in (ALL, NONE_AWAY):
             return tuple(PARTS) if self.without == ALL else ()
-        named = tuple(split_names(self.without))
+        named = tuple(dict.fromkeys(split_names(self.without)))
         for part in named:
             if part not in PARTS:
                 raise ValueError(f"there is no part {part!r}; there are {', '.join(PARTS)}")

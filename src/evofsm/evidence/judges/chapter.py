@@ -4,18 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
-from evofsm.app import (
-    NONE,
-    Column,
-    Table,
-    bare_percent,
-    count,
-    listed,
-    number,
-    percent,
-    seeds_text,
-    within,
-)
+from evofsm.app import NONE, Column, Table, count, listed, number, percent, seeds_text
 from evofsm.evidence.judges.amounts import PARTS
 from evofsm.evidence.judges.figures import sketches
 from evofsm.evidence.judges.study import Judges
@@ -24,10 +13,18 @@ from evofsm.evidence.judges.targets import claims
 from evofsm.evidence.report.asked import failures, tables_of_asked
 from evofsm.evidence.report.chapter import Chapter, Section
 from evofsm.evidence.report.html import Setting
+from evofsm.evidence.report.trials import (
+    FAILED,
+    KEPT,
+    TIMES,
+    WORST,
+    failing,
+    hardly_kept,
+    scores,
+    settings,
+)
 from evofsm.evidence.systems.trial import LATE
 
-# Fewer proposals kept than this are told among the losses.
-_FEW = 0.25
 # A score that is nearer to another one's is no worse.
 _MOBILITY = 0.01
 #: The longest that a decision may take, in 99 of 100 cases [ms].
@@ -119,12 +116,7 @@ def _losses(found: Judges, every: Sequence[Effect]) -> Iterator[str]:
     """What goes against the learnt judge, the most important first."""
     whole = list(_by_controller(found))
     ours = [one for one in whole if one.judge == "learnt"]
-    for one in ours:
-        if one.failed.held:
-            yield (
-                f"{one.who}: {count(one.failed.held)} of {count(one.failed.tried)} held-out "
-                f"episodes fail, {percent(one.worst)} in the worst run."
-            )
+    yield from failing(ours)
     for one in ours:
         if one.late:
             yield (
@@ -147,8 +139,7 @@ def _losses(found: Judges, every: Sequence[Effect]) -> Iterator[str]:
     for less in every:
         if less.worth is Worth.HARMS:
             yield f"{less.system}: without {less.part} it does clearly better ({less.text})."
-    if few := [f"{one.who} ({percent(one.kept)})" for one in ours if one.kept < _FEW]:
-        yield f"Few proposals are executed exactly: {listed(few)}."
+    yield from hardly_kept(ours)
     if slow := [one for one in ours if one.p99 > _SLOW]:
         most = max(slow, key=lambda one: one.p99)
         yield (
@@ -170,27 +161,15 @@ def _by_controller(found: Judges) -> Iterator[Summary]:
                     yield summary(rows)
 
 
-def _failed_text(one: Summary) -> str:
-    share = one.failed
-    return f"{share.held} of {share.tried}"
-
-
 _COLUMNS: tuple[Column[Summary], ...] = (
-    Column("failed", _failed_text),
-    Column(
-        "[%]",
-        lambda one: tuple(100.0 * x for x in (one.failed.value, one.failed.low, one.failed.high)),
-        within(1, 1),
-    ),
-    Column("worst [%]", "worst", bare_percent),
+    *FAILED,
+    WORST,
     Column("learning", "learning", count),
     Column("late", "late", count),
-    Column("kept [%]", "kept", bare_percent),
-    Column("change", "change", lambda value: number(value, 2)),
-    Column("score", "score", lambda value: _score_text(value)),
-    Column("worst score", "score_worst", lambda value: _score_text(value)),
-    Column("p50 [ms]", "p50", lambda value: number(value, 2)),
-    Column("p99 [ms]", "p99", lambda value: number(value, 2)),
+    *KEPT,
+    Column("score", "score", scores(3)),
+    Column("worst score", "score_worst", scores(3)),
+    *TIMES,
 )
 _NOTE = (
     "Failed: held-out episodes of all learning seeds, with a 95 % interval as if they were "
@@ -198,11 +177,6 @@ _NOTE = (
     f"late: of those the ones after episode {LATE}. Kept, change, score, p50: median over runs; "
     "p99: of the worst run, with all cores of the machine at work."
 )
-
-
-def _score_text(value: float) -> str:
-    """Three digits or all whole ones."""
-    return number(value, 0 if abs(value) >= 100.0 else 1 if abs(value) >= 10.0 else 3)
 
 
 def _table(found: Judges) -> Table:
@@ -272,10 +246,6 @@ _WORTH = {
 
 
 def _plan(found: Judges) -> Iterator[Setting]:
-    plan = found.plan
-    yield Setting("seed", str(plan.seed))
-    yield Setting("learnt", f"with {seeds_text(plan.seeds)}")
-    trained = {row.system: row.trained for row in found.of()}
-    yield Setting("training episodes", ", ".join(f"{one} {n}" for one, n in trained.items()))
-    yield Setting("held-out episodes", count(plan.test))
+    plan, trained = found.plan, {row.system: row.trained for row in found.of()}
+    yield from settings(plan.seed, seeds_text(plan.seeds), trained, plan.test)
     yield Setting("parts taken away", ", ".join(found.parts) or "none")

@@ -13,6 +13,7 @@ from evofsm import plot
 from evofsm.evidence.judges.study import Judges
 from evofsm.evidence.judges.summary import Summary, summary
 from evofsm.evidence.report.drawing import Sketch
+from evofsm.evidence.report.trials import scale_failed, scale_kept
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -79,11 +80,9 @@ def draw(found: Judges, place: Callable[[Judges, Summary], _Place], label: str) 
                     plot.level(axes, value, across=False)
         axes.tick_params(axis="x", labelsize=6.5)
     if place is _failed:
-        grid[0, 0].set_xscale("symlog", linthresh=1.0, linscale=0.7)
-        grid[0, 0].set_xlim(-0.12, 130.0)
-        grid[0, 0].set_xticks([0.0, 1.0, 10.0, 100.0], ["0", "1", "10", "100"])
+        scale_failed(grid[0, 0])
     else:
-        grid[0, 0].set_xlim(-4.0, 104.0)
+        scale_kept(grid[0, 0])
     for axes in grid.flat:
         axes.minorticks_off()
     figure.supxlabel(label, fontsize=8.0)
@@ -92,7 +91,7 @@ def draw(found: Judges, place: Callable[[Judges, Summary], _Place], label: str) 
 
 
 def _is_shown(name: str, names: list[str]) -> bool:
-    return name in names or (name not in _JUDGES and len(names) > len(_JUDGES))
+    return name in names or (name not in _JUDGES and any(one not in _JUDGES for one in names))
 
 
 def _failed(found: Judges, one: Summary) -> _Place:

@@ -70,7 +70,7 @@ def run_judges(plan: Amounts, progress: Progress = silent, workers: int | None =
 
 def _tasks(plan: Amounts) -> Iterator[partial[Row]]:
     """A trial each, system by system, so that what is told can be drawn in their order."""
-    names = SYSTEMS if plan.systems == ALL else split_names(plan.systems)
+    names = dict.fromkeys(SYSTEMS if plan.systems == ALL else split_names(plan.systems))
     parts = plan.parts
     for name in names:
         system = make_system(name)

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from enum import Enum
 from typing import NamedTuple
 
 import numpy as np
 
 from evofsm.evidence.judges.study import Judges
-from evofsm.evidence.scores import Share, share_of
+from evofsm.evidence.scores import Share
+from evofsm.evidence.systems.pooled import middle, pooled
 from evofsm.evidence.systems.trial import Row
 from evofsm.extras import needs
 
@@ -30,7 +31,6 @@ class Summary(NamedTuple):
     without: str
     runs: int
     failed: Share  #: held-out episodes of all runs, which share their draws
-    unrevised: float  #: share of the same episodes that the controller alone fails in
     worst: float  #: share that failed in the worst run
     learning: int  #: failures while learning in the worst run
     late: int  #: those from the 31st episode on, in the worst run
@@ -56,29 +56,14 @@ def summary(rows: Sequence[Row]) -> Summary:
     """Rows of one system and one judge as one; of several controllers they are pooled."""
     first = rows[0]
     controllers = {row.controller for row in rows}
-    failed, episodes = sum(row.failed for row in rows), sum(row.episodes for row in rows)
     return Summary(
-        first.system,
-        first.controller if len(controllers) == 1 else "",
-        first.judge,
-        first.without,
-        len(rows),
-        share_of([True] * failed + [False] * (episodes - failed)),
-        sum(row.unrevised_failed for row in rows) / episodes,
-        max(row.failed / row.episodes for row in rows),
-        max(row.failed_while_learning for row in rows),
-        max(row.failed_late for row in rows),
-        _middle(row.kept for row in rows),
-        _middle(row.mean_change for row in rows),
-        _middle(row.score for row in rows),
-        min(row.score for row in rows),
-        _middle(row.p50_ms for row in rows),
-        max(row.p99_ms for row in rows),
+        system=first.system,
+        controller=first.controller if len(controllers) == 1 else "",
+        judge=first.judge,
+        without=first.without,
+        score=middle(row.score for row in rows),
+        **pooled(rows),
     )
-
-
-def _middle(values: Iterable[float]) -> float:
-    return float(np.median(list(values)))
 
 
 # -- What a part is worth -------------------------------------------------------------------------

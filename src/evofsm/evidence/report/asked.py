@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 from evofsm.app import Column, Table
@@ -15,6 +15,20 @@ class Asked(NamedTuple):
     asked: str
     measured: str
     met: bool
+
+
+def at_most(what: str, value: float, most: float, show: Callable[[float], str]) -> Asked:
+    """That a number be no larger than another one.
+
+    >>> at_most("episodes that fail", 3, 2, str)
+    Asked(claim='episodes that fail', asked='≤ 2', measured='3', met=False)
+    """
+    return Asked(what, f"≤ {show(most)}", show(value), value <= most)
+
+
+def at_least(what: str, value: float, least: float, show: Callable[[float], str]) -> Asked:
+    """That a number be no smaller than another one."""
+    return Asked(what, f"≥ {show(least)}", show(value), value >= least)
 
 
 def failures(asked: Sequence[Asked]) -> tuple[str, ...] | None:

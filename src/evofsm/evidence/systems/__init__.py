@@ -16,6 +16,7 @@ from evofsm.evidence.systems.pendulum import Pendulum
 from evofsm.evidence.systems.reactor import Reactor
 from evofsm.evidence.systems.system import System
 from evofsm.evidence.systems.tanks import Tanks
+from evofsm.extras import install
 
 #: By name: makes the system with the controller of that name, or with its first one.
 SYSTEMS: dict[str, Callable[[str | None], System]] = {
@@ -56,7 +57,7 @@ TASKS: dict[str, Callable[[str | None], System]] = {
 # Packages that no extra brings, or a heavy one, by the tasks and rivals that need them.
 _PACKAGES = {
     **dict.fromkeys(MASA, (PACKAGE, INSTALL)),
-    **dict.fromkeys(HIGHWAY, ("highway_env", "pip install 'evofsm[highway]'")),
+    **dict.fromkeys(HIGHWAY, ("highway_env", install("highway"))),
     "cbfpy": ("cbfpy", "pip install cbfpy"),
 }
 

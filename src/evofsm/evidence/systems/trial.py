@@ -144,15 +144,15 @@ def make_judge(name: str, system: System, without: Sequence[str] = (), seed: int
     """
     if ":" in name:
         own = imported(name)(system, seed)
+        if all(hasattr(own, method) for method in ("begin", "decide", "end", "freeze")):
+            made: Judge = own  # a guard, too, which has a judge beside
+            return made
         if hasattr(own, "judge"):
             return Guard(**system.actions.settings, interval=system.interval, judge=own, seed=seed)
-        if not all(hasattr(own, method) for method in ("begin", "decide", "end", "freeze")):
-            raise TypeError(
-                f"{name} makes a {type(own).__name__}, which is no judge: it has neither judge, "
-                "nor begin, decide, end and freeze"
-            )
-        made: Judge = own
-        return made
+        raise TypeError(
+            f"{name} makes a {type(own).__name__}, which is no judge: it has neither judge, "
+            "nor begin, decide, end and freeze"
+        )
     if name in JUDGES:
         return JUDGES[name](system, without, seed)
     rivals = system.rivals
@@ -172,7 +172,9 @@ _TOLD = {
 
 def told_to(judge: Judge) -> str:
     """What a judge is told, in a few words: as it says itself in ``told``, if it is not ours."""
-    inside = judge.judge if isinstance(judge, Guard) else judge
+    inside: Any = judge
+    if isinstance(judge, Guard):  # its own judge is None where that does not learn
+        inside = getattr(judge.reviser, "risk", judge.judge)
     return str(getattr(inside, "told", _TOLD.get(type(inside).__name__, "not said")))
 
 

@@ -58,7 +58,6 @@ class Amounts:
             train=min(self.train or 20, 20),
             test=min(self.test, 10),
             acc_seeds=1,
-            acc_train=20,
             rounds=100,
             generations=2,
             population=4,

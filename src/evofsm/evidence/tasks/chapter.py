@@ -11,15 +11,23 @@ from evofsm.app import (
     bare_percent,
     count,
     decimals,
-    listed,
     number,
     percent,
     seeds_text,
-    within,
 )
 from evofsm.evidence.report.asked import failures, tables_of_asked
 from evofsm.evidence.report.chapter import Chapter, Section, Source
 from evofsm.evidence.report.html import Setting
+from evofsm.evidence.report.trials import (
+    FAILED,
+    KEPT,
+    TIMES,
+    WORST,
+    failing,
+    hardly_kept,
+    scores,
+    settings,
+)
 from evofsm.evidence.systems import TASKS
 from evofsm.evidence.tasks.amounts import ACC
 from evofsm.evidence.tasks.figures import sketches
@@ -30,8 +38,8 @@ from evofsm.evidence.tasks.targets import SEEDS, TRAIN, claims
 
 # Returns less apart than this are the same.
 _SAME = 0.01
-# Fewer proposals kept than this are told among the losses.
-_FEW = 0.25
+# How returns are written.
+_score_text = scores(2)
 
 
 def tell(found: Tasks) -> Chapter:
@@ -98,11 +106,12 @@ def _share(some: Sequence[Summary]) -> float:
 
 def _answer(found: Tasks, every: Sequence[Summary]) -> Iterator[str]:
     ours = [one for one in every if one.judge in OURS]
-    worst = max(ours, key=lambda one: one.learning)
-    yield (
-        f"While learning at most {count(worst.learning)} of {worst.trained} episodes fail "
-        f"({worst.who})."
-    )
+    if ours:  # none where a task of one's own names no learners of ours
+        worst = max(ours, key=lambda one: one.learning)
+        yield (
+            f"While learning at most {count(worst.learning)} of {worst.trained} episodes fail "
+            f"({worst.who})."
+        )
     told = [one for one in every if not one.told.startswith("nothing")]
     if told:
         yield (
@@ -123,12 +132,7 @@ def _answer(found: Tasks, every: Sequence[Summary]) -> Iterator[str]:
 def _losses(found: Tasks, every: Sequence[Summary]) -> Iterator[str]:
     """What goes against the learnt judge, the most important first."""
     ours = [one for one in every if one.judge in OURS]
-    for one in ours:
-        if one.failed.held:
-            yield (
-                f"{one.who}: {count(one.failed.held)} of {count(one.failed.tried)} held-out "
-                f"episodes fail, {percent(one.worst)} in the worst run."
-            )
+    yield from failing(ours)
     for one in ours:
         if one.late:
             yield f"{one.who}: up to {count(one.late)} failures while learning are late ones."
@@ -153,8 +157,7 @@ def _losses(found: Tasks, every: Sequence[Summary]) -> Iterator[str]:
                     f"{knows} keeps more proposals ({percent(other.kept)}, ours "
                     f"{percent(one.kept)})."
                 )
-    if few := [f"{one.who} ({percent(one.kept)})" for one in ours if one.kept < _FEW]:
-        yield f"Few proposals are executed exactly: {listed(few)}."
+    yield from hardly_kept(ours)
     yield from _slower(ours, [one for one in every if not one.told.startswith("nothing")])
     for one in policies(found):
         if one.judge == "filter off" and one.failed.held and "no filter" not in one.controller:
@@ -177,48 +180,29 @@ def _slower(ours: Sequence[Summary], told: Sequence[Summary]) -> Iterator[str]:
 # -- Tables ---------------------------------------------------------------------------------------
 
 
-def _failed_text(one: Summary) -> str:
-    return f"{one.failed.held} of {one.failed.tried}"
-
-
 def _while(name: str) -> Column[Summary]:
     """A count of training episodes; none of who does not learn."""
     return Column(name, lambda one: getattr(one, name) if one.learns else None, count)
-
-
-def _score_text(value: float) -> str:
-    """Three digits or all whole ones."""
-    return number(value, 0 if abs(value) >= 100.0 else 1 if abs(value) >= 10.0 else 2)
 
 
 def _return_text(value: float, low: float, high: float) -> str:
     return f"{_score_text(value)} ({_score_text(low)}–{_score_text(high)})"
 
 
-_FAILED: tuple[Column[Summary], ...] = (
-    Column("failed", _failed_text),
-    Column(
-        "[%]",
-        lambda one: tuple(100.0 * x for x in (one.failed.value, one.failed.low, one.failed.high)),
-        within(1, 1),
-    ),
-)
 _FAILS: tuple[Column[Summary], ...] = (
     _while("trained"),
     _while("learning"),
     _while("late"),
-    *_FAILED,
-    Column("worst [%]", "worst", bare_percent),
+    *FAILED,
+    WORST,
 )
 _COSTS: tuple[Column[Summary], ...] = (
     Column("return", "score score_low score_high", _return_text),
     Column("worst", "score_worst", _score_text),
     Column("of told [%]", "of_told", bare_percent),
     Column("speed [m/s]", "speed", decimals(1)),
-    Column("kept [%]", "kept", bare_percent),
-    Column("change", "change", decimals(2)),
-    Column("p50 [ms]", "p50", decimals(2)),
-    Column("p99 [ms]", "p99", decimals(2)),
+    *KEPT,
+    *TIMES,
 )
 _ON_FAILS = (
     "Trained: episodes that were learnt from. Learning: failures in them, in the worst run; late: "
@@ -255,9 +239,9 @@ def _policies(found: Tasks) -> Iterator[Table]:
         Column[Summary]("then", "judge"),
         Column[Summary]("episodes", "trained", count),
         Column[Summary]("failed in them", "learning", count),
-        *_FAILED,
+        *FAILED,
         Column[Summary]("return", "score score_low score_high", _return_text),
-        Column[Summary]("kept [%]", "kept", bare_percent),
+        KEPT[0],
         Column[Summary]("own safety [%]", own, bare_percent),
     )
     if found.policies:
@@ -285,7 +269,7 @@ def _learning(found: Tasks) -> Section:
         Column("seed", "seed", count),
         Column("episodes", "trained", count),
         Column("failed", which),
-        Column("return by then", "score_by_late", lambda value: _score_text(value)),
+        Column("return by then", "score_by_late", _score_text),
         Column("held out", lambda row: f"{row.failed} of {row.episodes}"),
         Column("return", "score", _score_text),
     )
@@ -301,10 +285,8 @@ def _learning(found: Tasks) -> Section:
 
 def _plan(found: Tasks) -> Iterator[Setting]:
     plan = found.plan
-    yield Setting("seed", str(plan.seed))
-    yield Setting("learnt", f"with {seeds_text(plan.seeds)}, acc with {plan.seeds_of('acc')}")
+    learnt = f"{seeds_text(plan.seeds)}, acc with {plan.seeds_of('acc')}"
     trained = {row.task: row.trained for row in found.rows if row.judge in OURS}
-    yield Setting("training episodes", ", ".join(f"{one} {n}" for one, n in trained.items()))
-    yield Setting("held-out episodes", count(plan.test))
+    yield from settings(plan.seed, learnt, trained, plan.test)
     if missing := [name for name in TASKS if not found.of(name)]:
         yield Setting("tasks not run", ", ".join(missing))

@@ -10,6 +10,7 @@ import numpy as np
 
 from evofsm import plot
 from evofsm.evidence.report.drawing import Sketch
+from evofsm.evidence.report.trials import scale_failed, scale_kept
 from evofsm.evidence.tasks.study import Tasks
 from evofsm.evidence.tasks.summary import Summary, summaries
 
@@ -65,11 +66,8 @@ def draw(found: Tasks) -> Figure:
             shown = [100.0 * value for value in (share.value, share.low, share.high)]
             plot.dots(failed, look, [place], *([value] for value in shown))
             plot.dots(kept, look, [place], *([100.0 * one.kept] for _ in range(3)))
-    failed.set_xscale("symlog", linthresh=1.0, linscale=0.7)
-    failed.set_xlim(-0.12, 130.0)
-    failed.set_xticks([0.0, 1.0, 10.0, 100.0], ["0", "1", "10", "100"])
-    failed.minorticks_off()
-    kept.set_xlim(-4.0, 104.0)
+    scale_failed(failed)
+    scale_kept(kept)
     failed.set_xlabel("failed [%]")
     kept.set_xlabel("kept [%]")
     kinds = {_kind(one) for one in every}

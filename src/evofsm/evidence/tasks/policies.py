@@ -26,7 +26,7 @@ from evofsm.guard import Guard, RevisedActions
 with needs("gymnasium", "gym", "CartPole-v1"):
     import gymnasium
 
-#: How policies are trained, in words; True and a penalty stand for under the guard.
+#: How policies are trained, in words; None without the guard, else the share of the plan's penalty.
 TRAININGS = {
     "no filter": None,
     "filter, no penalty": 0.0,

@@ -12,10 +12,7 @@ from functools import partial
 from evofsm.app import split_names
 from evofsm.evidence.frame import Frame, Progress, silent
 from evofsm.evidence.systems import TASKS, lacking, make_system
-from evofsm.evidence.systems.trial import (
-    make_judge,
-    try_judge,
-)
+from evofsm.evidence.systems.trial import make_judge, try_judge
 from evofsm.evidence.tasks.amounts import ALL, Amounts
 from evofsm.evidence.tasks.policies import trained_policies
 from evofsm.evidence.tasks.rows import OURS, Row, row
@@ -88,7 +85,8 @@ def _named(plan: Amounts) -> tuple[list[str], list[str]]:
     without = [name for name in names if lack[name]]
     left_out = [f"{name} is left out: {lack[name]}." for name in without]
     own = [plan.task] if plan.task else []
-    return [*own, *(name for name in names if name not in without)], left_out
+    named = [*own, *(name for name in names if name not in without)]
+    return list(dict.fromkeys(named)), left_out
 
 
 def _trials(
@@ -101,8 +99,9 @@ def _trials(
         for rival in [one for one in rivals if lacking(one)]:
             rivals.remove(rival)
             left_out.append(f"{name}: the rival {rival} is left out: {lacking(rival)}.")
-        if plan.judge:
-            make_judge(plan.judge, task)  # so that a wrong one shows at once
+        own = [plan.judge] if plan.judge and plan.judge not in ("unrevised", *rivals) else []
+        for judge in own:
+            make_judge(judge, task)  # so that a wrong one shows at once
         controllers = list(task.controllers)
         train = plan.train_of(name) or task.train
         for controller in controllers if plan.all_controllers else controllers[:1]:
@@ -110,7 +109,7 @@ def _trials(
             for judge in ("unrevised", *rivals):
                 yield partial(one, judge, 0, 0)
             for seed in range(plan.seeds_of(name)):
-                for judge in (*([plan.judge] if plan.judge else []), *task.learners):
+                for judge in dict.fromkeys([*own, *task.learners]):
                     yield partial(one, judge, seed, train)
 
 

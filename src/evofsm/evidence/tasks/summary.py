@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from functools import lru_cache
 from typing import NamedTuple
 
-import numpy as np
-
-from evofsm.evidence.scores import Share, share_of
+from evofsm.evidence.scores import Share
+from evofsm.evidence.systems.pooled import middle, pooled
 from evofsm.evidence.tasks.rows import Row
 from evofsm.evidence.tasks.study import Tasks
 
@@ -58,36 +56,22 @@ def summary(rows: Sequence[Row], best_told: float | None = None) -> Summary:
         Return that `Summary.of_told` is a share of.
     """
     first = rows[0]
-    failed, episodes = sum(row.failed for row in rows), sum(row.episodes for row in rows)
     speeds = [row.speed for row in rows if row.speed is not None]
-    middle = sorted(rows, key=lambda row: row.score)[(len(rows) - 1) // 2]
+    central = sorted(rows, key=lambda row: row.score)[(len(rows) - 1) // 2]
+    score = central.score
     return Summary(
-        first.task,
-        first.controller,
-        first.judge,
-        first.told,
-        len(rows),
-        first.trained,
-        max(row.failed_while_learning for row in rows),
-        max(row.failed_late for row in rows),
-        _share(failed, episodes),
-        max(row.failed / row.episodes for row in rows),
-        middle.score,
-        middle.score_low,
-        middle.score_high,
-        min(row.score for row in rows),
-        middle.score / best_told if best_told and min(best_told, middle.score) > 0.0 else None,
-        float(np.median([row.kept for row in rows])),
-        float(np.median([row.mean_change for row in rows])),
-        float(np.median([row.p50_ms for row in rows])),
-        max(row.p99_ms for row in rows),
-        float(np.median(speeds)) if speeds else None,
+        task=first.task,
+        controller=first.controller,
+        judge=first.judge,
+        told=first.told,
+        trained=first.trained,
+        score=score,
+        score_low=central.score_low,
+        score_high=central.score_high,
+        of_told=score / best_told if best_told and min(best_told, score) > 0.0 else None,
+        speed=middle(speeds) if speeds else None,
+        **pooled(rows),
     )
-
-
-@lru_cache(maxsize=4096)
-def _share(held: int, tried: int) -> Share:
-    return share_of([True] * held + [False] * (tried - held))
 
 
 def summaries(found: Tasks) -> Iterator[Summary]:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 
 import numpy as np
 
-from evofsm.app import count, number, percent
-from evofsm.evidence.report.asked import Asked
+from evofsm.app import count, decimals, percent
+from evofsm.evidence.report.asked import Asked, at_least, at_most
 from evofsm.evidence.tasks.rows import LATE, Row
 from evofsm.evidence.tasks.study import Tasks
 
@@ -16,8 +17,10 @@ SEEDS, TRAIN = 20, 200
 # Failures of a learning seed, seeds without a late one, and return by then, by task.
 _LEARNING, _CLEAN = 2, 0.95
 RETURNS = {"acc": 545.0, "acc-5": 520.0}
-#: Share of crashes that is to be prevented, and of the mean speed that is to be kept.
+# Share of crashes that is to be prevented, and of the mean speed that is to be kept; and the number
+# of held-out episodes before which neither is judged.
 CRASHES = {"highway-fast": (0.9, 0.85), "merge": (0.9, 0.85), "intersection": (0.7, 0.85)}
+_HELD_OUT = 200
 
 
 def claims(found: Tasks) -> Iterator[Asked]:
@@ -27,28 +30,19 @@ def claims(found: Tasks) -> Iterator[Asked]:
         if not is_long(rows):
             continue
         worst = max(row.failed_while_learning for row in rows)
-        yield Asked(
-            f"{task}: unsafe episodes while learning, worst seed",
-            f"≤ {_LEARNING}",
-            count(worst),
-            worst <= _LEARNING,
-        )
+        what = f"{task}: unsafe episodes while learning, worst seed"
+        yield at_most(what, worst, _LEARNING, count)
         clean = sum(row.failed_late == 0 for row in rows)
+        needed = math.ceil(round(_CLEAN * len(rows), 6))
         yield Asked(
             f"{task}: seeds without an unsafe episode after episode {LATE}",
-            f"≥ {_CLEAN * len(rows):.0f} of {len(rows)}",
+            f"≥ {needed} of {len(rows)}",
             count(clean),
-            clean >= _CLEAN * len(rows),
+            clean >= needed,
         )
         by_late = [row.score_by_late for row in rows if row.score_by_late is not None]
-        middle = float(np.median(by_late))
-        yield Asked(
-            f"{task}: return of training episodes {LATE - 9} to {LATE}, median seed",
-            f"≥ {least:.0f}",
-            number(middle, 0),
-            middle >= least,
-        )
-
+        what = f"{task}: return of training episodes {LATE - 9} to {LATE}, median seed"
+        yield at_least(what, float(np.median(by_late)), least, decimals(0))
     for task, (fewer, speed) in CRASHES.items():
         for controller in dict.fromkeys(row.controller for row in found.of(task)):
             yield from _crashes(found, task, controller, fewer, speed)
@@ -60,15 +54,15 @@ def _crashes(
     """How many crashes fewer there are than without a guard, and at what speed."""
     rows = found.of(task, controller)
     alone = found.of(task, controller, "unrevised")
-    if not alone or min(row.episodes for row in rows) < TRAIN:
+    if not alone or min(row.episodes for row in rows) < _HELD_OUT:
         return
     crashed = float(np.mean([row.failed / row.episodes for row in rows]))
     before = alone[0].failed / alone[0].episodes
     down = 1.0 - crashed / before if before else 0.0
     kept = float(np.mean([row.speed or 0.0 for row in rows])) / (alone[0].speed or 1.0)
     who = f"{task}, {controller}"
-    yield Asked(f"{who}: crashes fewer", f"≥ {percent(fewer)}", percent(down), down >= fewer)
-    yield Asked(f"{who}: speed kept", f"≥ {percent(speed)}", percent(kept), kept >= speed)
+    yield at_least(f"{who}: crashes fewer", down, fewer, percent)
+    yield at_least(f"{who}: speed kept", kept, speed, percent)
 
 
 def is_long(rows: list[Row]) -> bool:

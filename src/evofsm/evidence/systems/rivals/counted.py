@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from itertools import product
+
 import numpy as np
 from numpy.typing import NDArray
 
 from evofsm.core import EvolvingFSM, Novelty
-from evofsm.evidence.systems.rivals.rival import Executed, tried
-from evofsm.evidence.systems.system import Action, Discrete, System, Vector
+from evofsm.evidence.systems.rivals.rival import Executed, States
+from evofsm.evidence.systems.system import Action, Box, Discrete, System, Vector
 
 # A state reaches so far, in standard deviations of the first episode.
 _RADIUS = 0.5
@@ -18,7 +20,7 @@ _MOST_STATES = 200
 _AWAY = 1e3
 # How far ahead it looks, in decisions, and the highest probability that it accepts.
 _STEPS, _ACCEPTED = 50, 0.05
-# Actions of a range that are told apart, at most.
+# Actions of a box that are told apart, about: as many along each axis, two of them at least.
 _LEVELS = 9
 
 
@@ -39,11 +41,8 @@ class Counted:
     told = "nothing but failures"
 
     def __init__(self, system: System) -> None:
-        every = tried(system.actions)
         self._discrete = isinstance(system.actions, Discrete)
-        if not self._discrete:
-            every = every[:: max(1, -(-len(every) // _LEVELS))]
-        self._actions = every.reshape(len(every), -1)
+        self._actions = _told_apart(system.actions)
         self._machine: EvolvingFSM | None = None
         self._failed_at: Vector = np.empty(0)
         self._risk: NDArray[np.float64] = np.empty((0, 0))  # (actions, states)
@@ -120,3 +119,12 @@ class Counted:
             risk[:, failure] = 1.0
             soon = risk.min(axis=0)
         self._risk = risk
+
+
+def _told_apart(actions: Box | Discrete) -> States:
+    """(k, d) actions that stand for all; of a box a grid, ends included."""
+    if isinstance(actions, Discrete):
+        return np.arange(actions.n_actions, dtype=np.float64)[:, None]
+    each = max(2, round(_LEVELS ** (1.0 / len(actions.low))))
+    ends = zip(actions.low, actions.high, strict=True)
+    return np.array(list(product(*(np.linspace(low, high, each) for low, high in ends))))

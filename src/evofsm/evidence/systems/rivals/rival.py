@@ -78,8 +78,6 @@ class BackupShield(Rival):
         From (k, m) states to k actions.
     steps : int
         That the backup has to last.
-    read : callable, optional
-        From an observation to the (m,) state; without it the observation is the state.
     """
 
     def __init__(
@@ -91,19 +89,17 @@ class BackupShield(Rival):
         fails: Callable[[States], NDArray[np.bool_]],
         backup: Callable[[States], States],
         steps: int,
-        read: Callable[[Vector], Vector] = lambda observation: observation,
     ) -> None:
         self.told = told
         self._move, self._fails, self._backup = move, fails, backup
-        self._steps, self._read = steps, read
+        self._steps = steps
         self._actions, self._tried = actions, tried(actions)
 
     def action(self, observation: Vector, proposal: Action) -> Action:
         """The proposal, or the closest action after which the backup lasts."""
-        state = self._read(observation)
-        if self._lasts(state, np.array([proposal], np.float64))[0] == self._steps:
+        if self._lasts(observation, np.array([proposal], np.float64))[0] == self._steps:
             return proposal
-        lasts = self._lasts(state, self._tried)
+        lasts = self._lasts(observation, self._tried)
         away = np.abs(self._tried - proposal).reshape(len(self._tried), -1).sum(axis=1)
         best = int(np.lexsort((away, -lasts))[0])
         return as_action(self._tried[best], self._actions)
