@@ -19,7 +19,7 @@ PARTS: dict[str, str] = {
     "margin": "no margin",
     "backups": "constant backups alone",
     "breaks": "it is not noticed where disturbances get worse",
-    "states": "no state decides anything",
+    "states": "one state only: nothing may change",
 }
 #: A value of the options that stands for all there is, and one for nothing.
 ALL, NONE_AWAY = "all", "none"
