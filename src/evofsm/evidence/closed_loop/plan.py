@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from evofsm.evidence.report.chapter import Chapter
 
 # Of the sections with tables beside, those that are short enough.
-_IN_THE_TERMINAL = ("shift", "separation", "cases", "worlds")
+_IN_THE_TERMINAL = ("shift", "separation", "cases", "machine_cases", "worlds")
 
 
 @dataclass(frozen=True)
