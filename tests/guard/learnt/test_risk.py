@@ -168,6 +168,7 @@ def test_what_is_not_seen_now_and_then_does_not_keep_it_from_deciding(point, exa
     nothing = guard.decide(np.full(2 * point.places, math.nan), point.propose(guard_rng()))
     assert same_action(nothing.executed, nothing.proposed)
     assert math.isnan(nothing.risk_proposed)
+    assert "was observed" in nothing.reason
     guard.begin()
     again = [exactly(point.play(guard, 31, seen=seen)[0]) for _ in range(2)]
     assert again[0] == again[1]

@@ -35,7 +35,7 @@ class Amounts:
     policies: bool = option(
         True, "Also train policies of CartPole under the guard.", name="--policies/--no-policies"
     )
-    seeds: int = option(5, "Learning seeds.", min=1)
+    seeds: int = option(5, "Learning seeds; of acc 20 at least.", min=1)
     train: int | None = option(
         None, "Training episodes. [default: 200 of acc, as many as suit the others]", min=1
     )

@@ -277,8 +277,10 @@ class LearntRisk:
         """
         dynamics, here = self.dynamics, self._here(situation)
         one = np.array([wanted])
-        if here is None or self.disturbances is None or self.backups is None:
+        if self.disturbances is None or self.backups is None:
             return Search(one, _unjudged(1), 0, words.NOTHING_LEARNT)
+        if here is None:
+            return Search(one, _unjudged(1), 0, words.NOTHING_SEEN)
         known = dynamics.consequents
         if not len(known.sides):
             return Search(one, _unjudged(1), 0, words.NO_FAILURE)

@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 #: Said as long as there is nothing to judge by.
 NOTHING_LEARNT = "nothing was learnt yet"
+NOTHING_SEEN = "nothing of this episode was observed yet"
 NO_FAILURE = "no failure is known yet, so nothing is refused"
 
 # Disturbances that are taken to be harder by a smaller factor are taken as they were.
