@@ -91,6 +91,7 @@ def test_a_guard_of_ones_own_is_tried_as_it_is(tmp_path, monkeypatch):
         (Plan(task="nowhere:Task"), ValueError, "is it in this folder, or installed?"),
         (Plan(tasks="pendulum", judge="barrier"), ValueError, "pendulum has no judge 'barrier'"),
         (Plan(tasks="acc", judge="acc"), ValueError, "acc has no judge 'acc'; there are learnt"),
+        (Plan(tasks="acc", controllers="dqn"), ValueError, "acc has no controller 'dqn'; it has"),
     ],
 )
 def test_wrong_names_show_at_once(plan, error, text):
@@ -177,3 +178,18 @@ def test_a_rival_is_told_something():
                 made = make()
                 assert isinstance(made, Rival)
                 assert made.told not in ("", "nothing")
+
+
+def test_controllers_are_all_or_the_first_or_those_that_are_named(monkeypatch):
+    tried = []
+    monkeypatch.setattr(study, "_trial", lambda plan, task, who, *_: tried.append(who))
+    monkeypatch.setattr(study, "in_order", lambda trials, *_: [one() or [] for one in trials])
+
+    def controllers(wanted):
+        tried.clear()
+        run_tasks(Plan(tasks="cartpole", controllers=wanted, policies=False, seeds=1))
+        return list(dict.fromkeys(tried))
+
+    assert controllers("all") == ["random", "hasty", "badgain"]
+    assert controllers("first") == ["random"]
+    assert controllers("badgain, random, badgain") == ["badgain", "random"]

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from typing import ClassVar, Self
 
 from evofsm.app import option, split_names
+from evofsm.evidence.systems.system import ALL, FIRST
 
 #: Parts of the learnt judge that can be taken away, each with what is left then.
 PARTS: dict[str, str] = {
@@ -21,8 +22,8 @@ PARTS: dict[str, str] = {
     "breaks": "it is not noticed where disturbances get worse",
     "states": "one state only: nothing may change",
 }
-#: A value of the options that stands for all there is, and one for nothing.
-ALL, NONE_AWAY = "all", "none"
+#: A value of `Amounts.without` that stands for nothing.
+NONE_AWAY = "none"
 
 
 @dataclass(frozen=True)
@@ -40,10 +41,8 @@ class Amounts:
     without: str = option(
         ALL, "Parts that are taken away, each by itself, with commas; all, or none."
     )
-    all_controllers: bool = option(
-        True,
-        "Every controller of a system, or the first alone.",
-        name="--all-controllers/--first-controller",
+    controllers: str = option(
+        ALL, "Controllers with commas; all, or first: the first one of each system."
     )
     seeds: int = option(5, "Learning seeds.", min=1)
     train: int | None = option(
@@ -57,7 +56,7 @@ class Amounts:
         return replace(
             self,
             without=NONE_AWAY if self.without == ALL else self.without,
-            all_controllers=False,
+            controllers=FIRST if self.controllers == ALL else self.controllers,
             seeds=1,
             train=min(self.train or 30, 30),
             test=min(self.test, 20),

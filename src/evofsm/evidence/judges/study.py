@@ -11,9 +11,10 @@ from functools import partial
 
 from evofsm.app import split_names
 from evofsm.evidence.frame import Frame, Progress, silent
-from evofsm.evidence.judges.amounts import ALL, Amounts
+from evofsm.evidence.judges.amounts import Amounts
 from evofsm.evidence.systems import SYSTEMS, make_system
 from evofsm.evidence.systems.cars import Cars
+from evofsm.evidence.systems.system import ALL
 from evofsm.evidence.systems.trial import Row, trial
 from evofsm.fleet import in_order
 
@@ -74,8 +75,7 @@ def _tasks(plan: Amounts) -> Iterator[partial[Row]]:
     parts = plan.parts
     for name in names:
         system = make_system(name)
-        controllers = list(system.controllers)
-        for controller in controllers if plan.all_controllers else controllers[:1]:
+        for controller in system.chosen(plan.controllers):
             one = partial(trial, name, controller, test=plan.test, base=plan.seed)
             yield partial(one, judge="unrevised", train=0)
             for seed in range(plan.seeds):

@@ -11,9 +11,13 @@ from typing import Any, ClassVar, Literal, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from evofsm.app import split_names
+
 #: A float, or (d,) of them, or an index from 0.
 Action = Any
 Vector = NDArray[np.float64]
+#: In place of names, with commas, that an option takes: all there are, or the first one.
+ALL, FIRST = "all", "first"
 
 
 class Start(NamedTuple):
@@ -137,12 +141,20 @@ class System(ABC):
     measure: ClassVar[str] = "return"  #: what `score` is
 
     def __init__(self, controller: str | None = None) -> None:
+        self.controller = self.chosen(FIRST if controller is None else controller)[0]
+
+    def chosen(self, wanted: str) -> list[str]:
+        """Names of its controllers that are ``wanted``: some with commas, `ALL` or `FIRST`."""
         known = list(self.controllers)
-        self.controller = known[0] if controller is None else controller
-        if self.controller not in known:
-            raise ValueError(
-                f"{self.name} has no controller {controller!r}; it has {', '.join(known)}"
-            )
+        if wanted in (ALL, FIRST):
+            return known if wanted == ALL else known[:1]
+        named = list(dict.fromkeys(split_names(wanted))) or [wanted]
+        for name in named:
+            if name not in known:
+                raise ValueError(
+                    f"{self.name} has no controller {name!r}; it has {', '.join(known)}"
+                )
+        return named
 
     def reset(self, start: Start) -> Vector:
         """Begin an episode; returns the first observation."""

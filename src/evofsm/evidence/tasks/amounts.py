@@ -6,9 +6,8 @@ from dataclasses import dataclass, replace
 from typing import ClassVar, Self
 
 from evofsm.app import option
+from evofsm.evidence.systems.system import ALL, FIRST
 
-#: A value of `Amounts.tasks` that stands for all there are.
-ALL = "all"
 # Those of a shortened run, unless others are named.
 _SHORT = "acc,cartpole,pendulum"
 #: Tasks of which more was asked.
@@ -27,10 +26,8 @@ class Amounts:
     )
     task: str = option("", "A task of your own, module:Class; see docs/tasks.md.")
     judge: str = option("", "A judge of your own on every task, module:Class.")
-    all_controllers: bool = option(
-        True,
-        "Every controller of a task, or the first alone.",
-        name="--all-controllers/--first-controller",
+    controllers: str = option(
+        ALL, "Controllers with commas; all, or first: the first one of each task."
     )
     policies: bool = option(
         True, "Also train policies of CartPole under the guard.", name="--policies/--no-policies"
@@ -53,7 +50,7 @@ class Amounts:
         return replace(
             self,
             tasks=self.tasks or ("" if self.task else _SHORT),
-            all_controllers=False,
+            controllers=FIRST if self.controllers == ALL else self.controllers,
             seeds=1,
             train=min(self.train or 20, 20),
             test=min(self.test, 10),

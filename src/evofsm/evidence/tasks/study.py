@@ -12,8 +12,9 @@ from functools import partial
 from evofsm.app import split_names
 from evofsm.evidence.frame import Frame, Progress, silent
 from evofsm.evidence.systems import TASKS, lacking, make_system
+from evofsm.evidence.systems.system import ALL
 from evofsm.evidence.systems.trial import make_judge, try_judge
-from evofsm.evidence.tasks.amounts import ALL, Amounts
+from evofsm.evidence.tasks.amounts import Amounts
 from evofsm.evidence.tasks.policies import trained_policies
 from evofsm.evidence.tasks.rows import OURS, Row, row
 from evofsm.fleet import in_order
@@ -102,9 +103,8 @@ def _trials(
         own = [plan.judge] if plan.judge and plan.judge not in ("unrevised", *rivals) else []
         for judge in own:
             make_judge(judge, task)  # so that a wrong one shows at once
-        controllers = list(task.controllers)
         train = plan.train_of(name) or task.train
-        for controller in controllers if plan.all_controllers else controllers[:1]:
+        for controller in task.chosen(plan.controllers):
             one = partial(_trial, plan, name, controller)
             for judge in ("unrevised", *rivals):
                 yield partial(one, judge, 0, 0)
