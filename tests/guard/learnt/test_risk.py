@@ -60,6 +60,18 @@ def test_its_risk_lies_in_its_interval_and_rests_on_what_is_remembered(point):
     assert as_it_was.evidence > 0.0  # of what is remembered
 
 
+def test_where_all_that_it_may_remember_are_lost_its_interval_has_no_end(points):
+    judge = points["box"].taught(10).judge
+    most = judge.dynamics.n_stretches
+    assert len(judge.dynamics.stretches) == most
+    outlooks = [judge.assess([0.5, speed]) for speed in np.linspace(0.0, 0.2, 400)]
+    assert {one.dead_end or one.lost == most for one in outlooks} == {False, True}
+    assert any(0 < one.lost < most for one in outlooks)
+    for one in outlooks:
+        assert (one.risk[2] == 1.0) == math.isinf(one.per_hour[2]) == (one.lost == most)
+        assert one.risk[0] == 1.0 if one.dead_end else one.risk[0] < one.risk[2]
+
+
 def test_an_episode_that_goes_on_and_on_is_studied_and_goes_on(points):
     """What is remembered of it is bounded, and what was learnt is used before its end."""
     point, guard = points["box"], points["box"].taught(2)

@@ -58,6 +58,8 @@ _HORIZON, _SHORTEST, _FARTHEST, _AHEAD = 64, 32, LONGEST_STRETCH, 1.5
 _LATEST, _REFUTED = 0.98, 0.8
 # Backups closer than this are alike; an action that was used less often is tried.
 _ALIKE, _TRIES = 0.02, 8
+# Risk, and its interval, where nothing helps by the model, of which nobody knows how good it is.
+_CERTAIN = (1.0, 0.0, 1.0)
 
 
 class Outlook(NamedTuple):
@@ -69,7 +71,8 @@ class Outlook(NamedTuple):
     margin: float  #: escape margin: distance to failure under the worst of them [ordinary changes]
     #: probability, with its 90 % interval, that within the horizon one begins that is lost
     risk: tuple[float, float, float]
-    #: how often such begin [1/h], with its 90 % interval
+    #: how often such begin [1/h], with its 90 % interval; its end is infinite where all that it
+    #: may remember are lost, as it is not known what was forgotten
     per_hour: tuple[float, float, float]
 
 
@@ -103,8 +106,9 @@ class LearntRisk:
     The risk of an action is the probability that within the horizon something begins that no
     backup survives after it: ``1 - exp(-lost / exposure * horizon)``, from the number of remembered
     disturbances that are lost and the time in which they were seen; 1 where not even an
-    undisturbed future is survived. Its 90 % interval is that of a Poisson count (Garwood 1936).
-    It speaks of what was seen: what never began is not in it.
+    undisturbed future is survived. Its 90 % interval is that of a Poisson count (Garwood 1936); it
+    ends at 1 where all disturbances that it may remember are lost, as those that it forgot may be
+    lost too. It speaks of what was seen: what never began is not in it.
 
     A predictive safety filter as of Wabersich & Zeilinger (Automatica 2021), with model,
     disturbances and backups learnt online. The margin follows adaptive conformal control (Gibbs &
@@ -396,14 +400,14 @@ class LearntRisk:
         lost, left, _ = found[:, 0].tolist()
         dead_end, hours = math.isinf(lost), self.exposure / 3600.0
         count = len(self.disturbances.residuals) - 1 if dead_end else int(lost)
-        low, high = poisson_bounds(count)
+        expected = self._expected(count)
         return Outlook(
             dead_end=dead_end,
             lost=count,
             remembered=self.remembered.number,
             margin=left,
-            risk=_risk(lost, self._soon),
-            per_hour=(count / hours, low / hours, high / hours),
+            risk=_CERTAIN if dead_end else _risk(expected, self._soon),
+            per_hour=(expected[0] / hours, expected[1] / hours, expected[2] / hours),
         )
 
     @property
@@ -445,9 +449,22 @@ class LearntRisk:
         """The horizon, as a share of the time in which all that is remembered was seen."""
         return self.horizon * self.dt / max(self.exposure, 1e-300)
 
+    def _expected(self, lost: int) -> tuple[float, float, float]:
+        """Disturbances that are lost, of all in the time observed, with their 90 % interval.
+
+        Where all that it may remember are lost, those that it forgot may be lost too, and it is not
+        known how many they were.
+        """
+        low, high = poisson_bounds(lost)
+        return float(lost), low, high if lost < self.dynamics.n_stretches else math.inf
+
     def _judgement(self, lost: _Floats, left: _Floats, situation: Situation) -> Judgement:
         soon = self._soon
-        risk, low, high = np.array([_risk(each, soon) for each in lost.tolist()]).T.copy()
+        each = [
+            _CERTAIN if math.isinf(k) else _risk(self._expected(int(k)), soon)
+            for k in lost.tolist()
+        ]
+        risk, low, high = np.array(each).T.copy()
         seen, machine = math.nan, self.machine
         if (
             machine is not None
@@ -717,15 +734,13 @@ class LearntRisk:
         return f"{type(self).__name__}(dt={self.dt:g}, seed={self.seed})"
 
 
-def _risk(lost: float, soon: float) -> tuple[float, float, float]:
+def _risk(expected: tuple[float, float, float], soon: float) -> tuple[float, float, float]:
     """Probability, with its interval, that something begins that is lost.
 
-    ``soon`` is the horizon, as a share of the time in which all that is remembered was seen.
+    ``soon`` is the horizon, as a share of the time in which so many were seen.
     """
-    if math.isinf(lost):
-        return 1.0, 0.0, 1.0
-    low, high = poisson_bounds(int(lost))
-    return _within(lost * soon), _within(low * soon), _within(high * soon)
+    lost, low, high = (_within(each * soon) for each in expected)
+    return lost, low, high
 
 
 def _within(expected: float) -> float:
