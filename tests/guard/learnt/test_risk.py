@@ -72,6 +72,31 @@ def test_where_all_that_it_may_remember_are_lost_its_interval_has_no_end(points)
         assert one.risk[0] == 1.0 if one.dead_end else one.risk[0] < one.risk[2]
 
 
+@pytest.mark.parametrize("steps", [30, 1100])
+def test_what_is_noted_of_a_decision_belongs_to_its_observation(points, monkeypatch, steps):
+    """Although the first observations lack something, and a long episode is studied in parts."""
+    guard, noted, refused = points["box"].taught(4), [], {}
+    add = Situations.add
+
+    def note(situations, episode, tight, *others):
+        noted.extend(zip(episode.observations[:-1], tight, strict=False))
+        add(situations, episode, tight, *others)
+
+    monkeypatch.setattr(Situations, "add", note)
+    rng = np.random.default_rng(3)
+    z = np.zeros(2)
+    for t in range(steps):
+        seen = z if t > 3 else np.array([z[0], np.nan])
+        said = guard.decide(seen, float(rng.uniform(-0.2, 1.0)))
+        refused[tuple(z)] = not same_action(said.executed, said.proposed)
+        speed = 0.9 * z[1] + 0.02 * said.executed + 0.002 * rng.normal()
+        z = np.array([z[0] + speed, speed])
+    guard.end(False, z)
+    assert len(noted) >= steps - 6
+    assert any(tight for _, tight in noted)
+    assert all(tight == refused[tuple(observed)] for observed, tight in noted)
+
+
 def test_an_episode_that_goes_on_and_on_is_studied_and_goes_on(points):
     """What is remembered of it is bounded, and what was learnt is used before its end."""
     point, guard = points["box"], points["box"].taught(2)

@@ -785,6 +785,11 @@ class Dynamics:
         return bool(self._Z)
 
     @property
+    def n_under_way(self) -> int:
+        """Number of observations of this episode that are not studied yet."""
+        return len(self._Z)
+
+    @property
     def has_acted(self) -> bool:
         """Whether it is known what was done after the latest observation."""
         return len(self._U) >= len(self._Z) > 0
@@ -854,11 +859,11 @@ class Dynamics:
             if not len(seen):
                 continue
             for k, (Z, *_) in enumerate(self.stretches, 1):
-                d = np.append(np.abs(np.diff(Z[:, j])), 0.0)
-                around = np.maximum(np.maximum(d[:-2], d[2:]), self.sums.unit[j])
-                left = np.abs(found.residuals[k, : len(d) - 2, j])
+                change = np.diff(Z, axis=0)
+                alone, size = have_jumped(change, self.sums.unit)[1:, j], np.abs(change[1:, j])
+                left = np.abs(found.residuals[k, : len(size), j])
                 n = len(left)
-                at = np.flatnonzero((d[1:-1] > 8.0 * around)[:n] & (left > 0.5 * d[1:-1][:n]))
+                at = np.flatnonzero(alone[:n] & (left > 0.5 * size[:n]))
                 if not len(at):
                     continue
                 t = int(at[0])

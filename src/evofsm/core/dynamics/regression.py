@@ -7,9 +7,10 @@ and what is ordinary. Jumps are no dynamics: they enter neither sums, nor units,
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from numba.extending import register_jitable
 from numpy.typing import NDArray
 
 from evofsm.core.dynamics.consequents import (
@@ -137,6 +138,13 @@ def count_ends(used: _Floats, action: _Floats, lowest: float, by: float) -> None
         used[i, 1] += by * (action[i] > 0.6)
 
 
+@register_jitable
+def _stands_out(change: Any, before: Any, after: Any, unit: Any, times: float) -> Any:
+    """Whether changes are so many times those around them, and the ordinary ones."""
+    around = np.maximum(np.abs(before), np.abs(after))
+    return np.abs(change) > times * np.maximum(around, unit)
+
+
 @compiled
 def learn_transition(
     sums: Sums,
@@ -171,9 +179,9 @@ def learn_transition(
         after = 0.0 if last else observations[3, j] - observations[2, j]
         moved[j] = now
         sums.variance[j] += (now * now - sums.variance[j]) / (n + 1.0)
-        around = max(max(abs(change[j]), abs(after)), sums.unit[j])
         unforeseen = abs(now - move[j]) > 0.5 * abs(now)
-        alone = abs(now) > (_JUMP if n > _FIRST else _FIRST_JUMP) * around
+        times = _JUMP if n > _FIRST else _FIRST_JUMP
+        alone = _stands_out(now, change[j], after, sums.unit[j], times)
         jumped[j] = 1.0 if n > 0.0 and alone and unforeseen else 0.0
         jump = jump or jumped[j] > 0.0
     for j in range(m):
@@ -235,9 +243,8 @@ def learn_transition(
 
 def have_jumped(change: _Floats, unit: _Floats) -> NDArray[np.bool_]:
     """(T, m) which changes (T, m) are far larger than those around them and the ordinary ones."""
-    size = np.abs(change)
-    around = np.maximum(np.vstack([size[:1], size[:-1]]), np.vstack([size[1:], 0.0 * size[-1:]]))
-    jumped: NDArray[np.bool_] = size > _JUMP * np.maximum(around, unit)
+    before, after = np.vstack([change[:1], change[:-1]]), np.vstack([change[1:], 0.0 * change[-1:]])
+    jumped: NDArray[np.bool_] = _stands_out(change, before, after, unit, _JUMP)
     return jumped
 
 

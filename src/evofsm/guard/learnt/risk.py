@@ -549,7 +549,8 @@ class LearntRisk:
         self._dead_ends.append(self._dead_end)
         if self.dynamics.n_episodes != self.n_studied:  # it goes on, but was long enough to study
             self._study()
-            self._tights, self._dead_ends = self._tights[-1:], self._dead_ends[-1:]
+        for notes in (self._tights, self._dead_ends):  # an entry for each observation to be studied
+            del notes[: max(0, len(notes) - self.dynamics.n_under_way)]
 
     def follow(self, observation: ArrayLike, action: Any) -> None:
         """Keep up with what happens, without learning from it."""
