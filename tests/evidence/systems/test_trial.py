@@ -191,3 +191,10 @@ def test_numbers_do_not_depend_on_the_number_of_processes():
         for took in ("p50_ms", "p99_ms"):
             assert one.pop(took) >= 0.0
     assert alone == shared
+
+
+@pytest.mark.parametrize("seed", [0, *(pytest.param(k, marks=pytest.mark.slow) for k in (1, 2))])
+def test_an_episode_of_ten_decisions_is_enough_to_learn_from(seed):
+    """It fails once, as it must, and then no more."""
+    row = trial("acc-5", train=6, test=4, base=7, seed=seed)
+    assert (row.failed_while_learning, row.failed, row.unrevised_failed) == (1, 0, 4)

@@ -47,8 +47,8 @@ _Floats = NDArray[np.float64]
 #: Parts that can be left out, to see what each is worth.
 DYNAMICS_PARTS = ("stretches", "memory", "products", "lags", "jumps", "carried", "drift")
 
-# Transitions before anything is expected.
-_FIRST = 15
+# Observations before anything is expected: an episode may fail after so few.
+_FIRST = 8
 # Of what was learnt so far, what still counts an episode later.
 _KEPT = 0.999
 # Steps, and between how many of them weights are solved for again.
