@@ -309,13 +309,36 @@ def test_the_horizon_follows_what_became_of_dead_ends(point, dead_ends, took, fa
     for episode in range(6):
         point.play(guard, episode)
     judge = guard.judge
-    judge.takes, judge.horizon = 40.0, 60
+    judge.takes, judge.horizon, judge.believed = 40.0, 60, 144.0
     judge._dead_ends, judge._took = dead_ends, took
     judge._look_ahead(judge.backups.policies[:1], failed=failed)
     ratio = judge.takes / 40.0
     expected = {"less far": ratio < 0.9, "as far": 0.95 < ratio < 1.05, "farther": ratio > 2.0}
     assert expected[looks]
     assert judge.horizon == int(min(max(1.5 * judge.takes, 32), 144))
+
+
+def test_what_was_refuted_is_believed_again_little_by_little(point):
+    """Else a model that says that all fails late looks as far again an episode later."""
+    guard = point.guard(horizon=None)
+    for episode in range(6):
+        point.play(guard, episode)
+    judge, policies = guard.judge, guard.judge.backups.policies[:1]
+
+    def look(dead_ends=(), took=0.0, failed=False):
+        judge._dead_ends, judge._took = list(dead_ends), took
+        judge._look_ahead(policies, failed=failed)
+        return judge.takes
+
+    judge.takes, judge.horizon, judge.believed = 90.0, 135, 144.0
+    refuted = look([True] * 200)
+    assert refuted < 90.0
+    later = [look(took=130.0) for _ in range(40)]
+    assert refuted < later[0] < 1.05 * refuted
+    assert later == sorted(later)
+    assert later[-1] == 130.0
+    judge.takes, judge.believed, judge._was_certified = 40.0, 30.0, True
+    assert look(failed=True) > 50.0  # who failed although it was certified not to looks farther
 
 
 def test_a_question_changes_nothing_of_what_is_learnt(point, content):

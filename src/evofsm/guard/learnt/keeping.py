@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from evofsm.core import Disturbances, Here
 from evofsm.files import ranges
+from evofsm.guard.learnt.actions import LONGEST_STRETCH
 from evofsm.guard.learnt.backups import Backups
 from evofsm.guard.learnt.breaks import Breaks
 from evofsm.guard.learnt.remembering import Situations
@@ -35,11 +36,12 @@ _SHAPES: dict[str, tuple[int | str, ...]] = {
     "turns": ("a",),
 }
 #: Attributes of the judge that are numbers, which it goes on with.
-NUMBERS = ("margin", "broken", "horizon", "takes", "n_studied", "n_scanned")
+NUMBERS = ("margin", "broken", "horizon", "takes", "believed", "n_studied", "n_scanned")
 
 
 def _upgrade(version: int, settings: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> None:
-    """At first it was not asked whether disturbances get worse."""
+    """At first it was not asked whether disturbances get worse, and all dead ends were believed."""
+    settings.setdefault("believed", float(LONGEST_STRETCH))
     for name, value in Breaks()._asdict().items():
         settings.setdefault(name, value)
 
@@ -55,7 +57,7 @@ KIND = ranges.register(
             "n_constant": ranges.COUNT,
             "horizon": ranges.FROM_1,
             "told_horizon": ranges.SIZE,
-            "takes": ranges.Range(0.0, 1e6),
+            **dict.fromkeys(("takes", "believed"), ranges.Range(0.0, 1e6)),
             "share": ranges.Range(0.0, 1.0),
             "doubt": ranges.Range(0.0, 1e6),
             "since": ranges.COUNT,

@@ -171,6 +171,8 @@ class LearntRisk:
         self.n_scanned = 0
         #: Steps that it takes to fail at the latest, where that cannot be avoided.
         self.takes = _HORIZON / _AHEAD
+        #: Steps in which a dead end is believed to fail, at most: the model was refuted beyond.
+        self.believed = float(_FARTHEST)
         self.situations = Situations()
         self.backups: Backups | None = None
         self.disturbances: Disturbances | None = None
@@ -640,6 +642,7 @@ class LearntRisk:
         """
         self.breaks = Breaks(worse=self.breaks.worse)
         self.takes = min(_AHEAD * max(self.takes, _HORIZON / _AHEAD), _FARTHEST / _AHEAD)
+        self.believed = float(_FARTHEST)
         self.n_scanned = 0
         if "margin" not in self.without:
             self.margin = max(self.margin, _MARGIN)
@@ -648,19 +651,23 @@ class LearntRisk:
         """As far as it takes to fail where nothing helps, and half as far again.
 
         Half as far again, too, after an episode that failed although it was certified not to; less
-        far after one that went on for the whole horizon from where nothing seemed to help.
+        far after one that went on for the whole horizon from where nothing seemed to help. What the
+        model says of dead ends farther away than that is believed again little by little.
         """
         assert self.disturbances is not None
         if not len(self.dynamics.consequents.sides):
             return
         if not failed and any(self._dead_ends[: -self.horizon]):  # it sees less far than it looks
             self.takes *= _REFUTED
+            self.believed = max(self.takes, _SHORTEST / _AHEAD)
         else:
+            self.believed = min(self.believed / _LATEST, float(_FARTHEST))
             after = failing_after(self.dynamics, self.situations, policies, self.disturbances)
-            takes = max(_LATEST * self.takes, self._took)
+            takes = max(_LATEST * self.takes, min(self._took, self.believed))
             if failed and self._was_certified:  # it did not look far enough
                 takes = min(_AHEAD * takes, _FARTHEST / _AHEAD)
-            self.takes = max(float(after), takes)
+                self.believed = max(self.believed, takes)
+            self.takes = max(min(float(after), self.believed), takes)
         self.horizon = int(min(max(_AHEAD * self.takes, _SHORTEST), _FARTHEST))
 
     def _evolve(self, random: np.random.Generator) -> None:
