@@ -1,4 +1,6 @@
 from . import cli as cli
+from .cli.common import ALL as ALL
+from .cli.common import FIRST as FIRST
 from .cli.common import PAGE as PAGE
 from .cli.common import command_line as command_line
 from .cli.common import counter as counter

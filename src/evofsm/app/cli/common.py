@@ -164,6 +164,10 @@ def command_line() -> str:
     return shlex.join(["evofsm", *sys.argv[1:]])
 
 
+#: What an option may take in place of names with commas: all there are, or the first one.
+ALL, FIRST = "all", "first"
+
+
 def split_names(text: str) -> list[str]:
     """Names that were given with commas between them."""
     return [name.strip() for name in text.split(",") if name.strip()]

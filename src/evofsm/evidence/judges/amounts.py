@@ -5,8 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import ClassVar, Self
 
-from evofsm.app import option, split_names
-from evofsm.evidence.systems.system import ALL, FIRST
+from evofsm.app import ALL, FIRST, option, split_names
 
 #: Parts of the learnt judge that can be taken away, each with what is left then.
 PARTS: dict[str, str] = {

@@ -9,12 +9,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 
-from evofsm.app import split_names
+from evofsm.app import ALL, split_names
 from evofsm.evidence.frame import Frame, Progress, silent
 from evofsm.evidence.judges.amounts import Amounts
 from evofsm.evidence.systems import SYSTEMS, make_system
 from evofsm.evidence.systems.cars import Cars
-from evofsm.evidence.systems.system import ALL
 from evofsm.evidence.systems.trial import Row, trial
 from evofsm.fleet import in_order
 

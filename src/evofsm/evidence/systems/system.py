@@ -11,13 +11,11 @@ from typing import Any, ClassVar, Literal, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.app import split_names
+from evofsm.app import ALL, FIRST, split_names
 
 #: A float, or (d,) of them, or an index from 0.
 Action = Any
 Vector = NDArray[np.float64]
-#: In place of names, with commas, that an option takes: all there are, or the first one.
-ALL, FIRST = "all", "first"
 
 
 class Start(NamedTuple):

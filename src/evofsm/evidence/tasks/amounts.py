@@ -5,8 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import ClassVar, Self
 
-from evofsm.app import option
-from evofsm.evidence.systems.system import ALL, FIRST
+from evofsm.app import ALL, FIRST, option
 
 # Those of a shortened run, unless others are named.
 _SHORT = "acc,cartpole,pendulum"

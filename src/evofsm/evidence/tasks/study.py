@@ -9,10 +9,9 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 
-from evofsm.app import split_names
+from evofsm.app import ALL, split_names
 from evofsm.evidence.frame import Frame, Progress, silent
 from evofsm.evidence.systems import TASKS, lacking, make_system
-from evofsm.evidence.systems.system import ALL
 from evofsm.evidence.systems.trial import make_judge, try_judge
 from evofsm.evidence.tasks.amounts import Amounts
 from evofsm.evidence.tasks.policies import trained_policies
