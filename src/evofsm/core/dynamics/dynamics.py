@@ -782,7 +782,7 @@ class Dynamics:
     @property
     def is_under_way(self) -> bool:
         """Whether something was observed in this episode."""
-        return bool(self._Z)
+        return self.n_under_way > 0
 
     @property
     def n_under_way(self) -> int:
@@ -859,8 +859,9 @@ class Dynamics:
             if not len(seen):
                 continue
             for k, (Z, *_) in enumerate(self.stretches, 1):
-                change = np.diff(Z, axis=0)
-                alone, size = have_jumped(change, self.sums.unit)[1:, j], np.abs(change[1:, j])
+                change = np.diff(Z[:, [j]], axis=0)
+                alone = have_jumped(change, self.sums.unit[[j]])[1:, 0]
+                size = np.abs(change[1:, 0])
                 left = np.abs(found.residuals[k, : len(size), j])
                 n = len(left)
                 at = np.flatnonzero(alone[:n] & (left > 0.5 * size[:n]))

@@ -58,8 +58,6 @@ _HORIZON, _SHORTEST, _FARTHEST, _AHEAD = 64, 32, LONGEST_STRETCH, 1.5
 _LATEST, _REFUTED = 0.98, 0.8
 # Backups closer than this are alike; an action that was used less often is tried.
 _ALIKE, _TRIES = 0.02, 8
-# Risk, and its interval, where nothing helps by the model, of which nobody knows how good it is.
-_CERTAIN = (1.0, 0.0, 1.0)
 
 
 class Outlook(NamedTuple):
@@ -408,7 +406,7 @@ class LearntRisk:
             lost=count,
             remembered=self.remembered.number,
             margin=left,
-            risk=_CERTAIN if dead_end else _risk(expected, self._soon),
+            risk=self._risk(lost),
             per_hour=(expected[0] / hours, expected[1] / hours, expected[2] / hours),
         )
 
@@ -460,13 +458,19 @@ class LearntRisk:
         low, high = poisson_bounds(lost)
         return float(lost), low, high if lost < self.dynamics.n_stretches else math.inf
 
-    def _judgement(self, lost: _Floats, left: _Floats, situation: Situation) -> Judgement:
+    def _risk(self, lost: float) -> tuple[float, float, float]:
+        """Probability, with its 90 % interval, that within the horizon something begins of those.
+
+        Certain where nothing helps by the model, of which nobody knows how good it is.
+        """
+        if math.isinf(lost):
+            return 1.0, 0.0, 1.0
         soon = self._soon
-        each = [
-            _CERTAIN if math.isinf(k) else _risk(self._expected(int(k)), soon)
-            for k in lost.tolist()
-        ]
-        risk, low, high = np.array(each).T.copy()
+        most_likely, low, high = (_within(each * soon) for each in self._expected(int(lost)))
+        return most_likely, low, high
+
+    def _judgement(self, lost: _Floats, left: _Floats, situation: Situation) -> Judgement:
+        risk, low, high = np.array([self._risk(each) for each in lost.tolist()]).T.copy()
         seen, machine = math.nan, self.machine
         if (
             machine is not None
@@ -740,15 +744,6 @@ class LearntRisk:
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}(dt={self.dt:g}, seed={self.seed})"
-
-
-def _risk(expected: tuple[float, float, float], soon: float) -> tuple[float, float, float]:
-    """Probability, with its interval, that something begins that is lost.
-
-    ``soon`` is the horizon, as a share of the time in which so many were seen.
-    """
-    lost, low, high = (_within(each * soon) for each in expected)
-    return lost, low, high
 
 
 def _within(expected: float) -> float:
