@@ -198,3 +198,11 @@ def test_an_episode_of_ten_decisions_is_enough_to_learn_from(seed):
     """It fails once, as it must, and then no more."""
     row = trial("acc-5", train=6, test=4, base=7, seed=seed)
     assert (row.failed_while_learning, row.failed, row.unrevised_failed) == (1, 0, 4)
+
+
+@pytest.mark.slow
+def test_it_turns_back_before_full_torque_only_just_holds():
+    """Leaning that far is no failure yet, but then it falls or not by the last digits of a model."""
+    row = trial("pendulum-cos", "random", train=30, test=40, base=7, seed=2)
+    assert row.unrevised_failed == 40
+    assert row.failed <= 1

@@ -17,6 +17,8 @@ from evofsm.core.kernels import compiled, inner_kernel, lanes, rare_kernel
 
 # After a change, so many times the largest change there was may be foreseen.
 _FARTHER = 3.0
+# So much of half the range of actions a policy leaves unused for each ordinary change of margin.
+_RESERVE = 0.01
 #: Where the effect of an action may bend, in each dimension of a box.
 KNOTS = np.array([-0.5, 0.0, 0.5])
 
@@ -216,8 +218,10 @@ def expect(known: Consequents, room: Futures, harder: float = 1.0) -> None:
 
 
 @inner_kernel
-def follow_policy(known: Consequents, policy: _Floats, z: _Floats, action: _Floats) -> None:
-    """Actions (a, n) of a linear policy, (a, 1 + m): saturated, or the largest of a few."""
+def follow_policy(
+    known: Consequents, policy: _Floats, z: _Floats, action: _Floats, end: float = 1.0
+) -> None:
+    """Actions (a, n) of a linear policy, (a, 1 + m): saturated at an end, or the largest of a few."""
     a, n = action.shape
     for i in range(a):
         for l in range(n):
@@ -228,7 +232,7 @@ def follow_policy(known: Consequents, policy: _Floats, z: _Floats, action: _Floa
                 action[i, l] += slope * (z[j, l] - mean) * inverse
         if known.choices == 0:
             for l in range(n):
-                action[i, l] = min(1.0, max(-1.0, action[i, l]))
+                action[i, l] = min(end, max(-end, action[i, l]))
     if known.choices > 0:
         for l in range(n):
             best = 0
@@ -299,14 +303,16 @@ def replay(
     """Replay disturbances side by side, into ``room``; returns how many are not survived.
 
     The action ``first`` is taken, then what the policy says; where ``first`` is empty, that from
-    the beginning. One ends where the distance to failure falls below ``enough``. All end as soon as
+    the beginning. One ends where the distance to failure falls below ``enough``, and the larger
+    that is, the more of the range of actions the policy leaves unused: where full action just
+    holds, no distance says how near the point of no return is. All end as soon as
     more than ``allowed`` did, or number 0 did, that is no disturbance at all; if ``allowed`` is
     negative, all go on as far as they can.
     """
     survived, least = room.steps, room.near
     count, steps, n = len(room.survived), disturbances.residuals.shape[1], len(least)
     begin_at(room, here)
-    lost = 0
+    lost, end = 0, 1.0 - _RESERVE * enough
     for l in range(n):
         survived[l], least[l] = steps if l < count else -1, np.inf
     for t in range(steps):
@@ -314,7 +320,7 @@ def replay(
             for i in range(len(first)):
                 room.action[i, :] = first[i]
         else:
-            follow_policy(known, policy, room.z, room.action)
+            follow_policy(known, policy, room.z, room.action, end)
         advance(known, disturbances, t, harder, room)
         for s in range(len(known.sides)):
             side = known.sides[s]

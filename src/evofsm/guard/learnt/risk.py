@@ -47,7 +47,7 @@ JUDGE_PARTS = ("margin", "backups", "breaks")
 # Backups that are asked in a decision, and disturbances that mutants are tried on, beside none.
 _ASKED, _TRIED_ON = 3, 5
 # The margin [ordinary changes]: at first, at most, what is left of it an episode later, and what a
-# broken certificate adds, for so many that may be.
+# broken certificate adds, which is also the least, for so many that may be.
 _MARGIN, _LARGEST, _FADES, _ADDED, _RATE = 3.0, 8.0, 0.9, 0.25, 0.001
 # Disturbances are taken to be harder than they were by so many over the number of episodes; by so
 # much at most after a change: a change half as large again as any there was has no sequel.
@@ -159,7 +159,8 @@ class LearntRisk:
         self.machine: EvolvingFSM | None = None
         #: Whether it may try actions to learn what they do.
         self.learning = True
-        #: What has to be left of the distance to failure [ordinary changes].
+        #: What has to be left of the distance to failure [ordinary changes]; for each of them
+        #: backups leave 1 % of half the range of actions unused.
         self.margin = 0.0 if "margin" in self.without else _MARGIN
         #: Certificates that were broken.
         self.broken = 0
@@ -539,7 +540,7 @@ class LearntRisk:
             broken = self._certified and not self._holds
             self.broken += broken
             self._broke |= broken
-            self.margin = min(_LARGEST, max(0.0, self.margin + _ADDED * (broken - _RATE)))
+            self.margin = min(_LARGEST, max(_ADDED, self.margin + _ADDED * (broken - _RATE)))
         self._certified = self._holds
         self._was_certified |= self._holds
         self._take_in(observation, action)
@@ -594,7 +595,8 @@ class LearntRisk:
         """Learn from the latest episode: what to remember, and what to do about it."""
         dynamics = self.dynamics
         self.n_studied = dynamics.n_episodes
-        self.margin *= _FADES
+        if "margin" not in self.without:
+            self.margin = max(_ADDED, _FADES * self.margin)
         moved = any(one.noticed == dynamics.n_episodes - 1 for one in dynamics.drifts)
         if moved or self._is_worse():
             self._begin_anew()
