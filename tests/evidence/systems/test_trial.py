@@ -202,7 +202,7 @@ def test_an_episode_of_ten_decisions_is_enough_to_learn_from(seed):
 
 @pytest.mark.slow
 def test_it_turns_back_before_full_torque_only_just_holds():
-    """Leaning that far is no failure yet, but then it falls or not by the last digits of a model."""
+    """Leaning that far is no failure yet, but then the last digits of a model decide."""
     row = trial("pendulum-cos", "random", train=30, test=40, base=7, seed=2)
     assert row.unrevised_failed == 40
     assert row.failed <= 1

@@ -36,8 +36,8 @@ def mover(choices=0):
 def search_for(known, proposal, policy, margin, place=0.0):
     """How the proposal does there, if the policy follows and nothing disturbs; what is left."""
     none = np.zeros((1, 1))
-    slopes, ranges = np.zeros((1, 1, 1)), np.zeros((1, 1, 1, 2))
-    calm = Disturbances(np.zeros((1, STEPS, 1)), none - 1.0, none, slopes, ranges, slopes[..., [0, 0]])
+    jumps = none - 1.0, none, np.zeros((1, 1, 1)), np.zeros((1, 1, 1, 2)), np.zeros((1, 1, 2))
+    calm = Disturbances(np.zeros((1, STEPS, 1)), *jumps)
     here = Here(np.array([place]), np.zeros(1), np.zeros(len(policy)))
     world = (policy[None], np.zeros(1, int), calm, 1.0, margin, 0)
     how, _, left = search(known, here, np.array(proposal), *world, np.empty(len(policy)))

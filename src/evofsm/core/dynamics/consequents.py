@@ -221,7 +221,7 @@ def expect(known: Consequents, room: Futures, harder: float = 1.0) -> None:
 def follow_policy(
     known: Consequents, policy: _Floats, z: _Floats, action: _Floats, end: float = 1.0
 ) -> None:
-    """Actions (a, n) of a linear policy, (a, 1 + m): saturated at an end, or the largest of a few."""
+    """Actions (a, n) of a linear policy, (a, 1 + m): saturated, or the largest of a few."""
     a, n = action.shape
     for i in range(a):
         for l in range(n):
