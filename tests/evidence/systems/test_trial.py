@@ -10,8 +10,9 @@ from evofsm.evidence.judges.amounts import PARTS
 from evofsm.evidence.judges.plan import Plan
 from evofsm.evidence.judges.study import run_judges
 from evofsm.evidence.systems import make_system
+from evofsm.evidence.systems.cartpole import CartPole
 from evofsm.evidence.systems.system import Start
-from evofsm.evidence.systems.trial import run, trial
+from evofsm.evidence.systems.trial import make_judge, run, trial, try_judge
 
 
 class Decided(NamedTuple):
@@ -206,3 +207,27 @@ def test_it_turns_back_before_full_torque_only_just_holds():
     row = trial("pendulum-cos", "random", train=30, test=40, base=7, seed=2)
     assert row.unrevised_failed == 40
     assert row.failed <= 1
+
+
+class Blurred(CartPole):
+    """CartPole, seen with noise: of a hundredth of a radian, of 5 cm, and as much a second."""
+
+    def reset(self, start):
+        self.blur = start.rng(7)
+        return self.blurred(super().reset(start))
+
+    def step(self, action):
+        step = super().step(action)
+        return step._replace(observation=self.blurred(step.observation))
+
+    def blurred(self, z):
+        return z + self.blur.normal(0.0, [0.05, 0.05, 0.01, 0.05])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [1, 4])
+def test_failures_that_noise_shows_amid_what_was_survived_are_understood(seed):
+    system = Blurred()
+    judge = make_judge("learnt", system, seed=seed)
+    tried = try_judge(system, judge, seed=seed, train=30, test=20, base=7)
+    assert sum(one.failed for one in tried.held_out) <= 1

@@ -60,8 +60,8 @@ _SHORTEST = 4
 # An episode that goes on for so many steps is studied, and goes on.
 _LONGEST = 1024
 # An extreme is a saturation if it was reached, by moving, in so many episodes, or if a variable
-# rested there for so many steps of one although it was expected to go on.
-_REACHED, _RESTED = 2, 4
+# rested there although it was expected to go on.
+_REACHED = 2
 MOST_KEPT = 200
 # Jumps that would have shown no dependence, for each variable.
 _JUMP_PRIOR = 3.0
@@ -526,7 +526,7 @@ class Dynamics:
         """Learn from an episode as a whole."""
         Z, U = np.array(self._Z), np.array(self._U).reshape(-1, self.size)
         safe = Z[:-1] if failed else Z
-        arrived = self._extremes(safe)
+        self._extremes(safe)
         if failed:
             self.failures = [*self.failures[1 - MOST_KEPT :], Z[-1]]
         self.settle()
@@ -539,7 +539,7 @@ class Dynamics:
                 self._follow_drift(safe, U[:T])
             found = np.zeros((T - 1, self.n_variables))
             residuals(self.consequents, Z, U, T - 1, False, found)
-            self._held(arrived, found, safe)
+            self._held(found, safe)
             self._rescale(found, safe)
             self.latest = Episode(safe, U[:T], found, failed)
             if "stretches" not in self.without:
@@ -603,14 +603,14 @@ class Dynamics:
                 self.lowest,
                 self.highest,
                 np.maximum(self.sums.unit, 1e-300),
+                np.where(self.reached < _REACHED, self.sums.scale[:, None], 0.0),
             )
         self._rebuild()
 
-    def _extremes(self, safe: _Floats) -> NDArray[np.bool_]:
-        """How far variables went; (m, 2) which of those ends they came to by moving."""
-        arrived = np.zeros((self.n_variables, 2), bool)
+    def _extremes(self, safe: _Floats) -> None:
+        """How far variables went, and in how many episodes they came to those ends by moving."""
         if not len(safe):
-            return arrived
+            return
         low, high = safe.min(0), safe.max(0)
         self.lowest, self.highest = self.lowest.copy(), self.highest.copy()
         self.reached = self.reached.copy()
@@ -623,27 +623,24 @@ class Dynamics:
             moving = (
                 np.abs(np.diff(safe[:, j])) > close
             )  # it arrived there, and did not start there
-            arrived[j, 0] = ((safe[1:, j] <= self.lowest[j] + close) & moving).any()
-            arrived[j, 1] = ((safe[1:, j] >= self.highest[j] - close) & moving).any()
-        self.reached += arrived
-        return arrived
+            self.reached[j, 0] += ((safe[1:, j] <= self.lowest[j] + close) & moving).any()
+            self.reached[j, 1] += ((safe[1:, j] >= self.highest[j] - close) & moving).any()
 
-    def _held(self, arrived: NDArray[np.bool_], found: _Floats, safe: _Floats) -> None:
-        """Count ends at which variables rested although they were expected to go on.
+    def _held(self, found: _Floats, safe: _Floats) -> None:
+        """Know ends by variables that rested there although they were expected to go on.
 
         Whoever never leaves an end does not come to it by moving.
         """
         rests, far = safe[1:-1] == safe[2:], ONSET * self.sums.scale
         held = np.column_stack(
             [
-                (rests & (safe[2:] == self.lowest) & (found > far)).sum(0),
-                (rests & (safe[2:] == self.highest) & (found < -far)).sum(0),
+                (rests & (safe[2:] == self.lowest) & (found > far)).any(0),
+                (rests & (safe[2:] == self.highest) & (found < -far)).any(0),
             ]
         )
-        held[(self.sums.moving <= MOVING) | (self.sums.scale[0] == 0.0)] = 0
+        held[(self.sums.moving <= MOVING) | (self.sums.scale[0] == 0.0)] = False
         if held.any():
-            self.reached += (held > 0) & ~arrived
-            np.maximum(self.reached, _REACHED, out=self.reached, where=held >= _RESTED)
+            np.maximum(self.reached, _REACHED, out=self.reached, where=held)
             self._rebuild()
 
     def _rescale(self, found: _Floats, safe: _Floats) -> None:

@@ -1,7 +1,8 @@
 """Where a system fails, from where it did: sides of the box of all that was survived.
 
 The fewest sides that explain the failures; of two that explain the first ones alike, both hold
-until another failure tells them apart.
+until another failure tells them apart. Where noise blurs the ends of the box, a failure may lie
+within it: then the side is where the innermost of such failures was seen.
 """
 
 from __future__ import annotations
@@ -17,47 +18,74 @@ _Floats = NDArray[np.float64]
 _FARTHEST, _HALVINGS = 40, 60
 # So many failures may leave two sides undecided.
 _FIRST = 2
+# Beyond an end is what is so many ordinary changes beyond; blurred ends are so wide.
+_BEYOND, _BLUR = 1e-12, 5.0
 
 
 def explain_failures(
-    failures: _Floats, lowest: _Floats, highest: _Floats, unit: _Floats
+    failures: _Floats, lowest: _Floats, highest: _Floats, unit: _Floats, blur: _Floats
 ) -> list[tuple[int, float, float]]:
     """Sides as (variable, sign, threshold): a variable beyond its threshold is failure.
 
     Parameters
     ----------
     failures : (k, m) ndarray
-        Last observations of episodes that failed.
+        Observations in which episodes failed.
     lowest, highest : (m,) ndarray
         Of all observations that were survived.
     unit : (m,) ndarray
         Ordinary change of each variable.
+    blur : (m, 2) ndarray
+        How far noise may blur the lowest and the highest in a step: a failure within five times
+        that of an end may have been beyond it. 0 where a variable saturates.
 
     Examples
     --------
     >>> low, high = np.array([1.0, 0.0]), np.array([9.0, 5.0])
-    >>> explain_failures(np.array([[-0.5, 3.0], [-0.1, 6.0]]), low, high, np.ones(2))
+    >>> failures, exact = np.array([[-0.5, 3.0], [-0.1, 4.0]]), np.zeros((2, 2))
+    >>> explain_failures(failures, low, high, np.ones(2), exact)
     [(0, -1.0, 1.0)]
+
+    With noise, -0.6 was survived as well:
+
+    >>> low[0] = -0.6
+    >>> explain_failures(failures, low, high, np.ones(2), exact)
+    []
+    >>> explain_failures(failures, low, high, np.ones(2), exact + 0.2)
+    [(0, -1.0, -0.1)]
     """
     m = len(unit)
     if not len(failures):
         return []
+    ends = np.concatenate([lowest, highest])
+    far = np.hstack([lowest - failures, failures - highest])
     with np.errstate(over="ignore"):  # of a variable that never changed it is far enough
-        beyond = np.hstack([lowest - failures, failures - highest]) / np.tile(unit, 2)
+        beyond = far / np.tile(unit, 2)
+    perhaps = far > -_BLUR * blur.T.ravel()
     left = np.ones(len(failures), bool)
-    found: list[int] = []
-    while (explained := (beyond > 1e-12) & left[:, None]).any():
-        votes = explained.sum(0)
-        tied = np.flatnonzero(votes == votes.max())
-        depth = [float(np.median(beyond[explained[:, k], k])) for k in tied]
-        best = int(tied[int(np.argmax(depth))])
+    found: dict[int, float] = {}
+    while (explained := (beyond > _BEYOND) & left[:, None]).any():
+        tied, best = _most_telling(explained, perhaps, beyond)
         left &= ~explained[:, best]
         undecided = len(failures) <= _FIRST and len(tied) == 2
-        found += [int(k) for k in tied] if undecided else [best]
-    return [
-        (k % m, -1.0 if k < m else 1.0, float(lowest[k % m] if k < m else highest[k % m]))
-        for k in found
-    ]
+        found |= {k: float(ends[k]) for k in (tied if undecided else [best])}
+    while (explained := perhaps & left[:, None]).any():
+        _, best = _most_telling(explained, perhaps, beyond)
+        left &= ~explained[:, best]
+        among = failures[explained[:, best], best % m]
+        found[best] = float(among.max() if best < m else among.min())  # the innermost
+    return [(k % m, -1.0 if k < m else 1.0, at) for k, at in found.items()]
+
+
+def _most_telling(
+    explained: NDArray[np.bool_], perhaps: NDArray[np.bool_], beyond: _Floats
+) -> tuple[list[int], int]:
+    """Ends that explain most failures, and of them the one that may explain most, and by most."""
+    votes = explained.sum(0)
+    tied = [int(k) for k in np.flatnonzero(votes == votes.max())]
+    return tied, max(
+        tied, key=lambda k: (perhaps[:, k].sum(), np.median(beyond[explained[:, k], k]))
+    )
 
 
 def probe(
