@@ -213,8 +213,8 @@ def test_a_header_that_makes_no_sense_is_refused_by_name(content, tmp_path):
 
 def test_a_file_of_a_newer_version_asks_for_a_newer_library(tmp_path):
     path = tmp_path / "newer"
-    path.write_bytes(npz({**HEADER, "version": 8}))
-    with pytest.raises(ValueError, match=r"version 8 is newer.*a newer evofsm reads it"):
+    path.write_bytes(npz({**HEADER, "version": 9}))
+    with pytest.raises(ValueError, match=r"version 9 is newer.*a newer evofsm reads it"):
         EvolvingFSM.load(path)
 
 
@@ -625,6 +625,14 @@ def test_a_machine_of_format_6_goes_on_and_follows_changes_from_then_on():
     np.testing.assert_allclose(old.dynamics.weights, new.dynamics.weights, rtol=1e-6, atol=1e-9)
 
 
+def test_a_machine_of_format_7_doubted_no_lags():
+    old = EvolvingFSM.load(FILES / "machine-format-7.evofsm")
+    assert (old.dynamics.n_episodes, old.dynamics.doubt_of_lags) == (1, 0.0)
+    old.save(again := io.BytesIO())
+    again.seek(0)
+    assert EvolvingFSM.load(again).dynamics.doubt_of_lags == 0.0
+
+
 def test_a_risk_of_format_3_is_read():
     risk = LatentRisk.load(FILES / "risk-format-3.evofsm")
     assert (len(risk.manoeuvres), len(risk.brakes.samples)) == (3, 80)
@@ -644,7 +652,7 @@ def test_a_file_says_who_wrote_it_and_what_it_learnt_from(grown, tmp_path):
     for item, kind in ((grown, "machine"), (grown.model(), "model")):
         item.save(tmp_path / kind, provenance)
         header = storage.read_header(tmp_path / kind)
-        assert (header.kind, header.version) == (kind, 7)
+        assert (header.kind, header.version) == (kind, 8)
         assert header.library == __version__
         assert header.provenance == provenance
 

@@ -72,6 +72,14 @@ class Disturbances(NamedTuple):
     jump_from: _Floats  #: (K, m, m, 2) least and most from which such jumps were seen
     landing: _Floats  #: (K, m, 2) least and most to which such jumps led
 
+    @classmethod
+    def nothing(cls, count: int, steps: int, m: int) -> Disturbances:
+        """So many that are none, of m variables."""
+        none = np.zeros((count, m))
+        slopes, ranges = np.zeros((count, m, m)), np.zeros((count, m, m, 2))
+        still = np.zeros((count, steps, m))
+        return cls(still, none - 1.0, none, slopes, ranges, np.zeros((count, m, 2)))
+
 
 class Futures(NamedTuple):
     """Futures side by side, so that loops over them are vector instructions: so many are in use.

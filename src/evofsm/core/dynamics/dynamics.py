@@ -9,6 +9,7 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from evofsm.core.dynamics.ahead import are_misleading, misled_by_lags
 from evofsm.core.dynamics.consequents import (
     Consequents,
     Disturbances,
@@ -45,7 +46,7 @@ from evofsm.core.validation import real_array, refuse_unusable, whole
 _Floats = NDArray[np.float64]
 
 #: Parts that can be left out, to see what each is worth.
-DYNAMICS_PARTS = ("stretches", "memory", "products", "lags", "jumps", "carried", "drift")
+DYNAMICS_PARTS = ("stretches", "memory", "products", "lags", "doubt", "jumps", "carried", "drift")
 
 # Observations before anything is expected: an episode may fail after so few.
 _FIRST = 8
@@ -352,12 +353,9 @@ class Dynamics:
         self.recent = Recent.nothing(p, m, self.n_episodes)
         self.drifts: list[Drift] = []
         self.weights = np.zeros((p, m))
+        #: That latest changes and the previous action foresee anything but one step.
+        self.doubt_of_lags = 0.0
         self.ready = False
-        self._left_out = np.zeros(p)
-        if "products" in self.without:
-            self._left_out[p - n_products(m, a) :] = 1.0
-        if "lags" in self.without:
-            self._left_out[lags(m, a)] = 1.0
         self._jumped = np.zeros(m)
         self._rebuild()
 
@@ -491,10 +489,56 @@ class Dynamics:
         if self.sums.counts[0] < _FIRST:
             return
         with suppress(np.linalg.LinAlgError):  # numbers of sizes that have nothing in common
-            weights = solve(self.sums, self.n_variables, self.size, self._left_out)
+            weights = self._solved("lags" in self.without or are_misleading(self.doubt_of_lags))
             if np.isfinite(weights).all():
                 self.weights, self.ready = weights, True
         self._rebuild()
+
+    def _solved(self, without_lags: bool) -> _Floats:
+        m, a = self.n_variables, self.size
+        left_out = np.zeros(len(self.sums.squares))
+        if "products" in self.without:
+            left_out[len(left_out) - n_products(m, a) :] = 1.0
+        if without_lags:
+            left_out[lags(m, a)] = 1.0
+        return solve(self.sums, m, a, left_out)
+
+    def refute(self, starts: NDArray[np.int64], steps: int) -> None:
+        """Hold the model against what came from where it had foreseen failure that never came.
+
+        Parameters
+        ----------
+        starts : (k,) ndarray of int
+            Observations of the latest episode from which it went on for so many steps, from 0.
+        steps : int
+
+        Examples
+        --------
+        >>> dynamics = Dynamics(n_actions=2)
+        >>> for t in range(40):
+        ...     dynamics.observe(np.array([t % 7.0]))
+        ...     dynamics.act(dynamics.encode(t % 2))
+        >>> dynamics.end(failed=False)
+        >>> dynamics.refute(np.array([3, 4]), 20)
+        >>> 0.0 <= dynamics.doubt_of_lags <= 1.0
+        True
+        """
+        assert self.latest is not None
+        Z, U = self.latest.observations, self.latest.actions
+        starts = starts[starts <= len(U) - steps]
+        if not len(starts) or "doubt" in self.without:
+            return
+        known, was = self.consequents, are_misleading(self.doubt_of_lags)
+        with suppress(np.linalg.LinAlgError):
+            asked, left_out = (
+                known._replace(weights=self._solved(without)) for without in (False, True)
+            )
+            worse = misled_by_lags(asked, left_out, Z, U, starts, steps, self.sums.unit)
+            if self.latest.failed:
+                worse = max(0.0, worse)
+            self.doubt_of_lags = max(0.0, self.doubt_of_lags + worse)
+        if are_misleading(self.doubt_of_lags) != was:
+            self._solve()
 
     def _rebuild(self) -> None:
         sums = self.sums
@@ -831,14 +875,7 @@ class Dynamics:
         """
         m, count = self.n_variables, 1 + len(self.stretches)
         steps = steps or self.horizon
-        found = Disturbances(
-            np.zeros((count, steps, m)),
-            np.full((count, m), -1.0),
-            np.zeros((count, m)),
-            np.zeros((count, m, m)),
-            np.zeros((count, m, m, 2)),
-            np.zeros((count, m, 2)),
-        )
+        found = Disturbances.nothing(count, steps, m)
         for k, (Z, U, _, unforeseen) in enumerate(self.stretches, 1):
             L = min(len(U) - 1, steps)
             if len(unforeseen):

@@ -79,18 +79,28 @@ _ARRAYS: dict[str, tuple[_Shape, ranges.Range]] = {
     "observations": (("observed", "m"), _OBSERVED),
     "actions": (("done", "a"), _SOME),
 }
-# Of whether the model still holds; files of before version 7 have none of it.
+# Of whether the model still holds.
 _RECENT: dict[str, tuple[_Shape, ranges.Range]] = {
     "squares": (("p", "p"), _SOME),
     "products": (("p", "m"), _SOME),
     "doubt": (("m",), _NOT_NEGATIVE),
     "since": (("m",), ranges.COUNT),
 }
-_NEW: dict[str, tuple[_Shape, ranges.Range]] = {
-    **{f"recent_{name}": told for name, told in _RECENT.items()},
-    "drifts": (("drifts", 3), ranges.COUNT),
-    "stretch_unforeseen": (("unforeseen", "m"), _SOME),
-    "stretch_is_of_then": (("stretches",), ranges.FLAG),
+# By the version from which on files have them.
+_SINCE: dict[int, dict[str, tuple[_Shape, ranges.Range]]] = {
+    1: _ARRAYS,
+    7: {
+        **{f"recent_{name}": told for name, told in _RECENT.items()},
+        "drifts": (("drifts", 3), ranges.COUNT),
+        "stretch_unforeseen": (("unforeseen", "m"), _SOME),
+        "stretch_is_of_then": (("stretches",), ranges.FLAG),
+    },
+    8: {"doubt_of_lags": ((1,), _NOT_NEGATIVE)},
+}
+_MEMBERS = {
+    name: ranges.Member(*told, since=version)
+    for version, more in _SINCE.items()
+    for name, told in more.items()
 }
 
 
@@ -103,8 +113,7 @@ def _upgrade(version: int, settings: dict[str, Any], arrays: dict[str, NDArray[A
 _KIND = ranges.register(
     ranges.Kind(
         "dynamics",
-        {name: ranges.Member(*told) for name, told in _ARRAYS.items()}
-        | {name: ranges.Member(*told, since=7) for name, told in _NEW.items()},
+        _MEMBERS,
         {
             **dict.fromkeys(("horizon", "stretches", "n_actions"), ranges.FROM_1),
             **dict.fromkeys(("n_episodes", "clock", "quiet"), ranges.COUNT),
@@ -171,8 +180,8 @@ def _arrays(dynamics: Dynamics) -> dict[str, NDArray[np.float64]]:
     if not m:  # nothing was observed: all that depends on it is empty
         sizes = {"a": a}
         return {
-            name: np.zeros([n if isinstance(n, int) else sizes.get(n, 0) for n in shape])
-            for name, (shape, _) in (_ARRAYS | _NEW).items()
+            name: np.zeros([n if isinstance(n, int) else sizes.get(n, 0) for n in one.shape])
+            for name, one in _MEMBERS.items()
         }
     jumps = [(j, jump) for j, one in enumerate(dynamics.jumps) for jump in one]
     stretches = dynamics.stretches
@@ -184,6 +193,7 @@ def _arrays(dynamics: Dynamics) -> dict[str, NDArray[np.float64]]:
         **{f"recent_{name}": array for name, array in dynamics.recent._asdict().items()},
         "drifts": np.array(dynamics.drifts, np.float64).reshape(-1, 3),
         "used": dynamics.used,
+        "doubt_of_lags": np.array([dynamics.doubt_of_lags]),
         "failures": np.array(dynamics.failures).reshape(-1, m),
         "jumps": np.array([(j, jump[-1]) for j, jump in jumps], np.float64).reshape(-1, 2),
         "jumps_from": np.array([jump[:-1] for _, jump in jumps], np.float64).reshape(-1, m),
@@ -235,6 +245,7 @@ def _restore(dynamics: Dynamics, arrays: dict[str, NDArray[Any]]) -> None:
     for name in _OWN:
         setattr(dynamics, name, arrays[name])
     dynamics.used = arrays["used"]
+    dynamics.doubt_of_lags = float(arrays["doubt_of_lags"][0])
     known: dict[str, Any] = {name: arrays[_KNOWN + name] for name in _CONSEQUENTS}
     dynamics.drifts = [Drift(*row) for row in arrays["drifts"].astype(int).tolist()]
     known |= {"origin": arrays["origin"], "anew": dynamics.anew, "choices": dynamics.choices}

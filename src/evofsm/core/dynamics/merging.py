@@ -145,6 +145,7 @@ def _add_up(merged: Dynamics, parts: Sequence[Dynamics]) -> None:
         )
     )
     merged.used = np.sum([part.used for part in parts], axis=0)
+    merged.doubt_of_lags = float(np.average([part.doubt_of_lags for part in parts], weights=learnt))
     merged.quiet = min(part.quiet for part in parts)
     merged.reached = np.stack(
         [

@@ -71,9 +71,9 @@ class Situations:
         """Remember those starts of the latest episode that would harm most in a few situations."""
         episode, known = dynamics.latest, dynamics.consequents
         assert episode is not None
-        n = len(episode.residuals)
-        alone = np.empty((1, len(self)))
-        harm(known, *self.arrays(), policies, undisturbed(1, dynamics, horizon), 1.0, alone)
+        n, m = len(episode.residuals), dynamics.n_variables
+        alone, calm = np.empty((1, len(self))), Disturbances.nothing(1, horizon, m)
+        harm(known, *self.arrays(), policies, calm, 1.0, alone)
         safe = np.flatnonzero(alone[0] > 0.0)
         if not len(safe):
             return
@@ -81,8 +81,8 @@ class Situations:
         steps = np.arange(n)
         if n > _MOST_STARTS:
             steps = np.sort(random.permutation(n)[:_MOST_STARTS])
-        rest = np.vstack([episode.residuals, np.zeros((horizon, dynamics.n_variables))])
-        begun = undisturbed(len(steps), dynamics, horizon)
+        rest = np.vstack([episode.residuals, np.zeros((horizon, m))])
+        begun = Disturbances.nothing(len(steps), horizon, m)
         for row, begin in zip(begun.residuals, steps, strict=True):
             row[:] = rest[begin : begin + horizon]
         found = np.empty((len(steps), len(safe)))
@@ -134,7 +134,7 @@ def _shuffled(
     assert dynamics.latest is not None
     pool = np.vstack([*situations.pool, dynamics.latest.residuals])[-_POOL:]
     situations.pool = [pool]
-    made = undisturbed(1 + dynamics.n_stretches, dynamics, horizon)
+    made = Disturbances.nothing(1 + dynamics.n_stretches, horizon, dynamics.n_variables)
     for row in made.residuals[1:]:
         row[:] = pool[random.integers(len(pool), size=len(row))]
     return made
@@ -148,17 +148,3 @@ def failing_after(
     ends = np.empty((len(disturbances.residuals), len(situations)))
     harm(dynamics.consequents, *situations.arrays(), policies, disturbances, 1.0, ends)
     return int(ends[ends < 0.0].max(initial=-1.0 - steps) + 1 + steps)
-
-
-def undisturbed(count: int, dynamics: Dynamics, horizon: int) -> Disturbances:
-    """Disturbances that are none."""
-    m = dynamics.n_variables
-    nothing = np.zeros((count, m))
-    return Disturbances(
-        np.zeros((count, horizon, m)),
-        nothing - 1.0,
-        nothing,
-        np.zeros((count, m, m)),
-        np.zeros((count, m, m, 2)),
-        np.zeros((count, m, 2)),
-    )

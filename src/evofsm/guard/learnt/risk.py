@@ -617,8 +617,11 @@ class LearntRisk:
         if "stretches" not in dynamics.without and len(known.sides) and enough > 3:
             self.situations.scan(dynamics, self.horizon, best[:1], random)
             self.n_scanned += 1
+        # From these it went on for the whole horizon although nothing seemed to help.
+        refuted = np.flatnonzero(self._dead_ends[: -self.horizon])
+        dynamics.refute(refuted, self.horizon)
         if self.told_horizon is None and self.disturbances is not None and enough:
-            self._look_ahead(best[:_ASKED], failed=episode.failed)
+            self._look_ahead(best[:_ASKED], failed=episode.failed, refuted=len(refuted) > 0)
         self.disturbances = choose(
             dynamics, self.situations, self.horizon, best[:2], self.harder, random
         )
@@ -653,7 +656,7 @@ class LearntRisk:
         if "margin" not in self.without:
             self.margin = max(self.margin, _MARGIN)
 
-    def _look_ahead(self, policies: _Floats, *, failed: bool) -> None:
+    def _look_ahead(self, policies: _Floats, *, failed: bool, refuted: bool) -> None:
         """As far as it takes to fail where nothing helps, and half as far again.
 
         Half as far again, too, after an episode that failed although it was certified not to; less
@@ -663,7 +666,7 @@ class LearntRisk:
         assert self.disturbances is not None
         if not len(self.dynamics.consequents.sides):
             return
-        if not failed and any(self._dead_ends[: -self.horizon]):  # it sees less far than it looks
+        if refuted and not failed:  # it sees less far than it looks
             self.takes *= _REFUTED
             self.believed = max(self.takes, _SHORTEST / _AHEAD)
         else:
