@@ -617,11 +617,9 @@ class LearntRisk:
         if "stretches" not in dynamics.without and len(known.sides) and enough > 3:
             self.situations.scan(dynamics, self.horizon, best[:1], random)
             self.n_scanned += 1
-        # From these it went on for the whole horizon although nothing seemed to help.
-        refuted = np.flatnonzero(self._dead_ends[: -self.horizon])
-        dynamics.refute(refuted, self.horizon)
+        dynamics.refute(self._refuted, self.horizon)
         if self.told_horizon is None and self.disturbances is not None and enough:
-            self._look_ahead(best[:_ASKED], failed=episode.failed, refuted=len(refuted) > 0)
+            self._look_ahead(best[:_ASKED], failed=episode.failed)
         self.disturbances = choose(
             dynamics, self.situations, self.horizon, best[:2], self.harder, random
         )
@@ -656,7 +654,12 @@ class LearntRisk:
         if "margin" not in self.without:
             self.margin = max(self.margin, _MARGIN)
 
-    def _look_ahead(self, policies: _Floats, *, failed: bool, refuted: bool) -> None:
+    @property
+    def _refuted(self) -> NDArray[np.int64]:
+        """Observations from which it went on for the whole horizon, where nothing seemed to help."""
+        return np.flatnonzero(self._dead_ends[: -self.horizon])
+
+    def _look_ahead(self, policies: _Floats, *, failed: bool) -> None:
         """As far as it takes to fail where nothing helps, and half as far again.
 
         Half as far again, too, after an episode that failed although it was certified not to; less
@@ -666,7 +669,7 @@ class LearntRisk:
         assert self.disturbances is not None
         if not len(self.dynamics.consequents.sides):
             return
-        if refuted and not failed:  # it sees less far than it looks
+        if not failed and len(self._refuted):  # it sees less far than it looks
             self.takes *= _REFUTED
             self.believed = max(self.takes, _SHORTEST / _AHEAD)
         else:
