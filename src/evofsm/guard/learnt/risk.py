@@ -656,7 +656,7 @@ class LearntRisk:
 
     @property
     def _refuted(self) -> NDArray[np.int64]:
-        """Observations from which it went on for the whole horizon, where nothing seemed to help."""
+        """From which observations it went on for the horizon although nothing seemed to help."""
         return np.flatnonzero(self._dead_ends[: -self.horizon])
 
     def _look_ahead(self, policies: _Floats, *, failed: bool) -> None:
