@@ -78,7 +78,8 @@ class LearntRisk:
     """Judges actions by what the machine beside it has learnt of how the system moves and fails.
 
     It is told neither what variables mean nor how they move. Before the first failure of an episode
-    there is nothing that it could prevent, unless failure was told as a function; then all is kept.
+    there is nothing that it could prevent, and all is kept; in the first episode also where failure
+    was told as a function.
 
     Parameters
     ----------
@@ -109,8 +110,8 @@ class LearntRisk:
     lost too. It speaks of what was seen: what never began is not in it.
 
     A predictive safety filter as of Wabersich & Zeilinger (Automatica 2021), with model,
-    disturbances and backups learnt online. The margin follows adaptive conformal control (Gibbs &
-    Candes 2021): each broken certificate (a step ago some backup survived all, now none does even
+    disturbances and backups learnt online. The margin follows adaptive conformal inference (Gibbs
+    & Candes 2021): each broken certificate (a step ago some backup survived all, now none does even
     without a margin) adds to it, and it fades else.
 
     Examples
