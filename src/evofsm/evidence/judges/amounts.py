@@ -13,7 +13,7 @@ PARTS: dict[str, str] = {
     "memory": "independent residuals in place of remembered stretches",
     "products": "no products of variables and actions",
     "lags": "no latest change and previous action",
-    "doubt": "lags are asked even where they foresaw failure that never came",
+    "doubt": "lags are used even where they foresaw failure that never came",
     "jumps": "jumps are learnt like all else",
     "carried": "no residual is carried on where a variable saturates",
     "drift": "the model is not corrected where the system has changed",
