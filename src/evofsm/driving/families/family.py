@@ -273,7 +273,8 @@ def load_family(name: str | PathLike[str]) -> Family:
     Parameters
     ----------
     name : str or path
-        One of `FAMILIES`, or the path of a TOML file, or of a JSON file that ends in ``.json``.
+        One of `FAMILIES`, with some of `SWITCHES` behind a ``+`` each; or the path of a TOML
+        file, or of a JSON file that ends in ``.json``.
 
     Returns
     -------
@@ -282,8 +283,8 @@ def load_family(name: str | PathLike[str]) -> Family:
     Raises
     ------
     ValueError
-        If there is no such family or file, or the file is not TOML or JSON, or holds a name or a
-        kind of value that no family knows.
+        If there is no such family, switch or file, or the file is not TOML or JSON, or holds a
+        name or a kind of value that no family knows.
 
     Examples
     --------
@@ -295,10 +296,13 @@ def load_family(name: str | PathLike[str]) -> Family:
     True
     >>> family.draw(seed=1, index=0) == (scenario, controller, "emergency")
     True
-    >>> noisy = family.with_switches(["noise"]).draw(seed=1, index=0).scenario
+    >>> noisy = load_family("emergency+noise").draw(seed=1, index=0).scenario
     >>> noisy.sensors.gap_noise, noisy.initial_gap == scenario.initial_gap
     (0.5, True)
     """
+    base, *switches = str(name).split("+")
+    if switches and base in FAMILIES:
+        return load_family(base).with_switches(switches)
     if name in FAMILIES:
         source = f"{name}.toml"
         text = files(__package__).joinpath(source).read_bytes()

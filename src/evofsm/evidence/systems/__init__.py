@@ -80,8 +80,9 @@ def make_system(name: str, controller: str | None = None) -> System:
     Parameters
     ----------
     name : str
-        One of `SYSTEMS` or `TASKS`, a family of scenarios, or ``module:Name`` of a class derived
-        from `System`, which is looked for in the present folder too.
+        One of `SYSTEMS` or `TASKS`, a family of scenarios (``emergency+noise`` with a switch), or
+        ``module:Name`` of a class derived from `System`, which is looked for in the present
+        folder too.
     controller : str, optional
         One of its controllers; without it the first.
 
@@ -104,7 +105,8 @@ def make_system(name: str, controller: str | None = None) -> System:
             raise TypeError(f"{name} makes a {type(made).__name__}, which is no System")
         return made
     known = SYSTEMS | TASKS
-    known |= {name: partial(Cars, family=name) for name in FAMILIES if name not in known}
+    families = [*FAMILIES, name] if name.partition("+")[0] in FAMILIES else FAMILIES
+    known |= {one: partial(Cars, family=one) for one in families if one not in known}
     if name not in known:
         raise ValueError(f"there is no system {name!r}; there are {', '.join(known)}")
     return known[name](controller)

@@ -27,7 +27,7 @@ class Cars(System):
     ----------
     controller : str, optional
     family : str
-        Its name.
+        Its name, as `load_family` takes it.
     """
 
     variables = ("gap [m]", "own speed [m/s]", "leader's speed [m/s]")
@@ -36,7 +36,7 @@ class Cars(System):
 
     def __init__(self, controller: str | None = None, *, family: str) -> None:
         self.family = _family(family)
-        self.name = self.family.name
+        self.name = family
         low, high = self.family.actions.low, self.family.actions.high
         self.actions = Box((low,), (high,))
         self.interval = self.family.interval
