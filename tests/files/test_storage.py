@@ -213,8 +213,8 @@ def test_a_header_that_makes_no_sense_is_refused_by_name(content, tmp_path):
 
 def test_a_file_of_a_newer_version_asks_for_a_newer_library(tmp_path):
     path = tmp_path / "newer"
-    path.write_bytes(npz({**HEADER, "version": 9}))
-    with pytest.raises(ValueError, match=r"version 9 is newer.*a newer evofsm reads it"):
+    path.write_bytes(npz({**HEADER, "version": 10}))
+    with pytest.raises(ValueError, match=r"version 10 is newer.*a newer evofsm reads it"):
         EvolvingFSM.load(path)
 
 
@@ -633,6 +633,18 @@ def test_a_machine_of_format_7_doubted_no_lags():
     assert EvolvingFSM.load(again).dynamics.doubt_of_lags == 0.0
 
 
+def test_a_machine_of_format_8_took_all_as_it_was_seen():
+    old = EvolvingFSM.load(FILES / "machine-format-8.evofsm")
+    old.save(again := io.BytesIO())
+    again.seek(0)
+    for machine in (old, EvolvingFSM.load(again)):
+        assert not machine.dynamics.is_noisy
+        np.testing.assert_array_equal(machine.dynamics.consequents.gains, 1.0)
+        np.testing.assert_array_equal(
+            machine.dynamics.consequents.close, 1e-9 / machine.dynamics.consequents.inverse
+        )
+
+
 def test_a_risk_of_format_3_is_read():
     risk = LatentRisk.load(FILES / "risk-format-3.evofsm")
     assert (len(risk.manoeuvres), len(risk.brakes.samples)) == (3, 80)
@@ -652,7 +664,7 @@ def test_a_file_says_who_wrote_it_and_what_it_learnt_from(grown, tmp_path):
     for item, kind in ((grown, "machine"), (grown.model(), "model")):
         item.save(tmp_path / kind, provenance)
         header = storage.read_header(tmp_path / kind)
-        assert (header.kind, header.version) == (kind, 8)
+        assert (header.kind, header.version) == (kind, 9)
         assert header.library == __version__
         assert header.provenance == provenance
 

@@ -28,6 +28,8 @@ def model(going_on):
         anew=none,
         mean=none,
         inverse=one,
+        close=1e-9 * one,
+        gains=one,
         choices=0,
     )
 

@@ -124,6 +124,15 @@ def test_parts_that_saw_nothing_add_nothing(taught):
     assert merge_dynamics([Dynamics(-2.5, 2.5)] * 2).n_variables == 0
 
 
+def test_parts_that_saw_no_transition_merge():
+    parts = [Dynamics(n_actions=2) for _ in range(2)]
+    for part, z in zip(parts, (1.0, 2.0), strict=True):
+        part.observe(np.array([z]))
+    merged = merge_dynamics(parts)
+    assert merged.sums.counts.tolist() == [2.0, 0.0]
+    assert not merged.is_noisy
+
+
 def test_what_was_told_stays_told(taught):
     def failed(z):
         return bool(z[0] < 0.0)

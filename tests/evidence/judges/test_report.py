@@ -66,8 +66,8 @@ def test_a_part_without_which_it_fails_is_needed(found):
     answer = " ".join(tell(found).answer)
     assert "Without stretches (no disturbances at all) it does clearly worse on acc" in answer
     idle = re.search(r"What adds nothing .*: (.*)\. It has", answer)[1]
-    parts = ("products", "lags", "doubt", "jumps", "carried", "drift", "margin", "backups")
-    assert idle == f"{', '.join(parts)}, breaks and states"
+    dynamics = ("products", "lags", "doubt", "jumps", "carried", "drift", "observer")
+    assert idle == f"{', '.join(dynamics)}, margin, backups, breaks and states"
 
 
 def test_a_part_without_which_it_does_better_is_a_loss(found):

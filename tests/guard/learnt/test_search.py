@@ -29,6 +29,8 @@ def mover(choices=0):
         anew=none,
         mean=none,
         inverse=one,
+        close=1e-9 * one,
+        gains=one,
         choices=choices,
     )
 

@@ -39,6 +39,8 @@ class Consequents(NamedTuple):
     anew: _Floats  #: (m,) 1 of a variable that moves otherwise than it did, -1 of others then, or 0
     mean: _Floats  #: (m,) of what policies take for their middle
     inverse: _Floats  #: (m,) and one over their spread
+    close: _Floats  #: (m,) how far from where it saturates a variable may be seen that is there
+    gains: _Floats  #: (m,) of `observer`
     choices: int  #: number of actions; 0 where the action is a box
 
 
@@ -395,7 +397,7 @@ def residuals(
             still = still and observations[t + 2, j] == observations[t + 1, j]
         for j in range(m):
             y, x = observations[t + 1, j] + room.move[j, t], observations[t + 2, j]
-            close = 1e-9 / known.inverse[j]
+            close = known.close[j]
             low, high = x <= known.lowest[j] + close, x >= known.highest[j] - close
             beyond = (y < known.lowest[j] and low) or (y > known.highest[j] and high)
             found[t, j] = 0.0 if still or beyond else x - y
@@ -413,25 +415,29 @@ def pack(known: Consequents) -> _Floats:
     """All but the sides and the number of choices, in one array."""
     parts = (known.weights, known.origin, known.reach, known.lowest, known.highest)
     more = (known.least, known.most, known.anew, known.mean, known.inverse)
-    return np.concatenate([np.ravel(part) for part in (*parts, *more)])
+    last = (known.close, known.gains)
+    return np.concatenate([np.ravel(part) for part in (*parts, *more, *last)])
 
 
 @compiled
 def unpacked(packed: _Floats, m: int, choices: int) -> Consequents:
     """What was packed, without sides."""
-    at = len(packed) - 9 * m
+    at = len(packed) - 11 * m
+    rest = packed[at:].reshape((11, m))
     return Consequents(
         packed[:at].reshape((at // m, m)),
-        packed[at : at + m],
-        packed[at + m : at + 2 * m],
-        packed[at + 2 * m : at + 3 * m],
-        packed[at + 3 * m : at + 4 * m],
-        packed[at + 4 * m : at + 5 * m],
-        packed[at + 5 * m : at + 6 * m],
+        rest[0],
+        rest[1],
+        rest[2],
+        rest[3],
+        rest[4],
+        rest[5],
         packed[:0].reshape((0, 4)),
-        packed[at + 6 * m : at + 7 * m],
-        packed[at + 7 * m : at + 8 * m],
-        packed[at + 8 * m :],
+        rest[6],
+        rest[7],
+        rest[8],
+        rest[9],
+        rest[10],
         choices,
     )
 

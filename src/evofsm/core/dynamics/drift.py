@@ -84,8 +84,7 @@ def compared(
     room = along(known, Z, U, length)
     features, moves = room.features[:, :length].T, room.move[:, :length].T
     after, change = Z[2:], np.diff(Z[1:], axis=0)
-    close = 1e-9 / known.inverse
-    says = (after > known.lowest + close) & (after < known.highest - close)
+    says = (after > known.lowest + known.close) & (after < known.highest - known.close)
     says &= (change >= sums.least) & (change <= sums.most)
     rows = says.all(1)
     features, change = features[rows], change[rows]

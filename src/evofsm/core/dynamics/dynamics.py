@@ -31,6 +31,7 @@ from evofsm.core.dynamics.drift import (
     correction,
 )
 from evofsm.core.dynamics.failures import explain_failures, probe
+from evofsm.core.dynamics.observer import best_gains, corrected, tried, untried
 from evofsm.core.dynamics.regression import (
     MOVING,
     Sums,
@@ -46,7 +47,10 @@ from evofsm.core.validation import real_array, refuse_unusable, whole
 _Floats = NDArray[np.float64]
 
 #: Parts that can be left out, to see what each is worth.
-DYNAMICS_PARTS = ("stretches", "memory", "products", "lags", "doubt", "jumps", "carried", "drift")
+DYNAMICS_PARTS = (
+    *("stretches", "memory", "products", "lags", "doubt", "jumps", "carried", "drift"),
+    "observer",
+)
 
 # Observations before anything is expected: an episode may fail after so few.
 _FIRST = 8
@@ -66,6 +70,8 @@ _REACHED = 2
 MOST_KEPT = 200
 # Jumps that would have shown no dependence, for each variable.
 _JUMP_PRIOR = 3.0
+# Of one that is where it saturates, a noisy sensor may say that it is so many residuals from there.
+_CLOSE = 3.0
 # So many times the stretches that are kept there may be until somebody chooses.
 _SPARE = 4
 
@@ -157,6 +163,7 @@ class Dynamics:
         self.n_episodes = 0
         self.latest: Episode | None = None
         self.used = np.zeros((self.size, 2))
+        self.is_noisy = False
         self.clock = 0.0  # of the machine that feeds it, at the latest observation
         self.quiet = 0.0  # observations since one that was not expected
         self._begin()
@@ -235,6 +242,8 @@ class Dynamics:
     @consequents.setter
     def consequents(self, known: Consequents) -> None:
         self._consequents, self._packed = known, pack(known)
+        #: Whether some variables are not taken as they are seen.
+        self.is_noisy = bool((known.gains < 1.0).any())
 
     @property
     def whole(self) -> Whole:
@@ -353,6 +362,8 @@ class Dynamics:
         self.recent = Recent.nothing(p, m, self.n_episodes)
         self.drifts: list[Drift] = []
         self.weights = np.zeros((p, m))
+        #: What gains of its observer miss.
+        self.missed = untried(m)
         #: That latest changes and the previous action foresee anything but one step.
         self.doubt_of_lags = 0.0
         self.ready = False
@@ -549,6 +560,8 @@ class Dynamics:
             (lowest if sign < 0.0 else highest)[j] = sign * np.inf
         variance = sums.scatter / max(1.0, sums.counts[0] - 1.0)
         worth = 1.0 / (1.25 * sums.unit + 1e-300)
+        inverse = 1.0 / np.sqrt(np.where(variance > 0.0, variance, 1.0))
+        gains = best_gains(self.missed)
         self.consequents = Consequents(
             weights=self.weights,
             origin=self.origin,
@@ -562,7 +575,9 @@ class Dynamics:
             ).reshape(-1, 4),
             anew=self.anew,
             mean=self.origin + sums.mean,
-            inverse=1.0 / np.sqrt(np.where(variance > 0.0, variance, 1.0)),
+            inverse=inverse,
+            close=np.where(gains < 1.0, _CLOSE * np.sqrt(sums.noise), 1e-9 / inverse),
+            gains=gains,
             choices=self.choices,
         )
 
@@ -579,8 +594,12 @@ class Dynamics:
         self.latest = None
         T = len(safe) - 1
         if self.ready and T > 4:
-            if self.sums.scale[0] > 0.0 and "drift" not in self.without:
-                self._follow_drift(safe, U[:T])
+            if self.sums.scale[0] > 0.0:
+                if "drift" not in self.without:
+                    self._follow_drift(safe, U[:T])
+                if "observer" not in self.without:
+                    self.missed = tried(self.missed, self.consequents, safe, U[:T], self.sums.unit)
+                    self._rebuild()
             found = np.zeros((T - 1, self.n_variables))
             residuals(self.consequents, Z, U, T - 1, False, found)
             self._held(found, safe)
@@ -849,6 +868,44 @@ class Dynamics:
             return False
         latest = Z[-3], Z[-2], Z[-1], U[n - 3], U[n - 2]
         return bool(is_unforeseen(self._packed, self.choices, *latest, scale, ONSET))
+
+    def corrected(self, here: Here, action: _Floats, seen: _Floats) -> _Floats:
+        """Where one is, from what was expected and what is seen.
+
+        Parameters
+        ----------
+        here : Here
+            Where one was a step ago, as it was corrected.
+        action : (a,) ndarray
+            What was done then, as `encode` returns it.
+        seen : (m,) ndarray
+            What is observed now.
+
+        Returns
+        -------
+        (m,) ndarray
+            ``seen`` itself as long as no sensor is known to be noisy.
+
+        Examples
+        --------
+        >>> dynamics, draw = Dynamics(n_actions=2), np.random.default_rng(0)
+        >>> for episode in range(30):
+        ...     x = 0.0
+        ...     for t in range(60):
+        ...         i = int(draw.integers(2))
+        ...         dynamics.observe(np.array([x + draw.normal()]))
+        ...         dynamics.act(dynamics.encode(i))
+        ...         x += 2.0 * i - 1.0
+        ...     dynamics.end(failed=False)
+        >>> dynamics.is_noisy
+        True
+        >>> here = Here(np.zeros(1), np.zeros(1), dynamics.encode(0))
+        >>> dynamics.corrected(here, dynamics.encode(1), np.array([2.0])).round(1)
+        array([1.3])
+        """
+        if not self.is_noisy:
+            return seen
+        return corrected(self.consequents, here, action, seen, self.sums.unit)
 
     def disturbances(self, steps: int | None = None) -> Disturbances:
         """Residuals of what is remembered, as they are seen now; number 0 is none at all.

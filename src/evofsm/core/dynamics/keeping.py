@@ -17,6 +17,7 @@ from evofsm.core.dynamics.consequents import Consequents, Stretch, n_features
 from evofsm.core.dynamics.drift import Drift, Recent
 from evofsm.core.dynamics.dynamics import Dynamics
 from evofsm.core.dynamics.following import LARGEST
+from evofsm.core.dynamics.observer import GAINS, untried
 from evofsm.core.dynamics.regression import Sums
 from evofsm.core.dynamics.undoing import side_by_side
 from evofsm.files import ranges, storage
@@ -40,7 +41,11 @@ _CONSEQUENTS: dict[str, _Shape] = {
     "sides": ("s", 4),
     "mean": ("m",),
     "inverse": ("m",),
+    "close": ("m",),
+    "gains": ("m",),
 }
+# Of those, what files have from version 9 on.
+_OBSERVER = ("close", "gains")
 _SUMS: dict[str, tuple[_Shape, ranges.Range]] = {
     "counts": ((2,), ranges.COUNT),
     "squares": (("p", "p"), _SOME),
@@ -67,7 +72,11 @@ _OWN: dict[str, tuple[_Shape, ranges.Range]] = {
 }
 _ARRAYS: dict[str, tuple[_Shape, ranges.Range]] = {
     **{f"sum_{name}": told for name, told in _SUMS.items()},
-    **{_KNOWN + name: (shape, _EXTREME) for name, shape in _CONSEQUENTS.items()},
+    **{
+        _KNOWN + name: (shape, _EXTREME)
+        for name, shape in _CONSEQUENTS.items()
+        if name not in _OBSERVER
+    },
     **_OWN,
     "used": (("a", 2), ranges.COUNT),
     "failures": (("failures", "m"), _OBSERVED),
@@ -96,6 +105,10 @@ _SINCE: dict[int, dict[str, tuple[_Shape, ranges.Range]]] = {
         "stretch_is_of_then": (("stretches",), ranges.FLAG),
     },
     8: {"doubt_of_lags": ((1,), _NOT_NEGATIVE)},
+    9: {
+        **{_KNOWN + name: (_CONSEQUENTS[name], _NOT_NEGATIVE) for name in _OBSERVER},
+        "missed": (("m", len(GAINS)), _NOT_NEGATIVE),
+    },
 }
 _MEMBERS = {
     name: ranges.Member(*told, since=version)
@@ -105,9 +118,13 @@ _MEMBERS = {
 
 
 def _upgrade(version: int, settings: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> None:
-    """No model was corrected before version 7."""
+    """No model was corrected before version 7, and no observation before version 9."""
+    m = len(arrays["origin"])
     arrays.setdefault("drifts", np.zeros((0, 3)))
-    arrays.setdefault("stretch_unforeseen", np.zeros((0, len(arrays["origin"]))))
+    arrays.setdefault("stretch_unforeseen", np.zeros((0, m)))
+    if version < 9:
+        arrays |= {"missed": untried(m), f"{_KNOWN}gains": np.ones(m)}
+        arrays[f"{_KNOWN}close"] = 1e-9 / arrays[f"{_KNOWN}inverse"]
 
 
 _KIND = ranges.register(
@@ -190,6 +207,7 @@ def _arrays(dynamics: Dynamics) -> dict[str, NDArray[np.float64]]:
         **{f"sum_{name}": array for name, array in dynamics.sums._asdict().items()},
         **{_KNOWN + name: getattr(dynamics.consequents, name) for name in _CONSEQUENTS},
         **{name: getattr(dynamics, name) for name in _OWN},
+        "missed": dynamics.missed,
         **{f"recent_{name}": array for name, array in dynamics.recent._asdict().items()},
         "drifts": np.array(dynamics.drifts, np.float64).reshape(-1, 3),
         "used": dynamics.used,
@@ -247,6 +265,7 @@ def _restore(dynamics: Dynamics, arrays: dict[str, NDArray[Any]]) -> None:
     dynamics.used = arrays["used"]
     dynamics.doubt_of_lags = float(arrays["doubt_of_lags"][0])
     known: dict[str, Any] = {name: arrays[_KNOWN + name] for name in _CONSEQUENTS}
+    dynamics.missed = arrays["missed"]
     dynamics.drifts = [Drift(*row) for row in arrays["drifts"].astype(int).tolist()]
     known |= {"origin": arrays["origin"], "anew": dynamics.anew, "choices": dynamics.choices}
     dynamics.consequents = Consequents(**known)

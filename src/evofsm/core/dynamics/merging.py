@@ -145,7 +145,10 @@ def _add_up(merged: Dynamics, parts: Sequence[Dynamics]) -> None:
         )
     )
     merged.used = np.sum([part.used for part in parts], axis=0)
-    merged.doubt_of_lags = float(np.average([part.doubt_of_lags for part in parts], weights=learnt))
+    weights = learnt if learnt.any() else observed
+    for name in ("doubt_of_lags", "missed"):
+        of_parts = [getattr(part, name) for part in parts]
+        setattr(merged, name, np.average(of_parts, axis=0, weights=weights))
     merged.quiet = min(part.quiet for part in parts)
     merged.reached = np.stack(
         [

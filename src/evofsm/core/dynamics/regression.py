@@ -221,7 +221,7 @@ def learn_transition(
     if sums.scale[0] > 0.0:
         worst = 0.0
         for j in range(m):
-            y, x, close = z[j] + move[j], observations[2, j], 1e-9 / known.inverse[j]
+            y, x, close = z[j] + move[j], observations[2, j], known.close[j]
             low = y < known.lowest[j] and x <= known.lowest[j] + close
             if low or (y > known.highest[j] and x >= known.highest[j] - close):
                 weight = 0.0  # it cannot be known how far it would have gone

@@ -17,6 +17,7 @@ PARTS: dict[str, str] = {
     "jumps": "jumps are learnt like all else",
     "carried": "no residual is carried on where a variable saturates",
     "drift": "the model is not corrected where the system has changed",
+    "observer": "variables are taken as they are seen, however noisy sensors are",
     "margin": "no margin",
     "backups": "constant backups alone",
     "breaks": "it is not noticed where disturbances get worse",

@@ -123,9 +123,8 @@ class LearntRisk:
     """
 
     # Of the present episode.
-    _z: _Floats | None  # latest observation, with what was missing filled in
-    _change: _Floats
-    _action: _Floats
+    _at: Here | None  # where one was last, by all that was seen
+    _action: _Floats  # what was done there
     _certified: bool  # whether at the decision before some backup survived all
     _was_certified: bool  # and at any before
     _holds: bool  # and at this one
@@ -158,6 +157,8 @@ class LearntRisk:
         self.without = frozenset(without)
         self.labels = Labels(names=tuple(names), units=tuple(units), dt=self.dt)
         self.machine: EvolvingFSM | None = None
+        #: What is done without a usable proposal, and then revised like any.
+        self.fallback = Fallback(0.0, "doing nothing")
         #: Whether it may try actions to learn what they do.
         self.learning = True
         #: What has to be left of the distance to failure [ordinary changes]; for each of them
@@ -198,6 +199,12 @@ class LearntRisk:
                     "do not belong together"
                 )
         self.machine = machine
+        if dynamics.choices:
+            self.fallback = Fallback(0.0, "the first action")
+        else:
+            middle = dynamics.decode(np.zeros(dynamics.size))
+            action = middle if len(middle) > 1 else float(middle[0])
+            self.fallback = Fallback(action, "the middle of the range")
 
     @property
     def dynamics(self) -> Dynamics:
@@ -205,17 +212,6 @@ class LearntRisk:
         if self.machine is None or self.machine.dynamics is None:
             raise ValueError("the judge was not told which machine to ask: bind it")
         return self.machine.dynamics
-
-    @property
-    def fallback(self) -> Fallback:
-        """What is done without a usable proposal, and then revised like any."""
-        if self.machine is None:
-            return Fallback(0.0, "doing nothing")
-        dynamics = self.dynamics
-        if dynamics.choices:
-            return Fallback(0.0, "the first action")
-        middle = dynamics.decode(np.zeros(dynamics.size))
-        return Fallback(middle if len(middle) > 1 else float(middle[0]), "the middle of the range")
 
     def trial(self) -> Trial | None:
         """None: what it has to try, its search tries."""
@@ -260,7 +256,10 @@ class LearntRisk:
         fails = [(called(j), sign < 0.0, at) for j, sign, at, _ in dynamics.consequents.sides]
         latest = {one.variable: one.since + 1 for one in dynamics.drifts}
         drifts = [(called(j), since) for j, since in latest.items()]
-        return words.experience(fails, self.remembered, self.margin, drifts, self.breaks.worse + 1)
+        noisy = [called(j) for j in np.flatnonzero(dynamics.consequents.gains < 1.0)]
+        return words.experience(
+            fails, self.remembered, self.margin, drifts, self.breaks.worse + 1, noisy
+        )
 
     def search(
         self, situation: Situation, wanted: Any, *, tolerance: float, revising: bool
@@ -281,7 +280,7 @@ class LearntRisk:
         -------
         Search
         """
-        dynamics, here = self.dynamics, self._here(situation)
+        dynamics, here = self.dynamics, self._here(situation.observation)
         one = np.array([wanted])
         if self.disturbances is None or self.backups is None:
             return Search(one, _unjudged(1), 0, words.NOTHING_LEARNT)
@@ -291,9 +290,10 @@ class LearntRisk:
         if not len(known.sides):
             return Search(one, _unjudged(1), 0, words.NO_FAILURE)
         proposal, best = dynamics.encode(wanted), np.empty(dynamics.size)
-        allowed = self._allowed(tolerance)
+        remembered, harder = self.remembered, self.harder
+        allowed = self._allowed(tolerance, remembered)
         asked = self._ranks[:_ASKED]
-        world = (self.backups.policies, asked, self.disturbances, self.harder)
+        world = (self.backups.policies, asked, self.disturbances, harder)
         how, backup, left = search(known, here, proposal, *world, self.margin, allowed, best)
         if backup != asked[0]:  # what passed now is asked first the next time
             self._ranks = np.array([backup, *(q for q in self._ranks if q != backup)])
@@ -318,15 +318,15 @@ class LearntRisk:
         )
         self._took = max(self._took, took)
         if how == KEPT:
-            return Search(one, judged, 0, words.kept(then, self.remembered, left, allowed))
+            return Search(one, judged, 0, words.kept(then, remembered, left, allowed))
         action = np.reshape(dynamics.decode(best), np.shape(wanted))
         if tried is not None:
             instead = words.tried()
         elif how == CHANGED:
-            instead = words.changed(then, self.remembered, self.margin, allowed)
+            instead = words.changed(then, remembered, self.margin, allowed)
         else:
             instead = words.lasting(then)
-        why = words.refused(self._lost, self.remembered, self.margin, self.harder, allowed)
+        why = words.refused(self._lost, remembered, self.margin, harder, allowed)
         return Search(np.array((one[0], action)), judged, 1, f"{why}; {instead}")
 
     def judge(self, situation: Situation, actions: ArrayLike) -> Judgement:
@@ -342,7 +342,7 @@ class LearntRisk:
         Judgement
             NaN as long as nothing can be said.
         """
-        given, here = np.asarray(actions, np.float64), self._here(situation)
+        given, here = np.asarray(actions, np.float64), self._here(situation.observation)
         if here is None or self.disturbances is None or not self._fails:
             return _unjudged(len(given))
         inner = np.array([self.dynamics.encode(one) for one in given])
@@ -408,7 +408,7 @@ class LearntRisk:
             lost=count,
             remembered=self.remembered.number,
             margin=left,
-            risk=self._risk(lost),
+            risk=self._risk(lost, self.exposure),
             per_hour=(expected[0] / hours, expected[1] / hours, expected[2] / hours),
         )
 
@@ -446,10 +446,9 @@ class LearntRisk:
         known, policies = self.dynamics.consequents, self.backups.policies
         outcomes(known, here, actions, policies, ranks, self.disturbances, to)
 
-    @property
-    def _soon(self) -> float:
+    def _soon(self, exposure: float) -> float:
         """The horizon, as a share of the time in which all that is remembered was seen."""
-        return self.horizon * self.dt / max(self.exposure, 1e-300)
+        return self.horizon * self.dt / max(exposure, 1e-300)
 
     def _expected(self, lost: int) -> tuple[float, float, float]:
         """Disturbances that are lost, of all in the time observed, with their 90 % interval.
@@ -460,51 +459,48 @@ class LearntRisk:
         low, high = poisson_bounds(lost)
         return float(lost), low, high if lost < self.dynamics.n_stretches else math.inf
 
-    def _risk(self, lost: float) -> tuple[float, float, float]:
+    def _risk(self, lost: float, exposure: float) -> tuple[float, float, float]:
         """Probability, with its 90 % interval, that within the horizon something begins of those.
 
         Certain where nothing helps by the model, of which nobody knows how good it is.
         """
         if math.isinf(lost):
             return 1.0, 0.0, 1.0
-        soon = self._soon
-        most_likely, low, high = (_within(each * soon) for each in self._expected(int(lost)))
-        return most_likely, low, high
+        soon, (expected, low, high) = self._soon(exposure), self._expected(int(lost))
+        return _within(expected * soon), _within(low * soon), _within(high * soon)
 
     def _judgement(self, lost: _Floats, left: _Floats, situation: Situation) -> Judgement:
-        risk, low, high = np.array([self._risk(each) for each in lost.tolist()]).T.copy()
-        seen, machine = math.nan, self.machine
-        if (
-            machine is not None
-            and situation.state is not None
-            and situation.state < machine.n_states
-        ):
-            seen = float(machine.visits[situation.state]) * self.dt
-        return Judgement(risk, low, high, left, float(len(self.dynamics.stretches)), seen)
+        remembered, risks = self.remembered, np.empty((3, len(lost)))
+        for k, each in enumerate(lost.tolist()):
+            risks[:, k] = self._risk(each, remembered.seconds)
+        seen, machine, state = math.nan, self.machine, situation.state
+        if machine is not None and state is not None and state < machine.n_states:
+            seen = float(machine.visits[state]) * self.dt
+        risk, low, high = risks
+        return Judgement(risk, low, high, left, float(remembered.number), seen)
 
-    def _allowed(self, tolerance: float) -> int:
+    def _allowed(self, tolerance: float, remembered: Remembered) -> int:
         """How many of the disturbances need not be survived.
 
         No larger share of them than the tolerance, and no more than keep the upper bound of the
         risk within it.
         """
-        soon = self._soon
-        most, allowed = tolerance * len(self.dynamics.stretches), 0
+        soon, most, allowed = self._soon(remembered.seconds), tolerance * remembered.number, 0
         while allowed + 1 <= most and _within(poisson_bounds(allowed + 1)[1] * soon) <= tolerance:
             allowed += 1
         return allowed
 
-    def _here(self, situation: Situation) -> Here | None:
-        """Where one is; what was not observed is taken to have gone on as before."""
-        z = situation.observation
+    def _here(self, z: _Floats) -> Here | None:
+        """Where one is, if that is seen; what was not is taken to have gone on as before."""
+        at = self._at
         if has_gaps(z):
-            if self._z is None:
+            if at is None:
                 return None
-            z = np.where(np.isnan(z), self._z + self._change, z)
-        change = np.zeros(len(z)) if self._z is None else z - self._z
-        return Here(
-            z, change, self._action if self._z is not None else np.zeros(self.dynamics.size)
-        )
+            z = np.where(np.isnan(z), at.z + at.change, z)
+        if at is None:
+            return Here(z, np.zeros(len(z)), np.zeros(self.dynamics.size))
+        z = self.dynamics.corrected(at, self._action, z)
+        return Here(z, z - at.z, self._action)
 
     def _untried(self, best: _Floats) -> _Floats | None:
         """An action whose effect is hardly known, if there is one."""
@@ -562,14 +558,9 @@ class LearntRisk:
 
     def follow(self, observation: ArrayLike, action: Any) -> None:
         """Keep up with what happens, without learning from it."""
-        z = np.array(observation, np.float64)
-        absent = np.isnan(z)
-        if absent.any():
-            if self._z is None:
-                return
-            z = np.where(absent, self._z + self._change, z)
-        self._change = np.zeros(len(z)) if self._z is None else z - self._z
-        self._z, self._action = z, self.dynamics.encode(action)
+        here = self._here(np.array(observation, np.float64))
+        if here is not None:
+            self._at, self._action = here, self.dynamics.encode(action)
 
     def start_episode(self, *, learn: bool = True) -> None:
         """What comes is not a consequence of what was; the episode before is learnt from."""
@@ -582,8 +573,7 @@ class LearntRisk:
         self.start_episode()
 
     def _forget(self) -> None:
-        self._z = None
-        self._change = self._action = np.zeros(0)
+        self._at, self._action = None, np.zeros(0)
         self._certified = self._was_certified = self._holds = self._tight = False
         self._broke = False
         self._dead_end = False

@@ -132,6 +132,7 @@ def experience(
     margin: float,
     drifts: Sequence[tuple[str, int]] = (),
     worse: int = 0,
+    noisy: Sequence[str] = (),
 ) -> str:
     """What was learnt so far.
 
@@ -145,9 +146,13 @@ def experience(
         Variables that do not move any more as they did, and since which episode, from 1.
     worse : int
         Since which episode, from 1, disturbances are worse than those of before; 0: since none.
+    noisy : sequence of str
+        Variables whose sensors are noisy.
 
     Examples
     --------
+    >>> experience([], Remembered(0, 12.0), 3.0, noisy=["gap", "speed"])
+    'no failure is known yet, so nothing is refused; sensors are noisy: gap, speed'
     >>> experience([], Remembered(0, 12.0), 3.0, [("speed", 101)])
     'no failure is known yet, so nothing is refused; since episode 101 speed moves otherwise'
     >>> experience([("gap", True, 0.05)], Remembered(10, 305.0), 0.4)
@@ -157,6 +162,8 @@ ordinary changes'
     since = "".join(f"; since episode {first} {name} moves otherwise" for name, first in drifts)
     if worse:
         since += f"; since episode {worse} disturbances are worse than those of before"
+    if noisy:
+        since += f"; sensors are noisy: {', '.join(noisy)}"
     if not fails:
         return NO_FAILURE + since
     where = " or ".join(
