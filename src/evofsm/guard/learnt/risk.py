@@ -256,7 +256,7 @@ class LearntRisk:
         fails = [(called(j), sign < 0.0, at) for j, sign, at, _ in dynamics.consequents.sides]
         latest = {one.variable: one.since + 1 for one in dynamics.drifts}
         drifts = [(called(j), since) for j, since in latest.items()]
-        noisy = [called(j) for j in np.flatnonzero(dynamics.consequents.gains < 1.0)]
+        noisy = [called(j) for j, gain in enumerate(dynamics.consequents.gains) if gain < 1.0]
         return words.experience(
             fails, self.remembered, self.margin, drifts, self.breaks.worse + 1, noisy
         )
