@@ -22,6 +22,7 @@ class Point:
 
     told: dict[str, Any] = field(default_factory=lambda: {"low": -1.0, "high": 1.0})
     places: int = 1
+    noise: float = 0.0  #: of the sensors
 
     def guard(self, **others):
         """One that knows nothing yet."""
@@ -41,8 +42,13 @@ class Point:
         rng = np.random.default_rng(episode)
         place, speed = rng.uniform(-0.3, 0.3, self.places), np.zeros(self.places)
         wind = 0.0
-        for _ in range(steps):
+
+        def seen():
             z = np.concatenate([place, speed])
+            return z + self.noise * rng.normal(size=z.shape) if self.noise else z
+
+        for _ in range(steps):
+            z = seen()
             executed = yield z, self.propose(rng), False
             push = _PUSHES[executed] if "n_actions" in self.told else np.atleast_1d(executed)
             wind = 0.9 * wind + 0.01 * rng.normal()
@@ -50,7 +56,7 @@ class Point:
             place = place + speed
             if place[0] >= _WALL:
                 break
-        yield np.concatenate([place, speed]), None, bool(place[0] >= _WALL)
+        yield seen(), None, bool(place[0] >= _WALL)
 
     def play(self, guard, episode, steps=60, seen=lambda k, z: z):
         """Revisions of an episode, and whether it failed."""
@@ -87,6 +93,12 @@ def point(request):
 def points():
     """All of them, by name."""
     return POINTS
+
+
+@pytest.fixture(scope="session")
+def noisy():
+    """One whose sensors are noisy, which takes some episodes to find out."""
+    return Point(noise=0.2)
 
 
 @pytest.fixture(scope="session")

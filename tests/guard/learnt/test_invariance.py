@@ -119,6 +119,21 @@ def test_points_are_kept_from_the_wall_however_they_are_written(point, seed, exa
     assert compare(told, walk, make, otherwise, 4, exact) > 0.05
 
 
+@pytest.mark.parametrize("seed", [0, pytest.param(2, marks=pytest.mark.slow)])
+def test_noise_is_the_same_however_it_is_written(noisy, seed):
+    otherwise, made = Otherwise.drawn(noisy.told, 2, np.random.default_rng(seed)), []
+
+    def make(told):
+        made.append(type(noisy)(told).guard(seed=seed))
+        return made[-1]
+
+    def walk(episode):
+        return noisy.walk(1000 * seed + episode, steps=40)
+
+    assert compare(noisy.told, walk, make, otherwise, 20) > 0.05
+    assert all(guard.machine.dynamics.is_noisy for guard in made)
+
+
 # Where two backups are all but equal, rounding may decide, and parts the two ways of writing for
 # good: that happens in the pendulum's fourth episode with seed 0, which is left out.
 @pytest.mark.slow

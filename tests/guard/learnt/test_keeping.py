@@ -27,6 +27,18 @@ def test_saved_and_loaded_it_goes_on_learning_bit_for_bit(point, exactly, conten
     assert exactly(point.play(again, 50)[0]) == exactly(point.play(guard, 50)[0])
 
 
+def test_with_noisy_sensors_it_goes_on_bit_for_bit_too(noisy, exactly, content):
+    guard, file = noisy.taught(20), BytesIO()
+    assert guard.machine.dynamics.is_noisy
+    guard.save(file)
+    again = Guard.load(BytesIO(file.getvalue()))
+    assert exactly(noisy.play(again, 40)[0]) == exactly(noisy.play(guard, 40)[0])
+    assert content(again) == content(guard)
+    again.freeze()
+    guard.freeze()
+    assert exactly(noisy.play(again, 50)[0]) == exactly(noisy.play(guard, 50)[0])
+
+
 def test_a_file_that_contradicts_itself_is_refused(points):
     file = BytesIO()
     points["box"].taught(3).judge.save(file)
