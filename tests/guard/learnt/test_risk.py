@@ -401,3 +401,10 @@ def test_where_certificates_break_in_every_episode_disturbances_are_harder_again
     assert "since episode 5 disturbances are worse" in judge.told_by_experience
     assert judge.harder == 1.44
     assert judge.margin > 2.0
+
+
+def test_where_sensors_are_noisy_a_margin_stays(noisy):
+    guard = noisy.taught(20)
+    assert guard.machine.dynamics.is_noisy
+    assert guard.judge.margin >= 1.5
+    assert "sensors are noisy: variable" in guard.judge.told_by_experience

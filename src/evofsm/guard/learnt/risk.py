@@ -49,6 +49,8 @@ _ASKED, _TRIED_ON = 3, 5
 # The margin [ordinary changes]: at first, at most, what is left of it an episode later, and what a
 # broken certificate adds, which is also the least, for so many that may be.
 _MARGIN, _LARGEST, _FADES, _ADDED, _RATE = 3.0, 8.0, 0.9, 0.25, 0.001
+# The least margin where sensors are noisy: one is not quite where one seems to be.
+_NOISY = 1.5
 # Disturbances are taken to be harder than they were by so many over the number of episodes; by so
 # much at most after a change: a change half as large again as any there was has no sequel.
 _CAUTION, _AGAIN = 4.0, 0.44
@@ -537,10 +539,16 @@ class LearntRisk:
             broken = self._certified and not self._holds
             self.broken += broken
             self._broke |= broken
-            self.margin = min(_LARGEST, max(_ADDED, self.margin + _ADDED * (broken - _RATE)))
+            self.margin = min(
+                _LARGEST, max(self._least_margin, self.margin + _ADDED * (broken - _RATE))
+            )
         self._certified = self._holds
         self._was_certified |= self._holds
         self._take_in(observation, action)
+
+    @property
+    def _least_margin(self) -> float:
+        return _NOISY if self.dynamics.is_noisy else _ADDED
 
     def watch(self, observation: ArrayLike, action: Any, belief: ArrayLike) -> None:
         """Take in what someone else does: then nothing was certified."""
@@ -587,7 +595,7 @@ class LearntRisk:
         dynamics = self.dynamics
         self.n_studied = dynamics.n_episodes
         if "margin" not in self.without:
-            self.margin = max(_ADDED, _FADES * self.margin)
+            self.margin = max(self._least_margin, _FADES * self.margin)
         moved = any(one.noticed == dynamics.n_episodes - 1 for one in dynamics.drifts)
         if moved or self._is_worse():
             self._begin_anew()
