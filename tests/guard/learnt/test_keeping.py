@@ -11,12 +11,8 @@ from evofsm.guard.learnt.breaks import Breaks
 from evofsm.guard.learnt.risk import LearntRisk
 
 
-@pytest.mark.parametrize(
-    "episodes", [0, *(pytest.param(k, marks=pytest.mark.slow) for k in (1, 3))]
-)
-def test_saved_and_loaded_it_goes_on_learning_bit_for_bit(point, exactly, content, episodes):
-    guard, file = point.taught(episodes), BytesIO()
-    guard.save(file)
+def assert_goes_on_alike(point, guard, exactly, content):
+    guard.save(file := BytesIO())
     again = Guard.load(BytesIO(file.getvalue()))
     assert content(again) == content(guard)
     for episode in range(40, 43):
@@ -27,16 +23,17 @@ def test_saved_and_loaded_it_goes_on_learning_bit_for_bit(point, exactly, conten
     assert exactly(point.play(again, 50)[0]) == exactly(point.play(guard, 50)[0])
 
 
+@pytest.mark.parametrize(
+    "episodes", [0, *(pytest.param(k, marks=pytest.mark.slow) for k in (1, 3))]
+)
+def test_saved_and_loaded_it_goes_on_learning_bit_for_bit(point, exactly, content, episodes):
+    assert_goes_on_alike(point, point.taught(episodes), exactly, content)
+
+
 def test_with_noisy_sensors_it_goes_on_bit_for_bit_too(noisy, exactly, content):
-    guard, file = noisy.taught(20), BytesIO()
+    guard = noisy.taught(20)
     assert guard.machine.dynamics.is_noisy
-    guard.save(file)
-    again = Guard.load(BytesIO(file.getvalue()))
-    assert exactly(noisy.play(again, 40)[0]) == exactly(noisy.play(guard, 40)[0])
-    assert content(again) == content(guard)
-    again.freeze()
-    guard.freeze()
-    assert exactly(noisy.play(again, 50)[0]) == exactly(noisy.play(guard, 50)[0])
+    assert_goes_on_alike(noisy, guard, exactly, content)
 
 
 def test_a_file_that_contradicts_itself_is_refused(points):

@@ -410,7 +410,7 @@ class LearntRisk:
             lost=count,
             remembered=self.remembered.number,
             margin=left,
-            risk=self._risk(lost, self.exposure),
+            risk=self._risk(lost, self._soon(self.exposure)),
             per_hour=(expected[0] / hours, expected[1] / hours, expected[2] / hours),
         )
 
@@ -461,20 +461,21 @@ class LearntRisk:
         low, high = poisson_bounds(lost)
         return float(lost), low, high if lost < self.dynamics.n_stretches else math.inf
 
-    def _risk(self, lost: float, exposure: float) -> tuple[float, float, float]:
+    def _risk(self, lost: float, soon: float) -> tuple[float, float, float]:
         """Probability, with its 90 % interval, that within the horizon something begins of those.
 
         Certain where nothing helps by the model, of which nobody knows how good it is.
         """
         if math.isinf(lost):
             return 1.0, 0.0, 1.0
-        soon, (expected, low, high) = self._soon(exposure), self._expected(int(lost))
+        expected, low, high = self._expected(int(lost))
         return _within(expected * soon), _within(low * soon), _within(high * soon)
 
     def _judgement(self, lost: _Floats, left: _Floats, situation: Situation) -> Judgement:
         remembered, risks = self.remembered, np.empty((3, len(lost)))
+        soon = self._soon(remembered.seconds)
         for k, each in enumerate(lost.tolist()):
-            risks[:, k] = self._risk(each, remembered.seconds)
+            risks[:, k] = self._risk(each, soon)
         seen, machine, state = math.nan, self.machine, situation.state
         if machine is not None and state is not None and state < machine.n_states:
             seen = float(machine.visits[state]) * self.dt
