@@ -15,7 +15,7 @@ watch: .venv/installed          ## look on while it drives case 1 of the paper, 
 	@$(BIN)/evofsm watch paper --case 1 --world sumo
 
 closed-loop: .venv/installed    ## does the reviser prevent collisions, at what cost? some 15 minutes
-	@$(BIN)/evofsm bench closed-loop --out results/closed-loop
+	@$(BIN)/python -m studies closed-loop --out results/closed-loop
 
 PYTEST = $(BIN)/python -m pytest -q -n auto --maxprocesses 4 --dist worksteal --durations=10
 test: .venv/installed           ## the quick tests, doctests included; a few minutes
@@ -36,7 +36,7 @@ bench: .venv/installed          ## how fast it is, as ratios against named refer
 	@$(BIN)/python benchmarks/decision.py
 
 evidence: .venv/installed       ## all studies in short, on one page; DATA=folder adds real drives
-	@$(BIN)/evofsm evidence --out results/evidence $(if $(DATA),--data $(DATA))
+	@$(BIN)/python -m studies evidence --out results/evidence $(if $(DATA),--data $(DATA))
 
 docs: .venv/installed           ## the documentation's site: results/docs/index.html
 	@$(BIN)/python -m sphinx -W --keep-going -n -q docs results/docs
@@ -55,7 +55,7 @@ lowest: .venv/installed         ## test the core with the lowest versions that a
 	@$(BIN)/uv venv --quiet --allow-existing --python $(BIN)/python .venv-lowest
 	@$(BIN)/uv pip install --quiet --python $(LOWEST) --resolution lowest-direct \
 	    --editable '.[tables,study]' 'pytest>=8.3' 'hypothesis>=6.100'
-	@$(LOWEST) -m pytest -q -p no:cacheprovider tests/core tests/fleet/test_batch.py
+	@$(LOWEST) -m pytest -q -p no:cacheprovider tests/fsm tests/fleet/test_batch.py
 supply: .venv/installed         ## known holes in what is pinned, and a bill of materials: sbom.json
 	@$(BIN)/uv tool run pip-audit --disable-pip --require-hashes --requirement requirements.lock
 	@$(BIN)/uv tool run --from cyclonedx-bom cyclonedx-py requirements requirements.lock -o sbom.json

@@ -91,7 +91,7 @@ def write_log(path: Path, rows: int) -> None:
     import polars
 
     from evofsm.driving.worlds.kinematic import KinematicWorld
-    from evofsm.evidence.paper.settings import Settings
+    from evofsm.paper.settings import Settings
 
     settings = Settings.load()
     world = KinematicWorld()
@@ -129,9 +129,9 @@ def _peak() -> float:
 
 def learn(path: str) -> None:
     """What the command does with a log."""
-    from evofsm.app.learning import learn_traces
-    from evofsm.core.actions import IntervalActions
-    from evofsm.core.machine import EvolvingFSM
+    from evofsm.cli.learning import learn_traces
+    from evofsm.fsm.actions import IntervalActions
+    from evofsm.fsm.machine import EvolvingFSM
     from evofsm.io.traces import read_traces
 
     actions = IntervalActions(low=-2.5, high=2.5, width=0.3, outside="clip")

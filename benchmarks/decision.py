@@ -15,9 +15,9 @@ import time
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.core.states.novelty import Novelty
 from evofsm.driving.cars import drive, guard_for_family, learnt_by
 from evofsm.driving.families.family import Family, load_family
+from evofsm.fsm.states.novelty import Novelty
 from evofsm.guard.guard import Guard
 
 _STATES = 200

@@ -22,10 +22,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-from evofsm.app.monitor.decider import EPISODE, Answer, Decider
-from evofsm.app.monitor.defaults import guard_of_monitor
-from evofsm.app.monitor.schema import Row
-from evofsm.app.monitor.state import State
+from evofsm.cli.monitor.decider import EPISODE, Answer, Decider
+from evofsm.cli.monitor.defaults import guard_of_monitor
+from evofsm.cli.monitor.schema import Row
+from evofsm.cli.monitor.state import State
 from evofsm.guard import Guard
 from monitor_rows import JUNK, line, traffic
 

@@ -19,10 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 import evofsm
-from evofsm.core.machine import EvolvingFSM
-from evofsm.core.memory import leaves
-from evofsm.core.observations import Missing
-from evofsm.core.states.novelty import Novelty
+from evofsm.fsm.machine import EvolvingFSM
+from evofsm.fsm.memory import leaves
+from evofsm.fsm.observations import Missing
+from evofsm.fsm.states.novelty import Novelty
 
 _PACKAGE = str(Path(evofsm.__file__).parent)
 _ACTIONS, _VARIABLES = 3, 2

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from evofsm.core.machine import EvolvingFSM
+from evofsm.fsm.machine import EvolvingFSM
 from reference import NumpyFSM
 from streams import (
     LATTICE_RADIUS,

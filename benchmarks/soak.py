@@ -19,10 +19,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.core.machine import EvolvingFSM
-from evofsm.core.states.novelty import Novelty
-from evofsm.core.states.paper import Paper
-from evofsm.core.states.rule import StateRule
+from evofsm.fsm.machine import EvolvingFSM
+from evofsm.fsm.states.novelty import Novelty
+from evofsm.fsm.states.paper import Paper
+from evofsm.fsm.states.rule import StateRule
 from streams import paper_stream
 
 # 1e9 steps are 116 days of decisions every 10 ms, or eight years of decisions every 0.25 s.

@@ -8,9 +8,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.core.states.novelty import Novelty
 from evofsm.driving.worlds.kinematic import KinematicWorld
-from evofsm.evidence.paper.settings import Settings
+from evofsm.fsm.states.novelty import Novelty
+from evofsm.paper.settings import Settings
 
 # One state for each point of a lattice of edge 1: observations scatter by less than half the
 # radius around a point, and points lie farther apart than the radius.

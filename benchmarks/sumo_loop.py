@@ -22,12 +22,12 @@ from typing import Any
 import numpy as np
 
 from decision import teach
-from evofsm.core.states.novelty import Novelty
 from evofsm.driving.cars import drive, guard_for_family, learnt_by
 from evofsm.driving.families.family import Draw, Family, load_family
 from evofsm.driving.framework import Drive
 from evofsm.driving.worlds.road import Episode
 from evofsm.driving.worlds.sumo import SumoWorld
+from evofsm.fsm.states.novelty import Novelty
 from evofsm.guard.guard import Guard
 
 _PROMISED = 1.25

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.core.machine import EvolvingFSM
+from evofsm.fsm.machine import EvolvingFSM
 from streams import LATTICE_RULE, LATTICES, Stream, lattice_stream
 from turns import Result, Work, compare, timed
 

@@ -31,17 +31,17 @@ import numpy as np
 
 import one_machine
 import torture_audit
-from evofsm.app.driving import Setup, drive_family, make_guard
-from evofsm.app.learning import learn_traces
-from evofsm.core.actions import IntervalActions
-from evofsm.core.machine import EvolvingFSM
-from evofsm.core.model import FSMModel
+from evofsm.cli.driving import Setup, drive_family, make_guard
+from evofsm.cli.learning import learn_traces
 from evofsm.driving.families.family import load_family
 from evofsm.driving.risk.latent import LatentRisk
 from evofsm.driving.worlds.kinematic import KinematicWorld
-from evofsm.files import storage
-from evofsm.files.checkpoint import Checkpoint, fingerprints
+from evofsm.fsm.actions import IntervalActions
+from evofsm.fsm.machine import EvolvingFSM
+from evofsm.fsm.model import FSMModel
 from evofsm.io.traces import read_traces
+from evofsm.store import storage
+from evofsm.store.checkpoint import Checkpoint, fingerprints
 
 #: What must not happen, in the order in which it is printed.
 WRONG = (

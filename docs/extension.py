@@ -286,7 +286,7 @@ def _list_methods(app: Sphinx, domain: str, kind: str, content: nodes.Element) -
     Every page carries the contents of all: with every method of every class they would be slow.
     """
     for signature in content.parent.findall(addnodes.desc_signature):
-        if signature.get("module") not in {"evofsm.core.machine", "evofsm.core.model"}:
+        if signature.get("module") not in {"evofsm.fsm.machine", "evofsm.fsm.model"}:
             signature["_toc_name"] = ""
 
 

@@ -7,7 +7,7 @@ import hypothesis
 import numpy as np
 import pytest
 
-from evofsm.core.machine import EvolvingFSM
+from evofsm.fsm.machine import EvolvingFSM
 
 # The same examples in every run, so that a red build is red again on the next machine.
 hypothesis.settings.register_profile("evofsm", deadline=None, derandomize=True, database=None)
@@ -51,7 +51,7 @@ def throttle():
 @pytest.fixture(scope="session")
 def compiled():
     """All that a watched run needs is compiled, for tests that wait for some seconds only."""
-    from evofsm.app.watch.session import Session, Watching, learn_first, watched_guard
+    from evofsm.cli.watch.session import Session, Watching, learn_first, watched_guard
     from evofsm.driving.families.family import load_family
     from evofsm.driving.worlds.kinematic import KinematicWorld
 

@@ -9,7 +9,7 @@ import pytest
 import clusterers
 import speed
 import tolerance
-from evofsm.core.machine import EvolvingFSM
+from evofsm.fsm.machine import EvolvingFSM
 from fleets import each_step, fleet, in_blocks
 from reference import NumpyFSM
 from single import pair

@@ -247,8 +247,8 @@ def test_formulas_are_there_without_a_script(site):
 def test_a_line_of_code_is_where_its_link_leads(site):
     folder, pages = site
     links = pages[folder / "equations" / "states.html"].links
-    found = {int(one.rpartition("L-")[2]) for one in links if "core/states/paper.html#" in one}
-    source = (ROOT / "src/evofsm/core/states/paper.py").read_text().splitlines()
+    found = {int(one.rpartition("L-")[2]) for one in links if "fsm/states/paper.html#" in one}
+    source = (ROOT / "src/evofsm/fsm/states/paper.py").read_text().splitlines()
     there = [source[line - 1].strip().partition("(")[0] for line in sorted(found)]
     assert there == ["def judge", "return MOVED if exceeds"]
 

@@ -7,14 +7,15 @@ from pathlib import Path
 import pytest
 
 PAGE = Path(__file__).parents[1] / "docs" / "glossary.md"
-NAMES = re.findall(r"`(evofsm[\w.]+)` \|$", PAGE.read_text("utf-8"), re.MULTILINE)
+NAMES = re.findall(r"`((?:evofsm|studies)[\w.]+)` \|$", PAGE.read_text("utf-8"), re.MULTILINE)
 
 
 def look_up(name):
     """What a dotted name stands for: modules first, then attributes."""
-    thing, parts = importlib.import_module("evofsm"), name.split(".")[1:]
+    root, *parts = name.split(".")
+    thing = importlib.import_module(root)
     for place, part in enumerate(parts):
-        module = ".".join(["evofsm", *parts[: place + 1]])
+        module = ".".join([root, *parts[: place + 1]])
         try:
             thing = getattr(thing, part)
         except AttributeError:

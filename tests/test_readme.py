@@ -54,9 +54,10 @@ def test_the_closed_loop_table_is_what_the_study_printed(page):
 
 
 def test_the_bold_row_is_rebuilt_in_ten_lines():
+    from studies.closed_loop.plan import Plan
+    from studies.closed_loop.study import _test_learner
+
     from evofsm.driving import load_family
-    from evofsm.evidence.closed_loop.plan import Plan
-    from evofsm.evidence.closed_loop.study import _test_learner
 
     blocks = re.findall(r"```pycon\n(.*?)```", README, re.DOTALL)
     (block,) = [block for block in blocks if "try_out(" in block]

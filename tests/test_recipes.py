@@ -1,5 +1,6 @@
 """The recipes of CONTRIBUTING.md, followed as they stand there."""
 
+import os
 import re
 import subprocess
 import sys
@@ -41,7 +42,10 @@ def write(title, folder):
 def python(folder, *arguments):
     """Run Python in a folder; returns what it printed."""
     command = [sys.executable, *map(str, arguments)]
-    result = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+    path = {**os.environ, "PYTHONPATH": str(ROOT)}  # the studies are no part of the package
+    result = subprocess.run(
+        command, cwd=folder, env=path, capture_output=True, text=True, check=False
+    )
     assert result.returncode == 0, result.stdout + result.stderr
     return result.stdout
 
@@ -85,11 +89,11 @@ def test_a_study(tmp_path):
     pytest.importorskip("matplotlib")
     write("Add a study", tmp_path)
     run = (
-        "from evofsm.evidence.studies import STUDIES\n"
+        "from studies.studies import STUDIES\n"
         "from plan import Plan\n"
         "STUDIES[Plan.id] = Plan\n"
-        "from evofsm.__main__ import application\n"
-        "application()(['bench', 'coin', '--short', '--throws', '5', '--out', 'out'])"
+        "from studies.__main__ import application\n"
+        "application()(['coin', '--short', '--throws', '5', '--out', 'out'])"
     )
     said = python(tmp_path, "-c", run)
     assert "of the throws are heads" in said

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from evofsm.app import cli
-from evofsm.evidence import commands
+from evofsm.cli import commands
+from evofsm.paper import Paper
 
 if TYPE_CHECKING:
     import typer
@@ -13,12 +13,12 @@ if TYPE_CHECKING:
 
 def main() -> None:
     """Run the command line."""
-    cli.main(application)
+    commands.main(application)
 
 
 def application() -> typer.Typer:
-    """All commands: those of the app, and those of the evidence."""
-    return cli.application(*commands())
+    """All commands: those of the app, and the paper's."""
+    return commands.application(Paper)
 
 
 if __name__ == "__main__":

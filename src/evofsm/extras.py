@@ -11,8 +11,6 @@ OF_COMMANDS = {
     "drive": ("study",),
     "watch": ("study", "watch"),
     "campaign": ("study",),
-    "bench": ("plot", "study"),
-    "evidence": ("dev", "plot", "study", "sumo"),
 }
 
 

@@ -12,10 +12,10 @@ from river import checks, datasets, preprocessing, stream
 from river.checks import common
 
 from evofsm.adapters.river import RiverClusterer
-from evofsm.core.crowding import WhenFull
-from evofsm.core.machine import EvolvingFSM
-from evofsm.core.observations import Missing
-from evofsm.core.states.novelty import Novelty
+from evofsm.fsm.crowding import WhenFull
+from evofsm.fsm.machine import EvolvingFSM
+from evofsm.fsm.observations import Missing
+from evofsm.fsm.states.novelty import Novelty
 
 # River's own list runs these only on models it has a data set for, and has none for clusterers.
 _ON_DATA = [

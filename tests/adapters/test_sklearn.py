@@ -12,10 +12,10 @@ from sklearn.preprocessing import StandardScaler
 from sklearn.utils.estimator_checks import parametrize_with_checks
 
 from evofsm.adapters.sklearn import EvolvingClusterer
-from evofsm.core.crowding import WhenFull
-from evofsm.core.machine import EvolvingFSM
-from evofsm.core.states.edges import Edges
-from evofsm.core.states.novelty import Novelty
+from evofsm.fsm.crowding import WhenFull
+from evofsm.fsm.machine import EvolvingFSM
+from evofsm.fsm.states.edges import Edges
+from evofsm.fsm.states.novelty import Novelty
 
 # docs/river-and-scikit-learn.md lists it as well.
 _EXCEPTIONS = {

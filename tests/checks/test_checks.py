@@ -12,14 +12,6 @@ import pytest
 from evofsm.checks.contracts import Broken
 from evofsm.checks.kinds import Kind, kind_of, maker
 from evofsm.checks.running import Case, Outcome, all_checks, cases, check
-from evofsm.core.actions import IntervalActions
-from evofsm.core.dynamics.dynamics import Dynamics
-from evofsm.core.machine import EvolvingFSM
-from evofsm.core.model import FSMModel
-from evofsm.core.states.edges import Edges
-from evofsm.core.states.failure import FailureSplit
-from evofsm.core.states.novelty import Novelty
-from evofsm.core.states.paper import Paper
 from evofsm.driving.drivers.acc import AdaptiveCruise
 from evofsm.driving.drivers.function import FunctionController
 from evofsm.driving.drivers.idm import IDM, ChangingIDM
@@ -36,6 +28,14 @@ from evofsm.driving.risk.r157 import PerformanceModel
 from evofsm.driving.risk.rss import ResponsibilitySensitiveSafety
 from evofsm.driving.risk.ttc import TimeToCollision
 from evofsm.fleet.batch import Fleet
+from evofsm.fsm.actions import IntervalActions
+from evofsm.fsm.dynamics.dynamics import Dynamics
+from evofsm.fsm.machine import EvolvingFSM
+from evofsm.fsm.model import FSMModel
+from evofsm.fsm.states.edges import Edges
+from evofsm.fsm.states.failure import FailureSplit
+from evofsm.fsm.states.novelty import Novelty
+from evofsm.fsm.states.paper import Paper
 from evofsm.guard.learnt.risk import LearntRisk
 from evofsm.guard.protocols import Proposal
 from evofsm.guard.reviser import ActionReviser, Mode, Way

@@ -6,14 +6,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from evofsm.core.crowding import WhenFull
-from evofsm.core.dynamics.dynamics import Dynamics
-from evofsm.core.machine import EvolvingFSM
-from evofsm.core.states.edges import Edges
-from evofsm.core.states.failure import FailureSplit
-from evofsm.core.states.novelty import Novelty
-from evofsm.core.states.paper import Paper
 from evofsm.fleet.batch import Fleet
+from evofsm.fsm.crowding import WhenFull
+from evofsm.fsm.dynamics.dynamics import Dynamics
+from evofsm.fsm.machine import EvolvingFSM
+from evofsm.fsm.states.edges import Edges
+from evofsm.fsm.states.failure import FailureSplit
+from evofsm.fsm.states.novelty import Novelty
+from evofsm.fsm.states.paper import Paper
 
 Q = 4
 

@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from evofsm.files.journal import Journal
 from evofsm.fleet.campaign import run_campaign
 from evofsm.fleet.executors import Here, Processes, Task, as_they_come
+from evofsm.store.journal import Journal
 
 SETTINGS = {"seed": 0, "family": {"limits": {"decel": 2.5}, "waves": [[1.0, -2.0]]}}
 RECORDS = {k: {"collided": k % 3 == 0, "mobility": 1.0 / (k + 1), "time": None} for k in range(9)}

@@ -7,17 +7,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from evofsm.core.crowding import WhenFull
-from evofsm.core.dynamics.dynamics import Dynamics
-from evofsm.core.machine import EvolvingFSM
-from evofsm.core.states.edges import Edges
-from evofsm.core.states.failure import FailureSplit
-from evofsm.core.states.novelty import Novelty
-from evofsm.core.states.paper import Paper
 from evofsm.driving.families.family import load_family
 from evofsm.driving.worlds.kinematic import KinematicWorld
 from evofsm.fleet.batch import Fleet
 from evofsm.fleet.merging import merge
+from evofsm.fsm.crowding import WhenFull
+from evofsm.fsm.dynamics.dynamics import Dynamics
+from evofsm.fsm.machine import EvolvingFSM
+from evofsm.fsm.states.edges import Edges
+from evofsm.fsm.states.failure import FailureSplit
+from evofsm.fsm.states.novelty import Novelty
+from evofsm.fsm.states.paper import Paper
 
 RULES = [
     Novelty(1.0, (2.0, 1.0)),

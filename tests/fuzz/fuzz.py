@@ -56,8 +56,8 @@ def parquet(data):
 
 def stored(data):
     """The file of a machine or a model."""
-    from evofsm.core.machine import EvolvingFSM
-    from evofsm.core.model import FSMModel
+    from evofsm.fsm.machine import EvolvingFSM
+    from evofsm.fsm.model import FSMModel
 
     _FILE.write_bytes(data)
     for kind in (EvolvingFSM, FSMModel):

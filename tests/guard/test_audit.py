@@ -15,9 +15,6 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from evofsm.core.actions import IntervalActions
-from evofsm.core.machine import EvolvingFSM
-from evofsm.core.states.novelty import Novelty
 from evofsm.driving.drivers.idm import IDM
 from evofsm.driving.framework import Framework
 from evofsm.driving.revisers import AlwaysBrake, EnvelopeReviser, Unrevised
@@ -26,8 +23,18 @@ from evofsm.driving.risk.latent import LatentRisk
 from evofsm.driving.risk.ttc import TimeToCollision
 from evofsm.driving.worlds.kinematic import KinematicWorld
 from evofsm.driving.worlds.scenario import Leader, Scenario, Sensors
-from evofsm.files import sealed as chain
-from evofsm.files.sealed import (
+from evofsm.fsm.actions import IntervalActions
+from evofsm.fsm.machine import EvolvingFSM
+from evofsm.fsm.states.novelty import Novelty
+from evofsm.guard.auditing.form import SINCE
+from evofsm.guard.auditing.log import AuditLog
+from evofsm.guard.auditing.participants import describe, restore
+from evofsm.guard.auditing.replay import audit
+from evofsm.guard.guard import Guard
+from evofsm.guard.protocols import Participants, Proposal
+from evofsm.guard.reviser import ActionReviser, Mode, Way
+from evofsm.store import sealed as chain
+from evofsm.store.sealed import (
     NOTHING,
     ChainedFile,
     Fault,
@@ -38,13 +45,6 @@ from evofsm.files.sealed import (
     unseal,
     verify,
 )
-from evofsm.guard.auditing.form import SINCE
-from evofsm.guard.auditing.log import AuditLog
-from evofsm.guard.auditing.participants import describe, restore
-from evofsm.guard.auditing.replay import audit
-from evofsm.guard.guard import Guard
-from evofsm.guard.protocols import Participants, Proposal
-from evofsm.guard.reviser import ActionReviser, Mode, Way
 
 ACTIONS = IntervalActions(low=-2.5, high=2.5, width=0.3, outside="clip")
 HASTY = IDM(2.25, 28.0, 0.8, 0.3, 2.0, lowest=-2.5, highest=2.5)

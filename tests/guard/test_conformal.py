@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from evofsm.files import storage
 from evofsm.guard.conformal import ConformalAlarm
+from evofsm.store import storage
 
 ANY = st.floats(allow_nan=True, allow_infinity=True)
 KINDS = ("false alarms", "misses")

@@ -13,8 +13,6 @@ from evofsm import EvolvingFSM, Guard, IntervalActions, Labels
 from evofsm.driving.cars import guard_for_cars
 from evofsm.driving.revisers import Unrevised
 from evofsm.driving.risk.latent import LatentRisk
-from evofsm.files import sealed as chain
-from evofsm.files import storage
 from evofsm.guard.actions import BoxActions, Choices, same_action
 from evofsm.guard.auditing import participants
 from evofsm.guard.auditing.log import AuditLog
@@ -22,6 +20,8 @@ from evofsm.guard.auditing.replay import audit
 from evofsm.guard.guard import Explain
 from evofsm.guard.protocols import Fallback, Judgement, Proposal, Search
 from evofsm.guard.reviser import Mode, Way
+from evofsm.store import sealed as chain
+from evofsm.store import storage
 
 DT = 0.1
 PUSHES = (-4.0, -1.0, 0.0, 1.0, 4.0)

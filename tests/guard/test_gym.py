@@ -10,9 +10,6 @@ gymnasium = pytest.importorskip("gymnasium")
 from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete  # noqa: E402
 from gymnasium.utils.env_checker import check_env  # noqa: E402
 
-from evofsm.core.actions import IntervalActions  # noqa: E402
-from evofsm.core.machine import EvolvingFSM  # noqa: E402
-from evofsm.core.naming import Labels  # noqa: E402
 from evofsm.driving.cars import guard_for_cars  # noqa: E402
 from evofsm.driving.families.family import load_family  # noqa: E402
 from evofsm.driving.framework import Framework  # noqa: E402
@@ -20,6 +17,9 @@ from evofsm.driving.revisers import Unrevised  # noqa: E402
 from evofsm.driving.risk.latent import LatentRisk  # noqa: E402
 from evofsm.driving.worlds.gym import CarFollowing  # noqa: E402
 from evofsm.driving.worlds.kinematic import KinematicWorld  # noqa: E402
+from evofsm.fsm.actions import IntervalActions  # noqa: E402
+from evofsm.fsm.machine import EvolvingFSM  # noqa: E402
+from evofsm.fsm.naming import Labels  # noqa: E402
 from evofsm.guard.auditing.log import AuditLog  # noqa: E402
 from evofsm.guard.guard import Guard  # noqa: E402
 from evofsm.guard.gym import RevisedActions, RevisedVectorActions  # noqa: E402

@@ -6,8 +6,6 @@ import math
 import numpy as np
 import pytest
 
-from evofsm.core.actions import IntervalActions
-from evofsm.core.machine import EvolvingFSM
 from evofsm.driving.drivers.idm import IDM
 from evofsm.driving.framework import Framework
 from evofsm.driving.revisers import AlwaysBrake, Unrevised
@@ -15,6 +13,8 @@ from evofsm.driving.risk.latent import LatentRisk
 from evofsm.driving.worlds.kinematic import KinematicWorld
 from evofsm.driving.worlds.motion import COMMANDED, SPEED
 from evofsm.driving.worlds.scenario import Body, Leader, Scenario, Sensors
+from evofsm.fsm.actions import IntervalActions
+from evofsm.fsm.machine import EvolvingFSM
 from evofsm.guard.guard import Guard
 from evofsm.guard.protocols import Proposal
 from evofsm.guard.reviser import ActionReviser, Mode, is_spoken

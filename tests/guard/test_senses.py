@@ -6,10 +6,6 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 
-from evofsm.core.actions import IntervalActions
-from evofsm.core.machine import EvolvingFSM
-from evofsm.core.observations import Missing
-from evofsm.core.states.novelty import Novelty
 from evofsm.driving.drivers.idm import IDM
 from evofsm.driving.framework import Framework
 from evofsm.driving.revisers import EnvelopeReviser
@@ -17,6 +13,10 @@ from evofsm.driving.risk.latent import LatentRisk
 from evofsm.driving.risk.ttc import TimeToCollision
 from evofsm.driving.worlds.kinematic import KinematicWorld
 from evofsm.driving.worlds.scenario import Leader, Scenario
+from evofsm.fsm.actions import IntervalActions
+from evofsm.fsm.machine import EvolvingFSM
+from evofsm.fsm.observations import Missing
+from evofsm.fsm.states.novelty import Novelty
 from evofsm.guard.guard import Guard
 from evofsm.guard.protocols import Intake, Proposal, Situation
 from evofsm.guard.reviser import ActionReviser

@@ -10,7 +10,7 @@ from importlib.util import find_spec
 import numpy as np
 import pytest
 
-from evofsm.core.observations import ObservationEncoder
+from evofsm.fsm.observations import ObservationEncoder
 from evofsm.io import following
 from evofsm.io.fcd import VehicleLengths
 from evofsm.io.traces import LogColumns, read_traces

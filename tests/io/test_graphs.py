@@ -5,8 +5,8 @@ import re
 import numpy as np
 import pytest
 
-from evofsm.core.actions import IntervalActions
-from evofsm.core.machine import EvolvingFSM
+from evofsm.fsm.actions import IntervalActions
+from evofsm.fsm.machine import EvolvingFSM
 from evofsm.io.graphs import to_dot, to_graphml, to_mermaid, to_prism
 
 ODD = 'v "\\#1;<b>&`x`{|}'

@@ -7,7 +7,7 @@ import tracemalloc
 import numpy as np
 import pytest
 
-from evofsm.core.observations import Category, ObservationEncoder
+from evofsm.fsm.observations import Category, ObservationEncoder
 from evofsm.io import blocks, tables
 from evofsm.io.traces import LogColumns, read_traces
 

@@ -5,8 +5,6 @@ import tracemalloc
 import numpy as np
 import pytest
 
-from evofsm.core.actions import IntervalActions
-from evofsm.core.machine import EvolvingFSM
 from evofsm.driving.drivers.idm import IDM
 from evofsm.driving.framework import Decision, Drive, Framework
 from evofsm.driving.naming import VARIABLES
@@ -15,6 +13,8 @@ from evofsm.driving.risk.latent import LatentRisk
 from evofsm.driving.risk.ttc import time_to_collision
 from evofsm.driving.worlds.kinematic import KinematicWorld
 from evofsm.driving.worlds.scenario import Leader, Scenario
+from evofsm.fsm.actions import IntervalActions
+from evofsm.fsm.machine import EvolvingFSM
 from evofsm.guard.guard import Explain, Guard
 from evofsm.guard.protocols import Intake
 from evofsm.guard.reviser import ActionReviser, Mode

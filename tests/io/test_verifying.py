@@ -6,7 +6,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from evofsm.core.machine import EvolvingFSM
+from evofsm.fsm.machine import EvolvingFSM
 from evofsm.io.graphs import to_prism
 from evofsm.io.process import process_of
 from evofsm.io.verifying import Property, solve, solve_by_storm

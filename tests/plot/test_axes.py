@@ -10,14 +10,14 @@ from matplotlib.colors import same_color, to_rgba
 from matplotlib.figure import Figure
 
 from evofsm import plot
-from evofsm.core.actions import IntervalActions
-from evofsm.core.machine import EvolvingFSM
-from evofsm.core.states.novelty import Novelty
 from evofsm.driving.drivers.idm import IDM
 from evofsm.driving.framework import Framework
 from evofsm.driving.risk.latent import LatentRisk
 from evofsm.driving.worlds.kinematic import KinematicWorld
 from evofsm.driving.worlds.scenario import Leader, Scenario
+from evofsm.fsm.actions import IntervalActions
+from evofsm.fsm.machine import EvolvingFSM
+from evofsm.fsm.states.novelty import Novelty
 from evofsm.guard.guard import Guard
 from evofsm.guard.reviser import ActionReviser, Mode
 from evofsm.plot.style import DEAD_END

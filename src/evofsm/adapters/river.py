@@ -9,8 +9,8 @@ from typing import Any, SupportsFloat
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.core import EvolvingFSM, Missing, StateRule, WhenFull
 from evofsm.extras import needs
+from evofsm.fsm import EvolvingFSM, Missing, StateRule, WhenFull
 
 with needs("River", "river", "a clusterer of River"):
     from river import base

@@ -7,8 +7,8 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from evofsm.core import EvolvingFSM, StateRule, WhenFull
 from evofsm.extras import needs
+from evofsm.fsm import EvolvingFSM, StateRule, WhenFull
 
 with needs("scikit-learn", "sklearn", "a clusterer of scikit-learn"):
     from sklearn.base import BaseEstimator, ClusterMixin

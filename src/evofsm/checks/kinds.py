@@ -18,7 +18,7 @@ class Kind(Enum):
     MACHINE = "machine"  #: learns states and transitions, as `evofsm.EvolvingFSM`
     FLEET = "fleet"  #: many machines at once, as `evofsm.fleet.batch.Fleet`
     MODEL = "model"  #: a frozen snapshot, as `evofsm.FSMModel`
-    RULE = "rule"  #: how states are determined, as `evofsm.core.states.rule.StateRule`
+    RULE = "rule"  #: how states are determined, as `evofsm.fsm.states.rule.StateRule`
     REVISER = "reviser"  #: keeps a proposal or replaces it, as `evofsm.guard.protocols.Reviser`
     CONTROLLER = "controller"  #: proposes, as `evofsm.guard.protocols.Controller`
     JUDGE = "judge"  #: says how dangerous actions are, as `evofsm.guard.protocols.LearningJudge`

@@ -13,7 +13,7 @@ import numpy as np
 
 from evofsm.checks.contracts import Contract, insist
 from evofsm.checks.kinds import Make
-from evofsm.core import EvolvingFSM, RuleSettings, describe_rule, restore_rule
+from evofsm.fsm import EvolvingFSM, RuleSettings, describe_rule, restore_rule
 
 CONTRACT = Contract()
 
@@ -75,7 +75,7 @@ def a_machine_takes_it(make: Make) -> None:
     try:
         machine = machine_of(make)()
     except TypeError as error:
-        insist(False, f"{error} (was it registered with evofsm.core.register_rule?)")
+        insist(False, f"{error} (was it registered with evofsm.fsm.register_rule?)")
     m = len(machine.rule.scales) or 2
     for k in range(10):
         machine.observe(np.arange(m) * k * 0.7)

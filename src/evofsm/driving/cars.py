@@ -7,7 +7,6 @@ from dataclasses import astuple
 from pathlib import Path
 from typing import Any, Literal
 
-from evofsm.core import EvolvingFSM, IntervalActions, Novelty, StateRule
 from evofsm.driving.families.family import Draw, Family
 from evofsm.driving.framework import Drive, Framework
 from evofsm.driving.naming import UNITS, VARIABLES
@@ -16,7 +15,7 @@ from evofsm.driving.revisers import Unrevised
 from evofsm.driving.risk.latent import LatentRisk
 from evofsm.driving.worlds.kinematic import KinematicWorld
 from evofsm.driving.worlds.road import World
-from evofsm.files import Place, storage
+from evofsm.fsm import EvolvingFSM, IntervalActions, Novelty, StateRule
 from evofsm.guard import (
     BELIEF_TOLERANCE,
     TOLERANCE,
@@ -28,6 +27,7 @@ from evofsm.guard import (
     Mode,
     dynamics_for,
 )
+from evofsm.store import Place, storage
 
 #: What each judge is told, by its name.
 TOLD: dict[str, str] = {

@@ -9,10 +9,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.core import FailureRecord
 from evofsm.driving.framework import Drive
 from evofsm.driving.worlds.motion import LEADER_ACCELERATION, SPEED
 from evofsm.extras import needs
+from evofsm.fsm import FailureRecord
 
 with needs("scipy", "study", "the closed-loop study"):
     from scipy.stats import binomtest

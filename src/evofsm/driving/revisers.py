@@ -10,8 +10,8 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.core import IntervalActions, positive
 from evofsm.driving.naming import VARIABLES
+from evofsm.fsm import IntervalActions, positive
 from evofsm.guard import (
     Fallback,
     Proposal,

@@ -14,7 +14,7 @@ import numba
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
-from evofsm.core import (
+from evofsm.fsm import (
     FULL,
     LINE,
     NO_ACTION,

@@ -13,8 +13,8 @@ from contextlib import AbstractContextManager, closing
 from functools import partial
 from itertools import islice
 
-from evofsm.files import Journal, Record
 from evofsm.fleet.executors import Task, as_they_come
+from evofsm.store import Journal, Record
 
 # Most episodes in a batch, some 100 to 500 ms; and batches for each worker, so that all of them
 # end at about the same time.

@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.core import (
+from evofsm.fsm import (
     NO_ACTION,
     NOT_OPEN,
     Counts,

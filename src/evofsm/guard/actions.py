@@ -16,7 +16,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from evofsm.core import IntervalActions, real_array, whole
+from evofsm.fsm import IntervalActions, real_array, whole
 
 # Cells that a box is divided into for the machine, at most, unless levels are given: 9 x 9.
 _CELLS = 81

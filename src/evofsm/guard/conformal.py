@@ -32,8 +32,8 @@ from typing import Any, Literal, NamedTuple, Self, get_args
 
 import numpy as np
 
-from evofsm.core import positive, whole
-from evofsm.files import Place, ranges, storage
+from evofsm.fsm import positive, whole
+from evofsm.store import Place, ranges, storage
 
 #: Errors whose rate is held.
 Errors = Literal["false alarms", "misses"]

@@ -16,7 +16,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from evofsm.core import (
+from evofsm.fsm import (
     DYNAMICS_PARTS,
     Dynamics,
     EvolvingFSM,
@@ -29,7 +29,6 @@ from evofsm.core import (
     real_array,
     refuse_unusable,
 )
-from evofsm.files import Place, ranges, storage
 from evofsm.guard.actions import Action, ActionSet, BoxActions, Choices, fixed, no_action
 from evofsm.guard.auditing.participants import outline, rebuild
 from evofsm.guard.defaults import BELIEF_TOLERANCE, TOLERANCE
@@ -52,6 +51,7 @@ from evofsm.guard.protocols import (
 )
 from evofsm.guard.reviser import NOTHING, ActionReviser, Mode, is_spoken
 from evofsm.guard.senses import Senses, has_gaps
+from evofsm.store import Place, ranges, storage
 
 # Intervals that a range of actions is divided into for the machine, unless a width is given.
 _INTERVALS = 17
@@ -782,7 +782,7 @@ def learnt_guard(
     low, high, n_actions, interval, horizon, seed
         As in `Guard`.
     without : sequence of str
-        Names of `JUDGE_PARTS` and of `evofsm.core.DYNAMICS_PARTS`; without ``states`` the machine
+        Names of `JUDGE_PARTS` and of `evofsm.fsm.DYNAMICS_PARTS`; without ``states`` the machine
         has a single one.
 
     Raises

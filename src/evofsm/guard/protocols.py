@@ -10,9 +10,9 @@ from typing import Any, NamedTuple, Protocol, Self, runtime_checkable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from evofsm.core import EvolvingFSM, Labels, Missing
-from evofsm.files import Place
+from evofsm.fsm import EvolvingFSM, Labels, Missing
 from evofsm.guard.actions import Action, ActionSet
+from evofsm.store import Place
 
 
 class Proposal(NamedTuple):

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.core import compiled
+from evofsm.fsm import compiled
 from evofsm.guard.actions import (
     Action,
     ActionSet,

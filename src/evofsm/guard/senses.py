@@ -11,7 +11,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.core import Missing
+from evofsm.fsm import Missing
 from evofsm.guard.protocols import Intake
 
 # Longer than so many intervals is a hole in time.

@@ -1,9 +1,4 @@
 from .conditions import Condition as Condition
-from .datasets.checksums import find_checksums as find_checksums
-from .datasets.episodes import Episode as Episode
-from .datasets.episodes import as_chunks as as_chunks
-from .datasets.layouts import Layout as Layout
-from .datasets.layouts import read_episodes as read_episodes
 from .fcd import VehicleLengths as VehicleLengths
 from .files import file_kind as file_kind
 from .files import silent as silent

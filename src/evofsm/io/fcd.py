@@ -15,11 +15,11 @@ from itertools import pairwise
 from typing import NamedTuple, Self
 from xml.parsers import expat
 
-from evofsm.core import positive
-from evofsm.files import LARGEST_OBSERVATION
+from evofsm.fsm import positive
 from evofsm.io.files import OnRead, damage_explained, open_unpacked
 from evofsm.io.following import Following, Moment
 from evofsm.io.tables import Table, explain_text
+from evofsm.store import LARGEST_OBSERVATION
 
 #: The column by which an FCD table is known.
 TIME = "timestep_time"

@@ -18,9 +18,9 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.core import Missing, positive
 from evofsm.driving import UNITS, VARIABLES, Decision
 from evofsm.extras import needs
+from evofsm.fsm import Missing, positive
 from evofsm.guard import Participants, Proposal, Revision, Situation
 from evofsm.io.channels import (
     ERROR,

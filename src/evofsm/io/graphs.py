@@ -17,7 +17,7 @@ from xml.etree import ElementTree as ET
 
 import numpy as np
 
-from evofsm.core import FSMModel, Policy
+from evofsm.fsm import FSMModel, Policy
 from evofsm.io.process import Command, process_of, refuse_no_probability
 
 # Vermillion of Okabe and Ito's colours; what is marked by it has another shape and words as well.

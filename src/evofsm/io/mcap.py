@@ -24,10 +24,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evofsm import __version__
-from evofsm.core import FSMModel
 from evofsm.driving import DECISION_COLUMNS, VARIABLES, Drive
 from evofsm.extras import needs
-from evofsm.files import storage
+from evofsm.fsm import FSMModel
 from evofsm.io.channels import (
     ERROR,
     INFO,
@@ -41,6 +40,7 @@ from evofsm.io.channels import (
     said,
     schemas_of,
 )
+from evofsm.store import storage
 
 with needs("mcap", "mcap", "reading and writing MCAP"):
     from lz4.frame import LZ4FrameDecompressor

@@ -16,9 +16,9 @@ from contextlib import contextmanager
 from typing import BinaryIO
 
 from evofsm.extras import needs
-from evofsm.files import LARGEST_OBSERVATION
 from evofsm.io.files import OnRead, damage_explained, open_unpacked
 from evofsm.io.objects import Object, Scene
+from evofsm.store import LARGEST_OBSERVATION
 
 _VARINT, _DOUBLE, _BYTES, _FLOAT = 0, 1, 2, 5
 _LONGEST_VARINT = 10

@@ -17,7 +17,7 @@ from typing import NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.core import compiled, kernel
+from evofsm.fsm import compiled, kernel
 
 _NEWLINE, _RETURN, _QUOTE = ord("\n"), ord("\r"), ord('"')
 _PLUS, _MINUS, _POINT, _ZERO, _NINE = (ord(sign) for sign in "+-.09")

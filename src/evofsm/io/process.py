@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.core import FSMModel
+from evofsm.fsm import FSMModel
 
 #: Probabilities have so many decimals; those of a command add up to 1 exactly.
 DECIMALS = 12

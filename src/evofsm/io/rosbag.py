@@ -38,8 +38,8 @@ from typing import Any, Literal, NamedTuple, Self
 
 import numpy as np
 
-from evofsm.core import positive
 from evofsm.extras import needs
+from evofsm.fsm import positive
 from evofsm.io.files import OnRead
 from evofsm.io.following import ACTION
 from evofsm.io.tables import Piece, refuse_unusable

@@ -21,8 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evofsm.driving import VARIABLES
-from evofsm.files import storage
 from evofsm.io.mcap import RecordedEpisode
+from evofsm.store import storage
 
 #: Risks at which a level ends; the last ends at 1.
 LEVELS = (0.001, 0.02, 0.1, 0.5)

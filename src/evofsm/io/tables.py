@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evofsm.extras import needs
-from evofsm.files import LARGEST_OBSERVATION
 from evofsm.io.dates import looks_like_a_date, microseconds
 from evofsm.io.files import BYTE_ORDER_MARK, OnRead, damage_explained, open_unpacked, silent
 from evofsm.io.plain import Texts, number_or_gap, parse_plain
+from evofsm.store import LARGEST_OBSERVATION
 
 # At once: enough that what Python does in between hardly counts.
 _CSV_BYTES = 1 << 21

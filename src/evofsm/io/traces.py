@@ -10,8 +10,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.core import Category, ObservationEncoder
 from evofsm.driving import VARIABLES
+from evofsm.fsm import Category, ObservationEncoder
 from evofsm.io import fcd, objects
 from evofsm.io.blocks import Blocks
 from evofsm.io.conditions import Condition

@@ -17,8 +17,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.core import FSMModel
 from evofsm.extras import install, needs
+from evofsm.fsm import FSMModel
 from evofsm.io.graphs import to_prism
 from evofsm.io.process import Process
 

@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from evofsm.core import FSMModel, Policy, Trace, variable_label
 from evofsm.driving import Drive
 from evofsm.extras import needs
+from evofsm.fsm import FSMModel, Policy, Trace, variable_label
 
 with needs("matplotlib", "plot", "plotting"):
     from matplotlib.colors import Normalize

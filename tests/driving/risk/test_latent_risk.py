@@ -9,8 +9,6 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from evofsm.core.machine import EvolvingFSM
-from evofsm.core.states.novelty import Novelty
 from evofsm.driving.risk.brakes import OwnBrakes
 from evofsm.driving.risk.by_state import RiskByState, assess_states
 from evofsm.driving.risk.counts import OutcomeCounts
@@ -18,6 +16,8 @@ from evofsm.driving.risk.dead_end import is_dead_end
 from evofsm.driving.risk.latent import LatentRisk
 from evofsm.driving.risk.manoeuvres import BrakeWatch, Manoeuvres
 from evofsm.driving.risk.rehearsal import HARDEST, Body, critical_decelerations
+from evofsm.fsm.machine import EvolvingFSM
+from evofsm.fsm.states.novelty import Novelty
 from evofsm.guard.protocols import Situation
 
 DT = 0.25

@@ -13,7 +13,7 @@ from evofsm.driving.drivers.idm import IDM, ChangingIDM
 from evofsm.driving.families.family import FAMILIES, SWITCHES, load_family
 from evofsm.driving.families.numbers import Numbers
 from evofsm.driving.risk.dead_end import is_dead_end
-from evofsm.evidence.paper.settings import Settings
+from evofsm.paper.settings import Settings
 
 SEEDS = st.integers(0, 2**32 - 1)
 LOADED = {name: load_family(name) for name in FAMILIES}

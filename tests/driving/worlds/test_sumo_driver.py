@@ -3,7 +3,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from evofsm.core.actions import IntervalActions
 from evofsm.driving.drivers.idm import IDM
 from evofsm.driving.framework import Framework
 from evofsm.driving.revisers import Unrevised
@@ -12,6 +11,7 @@ from evofsm.driving.worlds.kinematic import KinematicWorld
 from evofsm.driving.worlds.scenario import CutIn, Leader, Scenario, Sensors
 from evofsm.driving.worlds.sumo import SumoWorld
 from evofsm.driving.worlds.sumo_driver import MODELS, SumoDriver
+from evofsm.fsm.actions import IntervalActions
 from evofsm.guard.guard import Guard
 from evofsm.guard.protocols import Proposal
 from evofsm.guard.reviser import ActionReviser

@@ -11,9 +11,9 @@ from evofsm.driving.worlds.kinematic import KinematicWorld
 from evofsm.driving.worlds.motion import REALISED
 from evofsm.driving.worlds.scenario import Behind, Body, CutIn, Leader, Scenario, Sensors
 from evofsm.driving.worlds.sumo import SumoWorld
-from evofsm.evidence.paper.runs import CASES
-from evofsm.evidence.paper.settings import Settings
 from evofsm.guard.protocols import Proposal
+from evofsm.paper.runs import CASES
+from evofsm.paper.settings import Settings
 
 pytest.importorskip("libsumo")
 

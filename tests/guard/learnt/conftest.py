@@ -118,7 +118,7 @@ def content():
     """All that a guard has learnt, byte for byte: what it would write to a file."""
     from io import BytesIO
 
-    from evofsm.files import storage
+    from evofsm.store import storage
 
     def take(guard):
         file = BytesIO()

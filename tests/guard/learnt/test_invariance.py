@@ -141,8 +141,9 @@ def test_noise_is_the_same_however_it_is_written(noisy, seed):
 @pytest.mark.parametrize("name", ["acc", "cartpole", "pendulum", "tanks", "reactor", "emergency"])
 def test_systems_are_learnt_however_they_are_written(name, seed):
     pytest.importorskip("gymnasium")
-    from evofsm.evidence.systems import make_system
-    from evofsm.evidence.systems.system import Start
+    from studies.systems import make_system
+    from studies.systems.system import Start
+
     from evofsm.guard import Guard
 
     # Pumps that always do the same, or actions that are never taken, as under the first controllers

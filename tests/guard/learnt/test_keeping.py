@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from evofsm import Guard
-from evofsm.files import storage
 from evofsm.guard.learnt.breaks import Breaks
 from evofsm.guard.learnt.risk import LearntRisk
+from evofsm.store import storage
 
 
 def assert_goes_on_alike(point, guard, exactly, content):

@@ -5,7 +5,7 @@ import pytest
 pytest.importorskip("scipy")
 pytest.importorskip("gymnasium")
 
-from evofsm.evidence.systems.trial import trial
+from studies.systems.trial import trial
 
 
 @pytest.mark.slow

@@ -8,7 +8,7 @@ from contextlib import suppress
 import numpy as np
 import pytest
 
-from evofsm.core.dynamics.drift import Drift
+from evofsm.fsm.dynamics.drift import Drift
 from evofsm.guard import Mode, same_action
 from evofsm.guard.auditing.log import AuditLog
 from evofsm.guard.auditing.replay import audit

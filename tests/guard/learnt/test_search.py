@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from evofsm.core import Consequents, Disturbances, Here
-from evofsm.core.dynamics.consequents import n_features
+from evofsm.fsm import Consequents, Disturbances, Here
+from evofsm.fsm.dynamics.consequents import n_features
 from evofsm.guard.learnt.search import KEPT, NOTHING_PASSES, search
 
 STEPS, WALL = 20, 100.0

@@ -8,7 +8,7 @@ import numpy as np
 from numba import types
 from numpy.typing import NDArray
 
-from evofsm.core import Function, compiled
+from evofsm.fsm import Function, compiled
 from evofsm.guard import Proposal
 
 #: ``kernel(parameters, time, gap, speed, leader_speed) -> acceleration``

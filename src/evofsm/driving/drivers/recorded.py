@@ -7,7 +7,7 @@ from typing import Protocol, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from evofsm.core import real_array, refuse_unusable
+from evofsm.fsm import real_array, refuse_unusable
 from evofsm.guard import Proposal
 
 # Clocks that should agree may differ in the last digits [s].

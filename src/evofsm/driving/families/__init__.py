@@ -12,7 +12,7 @@ as well. All are SI units.
 ==================  ===============================================================================
 ``about``           what happens, in a sentence
 ``interval``        time between decisions [s]
-``[actions]``       the set of actions, as `evofsm.core.actions.IntervalActions`
+``[actions]``       the set of actions, as `evofsm.fsm.actions.IntervalActions`
 ``[limits]``        true hardest braking: ``decel`` of the follower, ``leader_decel`` of any leader
 ``[values]``        numbers that others relate to, by names of your choice
 ``[scenario]``      as `Scenario`, and likewise ``[body]``, ``[sensors]``, whose ``seed`` may be

@@ -11,7 +11,6 @@ from os import PathLike
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
-from evofsm.core import IntervalActions, Labels
 from evofsm.driving.drivers.idm import IDM, ChangingIDM
 from evofsm.driving.families.numbers import Chance, GivenNumbers, Numbers
 from evofsm.driving.families.tables import (
@@ -25,6 +24,7 @@ from evofsm.driving.families.tables import (
 )
 from evofsm.driving.naming import UNITS, VARIABLES
 from evofsm.driving.worlds.scenario import Behind, Body, CutIn, Leader, Scenario, Sensors
+from evofsm.fsm import IntervalActions, Labels
 
 #: The families that come with the package.
 FAMILIES = (

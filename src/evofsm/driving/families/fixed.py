@@ -8,9 +8,9 @@ from collections.abc import Sequence
 from dataclasses import astuple, fields
 from typing import Any, NamedTuple
 
-from evofsm.core import IntervalActions
 from evofsm.driving.drivers.idm import IDM, ChangingIDM
 from evofsm.driving.families.family import Draw, Family
+from evofsm.fsm import IntervalActions
 
 
 class NamedDraw(NamedTuple):

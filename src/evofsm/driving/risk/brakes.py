@@ -9,8 +9,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.core import compiled, kernel
 from evofsm.driving.risk.ranges import hardest_seen
+from evofsm.fsm import compiled, kernel
 
 # Full braking is judged by so many of the latest decisions, and by no fewer than the second number;
 # that it is weaker than before shows in as few, and in no more than the third number.

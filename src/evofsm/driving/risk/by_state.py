@@ -13,8 +13,8 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from evofsm.core import EvolvingFSM, FSMModel
 from evofsm.driving.risk.latent import LatentRisk
+from evofsm.fsm import EvolvingFSM, FSMModel
 from evofsm.guard import Action, Judgement, Situation, Trial
 
 # States of a smaller belief are left out.

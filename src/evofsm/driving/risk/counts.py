@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from evofsm.core import (
+from evofsm.fsm import (
     check_action,
     positive,
     real_array,

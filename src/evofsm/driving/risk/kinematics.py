@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.core import positive
+from evofsm.fsm import positive
 
 
 def columns(observations: NDArray[np.float64]) -> NDArray[np.float64]:

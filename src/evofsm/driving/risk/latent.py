@@ -19,15 +19,6 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from evofsm.core import (
-    compiled,
-    inner_kernel,
-    positive,
-    real_array,
-    refuse_unless_distribution,
-    refuse_unusable,
-    wilson_bounds,
-)
 from evofsm.driving.naming import LABELS
 from evofsm.driving.revisers import GENTLE_BRAKE
 from evofsm.driving.risk.brakes import OwnBrakes, Sample
@@ -36,8 +27,17 @@ from evofsm.driving.risk.manoeuvres import BrakeWatch, Manoeuvres
 from evofsm.driving.risk.perception import Estimate, Perception, is_whole
 from evofsm.driving.risk.ranges import RISK
 from evofsm.driving.risk.rehearsal import Body, Three, critical_decelerations
-from evofsm.files import LARGEST_OBSERVATION, ranges, storage
+from evofsm.fsm import (
+    compiled,
+    inner_kernel,
+    positive,
+    real_array,
+    refuse_unless_distribution,
+    refuse_unusable,
+    wilson_bounds,
+)
 from evofsm.guard import TOLERANCE, Action, Judgement, Situation, Trial
+from evofsm.store import LARGEST_OBSERVATION, ranges, storage
 
 # Pseudo-evidence for the pooled rate of manoeuvres, against that of a state [s].
 _POOLED = 20.0

@@ -2,7 +2,7 @@
 
 Without it the first `Manoeuvres` are only assumed, and it takes 49 hard brakes of leaders until a
 risk of 2 % can be told from that assumption. The table is statistics of public drives, not the
-drives; ``evofsm bench leaders --data FOLDER`` prints such a table of any folder of them.
+drives; ``python -m studies leaders --data FOLDER`` prints such a table of any folder of them.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import NamedTuple, Self
 
 import numpy as np
 
-from evofsm.core import positive
+from evofsm.fsm import positive
 
 # Of a bin of the table [m/s²].
 _WIDTH = 0.25

@@ -17,9 +17,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from evofsm.core import positive
 from evofsm.driving.risk.leaders import LeaderBrakes
 from evofsm.driving.risk.rehearsal import HARDEST
+from evofsm.fsm import positive
 
 # Of a manoeuvre the hardest second counts; it shows in the latest half, and takes at least three
 # quarters: less may be noise [s].

@@ -16,9 +16,9 @@ from typing import NamedTuple, TypeAlias, cast
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from evofsm.core import compiled, kernel
 from evofsm.driving.risk.manoeuvres import latest_of_each
 from evofsm.driving.risk.rehearsal import Three
+from evofsm.fsm import compiled, kernel
 
 # Gap [m], speed of the follower and of the leader [m/s], or what is said of each of them.
 Matrix: TypeAlias = tuple[Three, Three, Three]

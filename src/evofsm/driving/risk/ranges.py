@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from evofsm.files import ranges
+from evofsm.store import ranges
 
 # No car brakes harder than this [m/s²].
 _HARDEST = 15.0

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from evofsm.core import IntervalActions
 from evofsm.driving.scene.risk import TrafficRisk
+from evofsm.fsm import IntervalActions
 from evofsm.guard import TOLERANCE, ActionReviser, Guard, Mode
 
 # Of an interval of accelerations [m/s²].

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from evofsm.core import real_array
+from evofsm.fsm import real_array
 
 #: What a row of a scene holds; the first is 1 where the row is in use.
 COLUMNS = ("present", "x", "y", "vx", "vy", "length", "width")

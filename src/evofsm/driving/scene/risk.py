@@ -13,9 +13,9 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from evofsm.core import Labels, positive
 from evofsm.driving.risk.latent import LatentRisk
 from evofsm.driving.scene.objects import COLUMNS, Pair, Role, pairs_of
+from evofsm.fsm import Labels, positive
 from evofsm.guard import Action, Fallback, Judgement, Search, Situation, Trial
 
 _Floats = NDArray[np.float64]

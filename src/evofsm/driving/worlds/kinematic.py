@@ -12,7 +12,6 @@ import numpy as np
 from numba import types
 from numpy.typing import NDArray
 
-from evofsm.core import compiled
 from evofsm.driving.drivers.compiled import DRIVER_KERNEL, CompiledController, Kernel
 from evofsm.driving.worlds.motion import (
     GAP,
@@ -28,6 +27,7 @@ from evofsm.driving.worlds.motion import (
 )
 from evofsm.driving.worlds.road import Episode, Road, drive, refuse_non_number
 from evofsm.driving.worlds.scenario import Scenario
+from evofsm.fsm import compiled
 from evofsm.guard import Controller
 
 

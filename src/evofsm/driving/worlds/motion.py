@@ -11,9 +11,9 @@ import numpy as np
 from numba import types
 from numpy.typing import NDArray
 
-from evofsm.core import compiled
 from evofsm.driving.drivers.idm import idm_kernel
 from evofsm.driving.worlds.scenario import Scenario
+from evofsm.fsm import compiled
 
 #: What a row of the record holds.
 RUN_COLUMNS = (

@@ -24,7 +24,7 @@ import numba
 import numpy as np
 
 import evofsm
-from evofsm.core import EvolvingFSM, IntervalActions
+from evofsm.fsm import EvolvingFSM, IntervalActions
 from evofsm.guard.actions import ActionSet, BoxActions, Choices
 from evofsm.guard.protocols import (
     ActionJudge,

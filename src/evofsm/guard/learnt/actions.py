@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from evofsm.core import DYNAMICS_PARTS, Dynamics
+from evofsm.fsm import DYNAMICS_PARTS, Dynamics
 from evofsm.guard.actions import ActionSet, Choices, limits
 
 #: Steps of a stretch where nobody says how far ahead to look.

@@ -8,12 +8,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.core import Disturbances, Here
-from evofsm.files import ranges
+from evofsm.fsm import Disturbances, Here
 from evofsm.guard.learnt.actions import LONGEST_STRETCH
 from evofsm.guard.learnt.backups import Backups
 from evofsm.guard.learnt.breaks import Breaks
 from evofsm.guard.learnt.remembering import Situations
+from evofsm.store import ranges
 
 # Names of the arrays of situations.
 _SITUATIONS = ("situations", "changes", "actions_before")

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.core import Disturbances, Dynamics, Episode, Here
+from evofsm.fsm import Disturbances, Dynamics, Episode, Here
 from evofsm.guard.learnt.search import harm
 
 _Floats = NDArray[np.float64]

@@ -2,7 +2,7 @@
 
 An action passes if after it some backup policy survives everything that is remembered, whichever of
 it begins now, by a margin. What failure is, how the system moves, what disturbs it and for how long
-is all learnt by the machine (`evofsm.core.Dynamics`); backups, margin and the situations on which
+is all learnt by the machine (`evofsm.fsm.Dynamics`); backups, margin and the situations on which
 they are tried are learnt here.
 """
 
@@ -16,7 +16,7 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from evofsm.core import (
+from evofsm.fsm import (
     Disturbances,
     Dynamics,
     EvolvingFSM,
@@ -27,7 +27,6 @@ from evofsm.core import (
     positive,
     refuse_unusable,
 )
-from evofsm.files import Place, storage
 from evofsm.guard.learnt import words
 from evofsm.guard.learnt.actions import LONGEST_STRETCH
 from evofsm.guard.learnt.backups import Backups
@@ -38,6 +37,7 @@ from evofsm.guard.learnt.search import CHANGED, KEPT, NOTHING_PASSES, outcomes, 
 from evofsm.guard.learnt.words import Remembered
 from evofsm.guard.protocols import Fallback, Judgement, Search, Situation, Trial
 from evofsm.guard.senses import has_gaps
+from evofsm.store import Place, storage
 
 _Floats = NDArray[np.float64]
 

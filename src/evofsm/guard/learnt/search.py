@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.core import (
+from evofsm.fsm import (
     Consequents,
     Disturbances,
     Futures,

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.core import compiled
+from evofsm.fsm import compiled
 
 _Floats = NDArray[np.float64]
 

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.files import ranges
 from evofsm.guard.scene.memory import Episode
+from evofsm.store import ranges
 
 _SOME = ranges.Range(-math.inf, math.inf)
 _INDEX = ranges.Range(-1.0, ranges.MOST_COUNTED, whole=True)

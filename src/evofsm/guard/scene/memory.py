@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.core import compiled
+from evofsm.fsm import compiled
 from evofsm.guard.scene.contact import Contact, learn
 from evofsm.guard.scene.seeing import Seen
 

@@ -15,13 +15,13 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from evofsm.core import Labels, positive, wilson_bounds
-from evofsm.files import Place, storage
+from evofsm.fsm import Labels, positive, wilson_bounds
 from evofsm.guard.actions import Action
 from evofsm.guard.protocols import Fallback, Judgement, Search, Situation, Trial
 from evofsm.guard.scene.keeping import KIND, arrays_of, episodes_of
 from evofsm.guard.scene.memory import ANALOGS, Episode, Foreseen, Memory
 from evofsm.guard.scene.seeing import Layout, Seen
+from evofsm.store import Place, storage
 
 _Floats = NDArray[np.float64]
 

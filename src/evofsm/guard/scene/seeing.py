@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.core import whole
+from evofsm.fsm import whole
 
 _Floats = NDArray[np.float64]
 

@@ -1,0 +1,451 @@
+"""How messages come and go: pipes, files, a UNIX socket, UDP on this computer, Zenoh.
+
+Each carrier hands lines to a `Station` and its answers back, until the input ends or the process
+is asked to stop. A peer that sends junk, vanishes or does not read is no reason to end.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import queue
+import select
+import selectors
+import signal
+import socket
+import stat
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from types import FrameType
+from typing import Any, BinaryIO, Self
+
+from evofsm.cli.monitor.decider import Answer, Decider
+from evofsm.cli.monitor.schema import LONGEST, MessageError
+from evofsm.cli.text.documents import to_json_line
+from evofsm.extras import needs
+
+_log = logging.getLogger(__name__)
+
+# So much is read at once; a peer that leaves more unread is cut off [byte].
+_CHUNK, _UNREAD = 1 << 16, 1 << 20
+# Messages of Zenoh that wait, at most.
+_WAITING = 1000
+
+Say = Callable[[str], None]
+
+
+class StoppedError(Exception):
+    """The process was asked to end."""
+
+
+class Lines:
+    r"""Cuts what comes in into lines; one that is too long is cut off, and so refused.
+
+    Examples
+    --------
+    >>> lines = Lines()
+    >>> [*lines.feed(b"one\r\ntw")], [*lines.feed(b"o\nthree")], [*lines.rest()]
+    ([b'one'], [b'two'], [b'three'])
+    """
+
+    def __init__(self) -> None:
+        self._begun = b""
+
+    def feed(self, data: bytes) -> Iterator[bytes]:
+        """The lines that are whole with this."""
+        *whole, begun = (self._begun + data).split(b"\n")
+        self._begun = begun[: LONGEST + 1]  # however long it gets
+        for line in whole:
+            yield line.removesuffix(b"\r")
+
+    def rest(self) -> Iterator[bytes]:
+        """What came last, without an end."""
+        if self._begun:
+            yield self._begun
+        self._begun = b""
+
+
+class Station:
+    """A decider as carriers see it: lines in, lines out, a sign of life where nothing comes.
+
+    Parameters
+    ----------
+    decider : Decider
+    heartbeat : float, optional
+        Time without a message after which it says that it is there [s].
+    """
+
+    def __init__(self, decider: Decider, heartbeat: float | None = None) -> None:
+        self.decider = decider
+        self.heartbeat = heartbeat
+        self._heard = self._said = time.monotonic()
+        self._stop = self._waits = False
+
+    def answer(self, lines: Iterable[bytes]) -> bytes:
+        """What is answered to lines, each with an end."""
+        answers = b"".join(_line(self.decider.answer(line)) for line in lines)
+        self._heard = self._said = time.monotonic()
+        return answers
+
+    def refuse(self, what: str) -> bytes:
+        """Say that something was wrong with messages that never came in."""
+        return _line(self.decider.error(MessageError("line", what)))
+
+    @property
+    def patience(self) -> float | None:
+        """How long to wait for a message [s]; None for as long as it takes."""
+        if self.heartbeat is None:
+            return None
+        return max(0.0, self._said + self.heartbeat - time.monotonic())
+
+    def beat(self) -> bytes:
+        """The sign of life that is due; empty where none is."""
+        now = time.monotonic()
+        if self.heartbeat is None or now - self._said < self.heartbeat:
+            return b""
+        self._said = now
+        return _line(self.decider.heartbeat(round(now - self._heard, 3)))
+
+    # -- Its end --------------------------------------------------------------------------------
+
+    @contextmanager
+    def stoppable(self) -> Iterator[Self]:
+        """Let SIGTERM and Ctrl-C end it while it waits, never while it decides.
+
+        What whoever started it let it ignore, as nohup does, it ignores.
+        """
+        names = ("SIGTERM", "SIGINT", "SIGHUP")
+        signals = [getattr(signal, name) for name in names if hasattr(signal, name)]
+        signals = [one for one in signals if signal.getsignal(one) is not signal.SIG_IGN]
+        if threading.current_thread() is not threading.main_thread():
+            signals = []
+        before = {one: signal.signal(one, self._asked) for one in signals}
+        try:
+            with suppress(StoppedError):
+                yield self
+        finally:
+            for one, handler in before.items():
+                signal.signal(one, handler)
+
+    @contextmanager
+    def waiting(self) -> Iterator[None]:
+        """In this it may be stopped.
+
+        Raises
+        ------
+        StoppedError
+            If it is.
+        """
+        self._waits = True
+        try:
+            if self._stop:
+                raise StoppedError
+            yield
+        finally:
+            self._waits = False
+
+    def stop(self) -> None:
+        """Stop it as it next waits."""
+        self._stop = True
+
+    def _asked(self, number: int, frame: FrameType | None) -> None:
+        self._stop = True
+        if self._waits:
+            raise StoppedError
+
+
+def _line(answer: Answer) -> bytes:
+    return to_json_line(answer).encode() + b"\n"
+
+
+# -- Pipes and files ------------------------------------------------------------------------------
+
+
+def serve_stream(station: Station, source: BinaryIO, sink: BinaryIO) -> None:
+    """Read lines to the end of a pipe or a file.
+
+    Raises
+    ------
+    BrokenPipeError
+        If nobody reads the answers any more.
+    """
+    lines = Lines()
+    while True:
+        with station.waiting():
+            data = _read(source, station.patience)
+        if data is None:
+            answers = station.beat()
+        else:
+            answers = station.answer(lines.feed(data) if data else lines.rest())
+        if answers:
+            sink.write(answers)
+            sink.flush()
+        if data == b"":
+            return
+
+
+def _read(source: BinaryIO, patience: float | None) -> bytes | None:
+    """What there is; empty at the end, None where nothing came in time."""
+    if patience is not None and not select.select([source], [], [], patience)[0]:
+        return None
+    return source.read1(_CHUNK)  # type: ignore[attr-defined,no-any-return]
+
+
+# -- A UNIX socket --------------------------------------------------------------------------------
+
+
+class _Peer:
+    """Whoever is connected, with what it has not read yet."""
+
+    def __init__(self, connection: socket.socket) -> None:
+        self.connection = connection
+        self.lines = Lines()
+        self.unread = b""
+
+    def send(self, data: bytes) -> bool:
+        """Send what goes; False where the peer is gone, or leaves too much unread."""
+        self.unread += data
+        try:
+            while self.unread:
+                self.unread = self.unread[self.connection.send(self.unread) :]
+        except (BlockingIOError, InterruptedError):
+            return len(self.unread) <= _UNREAD
+        except OSError:
+            return False
+        return True
+
+
+class SocketServer:
+    """Answers whoever connects to a UNIX socket; several peers speak of the same car.
+
+    Parameters
+    ----------
+    path : Path
+        Of the socket, for this user only. One that nobody listens to any more is replaced.
+
+    Raises
+    ------
+    OSError
+        If there can be none, or something else is there.
+    ValueError
+        If another process listens there.
+    """
+
+    def __init__(self, path: Path) -> None:
+        if not hasattr(socket, "AF_UNIX"):
+            raise ValueError("this system has no UNIX sockets; --udp PORT carries the same")
+        _make_way(path)
+        self.path = path
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        try:
+            self._socket.bind(os.fspath(path))
+            path.chmod(0o600)
+            self._socket.listen()
+            self._socket.setblocking(False)
+        except BaseException as error:
+            self._socket.close()
+            if isinstance(error, OSError) and error.filename is None:
+                error.filename = os.fspath(path)
+            raise
+        self._selector = selectors.DefaultSelector()
+        self._selector.register(self._socket, selectors.EVENT_READ)
+
+    def serve(self, station: Station) -> None:
+        """Serve until it is stopped."""
+        while True:
+            with station.waiting():
+                ready = self._selector.select(station.patience)
+            for key, events in ready:
+                if key.data is None:
+                    self._accept()
+                else:
+                    self._attend(key.data, events, station)
+            if beat := station.beat():
+                for peer in self._peers():
+                    self._send(peer, beat)
+
+    def close(self) -> None:
+        """Let go of all peers, and remove the socket."""
+        for peer in self._peers():
+            self._let_go(peer)
+        self._selector.close()
+        self._socket.close()
+        self.path.unlink(missing_ok=True)
+
+    def _peers(self) -> list[_Peer]:
+        return [key.data for key in self._selector.get_map().values() if key.data is not None]
+
+    def _accept(self) -> None:
+        with suppress(OSError):  # gone already
+            connection, _ = self._socket.accept()
+            connection.setblocking(False)
+            self._selector.register(connection, selectors.EVENT_READ, _Peer(connection))
+
+    def _attend(self, peer: _Peer, events: int, station: Station) -> None:
+        answers = b""
+        if events & selectors.EVENT_READ:
+            try:
+                data = peer.connection.recv(_CHUNK)
+            except (BlockingIOError, InterruptedError):
+                return
+            except OSError:
+                data = b""
+            answers = station.answer(peer.lines.feed(data) if data else peer.lines.rest())
+            if not data:
+                peer.send(answers)
+                self._let_go(peer)
+                return
+        self._send(peer, answers)
+
+    def _send(self, peer: _Peer, data: bytes) -> None:
+        if not peer.send(data):
+            self._let_go(peer)
+            return
+        events = selectors.EVENT_READ | (selectors.EVENT_WRITE if peer.unread else 0)
+        self._selector.modify(peer.connection, events, peer)
+
+    def _let_go(self, peer: _Peer) -> None:
+        self._selector.unregister(peer.connection)
+        peer.connection.close()
+
+
+def _make_way(path: Path) -> None:
+    """Remove the socket of a process that is gone."""
+    try:
+        mode = path.stat().st_mode
+    except FileNotFoundError:
+        return
+    if not stat.S_ISSOCK(mode):
+        raise ValueError(f"{path} is there, and is no socket; name another file")
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
+        if probe.connect_ex(os.fspath(path)) == 0:
+            raise ValueError(f"{path}: another process listens there")
+    path.unlink(missing_ok=True)
+
+
+# -- UDP ------------------------------------------------------------------------------------------
+
+
+class UdpServer:
+    """Answers datagrams from this computer, a line or some of them in each, to their senders.
+
+    Parameters
+    ----------
+    port : int
+        0 for any that is free.
+    """
+
+    def __init__(self, port: int) -> None:
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        try:
+            self._socket.bind(("127.0.0.1", port))
+        except OSError as error:
+            self._socket.close()
+            error.filename = f"UDP port {port}"
+            raise
+        self.port: int = self._socket.getsockname()[1]
+        self._sender: Any = None
+
+    def serve(self, station: Station) -> None:
+        """Serve until it is stopped."""
+        while True:
+            self._socket.settimeout(station.patience)
+            data = None
+            try:
+                with station.waiting():
+                    data, self._sender = self._socket.recvfrom(_CHUNK)
+            except OSError:  # nothing in time; or the sender of before is gone
+                pass
+            if data is None:
+                answers = station.beat()
+            else:
+                answers = station.answer(data.removesuffix(b"\n").split(b"\n"))
+            for answer in answers.splitlines(keepends=True):
+                with suppress(OSError):
+                    self._socket.sendto(answer, self._sender)
+
+    def close(self) -> None:
+        """Let others have the port."""
+        self._socket.close()
+
+
+# -- Zenoh ----------------------------------------------------------------------------------------
+
+
+class ZenohServer:
+    """Takes messages that are put under ``KEY/row``, and puts answers under ``KEY/decision``.
+
+    The session is configured by the file that the variable ``ZENOH_CONFIG`` names, where it is
+    set; else it finds peers and routers of its network by itself.
+
+    Parameters
+    ----------
+    key : str
+
+    Raises
+    ------
+    ModuleNotFoundError
+        If Zenoh is not installed.
+    ValueError
+        If the key is none, or no session can be opened.
+    """
+
+    def __init__(self, key: str) -> None:
+        with needs("eclipse-zenoh", "zenoh", "Zenoh"):
+            import zenoh
+        self._came: queue.Queue[bytes] = queue.Queue(_WAITING)
+        self._dropped = 0
+        try:
+            told = os.environ.get("ZENOH_CONFIG")
+            config = zenoh.Config.from_file(told) if told else zenoh.Config()
+            self._session = zenoh.open(config)
+        except zenoh.ZError as error:
+            raise ValueError(f"Zenoh: {error}") from None
+        try:
+            self._publisher = self._session.declare_publisher(
+                f"{key}/decision", express=True, priority=zenoh.Priority.REAL_TIME
+            )
+            self._subscriber = self._session.declare_subscriber(f"{key}/row", self._take)
+        except zenoh.ZError as error:
+            self.close()
+            raise ValueError(f"--zenoh {key}: {error}") from None
+
+    def serve(self, station: Station) -> None:
+        """Serve until it is stopped."""
+        while True:
+            data = None
+            try:
+                with station.waiting():
+                    data = self._came.get(timeout=station.patience)
+            except queue.Empty:
+                pass
+            if data is None:
+                answers = station.beat()
+            else:
+                answers = station.answer(data.removesuffix(b"\n").split(b"\n"))
+            dropped, self._dropped = self._dropped, 0
+            if dropped:
+                answers += station.refuse(f"{dropped} messages came too fast, and were left out")
+            for answer in answers.splitlines():
+                self._publisher.put(answer)
+
+    def close(self) -> None:
+        """Leave the network."""
+        self._session.close()  # type: ignore[no-untyped-call]
+
+    def _take(self, sample: Any) -> None:
+        """In a thread of Zenoh's."""
+        try:
+            self._came.put_nowait(sample.payload.to_bytes())
+        except queue.Full:
+            self._dropped += 1
+
+
+def silence_output() -> None:
+    """Nobody reads it any more: nothing is to fail as the process ends."""
+    with suppress(OSError, ValueError), open(os.devnull, "wb") as nothing:
+        os.dup2(nothing.fileno(), sys.stdout.fileno())

@@ -1,0 +1,269 @@
+"""The clock of a run that is watched: pause, step, speed, restart; in a thread of its own."""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from typing import NamedTuple, Protocol, Self
+
+from evofsm.cli.watch.shown import Frame, Graph, Start
+
+#: Speeds that can be chosen, as multiples of real time.
+SPEEDS = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
+
+# Between two graphs, unless a state was created [decisions].
+_GRAPH_EVERY = 8
+# Who is late by more does not hurry to make up for it [s].
+_LATE = 0.1
+
+
+class Watched(Protocol):
+    """Anything that can be watched: a session, or a run that was recorded."""
+
+    revising: bool  #: whether the reviser may act
+
+    @property
+    def start(self) -> Start:
+        """What is known as the run begins."""
+        ...
+
+    def restart(self, case: int | None = None) -> Start:
+        """Begin anew, or another case."""
+        ...
+
+    def step(self) -> Frame:
+        """The next frame."""
+        ...
+
+    def graph(self) -> Graph:
+        """The states at the latest frame."""
+        ...
+
+
+class Clock(NamedTuple):
+    """How the run is being played."""
+
+    paused: bool
+    speed: float  #: multiple of real time; infinite for as fast as it goes
+    revising: bool
+    over: bool
+
+
+class Audience(Protocol):
+    """Whoever is told what happens; it must not wait."""
+
+    def began(self, start: Start, clock: Clock) -> None:
+        """A run begins."""
+        ...
+
+    def saw(self, frame: Frame) -> None:
+        """The next frame."""
+        ...
+
+    def grew(self, graph: Graph) -> None:
+        """States, or ways between them, have changed."""
+        ...
+
+    def ticked(self, clock: Clock) -> None:
+        """It is played otherwise."""
+        ...
+
+    def failed(self, text: str) -> None:
+        """It broke off with an error."""
+        ...
+
+
+class Player:
+    """Plays what is watched at a pace, and does as it is told while it plays.
+
+    What it is told is carried out before the next decision; telling never waits. What cannot be
+    opened raises its error where the player is entered.
+
+    Parameters
+    ----------
+    watched : callable
+        Opens what is watched, for use in a ``with`` statement, in the player's own thread: SUMO
+        and its roads stay in one thread.
+    audience : Audience
+    paused : bool
+        Whether it waits at first.
+    speed : float
+        Multiple of real time; infinite for as fast as it goes.
+    awaits : bool
+        Whether it plays nothing before `attend`, as long as no one looks on.
+    """
+
+    def __init__(
+        self,
+        watched: Callable[[], AbstractContextManager[Watched]],
+        audience: Audience,
+        *,
+        paused: bool = False,
+        speed: float = 1.0,
+        awaits: bool = False,
+    ) -> None:
+        self._watched = watched
+        self._audience = audience
+        self._awaits = awaits
+        self._paused = paused
+        self._speed = _checked(speed)
+        self._over = False
+        self._steps = 0  # to be taken although paused
+        self._due = 0.0  # when the next frame is [s]
+        self._since = 0  # frames since the latest graph
+        self._told = threading.Condition()
+        self._orders: dict[str, Callable[[Watched], None]] = {}  # the latest of each kind
+        self._closed = False
+        self._opened = threading.Event()
+        self._refused: Exception | None = None  # why it could not be opened
+        self._thread = threading.Thread(target=self._play, name="evofsm-player", daemon=True)
+
+    # -- Told from any thread ---------------------------------------------------------------------
+
+    def attend(self) -> None:
+        """Someone looks on: play, if that was waited for."""
+        if self._awaits:
+
+            def order(watched: Watched) -> None:
+                self._awaits, self._due = False, time.monotonic()
+
+            self._tell("attend", order)
+
+    def pause(self, paused: bool) -> None:
+        """Wait, or go on."""
+
+        def order(watched: Watched) -> None:
+            self._paused, self._due = paused, time.monotonic()
+
+        self._tell("pause", order)
+
+    def step(self) -> None:
+        """One decision, then wait."""
+
+        def order(watched: Watched) -> None:
+            self._paused, self._steps = True, 1
+
+        self._tell("step", order)
+
+    def speed(self, speed: float) -> None:
+        """Play so many times as fast as real time.
+
+        Raises
+        ------
+        ValueError
+            If the speed is not positive.
+        """
+        _checked(speed)
+
+        def order(watched: Watched) -> None:
+            self._speed, self._due = speed, time.monotonic()
+
+        self._tell("speed", order)
+
+    def revise(self, on: bool) -> None:
+        """Switch the reviser on or off."""
+
+        def order(watched: Watched) -> None:
+            watched.revising = on
+
+        self._tell("revise", order)
+
+    def restart(self, case: int | None = None) -> None:
+        """Begin anew, or another case; and go on if it waited."""
+
+        def order(watched: Watched) -> None:
+            watched.restart(case)
+            self._paused = False
+            self._begin(watched)
+
+        self._tell("restart", order)
+
+    def _tell(self, kind: str, order: Callable[[Watched], None]) -> None:
+        with self._told:
+            self._orders.pop(kind, None)  # what was told last comes last
+            self._orders[kind] = order
+            self._told.notify()
+
+    # -- In its own thread ------------------------------------------------------------------------
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        self._opened.wait()
+        if self._refused is not None:
+            self._thread.join()
+            raise self._refused
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        with self._told:
+            self._closed = True
+            self._told.notify()
+        self._thread.join()
+
+    def _play(self) -> None:
+        try:
+            with self._watched() as watched:
+                self._begin(watched)
+                self._opened.set()
+                while self._is_due(watched):
+                    self._show(watched, watched.step())
+        except Exception as error:
+            if not self._opened.is_set():
+                self._refused = error
+                self._opened.set()
+            # Whoever looks on must learn why nothing moves any more.
+            self._audience.failed(f"{type(error).__name__}: {error}")
+
+    def _begin(self, watched: Watched) -> None:
+        self._over, self._due = False, time.monotonic()
+        self._audience.began(watched.start, self._clock(watched))
+        self._audience.grew(watched.graph())
+
+    def _is_due(self, watched: Watched) -> bool:
+        """Wait for the next frame, and do meanwhile what was told; False once closed."""
+        while True:
+            with self._told:
+                while not (self._orders or self._closed or (wait := self._wait()) <= 0.0):
+                    self._told.wait(None if math.isinf(wait) else wait)
+                if self._closed:
+                    return False
+                orders, self._orders = self._orders, {}
+            if not orders:
+                break
+            for order in orders.values():
+                order(watched)
+            self._audience.ticked(self._clock(watched))
+        self._steps = 0
+        # What came late is not made up for.
+        self._due = max(self._due, time.monotonic() - _LATE) + watched.start.interval / self._speed
+        return True
+
+    def _wait(self) -> float:
+        """Time until the next frame [s]; infinite where none comes by itself."""
+        if self._over or self._awaits:
+            return math.inf
+        if self._paused:
+            return 0.0 if self._steps else math.inf
+        return self._due - time.monotonic()
+
+    def _show(self, watched: Watched, frame: Frame) -> None:
+        self._audience.saw(frame)
+        self._since += 1
+        if frame.event == "created" or frame.over or self._since >= _GRAPH_EVERY:
+            self._audience.grew(watched.graph())
+            self._since = 0
+        if frame.over:
+            self._over = True
+            self._audience.ticked(self._clock(watched))
+
+    def _clock(self, watched: Watched) -> Clock:
+        return Clock(self._paused, self._speed, watched.revising, self._over)
+
+
+def _checked(speed: float) -> float:
+    if not speed > 0.0:
+        raise ValueError(f"speed is {speed}; it must be positive")
+    return speed

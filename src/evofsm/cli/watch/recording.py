@@ -1,0 +1,235 @@
+"""A run that was recorded, shown as one that is driven: nothing is computed anew."""
+
+from __future__ import annotations
+
+import math
+from os import PathLike
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evofsm.cli.watch.chronicle import Chronicle
+from evofsm.cli.watch.shown import (
+    CAR_LENGTH,
+    HEADWAY,
+    RECORDED,
+    TTC,
+    Frame,
+    Graph,
+    Judged,
+    Start,
+    most_believed,
+    states_of,
+    usual_ways,
+)
+from evofsm.driving import VARIABLES, time_headway, time_to_collision
+from evofsm.guard import RECORD, TOLERANCE
+from evofsm.io import RecordedEpisode, Run, read_run
+
+# What is accepted where a log does not say.
+# So many of a log's episodes can be chosen among.
+_MOST_EPISODES = 500
+_NONE = -1
+
+
+class Recording:
+    """Shows the episodes of a log, frame by frame.
+
+    What a log does not hold stays unknown: how hard a leader's braking could be survived, and so
+    which states are dead ends; those in which a collision ended are marked instead.
+
+    Parameters
+    ----------
+    path : str or path-like
+        Of a log that `evofsm.io.mcap.write_run` wrote.
+
+    Raises
+    ------
+    OSError
+        If there is no such file.
+    ValueError
+        If it holds no run, or no episode with a decision.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from evofsm.driving import drive, load_family, unrevised_guard
+    >>> from evofsm.io import write_run
+    >>> family = load_family("paper")
+    >>> driven = drive(unrevised_guard(family), family.draw(0, 0))
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     write_run(Path(folder) / "run.mcap", [driven], about={"family": "paper"})
+    ...     recording = Recording(Path(folder) / "run.mcap")
+    >>> frame = recording.step()
+    >>> while not frame.over:
+    ...     frame = recording.step()
+    >>> frame.collided, frame.time
+    (True, 31.4)
+    """
+
+    def __init__(self, path: str | PathLike[str]) -> None:
+        self._run: Run = read_run(path)
+        self._name = self._run.about.get("source", Path(path).name)
+        self._episodes = [one for one in self._run.episodes if len(one.columns["time"])]
+        if not self._episodes:
+            raise ValueError(f"{path} holds no episode with a decision")
+        self._tolerance = _number(self._run.about.get("tolerance"), TOLERANCE)
+        self.revising = self._run.about.get("mode", "act") == "act"
+        self.start = self.restart(0)
+
+    def restart(self, case: int | None = None) -> Start:
+        """Show an episode from its start, or another one.
+
+        Raises
+        ------
+        ValueError
+            If there is no such episode.
+        """
+        case = self.start.case if case is None else case
+        if not 0 <= case < len(self._episodes):
+            raise ValueError(f"episode is {case + 1}; there are 1 to {len(self._episodes)}")
+        self._episode = self._episodes[case]
+        self._cars = _cars(self._episode)
+        self._number = 0
+        self._chronicle = Chronicle(self._tolerance, (TTC.threshold, HEADWAY.threshold))
+        self.start = self._start(case)
+        return self.start
+
+    def step(self) -> Frame:
+        """The next frame.
+
+        Raises
+        ------
+        RuntimeError
+            If the episode is over.
+        """
+        number, decisions = self._number, len(self._episode.columns["time"])
+        if number > decisions:
+            raise RuntimeError("the episode is over; restart it")
+        frame = self._moved(number)
+        if number < decisions:
+            frame = frame._replace(**_decided(self._episode.columns, number))
+        else:
+            frame = frame._replace(
+                over=True, collided=self._episode.collided, rear_ended=self._episode.rear_ended
+            )
+        self._number += 1
+        return frame._replace(story=self._chronicle.tell(frame))
+
+    def graph(self) -> Graph:
+        """The states as they were after the last episode."""
+        model = self._run.model
+        if model is None:
+            return Graph(self._number, (), ())
+        return Graph(self._number, states_of(model), tuple(usual_ways(model)))
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        """Nothing is open."""
+
+    def _start(self, case: int) -> Start:
+        about, columns = self._run.about, self._episode.columns
+        times = np.append(columns["time"], self._episode.end_time)
+        commands = np.concatenate([columns["proposed"], columns["executed"], [0.0]])
+        return Start(
+            family=about.get("family", self._name),
+            about=f"recorded in {self._name}",
+            cases=tuple(f"episode {k + 1}" for k in range(len(self._episodes[:_MOST_EPISODES]))),
+            case=case,
+            world=about.get("world", ""),
+            controller=about.get("controller", ""),
+            reviser=about.get("reviser", ""),
+            tolerance=self._tolerance,
+            interval=float(np.median(np.diff(times))),
+            duration=self._episode.end_time,
+            actions=(float(np.nanmin(commands)), float(np.nanmax(commands))),
+            car_length=CAR_LENGTH,
+            ttc_threshold=TTC.threshold,
+            headway_threshold=HEADWAY.threshold,
+            learnt=0,
+            judge=about.get("judge", "kinematic"),
+        )
+
+    def _moved(self, number: int) -> Frame:
+        """Where the cars are; the rest is as in a frame in which nothing is decided."""
+        columns, cars = self._episode.columns, self._cars
+        observed = cars["observed"][number]
+        gap, speed, leader_speed = observed.tolist()
+        last = min(number, len(columns["time"]) - 1)
+        return Frame(
+            number=number,
+            time=float(cars["time"][number]),
+            gap=gap,
+            v_follower=speed,
+            v_leader=leader_speed,
+            a_follower=float(cars["a_follower"][number]),
+            a_leader=float(cars["a_leader"][number]),
+            x_follower=float(cars["x_follower"][number]),
+            gap_behind=math.inf,
+            observation=(gap, speed, leader_speed),
+            n_states=int(columns["n_states"][last]),
+            time_to_collision=float(time_to_collision(observed)),
+            time_headway=float(time_headway(observed)),
+            revising=self.revising,
+            story=self._chronicle.story,
+        )
+
+
+def _decided(columns: Any, number: int) -> dict[str, Any]:
+    """What was recognised, judged and decided, by the names of a frame."""
+    state, before = (int(columns["state"][k]) for k in (number, max(0, number - 1)))
+    executed = Judged(
+        *(float(columns[name][number]) for name in ("risk_executed", "risk_low", "risk_high"))
+    )
+    proposed = float(columns["risk_proposed"][number])
+    # The log has the interval of what was executed only.
+    is_kept = proposed == executed.risk
+    unknown = Judged(proposed, math.nan, math.nan)
+    return {
+        **{name: RECORD[name].kind(columns[name][number]) for name in RECORDED},
+        "belief": most_believed(columns["belief"][number]),
+        "state": None if state == _NONE else state,
+        "event": "moved" if state != before else "",
+        "proposed_risk": executed if is_kept else unknown,
+        "executed_risk": executed,
+    }
+
+
+def _cars(episode: RecordedEpisode) -> dict[str, NDArray[np.float64]]:
+    """Where the cars are at each decision and at the end, and how they got there."""
+    columns = episode.columns
+    time = np.append(columns["time"], episode.end_time)
+    observed = np.column_stack([columns[name] for name in VARIABLES])
+    observed = _held(np.vstack([observed, episode.end]))
+    lasted, speeds = np.diff(time), observed[:, 1:]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        accelerations = np.diff(speeds, axis=0) / lasted[:, None]
+    moved = 0.5 * (speeds[1:, 0] + speeds[:-1, 0]) * lasted
+    return {
+        "time": time,
+        "observed": observed,
+        "a_follower": np.insert(accelerations[:, 0], 0, math.nan),
+        "a_leader": np.insert(accelerations[:, 1], 0, math.nan),
+        "x_follower": np.insert(np.cumsum(moved), 0, 0.0),
+    }
+
+
+def _held(rows: NDArray[np.float64]) -> NDArray[np.float64]:
+    """What was not seen is as it was seen last; before that, as it was seen first."""
+    for column in rows.T:
+        known = np.flatnonzero(np.isfinite(column))
+        if len(known):
+            latest = np.searchsorted(known, np.arange(len(column)), side="right") - 1
+            column[:] = column[known[np.maximum(latest, 0)]]
+    return rows
+
+
+def _number(text: str | None, default: float) -> float:
+    try:
+        return default if text is None else float(text)
+    except ValueError:
+        return default

@@ -1,0 +1,246 @@
+"""What is shown of a run: its start, a frame for every decision, its story, and the states."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evofsm.driving import LatentRisk, TimeHeadway, TimeToCollision, assess_states
+from evofsm.fsm import EvolvingFSM, FSMModel
+from evofsm.guard import LearningJudge
+
+#: What is drawn of a car; worlds need no length [m].
+CAR_LENGTH = 5.0
+#: The classic measures that are shown beside, with their thresholds.
+TTC, HEADWAY = TimeToCollision(), TimeHeadway()
+
+# So many states of a belief are shown, and none that is less probable.
+_MOST_BELIEVED, _LEAST_BELIEF = 12, 0.002
+# Of each state so many ways out are shown, and none that is rarer.
+_MOST_WAYS, _LEAST_SHARE = 3, 0.02
+
+
+class Danger(NamedTuple):
+    """A stretch of time in which the driver's wishes were not tolerable."""
+
+    since: float  #: [s]
+    gap: float  #: then [m]
+    speed: float  #: the follower's, then [m/s]
+    closing: float  #: the follower's speed less the leader's, then [m/s]
+    risk: float  #: of what the driver then wanted
+    #: hardest braking of the leader that was then survived [m/s²]; NaN, as the next two, where the
+    #: judge knows no leaders
+    critical: float
+    brakes_to: float  #: how hard leaders were then known to brake [m/s²]
+    decel: float  #: how hard the follower was then known to brake in full [m/s²]
+    proposed: float  #: what the driver then wanted [m/s²]
+    advised: float  #: what the reviser then found better [m/s²]
+    why: str = ""  #: what a judge then said that knows no leaders
+    stepped_in: float = math.nan  #: when the reviser first changed something in it [s]
+    wished: float = math.nan  #: what the driver wanted then [m/s²]
+    instead: float = math.nan  #: and what was executed [m/s²]
+    revised: int = 0  #: decisions in it that the reviser changed
+    change: float = 0.0  #: by how much, all of them together [m/s²]
+    off: float = math.nan  #: time of the latest decision in it with the reviser off [s]
+    decisions: int = 0  #: decisions in it
+    hardest: float = math.inf  #: lowest acceleration that the reviser put through in it [m/s²]
+    dead_end: float = math.nan  #: since when full braking was too late as well [s]
+    last: float = math.nan  #: time of the latest decision that was not tolerable [s]
+
+
+class Story(NamedTuple):
+    """What has happened so far; times are NaN where it has not."""
+
+    danger: Danger | None = None  #: the present or the latest one
+    in_danger: bool = False
+    judged: bool = False  #: whether any wish of the driver was judged
+    first: float = math.nan  #: when danger began for the first time [s]
+    time_to_collision: float = math.nan  #: when it first fell below its threshold [s]
+    time_headway: float = math.nan  #: the same of time headway [s]
+    leader_brakes: float = math.nan  #: when the leader first braked hard [s]
+    leader_decel: float = math.nan  #: how hard it has braked since, at most [m/s²]
+    revised: int = 0  #: decisions that the reviser changed, in danger or not
+    alone: float = math.nan  #: when the driver left alone collides [s]; infinite if it does not
+    collision: float = math.nan  #: [s]
+    impact: float = math.nan  #: speed at which the cars met [m/s]
+    ended: float = math.nan  #: [s]
+
+
+class Judged(NamedTuple):
+    """Risk of an action, with its 90 % interval."""
+
+    risk: float
+    low: float
+    high: float
+
+
+#: Where nothing is judged.
+UNJUDGED = Judged(math.nan, math.nan, math.nan)
+
+
+class Start(NamedTuple):
+    """What is known as a run begins."""
+
+    family: str
+    about: str  #: what happens in the family, in a sentence
+    cases: tuple[str, ...]  #: that can be chosen
+    case: int  #: the one that is driven
+    world: str
+    controller: str
+    reviser: str
+    tolerance: float  #: highest risk that is accepted
+    interval: float  #: time between decisions [s]
+    duration: float  #: time that is driven at most [s]
+    actions: tuple[float, float]  #: lowest and highest acceleration [m/s²]
+    car_length: float  #: [m]
+    ttc_threshold: float  #: time to collision below which it is said to warn [s]
+    headway_threshold: float  #: the same of time headway [s]
+    learnt: int  #: episodes learnt from before
+    judge: str = "kinematic"  #: by what it was told, a name of `evofsm.driving.TOLD`
+
+
+class Frame(NamedTuple):
+    """One decision: where the cars are, what was recognised, judged, proposed and executed.
+
+    The last frame of a run shows how it ended: nothing is decided in it, and what was not is NaN.
+    """
+
+    number: int  #: in this run, from 0
+    time: float  #: [s]
+    gap: float  #: bumper to bumper, as it truly is [m]
+    v_follower: float  #: [m/s]
+    v_leader: float  #: [m/s]
+    a_follower: float  #: what the body did until now [m/s²]; NaN at first
+    a_leader: float  #: [m/s²]; NaN at first
+    x_follower: float  #: front bumper, from where it started [m]
+    gap_behind: float  #: to the car behind [m]; infinite where there is none
+    observation: tuple[float, ...]  #: gap, v_follower, v_leader, as they were seen
+    n_states: int
+    time_to_collision: float  #: [s]; infinite where the gap does not close
+    time_headway: float  #: [s]
+    revising: bool  #: whether the reviser may act
+    story: Story  #: what has happened so far
+    decel: float = math.nan  #: of the follower if it brakes in full, as far as is known [m/s²]
+    #: all but a tolerated share of leaders' hard brakes are softer [m/s²]
+    brakes_to: float = math.nan
+    #: the most probable states, and how probable they are
+    belief: tuple[tuple[int, float], ...] = ()
+    state: int | None = None  #: the most probable one
+    event: str = ""  #: ``created``, ``moved``, or nothing
+    surprise: float = math.nan  #: [bit]
+    proposed_risk: Judged = UNJUDGED  #: of what the driver wants
+    executed_risk: Judged = UNJUDGED  #: of what is executed
+    #: of full braking at once, or of the best that a learnt judge knows: high in a dead end
+    braking_risk: float = math.nan
+    #: hardest braking of the leader that is survived if the driver has its way [m/s²]
+    critical: float = math.nan
+    why: str = ""  #: why a learnt judge finds dangerous what the driver wants; empty of another
+    proposed: float = math.nan  #: [m/s²]
+    executed: float = math.nan  #: [m/s²]
+    advised: float = math.nan  #: what the reviser would execute, on or off [m/s²]
+    reason: str = ""  #: the reviser's
+    explanation: str = ""  #: what the machine has seen of such situations
+    collided: bool = False  #: with the leader
+    rear_ended: bool = False  #: by the car behind
+    over: bool = False  #: whether the run ended here
+
+
+#: What a frame takes over from the record of a decision (`evofsm.guard.RECORD`), as it is.
+RECORDED = ("state", "surprise", "proposed", "executed", "advised", "reason", "explanation")
+
+
+class StateShown(NamedTuple):
+    """A state, as it is drawn."""
+
+    state: int
+    center: tuple[float, ...]  #: gap [m], v_follower [m/s], v_leader [m/s]
+    visits: float
+    risk: float  #: latent risk if one brakes in full at once; NaN where it is not known
+    is_dead_end: bool  #: or where that is not known, whether a collision ended in it
+    failures: float  #: collisions that ended in it
+
+
+class Transition(NamedTuple):
+    """From a state to another."""
+
+    origin: int
+    target: int
+    share: float  #: of all changes out of the origin
+
+
+class Graph(NamedTuple):
+    """The states found so far, and how one follows another."""
+
+    number: int  #: of the frame from which on it holds
+    states: tuple[StateShown, ...]
+    transitions: tuple[Transition, ...]
+
+
+def graph_of(known: EvolvingFSM | FSMModel, judge: LearningJudge, number: int = 0) -> Graph:
+    """The states of a machine or a model, and their usual ways out.
+
+    Parameters
+    ----------
+    known : EvolvingFSM or FSMModel
+    judge : LearningJudge
+        A `LatentRisk` says which states are dead ends.
+    number : int
+        Of the frame from which on it holds.
+
+    Examples
+    --------
+    >>> from evofsm import EvolvingFSM
+    >>> machine = EvolvingFSM(n_actions=1, radius=0.5)
+    >>> trace = machine.learn_many([[50.0, 5.0, 5.0], [9.0, 20.0, 20.0]], [0, 0])
+    >>> graph_of(machine, LatentRisk(lowest=-4.0)).transitions
+    ()
+    """
+    ways = tuple(usual_ways(known))
+    if not isinstance(judge, LatentRisk):
+        return Graph(number, states_of(known), ways)
+    centers, visits = known.centers, known.visits
+    states = tuple(
+        StateShown(
+            one.state,
+            tuple(centers[one.state].tolist()),
+            float(visits[one.state]),
+            one.risk,
+            one.is_dead_end,
+            one.failures,
+        )
+        for one in assess_states(known, judge)
+    )
+    return Graph(number, states, ways)
+
+
+def states_of(known: EvolvingFSM | FSMModel) -> tuple[StateShown, ...]:
+    """The states, those marked in which a collision ended: how dangerous each is nobody says."""
+    return tuple(
+        StateShown(state, tuple(center), float(visits), math.nan, bool(ended > 0.0), float(ended))
+        for state, (center, visits, ended) in enumerate(
+            zip(known.centers.tolist(), known.visits, known.endings, strict=True)
+        )
+    )
+
+
+def usual_ways(known: EvolvingFSM | FSMModel) -> list[Transition]:
+    """How one state follows another, of each state the most usual ways."""
+    changes = known.changes * ~np.eye(known.n_states, dtype=bool)
+    ways = []
+    for origin, row in enumerate(changes):
+        if not row.any():
+            continue
+        shares = row / row.sum()
+        for target in np.argsort(-shares, kind="stable")[:_MOST_WAYS].tolist():
+            if shares[target] >= _LEAST_SHARE:
+                ways.append(Transition(origin, target, float(shares[target])))
+    return ways
+
+
+def most_believed(belief: NDArray[np.float64]) -> tuple[tuple[int, float], ...]:
+    """The most probable states, and how probable they are."""
+    most = np.argsort(-belief, kind="stable")[:_MOST_BELIEVED].tolist()
+    return tuple((k, float(belief[k])) for k in most if belief[k] >= _LEAST_BELIEF)

@@ -1,0 +1,255 @@
+# ruff: noqa: RUF009  (an `Array` as a default never changes)
+"""The one table of what a machine learns: each array stands here, once, with all there is to know.
+
+The flat buffer (`layout`), the members of files and their ranges, what a merge adds up and a state
+that is given up loses, the fields of a model and the properties of a machine are read from it.
+Counts that people may ask for stand in `Counts`; a new one is a line there, and a line where it is
+counted (CONTRIBUTING.md, *Add a counter*).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, cast, get_type_hints
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evofsm.fsm.layout import SHAPES, Array, Floats
+from evofsm.store import ranges
+
+# A row with a smaller scale is multiplied out, long before it underflows.
+SMALLEST_SCALE = 1e-30
+#: The place of an action without a matrix, and the action where there is none.
+NOT_OPEN = -1.0
+NO_ACTION = -1
+
+_FARTHEST = (1.0 + ranges.ROUNDING) * ranges.LARGEST_OBSERVATION
+_OBSERVED = ranges.Range(-_FARTHEST, _FARTHEST)
+_INDEX = ranges.Range(-1.0, ranges.MOST_COUNTED, whole=True)
+# Of all states together, where they were merged into one.
+_FREQUENCY = ranges.Range(0.0, ranges.LARGEST_OBSERVATION)
+
+
+def _array(kind: str, *arguments: Any, **options: Any) -> Any:
+    """An `Array`; as a default of a field it has any type."""
+    return Array(kind, *arguments, **options)
+
+
+_counter = partial(_array, "counter", ranges.COUNT)
+_per_state, _per_place = partial(_array, "state"), partial(_array, "place")
+# Counts of states, and of states and actions, that never forget.
+_of_states = partial(_per_state, ranges.COUNT, "sum")
+_of_actions = partial(_per_place, ranges.COUNT, "sum")
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Counts:
+    """What was counted; machines and models have it under these names.
+
+    n is the number of states, q of actions. Counts never forget: a rare failure must not fade, and
+    they are the evidence that there is. An episode is counted once for each state it came to, and
+    each action it took there, for observations of one episode are no independent evidence; the one
+    that is going on is not shown yet. It failed *soon* after it was in a state if no more than
+    ``failure_horizon`` observations lay between; where that is not set, if it failed at all.
+
+    Examples
+    --------
+    >>> from evofsm import EvolvingFSM
+    >>> machine = EvolvingFSM(n_actions=2, radius=0.5)
+    >>> trace = machine.learn_many([[0.0], [0.1], [2.0], [1.0]], [0, 1, 0, 0], [0, 2], [3])
+    >>> machine.visits, machine.endings, machine.episodes, machine.failed_soon
+    (array([3., 1.]), array([0., 1.]), array([2., 1.]), array([1., 1.]))
+    >>> machine.decisions, machine.failures
+    (array([[2., 0.],
+           [0., 0.]]), array([[1., 0.],
+           [0., 0.]]))
+    >>> machine.model().tried, machine.model().failed_after
+    (array([[2., 0.],
+           [0., 0.]]), array([[1., 0.],
+           [0., 0.]]))
+    >>> machine.onsets  # it was not asked to learn how its system moves
+    array([0., 0.])
+    """
+
+    #: (n,) observations in which each state was the most probable
+    visits: Floats = _of_states()
+    #: (n,) number of the observation that created each state, from 1
+    founded: Floats = _per_state(ranges.COUNT)
+    #: (n, n) steps from the most probable state (row) to the next one (column)
+    changes: Floats = _array("change", ranges.COUNT, "sum")
+    #: (q, n) for each action, transitions that began in each state, by belief
+    decisions: Floats = _per_place(ranges.SUM, "sum", since=2)
+    #: (q, n) those of `decisions` that led straight into failure
+    failures: Floats = _per_place(ranges.SUM, "sum", since=2)
+    #: (n,) failures whose last observation was recognised as each state: maybe a dead end
+    endings: Floats = _of_states(since=2)
+    #: (n,) episodes that came to each state
+    episodes: Floats = _of_states(since=5, latest="latest_visit")
+    #: (n,) those of `episodes` that failed soon after they were there
+    failed_soon: Floats = _of_states(since=5)
+    #: (n,) 1 where two states were joined, so that an episode may count twice
+    joined: Floats = _per_state(ranges.FLAG, "most", since=5)
+    #: (q, n) episodes that took each action in each state
+    tried: Floats = _of_actions(since=5, latest="latest_try")
+    #: (q, n) those of `tried` that failed soon after they did
+    failed_after: Floats = _of_actions(since=5)
+    #: (n,) times that something unexpected began in each state, where the machine has `dynamics`
+    onsets: Floats = _of_states(since=6)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Outcomes(Counts):
+    """`Counts`, and what a machine needs to go on counting. Places are those of `Transitions`."""
+
+    clock: Floats = _counter(since=5)  # observations so far, with those that lacked something
+    began: Floats = _counter(since=5)  # the clock at the present episode's first observation
+    latest_visit: Floats = _per_state(ranges.COUNT, "most", since=5)  # clock at the latest one
+    latest_try: Floats = _per_place(ranges.COUNT, "most", since=5)  # clock one observation later
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Clusters:
+    """What state rules remember: m variables, ``capacity`` centres, the first ``n`` in use."""
+
+    n_observations: Floats = _counter()
+    first: Floats = _array("variable", _OBSERVED)  # z_1, the origin of `mean`
+    latest: Floats = _array("variable", _OBSERVED, since=2)  # z_t
+    #: of all observations, minus `first`
+    mean: Floats = _array("variable", ranges.Range(-2.0 * _FARTHEST, 2.0 * _FARTHEST))
+    scatter: Floats = _array("counter", ranges.PRODUCT)  # sum of squared distances to the mean
+    centers: Floats = _array("center", _OBSERVED)
+    potentials: Floats = _per_state(ranges.SHARE, "most")
+    squared_distances: Floats = _per_state(ranges.PRODUCT)  # from the latest observation
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Transitions:
+    """One row-stochastic matrix per action, the first n of ``capacity`` states in use.
+
+    An action has a place among the s matrices from its first use on. One that was never used
+    has none, and costs nothing: all its transitions are alike.
+
+    A row is kept as a scale times what is stored of it. What decays as a whole then decays by
+    its scale, without touching the row.
+    """
+
+    places: Floats = _array("action", _INDEX, since=3)  # of each action's matrix, or NOT_OPEN
+    uses: Floats = _array("action", ranges.COUNT)  # transitions learnt with each action
+    matrices: Floats = _array("matrix", ranges.Range(0.0, 10.0 / SMALLEST_SCALE))  # over `scales`
+    scales: Floats = _per_place(ranges.Range(0.1 * SMALLEST_SCALE, ranges.SHARE.most), since=3)
+    origin_frequency: Floats = _per_place(_FREQUENCY)
+
+
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
+class Learnt:
+    """What the next step needs, and what people ask of the states."""
+
+    n_states: Floats = _counter()
+    n_founded: Floats = _counter(since=3)  # states so far, with those given up
+    action: Floats = _array("counter", _INDEX)  # after the latest observation, or NO_ACTION
+    chained: Floats = _array("counter", ranges.FLAG)  # 1: `belief` is of the present episode
+    state: Floats = _counter()  # the most probable state at the latest observation
+    belief: Floats = _per_state(ranges.SHARE, "sum")
+    ids: Floats = _per_state(ranges.COUNT, since=3)  # number of its creation, from 0
+    outcomes: Outcomes
+    clusters: Clusters
+    transitions: Transitions
+
+
+def arrays_of(part: type) -> Iterator[Array]:
+    """The arrays of a part, and of the parts in it."""
+    for name, told in get_type_hints(part).items():
+        if isinstance(array := getattr(part, name, None), Array):
+            yield array
+        else:
+            yield from arrays_of(told)
+
+
+# -- In files -------------------------------------------------------------------------------------
+
+
+def _member(array: Array, **sizes: str) -> ranges.Member:
+    """An array as it is kept in a file, where ``sizes`` has other letters for some sizes."""
+    letters: dict[str, int | str] = {"one": 1, "capacity": "n", **sizes}
+    shape = tuple(letters.get(size, size) for size in SHAPES[array.kind])
+    return ranges.Member(shape, array.range, array.since)
+
+
+def _upgrade_machine(
+    version: int, settings: dict[str, Any], arrays: dict[str, NDArray[Any]]
+) -> None:
+    """Version 2 held a matrix for each action; episodes count from version 5 on."""
+    _upgrade_model(version, settings, arrays)
+    if version < 3:
+        arrays["places"] = np.arange(len(arrays["uses"]), dtype=np.float64)
+        arrays["scales"] = np.ones_like(arrays["origin_frequency"])
+        arrays["n_founded"] = arrays["n_states"]
+        arrays["ids"] = np.arange(len(arrays["visits"]), dtype=np.float64)
+    if version < 5:
+        arrays["clock"] = arrays["began"] = arrays["n_observations"]
+
+
+def _upgrade_model(version: int, settings: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> None:
+    """Version 1 knew one rule; up to version 5 nobody learnt how systems move."""
+    if version < 2:
+        settings["rule"] = {"name": "paper"}
+    if version < 6:
+        arrays["dynamics"] = np.zeros(0, np.uint8)
+
+
+#: The file of `Dynamics` within a file, as bytes; empty where there are none.
+_WITHIN = {"dynamics": ranges.Member(("bytes",), ranges.Range(0.0, 255.0, whole=True), since=6)}
+_RULE: dict[str, Any] = {
+    "memory": ranges.Range(2.0, ranges.MOST_COUNTED, whole=True),
+    **dict.fromkeys(("radius", "spread", "distance"), ranges.SIZE),
+    "scales": ranges.Range(1e-20, 1e20),
+    "share": ranges.Range(ranges.SMALLEST, 1.0),
+}
+_RULE["base"] = _RULE
+_BELOW_1 = math.nextafter(1.0, 0.0)
+_SETTINGS: dict[str, Any] = {
+    "n_actions": ranges.FROM_1,
+    **dict.fromkeys(("radius", "spread"), ranges.SIZE),
+    **dict.fromkeys(("distance_weight", "prior_frequency"), ranges.Range(ranges.SMALLEST, 1e50)),
+    "learning_rate": ranges.Range(ranges.SMALLEST, _BELOW_1),
+    "belief_tolerance": ranges.Range(0.0, _BELOW_1),
+    **dict.fromkeys(("max_states", "failure_horizon"), ranges.FROM_1),
+    "when_full": ranges.FLAG,
+    "rule": _RULE,
+}
+MACHINE = ranges.register(
+    ranges.Kind(
+        "machine",
+        {array.name: _member(array) for array in arrays_of(Learnt)} | _WITHIN,
+        _SETTINGS,
+        upgrade=_upgrade_machine,
+    )
+)
+# What a model has beside its `Counts`, centres by state.
+_CENTRAL = cast(
+    tuple[Array, ...], (Clusters.potentials, Transitions.uses, Transitions.origin_frequency)
+)
+#: The arrays of a model.
+OF_MODEL = {
+    "centers": ranges.Member(("n", "m"), _OBSERVED),
+    "transition_matrices": ranges.Member(("q", "n", "n"), ranges.SHARE),
+    **{array.name: _member(array, places="q") for array in (*_CENTRAL, *arrays_of(Counts))},
+}
+MODEL = ranges.register(
+    ranges.Kind(
+        "model",
+        OF_MODEL | _WITHIN,
+        {
+            "width": ranges.Range(0.0, 1e308),
+            "dt": ranges.SIZE,
+            "rule": _RULE,
+            "settings": _SETTINGS,
+            "actions": {"low": _OBSERVED, "high": _OBSERVED, "width": ranges.SIZE},
+        },
+        upgrade=_upgrade_model,
+    )
+)

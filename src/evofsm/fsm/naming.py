@@ -1,0 +1,140 @@
+"""Places in words: where a centre lies, with its numbers and units."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from functools import cache
+from importlib.metadata import entry_points
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from evofsm.fsm.actions import IntervalActions
+from evofsm.fsm.numbering import action_name
+
+# What a terminal obeys, or cannot print: control characters but for tab and newline, ends of lines
+# and directions of Unicode, halves of characters.
+_UNPRINTABLE = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
+
+
+def visible(text: str) -> str:
+    r"""A text, from wherever it came, in which no character tells a terminal what to do.
+
+    Each such one is shown as JSON would write it.
+
+    Examples
+    --------
+    >>> visible("gap \x1b[2J")
+    'gap \\u001b[2J'
+    """
+    return _UNPRINTABLE.sub(lambda found: f"\\u{ord(found[0]):04x}", text)
+
+
+class Words(NamedTuple):
+    """How places and actions of one kind of system are told in words."""
+
+    place: Callable[[ArrayLike], str]  #: of a centre
+    unit: str  #: of an action
+
+
+@cache
+def _words_of(names: tuple[str, ...]) -> Words | None:
+    """The words for variables of these names, if an installed package declares some.
+
+    It does so by an entry point of the group ``evofsm.words``: the names with commas, and where
+    the `Words` are.
+    """
+    for point in entry_points(group="evofsm.words", name=",".join(names)):
+        words: Words = point.load()
+        return words
+    return None
+
+
+class Labels(NamedTuple):
+    """What the numbers of a machine mean: for words and pictures, it learns without.
+
+    Examples
+    --------
+    >>> Labels(names=("gap", "speed"), units=("m", "m/s")).place([9.21, 4.0])
+    'gap 9.21 m, speed 4 m/s'
+    """
+
+    actions: IntervalActions | None = None  #: what the action indices mean
+    names: tuple[str, ...] = ()  #: of the variables
+    units: tuple[str, ...] = ()  #: of the variables
+    dt: float | None = None  #: time between two observations [s]
+
+    def place(self, center: ArrayLike) -> str:
+        """Where a centre lies: in words where a package declares some, else by its numbers.
+
+        Parameters
+        ----------
+        center : (m,) array_like
+            In the units of the observations.
+
+        Returns
+        -------
+        str
+
+        Examples
+        --------
+        >>> Labels(names=("angle", "rate"), units=("rad", "rad/s")).place([0.12, 3.0])
+        'angle 0.12 rad, rate 3 rad/s'
+        >>> Labels().place([9.2, 4.1])
+        '(9.2, 4.1)'
+        """
+        if words := _words_of(self.names):
+            return words.place(center)
+        values = [f"{value:.3g}" for value in np.asarray(center, np.float64).tolist()]
+        if not self.names:
+            return f"({', '.join(values)})"
+        units = self.units or ("",) * len(values)
+        named = zip(self.names, values, units, strict=True)
+        return ", ".join(" ".join(part for part in one if part) for one in named)
+
+    def action(self, index: int) -> str:
+        """An action with its interval, where that is known.
+
+        Parameters
+        ----------
+        index : int
+            From 0.
+
+        Returns
+        -------
+        str
+
+        Examples
+        --------
+        >>> actions = IntervalActions(low=-2.5, high=2.5, width=0.3)
+        >>> Labels(actions).action(16), Labels().action(16)
+        ('a(17) [2.3, 2.5]', 'a(17)')
+        """
+        name = action_name(index)
+        if self.actions is None:
+            return name
+        words = _words_of(self.names)
+        return f"{name} {self.actions.label(index)}{f' {words.unit}' if words else ''}"
+
+    def duration(self, observations: int) -> str:
+        """How long so many observations last.
+
+        Parameters
+        ----------
+        observations : int
+
+        Returns
+        -------
+        str
+            In seconds where the time between two is known, else their number.
+
+        Examples
+        --------
+        >>> Labels(dt=0.25).duration(20), Labels().duration(20)
+        ('5 s', '20 observations')
+        """
+        if self.dt is None:
+            return f"{observations:,} observation{'s' * (observations != 1)}"
+        return f"{observations * self.dt:.4g} s"

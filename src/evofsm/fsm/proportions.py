@@ -1,0 +1,170 @@
+"""How well a share is known that was counted."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from functools import cache
+
+from evofsm.fsm.kernels import compiled
+
+# Two-sided 90 %.
+_WIDTH = 1.645
+# From this shape on a gamma distribution is taken to be a power of a normal one.
+_LARGE = 50.0
+_HALVINGS = 60
+
+
+@compiled
+def wilson_bounds(share: float, count: float) -> tuple[float, float]:
+    """90 % interval of a share that was counted (Wilson 1927).
+
+    Parameters
+    ----------
+    share : float
+        Of the cases, in [0, 1].
+    count : float
+        Number of cases, above 0.
+
+    Returns
+    -------
+    (float, float)
+        Lower and upper bound.
+
+    Examples
+    --------
+    >>> low, high = wilson_bounds(0.25, 12.0)
+    >>> round(low, 2), round(high, 2)
+    (0.1, 0.49)
+    """
+    spread = _WIDTH * _WIDTH / count
+    centre = (share + 0.5 * spread) / (1.0 + spread)
+    reach = math.sqrt(spread * (share * (1.0 - share) + 0.25 * spread)) / (1.0 + spread)
+    return max(centre - reach, 0.0), min(centre + reach, 1.0)
+
+
+@cache
+def poisson_bounds(count: int) -> tuple[float, float]:
+    """90 % interval of the number of events to be expected where ``count`` were seen.
+
+    Exact (Garwood 1936): the bounds are where as few, and as many, are seen in 5 % of cases.
+
+    Parameters
+    ----------
+    count : int
+        At least 0.
+
+    Returns
+    -------
+    (float, float)
+        Lower and upper bound.
+
+    Examples
+    --------
+    >>> [round(bound, 3) for bound in poisson_bounds(0) + poisson_bounds(3)]
+    [0.0, 2.996, 0.818, 7.754]
+    """
+    low = gamma_quantile(0.05, count) if count else 0.0
+    return low, gamma_quantile(0.95, count + 1.0)
+
+
+def gamma_quantile(share: float, shape: float) -> float:
+    """Below which a gamma variable of scale 1 lies with this probability, 0.05 or 0.95.
+
+    Examples
+    --------
+    >>> round(gamma_quantile(0.95, 1.0), 3), round(gamma_quantile(0.05, 3.0), 3)  # - log 0.05
+    (2.996, 0.818)
+    """
+    if shape > _LARGE:  # Wilson & Hilferty 1931
+        width = _WIDTH if share > 0.5 else -_WIDTH
+        return float(shape * (1.0 - 1.0 / (9.0 * shape) + width / (3.0 * math.sqrt(shape))) ** 3)
+    low, high = 0.0, shape + 10.0 * math.sqrt(shape) + 10.0
+    for _ in range(_HALVINGS):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if _gamma_below(middle, shape) < share else (low, middle)
+    return high
+
+
+def _gamma_below(x: float, shape: float) -> float:
+    """Probability that a gamma variable of scale 1 lies below x: the series of its density."""
+    if x <= 0.0:
+        return 0.0
+    term = total = 1.0 / shape
+    k = shape
+    while term > 1e-15 * total:
+        k += 1.0
+        term *= x / k
+        total += term
+    return total * math.exp(shape * math.log(x) - x - math.lgamma(shape))
+
+
+def bounds_text(low: float, high: float) -> str:
+    """Bounds of a share in percent, rounded outward, so that what is said of it holds.
+
+    Whole percents; within one percent of 0 or of 1, with the first digit that shows them.
+
+    Parameters
+    ----------
+    low, high : float
+        In [0, 1]; a bound of 0 from below, or of 1 from above, says nothing and is left out.
+
+    Returns
+    -------
+    str
+
+    Examples
+    --------
+    >>> bounds_text(0.0, 0.00309), bounds_text(0.276, 1.0), bounds_text(0.104, 0.487)
+    ('at most 0.4 %', 'at least 27 %', '10 to 49 %')
+    >>> bounds_text(0.0034, 0.9962), bounds_text(0.9969, 1.0), bounds_text(0.0, 1.0)
+    ('0.3 to 99.7 %', 'at least 99.6 %', '0 to 100 %')
+    """
+    if low <= 0.0 and high < 1.0:
+        return f"at most {_rounded_up(high)} %"
+    if high >= 1.0 and low > 0.0:
+        return f"at least {_rounded_down(low)} %"
+    return f"{_rounded_down(low)} to {_rounded_up(high)} %"
+
+
+def two_digits(value: float, rounded: Callable[[float], int]) -> float:
+    """A number from 0 on with two significant digits, rounded as `outward` rounds.
+
+    Examples
+    --------
+    >>> two_digits(0.000184, math.ceil), two_digits(0.000184, math.floor)
+    (0.00019, 0.00018)
+    """
+    if not 0.0 < value < math.inf:
+        return value
+    return outward(rounded, value, 1 - math.floor(math.log10(value)))
+
+
+def outward(rounded: Callable[[float], int], value: float, decimals: int) -> float:
+    """A number with so many decimals, rounded by ``math.floor`` or ``math.ceil``.
+
+    What is off such a number by rounding alone is that number.
+
+    Examples
+    --------
+    >>> outward(math.ceil, 0.71, 1), outward(math.floor, 0.71, 1), outward(math.ceil, 0.1 + 0.2, 1)
+    (0.8, 0.7, 0.3)
+    """
+    scale = 10.0**decimals
+    return rounded(round(value * scale, 6)) / scale
+
+
+def _rounded_up(share: float) -> str:
+    decimals = _decimals(share)
+    return f"{min(outward(math.ceil, 100.0 * share, decimals), 100.0):.{decimals}f}"
+
+
+def _rounded_down(share: float) -> str:
+    decimals = _decimals(share)
+    return f"{max(outward(math.floor, 100.0 * share, decimals), 0.0):.{decimals}f}"
+
+
+def _decimals(share: float) -> int:
+    """How many show how far it is from 0 and from 1."""
+    apart = 100.0 * min(share, 1.0 - share)
+    return max(-math.floor(math.log10(apart)), 0) if 1e-9 < apart < 1.0 else 0

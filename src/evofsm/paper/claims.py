@@ -1,0 +1,161 @@
+"""The paper's claims, held against the runs."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from evofsm.paper.frame import Frame
+from evofsm.paper.runs import PaperStudy, Run
+
+#: In which cases the paper saw a collision.
+_COLLIDES = {1: True, 2: False, 3: False, 4: True}
+_STATES = 7
+#: The paper's bound on the divergence of forecast and recognised state [bit].
+LARGEST_DIVERGENCE = 0.15
+
+
+@dataclass(frozen=True)
+class Claim:
+    """One claim of the paper, and what was measured."""
+
+    id: str
+    claim: str
+    paper: str
+    measured: str
+    holds: bool
+
+
+@dataclass(frozen=True)
+class Reproduction:
+    """The runs, and every claim held against them."""
+
+    study: PaperStudy
+    claims: tuple[Claim, ...]
+
+    @property
+    def frame(self) -> Frame:
+        """The claims, each with its verdict."""
+        return Frame(self.claims)
+
+
+def check_claims(study: PaperStudy) -> tuple[Claim, ...]:
+    """Every claim of the paper's Section 3, with a verdict each."""
+    return tuple(_claims(study))
+
+
+def _claims(study: PaperStudy) -> Iterator[Claim]:
+    counts = [int(run.n_states[-1]) for run in study.runs]
+    collisions = [run for run in study.runs if run.episode.collided]
+
+    as_in_paper = sum(run.episode.collided == _COLLIDES[run.case] for run in study.runs)
+    safe = all(study.safe_at_the_end.values())
+    yield Claim(
+        "collisions_by_case",
+        "Collision in cases 1 and 4, none in cases 2 and 3",
+        "yes, no, no, yes",
+        f"{', '.join(_outcome(run) for run in study.last_round)}; so in {as_in_paper} of "
+        f"{len(study.runs)} runs; cases 2 and 3 "
+        f"{'are safe' if safe else 'have collided'} at {study.settings.safe_until:g} s",
+        as_in_paper == len(study.runs) and safe,
+    )
+    for time, run in zip(study.settings.brake_at, study.extra_runs, strict=True):
+        at_brake = _state_at_brake(study, run)
+        yield Claim(
+            f"brake_at_{time:g}",
+            f"Leader brakes at {time:g} s, in the dead end: collision",
+            "collision",
+            "the leader did not brake"
+            if at_brake is None
+            else f"{_name(at_brake)} at the brake; "
+            + (
+                f"collision at {run.episode.time[-1]:.1f} s, in {_name(run.state[-1])}"
+                if run.episode.collided
+                else "no collision"
+            ),
+            run.episode.collided and at_brake == study.dead_end,
+        )
+    yield Claim(
+        "states_after_each_run",
+        "States are created in the first four runs, then none",
+        "0 to 7 in 4 runs, 7 after 80",
+        f"{', '.join(map(str, counts[:4]))} after runs 1 to 4, {counts[-1]} after {len(counts)}",
+        len(set(counts[3:])) == 1 and counts == sorted(counts),
+    )
+    yield Claim(
+        "states_final",
+        "Number of states at the end",
+        str(_STATES),
+        str(counts[-1]),
+        counts[-1] == _STATES,
+    )
+    at_collisions = sorted({int(run.state[-1]) for run in collisions})
+    yield Claim(
+        "dead_end_state",
+        f"One and the same state at every collision of the {len(study.runs)} runs, the dead end "
+        "(numbers: order of creation)",
+        "#3",
+        ", ".join(map(_name, at_collisions)) or "no collision",
+        len(at_collisions) == 1,
+    )
+    inside = sum(int(run.state[-1]) == study.dead_end for run in collisions)
+    yield Claim(
+        "dead_end_share",
+        "Share of collisions recognised as the dead end",
+        "all",
+        f"{inside} of {len(collisions)}",
+        0 < inside == len(collisions),
+    )
+    yield Claim(
+        "case3_leaves_dead_end",
+        "Case 3 leaves the dead end when its driver turns normal",
+        "yes",
+        *_change(study, 3, leaves=True),
+    )
+    yield Claim(
+        "case4_enters_dead_end",
+        "Case 4 comes to the dead end when its driver turns aggressive",
+        "yes",
+        *_change(study, 4, leaves=False),
+    )
+    largest = [float(np.nanmax(run.surprise)) for run in study.last_round]
+    yield Claim(
+        "jsd_max_by_case",
+        "Largest divergence of forecast and recognised state, but for a run's first, "
+        "in the last round",
+        f"< {LARGEST_DIVERGENCE} in all cases",
+        ", ".join(f"{value:.3f}" for value in largest) + " bit",
+        max(largest) < LARGEST_DIVERGENCE,
+    )
+
+
+def _change(study: PaperStudy, case: int, *, leaves: bool) -> tuple[str, bool]:
+    """What the driver's change did in the last round, and whether it did so in every round."""
+    runs = [run for run in study.runs if run.case == case]
+    switch = study.settings.switch_at[case]
+    as_in_paper = 0
+    for run in runs:
+        inside = run.state == study.dead_end
+        row = min(int(np.searchsorted(run.episode.time, switch)), len(inside) - 1)
+        changed = row + int(np.argmax(inside[row:] != inside[row]))  # `row` where it never does
+        as_in_paper += bool(inside[row] == leaves and inside[changed] != leaves != inside[-1])
+    text = f"{_name(run.state[row])} at {switch:g} s"
+    if changed > row:
+        text += f", {_name(run.state[changed])} from {run.episode.time[changed]:.2f} s"
+    return f"{text}; so in {as_in_paper} of {len(runs)} rounds", as_in_paper == len(runs)
+
+
+def _name(state: int) -> str:
+    return f"#{state + 1}"
+
+
+def _outcome(run: Run) -> str:
+    return f"yes ({run.episode.time[-1]:.1f} s)" if run.episode.collided else "no"
+
+
+def _state_at_brake(study: PaperStudy, run: Run) -> int | None:
+    """The state at the first row at which the leader brakes in full."""
+    braking = run.episode.leader_accelerations == -study.settings.scenario.leader.brake_decel
+    return int(run.state[np.argmax(braking)]) if braking.any() else None

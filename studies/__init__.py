@@ -1,0 +1,10 @@
+"""The studies: what is claimed, what was measured, and the pages that say so.
+
+They are not part of the package: run them from a checkout, ``python -m studies NAME``.
+"""
+
+from studies.studies import STUDIES
+from studies.systems.rivals.rival import Rival
+from studies.systems.system import Box, Discrete, System
+
+__all__ = ["STUDIES", "Box", "Discrete", "Rival", "System"]

@@ -1,0 +1,152 @@
+"""What is to be broken: a case is played, and its score says how close it came to failing."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from statistics import NormalDist
+from typing import Protocol
+
+import numpy as np
+
+from evofsm.driving import (
+    GAP,
+    LEADER_ACCELERATION,
+    LEADER_SPEED,
+    SPEED,
+    Draw,
+    Episode,
+    Family,
+    KinematicWorld,
+    drive,
+    guard_for_family,
+    load_family,
+    load_learnt,
+    name_judge,
+    teach,
+    training,
+    unrevised_guard,
+)
+from evofsm.guard import Guard
+from studies.breaks.amounts import NOBODY, SELDOM, TOY
+from studies.breaks.splitting import Chance
+
+#: How likely the toy fails.
+KNOWN = 1e-5
+_SELDOM = Path(__file__).with_name("seldom.toml")
+_NORMAL = NormalDist()
+
+
+class Subject(Protocol):
+    """Whatever may fail."""
+
+    def score(self, chance: Chance) -> float:
+        """How close a case came to failing; infinite where it failed."""
+        ...
+
+
+@dataclass(frozen=True)
+class Toy:
+    """Fails where some normal numbers add up to more than they do in one case of 100,000."""
+
+    probability: float = KNOWN
+    numbers: int = 6
+
+    def score(self, chance: Chance) -> float:
+        """The sum, in its standard deviations."""
+        # A chance of 0 is none that a normal number has; the smallest is as good.
+        drawn = (
+            _NORMAL.inv_cdf(max(chance(f"number {k}"), 1e-300)) for k in range(1, self.numbers + 1)
+        )
+        total = sum(drawn) / math.sqrt(self.numbers)
+        return math.inf if total >= _NORMAL.inv_cdf(1.0 - self.probability) else total
+
+
+@dataclass(frozen=True)
+class Cars:
+    """A family's own controller in the closed-form world, under a frozen guard or none."""
+
+    family: str
+    judge: str
+    switches: tuple[str, ...] = ()
+    train: int = 0
+    learnt: str | None = None
+    seed: int = 0
+
+    def score(self, chance: Chance) -> float:
+        """The braking that was needed at the worst moment [m/s²]."""
+        return needed_braking(self.play(load(self.family, self.switches).draw_by(chance)))
+
+    def play(self, draw: Draw) -> Episode:
+        """Drive one draw."""
+        family = load(self.family, self.switches)
+        if self.judge != NOBODY:
+            return drive(_guard(self), draw).episode
+        limits = draw.controller.parameters[:, 7:9]
+        if limits.min() >= family.actions.low and limits.max() <= family.actions.high:
+            # Exactly what the framework makes of it, without leaving compiled code.
+            return KinematicWorld().run(draw.scenario, draw.controller, family.interval)
+        return drive(unrevised_guard(family), draw).episode
+
+
+def subject_of(
+    family: str, judge: str, switches: Sequence[str], train: int, learnt: str | None, seed: int
+) -> Subject:
+    """What a family and a judge make."""
+    if family == TOY:
+        return Toy()
+    return Cars(family, judge, tuple(switches), train, learnt, seed)
+
+
+def needed_braking(episode: Episode) -> float:
+    """How hard the follower had to brake at the worst moment not to collide [m/s²].
+
+    Parameters
+    ----------
+    episode : Episode
+
+    Returns
+    -------
+    float
+        As if the leader went on as it did, until it stands; infinite where they collided.
+    """
+    if episode.collided:
+        return math.inf
+    record = episode.record
+    gap, speed, ahead = record[:, GAP], record[:, SPEED], record[:, LEADER_SPEED]
+    closing = np.maximum(speed - ahead, 0.0)
+    slows = record[:, LEADER_ACCELERATION] < 0.0
+    stops = ahead[slows] ** 2 / (-2.0 * record[slows, LEADER_ACCELERATION])
+    to_stop = speed[slows] ** 2 / (2.0 * (gap[slows] + stops))
+    return float(max((closing**2 / (2.0 * gap)).max(), to_stop.max(initial=0.0)))
+
+
+@lru_cache(maxsize=8)
+def load(name: str, switches: tuple[str, ...] = ()) -> Family:
+    """A family by its name or file, with switches."""
+    return load_family(_SELDOM if name == SELDOM else name).with_switches(switches)
+
+
+def check_learnt(folder: str | None, judge: str) -> None:
+    """Raise where a folder holds what another judge learnt."""
+    if folder is not None and judge != NOBODY:
+        held = name_judge(load_learnt(Path(folder))[1])
+        if held != judge:
+            raise ValueError(f"{folder} holds the judge {held!r}, not {judge!r}: --judge {held}")
+
+
+@lru_cache(maxsize=8)
+def _guard(cars: Cars) -> Guard:
+    """Taught, then frozen; the same in every process."""
+    family = load(cars.family, cars.switches)
+    machine, judge = load_learnt(Path(cars.learnt)) if cars.learnt else (None, None)
+    guard = guard_for_family(family, machine=machine, judge=judge or cars.judge, seed=cars.seed)
+    if judge is None:
+        teach(guard, training(family, cars.seed, 0, cars.train))
+    guard.freeze()
+    frozen = guard.copy(states=False)
+    frozen.freeze()
+    return frozen

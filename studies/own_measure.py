@@ -1,0 +1,43 @@
+"""A risk measure of somebody else's, beside those of a study."""
+
+from __future__ import annotations
+
+import inspect
+from typing import TYPE_CHECKING
+
+from evofsm.cli import imported
+
+if TYPE_CHECKING:
+    from evofsm.guard import RiskMeasure
+
+#: What the option of every study says that takes one.
+ABOUT = "A measure of your own beside the others, module:Class; evofsm check holds it to its kind."
+
+
+def own_measure(name: str) -> RiskMeasure:
+    """A measure by the name ``module:Name`` of a class, an instance, or a function that makes one.
+
+    Raises
+    ------
+    ValueError
+        If there is nothing of that name.
+    TypeError
+        If it is no measure, or a class that needs arguments.
+
+    Examples
+    --------
+    >>> own_measure("evofsm.driving:TimeToCollision")
+    TimeToCollision(threshold=1.5)
+    """
+    from evofsm.checks import Kind, kind_of
+
+    thing = imported(name)
+    kind = kind_of(thing)
+    if kind is not Kind.MEASURE and not (kind is Kind.JUDGE and hasattr(thing, "score")):
+        raise TypeError(f"{name} is a {kind.value}, not a measure: it has no method score")
+    is_made = hasattr(thing, "score") and not inspect.isclass(thing)
+    try:
+        made: RiskMeasure = thing if is_made else thing()
+    except TypeError as error:
+        raise TypeError(f"{name} cannot be made without arguments: {error}") from error
+    return made

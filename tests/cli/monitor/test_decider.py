@@ -1,0 +1,282 @@
+import json
+
+import numpy as np
+import pytest
+
+from evofsm.cli.monitor.decider import Decider
+from evofsm.cli.monitor.defaults import guard_of_monitor, guard_of_traffic
+from evofsm.driving.cars import guard_for_cars
+from evofsm.driving.revisers import AlwaysBrake
+from evofsm.guard.auditing.log import AuditLog
+from evofsm.guard.auditing.replay import audit
+from evofsm.guard.guard import Guard
+from evofsm.guard.reviser import Mode
+from monitor_rows import closing_in as rows
+from monitor_rows import line
+
+
+def made(learn=False):
+    guard = guard_of_monitor(0.1, 6.0)
+    guard.learn = learn
+    return guard
+
+
+def test_it_decides_as_the_guard_does():
+    decider, guard = Decider(made()), made()
+    for row in rows(80):
+        answer = decider.answer(line(row))
+        revision = guard.decide(
+            [row[k] for k in ("gap", "v_follower", "v_leader")], 0.5, row["time"]
+        )
+        assert answer["executed"] == revision.executed == 0.5
+        assert (answer["risk_proposed"], answer["advised"], answer["reason"]) == (
+            revision.risk_proposed,
+            revision.advised,
+            revision.reason,
+        )
+        assert answer["alarm"] == (revision.risk_proposed > 0.02)
+    assert answer["n"] == 80
+    assert answer["alarm"]
+
+
+def test_in_act_what_is_executed_is_the_guards():
+    guard = made()
+    guard.reviser.mode = Mode.ACT
+    answers = [Decider(guard).answer(line(row)) for row in rows(80)]
+    assert answers[-1]["executed"] == answers[-1]["advised"] < 0.0
+    assert answers[-1]["mode"] == "act"
+
+
+def test_what_is_refused_changes_nothing():
+    decider, plain = Decider(made()), Decider(made())
+    for k, row in enumerate(rows(60)):
+        for junk in (b"junk", line(row | {"gap": "x"}), line(row | {"schema": 9})):
+            answer = decider.answer(junk)
+            assert (answer["kind"], answer["n"], answer["schema"]) == ("error", k, 1)
+        assert decider.answer(line(row)) == plain.answer(line(row))
+    assert decider.refused == 180
+
+
+def test_a_row_that_is_sent_again_gets_the_same_answer_and_counts_once():
+    decider = Decider(made())
+    first, second, third = (line(row) for row in rows(3))
+    decider.answer(first)
+    answer = decider.answer(second)
+    assert decider.answer(second) == answer
+    assert decider.answer(third)["n"] == 3
+
+
+def test_time_that_stands_or_goes_backward():
+    decider = Decider(made())
+    row = next(iter(rows(1))) | {"time": 50.0}
+    decider.answer(line(row))
+    other = decider.answer(line(row | {"gap": 3.0}))
+    assert (other["kind"], other["about"], other["n"]) == ("error", "time", 1)
+    late = decider.answer(line(row | {"time": 49.5}))
+    assert late["error"] == "49.5 s comes after 50 s: late rows are left out"
+    anew = decider.answer(line(row | {"time": 0.0}))
+    assert (anew["kind"], anew["n"]) == ("decision", 2)
+    assert anew["note"] == "time went back from 50 s: a new episode"
+    assert "note" not in decider.answer(line(row | {"time": 0.1}))
+
+
+def test_gaps_in_time_and_rows_that_come_too_often_are_noted():
+    decider = Decider(made())
+    row = next(iter(rows(1)))
+    notes = [decider.answer(line(row | {"time": t})).get("note") for t in (0, 0.1, 3.1, 3.12, 3.14)]
+    assert notes[:3] == [None, None, "3 s without a row: nothing is learnt or carried across"]
+    assert notes[3].startswith("rows come every 0.02 s, but the guard was made for 0.1 s")
+    assert notes[4] is None
+
+
+def test_what_was_not_seen_is_said():
+    decider = Decider(made())
+    row = next(iter(rows(1)))
+    assert "not seen: gap" in decider.answer(line(row | {"gap": None}))["reason"]
+
+
+def test_without_a_proposal_the_fallback_is_judged():
+    answer = Decider(made()).answer(line(next(iter(rows(1))) | {"proposal": None}))
+    assert answer["proposed"] is None
+    assert answer["reason"].startswith("no usable proposal")
+
+
+def test_an_episode_ends_where_it_is_told_to_and_learns_of_it():
+    guard = made(learn=True)
+    decider = Decider(guard)
+    for row in rows(20):
+        decider.answer(line(row))
+    answer = decider.answer(b'{"end": true, "failed": true}')
+    assert (answer["kind"], answer["failed"], answer["n"]) == ("end", True, 20)
+    assert guard.machine.endings.sum() == 1.0
+    assert decider.answer(b'{"end": true}')["kind"] == "end"  # nothing is under way: nothing to do
+
+
+def test_after_an_end_time_may_begin_anew():
+    decider = Decider(made())
+    row = next(iter(rows(1)))
+    assert [decider.answer(line(row | {"time": t}))["n"] for t in (0.1, 0.2)] == [1, 2]
+    decider.answer(b'{"end": true}')
+    again = decider.answer(line(row | {"time": 0.1}))
+    assert (again["kind"], again["n"]) == ("decision", 3)
+    assert "note" not in again
+
+
+def test_an_episode_ends_by_itself_while_there_is_no_alarm():
+    decider = Decider(made(), episode=10)
+    calm = next(iter(rows(1)))
+    begun = []
+    for k in range(25):
+        decider.answer(line(calm | {"time": 0.1 * k}))
+        begun.append(decider.rows)
+    assert begun == [*range(1, 10), 0, *range(1, 10), 0, *range(1, 6)]
+    decider = Decider(made(), episode=10)
+    close = calm | {"gap": 3.0, "v_leader": 5.0}
+    begun = []
+    for k in range(25):
+        assert decider.answer(line(close | {"time": 0.1 * k}))["alarm"]
+        begun.append(decider.rows)
+    assert begun == [*range(1, 20), 0, *range(1, 6)]
+
+
+def test_a_scene_names_who_is_ahead_and_a_change_begins_anew():
+    decider = Decider(made())
+    ego = {"s": 0.0, "lane": 0, "vx": 20.0, "length": 5.0}
+    car = {"id": "a", "s": 40.0, "lane": 0, "vx": 20.0, "length": 5.0}
+
+    def seen(time, *objects):
+        told = {"time": time, "ego": ego, "objects": objects, "proposal": 0.5}
+        return decider.answer(json.dumps(told).encode())
+
+    assert seen(0.0, car)["ahead"] == "a"
+    assert "note" not in seen(0.1, car)
+    other = seen(0.2, car, car | {"id": "b", "s": 15.0})
+    assert (other["ahead"], other["note"]) == ("b", "another one is ahead: a new episode")
+    gone = seen(0.3)
+    assert (gone["ahead"], gone["alarm"], gone["executed"]) == (None, False, 0.5)
+    assert (gone["risk_proposed"], gone["reason"]) == (None, "nothing is ahead in the lane")
+    assert seen(0.4, car)["n"] == 5
+
+
+def test_a_judge_that_raises_is_answered_and_gone_on_after(monkeypatch):
+    guard = made()
+    decider = Decider(guard)
+    first, second, third = (line(row) for row in rows(3))
+    decider.answer(first)
+
+    def fails(*_):
+        raise RuntimeError("a bug of somebody's own")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(guard.judge, "judge", fails)
+        answer = decider.answer(second)
+    assert (answer["kind"], answer["about"], answer["n"]) == ("error", "guard", 2)
+    assert answer["error"] == "failed: RuntimeError: a bug of somebody's own"
+    assert decider.answer(third)["kind"] == "decision"
+
+
+def test_where_the_audit_log_cannot_be_written_the_decisions_go_on(tmp_path, monkeypatch):
+    guard = made()
+    guard.audit = log = AuditLog(tmp_path / "audit.jsonl")
+    decider, plain = Decider(guard), Decider(made())
+
+    def full(_):
+        raise OSError(28, "No space left on device")
+
+    for k, row in enumerate(rows(60)):
+        if k == 20:
+            monkeypatch.setattr(log._file, "append", full)
+        for message in [line(row), b'{"end": true}'][: 2 if k % 10 == 9 else 1]:
+            assert decider.answer(message) == plain.answer(message)
+    assert guard.audit is None
+    with pytest.raises(OSError, match="the audit log ends with record"):
+        log.close()
+
+
+def test_what_it_decides_can_be_replayed(tmp_path):
+    with AuditLog(tmp_path / "audit.jsonl") as log:
+        guard = made()
+        guard.audit = log
+        decider = Decider(guard, episode=30)
+        for row in rows(80):
+            decider.answer(line(row))
+        decider.end()
+    found = audit(log.path, log.head)
+    assert found.is_good
+    assert found.replay.decisions == 80
+
+
+def test_other_systems_by_their_variables():
+    actions = Guard(low=[-1.0, -1.0], high=[1.0, 1.0], interval=0.1)
+    answer = Decider(actions).answer(b'{"time": 0, "observation": [1, 2], "proposal": [0.5, 0]}')
+    assert (answer["executed"], answer["risk_proposed"]) == ([0.5, 0.0], None) or answer["n"] == 1
+    few = Guard(n_actions=3, interval=0.1)
+    assert Decider(few).answer(b'{"time": 0, "observation": [1], "proposal": 2}')["executed"] == 2
+
+
+def test_a_judge_that_searches_alarms_where_it_refuses_whatever_the_risk():
+    guard = Guard(low=-1.0, high=1.0, interval=0.1, mode=Mode.ACT)
+    decider, alarms = Decider(guard), []
+    for _ in range(12):
+        x, v, t = -1.0, 0.0, 0
+        while x < 1.0 and t < 80:
+            row = {"time": 0.1 * decider.n, "observation": [x, v], "proposal": 1.0}
+            answer = decider.answer(json.dumps(row).encode())
+            refused = answer["advised"] != answer["proposed"]
+            assert answer["alarm"] == (refused or (answer["risk_proposed"] or 0.0) > 0.02)
+            alarms += [answer] if refused else []
+            x, v, t = x + 0.1 * v, v + 0.1 * answer["executed"], t + 1
+        decider.answer(json.dumps({"end": True, "failed": x >= 1.0}).encode())
+    assert any(one["risk_proposed"] <= 0.02 for one in alarms)  # for want of the margin alone
+
+
+def test_a_reviser_without_risks_alarms_where_it_differs():
+    cars = guard_for_cars(-6.0, 2.5)
+    guard = Guard.of(AlwaysBrake(cars.actions), interval=0.1)
+    answer = Decider(guard).answer(b'{"time": 0, "observation": [9, 9, 9], "proposal": 2}')
+    assert (answer["alarm"], answer["mode"], answer["risk_proposed"]) == (True, "act", None)
+
+
+def test_answers_are_json():
+    decider = Decider(made())
+    for row in rows(60):
+        answer = decider.answer(line(row))
+        assert json.loads(json.dumps(answer, allow_nan=False)) == answer
+    beat = decider.heartbeat(2.0)
+    assert (beat["kind"], beat["n"], beat["time"]) == ("heartbeat", 60, pytest.approx(5.9))
+    assert np.isfinite(beat["silent"])
+
+
+def test_an_episode_has_a_row_at_least():
+    with pytest.raises(ValueError, match="episode is 0"):
+        Decider(made(), episode=0)
+
+
+def test_in_traffic_the_worst_object_is_named_and_who_is_behind_counts():
+    decider = Decider(guard_of_traffic(interval=0.1, brakes=6.0))
+    ego = {"x": 0.0, "y": 0.0, "vx": 14.0, "length": 5.0}
+    ahead = {"id": "lorry", "x": 16.0, "y": 0.2, "vx": 9.0, "length": 10.0, "width": 2.5}
+    beside = ahead | {"id": "bus", "y": 3.5}
+    close = {"id": 7, "x": -7.0, "y": 0.0, "vx": 16.0, "length": 4.0}
+
+    def seen(time, *objects, proposal=0.5):
+        told = {"time": time, "ego": ego, "objects": objects, "proposal": proposal}
+        return decider.answer(json.dumps(told).encode())
+
+    free = seen(0.0, beside)
+    assert (free["alarm"], free["object"], free["role"]) == (False, None, None)
+    stuck = seen(0.1, beside, ahead)
+    assert (stuck["alarm"], stuck["object"], stuck["role"]) == (True, "lorry", "ahead")
+    braking = seen(0.2, close, proposal=-6.0)
+    assert (braking["alarm"], braking["object"], braking["role"]) == (True, "7", "behind")
+    assert braking["executed"] == -6.0  # in the shadow
+    flat = {key: value for key, value in ahead.items() if key != "y"}
+    refused = seen(0.3, flat | {"lane": 1}, ahead)
+    assert (refused["kind"], refused["about"]) == ("error", "objects[0].lane")
+    assert seen(0.4)["alarm"] is False
+
+
+def test_a_guard_of_traffic_takes_scenes_alone():
+    decider = Decider(guard_of_traffic(interval=0.1, brakes=6.0))
+    answer = decider.answer(b'{"time": 0, "gap": 9, "v_follower": 9, "v_leader": 9, "proposal": 0}')
+    assert (answer["kind"], answer["about"]) == ("error", "gap")

@@ -1,0 +1,143 @@
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+pytest.importorskip("typer")
+pytest.importorskip("rich")
+
+from typer.testing import CliRunner
+
+from evofsm.__main__ import application
+from evofsm.driving.risk.latent import LatentRisk
+from evofsm.fsm.actions import IntervalActions
+from evofsm.guard.auditing.log import AuditLog
+from evofsm.guard.guard import Guard
+from evofsm.guard.protocols import Proposal
+from evofsm.guard.reviser import ActionReviser
+from evofsm.store.sealed import NOTHING, Head, seal, unseal
+
+ACTIONS = IntervalActions(low=-2.5, high=2.5, width=0.3, outside="clip")
+
+
+@pytest.fixture
+def log(tmp_path):
+    """A log of ten records, seven of them decisions; and its head."""
+    risk = LatentRisk(ACTIONS.low)
+    with AuditLog(tmp_path / "log.jsonl") as written:
+        guard = Guard.of(ActionReviser(risk, ACTIONS), judge=risk, audit=written)
+        for step in range(7):
+            seen = np.array([20.0 - step, 15.0 - 0.6 * step, 11.0])
+            guard.revise(guard.recognise(seen, 0.25 * step), Proposal(1.0))
+        guard.end(failed=False, observation=np.array([13.0, 10.0, 11.0]))
+    return written.path, str(written.head)
+
+
+def evofsm(*arguments):
+    return CliRunner().invoke(application(), [*map(str, arguments)])
+
+
+def test_a_log_that_is_whole(log):
+    path, head = log
+    result = evofsm("audit", path)
+    assert result.exit_code == 0, result.output
+    assert "unbroken: 10 records" in result.output
+    assert "7 decisions as recorded, to the last bit" in result.output
+    assert head in result.output
+    assert "Keep the head" in result.output
+    assert max(map(len, result.output.splitlines()[1:])) <= 80
+    assert "Keep the head" not in evofsm("audit", path, "--head", head).output
+    assert "not done" in evofsm("audit", path, "--no-replay").output
+
+
+def test_the_record_that_was_tampered_with_is_named(log):
+    path, _ = log
+    lines = path.read_bytes().splitlines(keepends=True)
+    lines[4] = lines[4].replace(b'"executed":-2.5', b'"executed":-1.5')
+    path.write_bytes(b"".join(lines))
+    result = evofsm("audit", path)
+    assert result.exit_code == 1
+    assert "TAMPERED WITH at record 5 (line 5): record 5 was altered" in " ".join(
+        result.output.split()
+    )
+    assert "not done" in result.output
+    found = json.loads(evofsm("audit", path, "--json").stdout)
+    assert (found["finding"]["record"], found["finding"]["fault"]) == (5, "altered")
+    assert not found["is_good"]
+    assert found["replay"] is None
+
+
+def test_a_cut_end_is_found_with_the_head(log):
+    path, head = log
+    path.write_bytes(b"".join(path.read_bytes().splitlines(keepends=True)[:7]))
+    assert evofsm("audit", path).exit_code == 0
+    result = evofsm("audit", path, "--head", head)
+    assert result.exit_code == 1
+    assert "records 8 to 10 were cut off" in " ".join(result.output.split())
+
+
+def test_a_decision_that_comes_out_otherwise_is_named(log):
+    path, _ = log
+    head, forged = Head(0, NOTHING), b""
+    for line in path.read_bytes().splitlines(keepends=True):
+        content = unseal(line).content
+        if head.number == 5:
+            content["executed"] = 0.5
+        line, head = seal(content, head)
+        forged += line
+    path.write_bytes(forged)
+    result = evofsm("audit", path)
+    assert result.exit_code == 1
+    said = " ".join(result.output.split())
+    assert "DIFFERS at record 6" in said
+    assert "executed: recorded 0.5, replayed -2.5" in said
+    found = json.loads(evofsm("audit", path, "--json").stdout)
+    assert found["replay"]["difference"]["fields"] == [
+        {"name": "executed", "recorded": "0.5", "replayed": "-2.5"}
+    ]
+
+
+def test_what_cannot_be_read_ends_with_two(log, tmp_path):
+    path, _ = log
+    (tmp_path / "notes").write_text("notes\n")
+    for wrong, says in (
+        (["audit", tmp_path / "none"], "no such file"),
+        (["audit", tmp_path / "notes"], "no audit log"),
+        (["audit", path, "--head", "abc"], "NUMBER:HASH"),
+    ):
+        result = evofsm(*wrong)
+        assert result.exit_code == 2
+        assert says in result.stderr
+
+
+@pytest.mark.slow
+def test_drive_writes_a_log(tmp_path):
+    pytest.importorskip("scipy")
+    path = tmp_path / "log.jsonl"
+    command = [sys.executable, "-m", "evofsm", "drive", "emergency", "--episodes", "2"]
+    run = subprocess.run(
+        [*command, "--audit", str(path), "--json"], capture_output=True, text=True, check=False
+    )
+    assert run.returncode == 0, run.stderr
+    result = evofsm("audit", path, "--json")
+    assert result.exit_code == 0, result.output
+    assert json.loads(result.stdout)["contents"]["episodes"] == 2
+
+
+def is_too_close(z):
+    return bool(z[0] <= 6.0)
+
+
+def test_what_told_the_guard_where_it_fails_is_named_by_its_module(tmp_path):
+    path = tmp_path / "log.jsonl"
+    with AuditLog(path) as written:
+        guard = Guard(low=-2.5, high=2.5, interval=0.25, failed=is_too_close, audit=written)
+        for step in range(5):
+            guard.decide([20.0 - step, 15.0], 1.0)
+        guard.end(observation=[15.0, 15.0])
+    assert "5 decisions compared with nothing" in evofsm("audit", path).output
+    again = evofsm("audit", path, "--failed", f"{__name__}:is_too_close")
+    assert again.exit_code == 0, again.output
+    assert "5 decisions as recorded" in again.output

@@ -1,0 +1,116 @@
+"""`evofsm drive my.sumocfg`."""
+
+import json
+
+import pytest
+
+pytest.importorskip("typer")
+pytest.importorskip("libsumo")
+
+from typer.testing import CliRunner
+
+from evofsm.__main__ import application
+from evofsm.cli.commands.watch import Watch
+from evofsm.cli.configuration import trace_configuration
+from evofsm.cli.watch.logged import record_log
+from evofsm.cli.watch.recording import Recording
+
+NET = """<net version="1.20">
+    <location netOffset="0,0" convBoundary="0,0,1500,0" origBoundary="0,0,1500,0"
+              projParameter="!"/>
+    <edge id="road" from="begin" to="end" priority="1">
+        <lane id="road_0" index="0" speed="20" length="1500" shape="0,0 1500,0"/>
+    </edge>
+    <junction id="begin" type="dead_end" x="0" y="0" incLanes="" intLanes="" shape="0,0 0,3.2"/>
+    <junction id="end" type="dead_end" x="1500" y="0" incLanes="road_0" intLanes=""
+              shape="1500,0 1500,3.2"/>
+</net>"""
+CARS = """<routes>
+    <vType id="calm" sigma="0" speedFactor="0.4" speedDev="0"/>
+    <vType id="hasty" tau="0.2" minGap="0.5" accel="3.5" sigma="0" speedDev="0"
+           actionStepLength="1.5"/>
+    <route id="along" edges="road"/>
+    <vehicle id="lead" type="calm" route="along" depart="0" departPos="400"/>
+    <vehicle id="ego" type="hasty" route="along" depart="0" departPos="0" departSpeed="20"/>
+</routes>"""
+CONFIGURATION = """<configuration>
+    <net-file value="road.net.xml"/>
+    <route-files value="cars.rou.xml"/>
+    <step-length value="0.1"/>
+    <collision.action value="warn"/>
+    <no-warnings value="true"/>
+    <end value="80"/>
+</configuration>"""
+
+
+@pytest.fixture
+def configuration(tmp_path):
+    (tmp_path / "road.net.xml").write_text(NET)
+    (tmp_path / "cars.rou.xml").write_text(CARS)
+    (tmp_path / "my.sumocfg").write_text(CONFIGURATION)
+    return tmp_path / "my.sumocfg"
+
+
+def evofsm(*arguments):
+    return CliRunner().invoke(application(), [str(argument) for argument in arguments])
+
+
+def test_guards_act_where_they_are_told_to(configuration):
+    found = {}
+    for mode in ("shadow", "act"):
+        asked = ("drive", configuration, "--vehicles", "type:hasty", "--mode", mode, "--json")
+        found[mode] = json.loads(evofsm(*asked).output)
+    assert found["shadow"]["collisions"] == found["shadow"]["of_guarded"] > 0
+    assert found["act"]["collisions"] == 0
+    assert found["act"]["guarded"] == 1
+    assert found["act"]["speed"] > 0.9 * found["shadow"]["speed"]
+
+
+def test_what_came_of_it_is_said(configuration):
+    result = evofsm("drive", configuration, "--vehicles", "ego,lead")
+    assert result.exit_code == 0
+    assert "2 cars (ego,lead), act" in result.output
+    assert "0 by guarded cars" in result.output
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--mode", "advise"], "act or shadow"),
+        (["--vehicles", "lots%"], "vehicles is"),
+        (["--out", "folder"], "--out is for families"),
+    ],
+)
+def test_what_does_not_hold_for_a_configuration_is_refused(configuration, options, said):
+    result = evofsm("drive", configuration, *options)
+    assert result.exit_code == 2
+    assert said in result.output
+
+
+def test_a_configuration_that_sumo_refuses_is_one_line(configuration):
+    (configuration.parent / "cars.rou.xml").unlink()
+    result = evofsm("drive", configuration)
+    assert result.exit_code == 2
+    assert "SUMO refuses it" in result.output
+    assert evofsm("drive", configuration.parent / "none.sumocfg").exit_code == 2
+
+
+def test_a_choice_of_no_car_is_said(configuration):
+    result = evofsm("drive", configuration, "--vehicles", "type:hatsy")
+    assert "no car was type:hatsy: is it the name of a type or car?" in result.output
+
+
+def test_what_a_configuration_drives_is_watched_in_shadow_mode(configuration, tmp_path):
+    log, run = tmp_path / "my.xml", tmp_path / "run.mcap"
+    trace_configuration(configuration, log, seconds=30.0)
+    assert not record_log(str(log), run)
+    recorded = Recording(run)
+    recorded.restart(0)
+    frames = [recorded.step() for _ in range(20)]
+    assert frames[-1].time > frames[0].time
+    assert Watch(what=str(configuration)).is_log
+
+
+def test_a_configuration_that_is_not_there_is_named(tmp_path):
+    with pytest.raises(FileNotFoundError, match="no such file"):
+        trace_configuration(tmp_path / "none.sumocfg", tmp_path / "my.xml", seconds=1.0)

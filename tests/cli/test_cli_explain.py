@@ -1,0 +1,86 @@
+"""`evofsm explain`: what was learnt of a situation."""
+
+import json
+
+import pytest
+
+pytest.importorskip("typer")
+
+from typer.testing import CliRunner
+
+from evofsm.__main__ import application
+from evofsm.driving.cars import guard_for_family, learnt_by, save_learnt, teach
+from evofsm.driving.families.family import load_family
+from evofsm.driving.revisers import Unrevised
+from evofsm.fsm.machine import EvolvingFSM
+from evofsm.guard.guard import Guard
+
+
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory):
+    """What unrevised driving into collisions has taught."""
+    family, folder = load_family("emergency"), tmp_path_factory.mktemp("learnt")
+    machine, risk = learnt_by(guard_for_family(family))
+    reviser = Unrevised(family.actions)
+    guard = Guard.of(reviser, interval=family.interval, machine=machine, judge=risk)
+    draws = [family.draw(0, index, split="train") for index in range(6)]
+    teach(guard, draws)
+    save_learnt(guard, folder, {"family": "emergency"})
+    return folder / "machine.evofsm", machine
+
+
+def run(*arguments):
+    return CliRunner().invoke(application(), ["explain", *map(str, arguments)])
+
+
+def test_every_state_is_explained_with_the_words_of_its_family(saved):
+    file, machine = saved
+    answer = run(file)
+    assert answer.exit_code == 0
+    told = answer.stdout.replace("\n   ", " ").splitlines()
+    assert [line.split(":")[0] for line in told] == [
+        f"#{state + 1}" for state in range(machine.n_states)
+    ]
+    assert all("m/s)" in line for line in told)
+    assert max(map(len, answer.stdout.splitlines())) <= 80
+
+
+def test_an_observation_is_recognised_and_an_action_counted(saved):
+    file, machine = saved
+    found = json.loads(run(file, "--observation", "9,14,14", "--action", "12", "--json").stdout)
+    (one,) = found["situations"]
+    assert one["state"] == machine.model().recognise([9.0, 14.0, 14.0]).argmax()
+    assert one["here"]["episodes"] == machine.episodes[one["state"]]
+    assert one["action"]["failed"] == machine.failed_after[11, one["state"]]
+    assert "a(12)" in one["text"]
+    assert "m/s²" in one["text"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (("--state", 0), "--state is 0; there are 1 to"),
+        (("--observation", "a,b"), "write numbers"),
+        (("--observation", "1,2,3", "--state", 1), "exclude each other"),
+        (("--action", 99), "--action is 99; there are 1 to 17"),
+    ],
+)
+def test_what_is_not_there_is_refused_in_one_line(saved, arguments, says):
+    answer = run(saved[0], *arguments)
+    assert answer.exit_code == 2
+    assert says in answer.stderr
+    assert len(answer.stderr.splitlines()) == 1
+
+
+def test_a_far_observation_is_never_seen_and_silence_about_failures_is_said(tmp_path):
+    machine = EvolvingFSM(1)
+    machine.learn_many([[0.0], [5.0]] * 20, [0] * 40, range(0, 40, 2))
+    machine.save(tmp_path / "machine")
+    answer = run(tmp_path / "machine", "--observation", "500")
+    assert "tells nothing of failures: none was ever told" in answer.stdout
+    assert "Never seen" in answer.stdout
+    told = run(tmp_path / "machine", "--observation", "500", "--json").stdout
+    assert json.loads(told)["situations"][0]["never_seen"] is True
+    machine.tell_of_failures()
+    machine.save(tmp_path / "machine")
+    assert "tells nothing of failures" not in run(tmp_path / "machine").stdout

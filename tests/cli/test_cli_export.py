@@ -1,0 +1,141 @@
+import json
+import os
+
+import pytest
+
+pytest.importorskip("typer")
+pytest.importorskip("scipy")
+pytest.importorskip("mcap")
+
+from typer.testing import CliRunner
+
+from evofsm.__main__ import application
+from evofsm.fsm.machine import EvolvingFSM
+from evofsm.io.mcap import read_run
+
+
+def evofsm(*arguments):
+    return CliRunner().invoke(application(), [str(argument) for argument in arguments])
+
+
+@pytest.fixture(scope="module")
+def driven(tmp_path_factory):
+    """A folder that was driven to: the learner, and the log of the same episodes."""
+    out = tmp_path_factory.mktemp("export") / "driven"
+    log = out.with_suffix(".mcap")
+    result = evofsm(
+        *("drive", "emergency", "--mode", "shadow", "--episodes", 2),
+        *("--out", out, "--mcap", log),
+    )
+    assert result.exit_code == 0, result.stderr
+    return out, log
+
+
+def test_drive_logs_every_episode_and_what_was_learnt(driven):
+    polars = pytest.importorskip("polars")
+    out, log = driven
+    run = read_run(log)
+    assert (run.about["family"], run.about["mode"], run.about["world"]) == (
+        *("emergency", "shadow", "kinematic"),
+    )
+    summary = json.loads((out / "summary.json").read_text())
+    assert sum(episode.collided for episode in run.episodes) == summary["collisions"]
+    table = polars.read_parquet(out / "decisions.parquet")
+    for name in set(table.columns) - {"episode", "state"}:
+        logged = [value for episode in run.episodes for value in episode.columns[name].tolist()]
+        assert polars.Series(logged).equals(table[name].alias(""), null_equal=True), name
+    assert run.model.names == ("gap", "v_follower", "v_leader")
+    assert run.model.actions is not None
+
+
+@pytest.mark.parametrize(
+    ("to", "begins"),
+    [
+        ("dot", "digraph"),
+        ("mermaid", "flowchart"),
+        ("graphml", "<?xml"),
+        ("prism", "// A machine of"),
+    ],
+)
+def test_folder_machine_and_log_give_the_same_states(driven, to, begins, tmp_path):
+    out, log = driven
+    printed = {}
+    for file in (out, out / "machine.evofsm", log):
+        result = evofsm("export", file, "--to", to)
+        assert result.exit_code == 0, result.stderr
+        assert result.stdout.startswith(begins)
+        printed[file] = result.stdout
+    assert "gap" in printed[out]
+    n = read_run(log).model.n_states
+    last = {"dot": f"s{n} [", "mermaid": f"s{n}", "graphml": f'id="s{n}"', "prism": f"[0..{n}]"}
+    assert all(last[to] in text for text in printed.values())
+    result = evofsm("export", out, "--to", to, "--out", tmp_path / "graph")
+    assert result.exit_code == 0
+    assert (tmp_path / "graph").read_bytes().decode() == printed[out]
+
+
+def test_options_choose_what_is_drawn(driven):
+    out, _ = driven
+    whole = evofsm("export", out, "--to", "dot", "--least", 0, "--evidence", 0).stdout
+    few = evofsm("export", out, "--to", "dot", "--evidence", 2, "--no-loops").stdout
+    assert whole.count("->") > 10 * few.count("->") > 0
+    marginal = evofsm("export", out, "--to", "dot", "--policy", "marginal").stdout
+    assert marginal != evofsm("export", out, "--to", "dot").stdout
+    process = evofsm("export", out, "--to", "prism", "--evidence", 5).stdout
+    assert "fewer than 5 decisions" in process
+
+
+def test_an_episode_is_written_for_sumo(driven, tmp_path):
+    _, log = driven
+    result = evofsm("export", log, "--to", "sumo", "--episode", 2, "--out", tmp_path / "replay")
+    assert result.exit_code == 0, result.stderr
+    assert f"sumo-gui {tmp_path / 'replay' / 'replay.sumocfg'}" in result.stdout
+
+
+@pytest.mark.parametrize(
+    ("arguments", "word"),
+    [
+        (("export", "nothing", "--to", "dot"), "nothing"),
+        (("export", "{out}", "--to", "dot", "--policy", "rarely"), "rarely"),
+        (("export", "{out}/summary.json", "--to", "dot"), "summary.json"),
+        (("export", "{out}/risk.evofsm", "--to", "dot"), "risk"),
+        (("export", "{out}/..", "--to", "dot"), "machine.evofsm"),
+        (("export", "{out}", "--to", "prism", "--evidence", 0), "evidence"),
+        (("export", "{log}", "--to", "sumo"), "--out"),
+        (("export", "{log}", "--to", "sumo", "--episode", 9, "--out", "{out}/r"), "9"),
+        (("export", "{out}", "--to", "dot", "--out", "{out}/machine.evofsm"), "left alone"),
+        (("export", "{out}", "--to", "dot", "--out", "{out}/risk.evofsm"), "left alone"),
+        (("export", "{log}", "--to", "dot", "--out", "{log}"), "left alone"),
+        (("export", "{out}", "--to", "dot", "--out", "/dev/null"), "is a device"),
+        (("drive", "emergency", "--mcap", "a", "--checkpoint", "b"), "--mcap"),
+        (("drive", "emergency", "--mcap", "no/folder/a.mcap"), "no/folder"),
+    ],
+)
+def test_what_cannot_be_exported_is_refused_in_one_line(driven, arguments, word):
+    out, log = map(os.fspath, driven)
+    given = [str(argument).format(out=out, log=log) for argument in arguments]
+    result = evofsm(*given)
+    assert result.exit_code == 2
+    assert word in result.stderr
+    assert len(result.stderr.splitlines()) == 1
+
+
+def test_no_text_from_a_file_tells_the_terminal_what_to_do(tmp_path):
+    machine = EvolvingFSM(n_actions=1, radius=0.5)
+    machine.learn_many([[0.0], [0.1], [2.0], [1.0]], [0, 0, 0, 0], failures=[3])
+    evil = "\x1b[2Jgap\x9b31m\r\u202e"
+    model = machine.model(names=[evil], units=[evil], dt=0.1)
+    model.save(tmp_path / "model", {evil: evil, "files": [{"name": evil, "bytes": 1}]})
+    (tmp_path / "text").write_text("x")
+    printed = [
+        *(("inspect", tmp_path / "model"), ("inspect", tmp_path / "model", "--json")),
+        *(("explain", tmp_path / "model"), ("explain", tmp_path / "model", "--json")),
+        *(("export", tmp_path / "model", "--to", to) for to in ("dot", "mermaid", "graphml")),
+        ("inspect", tmp_path / evil),
+    ]
+    for arguments in printed:
+        result = evofsm(*arguments)
+        told = result.stdout + result.stderr
+        assert "gap" in told
+        assert not set(told) & set("\x1b\x9b\r\u202e"), arguments
+    assert json.loads(evofsm("inspect", tmp_path / "model", "--json").stdout)["provenance"][evil]

@@ -1,0 +1,482 @@
+"""`evofsm learn` and `evofsm inspect`, as a user meets them."""
+
+import json
+import math
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from evofsm.fsm.machine import EvolvingFSM
+from evofsm.fsm.model import FSMModel
+from evofsm.fsm.states.edges import Edges
+from evofsm.fsm.states.failure import FailureSplit
+from evofsm.fsm.states.novelty import Novelty
+from evofsm.fsm.states.paper import Paper
+
+pytest.importorskip("typer")
+pytest.importorskip("rich")
+
+import typer.testing
+
+from evofsm.__main__ import application
+
+
+def lines(rows=400, pair="v1-v2"):
+    found = []
+    for k in range(rows):
+        gap, speed = 20.0 + 8.0 * math.sin(k / 30), 15.0 + math.cos(k / 20)
+        action = -0.05 * math.sin(k / 20) * (100 if k == 99 else 1)
+        found.append(f"r,{pair},0,{k / 10:.1f},{gap:.3f},{speed:.3f},15,{action:.3f}")
+    return found
+
+
+@pytest.fixture
+def log(tmp_path):
+    path = tmp_path / "log.csv"
+    header = "run,pair,segment,time,gap,v_follower,v_leader,a_follower"
+    path.write_text("\n".join([header, *lines(), *lines(300, "v2-v3"), ""]))
+    return path
+
+
+@pytest.fixture
+def evofsm(monkeypatch):
+    """Runs a command in 80 columns without a terminal."""
+    monkeypatch.setenv("COLUMNS", "80")
+
+    def run(*arguments):
+        return typer.testing.CliRunner().invoke(application(), [str(a) for a in arguments])
+
+    return run
+
+
+def failure(result):
+    """The one line of an error."""
+    assert result.exit_code == 2
+    assert result.stdout == ""
+    (line,) = result.stderr.splitlines()
+    assert line.startswith("evofsm: ")
+    return line
+
+
+# -- Learn ----------------------------------------------------------------------------------------
+
+
+def test_learn_prints_what_was_read_and_learnt(evofsm, log):
+    result = evofsm("learn", log)
+    assert result.exit_code == 0
+    text = " ".join(result.stdout.split())
+    for part in (
+        "rows 700, one every 0.1 s",
+        "episodes 2, together 69.8 s",
+        "17 intervals of a_follower from -2.5 to 2.5; 0 below and 2 above",
+        "gap v_follower v_leader",
+        "[m] [m/s] [m/s]",
+        "#1 20.0",
+        "Transitions that matter",
+        "a(9) [-0.1, 0.2)",
+        "Forecasts against persistence",
+        "1 s all actions alike, as in the paper",
+        "1 s the same action, held",
+        "1 s actions as often as they were used",
+        "Nothing was saved; --out MODEL",
+    ):
+        assert part in text
+    assert result.stderr == ""
+
+
+def test_piped_output_is_plain_text_of_80_columns(evofsm, log):
+    for line in evofsm("learn", log).stdout.splitlines():
+        assert len(line) <= 80
+        assert "\x1b" not in line
+
+
+def test_learn_saves_a_model_that_inspect_prints(evofsm, log, tmp_path):
+    path = tmp_path / "model.evofsm"
+    learnt = evofsm("learn", log, "--out", path)
+    assert learnt.stdout.splitlines()[-1] == (
+        f"Saved to {path}. Look at it again: evofsm inspect {path}"
+    )
+    model = FSMModel.load(path)
+    assert model.names == ("gap", "v_follower", "v_leader")
+    assert model.units == ("m", "m/s", "m/s")
+    assert model.dt == 0.1
+    shown = evofsm("inspect", path)
+    assert shown.exit_code == 0
+    text = " ".join(shown.stdout.split())
+    assert f"file {path}"[:60] in text or str(path)[:20] in text
+    assert "observations 700, one every 0.1 s" in text
+    assert f"states {model.n_states}, of 3 variables" in text
+    assert "a(17) ≥ 2.3" in text
+
+
+def test_options_reach_the_machine_and_the_log(evofsm, tmp_path):
+    path, model = tmp_path / "log.csv", tmp_path / "model.evofsm"
+    rows = [f"{k % 7},{'red' if k % 20 < 10 else 'green'},{k % 3}" for k in range(100)]
+    path.write_text("\n".join(["x,light,u", *rows, ""]))
+    result = evofsm(
+        *("learn", path, "--observe", "x,light=red/green", "--category-distance", "3"),
+        *("--action", "u", "--action-range", "0:3:1", "--dt", "0.5", "--radius", "0.5"),
+        *("--learning-rate", "0.1", "--spread", "0.01", "--prior-frequency", "0.01"),
+        *("--distance-weight", "0.5", "--episode", "", "--out", model),
+    )
+    assert result.exit_code == 0
+    learnt = FSMModel.load(model)
+    assert learnt.names == ("x", "light=red", "light=green")
+    assert learnt.n_actions == 3
+    assert learnt.dt == 0.5
+    assert learnt.centers[:, 1].max() == pytest.approx(3 / math.sqrt(2))
+
+
+def test_an_action_range_may_begin_with_a_minus_either_way(evofsm, log):
+    first = evofsm("learn", log, "--action-range", "-1:1:0.5", "--json")
+    second = evofsm("learn", log, "--action-range=-1:1:0.5", "--json")
+    assert first.stdout == second.stdout
+    assert len(json.loads(first.stdout)["model"]["actions"]) == 4
+
+
+def test_json_is_one_document_with_counts_from_zero(evofsm, log, tmp_path):
+    path = tmp_path / "model.evofsm"
+    learnt = json.loads(evofsm("learn", log, "--json", "--out", path).stdout)
+    assert learnt["files"] == [str(log)]
+    assert learnt["saved"] == str(path)
+    assert (learnt["rows"], learnt["episodes"], learnt["clipped_above"]) == (700, 2, 2)
+    assert [skill["policy"] for skill in learnt["skills"]] == [
+        None,
+        "marginal",
+        "hold",
+        "observed",
+    ]
+    shown = json.loads(evofsm("inspect", path, "--json").stdout)
+    assert {"file": str(path), **learnt["model"]} == shown
+    assert shown["states"][0]["state"] == 0
+    assert sum(action["uses"] for action in shown["actions"]) == learnt["transitions"] == 698
+
+
+def test_fcd_says_which_lengths_it_assumed(evofsm, tmp_path):
+    path = tmp_path / "fcd.xml"
+    steps = [
+        f'<timestep time="{k / 10}"><vehicle id="a" lane="e" pos="{60 + 2 * k}" speed="20" '
+        f'type="truck"/><vehicle id="b" lane="e" pos="{k}" speed="{20 + k / 9}"/></timestep>'
+        for k in range(30)
+    ]
+    path.write_text(f"<fcd-export>{''.join(steps)}</fcd-export>")
+    result = evofsm("learn", path, "--vehicle-length", "4.5", "--vehicle-length", "truck=12")
+    assert result.exit_code == 0
+    text = " ".join(result.stdout.split())
+    assert "vehicle lengths assumed, for FCD has none: truck 12 m, others 4.5 m" in text
+    assert "#1 48.0" in text
+
+
+# -- Inspect --------------------------------------------------------------------------------------
+
+
+def test_inspect_reads_machines_too(evofsm, tmp_path):
+    machine = EvolvingFSM(n_actions=2, radius=0.5)
+    machine.learn_many([[0.0], [0.1], [2.0], [1.0], [1.1]], [0, 1, 0, 0, 0])
+    machine.save(tmp_path / "machine")
+    text = " ".join(evofsm("inspect", tmp_path / "machine").stdout.split())
+    assert "a machine that can go on learning" in text
+    assert "radius 0.5" in text
+    assert "observations 5, the step is not known" in text
+    assert "variable 1" in text
+
+
+def test_inspect_of_a_machine_that_saw_nothing_prints_that(evofsm, tmp_path):
+    EvolvingFSM.paper().save(tmp_path / "machine")
+    result = evofsm("inspect", tmp_path / "machine")
+    assert result.exit_code == 0
+    assert "observations  0" in result.stdout
+
+
+# -- What goes wrong ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--observe", "gap,speed"], "no column 'speed'"),
+        (["--observe", ""], "--observe"),
+        (["--observe", "gap,gap"], "same name twice"),
+        (["--observe", "pair=v1-v2"], "two or more different values"),
+        (["--observe", "pair=a/b"], "'v1-v2' is none of the values"),
+        (["--action-range", "1:2"], "write LOW:HIGH:WIDTH"),
+        (["--action-range", "2:1:0.1"], "low must be below high"),
+        (["--action-range", "0:1:1e-9"], "more than 1000 intervals"),
+        (["--action-range", "nan:1:1"], "must be finite"),
+        (["--action-range", "0:1:0"], "width is 0.0; it must be positive"),
+        (["--dt", "0"], "--dt is 0.0; it must be a positive"),
+        (["--radius", "-1"], "radius is -1.0"),
+        (["--learning-rate", "2"], "learning_rate is 2.0; it must lie below 1"),
+        (["--vehicle-length", "long"], "--vehicle-length is 'long'"),
+        (["--vehicle-length", "truck=9"], "no leading vehicle has the type 'truck'"),
+        (["--category-distance", "-1"], "distance"),
+        (["--out", "/no/such/folder/model"], "there is no folder"),
+    ],
+)
+def test_wrong_options_end_with_one_line(evofsm, log, options, message):
+    if options[0] == "--category-distance":
+        options = ["--observe", "gap,pair=v1-v2/v2-v3", *options]
+    assert message in failure(evofsm("learn", log, *options))
+
+
+def test_files_that_are_none_end_with_one_line(evofsm, log, tmp_path):
+    assert failure(evofsm("learn", "nosuch.csv")) == "evofsm: nosuch.csv: no such file or directory"
+    assert failure(evofsm("inspect", "nosuch")) == "evofsm: nosuch: no such file or directory"
+    assert "is a folder" in failure(evofsm("learn", tmp_path))
+    assert "not a ZIP archive" in failure(evofsm("inspect", log))
+
+
+def test_a_bad_row_late_in_the_file_leaves_the_model_of_before(evofsm, log, tmp_path):
+    path = tmp_path / "model.evofsm"
+    assert evofsm("learn", log, "--out", path).exit_code == 0
+    before = path.read_bytes()
+    bad = tmp_path / "bad.csv"
+    bad.write_text(log.read_text() + "r,v9,0,0.0,nan,1,1,1\n")
+    assert "bad.csv, line 702, column 'gap'" in failure(evofsm("learn", log, bad, "--out", path))
+    assert path.read_bytes() == before
+    new = tmp_path / "new.evofsm"
+    failure(evofsm("learn", bad, "--out", new))
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["bad.csv", "log.csv", "model.evofsm"]
+
+
+def test_out_never_overwrites_a_file_of_another_kind(evofsm, log):
+    before = log.read_bytes()
+    assert "is no file of evofsm; it was left alone" in failure(evofsm("learn", log, "--out", log))
+    assert log.read_bytes() == before
+
+
+def test_ctrl_c_says_so_and_saves_nothing(evofsm, log, tmp_path, monkeypatch):
+    def interrupted(*arguments):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("evofsm.io.traces._read_table", interrupted)
+    result = evofsm("learn", log, "--out", tmp_path / "model")
+    assert result.exit_code == 130
+    assert "stopped before the end" in result.stderr
+    assert not (tmp_path / "model").exists()
+
+
+def python(code):
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+
+
+@pytest.mark.parametrize("missing", ["typer", "rich"])
+def test_without_the_extra_one_line_says_what_to_install(missing):
+    result = python(
+        f"import sys; sys.modules[{missing!r}] = None\nfrom evofsm.__main__ import main\nmain()"
+    )
+    assert result.returncode == 2
+    assert result.stderr == (
+        "evofsm: the command line needs typer and rich: pip install '.[cli]' in a clone of evofsm\n"
+    )
+
+
+def test_without_the_command_line_all_that_a_command_needs_is_named_at_once():
+    result = python(
+        "import sys; sys.modules['typer'] = None; sys.argv = ['evofsm', 'paper']\n"
+        "from evofsm.__main__ import main\nmain()"
+    )
+    assert "pip install '.[cli,plot,sumo,tables]'" in result.stderr
+
+
+def test_all_that_lacks_is_named_at_once(monkeypatch):
+    from evofsm.cli.commands import common
+    from evofsm.cli.commands.drive import Drive
+    from evofsm.cli.commands.groups import WorldName
+
+    monkeypatch.setattr(common, "find_spec", lambda name: None)
+    with pytest.raises(ModuleNotFoundError, match="needs scipy and libsumo") as caught:
+        common.require(**Drive(family="paper", world=WorldName.SUMO).packages())
+    assert "pip install '.[cli,study,sumo]'" in str(caught.value)
+
+
+def test_extras_of_commands_exist():
+    from evofsm.extras import OF_COMMANDS
+
+    project = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())["project"]
+    assert {one for extras in OF_COMMANDS.values() for one in extras} <= set(
+        project["optional-dependencies"]
+    )
+
+
+def test_python_m_evofsm_is_the_command():
+    run = subprocess.run(
+        [sys.executable, "-m", "evofsm", "--version"], capture_output=True, text=True
+    )
+    assert run.returncode == 0, run.stderr
+    assert run.stdout.startswith("evofsm 0.")
+
+
+def test_help_loads_neither_numba_nor_polars():
+    result = python(
+        "import sys\n"
+        "from evofsm.__main__ import application\n"
+        "application()(['--help'], standalone_mode=False)\n"
+        "print(sorted({'numba', 'polars', 'libsumo'} & set(sys.modules)))"
+    )
+    assert result.stdout.splitlines()[-1] == "[]"
+    assert "learn" in result.stdout
+    assert "inspect" in result.stdout
+
+
+def test_csv_needs_no_extra(log):
+    result = python(
+        "import sys\n"
+        "sys.modules['polars'] = sys.modules['typer'] = sys.modules['rich'] = None\n"
+        "from evofsm.io import read_traces\n"
+        f"print(sum(len(chunk.times) for chunk in read_traces([{str(log)!r}])))"
+    )
+    assert result.stdout == "700\n", result.stderr
+
+
+def test_numbers_stay_whole_in_a_narrow_terminal(evofsm, log, monkeypatch):
+    def cells_of_first_state():
+        text = evofsm("learn", log).stdout.partition("\nStates")[2].partition("\nTransitions")[0]
+        rows = [row.split() for row in text.splitlines() if row.startswith("#1 ")]
+        return [cell for name, *cells in rows for cell in cells], len(rows)
+
+    wide, parts = cells_of_first_state()
+    assert (len(wide), parts) == (6, 1)
+    monkeypatch.setenv("COLUMNS", "30")
+    narrow, parts = cells_of_first_state()
+    assert narrow == wide
+    assert parts > 1
+
+
+def test_an_out_that_is_a_folder_is_refused_before_the_work(evofsm, log, tmp_path):
+    result = evofsm("learn", log, "--out", tmp_path)
+    assert result.exit_code == 2
+    assert "is a folder" in result.stderr
+
+
+def test_the_version_is_told(evofsm):
+    result = evofsm("--version")
+    assert result.exit_code == 0
+    assert result.stdout.startswith("evofsm 0.")
+
+
+# -- What a log tells, and how ---------------------------------------------------------------------
+
+
+@pytest.fixture
+def crashes(tmp_path):
+    """Four drives, of which two end in a collision that lasts for some rows."""
+    path = tmp_path / "crashes.csv"
+    rows = ["pair,time,gap,v_follower,v_leader,a_follower,hit"]
+    for pair in range(4):
+        for k in range(60):
+            gap = 5.0 - 0.1 * k if pair % 2 else 5.0 + math.sin(k)
+            rows.append(f"{pair},{k / 10:.1f},{gap:.2f},{15 + k % 3},15,0.1,{int(gap <= 0.0)}")
+    path.write_text("\n".join([*rows, ""]))
+    return path
+
+
+def test_failures_are_learnt_from_a_column_or_a_comparison(evofsm, crashes, tmp_path):
+    path = tmp_path / "model"
+    documents = [
+        json.loads(evofsm("learn", crashes, "--failed", told, "--json", "--out", path).stdout)
+        for told in ("hit", "gap<=0")
+    ]
+    assert [one["failures"] for one in documents] == [2, 2]
+    assert [one["noted"]["after_failure"] for one in documents] == [18, 18]
+    assert documents[1]["model"]["provenance"]["failed"] == "gap<=0"
+    assert FSMModel.load(path).failed_soon.max() == 2.0
+    text = " ".join(evofsm("learn", crashes, "--failed", "hit").stdout.split())
+    assert "failures 2 episodes ended with hit; 18 rows after them" in text
+    assert "failures 2 episodes ended in one" in " ".join(evofsm("inspect", path).stdout.split())
+    assert "2 of 4" in " ".join(evofsm("explain", path, "--state", "1").stdout.split())
+
+
+def test_a_log_that_tells_nothing_of_failures_is_said_to(evofsm, crashes, tmp_path):
+    path = tmp_path / "model"
+    learnt = evofsm("learn", crashes, "--out", path)
+    assert "failures not told; --failed" in " ".join(learnt.stdout.split())
+    text = " ".join(evofsm("explain", path).stdout.split())
+    assert "tells nothing of failures" in text
+    assert "0 of" not in text
+    safe = tmp_path / "safe"
+    assert evofsm("learn", crashes, "--failed", "gap<-9", "--out", safe).exit_code == 0
+    text = " ".join(evofsm("explain", safe).stdout.split())
+    assert "tells nothing of failures" not in text
+    assert "0 of 3 (at most 48 %) failed later on" in text
+
+
+def test_failures_survive_a_stop_and_another_condition_is_other_work(evofsm, crashes, tmp_path):
+    whole, kept = tmp_path / "whole", tmp_path / "kept"
+    command = ("learn", crashes, crashes, "--failed", "hit", "--every", "0s")
+    assert evofsm(*command, "--out", whole).exit_code == 0
+    assert evofsm(*command, "--checkpoint", kept).exit_code == 0
+    again = evofsm(*command, "--checkpoint", kept, "--out", tmp_path / "again")
+    assert "4 episodes ended with hit; 36 rows" in " ".join(again.stdout.split())
+    assert (tmp_path / "again").read_bytes() == whole.read_bytes()
+    other = evofsm("learn", crashes, crashes, "--failed", "gap<=0", "--checkpoint", kept)
+    assert 'failed was "hit" and is now "gap<=0"' in failure(other)
+
+
+def test_units_and_missing_leaders_are_said_in_the_summary(evofsm, tmp_path):
+    path = tmp_path / "log.csv"
+    rows = [f"p,{100 * k},{'' if k == 9 else 20},54,54,0.1" for k in range(30)]
+    header = "pair,time,gap,v_follower,v_leader,a_follower"
+    path.write_text("\n".join([header, *rows, ""]))
+    assert "no leader? --no-leader end" in failure(evofsm("learn", path))
+    told = evofsm(
+        *("learn", path, "--no-leader", "end", "--unit", "v=km/h", "--unit", "time=ms"),
+        *("--out", tmp_path / "model"),
+    )
+    text = " ".join(told.stdout.split())
+    assert "no leader in 1 rows, left out" in text
+    assert "converted v_follower from km/h, v_leader from km/h, time from ms" in text
+    assert "rows 29, one every 0.1 s" in text
+    assert told.stderr == ""
+    assert FSMModel.load(tmp_path / "model").centers[0].tolist() == pytest.approx([20, 15, 15])
+    warned = evofsm("learn", path, "--no-leader", "end")
+    assert "a row every 100 s: is the time in ms? --unit time=ms converts it" in warned.stderr
+
+
+@pytest.mark.parametrize(
+    ("options", "rule"),
+    [
+        ([], Paper()),
+        (["--rule", "edges"], Edges()),
+        (["--rule", "novelty"], Novelty(1.0, (4.0, 2.0, 2.0))),
+        (
+            ["--rule", "novelty", "--radius", "2", "--spread", "0.5", "--scale", "gap=8"],
+            Novelty(2.0, (8.0, 2.0, 2.0), 0.5),
+        ),
+        (["--rule", "failure", "--failed", "hit"], FailureSplit(Novelty(1.0, (4.0, 2.0, 2.0)))),
+    ],
+)
+def test_another_rule_is_told_by_its_name(evofsm, crashes, tmp_path, options, rule):
+    assert evofsm("learn", crashes, *options, "--out", tmp_path / "model").exit_code == 0
+    assert FSMModel.load(tmp_path / "model").rule == rule
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--failed", "gap<"], "--failed is 'gap<'"),
+        (["--failed", "crash"], "no column 'crash'"),
+        (["--unit", "v=warp"], "--unit is 'v=warp'"),
+        (["--scale", "gap=4"], "--scale is for --rule novelty or failure, not paper"),
+        (["--rule", "novelty", "--scale", "speed=4"], "--scale names 'speed'; observed are gap"),
+        (["--rule", "novelty", "--scale", "gap=0"], "--scale is 'gap=0'; write COLUMN=NUMBER"),
+        (["--rule", "novelty", "--observe", "gap,hit"], "difference that counts as 1 in 'hit'"),
+        (["--rule", "failure"], "--failed has to tell"),
+        (["--max-states", "0"], "max_states is 0"),
+    ],
+)
+def test_wrong_words_on_rules_failures_and_units_end_with_one_line(
+    evofsm, crashes, options, message
+):
+    assert message in failure(evofsm("learn", crashes, *options))
+
+
+def test_novelty_counts_as_the_closed_loop_does():
+    pytest.importorskip("scipy")
+    from evofsm.cli.commands.learn import _SCALES
+    from evofsm.driving.cars import SAFETY_RULE
+
+    assert tuple(SAFETY_RULE.scales) == _SCALES

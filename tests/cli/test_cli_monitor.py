@@ -1,0 +1,245 @@
+import json
+import os
+import shlex
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("typer")
+pytest.importorskip("rich")
+
+from typer.testing import CliRunner
+
+from evofsm.__main__ import application
+from evofsm.cli.monitor.decider import Decider
+from evofsm.cli.monitor.defaults import guard_of_monitor
+from evofsm.guard.auditing.replay import audit
+from evofsm.guard.guard import Guard
+from evofsm.guard.reviser import Mode
+from monitor_rows import JUNK, closing_in, line, traffic
+
+EXAMPLES = Path(__file__).parents[2] / "examples" / "monitor"
+PATIENCE = 120.0
+ROWS = [line(row) for row in closing_in(40)]
+posix = pytest.mark.skipif(sys.platform == "win32", reason="signals and sockets of POSIX")
+
+
+def evofsm(*arguments, lines=()):
+    sent = b"".join(one + b"\n" for one in lines)
+    return CliRunner().invoke(application(), ["monitor", *map(str, arguments)], input=sent)
+
+
+def told(result):
+    return [json.loads(one) for one in result.stdout.splitlines()]
+
+
+def expected(rows=ROWS, **settings):
+    decider = Decider(guard_of_monitor(0.1, 6.0), **settings)
+    return [decider.answer(row) for row in rows]
+
+
+def started(*arguments, **pipes):
+    command = [sys.executable, "-m", "evofsm", "monitor", *map(str, arguments)]
+    given = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.PIPE) | pipes
+    return subprocess.Popen(command, **given)
+
+
+def asked(process, row):
+    process.stdin.write(row + b"\n")
+    process.stdin.flush()
+    return json.loads(process.stdout.readline())
+
+
+def ended(process):
+    out, err = process.communicate(timeout=PATIENCE)
+    return process.returncode, out, err.decode()
+
+
+# -- What it is given -----------------------------------------------------------------------------
+
+
+def test_rows_from_a_file_and_from_standard_input_are_answered_alike(tmp_path):
+    file = tmp_path / "rows.jsonl"
+    file.write_bytes(b"\n".join(ROWS))
+    frozen = guard_of_monitor(0.1, 6.0)
+    frozen.learn = False
+    decider = Decider(frozen)
+    by_hand = [decider.answer(row) for row in ROWS]
+    for result in (evofsm(file), evofsm(lines=ROWS), evofsm("--warm", lines=ROWS)):
+        assert result.exit_code == 0, result.stderr
+        assert told(result) == by_hand
+    assert "compiled" in result.stderr
+
+
+def test_learning_says_that_it_is_not_kept():
+    result = evofsm("--learn", lines=ROWS)
+    assert "--state FILE keeps it" in result.stderr
+    assert told(result) == expected()
+
+
+def test_a_saved_guard_in_another_mode(tmp_path):
+    guard = guard_of_monitor(0.1, 6.0)
+    guard.reviser.mode = Mode.ACT
+    guard.save(tmp_path / "guard.evofsm")
+    rows = [line(row) for row in closing_in(80)]
+    shadow = told(evofsm("--guard", tmp_path / "guard.evofsm", lines=rows))
+    assert {one["executed"] for one in shadow} == {0.5}
+    act = told(evofsm("--guard", tmp_path / "guard.evofsm", "--mode", "act", lines=rows))
+    assert act[-1]["executed"] < 0.0
+    assert act[-1]["mode"] == "act"
+
+
+def test_a_proposal_taken_for_granted():
+    rows = [line({k: v for k, v in row.items() if k != "proposal"}) for row in closing_in(3)]
+    assert {one["about"] for one in told(evofsm(lines=rows))} == {"proposal"}
+    assert {one["proposed"] for one in told(evofsm("--proposal", 0, lines=rows))} == {0.0}
+
+
+def test_a_state_goes_on_over_runs_and_may_be_the_guards_own_file(tmp_path):
+    rows = [line(row) for row in traffic(200)]
+    by_hand = expected(rows)
+    state = tmp_path / "state.evofsm"
+    guard_of_monitor(0.1, 6.0).save(state)
+    options = ("--learn", "--guard", state, "--state", state)
+    first, second = (evofsm(*options, lines=part) for part in (rows[:90], rows[90:]))
+    assert [*told(first), *told(second)] == by_hand
+    assert "goes on after decision 90 (90 rows taken in again)" in second.stderr
+    refused = evofsm("--guard", state, "--state", state, lines=rows)
+    assert refused.exit_code == 2
+    assert "learn was True and is False" in refused.stderr
+
+
+def test_the_audit_log_is_good(tmp_path):
+    log, state = tmp_path / "audit.jsonl", tmp_path / "state.evofsm"
+    assert evofsm("--audit", log, lines=ROWS).exit_code == 0
+    found = audit(log)
+    assert (found.is_good, found.replay.decisions) == (True, 40)
+    log.unlink()
+    for part in (ROWS[:25], ROWS[25:]):  # its rows are taken in again, and written again
+        assert evofsm("--learn", "--audit", log, "--state", state, lines=part).exit_code == 0
+    found = audit(log)
+    assert (found.is_good, found.replay.decisions) == (True, 65)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("--mode", "drive"), "--mode is 'drive'"),
+        (("--udp", 0, "--socket", "x"), "give one of FILE, --socket, --udp and --zenoh"),
+        (("--guard", "nowhere"), "nowhere: no such file or directory"),
+        (("nowhere.jsonl",), "nowhere.jsonl: no such file or directory"),
+        (("--heartbeat", 0), "--heartbeat"),
+        (("--interval", -1), "interval"),
+    ],
+)
+def test_what_cannot_be_is_said_in_a_line(arguments, said, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    result = evofsm(*arguments)
+    assert result.exit_code == 2
+    assert said in result.stderr
+    assert result.stderr.count("\n") == 1
+
+
+def test_a_recorded_run_is_watched(tmp_path):
+    pytest.importorskip("mcap")
+    from evofsm.driving import drive, guard_for_family, load_family
+    from evofsm.io import write_run
+
+    family = load_family("emergency")
+    driven = drive(guard_for_family(family), family.draw(seed=0, index=0))
+    write_run(tmp_path / "run.mcap", [driven])
+    result = evofsm(tmp_path / "run.mcap", "--interval", family.interval)
+    *decisions, end = told(result)
+    assert len(decisions) == len(driven.decisions)
+    assert {one["kind"] for one in decisions} == {"decision"}
+    assert (end["kind"], end["failed"]) == ("end", driven.episode.collided)
+
+
+# -- As a process ---------------------------------------------------------------------------------
+
+
+@posix
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["SIGTERM", "SIGINT", "SIGKILL"])
+def test_however_it_ends_it_goes_on_bit_for_bit(tmp_path, name):
+    number = getattr(signal, name)
+    rows = [line(row) for row in traffic(90)]
+    by_hand, answers = expected(rows), []
+    for k in range(0, 90, 30):
+        with started("--learn", "--state", tmp_path / "state.evofsm") as process:
+            for row in rows[k : k + 30]:
+                assert asked(process, JUNK[1])["kind"] == "error"
+                answers.append(asked(process, row))
+            process.send_signal(number)
+            status, _, said = ended(process)
+        assert status == (-number if name == "SIGKILL" else 0), said
+        assert "Traceback" not in said
+    assert answers == by_hand
+
+
+@posix
+@pytest.mark.slow
+def test_a_reader_that_vanishes_ends_it_in_a_line():
+    with started() as process:
+        asked(process, ROWS[0])
+        process.stdout.close()
+        process.stdin.write(ROWS[1] + b"\n")
+        process.stdin.close()
+        said = process.stderr.read().decode()
+        assert process.wait(PATIENCE) == 1
+    assert said.splitlines()[-1] == "evofsm: nobody reads the decisions any more"
+
+
+@pytest.fixture
+def listening(tmp_path):
+    """A monitor that listens to a socket, the path of which is returned."""
+    path = tmp_path / "monitor.sock"
+    with started("--warm", "--socket", path) as process:
+        while b"listens" not in process.stderr.readline():
+            assert process.poll() is None
+        yield path
+        process.terminate()
+        status, _, said = ended(process)
+    assert (status, said) == (0, "")
+    assert not path.exists()
+
+
+@posix
+@pytest.mark.slow
+def test_the_client_in_c_gets_its_alarm(listening, tmp_path):
+    compiler = os.environ.get("CC") or shutil.which("cc")
+    if compiler is None:
+        pytest.skip("there is no C compiler")
+    flags = ("-std=c99", "-D_POSIX_C_SOURCE=200809L", "-Wall", "-Wextra", "-Werror")
+    client = tmp_path / "client"
+    build = [*shlex.split(compiler), *flags, "-o", client, EXAMPLES / "client.c"]
+    subprocess.run(build, check=True)
+    begun = time.monotonic()
+    done = subprocess.run([client, listening], capture_output=True, text=True, timeout=PATIENCE)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith("alarm at ")
+    assert json.loads(done.stdout.partition(": ")[2])["alarm"]
+    assert time.monotonic() - begun < PATIENCE
+    nowhere = subprocess.run([client, "nowhere"], capture_output=True, text=True)
+    assert nowhere.returncode == 2
+
+
+@posix
+@pytest.mark.slow
+def test_the_client_in_shell_gets_its_alarm():
+    command = ["sh", EXAMPLES / "client.sh"]
+    here = os.environ | {"EVOFSM": f"{shlex.quote(sys.executable)} -m evofsm"}
+    done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE, env=here)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith("alarm at ")
+
+
+def test_what_is_kept_can_be_loaded_as_a_guard(tmp_path):
+    state = tmp_path / "state.evofsm"
+    assert evofsm("--learn", "--state", state, lines=ROWS).exit_code == 0
+    assert Guard.load(state).learn

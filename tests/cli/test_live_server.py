@@ -1,0 +1,376 @@
+"""The live page's server: who gets in, and that nobody who looks on can harm the run."""
+
+import asyncio
+import json
+import math
+import socket
+import time
+from contextlib import contextmanager, suppress
+from http.client import HTTPConnection
+from urllib.parse import urlsplit
+
+import pytest
+
+pytest.importorskip("websockets")
+
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.sync.client import connect
+
+from evofsm.cli.watch.live.server import LivePage
+from evofsm.cli.watch.live.wire import encode, frame_message
+from evofsm.cli.watch.player import Player
+from evofsm.cli.watch.session import Session, Watching, watched_guard
+from evofsm.driving.families.family import load_family
+from evofsm.driving.worlds.kinematic import KinematicWorld
+
+pytestmark = pytest.mark.usefixtures("compiled")
+
+PAPER = Watching(load_family("paper"))
+
+
+@contextmanager
+def session():
+    with Session(PAPER, watched_guard(PAPER.family), KinematicWorld()) as opened:
+        yield opened
+
+
+@pytest.fixture
+def page():
+    """A page that shows a run, which waits."""
+    with LivePage() as page, Player(session, page, paused=True) as player:
+        page.player = player
+        yield page
+
+
+def get(page, path, host=None, **headers):
+    """Status, headers and body of a request."""
+    connection = HTTPConnection("127.0.0.1", page.port, timeout=60)
+    try:
+        connection.putrequest("GET", path, skip_host=True)
+        connection.putheader("Host", host or f"127.0.0.1:{page.port}")
+        for name, value in headers.items():
+            connection.putheader(name, value)
+        connection.endheaders()
+        answer = connection.getresponse()
+        return answer.status, dict(answer.getheaders()), answer.read()
+    finally:
+        connection.close()
+
+
+def looking_on(page, *, origin=None, token=None, sock=None):
+    return connect(
+        f"ws://127.0.0.1:{page.port}/{token or page.token}/socket",
+        origin=origin or f"http://127.0.0.1:{page.port}",
+        sock=sock,
+        proxy=None,
+        open_timeout=60,
+    )
+
+
+def told(client, kind):
+    """The next message of a kind."""
+    while True:
+        message = json.loads(client.recv(timeout=60))
+        for part in message.get("parts", [message]):
+            if part["kind"] == kind:
+                return part
+
+
+# -- Who gets in ----------------------------------------------------------------------------------
+
+
+def test_the_page_and_all_that_it_needs_are_served_under_its_address(page):
+    folder = urlsplit(page.address).path
+    status, headers, body = get(page, folder)
+    assert status == 200
+    assert b"<!doctype html>" in body
+    assert "default-src 'none'" in headers["Content-Security-Policy"]
+    assert b"http:" not in body
+    assert b"https:" not in body
+    for name in page._files:
+        status, headers, body = get(page, folder + name)
+        assert status == 200
+        assert headers["X-Content-Type-Options"] == "nosniff"
+        assert body
+
+
+@pytest.mark.parametrize("path", ["/", "/wrong/", "/wrong/page.js", "/%00/", "//", "/socket"])
+def test_without_the_token_nothing_is_served(page, path):
+    assert get(page, path)[0] == 403
+
+
+def test_files_beside_the_page_are_not_served(page):
+    for name in ("server.py", "../live/page.html", "..%2f..%2fpage.py", "words.py", "socket/x"):
+        assert get(page, f"/{page.token}/{name}")[0] in (403, 404)
+
+
+@pytest.mark.parametrize("host", ["evil.example", "127.0.0.1", "127.0.0.1:1", "localhost.evil:80"])
+def test_other_names_are_refused(page, host):
+    """As when a page elsewhere lets its name point to this computer (DNS rebinding)."""
+    assert get(page, f"/{page.token}/", host=host)[0] == 403
+
+
+@pytest.mark.parametrize("origin", ["http://evil.example", "null", "https://127.0.0.1"])
+def test_pages_of_other_origins_may_not_open_the_socket(page, origin):
+    with pytest.raises(InvalidStatus) as refused:
+        looking_on(page, origin=origin)
+    assert refused.value.response.status_code == 403
+
+
+def test_a_socket_needs_the_token_and_an_origin(page):
+    with pytest.raises(InvalidStatus):
+        looking_on(page, token="A" * 32)
+    with pytest.raises(InvalidStatus):
+        connect(f"ws://127.0.0.1:{page.port}/{page.token}/socket", proxy=None)
+
+
+def test_it_listens_on_this_computer_only(page):
+    own = {info[4][0] for info in socket.getaddrinfo(socket.gethostname(), None, socket.AF_INET)}
+    elsewhere = own - {"127.0.0.1", "127.0.1.1"}
+    with socket.create_connection(("127.0.0.1", page.port), timeout=5):
+        pass
+    for address in {*elsewhere, "127.0.0.2"}:
+        with pytest.raises(ConnectionRefusedError):
+            socket.create_connection((address, page.port), timeout=5).close()
+
+
+def test_every_page_has_a_token_of_its_own():
+    with LivePage() as one, LivePage() as other:
+        assert one.token != other.token
+        assert len(one.token) >= 32
+
+
+def test_a_port_that_is_taken_is_said(page):
+    with pytest.raises(OSError, match="address already in use"), LivePage(page.port):
+        pass
+
+
+# -- What is shown, and done ----------------------------------------------------------------------
+
+
+def test_a_port_that_cannot_be_is_said_too():
+    with pytest.raises(OverflowError, match="port"), LivePage(70_000):
+        pass
+
+
+def test_who_connects_and_says_nothing_does_not_hold_up_the_end():
+    with LivePage() as page:
+        silent = socket.create_connection(("127.0.0.1", page.port), timeout=5)
+        time.sleep(0.1)
+        began = time.monotonic()
+    assert time.monotonic() - began < 4.0
+    silent.close()
+
+
+def test_who_comes_late_is_shown_all_of_it(page):
+    with looking_on(page) as first:
+        for number in range(3):
+            page.player.step()
+            assert told(first, "frame")["number"] == number
+    with looking_on(page) as later:
+        whole = json.loads(later.recv(timeout=60))
+    kinds = [part["kind"] for part in whole["parts"]]
+    assert kinds[0] == "start"
+    assert kinds.count("frame") == 3
+    assert {"clock", "graph"} <= set(kinds)
+
+
+def test_pages_act_on_the_run(page):
+    with looking_on(page) as client:
+        told(client, "clock")
+        for command, name, value in [
+            ({"do": "revise", "value": False}, "revising", False),
+            ({"do": "speed", "value": 8}, "speed", 8.0),
+            ({"do": "pause", "value": False}, "paused", False),
+        ]:
+            client.send(json.dumps(command))
+            assert told(client, "clock")[name] == value
+        client.send(json.dumps({"do": "case", "value": 3}))
+        assert told(client, "start")["case"] == 3
+
+
+def test_numbers_that_are_none_are_sent_as_null():
+    with session() as opened:
+        frame = opened.step()
+    assert math.isinf(frame.time_to_collision)
+    message = json.loads(encode(frame_message(frame, opened.start)))
+    assert message["time_to_collision"] is None
+    assert message["told"]["status"] == "safe"
+
+
+def test_a_run_waits_for_the_first_who_looks_on():
+    with (
+        LivePage() as page,
+        Player(session, page, speed=math.inf, awaits=True) as player,
+    ):
+        page.player = player
+        assert get(page, f"/{page.token}/")[0] == 200  # who loads the page only sees nothing yet
+        assert not page._shown._frames
+        with looking_on(page) as client:
+            assert told(client, "frame")["number"] == 0
+            assert told(client, "frame")["number"] == 1
+
+
+# -- Who looks on cannot harm it ------------------------------------------------------------------
+
+_JUNK = [
+    "hello",
+    "[]",
+    "{",
+    '{"do": "explode"}',
+    '{"do": "\\ud800"}',  # half a character, which no reason can hold
+    '{"do": "\\ud83d\\ude00"}',
+    '{"do": "speed", "value": 3.21}',
+    '{"do": "speed", "value": NaN}',
+    '{"do": "case", "value": 1e400}',
+    '{"do": "case", "value": -1}',
+    '{"do": "case", "value": 2.5}',
+    '{"do": "pause"}',
+    '{"do": "pause", "value": 1, "also": 2}',
+    '{"do": ["pause"]}',
+    "[" * 500,
+]
+
+
+@pytest.mark.parametrize("junk", _JUNK)
+def test_what_is_no_command_closes_the_socket_and_says_so(page, junk):
+    with looking_on(page) as client:
+        told(client, "start")
+        client.send(junk)
+        with pytest.raises(ConnectionClosed) as closed:
+            told(client, "nothing")
+    assert closed.value.rcvd.code == 1008
+    assert "command" in closed.value.rcvd.reason
+
+
+@pytest.mark.parametrize(("junk", "code"), [(b"\x00\x01", 1003), ("x" * 10_000, 1009)])
+def test_bytes_and_long_messages_close_it_too(page, junk, code):
+    with looking_on(page) as client:
+        told(client, "start")
+        client.send(junk)
+        with pytest.raises(ConnectionClosed) as closed:
+            told(client, "nothing")
+    assert closed.value.rcvd.code == code
+
+
+def test_junk_on_the_wire_is_survived(page):
+    request = f"GET /{page.token}/socket HTTP/1.1\r\nHost: 127.0.0.1:{page.port}\r\n"
+    upgraded = (
+        f"{request}Origin: http://127.0.0.1:{page.port}\r\nUpgrade: websocket\r\n"
+        "Connection: Upgrade\r\nSec-WebSocket-Version: 13\r\n"
+        "Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n\r\n"
+    )
+    for junk in (
+        b"\x16\x03\x01\x02\x00\x01" * 50,  # as if it were TLS
+        b"GET / HTTP/1.1\r\n" + b"A: b\r\n" * 500,
+        b"GET /\xff/ HTTP/1.1\r\n\r\n",
+        f"GET /{'x' * 5000}/ HTTP/1.1\r\nHost: 127.0.0.1:{page.port}\r\n\r\n".encode(),
+        f"GET /\xff/ HTTP/1.1\r\nHost: 127.0.0.1:{page.port}\r\n\r\n".encode("latin-1"),
+        b"POST / HTTP/1.1\r\nContent-Length: 9\r\n\r\n",
+        b"\x00" * 100_000,
+        request.encode(),  # and then nothing
+        upgraded.encode() + b"\xff" * 1000,  # no frame at all
+        upgraded.encode() + b"\x81\x05hello",  # not masked
+        upgraded.encode() + b"\x81\xff" + b"\x7f" * 12,  # as if 2^62 bytes followed
+    ):
+        wire = socket.create_connection(("127.0.0.1", page.port), timeout=5)
+        with wire, suppress(OSError):
+            wire.sendall(junk)
+            wire.settimeout(0.05)
+            wire.recv(100)
+    with looking_on(page) as client:
+        page.player.step()
+        assert told(client, "frame")["number"] == 0
+
+
+def test_a_client_that_vanishes_is_forgotten(page):
+    with looking_on(page) as client:
+        told(client, "start")
+        assert page.clients == 1
+        client.socket.shutdown(socket.SHUT_RDWR)  # without a word
+        until(lambda: page.clients == 0)
+    with looking_on(page) as another:
+        page.player.step()
+        assert told(another, "frame")
+
+
+def test_fifty_look_on_and_all_see_every_frame(page):
+    async def look_on():
+        from websockets.asyncio.client import connect as connect_async
+
+        address = f"ws://127.0.0.1:{page.port}/{page.token}/socket"
+        origin = f"http://127.0.0.1:{page.port}"
+        clients = [
+            await connect_async(address, origin=origin, proxy=None, compression=None)
+            for _ in range(50)
+        ]
+        for client in clients:
+            await client.recv()
+        assert page.clients == 50
+        seen = []
+        for number in range(5):
+            page.player.step()
+            for client in clients:
+                while (message := json.loads(await client.recv()))["kind"] != "frame":
+                    pass
+                seen.append(message["number"] == number)
+        await asyncio.gather(*(client.close() for client in clients))
+        return seen
+
+    assert all(asyncio.run(asyncio.wait_for(look_on(), 30.0)))
+
+
+class Counted:
+    """An audience that passes on what it is told, and counts the runs that came to their end."""
+
+    def __init__(self, audience):
+        self.audience = audience
+        self.ends = 0
+
+    def __getattr__(self, name):
+        return getattr(self.audience, name)
+
+    def saw(self, frame):
+        self.audience.saw(frame)
+        self.ends += frame.over
+
+
+@pytest.mark.slow
+def test_who_does_not_read_does_not_hold_the_run_up_and_is_later_shown_all_of_it():
+    runs = 5  # far more than all buffers on the way hold
+    with LivePage() as page:
+        counted = Counted(page)
+        narrow = socket.socket()
+        narrow.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        narrow.connect(("127.0.0.1", page.port))
+        with (
+            Player(session, counted, paused=True, speed=math.inf) as player,
+            looking_on(page, sock=narrow) as stalled,
+        ):
+            for run in range(runs):
+                player.restart()
+                until(lambda run=run: counted.ends == run + 1)
+            received = list(messages_of_runs(stalled, runs))
+    assert sum(message["kind"] == "whole" for message in received) >= 2
+    assert sum(message["kind"] == "frame" for message in received) < 150 * runs / 2
+
+
+def messages_of_runs(client, runs):
+    """All messages up to the end of the last run."""
+    learnt = ends = 0
+    while not (learnt == runs - 1 and ends):
+        message = json.loads(client.recv(timeout=60))
+        yield message
+        for part in message.get("parts", [message]):
+            if part["kind"] == "start":
+                learnt, ends = part["learnt"], 0
+            ends += part["kind"] == "frame" and part["over"]
+
+
+def until(holds, seconds=5.0):
+    """Wait until it holds."""
+    end = time.monotonic() + seconds
+    while not holds():
+        assert time.monotonic() < end
+        time.sleep(0.01)
+    return True

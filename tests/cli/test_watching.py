@@ -1,0 +1,368 @@
+"""A run that is watched: what is shown of it, its story, and the clock it is played by."""
+
+import math
+import threading
+from contextlib import contextmanager
+from dataclasses import replace
+from itertools import pairwise
+
+import pytest
+
+from evofsm.cli.watch.live.words import tell
+from evofsm.cli.watch.player import Player
+from evofsm.cli.watch.session import Session, Watching, learn_first, watched_guard
+from evofsm.driving.cars import guard_for_family, learnt_by, load_learnt, save_learnt, teach
+from evofsm.driving.families.family import load_family
+from evofsm.driving.worlds.kinematic import KinematicWorld
+from evofsm.guard.reviser import Mode
+
+pytestmark = pytest.mark.usefixtures("compiled")
+
+PAPER = Watching(load_family("paper"))
+
+
+def learnt(episodes=6):
+    guard = watched_guard(PAPER.family)
+    learn_first(PAPER, guard, episodes)
+    return guard
+
+
+def opened(watching=PAPER, guard=None):
+    return Session(watching, guard or learnt(), KinematicWorld())
+
+
+def drive(session):
+    """All frames up to the end."""
+    frames = [session.step()]
+    while not frames[-1].over:
+        frames.append(session.step())
+    return frames
+
+
+@pytest.mark.slow
+def test_the_reviser_prevents_the_collision_that_happens_without_it():
+    session = opened()
+    revised = drive(session)[-1]
+    session.restart()
+    session.revising = False
+    alone = drive(session)[-1]
+    assert not revised.collided
+    assert alone.collided
+    assert alone.time == alone.story.collision == revised.story.alone
+
+
+def test_switched_on_in_time_it_still_prevents_it_and_switched_off_it_says_what_it_would_do():
+    session = opened()
+    session.revising = False
+    frames = [session.step() for _ in range(20)]  # 5 s: danger, but no dead end yet
+    session.revising = True
+    frames += drive(session)
+    assert not frames[-1].collided
+    off = frames[:20]
+    assert all(frame.executed == frame.proposed for frame in off)
+    assert any(frame.advised < frame.executed - 0.5 for frame in off)
+    assert any(frame.executed < frame.proposed - 0.5 for frame in frames[20:-1])
+    assert frames[-1].story.danger.since < 5.0 <= frames[-1].story.danger.stepped_in
+
+
+def test_danger_shows_long_before_time_to_collision_notices_and_is_told_from_when_it_began():
+    session = opened(Watching(PAPER.family, reviser="none"))
+    frames = drive(session)
+    story = frames[-1].story
+    risky = next(frame for frame in frames if frame.proposed_risk.risk > PAPER.tolerance)
+    assert story.first == story.danger.since == risky.time
+    assert story.danger.critical < story.danger.brakes_to
+    assert story.danger.since < story.danger.dead_end < story.leader_brakes
+    assert story.time_to_collision - story.first > 20.0
+    assert story.leader_decel == 9.0
+    late = [frame.story for frame in frames if frame.time >= story.danger.dead_end]
+    assert {one.danger.dead_end for one in late} == {story.danger.dead_end}
+
+
+def test_the_same_run_is_shown_the_same_and_restarting_begins_anew():
+    first, again = drive(opened()), drive(opened())
+    assert repr(first) == repr(again)
+    session = opened()
+    for _ in range(30):
+        session.step()
+    session.restart(3)
+    frames = drive(session)
+    assert session.start.case == 3
+    assert [frame.number for frame in frames] == list(range(len(frames)))
+    assert frames[0].x_follower == 0.0
+    assert frames[0].story.danger is None
+    with pytest.raises(ValueError, match="case is 5; there are 1 to 4"):
+        session.restart(4)
+
+
+def test_positions_follow_from_speeds():
+    frames = drive(opened())
+    for before, now in pairwise(frames):
+        mean = 0.5 * (before.v_follower + now.v_follower)
+        moved = now.x_follower - before.x_follower
+        assert moved == pytest.approx(mean * (now.time - before.time), abs=0.02)
+
+
+def test_states_grow_from_empty_and_keep_their_numbers():
+    session = Session(PAPER, watched_guard(PAPER.family), KinematicWorld())
+    assert session.graph().states == ()
+    created = [frame for frame in drive(session) if frame.event == "created"]
+    graph = session.graph()
+    assert len(created) >= len(graph.states) - 1 > 3
+    assert [state.state for state in graph.states] == list(range(len(graph.states)))
+    origins = {way.origin for way in graph.transitions}
+    assert all(way.origin != way.target for way in graph.transitions)
+    assert origins <= set(range(len(graph.states)))
+
+
+def test_a_finished_run_does_not_go_on_and_counts_as_learnt_from():
+    session = opened()
+    drive(session)
+    with pytest.raises(RuntimeError, match="over"):
+        session.step()
+    assert session.restart().learnt == 1
+
+
+@pytest.mark.parametrize("reviser", ["aeb", "rss"])
+def test_other_revisers_are_judged_by_the_same_risk(reviser):
+    frames = drive(opened(Watching(PAPER.family, reviser=reviser)))
+    assert all(0.0 <= frame.proposed_risk.risk <= 1.0 for frame in frames[:-1])
+
+
+def test_what_was_saved_is_gone_on_from(tmp_path):
+    save_learnt(learnt(), tmp_path)
+    machine, risk = load_learnt(tmp_path)
+    loaded = guard_for_family(PAPER.family, machine=machine, judge=risk)
+    session = opened(guard=loaded)
+    assert len(session.graph().states) == loaded.machine.n_states > 3
+
+
+# -- A recording ----------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def recorded(tmp_path):
+    """A log of two episodes, revised and not, and its drives."""
+    pytest.importorskip("mcap")
+    from evofsm.io.mcap import write_run
+
+    family = PAPER.family
+    machine, risk = learnt_by(learnt())
+    drives = [
+        drive
+        for mode in (Mode.ACT, Mode.SHADOW)
+        for drive in teach(
+            guard_for_family(family, mode=mode, machine=machine, judge=risk), [family.draw(0, 0)]
+        )
+    ]
+    path = tmp_path / "run.mcap"
+    write_run(path, drives, model=machine.model(), about={"family": "paper"})
+    return path, drives
+
+
+def test_a_recording_shows_what_was_decided(recorded):
+    from evofsm.cli.watch.recording import Recording
+
+    path, drives = recorded
+    recording = Recording(path)
+    for case, drive_ in enumerate(drives):
+        recording.restart(case)
+        frames = drive(recording)
+        assert [frame.executed for frame in frames[:-1]] == drive_.executed.tolist()
+        assert frames[-1].collided == drive_.episode.collided == bool(case)
+        assert frames[-1].time == drive_.episode.time[-1]
+        risks = [decision.revision.risk_proposed for decision in drive_.decisions]
+        assert frames[-1].story.first == next(
+            frame.time for frame, risk in zip(frames, risks, strict=False) if risk > 0.02
+        )
+        assert frames[-1].story.leader_brakes == pytest.approx(29.75, abs=0.3)
+        assert math.isnan(frames[-1].story.danger.dead_end)  # which the log does not hold
+    assert [state.is_dead_end for state in recording.graph().states].count(True) == 1
+    with pytest.raises(ValueError, match="there are 1 to 2"):
+        recording.restart(2)
+
+
+def test_no_recording_is_made_of_something_else(tmp_path):
+    pytest.importorskip("mcap")
+    from evofsm.cli.watch.recording import Recording
+
+    (tmp_path / "no.mcap").write_bytes(b"junk")
+    with pytest.raises(ValueError, match=r"no\.mcap"):
+        Recording(tmp_path / "no.mcap")
+
+
+# -- The clock ------------------------------------------------------------------------------------
+
+
+class Told:
+    """An audience that writes down what it is told, and can be waited for."""
+
+    def __init__(self):
+        self.events = []
+        self.news = threading.Condition()
+
+    def _add(self, kind, what):
+        with self.news:
+            self.events.append((kind, what))
+            self.news.notify_all()
+
+    def began(self, start, clock):
+        self._add("began", start)
+
+    def saw(self, frame):
+        self._add("saw", frame)
+
+    def grew(self, graph):
+        self._add("grew", graph)
+
+    def ticked(self, clock):
+        self._add("ticked", clock)
+
+    def failed(self, text):
+        self._add("failed", text)
+
+    def of(self, kind):
+        with self.news:
+            return [what for one, what in self.events if one == kind]
+
+    def wait(self, holds):
+        with self.news:
+            assert self.news.wait_for(lambda: holds(self), timeout=60.0), self.events[-3:]
+
+
+def ends(told):
+    return sum(frame.over for frame in told.of("saw"))
+
+
+def played(told, **settings):
+    guard = learnt()
+
+    @contextmanager
+    def session():
+        with opened(guard=guard) as one:
+            yield one
+
+    return Player(session, told, **settings)
+
+
+def test_it_waits_steps_and_goes_on():
+    told = Told()
+    with played(told, paused=True, speed=math.inf) as player:
+        told.wait(lambda told: told.of("began"))
+        for number in range(3):
+            player.step()
+            told.wait(lambda told, n=number: len(told.of("saw")) > n)
+        assert len(told.of("saw")) == 3
+        assert told.of("ticked")[-1].paused
+        player.pause(False)
+        told.wait(lambda told: told.of("ticked")[-1].over)
+    assert told.of("saw")[-1].over
+
+
+def test_restarted_over_and_over_every_run_is_whole():
+    told = Told()
+    with played(told, speed=math.inf) as player:
+        told.wait(lambda told: ends(told) == 1)
+        player.restart(2)
+        told.wait(lambda told: ends(told) == 2)
+    numbers = [frame.number for frame in told.of("saw")]
+    assert numbers.count(0) == 2
+    assert told.of("began")[-1].case == 2
+
+
+def test_the_reviser_is_switched_while_it_plays():
+    told = Told()
+    with played(told, paused=True) as player:
+        player.revise(False)
+        player.step()
+        told.wait(lambda told: told.of("saw"))
+    assert not told.of("saw")[0].revising
+
+
+def test_speed_is_kept():
+    told = Told()
+    with played(told, speed=8.0):
+        told.wait(lambda told: len(told.of("saw")) >= 20)
+    assert len(told.of("saw")) < 60  # and not as fast as it goes
+
+
+def test_what_cannot_be_opened_raises_and_a_run_that_breaks_off_says_why():
+    @contextmanager
+    def no_road():
+        raise ValueError("no road")
+        yield
+
+    with pytest.raises(ValueError, match="no road"), Player(no_road, Told()):
+        pass
+
+    @contextmanager
+    def short_road():
+        with opened() as session:
+            session.step = lambda: 1 / 0
+            yield session
+
+    told = Told()
+    with Player(short_road, told, speed=math.inf):
+        told.wait(lambda told: told.of("failed"))
+    assert told.of("failed") == ["ZeroDivisionError: division by zero"]
+
+
+def test_it_ends_at_once_when_closed():
+    with played(Told(), speed=0.01):
+        pass
+
+
+def test_no_speed_of_nothing():
+    with pytest.raises(ValueError, match="speed is 0"):
+        played(Told(), speed=0.0)
+
+
+# -- A judge that was told nothing but which episodes failed --------------------------------------
+
+LEARNING = Watching(load_family("emergency"), judge="learnt", case=1)
+LEADERS = ("leader brake", "leaders", "latent risk", "braking in full")
+
+
+def told_over(watching, episodes):
+    """Frames of a run under a learnt judge, each with its story in words."""
+    guard = watched_guard(watching.family, "learnt")
+    learn_first(watching, guard, episodes)
+    with opened(watching, guard) as session:
+        return [(frame, tell(frame, session.start)) for frame in drive(session)]
+
+
+def test_before_the_first_failure_nothing_is_called_safe():
+    for frame, told in told_over(LEARNING, 0)[:-1]:
+        assert math.isnan(frame.proposed_risk.risk)
+        assert (told.status, told.headline) == ("unjudged", "Nothing is judged yet")
+        assert told.why == "Nothing was judged, for no failure was known yet."
+        assert frame.reason == "nothing was learnt yet"
+
+
+@pytest.mark.slow
+def test_a_learnt_judge_is_not_said_to_know_how_leaders_brake():
+    alone = replace(LEARNING, reviser="none")
+    frames = [*told_over(LEARNING, 12), *told_over(alone, 12)]
+    for frame, told in frames:
+        assert math.isnan(frame.brakes_to)
+        assert math.isnan(frame.critical)
+        said = " ".join((told.headline, told.when, told.why, told.done)).lower()
+        assert not any(words in said for words in LEADERS), said
+    assert any("disturbances remembered from" in told.why for _, told in frames)
+    assert {"dead end", "collision"} <= {told.status for _, told in frames}
+    for frame, told in frames:  # what it changes where it sees no danger, it changes for the margin
+        story = frame.story
+        assert ("by a margin" in told.done) == (story.danger is None and story.revised > 0)
+
+
+def test_what_a_learnt_judge_changes_where_it_sees_no_danger_it_changes_for_the_margin():
+    with opened(LEARNING, watched_guard(LEARNING.family, "learnt")) as session:
+        frame = session.step()
+        quiet = frame._replace(story=frame.story._replace(danger=None, revised=2))
+        done = tell(quiet, session.start).done
+    assert done == "The reviser changed 2 decisions, to survive all that it remembers by a margin."
+
+
+def test_what_was_learnt_is_of_the_judge_that_is_asked_for():
+    with pytest.raises(ValueError, match="of the judge 'kinematic', not of 'learnt'"):
+        opened(LEARNING, watched_guard(LEARNING.family))

@@ -1,0 +1,209 @@
+import math
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from evofsm.fsm.actions import IntervalActions
+
+PAPER = {"low": -2.5, "high": 2.5, "width": 0.3}
+# Edges as a person writes them, not as floating point computes them.
+PAPER_EDGES = [-2.5, -2.2, -1.9, -1.6, -1.3, -1.0, -0.7, -0.4, -0.1]
+PAPER_EDGES += [0.2, 0.5, 0.8, 1.1, 1.4, 1.7, 2.0, 2.3, 2.5]
+
+
+def test_the_papers_experiment_has_17_actions():
+    actions = IntervalActions(**PAPER)
+    assert actions.n_actions == 17
+    assert actions.edges.tolist() == PAPER_EDGES
+
+
+@pytest.mark.parametrize(("closed", "above"), [("left", 1), ("right", 0)])
+def test_every_inner_edge_falls_on_the_closed_side_and_its_neighbours_on_their_own(closed, above):
+    actions = IntervalActions(**PAPER, closed=closed)
+    for k, edge in enumerate(PAPER_EDGES[1:-1]):
+        assert actions.encode(edge) == k + above
+        assert actions.encode(math.nextafter(edge, -math.inf)) == k
+        assert actions.encode(math.nextafter(edge, math.inf)) == k + 1
+
+
+@pytest.mark.parametrize("closed", ["left", "right"])
+def test_both_ends_of_the_range_belong_to_the_end_intervals(closed):
+    actions = IntervalActions(**PAPER, closed=closed)
+    assert actions.encode(-2.5) == 0
+    assert actions.encode(2.5) == 16
+
+
+def test_the_papers_section_2_1_2_has_intervals_closed_on_the_right():
+    actions = IntervalActions(low=-1.0, high=1.0, width=0.5, closed="right")
+    assert actions.n_actions == 4
+    assert actions.encode([-0.99, -0.5, -0.49, 0.0, 0.01, 0.5, 0.51, 1.0]).tolist() == [
+        *(0, 0, 1, 1, 2, 2, 3, 3)
+    ]
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "width", "count"),
+    [
+        (0.0, 1.0, 0.1, 10),
+        (0.0, 0.3, 0.1, 3),
+        (0.0, 2.1, 0.3, 7),
+        (-1.0, 1.0, 3.0, 1),
+        (0.0, 1.0, 0.4, 3),
+    ],
+)
+def test_the_range_is_covered_by_as_many_intervals_as_arithmetic_on_paper_says(
+    low, high, width, count
+):
+    actions = IntervalActions(low, high, width)
+    assert actions.n_actions == count
+    assert (actions.edges[0], actions.edges[-1]) == (low, high)
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1.0, 1e6])
+def test_edges_rise_in_small_and_large_units(scale):
+    edges = IntervalActions(-2.5 * scale, 2.5 * scale, 0.3 * scale).edges
+    np.testing.assert_allclose(edges, np.array(PAPER_EDGES) * scale, rtol=1e-8, atol=1e-9 * scale)
+    assert (np.diff(edges) > 0).all()
+
+
+@pytest.mark.parametrize("closed", ["left", "right"])
+def test_intervals_meet_and_their_centers_are_encoded_as_themselves(closed):
+    actions = IntervalActions(**PAPER, closed=closed)
+    intervals = [actions.interval(i) for i in range(17)]
+    assert all(a[1] == b[0] for a, b in pairwise(intervals))
+    assert [actions.center(i) for i in (0, 8, 16)] == [-2.35, 0.05, 2.4]
+    assert [actions.encode(actions.center(i)) for i in range(17)] == list(range(17))
+
+
+@pytest.mark.parametrize(
+    ("closed", "labels"),
+    [
+        ("left", ["[-2.5, -2.2)", "[-0.1, 0.2)", "[2.3, 2.5]"]),
+        ("right", ["[-2.5, -2.2]", "(-0.1, 0.2]", "(2.3, 2.5]"]),
+    ],
+)
+def test_labels_show_which_edges_belong_to_the_interval(closed, labels):
+    actions = IntervalActions(**PAPER, closed=closed)
+    assert [actions.label(i) for i in (0, 8, 16)] == labels
+
+
+def test_a_number_gives_an_int_and_an_array_gives_an_array_of_its_shape():
+    actions = IntervalActions(**PAPER)
+    assert type(actions.encode(0.0)) is int
+    assert type(actions.encode(np.float64(0.0))) is int
+    encoded = actions.encode([[-2.5, 0.0], [1.0, 2.5]])
+    assert encoded.dtype == np.int64
+    assert encoded.tolist() == [[0, 8], [11, 16]]
+
+
+def test_values_beyond_the_range_are_refused_by_default():
+    actions = IntervalActions(**PAPER)
+    for value in (2.6, -math.inf, [0.0, math.nextafter(2.5, 3)]):
+        with pytest.raises(ValueError, match=r"outside \[-2.5, 2.5\].*clip"):
+            actions.encode(value)
+
+
+@pytest.mark.parametrize("closed", ["left", "right"])
+def test_values_beyond_the_range_fall_into_the_end_intervals_when_clipped(closed):
+    actions = IntervalActions(**PAPER, closed=closed, outside="clip")
+    assert actions.encode([-math.inf, -9.0, -2.6, 2.6, 9.0, math.inf]).tolist() == [
+        *(0, 0, 0, 16, 16, 16)
+    ]
+
+
+def test_beyond_tells_which_values_would_be_clipped():
+    actions = IntervalActions(**PAPER, outside="clip")
+    assert actions.beyond([-2.6, -2.5, 0.0, 2.5, 2.6]).tolist() == [True, False, False, False, True]
+
+
+@pytest.mark.parametrize("outside", ["error", "clip"])
+def test_nan_is_refused_even_when_clipped(outside):
+    actions = IntervalActions(**PAPER, outside=outside)
+    for value in (math.nan, [0.0, math.nan]):
+        with pytest.raises(ValueError, match="NaN"):
+            actions.encode(value)
+
+
+@pytest.mark.parametrize("i", [-1, 17])
+def test_an_interval_that_does_not_exist_is_refused(i):
+    actions = IntervalActions(**PAPER)
+    for method in (actions.interval, actions.center, actions.label):
+        with pytest.raises(ValueError, match=f"interval {i} does not exist; there are 0 to 16"):
+            method(i)
+
+
+@pytest.mark.parametrize("i", [1.5, 1.0, "1", None])
+def test_an_index_that_is_no_integer_is_named(i):
+    actions = IntervalActions(**PAPER)
+    for method in (actions.interval, actions.center, actions.label):
+        with pytest.raises(TypeError, match=f"interval {i!r} does not exist; .*integer"):
+            method(i)
+
+
+def test_an_index_may_be_any_integer():
+    actions = IntervalActions(**PAPER)
+    for i in (np.int64(16), np.array(16)):
+        assert actions.interval(i) == (2.3, 2.5)
+        assert actions.label(i) == "[2.3, 2.5]"
+
+
+@pytest.mark.parametrize(
+    ("value", "words"),
+    [
+        ("abc", "action is 'abc'"),
+        ("0.5", "action is '0.5'"),
+        (None, "action is None"),
+        (1j, "action is 1j"),
+        (["0.5", "1"], "action has dtype <U3"),
+        ([0.0, None], "action has dtype object"),
+    ],
+)
+def test_an_action_that_is_no_number_is_named(value, words):
+    actions = IntervalActions(**PAPER)
+    for method in (actions.encode, actions.beyond):
+        with pytest.raises(TypeError, match=f"{words}; it must be a real number"):
+            method(value)
+
+
+def test_no_actions_have_no_intervals():
+    assert IntervalActions(**PAPER).encode([]).shape == (0,)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"low": math.nan}, "low is nan"),
+        ({"high": math.inf}, "high is inf"),
+        ({"width": math.inf}, "width is inf"),
+        ({"width": 0.0}, "width is 0.0"),
+        ({"width": -0.3}, "width is -0.3"),
+        ({"low": 2.5}, "low must be below high"),
+        ({"low": 3.0}, "low must be below high"),
+        ({"closed": "both"}, "closed is 'both'"),
+        ({"outside": "ignore"}, "outside is 'ignore'"),
+    ],
+)
+def test_settings_that_make_no_sense_are_refused(change, words):
+    with pytest.raises(ValueError, match=words):
+        IntervalActions(**{**PAPER, **change})
+
+
+def test_encoders_with_equal_settings_are_equal_and_cannot_be_changed():
+    actions = IntervalActions(**PAPER)
+    assert actions == IntervalActions(**PAPER)
+    assert actions != IntervalActions(**PAPER, closed="right")
+    with pytest.raises(ValueError, match="read-only"):
+        actions.edges[0] = 0.0
+
+
+def test_intervals_too_narrow_for_their_edges_to_be_told_apart_are_refused():
+    with pytest.raises(ValueError, match="larger unit"):
+        IntervalActions(0.0, 1e-10, 1e-11)
+
+
+def test_end_intervals_that_hold_what_is_beyond_say_so():
+    clipping = IntervalActions(-2.5, 2.5, 0.3, outside="clip")
+    assert [clipping.label(i) for i in (0, 1, 16)] == ["< -2.2", "[-2.2, -1.9)", "≥ 2.3"]
+    right = IntervalActions(-1.0, 1.0, 0.5, closed="right", outside="clip")
+    assert [right.label(i) for i in (0, 3)] == ["≤ -0.5", "> 0.5"]

@@ -1,0 +1,259 @@
+"""What cannot be right is refused with its cause, and the machine is then as it was."""
+
+import numpy as np
+import pytest
+
+from evofsm.fsm.machine import EvolvingFSM
+from evofsm.fsm.observations import Missing
+
+NAN, INF = float("nan"), float("inf")
+RAGGED = [[1.0, 2.0], [3.0]]
+
+# What is wrong with one observation of two variables: the exception and the words that tell.
+OBSERVATIONS = {
+    "NaN": ([0.0, NAN], ValueError, "observation, variable 1: nan .*finite"),
+    "infinity": ([INF, 0.0], ValueError, "observation, variable 0: inf .*finite"),
+    "minus infinity": ([0.0, -INF], ValueError, "observation, variable 1: -inf .*finite"),
+    "too large": ([0.0, 1e200], ValueError, r"observation, variable 1: 1e\+200 .*at most 1e\+100"),
+    "texts": (["a", "b"], TypeError, "observation has dtype <U1.*text"),
+    "complex": ([1j, 0.0], TypeError, "observation has dtype complex128.*complex"),
+    "nothing": (None, TypeError, "observation has dtype object.*None"),
+    "a None": ([None, 1.0], TypeError, "observation has dtype object.*None"),
+    "an object": ([object(), 1.0], TypeError, "observation has dtype object"),
+    "ragged": (RAGGED, ValueError, "observation: rows have different lengths"),
+    "two axes": ([[0.0, 1.0]], ValueError, r"observation has shape \(1, 2\).*\(variables,\)"),
+    "a number": (1.0, ValueError, r"observation has shape \(\).*\(variables,\)"),
+    "an empty list": ([], ValueError, r"observation has shape \(0,\).*not empty"),
+    "an empty array": (np.empty(0), ValueError, r"observation has shape \(0,\).*not empty"),
+}
+# The same, where a machine already knows that there are two.
+LENGTHS = {
+    "too short": ([1.0], ValueError, "observation has 1 variables.*started with 2"),
+    "too long": ([1.0, 2.0, 3.0], ValueError, "observation has 3 variables.*started with 2"),
+}
+ACTIONS = {
+    "a number": (1.0, TypeError, "action is 1.0; it must be an integer index"),
+    "NaN": (NAN, TypeError, "action is nan; it must be an integer"),
+    "a text": ("1", TypeError, "action is '1'; it must be an integer"),
+    "nothing": (None, TypeError, "action is None; it must be an integer"),
+    "a list": ([1], TypeError, r"action is \[1\]; it must be an integer"),
+    "too high": (3, ValueError, "action is 3; there are actions 0 to 2"),
+    "below zero": (-1, ValueError, "action is -1; there are actions 0 to 2"),
+}
+# Z, I and episode_starts of a batch.
+ROWS = np.array([[0.0, 1.0], [2.0, 3.0], [1.0, 2.0]])
+BATCHES = {
+    "NaN": ([[0.0, 1.0], [2.0, NAN]], [0, 0], [], ValueError, "row 1, variable 1: nan .*finite"),
+    "infinity": ([[0.0, 1.0], [INF, 0.0]], [0, 0], [], ValueError, "row 1, variable 0: inf"),
+    "too large": ([[0.0, 1.0], [1e200, 0.0]], [0, 0], [], ValueError, r"row 1.*1e\+200.*1e\+100"),
+    "texts": ([["a", "b"]], [0], [], TypeError, "observations has dtype <U1.*text"),
+    "complex": ([[1j, 0.0]], [0], [], TypeError, "observations has dtype complex128"),
+    "a None": ([[None, 0.0]], [0], [], TypeError, "observations has dtype object.*None"),
+    "ragged rows": (RAGGED, [0, 0], [], ValueError, "observations: rows have different lengths"),
+    "one axis": ([0.0, 1.0], [0, 0], [], ValueError, r"observations has shape \(2,\).*\(rows, var"),
+    "three axes": ([ROWS], [0, 0, 0], [], ValueError, r"observations has shape \(1, 3, 2\)"),
+    "no variables": (np.empty((3, 0)), [0, 0, 0], [], ValueError, r"shape \(3, 0\).*not empty"),
+    "too few actions": (ROWS, [0, 0], [], ValueError, r"actions .*\(2,\); 3 observations"),
+    "too many actions": (ROWS, [0] * 4, [], ValueError, r"actions .*\(4,\); 3 observations"),
+    "two axes of actions": (ROWS, [[0, 0, 0]], [], ValueError, r"actions .*\(1, 3\)"),
+    "one action": (ROWS, 0, [], ValueError, r"actions .*\(\); 3 observations"),
+    "ragged actions": (ROWS, [[0], [0, 1], 2], [], (TypeError, ValueError), "actions"),
+    "numbers as actions": (ROWS, [0.0, 1.0, 2.0], [], TypeError, "actions .*float64.*integer"),
+    "texts as actions": (ROWS, ["0", "1", "2"], [], TypeError, "actions .*<U1.*integer"),
+    "a None action": (ROWS, [0, None, 1], [], TypeError, "actions .*object.*integer"),
+    "action too high": (ROWS, [0, 1, 3], [], ValueError, "row 2 is 3; .*0 to 2, and -1 for none"),
+    "action too low": (ROWS, [0, -2, 1], [], ValueError, "row 1 is -2; .*0 to 2, and -1 for none"),
+    "start beyond": (ROWS, [0, 0, 0], [0, 3], ValueError, "episode_starts names row 3.* 3 rows"),
+    "start before": (ROWS, [0, 0, 0], [-1], ValueError, "episode_starts names row -1"),
+    "numbers as starts": (ROWS, [0, 0, 0], [0.0], TypeError, "episode_starts .*float64.*row"),
+    "flags as starts": (ROWS, [0] * 3, [True, False, False], TypeError, "episode_starts .*bool"),
+    "ragged starts": (ROWS, [0] * 3, [[0], [1, 2]], (TypeError, ValueError), "episode_starts"),
+}
+BATCH_LENGTHS = {
+    "too short": (ROWS[:, :1], [0] * 3, [], ValueError, "observation has 1 var.*started with 2"),
+    "too long": (np.ones((1, 3)), [0], [], ValueError, "observation has 3 var.*started with 2"),
+    "NaN and too long": ([[NAN] * 3], [0], [], ValueError, "observation has 3 var.*with 2"),
+}
+
+
+FAILURES = {
+    "failure beyond": ([0, 3], ValueError, "failures names row 3, but there are 3 rows"),
+    "failure before": ([-1], ValueError, "failures names row -1"),
+    "flags as failures": ([True, False, False], TypeError, "failures has dtype bool.*row"),
+}
+
+
+def cases(*tables):
+    return [pytest.param(*case, id=name) for table in tables for name, case in table.items()]
+
+
+@pytest.fixture(params=["new", "grown"])
+def machine(request):
+    return EvolvingFSM(n_actions=3) if request.param == "new" else request.getfixturevalue("grown")
+
+
+@pytest.fixture
+def refuses(snapshot):
+    """Check that a call fails as it should and that the machine then goes on as if never asked."""
+
+    def check(machine, call, error, words):
+        twin, before = machine.copy(), snapshot(machine)
+        with pytest.raises(error, match=words):
+            call(machine)
+        assert snapshot(machine) == before
+        Z = np.random.default_rng(5).normal(size=(30, 2))
+        traces = [m.learn_many(Z, np.arange(30) % 3, belief=True) for m in (machine, twin)]
+        for a, b in zip(*traces, strict=True):
+            assert a.tobytes() == b.tobytes()
+        assert snapshot(machine) == snapshot(twin)
+
+    return check
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("z", "error", "words"), cases(OBSERVATIONS))
+def test_an_observation_that_cannot_be_right(machine, refuses, z, error, words):
+    refuses(machine, lambda m: m.observe(z), error, words)
+    refuses(machine, lambda m: m.learn_one(z, 1), error, words)
+
+
+@pytest.mark.parametrize("name", ["NaN", "infinity", "minus infinity", "too large"])
+def test_an_array_is_looked_at_as_closely_as_a_list(machine, refuses, name):
+    z, error, words = OBSERVATIONS[name]
+    refuses(machine, lambda m: m.observe(np.array(z)), error, words)
+
+
+@pytest.mark.parametrize(("z", "error", "words"), cases(LENGTHS))
+def test_an_observation_of_another_length(grown, refuses, z, error, words):
+    refuses(grown, lambda m: m.observe(z), error, words)
+    refuses(grown, lambda m: m.observe(np.array(z)), error, words)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("i", "error", "words"), cases(ACTIONS))
+def test_an_action_that_cannot_be_right(machine, refuses, i, error, words):
+    refuses(machine, lambda m: m.act(i), error, words)
+    refuses(machine, lambda m: m.learn_one([0.0, 1.0], i), error, words)
+    refuses(machine, lambda m: m.predict(i), error, words)
+
+
+def test_an_action_before_any_observation(refuses):
+    refuses(EvolvingFSM(3), lambda m: m.act(0), ValueError, "act before observe")
+
+
+def test_an_action_before_the_first_observation_of_an_episode(grown, refuses):
+    grown.start_episode()
+    refuses(grown, lambda m: m.act(0), ValueError, "act before observe: this episode")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("Z", "I", "starts", "error", "words"), cases(BATCHES))
+def test_a_batch_that_cannot_be_right(machine, refuses, Z, I, starts, error, words):
+    refuses(machine, lambda m: m.learn_many(Z, I, starts), error, words)
+
+
+@pytest.mark.parametrize(("Z", "I", "starts", "error", "words"), cases(BATCH_LENGTHS))
+def test_a_batch_of_another_length(grown, refuses, Z, I, starts, error, words):
+    refuses(grown, lambda m: m.learn_many(Z, I, starts), error, words)
+
+
+@pytest.mark.parametrize(("failures", "error", "words"), cases(FAILURES))
+def test_failures_of_a_batch_that_cannot_be_right(machine, refuses, failures, error, words):
+    refuses(machine, lambda m: m.learn_many(ROWS, [0] * 3, [], failures), error, words)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("z", "error", "words"), cases(OBSERVATIONS))
+def test_a_failed_observation_that_cannot_be_right(machine, refuses, z, error, words):
+    refuses(machine, lambda m: m.observe(z, failed=True), error, words)
+
+
+def test_a_failure_before_any_observation(refuses):
+    refuses(EvolvingFSM(3), EvolvingFSM.fail, ValueError, "fail before observe")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ({"horizon": 0}, "horizon is 0"),
+        ({"horizon": -2}, "horizon is -2"),
+        ({"policy": "greedy"}, "policy is 'greedy'.*marginal, hold, observed"),
+    ],
+)
+def test_a_forecast_that_cannot_be_right(machine, refuses, arguments, words):
+    refuses(machine, lambda m: m.predict(0, **arguments), ValueError, words)
+
+
+POSITIVE = ["radius", "distance_weight", "learning_rate", "prior_frequency", "spread"]
+
+
+@pytest.mark.parametrize("value", [0.0, -1.0, NAN, INF, None, "wide", 1j, [0.1, 0.2]])
+@pytest.mark.parametrize("name", POSITIVE)
+def test_a_setting_that_is_no_positive_number(name, value):
+    if value is None and name in ("radius", "spread"):
+        pytest.skip("the rule's own")
+    with pytest.raises(ValueError, match=f"{name} is .*; it must be a positive, finite number"):
+        EvolvingFSM(**{"n_actions": 2, name: value})
+
+
+@pytest.mark.parametrize("value", [0, -1, 1.0, 2.5, None, "2", [2]])
+def test_a_number_of_actions_that_is_no_whole_number(value):
+    with pytest.raises(ValueError, match=r"n_actions is .*; it must be a whole number"):
+        EvolvingFSM(n_actions=value)
+
+
+@pytest.mark.parametrize("value", [1.0, 1.5])
+def test_a_learning_rate_that_would_forget_all_at_once(value):
+    with pytest.raises(ValueError, match=f"learning_rate is {value}; it must lie below 1"):
+        EvolvingFSM(n_actions=2, learning_rate=value)
+
+
+# -- Masked arrays -----------------------------------------------------------------------------
+
+
+HIDDEN = {
+    "numbers": np.ma.array([0.5, 7.0], mask=[False, True]),
+    "whole numbers": np.ma.array([1, 7], mask=[False, True]),
+    "flags": np.ma.array([True, True], mask=[False, True]),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("z", HIDDEN.values(), ids=HIDDEN)
+def test_a_masked_entry_is_missing(machine, refuses, z):
+    words = "observation, variable 1: nan .*missing"
+    refuses(machine, lambda m: m.observe(z), ValueError, words)
+    refuses(machine, lambda m: m.learn_one(z, 1), ValueError, words)
+    refuses(machine, lambda m: m.update(z, 1), ValueError, words)
+    for Z in (np.ma.array([z, z]), [z, z]):
+        words = "observations, row 0, variable 1: nan"
+        refuses(machine, lambda m, Z=Z: m.learn_many(Z, [0, 0]), ValueError, words)
+
+
+@pytest.mark.parametrize("missing", [Missing.HOLD, Missing.PARTIAL])
+@pytest.mark.parametrize("z", HIDDEN.values(), ids=HIDDEN)
+def test_a_masked_entry_is_treated_as_nan_is(grown, z, missing):
+    twin = grown.copy()
+    step = grown.observe(z, missing=missing)
+    expected = twin.observe([float(z[0]), NAN], missing=missing)
+    assert step.missing == expected.missing == (1,)
+    assert step.belief.tobytes() == expected.belief.tobytes()
+
+
+def test_a_mask_that_hides_nothing_changes_nothing(machine, snapshot):
+    twin, Z = machine.copy(), np.array([[0.5, 7.0], [1.0, 2.0]])
+    machine.learn_many(np.ma.array(Z), np.ma.array([0, 1]))
+    twin.learn_many(Z, [0, 1])
+    assert snapshot(machine) == snapshot(twin)
+
+
+def test_a_masked_action_or_row_number_is_refused(machine, refuses):
+    hidden = np.ma.array([0, 1], mask=[False, True])
+    refuses(machine, lambda m: m.learn_many(ROWS[:2], hidden), ValueError, "actions .*masked")
+    words = "failures .*masked"
+    refuses(machine, lambda m: m.learn_many(ROWS[:2], [0, 0], [], hidden), ValueError, words)
+
+
+def test_a_model_does_not_see_what_is_masked(grown):
+    with pytest.raises(ValueError, match="variable 1: nan"):
+        grown.model().recognise(HIDDEN["numbers"])

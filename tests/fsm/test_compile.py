@@ -1,0 +1,142 @@
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import pytest
+
+from evofsm.fsm import kernels
+
+CALLER = """
+from compiled.core import kernels
+from compiled.callee import callee
+
+@kernels.kernel
+def caller(x: float) -> float:
+    return callee(x) + 1.0
+
+if __name__ == "__main__":
+    print(caller(1.0), sum(caller.stats.cache_hits.values()))
+"""
+CALLEE = """
+from compiled.core import kernels
+
+@kernels.kernel
+def callee(x: float) -> float:
+    return x * FACTOR
+"""
+
+
+@pytest.fixture
+def package(tmp_path):
+    """A package of two kernels, one calling the other, compiled as those of evofsm are."""
+    folder = tmp_path / "compiled"
+    (folder / "core").mkdir(parents=True)
+    (folder / "__init__.py").touch()
+    (folder / "core" / "__init__.py").touch()
+    (folder / "core" / "kernels.py").write_text(Path(kernels.__file__).read_text())
+    (folder / "caller.py").write_text(CALLER)
+    (folder / "callee.py").write_text(CALLEE.replace("FACTOR", "2.0"))
+    return folder
+
+
+def run(package):
+    environment = {k: v for k, v in os.environ.items() if k != "NUMBA_CACHE_DIR"}
+    command = [sys.executable, "-m", "compiled.caller"]
+    finished = subprocess.run(
+        command, cwd=package.parent, env=environment, capture_output=True, text=True, check=True
+    )
+    result, hits = finished.stdout.split()
+    return float(result), int(hits)
+
+
+@pytest.mark.slow
+def test_editing_a_kernel_takes_effect_in_the_kernels_that_call_it(package):
+    assert run(package) == (3.0, 0)
+    assert run(package) == (3.0, 1)  # the second process finds the compiled code
+    (package / "callee.py").write_text(CALLEE.replace("FACTOR", "5.0"))
+    assert run(package) == (6.0, 0)
+
+
+@pytest.mark.slow
+def test_a_source_dated_in_the_future_keeps_the_caches(package):
+    in_a_year = time.time() + 3e7
+    os.utime(package / "callee.py", (in_a_year, in_a_year))
+    assert run(package) == (3.0, 0)
+    assert run(package) == (3.0, 1)
+
+
+@pytest.fixture
+def cached(tmp_path):
+    """A package with a kernel, a constant that it uses, a page, and the cache of the kernel."""
+    (tmp_path / "room" / "__pycache__").mkdir(parents=True)
+    (tmp_path / "kernel.py").write_text(
+        f"from {tmp_path.name}.core import (\n    kernel,\n)\n"
+        f"from {tmp_path.name}.room.limits import LARGEST\n"
+    )
+    (tmp_path / "core").mkdir()
+    (tmp_path / "core" / "__init__.pyi").write_text("from .kernels import kernel as kernel")
+    (tmp_path / "core" / "kernels.py").touch()
+    (tmp_path / "room" / "limits.py").write_text("LARGEST = 1.0")
+    (tmp_path / "page.py").write_text("draws nothing that kernels compile")
+    kernels._drop_stale_caches(tmp_path)
+    cache = tmp_path / "room" / "__pycache__" / "kernel.kernel-3.py311.nbi"
+    cache.touch()
+    return cache
+
+
+@pytest.mark.parametrize(
+    ("edited", "kept"), [("kernel.py", False), ("room/limits.py", False), ("page.py", True)]
+)
+def test_caches_go_where_what_kernels_are_made_of_was_edited(cached, tmp_path, edited, kept):
+    kernels._drop_stale_caches(tmp_path)
+    assert cached.exists()
+    with open(tmp_path / edited, "a") as file:
+        file.write("\n# another line\n")
+    kernels._drop_stale_caches(tmp_path)
+    assert cached.exists() is kept
+
+
+def test_touching_a_source_keeps_the_caches(cached, tmp_path):
+    os.utime(tmp_path / "kernel.py", (1000, 1000))
+    kernels._drop_stale_caches(tmp_path)
+    assert cached.exists()
+
+
+@pytest.mark.slow
+def test_a_machine_without_a_limit_compiles_nothing_that_gives_up_states():
+    """What is rare stays out of the kernel of every step: it takes as long to compile as a step."""
+    code = (
+        "import numpy as np, evofsm, evofsm.fsm.crowding as c\n"
+        "evofsm.EvolvingFSM(1).observe(np.zeros(2))\n"
+        "print(len(c.merge_closest.signatures), len(c.retire_least_useful.signatures))"
+    )
+    fresh = {**os.environ, "NUMBA_CACHE_DIR": tempfile.mkdtemp()}
+    finished = subprocess.run(
+        [sys.executable, "-c", code], env=fresh, capture_output=True, text=True, check=True
+    )
+    assert finished.stdout.split() == ["0", "0"]
+
+
+def test_compiling_that_takes_long_is_announced_once(capsys, monkeypatch):
+    monkeypatch.setattr(kernels.Announcement, "_PATIENCE", 0.05)
+    told = kernels.Announcement()
+    for _ in range(2):
+        told.on_start(None)
+        told.on_start(None)  # for another kernel
+        told.on_end(None)
+        deadline = time.monotonic() + 5.0
+        while told._spent < 0.05 and time.monotonic() < deadline:
+            time.sleep(0.01)
+        told.on_end(None)
+    assert capsys.readouterr().err == "compiling kernels, once ...\n"
+
+
+def test_compiling_that_is_quick_is_not_announced(capsys):
+    told = kernels.Announcement()
+    told.on_start(None)
+    told.on_end(None)
+    told._timer.join()
+    assert capsys.readouterr().err == ""

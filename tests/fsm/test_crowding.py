@@ -1,0 +1,176 @@
+"""Machines with a limit on their states, and with a tolerance in their beliefs."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from evofsm.fsm.crowding import WhenFull
+from evofsm.fsm.machine import EvolvingFSM
+from evofsm.fsm.states.failure import FailureSplit
+from evofsm.fsm.states.novelty import Novelty
+from evofsm.fsm.states.paper import Paper
+from evofsm.fsm.step import Event
+
+
+def sharp(**settings):
+    """A machine whose beliefs are 0 or 1, on a line."""
+    rule = Novelty(radius=1.0, spread=1e-6)
+    return EvolvingFSM(n_actions=2, learning_rate=0.5, rule=rule, **settings)
+
+
+def learn(machine, points, actions=None):
+    Z = np.array(points, dtype=float)[:, None]
+    return machine.learn_many(Z, np.zeros(len(Z), int) if actions is None else actions)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("when_full", WhenFull)
+@given(seed=st.integers(0, 1000), most=st.integers(1, 12))
+def test_there_are_never_more_states_and_every_array_stays_sound(when_full, seed, most):
+    rng = np.random.default_rng(seed)
+    Z, I = np.cumsum(rng.normal(size=(200, 2)), axis=0), rng.integers(-1, 3, 200)
+    failures = np.flatnonzero(rng.random(200) < 0.05)
+    rule = FailureSplit(Novelty(radius=0.7), distance=0.1)
+    machine = EvolvingFSM(3, rule=rule, max_states=most, when_full=when_full)
+    trace = machine.learn_many(Z, I, [50], failures, belief=True)
+    assert trace.n_states.max() <= most
+    assert (trace.state < trace.n_states).all()
+    np.testing.assert_allclose(trace.belief.sum(axis=1), 1.0)
+    np.testing.assert_allclose(machine.transition_matrices.sum(axis=2), 1.0)
+    assert (machine.transition_matrices >= 0.0).all()
+    assert (machine.failures <= machine.decisions + 1e-12).all()
+    model = machine.model()
+    assert len(set(machine.state_ids)) == machine.n_states
+    assert (model.visits >= 0).all()
+    assert (model.changes >= 0).all()
+    if when_full is WhenFull.MERGE:  # which loses no evidence
+        assert model.visits.sum() == 200
+        assert machine.endings.sum() == len(failures)
+
+
+def test_the_settings_are_saved(tmp_path):
+    settings = {"max_states": 5, "when_full": WhenFull.RETIRE, "belief_tolerance": 1e-6}
+    machine = sharp(**settings)
+    learn(machine, range(0, 40, 2))
+    machine.save(tmp_path / "machine")
+    loaded = EvolvingFSM.load(tmp_path / "machine")
+    assert {name: getattr(loaded, name) for name in settings} == settings
+    assert loaded.state_ids.tolist() == machine.state_ids.tolist()
+    assert repr(loaded) == repr(machine)
+
+
+def test_without_reaching_the_limit_nothing_differs(snapshot):
+    rng = np.random.default_rng(0)
+    Z, I = rng.normal(size=(100, 2)), rng.integers(0, 2, 100)
+    free, limited = (EvolvingFSM(2, radius=0.1, max_states=most) for most in (None, 99))
+    for a, b in zip(*(m.learn_many(Z, I) for m in (free, limited)), strict=True):
+        assert a is b is None or a.tobytes() == b.tobytes()
+
+
+def test_merged_states_have_the_evidence_of_both():
+    machine = sharp(max_states=3)
+    learn(machine, [0, 0, 0, 3, 3, 9, 0, 9, 3], [0, 0, 1, 0, 0, 0, 0, 0, -1])
+    before = machine.model()
+    step = machine.observe([50.0])
+    assert step.event == Event.CREATED | Event.MERGED
+    assert machine.centers.ravel().tolist() == [pytest.approx(9 / 7), 50.0, 9.0]  # 4 and 3 visits
+    after = machine.model()
+    assert step.state == 1
+    assert after.visits.tolist() == [7, 1, 2]
+    assert machine.decisions[:, 0].tolist() == (before.decisions[:, :2].sum(axis=1)).tolist()
+    # A row of both, weighed by how often and how recently each was left.
+    weights = before.origin_frequency[0, :2]
+    row = weights @ before.transition_matrices[0, :2] / weights.sum()
+    kept = 1.0 - 1e-3 / after.origin_frequency[0, 0]  # the newcomer's prior takes its share
+    np.testing.assert_allclose(
+        after.transition_matrices[0, 0],
+        kept * np.array([row[:2].sum(), 0.0, row[2]]) + [0, 1 - kept, 0],
+    )
+    assert machine.state_ids.tolist() == [0, 3, 2]
+
+
+def test_a_newcomer_close_to_a_state_is_left_to_it():
+    machine = sharp(max_states=2)
+    learn(machine, [0, 9])
+    step = machine.observe([1.5])  # closer to 0 than 0 is to 9
+    assert (step.event, step.state, machine.n_states) == (Event.MERGED, 0, 2)
+    assert machine.centers.ravel().tolist() == [0.0, 9.0]
+
+
+def test_the_least_useful_state_is_retired_with_all_that_was_learnt_of_it():
+    machine = sharp(max_states=3, when_full=WhenFull.RETIRE)
+    learn(machine, [0, 0, 0, 3, 9, 9, 0, 9])
+    step = machine.observe([50.0])
+    assert step.event == Event.CREATED | Event.RETIRED
+    assert machine.centers.ravel().tolist() == [0.0, 50.0, 9.0]  # 3 was seen once of eight times
+    assert machine.model().visits.tolist() == [4, 1, 3]
+    assert machine.decisions[0, 1] == 0.0
+    assert machine.model().changes[1].tolist() == [0.0, 0.0, 0.0]
+    assert machine.state_ids.tolist() == [0, 3, 2]
+
+
+def test_a_state_in_which_failures_ended_is_retired_last():
+    machine = sharp(max_states=3, when_full=WhenFull.RETIRE)
+    learn(machine, [0, 0, 0])
+    machine.observe([3.0], failed=True)
+    learn(machine, [9, 9, 9, 9, 0])
+    machine.observe([50.0])
+    assert 3.0 in machine.centers
+    assert machine.endings.sum() == 1.0
+
+
+def test_the_present_state_is_not_retired():
+    machine = sharp(max_states=1, when_full=WhenFull.RETIRE)
+    trace = learn(machine, [0, 5, 0])
+    assert trace.event.tolist() == [Event.CREATED, Event.MERGED, Event.NONE]
+    assert machine.centers.ravel().tolist() == [0.0]
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"max_states": 0}, "max_states is 0; it must be a whole number"),
+        ({"max_states": 2.5}, "max_states is 2.5"),
+        ({"when_full": "merge"}, "'merge' is not a valid WhenFull"),
+        ({"belief_tolerance": 1.0}, "belief_tolerance is 1.0; it must lie below 1"),
+        ({"belief_tolerance": -1e-6}, "belief_tolerance is -1e-06"),
+        ({"belief_tolerance": np.nan}, "belief_tolerance is nan"),
+    ],
+)
+def test_settings_that_cannot_be_are_refused(settings, words):
+    with pytest.raises(ValueError, match=words):
+        EvolvingFSM(n_actions=2, **settings)
+
+
+def wander(rows, seed=0):
+    rng = np.random.default_rng(seed)
+    Z = np.abs(np.cumsum(rng.normal(scale=0.5, size=(rows, 2)), axis=0)) % 12.0
+    return Z, np.repeat(rng.integers(0, 3, rows // 10), 10)
+
+
+@pytest.mark.parametrize("rule", [Novelty(radius=1.0, spread=0.5), Paper()])
+@pytest.mark.parametrize("tolerance", [1e-3, 1e-6, 1e-9])
+def test_a_tolerant_belief_is_that_close_to_the_exact_one(rule, tolerance):
+    Z, I = wander(2000)
+    exact, tolerant = (EvolvingFSM(3, rule=rule, belief_tolerance=t) for t in (0.0, tolerance))
+    a, b = (machine.learn_many(Z, I, belief=True) for machine in (exact, tolerant))
+    assert a.n_states.tolist() == b.n_states.tolist()  # beliefs have no say in what is founded
+    assert np.abs(a.belief - b.belief).sum(axis=1).max() <= tolerance
+    np.testing.assert_allclose(b.belief.sum(axis=1), 1.0)
+    if isinstance(rule, Novelty):  # most states take no part
+        assert (b.belief > 0).sum(axis=1).mean() < 0.6 * exact.n_states
+
+
+def test_a_tolerance_changes_forecasts_by_little_and_rare_jumps_stay_rare_events():
+    Z, I = wander(4000)
+    jumps = np.arange(500, 4000, 500)
+    Z[jumps] = [11.0, 11.0]
+    exact, tolerant = (
+        EvolvingFSM(3, rule=Novelty(radius=1.0, spread=0.5), belief_tolerance=t)
+        for t in (0.0, 1e-6)
+    )
+    a, b = exact.learn_many(Z, I), tolerant.learn_many(Z, I)
+    np.testing.assert_allclose(b.surprise, a.surprise, atol=1e-5)
+    np.testing.assert_allclose(tolerant.transition_matrices, exact.transition_matrices, atol=1e-5)
+    assert np.nanmedian(b.surprise[jumps]) > np.nanmedian(b.surprise) + 0.3

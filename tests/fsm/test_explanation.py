@@ -1,0 +1,376 @@
+"""What is counted of episodes, and what is said of it."""
+
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from evofsm.driving.naming import UNITS, VARIABLES
+from evofsm.fleet.batch import Fleet
+from evofsm.fleet.merging import merge
+from evofsm.fsm.actions import IntervalActions
+from evofsm.fsm.crowding import WhenFull
+from evofsm.fsm.explanation import Tally
+from evofsm.fsm.machine import EvolvingFSM
+from evofsm.fsm.model import FSMModel
+from evofsm.fsm.naming import Labels
+from evofsm.fsm.observations import Missing
+from evofsm.fsm.states.failure import FailureSplit
+from evofsm.fsm.states.novelty import Novelty
+
+COUNTS = ("episodes", "failed_soon", "tried", "failed_after")
+
+
+def drives(seed, rows=60, places=4):
+    """Rows over a few places, cut into episodes of which some fail."""
+    rng = np.random.default_rng(seed)
+    Z = rng.integers(0, places, size=(rows, 1)) * 10.0
+    I = rng.integers(-1, 3, size=rows)
+    starts = np.flatnonzero(rng.random(rows) < 0.1)
+    failures = np.flatnonzero(rng.random(rows) < 0.1)
+    return Z, I, starts, failures
+
+
+def by_hand(states, I, starts, failures, horizon, n):
+    """The same counts, episode by episode, as their definitions have them."""
+    cut = sorted({0, *starts.tolist(), *(failures + 1).tolist(), len(states)})
+    counts = {"episodes": np.zeros(n), "failed_soon": np.zeros(n)}
+    counts |= {"tried": np.zeros((3, n)), "failed_after": np.zeros((3, n))}
+    for begin, end in pairwise(cut):
+        failed = end - 1 in failures
+        if end == len(states) and not failed:
+            continue  # it is going on
+        for state in set(states[begin:end]):
+            counts["episodes"][state] += 1
+            soon = [end - 1 - row <= horizon for row in range(begin, end) if states[row] == state]
+            counts["failed_soon"][state] += failed and any(soon)
+        taken = {(I[row], states[row], row) for row in range(begin, end - 1) if I[row] >= 0}
+        for action, state in {(a, s) for a, s, _ in taken}:
+            counts["tried"][action, state] += 1
+            followed = [row + 1 for a, s, row in taken if (a, s) == (action, state)]
+            soon = [end - 1 - row <= horizon for row in followed]
+            counts["failed_after"][action, state] += failed and any(soon)
+    return counts
+
+
+@settings(max_examples=60)
+@given(seed=st.integers(0, 10_000), horizon=st.sampled_from([1, 3, 8, None]))
+def test_an_episode_counts_once_for_each_state_and_action(seed, horizon):
+    Z, I, starts, failures = drives(seed)
+    machine = EvolvingFSM(3, rule=Novelty(radius=1.0), failure_horizon=horizon)
+    states = machine.learn_many(Z, I, starts, failures).state
+    limit = np.inf if horizon is None else horizon
+    told = by_hand(states.tolist(), I, starts, failures, limit, machine.n_states)
+    for name in COUNTS:
+        np.testing.assert_array_equal(getattr(machine, name), told[name], err_msg=name)
+        np.testing.assert_array_equal(getattr(machine.model(), name), told[name], err_msg=name)
+
+
+@settings(max_examples=20)
+@given(seed=st.integers(0, 10_000), when_full=st.sampled_from(WhenFull))
+def test_counts_stay_counts_where_states_are_given_up(seed, when_full):
+    Z, I, starts, failures = drives(seed, places=12)
+    machine = EvolvingFSM(3, rule=Novelty(radius=1.0), max_states=4, when_full=when_full)
+    machine.learn_many(Z, I, starts, failures)
+    for cases, failed in (("episodes", "failed_soon"), ("tried", "failed_after")):
+        assert (getattr(machine, failed) >= 0.0).all()
+        assert (getattr(machine, failed) <= getattr(machine, cases)).all()
+    assert machine.episodes.max() <= len(starts) + len(failures) + 1
+
+
+def test_an_episode_that_begins_unseen_is_no_part_of_the_one_before():
+    machine = EvolvingFSM(1, rule=Novelty(radius=1.0))
+    machine.learn_many([[0.0, 0.0], [9.0, 9.0]], [0, 0])
+    machine.start_episode()
+    machine.observe([9.0, np.nan], missing=Missing.PARTIAL)
+    machine.fail()
+    assert machine.episodes.tolist() == [1.0, 1.0]
+    assert machine.failed_soon.tolist() == [0.0, 0.0]
+
+
+def test_a_failure_straight_after_an_action_is_counted_however_the_episode_began():
+    machine = EvolvingFSM(2, rule=Novelty(radius=1.0))
+    machine.learn_many([[0.0, 0.0], [9.0, 9.0]], [0, 0])
+    machine.start_episode()
+    machine.observe([9.0, np.nan], missing=Missing.PARTIAL)
+    machine.act(1)
+    machine.fail()
+    assert machine.tried[1].sum() == machine.failed_after[1].sum() == 1.0
+
+
+def test_what_was_not_seen_whole_splits_no_state():
+    rule = FailureSplit(Novelty(radius=2.0), distance=0.5)
+    machine = EvolvingFSM(1, rule=rule)
+    machine.learn_many([[0.0, 0.0], [9.0, 9.0], [9.0, 8.0]], [0, 0, 0])
+    machine.start_episode()
+    machine.observe([0.0, np.nan], missing=Missing.PARTIAL)
+    machine.fail()
+    assert machine.n_states == 2
+    assert machine.endings.tolist() == [1.0, 0.0]
+
+
+def test_time_goes_on_while_nothing_is_seen():
+    machine = EvolvingFSM(1, rule=Novelty(radius=1.0), failure_horizon=2)
+    machine.observe([0.0])
+    for _ in range(50):
+        machine.observe([np.nan], missing=Missing.PARTIAL)
+    machine.fail()
+    assert (machine.episodes.tolist(), machine.failed_soon.tolist()) == ([1.0], [0.0])
+
+
+def test_where_states_were_joined_there_is_no_interval():
+    machine = EvolvingFSM(1, rule=Novelty(radius=1.0), max_states=2)
+    for episode in range(6):
+        machine.start_episode()
+        machine.learn_many([[0.0], [4.0]], [0, 0])
+        if episode:
+            machine.fail()
+    machine.start_episode()
+    machine.observe([50.0])  # the two of before are joined
+    machine.start_episode()
+    model = machine.model()
+    (joined,) = np.flatnonzero(model.joined)
+    text = model.explain(int(joined)).text
+    assert "States were joined here, so an episode may count twice." in text
+    assert "%" not in text
+    one, other = EvolvingFSM(1, rule=Novelty(radius=1.0)), EvolvingFSM(1, rule=Novelty(radius=1.0))
+    one.learn_many([[0.0], [1.5]], [0, 0])
+    other.learn_many([[0.7]], [0])
+    assert merge([one, other], radius=2.0).joined.tolist() == [1.0]
+    assert not merge([one, other.copy()], radius=0.1).joined.any()
+
+
+def test_a_fleet_counts_as_its_machines_would():
+    machine = EvolvingFSM(3, rule=Novelty(radius=1.0), failure_horizon=3)
+    fleet, alone = Fleet(machine, 2), [machine.copy(), machine.copy()]
+    given_ = [drives(seed) for seed in (1, 2)]
+    for row in range(60):
+        starts = [k for k, (_, _, s, _) in enumerate(given_) if row in s]
+        failed = [k for k, (_, _, _, f) in enumerate(given_) if row in f]
+        Z, I = [g[0][row] for g in given_], [g[1][row] for g in given_]
+        fleet.observe(Z, I, episode_starts=starts, failures=failed)
+    for k, one in enumerate(alone):
+        one.learn_many(*given_[k])
+        for name in COUNTS:
+            np.testing.assert_array_equal(getattr(fleet[k], name), getattr(one, name))
+
+
+def test_merging_adds_episodes_up():
+    parts = [EvolvingFSM(3, rule=Novelty(radius=1.0)) for _ in range(3)]
+    for seed, part in enumerate(parts):
+        part.learn_many(*drives(seed))
+        part.start_episode()
+    merged = merge(parts)
+    for name in COUNTS:
+        assert getattr(merged, name).sum() == sum(getattr(p, name).sum() for p in parts)
+    order = np.argsort(merged.centers[:, 0])
+    first = parts[0].episodes[np.argsort(parts[0].centers[:, 0])]
+    assert (merged.episodes[order][: len(first)] >= first).all()
+
+
+def test_counts_survive_a_file(tmp_path):
+    machine = EvolvingFSM(3, rule=Novelty(radius=1.0), failure_horizon=4)
+    Z, I, starts, failures = drives(3)
+    machine.learn_many(Z[:37], I[:37], starts[starts < 37], failures[failures < 37])
+    machine.save(tmp_path / "machine")
+    machine.model(names=["place"]).save(tmp_path / "model")
+    again, model = EvolvingFSM.load(tmp_path / "machine"), FSMModel.load(tmp_path / "model")
+    assert model.explain(0, 1) == machine.model(names=["place"]).explain(0, 1)
+    for one in (machine, again):
+        one.learn_many(Z[37:], I[37:])
+        one.fail()
+    assert again.failure_horizon == 4
+    for name in COUNTS:
+        np.testing.assert_array_equal(getattr(again, name), getattr(machine, name))
+
+
+# -- What is said ----------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def crash():
+    """Ten episodes from a far place to a close one; after throttle there eight of nine fail."""
+    actions = IntervalActions(-2.0, 2.0, 2.0, outside="clip")
+    machine = EvolvingFSM(2, rule=Novelty(radius=5.0), failure_horizon=2)
+    far, close = [60.0, 20.0, 20.0], [5.0, 20.0, 20.0]
+    for episode in range(12):
+        machine.start_episode()
+        machine.learn_one(far, 1)
+        machine.learn_one(close, 0 if episode < 3 else 1)
+        machine.observe(close, failed=episode > 3)
+    return machine, Labels(actions, VARIABLES, UNITS, 0.5)
+
+
+def test_an_explanation_tells_where_how_often_what_came_of_it_and_what_was_better(crash):
+    machine, labels = crash
+    model = machine.model(
+        actions=labels.actions, names=labels.names, units=labels.units, dt=labels.dt
+    )
+    found = model.explain(1, action=1)
+    assert str(found) == (
+        "#2: close (5 m), at medium speed (20 m/s), at equal speeds. "
+        "12 episodes came here (24 observations); 8 of 12 (43 to 85 %) failed within 1 s, "
+        "and 8 of 9 (62 to 98 %) after a(2) ≥ 0 m/s². "
+        "Better after a(1) < 0 m/s²: 0 of 3 (at most 48 %). "
+        "Most often reached from #1: 12 of 12 times."
+    )
+    assert (found.here, found.action, found.after_better) == (
+        Tally(8, 12),
+        Tally(8, 9),
+        Tally(0, 3),
+    )
+    assert (found.state, found.visits, found.reached_from, found.better) == (1, 24, 0, 0)
+
+
+def test_the_step_tells_the_same_as_the_machine(crash):
+    machine, labels = crash
+    machine.start_episode()
+    step = machine.observe([5.0, 20.0, 20.0], explained=labels)
+    assert step.explanation == machine.explain(labels=labels).text
+    assert step.explanation.startswith("#2: close (5 m)")
+    assert machine.observe([5.0, 20.0, 20.0]).explanation == ""
+
+
+def test_what_is_new_is_said_to_be(crash):
+    machine, labels = crash
+    machine.start_episode()
+    assert machine.explain().text == "Nothing was observed yet in this episode."
+    machine.observe([200.0, 5.0, 5.0])
+    found = machine.explain(labels=labels)
+    assert "Never seen but in one observation." in found.text
+    assert found.here == Tally(0, 0)
+    machine.observe([200.0, 5.0, 5.0])
+    assert (
+        "No earlier episode that was counted came here (2 observations)." in machine.explain().text
+    )
+    assert EvolvingFSM(1).model().explain([]).text == "Nothing was learnt yet."
+
+
+def test_asking_changes_nothing(crash, snapshot):
+    machine, labels = crash
+    machine.observe([5.0, 20.0, 20.0])
+    before = snapshot(machine)
+    machine.explain(0, labels)
+    machine.model().explain(0)
+    assert snapshot(machine) == before
+
+
+@pytest.mark.parametrize(
+    ("situation", "action", "error", "says"),
+    [
+        (2, None, ValueError, "state is 2; there are 2 states"),
+        (0.5, None, TypeError, "state is 0.5"),
+        ([1.0], None, ValueError, "the model has 2 states"),
+        ([0.5, 0.9], None, ValueError, "belief"),
+        (0, 2, ValueError, "action is 2"),
+    ],
+)
+def test_what_cannot_be_explained_is_refused(crash, situation, action, error, says):
+    with pytest.raises(error, match=says):
+        crash[0].model().explain(situation, action)
+
+
+# -- Failures that nobody told of ------------------------------------------------------------------
+
+
+def untold():
+    machine = EvolvingFSM(1, rule=Novelty(radius=1.0))
+    for _ in range(3):
+        machine.start_episode()
+        machine.learn_many([[0.0], [5.0]], [0, 0])
+    machine.start_episode()
+    return machine
+
+
+def test_without_a_word_of_failures_none_are_said_to_be_rare():
+    found = untold().model().explain(0, action=0)
+    assert "how many failed is not known, for no failure was ever told" in found.text
+    assert "3 of which took a(1)" in found.text
+    assert "0 of 3" not in found.text
+    assert np.isnan(found.here.share)
+    assert found.here.interval == (0.0, 1.0)
+    assert found.better is None
+
+
+@pytest.mark.parametrize(
+    "tell",
+    [
+        lambda machine: machine.tell_of_failures(),
+        lambda machine: machine.observe([0.0], failed=False),
+        lambda machine: machine.learn_many([[0.0]], [0], failures=[]),
+    ],
+)
+def test_failures_that_were_told_and_never_happened_are_counted_as_none(tell, tmp_path):
+    machine = untold()
+    assert not machine.failures_told
+    tell(machine)
+    assert "0 of 3 (at most 48 %) failed later on" in machine.model().explain(0).text
+    machine.save(tmp_path / "machine")
+    machine.model().save(tmp_path / "model")
+    assert EvolvingFSM.load(tmp_path / "machine").failures_told
+    assert FSMModel.load(tmp_path / "model").failures_told
+    assert machine.copy().failures_told
+    assert Fleet(machine, 2)[1].failures_told
+    assert not merge([machine, untold()]).failures_told
+    assert merge([machine, machine.copy()]).failures_told
+
+
+def test_one_failure_tells_of_failures_and_old_files_know_of_none():
+    machine = untold()
+    machine.observe([0.0])
+    machine.fail()
+    assert machine.failures_told
+    fleet = Fleet(untold(), 2)
+    fleet.observe([[0.0]], vehicles=[1], failures=[])
+    assert [fleet[k].failures_told for k in range(2)] == [False, True]
+    files = Path(__file__).parents[1] / "kept"
+    assert not FSMModel.load(files / "model-0.1.evofsm").failures_told
+
+
+# -- What was never seen ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("rule", "seen", "never"),
+    [
+        (Novelty(radius=1.0, spread=9.0), 5.9, 6.1),  # its radius
+        (FailureSplit(Novelty(radius=2.0)), 6.9, 7.1),
+        (None, 8.6, 8.7),  # twice the root of the width, which is 3 times the variance
+    ],
+)
+def test_what_lies_far_from_every_state_was_never_seen_whatever_the_belief(rule, seen, never):
+    machine = EvolvingFSM(1, rule=rule)
+    machine.learn_many([[0.0], [5.0]] * 20, [0] * 40, range(0, 40, 2), failures=[])
+    model = machine.model()
+    near, far = model.explain(observation=[seen]), model.explain(observation=[never])
+    assert not near.never_seen
+    assert "came here" in near.text
+    assert far.never_seen
+    assert far.text.startswith("Never seen, as far as the states tell")
+    assert (far.here, far.visits, far.action) == (Tally(0, 0), 0, None)
+    assert far.state == model.recognise([never]).argmax()
+
+
+def test_the_machine_says_so_of_what_founds_no_state():
+    machine = EvolvingFSM(1, radius=0.5)
+    machine.learn_many([[0.0], [0.1], [-0.1]] * 20, [0] * 60)
+    step = machine.observe([3.0], explained=Labels())
+    assert step.belief[step.state] > 0.9
+    assert "Never seen" in step.explanation
+    assert machine.explain().never_seen
+    machine.observe([np.nan], missing=Missing.PARTIAL)
+    assert not machine.explain().never_seen  # nothing is known of it
+
+
+def test_either_a_situation_or_an_observation_is_explained():
+    model = untold().model()
+    for wrong in ({}, {"situation": 0, "observation": [0.0]}):
+        with pytest.raises(ValueError, match="either a situation or an observation"):
+            model.explain(**wrong)
+    with pytest.raises(ValueError, match="z has shape"):
+        model.explain(observation=[0.0, 1.0])
+    with pytest.raises(ValueError, match="2 observations; one"):
+        model.explain(observation=[[0.0], [1.0]])

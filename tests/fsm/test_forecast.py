@@ -1,0 +1,169 @@
+"""Direct forecasts: what they learn, that they agree with themselves, and what they refuse."""
+
+import copy
+import pickle
+
+import numpy as np
+import pytest
+
+from evofsm.fsm.divergence import jensen_shannon
+from evofsm.fsm.forecast import Forecasts
+from evofsm.fsm.machine import EvolvingFSM
+from evofsm.fsm.states.novelty import Novelty
+
+RULE = Novelty(radius=0.9, spread=0.5)
+
+
+@pytest.fixture(scope="module")
+def walk():
+    """A drive along a line, back and forth; the action tells the direction."""
+    rng = np.random.default_rng(0)
+    direction = np.repeat(rng.integers(0, 2, 400), 5)
+    at = np.zeros(2000)
+    for k, up in enumerate(direction[:-1]):
+        at[k + 1] = np.clip(at[k] + (0.3 if up else -0.3), -4.0, 4.0)
+    return at[:, None] + 0.02 * rng.normal(size=(2000, 1)), direction
+
+
+@pytest.fixture(scope="module")
+def machine(walk):
+    machine = EvolvingFSM(n_actions=2, rule=RULE)
+    machine.learn_many(*walk)
+    return machine
+
+
+@pytest.fixture(scope="module")
+def taught(walk, machine):
+    Z, actions = walk
+    forecasts = Forecasts(n_actions=2, steps=[1, 5])
+    forecasts.learn(machine.model(), Z[:1500], actions[:1500])
+    return forecasts
+
+
+def divergences(forecasts, machine, walk, steps, by_action=True):
+    Z, actions = walk
+    beliefs = machine.model().recognise(Z[1500:])
+    now, then = beliefs[:-steps], beliefs[steps:]
+    predicted = forecasts.predict(now, actions[1500:-steps] if by_action else None, steps)
+    return jensen_shannon(predicted, then).mean(), jensen_shannon(now, then).mean()
+
+
+@pytest.mark.parametrize("steps", [1, 5])
+def test_held_out_rows_are_foreseen_better_than_by_persistence(taught, machine, walk, steps):
+    ours, persistence = divergences(taught, machine, walk, steps)
+    assert ours < 0.8 * persistence
+
+
+def test_the_action_helps(taught, machine, walk):
+    with_action, _ = divergences(taught, machine, walk, 5)
+    without, _ = divergences(taught, machine, walk, 5, by_action=False)
+    assert with_action < 0.9 * without
+
+
+def test_where_beliefs_never_move_the_forecast_hardly_differs_from_persistence(machine, walk):
+    Z, actions = walk
+    forecasts = Forecasts(n_actions=2, steps=[1])
+    standing = np.repeat(Z[:40], 50, axis=0)
+    starts = np.arange(0, 2000, 50)
+    forecasts.learn(machine.model(), standing, np.resize(actions, 2000), starts)
+    beliefs = machine.model().recognise(Z[:40])
+    assert jensen_shannon(forecasts.predict(beliefs, 0, 1), beliefs).mean() < 1e-3
+
+
+@pytest.mark.parametrize("action", [None, 0, 1])
+def test_rows_of_matrices_are_distributions(taught, action):
+    for steps in taught.steps:
+        matrix = taught.matrix(action, steps)
+        assert matrix.shape == (taught.n_states, taught.n_states)
+        assert (matrix > 0.0).all()
+        np.testing.assert_allclose(matrix.sum(axis=1), 1.0, atol=1e-9)
+
+
+def test_episodes_apart_and_together_teach_the_same(machine, walk):
+    Z, actions = walk
+    apart, together = (Forecasts(n_actions=2, steps=[1, 5]) for _ in range(2))
+    model = machine.model()
+    for begin in (0, 100, 300):
+        apart.learn(model, Z[begin : begin + 100], actions[begin : begin + 100])
+    rows = np.r_[0:200, 300:400]
+    together.learn(model, Z[rows], actions[rows], episode_starts=[100, 200])
+    np.testing.assert_array_equal(apart.matrix(0, 5), together.matrix(0, 5))
+
+
+def test_asking_changes_nothing_and_many_rows_are_answered_as_one_by_one(taught, machine, walk):
+    Z, actions = walk
+    before = taught.matrix(1, 5)
+    beliefs = machine.model().recognise(Z[:20])
+    given = beliefs.copy()
+    many = taught.predict(beliefs, actions[:20], 5)
+    single = [taught.predict(b, i, 5) for b, i in zip(beliefs, actions[:20], strict=True)]
+    np.testing.assert_array_equal(many, single)
+    np.testing.assert_array_equal(beliefs, given)
+    np.testing.assert_array_equal(before, taught.matrix(1, 5))
+
+
+def test_an_action_never_seen_goes_where_all_go(machine, walk):
+    Z, actions = walk
+    forecasts = Forecasts(n_actions=3, steps=[5])
+    forecasts.learn(machine.model(), Z[:500], actions[:500])
+    np.testing.assert_array_equal(forecasts.matrix(2, 5), forecasts.matrix(None, 5))
+
+
+def test_states_founded_later_are_taken_in(walk):
+    Z, actions = walk
+    machine = EvolvingFSM(n_actions=2, rule=RULE)
+    forecasts = Forecasts(n_actions=2, steps=[1])
+    counts = []
+    for begin in range(0, 400, 20):
+        rows = slice(begin, begin + 20)
+        machine.learn_many(Z[rows], actions[rows])
+        forecasts.learn(machine.model(), Z[rows], actions[rows])
+        counts.append(forecasts.n_states)
+    assert counts[0] < counts[-1] == machine.n_states
+    np.testing.assert_allclose(forecasts.matrix(0, 1).sum(axis=1), 1.0, atol=1e-9)
+
+
+def test_a_state_that_nothing_was_learnt_of_stays(taught):
+    newer = np.zeros(taught.n_states + 2)
+    newer[-1] = 1.0
+    np.testing.assert_array_equal(taught.predict(newer, 0, 1), newer)
+
+
+def test_a_copy_goes_its_own_way(taught, machine, walk):
+    Z, actions = walk
+    twin, other = copy.deepcopy(taught), pickle.loads(pickle.dumps(taught))
+    for one in (twin, other):
+        one.learn(machine.model(), Z[1500:], actions[1500:])
+    np.testing.assert_array_equal(twin.matrix(1, 5), other.matrix(1, 5))
+    assert not np.array_equal(twin.matrix(1, 5), taught.matrix(1, 5))
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"steps": []}, "one or more"),
+        ({"steps": [2, 2]}, "each once"),
+        ({"steps": [0]}, "at least 1"),
+        ({"evidence": 0.0}, "evidence"),
+        ({"moved": 1.0}, "below 1"),
+    ],
+)
+def test_settings_that_cannot_be_are_refused(settings, message):
+    with pytest.raises(ValueError, match=message):
+        Forecasts(n_actions=2, **settings)
+
+
+def test_questions_that_cannot_be_are_refused_and_change_nothing(taught, machine, walk):
+    Z, actions = walk
+    before = taught.matrix(None, 1)
+    with pytest.raises(ValueError, match="no horizon of 3 steps; there are 1, 5"):
+        taught.predict(machine.belief, 0, 3)
+    with pytest.raises(ValueError, match="actions 0 to 1"):
+        taught.predict(machine.belief, 2, 1)
+    with pytest.raises(ValueError, match="of another machine"):
+        taught.predict([1.0], 0, 1)
+    with pytest.raises(ValueError, match="actions"):
+        taught.learn(machine.model(), Z[:10], actions[:9])
+    with pytest.raises(ValueError, match="cannot be used"):
+        taught.learn(machine.model(), [[np.nan]], [0])
+    np.testing.assert_array_equal(before, taught.matrix(None, 1))

@@ -1,0 +1,293 @@
+"""The whole public life of a machine, in any order, with what cannot be right mixed in."""
+
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, assume, settings
+from hypothesis import strategies as st
+from hypothesis.stateful import (
+    RuleBasedStateMachine,
+    initialize,
+    invariant,
+    precondition,
+    rule,
+    run_state_machine_as_test,
+)
+
+from evofsm.fsm.crowding import WhenFull
+from evofsm.fsm.machine import EvolvingFSM
+from evofsm.fsm.memory import leaves
+from evofsm.fsm.model import FSMModel
+from evofsm.fsm.states.failure import FailureSplit
+from evofsm.fsm.states.novelty import Novelty
+from evofsm.fsm.states.paper import Paper
+
+M, Q = 2, 3
+ROUNDING = 1e-9
+# A coarse grid, so that many observations are equal, and now and then any number.
+NUMBERS = st.one_of(
+    st.integers(-24, 24).map(lambda k: k / 8),
+    st.floats(-1e100, 1e100),
+    st.sampled_from([0.0, -0.0, 5e-324, 1e-200, -1e100, 1e100]),
+)
+OBSERVATIONS = st.tuples(NUMBERS, NUMBERS)
+ACTIONS = st.integers(0, Q - 1)
+BAD_OBSERVATIONS = st.sampled_from(
+    [
+        [np.nan, 0.0],
+        [0.0, np.inf],
+        [0.0, 1e200],
+        [0.0],
+        [0.0, 0.0, 0.0],
+        [[0.0, 0.0]],
+        [],
+        ["a", "b"],
+        [1j, 0.0],
+        [None, 0.0],
+        None,
+        1.0,
+    ]
+)
+BAD_ACTIONS = st.sampled_from([Q, -1, 0.5, np.nan, "0", None, [0], 2**70])
+RULES = st.sampled_from([Paper(), Novelty(2.0), FailureSplit(Novelty(2.0), distance=0.5)])
+QUESTIONS = (
+    *("belief", "state", "n_states", "state_ids", "centers", "potentials", "transition_matrices"),
+    *("marginal_matrix", "joint_frequency", "origin_frequency", "decisions", "failures"),
+    *("endings", "nbytes"),
+)
+
+
+def everything(machine):
+    """All that a machine holds, byte for byte; room for what is to come is no part of it."""
+    return [(name, array.tobytes()) for name, array in leaves(machine._trimmed())]
+
+
+def assert_distributions(rows):
+    assert (rows >= 0.0).all()
+    np.testing.assert_allclose(rows.sum(axis=-1), 1.0, rtol=0, atol=ROUNDING)
+
+
+class Life(RuleBasedStateMachine):
+    """A machine that grows, and a twin that is asked nothing and is told nothing wrong."""
+
+    @initialize(
+        state_rule=RULES,
+        most=st.sampled_from([None, 1, 2, 4]),
+        when_full=st.sampled_from(WhenFull),
+        tolerance=st.sampled_from([0.0, 1e-6]),
+    )
+    def begin(self, state_rule, most, when_full, tolerance):
+        self.machine = EvolvingFSM(
+            Q,
+            rule=state_rule,
+            learning_rate=0.3,
+            max_states=most,
+            when_full=when_full,
+            belief_tolerance=tolerance,
+        )
+        self.twin = self.machine.copy()
+        self.most = most
+
+    def both(self, do):
+        """Do the same to the machine and to its twin, which answer the same."""
+        mine, other = do(self.machine), do(self.twin)
+        told = (tuple(one) if isinstance(one, tuple) else one for one in (mine, other))
+        assert len(set(map(repr, told))) == 1
+        return mine
+
+    # -- What may be done ----------------------------------------------------------------------
+
+    @rule(z=OBSERVATIONS, failed=st.booleans())
+    def observe(self, z, failed):
+        step = self.both(lambda machine: machine.observe(z, failed=failed))
+        assert_distributions(step.belief)
+        assert step.belief[step.state] == step.belief.max()
+        assert np.isnan(step.surprise) or 0.0 <= step.surprise <= 1.0
+        assert len(step.predicted) == 0 or len(step.predicted) <= len(step.belief)
+
+    @rule(i=ACTIONS)
+    def act(self, i):
+        assume(self.machine.state is not None)
+        self.both(lambda machine: machine.act(i))
+
+    @rule(z=OBSERVATIONS, i=ACTIONS)
+    def learn_one(self, z, i):
+        self.both(lambda machine: machine.learn_one(z, i))
+
+    @rule(z=OBSERVATIONS, i=ACTIONS)
+    def update(self, z, i):
+        self.both(lambda machine: machine.update(np.array(z), i))
+
+    @rule(z=OBSERVATIONS, i=ACTIONS)
+    def update_is_learn_one(self, z, i):
+        self.machine.update(np.array(z), i)
+        self.twin.learn_one(z, i)
+
+    @rule(
+        data=st.data(), rows=st.lists(st.tuples(OBSERVATIONS, st.integers(-1, Q - 1)), max_size=8)
+    )
+    def learn_many(self, data, rows):
+        Z = np.array([z for z, _ in rows]).reshape(-1, M)
+        I = np.array([i for _, i in rows], dtype=int)
+        some = st.sets(st.integers(0, max(len(rows) - 1, 0)), max_size=2 if rows else 0)
+        starts, failures = sorted(data.draw(some)), sorted(data.draw(some))
+        trace = self.machine.learn_many(Z, I, starts, failures, belief=True)
+        for row, (z, i) in enumerate(rows):  # the twin takes them one by one
+            if row in starts:
+                self.twin.start_episode()
+            step = self.twin.observe(z, failed=row in failures)
+            assert trace.state[row] == step.state
+            assert repr(float(trace.surprise[row])) == repr(float(step.surprise))
+            if i >= 0 and row not in failures:
+                self.twin.act(i)
+
+    @rule()
+    def start_episode(self):
+        self.both(lambda machine: machine.start_episode())
+
+    @rule()
+    def fail(self):
+        assume(self.machine.state is not None)
+        self.both(lambda machine: machine.fail())
+
+    # -- What changes nothing ------------------------------------------------------------------
+
+    @rule(
+        i=ACTIONS,
+        horizon=st.sampled_from([1, 2, 50]),
+        policy=st.sampled_from(["marginal", "hold", "observed"]),
+    )
+    def predict(self, i, horizon, policy):
+        before = everything(self.machine)
+        forecast = self.machine.predict(i, horizon, policy)
+        assert forecast.shape == (self.machine.n_states,)
+        if len(forecast):
+            assert_distributions(forecast)
+        assert everything(self.machine) == before
+
+    @rule(name=st.sampled_from(QUESTIONS))
+    def ask(self, name):
+        before = everything(self.machine)
+        answer = getattr(self.machine, name)
+        if isinstance(answer, np.ndarray) and answer.size:  # it is the asker's own
+            answer[...] = 7
+        assert everything(self.machine) == before
+
+    @precondition(lambda self: self.machine.n_states)
+    @rule(z=OBSERVATIONS)
+    def snapshot(self, z):
+        before = everything(self.machine)
+        model = self.machine.model()
+        assert_distributions(model.recognise(z))
+        assert_distributions(model.propagate(self.machine.belief, 0, 3))
+        assert everything(self.machine) == before
+
+    # -- Going away and coming back ------------------------------------------------------------
+
+    @rule()
+    def save_and_load(self):
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "machine"
+            self.machine.save(path)
+            self.machine = EvolvingFSM.load(path)
+            self.machine.model().save(path)
+            FSMModel.load(path)
+            with pytest.raises(ValueError, match="model"):
+                EvolvingFSM.load(path)
+
+    @rule()
+    def copy(self):
+        copy = self.machine.copy()
+        copy.learn_many(np.ones((4, M)), [0] * 4)  # what becomes of a copy is its own
+        self.machine = self.machine.copy()
+
+    # -- What cannot be right ------------------------------------------------------------------
+
+    def refused(self, do):
+        before = everything(self.machine)
+        with pytest.raises((TypeError, ValueError)):
+            do(self.machine)
+        assert everything(self.machine) == before
+
+    # Of what length an observation is, is only known once there was one.
+    @precondition(lambda self: self.machine.n_states)
+    @rule(z=BAD_OBSERVATIONS, i=ACTIONS, failed=st.booleans())
+    def observe_nonsense(self, z, i, failed):
+        self.refused(lambda machine: machine.observe(z, failed=failed))
+        self.refused(lambda machine: machine.learn_one(z, i))
+        self.refused(lambda machine: machine.update(z, i))
+        if isinstance(z, list) and z and isinstance(z[0], float):
+            self.refused(lambda machine: machine.update(np.array(z), i))
+
+    @rule(z=OBSERVATIONS, i=BAD_ACTIONS)
+    def act_nonsense(self, z, i):
+        self.refused(lambda machine: machine.act(i))
+        self.refused(lambda machine: machine.learn_one(z, i))
+        self.refused(lambda machine: machine.update(np.array(z), i))
+        self.refused(lambda machine: machine.predict(i))
+
+    @rule(
+        rows=st.integers(1, 5), what=st.sampled_from(["nan", "action", "start", "failure", "few"])
+    )
+    def learn_nonsense(self, rows, what):
+        Z, I, starts, failures = np.ones((rows, M)), np.zeros(rows, int), [], []
+        if what == "nan":
+            Z[-1, -1] = np.nan
+        elif what == "action":
+            I[-1] = Q
+        elif what == "start":
+            starts = [rows]
+        elif what == "failure":
+            failures = [-1]
+        else:
+            I = I[1:]
+        self.refused(lambda machine: machine.learn_many(Z, I, starts, failures))
+
+    @precondition(lambda self: self.machine.state is None)
+    @rule(i=ACTIONS)
+    def act_too_soon(self, i):
+        self.refused(lambda machine: machine.act(i))
+        self.refused(lambda machine: machine.fail())
+
+    @rule(i=ACTIONS, horizon=st.sampled_from([0, -1, 1.5, "2", None]))
+    def look_ahead_nonsense(self, i, horizon):
+        self.refused(lambda machine: machine.predict(i, horizon))
+        self.refused(lambda machine: machine.predict(i, 2, "greedy"))
+
+    # -- What holds always ---------------------------------------------------------------------
+
+    @invariant()
+    def rows_are_distributions(self):
+        machine = self.machine
+        assert self.most is None or machine.n_states <= self.most
+        if machine.n_states:
+            assert_distributions(machine.belief)
+            assert_distributions(machine.transition_matrices)
+            assert_distributions(machine.marginal_matrix)
+
+    @invariant()
+    def all_is_finite(self):
+        for name in ("centers", "potentials", "origin_frequency", "decisions", "failures"):
+            assert np.isfinite(getattr(self.machine, name)).all()
+        assert (self.machine.failures <= self.machine.decisions + ROUNDING).all()
+
+    @invariant()
+    def the_twin_is_the_same(self):
+        assert everything(self.machine) == everything(self.twin)
+
+
+@pytest.mark.slow
+def test_whatever_happens_in_its_life_a_machine_stays_sound():
+    run_state_machine_as_test(
+        Life,
+        settings=settings(
+            max_examples=25,
+            stateful_step_count=15,
+            deadline=None,
+            derandomize=True,
+            database=None,
+            suppress_health_check=list(HealthCheck),
+        ),
+    )

@@ -1,0 +1,556 @@
+import copy
+import pickle
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from evofsm.fsm.machine import EvolvingFSM
+from evofsm.fsm.states.novelty import Novelty
+from evofsm.fsm.step import Event
+
+LEARNT = (
+    "n_states",
+    "state",
+    "centers",
+    "potentials",
+    "transition_matrices",
+    "origin_frequency",
+    "belief",
+    "decisions",
+    "failures",
+    "endings",
+)
+
+
+def new_machine():
+    return EvolvingFSM(n_actions=3, radius=0.01)
+
+
+def learn_in_a_loop(machine, Z, I, starts=()):
+    """What `learn_many` does, with `observe` and `act`; answers the steps."""
+    steps = []
+    for row, (z, i) in enumerate(zip(Z, I, strict=True)):
+        if row in starts:
+            machine.start_episode()
+        steps.append(machine.observe(z))
+        if i >= 0:
+            machine.act(i)
+    return steps
+
+
+def assert_same_trace(trace, steps, n_states):
+    assert trace.state.tolist() == [s.state for s in steps]
+    assert trace.n_states.tolist() == [len(s.belief) for s in steps]
+    assert trace.event.tolist() == [s.event for s in steps]
+    assert trace.surprise.tobytes() == np.array([s.surprise for s in steps]).tobytes()
+    if trace.belief is not None:
+        padded = [np.pad(s.belief, (0, n_states - len(s.belief))) for s in steps]
+        assert trace.belief.tobytes() == np.array(padded).tobytes()
+
+
+@pytest.fixture(scope="module")
+def stream(spiral):
+    """120 rows that found more than 32 states, in three episodes, some rows without action."""
+    rng = np.random.default_rng(1)
+    return spiral(120), rng.integers(-1, 3, 120), [0, 41, 90]
+
+
+# -- A batch and a loop ------------------------------------------------------------------------
+
+
+def test_a_batch_learns_bit_for_bit_what_the_loop_learns(stream, snapshot):
+    loop, batch = new_machine(), new_machine()
+    steps = learn_in_a_loop(loop, *stream)
+    trace = batch.learn_many(*stream, belief=True)
+    assert loop.n_states > 32
+    assert_same_trace(trace, steps, loop.n_states)
+    assert snapshot(batch) == snapshot(loop)
+
+
+@pytest.mark.parametrize("cuts", [[1], [41], [40, 41, 42], [7, 60, 61, 119]])
+def test_a_batch_may_be_split_anywhere(stream, snapshot, cuts):
+    Z, I, starts = stream
+    whole, split = new_machine(), new_machine()
+    expected = whole.learn_many(Z, I, starts)
+    parts = []
+    for a, b in zip([0, *cuts], [*cuts, len(Z)], strict=True):
+        parts.append(split.learn_many(Z[a:b], I[a:b], [s - a for s in starts if a <= s < b]))
+    for name in ("state", "n_states", "event", "surprise"):
+        joined = np.concatenate([getattr(part, name) for part in parts])
+        assert joined.tobytes() == getattr(expected, name).tobytes()
+    assert snapshot(split) == snapshot(whole)
+
+
+def test_loops_and_batches_may_alternate(stream, snapshot):
+    Z, I, _ = stream
+    batch, mixed = new_machine(), new_machine()
+    batch.learn_many(Z, I)
+    learn_in_a_loop(mixed, Z[:30], I[:30])
+    mixed.learn_many(Z[30:77], I[30:77])
+    learn_in_a_loop(mixed, Z[77:], I[77:])
+    assert snapshot(mixed) == snapshot(batch)
+
+
+def test_without_row_0_among_the_starts_the_present_episode_goes_on(stream):
+    Z, I, _ = stream
+    machine = new_machine()
+    machine.learn_many(Z[:20], np.zeros(20, int))
+    going_on = machine.copy().learn_many(Z[20:], I[20:])
+    beginning = machine.copy().learn_many(Z[20:], I[20:], [0])
+    assert not np.isnan(going_on.surprise[0])
+    assert np.isnan(beginning.surprise[0])
+
+
+def test_a_batch_of_no_rows_changes_nothing(grown, snapshot):
+    before = snapshot(grown)
+    trace = grown.learn_many(np.empty((0, 2)), [], belief=True)
+    assert [len(column) for column in trace] == [0, 0, 0, 0, 0]
+    assert snapshot(grown) == before
+
+
+def test_a_new_machine_still_takes_any_number_of_variables_after_a_batch_of_no_rows():
+    machine = EvolvingFSM(1)
+    machine.learn_many(np.empty((0, 2)), [])
+    assert machine.observe([1.0, 2.0, 3.0]).state == 0
+
+
+def test_beliefs_are_traced_only_when_asked_for(stream):
+    assert new_machine().learn_many(*stream).belief is None
+
+
+@pytest.mark.parametrize("order", ["C", "F"])
+@pytest.mark.parametrize("dtype", [np.float64, np.float32, np.int16])
+def test_any_real_array_is_read_and_none_is_written(dtype, order, snapshot):
+    Z = np.array([[0, 4], [9, 1], [4, 3], [5, 2]], dtype=dtype, order=order)
+    Z.setflags(write=False)
+    I = np.array([0, 1, 2, 0], dtype=np.uint8)
+    I.setflags(write=False)
+    machine, expected = new_machine(), new_machine()
+    machine.learn_many(Z, I)
+    learn_in_a_loop(expected, [list(map(float, z)) for z in Z], I.tolist())
+    assert snapshot(machine) == snapshot(expected)
+
+
+# -- Actions and episodes ----------------------------------------------------------------------
+
+
+def test_a_second_act_replaces_the_first(grown, snapshot):
+    once, twice = grown.copy(), grown.copy()
+    once.act(2)
+    twice.act(0)
+    twice.act(2)
+    assert snapshot(once) == snapshot(twice)
+
+
+def test_an_action_labels_the_next_transition_and_no_other(grown):
+    grown.act(1)
+    assert not np.isnan(grown.observe([0.3, 0.1]).surprise)
+    assert np.isnan(grown.observe([0.2, 0.1]).surprise)
+
+
+def test_only_the_matrix_of_the_action_taken_learns(grown):
+    before = grown.transition_matrices
+    grown.act(1)
+    step = grown.observe(grown.centers[0])
+    assert step.event == Event.NONE
+    changed = (grown.transition_matrices != before).any(axis=(1, 2))
+    assert changed.tolist() == [False, True, False]
+
+
+def test_an_observation_without_an_action_before_it_teaches_no_transition(grown):
+    grown.start_episode()
+    grown.observe([3.0, 1.0])
+    matrices, frequency = grown.transition_matrices, grown.origin_frequency
+    step = grown.observe([3.1, 1.0])
+    assert (step.event, step.predicted.shape) == (Event.NONE, (0,))
+    assert np.isnan(step.surprise)
+    assert grown.transition_matrices.tolist() == matrices.tolist()
+    assert grown.origin_frequency.tolist() == frequency.tolist()
+
+
+def test_a_new_episode_learns_no_transition_from_the_last_one(grown):
+    matrices = grown.transition_matrices
+    grown.act(0)
+    grown.start_episode()
+    step = grown.observe(grown.centers[0])
+    assert step.event == Event.NONE
+    assert np.isnan(step.surprise)
+    assert grown.transition_matrices.tolist() == matrices.tolist()
+
+
+def test_a_new_episode_clears_the_belief_and_nothing_else(grown):
+    n = grown.n_states
+    before = {name: getattr(grown, name) for name in LEARNT}
+    grown.start_episode()
+    assert grown.belief.tolist() == [1.0 / n] * n
+    assert grown.state is None
+    for name in set(LEARNT) - {"belief", "state"}:
+        np.testing.assert_array_equal(getattr(grown, name), before[name])
+
+
+def test_states_are_determined_from_all_episodes_alike(stream):
+    Z, I, starts = stream
+    apart = new_machine().learn_many(Z, I, starts)
+    together = new_machine().learn_many(Z, I)
+    np.testing.assert_array_equal(apart.state, together.state)
+    np.testing.assert_array_equal(apart.event, together.event)
+
+
+def test_learn_one_observes_and_then_acts(snapshot):
+    one, two = new_machine(), new_machine()
+    for z, i in (([0.0], 1), ([1.0], 2), ([0.4], 0)):
+        step = one.learn_one(z, i)
+        expected = two.observe(z)
+        two.act(i)
+        assert step.belief.tolist() == expected.belief.tolist()
+        np.testing.assert_array_equal(step.surprise, expected.surprise)
+    assert snapshot(one) == snapshot(two)
+
+
+# -- What a machine shows ----------------------------------------------------------------------
+
+
+def test_a_new_machine_knows_no_state():
+    machine = new_machine()
+    assert machine.n_states == 0
+    assert machine.state is None
+    assert machine.belief.shape == machine.state_ids.shape == (0,)
+    assert machine.transition_matrices.shape == (3, 0, 0)
+
+
+def test_the_first_observation_founds_the_first_state():
+    machine = new_machine()
+    step = machine.observe([3.0, -1.0])
+    assert (step.state, step.event, step.belief.tolist()) == (0, Event.CREATED, [1.0])
+    assert machine.centers.tolist() == [[3.0, -1.0]]
+    assert machine.potentials.tolist() == [1.0]
+    assert machine.transition_matrices.tolist() == [[[1.0]]] * 3
+    assert machine.origin_frequency.tolist() == [[1e-3]] * 3
+
+
+def test_the_state_is_the_most_probable_one(stream):
+    machine = new_machine()
+    trace = machine.learn_many(*stream, belief=True)
+    assert trace.state.tolist() == trace.belief.argmax(axis=1).tolist()
+    assert machine.state == trace.state[-1]
+    assert machine.state_ids.tolist() == list(range(machine.n_states))
+
+
+def test_a_denser_observation_moves_the_nearest_state_if_closer_than_the_radius():
+    Z = [[0.0], [0.1], [2.0], [1.0]]
+    for radius, event in ((1.5, Event.MOVED), (0.5, Event.CREATED)):
+        machine = EvolvingFSM(n_actions=1, radius=radius)
+        assert machine.learn_many(Z, [0] * 4).event.tolist() == [Event.CREATED, 0, 0, event]
+        assert machine.centers[-1].tolist() == [1.0]
+
+
+def test_a_state_at_exactly_the_radius_is_not_near_enough_to_move():
+    machine = EvolvingFSM(n_actions=1, radius=1.0)
+    assert machine.learn_many([[0.0], [0.1], [2.0], [1.0]], [0] * 4).event[-1] == Event.CREATED
+
+
+@pytest.mark.parametrize("spread", [3.0, 0.02])
+def test_belief_falls_with_distance_against_the_variance_of_all_observations(spread, spiral):
+    Z = spiral(60)
+    machine = EvolvingFSM(n_actions=1, radius=0.01, spread=spread)
+    machine.learn_many(Z, [0] * 60)
+    belief = machine.observe([7.0, 3.0]).belief
+    variance = np.vstack([Z, [7.0, 3.0]]).var(axis=0).sum()
+    squared = ((machine.centers - [7.0, 3.0]) ** 2).sum(axis=1)
+    similarity = np.exp(-squared / (spread * variance))
+    np.testing.assert_allclose(belief, similarity / similarity.sum(), rtol=1e-11)
+
+
+@pytest.mark.parametrize("name", sorted(set(LEARNT) - {"n_states", "state"} | {"joint_frequency"}))
+def test_what_a_property_gives_may_be_written_over(grown, snapshot, name):
+    before = snapshot(grown)
+    getattr(grown, name)[...] = -1.0
+    assert snapshot(grown) == before
+
+
+def test_a_step_keeps_its_arrays_when_the_machine_goes_on(grown):
+    first = grown.learn_one([0.5, 0.2], 0)
+    belief, predicted = first.belief.tolist(), first.predicted.tolist()
+    grown.learn_one([-3.0, 1.0], 1)
+    assert (first.belief.tolist(), first.predicted.tolist()) == (belief, predicted)
+
+
+@pytest.mark.parametrize("duplicate", [EvolvingFSM.copy, copy.copy, copy.deepcopy])
+def test_a_copy_goes_its_own_way(grown, snapshot, duplicate):
+    twin, before = duplicate(grown), snapshot(grown)
+    assert snapshot(twin) == before
+    twin.learn_many([[5.0, 5.0], [0.0, 0.1]], [0, 1])
+    assert snapshot(grown) == before
+    grown.learn_many([[5.0, 5.0], [0.0, 0.1]], [0, 1])
+    assert snapshot(twin) == snapshot(grown)
+
+
+def test_a_constructor_argument_is_an_attribute_of_the_same_name():
+    settings = {
+        "n_actions": 4,
+        "radius": 0.5,
+        "distance_weight": 0.7,
+        "learning_rate": 0.2,
+        "prior_frequency": 0.1,
+        "spread": 2.0,
+    }
+    machine = EvolvingFSM(**settings)
+    assert {name: getattr(machine, name) for name in settings} == settings
+    assert repr(eval(repr(machine))) == repr(machine)
+
+
+@pytest.mark.parametrize("name", ["n_actions", "radius", "spread"])
+def test_settings_cannot_change_under_a_running_machine(name):
+    machine = EvolvingFSM(n_actions=2)
+    with pytest.raises(AttributeError):
+        setattr(machine, name, 5)
+
+
+def test_a_machine_sent_to_another_process_goes_on_as_the_original(grown):
+    sent = pickle.loads(pickle.dumps(grown))
+    z = np.asarray(grown.centers[0]) + 0.25
+    for machine in (grown, sent):
+        machine.start_episode()
+        machine.learn_many([z, z + 0.5, z], [0, 1, 0])
+    assert np.array_equal(sent.transition_matrices, grown.transition_matrices)
+    assert np.array_equal(sent.belief, grown.belief)
+
+
+def test_the_state_is_the_nearest_also_where_beliefs_tie():
+    machine = EvolvingFSM(n_actions=1, radius=0.5, spread=1e6)
+    machine.learn_many([[0.0], [0.1], [2.0], [1.0]], [0, 0, 0, 0])
+    step = machine.observe([0.5 + 1e-12])
+    assert machine.state == step.state
+
+
+@pytest.mark.parametrize("horizon", [0, -1, 1.5, np.nan, "2"])
+def test_a_horizon_is_a_whole_number_of_steps(grown, horizon):
+    with pytest.raises(ValueError, match="horizon"):
+        grown.predict(0, horizon)
+
+
+def test_changes_count_the_steps_of_the_recognised_state_within_episodes(grown):
+    machine = EvolvingFSM(n_actions=2, radius=0.5)
+    Z = np.random.default_rng(1).normal(size=(500, 2)) * 3.0
+    starts = [0, 100, 101, 400]
+    trace = machine.learn_many(Z, np.zeros(500, int), starts)
+    counts = np.zeros((machine.n_states, machine.n_states))
+    for row in set(range(1, 500)) - set(starts):
+        counts[trace.state[row - 1], trace.state[row]] += 1
+    assert machine.n_states > 1
+    assert np.array_equal(machine.model().changes, counts)
+
+
+# -- Failure -----------------------------------------------------------------------------------
+
+
+def sharp_machine():
+    """States at 0 and 1, recognised so sharply that a belief is exactly 0 or 1."""
+    machine = EvolvingFSM(n_actions=3, radius=0.5, spread=1e-6)
+    machine.learn_many([[0.0], [0.0], [2.0], [1.0]], [-1, -1, -1, -1])
+    assert machine.centers.tolist() == [[0.0], [1.0]]
+    machine.start_episode()
+    return machine
+
+
+def test_what_led_to_failure_is_counted_by_hand():
+    machine = sharp_machine()
+    machine.learn_one([0.0], 1)
+    machine.learn_one([1.0], 2)
+    machine.learn_one([1.0], 0)
+    machine.observe([0.0], failed=True)  # action 0 in state 1 led there
+    machine.learn_one([0.0], 1)
+    machine.fail()  # action 1 in state 0 led there
+    assert machine.decisions.tolist() == [[0.0, 1.0], [2.0, 0.0], [0.0, 1.0]]
+    assert machine.failures.tolist() == [[0.0, 1.0], [1.0, 0.0], [0.0, 0.0]]
+    assert machine.endings.tolist() == [2.0, 0.0]
+    assert machine.model().uses.tolist() == [1.0, 1.0, 1.0]  # `fail` teaches no transition
+
+
+def test_a_failed_observation_is_learnt_like_any_other(grown):
+    twin = grown.copy()
+    a, b = grown.observe([0.3, 0.1], failed=True), twin.observe([0.3, 0.1])
+    for one, other in zip(a, b, strict=True):
+        np.testing.assert_array_equal(one, other)
+    twin.start_episode()
+    for name in set(LEARNT) - {"failures", "endings"}:
+        np.testing.assert_array_equal(getattr(grown, name), getattr(twin, name))
+    assert grown.failures.sum() == pytest.approx(1.0)
+    assert grown.endings.tolist() == [float(k == a.state) for k in range(grown.n_states)]
+
+
+@pytest.mark.parametrize("end", [EvolvingFSM.fail, lambda m: m.observe([0.3, 0.1], failed=True)])
+def test_after_a_failure_an_episode_begins(grown, end):
+    end(grown)
+    assert grown.state is None
+    assert grown.belief.tolist() == [1.0 / grown.n_states] * grown.n_states
+    with pytest.raises(ValueError, match="act before observe"):
+        grown.act(0)
+    with pytest.raises(ValueError, match="fail before observe: this episode"):
+        grown.fail()
+    changes = grown.model().changes.sum()
+    assert np.isnan(grown.observe([0.2, 0.1]).surprise)
+    assert grown.model().changes.sum() == changes
+
+
+def test_a_failure_without_an_action_before_it_is_counted_for_the_state_alone():
+    machine = sharp_machine()
+    machine.observe([1.0], failed=True)
+    machine.observe([1.0])
+    machine.fail()
+    assert machine.endings.tolist() == [0.0, 2.0]
+    assert not machine.decisions.any()
+
+
+def test_the_first_observation_of_all_may_fail(snapshot):
+    machine = new_machine()
+    machine.observe([1.0, 2.0], failed=True)
+    assert (machine.n_states, machine.endings.tolist()) == (1, [1.0])
+
+
+def test_failing_teaches_the_matrices_nothing(grown):
+    before = grown.transition_matrices, grown.origin_frequency, grown.centers
+    grown.act(1)
+    grown.fail()
+    after = grown.transition_matrices, grown.origin_frequency, grown.centers
+    for a, b in zip(before, after, strict=True):
+        assert a.tobytes() == b.tobytes()
+
+
+def test_counts_never_forget_where_frequencies_do():
+    machine = EvolvingFSM(n_actions=1, radius=0.5, learning_rate=0.5, spread=1e-6)
+    machine.learn_many([[0.0], [0.0], [2.0], [1.0]], [-1, -1, -1, 0], failures=[])
+    machine.observe([0.0], failed=True)
+    machine.learn_many(np.zeros((5000, 1)), [0] * 5000)
+    assert machine.origin_frequency[0, 1] == 0.0
+    assert machine.decisions[0].tolist() == [4999.0, 1.0]
+    assert machine.failures[0].tolist() == [0.0, 1.0]
+
+
+def test_decisions_sum_to_the_transitions_learnt_and_the_failures_after_them(stream):
+    machine = new_machine()
+    trace = machine.learn_many(*stream, failures=[10, 77])
+    machine.observe([0.0, 0.0])
+    machine.act(2)
+    uses = machine.model().uses
+    assert uses.sum() == (~np.isnan(trace.surprise)).sum() + (stream[1][-1] >= 0)
+    np.testing.assert_allclose(machine.decisions.sum(axis=1), uses, rtol=1e-12)
+    machine.fail()
+    np.testing.assert_allclose(machine.decisions.sum(axis=1), [*uses[:2], uses[2] + 1], rtol=1e-12)
+
+
+def test_a_batch_of_episodes_that_fail_is_the_loop_bit_for_bit(stream, snapshot):
+    Z, I, starts = stream
+    failures = [0, 40, 41, 89, 119]
+    batch, loop, split = new_machine(), new_machine(), new_machine()
+    batch.learn_many(Z, I, starts, failures)
+    for row, (z, i) in enumerate(zip(Z, I, strict=True)):
+        if row in starts:
+            loop.start_episode()
+        loop.observe(z, failed=row in failures)
+        if i >= 0 and row not in failures:
+            loop.act(i)
+    split.learn_many(Z[:41], I[:41], [0], [0, 40])
+    split.learn_many(Z[41:], I[41:], [0, 49], np.array([0, 48, 78]))
+    assert snapshot(batch) == snapshot(loop) == snapshot(split)
+
+
+def test_what_happened_to_states_may_be_combined():
+    assert [event.value for event in (Event.NONE, *Event)] == [0, 1, 2, 4, 8]
+    assert Event.CREATED in Event.CREATED | Event.MERGED
+    assert Event(12) == Event.MERGED | Event.RETIRED
+
+
+# -- The quick call ----------------------------------------------------------------------------
+
+
+def test_update_is_learn_one_with_a_shorter_answer(grown, spiral, snapshot):
+    twin = grown.copy()
+    for row, z in enumerate(spiral(60)):
+        surprise = grown.update(z, row % 3)
+        assert (
+            np.array(surprise).tobytes() == np.array(twin.learn_one(z, row % 3).surprise).tobytes()
+        )
+    assert snapshot(grown) == snapshot(twin)
+
+
+GIVEN = {
+    "a list": lambda z: z.tolist(),
+    "single precision": lambda z: z.astype(np.float32),
+    "whole numbers": lambda z: z.astype(int),
+    "with gaps": lambda z: np.column_stack([z, z])[:, 0],
+    "read-only": lambda z: np.broadcast_to(z, z.shape),
+    "another order of bytes": lambda z: z.astype(">f8"),
+}
+
+
+@pytest.mark.parametrize("given", GIVEN.values(), ids=GIVEN.keys())
+def test_observations_of_any_kind_are_the_same_once_kernels_are_loaded(given, grown, snapshot):
+    z = np.array([2.0, 1.0])
+    machines = [grown.copy() for _ in range(4)]
+    for machine in machines:
+        machine.update(z, 0)
+    machines[0].update(z, 1)
+    machines[1].update(given(z), 1)
+    machines[2].learn_one(given(z), 1)
+    machines[3].observe(given(z))
+    machines[3].act(1)
+    assert all(snapshot(machine) == snapshot(machines[0]) for machine in machines)
+
+
+@pytest.mark.parametrize(
+    ("z", "i", "error"),
+    [
+        ([0.0, 1.0], -1, ValueError),
+        ([0.0, 1.0], 3, ValueError),
+        ([0.0, 1.0], 2**70, ValueError),
+        ([0.0, 1.0], 1.0, TypeError),
+        ([0.0, np.nan], 0, ValueError),
+        ([0.0], 0, ValueError),
+        ([[0.0, 1.0]], 0, ValueError),
+        (1.0, 0, ValueError),
+    ],
+)
+def test_update_refuses_what_learn_one_refuses_and_changes_nothing(z, i, error, grown, snapshot):
+    grown.update(np.array([2.0, 1.0]), 0)
+    before = snapshot(grown)
+    for call in (grown.update, grown.learn_one):
+        with pytest.raises(error):
+            call(np.array(z), i)
+        assert snapshot(grown) == before
+
+
+def test_a_width_beyond_all_bounds_leaves_no_belief_to_states_that_are_not_there():
+    machine = EvolvingFSM(1, rule=Novelty(radius=1e100, spread=1e100))
+    assert machine.observe([0.0]).belief.tolist() == [1.0]
+    machine = EvolvingFSM(1, rule=Novelty(radius=1e100))
+    assert machine.observe([0.0]).belief.tolist() == [1.0]
+
+
+@pytest.mark.slow
+def test_threads_may_begin_at_once():
+    program = """
+import threading, numpy as np
+from evofsm.fsm.machine import EvolvingFSM
+failed = []
+def work():
+    try:
+        EvolvingFSM(1).update(np.zeros(1), 0)
+    except Exception as error:
+        failed.append(error)
+threads = [threading.Thread(target=work) for _ in range(4)]
+[thread.start() for thread in threads]
+[thread.join() for thread in threads]
+print(failed)
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert done.stdout == "[]\n", done.stderr
+
+
+def test_what_was_told_of_failures_before_the_first_observation_holds():
+    machine = EvolvingFSM(n_actions=1)
+    machine.tell_of_failures()
+    machine.learn_one([0.0], 0)
+    assert machine.failures_told

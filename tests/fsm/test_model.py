@@ -1,0 +1,285 @@
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from evofsm.fsm.actions import IntervalActions
+from evofsm.fsm.machine import EvolvingFSM
+from evofsm.fsm.model import FSMModel
+from evofsm.fsm.observations import Missing
+from evofsm.fsm.states.novelty import Novelty
+from evofsm.fsm.step import Event
+
+ACTIONS = IntervalActions(low=-1.0, high=1.0, width=1.0)
+
+
+def chain(*matrices, uses=None):
+    """A model with the given transition matrices; the rest is of no account."""
+    q, n = len(matrices), len(matrices[0])
+    return FSMModel(
+        centers=np.arange(2.0 * n).reshape(n, 2),
+        potentials=np.ones(n),
+        width=1.0,
+        transition_matrices=np.array(matrices),
+        origin_frequency=np.ones((q, n)),
+        uses=np.ones(q) if uses is None else uses,
+        visits=np.ones(n),
+        founded=np.arange(1.0, n + 1),
+        changes=np.zeros((n, n)),
+    )
+
+
+SWITCH = [[0.9, 0.1], [0.5, 0.5]]
+STAY = [[1.0, 0.0], [0.0, 1.0]]
+
+
+# -- A snapshot --------------------------------------------------------------------------------
+
+
+def test_a_snapshot_holds_what_the_machine_knew(grown):
+    model = grown.model(names=("x", "y"), units=("m", "m/s"), dt=0.01)
+    for name in (
+        *("centers", "potentials", "transition_matrices", "origin_frequency"),
+        *("decisions", "failures", "endings"),
+    ):
+        np.testing.assert_array_equal(getattr(model, name), getattr(grown, name))
+    assert (model.n_states, model.n_variables, model.n_actions) == (grown.n_states, 2, 3)
+    assert (model.names, model.units, model.dt) == (("x", "y"), ("m", "m/s"), 0.01)
+    np.testing.assert_array_equal(model.marginal_matrix, grown.marginal_matrix)
+
+
+def test_it_counts_founding_visits_and_uses(spiral):
+    machine = EvolvingFSM(n_actions=2, radius=0.01)
+    trace = machine.learn_many(spiral(120), [1] * 30 + [0] * 20 + [-1] * 10 + [0] * 60)
+    model = machine.model()
+    assert model.n_states > 32
+    assert model.founded.tolist() == (np.flatnonzero(trace.event == Event.CREATED) + 1).tolist()
+    assert model.visits.tolist() == np.bincount(trace.state).tolist()
+    assert model.uses.tolist() == [79, 30]
+
+
+def test_later_learning_does_not_change_a_snapshot(grown):
+    model = grown.model()
+    fields = [field.name for field in dataclasses.fields(model)]
+    before = {name: np.array(getattr(model, name)) for name in fields[:8]}
+    grown.learn_many(np.random.default_rng(0).normal(size=(50, 2)), [0, 1] * 25)
+    for name, value in before.items():
+        np.testing.assert_array_equal(getattr(model, name), value)
+
+
+def test_nothing_in_a_snapshot_can_be_changed(grown):
+    model = grown.model()
+    for field in dataclasses.fields(model):
+        with pytest.raises(dataclasses.FrozenInstanceError):
+            setattr(model, field.name, None)
+        value = getattr(model, field.name)
+        if isinstance(value, np.ndarray):
+            with pytest.raises(ValueError, match="read-only"):
+                value[...] = 0.0
+
+
+def test_arrays_given_to_a_model_stay_the_givers_own():
+    matrices = np.array([SWITCH])
+    model = dataclasses.replace(chain(STAY), transition_matrices=matrices)
+    matrices[:] = 0.0
+    assert model.transition_matrices.tolist() == [SWITCH]
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"potentials": np.ones(3)}, r"potentials has shape \(3,\), not \(2,\)"),
+        ({"transition_matrices": np.ones((1, 2, 3))}, "transition_matrices has shape"),
+        ({"names": ("x",)}, "names are .*2 variables"),
+        ({"units": ("m", "m", "s")}, "units are .*2 variables"),
+        ({"actions": ACTIONS}, "2 intervals for 1 matrices"),
+        ({"decisions": np.ones((1, 3))}, r"decisions has shape \(1, 3\), not \(1, 2\)"),
+        ({"failures": np.ones((1, 2))}, "failures cannot be more than decisions"),
+        ({"endings": np.array([-1.0, 0.0])}, "endings of -1 cannot be right"),
+        ({"width": math.nan}, "width of nan cannot be right"),
+        ({"potentials": np.array([np.nan, 1.0])}, "potentials of nan cannot be right"),
+    ],
+)
+def test_parts_that_do_not_fit_each_other_are_refused(change, words):
+    with pytest.raises(ValueError, match=words):
+        dataclasses.replace(chain(STAY), **change)
+
+
+def test_a_model_made_without_counts_of_outcomes_has_counted_none():
+    model = chain(SWITCH, STAY)
+    assert model.decisions.tolist() == model.failures.tolist() == [[0.0, 0.0]] * 2
+    assert model.endings.tolist() == [0.0, 0.0]
+
+
+# -- Recognition -------------------------------------------------------------------------------
+
+
+def test_the_snapshot_recognises_the_latest_observation_as_the_machine_did(grown):
+    z = [0.7, 0.1]
+    belief = grown.observe(z).belief
+    np.testing.assert_allclose(grown.model().recognise(z), belief, rtol=1e-13)
+
+
+def test_recognition_follows_the_similarity_equation(grown):
+    model = grown.model()
+    z = np.array([0.7, 0.1])
+    similarity = np.exp(-((model.centers - z) ** 2).sum(axis=1) / model.width)
+    np.testing.assert_allclose(model.recognise(z), similarity / similarity.sum(), rtol=1e-12)
+
+
+def test_many_rows_are_recognised_each_as_alone(grown):
+    model = grown.model()
+    Z = np.random.default_rng(0).normal(size=(20, 2)) * 4.0
+    many = model.recognise(Z)
+    assert many.shape == (20, model.n_states)
+    for z, belief in zip(Z, many, strict=True):
+        assert model.recognise(z).tobytes() == belief.tobytes()
+
+
+def test_the_farthest_observation_a_machine_takes_is_recognised_too(grown):
+    belief = grown.model().recognise([1e100, -1e100])
+    assert belief.sum() == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize(
+    ("z", "words"),
+    [
+        ([1.0], r"z has shape \(1,\); a row needs 2 variables"),
+        ([[1.0, 2.0, 3.0]], r"z has shape \(1, 3\)"),
+        (np.zeros((1, 1, 2)), r"z has shape \(1, 1, 2\)"),
+        ([np.nan, 0.0], "variable 0: nan cannot be used"),
+        ([0.0, -np.inf], "variable 1: -inf"),
+        ([0.0, 1e200], r"variable 1: 1e\+200"),  # its square is infinite
+    ],
+)
+def test_what_cannot_be_recognised_is_refused(grown, z, words):
+    with pytest.raises(ValueError, match=words):
+        grown.model().recognise(z)
+
+
+def test_a_model_of_a_machine_that_saw_nothing_says_so():
+    model = EvolvingFSM(n_actions=2).model()
+    assert model.n_states == 0
+    assert model.stationary_distribution().shape == (0,)
+    with pytest.raises(ValueError, match=r"no states|variables"):
+        model.recognise([0.0])
+
+
+# -- Forecasts ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("policy", ["marginal", "hold", "observed"])
+@pytest.mark.parametrize("horizon", [1, 4])
+def test_the_snapshot_forecasts_as_the_machine_does(grown, policy, horizon):
+    forecast = grown.model().propagate(grown.belief, 1, horizon, policy)
+    np.testing.assert_array_equal(forecast, grown.predict(1, horizon, policy))
+
+
+def test_without_an_action_the_policy_rules_from_the_first_step_on():
+    model = chain(SWITCH, STAY, uses=[3.0, 1.0])
+    np.testing.assert_allclose(model.propagate([1.0, 0.0]), [0.95, 0.05])
+    np.testing.assert_allclose(model.propagate([1.0, 0.0], policy="observed"), [0.925, 0.075])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ({"belief": [1.0]}, r"belief has shape \(1,\); the model has 2 states"),
+        ({"action": 2}, "action is 2; there are actions 0 to 1"),
+        ({"action": -1}, "action is -1"),
+        ({"horizon": 0}, "horizon is 0"),
+        ({"policy": "greedy"}, "policy is 'greedy'.*marginal, hold, observed"),
+        ({"action": None, "policy": "hold"}, "'hold' needs the action"),
+    ],
+)
+def test_a_forecast_that_makes_no_sense_is_refused(arguments, words):
+    with pytest.raises(ValueError, match=words):
+        chain(SWITCH, STAY).propagate(**{"belief": [1.0, 0.0], "action": 0, **arguments})
+
+
+# -- The chain in the long run -----------------------------------------------------------------
+
+
+def test_the_stationary_distribution_of_two_states_is_worked_out_by_hand():
+    np.testing.assert_allclose(chain(SWITCH).stationary_distribution(), [5 / 6, 1 / 6])
+
+
+@pytest.mark.slow
+@given(st.integers(1, 12), st.integers(1, 4), st.integers(0, 2**32 - 1))
+def test_the_stationary_distribution_is_where_power_iteration_ends(n, q, seed):
+    rng = np.random.default_rng(seed)
+    matrices = rng.dirichlet(np.ones(n), size=(q, n))
+    model = chain(*matrices, uses=rng.integers(1, 9, q).astype(float))
+    for policy in ("marginal", "observed"):
+        shares = np.full(n, 1.0 / n)
+        for _ in range(500):
+            shares = shares @ model.averaged_matrix(policy)
+        np.testing.assert_allclose(model.stationary_distribution(policy), shares, atol=1e-9)
+
+
+def test_a_chain_that_comes_round_has_a_stationary_distribution_too():
+    around = np.roll(np.eye(3), 1, axis=1)
+    np.testing.assert_allclose(chain(around).stationary_distribution(), [1 / 3] * 3)
+
+
+def test_an_absorbing_state_takes_all():
+    assert chain([[0.5, 0.5], [0.0, 1.0]]).stationary_distribution() == pytest.approx([0.0, 1.0])
+
+
+def test_a_chain_that_falls_apart_has_no_single_stationary_distribution():
+    with pytest.raises(ValueError, match="never meet"):
+        chain(STAY).stationary_distribution()
+
+
+@pytest.mark.parametrize("policy", ["hold", "nonsense"])
+def test_an_average_over_actions_takes_only_policies_that_average(grown, policy):
+    with pytest.raises(ValueError, match="an average is 'marginal' or 'observed'"):
+        grown.model().averaged_matrix(policy)
+
+
+@pytest.mark.parametrize("belief", [[2.0, -1.0], [0.5, 0.2], [np.nan, 1.0]])
+def test_what_is_no_distribution_is_not_propagated(belief):
+    machine = EvolvingFSM(n_actions=1, radius=0.5)
+    machine.learn_many([[0.0], [0.1], [2.0], [1.0]], [0, 0, 0, 0])
+    with pytest.raises(ValueError, match="no distribution"):
+        machine.model().propagate(belief)
+
+
+@pytest.mark.parametrize("dt", [0.0, -1.0, np.nan])
+def test_a_time_step_is_positive(grown, dt):
+    with pytest.raises(ValueError, match="dt"):
+        grown.model(dt=dt)
+
+
+def test_numbers_of_numpy_are_saved_like_any_other(grown, tmp_path):
+    actions = IntervalActions(np.float32(0.0), np.float32(grown.n_actions), np.int64(1))
+    grown.model(actions=actions, dt=np.float32(0.5)).save(tmp_path / "model")
+    assert FSMModel.load(tmp_path / "model").actions == actions
+
+
+def test_a_model_knows_the_settings_of_its_machine_and_keeps_them(grown, tmp_path):
+    grown.model().save(tmp_path / "model")
+    settings = FSMModel.load(tmp_path / "model").settings
+    assert repr(type(grown)(**settings)) == repr(grown)
+
+
+def test_models_and_steps_are_shown_in_a_line():
+    machine = EvolvingFSM(n_actions=2, rule=Novelty(radius=0.001))
+    machine.learn_many(np.arange(500.0)[:, None], np.zeros(500, int))
+    model = machine.model(names=["gap"])
+    assert (
+        str(model)
+        == repr(model)
+        == (
+            "FSMModel(500 states of gap, 2 actions, 500 observations, "
+            "Novelty(radius=0.001, scales=(), spread=1.0))"
+        )
+    )
+    machine.start_episode()
+    step = machine.observe([3.2])
+    assert repr(step) == "Step(state=500, belief=1 of 501 states, event=CREATED, surprise=nan)"
+    step = machine.observe([np.nan], missing=Missing.PARTIAL)
+    assert repr(step).endswith("event=NONE, surprise=nan, missing=(0,))")

@@ -1,0 +1,196 @@
+"""What a notebook shows of a machine, a model and a step: well-formed, escaped, and true."""
+
+import re
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+
+from evofsm.fsm.crowding import WhenFull
+from evofsm.fsm.machine import EvolvingFSM
+from evofsm.fsm.notebook import machine_html, model_html, step_html
+from evofsm.fsm.observations import Missing
+from evofsm.fsm.states.novelty import Novelty
+
+_VOID = {"br"}
+
+
+class Reader(HTMLParser):
+    """Reads rows of cells, and insists that every tag is closed where it should be."""
+
+    def __init__(self, html):
+        super().__init__()
+        self.rows, self.text, self.styles, self.tags = [], "", [], set()
+        self._open = []
+        self.feed(html)
+        self.close()
+        assert self._open == []
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.add(tag)
+        self.styles += [value for name, value in attrs if name == "style"]
+        if tag == "tr":
+            self.rows.append([])
+        if tag in ("td", "th"):
+            self.rows[-1].append("")
+        if tag not in _VOID:
+            self._open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self._open.pop() == tag
+
+    def handle_data(self, data):
+        self.text += data
+        if {"td", "th"} & set(self._open):
+            self.rows[-1][-1] += data
+
+
+def column(rows, head):
+    place = rows[0].index(head)
+    return [row[place] for row in rows[1:]]
+
+
+@pytest.fixture
+def machine():
+    machine = EvolvingFSM(n_actions=2, radius=0.5)
+    machine.learn_many([[0.0, -7.5], [0.1, -7.5], [2.0, -7.5], [1.0, -7.5]], [0, 0, 0, 0])
+    return machine
+
+
+@pytest.fixture
+def crowd():
+    """A machine of 52 states; the last twelve were seen twice."""
+    machine = EvolvingFSM(n_actions=1, rule=Novelty(0.5))
+    Z = np.concatenate([np.arange(52.0), np.arange(40.0, 52.0)])[:, None]
+    machine.learn_many(Z, np.zeros(len(Z), np.int64))
+    return machine
+
+
+def test_a_machine_shows_its_states_and_where_it_is(machine):
+    page = Reader(machine_html(machine))
+    assert page.text.startswith("EvolvingFSM: 2 states, 2 actions, now in #2")
+    assert "radius 0.5" in page.text
+    assert "rule Paper" in page.text
+    assert column(page.rows, "state") == ["#1", "#2"]
+    assert column(page.rows, "variable 0") == ["0", "1"]
+    assert column(page.rows, "variable 1") == ["−7.5", "−7.5"]
+    assert column(page.rows, "visits") == ["3", "1"]
+    assert column(page.rows, "share") == ["75.0 %", "25.0 %"]
+    assert column(page.rows, "belief") == [f"{100 * share:.1f} %" for share in machine.belief]
+    assert "failures ended here" not in page.rows[0]
+
+
+def test_bars_are_as_long_as_the_belief_and_have_its_number_beside_them(machine):
+    html = machine_html(machine)
+    lengths = [float(number) for number in re.findall(r"width:([\d.]+)%;height:100%", html)]
+    assert np.allclose(lengths, 100 * machine.belief, atol=0.05)
+    assert html.count("aria-hidden='true'") == len(lengths)
+
+
+def test_failures_have_a_column_where_there_were_any(machine):
+    machine.observe([1.1, -7.5], failed=True)
+    page = Reader(machine_html(machine))
+    assert column(page.rows, "failures ended here") == ["0", "1"]
+    assert "no episode has begun" in page.text
+    assert "belief" not in page.rows[0]
+
+
+def test_a_machine_that_has_seen_nothing_has_no_table():
+    page = Reader(machine_html(EvolvingFSM(n_actions=1)))
+    assert "0 states, 1 action, no episode has begun" in page.text
+    assert page.rows == []
+    assert Reader(model_html(EvolvingFSM(n_actions=1).model())).rows == []
+
+
+def test_many_states_are_the_most_visited_and_a_row_for_all_others(crowd):
+    page = Reader(machine_html(crowd))
+    assert column(page.rows, "state") == [*(f"#{i}" for i in range(41, 53)), "… and 40 more"]
+    assert column(page.rows, "visits")[-1] == "40"
+    assert column(page.rows, "share")[-1] == "62.5 %"
+    assert all(len(row) == len(page.rows[0]) for row in page.rows)
+    crowd.observe([3.0])
+    page = Reader(machine_html(crowd))
+    assert column(page.rows, "state")[:2] == ["#4", "#41"]  # the present one is always there
+    assert len(page.rows) == 14
+
+
+def test_many_variables_are_cut_short():
+    machine = EvolvingFSM(n_actions=1)
+    machine.observe(np.arange(9.0))
+    heads = Reader(machine_html(machine)).rows[0]
+    assert heads[1:7] == [*(f"variable {j}" for j in range(5)), "variable 5 (and 3 more)"]
+
+
+def test_a_model_shows_names_units_and_what_follows(machine):
+    model = machine.model(names=["gap", "speed"], units=["m", ""], dt=0.25)
+    page = Reader(model_html(model))
+    matrix = model.averaged_matrix("observed")
+    assert "an observation every 0.25 s" in page.text
+    assert page.rows[0][1:3] == ["gap [m]", "speed"]
+    assert column(page.rows, "stays") == [f"{100 * matrix[i, i]:.1f} %" for i in range(2)]
+    assert column(page.rows, "likeliest other next") == [
+        f"#2 ({100 * matrix[0, 1]:.1f} %)",
+        f"#1 ({100 * matrix[1, 0]:.1f} %)",
+    ]
+
+
+def test_a_model_without_transitions_claims_none():
+    machine = EvolvingFSM(n_actions=1, rule=Novelty(0.5))
+    machine.learn_many([[0.0], [1.0]], [-1, -1])
+    assert "stays" not in Reader(model_html(machine.model())).rows[0]
+
+
+def test_what_users_name_is_escaped(machine):
+    html = model_html(machine.model(names=["<script>alert(1)</script>", "a & 'b'"]))
+    page = Reader(html)
+    assert "script" not in page.tags
+    assert page.rows[0][1:3] == ["<script>alert(1)</script>", "a & 'b'"]
+
+
+def test_colours_are_the_notebooks_own(machine):
+    for html in (machine_html(machine), model_html(machine.model())):
+        for style in Reader(html).styles:
+            for colour in re.findall(r"(?:color|background):([^;]+)", style):
+                assert colour in ("inherit", "none", "currentColor") or "rgba(128,128,128" in colour
+
+
+def test_a_step_shows_belief_forecast_and_surprise(machine):
+    step = machine.learn_one([1.1, -7.5], 0)
+    page = Reader(step_html(step))
+    assert page.text.startswith(f"Step: #{step.state + 1}, ")
+    assert f"surprise {step.surprise:.3f} bit" in page.text
+    assert column(page.rows, "belief") == [f"{100 * share:.1f} %" for share in step.belief]
+    assert column(page.rows, "forecast") == [f"{100 * share:.1f} %" for share in step.predicted]
+
+
+def test_a_step_says_in_words_what_happened():
+    machine = EvolvingFSM(1, rule=Novelty(1.0), max_states=2, when_full=WhenFull.RETIRE)
+    said = [Reader(step_html(machine.learn_one([z], 0))).text for z in (0.0, 0.1, 4.0, 9.0)]
+    assert "a state was created here, nothing was forecast" in said[0]
+    assert "the states stayed as they were, surprise 0.000 bit" in said[1]
+    assert "a state was created here, a state was given up" in said[3]
+    assert "when_full RETIRE" in machine_html(machine)
+    machine = EvolvingFSM(1, rule=Novelty(1.0), max_states=2)
+    machine.learn_many([[0.0], [5.0]], [0, 0])
+    assert "none was created" in step_html(machine.observe([1.5]))
+    assert "two states were merged" in step_html(merging_step())
+    moved = EvolvingFSM(n_actions=1, radius=5.0)
+    moved.learn_many([[0.0], [4.0], [0.0]], [0, 0, 0])
+    assert "the nearest state moved here" in step_html(moved.observe([1.0]))
+
+
+def merging_step():
+    machine = EvolvingFSM(1, rule=Novelty(1.0), max_states=2)
+    machine.learn_many([[0.0], [4.0]], [0, 0])
+    return machine.observe([9.0])
+
+
+def test_a_step_says_what_was_not_observed(machine):
+    step = machine.observe([1.0, np.nan], missing=Missing.PARTIAL)
+    assert "not observed: variable 1; so nothing was learnt" in Reader(step_html(step)).text
+
+
+def test_asking_changes_nothing(machine, snapshot):
+    before = snapshot(machine)
+    machine_html(machine), model_html(machine.model())
+    assert snapshot(machine) == before

@@ -1,0 +1,92 @@
+import math
+import re
+from fractions import Fraction
+from itertools import combinations
+
+import numpy as np
+import pytest
+
+from evofsm.fsm.machine import EvolvingFSM
+from evofsm.fsm.observations import Category, ObservationEncoder
+from evofsm.fsm.step import Event
+
+LIGHT = Category("light", ("red", "amber", "green"), distance=10.0)
+
+
+def test_any_two_categories_lie_the_given_distance_apart():
+    encoder = ObservationEncoder("gap", LIGHT)
+    points = [encoder.encode({"gap": 5.0, "light": value}) for value in LIGHT.values]
+    for a, b in combinations(points, 2):
+        assert math.dist(a, b) == pytest.approx(10.0, rel=1e-15)
+
+
+def test_entries_follow_the_order_of_the_variables_and_are_named():
+    encoder = ObservationEncoder("gap", LIGHT, "speed")
+    encoded = encoder.encode({"speed": 2.0, "light": "amber", "gap": 5.0})
+    assert encoder.names == ("gap", "light=red", "light=amber", "light=green", "speed")
+    np.testing.assert_allclose(encoded, [5.0, 0.0, 10.0 / math.sqrt(2.0), 0.0, 2.0])
+
+
+def test_no_state_lies_between_two_categories():
+    encoder = ObservationEncoder("gap", LIGHT)
+    machine = EvolvingFSM(n_actions=1, radius=9.9)
+    rng = np.random.default_rng(0)
+    for gap, light in zip(rng.normal(size=300), rng.choice(LIGHT.values, 300), strict=True):
+        before = machine.centers
+        step = machine.observe(encoder.encode({"gap": gap, "light": light}))
+        if step.event == Event.MOVED:
+            assert machine.centers[:, 1:].tolist() == before[:, 1:].tolist()
+    assert machine.n_states > 1
+
+
+# At equality some of these move by rounding: 10.0 does not, 16.9 does.
+@pytest.mark.parametrize("radius", [0.3, 5.25, 9.58, 10.0, 15.18, 16.9])
+def test_above_the_radius_a_category_founds_a_state_and_below_it_moves_one(radius):
+    for distance, n_states in ((radius * (1 + 1e-12), 2), (radius * 0.99, 1)):
+        encoder = ObservationEncoder(Category("light", ("red", "green"), distance))
+        machine = EvolvingFSM(n_actions=1, radius=radius)
+        machine.observe(encoder.encode({"light": "red"}))
+        events = [machine.observe(encoder.encode({"light": "green"})).event for _ in range(9)]
+        assert Event.MOVED in events or Event.CREATED in events
+        assert machine.n_states == n_states
+
+
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [
+        ({"light": "red"}, "lacks 'gap'; it has light"),
+        ({"gap": 1.0}, "lacks 'light'"),
+        ({"gap": 1.0, "light": "blue"}, "light is 'blue'; it may be red, amber, green"),
+    ],
+)
+def test_a_missing_variable_or_unknown_category_is_named(values, words):
+    with pytest.raises(ValueError, match=words):
+        ObservationEncoder("gap", LIGHT).encode(values)
+
+
+@pytest.mark.parametrize("value", ["abc", "1.5", b"1.5", "", None, 1j, [1.0], object])
+def test_a_value_that_is_no_number_is_named(value):
+    with pytest.raises(TypeError, match=re.escape(f"gap is {value!r}; it must be a number")):
+        ObservationEncoder("gap", LIGHT).encode({"gap": value, "light": "red"})
+
+
+@pytest.mark.parametrize("value", [2, True, np.float32(2.0), np.int64(2), Fraction(2), np.array(2)])
+def test_any_real_number_is_taken(value):
+    encoded = ObservationEncoder("gap").encode({"gap": value})
+    assert encoded.tolist() == [float(value)]
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: Category("light", ("red",)), "light: needs two or more"),
+        (lambda: Category("light", ("red", "red", "green")), "different values"),
+        (lambda: Category("light", ("red", "green"), distance=0.0), "distance is 0.0"),
+        (lambda: Category("light", ("red", "green"), distance=math.inf), "distance is inf"),
+        (lambda: ObservationEncoder(), "at least one variable"),
+        (lambda: ObservationEncoder("gap", "gap"), "same name twice"),
+    ],
+)
+def test_variables_that_make_no_sense_are_refused(make, words):
+    with pytest.raises(ValueError, match=words):
+        make()

@@ -1,0 +1,117 @@
+"""Threads that share a machine lose nothing, and Ctrl-C never leaves one half done."""
+
+import copy
+import os
+import pickle
+import sys
+import threading
+from collections import Counter
+
+import numpy as np
+import pytest
+
+import one_machine
+from evofsm.fsm.machine import EvolvingFSM
+from evofsm.fsm.memory import resize
+
+needs_fork = pytest.mark.skipif(not hasattr(os, "fork"), reason="this system cannot fork")
+
+
+def elsewhere(work):
+    """Do it in another thread, for which nobody waits longer than some seconds."""
+    done = threading.Event()
+    thread = threading.Thread(target=lambda: (work(), done.set()), daemon=True)
+    thread.start()
+    return done.wait(20.0)
+
+
+@pytest.mark.parametrize("interval", [sys.getswitchinterval(), 1e-6])
+def test_threads_on_one_machine_lose_no_observation(interval):
+    one_machine.compile_all()
+    assert one_machine.share(one_machine.growing(), 4, 100, interval) == 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("deed", "every"),
+    [
+        ("first observation", 7),
+        ("learn_one", 1),
+        ("update", 7),
+        ("failed", 7),
+        ("missing", 1),
+        ("missing, failed", 7),
+        ("fail", 7),
+        ("start_episode", 1),
+        ("act", 1),
+        ("model", 11),
+        ("learn_many", 7),
+    ],
+)
+def test_an_interrupt_at_any_line_leaves_a_whole_machine(deed, every):
+    found = Counter(one_machine.harms(one_machine.DEEDS[deed], every))
+    assert found.total() >= 5
+    assert set(found) == {""}
+
+
+def test_a_buffer_without_its_views_would_be_found():
+    class Apart(EvolvingFSM):
+        def _use(self, buffer):
+            if hasattr(self, "_held"):
+                self._held = type(self._held)(buffer, self._held.memory)
+            super()._use(buffer)
+
+    def start():
+        machine = Apart(3, rule=one_machine.growing().rule)
+        machine.learn_many([[3.0 * k, 0.0] for k in range(8)], [0] * 8)
+        machine.act(1)
+        return machine
+
+    deed = one_machine.DEEDS["learn_one"]._replace(start=start)
+    assert "results that differ" in one_machine.harms(deed, 11)
+
+
+@pytest.mark.parametrize(
+    "twin", [copy.copy, copy.deepcopy, lambda m: pickle.loads(pickle.dumps(m))]
+)
+def test_a_copy_has_a_lock_of_its_own(grown, twin):
+    with grown._lock:
+        another = twin(grown)
+        assert elsewhere(lambda: another.learn_one([0.1, 0.2], 0))
+    assert another.n_states >= grown.n_states
+
+
+@needs_fork
+def test_a_forked_process_is_not_kept_waiting_by_a_thread_that_it_lacks(grown):
+    held, over = threading.Event(), threading.Event()
+
+    def hold():
+        with grown._lock:
+            held.set()
+            over.wait()
+
+    thread = threading.Thread(target=hold)
+    thread.start()
+    held.wait()
+    if (child := os.fork()) == 0:
+        os._exit(0 if elsewhere(lambda: grown.observe([0.1, 0.2])) else 1)
+    over.set()
+    thread.join()
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+
+
+def test_a_buffer_is_never_given_less_room_than_is_used(grown):
+    n = grown.n_states
+    with pytest.raises(ValueError, match=f"room for {n - 1} states and 3 .*but {n} and 3 are in"):
+        resize(grown._buffer, n - 1, 3)
+    with pytest.raises(ValueError, match=f"room for {n} states and 2 matrices"):
+        resize(grown._buffer, n, 2)
+    assert len(resize(grown._buffer, n, 3)) <= len(grown._buffer)
+
+
+def test_learning_by_missing_and_failing_counts_as_ever(grown):
+    twin = grown.copy()
+    grown.observe([0.1, np.nan], missing=one_machine.Missing.PARTIAL, failed=True)
+    twin.observe([0.1, np.nan], missing=one_machine.Missing.PARTIAL)
+    twin.fail()
+    assert one_machine.saved(grown) == one_machine.saved(twin)

@@ -1,0 +1,182 @@
+"""What holds for every stream of observations."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from evofsm.fsm.machine import EvolvingFSM
+from reference import NumpyFSM
+
+
+def machines(n_actions):
+    return st.builds(
+        EvolvingFSM,
+        n_actions=st.just(n_actions),
+        radius=st.sampled_from([0.05, 0.3, 2.0]),
+        distance_weight=st.sampled_from([0.3, 0.85, 1.5]),
+        learning_rate=st.sampled_from([0.01, 0.3, 0.9]),
+        prior_frequency=st.sampled_from([1e-6, 1e-3, 1.0]),
+        spread=st.sampled_from([0.05, 1.0, 3.0]),
+    )
+
+
+@st.composite
+def streams(draw, numbers=None):
+    """A machine, observations on a coarse grid (so that many are equal), actions and starts."""
+    m, q = draw(st.integers(1, 3)), draw(st.integers(1, 4))
+    if numbers is None:
+        numbers = st.integers(-32, 32).map(lambda k: k / 8)
+    rows = draw(st.lists(st.tuples(*[numbers] * m), min_size=1, max_size=60))
+    I = draw(st.lists(st.integers(-1, q - 1), min_size=len(rows), max_size=len(rows)))
+    starts = draw(st.lists(st.integers(0, len(rows) - 1), max_size=3))
+    return draw(machines(q)), np.array(rows, dtype=float), np.array(I), sorted(set(starts))
+
+
+def assert_distribution(rows):
+    assert (rows >= 0.0).all()
+    np.testing.assert_allclose(rows.sum(axis=-1), 1.0, rtol=0, atol=1e-9)
+
+
+def assert_sound(machine, trace):
+    assert_distribution(machine.transition_matrices)
+    assert_distribution(machine.marginal_matrix)
+    assert_distribution(machine.belief)
+    assert_distribution(trace.belief)
+    for i in range(machine.n_actions):
+        assert_distribution(machine.predict(i, 3, "observed"))
+    assert (np.diff(trace.n_states) >= 0).all()
+    assert (np.diff(trace.n_states, prepend=0) == (trace.event == 2)).all()
+    assert (machine.origin_frequency >= 0.0).all()
+    assert ((machine.potentials > 0.0) & (machine.potentials <= 1.0)).all()
+    surprise = trace.surprise[~np.isnan(trace.surprise)]
+    assert ((surprise >= 0.0) & (surprise <= 1.0)).all()
+
+
+@given(streams())
+def test_matrices_and_beliefs_are_distributions_and_states_never_fall(stream):
+    machine, Z, I, starts = stream
+    assert_sound(machine, machine.learn_many(Z, I, starts, belief=True))
+
+
+@given(streams(numbers=st.floats(-1e100, 1e100)))
+def test_that_holds_for_numbers_of_every_size(stream):
+    machine, Z, I, starts = stream
+    assert_sound(machine, machine.learn_many(Z, I, starts, belief=True))
+
+
+@pytest.mark.parametrize("scale", [1e-300, 1e-160, 1e-150, 1e-9, 1e9, 1e99])
+def test_that_holds_in_every_unit(scale):
+    Z = np.random.default_rng(3).normal(size=(200, 2)) * scale
+    machine = EvolvingFSM(n_actions=2, radius=0.3 * scale)
+    assert_sound(machine, machine.learn_many(Z, np.arange(200) % 2, belief=True))
+
+
+@given(streams(), st.integers(0, 60))
+def test_a_batch_is_the_loop_bit_for_bit(stream, cut):
+    batch, Z, I, starts = stream
+    loop = batch.copy()
+    surprises = []
+    for row in range(len(Z)):
+        if row in starts:
+            loop.start_episode()
+        surprises.append(loop.observe(Z[row]).surprise)
+        if I[row] >= 0:
+            loop.act(I[row])
+    parts = []
+    for a, b in ((0, min(cut, len(Z))), (min(cut, len(Z)), len(Z))):
+        if a < b:
+            parts.append(batch.learn_many(Z[a:b], I[a:b], [s - a for s in starts if a <= s < b]))
+    assert np.concatenate([p.surprise for p in parts]).tobytes() == np.array(surprises).tobytes()
+    for name in ("centers", "potentials", "joint_frequency", "transition_matrices", "belief"):
+        assert getattr(batch, name).tobytes() == getattr(loop, name).tobytes()
+
+
+@given(streams(), st.sampled_from([1.0, -64.0, 2.0**20, -(2.0**40)]))
+def test_shifting_all_observations_changes_no_belief(stream, offset):
+    machine, Z, I, starts = stream
+    shifted = machine.copy()
+    expected = machine.learn_many(Z, I, starts, belief=True)
+    trace = shifted.learn_many(Z + offset, I, starts, belief=True)  # exact: a coarse grid
+    for a, b in zip(trace, expected, strict=True):
+        assert a.tobytes() == b.tobytes()
+    assert (shifted.centers == machine.centers + offset).all()
+
+
+@pytest.mark.slow
+@settings(max_examples=50)
+@given(
+    st.integers(0, 2**32 - 1),
+    st.integers(1, 4),
+    st.integers(1, 5),
+    st.sampled_from([0.05, 0.3, 1.0]),
+    st.sampled_from([0.01, 0.3]),
+)
+def test_an_independent_writing_of_the_equations_agrees(seed, m, q, radius, learning_rate):
+    rng = np.random.default_rng(seed)
+    Z = np.cumsum(rng.normal(size=(300, m)), axis=0) * 0.3
+    I = rng.integers(-1, q, 300)
+    starts = {0, 100, 101}
+    machine = EvolvingFSM(q, radius, learning_rate=learning_rate)
+    reference = NumpyFSM(q, radius=radius, learning_rate=learning_rate)
+    trace = machine.learn_many(Z, I, sorted(starts), belief=True)
+    for row in range(300):
+        if row in starts:
+            reference.start_episode()
+        state, belief, surprise = reference.observe(Z[row])
+        if I[row] >= 0:
+            reference.act(I[row])
+        assert trace.state[row] == state
+        np.testing.assert_allclose(trace.belief[row, : len(belief)], belief, atol=1e-9)
+        assert not trace.belief[row, len(belief) :].any()
+        np.testing.assert_allclose(trace.surprise[row], surprise, atol=1e-9)
+    np.testing.assert_allclose(machine.centers, reference.centers, atol=1e-9)
+    np.testing.assert_allclose(machine.potentials, reference.potentials, rtol=1e-9)
+    np.testing.assert_allclose(machine.transition_matrices, reference.matrices, atol=1e-9)
+    np.testing.assert_allclose(machine.origin_frequency, reference.frequencies, atol=1e-9)
+
+
+@pytest.mark.parametrize("rare", [0, 1])
+def test_a_million_steps_leave_every_row_a_distribution(rare, spiral):
+    rows = 1_000_000
+    # First a spiral that founds states; then one corner for ever, so that the rows of all other
+    # states only decay. The rare action is taken at the beginning and at the very end.
+    Z = np.random.default_rng(rare).normal([8.0, 4.0], 0.01, size=(rows, 2))
+    Z[:60] = spiral(60)
+    I = np.full(rows, 1 - rare)
+    I[:60:5] = I[-3:] = rare
+    machine = EvolvingFSM(n_actions=2, radius=0.01, learning_rate=0.05, spread=0.01)
+    trace = machine.learn_many(Z, I)
+    assert machine.n_states > 8
+    assert machine.origin_frequency.min() < 1e-200  # what would be 0/0 with F and F_o kept apart
+    assert_distribution(machine.transition_matrices)
+    assert_distribution(machine.belief)
+    assert np.flatnonzero(np.isnan(trace.surprise)).tolist() == [0]
+    for i in (0, 1):
+        assert_distribution(machine.predict(i, 100))
+
+
+def test_a_row_forgotten_for_long_is_learnt_anew_from_one_visit():
+    machine = EvolvingFSM(n_actions=1, radius=0.5, learning_rate=0.5, spread=1e-6)
+    machine.learn_many([[0.0], [0.1], [2.0], [1.0]], [0] * 4)
+    machine.learn_many(np.ones((5000, 1)), [0] * 5000)
+    assert machine.origin_frequency.tolist() == [[0.0, 1.0]]
+    machine.learn_many([[0.0], [0.0]], [0, 0])
+    assert machine.transition_matrices[0, 0].tolist() == [1.0, 0.0]
+
+
+@given(st.floats(-1e100, 1e100), st.integers(1, 50))
+def test_equal_observations_make_one_state_that_is_certain(value, rows):
+    machine = EvolvingFSM(n_actions=1)
+    trace = machine.learn_many(np.full((rows, 2), value), [0] * rows)
+    assert machine.n_states == 1
+    assert machine.belief.tolist() == [1.0]
+    assert machine.centers.tolist() == [[value, value]]
+    assert not trace.event[1:].any()  # as dense as the centre is not denser
+    assert (trace.surprise[1:] == 0.0).all()
+
+
+def test_two_tiny_apart_observations_still_give_a_belief():
+    machine = EvolvingFSM(n_actions=1)
+    machine.observe([0.0])
+    assert machine.observe([1e-160]).belief.tolist() == [1.0]

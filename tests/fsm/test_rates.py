@@ -1,0 +1,80 @@
+"""How often something begins, and how well that is known."""
+
+import numpy as np
+import pytest
+
+from evofsm.fsm.proportions import gamma_quantile, poisson_bounds
+from evofsm.fsm.rates import FailureRecord, Rate, shrunk_rates
+
+
+@pytest.mark.parametrize(
+    ("count", "low", "high"),
+    [(0, 0.0, 2.9957), (1, 0.0513, 4.7439), (10, 5.4254, 16.9622), (1000, 948.6, 1053.6)],
+)
+def test_intervals_of_counts_are_those_of_the_tables(count, low, high):
+    np.testing.assert_allclose(poisson_bounds(count), (low, high), rtol=1e-3, atol=1e-9)
+
+
+def test_the_interval_of_a_count_holds_the_truth_nine_times_of_ten():
+    draw = np.random.default_rng(0)
+    for mean in (0.7, 4.0, 60.0):
+        low, high = np.array([poisson_bounds(int(k)) for k in draw.poisson(mean, 4000)]).T
+        assert ((low <= mean) & (mean <= high)).mean() >= 0.89
+
+
+def test_quantiles_join_where_they_are_approximated():
+    for share in (0.05, 0.95):
+        exact, near = (gamma_quantile(share, shape) for shape in (49.999, 50.001))
+        assert abs(near - exact) < 0.01
+
+
+def test_states_without_a_count_have_the_rate_of_all():
+    found = shrunk_rates(np.array([5.0, 0.0]), np.array([50.0, 0.0]))
+    np.testing.assert_allclose(found.rate, 0.1)
+    found = shrunk_rates(np.zeros(3), np.full(3, 10.0))
+    np.testing.assert_array_equal(found.rate, 0.0)
+    np.testing.assert_allclose(found.high, 2.9957 / 30.0, rtol=1e-3)
+
+
+def test_states_that_differ_by_chance_only_are_alike():
+    draw = np.random.default_rng(1)
+    exposure = draw.uniform(10.0, 100.0, 30)
+    found = shrunk_rates(draw.poisson(0.05 * exposure).astype(float), exposure)
+    assert np.ptp(found.rate) < 0.05
+    assert abs(found.rate.mean() - 0.05) < 0.02
+
+
+def test_the_more_was_seen_the_more_a_states_own_count_says():
+    found = shrunk_rates(np.array([1.0, 100.0, 1.0, 10.0]), np.array([10.0, 1000.0, 100.0, 1000.0]))
+    pooled = found.pooled.rate
+    assert abs(found.rate[1] - 0.1) < abs(found.rate[0] - 0.1)
+    assert found.rate[3] < pooled < found.rate[1]
+    assert (found.high - found.low)[1] < (found.high - found.low)[0]
+
+
+def test_nothing_is_known_without_exposure():
+    rate = Rate.of(0, 0.0)
+    assert np.isnan(rate.rate)
+    assert (rate.low, rate.high) == (0.0, np.inf)
+    assert str(Rate.of(1, 2.0)).startswith("once in 2: ")
+
+
+def test_failures_are_told_with_what_they_rest_on():
+    assert str(FailureRecord(0, 12.0)) == "0 failures in 12 h: at most 0.25 per hour, 95 %"
+    assert (
+        str(FailureRecord(1, 0.0, 0.0, 1)) == "1 failure in 1 episode, 0 h, 0 km: nothing is known"
+    )
+    text = str(FailureRecord(2, 120.7, 9000.0, 500))
+    assert text.startswith("2 failures in 500 episodes, 120 h, 9,000 km: 0.017 per hour (0.0029 to")
+    assert text.endswith("0.22 per 1,000 km (0.039 to 0.70), 90 %")
+    assert FailureRecord(2, 1.0).per_1000_km is None
+
+
+def test_bounds_of_failures_are_rounded_outward():
+    for failures in range(12):
+        record = FailureRecord(failures, 7.3)
+        said = str(record).partition(": ")[2]
+        low, high = (0.0, said.split()[2]) if not failures else said.split("(")[1].split()[:3:2]
+        low, high = float(low), float(str(high).rstrip("),"))
+        assert low <= record.per_hour.low <= record.per_hour.high <= high
+        assert high <= 1.11 * record.per_hour.high

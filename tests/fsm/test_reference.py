@@ -1,0 +1,83 @@
+"""The compiled machine against its twin in plain NumPy, which is the paper on one screen."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from evofsm.fsm import reference
+from evofsm.fsm.machine import EvolvingFSM
+from evofsm.fsm.reference import Reference, divergence
+
+
+@st.composite
+def streams(draw):
+    """Settings of a machine, and random observations, actions and starts of episodes."""
+    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    m, rows = draw(st.integers(1, 4)), draw(st.integers(1, 150))
+    Z = rng.normal(size=(rows, m)).cumsum(axis=0) * draw(st.sampled_from([0.1, 1.0, 20.0]))
+    told = {
+        "radius": draw(st.sampled_from([0.05, 0.5, 3.0])),
+        "distance_weight": draw(st.sampled_from([0.5, 0.85, 2.0])),
+        "learning_rate": draw(st.sampled_from([0.01, 0.2, 0.9])),
+        "prior_frequency": draw(st.sampled_from([1e-3, 0.5])),
+        "spread": draw(st.sampled_from([0.1, 3.0])),
+    }
+    return told, Z, rng.integers(-1, 3, rows), rng.random(rows) < 0.05
+
+
+@settings(max_examples=60)
+@given(streams())
+def test_the_machine_is_its_twin(stream):
+    told, Z, I, starts = stream
+    machine, twin = EvolvingFSM(3, **told), Reference(3, **told)
+    for z, i, begins in zip(Z, I, starts, strict=True):
+        if begins:
+            machine.start_episode()
+            twin.start_episode()
+        n = machine.n_states
+        step = machine.observe(z)
+        state, belief, surprise = twin.observe(z)
+        assert len(twin.centers) == machine.n_states >= n
+        assert step.belief[state] == pytest.approx(step.belief.max(), rel=1e-9)
+        np.testing.assert_allclose(step.belief, belief, rtol=1e-9, atol=1e-10)
+        np.testing.assert_allclose(step.surprise, surprise, rtol=0.0, atol=1e-10)
+        if i >= 0:
+            machine.act(i)
+            twin.act(i)
+    for ours, theirs in (
+        (machine.centers, twin.centers),
+        (machine.potentials, twin.potentials),
+        (machine.transition_matrices, twin.matrices),
+        (machine.origin_frequency, twin.frequencies),
+        (machine.predict(1), twin.predict(1)),
+        (machine.predict(0, horizon=5), twin.predict(0, horizon=5)),
+    ):
+        np.testing.assert_allclose(ours, theirs, rtol=1e-9, atol=1e-10)
+
+
+def test_it_follows_the_golden_vectors_too():
+    """A literal transcription of the paper's sums made these; see golden/README.md."""
+    with np.load(Path(__file__).parents[1] / "golden" / "random_walk.npz") as archive:
+        golden = dict(archive)
+    q, distance_weight, radius, learning_rate, prior_frequency, spread = golden["params"]
+    twin = Reference(int(q), radius, distance_weight, learning_rate, prior_frequency, spread)
+    found = [np.nan] * len(golden["observations"])
+    for row, z in enumerate(golden["observations"]):
+        if row in golden["episode_starts"]:
+            twin.start_episode()
+        found[row] = twin.observe(z)[2]
+        if golden["actions"][row] >= 0:
+            twin.act(golden["actions"][row])
+    np.testing.assert_allclose(found, golden["jsd"], rtol=0.0, atol=1e-7)
+
+
+def test_divergence_is_between_0_and_1_bit():
+    assert divergence(np.array([1.0, 0.0]), np.array([0.0, 1.0])) == 1.0
+    assert divergence(np.array([0.3, 0.7]), np.array([0.3, 0.7])) == 0.0
+
+
+def test_it_fits_on_a_screen():
+    assert len(Path(reference.__file__).read_text("utf-8").splitlines()) <= 140

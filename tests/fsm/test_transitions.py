@@ -1,0 +1,114 @@
+"""Transition matrices and forecasts, worked out by hand on two states and two actions."""
+
+from collections import namedtuple
+
+import numba
+import numpy as np
+import pytest
+
+from evofsm.fsm.machine import EvolvingFSM
+from evofsm.fsm.transitions import retire_state
+
+# Learnt by `machine`, and by hand with phi = 1/2 and prior frequency 1/4 from
+# F = [[1/4, 1/4], [1/4, 1/4]]: action 0 led once from state 1 to 0, action 1 once from 0 to 0 and
+# once from 0 to 1.
+P = np.array([[[1 / 2, 1 / 2], [5 / 6, 1 / 6]], [[5 / 14, 9 / 14], [1 / 2, 1 / 2]]])
+F_O = np.array([[1 / 4, 3 / 4], [7 / 8, 1 / 8]])
+
+
+@pytest.fixture
+def machine():
+    """States at 0 and 1, recognised so sharply that a belief is exactly 0 or 1."""
+    machine = EvolvingFSM(
+        n_actions=2, radius=0.5, learning_rate=0.5, prior_frequency=0.25, spread=1e-6
+    )
+    machine.learn_many([[0.0], [0.0], [2.0], [1.0]], [-1, -1, -1, 0])
+    machine.learn_many([[0.0], [0.0], [1.0]], [1, 1, -1])
+    return machine
+
+
+def test_matrices_are_those_worked_out_by_hand(machine):
+    np.testing.assert_allclose(machine.transition_matrices, P, rtol=1e-15)
+    np.testing.assert_allclose(machine.origin_frequency, F_O, rtol=1e-15)
+    np.testing.assert_allclose(machine.joint_frequency, F_O[:, :, None] * P, rtol=1e-15)
+
+
+def test_marginal_matrix_weighs_all_actions_alike(machine):
+    np.testing.assert_allclose(
+        machine.marginal_matrix, [[3 / 7, 4 / 7], [2 / 3, 1 / 3]], rtol=1e-15
+    )
+
+
+@pytest.mark.parametrize("policy", ["marginal", "hold", "observed"])
+@pytest.mark.parametrize(("action", "expected"), [(0, [5 / 6, 1 / 6]), (1, [1 / 2, 1 / 2])])
+def test_one_step_ahead_the_action_alone_decides(machine, action, policy, expected):
+    assert machine.belief.tolist() == [0.0, 1.0]
+    np.testing.assert_allclose(machine.predict(action, policy=policy), expected, rtol=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("policy", "action", "horizon", "expected"),
+    [
+        ("marginal", 0, 2, [59 / 126, 67 / 126]),
+        ("marginal", 0, 3, [1469 / 2646, 1177 / 2646]),
+        ("marginal", 1, 2, [23 / 42, 19 / 42]),
+        ("hold", 0, 2, [5 / 9, 4 / 9]),
+        ("hold", 0, 3, [35 / 54, 19 / 54]),
+        ("hold", 1, 2, [3 / 7, 4 / 7]),
+        ("observed", 0, 2, [83 / 189, 106 / 189]),  # action 0 was used once, action 1 twice
+        ("observed", 0, 3, [12395 / 23814, 11419 / 23814]),
+    ],
+)
+def test_further_steps_follow_the_policy(machine, policy, action, horizon, expected):
+    np.testing.assert_allclose(machine.predict(action, horizon, policy), expected, rtol=1e-14)
+
+
+def test_the_paper_policy_is_the_default(machine):
+    np.testing.assert_array_equal(machine.predict(0, 3), machine.predict(0, 3, "marginal"))
+
+
+def test_before_any_observation_the_forecast_is_empty():
+    assert EvolvingFSM(2).predict(0).shape == (0,)
+    assert EvolvingFSM(2).predict(1, 3).shape == (0,)
+
+
+def test_at_the_start_of_an_episode_the_forecast_comes_from_the_uniform_belief(machine):
+    machine.start_episode()
+    assert machine.belief.tolist() == [0.5, 0.5]
+    np.testing.assert_allclose(machine.predict(0), [2 / 3, 1 / 3], rtol=1e-15)
+
+
+def test_a_forecast_changes_nothing(machine, snapshot):
+    machine.act(1)
+    before = snapshot(machine)
+    machine.predict(0, 5, "observed")
+    assert snapshot(machine) == before
+
+
+def test_the_step_reports_the_forecast_made_one_step_before(machine):
+    forecast = machine.predict(1)
+    machine.act(1)
+    step = machine.observe([0.0])
+    np.testing.assert_allclose(step.predicted, forecast, rtol=1e-15)
+
+
+Rows = namedtuple("Rows", "places uses matrices scales origin_frequency")
+
+
+@numba.njit
+def retire(transitions, given, n, prior):
+    retire_state(transitions, given, n, prior)
+
+
+def test_a_row_that_led_almost_surely_to_a_state_that_is_retired_still_sums_to_1():
+    random, n, given = np.random.default_rng(0), 8, 3
+    for other in np.tile(10.0 ** np.arange(-13, -6, 0.25), 20):
+        row = random.random(n)
+        row[given] = 0.0
+        row *= other / row.sum()
+        row[given] = 1.0 - row.sum()
+        matrices = np.tile(row, (1, n, 1))
+        one, rows = np.zeros(1), np.ones((1, n))
+        retire(Rows(one, one, matrices, rows, rows.copy()), given, n, 1e-3)
+        sums = np.delete(matrices[0], given, axis=0).sum(axis=1)
+        np.testing.assert_allclose(sums, 1.0, atol=1e-6, rtol=0)  # else no file of it would load
