@@ -1,8 +1,10 @@
-"""Draws the house from its imports, and fails where it is not as it should be: `make house`.
+"""Draws the house from its imports, counts its rooms, holds them to their budgets: `make house`.
 
-Rooms are the folders and files at the top of the package. A room's face is its `__init__.pyi`; what
-is not in it is private to the room. The order of the rooms stands in `pyproject.toml`, where
-import-linter reads it too. With ``--write`` the picture in CONTRIBUTING.md is drawn anew.
+Rooms are the folders and files at the top of the package; their order stands in `pyproject.toml`
+under ``tool.importlinter``, their budgets under ``tool.house``. It fails where a room imports from
+one above it or uses its private names, where modules import in a circle, where a class name stands
+in three rooms, and where a room has more lines, files or public names than its budget. With
+``--write`` the picture in CONTRIBUTING.md is drawn anew, and budgets fall to what is there and 3 %.
 """
 
 from __future__ import annotations
@@ -12,37 +14,27 @@ import ast
 import re
 import sys
 import tomllib
-from collections import Counter, defaultdict
+from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import NamedTuple
 
 import grimp
 
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "src" / "evofsm"
 PAGE = ROOT / "CONTRIBUTING.md"
+PROJECT = ROOT / "pyproject.toml"
 BEGIN, END = "<!-- house: begin -->", "<!-- house: end -->"
-
-MOST_ROOMS = 14
-MOST_PLACES = 8
+SLACK = 1.03
 
 # Of named tuples; with an underscore lest they hide a field.
 _PUBLIC = {"_asdict", "_fields", "_make", "_replace"}
-_IMPORT = re.compile(r"^(?:\s|>>> |\.\.\. )*(?:from|import) (evofsm[\w.]*)", re.MULTILINE)
 
 Arrows = Mapping[str, set[str]]
+Trees = Mapping[str, ast.Module]
 
 
-class Use(NamedTuple):
-    """Something of another room that is not in its face."""
-
-    module: str
-    line: int
-    what: str
-
-    def __str__(self) -> str:
-        return f"{self.module}, line {self.line}: {self.what}"
+# -- What there is ----------------------------------------------------------------------------
 
 
 def room_of(module: str) -> str:
@@ -50,8 +42,70 @@ def room_of(module: str) -> str:
     return module.partition(".")[2].partition(".")[0]
 
 
-def arrows_between(graph: grimp.ImportGraph) -> Arrows:
+def files_of(room: str) -> list[Path]:
+    """All files of a room, also those that are no Python; without caches."""
+    path = PACKAGE / room
+    if not path.is_dir():
+        return [path.with_suffix(".py")]
+    return [
+        file
+        for file in sorted(path.rglob("*"))
+        if file.is_file() and "__pycache__" not in file.parts
+    ]
+
+
+def lines_in(files: Iterable[Path]) -> int:
+    """Lines of Python in some files."""
+    return sum(len(file.read_text("utf-8").splitlines()) for file in files if file.suffix == ".py")
+
+
+def public_names(room: str) -> set[str]:
+    """Names that a room offers to users: those of its faces (`__init__.pyi`)."""
+    return {
+        alias.asname or alias.name
+        for face in (PACKAGE / room).rglob("__init__.pyi")
+        for node in ast.walk(ast.parse(face.read_text("utf-8")))
+        if isinstance(node, ast.ImportFrom)
+        for alias in node.names
+    }
+
+
+def words_in(folder: Path) -> int:
+    """Words of the pages in a folder, and of the README."""
+    pages = [page for kind in ("*.md", "*.rst") for page in folder.rglob(kind)]
+    return sum(len(page.read_text("utf-8").split()) for page in [*pages, ROOT / "README.md"])
+
+
+def commands() -> int:
+    """Commands of ``evofsm``."""
+    from evofsm.__main__ import application
+
+    app = application()
+    return len(app.registered_commands) + len(app.registered_groups)
+
+
+def sources(package: Path = PACKAGE) -> dict[str, ast.Module]:
+    """Every module of a package by its dotted name."""
+    found = {}
+    for path in sorted(package.rglob("*.py")):
+        parts = path.relative_to(package.parent).with_suffix("").parts
+        found[".".join(parts).removesuffix(".__init__")] = ast.parse(path.read_text("utf-8"))
+    return found
+
+
+# -- How it hangs together --------------------------------------------------------------------
+
+
+def floors() -> list[set[str]]:
+    """The rooms of each floor, from the ground up."""
+    settings = tomllib.loads(PROJECT.read_text("utf-8"))
+    layers = settings["tool"]["importlinter"]["contracts"][0]["layers"]
+    return [{room.strip() for room in layer.split("|")} for layer in reversed(layers)]
+
+
+def arrows_between() -> Arrows:
     """The modules that each module imports, imports for types included."""
+    graph = grimp.build_graph(PACKAGE.name, exclude_type_checking_imports=False, cache_dir=None)
     return {
         module: set(graph.find_modules_directly_imported_by(module))
         for module in graph.modules
@@ -68,39 +122,26 @@ def rooms_between(modules: Arrows) -> Arrows:
 
 
 def circles(arrows: Arrows) -> list[list[str]]:
-    """Groups in which each can be reached from each other one (Tarjan 1972)."""
-    found: list[list[str]] = []
-    index: dict[str, int] = {}
-    low: dict[str, int] = {}
-    stack: list[str] = []
-
-    def visit(node: str) -> None:
-        index[node] = low[node] = len(index)
-        stack.append(node)
-        for other in sorted(arrows.get(node, ())):
-            if other not in index:
-                visit(other)
-                low[node] = min(low[node], low[other])
-            elif other in stack:
-                low[node] = min(low[node], index[other])
-        if low[node] == index[node]:
-            group = stack[stack.index(node) :]
-            del stack[stack.index(node) :]
-            if len(group) > 1:
-                found.append(sorted(group))
-
-    sys.setrecursionlimit(10_000)
-    for node in sorted(arrows):
-        if node not in index:
-            visit(node)
-    return found
-
-
-def floors() -> list[set[str]]:
-    """The rooms of each floor, from the ground up."""
-    settings = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))
-    layers = settings["tool"]["importlinter"]["contracts"][0]["layers"]
-    return [{room.strip() for room in layer.split("|")} for layer in reversed(layers)]
+    """Groups in which each can be reached from each other one."""
+    reached = {node: set(others) for node, others in arrows.items()}
+    grown = True
+    while grown:
+        grown = False
+        for node, others in reached.items():
+            further = set().union(others, *(reached.get(other, ()) for other in others))
+            grown |= further != others
+            reached[node] = further
+    inside = [node for node in sorted(reached) if node in reached[node]]
+    return [
+        group
+        for node in inside
+        if (
+            group := [
+                other for other in inside if other in reached[node] and node in reached[other]
+            ]
+        )
+        and group[0] == node
+    ]
 
 
 def arrows_up(rooms: Arrows) -> list[str]:
@@ -114,27 +155,7 @@ def arrows_up(rooms: Arrows) -> list[str]:
     ]
 
 
-def sources() -> dict[str, ast.Module]:
-    """Every module of the package by its dotted name."""
-    found = {}
-    for path in sorted(PACKAGE.rglob("*.py")):
-        parts = path.relative_to(PACKAGE.parent).with_suffix("").parts
-        found[".".join(parts).removesuffix(".__init__")] = ast.parse(path.read_text("utf-8"))
-    return found
-
-
-def imports_past_a_face(trees: Mapping[str, ast.Module]) -> Iterator[Use]:
-    """Imports from within another room."""
-    for module, tree in trees.items():
-        for node in ast.walk(tree):
-            if not isinstance(node, ast.ImportFrom) or not (node.module or "").startswith("evofsm"):
-                continue
-            home = node.module or ""
-            if room_of(home) not in ("", room_of(module)) and home.count(".") > 1:
-                yield Use(module, node.lineno, f"from {home} import ...")
-
-
-def private_names(trees: Mapping[str, ast.Module]) -> Iterator[Use]:
+def private_names(trees: Trees) -> Iterator[str]:
     """Names with an underscore that only other rooms define."""
     defined: dict[str, set[str]] = defaultdict(set)
     for module, tree in trees.items():
@@ -144,7 +165,7 @@ def private_names(trees: Mapping[str, ast.Module]) -> Iterator[Use]:
         for name, line in _names_used(tree):
             is_private = name.startswith("_") and not name.startswith("__")
             if is_private and name in ours - defined[room_of(module)] - _PUBLIC:
-                yield Use(module, line, name)
+                yield f"{module}, line {line}: {name}"
 
 
 def _names_defined(tree: ast.Module) -> Iterator[str]:
@@ -164,21 +185,27 @@ def _names_used(tree: ast.Module) -> Iterator[tuple[str, int]]:
             yield from ((name.name, node.lineno) for name in node.names)
 
 
-def places() -> Counter[str]:
-    """How often README, docs and examples import from each place."""
-    files = [ROOT / "README.md"]
-    for folder, kinds in (("docs", ("*.md", "*.rst")), ("examples", ("*.py",))):
-        files += [path for kind in kinds for path in sorted((ROOT / folder).rglob(kind))]
-    return Counter(
-        found for path in files for found in _IMPORT.findall(path.read_text(encoding="utf-8"))
-    )
+def repeated_classes(trees: Trees) -> list[str]:
+    """Class names that stand in three rooms or more."""
+    homes: dict[str, set[str]] = defaultdict(set)
+    for module, tree in trees.items():
+        for node in ast.walk(tree):
+            if isinstance(node, ast.ClassDef):
+                homes[node.name].add(room_of(module))
+    return [
+        f"{name}: {', '.join(sorted(rooms))}" for name, rooms in homes.items() if len(rooms) > 2
+    ]
 
 
-def lines_of(room: str) -> int:
-    """Lines of Python in a room."""
-    path = PACKAGE / room
-    files = path.rglob("*.py") if path.is_dir() else [path.with_suffix(".py")]
-    return sum(len(file.read_text("utf-8").splitlines()) for file in files)
+def imports_past_a_face(trees: Trees) -> Iterator[str]:
+    """Imports of studies from within a room: they see what users see."""
+    for module, tree in trees.items():
+        for node in ast.walk(tree):
+            if isinstance(node, ast.ImportFrom) and re.match(r"evofsm\.\w+\.", node.module or ""):
+                yield f"{module}, line {node.lineno}: from {node.module} import ..."
+
+
+# -- What is said -----------------------------------------------------------------------------
 
 
 def about(room: str) -> str:
@@ -215,43 +242,93 @@ def page_with(drawn: str) -> str:
     return f"{head}{BEGIN}\n{drawn}\n{END}{rest.split(END)[1]}"
 
 
-def report(name: str, found: Iterable[object], most: int) -> bool:
-    """Print how many there are of what, and those that are too many; whether there are."""
+def counted() -> dict[str, dict[str, int]]:
+    """Lines, files and public names of each room, and what is counted outside of rooms."""
+    rooms = [room for floor in reversed(floors()) for room in sorted(floor)]
+    files = {room: files_of(room) for room in rooms}
+    found = {
+        "lines": {room: lines_in(files[room]) for room in rooms},
+        "files": {room: len(files[room]) for room in rooms},
+        "names": {room: len(public_names(room)) for room in rooms},
+    }
+    faces = [PACKAGE / name for name in ("__init__.py", "__init__.pyi", "py.typed")]
+    found["all"] = {
+        "src": sum(found["lines"].values()) + lines_in(faces),
+        "files": sum(found["files"].values()) + len(faces),
+        "names": sum(found["names"].values()),
+        "commands": commands(),
+        "studies": lines_in((ROOT / "studies").rglob("*.py")),
+        "tests": lines_in((ROOT / "tests").rglob("*.py")),
+        "words": words_in(ROOT / "docs"),
+    }
+    return found
+
+
+def lower(found: Mapping[str, Mapping[str, int]], budgets: Mapping[str, Mapping[str, int]]) -> None:
+    """Write budgets that fall to what is there and 3 %; none is raised."""
+    text = PROJECT.read_text("utf-8")
+    for table, entries in budgets.items():
+        for name, budget in entries.items():
+            needed = found[table].get(name, 0)
+            least = (
+                round(SLACK * needed)
+                if table == "lines" or name in ("src", "tests", "studies", "words")
+                else needed
+            )
+            head, rest = text.split(f"[tool.house.{table}]\n")
+            rest = re.sub(
+                rf"^{name} = \d+", f"{name} = {min(budget, least)}", rest, count=1, flags=re.M
+            )
+            text = f"{head}[tool.house.{table}]\n{rest}"
+    PROJECT.write_text(text, "utf-8")
+
+
+def report(name: str, found: Iterable[object], most: int = 0) -> bool:
+    """Print how many there are of what should not be, and them if they are more than allowed."""
     all_found = list(found)
-    print(f"{len(all_found):6,}  {name} (at most {most})")
+    print(f"{len(all_found):7,}  {name} (at most {most})")
     if len(all_found) <= most:
         return False
     for one in all_found:
-        print(f"        {one}")
+        print(f"         {one}")
     return True
 
 
 def main() -> int:
     """Print the house; 1 where something is not as it should be."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--write", action="store_true", help="draw the picture anew")
+    parser.add_argument("--write", action="store_true", help="draw the picture anew, lower budgets")
     arguments = parser.parse_args()
-    graph = grimp.build_graph(PACKAGE.name, exclude_type_checking_imports=False, cache_dir=None)
-    modules, trees = arrows_between(graph), sources()
+    modules, trees, found = arrows_between(), sources(), counted()
     rooms = rooms_between(modules)
     drawn = page_with(picture(rooms))
+    budgets = tomllib.loads(PROJECT.read_text("utf-8"))["tool"]["house"]
+    faults = budgets.pop("faults")
     if arguments.write:
         PAGE.write_text(drawn, "utf-8")
-    for floor in reversed(floors()):
-        for room in sorted(floor):
-            print(f"{lines_of(room):6,}  {room:<9} {', '.join(sorted(rooms[room]))}")
-    print(f"{sum(lines_of(room) for floor in floors() for room in floor):6,}  lines of Python")
-    past = [str(use) for use in imports_past_a_face(trees)]
+        lower(found, budgets)
+    print("  lines  files  names  room")
+    for room, lines in found["lines"].items():
+        others = ", ".join(sorted(rooms[room]))
+        print(f"{lines:7,} {found['files'][room]:6} {found['names'][room]:6}  {room:<9} {others}")
+    for what, count in found["all"].items():
+        print(f"{count:7,}  {what} (at most {budgets['all'][what]:,})")
+    over = [
+        f"{name}: {found[table][name]:,} {table}, {budget:,} allowed"
+        for table, entries in budgets.items()
+        for name, budget in entries.items()
+        if found[table].get(name, 0) > budget
+    ]
     stale = [PAGE.name] if drawn != PAGE.read_text("utf-8") else []
+    studies = sources(ROOT / "studies")
     wrong = [
-        report("rooms at the top", [room for floor in floors() for room in floor], MOST_ROOMS),
-        report("circles of rooms", circles(rooms), 0),
-        report("circles of modules", circles(modules), 0),
-        report("arrows up", arrows_up(rooms), 0),
-        report("imports past a face", past, 0),
-        report("private names across rooms", private_names(trees), 0),
-        report("places that README, docs and examples import from", places(), MOST_PLACES),
-        report("pictures that are out of date", stale, 0),
+        report("over budget", over),
+        report("circles", [*circles(rooms), *circles(modules)]),
+        report("arrows up", arrows_up(rooms)),
+        report("private names across rooms", private_names(trees)),
+        report("class names in three rooms", repeated_classes(trees), faults["classes"]),
+        report("imports of studies past a face", imports_past_a_face(studies), faults["past"]),
+        report("pictures that are out of date", stale),
     ]
     return int(any(wrong))
 
