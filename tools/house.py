@@ -4,7 +4,8 @@ Rooms are the folders and files at the top of the package; their order stands in
 under ``tool.importlinter``, their budgets under ``tool.house``. It fails where a room imports from
 one above it or uses its private names, where modules import in a circle, where a class name stands
 in three rooms, and where a room has more lines, files or public names than its budget. With
-``--write`` the picture in CONTRIBUTING.md is drawn anew, and budgets fall to what is there and 3 %.
+``--draw`` the picture in CONTRIBUTING.md is drawn anew; with ``--lower`` budgets fall to what is
+there and 3 %.
 """
 
 from __future__ import annotations
@@ -297,15 +298,17 @@ def report(name: str, found: Iterable[object], most: int = 0) -> bool:
 def main() -> int:
     """Print the house; 1 where something is not as it should be."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--write", action="store_true", help="draw the picture anew, lower budgets")
+    parser.add_argument("--draw", action="store_true", help="draw the picture anew")
+    parser.add_argument("--lower", action="store_true", help="lower budgets to what is there")
     arguments = parser.parse_args()
     modules, trees, found = arrows_between(), sources(), counted()
     rooms = rooms_between(modules)
     drawn = page_with(picture(rooms))
     budgets = tomllib.loads(PROJECT.read_text("utf-8"))["tool"]["house"]
     faults = budgets.pop("faults")
-    if arguments.write:
+    if arguments.draw:
         PAGE.write_text(drawn, "utf-8")
+    if arguments.lower:
         lower(found, budgets)
     print("  lines  files  names  room")
     for room, lines in found["lines"].items():
