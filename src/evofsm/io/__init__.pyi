@@ -5,17 +5,16 @@ from .files import silent as silent
 from .following import ACTION as ACTION
 from .foxglove import FOXGLOVE_LAYOUT as FOXGLOVE_LAYOUT
 from .foxglove import FoxgloveSink as FoxgloveSink
-from .graphs import to_mermaid as to_mermaid
+from .graphs import to_dot as to_dot
+from .graphs import to_networkx as to_networkx
+from .graphs import to_prism as to_prism
 from .mcap import RecordedEpisode as RecordedEpisode
 from .mcap import Run as Run
 from .mcap import RunWriter as RunWriter
 from .mcap import read_run as read_run
 from .mcap import recording as recording
 from .mcap import write_run as write_run
-from .process import Process as Process
-from .process import process_of as process_of
 from .rosbag import Topics as Topics
-from .sumo_gui import write_replay as write_replay
 from .tables import CsvTable as CsvTable
 from .tables import ParquetTable as ParquetTable
 from .traces import Chunk as Chunk
@@ -25,6 +24,3 @@ from .traces import Noted as Noted
 from .traces import read_traces as read_traces
 from .traces import rows_of as rows_of
 from .units import parse_units as parse_units
-from .verifying import Property as Property
-from .verifying import solve as solve
-from .verifying import solve_by_storm as solve_by_storm

@@ -1,45 +1,37 @@
 """A learnt machine as a graph or a Markov decision process, in the formats of others' tools.
 
-DOT is Graphviz's language, Mermaid is what GitHub draws within a page, GraphML is read by yEd,
-Gephi and networkx, and PRISM's language by the model checkers PRISM and Storm. All count states and
-actions from 1, as people read them.
-
-Every number that was learnt stands beside the evidence for it: a probability may come from one
-observation, or from the prior alone.
+All count states and actions from 1, as people read them. Every number that was learnt comes with
+the evidence for it: a probability may come from one observation, or from the prior alone.
 """
 
 from __future__ import annotations
 
-import re
-from collections.abc import Collection, Iterator, Mapping, Sequence
-from typing import NamedTuple
-from xml.etree import ElementTree as ET
+from collections.abc import Collection, Iterator
+from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
+from evofsm.extras import needs
 from evofsm.fsm import FSMModel, Policy
-from evofsm.io.process import Command, process_of, refuse_no_probability
+
+if TYPE_CHECKING:
+    import networkx
 
 # Vermillion of Okabe and Ito's colours; what is marked by it has another shape and words as well.
 _DEAD_END = "#D55E00"
 _DOT_MARK = (
     f',\n      shape=hexagon, style=filled, fillcolor="{_DEAD_END}", fontcolor=white, penwidth=2'
 )
+_DOT_HEAD = """digraph evofsm {
+  graph [rankdir=LR, fontname="Helvetica", fontsize=10, labelloc=b,
+         label="An edge: probability (times seen); dashed: never seen"];
+  node [shape=ellipse, fontname="Helvetica", fontsize=10];
+  edge [fontname="Helvetica", fontsize=9];"""
 # Width of the largest node beyond the smallest [inch], and of the line of a certain edge [point].
 _LARGEST_NODE, _WIDEST_LINE = 1.2, 3.0
-_GRAPHML = "http://graphml.graphdrawing.org/xmlns"
-
-
-class _Graph(NamedTuple):
-    """What all graphs show."""
-
-    lines: list[list[str]]  # what stands in each state
-    marked: frozenset[int]  # states that are drawn as dead ends
-    edges: list[tuple[int, int, float, float]]  # from, to, probability and how often it was seen
-
-
-def _label(probability: float, seen: float) -> str:
-    return f"{probability:.3f} ({seen:,.0f})"
+# Probabilities of a process have so many decimals; those of a command add up to 1 exactly.
+_DECIMALS = 12
 
 
 def to_dot(
@@ -66,8 +58,8 @@ def to_dot(
     self_loops : bool
         Whether edges from a state to itself are drawn.
     dead_ends : collection of int, optional
-        Indices of the states to be called dead ends, from 0, as `by_state` finds them.
-        Without it, those in which failures ended are marked.
+        Indices of the states to be called dead ends, from 0. Without it, those in which failures
+        ended are marked.
 
     Returns
     -------
@@ -102,81 +94,28 @@ def to_dot(
     }
     <BLANKLINE>
     """
-    graph = _graph(model, policy, least, evidence, self_loops, dead_ends)
-    lines = [
-        "digraph evofsm {",
-        '  graph [rankdir=LR, fontname="Helvetica", fontsize=10, labelloc=b,',
-        '         label="An edge: probability (times seen); dashed: never seen"];',
-        '  node [shape=ellipse, fontname="Helvetica", fontsize=10];',
-        '  edge [fontname="Helvetica", fontsize=9];',
-    ]
+    marked = _marked(model, dead_ends)
+    lines = [_DOT_HEAD]
     most = model.visits.max(initial=0.0) or 1.0
-    for state, texts in enumerate(graph.lines):
-        label = r"\n".join(_dot_text(text) for text in texts)
+    for state in range(model.n_states):
+        texts = [f"#{state + 1}", *_where(model, state), _counted(model.visits[state], "visit")]
+        if ends := model.endings[state]:
+            share = ends / model.endings.sum()
+            texts.append(f"{_counted(ends, 'failure')}, {share:.0%} of all")
+        if dead_ends is not None and state in marked:
+            texts.append("dead end")
+        label = r"\n".join(text.replace("\\", r"\\").replace('"', r"\"") for text in texts)
         width = 0.75 + _LARGEST_NODE * (model.visits[state] / most) ** 0.5
-        marked = _DOT_MARK if state in graph.marked else ""
-        lines.append(f'  s{state + 1} [label="{label}", width={width:.2f}{marked}];')
-    for i, j, probability, seen in graph.edges:
-        width = max(_WIDEST_LINE * probability, 0.3)
-        told = f'label="{_label(probability, seen)}", penwidth={width:.2f}'
-        lines.append(f"  s{i + 1} -> s{j + 1} [{told}{'' if seen else ', style=dashed'}];")
+        mark = _DOT_MARK if state in marked else ""
+        lines.append(f'  s{state + 1} [label="{label}", width={width:.2f}{mark}];')
+    for i, j, chance, seen in _edges(model, policy, least, evidence, self_loops):
+        width, dashes = max(_WIDEST_LINE * chance, 0.3), "" if seen else ", style=dashed"
+        label = f'label="{chance:.3f} ({seen:,.0f})", penwidth={width:.2f}'
+        lines.append(f"  s{i + 1} -> s{j + 1} [{label}{dashes}];")
     return "\n".join([*lines, "}", ""])
 
 
-def to_mermaid(
-    model: FSMModel,
-    policy: Policy = "observed",
-    least: float = 0.001,
-    evidence: float = 1.0,
-    *,
-    self_loops: bool = True,
-    dead_ends: Collection[int] | None = None,
-) -> str:
-    """The states and transitions as a Mermaid flowchart, which GitHub draws in Markdown.
-
-    Parameters
-    ----------
-    model, policy, least, evidence, self_loops, dead_ends
-        As in `to_dot`.
-
-    Returns
-    -------
-    str
-        The flowchart, to stand in a block of code marked ``mermaid``. Hexagons are the states that
-        are marked; dotted edges, if drawn, were never seen.
-
-    Raises
-    ------
-    ValueError
-        As `to_dot`.
-
-    Examples
-    --------
-    >>> from evofsm import EvolvingFSM
-    >>> machine = EvolvingFSM(n_actions=2, radius=0.5)
-    >>> trace = machine.learn_many([[0.0], [0.1], [2.0], [1.0]], [0, 0, 0, 0], failures=[3])
-    >>> print(to_mermaid(machine.model(names=["gap"], units=["m"]), least=0.6))
-    flowchart LR
-      s1(["#35;1<br/>gap 0 m<br/>3 visits"])
-      s2{{"#35;2<br/>gap 1 m<br/>1 visit<br/>1 failure, 100% of all"}}:::marked
-      s1 -->|"0.771 (2)"| s1
-      classDef marked fill:#D55E00,color:#fff,stroke:#222,stroke-width:2px
-    <BLANKLINE>
-    """
-    graph = _graph(model, policy, least, evidence, self_loops, dead_ends)
-    lines = ["flowchart LR"]
-    for state, texts in enumerate(graph.lines):
-        label = "<br/>".join(_mermaid_text(text) for text in texts)
-        shape = f'{{{{"{label}"}}}}:::marked' if state in graph.marked else f'(["{label}"])'
-        lines.append(f"  s{state + 1}{shape}")
-    for i, j, probability, seen in graph.edges:
-        arrow = "-->" if seen else "-.->"
-        lines.append(f'  s{i + 1} {arrow}|"{_label(probability, seen)}"| s{j + 1}')
-    lines.append(f"  classDef marked fill:{_DEAD_END},color:#fff,stroke:#222,stroke-width:2px")
-    return "\n".join([*lines, ""])
-
-
-def to_graphml(
+def to_networkx(
     model: FSMModel,
     policy: Policy = "observed",
     least: float = 0.0,
@@ -184,8 +123,8 @@ def to_graphml(
     *,
     self_loops: bool = True,
     dead_ends: Collection[int] | None = None,
-) -> str:
-    """The states and transitions as GraphML, for yEd, Gephi, networkx and others.
+) -> networkx.DiGraph[int]:
+    """The states and transitions as a graph of networkx, which writes GraphML and more.
 
     Parameters
     ----------
@@ -194,13 +133,15 @@ def to_graphml(
 
     Returns
     -------
-    str
-        An XML document. Nodes have ``label``, ``visits``, ``founded``, ``failures``, ``dead_end``
-        and a ``center.NAME`` for each variable, whose unit stands in the key's description; edges
-        have ``probability`` and ``changes``, how often the change was seen.
+    networkx.DiGraph
+        Its nodes are the states, from 1, with ``label``, ``visits``, ``created``, ``failures``,
+        ``dead_end`` and a ``center.NAME`` for each variable; edges have ``probability`` and
+        ``changes``, how often the change was seen.
 
     Raises
     ------
+    ModuleNotFoundError
+        If networkx is not installed.
     ValueError
         As `to_dot`.
 
@@ -209,114 +150,72 @@ def to_graphml(
     >>> from evofsm import EvolvingFSM
     >>> machine = EvolvingFSM(n_actions=2, radius=0.5)
     >>> trace = machine.learn_many([[0.0], [0.1], [2.0], [1.0]], [0, 0, 0, 0])
-    >>> document = to_graphml(machine.model(names=["gap"], units=["m"]))
-    >>> [line.strip() for line in document.splitlines() if "center" in line][0]
-    '<key id="center1" for="node" attr.name="center.gap" attr.type="double">'
+    >>> graph = to_networkx(machine.model(names=["gap"], units=["m"]))
+    >>> graph.nodes[2]["center.gap"], round(graph.edges[1, 2]["probability"], 3)
+    (1.0, 0.229)
     """
-    graph = _graph(model, policy, least, evidence, self_loops, dead_ends)
-    root = ET.Element("graphml", xmlns=_GRAPHML)
-    of_nodes = {"label": "string", "visits": "double", "founded": "double", "failures": "double"}
-    for name, kind in {**of_nodes, "dead_end": "boolean"}.items():
-        _key(root, name, "node", name, kind)
-    for place, (name, unit) in enumerate(zip(*_variables(model), strict=True), 1):
-        key = _key(root, f"center{place}", "node", f"center.{name or place}", "double")
-        ET.SubElement(key, "desc").text = _xml_text(unit) or "no unit"
-    for name in ("probability", "changes"):
-        _key(root, name, "edge", name, "double")
-    parent = ET.SubElement(root, "graph", id="evofsm", edgedefault="directed")
+    with needs("networkx", "graph", "GraphML"):
+        import networkx
+    marked = _marked(model, dead_ends)
+    graph = networkx.DiGraph()
+    names = model.names or [str(place) for place in range(1, model.n_variables + 1)]
     for i, center in enumerate(model.centers.tolist()):
-        data = {
-            "label": f"#{i + 1}",
-            "visits": float(model.visits[i]),
-            "founded": float(model.founded[i]),
-            "failures": float(model.endings[i]),
-            "dead_end": str(i in graph.marked).lower(),
-            **{f"center{place}": value for place, value in enumerate(center, 1)},
-        }
-        _data(ET.SubElement(parent, "node", id=f"s{i + 1}"), data)
-    for i, j, probability, seen in graph.edges:
-        edge = ET.SubElement(parent, "edge", source=f"s{i + 1}", target=f"s{j + 1}")
-        _data(edge, {"probability": probability, "changes": seen})
-    ET.indent(root)
-    return "<?xml version='1.0' encoding='UTF-8'?>\n" + ET.tostring(root, "unicode") + "\n"
+        graph.add_node(
+            i + 1,
+            label=f"#{i + 1}",
+            visits=float(model.visits[i]),
+            created=float(model.founded[i]),
+            failures=float(model.endings[i]),
+            dead_end=i in marked,
+            **{f"center.{_shown(name)}": x for name, x in zip(names, center, strict=True)},
+        )
+    for i, j, probability, seen in _edges(model, policy, least, evidence, self_loops):
+        graph.add_edge(i + 1, j + 1, probability=probability, changes=seen)
+    return graph
 
 
-def _graph(
-    model: FSMModel,
-    policy: Policy,
-    least: float,
-    evidence: float,
-    self_loops: bool,
-    dead_ends: Collection[int] | None,
-) -> _Graph:
-    refuse_no_probability(least)
+def _marked(model: FSMModel, dead_ends: Collection[int] | None) -> frozenset[int]:
     ended = np.flatnonzero(model.endings) if dead_ends is None else dead_ends
     marked = frozenset(int(state) for state in ended)
     if beyond := sorted(state for state in marked if not 0 <= state < model.n_states):
         raise ValueError(f"dead_ends names {beyond}; the model has {model.n_states} states, from 0")
-    lines = []
-    for state in range(model.n_states):
-        texts = [f"#{state + 1}", *_where(model, state), _counted(model.visits[state], "visit")]
-        if ends := model.endings[state]:
-            share = ends / model.endings.sum()
-            texts.append(f"{_counted(ends, 'failure')}, {share:.0%} of all")
-        if dead_ends is not None and state in marked:
-            texts.append("dead end")
-        lines.append(texts)
+    return marked
+
+
+def _edges(
+    model: FSMModel, policy: Policy, least: float, evidence: float, self_loops: bool
+) -> Iterator[tuple[int, int, float, float]]:
+    """From, to, probability and how often it was seen."""
+    _refuse_no_probability(least)
     matrix = model.averaged_matrix(policy)
     drawn = (matrix >= least) & (model.changes >= evidence) & (matrix > 0.0)
-    edges = [
-        (i, j, float(matrix[i, j]), float(model.changes[i, j]))
-        for i, j in np.argwhere(drawn).tolist()
-        if self_loops or i != j
-    ]
-    return _Graph(lines, marked, edges)
+    for i, j in np.argwhere(drawn).tolist():
+        if self_loops or i != j:
+            yield i, j, float(matrix[i, j]), float(model.changes[i, j])
+
+
+def _refuse_no_probability(least: float) -> None:
+    if not 0.0 <= least <= 1.0:
+        raise ValueError(f"least is {least}; it must be a probability, from 0 to 1")
 
 
 def _where(model: FSMModel, state: int) -> list[str]:
     """Name, value and unit of each variable at the centre of a state."""
-    return [
-        " ".join(part for part in (_one_line(name), f"{value:.4g}", _one_line(unit)) if part)
-        for name, unit, value in zip(*_variables(model), model.centers[state], strict=True)
-    ]
-
-
-def _variables(model: FSMModel) -> tuple[Sequence[str], Sequence[str]]:
-    """Names and units of the variables, empty where the model has none."""
     nothing = ("",) * model.n_variables
-    return model.names or nothing, model.units or nothing
+    variables = zip(model.names or nothing, model.units or nothing, strict=True)
+    return [
+        " ".join(part for part in (_shown(name), f"{value:.4g}", _shown(unit)) if part)
+        for (name, unit), value in zip(variables, model.centers[state], strict=True)
+    ]
 
 
 def _counted(number: float, what: str) -> str:
     return f"{number:,.0f} {what}{'' if round(number) == 1 else 's'}"
 
 
-def _one_line(text: str) -> str:
-    return " ".join(text.split())
-
-
-def _dot_text(text: str) -> str:
-    return _one_line(text).replace("\\", r"\\").replace('"', r"\"")
-
-
-def _mermaid_text(text: str) -> str:
-    """With Mermaid's own codes for what it would take for its syntax."""
-    return re.sub(r"[#\"&<>`]", lambda sign: f"#{ord(sign[0])};", _one_line(text))
-
-
-def _xml_text(text: str) -> str:
-    """Without the control characters that no XML may hold."""
-    return re.sub(r"[^\t\n\r -\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]", "", text)
-
-
-def _key(root: ET.Element, key: str, of: str, name: str, kind: str) -> ET.Element:
-    told = {"id": key, "for": of, "attr.name": _xml_text(name), "attr.type": kind}
-    return ET.SubElement(root, "key", told)
-
-
-def _data(element: ET.Element, values: Mapping[str, str | float]) -> None:
-    for key, value in values.items():
-        ET.SubElement(element, "data", key=key).text = str(value)
+def _shown(text: str) -> str:
+    """In one line, without the control characters that no XML may hold."""
+    return "".join(sign for sign in " ".join(text.split()) if sign.isprintable())
 
 
 # -- PRISM ----------------------------------------------------------------------------------------
@@ -341,7 +240,7 @@ def to_prism(
         Transitions to states below this probability are left out, and the others made to add up
         to 1; failure is never left out.
     first : int, optional
-        The state that it begins in, from 1 as people count; the one that was founded first if not
+        The state that it begins in, from 1 as people count; the one that was created first if not
         given.
 
     Returns
@@ -388,26 +287,38 @@ def to_prism(
     label "state_2" = s=2;
     <BLANKLINE>
     """
-    process = process_of(model, evidence, least)
+    _refuse_no_probability(least)
     n = model.n_states
-    begin = process.checked(first)
-    body: list[str] = []
-    for state, commands in enumerate(process.commands):
-        remark = "" if commands else ": no action has the evidence"
-        body += ["", f"  // {_described(model, state)}{remark}"]
-        for command in commands:
-            body += _written(model, state, command)
-        if not commands:
+    if not evidence > 0.0:
+        raise ValueError(f"evidence is {evidence}; it must be positive")
+    if not model.decisions.any():
+        raise ValueError(
+            "the model counted no decisions, so there is no action to choose (has its machine been "
+            "told its actions?)"
+        )
+    begin = int(np.argmin(model.founded)) + 1 if first is None else first
+    if not 1 <= begin <= n:
+        raise ValueError(f"there is no state #{begin}; there are #1 to #{n}")
+    body, unknown = list[str](), list[int]()
+    for state in range(n):
+        about = [f"#{state + 1}", *(_where(model, state) if model.names else [])]
+        body += ["", f"  // {', '.join([*about, _counted(model.visits[state], 'visit')])}"]
+        actions = np.flatnonzero(model.decisions[:, state] >= evidence).tolist()
+        for action in actions:
+            body += _command(model, state, action, least)
+        if not actions:
+            unknown.append(state + 1)
+            body[-1] += ": no action has the evidence"
             body.append(f"  [unknown] s={state + 1} -> 1:(s'={state + 1});")
-    unknown = process.unknown
-    labels = [f'label "state_{i}" = s={i};' for i in range(1, n + 1)]
     nowhere = " | ".join(f"s={i}" for i in unknown) or "false"
     lines = [
         *_header(model, evidence, least, len(unknown)),
         *("mdp", "", "module evofsm", f"  s : [0..{n}] init {begin};"),
         *body,
         *("", "  [failed] s=0 -> 1:(s'=0);", "endmodule", ""),
-        *('label "failed" = s=0;', f'label "unknown" = {nowhere};', *labels, ""),
+        *('label "failed" = s=0;', f'label "unknown" = {nowhere};'),
+        *(f'label "state_{i}" = s={i};' for i in range(1, n + 1)),
+        "",
     ]
     return "\n".join(lines)
 
@@ -417,7 +328,7 @@ def _header(model: FSMModel, evidence: float, least: float, unknown: int) -> lis
     tried = model.decisions > 0.0
     few = tried & (model.decisions < evidence)
     lost = model.decisions[few].sum() / model.decisions.sum()
-    told = [
+    lines = [
         f"A machine of {model.n_states} states and {model.n_actions} actions, learnt by evofsm.",
         "s=0 is failure, s=i the state #i. Comments say how many decisions a command rests on, how",
         "many of them failed, and how often a change was seen after whatever action: seen 0 is the",
@@ -427,28 +338,37 @@ def _header(model: FSMModel, evidence: float, least: float, unknown: int) -> lis
         f"{few.sum():,} that rest on fewer than {evidence:g} decisions ({lost:.2%} of all).",
         f"States left without any action, absorbing and labelled unknown: {unknown}.",
     ]
+    if not model.failures.any():
+        lines.append("NO DECISION FAILED, or nothing told of failures: a probability of failure")
+        lines.append("that is computed from this process is 0 for want of knowledge.")
     if least > 0.0:
-        told.append(f"Transitions below {least:g} are left out as well.")
+        lines.append(f"Transitions below {least:g} are left out as well.")
     if model.dt is not None:
-        told.append(f"A step is {model.dt:g} s.")
+        lines.append(f"A step is {model.dt:g} s.")
     if model.actions is not None:
-        told += ["", "Actions:"]
-        told += [f"  a{a + 1}: {model.actions.label(a)}" for a in range(model.n_actions)]
-    return [f"// {line}".rstrip() for line in told] + [""]
+        lines += ["", "Actions:"]
+        lines += [f"  a{a + 1}: {model.actions.label(a)}" for a in range(model.n_actions)]
+    return [f"// {line}".rstrip() for line in lines] + [""]
 
 
-def _described(model: FSMModel, state: int) -> str:
-    where = _where(model, state) if model.names else []
-    return ", ".join([f"#{state + 1}", *where, _counted(model.visits[state], "visit")])
-
-
-def _written(model: FSMModel, state: int, command: Command) -> Iterator[str]:
-    """A command in PRISM's language, with what it rests on."""
-    action, decided, failed, _ = command
+def _command(model: FSMModel, state: int, action: int, least: float) -> Iterator[str]:
+    """What an action does in a state, with what it rests on."""
+    decided, failed = model.decisions[action, state], model.failures[action, state]
+    row = model.transition_matrices[action, state]
+    row = np.where(row >= min(least, row.max()), row, 0.0)
+    share = failed / decided
+    parts = _parts(np.concatenate([[share], (1.0 - share) * row / row.sum()]))
     seen = [f"failed {failed:.4g}", *(f"seen {count:g}" for count in model.changes[state])]
-    rests = f"{decided:.4g} decisions; a{action + 1} was used {model.uses[action]:,.0f} times"
-    updates = command.decimals
-    yield f"  [a{action + 1}] s={state + 1} -> // {rests}"
-    for target, probability in updates:
-        end = ";" if target == updates[-1][0] else " +"
-        yield f"    {probability}:(s'={target}){end} // {seen[target]}"
+    used = f"a{action + 1} was used {model.uses[action]:,.0f} times"
+    yield f"  [a{action + 1}] s={state + 1} -> // {decided:.4g} decisions; {used}"
+    for target, part in parts:
+        chance = "1" if part == 10**_DECIMALS else f"0.{part:0{_DECIMALS}d}"
+        end = ";" if target == parts[-1][0] else " +"
+        yield f"    {chance}:(s'={target}){end} // {seen[target]}"
+
+
+def _parts(chances: NDArray[np.float64]) -> list[tuple[int, int]]:
+    """Places and probabilities in integer parts whose sum is 1 to the last digit."""
+    parts: list[int] = np.rint(chances * 10**_DECIMALS).astype(np.int64).tolist()
+    parts[int(np.argmax(parts))] += 10**_DECIMALS - sum(parts)
+    return [(place, part) for place, part in enumerate(parts) if part]

@@ -1,6 +1,6 @@
 """What all figures share: size, type, colours, and how a state looks.
 
-The same colours stand in ``io/graphs.py``, ``io/sumo_gui.py`` and ``cli/watch/live/page.css``.
+The same colours stand in ``io/graphs.py`` and ``cli/watch/live/page.css``.
 """
 
 from __future__ import annotations

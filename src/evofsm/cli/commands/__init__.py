@@ -40,12 +40,11 @@ def application(*others: type[Command] | typer.Typer) -> typer.Typer:
     from evofsm.cli.commands.export import Export
     from evofsm.cli.commands.learn import Inspect, Learn
     from evofsm.cli.commands.monitor import Monitor
-    from evofsm.cli.commands.verify import Verify
     from evofsm.cli.commands.watch import Watch
 
     app = group("evofsm", options.__doc__ or "")
     app.callback()(options)
-    ours = (Learn, Inspect, Explain, Drive, Watch, Monitor, Campaign, Export, Verify, Audit, Check)
+    ours = (Learn, Inspect, Explain, Drive, Watch, Monitor, Campaign, Export, Audit, Check)
     for command in (*ours, *others):
         if isinstance(command, typer.Typer):
             app.add_typer(command)

@@ -8,7 +8,7 @@ from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from evofsm.cli.commands.common import load_model, require, say
+from evofsm.cli.commands.common import load_model
 from evofsm.cli.commands.declared import REQUIRED, Command, argument, option
 
 if TYPE_CHECKING:
@@ -27,10 +27,8 @@ class Format(StrEnum):
     """What it is written as."""
 
     DOT = "dot"
-    MERMAID = "mermaid"
     GRAPHML = "graphml"
     PRISM = "prism"
-    SUMO = "sumo"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,10 +41,9 @@ class Export(Command):
     )
     to: Format = option(
         REQUIRED,
-        "Graph for Graphviz, for a page in Markdown, or for graph tools; process for PRISM and "
-        "Storm; episode of a log for sumo-gui.",
+        "Graph for Graphviz (dot) or for graph tools (graphml); process for PRISM and Storm.",
     )
-    out: Path | None = option(None, "File to write (sumo: folder); else it is printed.")
+    out: Path | None = option(None, "File to write; else it is printed.")
     policy: str = option(
         "observed", "Weights of actions in a graph: observed, as used, or marginal, alike."
     )
@@ -59,13 +56,9 @@ class Export(Command):
         min=0.0,
     )
     loops: bool = option(True, "Whether a graph shows that states lead to themselves.")
-    episode: int = option(1, "Which episode of a log, from 1, for sumo.", min=1)
 
     def run(self) -> None:
         """Write it, or print it."""
-        if self.to is Format.SUMO:
-            self._export_replay()
-            return
         if self.policy not in ("observed", "marginal"):
             raise ValueError(f"--policy is {self.policy!r}; it must be observed or marginal")
         _refuse_learnt(self.out)
@@ -87,13 +80,9 @@ class Export(Command):
         if self.to is Format.PRISM:
             evidence = 1.0 if self.evidence is None else self.evidence
             return graphs.to_prism(model, evidence, self.least or 0.0)
-        is_picture = self.to is not Format.GRAPHML
-        write = {
-            Format.DOT: graphs.to_dot,
-            Format.MERMAID: graphs.to_mermaid,
-            Format.GRAPHML: graphs.to_graphml,
-        }[self.to]
-        return write(
+        write = graphs.to_dot if self.to is Format.DOT else graphs.to_networkx
+        is_picture = self.to is Format.DOT
+        graph = write(
             model,
             "marginal" if self.policy == "marginal" else "observed",
             _PICTURE_LEAST * is_picture if self.least is None else self.least,
@@ -101,18 +90,11 @@ class Export(Command):
             self_loops=self.loops,
             dead_ends=dead_ends,
         )
+        if isinstance(graph, str):
+            return graph
+        from networkx import generate_graphml
 
-    def _export_replay(self) -> None:
-        """An episode of a log, for sumo-gui."""
-        require(mcap="mcap")
-        from evofsm.io import read_run, write_replay
-
-        if self.out is None:
-            raise ValueError("--to sumo writes several files; --out names a folder for them")
-        episodes = read_run(self.file).episodes
-        if self.episode > len(episodes):
-            raise ValueError(f"--episode is {self.episode}; {self.file} holds {len(episodes)}")
-        say(f"Open it: sumo-gui {write_replay(self.out, episodes[self.episode - 1])}")
+        return "\n".join([*generate_graphml(graph), ""])
 
 
 def _refuse_learnt(out: Path | None) -> None:
