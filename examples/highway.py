@@ -22,13 +22,14 @@ import gymnasium
 import highway_env  # noqa: F401  (registers its environments)
 import numpy as np
 from comparison import Result, compare, settings
+from gymnasium.wrappers import RescaleAction
 from highway_env.vehicle.kinematics import Vehicle
 from numpy.typing import NDArray
 
 from evofsm.driving import guard_for_cars
 from evofsm.guard import RevisedActions
 
-FULL = 5.0  # of throttle and of brakes [m/s²]; the environment's actions are shares of it
+FULL = 5.0  # throttle and brakes [m/s²]; the environment's own actions are shares of it
 INTERVAL = 0.25  # between decisions [s]
 PRESENCE, X, Y, SPEED = range(4)  # columns of its observation; the first row is the car itself
 CONFIG = {
@@ -71,19 +72,18 @@ def ahead(observation: NDArray[np.float32]) -> NDArray[np.float64] | None:
 
 def full_throttle(observation: NDArray[np.float32], info: dict[str, Any]) -> NDArray[np.float32]:
     """The policy."""
-    return np.ones(1, dtype=np.float32)
+    return np.full(1, FULL, dtype=np.float32)
 
 
 def main(argv: Sequence[str] | None = None) -> tuple[Result, Result]:
     """Drive, print, and answer with what came of it: unrevised, revised."""
     chosen = settings("Full throttle on a highway, revised.", argv, episodes=25, train=10)
+    env = gymnasium.make("highway-fast-v0", config=CONFIG)
     revised = RevisedActions(
-        gymnasium.make("highway-fast-v0", config=CONFIG),
+        RescaleAction(env, np.float32(-FULL), np.float32(FULL)),
         guard_for_cars(-FULL, FULL, INTERVAL, width=0.5),
         observe=ahead,
         failed=lambda info: info["crashed"],
-        to_acceleration=lambda action: FULL * float(action[0]),
-        to_action=lambda acceleration: np.array([acceleration / FULL], dtype=np.float32),
     )
     held_out = range(chosen.seed, chosen.seed + chosen.episodes)
     training = range(held_out.stop, held_out.stop + chosen.train)

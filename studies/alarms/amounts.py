@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import ClassVar, Self
+from typing import ClassVar, Literal, Self
 
 from evofsm.cli import option, split_names
-from evofsm.guard import Errors
+
+Errors = Literal["false alarms", "misses"]
 
 #: Families that are driven unless others are asked for; the last one changes on the way.
 FAMILIES = ("emergency", "cut_in", "stop_and_go", "shift")

@@ -8,12 +8,11 @@ from typing import TYPE_CHECKING, Any
 
 from evofsm import plot
 from evofsm.cli import Column, Table, count, listed, percent, percents, seeds_text
-from evofsm.guard import Errors
 from evofsm.paper.report.asked import Asked, failures, tables_of_asked
 from evofsm.paper.report.chapter import Chapter, Source
 from evofsm.paper.report.drawing import Sketch
 from evofsm.paper.report.html import Setting
-from studies.alarms.amounts import Amounts
+from studies.alarms.amounts import Amounts, Errors
 from studies.alarms.study import ADAPTIVE, DELAY, FIXED, Found, Row
 from studies.alarms.windows import LENGTH
 

@@ -18,9 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evofsm.fleet import in_order
-from evofsm.guard import ConformalAlarm, Errors
+from evofsm.guard import ConformalAlarm
 from evofsm.paper.frame import Frame, Progress, silent
-from studies.alarms.amounts import Amounts
+from studies.alarms.amounts import Amounts, Errors
 from studies.alarms.windows import Windows, stages
 from studies.scores import bootstrap, share_of
 
@@ -110,7 +110,7 @@ def _of_stream(name: str, plan: Amounts, seed: int) -> list[_Said]:
         once = threshold(chosen_on[score], rate, of)
         for stage in then:
             seen = stage.windows[score]
-            # As the level is now; see the proof in `evofsm.guard.conformal`.
+            # As the level is now; see the proof in `evofsm.guard.alarms`.
             most = adaptive.level / plan.step + 1.0 - rate + DELAY
             key = stage.name, stage.changed, score
             alarmed = np.array(list(said_by(adaptive, seen)), np.bool_)

@@ -1,5 +1,10 @@
+"""Any environment of Gymnasium or PettingZoo runs under a guard, alone or many at once."""
+
 import importlib
 import math
+import subprocess
+import sys
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -9,31 +14,28 @@ gymnasium = pytest.importorskip("gymnasium")
 
 from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete  # noqa: E402
 from gymnasium.utils.env_checker import check_env  # noqa: E402
+from gymnasium.vector import AutoresetMode, SyncVectorEnv  # noqa: E402
 
-from evofsm.driving.cars import guard_for_cars  # noqa: E402
-from evofsm.driving.families.family import load_family  # noqa: E402
-from evofsm.driving.framework import Framework  # noqa: E402
-from evofsm.driving.revisers import Unrevised  # noqa: E402
-from evofsm.driving.risk.latent import LatentRisk  # noqa: E402
-from evofsm.driving.worlds.gym import CarFollowing  # noqa: E402
-from evofsm.driving.worlds.kinematic import KinematicWorld  # noqa: E402
-from evofsm.fsm.actions import IntervalActions  # noqa: E402
-from evofsm.fsm.machine import EvolvingFSM  # noqa: E402
-from evofsm.fsm.naming import Labels  # noqa: E402
-from evofsm.guard.auditing.log import AuditLog  # noqa: E402
-from evofsm.guard.guard import Guard  # noqa: E402
-from evofsm.guard.gym import RevisedActions, RevisedVectorActions  # noqa: E402
-from evofsm.guard.protocols import Fallback, Judgement, Proposal, Search  # noqa: E402
-from evofsm.guard.reviser import ActionReviser, Mode  # noqa: E402
+from evofsm.driving import CarFollowing, guard_for_cars  # noqa: E402
+from evofsm.fsm import Labels  # noqa: E402
+from evofsm.guard import (  # noqa: E402
+    Fallback,
+    Guard,
+    Judgement,
+    Proposal,
+    RevisedActions,
+    RevisedVectorActions,
+    Search,
+)
 
-FAMILY = load_family("emergency")
-ACTIONS = FAMILY.actions
 EXAMPLES = Path(__file__).parents[2] / "examples"
 KEYS = {
     *("reviser/proposed_action", "reviser/executed_action", "reviser/reason"),
     *("reviser/risk", "reviser/risk_proposed", "reviser/penalty"),
 }
 FAR, NEAR, HIT = [90.0, 10.0, 10.0], [4.0, 20.0, 10.0], [-0.1, 18.0, 8.0]
+MODES = NEXT_STEP, SAME_STEP, DISABLED = list(AutoresetMode)
+ONE = Box(-2.5, 2.5, (1,), np.float64)
 
 
 class Script(gymnasium.Env):
@@ -41,8 +43,8 @@ class Script(gymnasium.Env):
 
     observation_space = Box(-100.0, 1000.0, (3,), np.float64)
 
-    def __init__(self, *seen, action_space=None, terminates=True, failed=False):
-        self.action_space = action_space or Box(-2.5, 2.5, (1,), np.float64)
+    def __init__(self, *seen, action_space=ONE, terminates=True, failed=False):
+        self.action_space = action_space
         self.seen = seen
         self.terminates = terminates
         self.failed = failed
@@ -61,277 +63,6 @@ class Script(gymnasium.Env):
         last = self.row + 1 == len(self.seen)
         info = {"of": "step", "failed": last and self.failed}
         return self.seen[self.row], 1.5, last and self.terminates, False, info
-
-
-def make_reviser():
-    return ActionReviser(LatentRisk(ACTIONS.low, FAMILY.interval), ACTIONS)
-
-
-def revise(env, reviser=None, *, machine=None, learn=True, **options):
-    guard = Guard.of(
-        reviser or make_reviser(), machine=machine, learn=learn, interval=FAMILY.interval
-    )
-    return RevisedActions(env, guard, failed=lambda info: info["failed"], **options)
-
-
-def own_driver(env):
-    car = env.unwrapped
-    return lambda observation, info: np.array(
-        [car.draw.controller.propose(observation, info["time"]).action]
-    )
-
-
-def drive(env, policy, **reset):
-    observation, info = env.reset(**reset)
-    infos, over = [], False
-    while not over:
-        observation, _, terminated, truncated, info = env.step(policy(observation, info))
-        infos.append(info)
-        over = terminated or truncated
-    return infos
-
-
-def full_throttle(observation, info):
-    return np.array([2.5])
-
-
-# -- It decides as the framework does ----------------------------------------------------------
-
-
-@pytest.mark.parametrize("learn", [True, False])
-def test_it_decides_and_learns_bit_for_bit_as_the_framework(learn, snapshot):
-    wrapped_machine, machine = (EvolvingFSM(ACTIONS.n_actions, radius=3.0) for _ in range(2))
-    reviser = make_reviser()
-    env = revise(CarFollowing(FAMILY), machine=wrapped_machine)
-    guard = Guard.of(reviser, machine=machine, interval=FAMILY.interval)
-    framework = Framework(None, guard)
-    for index in range(4):
-        env.guard.learn = guard.learn = learn or index < 2
-        infos = drive(env, own_driver(env), options={"index": index})
-        scenario, framework.controller, _ = FAMILY.draw(0, index)
-        driven = framework.drive(KinematicWorld(), scenario)
-        executed = [info["reviser/executed_action"][0] for info in infos]
-        assert executed == driven.executed.tolist()
-        assert [info["reviser/proposed_action"][0] for info in infos] == driven.proposed.tolist()
-        assert [i["reviser/reason"] for i in infos] == [d.revision.reason for d in driven.decisions]
-        assert infos[-1]["failed"] == driven.episode.collided
-    assert snapshot(wrapped_machine) == snapshot(machine)
-    assert env.guard.judge.manoeuvres.decels == reviser.risk.manoeuvres.decels
-
-
-def test_who_would_collide_does_not():
-    unrevised = CarFollowing(FAMILY)
-    assert drive(unrevised, full_throttle, seed=1)[-1]["failed"]
-    assert not drive(revise(unrevised), full_throttle, seed=1)[-1]["failed"]
-
-
-# -- What it changes, and what it forwards -----------------------------------------------------
-
-
-def test_a_dangerous_proposal_is_replaced_and_info_says_so():
-    env = revise(Script(NEAR, NEAR))
-    env.reset()
-    proposed = np.array([1.0])
-    observation, reward, terminated, truncated, info = env.step(proposed)
-    assert env.env.executed == [info["reviser/executed_action"]] == [np.array([-2.5])]
-    assert info["reviser/proposed_action"] == proposed
-    assert info["reviser/risk_proposed"] == 1.0
-    assert "own brakes not known yet" in info["reviser/reason"]
-    assert info.keys() == KEYS | {"of", "failed"}
-    assert (observation, reward, terminated, truncated) == (NEAR, 1.5, True, False)
-    assert env.revision.executed == -2.5
-
-
-def test_a_proposal_that_is_kept_is_passed_on_as_it_is():
-    env = revise(Script(FAR, FAR), Unrevised(ACTIONS))
-    env.reset()
-    proposed = np.array([1.0], dtype=np.float32)
-    info = env.step(proposed)[-1]
-    assert env.env.executed[0] is proposed
-    assert info["reviser/proposed_action"] == info["reviser/executed_action"] == proposed
-    proposed[0] = 9.0  # what was told is not changed later
-    assert info["reviser/proposed_action"] == [1.0]
-    assert math.isnan(info["reviser/risk"])
-
-
-def test_in_the_shadow_it_only_looks_on():
-    reviser = ActionReviser(LatentRisk(-2.5), ACTIONS, mode=Mode.SHADOW)
-    env = revise(Script(NEAR, NEAR), reviser)
-    env.reset()
-    info = env.step(np.array([1.0]))[-1]
-    assert info["reviser/executed_action"] == [1.0]
-    assert env.revision.advised == -2.5
-
-
-def test_all_else_is_forwarded():
-    inner = gymnasium.make("evofsm.driving.worlds.gym:evofsm/CarFollowing-v0", render_mode="ansi")
-    env = revise(inner)
-    assert env.spec.id == inner.spec.id
-    assert env.unwrapped is inner.unwrapped
-    assert env.action_space is inner.action_space
-    assert env.observation_space is inner.observation_space
-    assert env.metadata == inner.metadata
-    assert env.render_mode == "ansi"
-    observation, info = env.reset(seed=3, options={"index": 4, "split": "test"})
-    assert (info["index"], info["split"]) == (4, "test")
-    assert np.array_equal(observation, inner.reset(options={"index": 4, "split": "test"})[0])
-    assert env.np_random is inner.np_random
-    assert env.render() == inner.render()
-    env.close()
-
-
-@pytest.mark.filterwarnings("ignore:.*symmetric and normalized space:UserWarning")
-@pytest.mark.filterwarnings("ignore:.*different from the unwrapped version:UserWarning")
-def test_gymnasium_finds_nothing_to_complain_of():
-    check_env(revise(CarFollowing(FAMILY), learn=False), skip_render_check=True)
-
-
-def test_it_drives_in_a_vector_of_environments():
-    cars = gymnasium.vector.SyncVectorEnv([lambda: revise(CarFollowing(FAMILY))] * 2)
-    cars.reset(seed=1)
-    *_, info = cars.step(np.full((2, 1), 2.5))
-    assert info["reviser/executed_action"].shape == (2, 1)
-    cars.close()
-
-
-@pytest.mark.parametrize(("action", "executed"), [(np.nan, -1.0), (np.inf, -1.0), (99.0, 2.5)])
-def test_an_action_that_cannot_be_executed_is_made_one_that_can(action, executed):
-    env = revise(Script(FAR, FAR), Unrevised(ACTIONS))
-    env.reset()
-    info = env.step(np.array([action]))[-1]
-    assert info["reviser/executed_action"] == [executed]
-
-
-def test_a_policy_that_answers_nan_does_not_stop_the_car():
-    env = revise(CarFollowing(FAMILY), machine=EvolvingFSM(ACTIONS.n_actions))
-    infos = drive(env, lambda *_: np.array([np.nan]), seed=1)
-    assert not infos[-1]["failed"]
-    assert "braking gently" in infos[0]["reviser/reason"]
-
-
-# -- Learning ----------------------------------------------------------------------------------
-
-
-def test_frozen_it_learns_nothing(snapshot):
-    env = revise(CarFollowing(FAMILY), machine=EvolvingFSM(ACTIONS.n_actions, radius=3.0))
-    for index in range(2):
-        drive(env, own_driver(env), options={"index": index})
-    env.guard.learn = False
-    machine, risk = snapshot(env.guard.machine), repr(env.guard.judge._learnt())
-    drive(env, own_driver(env), options={"index": 2})
-    assert (snapshot(env.guard.machine), repr(env.guard.judge._learnt())) == (machine, risk)
-    env.guard.learn = True
-    drive(env, own_driver(env), options={"index": 2})
-    assert snapshot(env.guard.machine) != machine
-    assert repr(env.guard.judge._learnt()) != risk
-
-
-def test_a_failure_is_reported_to_the_machine_and_the_end_of_time_is_none():
-    for failed in (True, False):
-        env = revise(
-            Script(FAR, NEAR, HIT, failed=failed), Unrevised(ACTIONS), machine=EvolvingFSM(17)
-        )
-        drive(env, full_throttle)
-        assert env.guard.machine.endings.sum() == failed
-        assert env.guard.machine.failures.sum(axis=1).argmax() == failed * (ACTIONS.n_actions - 1)
-        assert env.guard.machine.model().uses.sum() == 2  # the last transition is learnt as well
-
-
-def test_a_failure_that_is_not_seen_is_reported_as_well():
-    env = revise(Script(FAR, NEAR, None, failed=True), machine=EvolvingFSM(17))
-    drive(env, full_throttle)
-    assert env.guard.machine.endings.sum() == 1
-
-
-def test_a_failure_ends_the_episode_where_the_environment_goes_on():
-    env = revise(Script(FAR, HIT, failed=True, terminates=False), machine=EvolvingFSM(17))
-    env.reset()
-    env.step(np.array([0.0]))
-    assert env.guard.machine.endings.sum() == 1
-    assert env.guard.machine.state is None  # the next observation is no consequence
-
-
-def test_a_reset_in_mid_episode_ends_it_without_failure():
-    env = revise(Script(FAR, NEAR, NEAR), Unrevised(ACTIONS), machine=EvolvingFSM(17))
-    env.reset(seed=1)
-    env.step(np.array([0.0]))
-    env.reset(seed=2, options={"a": "b"})
-    env.step(np.array([0.0]))
-    assert env.env.resets == [(1, None), (2, {"a": "b"})]
-    assert env.guard.machine.model().uses.sum() == 1  # FAR to NEAR, and not NEAR to FAR
-    assert env.guard.machine.endings.sum() == 0
-
-
-def test_where_nothing_is_ahead_the_proposal_is_kept_and_nothing_is_learnt():
-    env = revise(Script(None, None, FAR, None, FAR, FAR), machine=EvolvingFSM(17))
-    infos = drive(env, full_throttle)
-    kept = [info["reviser/reason"].startswith("nothing is ahead") for info in infos]
-    assert kept == [True, True, False, True, False]
-    assert env.env.executed[0] == [2.5]
-    assert env.guard.machine.model().uses.sum() == 1  # FAR to FAR: the unseen is not
-
-
-def test_nan_is_not_executed_where_nothing_is_ahead_either():
-    env = revise(Script(None, None))
-    env.reset()
-    assert env.step(np.array([np.nan]))[-1]["reviser/executed_action"] == [-1.0]
-
-
-# -- Other environments' actions ---------------------------------------------------------------
-
-
-def test_actions_in_other_units_are_converted():
-    env = revise(
-        Script(NEAR, NEAR, action_space=Box(-1.0, 1.0, (1,), np.float32)),
-        to_acceleration=lambda action: 5.0 * float(action[0]),
-        to_action=lambda acceleration: np.array([acceleration / 5.0], dtype=np.float32),
-    )
-    env.reset()
-    info = env.step(np.array([0.1], dtype=np.float32))[-1]
-    assert env.revision.proposed == pytest.approx(0.5)
-    assert info["reviser/executed_action"] == [-0.5]
-    assert info["reviser/executed_action"] in env.action_space
-
-
-@pytest.mark.parametrize("shape", [(), (1,)])
-def test_one_number_is_taken_for_an_acceleration_and_stays_in_the_space(shape):
-    env = revise(Script(NEAR, NEAR, action_space=Box(-2.0, 2.0, shape, np.float32)))
-    env.reset()
-    info = env.step(np.full(shape, 1.0, np.float32))[-1]
-    assert info["reviser/executed_action"] in env.action_space
-    assert info["reviser/executed_action"] == -2.0
-
-
-@pytest.mark.parametrize("space", [Box(-1.0, 1.0, (2,)), MultiBinary(2)])
-def test_actions_that_are_not_one_number_need_a_conversion(space):
-    with pytest.raises(ValueError, match="give to_acceleration and to_action"):
-        revise(Script(FAR, action_space=space))
-
-
-def test_one_conversion_is_not_enough():
-    with pytest.raises(ValueError, match="both"):
-        revise(Script(FAR), to_acceleration=float)
-
-
-def test_a_machine_for_other_actions_is_refused():
-    with pytest.raises(ValueError, match="5 actions"):
-        revise(Script(FAR), machine=EvolvingFSM(5))
-
-
-@pytest.mark.parametrize("seen", [[1.0, 2.0], [np.inf, 2.0, 3.0], [[1.0, 2.0, 3.0]]])
-def test_an_observation_that_is_not_ours_is_refused(seen):
-    with pytest.raises(ValueError, match="v_leader"):
-        revise(Script(seen)).reset()
-
-
-def test_the_set_of_actions_may_be_coarser_than_the_environments():
-    actions = IntervalActions(-2.0, 2.0, 1.0, outside="clip")
-    env = revise(Script(NEAR, NEAR), ActionReviser(LatentRisk(-2.0), actions))
-    env.reset()
-    assert env.step(np.array([2.5]))[-1]["reviser/executed_action"] == [-2.0]
-
-
-# -- Any other environment ---------------------------------------------------------------------
 
 
 class Spy:
@@ -372,9 +103,8 @@ class Spy:
         self.rows = []
 
     def end(self, observation, *, failed):
-        self.episodes.append(
-            (self.rows, None if observation is None else tuple(observation), failed)
-        )
+        last = None if observation is None else tuple(observation)
+        self.episodes.append((self.rows, last, failed))
         self.rows = []
 
     def sums(self, n_states):
@@ -388,18 +118,173 @@ class Spy:
         return cls()
 
 
-def guard_for(space, judge, **others):
+def guard_for(space, judge=None, **others):
+    judge = judge or Spy()
     if isinstance(space, Discrete):
         return Guard(n_actions=int(space.n), interval=0.1, judge=judge, **others)
-    return Guard(
-        low=space.low.ravel(), high=space.high.ravel(), interval=0.1, judge=judge, **others
-    )
+    low, high = space.low.ravel(), space.high.ravel()
+    return Guard(low=low, high=high, interval=0.1, judge=judge, **others)
+
+
+def of_cars(env):
+    return RevisedActions(env, guard_for_cars(-2.5, 2.5), failed=lambda info: info["failed"])
+
+
+def drive(env, policy, **reset):
+    observation, info = env.reset(**reset)
+    steps, over = [], False
+    while not over:
+        steps.append(env.step(policy(observation, info)))
+        observation, _, terminated, truncated, info = steps[-1]
+        over = terminated or truncated
+    return steps
+
+
+def infos_of(steps):
+    return [step[-1] for step in steps]
+
+
+def full_throttle(observation, info):
+    return np.array([2.5])
+
+
+def above_half(action):
+    return bool(np.max(action) > 0.5)
+
+
+# -- One environment ---------------------------------------------------------------------------
+
+
+def test_it_decides_and_learns_bit_for_bit_as_a_loop_of_ones_own(snapshot):
+    env, plain = of_cars(CarFollowing()), CarFollowing()
+    guard = guard_for_cars(-2.5, 2.5)
+    for index in range(3):
+        revised = infos_of(drive(env, full_throttle, options={"index": index}))
+        (seen, _), over, executed = plain.reset(options={"index": index}), False, []
+        while not over:
+            executed.append(guard.decide(seen, 2.5).executed)
+            seen, _, terminated, truncated, info = plain.step(np.array([executed[-1]]))
+            over = terminated or truncated
+        guard.end(info["failed"], seen)
+        assert [info["reviser/executed_action"][0] for info in revised] == executed
+    assert snapshot(env.guard.machine) == snapshot(guard.machine)
+
+
+def test_a_dangerous_proposal_is_replaced_and_info_says_so():
+    env = of_cars(Script(NEAR, NEAR))
+    env.reset()
+    observation, reward, terminated, truncated, info = env.step(np.array([1.0]))
+    assert env.env.executed == [info["reviser/executed_action"]] == [np.array([-2.5])]
+    assert info["reviser/proposed_action"] == [1.0]
+    assert info["reviser/risk_proposed"] == 1.0
+    assert "own brakes not known yet" in info["reviser/reason"]
+    assert info.keys() == KEYS | {"of", "failed"}
+    assert (observation, reward, terminated, truncated) == (NEAR, 1.5, True, False)
+    assert env.revision.executed == -2.5
+
+
+def test_a_proposal_that_is_kept_is_passed_on_untouched():
+    env = RevisedActions(Script(FAR, FAR), guard_for(ONE))
+    env.reset()
+    proposed = np.array([1.0], dtype=np.float32)
+    info = env.step(proposed)[-1]
+    assert env.env.executed[0] is proposed
+    proposed[0] = 9.0  # what was said is not changed later
+    assert info["reviser/proposed_action"] == info["reviser/executed_action"] == [1.0]
+
+
+def test_all_else_is_forwarded():
+    inner = gymnasium.make("evofsm.driving.worlds.gym:evofsm/CarFollowing-v0", render_mode="ansi")
+    env = of_cars(inner)
+    assert env.spec.id == inner.spec.id
+    for name in ("unwrapped", "action_space", "observation_space", "metadata"):
+        assert getattr(env, name) == getattr(inner, name)
+    options = {"index": 4, "split": "test"}
+    observation, info = env.reset(seed=3, options=options)
+    assert (info["index"], info["split"]) == (4, "test")
+    assert np.array_equal(observation, inner.reset(options=options)[0])
+    assert env.render() == inner.render()
+    env.close()
+
+
+@pytest.mark.filterwarnings("ignore:.*symmetric and normalized space:UserWarning")
+@pytest.mark.filterwarnings("ignore:.*different from the unwrapped version:UserWarning")
+def test_gymnasium_finds_nothing_to_complain_of():
+    env = of_cars(CarFollowing())
+    env.guard.freeze()
+    check_env(env, skip_render_check=True)
+
+
+def test_environments_that_are_wrapped_one_by_one_make_a_vector():
+    cars = SyncVectorEnv([lambda: of_cars(CarFollowing())] * 2)
+    cars.reset(seed=1)
+    *_, info = cars.step(np.full((2, 1), 2.5))
+    assert info["reviser/executed_action"].shape == (2, 1)
+    cars.close()
+
+
+def test_a_failure_is_learnt_and_the_end_of_time_is_none():
+    for failed in (True, False):
+        env = of_cars(Script(FAR, NEAR, HIT, failed=failed))
+        drive(env, full_throttle)
+        assert env.guard.machine.endings.sum() == failed
+        assert env.guard.machine.model().uses.sum() == 2  # the last transition is learnt as well
+
+
+def test_a_failure_that_is_not_seen_is_learnt_as_well():
+    env = of_cars(Script(FAR, NEAR, None, failed=True))
+    drive(env, full_throttle)
+    assert env.guard.machine.endings.sum() == 1
+
+
+def test_a_failure_ends_the_episode_where_the_environment_goes_on():
+    env = of_cars(Script(FAR, HIT, failed=True, terminates=False))
+    env.reset()
+    env.step(np.array([0.0]))
+    assert env.guard.machine.endings.sum() == 1
+    assert env.guard.machine.state is None  # the next observation is no consequence
+
+
+def test_a_reset_in_mid_episode_ends_it_without_failure():
+    env = of_cars(Script(FAR, NEAR, NEAR))
+    for seed, options in ((1, None), (2, {"a": "b"})):
+        env.reset(seed=seed, options=options)
+        env.step(np.array([0.0]))
+    assert env.env.resets == [(1, None), (2, {"a": "b"})]
+    assert env.guard.machine.model().uses.sum() == 1  # FAR to NEAR, and not NEAR to FAR
+    assert env.guard.machine.endings.sum() == 0
+
+
+def test_where_nothing_is_ahead_a_usable_proposal_is_kept_and_nothing_is_learnt():
+    env = of_cars(Script(None, None, FAR, None, FAR, FAR))
+    infos = infos_of(drive(env, lambda seen, info: np.array([2.5 if seen is None else 9.0])))
+    kept = [info["reviser/reason"].startswith("nothing is ahead") for info in infos]
+    assert kept == [True, True, False, True, False]
+    assert env.env.executed[0] == [2.5]
+    assert env.guard.machine.model().uses.sum() == 1  # FAR to FAR: what is not seen is not
+    env = of_cars(Script(None, None))
+    env.reset()
+    assert env.step(np.array([np.nan]))[-1]["reviser/executed_action"] == [-1.0]
+
+
+@pytest.mark.parametrize("shape", [(), (1,)])
+def test_what_is_executed_stays_in_the_environments_space(shape):
+    env = of_cars(Script(NEAR, NEAR, action_space=Box(-2.0, 2.0, shape, np.float32)))
+    env.reset()
+    info = env.step(np.full(shape, 1.0, np.float32))[-1]
+    assert info["reviser/executed_action"] in env.action_space
+    assert info["reviser/executed_action"] == -2.0
+
+
+@pytest.mark.parametrize("seen", [[1.0, 2.0], [np.inf, 2.0, 3.0]])
+def test_an_observation_that_is_not_the_guards_is_refused(seen):
+    with pytest.raises(ValueError, match="v_leader"):
+        of_cars(Script(seen)).reset()
 
 
 @pytest.mark.parametrize(
     "space",
     [
-        Box(-2.0, 2.0, (1,), np.float32),
         Box(np.array([-1.0, 0.0]), np.array([1.0, 4.0]), dtype=np.float64),
         Box(-1.0, 1.0, (2, 3), np.float32),
         Discrete(3),
@@ -407,16 +292,31 @@ def guard_for(space, judge, **others):
     ],
 )
 def test_actions_of_a_box_and_discrete_ones_need_nothing(space):
-    env = RevisedActions(Script(FAR, FAR, FAR, action_space=space), guard_for(space, Spy()))
+    env = RevisedActions(Script(FAR, FAR, FAR, action_space=space), guard_for(space))
     env.reset()
     space.seed(1)
     for _ in range(2):
         action = space.sample()
         *_, info = env.step(action)
-        assert info["reviser/executed_action"] is not None
         assert np.array_equal(env.env.executed[-1], action)
         assert info["reviser/penalty"] == 0.0
     assert len(env.guard.judge.episodes[0][0]) == 2
+
+
+@pytest.mark.parametrize(
+    ("space", "guarded"),
+    [
+        (MultiBinary(2), ONE),
+        (MultiDiscrete([2, 2]), Discrete(4)),
+        (Discrete(3), Discrete(2)),
+        (Discrete(3), Box(0.0, 2.0, (1,))),
+        (Box(-1.0, 1.0, (2,)), Box(-1.0, 1.0, (3,))),
+        (Box(-1.0, 1.0, (1,)), Discrete(2)),
+    ],
+)
+def test_actions_that_are_not_the_guards_are_refused(space, guarded):
+    with pytest.raises(ValueError, match=r"the environment's actions are .*, but the guard's are"):
+        RevisedActions(Script(FAR, action_space=space), guard_for(guarded))
 
 
 @pytest.mark.parametrize(
@@ -429,7 +329,8 @@ def test_actions_of_a_box_and_discrete_ones_need_nothing(space):
         (Box(-2.0, 2.0, (1,), np.float32), [math.nan], [0.0], 1.0),
     ],
 )
-def test_a_change_is_executed_and_can_be_taken_off_the_reward(space, proposed, executed, size):
+@pytest.mark.parametrize("penalty", [0.0, 3.0])
+def test_a_change_is_executed_and_can_cost_reward(space, proposed, executed, size, penalty):
     def dangerous(action):
         return action == 2 if isinstance(space, Discrete) else (np.asarray(action) > 0.5).any()
 
@@ -439,72 +340,44 @@ def test_a_change_is_executed_and_can_be_taken_off_the_reward(space, proposed, e
             best = int(bool(dangerous(wanted)))
             return Search(options, self.judge(situation, options), best, "nearest")
 
-    for penalty in (0.0, 3.0):
-        env = RevisedActions(
-            Script(FAR, FAR, FAR, action_space=space),
-            guard_for(space, Half(dangerous)),
-            penalty=penalty,
-        )
-        env.reset()
-        action = np.int64(proposed) if isinstance(space, Discrete) else np.array(proposed, "f4")
-        _, reward, _, _, info = env.step(action)
-        assert info["reviser/executed_action"] in space
-        assert np.array_equal(info["reviser/executed_action"], executed)
-        assert info["reviser/penalty"] == pytest.approx(size)
-        assert reward == pytest.approx(1.5 - penalty * size)
-
-
-@pytest.mark.parametrize(
-    ("space", "guarded"),
-    [
-        (MultiDiscrete([2, 2]), Discrete(4)),
-        (Discrete(3), Discrete(2)),
-        (Discrete(3), Box(0.0, 2.0, (1,))),
-        (Box(-1.0, 1.0, (2,)), Box(-1.0, 1.0, (3,))),
-        (Box(-1.0, 1.0, (1,)), Discrete(2)),
-    ],
-)
-def test_actions_that_are_not_the_guards_need_a_conversion(space, guarded):
-    env = Script(FAR, action_space=space)
-    with pytest.raises(ValueError, match=r"the environment's actions are .*, but the guard's are"):
-        RevisedActions(env, guard_for(guarded, Spy()))
+    script = Script(FAR, FAR, FAR, action_space=space)
+    env = RevisedActions(script, guard_for(space, Half(dangerous)), penalty=penalty)
+    env.reset()
+    action = np.int64(proposed) if isinstance(space, Discrete) else np.array(proposed, "f4")
+    _, reward, _, _, info = env.step(action)
+    assert info["reviser/executed_action"] in space
+    assert np.array_equal(info["reviser/executed_action"], executed)
+    assert info["reviser/penalty"] == pytest.approx(size)
+    assert reward == pytest.approx(1.5 - penalty * size)
 
 
 @pytest.mark.parametrize("penalty", [-1.0, math.nan, math.inf])
 def test_a_penalty_is_no_reward(penalty):
     with pytest.raises(ValueError, match="penalty"):
-        revise(Script(FAR), penalty=penalty)
+        RevisedActions(Script(FAR), guard_for(ONE), penalty=penalty)
 
 
 @pytest.mark.parametrize(
-    ("space", "observation", "seen"),
+    ("space", "observation", "observe", "seen"),
     [
-        (Box(0.0, 9.0, (2, 2)), np.array([[1.0, 2.0], [3.0, 4.0]]), (1.0, 2.0, 3.0, 4.0)),
-        (Box(0.0, 9.0, ()), np.array(2.0), (2.0,)),
-        (Box(0, 9, (2,), np.uint8), np.array([1, 2], np.uint8), (1.0, 2.0)),
-        (Discrete(3), 2, (0.0, 0.0, 1.0)),
-        (Discrete(3, start=5), 5, (1.0, 0.0, 0.0)),
+        (Box(0.0, 9.0, (2, 2)), np.array([[1.0, 2.0], [3.0, 4.0]]), None, (1.0, 2.0, 3.0, 4.0)),
+        (Box(0.0, 9.0, ()), np.array(2.0), None, (2.0,)),
+        (Discrete(3), 2, None, (0.0, 0.0, 1.0)),
+        (Discrete(3, start=5), 5, None, (1.0, 0.0, 0.0)),
+        (Dict({"a": Box(0.0, 9.0, ())}), {"a": 3.0}, lambda given: [given["a"]], (3.0,)),
     ],
 )
-def test_observations_become_a_vector(space, observation, seen):
+def test_observations_become_a_vector(space, observation, observe, seen):
     script = Script(observation, observation)
     script.observation_space = space
-    env = RevisedActions(script, guard_for(script.action_space, Spy()))
+    guard = guard_for(ONE)
+    env = RevisedActions(script, guard, observe)
     env.reset()
     env.step(np.array([0.0]))
-    assert env.guard.judge.episodes == [([(seen, (0.0,))], seen, True)]
-
-
-def test_observations_of_other_kinds_need_a_function():
-    script = Script({"a": 3.0}, {"a": 4.0})
-    script.observation_space = Dict({"a": Box(0.0, 9.0, ())})
-    guard = guard_for(script.action_space, Spy())
-    with pytest.raises(ValueError, match="give observe"):
-        RevisedActions(script, guard)
-    env = RevisedActions(script, guard, lambda observation: [observation["a"]])
-    env.reset()
-    env.step(np.array([0.0]))
-    assert guard.judge.episodes == [([((3.0,), (0.0,))], (4.0,), True)]
+    assert guard.judge.episodes == [([(seen, (0.0,))], seen, True)]
+    if observe is not None:
+        with pytest.raises(ValueError, match="give observe"):
+            RevisedActions(script, guard)
 
 
 @pytest.mark.parametrize(
@@ -521,26 +394,13 @@ def test_observations_of_other_kinds_need_a_function():
 def test_what_is_terminated_has_failed_unless_somebody_says_otherwise(
     settings, own, terminates, failed
 ):
-    script = Script(FAR, FAR, terminates=terminates)
-    guard = guard_for(script.action_space, Spy(), failed=own)
-    env = RevisedActions(script, guard, **settings)
+    guard = guard_for(ONE, failed=own)
+    env = RevisedActions(Script(FAR, FAR, terminates=terminates), guard, **settings)
     env.reset()
     env.step(np.array([0.0]))
     env.reset()
     assert [ended[-1] for ended in guard.judge.episodes] == [failed]
     assert guard.machine.endings.sum() == failed
-
-
-@pytest.mark.parametrize("name", ["CartPole-v1", "Pendulum-v1", "FrozenLake-v1"])
-def test_environments_of_gymnasium_need_nothing_else(name):
-    inner = gymnasium.make(name, max_episode_steps=30)
-    guard = guard_for(inner.action_space, Spy())
-    env = RevisedActions(inner, guard)
-    env.action_space.seed(0)
-    for seed in range(2):
-        drive(env, lambda *_: env.action_space.sample(), seed=seed)
-    assert len(guard.judge.episodes) == 2
-    assert guard.machine.endings.sum() == (0 if name == "Pendulum-v1" else 2)
 
 
 # -- Many at once ------------------------------------------------------------------------------
@@ -567,9 +427,6 @@ class Recorder(gymnasium.Wrapper):
         return answer
 
 
-MODES = NEXT_STEP, SAME_STEP, DISABLED = list(gymnasium.vector.AutoresetMode)
-
-
 def recorded(name, count, mode, steps):
     """A vector of environments, and the list of the episodes that ended in it."""
     ended = []
@@ -579,7 +436,7 @@ def recorded(name, count, mode, steps):
         recorder.ended = ended
         return recorder
 
-    return gymnasium.vector.SyncVectorEnv([make] * count, autoreset_mode=mode), ended
+    return SyncVectorEnv([make] * count, autoreset_mode=mode), ended
 
 
 def drive_all(envs, steps, seed=0, wish=None):
@@ -594,10 +451,7 @@ def drive_all(envs, steps, seed=0, wish=None):
         _, _, terminated, truncated, infos = envs.step(actions)
         over = terminated | truncated
         said.append((over, infos))
-        if (
-            envs.metadata["autoreset_mode"] is gymnasium.vector.AutoresetMode.DISABLED
-            and over.any()
-        ):
+        if envs.metadata["autoreset_mode"] is DISABLED and over.any():
             envs.reset(options={"reset_mask": over})
     return said
 
@@ -606,7 +460,7 @@ def drive_all(envs, steps, seed=0, wish=None):
 @pytest.mark.parametrize(("name", "steps"), [("CartPole-v1", 15), ("Pendulum-v1", 7)])
 def test_what_each_meets_is_learnt_whole_and_nothing_across_a_reset(name, steps, mode):
     envs, ended = recorded(name, 3, mode, steps)
-    guard = guard_for(envs.single_action_space, Spy(lambda action: np.max(action) > 0.5))
+    guard = guard_for(envs.single_action_space, Spy(above_half))
     revised = RevisedVectorActions(envs, guard)
     drive_all(revised, 43)
     assert len(ended) > 6
@@ -622,10 +476,9 @@ def test_what_each_meets_is_learnt_whole_and_nothing_across_a_reset(name, steps,
 @pytest.mark.parametrize("mode", MODES)
 def test_infos_are_arrays_with_masks(mode):
     envs, _ = recorded("Pendulum-v1", 2, mode, 5)
-    guard = guard_for(envs.single_action_space, Spy(lambda action: np.max(action) > 0.5))
-    revised = RevisedVectorActions(envs, guard)
+    revised = RevisedVectorActions(envs, guard_for(envs.single_action_space, Spy(above_half)))
     resets = 0
-    for over, infos in drive_all(revised, 13):
+    for _, infos in drive_all(revised, 13):
         assert KEYS | {f"_{key}" for key in KEYS} <= infos.keys()
         resets += not infos["_reviser/reason"].any()
         assert all(len(set(infos[f"_{key}"].tolist())) == 1 for key in KEYS)
@@ -634,20 +487,18 @@ def test_infos_are_arrays_with_masks(mode):
             assert infos[f"reviser/{key}_action"].dtype == np.float32
         assert infos["reviser/risk"].shape == infos["reviser/penalty"].shape == (2,)
         assert infos["reviser/reason"].dtype == object
-        assert over.shape == (2,)
     assert resets == (2 if mode is NEXT_STEP else 0)
     assert all(revision.executed[0] <= 0.5 for revision in revised.revisions)
     envs.close()
 
 
-def test_a_step_that_only_resets_is_no_decision():
+def test_a_step_that_only_resets_is_no_decision_and_costs_nothing():
     envs, _ = recorded("Pendulum-v1", 1, NEXT_STEP, 3)
-    guard = guard_for(envs.single_action_space, Spy(lambda action: np.max(action) > 0.5))
+    guard = guard_for(envs.single_action_space, Spy(above_half))
     revised = RevisedVectorActions(envs, guard, penalty=2.0)
     revised.reset(seed=0)
-    wanted = np.array([[2.0]], np.float32)
     for step in range(1, 9):
-        _, rewards, _, _, infos = revised.step(wanted)
+        _, rewards, _, _, infos = revised.step(np.array([[2.0]], np.float32))
         resets = step in (4, 8)
         assert infos["_reviser/executed_action"].tolist() == [not resets]
         executed = 2.0 if resets else 6.0 / 17.0  # the end of an interval of actions
@@ -658,9 +509,9 @@ def test_a_step_that_only_resets_is_no_decision():
 
 
 @pytest.mark.parametrize("mode", MODES)
-def test_a_failure_is_told_by_its_own_info(mode):
+def test_a_failure_is_told_by_the_environments_own_info(mode):
     envs, ended = recorded("CartPole-v1", 3, mode, 12)
-    guard = guard_for(envs.single_action_space, Spy())
+    guard = guard_for(envs.single_action_space)
     asked = []
 
     def failed(info):
@@ -668,10 +519,8 @@ def test_a_failure_is_told_by_its_own_info(mode):
         return info["length"] == 12
 
     drive_all(RevisedVectorActions(envs, guard, failed=failed), 60)
-    assert [failed for *_, failed in guard.judge.episodes] == [
-        len(rows) == 12 for rows, *_ in ended
-    ]
-    assert {type(info["length"]) for info in asked} <= {int, np.int64}
+    learnt = [failed for *_, failed in guard.judge.episodes]
+    assert learnt == [len(rows) == 12 for rows, *_ in ended]
     assert all("_length" not in info for info in asked)
     envs.close()
 
@@ -683,8 +532,7 @@ def test_an_episode_is_decided_by_what_was_learnt_before_it_began():
             return super().judge(situation, actions)
 
     envs, _ = recorded("Pendulum-v1", 2, SAME_STEP, 4)
-    guard = Guard(low=-2.0, high=2.0, interval=0.1, judge=Once())
-    revised = RevisedVectorActions(envs, guard)
+    revised = RevisedVectorActions(envs, Guard(low=-2.0, high=2.0, interval=0.1, judge=Once()))
     revised.reset(seed=0)
     full = np.full((2, 1), 2.0, np.float32)
     executed = [revised.step(full)[-1]["reviser/executed_action"].ravel() for _ in range(8)]
@@ -695,20 +543,19 @@ def test_an_episode_is_decided_by_what_was_learnt_before_it_began():
 
 @pytest.mark.parametrize("mode", MODES)
 def test_with_one_environment_it_comes_to_the_same_bit_for_bit(mode, snapshot):
-    guards = [guard_for_cars(-2.5, 2.5, FAMILY.interval) for _ in range(2)]
-    envs = gymnasium.vector.SyncVectorEnv([lambda: CarFollowing(FAMILY)], autoreset_mode=mode)
-    many = RevisedVectorActions(envs, guards[0], failed=lambda info: bool(info["failed"]))
-    one = RevisedActions(CarFollowing(FAMILY), guards[1], failed=lambda info: info["failed"])
-    alone = drive(one, full_throttle, seed=1)
-    alone += drive(one, full_throttle) + drive(one, full_throttle)
-    said = drive_all(many, len(alone) + (2 if mode is NEXT_STEP else 0), seed=1, wish=2.5)
+    envs = SyncVectorEnv([CarFollowing], autoreset_mode=mode)
+    many = RevisedVectorActions(
+        envs, guard_for_cars(-2.5, 2.5), failed=lambda info: bool(info["failed"])
+    )
+    one = of_cars(CarFollowing())
+    alone = infos_of(drive(one, full_throttle, seed=1) + drive(one, full_throttle))
+    said = drive_all(many, len(alone) + (mode is NEXT_STEP), seed=1, wish=2.5)
     told = [infos for _, infos in said if infos["_reviser/reason"][0]]
     assert len(told) == len(alone)
     for name in KEYS:
         many_said = [np.asarray(infos[name][0]).tolist() for infos in told]
         assert repr(many_said) == repr([np.asarray(info[name]).tolist() for info in alone]), name
-    assert snapshot(guards[0].machine) == snapshot(guards[1].machine)
-    assert repr(guards[0].judge._learnt()) == repr(guards[1].judge._learnt())
+    assert snapshot(many.guard.machine) == snapshot(one.guard.machine)
     envs.close()
 
 
@@ -721,75 +568,140 @@ def test_what_a_judge_learns_from_being_asked_is_learnt_as_well():
             options = np.array([wanted, np.clip(wanted, -1.0 / self.times, 1.0 / self.times)])
             return Search(options, self.judge(situation, options), 1, "asked")
 
-    judges = []
-    for many in (False, True):
-        inner = gymnasium.make("Pendulum-v1", max_episode_steps=6)
-        guard = guard_for(inner.action_space, Asked())
-        judges.append(guard.judge)
-        if many:
-            envs, _ = recorded("Pendulum-v1", 1, SAME_STEP, 6)
-            drive_all(RevisedVectorActions(envs, guard), 18, wish=2.0)
-        else:
-            env = RevisedActions(inner, guard)
-            for seed in (0, None, None):
-                drive(env, lambda *_: np.full(1, 2.0, np.float32), seed=seed)
-    assert judges[0].times == judges[1].times == 18
-    assert judges[0].episodes == judges[1].episodes
+    inner, (envs, _) = gymnasium.make("Pendulum-v1"), recorded("Pendulum-v1", 1, SAME_STEP, 6)
+    one, many = (guard_for(inner.action_space, Asked()) for _ in range(2))
+    drive_all(RevisedVectorActions(envs, many), 12, wish=2.0)
+    env = RevisedActions(gymnasium.wrappers.TimeLimit(inner.unwrapped, 6), one)
+    for seed in (0, None):
+        drive(env, lambda *_: np.full(1, 2.0, np.float32), seed=seed)
+    assert many.judge.times == one.judge.times == 12
+    assert many.judge.episodes == one.judge.episodes
+    envs.close()
 
 
-def test_frozen_many_decide_as_one_does():
-    guard = guard_for_cars(-2.5, 2.5)
-    drive(RevisedActions(CarFollowing(FAMILY), guard), full_throttle, seed=5)
+def test_a_frozen_guard_learns_from_none_of_them():
+    guard = guard_for(ONE)
     guard.freeze()
-    machine = guard.machine.model().uses.sum()
-    envs = gymnasium.vector.SyncVectorEnv([lambda: CarFollowing(FAMILY)] * 2)
-    revised = RevisedVectorActions(envs, guard)
-    revised.reset(seed=3)
-    told = [revised.step(np.full((2, 1), 2.5))[-1]["reviser/executed_action"] for _ in range(40)]
-    for k in range(2):
-        env = RevisedActions(CarFollowing(FAMILY), guard)
-        alone = [i["reviser/executed_action"] for i in drive(env, full_throttle, seed=3 + k)]
-        count = min(len(alone), 40)
-        assert [one[k].tolist() for one in told][:count] == [one.tolist() for one in alone][:count]
-    assert guard.machine.model().uses.sum() == machine
-    envs.close()
-
-
-def test_cars_are_kept_from_colliding_in_many_environments():
-    envs = gymnasium.vector.SyncVectorEnv([lambda: CarFollowing(FAMILY)] * 3)
-    guard = guard_for_cars(FAMILY.actions.low, FAMILY.actions.high, FAMILY.interval)
-    revised = RevisedVectorActions(envs, guard, failed=lambda info: bool(info["failed"]))
-    collisions = 0
-    revised.reset(seed=1)
-    for _ in range(400):
-        *_, infos = revised.step(np.full((3, 1), 2.5))
-        collisions += infos["failed"].sum()
-    assert collisions == guard.machine.endings.sum() <= 1
-    assert guard.judge.brakes.known
-    envs.close()
+    revised = RevisedVectorActions(SyncVectorEnv([lambda: Script(FAR, NEAR, FAR)] * 2), guard)
+    drive_all(revised, 7)
+    assert guard.judge.episodes == []
+    assert guard.machine.n_states == 0
 
 
 def test_environments_that_are_a_vector_by_themselves_are_driven_too():
     envs = gymnasium.make_vec("CartPole-v1", num_envs=3, vectorization_mode="vector_entry_point")
-    guard = guard_for(envs.single_action_space, Spy())
+    guard = guard_for(envs.single_action_space)
     ended = [over.copy() for over, _ in drive_all(RevisedVectorActions(envs, guard), 60)]
     assert len(guard.judge.episodes) == np.sum(ended)
-    assert all(failed for *_, failed in guard.judge.episodes)
     assert all(abs(last[0]) > 2.4 or abs(last[2]) > 0.2 for _, last, _ in guard.judge.episodes)
     envs.close()
 
 
-def test_a_guard_with_an_audit_log_is_not_shared(tmp_path):
-    envs, _ = recorded("CartPole-v1", 2, NEXT_STEP, 12)
-    with AuditLog(tmp_path / "log") as log:
-        guard = guard_for(envs.single_action_space, Spy(), audit=log)
-        with pytest.raises(ValueError, match="one episode at a time"):
-            RevisedVectorActions(envs, guard)
-        with pytest.raises(ValueError, match="call revise"):
-            guard.take_in(guard.recognise([0.0], 0.0), Proposal(0), 0)
+def test_a_guard_with_an_audit_log_is_not_shared():
+    guard = guard_for(ONE, audit=object())
+    with pytest.raises(ValueError, match="one episode at a time"):
+        RevisedVectorActions(SyncVectorEnv([lambda: Script(FAR)]), guard)
+    with pytest.raises(ValueError, match="call revise"):
+        guard.take_in(None, Proposal(0), 0)
 
 
-# -- The examples ------------------------------------------------------------------------------
+# -- PettingZoo --------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def crowd():
+    """A parallel environment of scripts of different lengths, an agent each."""
+    pettingzoo = pytest.importorskip("pettingzoo")
+
+    class Crowd(pettingzoo.ParallelEnv):
+        metadata = {"name": "crowd"}  # noqa: RUF012
+        render_mode = None
+
+        def __init__(self, *lengths):
+            self.scripts = {
+                f"a{k}": Script(*[FAR] * (length - 1), NEAR) for k, length in enumerate(lengths)
+            }
+            self.possible_agents = list(self.scripts)
+
+        def observation_space(self, agent):
+            return Script.observation_space
+
+        def action_space(self, agent):
+            return ONE
+
+        def reset(self, seed=None, options=None):
+            self.agents = self.possible_agents[:]
+            each = {one: script.reset(seed=seed) for one, script in self.scripts.items()}
+            return tuple({one: np.array(got[k]) for one, got in each.items()} for k in range(2))
+
+        def step(self, actions):
+            each = {one: self.scripts[one].step(action) for one, action in actions.items()}
+            said = tuple({one: got[k] for one, got in each.items()} for k in range(5))
+            self.agents = [one for one in self.agents if not said[2][one]]
+            return ({one: np.array(seen) for one, seen in said[0].items()}, *said[1:])
+
+    return Crowd
+
+
+def drive_agents(env, wanted):
+    env.reset()
+    steps = []
+    while env.agents:
+        steps.append(env.step({agent: np.array([wanted]) for agent in env.agents}))
+    return steps
+
+
+def test_the_guard_learns_each_agents_episode_whole_and_info_says_what_was_done(crowd):
+    from evofsm.guard import RevisedAgents
+
+    guard = guard_for(ONE, Spy(above_half))
+    env = RevisedAgents(crowd(2, 4), guard, penalty=2.0)
+    first, *_, last = drive_agents(env, 2.5)
+    size = first[4]["a0"]["reviser/penalty"]
+    assert size > 0.5
+    assert first[1] == {"a0": 1.5 - 2.0 * size, "a1": 1.5 - 2.0 * size}
+    assert first[4]["a1"].keys() == KEYS | {"of", "failed"}
+    assert first[4]["a0"]["reviser/executed_action"] == env.env.scripts["a0"].executed[0] <= [0.5]
+    assert [len(rows) for rows, *_ in guard.judge.episodes] == [1, 3]
+    assert [(end, failed) for _, end, failed in guard.judge.episodes] == [(tuple(NEAR), True)] * 2
+    assert last[4].keys() == {"a1"}
+    assert env.revisions.keys() == {"a0", "a1"}
+    env.reset()
+    env.step({agent: np.array([0.0]) for agent in env.agents})
+    env.reset()  # what is under way ends without failure
+    assert [failed for *_, failed in guard.judge.episodes] == [True, True, True, False]
+
+
+def test_with_one_agent_it_comes_to_the_same_as_with_gymnasium(crowd):
+    from evofsm.guard import RevisedAgents
+
+    many, one = guard_for(ONE, Spy(above_half)), guard_for(ONE, Spy(above_half))
+    drive_agents(RevisedAgents(crowd(5), many), 2.5)
+    drive(RevisedActions(Script(*[FAR] * 4, NEAR), one), full_throttle)
+    assert many.judge.episodes == one.judge.episodes
+
+
+def test_pettingzoo_finds_nothing_to_complain_of(crowd):
+    from evofsm.guard import RevisedAgents
+
+    with warnings.catch_warnings():  # its tests import what it has deprecated itself
+        warnings.simplefilter("ignore", DeprecationWarning)
+        from pettingzoo.test import parallel_api_test
+    parallel_api_test(RevisedAgents(crowd(9, 30), guard_for(ONE)), num_cycles=60)
+
+
+# -- Extras and examples -----------------------------------------------------------------------
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("module", "package", "extra"),
+    [("gym", "gymnasium", "gym"), ("pettingzoo", "pettingzoo", "pettingzoo")],
+)
+def test_without_its_package_the_extra_is_named(module, package, extra):
+    program = f"import sys; sys.modules['{package}'] = None; import evofsm.guard.{module}"
+    finished = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert finished.stderr.rstrip().endswith(f"pip install '.[{extra}]' in a clone of evofsm")
 
 
 @pytest.mark.slow

@@ -3,6 +3,7 @@ from .actions import ActionSet as ActionSet
 from .actions import BoxActions as BoxActions
 from .actions import Choices as Choices
 from .actions import same_action as same_action
+from .alarms import ConformalAlarm as ConformalAlarm
 from .auditing.form import Misfit as Misfit
 from .auditing.log import AuditLog as AuditLog
 from .auditing.participants import participant_class as participant_class
@@ -13,9 +14,6 @@ from .auditing.replay import Difference as Difference
 from .auditing.replay import Field as Field
 from .auditing.replay import Replay as Replay
 from .auditing.replay import audit as audit
-from .conformal import ConformalAlarm as ConformalAlarm
-from .conformal import Errors as Errors
-from .conformal import Held as Held
 from .defaults import BELIEF_TOLERANCE as BELIEF_TOLERANCE
 from .defaults import TOLERANCE as TOLERANCE
 from .guard import Explain as Explain

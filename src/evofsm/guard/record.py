@@ -1,7 +1,7 @@
-"""What is recorded of a decision: each number once, with its name, its unit and its description.
+"""What is recorded of a decision: each number once, with its type, its unit and its description.
 
-Tables, logs, the audit log, the live page and Gymnasium's ``info`` all read this. A number that is
-not known is NaN, or None where it is whole; JSON that has neither leaves it out.
+Tables, logs, the audit log and the live page all read this. A number that is not known is NaN, or
+None where it is an int; JSON, which has neither, leaves it out.
 """
 
 from __future__ import annotations
@@ -26,65 +26,51 @@ class Column(NamedTuple):
     kind: type[int] | type[float] | type[str]
     about: str  #: with its unit in brackets, and where it is not known
     read: Callable[[Any], Any]  #: from a decision
-    info: str = ""  #: its name in Gymnasium's ``info``, after ``reviser/``; empty where it is not
     in_table: bool = True  #: whether ``decisions.parquet`` has it
 
 
-def _seen(kind: type[int] | type[float] | type[str], name: str, about: str) -> Column:
-    return Column(kind, about, attrgetter(f"situation.{name}"))
-
-
-def _decided(
-    kind: type[int] | type[float] | type[str], name: str, about: str, info: str = ""
-) -> Column:
-    return Column(kind, about, attrgetter(f"revision.{name}"), info)
+def _of(part: str, name: str, kind: type[Any], about: str) -> Column:
+    return Column(kind, about, attrgetter(f"{part}.{name}"))
 
 
 _INTAKE = ", ".join(f"{flag.value} {flag.name}" for flag in Intake if flag.name)
+_PROPOSED = "what the controller wanted [m/s²]; left out where there is none"
+_STATE = "the most probable one, from 0; left out where none is known"
 
-#: By name in tables and in the audit log. Elsewhere two have other names: MCAP's channel ``/risk``
-#: drops ``risk_``, and ``info`` has its own.
+#: By name in tables and in the audit log; MCAP's channel ``/risk`` drops ``risk_``.
 RECORD: Mapping[str, Column] = {
-    "time": _seen(float, "time", "since the start of the episode [s]"),
+    "time": _of("situation", "time", float, "since the start of the episode [s]"),
     "intake": Column(
         int, f"what was wrong: a sum of {_INTAKE}", lambda one: int(one.situation.intake)
     ),
-    "state": _seen(int, "state", "the most probable one, from 0; left out where none is known"),
+    "state": _of("situation", "state", int, _STATE),
     "n_states": Column(
         int,
         "how many states there were",
         lambda one: 0 if one.situation.state is None else len(one.situation.belief),
     ),
-    "surprise": _seen(
-        float, "surprise", "divergence of forecast and belief [bit]; left out at first"
+    "surprise": _of(
+        "situation", "surprise", float, "divergence of forecast and belief [bit]; left out at first"
     ),
-    "proposed": _decided(
-        float, "proposed", "what the controller wanted [m/s²]; left out where there is none"
+    "proposed": _of("revision", "proposed", float, _PROPOSED),
+    "executed": _of("revision", "executed", float, "what was commanded [m/s²]"),
+    "advised": _of("revision", "advised", float, "what the reviser would have executed [m/s²]"),
+    "risk_proposed": _of(
+        "revision", "risk_proposed", float, "probability of failure under the proposal"
     ),
-    "executed": _decided(float, "executed", "what was commanded [m/s²]"),
-    "advised": _decided(float, "advised", "what the reviser would have executed [m/s²]"),
-    "risk_proposed": _decided(
-        float, "risk_proposed", "probability of failure under the proposal", "risk_proposed"
-    ),
-    "risk_executed": _decided(float, "risk_executed", "the same for what is executed", "risk"),
+    "risk_executed": _of("revision", "risk_executed", float, "the same for what is executed"),
     "risk_low": Column(
         float, "lower end of its 90 % interval", lambda one: one.revision.interval[0]
     ),
     "risk_high": Column(
         float, "upper end of its 90 % interval", lambda one: one.revision.interval[1]
     ),
-    "evidence": _decided(
-        float, "evidence", "disturbances that it rests on, such as braking leaders"
+    "evidence": _of(
+        "revision", "evidence", float, "disturbances that it rests on, such as braking leaders"
     ),
-    "seen": _decided(float, "seen", "time spent in states like this one before [s]"),
-    "reason": _decided(str, "reason", "why, in a few words", "reason"),
-    "explanation": _decided(
-        str, "explanation", "why, in detail; empty where nothing was said"
+    "seen": _of("revision", "seen", float, "time spent in states like this one before [s]"),
+    "reason": _of("revision", "reason", str, "why, in a few words"),
+    "explanation": _of(
+        "revision", "explanation", str, "why, in detail; empty where nothing was said"
     )._replace(in_table=False),
 }
-
-
-def info_of(revision: Revision) -> dict[str, Any]:
-    """What Gymnasium's ``info`` says of a decision, but for the actions."""
-    one = Pair(None, revision)  # type: ignore[arg-type]  # nothing of a situation stands there
-    return {f"reviser/{by.info}": by.read(one) for by in RECORD.values() if by.info}

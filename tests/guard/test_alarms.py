@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from evofsm.guard.conformal import ConformalAlarm
+from evofsm.guard.alarms import ConformalAlarm
 from evofsm.store import storage
 
 ANY = st.floats(allow_nan=True, allow_infinity=True)
@@ -32,26 +32,23 @@ def test_the_rate_is_held_whatever_comes(came, rate, step, of):
         alarm.update(score, happened)
         assert (alarm.errors, alarm.counted) == (errors, counted)
         if counted:
-            assert alarm.held.low - 1e-9 <= alarm.realised <= alarm.held.high + 1e-9
+            low, high = alarm.held
+            assert low - 1e-9 <= alarm.realised <= high + 1e-9
 
 
 @pytest.mark.parametrize("of", KINDS)
-def test_an_adversary_who_knows_the_threshold_gets_no_further_than_the_bound(of):
-    alarm = ConformalAlarm(0.05, of=of, step=0.01, memory=100)
-    for _ in range(3000):
-        worst = math.inf if of == "false alarms" else -math.inf
-        alarm.update(worst, of == "misses")
-    assert alarm.errors <= 0.05 * 3000 + 0.05 / 0.01 + 0.95
-
-
-def test_a_delay_costs_no_more_errors_than_its_length():
-    alarm, delay, said = ConformalAlarm(0.05, step=0.01, memory=100), 30, []
-    for t in range(3000):
-        said.append((float(t), alarm.alarms(float(t))))  # each score is above all before
+@pytest.mark.parametrize("delay", [0, 30])
+def test_an_adversary_gets_no_further_than_the_bound_and_one_error_more_per_update_of_delay(
+    of, delay
+):
+    alarm, said = ConformalAlarm(0.05, of=of, step=0.01, memory=100), []
+    sign = 1.0 if of == "false alarms" else -1.0
+    for t in range(3000):  # each score is worse than all before
+        said.append((sign * t, alarm.alarms(sign * t)))
         if t >= delay:
             score, alarmed = said[t - delay]
-            alarm.update(score, False, alarmed=alarmed)
-    assert alarm.errors <= 0.05 * alarm.counted + 0.05 / 0.01 + 1.0 + delay
+            alarm.update(score, of == "misses", alarmed=alarmed)
+    assert alarm.errors <= 0.05 * alarm.counted + 0.05 / 0.01 + 0.95 + delay
 
 
 def test_after_a_shift_the_rate_comes_back_and_a_fixed_threshold_loses_it():
@@ -67,32 +64,24 @@ def test_after_a_shift_the_rate_comes_back_and_a_fixed_threshold_loses_it():
     assert (after > fixed).mean() > 0.15
 
 
-def test_only_the_order_of_scores_matters():
+@pytest.mark.parametrize("of", KINDS)
+def test_only_the_order_of_scores_matters_and_nan_is_the_most_dangerous(of):
     rng = np.random.default_rng(5)
-    scores, happened = rng.normal(size=500), rng.random(500) < 0.3
-    for of in KINDS:
-        one, other = (ConformalAlarm(0.1, of=of, step=0.03, memory=60) for _ in range(2))
-        for score, came in zip(scores, happened, strict=True):
-            assert one.alarms(score) == other.alarms(math.exp(score))
-            one.update(score, came)
-            other.update(math.exp(score), came)
+    one, other = (ConformalAlarm(0.1, of=of, step=0.03, memory=60) for _ in range(2))
+    for score, came in zip(rng.normal(size=500), rng.random(500) < 0.3, strict=True):
+        assert one.alarms(score) == other.alarms(math.exp(score))
+        one.update(score, came)
+        other.update(math.exp(score), came)
+    assert one.alarms(math.nan)
+    assert not one.alarms(-math.inf)
 
 
-def test_what_is_not_known_is_taken_for_the_most_dangerous():
-    for of in KINDS:
-        alarm = ConformalAlarm(0.1, of=of, memory=20)
-        for score in range(20):
-            alarm.update(float(score), of == "misses")
-        assert alarm.alarms(math.nan)
-        assert not alarm.alarms(-math.inf)
-
-
-def test_a_question_changes_nothing_and_the_other_outcome_does_not_count():
+def test_until_enough_was_seen_it_is_silent_or_always_on():
     alarm = ConformalAlarm(0.1)
-    assert not alarm.alarms(5.0)  # too little was seen: silent
+    assert not alarm.alarms(5.0)
     assert alarm.threshold == math.inf
-    assert ConformalAlarm(0.1, of="misses").alarms(-5.0)  # always on
-    alarm.update(3.0, True)
+    assert ConformalAlarm(0.1, of="misses").alarms(-5.0)
+    alarm.update(3.0, True)  # an event: no false alarm is possible
     assert (alarm.counted, alarm.held) == (0, (0.0, 1.0))
     assert math.isnan(alarm.realised)
 
@@ -110,26 +99,27 @@ def test_saved_and_loaded_it_goes_on_the_same(of):
         assert again.threshold == alarm.threshold
         again.update(score, of == "misses")
         alarm.update(score, of == "misses")
-    assert again.errors == alarm.errors
-
-
-def test_a_file_that_contradicts_itself_is_refused():
-    file = BytesIO()
-    ConformalAlarm(0.1).save(file)
-    content, arrays = storage.read(BytesIO(file.getvalue()), "conformalalarm")
-    for told, scores, what in (
-        (content | {"of": "luck"}, [], "of is 'luck'"),
-        (content | {"counted": 2, "errors": 3}, [1.0, 2.0], "3 errors of 2"),
-        (content | {"counted": 2}, [1.0], "1 scores of 2 updates"),
-    ):
-        bad = BytesIO()
-        storage.write(bad, "conformalalarm", told, arrays | {"scores": np.array(scores)})
-        with pytest.raises(ValueError, match=what):
-            ConformalAlarm.load(BytesIO(bad.getvalue()))
 
 
 @pytest.mark.parametrize(
-    ("told", "what"),
+    ("changed", "scores", "what"),
+    [
+        ({"of": "luck"}, [], "of is 'luck'"),
+        ({"counted": 2, "errors": 3}, [1.0, 2.0], "3 errors of 2"),
+        ({"counted": 2}, [1.0], "1 scores of 2 updates"),
+    ],
+)
+def test_a_file_that_contradicts_itself_is_refused(changed, scores, what):
+    file, bad = BytesIO(), BytesIO()
+    ConformalAlarm(0.1).save(file)
+    content, _ = storage.read(BytesIO(file.getvalue()), "conformalalarm")
+    storage.write(bad, "conformalalarm", content | changed, {"scores": np.array(scores)})
+    with pytest.raises(ValueError, match=what):
+        ConformalAlarm.load(BytesIO(bad.getvalue()))
+
+
+@pytest.mark.parametrize(
+    ("settings", "what"),
     [
         ({"rate": 0.0}, "rate is 0.0"),
         ({"rate": 1.0}, "below 1"),
@@ -139,6 +129,6 @@ def test_a_file_that_contradicts_itself_is_refused():
         ({"memory": 0}, "memory is 0"),
     ],
 )
-def test_what_cannot_be_held_is_refused(told, what):
+def test_settings_out_of_range_are_refused(settings, what):
     with pytest.raises(ValueError, match=what):
-        ConformalAlarm(**told)
+        ConformalAlarm(**settings)

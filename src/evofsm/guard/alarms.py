@@ -1,25 +1,24 @@
-"""Alarms whose rate of errors is held, whatever the score and whatever comes.
+"""Alarms whose error rate is held, whatever the score and whatever comes.
 
 Adaptive conformal inference (Gibbs & Candes, "Adaptive conformal inference under distribution
-shift", NeurIPS 2021) on the score of an alarm. An update t brings a score and what came of it; it
-is an error, err_t = 1, if the score lies above the threshold, which is the (1 - alpha_t) quantile
-of the latest scores. Then ::
+shift", NeurIPS 2021) on the score of an alarm. Update t brings a score and its outcome. It is an
+error, err_t = 1, if the score lies above the threshold, the (1 - alpha_t) quantile of the latest
+scores. Then ::
 
     alpha_{t+1} = alpha_t + step (rate - err_t),      alpha_1 = rate
 
-so that errors raise the threshold, and each of the others lowers it a little.
+so that an error raises the threshold, and every other update lowers it a little.
 
 **What is guaranteed.** Where alpha_t <= 0 the threshold is infinite and nothing is an error; where
-alpha_t >= 1 it is minus infinite and everything is. So alpha_t never leaves
+alpha_t >= 1 it is minus infinity and everything is. So alpha_t never leaves
 [-step (1 - rate), 1 + step rate]. The sum of both sides over T updates is
 alpha_{T+1} - rate = step (T rate - sum err), hence ::
 
     -((1 - rate) / step + rate)  <=  sum err - T rate  <=  rate / step + 1 - rate
 
-for *any* sequence of scores and outcomes: no distribution is assumed, none has to stay the same,
-and nothing has to be independent. The right side is what a user has to fear: with ``rate=0.01``
-and ``step=0.005`` never more than 2.99 errors above 1 % of the updates, after a shift as before it.
-What it does not say stands in `ConformalAlarm`.
+for *any* sequence of scores and outcomes: no distribution is assumed, nothing has to stay the same
+or be independent. With ``rate=0.01`` and ``step=0.005`` there are never more than 2.99 errors above
+1 % of the updates. What is not guaranteed stands in `ConformalAlarm`.
 """
 
 from __future__ import annotations
@@ -28,18 +27,19 @@ import math
 from bisect import bisect_left, insort
 from collections import deque
 from collections.abc import Mapping
-from typing import Any, Literal, NamedTuple, Self, get_args
+from typing import Any, Literal, Self, get_args
 
 import numpy as np
 
-from evofsm.fsm import positive, whole
+from evofsm.fsm.validation import positive, whole
 from evofsm.store import Place, ranges, storage
 
-#: Errors whose rate is held.
+#: Kinds of errors, of which one has its rate held.
 Errors = Literal["false alarms", "misses"]
 
-# A rank that is off a whole number by rounding alone is that number.
+# A rank this close to an integer differs from it by rounding alone.
 _ROUNDING = 1e-9
+_SETTINGS = ("rate", "of", "step", "memory")
 _KIND = ranges.register(
     ranges.Kind(
         "conformalalarm",
@@ -55,28 +55,20 @@ _KIND = ranges.register(
 ).name
 
 
-class Held(NamedTuple):
-    """Between which shares the rate of errors is guaranteed to lie, of the updates so far."""
-
-    low: float
-    high: float
-
-
 class ConformalAlarm:
-    """An alarm above a threshold that adapts, so that the rate of its errors is as stated.
+    """An alarm above a threshold that adapts, so that its error rate is as stated.
 
     Parameters
     ----------
     rate : float
-        That is held, above 0 and below 1: of ``"false alarms"``, the share of updates in which
-        nothing happened that were in alarm; of ``"misses"``, the share of those in which something
-        happened that were not.
+        To be held, in (0, 1). Of ``"false alarms"``: the share of updates without an event that
+        were in alarm. Of ``"misses"``: the share of updates with an event that were not.
     of : {"false alarms", "misses"}
     step : float
-        How fast the threshold adapts. Larger ones hold the rate more tightly, smaller ones let the
-        threshold waver less.
+        How fast the threshold adapts. A larger step holds the rate more tightly; under a smaller
+        one the threshold wavers less.
     memory : int
-        Latest scores among which the threshold is, at least ``1 / rate``.
+        Number of latest scores that the threshold is a quantile of, at least ``1 / rate``.
 
     Raises
     ------
@@ -85,25 +77,22 @@ class ConformalAlarm:
 
     Notes
     -----
-    Scores are plain floats, the higher the more dangerous: a risk, minus a time to collision, a
-    state's share of failures. Only their order matters, so they may be infinite, and in any unit.
-    NaN counts as the most dangerous one.
+    Scores are floats, the higher the more dangerous: a risk, minus a time to collision, a state's
+    share of failures. Only their order matters, so any unit and infinities will do. NaN counts as
+    the most dangerous score.
 
-    The guarantee (`held`) is on the rate of errors over all updates that count, and on nothing
-    else. It says nothing of a single alarm, nor of the errors of the other kind: a score that tells
-    nothing keeps its false alarms as rare, and sees no danger. A rate of false alarms is held by
-    silence if need be (`threshold` is infinite then), a rate of misses by an alarm that is always
-    on. Until about ``1 / rate`` updates were counted the alarm is silent, or always on.
+    The guarantee (`held`) is about the error rate over all updates that count, and nothing else:
+    not about a single alarm, nor about the other kind of errors. A rate of false alarms is held by
+    silence if need be, a rate of misses by an alarm that is always on; until about ``1 / rate``
+    updates were counted it is so. Decisions a quarter of a second apart are much alike: the bound
+    holds for them too, but one long false alarm is then many errors.
 
-    Updates are whatever the rate is to be of. Decisions a quarter of a second apart are much alike:
-    the bound holds for them too, but a false alarm that lasts is many errors.
-
-    Where the outcome is known only later, update then, and say with ``alarmed`` what the alarm said
-    at the time. With a delay of d updates there may be d errors more on either side.
+    Where the outcome is known only later, update then, with ``alarmed`` as the alarm was at the
+    time. A delay of d updates allows for d more errors on either side.
 
     Examples
     --------
-    A score whose scale doubles half way; 5 % of what was safe may be in alarm:
+    A score whose scale doubles half way; 5 % of the safe updates may be in alarm:
 
     >>> alarm = ConformalAlarm(rate=0.05, step=0.02)
     >>> rng = np.random.default_rng(0)
@@ -136,7 +125,7 @@ class ConformalAlarm:
                 f"memory is {memory}; a rate of {rate:g} needs {math.ceil(1.0 / self.rate):,} "
                 "scores at least"
             )
-        #: Updates that counted: nothing happened in them, or, of misses, something.
+        #: Updates that counted: those without an event; of misses, those with one.
         self.counted = 0
         #: Errors among them.
         self.errors = 0
@@ -150,13 +139,11 @@ class ConformalAlarm:
 
     @property
     def threshold(self) -> float:
-        """Where the alarm is raised now.
+        """Scores above it are in alarm; of ``"misses"``, those at it as well.
 
-        Scores above it are in alarm; of ``"misses"``, those at it are, too. Infinite while the
-        alarm is silent, minus infinite while it is always on.
+        Infinite while the alarm is silent, minus infinity while it is always on.
         """
-        quantile = self._quantile
-        return quantile if self.of == "false alarms" else -quantile
+        return self._quantile if self.of == "false alarms" else -self._quantile
 
     @property
     def realised(self) -> float:
@@ -164,42 +151,31 @@ class ConformalAlarm:
         return self.errors / self.counted if self.counted else math.nan
 
     @property
-    def held(self) -> Held:
-        """Between which shares `realised` must lie now, whatever came (without delay)."""
+    def held(self) -> tuple[float, float]:
+        """(low, high): where `realised` must lie now, whatever came (without delay)."""
         if not self.counted:
-            return Held(0.0, 1.0)
+            return 0.0, 1.0
         fewer = (1.0 - self.rate) / self.step + self.rate
         more = self.rate / self.step + 1.0 - self.rate
         low, high = self.rate - fewer / self.counted, self.rate + more / self.counted
-        return Held(max(0.0, low), min(1.0, high))
+        return max(0.0, low), min(1.0, high)
 
     def alarms(self, score: float) -> bool:
-        """Whether a score is in alarm now. Changes nothing.
-
-        Raises
-        ------
-        TypeError
-            If it is no number.
-        """
+        """Whether a score is in alarm now. Changes nothing."""
         return self._errs(self._value(score)) == (self.of == "false alarms")
 
     def update(self, score: float, happened: bool, *, alarmed: bool | None = None) -> None:
-        """Learn what came of a score.
+        """Learn the outcome of a score.
 
         Parameters
         ----------
         score : float
             NaN counts as the most dangerous one.
         happened : bool
-            Whether what the alarm is to warn of came. Of false alarms only updates in which nothing
-            happened count, of misses only those in which something did.
+            Whether the event came that the alarm is to warn of. Of false alarms only updates
+            without it count, of misses only updates with it.
         alarmed : bool, optional
-            What the alarm said of it at the time; what it says now if not given.
-
-        Raises
-        ------
-        TypeError
-            If the score is no number.
+            Whether it was in alarm at the time; without it, whether it is now.
         """
         value = self._value(score)
         if bool(happened) != (self.of == "misses"):
@@ -223,7 +199,7 @@ class ConformalAlarm:
 
     @property
     def _quantile(self) -> float:
-        """Of the latest values, with the correction for few of them; infinite past either end."""
+        """Of the latest values, corrected for few of them; infinite past either end."""
         n = len(self._ordered)
         above = math.floor(self.level * (n + 1) + _ROUNDING)
         if above < 1:
@@ -234,29 +210,14 @@ class ConformalAlarm:
         quantile = self._quantile
         return value > quantile or quantile == -math.inf
 
-    # -- Keeping it -----------------------------------------------------------------------------
-
     def save(self, path: Place, provenance: Mapping[str, Any] | None = None) -> None:
-        """Write all of it to a file (arrays and a JSON header, nothing that can run).
-
-        Parameters
-        ----------
-        path : path-like, or file open for writing bytes
-        provenance : mapping, optional
-            What it was updated with, for people; kept in the file.
-
-        Raises
-        ------
-        OSError
-            If it cannot be written.
-        """
-        names = ("rate", "of", "step", "memory", "counted", "errors")
-        content = {name: getattr(self, name) for name in names}
-        storage.write(path, _KIND, content, {"scores": np.array(self._latest)}, provenance)
+        """Write it to a file, with ``provenance`` for people; it goes on where it was."""
+        settings = {name: getattr(self, name) for name in (*_SETTINGS, "counted", "errors")}
+        storage.write(path, _KIND, settings, {"scores": np.array(self._latest)}, provenance)
 
     @classmethod
     def load(cls, path: Place) -> Self:
-        """Read an alarm, which goes on as if it had never been kept.
+        """Read what `save` wrote.
 
         Raises
         ------
@@ -265,16 +226,15 @@ class ConformalAlarm:
         ValueError
             If the file holds something else or is damaged.
         """
-        content, arrays = storage.read(path, _KIND)
+        settings, arrays = storage.read(path, _KIND)
         with storage.explained(path):
-            counts = {name: int(content.pop(name)) for name in ("counted", "errors")}
-            alarm = cls(**content)
+            alarm = cls(**{name: settings[name] for name in _SETTINGS})
+            alarm.counted, alarm.errors = int(settings["counted"]), int(settings["errors"])
             scores = arrays["scores"].tolist()
-            if len(scores) != min(counts["counted"], alarm.memory):
-                raise ValueError(f"{len(scores)} scores of {counts['counted']} updates are kept")
-            if counts["errors"] > counts["counted"]:
-                raise ValueError(f"{counts['errors']} errors of {counts['counted']} updates")
-        alarm.counted, alarm.errors = counts["counted"], counts["errors"]
+            if len(scores) != min(alarm.counted, alarm.memory):
+                raise ValueError(f"it has {len(scores)} scores of {alarm.counted} updates")
+            if alarm.errors > alarm.counted:
+                raise ValueError(f"it has {alarm.errors} errors of {alarm.counted} updates")
         alarm._latest, alarm._ordered = deque(scores), sorted(scores)
         return alarm
 
