@@ -53,6 +53,5 @@ from .reviser import is_spoken as is_spoken
 from .reviser import make_usable as make_usable
 from .reviser import unjudged_revision as unjudged_revision
 from .reviser import unseen_text as unseen_text
-from .scene.risk import SceneRisk as SceneRisk
-from .scene.seeing import Layout as Layout
+from .scene import SceneRisk as SceneRisk
 from .senses import Senses as Senses

@@ -20,9 +20,7 @@ from evofsm.driving.attached.seen import Neighbour, Seeing
 from evofsm.driving.naming import VARIABLES
 from evofsm.driving.risk.latent import LatentRisk
 from evofsm.driving.risk.manoeuvres import BrakeWatch, Manoeuvres
-from evofsm.driving.scene.guarding import guard_for_traffic
-from evofsm.driving.scene.objects import Role
-from evofsm.driving.scene.risk import TrafficRisk
+from evofsm.driving.traffic import Role, TrafficRisk, guard_for_traffic
 from evofsm.guard import ActionReviser, Guard, Mode, Revision
 
 # Leaders are assumed to brake so hard until they were seen to: SUMO's emergencyDecel [m/s²].

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.driving.scene.objects import COLUMNS
+from evofsm.driving.traffic import COLUMNS
 
 # How far one looks at least [m]; further by what it takes to stop.
 _NEAR, _GENTLE = 30.0, 3.0

@@ -1,0 +1,797 @@
+"""A judge of scenes: failure is to meet one of the objects around, and nothing about it is given.
+
+An action is as dangerous as the best that can follow it: each action, taken for good. What that
+brings is forecast from remembered episodes. Four things are learnt, from all objects alike:
+
+* *Which object is which* a step later: the one nearest to where it was expected. How places change
+  is a linear model of what oneself and the object were like before and after, fitted by robust
+  least squares; its prior is that by what oneself moves, all else moves back (`_fit_motion`).
+* *How oneself moves*: as after the same action where it was most alike (`_own_courses`).
+* *How objects go on*: as the objects did that were most alike, an analog ensemble (Delle Monache et
+  al., "Probabilistic weather prediction with an analog ensemble", Monthly Weather Review 2013;
+  `foresee`).
+* *How close is too close*: from how close objects came in steps that ended in failure (`Contact`).
+"""
+
+from __future__ import annotations
+
+import math
+import operator
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from evofsm.fsm.kernels import compiled
+from evofsm.fsm.naming import Labels
+from evofsm.fsm.proportions import wilson_bounds
+from evofsm.fsm.validation import positive, whole
+from evofsm.guard.actions import Action
+from evofsm.guard.protocols import Fallback, Judgement, Search, Situation, Trial
+from evofsm.store import Place, ranges, storage
+
+_Floats = NDArray[np.float64]
+_Ints = NDArray[np.int64]
+
+# Steps that are looked ahead.
+_STEPS = 5
+# Objects of all moments that are remembered, at most; the oldest episodes are forgotten.
+_MOST = 40_000
+# Analogs of an object, and of oneself.
+_ANALOGS, _OWN_ANALOGS = 20, 3
+# An analog at this squared distance counts a quarter of one that is the same.
+_ALIKE = 0.1
+# Weight of a place, relative to the rest, where objects are linked; and where they are compared.
+_OF_REST, _NEAR_TO = 0.1, 2.0
+# Squared distance from where an object was expected beyond which it is another one.
+_GATE = 0.5
+# Nothing is forecast from an object that went so many times as far astray as is too close.
+_ASTRAY = 2.5
+# Reweightings of a robust fit; the squared residual, in medians, that counts half; the ridge.
+_FITS, _HALF, _RIDGE = 4, 9.0, 1e-6
+# A number varies by so much of its mean square at least, so that two that never change differ.
+_CONSTANT = 1e-6
+# Squared residuals count as this large at least, in squared spreads.
+_EXACT = 1e-4
+# Objects that have to be seen twice before anything is learnt, times the numbers of oneself.
+_ROWS = 10
+# Points of a step at which a distance is taken, its two ends included.
+_POINTS = 6
+# Shapes of the box around an object that are tried: how much longer than wide, as powers of e.
+_SHAPES = np.linspace(-3.5, 3.5, 29)
+# Closest steps that were survived, of which each counts.
+_CLOSEST = 2000
+
+_SOME = ranges.Range(-math.inf, math.inf)
+_INDEX = ranges.Range(-1.0, ranges.MOST_COUNTED, whole=True)
+_KIND = ranges.register(
+    ranges.Kind(
+        "scenerisk",
+        {
+            "own": ranges.Member(("n", "o"), _SOME),
+            "actions": ranges.Member(("n",), _INDEX),
+            "counts": ranges.Member(("n",), ranges.COUNT),
+            "lost": ranges.Member(("n",), ranges.FLAG),
+            "away": ranges.Member(("m", "p"), _SOME),
+            "other": ranges.Member(("m", "r"), _SOME),
+            "links": ranges.Member(("m",), _INDEX),
+        },
+        {
+            "dt": ranges.SIZE,
+            "n_actions": ranges.FROM_1,
+            "columns": ranges.FROM_1,
+            "failures": ranges.COUNT,
+            "fitted": ranges.COUNT,
+        },
+    )
+).name
+
+
+class SceneRisk:
+    """Judges one of a few actions among any number of objects; given only which episodes failed.
+
+    The risk of an action is the probability to meet an object within five decisions, if the best
+    of all actions follows it for good. For decisions that are few and coarse, such as one a second;
+    actions are `Choices`.
+
+    Parameters
+    ----------
+    dt : float
+        Time between two decisions [s].
+    n_actions : int
+    columns : int
+        Numbers in a row of the observation. The first is above 0.5 where the row is in use; the
+        first row is oneself, each other one an object. A row with a NaN is not in use.
+    place : sequence of int
+        Columns that say where something is.
+    relative : bool
+        Whether rows of objects are relative to oneself in all columns but the first.
+
+    Raises
+    ------
+    ValueError
+        If a number is out of its range, or ``place`` names none or all of the columns after the
+        first.
+
+    Notes
+    -----
+    Before the first failure all is kept. Failures that no object explains (a border, time) are
+    not learnt. How objects answer to one's own action is not forecast: they go on as such objects
+    went on before. The 90 % interval is that of a share of so many analogs (Wilson 1927).
+
+    Examples
+    --------
+    >>> from evofsm.guard import Guard
+    >>> judge = SceneRisk(1.0, 5)
+    >>> guard = Guard(n_actions=5, interval=1.0, judge=judge)
+    >>> ego, car = [1.0, 0.0, 4.0, 25.0, 0.0], [1.0, 30.0, 0.0, -5.0, 0.0]
+    >>> guard.decide(ego + car, proposal=3).reason
+    'no failure is known yet, so nothing is refused'
+    """
+
+    _seen: list[Seen]
+    _actions: list[int]
+    fallback = Fallback(0.0, "the first action")  #: without a usable proposal, revised like any
+
+    def __init__(
+        self,
+        dt: float,
+        n_actions: int,
+        *,
+        columns: int = 5,
+        place: Sequence[int] = (1, 2),
+        relative: bool = True,
+    ) -> None:
+        self.dt = positive("dt", dt)
+        self.labels = Labels(dt=self.dt)
+        self.columns = whole("columns", columns)
+        self.place = [int(column) for column in place]
+        self.relative = relative
+        among = set(range(1, self.columns))
+        if not 0 < len(set(self.place)) == len(self.place) < len(among) or set(self.place) - among:
+            raise ValueError(
+                f"place is {self.place}; it must name some, not all, of the columns from 1 to "
+                f"{self.columns - 1}, each once"
+            )
+        self._rest = sorted(among - set(self.place))
+        #: What was learnt.
+        self.memory = Memory(operator.index(n_actions), len(self.place), len(self._rest))
+        self._seen, self._actions = [], []
+
+    def trial(self) -> Trial | None:
+        """None: it tries nothing."""
+        return None
+
+    def effective(self, situation: Situation, actions: _Floats) -> _Floats:
+        """All actions as they are."""
+        return actions
+
+    def refuse_unfit(self, low: Action, high: Action) -> None:
+        """Raise a ValueError if there are other actions than it was made for."""
+        if (low, high) != (0.0, self.memory.n_actions - 1.0):
+            raise ValueError(
+                f"the judge was made for {self.memory.n_actions} choices, but actions lie from "
+                f"{low} to {high}"
+            )
+
+    # -- Deciding -------------------------------------------------------------------------------
+
+    def search(
+        self, situation: Situation, wanted: Action, *, tolerance: float, revising: bool
+    ) -> Search:
+        """The action within the tolerance that is closest to ``wanted`` in what it brings oneself.
+
+        Where none is, one of those that are as little risky as any, and of these one after which
+        it lasts as long as after any, both up to the tolerance; ``wanted``, if it is among them.
+        ``revising`` is not used.
+        """
+        found = self._foreseen(situation)
+        if isinstance(found, str):
+            return Search(np.array([wanted]), self._judged(np.full(1, math.nan)), 0, found)
+        risks, proposed = found.risks.min(1), int(wanted)
+        judged = self._judged(risks[[proposed]])
+        if risks[proposed] <= tolerance:
+            said = f"risk within {_STEPS * self.dt:g} s is within the tolerance"
+            return Search(np.array([wanted]), judged, 0, said)
+        why, after = self.why(judged), found.after
+        good, what = np.flatnonzero(risks <= tolerance), "the closest in effect that can"
+        if not len(good):
+            good = np.flatnonzero(risks <= risks.min() + tolerance)
+            lasting = found.lasting[good].max(1)
+            good = good[lasting >= lasting.max() - tolerance]
+            what = "nothing can, the one that lasts longest"
+        if proposed in good:
+            best, what = proposed, "nothing can, nor does anything last longer"
+        else:
+            best = int(good[self.memory.apart(after[good], after[proposed]).argmin()])
+        judged = self._judged(risks[[proposed, best]])
+        options = np.array([wanted, float(best)])
+        return Search(options, judged, int(best != proposed), f"{why}; {what}")
+
+    def judge(self, situation: Situation, actions: ArrayLike) -> Judgement:
+        """Risk of each action; NaN as long as nothing can be said."""
+        given, found = np.asarray(actions, np.float64), self._foreseen(situation)
+        if isinstance(found, str):
+            return self._judged(np.full(len(given), math.nan))
+        return self._judged(found.risks.min(1)[given.astype(int)])
+
+    def why(self, judged: Judgement) -> str:
+        """Why the first action that was judged is dangerous, in a few words.
+
+        Examples
+        --------
+        >>> judge = SceneRisk(1.0, 5)
+        >>> judge.why(Judgement(np.array([0.25]), *np.zeros((3, 1)), evidence=3.0))
+        'whatever follows, an object is met within 5 s: 25 %'
+        """
+        ahead, risk = _STEPS * self.dt, 100.0 * judged.risk[0]
+        return f"whatever follows, an object is met within {ahead:g} s: {risk:.2g} %"
+
+    def _foreseen(self, situation: Situation) -> Foreseen | str:
+        """What each action brings, or why nothing can be said."""
+        seen = self._read(situation.observation)
+        if self.memory.contact is None:
+            return "no failure is known yet, so nothing is refused"
+        if not np.isfinite(seen.own).all():
+            return "own row is not seen"
+        return self.memory.foresee(seen)
+
+    def _judged(self, risks: _Floats) -> Judgement:
+        bounds = [wilson_bounds(float(risk), _ANALOGS) for risk in risks]
+        low, high = np.where(np.isnan(risks), math.nan, np.transpose(bounds))
+        evidence = 0.0 if np.isnan(risks).any() else float(self.memory.failures)
+        return Judgement(risks, low, high, np.full(len(risks), math.nan), evidence)
+
+    def _read(self, observation: _Floats) -> Seen:
+        """What an observation shows."""
+        if not observation.size or observation.size % self.columns:
+            raise ValueError(f"{observation.size} numbers are no rows of {self.columns}")
+        rows = observation.reshape(-1, self.columns)
+        own, objects = rows[0], rows[1:]
+        objects = objects[(objects[:, 0] > 0.5) & np.isfinite(objects).all(1)]
+        away, other = objects[:, self.place], objects[:, self._rest]
+        if self.relative:
+            other = other + own[self._rest]
+        else:
+            away = away - own[self.place]
+        return Seen(np.concatenate([own[self.place], own[self._rest]]), away, other)
+
+    # -- Learning -------------------------------------------------------------------------------
+
+    def learn(self, observation: ArrayLike, action: Action, belief: ArrayLike) -> None:
+        """Take in an observation and the action after it."""
+        seen = self._read(np.asarray(observation, np.float64))
+        if not np.isfinite(seen.own).all():  # what follows begins anew
+            self._remember(failed=False)
+            return
+        self._seen.append(seen)
+        self._actions.append(int(action))
+
+    watch = learn
+
+    def follow(self, observation: ArrayLike, action: Action) -> None:
+        """Nothing: its decisions depend on the present observation alone."""
+
+    def start_episode(self, *, learn: bool = True) -> None:
+        """What comes does not follow from what was; with ``learn`` that is still learnt from."""
+        if learn:
+            self._remember(failed=False)
+        self._seen, self._actions = [], []
+
+    def end(self, observation: NDArray[np.float64] | None, *, failed: bool) -> None:
+        """Learn from an episode, and from its last observation if there is one."""
+        if observation is not None:
+            last = self._read(observation)
+            if np.isfinite(last.own).all():
+                self._seen.append(last)
+        self._remember(failed=failed)
+
+    def _remember(self, *, failed: bool) -> None:
+        """Add what was seen to the memory, if it was more than a moment."""
+        if len(self._seen) > 1:
+            actions = self._actions[: len(self._seen) - 1]
+            p, q = len(self.place), len(self._rest)
+            self.memory.add(Past.of(self._seen, p, q, actions, failed))
+        self._seen, self._actions = [], []
+
+    def sums(self, n_states: int) -> dict[str, float]:
+        """A few sums that change with whatever is learnt."""
+        past = self.memory.past
+        return {
+            "episodes": float(len(past.ends) - 1),
+            "failures": float(self.memory.failures),
+            "moments": float(len(past.own)),
+            "places": float(past.away.sum()),
+        }
+
+    # -- Files ----------------------------------------------------------------------------------
+
+    def save(self, path: Place, provenance: Mapping[str, Any] | None = None) -> None:
+        """Write what is remembered to a file; all else follows from it."""
+        settings = {name: getattr(self, name) for name in ("dt", "columns", "place", "relative")}
+        counts = {name: getattr(self.memory, name) for name in ("n_actions", "failures", "fitted")}
+        arrays = {
+            name: array.astype(np.float64) for name, array in self.memory.past._asdict().items()
+        }
+        storage.write(path, _KIND, settings | counts, arrays, provenance)
+
+    @classmethod
+    def load(cls, path: Place) -> Self:
+        """Read what `save` wrote, as between two episodes.
+
+        Raises
+        ------
+        OSError
+            If there is no such file, or it may not be read.
+        ValueError
+            If the file holds something else or is damaged.
+        """
+        settings, arrays = storage.read(path, _KIND)
+        with storage.explained(path):
+            counted = {name: int(settings.pop(name)) for name in ("failures", "fitted")}
+            judge = cls(settings.pop("dt"), settings.pop("n_actions"), **settings)
+            whole_numbers = ("actions", "counts", "links")
+            arrays |= {name: arrays[name].astype(np.int64) for name in whole_numbers}
+            past = Past(**arrays | {"lost": arrays["lost"].astype(bool)})
+            past.refuse_damaged(judge.memory.past, judge.memory.n_actions)
+            judge.memory.restore(past, **counted)
+        return judge
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}(dt={self.dt:g}, n_actions={self.memory.n_actions})"
+
+
+# -- What is remembered -------------------------------------------------------------------------
+
+
+class Seen(NamedTuple):
+    """A scene at one time, of k objects in any order."""
+
+    own: _Floats  #: (p + q,) place, then all else
+    away: _Floats  #: (k, p) places of the objects, relative to one's own
+    other: _Floats  #: (k, q) all else of them, not relative
+
+
+class Past(NamedTuple):
+    """N moments of one or more episodes, one after the other, and M objects in all of them."""
+
+    own: _Floats  #: (N, p + q)
+    actions: _Ints  #: (N,); -1 at the last moment of an episode
+    counts: _Ints  #: (N,) number of objects
+    lost: NDArray[np.bool_]  #: (N,) whether failure came in the step from this moment
+    away: _Floats  #: (M, p)
+    other: _Floats  #: (M, q)
+    links: _Ints  #: (M,) index of the same object a step later; -1 where it is not known
+
+    @classmethod
+    def of(
+        cls, seen: Sequence[Seen], p: int, q: int, actions: Sequence[int] = (), failed: bool = False
+    ) -> Past:
+        """An episode, from what was seen at each moment; actions are one fewer."""
+        lost = np.zeros(len(seen), bool)
+        lost[-2:-1] = failed
+        # In the order in which a file holds them: sums are then the same to the last bit.
+        own = np.array([one.own for one in seen]).reshape(-1, p + q)
+        away, other = (
+            np.ascontiguousarray(np.concatenate([np.zeros((0, width)), *each]))
+            for width, each in ((p, [one.away for one in seen]), (q, [one.other for one in seen]))
+        )
+        acted = np.array([*actions, -1][: len(seen)], np.int64)
+        counts = np.array([len(one.away) for one in seen], np.int64)
+        return cls(own, acted, counts, lost, away, other, np.full(len(away), -1))
+
+    @property
+    def ends(self) -> _Ints:
+        """(e + 1,) first moment of each episode, and of none."""
+        return np.append(0, np.flatnonzero(self.actions < 0) + 1)
+
+    @property
+    def objects(self) -> _Ints:
+        """(N + 1,) index of the first object of each moment, and of none."""
+        return np.append(0, np.cumsum(self.counts))
+
+    @property
+    def moment(self) -> _Ints:
+        """(M,) the moment of each object."""
+        return np.repeat(np.arange(len(self.own)), self.counts)
+
+    def and_then(self, later: Past) -> Past:
+        """These episodes, and others after them."""
+        links = np.where(later.links >= 0, later.links + len(self.away), -1)
+        both = zip(self, later._replace(links=links), strict=True)
+        return Past(*(np.concatenate(arrays) for arrays in both))
+
+    def between(self, first: int, last: int) -> Past:
+        """Some of the episodes."""
+        begin, end = self.ends[[first, last]]
+        start, stop = self.objects[[begin, end]]
+        links = np.where(self.links >= 0, self.links - start, -1)
+        of_moments = (array[begin:end] for array in self[:4])
+        return Past(*of_moments, *(array[start:stop] for array in (self.away, self.other, links)))
+
+    def refuse_damaged(self, none: Past, n_actions: int) -> None:
+        """Raise a ValueError where arrays contradict each other, or are of other rows than none."""
+        linked, last = self.links >= 0, self.actions < 0
+        if [array.shape[1:] for array in self] != [array.shape[1:] for array in none]:
+            raise ValueError("its rows are of other columns than it says")
+        if self.counts.sum() != len(self.links) or (self.links >= len(self.links)).any():
+            raise ValueError("moments and objects are not as many as counted")
+        if (self.moment[self.links[linked]] != self.moment[linked] + 1).any():
+            raise ValueError("an object is linked to another moment than the next one")
+        if (self.actions >= n_actions).any() or not np.append(True, last)[-1]:
+            raise ValueError("an action is none, or the last episode has no end")
+        if (np.append(last[1:], False) < self.lost).any():
+            raise ValueError("a failure is not at the end of an episode")
+
+
+# -- How close is too close ---------------------------------------------------------------------
+
+
+class Contact(NamedTuple):
+    """The probability of failure in a step, by how close an object comes in it.
+
+    At closeness c it is (F + 1) / (F + 1 + S): F failures that happened at c or farther away, one
+    more that might, and S steps that were survived at c or closer. So it falls with the distance,
+    and is high where little was survived although nothing failed.
+    """
+
+    sides: _Floats  #: (p,) half sides of the box in which closeness is counted
+    closeness: _Floats  #: (n,) rising; 1 is at the side of the box
+    risk: _Floats  #: (n,) probability of failure, falling
+    met: float  #: median closeness of what failed
+
+    @classmethod
+    def learn(
+        cls,
+        survived: tuple[_Floats, _Floats],
+        failed: list[tuple[_Floats, _Floats]],
+        spread: _Floats,
+    ) -> Contact:
+        """From steps of objects that were survived, and of all objects at each failure.
+
+        A step is the (s, p) places at its beginning and at its end. Whichever object came closest
+        in a failure is taken to be the one that was met. Of the shapes of the box, beginning with
+        the ``spread`` of places, that is taken by which the fewest survived steps came closer than
+        the failed ones.
+        """
+        best: tuple[float, _Floats, _Floats, _Floats] | None = None
+        for power in _SHAPES if len(spread) == 2 else (0.0,):
+            turned = np.exp(0.5 * power * np.array([1.0, -1.0])) if len(spread) == 2 else 1.0
+            sides = spread * turned
+            near = np.sort(_closest(*survived, sides))
+            met = np.sort([_closest(*steps, sides).min() for steps in failed])
+            score = float(np.log1p(np.searchsorted(near, met)).sum())
+            if best is None or score < best[0]:
+                best = score, sides, near, met
+        assert best is not None
+        _, sides, near, met = best
+        at = np.unique(np.concatenate([met, near[:_CLOSEST]]))
+        failures = 1 + len(met) - np.searchsorted(met, at, "left")
+        risk = failures / (failures + np.searchsorted(near, at, "right"))
+        return cls(sides, np.append(0.0, at), np.append(1.0, risk), float(np.median(met)))
+
+    def of(self, path: _Floats) -> _Floats:
+        """(..., n) probability of failure by each step of paths, (..., n + 1, p) places.
+
+        It is that of the closest step so far: what is not known of how close is too close is not
+        drawn anew in each step.
+        """
+        come = _closest(path[..., :-1, :], path[..., 1:, :], self.sides)
+        so_far = np.minimum.accumulate(come, axis=-1)
+        return np.asarray(np.interp(so_far, self.closeness, self.risk))
+
+
+def _closest(start: _Floats, end: _Floats, sides: _Floats) -> _Floats:
+    """How close it comes between two places: the least of ``max(abs(x) / sides)`` on the line."""
+    start, end = np.broadcast_arrays(start, end)
+    least = np.empty(start.shape[:-1])
+    first, last = (np.ascontiguousarray(of).reshape(-1, len(sides)) for of in (start, end))
+    _closest_on_lines(first, last, sides, least.reshape(-1))
+    return least
+
+
+@compiled
+def _closest_on_lines(start: _Floats, end: _Floats, sides: _Floats, least: _Floats) -> None:
+    for k in range(len(least)):
+        least[k] = np.inf
+        for point in range(_POINTS):
+            share = point / (_POINTS - 1)
+            far = 0.0
+            for i in range(len(sides)):
+                at = start[k, i] + share * (end[k, i] - start[k, i])
+                far = max(far, abs(at) / sides[i])
+            least[k] = min(least[k], far)
+
+
+# -- What is remembered, and forecast from it ---------------------------------------------------
+
+
+class Foreseen(NamedTuple):
+    """What comes of each of n actions, if each action follows it for good."""
+
+    risks: _Floats  #: (n, n) probability of failure within the horizon
+    lasting: _Floats  #: (n, n) expected share of the horizon that is survived
+    after: _Floats  #: (n, p + q) oneself a step later
+
+
+class Memory:
+    """Remembers episodes, and forecasts from them."""
+
+    def __init__(self, n_actions: int, p: int, q: int) -> None:
+        self.n_actions = n_actions
+        #: All episodes that are remembered.
+        self.past = Past.of([], p, q)
+        #: How close is too close; None before the first failure.
+        self.contact: Contact | None = None
+        self.failures = 0
+        #: How many of the episodes were learnt from.
+        self.fitted = 0
+        self._motion: _Floats | None = None
+
+    def add(self, episode: Past) -> None:
+        """Remember an episode; learn from it at once if it failed, else now and then."""
+        failed, past = bool(episode.lost.any()), self.past.and_then(episode)
+        starts = past.objects[past.ends]  # of each episode, as objects
+        forgotten = min(int((len(past.away) - starts > _MOST).sum()), len(starts) - 2)
+        past = past.between(forgotten, len(starts) - 1)
+        self.fitted = max(0, self.fitted - forgotten)
+        self.failures += failed
+        count = len(past.ends) - 1
+        fits = failed or forgotten > 0 or count - self.fitted >= max(1, count // 10)
+        self.past = self._fit(past) if fits else past
+
+    def restore(self, past: Past, failures: int, fitted: int) -> None:
+        """Remember these, of which the first ``fitted`` were learnt from, as they were linked."""
+        self.past, self.failures, self.fitted = past, failures, fitted
+        if fitted:
+            known = past.between(0, fitted)
+            self._fit_spreads(known)
+            self._conclude(known)
+
+    def _fit(self, past: Past) -> Past:
+        """Link objects, and learn from all that is remembered."""
+        count = len(past.ends) - 1
+        again = self._motion is None or count & (count - 1) == 0
+        first = 0 if again else int(past.ends[self.fitted])
+        self._fit_spreads(past)
+        for _ in range(3 if self._motion is None else 1):
+            past = self._linked(past, first)
+            self._fit_motion(past)
+            if self._motion is None:
+                return past
+        self.fitted = count
+        self._conclude(past)
+        return past
+
+    def _conclude(self, past: Past) -> None:
+        self._fit_motion(past)
+        self._fit_oneself(past)
+        self._fit_contact(past)
+        self._fit_objects(past)
+
+    def _fit_spreads(self, past: Past) -> None:
+        self._spreads = tuple(
+            np.where((s := of.std(0)) > 0.0, s, 1.0) if len(of) else np.ones(of.shape[1])
+            for of in (past.away, past.other, past.own)
+        )
+
+    def _linked(self, past: Past, first: int) -> Past:
+        """Which object is which a step later: each is nearest to where the other is expected."""
+        away, other, _ = self._spreads
+        links, ends = past.links.copy(), past.objects
+        links[ends[first] :] = -1
+        gate = np.inf if self._motion is None else _GATE
+        for t in range(first, len(past.own) - 1):
+            if past.actions[t] < 0 or not (past.counts[t] and past.counts[t + 1]):
+                continue
+            now, then = slice(ends[t], ends[t + 1]), slice(ends[t + 1], ends[t + 2])
+            expected = past.away[now] + self._moved(past.own[t : t + 2], past.other[now])
+            off = (expected[:, None] - past.away[then]) / away
+            change = (past.other[now][:, None] - past.other[then]) / other
+            apart = (off**2).sum(2)
+            unlike = apart + _OF_REST * (change**2).sum(2)
+            nearest, back = unlike.argmin(1), unlike.argmin(0)
+            each = np.arange(len(nearest))
+            mutual = (back[nearest] == each) & (apart[each, nearest] < gate)
+            links[ends[t] + each[mutual]] = ends[t + 1] + nearest[mutual]
+        return past._replace(links=links)
+
+    # -- Learning -------------------------------------------------------------------------------
+
+    def _fit_motion(self, past: Past) -> None:
+        """How places change, by what oneself and objects were like before and after."""
+        rows, moment = np.flatnonzero(past.links >= 0), past.moment
+        p = past.away.shape[1]
+        if len(rows) < _ROWS * past.own.shape[1]:
+            return
+        now, then = moment[rows], past.links[rows]
+        mine = _terms(past.own[now], past.own[now + 1], p)
+        x = np.hstack([mine, past.other[rows], past.other[then], np.ones((len(rows), 1))])
+        y = past.away[then] - past.away[rows]
+        prior = _first_motion(x.shape[1], p)
+        weights = np.ones(len(rows))
+        spread = np.maximum(x.var(0), _CONSTANT * (x**2).mean(0)) + 1e-12
+        ridge = _RIDGE * len(rows) * np.diag(spread)
+        for _ in range(_FITS):
+            weighed = x * weights[:, None]
+            motion = np.linalg.solve(weighed.T @ x + ridge, weighed.T @ y + ridge @ prior)
+            off = (((y - x @ motion) / self._spreads[0]) ** 2).sum(1)
+            middle = max(float(np.median(off)), _EXACT)
+            weights = 1.0 / (1.0 + off / (_HALF * middle))
+        self._motion = np.asarray(motion, np.float64)
+
+    def _moved(self, own: _Floats, other: _Floats) -> _Floats:
+        """(k, p) expected change of relative places in a step; ``own`` is before and after it."""
+        p = own.shape[1] - other.shape[1]
+        mine = np.repeat(_terms(own[:1], own[1:], p), len(other), axis=0)
+        x = np.hstack([mine, other, other, np.ones((len(other), 1))])
+        motion = _first_motion(x.shape[1], p) if self._motion is None else self._motion
+        return np.asarray(x @ motion)
+
+    def _mine(self, before: _Floats, after: _Floats, p: int) -> _Floats:
+        """(k, p) how oneself moves all relative places in a step."""
+        assert self._motion is not None
+        terms = _terms(before, after, p)
+        return np.asarray(terms @ self._motion[: terms.shape[1]])
+
+    def _fit_oneself(self, past: Past) -> None:
+        """What each action brought oneself, from states in units of their spreads."""
+        known = np.flatnonzero((past.actions >= 0) & ~past.lost)
+        self._own = []
+        for action in range(self.n_actions):
+            rows = known[past.actions[known] == action]
+            before = past.own[rows]
+            self._own.append((before / self._spreads[2], past.own[rows + 1] - before))
+
+    def _fit_contact(self, past: Past) -> None:
+        """How close is too close."""
+        safe = np.flatnonzero((past.links >= 0) & ~past.lost[past.moment])
+        failed, ends = [], past.objects
+        for t in np.flatnonzero(past.lost):
+            rows = slice(ends[t], ends[t + 1])
+            last = past.away[ends[t + 1] : ends[t + 2]]
+            start, linked = past.away[rows], past.links[rows]
+            expected = start + self._moved(past.own[t : t + 2], past.other[rows])
+            end = np.where((linked >= 0)[:, None], past.away[linked], expected)
+            if len(start) or len(last):
+                failed.append((np.concatenate([start, last]), np.concatenate([end, last])))
+        if failed and len(safe):
+            steps = past.away[safe], past.away[past.links[safe]]
+            self.contact = Contact.learn(steps, failed, self._spreads[0])
+
+    def _fit_objects(self, past: Past) -> None:
+        """Where each object went from then on, oneself left out."""
+        p, moment = past.away.shape[1], past.moment
+        rows = np.flatnonzero(past.links >= 0)
+        now, then = moment[rows], past.links[rows]
+        mine = self._mine(past.own[now], past.own[now + 1], p)
+        went = np.full_like(past.away, np.nan)
+        went[rows] = past.away[then] - past.away[rows] - mine
+        known = np.hstack([past.other, np.ones((len(past.other), 1))])
+        steady = np.linalg.lstsq(known[rows], went[rows], rcond=None)[0]
+        self._steady = steady[:-1]
+        step, links = known @ steady, past.links.copy()
+        if self.contact is not None:
+            off = np.abs((went[rows] - step[rows]) / self.contact.sides).max(1)
+            astray = rows[off > _ASTRAY * self.contact.met]
+            if 2 * len(astray) < len(rows):  # else what failed met in one point, as in cells
+                links[astray], went[astray] = -1, np.nan
+                rows = np.flatnonzero(links >= 0)
+        total, at = np.zeros_like(past.away), np.arange(len(past.away))
+        paths = np.empty((len(past.away), _STEPS, p))
+        for h in range(_STEPS):
+            here = np.where((at >= 0)[:, None], went[at], np.nan)
+            step = np.where(np.isnan(here), step, here)
+            total = total + step
+            paths[:, h] = total
+            at = np.where(at >= 0, links[at], -1)
+        self._objects = self._features(past.own[moment], past.away, past.other)[rows]
+        self._paths, self._others = paths[rows], past.other[rows]
+
+    def _features(self, own: _Floats, away: _Floats, other: _Floats) -> _Floats:
+        """(k, f) what two objects are compared by."""
+        p = away.shape[1]
+        far, rest, mine = self._spreads
+        near = _NEAR_TO * away / far, _NEAR_TO * other / rest
+        return np.hstack([*near, (away + own[:, :p]) / far, own[:, p:] / mine[p:]])
+
+    # -- Forecasting ----------------------------------------------------------------------------
+
+    def apart(self, own: _Floats, one: _Floats) -> _Floats:
+        """(k,) squared distance of states of oneself from one, each number by its spread."""
+        return np.asarray((((own - one) / self._spreads[2]) ** 2).sum(1))
+
+    def foresee(self, seen: Seen) -> Foreseen:
+        """What comes of each action."""
+        assert self.contact is not None
+        n, p = self.n_actions, seen.away.shape[1]
+        gone, weights, after = self._own_courses(seen.own, p)
+        safe = np.ones(gone.shape[:3])
+        own = np.repeat(seen.own[None], len(seen.away), axis=0)
+        analogs = _nearest(self._objects, self._features(own, seen.away, seen.other), _ANALOGS)
+        for i, (like, share) in enumerate(zip(*analogs, strict=True)):
+            faster = (seen.other[i] - self._others[like]) @ self._steady
+            path = self._paths[like] + faster[:, None] * np.arange(1, _STEPS + 1)[:, None]
+            to = seen.away[i] + path + gone[:, :, None]
+            start = np.broadcast_to(seen.away[i], (*to.shape[:3], 1, p))
+            safe *= share @ (1.0 - self.contact.of(np.concatenate([start, to], axis=-2)))
+        lost = ((1.0 - safe) * weights[:, :, None]).sum(0).reshape(n, n, _STEPS)
+        return Foreseen(lost[:, :, -1], 1.0 - lost.mean(-1), after)
+
+    def _own_courses(self, own: _Floats, p: int) -> tuple[_Floats, _Floats, _Floats]:
+        """How oneself moves relative places, for each action and each that follows for good.
+
+        (r, n², H, p) for each of r courses, of which each is what once happened after the same
+        actions; (r, n²) their shares; and the (n, p + q) state after each action in the first.
+        """
+        n, r = self.n_actions, _OWN_ANALOGS
+        first, then = np.repeat(np.arange(n), n), np.tile(np.arange(n), n)
+        at = np.broadcast_to(own, (r, n * n, len(own)))
+        gone = np.zeros((r, n * n, _STEPS, p))
+        shares = np.full((r, n * n), 1.0 / r)
+        total = np.zeros((r * n * n, p))
+        course = np.arange(r)[:, None, None]
+        for h in range(_STEPS):
+            to = at.copy()
+            for action, (before, change) in enumerate(self._own):
+                rows = np.flatnonzero((then if h else first) == action)
+                if not len(before):
+                    continue
+                here = (at[:, rows] / self._spreads[2]).reshape(-1, len(own))
+                like, share = (of.reshape(r, len(rows), -1) for of in _nearest(before, here, r))
+                which = np.minimum(course, like.shape[-1] - 1)
+                to[:, rows] += change[np.take_along_axis(like, which, -1)[..., 0]]
+                if h == 0:
+                    shares[:, rows] = np.take_along_axis(share, which, -1)[..., 0]
+            total = total + self._mine(at.reshape(-1, len(own)), to.reshape(-1, len(own)), p)
+            gone[:, :, h] = total.reshape(r, n * n, p)
+            if h == 0:
+                after = to[0, ::n]
+            at = to
+        return gone, shares / shares.sum(0), after
+
+
+def _terms(before: _Floats, after: _Floats, p: int) -> _Floats:
+    """(k, p + 2 q) what of oneself moves all relative places in a step."""
+    return np.hstack([after[:, :p] - before[:, :p], before[:, p:], after[:, p:]])
+
+
+def _first_motion(terms: int, p: int) -> _Floats:
+    """The prior of how places change: by what oneself moves, all places move back.
+
+    Without it one's own moves, if they are rare, are never learnt: the right links are then far
+    from where objects are expected.
+    """
+    motion = np.zeros((terms, p))
+    motion[:p] = -np.eye(p)
+    return motion
+
+
+def _nearest(points: _Floats, around: _Floats, most: int) -> tuple[_Ints, _Floats]:
+    """(k, most) indices of the points nearest to each of k, nearest first, and their weights."""
+    most = min(most, len(points))
+    like = np.empty((len(around), most), np.int64)
+    apart = np.full((len(around), most), np.inf)
+    _nearest_into(points, around, like, apart)
+    weight = 1.0 / (_ALIKE + apart) ** 2
+    return like, weight / weight.sum(-1, keepdims=True)
+
+
+@compiled
+def _nearest_into(points: _Floats, around: _Floats, like: _Ints, apart: _Floats) -> None:
+    """The nearest points and their squared distances; of two equally near ones the first."""
+    last = apart.shape[1] - 1
+    for k in range(len(around)):
+        for j in range(len(points)):
+            far = 0.0
+            for i in range(points.shape[1]):
+                off = points[j, i] - around[k, i]
+                far += off * off
+            at = last
+            if far >= apart[k, at]:
+                continue
+            while at and apart[k, at - 1] > far:
+                apart[k, at], like[k, at] = apart[k, at - 1], like[k, at - 1]
+                at -= 1
+            apart[k, at], like[k, at] = far, j

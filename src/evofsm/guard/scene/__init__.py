@@ -1,1 +1,0 @@
-"""A judge of scenes, in which failure is to meet an object: see `risk.SceneRisk`."""

@@ -1,0 +1,185 @@
+"""Scenes: which objects one may meet, as pairs, and the judge of the worst of them."""
+
+import numpy as np
+import pytest
+
+from evofsm.driving import LatentRisk, Object, Role, Scene, TrafficRisk, guard_for_traffic
+from evofsm.guard import Situation
+
+LOW, HIGH, DECEL, INTERVAL = -9.0, 2.5, 4.5, 0.1
+ME = Object("me", x=100.0, y=0.0, vx=20.0)
+SLOWER = Object("me", x=0.0, y=0.0, vx=15.0)
+ACTIONS = np.array([2.5, 0.0, -4.5, -9.0])
+
+
+# -- Pairs -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("other", "pair"),
+    [
+        (Object("a", 130.0, 0.3, 15.0, length=12.0), (Role.AHEAD, 1, 21.5, 20.0, 15.0)),
+        (Object("b", 90.0, 0.0, 25.0), (Role.BEHIND, 1, 5.0, 25.0, 20.0)),
+        (Object("c", 105.0, 3.5, 20.0), None),  # keeps to the next lane
+        (Object("d", 115.0, 3.5, 20.0, vy=-1.0), (Role.CUTTING_IN, 1, 10.0, 20.0, 20.0)),
+        (Object("e", 115.0, -3.5, 20.0, vy=1.0), (Role.CUTTING_IN, 1, 10.0, 20.0, 20.0)),
+        (Object("f", 115.0, 3.5, 20.0, vy=1.0), None),  # moves away
+        # Who crosses is as long along the road as it is wide.
+        (
+            Object("g", 120.0, -6.0, 0.0, vy=4.0, length=2.0, width=0.6),
+            (Role.CROSSING, 1, 17.2, 20.0, 0.0),
+        ),
+        (Object("h", 80.0, -6.0, 0.0, vy=4.0), None),  # crosses behind
+    ],
+)
+def test_whom_one_may_meet_is_a_pair(other, pair):
+    found = Scene(ME, [other]).pairs()
+    assert found == ([] if pair is None else [pair])
+
+
+def test_one_may_move_over_oneself():
+    (pair,) = Scene(ME._replace(vy=1.0), [Object("car", x=115.0, y=3.5, vx=20.0)]).pairs()
+    assert pair.role is Role.CUTTING_IN
+
+
+def test_rows_hold_the_closest_and_zeros_where_there_is_none():
+    far, near = Object("far", 180.0, 0.0, 20.0), Object("near", 120.0, 0.0, 20.0)
+    assert [pair.gap for pair in Scene(ME, [far, near]).pairs()] == [15.0, 75.0]
+    rows = Scene(ME, [far, near]).rows(most=1).reshape(2, 7)
+    assert rows[1].tolist() == [1.0, 120.0, 0.0, 20.0, 0.0, 5.0, 1.8]
+    assert not Scene(ME).rows(most=3)[7:].any()
+
+
+# -- The judge ---------------------------------------------------------------------------------
+
+
+def judge():
+    return TrafficRisk.told(LOW, HIGH, DECEL, INTERVAL)
+
+
+def scene(*others):
+    return Scene(SLOWER, others).rows(most=2)
+
+
+def at(rows):
+    return Situation(np.asarray(rows), np.ones(1), None, np.nan, 0.0)
+
+
+def decide(rows, proposal=1.0):
+    return guard_for_traffic(LOW, HIGH, DECEL, INTERVAL).decide(rows, proposal)
+
+
+def ahead(gap, speed):
+    return Object("ahead", gap + 5.0, 0.0, speed)
+
+
+def behind(gap, speed):
+    return Object("behind", -gap - 5.0, 0.0, speed)
+
+
+def test_one_leader_is_judged_as_by_the_kinematic_judge():
+    alone = LatentRisk.told(-DECEL, DECEL, 9.0, INTERVAL)
+    expected = alone.judge(at([22.0, 15.0, 12.0]), ACTIONS)
+    found = judge().judge(at(scene(ahead(22, 12))), ACTIONS)
+    np.testing.assert_array_equal(found.risk, expected.risk)
+    np.testing.assert_array_equal(found.critical, expected.critical)
+
+
+def test_an_empty_road_has_no_risk_nor_has_what_is_not_seen_whole():
+    half_seen = scene(ahead(3.0, 0.0))
+    half_seen[8] = np.nan
+    for rows in (scene(), half_seen):
+        assert not judge().judge(at(rows), ACTIONS).risk.any()
+
+
+def test_the_risk_is_that_of_the_worst_and_names_it():
+    one = judge()
+    cutting_in = Object("in", 13.0, 3.5, 5.0, vy=-2.0)
+    several = one.judge(at(scene(ahead(60, 15), cutting_in)), ACTIONS)
+    assert one.worst.role is Role.CUTTING_IN
+    assert several.risk[0] == 1.0
+    assert "object 1, cutting in" in one.why(several)
+
+
+def test_whoever_crosses_is_braked_for():
+    walker = Object("walker", 28.3, -3.0, 0.0, vy=1.5, length=0.5, width=0.5)
+    revision = decide(scene(walker))
+    assert revision.executed <= -4.0
+    assert "crossing" in revision.reason
+    assert decide(scene(walker._replace(y=3.0))).executed == 1.0
+
+
+def test_a_proposal_is_kept_or_changed_as_little_as_it_can_be():
+    assert decide(scene(ahead(100, 15))).executed == 1.0
+    rows = scene(ahead(14.0, 15))
+    revision = decide(rows, 2.5)
+    assert LOW < revision.executed < 2.5
+    assert revision.risk_executed <= 0.02
+    assert judge().judge(at(rows), [revision.executed + 0.3]).risk[0] > 0.018
+
+
+def test_once_revising_a_proposal_is_kept_again_below_nine_tenths_of_the_tolerance_only():
+    one, rows = judge(), scene(ahead(14.0, 15))
+    one.ahead.manoeuvres.remember(*np.linspace(2.5, 9.0, 1000))
+    grid = np.linspace(LOW, HIGH, 2000)
+    risks = one.judge(at(rows), grid).risk
+    wanted = grid[np.flatnonzero((risks > 0.018) & (risks <= 0.02))[0]]
+    kept = [
+        one.search(at(rows), wanted, tolerance=0.02, revising=revising).best == 0
+        for revising in (False, True)
+    ]
+    assert kept == [True, False]
+
+
+def test_braking_that_would_be_hit_from_behind_is_as_risky():
+    risk = judge().judge(at(scene(behind(6.0, 15.0))), ACTIONS).risk
+    assert risk.tolist() == [0.0, 0.0, 1.0, 1.0]
+    assert not judge().judge(at(scene(behind(60.0, 15.0))), ACTIONS).risk.any()
+
+
+def test_one_brakes_no_harder_than_who_is_behind_survives():
+    alone, followed = (
+        decide(scene(ahead(9.0, 15), *others)) for others in ([], [behind(14.0, 15)])
+    )
+    assert alone.executed == LOW  # a leader who brakes in full could not be survived
+    assert LOW < followed.executed < 0.0
+    assert "who is behind survives" in followed.reason
+
+
+def test_what_is_sure_ahead_weighs_more_than_who_is_behind():
+    assert decide(scene(ahead(10.0, 0.0), behind(3.0, 15))).executed == LOW
+
+
+def test_where_who_is_behind_cannot_be_spared_one_brakes_as_softly_as_one_can():
+    revision = decide(scene(ahead(27.0, 0.0), behind(0.5, 15)))
+    assert -DECEL <= revision.executed < 0.0
+    assert "the softest for ahead" in revision.reason
+    softer = judge().ahead.judge(at([27.0, 15.0, 0.0]), [revision.executed + 0.25])
+    assert softer.risk[0] > 0.02
+
+
+def test_hard_braking_of_the_driver_is_softened_for_who_is_behind():
+    revision = decide(scene(behind(12.0, 15)), -9.0)
+    assert -9.0 < revision.executed < 0.0
+    assert "object 1, behind" in revision.reason
+
+
+def test_what_was_taught_of_leaders_is_used():
+    one, near = judge(), at(scene(ahead(9.0, 15)))
+    assert one.judge(near, [0.0]).risk[0] == 1.0
+    one.ahead.manoeuvres.remember(*[3.0] * 200)
+    assert one.judge(near, [0.0]).risk[0] < 0.02
+
+
+@pytest.mark.parametrize(
+    ("make", "why"),
+    [
+        (lambda: TrafficRisk.told(0.0, 1.0, DECEL, INTERVAL), "around 0"),
+        (lambda: TrafficRisk.told(-np.inf, 1.0, DECEL, INTERVAL), "around 0"),
+        (lambda: guard_for_traffic(-5.0, HIGH, DECEL, INTERVAL, judge=judge()), "looks at"),
+        (lambda: decide([1.0, 2.0]), "no rows of 7"),
+    ],
+)
+def test_what_it_cannot_work_with_is_refused(make, why):
+    with pytest.raises(ValueError, match=why):
+        make()
