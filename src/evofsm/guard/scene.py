@@ -407,8 +407,12 @@ class Past(NamedTuple):
         begin, end = self.ends[[first, last]]
         start, stop = self.objects[[begin, end]]
         links = np.where(self.links >= 0, self.links - start, -1)
-        of_moments = (array[begin:end] for array in self[:4])
-        return Past(*of_moments, *(array[start:stop] for array in (self.away, self.other, links)))
+        cut: dict[str, Any] = {
+            name: getattr(self, name)[begin:end] for name in ("own", "actions", "counts", "lost")
+        }
+        return Past(
+            **cut, away=self.away[start:stop], other=self.other[start:stop], links=links[start:stop]
+        )
 
     def refuse_damaged(self, none: Past, n_actions: int) -> None:
         """Raise a ValueError where arrays contradict each other, or are of other rows than none."""
