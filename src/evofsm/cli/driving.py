@@ -49,12 +49,12 @@ from evofsm.fsm import EvolvingFSM
 from evofsm.guard import (
     TOLERANCE,
     Controller,
+    DecisionLogger,
     Explain,
     Guard,
     LearningJudge,
     Mode,
     Reviser,
-    Witness,
 )
 from evofsm.store import Checkpoint, Kept, storage
 
@@ -138,7 +138,7 @@ def drive_family(
     world: World,
     progress: Callable[[int, int], None] = lambda done, collisions: None,
     checkpoint: Checkpoint | None = None,
-    audit: Witness | None = None,
+    audit: DecisionLogger | None = None,
     record: Callable[[Drive], None] | None = None,
 ) -> Driving:
     """Drive the episodes in turn.
@@ -155,7 +155,7 @@ def drive_family(
         Keeps, between two episodes, all that came of those before. Where its file exists, it is
         gone on from, with a guard that has learnt what was learnt until then. The result is the
         same, bit for bit; there may be more episodes than before.
-    audit : Witness, optional
+    audit : DecisionLogger, optional
         Writes down what is decided; also in episodes that are driven again after a stop.
     record : callable, optional
         Given each episode that is driven here, none of those before a stop; every decision is then

@@ -16,6 +16,7 @@ from .auditing.replay import Replay as Replay
 from .auditing.replay import audit as audit
 from .defaults import BELIEF_TOLERANCE as BELIEF_TOLERANCE
 from .defaults import TOLERANCE as TOLERANCE
+from .guard import DecisionLogger as DecisionLogger
 from .guard import Explain as Explain
 from .guard import Guard as Guard
 from .guard import learnt_guard as learnt_guard
@@ -33,7 +34,6 @@ from .protocols import Fallback as Fallback
 from .protocols import Intake as Intake
 from .protocols import Judgement as Judgement
 from .protocols import LearningJudge as LearningJudge
-from .protocols import Participants as Participants
 from .protocols import Proposal as Proposal
 from .protocols import Reviser as Reviser
 from .protocols import Revision as Revision
@@ -42,7 +42,6 @@ from .protocols import Search as Search
 from .protocols import SearchingJudge as SearchingJudge
 from .protocols import Situation as Situation
 from .protocols import Trial as Trial
-from .protocols import Witness as Witness
 from .record import RECORD as RECORD
 from .record import Column as Column
 from .record import Pair as Pair

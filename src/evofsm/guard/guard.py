@@ -11,7 +11,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from enum import Enum
 from io import BytesIO
-from typing import Any, Self
+from typing import Any, Protocol, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -47,7 +47,6 @@ from evofsm.guard.protocols import (
     Reviser,
     Revision,
     Situation,
-    Witness,
 )
 from evofsm.guard.reviser import NOTHING, ActionReviser, Mode, is_spoken
 from evofsm.guard.senses import Senses, has_gaps
@@ -65,6 +64,26 @@ class Explain(Enum):
     NONE = "none"
     SPOKEN = "spoken"  #: those that change a proposal or warn
     ALL = "all"
+
+
+class DecisionLogger(Protocol):
+    """Anything that records what a guard does in an episode, such as an audit log."""
+
+    def begin(self, guard: Guard) -> None:
+        """An episode begins."""
+        ...
+
+    def seen(self, observation: NDArray[np.float64], time: float) -> None:
+        """An observation came in, at ``time`` [s]."""
+        ...
+
+    def decided(self, situation: Situation, proposal: Proposal, revision: Revision) -> None:
+        """A decision was made."""
+        ...
+
+    def ended(self, observation: NDArray[np.float64] | None, *, failed: bool) -> None:
+        """The episode ended."""
+        ...
 
 
 # What a judge has that learns.
@@ -119,7 +138,7 @@ class Guard:
     width : float, optional
         Width of an interval of actions, for the machine; without it a 17th of the range. Vectors
         lie in the cells of a grid instead (`BoxActions`).
-    audit : Witness, optional
+    audit : DecisionLogger, optional
         Records what is decided: an `AuditLog`, or `evofsm.io.FoxgloveSink`, which shows it.
     explaining : Explain, optional
         For which decisions the machine's experience is looked up; without it for none, and with
@@ -165,7 +184,7 @@ class Guard:
         seed: int = 0,
         machine: EvolvingFSM | None = None,
         width: float | None = None,
-        audit: Witness | None = None,
+        audit: DecisionLogger | None = None,
         explaining: Explain | None = None,
         missing: Missing = Missing.PARTIAL,
     ) -> None:
@@ -238,7 +257,7 @@ class Guard:
         learn: bool = True,
         failed: Callable[[NDArray[np.float64]], bool] | None = None,
         seed: int = 0,
-        audit: Witness | None = None,
+        audit: DecisionLogger | None = None,
         explaining: Explain | None = None,
         missing: Missing = Missing.PARTIAL,
     ) -> None:
@@ -344,14 +363,7 @@ class Guard:
         if self.machine is not None and self.learn:
             self.machine.start_episode()
         if self.audit is not None:
-            who = self._participants
-            self.audit.begin(
-                who,
-                interval=self.interval,
-                learn=self.learn,
-                missing=self.missing,
-                failure_told=self.failed is not None,
-            )
+            self.audit.begin(self)
         self._under_way = True
 
     def decide(
@@ -622,7 +634,8 @@ class Guard:
     # -- Keeping it -----------------------------------------------------------------------------
 
     @property
-    def _participants(self) -> Participants:
+    def participants(self) -> Participants:
+        """All that its decisions depend on but observations and proposals."""
         return Participants(self.actions, self.reviser, self.machine, self.judge)
 
     def copy(self, *, states: bool = True) -> Self:
@@ -690,7 +703,7 @@ class Guard:
         >>> again.decide([9.0, 20.0, 20.0], 1.0).executed
         -2.5
         """
-        described = outline(self._participants)
+        described = outline(self.participants)
         reviser = described["reviser"]
         if not (reviser["known"] or isinstance(self.reviser, ActionReviser)):
             raise ValueError(f"a {reviser['class']} is no reviser that a file can hold")
@@ -711,7 +724,7 @@ class Guard:
         *,
         judge: ActionJudge | type[LearningJudge] | None = None,
         failed: Callable[[NDArray[np.float64]], bool] | None = None,
-        audit: Witness | None = None,
+        audit: DecisionLogger | None = None,
     ) -> Self:
         """Read a guard, as it was between two episodes.
 
@@ -723,7 +736,7 @@ class Guard:
             an entry point of ``evofsm.participants``.
         failed : callable, optional
             As in `Guard`; needed where the guard had one.
-        audit : Witness, optional
+        audit : DecisionLogger, optional
 
         Returns
         -------

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple, Protocol, Self, runtime_checkable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from evofsm.fsm import EvolvingFSM, Labels, Missing
+from evofsm.fsm import EvolvingFSM, Labels
 from evofsm.guard.actions import Action, ActionSet
 from evofsm.store import Place
 
@@ -258,34 +258,6 @@ class Participants(NamedTuple):
     reviser: Reviser
     machine: EvolvingFSM | None
     risk: LearningJudge | None
-
-
-class Witness(Protocol):
-    """Anything that records what happens in an episode, such as an audit log."""
-
-    def begin(
-        self,
-        who: Participants,
-        *,
-        interval: float | None,
-        learn: bool,
-        missing: Missing,
-        failure_told: bool,
-    ) -> None:
-        """An episode begins."""
-        ...
-
-    def seen(self, observation: NDArray[np.float64], time: float) -> None:
-        """An observation came in, at ``time`` [s]."""
-        ...
-
-    def decided(self, situation: Situation, proposal: Proposal, revision: Revision) -> None:
-        """A decision was made."""
-        ...
-
-    def ended(self, observation: NDArray[np.float64] | None, *, failed: bool) -> None:
-        """The episode ended."""
-        ...
 
 
 class RiskMeasure(Protocol):

@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 
 from evofsm.driving import UNITS, VARIABLES, Decision
 from evofsm.extras import needs
-from evofsm.fsm import Missing, positive
-from evofsm.guard import Participants, Proposal, Revision, Situation
+from evofsm.fsm import positive
+from evofsm.guard import Guard, Proposal, Revision, Situation
 from evofsm.io.channels import (
     ERROR,
     INFO,
@@ -165,17 +165,9 @@ class FoxgloveSink:
         """
         return self._arrivals.someone.wait(timeout)
 
-    # -- As the witness of a guard ----------------------------------------------------------------
+    # -- As the decision logger of a guard --------------------------------------------------------
 
-    def begin(
-        self,
-        who: Participants,
-        *,
-        interval: float | None,
-        learn: bool,
-        missing: Missing,
-        failure_told: bool,
-    ) -> None:
+    def begin(self, guard: Guard) -> None:
         """An episode begins."""
         if self._episodes >= 0:
             self._begin += round((self._time + _PAUSE) * _SECOND)

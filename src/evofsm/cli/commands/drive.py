@@ -16,7 +16,7 @@ from evofsm.cli.commands.groups import Driven
 if TYPE_CHECKING:
     from evofsm.cli.driving import Driving, Setup
     from evofsm.driving import World
-    from evofsm.guard import Guard, Witness
+    from evofsm.guard import DecisionLogger, Guard
     from evofsm.io import FoxgloveSink, RunWriter
     from evofsm.store import Checkpoint
 
@@ -192,7 +192,7 @@ def _drive(
     guard: Guard,
     place: World,
     checkpoint: Checkpoint | None,
-    audit: Witness | None,
+    audit: DecisionLogger | None,
     run: RunWriter | None,
 ) -> Driving:
     """With a bar that shows the collisions so far."""

@@ -35,10 +35,10 @@ from typing import Any, Concatenate, ParamSpec, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.fsm import Missing
 from evofsm.guard.actions import written
 from evofsm.guard.auditing.form import LOG_VERSION, TOLD
 from evofsm.guard.auditing.participants import describe, learnt, settings
+from evofsm.guard.guard import Guard
 from evofsm.guard.protocols import Participants, Proposal, Reviser, Revision, Situation
 from evofsm.guard.record import RECORD, Pair
 from evofsm.guard.reviser import is_spoken
@@ -176,17 +176,10 @@ class AuditLog:
 
     # -- What it is told by whoever oversees an episode -------------------------------------------
 
-    def begin(
-        self,
-        who: Participants,
-        *,
-        interval: float | None,
-        learn: bool,
-        missing: Missing,
-        failure_told: bool,
-    ) -> None:
-        """An episode begins; ``failure_told`` if a function says where it fails."""
+    def begin(self, guard: Guard) -> None:
+        """An episode begins."""
         self._raise()
+        who = guard.participants
         was_broken_off, self._broken_off = self._broken_off, True  # until it has begun
         self._flush()  # of one that was broken off
         self._seen = []
@@ -205,10 +198,10 @@ class AuditLog:
             {
                 "kind": "begin",
                 "episode": self._episodes,
-                "failure_told": failure_told,
-                "interval": interval,
-                "learn": learn,
-                "missing": missing.value,
+                "failure_told": guard.failed is not None,
+                "interval": guard.interval,
+                "learn": guard.learn,
+                "missing": guard.missing.value,
             }
         )
         self._force()
