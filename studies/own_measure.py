@@ -29,15 +29,12 @@ def own_measure(name: str) -> RiskMeasure:
     >>> own_measure("evofsm.driving:TimeToCollision")
     TimeToCollision(threshold=1.5)
     """
-    from evofsm.checks import Kind, kind_of
-
     thing = imported(name)
-    kind = kind_of(thing)
-    if kind is not Kind.MEASURE and not (kind is Kind.JUDGE and hasattr(thing, "score")):
-        raise TypeError(f"{name} is a {kind.value}, not a measure: it has no method score")
     is_made = hasattr(thing, "score") and not inspect.isclass(thing)
     try:
         made: RiskMeasure = thing if is_made else thing()
     except TypeError as error:
         raise TypeError(f"{name} cannot be made without arguments: {error}") from error
+    if not hasattr(made, "score"):
+        raise TypeError(f"{name} is no measure: it has no method score")
     return made

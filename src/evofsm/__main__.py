@@ -1,24 +1,24 @@
 """The command ``evofsm``, also as ``python -m evofsm``."""
 
-from __future__ import annotations
+from typing import Any
 
-from typing import TYPE_CHECKING
-
-from evofsm.cli import commands
-from evofsm.paper import Paper
-
-if TYPE_CHECKING:
-    import typer
+from evofsm.extras import refuse_without_command_line
 
 
 def main() -> None:
     """Run the command line."""
-    commands.main(application)
+    refuse_without_command_line()
+    from evofsm.cli.app import run
+
+    run(application)
 
 
-def application() -> typer.Typer:
-    """All commands: those of the app, and the paper's."""
-    return commands.application(Paper)
+def application() -> Any:
+    """All commands."""
+    from evofsm.cli.app import application as commands
+    from evofsm.paper import Paper
+
+    return commands(Paper)
 
 
 if __name__ == "__main__":

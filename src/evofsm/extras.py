@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from importlib.util import find_spec
 
 #: Extras that each command needs as it stands, beside ``cli``; options may need others.
 OF_COMMANDS = {
     "paper": ("plot", "sumo", "tables"),
     "drive": ("study",),
     "watch": ("study", "watch"),
-    "campaign": ("study",),
 }
 
 
@@ -34,6 +35,10 @@ def install(*extras: str) -> str:
     return f"pip install '.[{','.join(extras)}]' in a clone of evofsm"
 
 
-def install_for(command: str | None) -> str:
-    """The same for all that a command of the command line needs."""
-    return install("cli", *OF_COMMANDS.get(command or "", ()))
+def refuse_without_command_line() -> None:
+    """End with one line where the packages of the command line are not installed."""
+    if find_spec("typer") is None or find_spec("rich") is None:
+        command = next((word for word in sys.argv[1:] if not word.startswith("-")), "")
+        needed = install("cli", *OF_COMMANDS.get(command, ()))
+        print(f"evofsm: the command line needs typer and rich: {needed}", file=sys.stderr)
+        sys.exit(2)

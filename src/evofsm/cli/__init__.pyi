@@ -1,10 +1,10 @@
 from . import commands as commands
+from .app import application as application
 from .commands.common import ALL as ALL
 from .commands.common import FIRST as FIRST
 from .commands.common import PAGE as PAGE
 from .commands.common import command_line as command_line
 from .commands.common import counter as counter
-from .commands.common import print_json as print_json
 from .commands.common import progress as progress
 from .commands.common import require as require
 from .commands.common import split_names as split_names
@@ -16,7 +16,8 @@ from .commands.declared import option as option
 from .commands.groups import InWorld as InWorld
 from .commands.groups import WithJson as WithJson
 from .commands.groups import WorldName as WorldName
-from .commands.imported import imported as imported
+from .options import imported as imported
+from .show import print_json as print_json
 from .text.columns import console as console
 from .text.columns import print_columns as print_columns
 from .text.columns import print_table as print_table

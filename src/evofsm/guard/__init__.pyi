@@ -14,6 +14,7 @@ from .auditing.replay import Difference as Difference
 from .auditing.replay import Field as Field
 from .auditing.replay import Replay as Replay
 from .auditing.replay import audit as audit
+from .check import check_contract as check_contract
 from .defaults import BELIEF_TOLERANCE as BELIEF_TOLERANCE
 from .defaults import TOLERANCE as TOLERANCE
 from .guard import DecisionLogger as DecisionLogger

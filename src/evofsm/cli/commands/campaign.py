@@ -13,9 +13,10 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from evofsm.cli.commands.common import print_json, progress
+from evofsm.cli.commands.common import progress
 from evofsm.cli.commands.declared import option
 from evofsm.cli.commands.groups import Driven
+from evofsm.cli.show import print_json
 
 if TYPE_CHECKING:
     from evofsm.cli.campaign import Result

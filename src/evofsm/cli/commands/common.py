@@ -7,22 +7,14 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from importlib.util import find_spec
-from io import BytesIO
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from evofsm.extras import install
 
-# What folders of results hold, in the order in which it is looked for.
-_MODELS = ("machine.evofsm", "model.evofsm")
-
-
 if TYPE_CHECKING:
     from rich.progress import Progress, ProgressColumn, Task
 
-    from evofsm.fsm import FSMModel
     from evofsm.guard import Mode
-    from evofsm.store import Header
 
 
 def chosen_mode(name: str) -> Mode:
@@ -34,61 +26,6 @@ def chosen_mode(name: str) -> Mode:
     return Mode(name)
 
 
-def load_model(place: Path) -> tuple[FSMModel, Header | None]:
-    """A model from wherever one was left, and what its file says of itself, if there is one.
-
-    From the file of a machine, a model or a guard, from a folder of results, or from a log of runs.
-    A machine that drove a family of scenarios is labelled as that family is.
-    """
-    from evofsm.fsm import FSMModel
-    from evofsm.store import storage
-
-    if place.is_dir():
-        within = next((place / name for name in _MODELS if (place / name).exists()), None)
-        if within is None:
-            raise FileNotFoundError(f"{place}: there is neither {' nor '.join(_MODELS)} in it")
-        return load_model(within)
-    if place.suffix == ".mcap":
-        return _model_of_log(place), None
-    header = storage.read_header(place)
-    if header.kind == "guard":
-        return _model_of_guard(place), header
-    return (_labelled(place, header) if header.kind == "machine" else FSMModel.load(place)), header
-
-
-def _labelled(place: Path, header: Header) -> FSMModel:
-    """The model of a machine, with the words of the family that it drove."""
-    from evofsm.driving import FAMILIES, load_family
-    from evofsm.fsm import EvolvingFSM
-
-    machine = EvolvingFSM.load(place)
-    if (name := header.provenance.get("family")) not in FAMILIES:
-        return machine.model()
-    return machine.model(**load_family(name).labels._asdict())
-
-
-def _model_of_guard(place: Path) -> FSMModel:
-    """Its machine's, whatever its judge is."""
-    from evofsm.fsm import EvolvingFSM
-    from evofsm.store import storage
-
-    _, files = storage.read(place, "guard")
-    machine = files["machine"].tobytes()
-    if not machine:
-        raise ValueError(f"{place}: this guard has no machine")
-    return EvolvingFSM.load(BytesIO(machine)).model()
-
-
-def _model_of_log(place: Path) -> FSMModel:
-    require(mcap="mcap")
-    from evofsm.io import read_run
-
-    model = read_run(place).model
-    if model is None:
-        raise ValueError(f"{place}: no model is attached to this log")
-    return model
-
-
 #: What a page with figures needs, and the extra that brings it.
 PAGE = {"matplotlib": "plot", "jinja2": "plot"}
 
@@ -98,14 +35,6 @@ def require(**extras: str) -> None:
     if lacking := [package for package in extras if find_spec(package) is None]:
         all_extras = install(*dict.fromkeys(["cli", *extras.values()]))
         raise ModuleNotFoundError(f"this needs {' and '.join(lacking)}: {all_extras}")
-
-
-def message(error: Exception) -> str:
-    """What an error says, in one line, and what it happened in."""
-    text = str(error)
-    if isinstance(error, OSError) and error.filename is not None and error.strerror:
-        text = f"{error.filename}: {error.strerror.lower()}"
-    return ", ".join([text, *getattr(error, "__notes__", ())])
 
 
 @contextmanager
@@ -150,13 +79,6 @@ def say(text: object) -> None:
     from evofsm.fsm import visible
 
     print(visible(str(text)))
-
-
-def print_json(document: object) -> None:
-    """Print for programs."""
-    from evofsm.cli.text.documents import to_json
-
-    print(to_json(document))
 
 
 def command_line() -> str:

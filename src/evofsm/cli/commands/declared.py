@@ -25,7 +25,6 @@ Hello, Ada. Hello, Ada.
 from __future__ import annotations
 
 import re
-import sys
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import MISSING, Field, dataclass, field, fields, is_dataclass
@@ -33,7 +32,7 @@ from inspect import Parameter, Signature
 from types import MappingProxyType, NoneType
 from typing import Annotated, Any, NamedTuple, TypeVar, get_args, get_origin, get_type_hints
 
-from evofsm.cli.commands.common import message, require
+from evofsm.cli.commands.common import require
 
 T = TypeVar("T")
 _KEY = "evofsm"
@@ -128,28 +127,13 @@ def settings(options: Any) -> dict[str, Any]:
     return found
 
 
-def callback(command: type[Command]) -> Callable[..., None]:
-    """The function of which Typer makes the command; errors that users can mend are one line."""
+def callback(command: type[Command]) -> Callable[..., int | None]:
+    """The function of which Typer makes the command."""
 
-    def run(**given: Any) -> None:
-        import typer
-
-        from evofsm.fsm import visible
-
-        try:
-            made = _made(command, given)
-            require(**made.packages())
-            status = made.run()
-        except KeyboardInterrupt:
-            print("\nevofsm: stopped before the end", file=sys.stderr)
-            status = 130
-        except BrokenPipeError:  # whoever read the output had enough
-            raise
-        except (ValueError, TypeError, OSError, ModuleNotFoundError) as error:
-            print(f"evofsm: {visible(message(error))}", file=sys.stderr)
-            status = 2
-        if status:
-            raise typer.Exit(status) from None
+    def run(**given: Any) -> int | None:
+        made = _made(command, given)
+        require(**made.packages())
+        return made.run()
 
     run.__name__ = re.sub(r"(?<!^)(?=[A-Z])", "-", command.__name__).lower()
     run.__doc__ = command.__doc__

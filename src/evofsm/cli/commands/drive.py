@@ -9,9 +9,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from evofsm.cli.commands.common import print_json, progress, split_names
+from evofsm.cli.commands.common import progress, split_names
 from evofsm.cli.commands.declared import option
 from evofsm.cli.commands.groups import Driven
+from evofsm.cli.show import print_json
 
 if TYPE_CHECKING:
     from evofsm.cli.driving import Driving, Setup

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
-from evofsm.cli.commands.common import load_model, print_json, progress, split_names
+from evofsm.cli.commands.common import progress, split_names
 from evofsm.cli.commands.declared import argument, option, settings
 from evofsm.cli.commands.groups import WithJson
+from evofsm.cli.show import print_json
 
 if TYPE_CHECKING:
     from rich.progress import Progress
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
     from evofsm.cli.learning import Learning
     from evofsm.fsm import Category, EvolvingFSM, IntervalActions
     from evofsm.io import Chunk, LogColumns, Noted, VehicleLengths
-    from evofsm.store import Checkpoint, Header
+    from evofsm.store import Checkpoint
 
 
 class RuleName(StrEnum):
@@ -42,9 +43,6 @@ class NoLeader(StrEnum):
 _MOST_ACTIONS = 1000
 # For novelty, of a gap [m] and of speeds [m/s]: as the closed loop has them.
 _SCALES = (4.0, 2.0, 2.0)
-# What there may be of in a provenance, and how many files of it are named.
-_AMOUNTS = ("files", "rows", "episodes", "transitions")
-_MOST_FILES = 3
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,7 +61,7 @@ class Learn(WithJson):
     Of a bag of ROS 2, --topics says which field of which topic is which variable.
 
     The time may be seconds, or dates of ISO 8601. Without --failed a log tells nothing of failures,
-    and evofsm explain says so.
+    and evofsm inspect --at says so.
 
     With --checkpoint, the same command goes on where it was stopped, whatever stopped it, and comes
     to the same result. The file is kept at the end: run again, the command prints it at once.
@@ -336,49 +334,6 @@ class Learn(WithJson):
                 "usual)"
             )
         return [told.get(name, 1.0) for name in columns.observe.names]
-
-
-@dataclass(frozen=True, kw_only=True)
-class Inspect(WithJson):
-    """Print a saved model: its states, the transitions that matter, the actions."""
-
-    file: Path = argument("A machine or a model that was saved, or a folder of evofsm drive --out.")
-
-    def run(self) -> None:
-        """Print the model, and what its file says of itself."""
-        from evofsm.cli.text.learning import console, model_document, print_model
-
-        model, header = load_model(self.file)
-        provenance = {} if header is None else header.provenance
-        if self.as_json:
-            document = model_document(model)
-            print_json({"file": str(self.file), **document, "provenance": provenance})
-            return
-        facts = [("file", str(self.file))]
-        if header is not None:
-            goes_on = ", a machine that can go on learning" if header.kind == "machine" else ""
-            facts = [("file", f"{self.file}{goes_on}"), ("written by", _writer(header))]
-        print_model(console(), model, [*facts, *_learnt_from(provenance)])
-
-
-def _writer(header: Header) -> str:
-    library = "an evofsm" if header.library is None else f"evofsm {header.library}"
-    checked = "its SHA-256 is right" if header.version >= 4 else "without a SHA-256 yet"
-    return f"{library}, file format {header.version}; {checked}"
-
-
-def _learnt_from(provenance: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """What a file says of where it comes from, line by line."""
-    facts = []
-    for name, value in provenance.items():
-        if name == "files":
-            shown = [f"{file['name']} ({file['bytes']:,} bytes)" for file in value[:_MOST_FILES]]
-            more = len(value) - _MOST_FILES
-            text = ", ".join(shown) + (f" and {more:,} more" if more > 0 else "")
-        else:
-            text = f"{value:,}" if isinstance(value, int) else str(value)
-        facts.append((f"learnt from {name}" if name in _AMOUNTS else name, text))
-    return facts
 
 
 # -- What was asked for ---------------------------------------------------------------------------

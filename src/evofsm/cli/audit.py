@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
-from evofsm.cli.commands.common import print_json
-from evofsm.cli.commands.declared import argument, option
-from evofsm.cli.commands.groups import WithJson
-from evofsm.cli.commands.imported import imported
+import typer
+
+from evofsm.cli.options import Json, imported
+from evofsm.cli.show import facts, print_json, show
 
 if TYPE_CHECKING:
     from evofsm.guard import Audit as Audited
@@ -21,65 +20,57 @@ _KEEP = (
     "Keep the head where the log is not. Without it (--head) neither an end that is cut off nor a "
     "log that is written anew can be detected."
 )
-# Of what was found, in the document for programs.
-_PARTS = ("misfit", "remarks", "contents", "replay")
 # So many fields that differ are shown, and so much of each.
 _FIELDS, _LETTERS = 5, 40
 
 
-@dataclass(frozen=True, kw_only=True)
-class Audit(WithJson):
+def audit(
+    file: Annotated[Path, typer.Argument(help="An audit log.")],
+    head: Annotated[
+        str | None,
+        typer.Option(
+            help="NUMBER:HASH of the last record at some time, kept elsewhere: shows an end that "
+            "was cut off, and a log that was written anew."
+        ),
+    ] = None,
+    replay: Annotated[
+        bool, typer.Option(help="Whether to drive again, and compare every decision.")
+    ] = True,
+    failed: Annotated[
+        str | None,
+        typer.Option(
+            help="MODULE:FUNCTION that told the guard where it fails, if one did: no log holds "
+            "code."
+        ),
+    ] = None,
+    as_json: Json = False,
+) -> int:
     """Verify an audit log, and replay it.
 
-    Finds the first record that was altered, removed, moved, repeated or inserted, or that no log of
-    its version holds; then tells the machine and the risk that the log began with what was observed
-    and proposed, and compares each decision to the last bit. Ends with 0 if all is well, 1 if the
-    log was tampered with or a decision comes out otherwise, and 2 if it cannot be read.
+    Finds the first record that was altered, removed, moved, repeated or inserted; then gives the
+    machine and the risk that the log began with what was observed and proposed, and compares each
+    decision to the last bit. Ends with 0 if all is well, 1 if the log was tampered with or a
+    decision comes out otherwise, and 2 if it cannot be read.
     """
+    from evofsm.guard import audit as examine
+    from evofsm.store import Head
 
-    file: Path = argument("An audit log.")
-    head: str | None = option(
-        None,
-        "NUMBER:HASH of the last record at some time, kept elsewhere: shows an end that was cut "
-        "off, and a log that was written anew.",
+    found = examine(
+        file,
+        None if head is None else Head.parse(head),
+        replay=replay,
+        failed=None if failed is None else imported(failed),
     )
-    replay: bool = option(True, "Whether to drive again, and compare every decision.")
-    failed: str | None = option(
-        None,
-        "MODULE:FUNCTION that told the guard where it fails, if one did: no log holds code.",
-    )
-
-    def run(self) -> int:
-        """Print what was found."""
-        from evofsm.cli.text.columns import console, print_facts
-        from evofsm.cli.text.documents import spelled_out
-        from evofsm.guard import audit
-        from evofsm.store import Head
-
-        found = audit(
-            self.file,
-            None if self.head is None else Head.parse(self.head),
-            replay=self.replay,
-            failed=None if self.failed is None else imported(self.failed),
-        )
-        if self.as_json:
-            chain = found.chain
-            print_json(
-                {
-                    "file": str(self.file),
-                    "is_good": found.is_good,
-                    "head": str(chain.head),
-                    "half_written": chain.half_written,
-                    "finding": spelled_out(chain.finding),
-                    **{key: spelled_out(getattr(found, key)) for key in _PARTS},
-                }
-            )
-        else:
-            out = console()
-            print_facts(out, str(self.file), list(_facts(found)))
-            if found.is_good and self.head is None:
-                out.print(_KEEP)
-        return 0 if found.is_good else 1
+    if as_json:
+        chain = found.chain
+        parts = {name: getattr(found, name) for name in ("misfit", "remarks", "contents", "replay")}
+        known = {"is_good": found.is_good, "head": str(chain.head), "finding": chain.finding}
+        print_json({"file": file, **known, "half_written": chain.half_written, **parts})
+    else:
+        show(facts(str(file), list(_facts(found))))
+        if found.is_good and head is None:
+            show(f"\n{_KEEP}")
+    return 0 if found.is_good else 1
 
 
 def _facts(found: Audited) -> Iterator[tuple[str, str]]:

@@ -1,0 +1,108 @@
+"""The command ``evofsm``: its commands, and one way in which every error is told."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from io import TextIOWrapper
+from typing import Annotated, Any
+
+import typer
+from typer.core import TyperGroup
+
+from evofsm.cli.audit import audit
+from evofsm.cli.check import check
+from evofsm.cli.export import export
+from evofsm.cli.inspect import inspect
+from evofsm.cli.show import message, warn
+
+# What Typer raises where a command is called wrongly, whoever it takes it from.
+_CalledWrongly: type[Any] = typer.BadParameter.__mro__[2]
+
+
+class Commands(TyperGroup):
+    """Commands whose errors are one line on standard error, and exit status 2."""
+
+    def invoke(self, ctx: Any) -> None:
+        """Run a command; the number that it returns is the exit status."""
+        try:
+            status = super().invoke(ctx)
+        except KeyboardInterrupt:
+            warn("stopped before the end")
+            status = 130
+        except BrokenPipeError:  # whoever read the output had enough
+            raise
+        except _CalledWrongly as error:
+            command = error.ctx.command_path if getattr(error, "ctx", None) else "evofsm"
+            warn(f"{error.format_message()} ({command} --help)")
+            status = 2
+        except (ValueError, TypeError, OSError, ModuleNotFoundError) as error:
+            warn(message(error))
+            status = 2
+        if status:
+            raise typer.Exit(status) from None
+
+
+def group(about: str, *commands: Any) -> typer.Typer:
+    """Functions as commands."""
+    app = typer.Typer(
+        cls=Commands,
+        help=about,
+        add_completion=False,
+        no_args_is_help=True,
+        rich_markup_mode=None,
+        pretty_exceptions_enable=False,
+    )
+    for command in commands:
+        app.command()(command)
+    return app
+
+
+def _print_version(asked: bool) -> None:
+    if asked:
+        from evofsm import __version__
+
+        print(f"evofsm {__version__}")
+        raise typer.Exit
+
+
+def _options(
+    version: Annotated[
+        bool,
+        typer.Option(
+            "--version", is_eager=True, callback=_print_version, help="Print the version and stop."
+        ),
+    ] = False,
+) -> None:
+    """Online recognition of latent risk with an evolving finite state machine."""
+
+
+def application(*others: Any) -> typer.Typer:
+    """All commands, in the order in which the help names them."""
+    from evofsm.cli.commands.campaign import Campaign
+    from evofsm.cli.commands.declared import callback
+    from evofsm.cli.commands.drive import Drive
+    from evofsm.cli.commands.learn import Learn
+    from evofsm.cli.commands.monitor import Monitor
+    from evofsm.cli.commands.watch import Watch
+
+    learn, drive, campaign, watch, monitor, *rest = map(
+        callback, (Learn, Drive, Campaign, Watch, Monitor, *others)
+    )
+    about = _options.__doc__ or ""
+    commands = (learn, inspect, drive, campaign, watch, monitor, audit, export, check)
+    app = group(about, *commands, *rest)
+    app.callback()(_options)
+    return app
+
+
+def run(make: Callable[[], typer.Typer]) -> None:
+    """Run the command line that ``make`` makes."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, TextIOWrapper):  # no letter that a terminal lacks ends a command
+            stream.reconfigure(errors="replace")
+    if not {"--help", "--version"} & set(sys.argv):  # which should not wait for Numba
+        from evofsm.fsm import announce_compiling
+
+        announce_compiling()
+    make()()

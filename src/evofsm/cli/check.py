@@ -1,0 +1,56 @@
+"""`evofsm check`."""
+
+from __future__ import annotations
+
+import sys
+from typing import Annotated, Any
+
+import typer
+
+from evofsm.cli.options import Json, imported
+from evofsm.cli.show import print_json, say, show
+
+
+def check(
+    name: Annotated[
+        str,
+        typer.Argument(help="module:Class, module:instance, or module:function that makes one."),
+    ],
+    make: Annotated[
+        str | None,
+        typer.Option(
+            help="How to make it, in Python with the module's names: 'MyRule(radius=2.0)'."
+        ),
+    ] = None,
+    as_json: Json = False,
+) -> int:
+    """Check a class of your own against the contract of its kind.
+
+    A state rule, a reviser, a controller, a judge or a risk measure; its methods tell which. The
+    module is imported, from the present folder too, so that its code is run: check code that you
+    trust. Ends with 1 if a check fails.
+    """
+    from rich.padding import Padding
+
+    from evofsm.guard.check import check_results, kind_of
+
+    part: Any = imported(name)
+    if make is not None:
+        code = compile(make, "--make", "eval")
+        names = vars(sys.modules[name.partition(":")[0]])
+
+        def part() -> Any:
+            return eval(code, names)
+
+    kind, results = kind_of(part), check_results(part)
+    failed = sum(not one.passed for one in results)
+    if as_json:
+        print_json(results)
+    else:
+        say(f"{name}, checked against the contract of a {kind}")
+        for one in results:
+            say(f"  {'passed' if one.passed else 'failed'}  {one.check}")
+            if one.message:
+                show(Padding(one.message, (0, 0, 0, 10)))
+        say(f"{len(results)} checks: {len(results) - failed} passed, {failed} failed")
+    return int(failed > 0)

@@ -1,0 +1,124 @@
+"""`evofsm export`."""
+
+from __future__ import annotations
+
+import sys
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from evofsm.cli.inspect import load_model
+from evofsm.cli.options import Saved
+
+if TYPE_CHECKING:
+    from evofsm.fsm import FSMModel
+
+# Beside the machine, in folders of results.
+_RISK = "risk.evofsm"
+# How files of evofsm and logs of runs begin.
+_LEARNT = (b"PK\x03\x04", b"\x89MCAP")
+# Whoever draws a picture wants no more edges than were seen.
+_PICTURE_LEAST, _PICTURE_EVIDENCE = 0.001, 1.0
+
+
+class Format(StrEnum):
+    """What it is written as."""
+
+    DOT = "dot"
+    GRAPHML = "graphml"
+    PRISM = "prism"
+
+
+class Weights(StrEnum):
+    """How actions are weighted."""
+
+    OBSERVED = "observed"
+    MARGINAL = "marginal"
+
+
+def export(
+    file: Saved,
+    to: Annotated[
+        Format,
+        typer.Option(
+            help="Graph for Graphviz (dot) or for graph tools (graphml); process for PRISM and "
+            "Storm."
+        ),
+    ],
+    out: Annotated[Path | None, typer.Option(help="File to write; else it is printed.")] = None,
+    policy: Annotated[
+        Weights,
+        typer.Option(help="Weights of actions in a graph: observed, as used, or marginal, alike."),
+    ] = Weights.OBSERVED,
+    least: Annotated[
+        float | None,
+        typer.Option(
+            min=0.0, max=1.0, help="Leave out what is less probable; 0.001 in a picture, else 0."
+        ),
+    ] = None,
+    evidence: Annotated[
+        float | None,
+        typer.Option(
+            min=0.0,
+            help="Leave out edges, for prism actions, that were seen less often; 1, graphml 0.",
+        ),
+    ] = None,
+    loops: Annotated[
+        bool, typer.Option(help="Whether a graph shows that states lead to themselves.")
+    ] = True,
+) -> None:
+    """Write what was learnt, or driven, in the formats of other tools."""
+    _refuse_learnt(out)
+    from evofsm.fsm import visible
+    from evofsm.io import graphs
+    from evofsm.store import storage
+
+    model, dead_ends = _learnt(file)
+    if to is Format.PRISM:
+        text = graphs.to_prism(model, 1.0 if evidence is None else evidence, least or 0.0)
+    else:
+        is_picture = to is Format.DOT
+        graph = (graphs.to_dot if is_picture else graphs.to_networkx)(
+            model,
+            policy.value,
+            _PICTURE_LEAST * is_picture if least is None else least,
+            _PICTURE_EVIDENCE * is_picture if evidence is None else evidence,
+            self_loops=loops,
+            dead_ends=dead_ends,
+        )
+        text = graph if isinstance(graph, str) else _graphml(graph)
+    if out is None:
+        sys.stdout.write(visible(text))
+        return
+    with storage.replacing(out) as place:
+        place.write(visible(text).encode())
+
+
+def _graphml(graph: Any) -> str:
+    from networkx import generate_graphml
+
+    return "\n".join([*generate_graphml(graph), ""])
+
+
+def _refuse_learnt(out: Path | None) -> None:
+    """Raise where a graph would take the place of what cannot be had again."""
+    if out is not None and out.is_file():
+        with out.open("rb") as file:
+            if file.read(max(map(len, _LEARNT))).startswith(_LEARNT):
+                raise ValueError(
+                    f"--out {out}: what was learnt or driven is kept there; it was left alone"
+                )
+
+
+def _learnt(file: Path) -> tuple[FSMModel, list[int] | None]:
+    """The model, and its dead ends where the risk that was learnt with it is known."""
+    from evofsm.driving import LatentRisk, assess_states
+    from evofsm.store import storage
+
+    model, _ = load_model(file)
+    if not (file / _RISK).exists() or storage.read_header(file / _RISK).kind != "risk":
+        return model, None
+    assessed = assess_states(model, LatentRisk.load(file / _RISK))
+    return model, [one.state for one in assessed if one.is_dead_end]

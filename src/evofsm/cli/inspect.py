@@ -1,0 +1,330 @@
+"""`evofsm inspect`: what was learnt, as a whole and of one situation."""
+
+from __future__ import annotations
+
+import math
+import textwrap
+from collections.abc import Iterator, Mapping
+from io import BytesIO
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+
+import typer
+
+from evofsm.cli.options import Json, Saved, require
+from evofsm.cli.show import facts, print_json, say, show, table
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+    from rich.console import RenderableType
+
+    from evofsm.fsm import Explanation, FSMModel
+    from evofsm.store import Header
+
+# What folders of results hold, in the order in which it is looked for.
+_MODELS = ("machine.evofsm", "model.evofsm")
+# So many files that something was learnt from are named.
+_MOST_FILES = 3
+# An action taken less often in a state than this says nothing about where it leads.
+_LEAST_EVIDENCE = 10.0
+_UNTOLD = (
+    "What was learnt tells nothing of failures: none was ever told. From a log, evofsm learn "
+    "--failed COLUMN or --failed 'gap<=0' tells of them."
+)
+
+
+def inspect(
+    file: Saved,
+    at: Annotated[
+        str | None,
+        typer.Option(
+            help="Explain an observation, its values with commas between them: which state it is, "
+            "how often that was seen, and what came of it."
+        ),
+    ] = None,
+    state: Annotated[
+        str | None, typer.Option(help="Explain a state by its number, from 1; or all.")
+    ] = None,
+    action: Annotated[
+        int | None, typer.Option(help="With --at or --state: what came of this action, from 1.")
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Print what was learnt: states, the transitions that matter, actions; or explain a situation.
+
+    All numbers of an explanation were counted, once for each episode that came to a state;
+    intervals are of 90 %. That one action ended better than another does not say that it was the
+    reason.
+    """
+    model, header = load_model(file)
+    if at is not None or state is not None:
+        _explain(file, model, at, state, action, as_json=as_json)
+        return
+    if action is not None:
+        raise ValueError("--action needs a situation: --at or --state")
+    provenance = {} if header is None else header.provenance
+    if as_json:
+        print_json({"file": file, **model_document(model), "provenance": provenance})
+        return
+    of_file = [("file", str(file))]
+    if header is not None:
+        goes_on = ", a machine that can go on learning" if header.kind == "machine" else ""
+        of_file = [("file", f"{file}{goes_on}"), ("written by", f"evofsm {header.library}")]
+    of_file += _learnt_from(provenance)
+    show(facts("Model", [*of_file, *_model_facts(model)]), *tables_of(model))
+    show("", _actions(model))
+
+
+def load_model(place: Path) -> tuple[FSMModel, Header | None]:
+    """A model from wherever one was left, and what its file says of itself, if there is one.
+
+    A machine that drove a family of scenarios is labelled as that family is.
+    """
+    from evofsm.driving import FAMILIES, load_family
+    from evofsm.fsm import EvolvingFSM, FSMModel
+    from evofsm.store import storage
+
+    if place.is_dir():
+        found = next((place / name for name in _MODELS if (place / name).exists()), None)
+        if found is None:
+            raise FileNotFoundError(f"{place}: there is neither {' nor '.join(_MODELS)} in it")
+        return load_model(found)
+    if place.suffix == ".mcap":
+        require(mcap="mcap")
+        from evofsm.io import read_run
+
+        model = read_run(place).model
+        if model is None:
+            raise ValueError(f"{place}: no model is attached to this log")
+        return model, None
+    header = storage.read_header(place)
+    if header.kind == "guard":
+        machine = storage.read(place, "guard")[1]["machine"].tobytes()
+        if not machine:
+            raise ValueError(f"{place}: this guard has no machine")
+        return EvolvingFSM.load(BytesIO(machine)).model(), header
+    if header.kind != "machine":
+        return FSMModel.load(place), header
+    family = header.provenance.get("family")
+    labels = load_family(family).labels._asdict() if family in FAMILIES else {}
+    return EvolvingFSM.load(place).model(**labels), header
+
+
+# -- As a whole -----------------------------------------------------------------------------------
+
+
+class Passage(NamedTuple):
+    """A transition from one state to another."""
+
+    origin: int  #: state
+    target: int  #: state
+    times: int  #: steps in which the recognised state went from the one to the other
+    share: float  #: of the steps from the state of origin
+    learnt: float  #: probability per step that the matrices give, actions as often as used
+    action: int | None  #: under which that is highest, of those taken there often enough
+    under_action: float  #: probability per step under that action
+    taken: float  #: about how often that action was taken in the state of origin
+
+
+def passages(model: FSMModel, most: int = 12) -> list[Passage]:
+    """The transitions between states that were recognised most often.
+
+    How often an action was taken in a state is estimated from its use as a whole and the share
+    of the state in its recent use.
+    """
+    import numpy as np
+
+    counts = model.changes - np.diag(np.diag(model.changes))
+    steps = model.changes.sum(axis=1)
+    learnt = model.averaged_matrix("observed")
+    recent = model.origin_frequency.sum(axis=1, keepdims=True)
+    taken = model.uses[:, None] * model.origin_frequency / np.where(recent > 0.0, recent, 1.0)
+    found = []
+    for place in np.argsort(-counts, axis=None, kind="stable")[:most]:
+        i, j = divmod(int(place), model.n_states)
+        if counts[i, j] == 0.0:
+            break
+        tried = np.flatnonzero(taken[:, i] >= _LEAST_EVIDENCE)
+        best, under, often = None, np.nan, np.nan
+        if len(tried):
+            best = int(tried[model.transition_matrices[tried, i, j].argmax()])
+            under, often = float(model.transition_matrices[best, i, j]), float(taken[best, i])
+        times, share = int(counts[i, j]), float(counts[i, j] / steps[i])
+        found.append(Passage(i, j, times, share, float(learnt[i, j]), best, under, often))
+    return found
+
+
+def model_document(model: FSMModel) -> dict[str, Any]:
+    """All that is printed of a model, for JSON; states and actions from 0."""
+    return {
+        **{name: getattr(model, name) for name in ("dt", "names", "units", "failures_told")},
+        "settings": dict(model.settings),
+        "states": [
+            {
+                "state": i,
+                "center": model.centers[i],
+                "visits": float(model.visits[i]),
+                "first_seen": int(model.founded[i]),
+            }
+            for i in range(model.n_states)
+        ],
+        "transitions": passages(model),
+        "actions": [
+            {
+                "action": r,
+                "interval": model.actions.interval(r) if model.actions else None,
+                "uses": float(model.uses[r]),
+            }
+            for r in range(model.n_actions)
+        ],
+    }
+
+
+def tables_of(model: FSMModel) -> Iterator[RenderableType]:
+    """Its states, and the transitions that matter."""
+    import numpy as np
+
+    total = max(float(model.visits.sum()), 1.0)
+    stays = np.diag(model.changes) / np.maximum(model.changes.sum(axis=1), 1.0)
+    names = model.names or [f"variable {j + 1}" for j in range(model.n_variables)]
+    units = model.units or [""] * model.n_variables
+    heads = [f"{name} [{unit}]" if unit else name for name, unit in zip(names, units, strict=True)]
+    centers = zip(*map(_aligned, model.centers.T), strict=True)
+    states = [
+        (f"#{i + 1}", *center, f"{visits / total:.1%}", f"{stays[i]:.3f}", f"{founded:,.0f}")
+        for i, (center, visits, founded) in enumerate(
+            zip(centers, model.visits.tolist(), model.founded.tolist(), strict=True)
+        )
+    ]
+    title = "States (stays: share of its steps; first seen: at which row)"
+    yield ""
+    yield table(title, ("", *heads, "share of time", "stays", "first seen"), states)
+    yield ""
+    found = passages(model)
+    if not found:
+        yield "The recognised state never changed."
+        return
+    rows = [
+        (f"#{one.origin + 1} → #{one.target + 1}", f"{one.times:,}")
+        + (f"{one.share:.4f}", f"{one.learnt:.3f}")
+        + (
+            ("", "", "")
+            if one.action is None
+            else (_action(model, one.action), f"{one.under_action:.3f}", f"{one.taken:,.0f}×")
+        )
+        for one in found
+    ]
+    header = ("from → to", "times", "share", "learnt", "most under", "there", "tried")
+    title = f"Transitions that matter: the {len(found)} most frequent"
+    yield table(title, header, rows, left=(0, 4))
+    yield (
+        "\nTimes and share: of the steps from that state, as recognised. Learnt: probability per "
+        "step that the matrices give; most under which action, how probable there, and about how "
+        "often that action was taken in the state. Where learnt is far above the share, beliefs "
+        "are wide."
+    )
+
+
+def _model_facts(model: FSMModel) -> list[tuple[str, str]]:
+    settings = ", ".join(f"{name} {value:g}" for name, value in model.settings.items())
+    step = "the step is not known" if model.dt is None else f"one every {model.dt:g} s"
+    failures = f"{model.endings.sum():,.0f} episodes ended in one"
+    return [
+        ("observations", f"{model.visits.sum():,.0f}, {step}"),
+        ("transitions", f"{model.uses.sum():,.0f}, under {model.n_actions} actions"),
+        ("states", f"{model.n_states}, of {model.n_variables} variables"),
+        ("settings", settings or "not known"),
+        ("failures", failures if model.failures_told else "none was ever told"),
+    ]
+
+
+def _learnt_from(provenance: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+    """What a file says of where it comes from, line by line."""
+    for name, value in provenance.items():
+        text = f"{value:,}" if isinstance(value, int) else str(value)
+        if name == "files":
+            shown = [f"{file['name']} ({file['bytes']:,} bytes)" for file in value[:_MOST_FILES]]
+            more = len(value) - _MOST_FILES
+            text = ", ".join(shown) + (f" and {more:,} more" if more > 0 else "")
+        is_amount = name in ("files", "rows", "episodes", "transitions")
+        yield f"learnt from {name}" if is_amount else name, text
+
+
+def _actions(model: FSMModel) -> RenderableType:
+    total = max(float(model.uses.sum()), 1.0)
+    rows = [
+        (_action(model, r), f"{uses:,.0f}", f"{uses / total:.1%}")
+        for r, uses in enumerate(model.uses.tolist())
+    ]
+    return table("Actions", ("action", "used", "share"), rows)
+
+
+def _action(model: FSMModel, r: int) -> str:
+    number = f"a({r + 1})"
+    return f"{number:6}{model.actions.label(r)}" if model.actions else number
+
+
+def _aligned(values: NDArray[np.float64]) -> list[str]:
+    """Numbers with the same number of decimals, such that the largest has four digits."""
+    largest = float(abs(values).max(initial=0.0))
+    decimals = max(3 - math.floor(math.log10(largest)), 0) if largest > 0.0 else 2
+    return [f"{value:.{decimals}f}" for value in values]
+
+
+# -- Of one situation -----------------------------------------------------------------------------
+
+
+def _explain(
+    file: Path,
+    model: FSMModel,
+    at: str | None,
+    state: str | None,
+    action: int | None,
+    *,
+    as_json: bool,
+) -> None:
+    """Print a paragraph for each situation."""
+    if at is not None and state is not None:
+        raise ValueError("--at and --state exclude each other")
+    done = None if action is None else _index("--action", action, model.n_actions)
+    if at is not None:
+        found = [model.explain(action=done, observation=_values(at))]
+    elif state == "all":
+        found = [model.explain(each, done) for each in range(model.n_states)]
+    else:
+        found = [model.explain(_index("--state", state, model.n_states), done)]
+    if as_json:
+        print_json({"file": file, "situations": [_document(model, each) for each in found]})
+        return
+    if not model.failures_told:
+        print(textwrap.fill(_UNTOLD, 80))
+    for each in found:
+        say(textwrap.fill(each.text, 80, subsequent_indent="   "))
+
+
+def _index(option: str, number: object, count: int) -> int:
+    """From what people count from 1."""
+    try:
+        index = int(str(number).removeprefix("#")) - 1
+    except ValueError:
+        index = -1
+    if not 0 <= index < count:
+        raise ValueError(f"{option} is {number}; there are 1 to {count}")
+    return index
+
+
+def _values(text: str) -> list[float]:
+    try:
+        return [float(value) for value in text.split(",")]
+    except ValueError:
+        raise ValueError(f"--at is {text!r}; write numbers, such as 9,24,24") from None
+
+
+def _document(model: FSMModel, found: Explanation) -> dict[str, Any]:
+    document = found._asdict()
+    document["center"] = None if found.state is None else model.centers[found.state]
+    for name in ("here", "action", "after_better"):
+        if (tally := getattr(found, name)) is not None:
+            document[name] = {**tally._asdict(), "interval": tally.interval}
+    return document

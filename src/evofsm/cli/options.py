@@ -1,0 +1,88 @@
+"""Options that several commands share, and what commands do with what was typed."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from enum import StrEnum
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from evofsm.extras import install
+
+if TYPE_CHECKING:
+    pass
+
+
+class World(StrEnum):
+    """Where to drive."""
+
+    SUMO = "sumo"
+    KINEMATIC = "kinematic"
+
+
+class Judge(StrEnum):
+    """What a judge was given."""
+
+    KINEMATIC = "kinematic"
+    LEARNT = "learnt"
+
+
+class ModeName(StrEnum):
+    """How far a guard goes, as `evofsm.guard.Mode`."""
+
+    OFF = "off"
+    SHADOW = "shadow"
+    ADVISE = "advise"
+    ACT = "act"
+
+
+Json = Annotated[
+    bool, typer.Option("--json", help="Print one JSON document; states and actions count from 0.")
+]
+Saved = Annotated[
+    Path,
+    typer.Argument(
+        help="A machine, a model or a guard that was saved, a folder of evofsm drive --out, or a "
+        "log of evofsm drive --mcap."
+    ),
+]
+
+
+def require(**extras: str) -> None:
+    """Refuse before the long work what lacks packages after it; all that lack at once."""
+    if lacking := [package for package in extras if find_spec(package) is None]:
+        command = install(*dict.fromkeys(["cli", *(extras[package] for package in lacking)]))
+        raise ModuleNotFoundError(f"this needs {' and '.join(lacking)}: {command}")
+
+
+def imported(name: str) -> Any:
+    """A class, function or instance by its name ``module:Name``, found in the present folder too.
+
+    >>> imported("math:pi"), imported("math.pi")
+    Traceback (most recent call last):
+        ...
+    ValueError: 'math.pi' names nothing; write module:Name
+    """
+    module, _, path = name.partition(":")
+    if not (module and path):
+        raise ValueError(f"{name!r} names nothing; write module:Name")
+    if "" not in sys.path:
+        sys.path.insert(0, "")  # as `python -m` does
+    try:
+        thing: Any = importlib.import_module(module)
+    except ModuleNotFoundError as error:
+        raise ValueError(f"{module}: {error} (is it in this folder, or installed?)") from error
+    for part in path.split("."):
+        if not hasattr(thing, part):
+            raise ValueError(f"{module} has no {path!r}")
+        thing = getattr(thing, part)
+    return thing
+
+
+def split_names(text: str) -> list[str]:
+    """Names that were given with commas between them."""
+    return [name.strip() for name in text.split(",") if name.strip()]

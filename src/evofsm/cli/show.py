@@ -1,0 +1,171 @@
+"""What every command prints with: facts, tables, bars, JSON, and errors in one line."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import sys
+from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import contextmanager
+from enum import Enum
+from pathlib import PurePath
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from rich.console import Console, RenderableType
+
+
+def screen() -> Console:
+    """Standard output: 80 columns in a pipe, and nothing in a text from a file is markup."""
+    from rich.console import Console
+
+    return Console(markup=False, highlight=False, emoji=False)
+
+
+def show(*parts: RenderableType) -> None:
+    """Print texts and tables; in a pipe without the spaces that fill lines up."""
+    out = screen()
+    for part in parts:
+        if out.is_terminal:
+            out.print(part)
+        else:
+            with out.capture() as printed:
+                out.print(part)
+            print("\n".join(line.rstrip() for line in printed.get().splitlines()))
+
+
+def say(text: object) -> None:
+    """Print a line, however long, that may hold texts from files."""
+    from evofsm.fsm import visible
+
+    print(visible(str(text)))
+
+
+def warn(text: object) -> None:
+    """Print a line on standard error."""
+    from evofsm.fsm import visible
+
+    print(f"evofsm: {visible(str(text))}", file=sys.stderr, flush=True)
+
+
+def facts(title: str, pairs: Sequence[tuple[str, str]]) -> RenderableType:
+    """Names with a text each, which is folded below itself."""
+    from rich.table import Table
+    from rich.text import Text
+
+    from evofsm.fsm import visible
+
+    grid = Table.grid(padding=(0, 2))
+    grid.title, grid.title_justify, grid.title_style = Text(title, "bold"), "left", ""
+    grid.add_column(no_wrap=True)
+    grid.add_column(overflow="fold")
+    for name, text in pairs:
+        grid.add_row(f"  {visible(name)}", visible(text))
+    return grid
+
+
+def table(
+    title: str,
+    header: Sequence[str],
+    rows: Sequence[Sequence[str]],
+    *,
+    left: Collection[int] = (0,),
+    bold: Collection[int] = (),
+) -> RenderableType:
+    """Cells below one another; ``left`` are the columns set to the left, ``bold`` rows set off."""
+    from rich import box
+    from rich.table import Table
+    from rich.text import Text
+
+    from evofsm.fsm import visible
+
+    made = Table(box=box.SIMPLE_HEAD, pad_edge=False, show_edge=False)
+    made.title, made.title_justify, made.title_style = Text(title, "bold"), "left", ""
+    for place, name in enumerate(header):
+        made.add_column(
+            visible(name),
+            justify="left" if place in left else "right",
+            vertical="bottom",
+            overflow="fold",
+        )
+    for place, row in enumerate(rows):
+        made.add_row(*map(visible, row), style="bold" if place in bold else "")
+    return made
+
+
+def print_json(document: object) -> None:
+    """Print one document for programs, with null for NaN and the infinite."""
+    from evofsm.fsm import visible
+
+    text = json.dumps(plain(document), allow_nan=False, ensure_ascii=False, indent=2)
+    print(visible(text))
+
+
+def plain(value: Any) -> Any:
+    """A value as JSON knows it.
+
+    >>> plain({"lead": (1.5, math.inf)})
+    {'lead': [1.5, None]}
+    """
+    if isinstance(value, Enum):
+        return value.value
+    if isinstance(value, PurePath):
+        return str(value)
+    if hasattr(value, "_asdict"):
+        value = value._asdict()
+    elif dataclasses.is_dataclass(value) and not isinstance(value, type):
+        value = {one.name: getattr(value, one.name) for one in dataclasses.fields(value)}
+    elif hasattr(value, "tolist"):
+        value = value.tolist()
+    if isinstance(value, dict):
+        return {key: plain(one) for key, one in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(one) for one in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+Advance = Callable[..., None]
+
+
+@contextmanager
+def progress(text: str, total: float | None = None) -> Iterator[Advance]:
+    """A bar on standard error, none where nobody watches; yields a function that moves it.
+
+    The function takes ``done``, ``total``, ``advance`` and a ``text`` in place of the first.
+    """
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        Progress,
+        TaskProgressColumn,
+        TextColumn,
+        TimeRemainingColumn,
+    )
+
+    columns = (TextColumn("{task.description}"), BarColumn(20), TaskProgressColumn(show_speed=True))
+    watched = sys.stderr.isatty()
+    console = Console(stderr=True)
+    with Progress(
+        *columns, TimeRemainingColumn(), console=console, transient=True, disable=not watched
+    ) as bars:
+        task = bars.add_task(text, total=total)
+
+        def move(
+            done: float | None = None,
+            total: float | None = None,
+            *,
+            advance: float | None = None,
+            text: str | None = None,
+        ) -> None:
+            bars.update(task, completed=done, total=total, advance=advance, description=text)
+
+        yield move
+
+
+def message(error: BaseException) -> str:
+    """What an error says, in one line, and what it happened in."""
+    text = str(error) or type(error).__name__
+    if isinstance(error, OSError) and error.filename is not None and error.strerror:
+        text = f"{error.filename}: {error.strerror.lower()}"
+    return " ".join(", ".join([text, *getattr(error, "__notes__", ())]).split())

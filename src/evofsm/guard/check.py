@@ -1,0 +1,442 @@
+"""Checks for what users write: whether it keeps what a guard, a machine or a study relies on.
+
+There is a contract for each kind of part: controllers, revisers, judges, risk measures and state
+rules. A check gets a part made anew, and says what is wrong and what the likely cause is.
+"""
+
+from __future__ import annotations
+
+import copy
+import inspect
+import math
+import tempfile
+import traceback
+from collections.abc import Callable, Sequence
+from dataclasses import FrozenInstanceError, fields, is_dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evofsm.fsm import EvolvingFSM
+from evofsm.guard.guard import Guard
+from evofsm.guard.protocols import Judgement, Proposal, Revision, Situation
+
+Make = Callable[[], Any]
+Rows = Sequence[NDArray[np.float64]]
+Answers = list[tuple[Any, ...]]
+Clause = Callable[[Make], None]
+
+_DT = 0.25  # between two rows [s]
+_ACTIONS = np.array([-2.5, -0.7, 0.0, 1.3, 2.5])
+# A part is of the first kind whose methods it has.
+_METHODS = {
+    "rule": ("table", "scales"),
+    "reviser": ("revise", "start_episode"),
+    "controller": ("propose",),
+    "judge": ("judge", "why"),
+    "measure": ("score",),
+}
+
+
+class Result(NamedTuple):
+    """What one check found."""
+
+    check: str  #: its name
+    passed: bool
+    message: str = ""  #: what is wrong, and the likely cause
+
+
+def check_contract(part: object) -> None:
+    """Check a part of your own against the contract of its kind; call it in a test.
+
+    Parameters
+    ----------
+    part : object
+        A class that is made without arguments, an instance (copied before each check), or a
+        function that makes one. Its methods tell of which kind it is.
+
+    Raises
+    ------
+    AssertionError
+        If a check fails; it names every one that does.
+    TypeError
+        If it has the methods of no kind, or a class needs arguments.
+
+    Examples
+    --------
+    >>> class Closing:
+    ...     def score(self, observations, dt):
+    ...         gap, speed, leader_speed = observations.T
+    ...         return speed - leader_speed
+    >>> check_contract(Closing())  # doctest: +ELLIPSIS
+    Traceback (most recent call last):
+        ...
+    AssertionError: having_met_is_worst: a gap of 0 m at 10 and 10 m/s scores ...
+    """
+    broken = [f"{one.check}: {one.message}" for one in check_results(part) if not one.passed]
+    if broken:
+        raise AssertionError("\n".join(broken))
+
+
+def check_results(part: object) -> list[Result]:
+    """What each check of its contract finds, in order."""
+    kind, make = kind_of(part), _maker(part)
+    is_scored = kind == "judge" and hasattr(make(), "score")
+    clauses = (*_CONTRACTS[kind], *(_CONTRACTS["measure"] if is_scored else ()))
+    return [_result(clause, make) for clause in clauses]
+
+
+def kind_of(part: object) -> str:
+    """Of which kind a class, an instance, or a function that makes one is."""
+    kind = _by_methods(part)
+    if kind is None and callable(part) and not inspect.isclass(part):
+        kind = _by_methods(part())
+    if kind is None:
+        known = "; ".join(f"a {kind} has {', '.join(names)}" for kind, names in _METHODS.items())
+        raise TypeError(f"{part!r} has the methods of no kind: {known}")
+    return kind
+
+
+def _by_methods(part: object) -> str | None:
+    found = (k for k, names in _METHODS.items() if all(hasattr(part, name) for name in names))
+    return next(found, None)
+
+
+def _maker(part: Any) -> Make:
+    """A function that makes the part anew: of a class instances, of an instance copies."""
+    if not inspect.isclass(part):
+        is_function = _by_methods(part) is None and callable(part)
+        return part if is_function else lambda: copy.deepcopy(part)
+    given = {"lowest": -2.5, "dt": _DT} if hasattr(part, "judge") else {}
+    by_name = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
+    parameters = inspect.signature(part).parameters.values()
+    needed = [one.name for one in parameters if one.default is one.empty and one.kind in by_name]
+    if not given.keys() >= set(needed):
+        raise TypeError(
+            f"{part.__name__} needs arguments ({', '.join(needed)}); give an instance, or a "
+            "function that makes one (--make on the command line)"
+        )
+    return lambda: part(**{name: given[name] for name in needed})
+
+
+def _result(clause: Clause, make: Make) -> Result:
+    name = clause.__name__
+    try:
+        clause(make)
+    except AssertionError as broken:
+        return Result(name, False, str(broken))
+    except Exception as error:
+        place = traceback.extract_tb(error.__traceback__)[-1]
+        where = f"{place.filename}, line {place.lineno}"
+        return Result(name, False, f"{type(error).__name__}: {error} ({where})")
+    return Result(name, True)
+
+
+def _insist(kept: object, message: str) -> None:
+    if not kept:
+        raise AssertionError(message)
+
+
+def _same(one: object, other: object) -> bool:
+    """Whether numbers, arrays or tuples of them are equal bit for bit, NaN to NaN."""
+    if isinstance(one, tuple | list) and isinstance(other, tuple | list):
+        return len(one) == len(other) and all(map(_same, one, other))
+    if one is None or other is None or isinstance(one, str):
+        return one == other
+    a, b = np.asarray(one), np.asarray(other)
+    return a.shape == b.shape and a.tobytes() == b.tobytes()
+
+
+def _drive(rows: int = 40, seed: int = 0) -> NDArray[np.float64]:
+    """(rows, 3) gap, speed, leader's speed: behind a leader that brakes now and then."""
+    draw = np.random.default_rng(seed)
+    leader = np.clip(15.0 + np.cumsum(draw.normal(0.0, 0.8, rows)), 5.0, 30.0)
+    follower = np.clip(leader + draw.normal(0.0, 2.0, rows), 1.0, 35.0)
+    gap = np.clip(25.0 + np.cumsum((leader - follower) * _DT), 3.0, 80.0)
+    return np.column_stack([gap, follower, leader])
+
+
+def _common(answers: Callable[[Any, Rows], Answers]) -> Clause:
+    """What holds for all that answers rows, by what it answers to them."""
+
+    def answers_hang_on_inputs_alone(make: Make) -> None:
+        """It changes no input, keeps no array of its caller, and draws no random numbers."""
+        part, other, buffer, found = make(), make(), np.empty(3), []
+        for row in _drive():
+            buffer[:] = row
+            found += answers(part, [buffer])
+            changed = "it changed an observation that it was given (work in place? copy it first)"
+            _insist(_same(buffer, row), changed)
+            buffer[:] = 1e6
+        expected = [answer for row in _drive() for answer in answers(other, [row])]
+        _insist(
+            _same(found, expected),
+            "two that saw the same answer otherwise (an array that is kept instead of copied, a "
+            "random number without a seed, or something shared by all of the class?)",
+        )
+
+    return answers_hang_on_inputs_alone
+
+
+def _proposals(controller: Any, rows: Rows) -> Answers:
+    proposals = [controller.propose(row, k * _DT) for k, row in enumerate(rows)]
+    return [(float(one.action), *map(float, one.candidates)) for one in proposals]
+
+
+def proposes_numbers(make: Make) -> None:
+    """It returns a `Proposal` of finite numbers, on a free road too, within its own bounds."""
+    controller = make()
+    low = getattr(controller, "lowest", -math.inf)
+    high = getattr(controller, "highest", math.inf)
+    rare = [[np.inf, 20.0, 0.0], [0.01, 30.0, 0.0], [0.0, 10.0, 0.0], [-1.0, 5.0, 0.0]]
+    for row in [*_drive(), *map(np.array, rare), np.array([500.0, 0.0, 50.0])]:
+        proposal = controller.propose(row.copy(), 0.0)
+        where = f"at gap {row[0]:g} m, {row[1]:.1f} and {row[2]:.1f} m/s"
+        _insist(isinstance(proposal, Proposal), f"propose returns {proposal!r}, not a Proposal")
+        for action in (proposal.action, *proposal.candidates):
+            why = "(a division by the gap or the speed?)"
+            _insist(math.isfinite(action), f"it proposes {action} {where} {why}")
+        beyond = f"outside its own bounds [{low:g}, {high:g}]"
+        _insist(
+            low <= proposal.action <= high, f"it proposes {proposal.action:g} {where}, {beyond}"
+        )
+
+
+def _situation(row: NDArray[np.float64], k: int) -> Situation:
+    """As a machine of one state recognises it; of none at first."""
+    return Situation(row, np.ones(1), None if k == 0 else 0, math.nan, k * _DT)
+
+
+def _revisions(reviser: Any, rows: Rows) -> Answers:
+    actions = np.resize(_ACTIONS, len(rows)).tolist()
+    pairs = enumerate(zip(rows, actions, strict=True))
+    made = [reviser.revise(_situation(row, k), Proposal(action)) for k, (row, action) in pairs]
+    return [(one.executed, one.risk_executed, one.reason, one.advised) for one in made]
+
+
+def revises_what_is_proposed(make: Make) -> None:
+    """It executes a finite number within its actions, even where no number was proposed."""
+    reviser = make()
+    actions = getattr(reviser, "actions", None)
+    wanted = (*_ACTIONS.tolist(), 5.0, -9.0, math.nan, math.inf, -math.inf, 1e9)
+    for k, row in enumerate(_drive(40)):
+        proposed = wanted[k % len(wanted)]
+        of = f"for a proposal of {proposed}"
+        try:
+            one = reviser.revise(_situation(row, k), Proposal(proposed, (0.5, -40.0)))
+        except Exception as error:
+            why = "a controller that failed must not take the reviser down"
+            raise AssertionError(f"{of} it raises {error!r}; {why}") from error
+        _insist(isinstance(one, Revision), f"revise returns {one!r}, not a Revision")
+        is_number = isinstance(one.executed, float) and math.isfinite(one.executed)
+        _insist(is_number, f"{of} it executes {one.executed!r}; it must be a finite float")
+        within = actions is None or actions.low <= one.executed <= actions.high
+        _insist(within, f"{of} it executes {one.executed}, outside its set of actions")
+        _insist(_same(one.proposed, proposed), f"{of} it reports {one.proposed} as proposed")
+        _insist(one.reason, "it gives no reason, and a driver would not learn why")
+        risks = (one.risk_proposed, one.risk_executed, *one.interval)
+        sound = all(math.isnan(risk) or 0.0 <= risk <= 1.0 for risk in risks)
+        _insist(sound and not one.interval[0] > one.interval[1], f"risk and interval are {risks}")
+
+
+def an_episode_starts_anew(make: Make) -> None:
+    """After `start_episode` it decides as one that has just been made."""
+    used, fresh = make(), make()
+    _revisions(used, [np.array([2.0, 25.0, 5.0])] * 3)
+    used.start_episode()
+    fresh.start_episode()
+    found, expected = (_revisions(one, list(_drive(seed=1))) for one in (used, fresh))
+    _insist(_same(found, expected), "after start_episode it still depends on the episode before")
+
+
+def _judgements(judge: Any, rows: Rows) -> Answers:
+    made = (judge.judge(_situation(row, 1), _ACTIONS.copy()) for row in rows)
+    return [(one.risk, one.low, one.high) for one in made]
+
+
+def _taught(make: Make, *, ask: bool = False) -> tuple[Guard, Any]:
+    """A guard with the judge, after episodes of which every other one failed."""
+    judge = make()
+    interval = getattr(judge, "dt", _DT)
+    guard = Guard(_ACTIONS[0], _ACTIONS[-1], interval=interval, judge=judge)
+    _go_on(guard, judge, range(6), ask=ask)
+    return guard, judge
+
+
+def _go_on(guard: Guard, judge: Any, episodes: range, *, ask: bool = False) -> None:
+    for episode in episodes:
+        rows, failed = _drive(seed=episode), episode % 2 == 0
+        for k, row in enumerate(rows):
+            if ask:
+                judge.why(judge.judge(_seen(guard, row), _ACTIONS))
+            guard.decide(row, float(_ACTIONS[k % len(_ACTIONS)]), k * _DT)
+        guard.end(failed, np.array([-0.1, *rows[-1, 1:]]) if failed else rows[-1])
+
+
+def _seen(guard: Guard, row: NDArray[np.float64]) -> Situation:
+    machine = guard.machine
+    if machine is None or machine.n_states == 0:
+        return _situation(row, 0)
+    belief = np.asarray(machine.model().recognise(row))
+    return _situation(row, 0)._replace(belief=belief, state=int(belief.argmax()))
+
+
+def _asked(guard: Guard, judge: Any) -> list[Judgement]:
+    return [judge.judge(_seen(guard, row), _ACTIONS.copy()) for row in _drive(8, seed=99)]
+
+
+def judges_each_action(make: Make) -> None:
+    """It returns a probability for each action, within its interval, or NaN where it knows none."""
+    for judged in _asked(*_taught(make)):
+        shapes = {np.shape(getattr(judged, name)) for name in ("risk", "low", "high")}
+        _insist(shapes == {_ACTIONS.shape}, f"of {len(_ACTIONS)} actions it returns {shapes}")
+        known = ~np.isnan(judged.risk)
+        low, risk, high = judged.low[known], judged.risk[known], judged.high[known]
+        sound = ((low >= 0.0) & (low <= risk) & (risk <= high) & (high <= 1.0)).all()
+        why = "probabilities lie in [0, 1], and in their interval"
+        _insist(sound, f"its risks are {risk} within {low} to {high}; {why}")
+
+
+def learns_only_from_what_happens(make: Make) -> None:
+    """Neither questions nor, once it is frozen, episodes change what it has learnt."""
+    guard, judge = _taught(make)
+    before = _asked(guard, judge)
+    text = (
+        "it learns otherwise where somebody else asks it too (does judge note what it was asked?)"
+    )
+    _insist(_same(before, _asked(*_taught(make, ask=True))), text)
+    guard.freeze()
+    _go_on(guard, judge, range(10, 12))
+    _insist(_same(before, _asked(guard, judge)), "a frozen guard's judge went on learning")
+
+
+def a_file_keeps_it(make: Make) -> None:
+    """Where it learns, a guard that is saved and loaded between two episodes judges as before."""
+    guard, judge = _taught(make)
+    if not hasattr(judge, "learn"):
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        guard.save(Path(folder) / "guard")
+        again = Guard.load(Path(folder) / "guard", judge=type(judge))
+    same = _same(_asked(guard, judge), _asked(again, again.judge))
+    _insist(same, "one that was saved and loaded judges otherwise (is all that it learns saved?)")
+
+
+def _score(measure: Any, rows: NDArray[np.float64]) -> NDArray[np.float64]:
+    with np.errstate(all="ignore"):
+        scores = measure.score(rows, _DT)
+    is_fit = isinstance(scores, np.ndarray) and scores.shape == rows.shape[:1]
+    _insist(is_fit, f"{len(rows)} rows give {scores!r:.60}, not an array of {len(rows)} scores")
+    return np.asarray(scores, float)
+
+
+def _scores(measure: Any, rows: Rows) -> Answers:
+    return [(float(_score(measure, row[None])[0]),) for row in rows]
+
+
+def uses_only_earlier_rows(make: Make) -> None:
+    """A row's score depends neither on later rows nor on what was scored before."""
+    measure, rows = make(), _drive()
+    whole = _score(measure, rows.copy())
+    for k in (1, 2, 3, 10, len(rows)):
+        same = _same(whole[:k], _score(measure, rows[:k].copy()))
+        why = "a difference taken forward, a mean over the episode, something that is kept?"
+        _insist(same, f"the first {k} rows score otherwise without those after them ({why})")
+
+
+def no_score_is_missing(make: Make) -> None:
+    """No score is NaN, however wild the numbers; infinity is allowed."""
+    measure, big = make(), 1e100
+    wild = [[10.0, 0.0, 0.0], [big, 20.0, 20.0], [0.0, 20.0, 20.0], [-5.0, 0.0, 0.0]]
+    wild += [[big, big, big], [1e-300, big, 0.0], [-big, big, -big], [5.0, -1.0, -1.0]]
+    for row in [*map(np.array, wild), *_drive()]:
+        text = f"the score of gap {row[0]:g} m, speeds {row[1]:g} and {row[2]:g} m/s is NaN"
+        is_number = not np.isnan(_score(measure, row[None])[0])
+        _insist(is_number, f"{text} (0 / 0, or infinity minus infinity?)")
+
+
+def having_met_is_worst(make: Make) -> None:
+    """Nothing scores higher than a row in which the cars have met, and that is above 0."""
+    measure = make()
+    for met in ([0.0, 10.0, 10.0], [-0.5, 20.0, 5.0], [-3.0, 0.0, 0.0]):
+        *before, last = _score(measure, np.vstack([_drive(), [met]])).tolist()
+        text = f"a gap of {met[0]:g} m at {met[1]:g} and {met[2]:g} m/s scores {last:g}, a row"
+        worst = f"{text} before it {max(before):g} (is a gap of 0 or less looked at apart?)"
+        _insist(last > 0.0 and last >= max(before), worst)
+
+
+def danger_is_in_order(make: Make) -> None:
+    """A smaller gap, a faster follower or a slower leader is never safer; above 0 is dangerous."""
+    measure = make()
+    changes = ((0, -1.0, "smaller gap"), (1, 1.0, "faster follower"), (2, -1.0, "slower leader"))
+    for column, sign, what in changes:
+        for row in _drive(12, seed=3):
+            steps = np.repeat(row[None], 4, axis=0)
+            steps[:, column] += sign * 0.7 * np.arange(4)
+            (scores,) = np.array(_scores(measure, list(steps))).T
+            where = f"at gap {row[0]:.1f} m, {row[1]:.1f} and {row[2]:.1f} m/s: {scores}"
+            text = f"a {what} lowers the score {where} (higher is more dangerous: is it a time?)"
+            _insist((scores[1:] >= scores[:-1] - 1e-6).all(), text)
+    (close,), (far,) = _scores(measure, list(np.array([[2.0, 20.0, 0.0], [300.0, 10.0, 25.0]])))
+    _insist(close > 0.0, f"2 m behind a standing car at 20 m/s scores {close:g}, not above 0")
+    text = f"300 m behind a car that is 15 m/s faster scores {far:g}, above 0"
+    _insist(far <= 0.0, f"{text} (subtract a threshold)")
+
+
+def is_frozen(make: Make) -> None:
+    """It is a frozen dataclass of settings: equal where they are, and none can be changed."""
+    rule = make()
+    _insist(is_dataclass(rule), "it is no dataclass: files could not tell its settings")
+    _insist(rule == make(), "two rules of the same settings are not equal")
+    _insist(dict(rule.table) == dict(rule.table), "its table is another one the second time")
+    for one in fields(rule):
+        try:
+            setattr(rule, one.name, getattr(rule, one.name))
+        except FrozenInstanceError:
+            continue
+        raise AssertionError(f"{one.name} can be changed under a machine (frozen=True)")
+
+
+def a_machine_takes_it(make: Make) -> None:
+    """A machine creates states by it, alike in a batch and one by one, and a file keeps it."""
+    rule = make()
+    for name in ("radius", "spread"):
+        value = dict(rule.table).get(name, 1.0)
+        _insist(0.0 < value < np.inf, f"it tells a {name} of {value}; it must be positive")
+    Z = np.cumsum(np.random.default_rng(0).normal(size=(60, len(rule.scales) or 3)), axis=0)
+    try:
+        machine, batch = EvolvingFSM(2, rule=rule), EvolvingFSM(2, rule=make())
+    except TypeError as error:
+        raise AssertionError(f"{error} (was it registered with register_rule?)") from error
+    for z in Z:
+        machine.observe(z)
+        machine.act(0)
+    batch.learn_many(Z, np.zeros(len(Z), np.int64))
+    _insist(machine.n_states, "a machine with this rule creates no state at all")
+    _insist(_same(machine.centers, batch.centers), "learn_many finds other states than observe")
+    with tempfile.TemporaryDirectory() as folder:
+        machine.save(Path(folder) / "machine")
+        again = EvolvingFSM.load(Path(folder) / "machine").rule
+    _insist(again == rule, f"from a file it comes back as {again}")
+
+
+_CONTRACTS: dict[str, tuple[Clause, ...]] = {
+    "rule": (is_frozen, a_machine_takes_it),
+    "reviser": (revises_what_is_proposed, an_episode_starts_anew, _common(_revisions)),
+    "controller": (proposes_numbers, _common(_proposals)),
+    "judge": (
+        judges_each_action,
+        learns_only_from_what_happens,
+        a_file_keeps_it,
+        _common(_judgements),
+    ),
+    "measure": (
+        uses_only_earlier_rows,
+        no_score_is_missing,
+        having_met_is_worst,
+        danger_is_in_order,
+        _common(_scores),
+    ),
+}

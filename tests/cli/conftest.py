@@ -1,0 +1,15 @@
+"""What tests of commands share."""
+
+import pytest
+
+
+@pytest.fixture(scope="session")
+def evofsm():
+    """Run a command as on the command line."""
+    pytest.importorskip("typer")
+    pytest.importorskip("rich")
+    from typer.testing import CliRunner
+
+    from evofsm.__main__ import application
+
+    return lambda *words: CliRunner().invoke(application(), [*map(str, words)])

@@ -1,0 +1,59 @@
+"""`evofsm check`."""
+
+import sys
+
+import pytest
+
+MODULE = """
+from evofsm.guard import Proposal
+
+class Hasty:
+    def __init__(self, action=1.0):
+        self.action = action
+
+    def propose(self, observation, time=0.0):
+        return Proposal(self.action)
+"""
+
+
+@pytest.fixture
+def check(evofsm, tmp_path, monkeypatch):
+    """Run `evofsm check` in a folder with a module of one's own."""
+    (tmp_path / "own_driver.py").write_text(MODULE)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    monkeypatch.delitem(sys.modules, "own_driver", raising=False)
+    return lambda *words: evofsm("check", *words)
+
+
+def test_a_class_in_the_folder_is_checked(check):
+    result = check("own_driver:Hasty")
+    assert result.exit_code == 0, result.output
+    assert "contract of a controller" in result.output
+    assert "2 checks: 2 passed, 0 failed" in result.output
+
+
+def test_it_ends_with_1_and_says_what_is_wrong(check):
+    result = check("own_driver:Hasty", "--make", "Hasty(float('nan'))", "--json")
+    assert result.exit_code == 1
+    assert '"passed": false' in result.output
+    assert "it proposes nan at gap" in result.output
+    result = check("own_driver:Hasty", "--make", "Hasty(float('nan'))")
+    assert max(map(len, result.output.splitlines())) <= 80
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["own_driver"], "names nothing; write module:Name"),
+        (["own_driver:Calm"], "own_driver has no 'Calm'"),
+        (["not_there:Calm"], "is it in this folder, or installed?"),
+        (["own_driver:Proposal"], "has the methods of no kind"),
+        (["own_driver:Hasty", "--kind", "judge"], "No such option: --kind"),
+    ],
+)
+def test_what_cannot_be_checked_is_refused_in_one_line(check, arguments, message):
+    result = check(*arguments)
+    assert result.exit_code == 2
+    assert message in result.stderr
+    assert len(result.stderr.splitlines()) == 1

@@ -1,0 +1,75 @@
+"""`evofsm inspect --at` and `--state`: what was learnt of a situation."""
+
+import json
+
+import pytest
+
+from evofsm import EvolvingFSM, Guard
+from evofsm.driving import Unrevised, guard_for_family, learners_of, load_family, save_learnt, teach
+
+
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory):
+    """What unrevised driving into collisions has taught."""
+    family, folder = load_family("emergency"), tmp_path_factory.mktemp("learnt")
+    machine, risk = learners_of(guard_for_family(family))
+    reviser = Unrevised(family.actions)
+    guard = Guard.of(reviser, interval=family.interval, machine=machine, judge=risk)
+    teach(guard, [family.draw(0, index, split="train") for index in range(6)])
+    save_learnt(guard, folder, {"family": "emergency"})
+    return folder, machine
+
+
+def test_every_state_is_explained_with_the_words_of_its_family(evofsm, saved):
+    folder, machine = saved
+    answer = evofsm("inspect", folder, "--state", "all")
+    assert answer.exit_code == 0
+    told = answer.stdout.replace("\n   ", " ").splitlines()
+    numbers = [line.split(":")[0] for line in told]
+    assert numbers == [f"#{state + 1}" for state in range(machine.n_states)]
+    assert all("m/s)" in line for line in told)
+    assert max(map(len, answer.stdout.splitlines())) <= 80
+
+
+def test_an_observation_is_recognised_and_an_action_counted(evofsm, saved):
+    folder, machine = saved
+    found = evofsm("inspect", folder, "--at", "9,14,14", "--action", "12", "--json")
+    (one,) = json.loads(found.stdout)["situations"]
+    assert one["state"] == machine.model().recognise([9.0, 14.0, 14.0]).argmax()
+    assert one["here"]["episodes"] == machine.episodes[one["state"]]
+    assert one["action"]["failed"] == machine.failed_after[11, one["state"]]
+    assert "a(12)" in one["text"]
+    assert "m/s²" in one["text"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (("--state", 0), "--state is 0; there are 1 to"),
+        (("--state", "close"), "--state is close; there are 1 to"),
+        (("--at", "a,b"), "write numbers"),
+        (("--at", "1,2,3", "--state", 1), "exclude each other"),
+        (("--state", 1, "--action", 99), "--action is 99; there are 1 to 17"),
+        (("--action", 1), "--action needs a situation"),
+    ],
+)
+def test_what_is_not_there_is_refused_in_one_line(evofsm, saved, arguments, says):
+    answer = evofsm("inspect", saved[0], *arguments)
+    assert answer.exit_code == 2
+    assert says in answer.stderr
+    assert len(answer.stderr.splitlines()) == 1
+
+
+def test_a_far_observation_is_never_seen_and_silence_about_failures_is_said(evofsm, tmp_path):
+    machine = EvolvingFSM(1)
+    machine.learn_many([[0.0], [5.0]] * 20, [0] * 40, range(0, 40, 2))
+    machine.save(tmp_path / "machine")
+    answer = evofsm("inspect", tmp_path / "machine", "--at", "500")
+    assert "tells nothing of failures: none was ever told" in answer.stdout
+    assert "Never seen" in answer.stdout
+    told = evofsm("inspect", tmp_path / "machine", "--at", "500", "--json").stdout
+    assert json.loads(told)["situations"][0]["never_seen"] is True
+    machine.tell_of_failures()
+    machine.save(tmp_path / "machine")
+    told = evofsm("inspect", tmp_path / "machine", "--state", "all").stdout
+    assert "tells nothing of failures" not in told

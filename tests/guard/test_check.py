@@ -1,0 +1,320 @@
+"""What breaks a contract is found by the check for it, and parts of ours keep theirs."""
+
+import random
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+import pytest
+
+from evofsm import EvolvingFSM
+from evofsm.driving import (
+    IDM,
+    AdaptiveCruise,
+    AlwaysBrake,
+    DecelerationToAvoidCollision,
+    EnvelopeReviser,
+    FunctionController,
+    FuzzySafety,
+    LatentRisk,
+    ModifiedTimeToCollision,
+    PerformanceModel,
+    Picud,
+    ResponsibilitySensitiveSafety,
+    TimeHeadway,
+    TimeToCollision,
+    Unrevised,
+)
+from evofsm.fsm import Edges, FailureSplit, IntervalActions, Novelty, Paper
+from evofsm.guard import ActionReviser, Mode, Proposal
+from evofsm.guard.check import check_contract, check_results, kind_of
+
+ACTIONS = IntervalActions(-2.5, 2.5, 0.3)
+CALM = IDM(1.0, 25.0, 2.0, 1.5, 2.0, lowest=-5.0)
+
+OURS = [
+    Paper,
+    Edges(),
+    Novelty(radius=1.5, scales=(2.0, 0.5), spread=0.7),
+    FailureSplit(Novelty(radius=3.0), share=0.8),
+    TimeToCollision,
+    ModifiedTimeToCollision(),
+    DecelerationToAvoidCollision(),
+    TimeHeadway(),
+    Picud(),
+    ResponsibilitySensitiveSafety.r157(),
+    PerformanceModel.regulation(),
+    FuzzySafety(),
+    LatentRisk,
+    ActionReviser(LatentRisk(lowest=-2.5), ACTIONS),
+    ActionReviser(LatentRisk(lowest=-2.5), ACTIONS, mode=Mode.SHADOW),
+    EnvelopeReviser(ModifiedTimeToCollision(), ACTIONS),
+    Unrevised(ACTIONS),
+    AlwaysBrake(ACTIONS),
+    CALM,
+    AdaptiveCruise(30.0, 2.0, 1.1, lowest=-3.5, highest=2.0),
+    FunctionController(lambda seen: -1.0 if seen[0] < 20.0 else 0.5),
+]
+
+
+@pytest.mark.parametrize(
+    "part", OURS, ids=[getattr(one, "__name__", type(one).__name__) for one in OURS]
+)
+def test_parts_of_ours_keep_their_contract(part):
+    check_contract(part)
+
+
+class Driver:
+    lowest, highest = -3.0, 3.0
+
+    def propose(self, observation, time=0.0):
+        return Proposal(float(np.clip(0.1 * (observation[0] - 20.0), self.lowest, self.highest)))
+
+
+class JustANumber(Driver):
+    def propose(self, observation, time=0.0):
+        return 0.0
+
+
+class DividesByGap(Driver):
+    def propose(self, observation, time=0.0):
+        return Proposal(observation[0] * -1.0)
+
+
+class OutOfBounds(Driver):
+    def propose(self, observation, time=0.0):
+        return Proposal(-4.0 if observation[0] < 1.0 else 0.0)
+
+
+class ChangesObservation(Driver):
+    def propose(self, observation, time=0.0):
+        observation[0] = 0.0
+        return Proposal(0.0)
+
+
+class KeepsObservation(Driver):
+    kept = np.zeros(3)
+
+    def propose(self, observation, time=0.0):
+        before, self.kept = self.kept, observation
+        return super().propose(before)
+
+
+class Dice(Driver):
+    def propose(self, observation, time=0.0):
+        return Proposal(random.random())
+
+
+class BrokenReviser(Unrevised):
+    def __init__(self):
+        super().__init__(ACTIONS)
+
+
+class ExecutesAnything(BrokenReviser):
+    def revise(self, situation, proposal):
+        return super().revise(situation, proposal)._replace(executed=proposal.action)
+
+
+class FailsOnNaN(BrokenReviser):
+    def revise(self, situation, proposal):
+        round(proposal.action)
+        return super().revise(situation, proposal)
+
+
+class ReportsExecuted(BrokenReviser):
+    def revise(self, situation, proposal):
+        revision = super().revise(situation, proposal)
+        return revision._replace(proposed=revision.executed)
+
+
+class NoReason(BrokenReviser):
+    def revise(self, situation, proposal):
+        return super().revise(situation, proposal)._replace(reason="")
+
+
+class NeverCalms(BrokenReviser):
+    scared = False
+
+    def revise(self, situation, proposal):
+        self.scared |= bool(situation.observation[0] < 2.5)
+        revision = super().revise(situation, proposal)
+        return revision._replace(executed=-2.5) if self.scared else revision
+
+
+class BrokenJudge(LatentRisk):
+    def __init__(self):
+        super().__init__(lowest=-2.5)
+
+
+class RiskInPercent(BrokenJudge):
+    def judge(self, situation, actions):
+        judged = super().judge(situation, actions)
+        return judged._replace(risk=100.0 * judged.risk, high=100.0 * judged.high)
+
+
+class OneForAll(BrokenJudge):
+    def judge(self, situation, actions):
+        judged = super().judge(situation, actions)
+        return judged._replace(risk=judged.risk[:1])
+
+
+class RoundsObservation(BrokenJudge):
+    def judge(self, situation, actions):
+        situation.observation[:] = np.round(situation.observation)
+        return super().judge(situation, actions)
+
+
+class LearnsFromQuestions(BrokenJudge):
+    asked = 0
+
+    def judge(self, situation, actions):
+        self.asked += len(actions) == 5  # a decision asks of other numbers of actions
+        judged = super().judge(situation, actions)
+        return judged._replace(risk=judged.risk * 0.99**self.asked, low=0.0 * judged.low)
+
+
+class LearnsFrozen(BrokenJudge):
+    seen = 0
+
+    def follow(self, observation, action):
+        self.seen += 1
+        super().follow(observation, action)
+
+    def judge(self, situation, actions):
+        judged = super().judge(situation, actions)
+        return judged._replace(low=np.full(len(actions), 0.5**self.seen * judged.low))
+
+
+class FileForgetsLearnt(BrokenJudge):
+    def save(self, path, provenance=None):
+        LatentRisk(lowest=-2.5).save(path, provenance)
+
+
+class LastOnly(TimeToCollision):
+    def score(self, observations, dt):
+        return super().score(observations, dt)[-1:]
+
+
+class ShiftsGaps(TimeToCollision):
+    def score(self, observations, dt):
+        observations[:, 0] -= 0.1
+        return super().score(observations, dt)
+
+
+class WorstOfAll(TimeToCollision):
+    def score(self, observations, dt):
+        scores = super().score(observations, dt)
+        return np.full(len(scores), scores.max())
+
+
+class ZeroOverZero(TimeToCollision):
+    def score(self, observations, dt):
+        return super().score(observations, dt) + 0.0 * (1.0 / observations[:, 1])
+
+
+class BlindOnceMet(TimeToCollision):
+    def score(self, observations, dt):
+        return np.where(observations[:, 0] < 0.0, -1.0, super().score(observations, dt))
+
+
+class TimeItself(TimeToCollision):
+    def score(self, observations, dt):
+        return -super().score(observations, dt)
+
+
+class NoThreshold(TimeToCollision):
+    def score(self, observations, dt):
+        return super().score(observations, dt) + 10.0
+
+
+class NotFrozen:
+    scales = ()
+    table: ClassVar = {}
+
+
+@dataclass
+class Thawed(NotFrozen):
+    width: float = 1.0
+
+
+@dataclass(frozen=True)
+class NegativeRadius(Paper):
+    @property
+    def table(self):
+        return {**super().table, "radius": -1.0}
+
+
+@dataclass(frozen=True)
+class NotRegistered(Paper):
+    pass
+
+
+BROKEN = {
+    "proposes_numbers": [JustANumber, DividesByGap, OutOfBounds],
+    "revises_what_is_proposed": [ExecutesAnything, FailsOnNaN, ReportsExecuted, NoReason],
+    "an_episode_starts_anew": [NeverCalms],
+    "answers_hang_on_inputs_alone": [
+        *(ChangesObservation, KeepsObservation, Dice, RoundsObservation, ShiftsGaps),
+    ],
+    "judges_each_action": [RiskInPercent, OneForAll],
+    "learns_only_from_what_happens": [LearnsFromQuestions, LearnsFrozen],
+    "a_file_keeps_it": [FileForgetsLearnt],
+    "uses_only_earlier_rows": [WorstOfAll, LastOnly],
+    "no_score_is_missing": [ZeroOverZero],
+    "having_met_is_worst": [BlindOnceMet],
+    "danger_is_in_order": [TimeItself, NoThreshold],
+    "is_frozen": [NotFrozen, Thawed],
+    "a_machine_takes_it": [NegativeRadius, NotRegistered],
+}
+
+
+@pytest.mark.parametrize(
+    ("name", "part"),
+    [pytest.param(name, part, id=part.__name__) for name, of in BROKEN.items() for part in of],
+)
+def test_what_breaks_a_contract_is_found_by_the_check_for_it(name, part):
+    found = [one for one in check_results(part) if one.check == name and not one.passed]
+    assert found
+    assert "guard/check.py, line" not in found[0].message  # the check says it, and did not stumble
+
+
+def test_every_check_has_something_that_breaks_it():
+    parts = (Paper, Unrevised(ACTIONS), CALM, LatentRisk, TimeToCollision)
+    assert {one.check for part in parts for one in check_results(part)} == BROKEN.keys()
+
+
+class DiceWithoutBounds(Driver):
+    def propose(self, observation, time=0.0):
+        return Proposal(10.0 * random.random())
+
+
+def test_all_that_is_wrong_is_said_at_once():
+    with pytest.raises(
+        AssertionError, match=r"proposes_numbers: .*\nanswers_hang_on_inputs_alone: "
+    ):
+        check_contract(DiceWithoutBounds)
+
+
+def test_the_kind_is_told_by_the_methods():
+    assert kind_of(lambda: CALM) == "controller"
+    with pytest.raises(TypeError, match=r"has the methods of no kind: .*a controller has propose"):
+        check_contract(3)
+    with pytest.raises(TypeError, match=r"IDM needs arguments \(accel, desired_speed.*--make"):
+        check_contract(IDM)
+
+
+def test_an_error_within_a_part_names_its_place():
+    def fails(seen):
+        raise ZeroDivisionError("by the gap")
+
+    message = check_results(FunctionController(fails))[0].message
+    assert "ZeroDivisionError: by the gap (" in message
+    assert "test_check.py, line" in message
+
+
+def test_an_instance_is_copied_before_each_check():
+    rule = EvolvingFSM(2, rule=Novelty()).rule
+    reviser = ActionReviser(LatentRisk(lowest=-2.5), ACTIONS)
+    check_contract(reviser)
+    check_contract(rule)
+    assert reviser.risk.sums(0) == LatentRisk(lowest=-2.5).sums(0)
