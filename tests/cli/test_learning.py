@@ -5,7 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from evofsm.cli.learning import learn_traces, passages
+from evofsm.cli.inspect import passages
+from evofsm.cli.learning import learn_traces
 from evofsm.fsm.actions import IntervalActions
 from evofsm.fsm.divergence import jensen_shannon
 from evofsm.fsm.machine import EvolvingFSM

@@ -42,9 +42,6 @@ from evofsm.store import Checkpoint, Kept, storage
 #: How far ahead the longer forecast looks [s].
 HORIZON = 1.0
 
-# An action taken less often in a state than this says nothing about where it leads.
-_LEAST_EVIDENCE = 10.0
-
 _POLICIES: tuple[Policy, ...] = get_args(Policy)
 _HOLD, _OBSERVED = _POLICIES.index("hold"), _POLICIES.index("observed")
 # What a learner counts.
@@ -196,47 +193,6 @@ def _pass_over(coming: Iterator[Chunk], learner: _Learner, checkpoint: Checkpoin
             f"{checkpoint.path} has learnt {learner.rows:,} rows, where there are {rows:,} now; "
             "the files were changed, or are read in other pieces: delete it to begin anew"
         )
-
-
-class Passage(NamedTuple):
-    """A transition from one state to another."""
-
-    origin: int  #: state
-    target: int  #: state
-    times: int  #: steps in which the recognised state went from the one to the other
-    share: float  #: of the steps from the state of origin
-    learnt: float  #: probability per step that the matrices give, actions as often as used
-    action: int | None  #: under which that is highest, of those taken there often enough
-    under_action: float  #: probability per step under that action
-    taken: float  #: about how often that action was taken in the state of origin
-
-
-def passages(model: FSMModel, most: int = 12) -> list[Passage]:
-    """The transitions between states that matter: those that were recognised most often.
-
-    How often an action was taken in a state is estimated from its use as a whole and the share
-    of the state in its recent use.
-    """
-    counts = model.changes - np.diag(np.diag(model.changes))
-    steps = model.changes.sum(axis=1)
-    learnt = model.averaged_matrix("observed")
-    recent = model.origin_frequency.sum(axis=1, keepdims=True)
-    taken = model.uses[:, None] * model.origin_frequency / np.where(recent > 0.0, recent, 1.0)
-    found = []
-    for place in np.argsort(-counts, axis=None, kind="stable")[:most]:
-        i, j = divmod(int(place), model.n_states)
-        if counts[i, j] == 0.0:
-            break
-        tried = np.flatnonzero(taken[:, i] >= _LEAST_EVIDENCE)
-        best = int(tried[model.transition_matrices[tried, i, j].argmax()]) if len(tried) else None
-        under, often = (
-            (np.nan, np.nan)
-            if best is None
-            else (float(model.transition_matrices[best, i, j]), float(taken[best, i]))
-        )
-        times, share = int(counts[i, j]), float(counts[i, j] / steps[i])
-        found.append(Passage(i, j, times, share, float(learnt[i, j]), best, under, often))
-    return found
 
 
 def _ahead(chunks: Iterable[Chunk]) -> Iterator[Chunk]:

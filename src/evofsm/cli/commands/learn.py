@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, cast
 from evofsm.cli.commands.common import progress, split_names
 from evofsm.cli.commands.declared import argument, option, settings
 from evofsm.cli.commands.groups import WithJson
-from evofsm.cli.show import print_json
+from evofsm.cli.show import print_json, say
 
 if TYPE_CHECKING:
     from rich.progress import Progress
@@ -159,7 +159,7 @@ class Learn(WithJson):
     def run(self) -> None:
         """Learn, save and print."""
         from evofsm.cli.learning import learn_traces
-        from evofsm.cli.text.learning import console, learning_document, print_learning
+        from evofsm.cli.text.learning import learning_document, print_learning
         from evofsm.driving import UNITS, VARIABLES
         from evofsm.io import Noted, Topics, VehicleLengths, read_traces
         from evofsm.store import Checkpoint, duration, fingerprints, result_kept
@@ -217,21 +217,17 @@ class Learn(WithJson):
             saved = self.out and str(self.out)
             print_json({"files": self.files, "saved": saved, **document, **apart})
             return
-        screen = console()
         print_learning(
-            screen,
             learning,
             action=self.action,
             lengths=_assumed(lengths, keeper),
             further=_read_otherwise(noted, self.failed, learning),
         )
-        screen.print()
+        say("")
         if self.out is None:
-            screen.print("Nothing was saved; --out MODEL keeps the model.", soft_wrap=True)
+            say("Nothing was saved; --out MODEL keeps the model.")
         else:
-            screen.print(
-                f"Saved to {self.out}. Look at it again: evofsm inspect {self.out}", soft_wrap=True
-            )
+            say(f"Saved to {self.out}. Look at it again: evofsm inspect {self.out}")
 
     @property
     def _has_novelty(self) -> bool:
