@@ -24,14 +24,20 @@ def screen() -> Console:
 
 
 def show(*parts: RenderableType) -> None:
-    """Print texts and tables; in a pipe without the spaces that fill lines up."""
+    """Print texts and tables; in a pipe without the spaces that fill lines up.
+
+    A table may be wider than the terminal: no number is ever cut in two.
+    """
+    from rich.measure import Measurement
+
     out = screen()
     for part in parts:
+        width = max(out.width, Measurement.get(out, out.options, part).minimum)
         if out.is_terminal:
-            out.print(part)
+            out.print(part, width=width, crop=False)
         else:
             with out.capture() as printed:
-                out.print(part)
+                out.print(part, width=width, crop=False)
             print("\n".join(line.rstrip() for line in printed.get().splitlines()))
 
 
@@ -80,14 +86,15 @@ def table(
 
     from evofsm.fsm import visible
 
-    made = Table(box=box.SIMPLE_HEAD, pad_edge=False, show_edge=False)
+    made = Table(box=box.SIMPLE_HEAD, pad_edge=False, show_edge=False, padding=(0, 1, 0, 0))
     made.title, made.title_justify, made.title_style = Text(title, "bold"), "left", ""
     for place, name in enumerate(header):
+        words = [word for row in (header, *rows) for word in row[place].split()]
         made.add_column(
             visible(name),
             justify="left" if place in left else "right",
             vertical="bottom",
-            overflow="fold",
+            min_width=max(map(len, words), default=0),
         )
     for place, row in enumerate(rows):
         made.add_row(*map(visible, row), style="bold" if place in bold else "")

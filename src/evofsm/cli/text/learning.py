@@ -15,9 +15,9 @@ if TYPE_CHECKING:
     from rich.console import RenderableType
 
 _SECOND_STEPS = {
-    "marginal": "all actions alike, as in the paper",
-    "hold": "the same action, held",
-    "observed": "actions as often as they were used",
+    "marginal": "all alike, as in the paper",
+    "hold": "the same, held",
+    "observed": "as often as they were used",
 }
 # With less of the belief, the most probable state is hardly told apart from the others.
 _UNCERTAIN = 0.5
