@@ -15,7 +15,8 @@ import time
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.driving.cars import drive, guard_for_family, learnt_by
+from evofsm.driving.cars import guard_for_family, learnt_by
+from evofsm.driving.episodes import drive
 from evofsm.driving.families.family import Family, load_family
 from evofsm.fsm.states.novelty import Novelty
 from evofsm.guard.guard import Guard

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.driving.worlds.kinematic import KinematicWorld
+from evofsm.driving.world import KinematicWorld
 from evofsm.fsm.states.novelty import Novelty
 from evofsm.paper.settings import Settings
 

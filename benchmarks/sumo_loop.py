@@ -22,11 +22,11 @@ from typing import Any
 import numpy as np
 
 from decision import teach
-from evofsm.driving.cars import drive, guard_for_family, learnt_by
+from evofsm.driving.cars import guard_for_family, learnt_by
+from evofsm.driving.episodes import drive
 from evofsm.driving.families.family import Draw, Family, load_family
-from evofsm.driving.framework import Drive
-from evofsm.driving.worlds.road import Episode
-from evofsm.driving.worlds.sumo import SumoWorld
+from evofsm.driving.sumo import SumoWorld
+from evofsm.driving.world import Episode
 from evofsm.fsm.states.novelty import Novelty
 from evofsm.guard.guard import Guard
 
@@ -84,7 +84,7 @@ def _measure(id_: str, interval: float, repeats: int) -> dict[str, Any]:
             for draw in draws:
                 seconds, driven = drive_timed(guard, draw, world)
                 seconds_without, replayed = replay(family, draw, driven.executed.tolist(), world)
-                if not np.array_equal(driven.episode.record, replayed.record):
+                if not np.array_equal(driven.record, replayed.record):
                     raise RuntimeError("the reference drives another way: the ratio means nothing")
                 taken += seconds, seconds_without
                 steps += len(replayed.time) - 1
@@ -104,7 +104,7 @@ def _measure(id_: str, interval: float, repeats: int) -> dict[str, Any]:
     }
 
 
-def drive_timed(guard: Guard, draw: Draw, world: SumoWorld) -> tuple[float, Drive]:
+def drive_timed(guard: Guard, draw: Draw, world: SumoWorld) -> tuple[float, Episode]:
     """Seconds taken, and what was driven under the guard, which goes on learning."""
     begun = time.process_time()
     driven = drive(guard, draw, world)

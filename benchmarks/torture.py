@@ -35,11 +35,11 @@ from evofsm.cli.driving import Setup, drive_family, make_guard
 from evofsm.cli.learning import learn_traces
 from evofsm.driving.families.family import load_family
 from evofsm.driving.risk.latent import LatentRisk
-from evofsm.driving.worlds.kinematic import KinematicWorld
+from evofsm.driving.world import KinematicWorld
 from evofsm.fsm.actions import IntervalActions
 from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.model import FSMModel
-from evofsm.io.logs import read_traces
+from evofsm.io.traces import read_traces
 from evofsm.store import storage
 from evofsm.store.checkpoint import Checkpoint, fingerprints
 

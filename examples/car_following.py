@@ -25,7 +25,7 @@ from evofsm.guard import RevisedActions
 def main(argv: Sequence[str] | None = None) -> tuple[Result, Result]:
     """Drive, print, and answer with what came of it: unrevised, revised."""
     chosen = settings("An aggressive driver, revised.", argv, episodes=100, train=40)
-    env = gymnasium.make("evofsm.driving.worlds.gym:evofsm/CarFollowing-v0", seed=chosen.seed)
+    env = gymnasium.make("evofsm.driving.env:evofsm/CarFollowing-v0", seed=chosen.seed)
     car = env.unwrapped
 
     def aggressive(observation: NDArray[np.float64], info: dict[str, Any]) -> NDArray[np.float64]:

@@ -26,7 +26,7 @@ def own_measure(name: str) -> RiskMeasure:
 
     Examples
     --------
-    >>> own_measure("evofsm.driving:TimeToCollision")
+    >>> own_measure("evofsm.driving.measures:TimeToCollision")
     TimeToCollision(threshold=1.5)
     """
     thing = imported(name)

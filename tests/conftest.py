@@ -27,33 +27,11 @@ def spiral():
 
 
 @pytest.fixture(scope="session")
-def drive_agents():
-    """Plays an episode of a parallel environment; returns what each step returned."""
-
-    def play(env, policy, **options):
-        observations, _ = env.reset(options=options or None)
-        steps = []
-        while env.agents:
-            actions = {agent: [policy(agent, observations[agent])] for agent in env.agents}
-            steps.append(env.step(actions))
-            observations = steps[-1][0]
-        return steps
-
-    return play
-
-
-@pytest.fixture(scope="session")
-def throttle():
-    """A policy of agents that always accelerate."""
-    return lambda agent, observation: 2.5
-
-
-@pytest.fixture(scope="session")
 def compiled():
     """All that a watched run needs is compiled, for tests that wait for some seconds only."""
     from evofsm.cli.watch.session import Session, Watching, learn_first, watched_guard
     from evofsm.driving.families.family import load_family
-    from evofsm.driving.worlds.kinematic import KinematicWorld
+    from evofsm.driving.world import KinematicWorld
 
     watching = Watching(load_family("paper"))
     guard = watched_guard(watching.family)

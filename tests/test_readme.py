@@ -70,7 +70,7 @@ def test_the_bold_row_is_rebuilt_in_ten_lines():
     (row,) = _test_learner(load_family("emergency"), plan, 1)["rows"]
     ours = names["row"]
     assert ours.collisions == row.collisions == 0
-    assert sum(drive.episode.collided for drive in names["drives"]) == row.train_collisions == 0
+    assert sum(drive.collided for drive in names["drives"]) == row.train_collisions == 0
     for name in ("mobility", "mobility_low", "intervention_rate", "mean_change", "jerk"):
         assert getattr(ours, name) == getattr(row, name)
 

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.driving import FIXED_MEASURES, Draw, Family, Group, load_family, training
+from evofsm.driving import Draw, Family, Group, load_family, measures, training
 from studies.alarms.amounts import Amounts
 from studies.detection.measures import Detector, Ours, Watcher, classic
 from studies.detection.watch import (
@@ -57,7 +57,7 @@ def stages(name: str, plan: Amounts, seed: int) -> tuple[dict[str, Windows], lis
     watcher = Watcher(family)
     watcher.watch((family, draw) for draw in training(family, seed, 0, plan.train))
     known = [one for one in watcher.detectors() if one.name in SCORES]
-    known.append(classic("ttc", Group.FIXED, FIXED_MEASURES["aeb-ttc"]))
+    known.append(classic("ttc", Group.FIXED, measures.FIXED_MEASURES["aeb-ttc"]))
 
     def seen(family: Family, draws: Iterable[Draw], episodes: int) -> dict[str, Windows]:
         watched = tuple(watch(family, draw) for draw in islice(draws, episodes))

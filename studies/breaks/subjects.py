@@ -84,12 +84,12 @@ class Cars:
         """Drive one draw."""
         family = load(self.family, self.switches)
         if self.judge != NOBODY:
-            return drive(_guard(self), draw).episode
+            return drive(_guard(self), draw)
         limits = draw.controller.parameters[:, 7:9]
         if limits.min() >= family.actions.low and limits.max() <= family.actions.high:
             # Exactly what the framework makes of it, without leaving compiled code.
             return KinematicWorld().run(draw.scenario, draw.controller, family.interval)
-        return drive(unrevised_guard(family), draw).episode
+        return drive(unrevised_guard(family), draw)
 
 
 def subject_of(

@@ -15,18 +15,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evofsm.driving import (
-    FIXED_MEASURES,
     WORLDS,
     Draw,
     EnvelopeReviser,
     Family,
     Group,
-    ResponsibilitySensitiveSafety,
     drive,
     guard_for_family,
     held_out,
-    is_dead_end,
     learnt_by,
+    measures,
     open_world,
     teach,
     training,
@@ -94,11 +92,11 @@ def _case(family: Family, guard: Guard, name: str, draw: Draw, seed: int) -> Cas
     late = np.array([decision.situation.time for decision in revised.decisions]) >= _SETTLED
     return CaseResult(
         name,
-        revised.episode.collided,
-        float(revised.episode.time[-1]),
+        revised.collided,
+        float(revised.time[-1]),
         float(changed.mean()),
         float(changed[late].mean()) if late.any() else 0.0,
-        alone.episode.collided,
+        alone.collided,
         seed,
     )
 
@@ -129,8 +127,8 @@ def run_two_worlds(family: Family, plan: Amounts) -> dict[str, list[Any]]:
             InWorld(
                 name,
                 len(drives),
-                sum(one.episode.collided for one in drives),
-                float(np.mean([one.episode.observations[:, 1].mean() for one in drives])),
+                sum(one.collided for one in drives),
+                float(np.mean([one.observations[:, 1].mean() for one in drives])),
                 float(np.concatenate([one.changed for one in drives]).mean()),
             )
         )
@@ -161,18 +159,18 @@ def run_separation(family: Family, plan: Amounts) -> dict[str, list[Any]]:
     """
     watching = guard_for_family(family, tolerance=0.01, mode=Mode.SHADOW)
     teach(watching, training(family, plan.seed, 0, plan.side_train))
-    measures: dict[tuple[str, str], RiskMeasure] = {
+    compared: dict[tuple[str, str], RiskMeasure] = {
         ("evofsm", Group.LEARNT): learnt_by(watching)[1],
         ("rss-matched", Group.MATCHED): _true_limits(family),
-        **{(name, Group.FIXED): measure for name, measure in FIXED_MEASURES.items()},
+        **{(name, Group.FIXED): measure for name, measure in measures.FIXED_MEASURES.items()},
     }
     test = plan.side_test
     alone = teach(unrevised_guard(family), held_out(family, plan.seed, test))
     seen = [np.array([one.situation.observation for one in run.decisions]) for run in alone]
-    truth = is_dead_end(np.concatenate(seen), family.decel, family.leader_decel)
+    truth = measures.is_dead_end(np.concatenate(seen), family.decel, family.leader_decel)
     episode = np.repeat(np.arange(test), [len(rows) for rows in seen])
     found = []
-    for (name, group), measure in measures.items():
+    for (name, group), measure in compared.items():
         scores = np.concatenate([measure.score(rows, family.interval) for rows in seen])
         ranked = Ranked(scores, truth, episode)
         low, high = bootstrap(partial(_resampled_area, ranked, test), test)
@@ -185,8 +183,8 @@ def _resampled_area(ranked: Ranked, episodes: int, chosen: NDArray[np.intp]) -> 
     return ranked.areas(np.bincount(chosen, minlength=episodes)).auroc
 
 
-def _true_limits(family: Family) -> ResponsibilitySensitiveSafety:
-    return ResponsibilitySensitiveSafety.matched(family.decel, family.leader_decel)
+def _true_limits(family: Family) -> measures.ResponsibilitySensitiveSafety:
+    return measures.ResponsibilitySensitiveSafety.matched(family.decel, family.leader_decel)
 
 
 # -- The world changes, and no one is told --------------------------------------------------------
@@ -243,8 +241,8 @@ def run_shift(family: Family, plan: Amounts, learning_seed: int) -> dict[str, li
             checks.append(check("evofsm", learning_seed, -1, guard, held))
         if place in AFTER:
             checks.append(check("evofsm", learning_seed, place, guard, held_shifted))
-        collided.append(drive(guard, draw).episode.collided)
-    theirs = tuple(one.episode.collided for one in teach(unchanged, stream))
+        collided.append(drive(guard, draw).collided)
+    theirs = tuple(one.collided for one in teach(unchanged, stream))
     return {
         "streams": [
             Stream("rss-unchanged", learning_seed, theirs),
@@ -257,4 +255,4 @@ def run_shift(family: Family, plan: Amounts, learning_seed: int) -> dict[str, li
 def check(policy: str, seed: int, after: int, guard: Guard, draws: Sequence[Draw]) -> Check:
     """Drive held-out draws with what was learnt so far, learning frozen."""
     drives = teach(frozen(guard), draws)
-    return Check(policy, seed, after, sum(one.episode.collided for one in drives), len(drives))
+    return Check(policy, seed, after, sum(one.collided for one in drives), len(drives))

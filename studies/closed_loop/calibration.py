@@ -78,7 +78,7 @@ def run_calibration(family: Family, plan: Amounts) -> dict[str, list[Any]]:
             action = int(family.actions.encode(decision.revision.executed))
             step = machine.learn_one(decision.situation.observation, action)
             counts.learn(step.belief, action)
-        counts.end_episode(failed=driven.episode.collided)
+        counts.end_episode(failed=driven.collided)
     draws = held_out(family, plan.seed, plan.side_test)
     return {
         "reliabilities": [
@@ -96,15 +96,15 @@ def _as_driven(
     came: list[bool] = []
     for draw in draws:
         driven = drive(unrevised_guard(family), draw)
-        end = driven.episode.time[-1]
+        end = driven.time[-1]
         for decision in driven.decisions:
             left = end - decision.situation.time
-            if not driven.episode.collided and left < HORIZON:
+            if not driven.collided and left < HORIZON:
                 break  # what would have come is not known
             belief = model.recognise(decision.situation.observation)
             action = int(family.actions.encode(decision.revision.executed))
             predicted.append(counts.outcome(belief, action).probability)
-            came.append(driven.episode.collided and left <= HORIZON)
+            came.append(driven.collided and left <= HORIZON)
     what = f"counted: failure within {HORIZON:g} s, going on as driven"
     return reliability(what, predicted, came)
 

@@ -47,7 +47,7 @@ def run_machine(family: Family, plan: Amounts, seed: int) -> dict[str, list[Any]
     draws = training(family, plan.seed, seed, train)
     for episodes in range(train + 1):
         if episodes > 0:
-            collisions += drive(guard, next(draws)).episode.collided
+            collisions += drive(guard, next(draws)).collided
         if episodes in {*_CHECKPOINTS, train}:
             outcomes = tests.first(plan.machine_checks).by(guard)
             collided = sum(o.collided for o in outcomes)
@@ -96,5 +96,5 @@ def run_machine_shift(family: Family, plan: Amounts, seed: int) -> dict[str, lis
             checks.append(check(MACHINE, seed, -1, guard, held))
         if place in _AFTER:
             checks.append(check(MACHINE, seed, place, guard, held_shifted))
-        collided.append(drive(guard, draw).episode.collided)
+        collided.append(drive(guard, draw).collided)
     return {"streams": [Stream(MACHINE, seed, tuple(collided))], "checks": checks}

@@ -223,7 +223,7 @@ def _test_learner(family: Family, plan: Amounts, seed: int) -> dict[str, list[An
     draws = training(family, plan.seed, seed, plan.train)
     for episodes in range(plan.train + 1):
         if episodes > 0:
-            collisions += drive(guard, next(draws)).episode.collided
+            collisions += drive(guard, next(draws)).collided
         if episodes in CHECKPOINTS:
             outcomes = tests.first(SAFE_EPISODES).by(guard)
             curve.append(
@@ -272,6 +272,6 @@ def _test_rule(family: Family, plan: Amounts, rule: str, seed: int) -> dict[str,
         score(family, tests.alone, teach(guard, tests.draws)),
         learning_seed=seed,
         train_episodes=episodes,
-        train_collisions=sum(driven.episode.collided for driven in taught),
+        train_collisions=sum(driven.collided for driven in taught),
     )
     return {"by_rule": [row]}

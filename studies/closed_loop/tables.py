@@ -21,7 +21,7 @@ from evofsm.cli import (
     seeds_text,
     span,
 )
-from evofsm.driving import FIXED_MEASURES, Group
+from evofsm.driving import Group, measures
 from studies.closed_loop.comparison import (
     Line,
     chosen,
@@ -142,7 +142,7 @@ def _made_of(study: ClosedLoop) -> Iterator[tuple[str, str]]:
     yield ("unrevised", "the family's controller, left alone")
     yield ("always-brake", "hardest braking at every decision")
     yield ("oracle", "our reviser, told how hard this very leader brakes, and the brakes")
-    for name, measure in FIXED_MEASURES.items():
+    for name, measure in measures.FIXED_MEASURES.items():
         if name in driven:
             yield (name, _short(repr(measure)))
     limits = f"own {study.family.decel:g}, leader's {study.family.leader_decel:g} m/s²"

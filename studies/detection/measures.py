@@ -15,19 +15,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evofsm.driving import (
-    FIXED_MEASURES,
     TUNED_MEASURES,
     Draw,
-    Drive,
+    Episode,
     Family,
     Group,
     LatentRisk,
     OutcomeCounts,
-    ResponsibilitySensitiveSafety,
     Unrevised,
     drive,
     guard_for_family,
     learnt_by,
+    measures,
 )
 from evofsm.fsm import EvolvingFSM
 from evofsm.guard import Guard, RiskMeasure
@@ -91,14 +90,14 @@ class Chain:
         self.by_state = OutcomeCounts(1, HORIZON, family.interval)
         self.by_action = OutcomeCounts(machine.n_actions, HORIZON, family.interval)
 
-    def count(self, drive: Drive, family: Family) -> None:
+    def count(self, drive: Episode, family: Family) -> None:
         """Count what came after each decision of a drive that the machine has learnt."""
         for decision in drive.decisions:
             belief = decision.situation.belief
             self.by_state.learn(belief, 0)
             self.by_action.learn(belief, int(family.actions.encode(decision.revision.executed)))
         for counts in (self.by_state, self.by_action):
-            counts.end_episode(failed=drive.episode.collided)
+            counts.end_episode(failed=drive.collided)
 
     def of_states(self, exposure: Exposure) -> NDArray[np.float64]:
         """(n,) probability of failure within `HORIZON`: of the states, weighed by the belief."""
@@ -201,7 +200,7 @@ class Watcher:
 
 def _drive(
     family: Family, draw: Draw, machine: EvolvingFSM | None, risk: LatentRisk | None
-) -> Drive:
+) -> Episode:
     reviser = Unrevised(family.actions)
     return drive(Guard.of(reviser, interval=family.interval, machine=machine, judge=risk), draw)
 
@@ -247,9 +246,9 @@ def _scores(measure: RiskMeasure, exposure: Exposure) -> NDArray[np.float64]:
 
 def fixed(family: Family) -> list[Detector]:
     """All that neither learn nor are tuned; the matched one is told the family's true limits."""
-    matched = ResponsibilitySensitiveSafety.matched(family.decel, family.leader_decel)
+    matched = measures.ResponsibilitySensitiveSafety.matched(family.decel, family.leader_decel)
     return [
-        *(classic(name, Group.FIXED, FIXED_MEASURES[key]) for name, key in _SHOWN.items()),
+        *(classic(name, Group.FIXED, measures.FIXED_MEASURES[key]) for name, key in _SHOWN.items()),
         classic("rss-matched", Group.MATCHED, matched),
     ]
 
@@ -261,7 +260,7 @@ def own(name: str) -> list[Detector]:
 
 def behind_filter(family: Family, risk: LatentRisk) -> list[Detector]:
     """Safe distances behind our filter of noise, to tell what is owed to the filter alone."""
-    rss = ResponsibilitySensitiveSafety
+    rss = measures.ResponsibilitySensitiveSafety
     told = rss.matched(family.decel, family.leader_decel)
 
     def behind(measure: RiskMeasure, exposure: Exposure) -> NDArray[np.float64]:

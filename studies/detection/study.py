@@ -13,7 +13,7 @@ from functools import partial
 from itertools import islice, product
 from typing import Any, NamedTuple
 
-from evofsm.driving import Group, ResponsibilitySensitiveSafety
+from evofsm.driving import Group, measures
 from evofsm.fleet import in_order
 from evofsm.paper.frame import Frame, Progress, silent
 from studies.detection.amounts import Amounts
@@ -176,7 +176,7 @@ def _judge_cell(decel: float, leader_decel: float, plan: Amounts) -> _Cell:
     here = grid_world(decel, leader_decel, plan)
     watcher = Watcher(here.watched).watch(here.training(plan, 0))
     held_out = expose(here.family, held_out_draws(here.family, plan.seed), plan.grid_hours)
-    assumed = ResponsibilitySensitiveSafety.matched(*ASSUMED)
+    assumed = measures.ResponsibilitySensitiveSafety.matched(*ASSUMED)
     known: list[Detector] = [
         *watcher.detectors(),
         *fixed(here.family),

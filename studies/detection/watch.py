@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.driving import Draw, Family, KinematicWorld, Sensors, is_dead_end, training
+from evofsm.driving import Draw, Family, KinematicWorld, Sensors, measures, training
 from evofsm.guard import make_usable
 
 #: A collision within so long counts as coming [s].
@@ -100,7 +100,7 @@ class Exposure:
             left = one.end - interval * np.arange(n)
             known = np.ones(n, dtype=np.bool_)
             if target is Target.DEAD_END:
-                truth = is_dead_end(one.true, family.decel, family.leader_decel)
+                truth = measures.is_dead_end(one.true, family.decel, family.leader_decel)
             else:
                 known = (left >= HORIZON) | one.collided
                 truth = (left <= HORIZON) & one.collided

@@ -14,18 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.driving import (
-    SAFETY_RULE,
-    BrakeWatch,
-    DecelerationToAvoidCollision,
-    FuzzySafety,
-    LatentRisk,
-    ModifiedTimeToCollision,
-    Picud,
-    ResponsibilitySensitiveSafety,
-    TimeHeadway,
-    TimeToCollision,
-)
+from evofsm.driving import SAFETY_RULE, BrakeWatch, LatentRisk, measures
 from evofsm.fsm import NO_ACTION, EvolvingFSM, FSMModel, Novelty
 from evofsm.guard import BELIEF_TOLERANCE, RiskMeasure
 from studies.real.cases import INTERVAL, QUESTIONS, Case, Question, recent_acceleration
@@ -81,13 +70,13 @@ class Learnt(NamedTuple):
 
 
 FIXED: Mapping[str, RiskMeasure] = {
-    "ttc": TimeToCollision(),
-    "mttc": ModifiedTimeToCollision(),
-    "drac": DecelerationToAvoidCollision(),
-    "headway": TimeHeadway(),
-    "picud": Picud(),
-    "rss-r157": ResponsibilitySensitiveSafety.r157(),
-    "fuzzy": FuzzySafety(),
+    "ttc": measures.TimeToCollision(),
+    "mttc": measures.ModifiedTimeToCollision(),
+    "drac": measures.DecelerationToAvoidCollision(),
+    "headway": measures.TimeHeadway(),
+    "picud": measures.Picud(),
+    "rss-r157": measures.ResponsibilitySensitiveSafety.r157(),
+    "fuzzy": measures.FuzzySafety(),
 }
 
 MEASURES = (

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.driving import time_to_collision
+from evofsm.driving import measures
 from studies.datasets.episodes import Episode
 
 #: Slower than this a short time to collision is mostly creeping to a stop [m/s].
@@ -45,7 +45,7 @@ class Target:
         if self.braking > 0.0:
             return np.asarray(episode.accelerations < -self.braking)
         seen = episode.observations
-        return (time_to_collision(seen) < self.time) & (seen[:, 1] > CREEPING)
+        return (measures.time_to_collision(seen) < self.time) & (seen[:, 1] > CREEPING)
 
 
 #: In the order in which they are reported.

@@ -9,7 +9,6 @@ import numpy as np
 
 from evofsm.driving import (
     Draw,
-    Drive,
     Family,
     KinematicWorld,
     Reference,
@@ -74,7 +73,7 @@ class Cars(System):
     def score(self) -> float:
         """Mobility: distance, in those of the driver alone in the same draw."""
         alone = _alone(self.name, self._start)
-        return outcome_of(Drive(self._road.episode(), ()), alone, self.interval).mobility
+        return outcome_of(self._road.episode(), alone, self.interval).mobility
 
 
 def _draw(family: Family, start: Start) -> Draw:

@@ -20,7 +20,7 @@ from evofsm.cli.campaign import Campaign, drive_campaign
 from evofsm.cli.driving import Setup, drive_family, make_guard
 from evofsm.driving.cars import load_learnt, save_learnt
 from evofsm.driving.families.family import load_family
-from evofsm.driving.worlds import open_world
+from evofsm.driving.sumo import open_world
 from evofsm.fleet.executors import Here, Processes
 from evofsm.guard.reviser import Mode
 

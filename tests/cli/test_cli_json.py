@@ -69,7 +69,7 @@ def test_audit(tmp_path):
 
 
 def test_check():
-    found = document("check", "evofsm.driving.risk.headway:TimeHeadway")
+    found = document("check", "evofsm.driving.measures:TimeHeadway")
     assert found
     assert all(one["passed"] for one in found)
 

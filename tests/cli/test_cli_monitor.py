@@ -157,7 +157,7 @@ def test_a_recorded_run_is_watched(tmp_path):
     *decisions, end = told(result)
     assert len(decisions) == len(driven.decisions)
     assert {one["kind"] for one in decisions} == {"decision"}
-    assert (end["kind"], end["failed"]) == ("end", driven.episode.collided)
+    assert (end["kind"], end["failed"]) == ("end", driven.collided)
 
 
 # -- As a process ---------------------------------------------------------------------------------

@@ -11,9 +11,10 @@ import pytest
 from evofsm.cli.watch.live.words import tell
 from evofsm.cli.watch.player import Player
 from evofsm.cli.watch.session import Session, Watching, learn_first, watched_guard
-from evofsm.driving.cars import guard_for_family, learnt_by, load_learnt, save_learnt, teach
+from evofsm.driving.cars import guard_for_family, learnt_by, load_learnt, save_learnt
+from evofsm.driving.episodes import teach
 from evofsm.driving.families.family import load_family
-from evofsm.driving.worlds.kinematic import KinematicWorld
+from evofsm.driving.world import KinematicWorld
 from evofsm.guard.reviser import Mode
 
 pytestmark = pytest.mark.usefixtures("compiled")
@@ -169,8 +170,8 @@ def test_a_recording_shows_what_was_decided(recorded):
         recording.restart(case)
         frames = drive(recording)
         assert [frame.executed for frame in frames[:-1]] == drive_.executed.tolist()
-        assert frames[-1].collided == drive_.episode.collided == bool(case)
-        assert frames[-1].time == drive_.episode.time[-1]
+        assert frames[-1].collided == drive_.collided == bool(case)
+        assert frames[-1].time == drive_.time[-1]
         risks = [decision.revision.risk_proposed for decision in drive_.decisions]
         assert frames[-1].story.first == next(
             frame.time for frame, risk in zip(frames, risks, strict=False) if risk > 0.02

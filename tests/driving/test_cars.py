@@ -14,10 +14,9 @@ from evofsm.driving.cars import (
     load_learnt,
     name_judge,
     save_learnt,
-    teach,
     training,
-    try_out,
 )
+from evofsm.driving.episodes import teach, try_out
 from evofsm.driving.families.family import load_family
 from evofsm.driving.risk.latent import LatentRisk
 from evofsm.guard.guard import Guard
@@ -31,7 +30,7 @@ EMERGENCY = load_family("emergency")
 def taught(episodes, **settings):
     guard = guard_for_family(EMERGENCY, judge="learnt", **settings)
     drives = teach(guard, training(EMERGENCY, 0, 0, episodes))
-    return guard, sum(one.episode.collided for one in drives)
+    return guard, sum(one.collided for one in drives)
 
 
 def decided(guard):

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from evofsm.driving import KinematicWorld, Leader, Scenario, guard_for_cars, shadow_drive
-from evofsm.driving.drivers.idm import IDM
+from evofsm.driving.drivers import IDM
 from evofsm.guard import Mode
 
 HASTY = IDM(2.25, 28.0, 0.8, 0.3, 2.0, lowest=-4.0, highest=2.5)
@@ -23,9 +23,9 @@ def test_it_decides_on_each_row_and_changes_none():
     drive = shadow_drive(guard, time, seen, did)
     assert len(drive.decisions) == len(time) - 1
     assert (drive.executed == drive.proposed).all()
-    assert drive.episode.collided
-    assert not drive.episode.rear_ended
-    assert (drive.episode.observations == seen).all()
+    assert drive.collided
+    assert not drive.rear_ended
+    assert (drive.observations == seen).all()
     assert guard.machine.endings.sum() == 1.0
     advised = np.array([one.revision.advised for one in drive.decisions])
     assert advised[-1] < -2.0

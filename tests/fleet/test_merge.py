@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from evofsm.driving.families.family import load_family
-from evofsm.driving.worlds.kinematic import KinematicWorld
+from evofsm.driving.world import KinematicWorld
 from evofsm.fleet.batch import Fleet
 from evofsm.fleet.merging import merge
 from evofsm.fsm.crowding import WhenFull

@@ -15,14 +15,13 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from evofsm.driving.drivers.idm import IDM
-from evofsm.driving.framework import Framework
+from evofsm.driving import episodes
+from evofsm.driving.drivers import IDM
+from evofsm.driving.measures import TimeToCollision
 from evofsm.driving.revisers import AlwaysBrake, EnvelopeReviser, Unrevised
 from evofsm.driving.risk.by_state import RiskByState
 from evofsm.driving.risk.latent import LatentRisk
-from evofsm.driving.risk.ttc import TimeToCollision
-from evofsm.driving.worlds.kinematic import KinematicWorld
-from evofsm.driving.worlds.scenario import Leader, Scenario, Sensors
+from evofsm.driving.scenarios import Leader, Scenario, Sensors
 from evofsm.fsm.actions import IntervalActions
 from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.states.novelty import Novelty
@@ -56,7 +55,7 @@ def scenario(brake_time=6.0, **others):
 
 
 class Learner:
-    """A machine, a risk and a framework that teaches both."""
+    """A machine, a risk and a guard that teaches both."""
 
     def __init__(self, **of_reviser):
         rule = Novelty(radius=1.0, scales=(4.0, 2.0, 2.0))
@@ -64,16 +63,15 @@ class Learner:
         self.risk = LatentRisk(ACTIONS.low)
         self.reviser = ActionReviser(self.risk, ACTIONS, **of_reviser)
 
-    def framework(self, log, controller=HASTY, **others):
+    def guard(self, log, **others):
         taking_part = {"machine": self.machine, "judge": self.risk, "interval": 0.25}
         reviser = others.pop("reviser", self.reviser)
-        guard = Guard.of(reviser, actions=ACTIONS, audit=log, **(taking_part | others))
-        return Framework(controller, guard)
+        return Guard.of(reviser, actions=ACTIONS, audit=log, **(taking_part | others))
 
 
-def drive(log, *scenarios, learner=None, **others):
-    framework = (learner or Learner()).framework(log, **others)
-    return [framework.drive(KinematicWorld(), one) for one in scenarios]
+def drive(log, *scenarios, learner=None, controller=HASTY, **others):
+    guard = (learner or Learner()).guard(log, **others)
+    return [episodes.drive(guard, one, controller=controller) for one in scenarios]
 
 
 def contents(path):
@@ -346,7 +344,7 @@ def test_episodes_of_learning_come_out_the_same(tmp_path):
         drives += drive(log, scenario(), learner=learner, reviser=learner.reviser, learn=False)
         collided = drive(log, scenario(), learner=learner, reviser=Unrevised(ACTIONS))
         drives += collided + drive(log, scenario(7.0), learner=learner)
-    assert collided[0].episode.collided
+    assert collided[0].collided
     assert learner.machine.n_states > 10
     result = audit(path, log.head)
     assert result.is_good
@@ -965,7 +963,7 @@ def test_of_a_log_that_grows_what_was_there_at_first_is_read(tmp_path, monkeypat
 
 def test_a_wrapped_environment_is_audited(tmp_path):
     pytest.importorskip("gymnasium")
-    from evofsm.driving.worlds.gym import CarFollowing
+    from evofsm.driving.env import CarFollowing
     from evofsm.guard.gym import RevisedActions
 
     env = CarFollowing()

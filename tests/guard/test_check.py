@@ -12,18 +12,19 @@ from evofsm.driving import (
     IDM,
     AdaptiveCruise,
     AlwaysBrake,
-    DecelerationToAvoidCollision,
     EnvelopeReviser,
-    FunctionController,
-    FuzzySafety,
     LatentRisk,
+    Unrevised,
+)
+from evofsm.driving.measures import (
+    DecelerationToAvoidCollision,
+    FuzzySafety,
     ModifiedTimeToCollision,
     PerformanceModel,
     Picud,
     ResponsibilitySensitiveSafety,
     TimeHeadway,
     TimeToCollision,
-    Unrevised,
 )
 from evofsm.fsm import Edges, FailureSplit, IntervalActions, Novelty, Paper
 from evofsm.guard import ActionReviser, Mode, Proposal
@@ -53,7 +54,6 @@ OURS = [
     AlwaysBrake(ACTIONS),
     CALM,
     AdaptiveCruise(30.0, 2.0, 1.1, lowest=-3.5, highest=2.0),
-    FunctionController(lambda seen: -1.0 if seen[0] < 20.0 else 0.5),
 ]
 
 
@@ -304,10 +304,11 @@ def test_the_kind_is_told_by_the_methods():
 
 
 def test_an_error_within_a_part_names_its_place():
-    def fails(seen):
-        raise ZeroDivisionError("by the gap")
+    class Fails:
+        def propose(self, observation, time=0.0):
+            raise ZeroDivisionError("by the gap")
 
-    message = check_results(FunctionController(fails))[0].message
+    message = check_results(Fails())[0].message
     assert "ZeroDivisionError: by the gap (" in message
     assert "test_check.py, line" in message
 

@@ -194,7 +194,7 @@ def test_a_proposal_that_is_kept_is_passed_on_untouched():
 
 
 def test_all_else_is_forwarded():
-    inner = gymnasium.make("evofsm.driving.worlds.gym:evofsm/CarFollowing-v0", render_mode="ansi")
+    inner = gymnasium.make("evofsm.driving.env:evofsm/CarFollowing-v0", render_mode="ansi")
     env = of_cars(inner)
     assert env.spec.id == inner.spec.id
     for name in ("unwrapped", "action_space", "observation_space", "metadata"):

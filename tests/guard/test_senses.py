@@ -6,13 +6,13 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 
-from evofsm.driving.drivers.idm import IDM
-from evofsm.driving.framework import Framework
+from evofsm.driving.drivers import IDM
+from evofsm.driving.episodes import drive
+from evofsm.driving.measures import TimeToCollision
 from evofsm.driving.revisers import EnvelopeReviser
 from evofsm.driving.risk.latent import LatentRisk
-from evofsm.driving.risk.ttc import TimeToCollision
-from evofsm.driving.worlds.kinematic import KinematicWorld
-from evofsm.driving.worlds.scenario import Leader, Scenario
+from evofsm.driving.scenarios import Leader, Scenario
+from evofsm.driving.world import KinematicWorld
 from evofsm.fsm.actions import IntervalActions
 from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.observations import Missing
@@ -199,9 +199,9 @@ def test_the_reviser_keeps_its_promise_with_a_gap_sensor_that_fails_half_the_tim
     leader = Leader(IDM(1.2, 25.0, 1.0, 1.0, 2.5), brake_decel=8.0, brake_time=12.0)
     risk = LatentRisk.told(-4.0, 4.0, 8.0)
     guard = Guard.of(ActionReviser(risk, ACTIONS), learn=False, interval=0.25)
-    drive = Framework(hasty, guard).drive(FlickeringWorld(), Scenario(leader, initial_gap=5.0))
-    assert any(decision.situation.intake for decision in drive.decisions)
-    assert not drive.episode.collided
+    driven = drive(guard, Scenario(leader, initial_gap=5.0), FlickeringWorld(), hasty)
+    assert any(decision.situation.intake for decision in driven.decisions)
+    assert not driven.collided
 
 
 def test_an_episode_may_end_unseen():

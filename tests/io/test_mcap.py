@@ -1,20 +1,20 @@
 import json
 import math
 import tracemalloc
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from evofsm.driving.drivers.idm import IDM
-from evofsm.driving.framework import Decision, Drive, Framework
+from evofsm.driving import episodes
+from evofsm.driving.drivers import IDM
+from evofsm.driving.measures import time_headway, time_to_collision
 from evofsm.driving.naming import VARIABLES
-from evofsm.driving.risk.headway import time_headway
 from evofsm.driving.risk.latent import LatentRisk
-from evofsm.driving.risk.ttc import time_to_collision
-from evofsm.driving.worlds.kinematic import KinematicWorld
-from evofsm.driving.worlds.scenario import Leader, Scenario
+from evofsm.driving.scenarios import Leader, Scenario
 from evofsm.fsm.actions import IntervalActions
 from evofsm.fsm.machine import EvolvingFSM
+from evofsm.guard.episodes import Decision
 from evofsm.guard.guard import Explain, Guard
 from evofsm.guard.protocols import Intake
 from evofsm.guard.reviser import ActionReviser, Mode
@@ -40,10 +40,8 @@ def run():
     for mode in (Mode.SHADOW, Mode.ACT, Mode.ACT):
         reviser = ActionReviser(risk, ACTIONS, mode=mode)
         guard = Guard.of(reviser, machine=machine, interval=0.25, explaining=Explain.ALL)
-        drives.append(
-            Framework(HASTY, guard).drive(KinematicWorld(), Scenario(LEADER, 8.0, duration=14.0))
-        )
-    assert [drive.episode.collided for drive in drives] == [True, False, False]
+        drives.append(episodes.drive(guard, Scenario(LEADER, 8.0, duration=14.0), controller=HASTY))
+    assert [drive.collided for drive in drives] == [True, False, False]
     names = {"names": VARIABLES, "units": ("m", "m/s", "m/s")}
     return drives, machine.model(actions=ACTIONS, dt=0.25, **names)
 
@@ -111,9 +109,9 @@ def test_the_log_holds_what_the_drives_held(run, log):
             n = len(situation.belief)
             np.testing.assert_array_equal(row[:n], situation.belief)
             assert not row[n:].any()
-        assert episode.collided == drive.episode.collided
-        assert episode.end_time == drive.episode.time[-1]
-        np.testing.assert_array_equal(episode.end, drive.episode.observations[-1])
+        assert episode.collided == drive.collided
+        assert episode.end_time == drive.time[-1]
+        np.testing.assert_array_equal(episode.end, drive.observations[-1])
         with pytest.raises(ValueError, match="read-only"):
             columns["gap"][0] = 0.0
 
@@ -208,7 +206,7 @@ def test_what_is_not_known_is_left_out_and_comes_back_as_such(run, tmp_path):
     still = first.situation._replace(observation=np.array([9.0, 0.0, 3.0]), time=0.25)
     unjudged = first.revision._replace(risk_proposed=math.nan, interval=(math.nan, math.nan))
     decisions = (Decision(nothing, unjudged, math.nan), Decision(still, first.revision, 0.0))
-    write_run(tmp_path / "run.mcap", [Drive(drive.episode, decisions)])
+    write_run(tmp_path / "run.mcap", [replace(drive, decisions=decisions)])
     assert "gap" not in messages(tmp_path / "run.mcap")["/observation"][0][1]
     columns = read_run(tmp_path / "run.mcap").episodes[0].columns
     assert columns["state"].tolist() == [-1, first.situation.state]
@@ -246,7 +244,7 @@ def test_the_same_run_gives_the_same_file(run, log, tmp_path):
 def test_damage_anywhere_is_one_error_that_names_the_file(run, tmp_path):
     path, damaged = tmp_path / "run.mcap", tmp_path / "damaged.mcap"
     drives, model = run
-    short = Drive(drives[0].episode, drives[0].decisions[:3])
+    short = replace(drives[0], decisions=drives[0].decisions[:3])
     write_run(path, [short], model=model)
     whole = path.read_bytes()
     data_end = whole.rindex(b"\x0f\x04\x00\x00\x00\x00\x00\x00\x00")  # the index follows

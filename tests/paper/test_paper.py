@@ -4,8 +4,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from evofsm.driving.worlds.kinematic import KinematicWorld
-from evofsm.driving.worlds.sumo import SumoWorld
+from evofsm.driving.sumo import SumoWorld
+from evofsm.driving.world import KinematicWorld
 from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.model import FSMModel
 from evofsm.paper.chapter import context_tables

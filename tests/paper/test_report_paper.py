@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 
 import evofsm
-from evofsm.driving.worlds.kinematic import KinematicWorld
+from evofsm.driving.world import KinematicWorld
 from evofsm.fsm.divergence import jensen_shannon
 from evofsm.paper.chapter import context_tables, losses, paper_chapter
 from evofsm.paper.claims import Claim, check_claims

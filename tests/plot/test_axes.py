@@ -10,11 +10,10 @@ from matplotlib.colors import same_color, to_rgba
 from matplotlib.figure import Figure
 
 from evofsm import plot
-from evofsm.driving.drivers.idm import IDM
-from evofsm.driving.framework import Framework
+from evofsm.driving.drivers import IDM
+from evofsm.driving.episodes import drive
 from evofsm.driving.risk.latent import LatentRisk
-from evofsm.driving.worlds.kinematic import KinematicWorld
-from evofsm.driving.worlds.scenario import Leader, Scenario
+from evofsm.driving.scenarios import Leader, Scenario
 from evofsm.fsm.actions import IntervalActions
 from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.states.novelty import Novelty
@@ -54,7 +53,7 @@ def _drive(mode):
     reviser = ActionReviser(LatentRisk(lowest=-4.0), actions, mode=mode)
     scenario = Scenario(leader, initial_gap=5.0)
     guard = Guard.of(reviser, interval=0.25)
-    return Framework(hasty, guard).drive(KinematicWorld(), scenario)
+    return drive(guard, scenario, controller=hasty)
 
 
 @pytest.fixture(scope="module")
@@ -236,7 +235,7 @@ def test_risk_is_that_of_the_decisions_and_holds_until_the_end(saved):
     drawn = lines(ax)
     assert drawn["proposed"].get_ydata()[:-1].tolist() == [r.risk_proposed for r in revisions]
     assert drawn["executed"].get_ydata()[:-1].tolist() == [r.risk_executed for r in revisions]
-    assert drawn["executed"].get_xdata()[-1] == saved.episode.time[-1]
+    assert drawn["executed"].get_xdata()[-1] == saved.time[-1]
     assert set(drawn["tolerance, 0.02"].get_ydata()) == {0.02}
     assert drawn["proposed"].get_linestyle() != drawn["executed"].get_linestyle()
     highest = max(revision.interval[1] for revision in revisions)
@@ -256,9 +255,9 @@ def test_accelerations_are_what_was_proposed_and_executed(saved):
 
 @pytest.mark.parametrize("draw", [plot.risk, plot.accelerations])
 def test_a_collision_is_marked_where_there_was_one(draw, saved, lost):
-    assert lost.episode.collided
-    assert not saved.episode.collided
-    assert lines(draw(lost, new()))["collision"].get_xdata()[0] == lost.episode.time[-1]
+    assert lost.collided
+    assert not saved.collided
+    assert lines(draw(lost, new()))["collision"].get_xdata()[0] == lost.time[-1]
     assert "collision" not in lines(draw(saved, new()))
 
 

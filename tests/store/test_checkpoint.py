@@ -15,7 +15,7 @@ import pytest
 from evofsm.cli.learning import learn_traces
 from evofsm.fsm.actions import IntervalActions
 from evofsm.fsm.machine import EvolvingFSM
-from evofsm.io.logs import Chunk
+from evofsm.io.traces import Chunk
 from evofsm.store import storage
 from evofsm.store.checkpoint import Checkpoint, Kept, differences, duration, fingerprints
 
@@ -226,7 +226,7 @@ def drive(path=None, episodes=5, stop_after=None):
     from evofsm.cli.driving import Setup, drive_family, make_guard
     from evofsm.driving.cars import learnt_by
     from evofsm.driving.families.family import load_family
-    from evofsm.driving.worlds.kinematic import KinematicWorld
+    from evofsm.driving.world import KinematicWorld
 
     def progress(done, collisions):
         if done == stop_after:
@@ -306,7 +306,7 @@ def test_learn_goes_on_from_its_checkpoint_and_prints_a_finished_one_at_once(
     good = logs[1].read_text()
     kept = evofsm("learn", *logs, "--out", tmp_path / "model", *options)
     assert kept.stdout == plain.stdout, kept.stderr
-    monkeypatch.setattr("evofsm.io.logs._open", lambda *_: pytest.fail("it was read"))
+    monkeypatch.setattr("evofsm.io.traces._read_file", lambda *_: pytest.fail("it was read"))
     (tmp_path / "model").unlink()
     again = evofsm("learn", *logs, "--out", tmp_path / "model", *options)
     assert again.stdout == plain.stdout, again.stderr

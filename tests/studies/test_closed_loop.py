@@ -21,16 +21,15 @@ from studies.closed_loop.plan import Plan
 from studies.closed_loop.study import run_closed_loop
 from studies.scores import auroc
 
-from evofsm.driving.cars import (
+from evofsm.driving.cars import guard_for_family, load_learnt, save_learnt
+from evofsm.driving.episodes import (
     drive,
-    guard_for_family,
-    load_learnt,
-    save_learnt,
+    outcome_of,
+    reference_of,
     teach,
     unrevised_guard,
 )
 from evofsm.driving.families.family import load_family
-from evofsm.driving.outcomes import bootstrap, outcome_of, reference_of
 from evofsm.driving.policies import fixed_policies
 
 pytestmark = pytest.mark.slow
@@ -202,12 +201,6 @@ def test_the_area_under_the_curve():
     assert np.isnan(auroc(np.zeros(4), np.zeros(4, bool)))
 
 
-def test_the_bootstrap_surrounds_the_mean():
-    values = np.random.default_rng(0).normal(size=200)
-    low, high = bootstrap(values)
-    assert low < values.mean() < high
-
-
 def test_a_driver_who_proposes_nothing_usable_is_replaced_and_counted():
     class Broken:
         def propose(self, observation, time=0.0):
@@ -215,7 +208,7 @@ def test_a_driver_who_proposes_nothing_usable_is_replaced_and_counted():
 
     draw = EMERGENCY.draw(0, 0, split="test")
     none = unrevised_guard(EMERGENCY)
-    base = reference_of(drive(none, draw), draw.scenario.leader.brake_decel)
+    base = reference_of(EMERGENCY, draw)
     found = outcome_of(drive(none, draw, controller=Broken()), base, EMERGENCY.interval)
     assert found.changed == found.decisions
     assert found.change == 0.0
@@ -268,7 +261,7 @@ highest = 2.5
     assert guard.judge.manoeuvres.gentle > 60
     guard.freeze()
     drives = teach(guard, (stops.draw(0, index, split="test") for index in range(40)))
-    assert not any(drive.episode.collided for drive in drives)
+    assert not any(drive.collided for drive in drives)
 
 
 def test_what_was_learnt_is_kept(tmp_path):

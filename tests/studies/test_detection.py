@@ -30,10 +30,10 @@ from studies.detection.watch import (
 from studies.detection.worlds import GRID, grid_world, world
 from studies.scores import Ranked, auprc, auroc, bootstrap, brier, isotonic
 
-from evofsm.driving.cars import drive, unrevised_guard
+from evofsm.driving import measures
+from evofsm.driving.episodes import drive, unrevised_guard
 from evofsm.driving.families.family import load_family
 from evofsm.driving.policies import Group
-from evofsm.driving.risk.rss import ResponsibilitySensitiveSafety
 from evofsm.paper.frame import Frame
 
 TINY = Plan(
@@ -187,8 +187,8 @@ def test_watching_is_driving_unrevised() -> None:
     seen = [decision.situation.observation for decision in driven.decisions]
     assert np.array_equal(one.seen, seen)
     assert np.array_equal(one.commands, driven.executed)
-    assert np.array_equal(one.true, driven.episode.observations[::25][: len(seen)])
-    assert (one.end, one.collided) == (driven.episode.time[-1], driven.episode.collided)
+    assert np.array_equal(one.true, driven.observations[::25][: len(seen)])
+    assert (one.end, one.collided) == (driven.time[-1], driven.collided)
 
 
 def test_runs_that_are_always_the_same_add_no_hours() -> None:
@@ -294,7 +294,7 @@ def test_tuning_takes_what_tells_best_in_training() -> None:
     family = load_family("weak_brakes")
     some = Exposure(family, tuple(watch(family, family.draw(0, index)) for index in range(12)))
     truth = some.cases(Target.DEAD_END).truth
-    unmatched = ResponsibilitySensitiveSafety.r157()
+    unmatched = measures.ResponsibilitySensitiveSafety.r157()
     best = auroc(tuned(some, Target.DEAD_END).score(some), truth)
     assert best >= auroc(classic("", Group.FIXED, unmatched).score(some), truth) - 0.01
 

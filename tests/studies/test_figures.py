@@ -10,8 +10,8 @@ import matplotlib
 import numpy as np
 import pytest
 
-from evofsm.driving.risk.dead_end import is_dead_end
-from evofsm.driving.worlds.kinematic import KinematicWorld
+from evofsm.driving import measures
+from evofsm.driving.world import KinematicWorld
 from evofsm.paper.figures import (
     draw_case,
     draw_divergence,
@@ -259,7 +259,7 @@ def test_a_dead_end_is_tinted_as_long_as_a_brake_could_not_be_survived(study: Pa
         to_time = axes.transData.inverted()
         boxes = [patch.get_window_extent() for patch in axes.patches]
         found = [to_time.transform([(box.x0, 0.0), (box.x1, 0.0)])[:, 0] for box in boxes]
-        times = run.episode.time[is_dead_end(run.episode.observations, 4.0, 9.0)]
+        times = run.episode.time[measures.is_dead_end(run.episode.observations, 4.0, 9.0)]
         expected = [[times[0], times[-1]]] if len(times) else []  # one stretch in these cases
         np.testing.assert_allclose(found, expected, atol=0.05)
         lasted.append(bool(len(times)))

@@ -30,8 +30,8 @@ from studies.closed_loop.tables import side_tables, why_not_by_state
 
 from evofsm.cli.text.documents import to_json
 from evofsm.cli.text.numbers import percent
+from evofsm.driving.episodes import Row
 from evofsm.driving.families.family import load_family
-from evofsm.driving.outcomes import Row
 from evofsm.driving.policies import Group
 from evofsm.paper.report.chapter import write_chapters
 

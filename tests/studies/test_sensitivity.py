@@ -21,7 +21,7 @@ from studies.sensitivity.setting import (
 from studies.sensitivity.shares import first_order, worst_sweeps
 from studies.sensitivity.study import _reach, _try_all, run_sensitivity
 
-from evofsm.driving.worlds.kinematic import KinematicWorld
+from evofsm.driving.world import KinematicWorld
 from evofsm.fleet.executors import in_order
 from evofsm.paper.claims import check_claims
 from evofsm.paper.runs import CASES, run_paper

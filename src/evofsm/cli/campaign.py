@@ -21,23 +21,8 @@ from pathlib import Path
 from threading import Lock
 from typing import Any
 
-from evofsm.cli.driving import (
-    Setup,
-    drive_alone,
-    is_judged,
-    lead_time,
-    make_controller,
-    make_guard,
-)
-from evofsm.driving import (
-    Outcome,
-    Row,
-    World,
-    drive,
-    open_world,
-    outcome_of,
-    summarise,
-)
+from evofsm.cli.driving import Setup, make_controller, make_guard
+from evofsm.driving import Outcome, Row, Trial, World, open_world, summarise
 from evofsm.fleet import Batch, run_campaign
 from evofsm.guard import Guard, LearningJudge, LearntRisk
 from evofsm.store import Journal, Record, room_needed, versions
@@ -180,14 +165,7 @@ def _world(name: str) -> World:
 
 def _drive(campaign: Campaign, guard: Guard, episode: int) -> Record:
     setup, world = campaign.setup, _world(campaign.world)
-    family = setup.family
-    draw = family.draw(setup.seed, episode, split="test")
-    controller = make_controller(setup, draw, world)
-    alone = drive_alone(family, draw, world, controller)
-    driven = drive(guard, draw, world, controller)
-    has_lead = driven.episode.collided and is_judged(driven)
-    return {
-        "variant": draw.variant,
-        **outcome_of(driven, alone, family.interval)._asdict(),
-        "lead_time": lead_time(driven, setup.tolerance) if has_lead else None,
-    }
+    trial = Trial(
+        setup.family, guard, world, setup.seed, controller=partial(make_controller, setup)
+    )
+    return {name: value for name, value in trial(episode).items() if name != "episode"}

@@ -17,17 +17,15 @@ from numpy.typing import NDArray
 
 from evofsm.driving import (
     DECISION_COLUMNS,
-    FIXED_MEASURES,
     IDM,
     TOLD,
     AdaptiveCruise,
     Draw,
-    Drive,
     EnvelopeReviser,
+    Episode,
     Family,
     LatentRisk,
     Outcome,
-    Reference,
     Row,
     StateRisk,
     Unrevised,
@@ -35,6 +33,7 @@ from evofsm.driving import (
     assess_states,
     drive,
     guard_for_family,
+    lead_time,
     learners_of,
     load_judge,
     name_judge,
@@ -42,8 +41,8 @@ from evofsm.driving import (
     reference_of,
     save_learnt,
     summarise,
-    unrevised_guard,
 )
+from evofsm.driving.measures import FIXED_MEASURES
 from evofsm.extras import needs
 from evofsm.fsm import EvolvingFSM
 from evofsm.guard import (
@@ -139,7 +138,7 @@ def drive_family(
     progress: Callable[[int, int], None] = lambda done, collisions: None,
     checkpoint: Checkpoint | None = None,
     audit: DecisionLogger | None = None,
-    record: Callable[[Drive], None] | None = None,
+    record: Callable[[Episode], None] | None = None,
 ) -> Driving:
     """Drive the episodes in turn.
 
@@ -171,7 +170,7 @@ def drive_family(
     guard.audit, guard.explaining = audit, None if record is None else Explain.ALL
     for draw in draws(setup, len(done.outcomes)):
         controller = make_controller(setup, draw, world)
-        alone = drive_alone(family, draw, world, controller)
+        alone = reference_of(family, draw, world, controller)
         driven = drive(guard, draw, world, controller)
         if record is not None:
             record(driven)
@@ -200,12 +199,6 @@ def _assessed(guard: Guard) -> list[StateRisk]:
         StateRisk(state, nan, nan, nan, float(seen), float(failures))
         for state, (seen, failures) in enumerate(zip(seconds, machine.endings, strict=True))
     ]
-
-
-def drive_alone(family: Family, draw: Draw, world: World, controller: Controller) -> Reference:
-    """How far the controller comes by itself."""
-    alone = drive(unrevised_guard(family), draw, world, controller)
-    return reference_of(alone, draw.scenario.leader.brake_decel)
 
 
 def draws(setup: Setup, done: int = 0) -> Iterator[Draw]:
@@ -330,14 +323,15 @@ class Driven:
         self.lead_times: list[float] = []
         self.decisions: dict[str, list[Any]] = {name: [] for name in DECISION_TABLE}
 
-    def add(self, drive: Drive, came_of_it: Outcome, tolerance: float) -> None:
+    def add(self, drive: Episode, came_of_it: Outcome, tolerance: float) -> None:
         """Take in the next episode."""
         self.decisions["episode"] += [len(self.outcomes)] * len(drive.decisions)
         for name in DECISION_TABLE[1:]:
             self.decisions[name] += map(DECISION_COLUMNS[name].read, drive.decisions)
         self.outcomes.append(came_of_it)
-        if drive.episode.collided and is_judged(drive):
-            self.lead_times.append(lead_time(drive, tolerance))
+        lead = lead_time(drive, tolerance)
+        if lead is not None:
+            self.lead_times.append(lead)
 
     @classmethod
     def resumed(
@@ -417,22 +411,3 @@ def _files(guard: Guard) -> tuple[bytes, bytes]:
     machine.save(files[0])
     judge.save(files[1])
     return files[0].getvalue(), files[1].getvalue()
-
-
-# -- One episode ----------------------------------------------------------------------------------
-
-
-def is_judged(drive: Drive) -> bool:
-    """Whether the reviser says how likely failure is."""
-    return not math.isnan(drive.decisions[0].revision.risk_proposed)
-
-
-def lead_time(drive: Drive, tolerance: float) -> float:
-    """From the alarm that stays on to the end of the run [s]; 0 without one."""
-    alarm = math.nan
-    for decision in drive.decisions:
-        if decision.revision.risk_proposed > tolerance:
-            alarm = decision.situation.time if math.isnan(alarm) else alarm
-        else:
-            alarm = math.nan
-    return 0.0 if math.isnan(alarm) else float(drive.episode.time[-1] - alarm)

@@ -2,25 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import astuple
 from pathlib import Path
 from typing import Any, Literal
 
 from evofsm.driving.families.family import Draw, Family
-from evofsm.driving.framework import Drive, Framework
 from evofsm.driving.naming import UNITS, VARIABLES
-from evofsm.driving.outcomes import Outcome, Reference, outcome_of, reference_of
-from evofsm.driving.revisers import Unrevised
 from evofsm.driving.risk.latent import LatentRisk
-from evofsm.driving.worlds.kinematic import KinematicWorld
-from evofsm.driving.worlds.road import World
 from evofsm.fsm import EvolvingFSM, IntervalActions, Novelty, StateRule
 from evofsm.guard import (
     BELIEF_TOLERANCE,
     TOLERANCE,
     ActionReviser,
-    Controller,
     Guard,
     LearningJudge,
     LearntRisk,
@@ -145,78 +139,6 @@ def training(
 def held_out(family: Family, seed: int, episodes: int) -> list[Draw]:
     """Draws that nothing learns from."""
     return [family.draw(seed, index, split="test") for index in range(episodes)]
-
-
-def drive(
-    guard: Guard, draw: Draw, world: World | None = None, controller: Controller | None = None
-) -> Drive:
-    """Drive one draw under a guard, which learns from it unless it is frozen.
-
-    Parameters
-    ----------
-    guard : Guard
-    draw : Draw
-    world : World, optional
-        Without one, it is driven in closed form.
-    controller : Controller, optional
-        Without one, the draw's own drives.
-    """
-    return Framework(controller or draw.controller, guard).drive(
-        world or KinematicWorld(), draw.scenario
-    )
-
-
-def teach(guard: Guard, draws: Iterable[Draw]) -> list[Drive]:
-    """Drive each draw in turn."""
-    return [drive(guard, draw) for draw in draws]
-
-
-def unrevised_guard(family: Family) -> Guard:
-    """A guard that executes whatever is proposed, and learns nothing."""
-    return Guard.of(Unrevised(family.actions), interval=family.interval, learn=False)
-
-
-def references_of(family: Family, draws: Sequence[Draw]) -> list[Reference]:
-    """How far the controller comes by itself in each draw."""
-    return [
-        reference_of(drive(unrevised_guard(family), draw), draw.scenario.leader.brake_decel)
-        for draw in draws
-    ]
-
-
-def score(family: Family, alone: Sequence[Reference], drives: Iterable[Drive]) -> list[Outcome]:
-    """Outcomes of driven draws, against the controller alone."""
-    return [
-        outcome_of(driven, base, family.interval)
-        for base, driven in zip(alone, drives, strict=True)
-    ]
-
-
-def try_out(
-    guard: Guard, family: Family, draws: Sequence[Draw], alone: Sequence[Reference] | None = None
-) -> list[Outcome]:
-    """What comes of draws under a frozen copy of a guard, against the controller alone.
-
-    Parameters
-    ----------
-    guard : Guard
-        Its copy has no machine: the same is decided, and nothing is recognised.
-    family : Family
-    draws : sequence of Draw
-    alone : sequence of Reference, optional
-        Of these draws; without them the controller is driven alone first.
-
-    Examples
-    --------
-    >>> from evofsm.driving import load_family
-    >>> family = load_family("emergency")
-    >>> outcomes = try_out(guard_for_family(family), family, held_out(family, seed=0, episodes=3))
-    >>> [outcome.collided for outcome in outcomes]
-    [False, False, False]
-    """
-    frozen = guard.copy(states=False)
-    frozen.freeze()
-    return score(family, alone or references_of(family, draws), teach(frozen, draws))
 
 
 def learnt_by(guard: Guard) -> tuple[EvolvingFSM, LatentRisk]:

@@ -7,16 +7,14 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 from evofsm.driving.families.family import Draw, Family
+from evofsm.driving.measures import (
+    FIXED_MEASURES,
+    ResponsibilitySensitiveSafety,
+    TimeHeadway,
+    TimeToCollision,
+)
 from evofsm.driving.revisers import AlwaysBrake, EnvelopeReviser, Unrevised
-from evofsm.driving.risk.drac import DecelerationToAvoidCollision
-from evofsm.driving.risk.fuzzy import FuzzySafety
-from evofsm.driving.risk.headway import TimeHeadway
 from evofsm.driving.risk.latent import LatentRisk
-from evofsm.driving.risk.mttc import ModifiedTimeToCollision
-from evofsm.driving.risk.picud import Picud
-from evofsm.driving.risk.r157 import PerformanceModel
-from evofsm.driving.risk.rss import ResponsibilitySensitiveSafety
-from evofsm.driving.risk.ttc import TimeToCollision
 from evofsm.guard import ActionReviser, Reviser, RiskMeasure
 
 
@@ -72,19 +70,6 @@ def fixed_policies(family: Family) -> list[Policy]:
         Policy("evofsm-told", Group.MATCHED, told_limits),
     ]
 
-
-#: Classic measures with the constants of their sources.
-FIXED_MEASURES: dict[str, RiskMeasure] = {
-    "aeb-ttc": TimeToCollision(),
-    "mttc": ModifiedTimeToCollision(),
-    "drac": DecelerationToAvoidCollision(),
-    "headway": TimeHeadway(),
-    "picud": Picud(),
-    "rss-r157": ResponsibilitySensitiveSafety.r157(),
-    "r157-regulation": PerformanceModel.regulation(),
-    "r157-careful": PerformanceModel.careful_human(),
-    "fuzzy": FuzzySafety(),
-}
 
 #: What is tried in tuning, from bold to cautious.
 TUNED_MEASURES: dict[str, tuple[RiskMeasure, ...]] = {

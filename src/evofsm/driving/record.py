@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from operator import attrgetter
 
-from evofsm.driving.risk.headway import time_headway
-from evofsm.driving.risk.ttc import time_to_collision
+from evofsm.driving.measures import time_headway, time_to_collision
 from evofsm.guard import RECORD, Column
 
 #: By name, in the order of ``decisions.parquet``, which has those that are `Column.in_table`: what

@@ -10,6 +10,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from evofsm.driving import measures
 from evofsm.driving.naming import VARIABLES
 from evofsm.fsm import IntervalActions, positive
 from evofsm.guard import (
@@ -44,7 +45,7 @@ class EnvelopeReviser:
 
     Examples
     --------
-    >>> from evofsm.driving import TimeToCollision
+    >>> from evofsm.driving.measures import TimeToCollision
     >>> actions = IntervalActions(low=-2.5, high=2.5, width=0.3)
     >>> reviser = EnvelopeReviser(TimeToCollision(threshold=1.5), actions)
     >>> close = Situation(np.array([5.0, 20.0, 10.0]), np.ones(1), 0, 0.0, 0.0)
@@ -81,16 +82,24 @@ class EnvelopeReviser:
 
     def described(self) -> dict[str, Any] | None:
         """What it takes to make it again; None where its measure is someone's own."""
-        name = participant_name(self.measure)
-        if name is None:
+        cls = type(self.measure)
+        if cls is not _own_measure(cls.__name__) and participant_name(self.measure) is None:
             return None
-        return {"dt": self.dt, "measure": {"class": name, **asdict(self.measure)}}  # type: ignore[call-overload]
+        return {"dt": self.dt, "measure": {"class": cls.__name__, **asdict(self.measure)}}  # type: ignore[call-overload]
 
     @classmethod
     def restored(cls, described: Mapping[str, Any], actions: IntervalActions) -> Self:
         """The one that was `described`."""
         given = dict(described["measure"])
-        return cls(participant_class(given.pop("class"))(**given), actions, described["dt"])
+        name = given.pop("class")
+        return cls(
+            (_own_measure(name) or participant_class(name))(**given), actions, described["dt"]
+        )
+
+
+def _own_measure(name: str) -> Any:
+    """A class of ours by its name."""
+    return getattr(measures, name, None)
 
 
 class Unrevised:

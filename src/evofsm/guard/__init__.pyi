@@ -17,6 +17,9 @@ from .auditing.replay import audit as audit
 from .check import check_contract as check_contract
 from .defaults import BELIEF_TOLERANCE as BELIEF_TOLERANCE
 from .defaults import TOLERANCE as TOLERANCE
+from .episodes import Decision as Decision
+from .episodes import Environment as Environment
+from .episodes import run_episode as run_episode
 from .guard import DecisionLogger as DecisionLogger
 from .guard import Explain as Explain
 from .guard import Guard as Guard

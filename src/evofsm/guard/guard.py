@@ -304,6 +304,7 @@ class Guard:
             machine.dynamics.told = failed
         self._frozen: FSMModel | None = None
         self._senses = Senses(missing, interval)
+        self._latest: Situation | None = None
         self._under_way = False
         self.learn = learn
 
@@ -345,6 +346,13 @@ class Guard:
         """(m,) ndarray: the latest value of each variable; NaN of one that was never observed."""
         return self._senses.held.copy()
 
+    @property
+    def situation(self) -> Situation:
+        """Where the system is, as of the latest `decide` in this episode."""
+        if self._latest is None:
+            raise RuntimeError("no observation was given yet in this episode")
+        return self._latest
+
     def begin(self) -> None:
         """Begin an episode; one that is under way is broken off, and nothing follows from it.
 
@@ -355,7 +363,7 @@ class Guard:
         >>> guard.begin()
         """
         self._senses = Senses(self.missing, self.interval)
-        self._latest: Situation | None = None
+        self._latest = None
         self._decisions = 0
         self.reviser.start_episode()
         if self.judge is not None:

@@ -39,15 +39,7 @@ class RevisedAgents(BaseParallelWrapper[Any, Any, Any]):  # type: ignore[misc]
 
     Examples
     --------
-    >>> from evofsm.driving import Platoon, guard_for_cars
-    >>> guard = guard_for_cars(low=-2.5, high=2.5)
-    >>> env = RevisedAgents(Platoon(n_cars=2), guard, failed=lambda info: info["failed"])
-    >>> observations, infos = env.reset(seed=1)
-    >>> while env.agents:
-    ...     full_throttle = {agent: [2.5] for agent in env.agents}
-    ...     observations, rewards, ended, _, infos = env.step(full_throttle)
-    >>> ended
-    {'car_1': False, 'car_2': False}
+    ``examples/platoon.py`` puts a guard beside every car of a platoon.
     """
 
     def __init__(

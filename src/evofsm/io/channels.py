@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from evofsm.driving import DECISION_COLUMNS, UNITS, VARIABLES, Decision
-from evofsm.guard import RECORD, Action, Column, Revision
+from evofsm.driving import DECISION_COLUMNS, UNITS, VARIABLES
+from evofsm.guard import RECORD, Action, Column, Decision, Revision
 
 #: Levels of foxglove.Log.
 INFO, WARNING, ERROR = 2, 3, 4

@@ -18,10 +18,10 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.driving import UNITS, VARIABLES, Decision
+from evofsm.driving import UNITS, VARIABLES
 from evofsm.extras import needs
 from evofsm.fsm import positive
-from evofsm.guard import Guard, Proposal, Revision, Situation
+from evofsm.guard import Decision, Guard, Proposal, Revision, Situation
 from evofsm.io.channels import (
     ERROR,
     INFO,
@@ -184,7 +184,7 @@ class FoxgloveSink:
 
     def decided(self, situation: Situation, proposal: Proposal, revision: Revision) -> None:
         """A decision was made."""
-        decision = Decision(situation, revision, math.nan)
+        decision = Decision(situation, revision)
         for topic, message in messages_of(decision, self.names):
             self._send(topic, message)
         changed = not is_same(revision.executed, revision.proposed)

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evofsm import __version__
-from evofsm.driving import DECISION_COLUMNS, VARIABLES, Drive
+from evofsm.driving import DECISION_COLUMNS, VARIABLES, Episode
 from evofsm.extras import needs
 from evofsm.fsm import FSMModel
 from evofsm.io.channels import (
@@ -92,7 +92,7 @@ class Run:
 
 def write_run(
     path: str | os.PathLike[str],
-    drives: Iterable[Drive],
+    drives: Iterable[Episode],
     *,
     model: FSMModel | None = None,
     about: Mapping[str, Any] | None = None,
@@ -103,7 +103,7 @@ def write_run(
     ----------
     path : str or path-like
         A file of that name is replaced.
-    drives : iterable of Drive
+    drives : iterable of Episode
         Taken one by one, so they need not all be kept at once.
     model : FSMModel, optional
         What was learnt, to be attached.
@@ -194,18 +194,18 @@ class RunWriter:
         number = self._mcap.register_schema(name, "jsonschema", json.dumps(schema).encode())
         return self._mcap.register_channel(topic, "json", number)
 
-    def add(self, drive: Drive) -> None:
+    def add(self, episode: Episode) -> None:
         """Write the next episode.
 
         Parameters
         ----------
-        drive : Drive
+        episode : Episode
+            With its decisions.
         """
-        episode = drive.episode
         start, end = float(episode.time[0]), float(episode.time[-1])
         self._event("episode started", start, episode.observations[0])
         for number, (decision, changed) in enumerate(
-            zip(drive.decisions, drive.changed.tolist(), strict=True)
+            zip(episode.decisions, episode.changed.tolist(), strict=True)
         ):
             time = decision.situation.time
             for topic, message in messages_of(decision):

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evofsm.cli import Column, Table, decimals
-from evofsm.driving import IDM, UNITS, VARIABLES, ChangingIDM, is_dead_end, time_to_collision
+from evofsm.driving import IDM, UNITS, VARIABLES, ChangingIDM
+from evofsm.driving.measures import is_dead_end, time_to_collision
 from evofsm.fsm import jensen_shannon
 from evofsm.paper.claims import LARGEST_DIVERGENCE, Claim, check_claims
 from evofsm.paper.figures import sketches

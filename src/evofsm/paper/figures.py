@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.driving import is_dead_end
+from evofsm.driving.measures import is_dead_end
 from evofsm.extras import needs
 from evofsm.paper.claims import LARGEST_DIVERGENCE
 from evofsm.paper.runs import CASES, Founding, PaperStudy, Run

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from evofsm.driving import Drive
+from evofsm.driving import Episode
 from evofsm.extras import needs
 from evofsm.fsm import FSMModel, Policy, Trace, variable_label
 
@@ -335,12 +335,12 @@ def _plot_beliefs(
 # -- Of a drive -------------------------------------------------------------------------------
 
 
-def risk(drive: Drive, ax: Axes | None = None, *, tolerance: float | None = None) -> Axes:
+def risk(drive: Episode, ax: Axes | None = None, *, tolerance: float | None = None) -> Axes:
     """Latent risk over time: of what was proposed, and of what was executed, with its interval.
 
     Parameters
     ----------
-    drive : Drive
+    drive : Episode
         Under a reviser that judges actions.
     ax : matplotlib.axes.Axes, optional
         Where to plot; without it on new axes of pyplot.
@@ -361,12 +361,11 @@ def risk(drive: Drive, ax: Axes | None = None, *, tolerance: float | None = None
     --------
     >>> from matplotlib.figure import Figure
     >>> from evofsm import plot
-    >>> from evofsm.driving import IDM, Framework, FunctionController, KinematicWorld, Leader
-    >>> from evofsm.driving import Scenario, guard_for_cars
+    >>> from evofsm.driving import IDM, Leader, Scenario, drive, guard_for_cars
     >>> leader = Leader(IDM(1.2, 25.0, 1.0, 1.0, 2.5), brake_decel=4.0, brake_time=12.0)
-    >>> framework = Framework(FunctionController(lambda z: 2.0), guard_for_cars(-4.0, 2.5))
-    >>> drive = framework.drive(KinematicWorld(), Scenario(leader, initial_gap=10.0))
-    >>> ax = plot.risk(drive, Figure().subplots(), tolerance=0.02)
+    >>> guard, scenario = guard_for_cars(-4.0, 2.5), Scenario(leader, initial_gap=10.0)
+    >>> episode = drive(guard, scenario, controller=lambda observation: 2.0)
+    >>> ax = plot.risk(episode, Figure().subplots(), tolerance=0.02)
     >>> ax.get_ylabel()
     'latent risk'
     """
@@ -388,12 +387,12 @@ def risk(drive: Drive, ax: Axes | None = None, *, tolerance: float | None = None
     return ax
 
 
-def accelerations(drive: Drive, ax: Axes | None = None) -> Axes:
+def accelerations(drive: Episode, ax: Axes | None = None) -> Axes:
     """What was proposed and what was executed, over time; where they differ it is shaded.
 
     Parameters
     ----------
-    drive : Drive
+    drive : Episode
     ax : matplotlib.axes.Axes, optional
         Where to plot; without it on new axes of pyplot.
 
@@ -411,12 +410,11 @@ def accelerations(drive: Drive, ax: Axes | None = None) -> Axes:
     --------
     >>> from matplotlib.figure import Figure
     >>> from evofsm import plot
-    >>> from evofsm.driving import IDM, Framework, KinematicWorld, Leader, Scenario
-    >>> from evofsm.driving import guard_for_cars
+    >>> from evofsm.driving import IDM, Leader, Scenario, drive, guard_for_cars
     >>> driver = IDM(1.2, 25.0, 1.0, 1.0, 2.5, lowest=-2.5, highest=2.5)
     >>> scenario = Scenario(Leader(driver, brake_decel=2.0, brake_time=5.0), initial_gap=10.0)
-    >>> drive = Framework(driver, guard_for_cars(-2.5, 2.5)).drive(KinematicWorld(), scenario)
-    >>> ax = plot.accelerations(drive, Figure().subplots())
+    >>> episode = drive(guard_for_cars(-2.5, 2.5), scenario, controller=driver)
+    >>> ax = plot.accelerations(episode, Figure().subplots())
     >>> ax.get_ylabel()
     'acceleration [m/s²]'
     """
@@ -432,11 +430,11 @@ def accelerations(drive: Drive, ax: Axes | None = None) -> Axes:
 
 
 def _draw_decisions(
-    ax: Axes, drive: Drive, values: ArrayLike, between: ArrayLike, color: str, label: str
+    ax: Axes, drive: Episode, values: ArrayLike, between: ArrayLike, color: str, label: str
 ) -> None:
     """Draw what was proposed and executed (2, D), and a band (2, D), until the end of the drive."""
     times = [decision.situation.time for decision in drive.decisions]
-    when = np.array([*times, float(drive.episode.time[-1])])
+    when = np.array([*times, float(drive.time[-1])])
     (proposed, executed), (low, high) = (
         np.pad(np.asarray(rows, dtype=np.float64), ((0, 0), (0, 1)), mode="edge")
         for rows in (values, between)
@@ -447,10 +445,10 @@ def _draw_decisions(
     ax.step(when, executed, where="post", color=FOLLOWER, label="executed")
 
 
-def _finish(ax: Axes, drive: Drive, y: float) -> None:
+def _finish(ax: Axes, drive: Episode, y: float) -> None:
     """Mark a collision at height ``y``, and explain."""
-    if drive.episode.collided:
-        draw_collision(ax, float(drive.episode.time[-1]), y)
+    if drive.collided:
+        draw_collision(ax, float(drive.time[-1]), y)
         ax.lines[-1].set_label("collision")
     ax.set_xlabel("time [s]")
     _explain(ax)

@@ -5,15 +5,8 @@ import xml.etree.ElementTree as ElementTree
 import numpy as np
 import pytest
 
-from evofsm.driving import (
-    LatentRisk,
-    Role,
-    attach,
-    deceleration_to_avoid_collision,
-    guard_for_cars,
-    guard_for_traffic,
-    time_to_collision,
-)
+from evofsm.driving import LatentRisk, Role, attach, guard_for_cars, guard_for_traffic
+from evofsm.driving.measures import deceleration_to_avoid_collision, time_to_collision
 
 from .conftest import drive
 

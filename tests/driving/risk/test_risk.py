@@ -2,8 +2,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from evofsm.driving.risk.dead_end import is_dead_end
-from evofsm.driving.risk.ttc import time_to_collision
+from evofsm.driving.measures import is_dead_end, time_to_collision
 
 SPEEDS = st.floats(0.0, 40.0)
 DECELS = st.floats(1.0, 10.0)

@@ -8,11 +8,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from evofsm.driving.cars import drive, unrevised_guard
-from evofsm.driving.drivers.idm import IDM, ChangingIDM
+from evofsm.driving.drivers import IDM, ChangingIDM
+from evofsm.driving.episodes import drive, unrevised_guard
 from evofsm.driving.families.family import FAMILIES, SWITCHES, load_family
 from evofsm.driving.families.numbers import Numbers
-from evofsm.driving.risk.dead_end import is_dead_end
+from evofsm.driving.measures import is_dead_end
 from evofsm.paper.settings import Settings
 
 SEEDS = st.integers(0, 2**32 - 1)
@@ -74,10 +74,7 @@ def own(tmp_path):
 
 
 def drive_many(family, count):
-    return [
-        drive(unrevised_guard(family), family.draw(1, index, "test")).episode
-        for index in range(count)
-    ]
+    return [drive(unrevised_guard(family), family.draw(1, index, "test")) for index in range(count)]
 
 
 def dead_end_share(family, episodes):
@@ -350,7 +347,7 @@ def test_paper_is_what_the_study_drives():
         sensors = settings.scenario.sensors
         assert replace(scenario, duration=35.0, sensors=sensors) == settings.scenario
         driven = drive(unrevised_guard(family), family.draw(0, case - 1))
-        assert driven.episode.collided == (case in (1, 4))
+        assert driven.collided == (case in (1, 4))
     assert family.decel == settings.decel
     wider = asdict(settings.actions) | {"low": -settings.decel}
     assert asdict(family.actions) == wider
@@ -374,14 +371,14 @@ def test_in_rare_dead_ends_are_rare_but_there():
 def test_both_worlds_agree(name):
     if importlib.util.find_spec("libsumo") is None:
         pytest.skip("libsumo is missing")
-    from evofsm.driving.worlds.sumo import SumoWorld
+    from evofsm.driving.sumo import SumoWorld
 
     family = LOADED[name].with_switches(["third_car", "noise"])
     with SumoWorld() as sumo:
         for index in range(2):
             draw = family.draw(2, index)
-            closed_form = drive(unrevised_guard(family), draw).episode
-            episode = drive(unrevised_guard(family), draw, sumo).episode
+            closed_form = drive(unrevised_guard(family), draw)
+            episode = drive(unrevised_guard(family), draw, sumo)
             assert episode.observations.shape == closed_form.observations.shape
             assert np.abs(episode.observations - closed_form.observations).max() < 1e-9
 

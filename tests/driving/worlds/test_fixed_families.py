@@ -106,7 +106,7 @@ def test_json_with_a_mistake_is_refused(text, reason, tmp_path):
 
 
 def test_who_is_asked_at_an_interval_keeps_its_command_between():
-    from evofsm.driving.worlds.kinematic import KinematicWorld
+    from evofsm.driving.world import KinematicWorld
 
     draw = load_family("emergency").draw(0, 0)
     often = KinematicWorld().run(draw.scenario, draw.controller, draw.scenario.dt)

@@ -1,6 +1,8 @@
+import importlib
 import subprocess
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,10 +11,10 @@ gymnasium = pytest.importorskip("gymnasium")
 
 from gymnasium.utils.env_checker import check_env  # noqa: E402
 
+from evofsm.driving.env import ID, CarFollowing  # noqa: E402
 from evofsm.driving.families.family import load_family  # noqa: E402
-from evofsm.driving.worlds.gym import ID, CarFollowing  # noqa: E402
 
-NAME = f"evofsm.driving.worlds.gym:{ID}"
+NAME = f"evofsm.driving.env:{ID}"
 INFO = {"time", "gap", "distance", "failed", "rear_ended", "split", "index"}
 
 
@@ -110,7 +112,7 @@ def test_a_step_is_an_interval_and_pays_the_distance():
     env.reset(options={"index": 0})
     for k in range(1, 5):
         observation, reward, terminated, truncated, info = env.step([2.0])
-        assert info.keys() == INFO
+        assert info.keys() == INFO | {"realised"}
         assert (terminated, truncated) == (False, False)
         assert info["time"] == pytest.approx(0.25 * k)
         assert observation[1] == pytest.approx(0.5 * k)
@@ -219,3 +221,10 @@ def test_without_gymnasium_the_extra_is_named(module):
     program = f"import sys; sys.modules['gymnasium'] = None; import {module}"
     finished = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
     assert finished.stderr.rstrip().endswith("pip install '.[gym]' in a clone of evofsm")
+
+
+def test_in_a_platoon_the_example_prevents_collisions(monkeypatch):
+    pytest.importorskip("pettingzoo")
+    monkeypatch.syspath_prepend(Path(__file__).parents[3] / "examples")
+    unguarded, guarded = importlib.import_module("platoon").main(["--episodes", "3"])
+    assert (unguarded, guarded) == (3, 0)

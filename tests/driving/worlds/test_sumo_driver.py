@@ -3,14 +3,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from evofsm.driving.drivers.idm import IDM
-from evofsm.driving.framework import Framework
+from evofsm.driving.drivers import IDM
+from evofsm.driving.episodes import drive
 from evofsm.driving.revisers import Unrevised
 from evofsm.driving.risk.latent import LatentRisk
-from evofsm.driving.worlds.kinematic import KinematicWorld
-from evofsm.driving.worlds.scenario import CutIn, Leader, Scenario, Sensors
-from evofsm.driving.worlds.sumo import SumoWorld
-from evofsm.driving.worlds.sumo_driver import MODELS, SumoDriver
+from evofsm.driving.scenarios import CutIn, Leader, Scenario, Sensors
+from evofsm.driving.sumo import MODELS, SumoDriver, SumoWorld
+from evofsm.driving.world import KinematicWorld
 from evofsm.fsm.actions import IntervalActions
 from evofsm.guard.guard import Guard
 from evofsm.guard.protocols import Proposal
@@ -119,17 +118,17 @@ def test_under_a_reviser_what_is_executed_is_carried_out_exactly(world):
     leader = replace(LEADER, brake_decel=4.0, brake_time=12.0, waves=())
     scenario = Scenario(leader, initial_gap=30.0, duration=25.0, initial_speed=10.0)
     alone = Guard.of(Unrevised(actions), interval=0.25)
-    unrevised = Framework(driver, alone).drive(world, scenario)
+    unrevised = drive(alone, scenario, world, driver)
     guard = Guard.of(ActionReviser(risk, actions), interval=0.25)
-    revised = Framework(driver, guard).drive(world, scenario)
-    assert unrevised.episode.collided
-    assert not revised.episode.collided
+    revised = drive(guard, scenario, world, driver)
+    assert unrevised.collided
+    assert not revised.collided
     assert np.isfinite(revised.proposed).all()
     assert (np.abs(revised.executed - revised.proposed) > 0.1).any()
-    speed, commanded = revised.episode.observations[:, 1], revised.episode.accelerations
+    speed, commanded = revised.observations[:, 1], revised.accelerations
     carried_out = np.maximum(0.0, speed[:-1] + commanded[:-1] * scenario.dt)
     assert np.abs(speed[1:] - carried_out).max() < 1e-12
-    held = revised.episode.accelerations[: 25 * len(revised.executed)]
+    held = revised.accelerations[: 25 * len(revised.executed)]
     assert np.array_equal(held[::25], revised.executed)
 
 

@@ -6,11 +6,10 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from evofsm.driving.drivers.idm import IDM
-from evofsm.driving.worlds.kinematic import KinematicWorld
-from evofsm.driving.worlds.motion import REALISED
-from evofsm.driving.worlds.scenario import Behind, Body, CutIn, Leader, Scenario, Sensors
-from evofsm.driving.worlds.sumo import SumoWorld
+from evofsm.driving.drivers import IDM
+from evofsm.driving.scenarios import Behind, Body, CutIn, Leader, Scenario, Sensors
+from evofsm.driving.sumo import SumoWorld
+from evofsm.driving.world import REALISED, KinematicWorld
 from evofsm.guard.protocols import Proposal
 from evofsm.paper.runs import CASES
 from evofsm.paper.settings import Settings

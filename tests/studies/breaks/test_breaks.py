@@ -18,7 +18,8 @@ from studies.breaks.subjects import Cars, load, needed_braking
 from studies.breaks.targets import claims
 from typer.testing import CliRunner
 
-from evofsm.driving.cars import drive, guard_for_family, unrevised_guard
+from evofsm.driving.cars import guard_for_family
+from evofsm.driving.episodes import drive, unrevised_guard
 from evofsm.driving.families.family import FAMILIES, load_family
 
 FOUND = Path(__file__).with_name("found-seldom-none.json")
@@ -61,7 +62,7 @@ def test_cases_are_written_as_a_family_that_fails_as_often(found, tmp_path):
     for k, (one, raw) in enumerate(zip(found.cases[2], found.raw[2], strict=True)):
         draw = family.draw(seed=7, index=k)
         assert draw[:2] == load("emergency").draw_by(raw.chance)[:2]
-        assert drive(unrevised_guard(family), draw).episode.collided
+        assert drive(unrevised_guard(family), draw).collided
         told = json.loads(written.read_text())["variant"][k]["about"]
         assert one.numbers[0].text.split()[0] in told or "scenario" in told
     numbers = {number.place: number for number in found.cases[2][0].numbers}
@@ -93,7 +94,7 @@ def test_where_nothing_failed_the_page_says_so_and_that_it_is_no_proof(found):
 def test_who_drives_alone_drives_as_in_the_framework(name):
     subject = Cars(name, "none")
     draw = load(name).draw(seed=2, index=0)
-    alone, whole = subject.play(draw), drive(unrevised_guard(load(name)), draw).episode
+    alone, whole = subject.play(draw), drive(unrevised_guard(load(name)), draw)
     assert alone.observations.tolist() == whole.observations.tolist()
     assert needed_braking(alone) == needed_braking(whole) > 0.0
     assert (needed_braking(alone) == math.inf) is whole.collided
@@ -106,8 +107,8 @@ def test_the_cases_that_were_found_stay_broken_alone_and_whole_under_the_guard()
     assert family.cases >= 5
     for k in range(family.cases):
         draw = family.draw(seed=0, index=k)
-        assert drive(unrevised_guard(family), draw).episode.collided
-        assert not drive(guard, draw).episode.collided
+        assert drive(unrevised_guard(family), draw).collided
+        assert not drive(guard, draw).collided
 
 
 def test_what_is_asked_for_wrongly_is_refused_before_anything_is_driven(tmp_path):

@@ -123,7 +123,7 @@ def test_the_kinematic_judge_drives_as_it_does_elsewhere():
     ended = run(system, guard, start)
     driven = drive(other, system.family.draw(start.seed, start.episode, split="train"))
     assert ended.kept == len(driven.decisions) - int(driven.changed.sum())
-    np.testing.assert_array_equal(system._road.episode().record, driven.episode.record)
+    np.testing.assert_array_equal(system._road.episode().record, driven.record)
 
 
 def test_the_kinematic_judge_knows_cars_alone():

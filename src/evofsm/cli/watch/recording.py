@@ -24,7 +24,8 @@ from evofsm.cli.watch.shown import (
     states_of,
     usual_ways,
 )
-from evofsm.driving import VARIABLES, time_headway, time_to_collision
+from evofsm.driving import VARIABLES
+from evofsm.driving.measures import time_headway, time_to_collision
 from evofsm.guard import RECORD, TOLERANCE
 from evofsm.io import RecordedEpisode, Run, read_run
 

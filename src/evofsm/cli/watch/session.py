@@ -38,10 +38,9 @@ from evofsm.driving import (
     guard_for_family,
     learners_of,
     teach,
-    time_headway,
-    time_to_collision,
     unrevised_guard,
 )
+from evofsm.driving.measures import time_headway, time_to_collision
 from evofsm.fsm import IntervalActions, Novelty
 from evofsm.guard import (
     RECORD,
@@ -340,7 +339,7 @@ class Session:
         if self.watching.controller == "sumo":  # which drives in SUMO only, where a run is open
             return math.nan
         controller = make_controller(self.watching.setup, draw, self.world)
-        episode = drive(unrevised_guard(self.watching.family), draw, controller=controller).episode
+        episode = drive(unrevised_guard(self.watching.family), draw, controller=controller)
         return float(episode.time[-1]) if episode.collided else math.inf
 
     def _decide(self) -> Frame:

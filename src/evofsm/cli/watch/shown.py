@@ -8,7 +8,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.driving import LatentRisk, TimeHeadway, TimeToCollision, assess_states
+from evofsm.driving import LatentRisk, assess_states
+from evofsm.driving.measures import TimeHeadway, TimeToCollision
 from evofsm.fsm import EvolvingFSM, FSMModel
 from evofsm.guard import LearningJudge
 

@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evofsm.driving.attached.seen import Seeing
-from evofsm.driving.risk.drac import deceleration_to_avoid_collision
-from evofsm.driving.risk.ttc import time_to_collision
+from evofsm.driving.measures import deceleration_to_avoid_collision, time_to_collision
 
 _NONE = np.empty((0, 3))
 # Needed decelerations from which on a car is amber, or red [m/s²].

@@ -11,7 +11,7 @@ from os import PathLike
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
-from evofsm.driving.drivers.idm import IDM, ChangingIDM
+from evofsm.driving.drivers import IDM, ChangingIDM
 from evofsm.driving.families.numbers import Chance, GivenNumbers, Numbers
 from evofsm.driving.families.tables import (
     LAYOUT,
@@ -23,7 +23,7 @@ from evofsm.driving.families.tables import (
     parse,
 )
 from evofsm.driving.naming import UNITS, VARIABLES
-from evofsm.driving.worlds.scenario import Behind, Body, CutIn, Leader, Scenario, Sensors
+from evofsm.driving.scenarios import Behind, Body, CutIn, Leader, Scenario, Sensors
 from evofsm.fsm import IntervalActions, Labels
 
 #: The families that come with the package.

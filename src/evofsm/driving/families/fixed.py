@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import astuple, fields
 from typing import Any, NamedTuple
 
-from evofsm.driving.drivers.idm import IDM, ChangingIDM
+from evofsm.driving.drivers import IDM, ChangingIDM
 from evofsm.driving.families.family import Draw, Family
 from evofsm.fsm import IntervalActions
 

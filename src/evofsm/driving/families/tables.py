@@ -8,14 +8,14 @@ from collections.abc import Callable, Mapping
 from dataclasses import fields
 from typing import Any, TypeGuard
 
-from evofsm.driving.drivers.idm import IDM
+from evofsm.driving.drivers import IDM
 from evofsm.driving.families.numbers import (
     check_fixed,
     check_number,
     check_unrelated,
     is_relation_or_choice,
 )
-from evofsm.driving.worlds.scenario import Behind, Body, CutIn, Leader, Scenario, Sensors
+from evofsm.driving.scenarios import Behind, Body, CutIn, Leader, Scenario, Sensors
 
 Table = Mapping[str, Any]
 Check = Callable[[Any, str], None]

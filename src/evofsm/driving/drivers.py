@@ -1,0 +1,285 @@
+"""Who drives the follower: laws of car following, within explicit bounds.
+
+SUMO's own IDM brakes as hard as its ``emergencyDecel`` allows, and then never collides. What a
+vehicle can really do is part of the question here, so the bounds are arguments.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import astuple, dataclass, fields
+from functools import cached_property
+from typing import TypeAlias
+
+import numpy as np
+from numba import types
+from numpy.typing import NDArray
+
+from evofsm.fsm import compiled
+from evofsm.guard import Proposal
+
+#: ``kernel(parameters, time, gap, speed, leader_speed) -> acceleration``: a driver that has one,
+#: and the table of its ``parameters``, is driven in closed form without leaving compiled code.
+Kernel: TypeAlias = Callable[[NDArray[np.float64], float, float, float, float], float]
+#: Its signature is fixed, so that it can be passed as a value.
+DRIVER_KERNEL = types.float64(
+    types.float64[:, ::1], types.float64, types.float64, types.float64, types.float64
+)
+
+
+def _idm(
+    phases: NDArray[np.float64], time: float, gap: float, speed: float, leader_speed: float
+) -> float:
+    """The paper's IDM equations, by the last phase that has begun."""
+    now = 0
+    while now + 1 < len(phases) and phases[now + 1, 0] <= time:
+        now += 1
+    accel = phases[now, 1]
+    desired_speed = phases[now, 2]
+    min_gap = phases[now, 3]
+    time_headway = phases[now, 4]
+    decel = phases[now, 5]
+    exponent = phases[now, 6]
+    closing = speed * (speed - leader_speed) / (2.0 * math.sqrt(accel * decel))
+    desired_gap = min_gap + max(0.0, speed * time_headway + closing)
+    # A gap of 0 or less is a collision, beyond the model: brake as hard as the bounds allow.
+    interaction = (desired_gap / gap) ** 2 if gap > 0.0 else np.inf
+    acceleration = accel * (1.0 - (speed / desired_speed) ** exponent - interaction)
+    return float(min(max(acceleration, phases[now, 7]), phases[now, 8]))
+
+
+def _acc(
+    settings: NDArray[np.float64], time: float, gap: float, speed: float, leader_speed: float
+) -> float:
+    """The lower of speed control and gap control, within the bounds."""
+    desired_speed = settings[0, 0]
+    min_gap = settings[0, 1]
+    time_headway = settings[0, 2]
+    gap_gain = settings[0, 3]
+    approach_gain = settings[0, 4]
+    cruise_gain = settings[0, 5]
+    cruise = cruise_gain * (desired_speed - speed)
+    excess = gap - min_gap - time_headway * speed
+    follow = gap_gain * excess + approach_gain * (leader_speed - speed)
+    return float(min(max(min(cruise, follow), settings[0, 6]), settings[0, 7]))
+
+
+idm_kernel: Kernel = compiled(_idm, [DRIVER_KERNEL])
+acc_kernel: Kernel = compiled(_acc, [DRIVER_KERNEL])
+
+
+@dataclass(frozen=True)
+class IDM:
+    """A car follower by the Intelligent Driver Model (Treiber, Hennecke, Helbing 2000).
+
+    Parameters
+    ----------
+    accel : float
+        Desired maximum acceleration [m/s²].
+    desired_speed : float
+        Speed on a free road [m/s].
+    min_gap : float
+        Gap at standstill [m].
+    time_headway : float
+        Desired time headway [s].
+    decel : float
+        Comfortable deceleration [m/s²], positive.
+    exponent : float
+        How acceleration falls off towards the desired speed.
+    lowest, highest : float
+        Bounds of the acceleration that comes out [m/s²].
+
+    Raises
+    ------
+    ValueError
+        If a parameter is impossible.
+
+    Examples
+    --------
+    >>> IDM(1.25, 25.0, 2.0, 1.5, 2.0).propose(np.array([np.inf, 0.0, 0.0])).action
+    1.25
+    >>> IDM(1.25, 25.0, 2.0, 1.5, 2.0, lowest=-4.0).propose(np.array([5.0, 20.0, 0.0])).action
+    -4.0
+    """
+
+    accel: float
+    desired_speed: float
+    min_gap: float
+    time_headway: float
+    decel: float
+    exponent: float = 4.0
+    lowest: float = -math.inf
+    highest: float = math.inf
+
+    kernel = staticmethod(idm_kernel)
+
+    def __post_init__(self) -> None:
+        _check(
+            self,
+            "IDM",
+            positive=("accel", "desired_speed", "decel", "exponent"),
+            not_negative=("min_gap", "time_headway"),
+        )
+
+    @cached_property
+    def parameters(self) -> NDArray[np.float64]:
+        """(1, 9) ndarray: begin of the phase [s], then the arguments in order."""
+        return np.array([[0.0, *_numbers(self)]])
+
+    def propose(self, observation: NDArray[np.float64], time: float = 0.0) -> Proposal:
+        """Acceleration [m/s²] for ``[gap, v_follower, v_leader]``."""
+        return Proposal(self.kernel(self.parameters, time, *observation))
+
+
+@dataclass(frozen=True)
+class ChangingIDM:
+    """One driver who drives by one IDM and, from given times on, by others.
+
+    Parameters
+    ----------
+    first : IDM
+    changes : tuple of (float, IDM)
+        When [s], and how it drives from then on, in the order of time.
+
+    Raises
+    ------
+    ValueError
+        If the times are negative or not in order.
+
+    Examples
+    --------
+    >>> calm, hasty = IDM(1.0, 25.0, 2.0, 1.5, 2.0), IDM(2.0, 28.0, 1.0, 0.5, 2.0)
+    >>> driver = ChangingIDM(calm, ((10.0, hasty), (12.0, calm)))
+    >>> free_road = np.array([np.inf, 0.0, 0.0])
+    >>> [driver.propose(free_road, time).action for time in (9.99, 10.0, 12.0)]
+    [1.0, 2.0, 1.0]
+    """
+
+    first: IDM
+    changes: tuple[tuple[float, IDM], ...]
+
+    kernel = staticmethod(idm_kernel)
+
+    def __post_init__(self) -> None:
+        times = [at for at, _ in self.changes]
+        if not all(at >= 0.0 for at in times) or times != sorted(times):
+            raise ValueError(f"the driver changes at {times} s; it must be 0 or later, in order")
+
+    @cached_property
+    def parameters(self) -> NDArray[np.float64]:
+        """(1 + changes, 9) ndarray: a row for each phase, as `IDM.parameters`."""
+        phases = ((0.0, self.first), *self.changes)
+        return np.array([[at, *_numbers(driver)] for at, driver in phases])
+
+    def propose(self, observation: NDArray[np.float64], time: float = 0.0) -> Proposal:
+        """Acceleration [m/s²] for ``[gap, v_follower, v_leader]`` at ``time`` [s]."""
+        return Proposal(self.kernel(self.parameters, time, *observation))
+
+
+@dataclass(frozen=True)
+class AdaptiveCruise:
+    """A car under adaptive cruise control: it keeps a time gap, or its set speed.
+
+    With a leader ``a = gap_gain (gap - min_gap - time_headway v) + approach_gain (v_leader - v)``,
+    on a free road ``a = cruise_gain (desired_speed - v)``; the lower one holds. The law is linear:
+    it does not know how hard a leader may brake, and the bounds are all that limits it.
+
+    Parameters
+    ----------
+    desired_speed : float
+        Set speed [m/s].
+    min_gap : float
+        Gap at standstill [m].
+    time_headway : float
+        Time gap that is kept [s].
+    gap_gain : float
+        Of the gap's deviation [1/s²].
+    approach_gain : float
+        Of the difference of speeds [1/s].
+    cruise_gain : float
+        Of the set speed's deviation [1/s].
+    lowest, highest : float
+        Bounds of the acceleration that comes out [m/s²].
+
+    Raises
+    ------
+    ValueError
+        If a parameter is impossible.
+
+    Notes
+    -----
+    The gap control is that of production cars (Milanés and Shladover 2014,
+    doi:10.1016/j.trc.2014.09.001), the speed control that of Xiao, Wang and van Arem (2017,
+    doi:10.3141/2623-01), and so are the preset gains. They switch between both by the range of the
+    sensor; that the lower one holds needs no memory, and does not jump.
+
+    Examples
+    --------
+    >>> cruise = AdaptiveCruise(30.0, 2.0, 1.1, lowest=-3.5, highest=2.0)
+    >>> cruise.propose(np.array([np.inf, 28.0, 0.0])).action  # a free road
+    0.8
+    >>> round(cruise.propose(np.array([20.0, 20.0, 18.0])).action, 3)  # too close, and closing
+    -1.06
+    >>> cruise.propose(np.array([5.0, 20.0, 0.0])).action
+    -3.5
+    """
+
+    desired_speed: float
+    min_gap: float
+    time_headway: float
+    gap_gain: float = 0.23
+    approach_gain: float = 0.07
+    cruise_gain: float = 0.4
+    lowest: float = -math.inf
+    highest: float = math.inf
+
+    kernel = staticmethod(acc_kernel)
+
+    def __post_init__(self) -> None:
+        _check(
+            self,
+            "ACC",
+            positive=("desired_speed", "gap_gain", "cruise_gain"),
+            not_negative=("min_gap", "time_headway", "approach_gain"),
+        )
+
+    @cached_property
+    def parameters(self) -> NDArray[np.float64]:
+        """(1, 8) ndarray: the arguments in order."""
+        return np.array([astuple(self)])
+
+    def propose(self, observation: NDArray[np.float64], time: float = 0.0) -> Proposal:
+        """Acceleration [m/s²] for ``[gap, v_follower, v_leader]``; the time does not matter."""
+        return Proposal(self.kernel(self.parameters, time, *observation))
+
+
+# As astuple does, which copies each of them: made for every draw, that is what takes long.
+_NAMES = tuple(one.name for one in fields(IDM))
+
+
+def _numbers(driver: IDM) -> tuple[float, ...]:
+    return tuple(getattr(driver, name) for name in _NAMES)
+
+
+def _check(
+    driver: IDM | AdaptiveCruise,
+    law: str,
+    *,
+    positive: tuple[str, ...],
+    not_negative: tuple[str, ...],
+) -> None:
+    for name in positive:
+        if not 0.0 < getattr(driver, name) < math.inf:
+            raise ValueError(
+                f"{law} {name} is {getattr(driver, name)}; it must be positive and finite"
+            )
+    for name in not_negative:
+        if not 0.0 <= getattr(driver, name) < math.inf:
+            raise ValueError(
+                f"{law} {name} is {getattr(driver, name)}; it must be finite, 0 or more"
+            )
+    if not driver.lowest < driver.highest:
+        raise ValueError(
+            f"{law} bounds are [{driver.lowest}, {driver.highest}]; lowest comes first"
+        )

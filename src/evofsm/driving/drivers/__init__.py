@@ -1,1 +1,0 @@
-"""Car-following models: each a compiled kernel, and a controller around it."""

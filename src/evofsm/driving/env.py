@@ -1,0 +1,204 @@
+"""Car following as a Gymnasium environment: ``evofsm/CarFollowing-v0``.
+
+Importing this module registers it, so that one call does both::
+
+    gymnasium.make("evofsm.driving.env:evofsm/CarFollowing-v0")
+"""
+
+from __future__ import annotations
+
+import math
+from contextlib import ExitStack
+from os import PathLike
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from evofsm.driving.families.family import Draw, Family, load_family
+from evofsm.driving.sumo import open_world
+from evofsm.driving.world import Episode, OnRoad
+from evofsm.extras import needs
+
+with needs("gymnasium", "gym", "an environment of Gymnasium"):
+    import gymnasium
+    from gymnasium.spaces import Box
+
+#: How it is asked for.
+ID = "evofsm/CarFollowing-v0"
+
+#: The range of an observation; what lies beyond is seen at its edge. A collision shows as a gap
+#: of 0 or less.
+LOW = (-10.0, 0.0, 0.0)
+HIGH = (2000.0, 100.0, 100.0)
+
+# Scenarios are drawn by an index below this.
+_INDICES = 2**31
+
+
+class CarFollowing(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
+    """Drive behind a leader who may brake, in scenarios of a family.
+
+    An observation is ``[gap [m], v_follower [m/s], v_leader [m/s]]``, the gap from bumper to
+    bumper; an action is an acceleration [m/s²] in the family's range, commanded for the
+    family's interval. What lies beyond the range is commanded at its edge.
+
+    The reward of a step is the distance travelled in it [m], less ``collision_cost`` where it
+    ends in a collision. An episode terminates when two cars collide, and is truncated when its
+    time is up. ``info`` holds ``time`` [s], ``gap`` [m] as it truly is, ``distance`` [m] and
+    ``realised`` acceleration [m/s²] of the step, ``failed``, whether the follower ran into its
+    leader, and ``rear_ended``, whether the car behind, if any, ran into the follower. Both
+    terminate and both cost, but only the first is a failure. ``split`` and ``index`` say which
+    scenario it is.
+
+    Parameters
+    ----------
+    family : str, path or Family
+        Name of a family of scenarios, a file with one, or one that `load_family` has made.
+    world : str
+        One of `evofsm.driving.WORLDS`.
+    seed : int
+        Of the family's draws. The seed of `reset` picks among them.
+    split : str
+        Which scenarios to pick from, unless `reset` is told.
+    collision_cost : float
+        Taken from the reward of the step that ends in a collision [m].
+    render_mode : {"ansi"}, optional
+        `render` then says in one line where the cars are.
+
+    Examples
+    --------
+    >>> env = CarFollowing()
+    >>> observation, info = env.reset(seed=1, options={"index": 7, "split": "test"})
+    >>> info["split"], info["index"], info["time"]
+    ('test', 7, 0.0)
+    >>> observation, reward, terminated, truncated, info = env.step([1.0])
+    >>> info["time"], terminated, truncated
+    (0.25, False, False)
+    """
+
+    metadata: dict[str, Any] = {"render_modes": ["ansi"]}  # noqa: RUF012 (as its base class has it)
+
+    def __init__(
+        self,
+        family: str | PathLike[str] | Family = "emergency",
+        world: str = "kinematic",
+        *,
+        seed: int = 0,
+        split: str = "train",
+        collision_cost: float = 1000.0,
+        render_mode: str | None = None,
+    ) -> None:
+        if render_mode not in (None, *self.metadata["render_modes"]):
+            raise ValueError(f"there is no render_mode {render_mode!r}; there is 'ansi'")
+        if not 0.0 <= collision_cost < math.inf:
+            raise ValueError(f"collision_cost is {collision_cost}; it must be finite, 0 or more")
+        self.family = family if isinstance(family, Family) else load_family(family)
+        self.seed = seed
+        self.split = split
+        self.collision_cost = collision_cost
+        self.render_mode = render_mode
+        self.metadata = {**self.metadata, "render_fps": 1.0 / self.family.interval}
+        self.draw: Draw | None = None  #: what is driven: its scenario, and its own controller
+        self.observation_space = Box(np.array(LOW), np.array(HIGH), dtype=np.float64)
+        actions = self.family.actions
+        self.action_space = Box(actions.low, actions.high, (1,), np.float64)
+        self._open = ExitStack()
+        self._world = self._open.enter_context(open_world(world))
+        self._run = ExitStack()
+        self._on: OnRoad | None = None
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[NDArray[np.float64], dict[str, Any]]:
+        """Begin a scenario, drawn by the seed or chosen exactly.
+
+        Parameters
+        ----------
+        seed : int, optional
+            Of the draws from now on.
+        options : dict, optional
+            ``split`` and ``index`` of the scenario.
+
+        Returns
+        -------
+        (ndarray, dict)
+            The first observation, and info.
+
+        Raises
+        ------
+        ValueError
+            If there is no such split, index or option.
+        """
+        super().reset(seed=seed)
+        asked = dict(options or {})
+        split = asked.pop("split", self.split)
+        drawn = int(self.np_random.integers(_INDICES))
+        index = int(asked.pop("index", drawn))
+        if asked:
+            raise ValueError(f"there is no option {', '.join(asked)}; there are index and split")
+        self.draw = self.family.draw(self.seed, index, split)
+        self._which = {"split": split, "index": index}
+        self._run.close()
+        scenario = self.draw.scenario
+        road = self._run.enter_context(self._world.open(scenario))
+        self._on = OnRoad(road, scenario.steps(self.family.interval))
+        return np.clip(road.observation, LOW, HIGH), self._info(road.episode())
+
+    def step(
+        self, action: ArrayLike
+    ) -> tuple[NDArray[np.float64], float, bool, bool, dict[str, Any]]:
+        """Drive for one interval with ``action`` commanded.
+
+        Raises
+        ------
+        RuntimeError
+            If the episode is over, or none was begun.
+        ValueError
+            If the action is no finite number.
+        """
+        on = self._on
+        if on is None or on.road.over:
+            raise RuntimeError("step before reset: no episode is under way")
+        acceleration = float(np.asarray(action, dtype=np.float64).reshape(()))
+        if not math.isfinite(acceleration):
+            raise ValueError(f"action is {acceleration}; an acceleration must be finite")
+        actions, row = self.family.actions, on.road.row
+        seen, _, terminated, truncated, came = on.step(
+            min(max(acceleration, actions.low), actions.high)
+        )
+        info = self._info(on.road.episode(first=row)) | {"realised": came["realised"]}
+        reward = info["distance"] - (self.collision_cost if terminated else 0.0)
+        return np.clip(seen, LOW, HIGH), reward, terminated, truncated, info
+
+    def render(self) -> str | None:
+        """Where the cars are, in one line, with ``render_mode="ansi"``."""
+        if self.render_mode is None or self._on is None:
+            return None
+        road = self._on.road
+        gap, speed, leader_speed = road.episode(first=road.row).observations[-1]
+        return (
+            f"{road.time:.2f} s: at {speed:.1f} m/s, {gap:.1f} m behind a leader at "
+            f"{leader_speed:.1f} m/s"
+        )
+
+    def close(self) -> None:
+        """Leave the road and the world."""
+        self._on = None
+        self._run.close()
+        self._open.close()
+
+    def _info(self, step: Episode) -> dict[str, Any]:
+        """What is known after a step, given its rows."""
+        return {
+            "time": float(step.time[-1]),
+            "gap": float(step.observations[-1, 0]),
+            "distance": float(np.trapezoid(step.observations[:, 1], step.time)),
+            "failed": step.collided,
+            "rear_ended": step.rear_ended,
+            **self._which,
+        }
+
+
+if ID not in gymnasium.registry:
+    gymnasium.register(ID, entry_point=f"{__name__}:{CarFollowing.__name__}")

@@ -1,0 +1,466 @@
+"""Episodes of cars under a guard, and what came of them: collisions, distance, comfort.
+
+All that drives cars goes through `drive`, which is the loop of `evofsm.guard.run_episode` on a
+road. A `Trial` is the same as a function of an episode's number, for any ``map``.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import cache
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from evofsm.driving.families.family import Draw, Family
+from evofsm.driving.revisers import Unrevised
+from evofsm.driving.scenarios import Scenario
+from evofsm.driving.sumo import open_world
+from evofsm.driving.world import (
+    COMMANDED,
+    GAP,
+    GAP_BEHIND,
+    LEADER_ACCELERATION,
+    LEADER_SPEED,
+    REALISED,
+    RUN_COLUMNS,
+    SPEED,
+    Drives,
+    Episode,
+    KinematicWorld,
+    OnRoad,
+    World,
+)
+from evofsm.extras import needs
+from evofsm.fsm import FailureRecord
+from evofsm.guard import TOLERANCE, BoxActions, Guard, Mode, Proposal, run_episode
+
+
+def drive(
+    guard: Guard,
+    what: Draw | Scenario,
+    world: World | None = None,
+    controller: Drives | None = None,
+) -> Episode:
+    """Drive one scenario under a guard, which learns from it unless it is frozen.
+
+    Parameters
+    ----------
+    guard : Guard
+        Made with the interval between decisions.
+    what : Draw or Scenario
+    world : World, optional
+        Without one, it is driven in closed form.
+    controller : Controller or callable, optional
+        From an observation to an acceleration [m/s²]; without one, the draw's own drives. Where it
+        raises or proposes no number, the guard falls back.
+
+    Returns
+    -------
+    Episode
+        With its ``decisions``.
+
+    Raises
+    ------
+    ValueError
+        If nobody drives, the guard has no interval or its actions are vectors, or the interval is
+        no multiple of the scenario's step.
+
+    Examples
+    --------
+    >>> from evofsm.driving import IDM, Leader, Scenario, Unrevised, guard_for_cars
+    >>> guard = guard_for_cars(low=-2.5, high=2.5)
+    >>> hasty = IDM(2.25, 28.0, 0.8, 0.3, 2.0, lowest=-2.5, highest=2.5)
+    >>> leader = Leader(IDM(1.2, 25.0, 1.0, 1.0, 2.5), brake_decel=4.0, brake_time=12.0)
+    >>> scenario = Scenario(leader, initial_gap=10.0)
+    >>> alone = Guard.of(Unrevised(guard.actions), interval=0.25)
+    >>> drive(alone, scenario, controller=hasty).collided
+    True
+    >>> drive(guard, scenario, controller=hasty).collided
+    False
+    """
+    scenario = what.scenario if isinstance(what, Draw) else what
+    if controller is None and isinstance(what, Draw):
+        controller = what.controller
+    if controller is None:
+        raise ValueError("nobody drives: a Scenario has no controller of its own, so give one")
+    if guard.interval is None:
+        raise ValueError("the guard was made without an interval, the time between decisions")
+    if isinstance(guard.actions, BoxActions):
+        raise ValueError("the guard's actions are vectors, but a car is driven by one number")
+    steps = scenario.steps_between(guard.interval)
+    with (world or KinematicWorld()).open(scenario) as road:
+        decisions = tuple(run_episode(OnRoad(road, steps), guard, controller))
+        return replace(road.episode(), decisions=decisions)
+
+
+def teach(guard: Guard, draws: Iterable[Draw]) -> list[Episode]:
+    """Drive each draw in turn, in closed form."""
+    return [drive(guard, draw) for draw in draws]
+
+
+# -- What was recorded ----------------------------------------------------------------------------
+
+
+def shadow_drive(
+    guard: Guard,
+    times: ArrayLike,
+    observations: ArrayLike,
+    accelerations: ArrayLike,
+    *,
+    failed: bool = False,
+) -> Episode:
+    """Let a guard in shadow mode decide on each row of a recorded episode, and learn from it.
+
+    Parameters
+    ----------
+    guard : Guard
+        For cars (`guard_for_cars`), in `Mode.SHADOW` or `Mode.OFF`: what was recorded cannot be
+        changed any more.
+    times : (T,) array_like
+        Rising, as far apart as the guard's interval [s].
+    observations : (T, 3) array_like
+        Gap [m], speed of the follower and of the leader [m/s].
+    accelerations : (T,) array_like
+        What the follower did after each row [m/s²]; that of the last row is not read.
+    failed : bool
+        Whether the episode ended in failure; a last gap of 0 or less is one anyway.
+
+    Returns
+    -------
+    Episode
+        With a decision for each row but the last, in which what was done stands as the proposal,
+        and what the guard would have done as ``advised``.
+
+    Raises
+    ------
+    ValueError
+        If the guard would act, there are fewer than two rows, or the shapes do not fit.
+
+    Examples
+    --------
+    >>> from evofsm.driving import guard_for_cars
+    >>> guard = guard_for_cars(low=-8.0, high=3.0, interval=0.1, mode=Mode.SHADOW)
+    >>> rows = [[40.0, 20.0, 20.0], [39.9, 20.0, 19.0], [39.7, 20.0, 18.0]]
+    >>> episode = shadow_drive(guard, [0.0, 0.1, 0.2], rows, [0.0, 0.0, 0.0])
+    >>> len(episode.decisions), episode.executed.tolist()
+    (2, [0.0, 0.0])
+    """
+    mode = getattr(guard.reviser, "mode", Mode.ACT)
+    if mode not in (Mode.SHADOW, Mode.OFF):
+        raise ValueError(f"the guard's mode is {mode.value}; what was recorded needs shadow or off")
+    recording = _Recording(times, observations, accelerations, failed)
+    decisions = tuple(run_episode(recording, guard, recording))
+    return Episode(recording.time, recording.record, decisions)
+
+
+class _Recording:
+    """A recorded episode, as an environment that goes on whatever is done, and as its driver."""
+
+    def __init__(
+        self, times: ArrayLike, observations: ArrayLike, accelerations: ArrayLike, failed: bool
+    ) -> None:
+        self.time, seen = np.asarray(times, np.float64), np.asarray(observations, np.float64)
+        did = np.asarray(accelerations, np.float64)
+        if len(self.time) < 2 or seen.shape != (len(self.time), 3) or did.shape != self.time.shape:
+            raise ValueError(
+                f"times, observations and accelerations have the shapes {self.time.shape}, "
+                f"{seen.shape} and {did.shape}; they must be (T,), (T, 3) and (T,), with T of 2 or "
+                "more"
+            )
+        self.record = np.zeros((len(self.time), len(RUN_COLUMNS)))
+        self.record[:, [GAP, SPEED, LEADER_SPEED]] = self._seen = seen
+        self.record[:, GAP_BEHIND] = np.inf
+        self.record[:-1, COMMANDED] = did[:-1]
+        for column, speed in ((REALISED, seen[:, 1]), (LEADER_ACCELERATION, seen[:, 2])):
+            self.record[:-1, column] = np.diff(speed) / np.diff(self.time)
+        self._failed, self._row = failed or bool(seen[-1, 0] <= 0.0), 0
+
+    def propose(self, observation: NDArray[np.float64], time: float = 0.0) -> Proposal:
+        return Proposal(float(self.record[self._row, COMMANDED]))
+
+    def reset(self, **_: Any) -> tuple[NDArray[np.float64], dict[str, Any]]:
+        return self._seen[0], {"time": float(self.time[0])}
+
+    def step(self, _: Any, /) -> tuple[NDArray[np.float64], float, bool, bool, dict[str, Any]]:
+        came = {"realised": self.record[self._row, REALISED]}
+        self._row += 1
+        over = self._row == len(self.time) - 1
+        came |= {"time": float(self.time[self._row]), "failed": over and self._failed}
+        return self._seen[self._row], 0.0, False, over, came
+
+
+# -- What came of an episode ----------------------------------------------------------------------
+
+
+class Reference(NamedTuple):
+    """How far the unrevised controller came in a draw, and until when that counts."""
+
+    distance: float  #: [m]
+    until: int  #: row of the leader's brake, or of the run's end
+
+
+class Outcome(NamedTuple):
+    """One driven draw."""
+
+    collided: bool
+    rear_ended: bool
+    mobility: float  #: distance, in those of the unrevised controller
+    changed: int  #: decisions in which the proposal was not executed
+    decisions: int
+    change: float  #: sum of the absolute differences of executed and proposed [m/s²]
+    jerk: float  #: sum over decisions of the squared jerk [m²/s⁶]
+    speed: float  #: mean [m/s]
+
+
+def unrevised_guard(family: Family) -> Guard:
+    """A guard that executes whatever is proposed, and learns nothing."""
+    return Guard.of(Unrevised(family.actions), interval=family.interval, learn=False)
+
+
+def reference_of(
+    family: Family, draw: Draw, world: World | None = None, controller: Drives | None = None
+) -> Reference:
+    """How far the controller comes by itself in a draw, up to the leader's full brake."""
+    alone = drive(unrevised_guard(family), draw, world, controller)
+    brake = -draw.scenario.leader.brake_decel
+    braking = np.flatnonzero(alone.record[:, LEADER_ACCELERATION] == brake)
+    until = int(braking[0]) if len(braking) else len(alone.time) - 1
+    return Reference(_distance(alone, until), until)
+
+
+def outcome_of(episode: Episode, unrevised: Reference, interval: float) -> Outcome:
+    """What came of an episode, against the unrevised controller in the same draw."""
+    change = np.abs(episode.executed - episode.proposed)
+    realised = [one.realised for one in episode.decisions if math.isfinite(one.realised)]
+    jerk = np.diff(realised) / interval
+    return Outcome(
+        episode.collided,
+        episode.rear_ended,
+        # Where the leader brakes at once there is no way to be kept.
+        _distance(episode, unrevised.until) / unrevised.distance if unrevised.distance > 0 else 1.0,
+        int(episode.changed.sum()),
+        len(episode.decisions),
+        float(change[np.isfinite(change)].sum()),  # else there was no usable proposal
+        float((jerk**2).sum()),
+        float(episode.record[:, SPEED].mean()),
+    )
+
+
+def _distance(episode: Episode, until: int) -> float:
+    """Driven up to a row [m]."""
+    dt = episode.time[1] - episode.time[0]
+    return float(episode.record[: until + 1, SPEED].sum() * dt)
+
+
+def lead_time(episode: Episode, tolerance: float = TOLERANCE) -> float | None:
+    """From the alarm that stays on to the collision [s], 0 without one.
+
+    None where the episode ended well, or nobody said how likely failure is.
+    """
+    if not episode.collided or math.isnan(episode.decisions[0].revision.risk_proposed):
+        return None
+    alarm = math.nan
+    for decision in episode.decisions:
+        if decision.revision.risk_proposed > tolerance:
+            alarm = decision.situation.time if math.isnan(alarm) else alarm
+        else:
+            alarm = math.nan
+    return 0.0 if math.isnan(alarm) else float(episode.time[-1] - alarm)
+
+
+def references_of(family: Family, draws: Iterable[Draw]) -> list[Reference]:
+    """How far the controller comes by itself in each draw."""
+    return [reference_of(family, draw) for draw in draws]
+
+
+def score(family: Family, alone: Iterable[Reference], episodes: Iterable[Episode]) -> list[Outcome]:
+    """Outcomes of driven draws, against the controller alone."""
+    return [
+        outcome_of(driven, base, family.interval)
+        for base, driven in zip(alone, episodes, strict=True)
+    ]
+
+
+def try_out(
+    guard: Guard, family: Family, draws: Sequence[Draw], alone: Sequence[Reference] | None = None
+) -> list[Outcome]:
+    """What comes of draws under a frozen copy of a guard, against the controller alone.
+
+    Parameters
+    ----------
+    guard : Guard
+        Its copy has no machine: the same is decided, and nothing is recognised.
+    family : Family
+    draws : sequence of Draw
+    alone : sequence of Reference, optional
+        Of these draws; without them the controller is driven alone first.
+
+    Examples
+    --------
+    >>> from evofsm.driving import guard_for_family, held_out, load_family
+    >>> family = load_family("emergency")
+    >>> outcomes = try_out(guard_for_family(family), family, held_out(family, seed=0, episodes=3))
+    >>> [outcome.collided for outcome in outcomes]
+    [False, False, False]
+    """
+    frozen = guard.copy(states=False)
+    frozen.freeze()
+    return score(family, alone or references_of(family, draws), teach(frozen, draws))
+
+
+@dataclass(frozen=True)
+class Trial:
+    """Episodes of a family by their number: a function for any ``map``, of threads to clusters.
+
+    Parameters
+    ----------
+    family : Family
+    guard : Guard
+        Where it is frozen, no episode depends on another one.
+    world : World or str
+        Of a name each process opens a world of its own.
+    seed : int
+    split : {"test", "train"}
+    controller : callable, optional
+        From a draw and the world to who drives; without it the draw's own.
+
+    Examples
+    --------
+    >>> from evofsm.driving import load_family
+    >>> family = load_family("emergency")
+    >>> rows = list(map(Trial(family, unrevised_guard(family)), range(2)))
+    >>> [(row["episode"], row["collided"]) for row in rows]
+    [(0, True), (1, True)]
+    """
+
+    family: Family
+    guard: Guard
+    world: World | str = "kinematic"
+    seed: int = 0
+    split: str = "test"
+    controller: Callable[[Draw, World], Drives] | None = None
+
+    def drive(self, number: int) -> tuple[Episode, dict[str, Any]]:
+        """An episode, and its row: number, variant, `Outcome`, and `lead_time`."""
+        world = _opened(self.world) if isinstance(self.world, str) else self.world
+        draw = self.family.draw(self.seed, number, split=self.split)
+        controller = draw.controller if self.controller is None else self.controller(draw, world)
+        alone = reference_of(self.family, draw, world, controller)
+        driven = drive(self.guard, draw, world, controller)
+        outcome = outcome_of(driven, alone, self.family.interval)
+        tolerance = getattr(self.guard.reviser, "tolerance", TOLERANCE)
+        return driven, {
+            "episode": number,
+            "variant": draw.variant,
+            **outcome._asdict(),
+            "lead_time": lead_time(driven, tolerance),
+        }
+
+    def __call__(self, number: int) -> dict[str, Any]:
+        """The row of an episode."""
+        return self.drive(number)[1]
+
+
+@cache
+def _opened(name: str) -> World:
+    """The world of this process, open for as long as it lives."""
+    return open_world(name).__enter__()
+
+
+# -- What came of many ----------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Row:
+    """A line of the table: one policy on the held-out draws of a family."""
+
+    family: str
+    policy: str
+    group: str
+    learning_seed: int | None
+    train_episodes: int
+    episodes: int
+    collisions: int  #: with the leader; not `rear_ends`
+    collision_rate: float
+    collision_low: float  #: 95 % interval (Clopper and Pearson 1934)
+    collision_high: float
+    rear_ends: int
+    mobility: float
+    mobility_low: float  #: 95 % interval (bootstrap over episodes)
+    mobility_high: float
+    intervention_rate: float
+    mean_change: float  #: [m/s²]
+    jerk: float  #: root mean square [m/s³]
+    mean_speed: float  #: [m/s]
+    episodes_until_safe: int | None = None
+    train_collisions: int = 0
+    hours: float = 0.0  #: driven, to complete decisions [h]
+    kilometres: float = 0.0  #: driven by the follower [km]
+
+    @property
+    def failures(self) -> FailureRecord:
+        """How often it collides, per hour and per 1,000 km, and what that rests on."""
+        return FailureRecord(self.collisions, self.hours, self.kilometres, self.episodes)
+
+    def as_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return asdict(self)
+
+
+def summarise(
+    family: str,
+    policy: str,
+    group: str,
+    outcomes: Sequence[Outcome],
+    interval: float,
+    *,
+    learning_seed: int | None = None,
+    train_episodes: int = 0,
+    episodes_until_safe: int | None = None,
+    train_collisions: int = 0,
+) -> Row:
+    """One line for the outcomes of a policy, deciding every ``interval`` [s]."""
+    with needs("scipy", "study", "the interval of a share"):
+        from scipy.stats import binomtest
+    n = len(outcomes)
+    collisions = sum(o.collided for o in outcomes)
+    exact = binomtest(collisions, n).proportion_ci(0.95, method="exact")
+    mobility = np.array([o.mobility for o in outcomes])
+    low, high = _bootstrap(mobility)
+    decisions = sum(o.decisions for o in outcomes)
+    return Row(
+        family=family,
+        policy=policy,
+        group=group,
+        learning_seed=learning_seed,
+        train_episodes=train_episodes,
+        episodes=n,
+        collisions=collisions,
+        collision_rate=collisions / n,
+        collision_low=float(exact.low),
+        collision_high=float(exact.high),
+        rear_ends=sum(o.rear_ended for o in outcomes),
+        mobility=float(mobility.mean()),
+        mobility_low=low,
+        mobility_high=high,
+        intervention_rate=sum(o.changed for o in outcomes) / decisions,
+        mean_change=sum(o.change for o in outcomes) / decisions,
+        jerk=float(np.sqrt(sum(o.jerk for o in outcomes) / decisions)),
+        mean_speed=float(np.mean([o.speed for o in outcomes])),
+        episodes_until_safe=episodes_until_safe,
+        train_collisions=train_collisions,
+        hours=decisions * interval / 3600.0,
+        kilometres=sum(o.speed * o.decisions for o in outcomes) * interval / 1000.0,
+    )
+
+
+def _bootstrap(values: NDArray[np.float64], rounds: int = 1000) -> tuple[float, float]:
+    """95 % interval of a mean, by resampling; the same numbers give the same interval."""
+    rng = np.random.default_rng(0)
+    means = [rng.choice(values, len(values)).mean() for _ in range(rounds)]
+    low, high = np.quantile(means, [0.025, 0.975])
+    return float(low), float(high)

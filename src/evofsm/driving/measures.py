@@ -1,0 +1,740 @@
+"""Classic measures of danger, and which situations are dead ends in truth.
+
+Every function takes observations (..., 3), the gap [m], the speed of the follower and that of the
+leader [m/s]. Every class scores them with a threshold: above 0 it calls for braking, and scores of
+different rows can be compared. Most return infinity where the cars have met.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import ClassVar, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evofsm.fsm import positive
+from evofsm.guard import RiskMeasure
+
+Floats = NDArray[np.float64]
+
+_GRAVITY = 9.81
+
+
+def _columns(observations: Floats) -> Floats:
+    """Gap and both speeds, one after the other."""
+    return np.moveaxis(np.asarray(observations, dtype=np.float64), -1, 0)
+
+
+def _acceleration(speed: Floats, dt: float) -> Floats:
+    """Mean acceleration since the row before; 0 in the first row, which has none."""
+    return np.diff(speed, prepend=speed[..., :1]) / positive("dt", dt)
+
+
+def _time_to_cover(gap: Floats, speed: Floats) -> Floats:
+    """[s]; infinite where the speed is not positive, 0 where the gap is not."""
+    time = np.full_like(gap, np.inf)
+    with np.errstate(over="ignore"):
+        np.divide(gap, speed, out=time, where=speed > 0.0)
+    return np.where(gap <= 0.0, 0.0, time)
+
+
+def _unsafe_once_met(gap: Floats, score: Floats) -> Floats:
+    return np.where(gap <= 0.0, np.inf, score)
+
+
+class _Measure:
+    """A measure whose arguments are positive numbers, or an allowed 0."""
+
+    _may_be_zero: ClassVar[tuple[str, ...]] = ()
+
+    def __post_init__(self) -> None:
+        for field in fields(self):  # type: ignore[arg-type]
+            value = getattr(self, field.name)
+            if not (field.name in self._may_be_zero and value == 0.0):
+                positive(f"{type(self).__name__} {field.name}", value)
+
+
+@dataclass(frozen=True)
+class _ShortTime(_Measure):
+    """Danger where a time is short: finite also where the time is infinite."""
+
+    threshold: float
+
+    def _score(self, time: Floats) -> Floats:
+        with np.errstate(divide="ignore", over="ignore"):
+            return np.asarray(1.0 / time - 1.0 / self.threshold)
+
+
+# -- Time to collision ----------------------------------------------------------------------------
+
+
+def time_to_collision(observations: Floats) -> Floats:
+    """Time until the cars meet if both kept their speed.
+
+    Parameters
+    ----------
+    observations : (..., 3) ndarray
+        Gap [m], speed of the follower and of the leader [m/s].
+
+    Returns
+    -------
+    (...) ndarray
+        Gap over closing speed [s]; infinite where the follower is not the faster one, 0 where
+        the cars have met.
+
+    Examples
+    --------
+    >>> time_to_collision(np.array([[20.0, 25.0, 20.0], [2.0, 20.0, 20.0]]))
+    array([ 4., inf])
+    """
+    gap, speed, leader_speed = _columns(observations)
+    return _time_to_cover(gap, speed - leader_speed)
+
+
+@dataclass(frozen=True)
+class TimeToCollision(_ShortTime):
+    """Danger where the time to collision (Hayward 1972) is short; it is blind at equal speeds.
+
+    Parameters
+    ----------
+    threshold : float
+        Time to collision below which it calls for braking [s]; that of the Swedish conflict
+        technique (Hydén 1987).
+
+    Raises
+    ------
+    ValueError
+        If the threshold is not positive and finite.
+
+    Examples
+    --------
+    >>> TimeToCollision().score(np.array([[20.0, 25.0, 20.0], [5.0, 25.0, 20.0]]), dt=0.1) > 0.0
+    array([False,  True])
+    """
+
+    threshold: float = 1.5
+
+    def score(self, observations: Floats, dt: float) -> Floats:
+        """1 / time to collision − 1 / threshold [1/s]; infinite where the cars have met."""
+        return self._score(time_to_collision(observations))
+
+
+def modified_time_to_collision(observations: Floats, dt: float) -> Floats:
+    """Time until the cars meet if both kept their acceleration (Ozbay et al. 2008).
+
+    It is the first t > 0 at which Δa·t²/2 + Δv·t = gap, where Δv and Δa are the speed and the
+    acceleration of the follower minus the leader's. As published, it lets cars roll backwards
+    where they would in truth have come to a standstill.
+
+    Parameters
+    ----------
+    observations : (..., T, 3) ndarray
+        Gap [m], speed of the follower and of the leader [m/s], in the order of time.
+    dt : float
+        Time between two rows [s]. Accelerations are those since the row before, and 0 in the
+        first row.
+
+    Returns
+    -------
+    (..., T) ndarray
+        [s]; infinite where the cars would never meet, 0 where they have met.
+
+    Raises
+    ------
+    ValueError
+        If ``dt`` is not positive and finite.
+
+    Examples
+    --------
+    The leader begins to brake by 4 m/s² in front of a follower as fast as itself.
+
+    >>> modified_time_to_collision(np.array([[10.0, 20.0, 20.0], [8.0, 20.0, 18.0]]), dt=0.5)
+    array([       inf, 1.56155281])
+    """
+    gap, speed, leader_speed = _columns(observations)
+    closing = speed - leader_speed
+    discriminant = closing**2 + 2.0 * _acceleration(closing, dt) * gap
+    # Gap over the mean closing speed until then: the first positive root, whatever the sign of Δa.
+    mean = np.where(discriminant >= 0.0, (closing + np.sqrt(np.maximum(discriminant, 0.0))) / 2, 0)
+    return _time_to_cover(gap, mean)
+
+
+@dataclass(frozen=True)
+class ModifiedTimeToCollision(_ShortTime):
+    """Danger where the modified time to collision is short: it sees the leader brake.
+
+    Parameters
+    ----------
+    threshold : float
+        Below which it calls for braking [s]; by default that of `TimeToCollision`, so that the two
+        differ in nothing but the accelerations.
+
+    Raises
+    ------
+    ValueError
+        If the threshold is not positive and finite.
+
+    Examples
+    --------
+    >>> episode = np.array([[10.0, 20.0, 20.0], [8.0, 20.0, 18.0], [5.0, 20.0, 16.0]])
+    >>> ModifiedTimeToCollision().score(episode, dt=0.5) > 0.0
+    array([False, False,  True])
+    """
+
+    threshold: float = 1.5
+
+    def score(self, observations: Floats, dt: float) -> Floats:
+        """1 / modified time to collision − 1 / threshold [1/s]; infinite where the cars met."""
+        return self._score(modified_time_to_collision(observations, dt))
+
+
+def time_headway(observations: Floats) -> Floats:
+    """Time until the follower reaches the place at which the leader's rear bumper is.
+
+    Parameters
+    ----------
+    observations : (..., 3) ndarray
+        Gap [m], speed of the follower and of the leader [m/s].
+
+    Returns
+    -------
+    (...) ndarray
+        Gap over speed of the follower [s]; infinite where it stands, 0 where the cars have met.
+
+    Examples
+    --------
+    >>> time_headway(np.array([[30.0, 20.0, 25.0], [5.0, 0.0, 0.0]]))
+    array([1.5, inf])
+    """
+    gap, speed, _ = _columns(observations)
+    return _time_to_cover(gap, speed)
+
+
+@dataclass(frozen=True)
+class TimeHeadway(_ShortTime):
+    """Danger where the follower drives close behind (Vogel 2003).
+
+    Parameters
+    ----------
+    threshold : float
+        Time headway below which it calls for braking [s]; below 1 s Sweden fines.
+
+    Raises
+    ------
+    ValueError
+        If the threshold is not positive and finite.
+
+    Examples
+    --------
+    >>> TimeHeadway().score(np.array([[30.0, 20.0, 25.0], [10.0, 20.0, 25.0]]), dt=0.1)
+    array([-0.33333333,  1.        ])
+    """
+
+    threshold: float = 1.0
+
+    def score(self, observations: Floats, dt: float) -> Floats:
+        """1 / time headway − 1 / threshold [1/s]; infinite where the cars have met."""
+        return self._score(time_headway(observations))
+
+
+# -- Needed braking -------------------------------------------------------------------------------
+
+
+def deceleration_to_avoid_collision(observations: Floats) -> Floats:
+    """Braking with which the follower just avoids a leader that keeps its speed.
+
+    Parameters
+    ----------
+    observations : (..., 3) ndarray
+        Gap [m], speed of the follower and of the leader [m/s].
+
+    Returns
+    -------
+    (...) ndarray
+        Square of the closing speed over twice the gap [m/s²]; 0 where the follower is not the
+        faster one, infinite where the cars have met.
+
+    Examples
+    --------
+    >>> deceleration_to_avoid_collision(np.array([[10.0, 30.0, 20.0], [10.0, 20.0, 20.0]]))
+    array([5., 0.])
+    """
+    gap, speed, leader_speed = _columns(observations)
+    closing = np.maximum(speed - leader_speed, 0.0)
+    needed = np.zeros_like(gap)
+    with np.errstate(over="ignore"):
+        np.divide(closing**2, 2.0 * gap, out=needed, where=gap > 0.0)
+    return _unsafe_once_met(gap, needed)
+
+
+@dataclass(frozen=True)
+class DecelerationToAvoidCollision(_Measure):
+    """DRAC (Cooper and Ferguson 1976): danger where hard braking is needed; blind at equal speeds.
+
+    Parameters
+    ----------
+    threshold : float
+        Needed deceleration above which it calls for braking [m/s²], after Archer (2005).
+
+    Raises
+    ------
+    ValueError
+        If the threshold is not positive and finite.
+
+    Examples
+    --------
+    >>> DecelerationToAvoidCollision().score(np.array([[10.0, 30.0, 20.0]]), dt=0.1)
+    array([1.65])
+    """
+
+    threshold: float = 3.35
+
+    def score(self, observations: Floats, dt: float) -> Floats:
+        """Needed deceleration − threshold [m/s²]; infinite where the cars have met."""
+        return deceleration_to_avoid_collision(observations) - self.threshold
+
+
+def picud(observations: Floats, decel: float, reaction: float) -> Floats:
+    """Gap that is left when both cars have braked to standstill.
+
+    Parameters
+    ----------
+    observations : (..., 3) ndarray
+        Gap [m], speed of the follower and of the leader [m/s].
+    decel : float
+        Braking of both cars [m/s²], positive.
+    reaction : float
+        Time after which the follower brakes too [s].
+
+    Returns
+    -------
+    (...) ndarray
+        gap + v_leader² / (2·decel) − v·reaction − v² / (2·decel) [m]; below 0 they collide.
+
+    Examples
+    --------
+    >>> picud(np.array([[30.0, 20.0, 20.0], [30.0, 20.0, 10.0]]), decel=3.0, reaction=1.0)
+    array([ 10., -40.])
+    """
+    gap, speed, leader_speed = _columns(observations)
+    braked = (leader_speed**2 - speed**2) / (2.0 * decel)
+    return np.asarray(gap + braked - speed * reaction)
+
+
+@dataclass(frozen=True)
+class Picud(_Measure):
+    """PICUD (Uno et al. 2002): danger where urgent braking of both would end in a collision.
+
+    Parameters
+    ----------
+    decel : float
+        Braking of both cars [m/s²], positive.
+    reaction : float
+        Time after which the follower brakes too [s]; 0 is allowed.
+
+    Raises
+    ------
+    ValueError
+        If ``decel`` is not positive and finite, or ``reaction`` is negative or not finite.
+
+    Examples
+    --------
+    >>> Picud().score(np.array([[30.0, 20.0, 20.0], [15.0, 20.0, 20.0]]), dt=0.1)
+    array([-10.,   5.])
+    """
+
+    decel: float = 3.3
+    reaction: float = 1.0
+
+    _may_be_zero = ("reaction",)
+
+    def score(self, observations: Floats, dt: float) -> Floats:
+        """Minus the gap left [m]; infinite where the cars have met."""
+        left = picud(observations, self.decel, self.reaction)
+        return _unsafe_once_met(_columns(observations)[0], -left)
+
+
+# -- Safe distances -------------------------------------------------------------------------------
+
+
+def safe_distance(
+    observations: Floats, response: float, accel: float, decel: float, leader_decel: float
+) -> Floats:
+    """Gap from which the follower can still stop behind a leader that brakes in full.
+
+    Parameters
+    ----------
+    observations : (..., 3) ndarray
+        Gap [m], which does not matter here, speed of the follower and of the leader [m/s].
+    response : float
+        Time before the follower brakes [s].
+    accel : float
+        Acceleration of the follower until then [m/s²].
+    decel, leader_decel : float
+        Braking that the follower is sure to reach, and the hardest of the leader [m/s²], positive.
+
+    Returns
+    -------
+    (...) ndarray
+        v·ρ + a·ρ²/2 + (v + ρ·a)² / (2·decel) − v_leader² / (2·leader_decel) [m], or 0 if that is
+        negative, where v is the follower's speed, ρ the response and a ``accel``.
+
+    Examples
+    --------
+    >>> safe_distance(np.array([50.0, 20.0, 20.0]), 0.5, 2.0, 5.0, 8.0)
+    array(29.35)
+    """
+    _, speed, leader_speed = _columns(observations)
+    fastest = speed + response * accel
+    travelled = (speed + fastest) / 2.0 * response
+    stopping = travelled + fastest**2 / (2.0 * decel)
+    return np.asarray(np.maximum(stopping - leader_speed**2 / (2.0 * leader_decel), 0.0))
+
+
+@dataclass(frozen=True)
+class ResponsibilitySensitiveSafety(_Measure):
+    """RSS (Shalev-Shwartz et al. 2017, arXiv:1708.06374), its longitudinal part.
+
+    Danger where the gap is shorter than the safe distance.
+
+    Parameters
+    ----------
+    response : float
+        Time before the follower brakes [s]; 0 is allowed.
+    accel : float
+        Acceleration of the follower until then [m/s²]; 0 is allowed.
+    decel, leader_decel : float
+        Braking that the follower is sure to reach, and the hardest of the leader [m/s²], positive.
+
+    Raises
+    ------
+    ValueError
+        If an argument is negative or not finite, or a deceleration is 0.
+
+    Examples
+    --------
+    >>> rss = ResponsibilitySensitiveSafety(0.5, 2.0, decel=5.0, leader_decel=8.0)
+    >>> rss.score(np.array([[50.0, 20.0, 20.0], [25.0, 20.0, 20.0]]), dt=0.1)
+    array([-20.65,   4.35])
+    """
+
+    response: float
+    accel: float
+    decel: float
+    leader_decel: float
+
+    _may_be_zero = ("response", "accel")
+
+    @classmethod
+    def r157(cls) -> Self:
+        """Constants with which RSS was compared for UN Regulation No. 157.
+
+        Response 0.75 s, acceleration 3 m/s², 6 m/s² of braking for both cars, as in the published
+        implementation (JRC-FSM) behind Mattas et al. (2022), Accident Analysis & Prevention 174.
+        """
+        return cls(response=0.75, accel=3.0, decel=6.0, leader_decel=6.0)
+
+    @classmethod
+    def matched(
+        cls, decel: float, leader_decel: float, response: float = 0.25, accel: float = 2.5
+    ) -> Self:
+        """Given what both cars can truly do [m/s²]; responding at the next decision [s]."""
+        return cls(response, accel, decel, leader_decel)
+
+    def score(self, observations: Floats, dt: float) -> Floats:
+        """Safe distance − gap [m]; infinite where the cars have met."""
+        gap = _columns(observations)[0]
+        safe = safe_distance(observations, self.response, self.accel, self.decel, self.leader_decel)
+        return _unsafe_once_met(gap, safe - gap)
+
+
+def distance_to_avoid(observations: Floats, reaction: float, decel: float) -> Floats:
+    """Gap from which the follower can still avoid a leader that keeps its speed.
+
+    Parameters
+    ----------
+    observations : (..., 3) ndarray
+        Gap [m], which does not matter here, speed of the follower and of the leader [m/s].
+    reaction : float
+        Time before the follower brakes [s].
+    decel : float
+        Its braking then [m/s²], positive.
+
+    Returns
+    -------
+    (...) ndarray
+        closing² / (2·decel) + closing·reaction [m], the regulation's time to collision times the
+        closing speed; 0 where the follower is not the faster one.
+
+    Examples
+    --------
+    >>> distance_to_avoid(np.array([[50.0, 30.0, 18.0], [50.0, 18.0, 30.0]]), 0.5, 6.0)
+    array([18.,  0.])
+    """
+    _, speed, leader_speed = _columns(observations)
+    closing = np.maximum(speed - leader_speed, 0.0)
+    return np.asarray(closing**2 / (2.0 * decel) + closing * reaction)
+
+
+@dataclass(frozen=True)
+class PerformanceModel(_Measure):
+    """Danger where a driver of UN Regulation No. 157 could not avoid the collision any more.
+
+    The regulation (5.2.5.2 and Annex 4, Appendix 3) compares times to collision; here they are
+    multiplied by the closing speed, so that the score is a distance and defined at any speeds. Its
+    sign stays the same.
+
+    Parameters
+    ----------
+    reaction : float
+        Time before the follower brakes [s]; 0 is allowed.
+    decel : float
+        Its braking then [m/s²], positive.
+
+    Raises
+    ------
+    ValueError
+        If ``decel`` is not positive and finite, or ``reaction`` is negative or not finite.
+
+    Examples
+    --------
+    >>> observations = np.array([[15.0, 30.0, 18.0], [17.0, 30.0, 18.0]])
+    >>> PerformanceModel.regulation().score(observations, dt=0.1)
+    array([ 1.2, -0.8])
+    """
+
+    reaction: float
+    decel: float
+
+    _may_be_zero = ("reaction",)
+
+    @classmethod
+    def regulation(cls) -> Self:
+        """The minimum for a car that cuts in, paragraph 5.2.5.2: 0.35 s and 6 m/s²."""
+        return cls(reaction=0.35, decel=6.0)
+
+    @classmethod
+    def careful_human(cls) -> Self:
+        """The competent and careful human driver of Annex 4 Appendix 3: 0.75 s and 0.774 g.
+
+        Its 0.6 s from the first to full braking are left out.
+        """
+        return cls(reaction=0.75, decel=0.774 * _GRAVITY)
+
+    def score(self, observations: Floats, dt: float) -> Floats:
+        """Distance to avoid − gap [m]; infinite where the cars have met."""
+        gap = _columns(observations)[0]
+        needed = distance_to_avoid(observations, self.reaction, self.decel)
+        return _unsafe_once_met(gap, needed - gap)
+
+
+# -- Fuzzy safety ---------------------------------------------------------------------------------
+
+
+def proactive_fuzzy(
+    observations: Floats,
+    reaction: float,
+    comfortable_decel: float,
+    decel: float,
+    leader_decel: float,
+    margin: float,
+) -> Floats:
+    """PFS, how unsafe the gap is should the leader brake in full (Mattas et al. 2020).
+
+    With the distance s(b) = v·reaction + v² / (2·b) − v_leader² / (2·leader_decel), it is 1 for
+    gap − margin below s(decel), 0 above s(comfortable_decel) + margin, and linear in between.
+
+    Parameters
+    ----------
+    observations : (..., 3) ndarray
+        Gap [m], speed of the follower and of the leader [m/s].
+    reaction, comfortable_decel, decel, leader_decel, margin
+        As in `FuzzySafety`.
+
+    Returns
+    -------
+    (...) ndarray
+        From 0, safe, to 1, unsafe; 1 where the cars have met.
+
+    Examples
+    --------
+    >>> observations = np.array([[50.0, 20.0, 20.0], [32.0, 20.0, 20.0], [20.0, 20.0, 20.0]])
+    >>> proactive_fuzzy(observations, 1.0, 4.0, 5.0, 5.0, margin=2.0).round(2)
+    array([0.  , 0.17, 1.  ])
+    """
+    gap, speed, leader_speed = _columns(observations)
+    shared = speed * reaction - leader_speed**2 / (2.0 * leader_decel)
+    unsafe = shared + speed**2 / (2.0 * decel)
+    safe = shared + speed**2 / (2.0 * comfortable_decel) + margin
+    return np.where(gap <= 0.0, 1.0, _membership(gap - margin, unsafe, safe))
+
+
+def critical_fuzzy(
+    observations: Floats, dt: float, reaction: float, comfortable_decel: float, decel: float
+) -> Floats:
+    """CFS, how unsafe the gap is while the follower closes in on a leader that keeps its speed.
+
+    Until it reacts, the follower keeps its acceleration, or brakes by ``comfortable_decel`` where
+    it brakes harder than that. If it is then still the faster one, CFS is 1 for gaps from which
+    ``decel`` would not do, 0 for gaps from which ``comfortable_decel`` does, and linear in
+    between. If not, it is 1 for gaps from which the present braking does not do, and 0 else.
+
+    Parameters
+    ----------
+    observations : (..., T, 3) ndarray
+        Gap [m], speed of the follower and of the leader [m/s], in the order of time.
+    dt : float
+        Time between two rows [s]. The acceleration is the one since the row before, and 0 in the
+        first row.
+    reaction, comfortable_decel, decel
+        As in `FuzzySafety`.
+
+    Returns
+    -------
+    (..., T) ndarray
+        From 0, safe, to 1, unsafe; 0 where the follower is not the faster one, 1 where the cars
+        have met.
+
+    Raises
+    ------
+    ValueError
+        If ``dt`` is not positive and finite.
+
+    Examples
+    --------
+    >>> observations = np.array([[30.0, 20.0, 10.0], [21.0, 20.0, 10.0], [5.0, 20.0, 10.0]])
+    >>> critical_fuzzy(observations, 0.5, 1.0, comfortable_decel=4.0, decel=5.0)
+    array([0. , 0.6, 1. ])
+    """
+    gap, speed, leader_speed = _columns(observations)
+    closing = speed - leader_speed
+    accel = _acceleration(speed, dt)
+    change = np.maximum(accel, -comfortable_decel) * reaction
+    later = closing + change
+    travelled = (closing + later) / 2.0 * reaction
+    approaches = closing > 0.0
+    slows = approaches & (later < 0.0)
+    # What the present braking needs until the speeds are equal.
+    present = np.zeros_like(gap)
+    np.divide(closing**2, -2.0 * accel, out=present, where=slows)
+    unsafe = np.where(slows, present, travelled + later**2 / (2.0 * decel))
+    safe = np.where(slows, present, travelled + later**2 / (2.0 * comfortable_decel))
+    critical = np.where(approaches, _membership(gap, unsafe, safe), 0.0)
+    return np.where(gap <= 0.0, 1.0, critical)
+
+
+def _membership(gap: Floats, unsafe: Floats, safe: Floats) -> Floats:
+    """1 below ``unsafe``, 0 from ``safe`` on, and linear in between."""
+    member = np.asarray(gap < unsafe, dtype=np.float64)
+    np.divide(safe - gap, safe - unsafe, out=member, where=(gap >= unsafe) & (gap < safe))
+    return member
+
+
+@dataclass(frozen=True)
+class FuzzySafety(_Measure):
+    """Danger where the Fuzzy Safety Model of UN Regulation No. 157 begins to brake.
+
+    It brakes gently before it must brake hard (Mattas et al. 2020, Accident Analysis & Prevention
+    148; 2022, the same 174).
+
+    Parameters
+    ----------
+    reaction : float
+        Time before the follower reacts [s]; 0 is allowed.
+    comfortable_decel, decel, leader_decel : float
+        Comfortable and hardest braking of the follower, braking of the leader [m/s²], positive;
+        ``decel`` is not the weaker one.
+    margin : float
+        Gap to be left at standstill, and once more before the follower must brake [m]; 0 is
+        allowed.
+    threshold : float
+        Degree of danger above which it calls for braking, from 0 to below 1; the model itself
+        brakes from 0 on, the harder the more dangerous it is.
+
+    Raises
+    ------
+    ValueError
+        If an argument is out of range or not finite.
+
+    Examples
+    --------
+    >>> FuzzySafety().score(np.array([[60.0, 20.0, 20.0], [25.0, 20.0, 20.0]]), dt=0.1).round(3)
+    array([0.   , 0.827])
+    """
+
+    reaction: float = 0.75
+    comfortable_decel: float = 4.0
+    decel: float = 6.0
+    leader_decel: float = 7.0
+    margin: float = 2.0
+    threshold: float = 0.0
+
+    _may_be_zero = ("reaction", "margin", "threshold")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.decel < self.comfortable_decel:
+            raise ValueError(
+                f"FuzzySafety decel is {self.decel}; it must not be below comfortable_decel, "
+                f"which is {self.comfortable_decel}"
+            )
+        if self.threshold >= 1.0:
+            raise ValueError(f"FuzzySafety threshold is {self.threshold}; it must be below 1")
+
+    def score(self, observations: Floats, dt: float) -> Floats:
+        """The larger one of PFS and CFS − threshold; 1 − threshold where the cars have met."""
+        own = self.reaction, self.comfortable_decel, self.decel
+        proactive = proactive_fuzzy(observations, *own, self.leader_decel, self.margin)
+        return np.maximum(proactive, critical_fuzzy(observations, dt, *own)) - self.threshold
+
+
+#: Measures with the constants of their sources, by the names of their revisers.
+FIXED_MEASURES: Mapping[str, RiskMeasure] = {
+    "aeb-ttc": TimeToCollision(),
+    "mttc": ModifiedTimeToCollision(),
+    "drac": DecelerationToAvoidCollision(),
+    "headway": TimeHeadway(),
+    "picud": Picud(),
+    "rss-r157": ResponsibilitySensitiveSafety.r157(),
+    "r157-regulation": PerformanceModel.regulation(),
+    "r157-careful": PerformanceModel.careful_human(),
+    "fuzzy": FuzzySafety(),
+}
+
+
+# -- The truth ------------------------------------------------------------------------------------
+
+
+def is_dead_end(observations: Floats, decel: float, leader_decel: float) -> NDArray[np.bool_]:
+    """Whether the cars collide if both brake in full from now until standstill.
+
+    Only a simulation knows both limits. It scores what was learnt; nothing learns from it.
+
+    Parameters
+    ----------
+    observations : (..., 3) ndarray
+        Gap [m], speed of the follower and of the leader [m/s].
+    decel, leader_decel : float
+        Hardest braking of the follower and of the leader [m/s²], positive.
+
+    Returns
+    -------
+    (...) ndarray of bool
+
+    Examples
+    --------
+    >>> is_dead_end(np.array([[30.0, 20.0, 20.0], [25.0, 20.0, 20.0]]), 4.0, 9.0)
+    array([False,  True])
+    """
+    gap, speed, leader_speed = _columns(observations)
+    stopped = gap + leader_speed**2 / (2 * leader_decel) - speed**2 / (2 * decel)
+    smallest = np.minimum(gap, stopped)
+    # A follower who brakes harder is nearest when the speeds meet, if both still move then.
+    if decel > leader_decel:
+        meeting = (speed - leader_speed) / (decel - leader_decel)
+        moving = (meeting > 0.0) & (meeting < leader_speed / leader_decel)
+        nearest = gap - (speed - leader_speed) ** 2 / (2 * (decel - leader_decel))
+        smallest = np.where(moving, np.minimum(smallest, nearest), smallest)
+    return np.asarray(smallest <= 0.0)

@@ -1,0 +1,241 @@
+"""What is driven, as data: a leader ahead of whatever drives the follower."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evofsm.driving.drivers import IDM
+
+#: No scenario has more, so that no file can ask for more memory than there is.
+MOST_STEPS = 2_000_000
+
+
+@dataclass(frozen=True)
+class CutIn:
+    """Another car moves in between: from then on it is the leader.
+
+    Parameters
+    ----------
+    time : float
+        When [s].
+    gap : float
+        Bumper to bumper from the follower to it [m].
+    speed : float
+        Its speed [m/s].
+    """
+
+    time: float
+    gap: float
+    speed: float
+
+    def __post_init__(self) -> None:
+        _require_positive("cut-in's", gap=self.gap)
+        _require_not_negative("cut-in's", time=self.time, speed=self.speed)
+
+
+@dataclass(frozen=True)
+class Leader:
+    """A leader on a free road who, once, may brake in full until standstill.
+
+    Parameters
+    ----------
+    driver : IDM
+        How it drives before.
+    brake_decel : float
+        Deceleration of the full brake [m/s²], positive.
+    brake_speed : float
+        It brakes on reaching this speed [m/s] ...
+    brake_time : float
+        ... or at this time [s], whichever comes first.
+    initial_speed : float
+        Speed at the start [m/s].
+    waves : tuple of (float, float)
+        From a time [s] on it accelerates so [m/s²] instead of by ``driver``; in order of time.
+    cut_in : CutIn, optional
+        Another car that takes its place.
+    """
+
+    driver: IDM
+    brake_decel: float
+    brake_speed: float = math.inf
+    brake_time: float = math.inf
+    initial_speed: float = 0.0
+    waves: tuple[tuple[float, float], ...] = ()
+    cut_in: CutIn | None = None
+
+    def __post_init__(self) -> None:
+        _require_positive("leader's", brake_decel=self.brake_decel)
+        for name in ("brake_speed", "brake_time"):
+            if not getattr(self, name) >= 0.0:
+                raise ValueError(f"leader's {name} is {getattr(self, name)}; it must be 0 or more")
+        _require_not_negative("leader's", initial_speed=self.initial_speed)
+        times = [time for time, _ in self.waves]
+        if times != sorted(times) or not np.isfinite(np.ravel(self.waves)).all():
+            raise ValueError(f"leader's waves are {self.waves}; they must be finite, in order")
+
+
+@dataclass(frozen=True)
+class Body:
+    """What the follower's body makes of a command: limits, a jerk limit, a delay.
+
+    Parameters
+    ----------
+    lowest, highest : float
+        Bounds of the realised acceleration [m/s²].
+    delay : float
+        Time from a command to its effect [s].
+    jerk : float
+        Fastest change of the realised acceleration [m/s³].
+    """
+
+    lowest: float = -math.inf
+    highest: float = math.inf
+    delay: float = 0.0
+    jerk: float = math.inf
+
+    def __post_init__(self) -> None:
+        if not self.lowest < self.highest:
+            raise ValueError(f"body's bounds are [{self.lowest}, {self.highest}]; lowest is first")
+        _require_not_negative("body's", delay=self.delay)
+        if not self.jerk > 0.0:
+            raise ValueError(f"body's jerk is {self.jerk}; it must be positive")
+
+
+@dataclass(frozen=True)
+class Sensors:
+    """How well the follower sees: noise and delay.
+
+    Parameters
+    ----------
+    gap_noise : float
+        Standard deviation of the gap [m].
+    speed_noise : float
+        Standard deviation of both speeds [m/s].
+    delay : float
+        Age of what is seen [s].
+    seed : int
+        Of the noise.
+    """
+
+    gap_noise: float = 0.0
+    speed_noise: float = 0.0
+    delay: float = 0.0
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        _require_not_negative(
+            "sensors'",
+            gap_noise=self.gap_noise,
+            speed_noise=self.speed_noise,
+            delay=self.delay,
+        )
+
+
+@dataclass(frozen=True)
+class Behind:
+    """A third car, behind the follower.
+
+    Parameters
+    ----------
+    driver : IDM
+    gap : float
+        Bumper to bumper from it to the follower at the start [m].
+    """
+
+    driver: IDM
+    gap: float
+
+    def __post_init__(self) -> None:
+        _require_positive("the car behind's", gap=self.gap)
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """Cars on a straight road, from a given start until two collide or time is up.
+
+    Parameters
+    ----------
+    leader : Leader
+    initial_gap : float
+        From bumper to bumper [m].
+    duration : float
+        Time that is driven at most [s].
+    dt : float
+        Time of a step [s].
+    initial_speed : float
+        Of the follower, and of the car behind it [m/s].
+    body : Body
+    sensors : Sensors
+    behind : Behind, optional
+    """
+
+    leader: Leader
+    initial_gap: float
+    duration: float = 35.0
+    dt: float = 0.01
+    initial_speed: float = 0.0
+    body: Body = field(default_factory=Body)
+    sensors: Sensors = field(default_factory=Sensors)
+    behind: Behind | None = None
+
+    def __post_init__(self) -> None:
+        _require_positive(
+            "scenario's", initial_gap=self.initial_gap, duration=self.duration, dt=self.dt
+        )
+        _require_not_negative("scenario's", initial_speed=self.initial_speed)
+        if self.duration < 2 * self.dt:
+            raise ValueError(
+                f"scenario's duration is {self.duration} and its dt {self.dt}; "
+                "it must last two steps or more"
+            )
+        for name, seconds in (
+            ("scenario's duration", self.duration),
+            ("body's delay", self.body.delay),
+            ("sensors' delay", self.sensors.delay),
+        ):
+            if seconds / self.dt > MOST_STEPS:
+                raise ValueError(
+                    f"{name} is {seconds} s, in steps of {self.dt} s; no more than {MOST_STEPS:,} "
+                    "steps are driven"
+                )
+
+    @property
+    def times(self) -> NDArray[np.float64]:
+        """(steps,) ndarray: when a full run is observed [s], as decimals: 0.07, not 7 * 0.01."""
+        return np.round(np.arange(self.steps(self.duration)) * self.dt, 9)
+
+    def steps(self, seconds: float) -> int:
+        """How many steps that is, rounded."""
+        return round(seconds / self.dt)
+
+    def steps_between(self, interval: float) -> int:
+        """How many steps lie between two decisions.
+
+        Raises
+        ------
+        ValueError
+            If the time between decisions is no whole number of them.
+        """
+        steps = self.steps(interval)
+        if steps < 1 or not math.isclose(steps * self.dt, interval):
+            raise ValueError(
+                f"interval is {interval} s, which is no whole number of the scenario's "
+                f"steps of {self.dt} s"
+            )
+        return steps
+
+
+def _require_positive(whose: str, **values: float) -> None:
+    for name, value in values.items():
+        if not 0.0 < value < math.inf:
+            raise ValueError(f"{whose} {name} is {value}; it must be positive and finite")
+
+
+def _require_not_negative(whose: str, **values: float) -> None:
+    for name, value in values.items():
+        if not 0.0 <= value < math.inf:
+            raise ValueError(f"{whose} {name} is {value}; it must be finite, 0 or more")

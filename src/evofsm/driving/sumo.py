@@ -1,0 +1,471 @@
+"""The same cars in SUMO, through libsumo, under exact external control; and SUMO as a driver.
+
+SUMO moves the cars and says where they are; both accelerations come from outside. What it takes
+to have them carried out to the letter: speed mode 0 (SUMO checks nothing), a speed set for every
+step, the ballistic update, and no teleporting, no gap added to collisions, no random speeds.
+"""
+
+from __future__ import annotations
+
+import math
+import tempfile
+from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from importlib import import_module
+from pathlib import Path
+from typing import Any, Self
+from xml.sax.saxutils import quoteattr
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evofsm.driving.scenarios import Scenario
+from evofsm.driving.world import (
+    ACCELERATION_BEHIND,
+    GAP,
+    GAP_BEHIND,
+    LEADER_ACCELERATION,
+    LEADER_SPEED,
+    REALISED,
+    SPEED,
+    SPEED_BEHIND,
+    Drives,
+    Episode,
+    KinematicWorld,
+    Road,
+    World,
+    decide,
+    drive_alone,
+)
+from evofsm.extras import needs
+from evofsm.guard import Proposal
+
+#: The worlds there are.
+WORLDS = ("sumo", "kinematic")
+
+_ROAD_LENGTH = 200_000.0
+_FASTEST = 100.0
+_VEHICLE_LENGTH = 5.0
+# Where the front bumper of the last car stands at first.
+_FIRST = 10.0
+
+_NET = f"""<net version="1.20">
+    <location netOffset="0,0" convBoundary="0,0,{_ROAD_LENGTH:.2f},0"
+              origBoundary="0,0,{_ROAD_LENGTH:.2f},0" projParameter="!"/>
+    <edge id="road" from="begin" to="end" priority="1">
+        <lane id="road_0" index="0" speed="{_FASTEST}" length="{_ROAD_LENGTH:.2f}"
+              shape="0,0 {_ROAD_LENGTH:.2f},0"/>
+    </edge>
+    <junction id="begin" type="dead_end" x="0" y="0" incLanes="" intLanes="" shape="0,0 0,3.2"/>
+    <junction id="end" type="dead_end" x="{_ROAD_LENGTH:.2f}" y="0" incLanes="road_0" intLanes=""
+              shape="{_ROAD_LENGTH:.2f},0 {_ROAD_LENGTH:.2f},3.2"/>
+</net>
+"""
+
+_ROUTES = """<routes>
+    {kinds}
+    <route id="along" edges="road"/>
+</routes>
+"""
+
+_CAR = (
+    f'minGap="0" maxSpeed="{_FASTEST}" accel="100" decel="100" emergencyDecel="100" '
+    'speedFactor="1" speedDev="0" sigma="0"'
+)
+
+
+class SumoWorld:
+    """The world that is SUMO itself. Close it after use, or use it in a ``with`` statement.
+
+    Parameters
+    ----------
+    options : sequence of str
+        Further options of SUMO, such as ``("--fcd-output", "trace.xml")``.
+
+    Raises
+    ------
+    ModuleNotFoundError
+        If libsumo is not installed.
+
+    Notes
+    -----
+    libsumo holds one simulation per process; a second one would silently end the first, and is
+    refused here.
+    """
+
+    def __init__(self, options: Sequence[str] = ()) -> None:
+        with needs("libsumo", "sumo", "the world 'sumo'"):
+            self._sumo: Any = import_module("libsumo")
+        self._options = list(options)
+        self._folder: tempfile.TemporaryDirectory[str] | None = None  # while a simulation is open
+        self._dt = 0.0
+        self._runs = 0
+        self._road: _Road | None = None  # the latest
+        self._kinds = {_CAR: "car"}  # attributes of each kind of car, and its id
+        self._known: set[str] = set()  # the kinds that the simulation has
+
+    def open(self, scenario: Scenario) -> AbstractContextManager[Road]:
+        """Put the cars on a road, for use in a ``with`` statement."""
+        _refuse_what_sumo_cannot_drive(scenario)
+        goes_on = self._folder is not None and self._sumo.isLoaded()
+        if not goes_on or self._dt != scenario.dt or len(self._known) < len(self._kinds):
+            self.close()
+            self._start(scenario.dt)
+        self._runs += 1
+        self._road = _Road(self._sumo, self._runs, scenario)
+        return self._road
+
+    def run(self, scenario: Scenario, controller: Drives) -> Episode:
+        """Drive the scenario with ``controller`` in the follower, asked at every step."""
+        with self.open(scenario) as road:
+            return drive_alone(road, controller)
+
+    def add_kind(self, attributes: Mapping[str, str]) -> str:
+        """A kind of car that SUMO can drive, known on every road opened from now on.
+
+        Parameters
+        ----------
+        attributes : mapping of str to str
+            Of SUMO's ``vType``, without ``id`` and ``length``.
+
+        Returns
+        -------
+        str
+            Its id.
+        """
+        given = " ".join(f"{name}={quoteattr(value)}" for name, value in attributes.items())
+        return self._kinds.setdefault(given, f"car{len(self._kinds)}")
+
+    def wish(
+        self, kind: str, observation: NDArray[np.float64], time: float, leader_decel: float
+    ) -> float:
+        """What SUMO itself would do with the follower, were it a car of this kind.
+
+        Parameters
+        ----------
+        kind : str
+            An id that `add_kind` gave.
+        observation : (3,) ndarray
+            Gap [m], v_follower [m/s], v_leader [m/s].
+        time : float
+            Now, on the road that was opened last [s].
+        leader_decel : float
+            How hard the follower takes the leader to be able to brake [m/s²].
+
+        Returns
+        -------
+        float
+            Acceleration over one step [m/s²].
+
+        Raises
+        ------
+        RuntimeError
+            If no road of this world is at that time.
+        """
+        road = self._road
+        if road is None or not road.is_open or road.time != time:
+            at = f"a road at {road.time:g} s" if road is not None and road.is_open else "no road"
+            raise RuntimeError(
+                f"a SUMO-driven car was asked at {time:g} s, but its SumoWorld has {at} open: "
+                "it drives only in the world that it was made with, and is told the road's time"
+            )
+        if kind not in self._known:
+            raise RuntimeError(
+                "this SUMO-driven car was made after the road was opened, and SUMO does not know "
+                "its kind yet: make it first, then open the road"
+            )
+        return road.wish(kind, observation, leader_decel)
+
+    def close(self) -> None:
+        """End the simulation."""
+        if self._folder is not None:
+            if self._sumo.isLoaded():
+                self._sumo.close()
+            self._folder.cleanup()
+            self._folder = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+    def _start(self, dt: float) -> None:
+        if self._sumo.isLoaded():
+            raise RuntimeError(
+                "this process runs a SUMO simulation already, and libsumo has room for one: "
+                "close that one, or use another process"
+            )
+        folder = tempfile.TemporaryDirectory(prefix="evofsm-sumo-")
+        net, routes = Path(folder.name) / "road.net.xml", Path(folder.name) / "road.rou.xml"
+        net.write_text(_NET)
+        kinds = "\n    ".join(
+            f'<vType id="{kind}" length="{_VEHICLE_LENGTH}" {attributes}/>'
+            for attributes, kind in self._kinds.items()
+        )
+        routes.write_text(_ROUTES.format(kinds=kinds))
+        try:
+            self._sumo.start(
+                [
+                    "sumo",
+                    *("--net-file", str(net)),
+                    *("--route-files", str(routes)),
+                    *("--step-length", repr(dt)),
+                    *("--step-method.ballistic", "true"),
+                    *("--collision.action", "warn"),
+                    *("--collision.mingap-factor", "0"),
+                    *("--time-to-teleport", "-1"),
+                    *("--no-step-log", "true"),
+                    *("--no-warnings", "true"),
+                    *self._options,
+                ]
+            )
+        except BaseException:
+            folder.cleanup()
+            raise
+        self._folder, self._dt, self._known = folder, dt, set(self._kinds.values())
+
+
+def open_world(name: str) -> AbstractContextManager[World]:
+    """Open a world by its name, one of `WORLDS`, for use in a ``with`` statement."""
+    if name == "sumo":
+        return SumoWorld()
+    if name == "kinematic":
+        return nullcontext(KinematicWorld())
+    raise ValueError(f"there is no world {name!r}; there are {', '.join(WORLDS)}")
+
+
+def _refuse_what_sumo_cannot_drive(scenario: Scenario) -> None:
+    milliseconds = scenario.dt * 1000.0
+    if round(milliseconds) < 1 or abs(milliseconds - round(milliseconds)) > 1e-9:
+        raise ValueError(
+            f"dt is {scenario.dt} s, but SUMO's clock counts whole milliseconds: it would drive "
+            "another step; choose one of 0.001 s, 0.002 s, ..., or the kinematic world"
+        )
+    # Nobody is faster than this; what the leader needs, the follower does not exceed.
+    farthest = _start(scenario) + scenario.initial_gap + _FASTEST * scenario.duration
+    if farthest > _ROAD_LENGTH:
+        raise ValueError(
+            f"initial_gap {scenario.initial_gap:g} m and duration {scenario.duration:g} s may lead "
+            f"beyond the road's {_ROAD_LENGTH:g} m"
+        )
+
+
+def _start(scenario: Scenario) -> float:
+    """Where the follower's front bumper stands at first [m], behind it what else there is."""
+    behind = scenario.behind
+    return _FIRST + (behind.gap + _VEHICLE_LENGTH if behind else 0.0)
+
+
+class _Road(Road):
+    """Cars of their own for one run, in a simulation that goes on from run to run."""
+
+    def __init__(self, sumo: Any, run: int, scenario: Scenario) -> None:
+        super().__init__(scenario)
+        self._sumo = sumo
+        self.is_open = True
+        self._cars = [f"{role}{run}" for role in ("follower", "leader", "behind")]
+        start, record = _start(scenario), self._record[0]
+        starts = [start, start + scenario.initial_gap + _VEHICLE_LENGTH, _FIRST]
+        speeds = record[[SPEED, LEADER_SPEED, SPEED_BEHIND]].tolist()
+        if scenario.behind is None:
+            del self._cars[2], starts[2], speeds[2]
+        for car, position, speed in zip(self._cars, starts, speeds, strict=True):
+            # Standing, as SUMO does not insert a car that is too fast for the one ahead.
+            sumo.vehicle.add(
+                car, "along", "car", depart="now", departPos=repr(position), departSpeed="0"
+            )
+            sumo.vehicle.setSpeedMode(car, 0)
+            sumo.vehicle.setSpeed(car, speed)
+        sumo.simulationStep()  # the first step only puts the cars on the road
+        for car, speed in zip(self._cars, speeds, strict=True):
+            sumo.vehicle.setPreviousSpeed(car, speed)
+        self._observe()
+
+    def advance(self, command: float, steps: int = 1) -> None:
+        for _ in range(steps):
+            decide(self._plan, self._record, self.row, command)
+            if self.over:
+                break
+            accelerations = self._record[self.row, [REALISED, LEADER_ACCELERATION]].tolist()
+            accelerations.append(float(self._record[self.row, ACCELERATION_BEHIND]))
+            self._move(accelerations)
+            self.row += 1
+            if self.row == self._plan.cut_in[0]:
+                self._cut_in(*self._plan.cut_in[1:].tolist())
+            self._observe()
+
+    def wish(self, kind: str, observation: NDArray[np.float64], leader_decel: float) -> float:
+        """As `SumoWorld.wish`: SUMO's car-following model, within the bounds that SUMO puts to it.
+
+        Asked of the follower itself, which this makes a car of that kind; it obeys as before.
+        """
+        vehicle, dt = self._sumo.vehicle, self.scenario.dt
+        follower, leader = self._cars[:2]
+        if vehicle.getTypeID(follower) != kind:
+            vehicle.setType(follower, kind)
+        gap, speed, leader_speed = observation.tolist()
+        # SUMO's models take the gap without minGap; those that need all of it add it again.
+        wanted = vehicle.getFollowSpeed(
+            *(follower, speed, gap - vehicle.getMinGap(follower)),
+            *(leader_speed, leader_decel, leader),
+        )
+        fastest = min(vehicle.getAllowedSpeed(follower), speed + vehicle.getAccel(follower) * dt)
+        fastest = max(fastest, speed - vehicle.getDecel(follower) * dt)  # if above the limit
+        slowest = speed - vehicle.getEmergencyDecel(follower) * dt
+        return float((max(min(wanted, fastest), slowest) - speed) / dt)
+
+    def _move(self, accelerations: list[float]) -> None:
+        vehicle = self._sumo.vehicle
+        for car, acceleration in zip(self._cars, accelerations, strict=False):
+            speed = max(0.0, vehicle.getSpeed(car) + acceleration * self.scenario.dt)
+            vehicle.setSpeed(car, speed)
+        self._sumo.simulationStep()
+
+    def _cut_in(self, gap: float, speed: float) -> None:
+        vehicle = self._sumo.vehicle
+        follower, leader = self._cars[:2]
+        vehicle.moveTo(leader, "road_0", vehicle.getLanePosition(follower) + gap + _VEHICLE_LENGTH)
+        vehicle.setPreviousSpeed(leader, speed)
+        vehicle.setSpeed(leader, speed)
+
+    def _observe(self) -> None:
+        vehicle, now = self._sumo.vehicle, self._record[self.row]
+        position = [vehicle.getLanePosition(car) for car in self._cars]
+        now[GAP] = position[1] - _VEHICLE_LENGTH - position[0]
+        now[GAP_BEHIND] = math.inf
+        now[SPEED], now[LEADER_SPEED] = (vehicle.getSpeed(car) for car in self._cars[:2])
+        if self.scenario.behind is not None:
+            now[GAP_BEHIND] = position[0] - _VEHICLE_LENGTH - position[2]
+            now[SPEED_BEHIND] = vehicle.getSpeed(self._cars[2])
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.is_open = False
+        for car in self._cars:
+            if car in self._sumo.vehicle.getIDList():
+                self._sumo.vehicle.remove(car)
+        self._sumo.simulationStep()
+
+
+# -- SUMO as a driver ---------------------------------------------------------------------------
+
+#: What every model takes: attributes of SUMO's ``vType``.
+COMMON = ("accel", "decel", "emergencyDecel", "tau", "minGap", "maxSpeed", "speedFactor")
+#: The models there are, and what each takes besides.
+MODELS: dict[str, tuple[str, ...]] = {
+    "IDM": ("delta", "stepping"),
+    "Krauss": (),
+    "KraussOrig1": (),
+    "ACC": (
+        *("speedControlGain", "gapControlGainSpeed", "gapControlGainSpace"),
+        *("gapClosingControlGainSpeed", "gapClosingControlGainSpace"),
+        *("collisionAvoidanceGainSpeed", "collisionAvoidanceGainSpace"),
+    ),
+    "CACC": (
+        *("speedControlGainCACC", "gapControlGainGap", "gapControlGainGapDot"),
+        *("gapClosingControlGainGap", "gapClosingControlGainGapDot"),
+        *("collisionAvoidanceGainGap", "collisionAvoidanceGainGapDot"),
+    ),
+}
+_MAY_BE_ANYTHING = {name for names in MODELS.values() for name in names} - {"stepping"}
+_MAY_BE_ZERO = {"tau", "minGap"}
+
+
+class SumoDriver:
+    """A follower with the car-following model of SUMO, for use in one `SumoWorld`.
+
+    It proposes what SUMO would do in its next step: the wish of the model, within the ``accel``
+    and ``emergencyDecel`` of the car and up to its speed limit. On its own it drives as SUMO does,
+    to the last digit; under a reviser, what is executed is carried out exactly.
+
+    Parameters
+    ----------
+    world : SumoWorld
+        Where it drives. Make the driver before the road is opened.
+    model : str
+        One of `MODELS`.
+    leader_decel : float
+        How hard it takes the leader to be able to brake [m/s²]; SUMO's preset for a passenger car.
+        Krauss' models rely on it, IDM does not.
+    **attributes : float
+        Of SUMO's ``vType``, such as ``accel``, ``decel``, ``tau``, ``minGap``, ``maxSpeed`` (the
+        desired speed on a free road: the road itself allows 100 m/s), ``emergencyDecel``, each in
+        SUMO's unit, which is SI. What is not given is SUMO's preset.
+
+    Raises
+    ------
+    TypeError
+        If ``world`` is another one than SUMO.
+    ValueError
+        If there is no such model or attribute, or a value is impossible.
+
+    Notes
+    -----
+    The acceleration is that of one step of the simulation: ``(wished speed - speed) / dt``. Whoever
+    decides more rarely holds it for longer than SUMO would. As SUMO wishes for no speed below 0,
+    it never brakes harder than to a standstill within the step; and where the step is longer than
+    ``stepping`` (0.25 s), SUMO's IDM takes several smaller ones in it.
+
+    The models are those whose wish, read before the step, is what SUMO then does. It is not for
+    EIDM, PWagner2009, SmartSK and Daniel1, which draw at random or remember being asked; nor for
+    Wiedemann on a free road; W99 has an acceleration of its own. Dawdling (``sigma``) is no wish:
+    SUMO adds it later.
+
+    Examples
+    --------
+    >>> from evofsm.driving import IDM, Leader, Scenario
+    >>> leader = Leader(IDM(1.2, 25.0, 1.0, 1.0, 2.5), brake_decel=5.0, brake_time=8.0)
+    >>> with SumoWorld() as world:
+    ...     driver = SumoDriver(world, "Krauss", accel=2.0, decel=4.0, tau=1.0, minGap=2.0)
+    ...     episode = world.run(Scenario(leader, initial_gap=10.0, duration=20.0), driver)
+    >>> episode.collided, float(round(episode.accelerations[0], 6))
+    (False, 2.0)
+    """
+
+    def __init__(
+        self,
+        world: SumoWorld,
+        model: str = "IDM",
+        *,
+        leader_decel: float = 4.5,
+        **attributes: float,
+    ) -> None:
+        if not isinstance(world, SumoWorld):
+            raise TypeError(f"world is {world!r}; a SUMO-driven car drives in a SumoWorld only")
+        _refuse_impossible(model, leader_decel, attributes)
+        self.world = world
+        self.model = model
+        self.leader_decel = leader_decel
+        self.attributes = dict(attributes)
+        given = {name: repr(float(value)) for name, value in attributes.items()}
+        # What SUMO would draw at random is fixed.
+        fixed = {"carFollowModel": model, "speedFactor": "1", "speedDev": "0", "sigma": "0"}
+        self._kind = world.add_kind(fixed | given)
+
+    def propose(self, observation: NDArray[np.float64], time: float = 0.0) -> Proposal:
+        """What SUMO would do in its next step [m/s²], seeing ``[gap, v_follower, v_leader]``.
+
+        Raises
+        ------
+        RuntimeError
+            If this is not asked on the open road of the driver's own world, at its present time.
+        """
+        return Proposal(self.world.wish(self._kind, observation, time, self.leader_decel))
+
+
+def _refuse_impossible(model: str, leader_decel: float, attributes: dict[str, float]) -> None:
+    if model not in MODELS:
+        raise ValueError(f"there is no model {model!r} here; there are {', '.join(MODELS)}")
+    known = (*COMMON, *MODELS[model])
+    for name, value in {"leader_decel": leader_decel, **attributes}.items():
+        if name not in ("leader_decel", *known):
+            raise ValueError(f"{model} takes no attribute {name!r}; it takes {', '.join(known)}")
+        if not math.isfinite(value):
+            raise ValueError(f"{name} is {value}; it must be finite")
+        if name in _MAY_BE_ZERO and value < 0.0:
+            raise ValueError(f"{name} is {value}; it must be 0 or more")
+        if name not in _MAY_BE_ZERO | _MAY_BE_ANYTHING and value <= 0.0:
+            raise ValueError(f"{name} is {value}; it must be positive")

@@ -1,0 +1,451 @@
+"""Where cars drive: how they move, what is recorded of it, and the world in closed form.
+
+The motion is SUMO's ballistic update, compiled once and the same in every world. A run is recorded
+in rows, one every ``dt``; the columns are those of `RUN_COLUMNS`. SUMO is the referee: both worlds
+agree within 1e-9 at every step.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+from numba import types
+from numpy.typing import NDArray
+
+from evofsm.driving.drivers import DRIVER_KERNEL, Kernel, idm_kernel
+from evofsm.driving.scenarios import Scenario
+from evofsm.fsm import compiled
+from evofsm.guard import Controller, Decision, Proposal
+
+#: What a row of the record holds.
+RUN_COLUMNS = (
+    *("gap", "v_follower", "v_leader", "gap_behind", "v_behind"),
+    *("commanded", "realised", "a_leader", "a_behind"),
+)
+GAP, SPEED, LEADER_SPEED, GAP_BEHIND, SPEED_BEHIND = range(5)
+COMMANDED, REALISED, LEADER_ACCELERATION, ACCELERATION_BEHIND = range(5, 9)
+# Actions that differ by less are the same [m/s²].
+_SAME = 1e-9
+
+Drives = Controller | Callable[[NDArray[np.float64]], float | Proposal]
+
+
+# -- What was driven ------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Episode:
+    """One run, a row every ``dt``; the last row of a collision is the first gap of 0 or less."""
+
+    time: NDArray[np.float64]  #: (T,) [s]
+    record: NDArray[np.float64]  #: (T, 9) the columns of `evofsm.driving.world.RUN_COLUMNS`
+    decisions: tuple[Decision, ...] = ()  #: of the guard that it was driven under, if any
+
+    @property
+    def observations(self) -> NDArray[np.float64]:
+        """(T, 3) ndarray: gap [m], v_follower [m/s], v_leader [m/s], as they truly were."""
+        return np.ascontiguousarray(self.record[:, [GAP, SPEED, LEADER_SPEED]])
+
+    @property
+    def accelerations(self) -> NDArray[np.float64]:
+        """(T,) ndarray: commanded to the follower after each row [m/s²]."""
+        return self.record[:, COMMANDED].copy()
+
+    @property
+    def leader_accelerations(self) -> NDArray[np.float64]:
+        """(T,) ndarray: commanded to the leader after each row [m/s²]."""
+        return self.record[:, LEADER_ACCELERATION].copy()
+
+    @property
+    def realised(self) -> NDArray[np.float64]:
+        """(T,) ndarray: what the follower did after each row [m/s²]; NaN after the last.
+
+        It differs from what was commanded where the body could not follow, or the car came to a
+        standstill.
+        """
+        change = np.diff(self.record[:, SPEED], append=np.nan)
+        return change / np.diff(self.time, append=np.nan)
+
+    @property
+    def collided(self) -> bool:
+        """Whether the run ended in a collision with the leader."""
+        return bool(self.record[-1, GAP] <= 0.0)
+
+    @property
+    def rear_ended(self) -> bool:
+        """Whether the car behind ran into the follower."""
+        return bool(self.record[-1, GAP_BEHIND] <= 0.0)
+
+    @property
+    def proposed(self) -> NDArray[np.float64]:
+        """(D,) ndarray: what the controller wanted at each decision [m/s²]."""
+        return np.array([decision.revision.proposed for decision in self.decisions])
+
+    @property
+    def executed(self) -> NDArray[np.float64]:
+        """(D,) ndarray: what was commanded at each decision [m/s²]."""
+        return np.array([decision.revision.executed for decision in self.decisions])
+
+    @property
+    def changed(self) -> NDArray[np.bool_]:
+        """(D,) ndarray: where the proposal was not executed, or was none that could be."""
+        change = np.abs(self.executed - self.proposed)
+        return np.asarray(~(change <= _SAME))  # also true of NaN
+
+
+# -- How cars move --------------------------------------------------------------------------------
+
+
+class Plan(NamedTuple):
+    """A scenario as kernels take it, for one run."""
+
+    times: NDArray[np.float64]  # (rows,)
+    dt: float
+    leader: NDArray[np.float64]  # (1, 9) parameters of its driver
+    waves: NDArray[np.float64]  # (k, 2) from a time on, an acceleration
+    brake: NDArray[np.float64]  # (4,) decel, speed, time, and 1 once it brakes
+    cut_in: NDArray[np.float64]  # (3,) row, gap, speed
+    body: NDArray[np.float64]  # (4,) lowest, highest, delay in steps, jerk times dt
+    behind: NDArray[np.float64]  # (1, 9) parameters of the driver behind; (0, 9) for none
+
+    @classmethod
+    def of(cls, scenario: Scenario) -> Plan:
+        """Tables of a scenario."""
+        leader, body, cut_in = scenario.leader, scenario.body, scenario.leader.cut_in
+        moved = [scenario.steps(cut_in.time), cut_in.gap, cut_in.speed] if cut_in else [-1, 0, 0]
+        return cls(
+            scenario.times,
+            scenario.dt,
+            leader.driver.parameters,
+            np.array(leader.waves, dtype=np.float64).reshape(-1, 2),
+            np.array([leader.brake_decel, leader.brake_speed, leader.brake_time, 0.0]),
+            np.array(moved, dtype=np.float64),
+            np.array(
+                [body.lowest, body.highest, scenario.steps(body.delay), body.jerk * scenario.dt]
+            ),
+            scenario.behind.driver.parameters if scenario.behind else np.empty((0, 9)),
+        )
+
+
+_TABLE, _SERIES = types.float64[:, ::1], types.float64[::1]
+_PLAN = types.NamedTuple(
+    [_SERIES, types.float64, _TABLE, _TABLE, _SERIES, _SERIES, _SERIES, _TABLE], Plan
+)
+
+
+@compiled
+def move(position: float, speed: float, acceleration: float, dt: float) -> tuple[float, float]:
+    """Position and speed one step later (SUMO's ballistic update); no one drives backwards."""
+    reached = max(0.0, speed + acceleration * dt)
+    return position + 0.5 * (speed + reached) * dt, reached
+
+
+@compiled
+def is_over(record: NDArray[np.float64], row: int) -> bool:
+    """Whether a run ends with this row: two cars have met, or it is the last."""
+    return bool(record[row, GAP] <= 0.0 or record[row, GAP_BEHIND] <= 0.0 or row + 1 == len(record))
+
+
+@compiled
+def decide(plan: Plan, record: NDArray[np.float64], row: int, command: float) -> None:
+    """Write into a row what each car does until the next, the follower being told ``command``."""
+    now, brake, body, time = record[row], plan.brake, plan.body, plan.times[row]
+    if now[LEADER_SPEED] >= brake[1] or time >= brake[2]:
+        brake[3] = 1.0
+    if brake[3] == 1.0:
+        now[LEADER_ACCELERATION] = -brake[0]
+    elif len(plan.waves) > 0 and time >= plan.waves[0, 0]:
+        wave = 0
+        while wave + 1 < len(plan.waves) and plan.waves[wave + 1, 0] <= time:
+            wave += 1
+        now[LEADER_ACCELERATION] = plan.waves[wave, 1]
+    else:
+        now[LEADER_ACCELERATION] = idm_kernel(plan.leader, time, np.inf, now[LEADER_SPEED], 0.0)
+
+    now[COMMANDED] = command
+    told = row - int(body[2])
+    realised = record[told, COMMANDED] if told >= 0 else 0.0
+    realised = min(max(realised, body[0]), body[1])
+    if body[3] < np.inf:
+        last = record[row - 1, REALISED] if row > 0 else 0.0
+        realised = min(max(realised, last - body[3]), last + body[3])
+    now[REALISED] = realised
+
+    if len(plan.behind) > 0:
+        now[ACCELERATION_BEHIND] = idm_kernel(
+            plan.behind, time, now[GAP_BEHIND], now[SPEED_BEHIND], now[SPEED]
+        )
+
+
+@compiled
+def advance(
+    plan: Plan,
+    record: NDArray[np.float64],
+    positions: NDArray[np.float64],
+    row: int,
+    command: float,
+    steps: int,
+) -> int:
+    """Some steps under one command, in closed form; returns the row reached.
+
+    ``positions`` are those of the follower, the leader, and the car behind. Where the run is over
+    no one moves any more.
+    """
+    for _ in range(steps):
+        decide(plan, record, row, command)
+        if is_over(record, row):
+            break
+        now, then = record[row], record[row + 1]
+        row += 1
+        dt = plan.dt
+        positions[0], then[SPEED] = move(positions[0], now[SPEED], now[REALISED], dt)
+        positions[1], then[LEADER_SPEED] = move(
+            positions[1], now[LEADER_SPEED], now[LEADER_ACCELERATION], dt
+        )
+        if row == plan.cut_in[0]:
+            positions[1], then[LEADER_SPEED] = positions[0] + plan.cut_in[1], plan.cut_in[2]
+        then[GAP] = positions[1] - positions[0]
+        then[GAP_BEHIND] = np.inf
+        if len(plan.behind) > 0:
+            positions[2], then[SPEED_BEHIND] = move(
+                positions[2], now[SPEED_BEHIND], now[ACCELERATION_BEHIND], dt
+            )
+            then[GAP_BEHIND] = positions[0] - positions[2]
+    return row
+
+
+# -- A run under way ------------------------------------------------------------------------------
+
+
+class Road(ABC):
+    """Cars under way in one run of a scenario.
+
+    Whoever drives asks `observation`, then tells `advance` what to do. The run is `over` with the
+    row in which two cars met, or with the last; `advance` then only records what was commanded.
+    """
+
+    def __init__(self, scenario: Scenario) -> None:
+        self.scenario = scenario
+        self.row = 0
+        self._plan = Plan.of(scenario)
+        self._record = np.zeros((len(self._plan.times), len(RUN_COLUMNS)))
+        self._noise = _noise(scenario, len(self._record))
+        self._delay = scenario.steps(scenario.sensors.delay)
+        behind, start = scenario.behind, self._record[0]
+        start[GAP], start[GAP_BEHIND] = scenario.initial_gap, behind.gap if behind else math.inf
+        start[SPEED] = start[SPEED_BEHIND] = scenario.initial_speed
+        start[LEADER_SPEED] = scenario.leader.initial_speed
+
+    @abstractmethod
+    def advance(self, command: float, steps: int = 1) -> None:
+        """Drive some steps with this acceleration commanded to the follower [m/s²]."""
+
+    @property
+    def time(self) -> float:
+        """Now [s]."""
+        return float(self._plan.times[self.row])
+
+    @property
+    def observation(self) -> NDArray[np.float64]:
+        """(3,) ndarray: gap [m], v_follower [m/s], v_leader [m/s], as the follower sees them."""
+        seen = self._record[max(0, self.row - self._delay), [GAP, SPEED, LEADER_SPEED]]
+        if self._noise is not None:
+            seen = seen + self._noise[self.row]
+            seen[1:] = np.maximum(seen[1:], 0.0)
+        return seen
+
+    @property
+    def over(self) -> bool:
+        """Whether the run ends with this row."""
+        return is_over(self._record, self.row)
+
+    @property
+    def collided(self) -> bool:
+        """Whether the follower has hit the leader."""
+        return bool(self._record[self.row, GAP] <= 0.0)
+
+    @property
+    def rear_ended(self) -> bool:
+        """Whether the car behind has hit the follower."""
+        return bool(self._record[self.row, GAP_BEHIND] <= 0.0)
+
+    @property
+    def realised(self) -> float:
+        """What the follower did in the latest step [m/s²]; NaN before the first."""
+        if self.row == 0:
+            return math.nan
+        now, before = self._record[self.row, SPEED], self._record[self.row - 1, SPEED]
+        return float((now - before) / self.scenario.dt)
+
+    def episode(self, first: int = 0) -> Episode:
+        """What was recorded so far, from a row on."""
+        rows = slice(first, self.row + 1)
+        return Episode(self._plan.times[rows], self._record[rows].copy())
+
+
+class OnRoad:
+    """A road as an environment for `evofsm.guard.run_episode`, deciding every so many steps."""
+
+    def __init__(self, road: Road, steps: int) -> None:
+        self.road, self.steps = road, steps
+
+    def reset(self, **_: Any) -> tuple[NDArray[np.float64], dict[str, Any]]:
+        """The road as it is."""
+        return self.road.observation, {"time": self.road.time}
+
+    def step(
+        self, action: float, /
+    ) -> tuple[NDArray[np.float64], float, bool, bool, dict[str, Any]]:
+        """Drive on; of two collisions that end a run, running into the leader is a failure."""
+        road = self.road
+        began, speed = road.time, road._record[road.row, SPEED]
+        road.advance(action, self.steps)
+        lasted, failed = road.time - began, road.collided
+        came = {
+            "time": road.time,
+            "failed": failed,
+            "realised": (road._record[road.row, SPEED] - speed) / lasted if lasted else math.nan,
+        }
+        terminated = failed or road.rear_ended
+        return road.observation, 0.0, terminated, road.over and not terminated, came
+
+
+class World(Protocol):
+    """A place to drive in."""
+
+    def open(self, scenario: Scenario) -> AbstractContextManager[Road]:
+        """Put the cars on a road, for use in a ``with`` statement."""
+        ...
+
+    def run(self, scenario: Scenario, controller: Controller) -> Episode:
+        """Drive the scenario with ``controller`` in the follower, asked at every step."""
+        ...
+
+
+def drive_alone(road: Road, controller: Drives, steps: int = 1) -> Episode:
+    """Ask the controller every so many steps, until time is up or the cars collide."""
+    propose = getattr(controller, "propose", None) or (lambda seen, time: controller(seen))  # type: ignore[operator]
+    over = False
+    while not over:
+        over = road.over
+        observation, time = road.observation, road.time
+        wanted = propose(observation, time)
+        acceleration = float(wanted.action if isinstance(wanted, Proposal) else wanted)
+        _refuse_non_number(acceleration, time, observation[0])
+        road.advance(acceleration, steps)
+    return road.episode()
+
+
+def _refuse_non_number(acceleration: float, time: float, gap: float) -> None:
+    if not math.isfinite(acceleration):
+        raise ValueError(f"controller proposed {acceleration} at {time:g} s, gap {gap:g} m")
+
+
+def _noise(scenario: Scenario, rows: int) -> NDArray[np.float64] | None:
+    """(rows, 3) what the sensors add; None for nothing."""
+    sensors = scenario.sensors
+    if sensors.gap_noise == 0.0 and sensors.speed_noise == 0.0:
+        return None
+    deviation = np.array([sensors.gap_noise, sensors.speed_noise, sensors.speed_noise])
+    return np.random.default_rng(sensors.seed).normal(scale=deviation, size=(rows, 3))
+
+
+# -- In closed form -------------------------------------------------------------------------------
+
+
+class KinematicWorld:
+    """The closed-form world: points on a line, by SUMO's ballistic update.
+
+    A controller with a kernel, such as `IDM`, is driven without leaving compiled code; any other is
+    asked once a step, with the same result.
+
+    Examples
+    --------
+    >>> from evofsm.driving import IDM, Leader, Scenario
+    >>> leader = Leader(IDM(1.2, 25.0, 1.0, 1.0, 2.5), brake_decel=9.0, brake_speed=24.2)
+    >>> hasty = IDM(2.25, 28.0, 0.8, 0.3, 2.0, lowest=-4.0, highest=2.5)
+    >>> episode = KinematicWorld().run(Scenario(leader, initial_gap=5.0), hasty)
+    >>> episode.collided, round(float(episode.time[-1]), 2)
+    (True, 31.49)
+    """
+
+    def open(self, scenario: Scenario) -> AbstractContextManager[Road]:
+        """Put the cars on a road, for use in a ``with`` statement."""
+        return nullcontext(_Road(scenario))
+
+    def run(self, scenario: Scenario, controller: Drives, interval: float | None = None) -> Episode:
+        """Drive the scenario with ``controller`` in the follower.
+
+        Parameters
+        ----------
+        scenario : Scenario
+        controller : Controller or callable
+            From an observation to an acceleration [m/s²].
+        interval : float, optional
+            Time between two decisions [s], a multiple of the scenario's step; asked at every step
+            if not given.
+
+        Raises
+        ------
+        ValueError
+            If the controller proposes no finite number, or the interval is no such multiple.
+        """
+        road = _Road(scenario)
+        steps = 1 if interval is None else scenario.steps_between(interval)
+        if hasattr(controller, "kernel") and road._noise is None and road._delay == 0:
+            return road.run(controller, steps)
+        return drive_alone(road, controller, steps)
+
+
+class _Road(Road):
+    """The road in closed form."""
+
+    def __init__(self, scenario: Scenario) -> None:
+        super().__init__(scenario)
+        behind = scenario.behind.gap if scenario.behind else math.inf
+        self._positions = np.array([0.0, scenario.initial_gap, -behind])
+
+    def advance(self, command: float, steps: int = 1) -> None:
+        self.row = advance(self._plan, self._record, self._positions, self.row, command, steps)
+
+    def run(self, driver: Any, steps: int) -> Episode:
+        """As `drive_alone`, without leaving compiled code."""
+        self.row = _drive_kernel(
+            driver.kernel, driver.parameters, self._plan, self._record, self._positions, steps
+        )
+        episode = self.episode()
+        # It is what ended the run.
+        _refuse_non_number(episode.accelerations[-1], self.time, episode.record[-1, GAP])
+        return episode
+
+
+def _drive(
+    driver: Kernel,
+    parameters: NDArray[np.float64],
+    plan: Plan,
+    record: NDArray[np.float64],
+    positions: NDArray[np.float64],
+    steps: int,
+) -> int:
+    """Ask a compiled driver every so many steps; returns the row in which it ended."""
+    row = 0
+    while True:
+        now = record[row]
+        command = driver(parameters, plan.times[row], now[GAP], now[SPEED], now[LEADER_SPEED])
+        if is_over(record, row) or not np.isfinite(command):
+            decide(plan, record, row, command)
+            return row
+        row = advance(plan, record, positions, row, command, steps)
+
+
+# With its signature stated it is compiled once for all drivers.
+_drive_kernel = compiled(
+    _drive,
+    types.int64(types.FunctionType(DRIVER_KERNEL), _TABLE, _PLAN, _TABLE, _SERIES, types.int64),
+)

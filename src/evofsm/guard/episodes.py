@@ -1,0 +1,130 @@
+"""The one loop of an episode: observe, propose, revise, execute, learn (the paper's Section 4.1).
+
+Whoever drives, teaches, tests, times or records a guard iterates over `run_episode`.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Callable, Iterator
+from time import perf_counter
+from typing import Any, NamedTuple, Protocol, SupportsFloat
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evofsm.guard.actions import Action
+from evofsm.guard.guard import Guard
+from evofsm.guard.protocols import Controller, Proposal, Revision, Situation
+
+_log = logging.getLogger(__name__)
+
+
+class Environment(Protocol):
+    """What an episode happens in: an environment of Gymnasium, or anything with its two methods.
+
+    Its ``info`` may hold ``failed``, whether the episode ended in failure (without it one that is
+    terminated has failed), ``time`` [s] since the start (without it decisions are counted), and
+    ``realised``, what the action came to.
+    """
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Begin an episode: the first observation, and info."""
+        ...
+
+    def step(self, action: Any, /) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
+        """Execute until the next decision: observation, reward, terminated, truncated, info."""
+        ...
+
+
+class Decision(NamedTuple):
+    """One decision, and what came of it until the next."""
+
+    situation: Situation
+    revision: Revision
+    realised: float = math.nan  #: as the environment says; of a car its acceleration [m/s²]
+    reward: float = 0.0
+    failed: bool = False  #: whether the episode then ended in failure
+    seconds: float = math.nan  #: that it took to decide
+
+
+def run_episode(
+    environment: Environment,
+    guard: Guard,
+    controller: Controller | Callable[[NDArray[np.float64]], Action | Proposal],
+    *,
+    seed: int | None = None,
+    options: dict[str, Any] | None = None,
+) -> Iterator[Decision]:
+    """Drive one episode under a guard, decision by decision; it learns unless it is frozen.
+
+    Parameters
+    ----------
+    environment : Environment
+    guard : Guard
+    controller : Controller or callable
+        What proposes. Where a variable was not observed, it is given the latest value. Where it
+        raises or proposes no number, the guard falls back.
+    seed, options
+        Of ``environment.reset``.
+
+    Yields
+    ------
+    Decision
+        Once it was executed. Whoever stops before the last one breaks the episode off.
+
+    Examples
+    --------
+    >>> from evofsm.driving import CarFollowing, guard_for_family
+    >>> env = CarFollowing("emergency")
+    >>> guard = guard_for_family(env.family)
+    >>> decisions = list(run_episode(env, guard, lambda observation: 2.5, seed=1))
+    >>> decisions[-1].failed, any(one.revision.executed < 2.5 for one in decisions)
+    (False, True)
+    """
+    propose = getattr(controller, "propose", None) or (lambda seen, time: controller(seen))  # type: ignore[operator]
+    observation, info = environment.reset(seed=seed, options=options)
+    guard.begin()
+    held, count, over, failed = _whole(observation, None), 0, False, False
+    while not over:
+        time = info.get("time", math.nan if guard.interval is None else count * guard.interval)
+        proposal = _asked(propose, held, time)
+        begin = perf_counter()
+        revision = guard.decide(np.ravel(observation), proposal, time)
+        seconds, situation = perf_counter() - begin, guard.situation
+        observation, reward, terminated, truncated, info = environment.step(revision.executed)
+        held, count = _whole(observation, held), count + 1
+        over, failed = bool(terminated or truncated), bool(info.get("failed", terminated))
+        if over:
+            guard.end(failed, np.ravel(observation))
+        realised = float(info.get("realised", math.nan))
+        yield Decision(situation, revision, realised, float(reward), failed, seconds)
+
+
+def _whole(observation: Any, held: NDArray[np.float64] | None) -> NDArray[np.float64]:
+    """The latest value of each variable; NaN of one that was never observed."""
+    now = np.array(observation, dtype=np.float64).ravel()
+    absent = np.isnan(now)
+    return np.where(absent, held, now) if held is not None and absent.any() else now
+
+
+def _asked(
+    propose: Callable[[NDArray[np.float64], float], Action | Proposal],
+    seen: NDArray[np.float64],
+    time: float,
+) -> Proposal | None:
+    """What the controller proposes; None where it fails to: someone has to go on driving."""
+    try:
+        wanted = propose(seen.copy(), time)
+        proposal = wanted if isinstance(wanted, Proposal) else Proposal(wanted)
+        numbers = np.array([proposal.action, *proposal.candidates], dtype=np.float64)
+    except Exception as error:
+        _log.warning("controller failed at %g s: %r", time, error)
+        return None
+    if np.isfinite(numbers[0]).all():
+        return proposal
+    _log.warning("controller proposed %s at %g s", proposal.action, time)
+    return None
