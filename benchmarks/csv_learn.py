@@ -132,7 +132,7 @@ def learn(path: str) -> None:
     from evofsm.cli.learning import learn_traces
     from evofsm.fsm.actions import IntervalActions
     from evofsm.fsm.machine import EvolvingFSM
-    from evofsm.io.traces import read_traces
+    from evofsm.io.logs import read_traces
 
     actions = IntervalActions(low=-2.5, high=2.5, width=0.3, outside="clip")
     learn_traces(read_traces([path]), EvolvingFSM.paper(), actions)

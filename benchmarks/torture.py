@@ -39,7 +39,7 @@ from evofsm.driving.world import KinematicWorld
 from evofsm.fsm.actions import IntervalActions
 from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.model import FSMModel
-from evofsm.io.traces import read_traces
+from evofsm.io.logs import read_traces
 from evofsm.store import storage
 from evofsm.store.checkpoint import Checkpoint, fingerprints
 

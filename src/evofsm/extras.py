@@ -9,6 +9,7 @@ from importlib.util import find_spec
 
 #: Extras that each command needs as it stands, beside ``cli``; options may need others.
 OF_COMMANDS = {
+    "learn": ("tables",),
     "paper": ("plot", "sumo", "tables"),
     "drive": ("study",),
     "watch": ("study", "watch"),

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import csv
-import io
+import gzip
+import zlib
 from array import array
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-
-from evofsm.io.files import damage_explained, open_unpacked
 
 #: How layouts write that a value is missing.
 MISSING = frozenset({"", ".", "nan", "na", "null"})
@@ -30,10 +29,13 @@ def name_of(path: Path) -> str:
 
 def header_and_rows(path: Path) -> Iterator[list[str]]:
     """Rows of a CSV file, gzipped or not, as texts; the header is the first of them."""
-    with open_unpacked(str(path)) as file:
-        rows = csv.reader(io.TextIOWrapper(file, "utf-8-sig", newline=""), skipinitialspace=True)
-        with damage_explained(str(path), lambda: rows.line_num):
+    opened = gzip.open if path.suffix == ".gz" else open
+    with opened(path, "rt", encoding="utf-8-sig", newline="") as file:
+        rows = csv.reader(file, skipinitialspace=True)
+        try:
             yield from rows
+        except (EOFError, zlib.error, gzip.BadGzipFile, csv.Error, UnicodeDecodeError) as error:
+            raise ValueError(f"{path}, after line {rows.line_num}: {error}") from error
 
 
 def places(path: Path, header: Sequence[str], names: Sequence[Sequence[str]]) -> list[int]:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.io.traces import LONGEST_STEP, Chunk
+from evofsm.io.logs import LONGEST_STEP, Chunk
 
 #: Shorter episodes are left out [s].
 SHORTEST = 2.0

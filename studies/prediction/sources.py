@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from enum import Enum
@@ -10,16 +9,20 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+import polars
 from numpy.typing import NDArray
 
 from evofsm.driving import VARIABLES, Draw, Family, KinematicWorld, held_out, load_family, training
 from evofsm.fsm import NO_ACTION, IntervalActions
-from evofsm.io import ACTION, CsvTable, ParquetTable, file_kind, read_traces, silent
+from evofsm.io import episodes_of, read_traces
 
 #: Families that are driven.
 FAMILIES = ("emergency", "stop_and_go", "cut_in", "rare")
 #: The actions of real drives [m/s²]: those of the paper.
 LOG_ACTIONS = IntervalActions(low=-2.5, high=2.5, width=0.3, outside="clip")
+
+
+_ACTION = "a_follower"
 
 
 class Pace(Enum):
@@ -119,14 +122,14 @@ def log_sources(folder: Path) -> list[LogSource]:
     if not sources:
         raise ValueError(
             f"{folder} has no two logs of one origin, with columns time, {', '.join(VARIABLES)} "
-            f"and {ACTION} (files of one origin are named alike up to the first _)"
+            f"and {_ACTION} (files of one origin are named alike up to the first _)"
         )
     return sources
 
 
 def _is_log(path: str) -> bool:
-    table = CsvTable(path, silent) if file_kind(path) == "csv" else ParquetTable(path, silent)
-    return {"time", ACTION, *VARIABLES} <= set(table.columns)
+    scan = polars.scan_parquet if path.endswith(".parquet") else polars.scan_csv
+    return {"time", _ACTION, *VARIABLES} <= set(scan(path).collect_schema())
 
 
 def split_logs(source: LogSource, seed: int, part: int, parts: int) -> tuple[list[str], list[str]]:
@@ -151,17 +154,9 @@ def read(source: LogSource, train: Iterable[str], test: Iterable[str], first: in
 
 def _read(path: str, pace: Pace) -> list[Episode]:
     """The episodes of a file."""
-    parts: list[list[Episode]] = []
-    for chunk in read_traces([path]):
-        if not np.isclose(chunk.dt, pace.dt):
-            raise ValueError(f"{path} has a row every {chunk.dt:g} s; {pace.dt:g} s are needed")
-        actions = _encode(LOG_ACTIONS, chunk.actions)
-        bounds = sorted({0, *chunk.starts.tolist(), len(actions)})
-        begins = set(chunk.starts.tolist())
-        for begin, end in itertools.pairwise(bounds):
-            if begin in begins:
-                parts.append([])
-            parts[-1].append(Episode(chunk.observations[begin:end], actions[begin:end]))
-    return [
-        Episode(*(np.concatenate(pieces) for pieces in zip(*part, strict=True))) for part in parts
-    ]
+    found = []
+    for whole in episodes_of(read_traces([path])):
+        if not np.isclose(whole.dt, pace.dt):
+            raise ValueError(f"{path} has a row every {whole.dt:g} s; {pace.dt:g} s are needed")
+        found.append(Episode(whole.observations, _encode(LOG_ACTIONS, whole.actions)))
+    return found

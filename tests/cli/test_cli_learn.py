@@ -251,7 +251,7 @@ def test_ctrl_c_says_so_and_saves_nothing(evofsm, log, tmp_path, monkeypatch):
     def interrupted(*arguments):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("evofsm.io.traces._read_table", interrupted)
+    monkeypatch.setattr("evofsm.io.logs._read_table", interrupted)
     result = evofsm("learn", log, "--out", tmp_path / "model")
     assert result.exit_code == 130
     assert "stopped before the end" in result.stderr
@@ -319,16 +319,6 @@ def test_help_loads_neither_numba_nor_polars():
     assert result.stdout.splitlines()[-1] == "[]"
     assert "learn" in result.stdout
     assert "inspect" in result.stdout
-
-
-def test_csv_needs_no_extra(log):
-    result = python(
-        "import sys\n"
-        "sys.modules['polars'] = sys.modules['typer'] = sys.modules['rich'] = None\n"
-        "from evofsm.io import read_traces\n"
-        f"print(sum(len(chunk.times) for chunk in read_traces([{str(log)!r}])))"
-    )
-    assert result.stdout == "700\n", result.stderr
 
 
 def test_numbers_stay_whole_in_a_narrow_terminal(evofsm, log, monkeypatch):

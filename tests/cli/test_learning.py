@@ -10,7 +10,7 @@ from evofsm.cli.learning import learn_traces
 from evofsm.fsm.actions import IntervalActions
 from evofsm.fsm.divergence import jensen_shannon
 from evofsm.fsm.machine import EvolvingFSM
-from evofsm.io.traces import Chunk
+from evofsm.io.logs import Chunk
 
 ACTIONS = IntervalActions(-1.0, 1.0, 0.5, outside="clip")
 STARTS = [0, 37, 38, 150]

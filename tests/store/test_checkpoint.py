@@ -15,7 +15,7 @@ import pytest
 from evofsm.cli.learning import learn_traces
 from evofsm.fsm.actions import IntervalActions
 from evofsm.fsm.machine import EvolvingFSM
-from evofsm.io.traces import Chunk
+from evofsm.io.logs import Chunk
 from evofsm.store import storage
 from evofsm.store.checkpoint import Checkpoint, Kept, differences, duration, fingerprints
 
@@ -306,7 +306,7 @@ def test_learn_goes_on_from_its_checkpoint_and_prints_a_finished_one_at_once(
     good = logs[1].read_text()
     kept = evofsm("learn", *logs, "--out", tmp_path / "model", *options)
     assert kept.stdout == plain.stdout, kept.stderr
-    monkeypatch.setattr("evofsm.io.traces._read_file", lambda *_: pytest.fail("it was read"))
+    monkeypatch.setattr("evofsm.io.logs._open", lambda *_: pytest.fail("it was read"))
     (tmp_path / "model").unlink()
     again = evofsm("learn", *logs, "--out", tmp_path / "model", *options)
     assert again.stdout == plain.stdout, again.stderr

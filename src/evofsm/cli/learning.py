@@ -36,7 +36,7 @@ from evofsm.fsm import (
     open_memory,
     widen,
 )
-from evofsm.io import Chunk
+from evofsm.io.logs import Chunk
 from evofsm.store import Checkpoint, Kept, storage
 
 #: How far ahead the longer forecast looks [s].

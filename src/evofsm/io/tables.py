@@ -1,199 +1,421 @@
-"""Read a table in CSV or Parquet piece by piece, and turn its columns into numbers and texts."""
+"""Tables in CSV and Parquet, read with polars piece by piece; and what kind of file a file is."""
 
 from __future__ import annotations
 
 import csv
+import gzip
 import io
+import logging
 import os
-from collections.abc import Callable, Iterable, Iterator, Sequence
+import re
+import zlib
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
-from itertools import chain
-from typing import Any, BinaryIO, NoReturn, Protocol, Self, cast
+from dataclasses import dataclass, field
+from functools import partial
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, NoReturn, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from evofsm.extras import needs
-from evofsm.io.dates import looks_like_a_date, microseconds
-from evofsm.io.files import BYTE_ORDER_MARK, OnRead, damage_explained, open_unpacked, silent
-from evofsm.io.plain import Texts, number_or_gap, parse_plain
 from evofsm.store import LARGEST_OBSERVATION
 
-# At once: enough that what Python does in between hardly counts.
-_CSV_BYTES = 1 << 21
-# Rows at once of a CSV file that is not plain, and characters in which so many may end sooner.
-_CSV_ROWS = 8192
-_CSV_CHARACTERS = 1 << 22
+if TYPE_CHECKING:
+    import polars
+
+Kind = Literal["csv", "parquet", "xml", "osi", "mcap", "bag", "run"]
+#: Called with the number of bytes each time some were read from a file.
+OnRead = Callable[[int], object]
+
+# Read at once: enough that what Python does in between hardly counts.
+_CSV_BYTES = 1 << 22
 _LONGEST_LINE = 1_000_000
-# Characters of a row, which a quoted field may carry on over many lines.
-_LONGEST_ROW = _LONGEST_LINE
-_LONGEST_CHARACTER = 4  # bytes, in UTF-8
 # polars decodes a whole row group for each slice of it, so small slices would only cost time.
-_PARQUET_ROWS = 65536
+_PARQUET_ROWS = 1 << 16
+
+_BYTE_ORDER_MARK = b"\xef\xbb\xbf"
+_GZIP, _PARQUET = b"\x1f\x8b", b"PAR1"
+_SQLITE, _MCAP = b"SQLite format 3\0", b"\x89MCAP0\r\n"
+# Where an MCAP file says what it was written by: behind the mark, an opcode and two lengths.
+_PROFILE = len(_MCAP) + 1 + 8 + 4
+_ROS, _OURS = b"ros2", b"evofsm "
+
+#: What is measured in a unit, and the factor that gives s, m, m/s or m/s².
+UNITS: Mapping[str, tuple[str, float]] = {
+    **{"s": ("time", 1.0), "ms": ("time", 1e-3), "us": ("time", 1e-6), "ns": ("time", 1e-9)},
+    **{"min": ("time", 60.0), "h": ("time", 3600.0)},
+    **{"m": ("length", 1.0), "mm": ("length", 1e-3), "cm": ("length", 0.01)},
+    **{"km": ("length", 1000.0), "ft": ("length", 0.3048)},
+    **{"m/s": ("speed", 1.0), "cm/s": ("speed", 0.01), "km/h": ("speed", 1.0 / 3.6)},
+    **{"mph": ("speed", 0.44704), "kn": ("speed", 1852.0 / 3600.0), "ft/s": ("speed", 0.3048)},
+    **{"m/s2": ("acceleration", 1.0), "cm/s2": ("acceleration", 0.01)},
+    **{"ft/s2": ("acceleration", 0.3048), "g": ("acceleration", 9.80665)},
+}
+
+# What stands in a field where there is no number.
+_NOTHING = ("", "na", "n/a", "null", "none")
+_DATE = re.compile(r"\s*\d{4}-?\d\d-?\d\d[Tt ]")
+_ZONE = r"([zZ]|[+-]\d\d:?\d\d)$"
+
+_log = logging.getLogger(__name__)
+
+
+def silent(count: int) -> None:
+    """Nobody wants to know how much was read."""
+
+
+# -- Files ----------------------------------------------------------------------------------------
+
+
+def file_kind(path: str) -> Kind:
+    """What the file holds, judged by how it begins.
+
+    A trace of OSI begins with nothing of its own and is known by its name, ``.osi``. The folder of
+    a bag of ROS 2 is ``"bag"``, as its files are; ``"run"`` is a log that evofsm wrote.
+    """
+    if os.path.isfile(os.path.join(path, "metadata.yaml")):
+        return "bag"
+    if path.removesuffix(".gz").endswith(".osi"):
+        return "osi"
+    with Source(path) as source:
+        beginning = source.read(64).removeprefix(_BYTE_ORDER_MARK).lstrip()
+    if not beginning:
+        raise ValueError(f"{path} is empty")
+    if beginning.startswith(_PARQUET):
+        return "parquet"
+    if beginning.startswith(_MCAP):
+        if beginning[_PROFILE:].startswith(_ROS):
+            return "bag"
+        # Ours has no profile, so that the length of what it was written by comes first.
+        return "run" if beginning[_PROFILE + 4 :].startswith(_OURS) else "mcap"
+    if beginning.startswith(_SQLITE):
+        return "bag"
+    return "xml" if beginning.startswith(b"<") else "csv"
+
+
+class Source:
+    """A file that is read once, unpacked if it is gzipped.
+
+    One that grows meanwhile is read up to where it was when it was opened, and to the end of that
+    line; a warning is logged.
+    """
+
+    def __init__(self, path: str, on_read: OnRead = silent) -> None:
+        if os.path.isdir(path):
+            raise IsADirectoryError(f"{path} is a folder; name the files in it")
+        if os.path.exists(path) and not os.path.isfile(path):
+            raise ValueError(f"{path} is a pipe or a device; write it to a file first")
+        self.path = path
+        self.lines = 0  #: read so far
+        self._on_read = on_read
+        self._raw = io.BufferedReader(io.FileIO(path))
+        self._size = os.fstat(self._raw.fileno()).st_size
+        self._packed = self._raw.peek(2).startswith(_GZIP)
+        self._file = gzip.GzipFile(fileobj=self._raw) if self._packed else self._raw
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._file.close()
+        self._raw.close()
+
+    def read(self, size: int) -> bytes:
+        """So many bytes, fewer at the end; then none."""
+        parts: list[bytes] = []
+        while size > 0 and (part := self._take(size)):
+            parts.append(part)
+            size -= len(part)
+        return b"".join(parts)
+
+    def rows(self) -> bytes:
+        """The next whole lines, some megabytes of them; no quoted field goes on behind them."""
+        block = self.read(_CSV_BYTES)
+        if not block:
+            self._warn_of_growth()
+            return block
+        is_open = block.count(b'"') % 2 == 1
+        parts, room = [block], _LONGEST_LINE
+        while is_open or not parts[-1].endswith(b"\n"):
+            line = self._take(_LONGEST_LINE, to_line_end=True)
+            is_open ^= line.count(b'"') % 2 == 1
+            parts.append(line or b"\n")
+            room -= len(line)
+            if room < 0 and not line.endswith(b"\n"):
+                raise ValueError(
+                    f"{self.path}, after line {self.lines}: a line of more than {_LONGEST_LINE:,} "
+                    "bytes; this is no table"
+                )
+            if room < 0 or not line:  # one that is not closed is found by whoever parses them
+                break
+        return b"".join(parts) if len(parts) > 1 else block
+
+    def _take(self, most: int, to_line_end: bool = False) -> bytes:
+        before = self._raw.tell()
+        if not (self._packed or to_line_end):
+            most = min(most, max(self._size - before, 0))
+        try:
+            data: bytes = self._file.readline(most) if to_line_end else self._file.read1(most)
+        except (EOFError, zlib.error, gzip.BadGzipFile) as error:
+            raise ValueError(
+                f"{self.path}, after line {self.lines}: the gzip data ends early or is damaged "
+                f"(was a copy or a download interrupted, or is it still being written?): {error}"
+            ) from error
+        self.lines += data.count(b"\n")
+        self._on_read(self._raw.tell() - before)
+        return data
+
+    def _warn_of_growth(self) -> None:
+        growth = os.fstat(self._raw.fileno()).st_size - self._size
+        if growth > 0:
+            _log.warning(
+                "%s grew by %s bytes while it was read; rows that came meanwhile are left out",
+                self.path,
+                f"{growth:,}",
+            )
+
+
+# -- Pieces of tables -----------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class Piece:
     """Some consecutive rows of a table: T values for each column that was asked for."""
 
-    path: str
-    unit: str  #: what its places count: "line" as an editor shows it, or "row" from 1
-    places: NDArray[np.int64]  #: (T,)
-    numbers: dict[str, NDArray[np.float64]]
-    texts: dict[str, Texts]
+    rows: int
+    numbers: dict[str, NDArray[np.float64]]  #: NaN where one is missing
+    #: Place of a row, for a message, and what stands there in a column.
+    find: Callable[[int, str | None], tuple[str, str]]
+    texts: dict[str, polars.Series] = field(default_factory=dict)
     #: Rows that begin an episode, of a table that knows; None where columns tell episodes apart.
     starts: NDArray[np.int64] | None = None
     cuts: int = 0  #: episodes in it that were cut because too many pairs were on the road at once
 
+    @classmethod
+    def of_numbers(
+        cls,
+        path: str,
+        before: int,
+        numbers: dict[str, NDArray[np.float64]],
+        starts: NDArray[np.int64],
+        cuts: int = 0,
+    ) -> Self:
+        """Rows of numbers alone, after so many others."""
+
+        def find(row: int, name: str | None) -> tuple[str, str]:
+            text = "" if name is None else str(numbers[name][row])
+            return f"{path}, row {before + row + 1}", text
+
+        rows = len(next(iter(numbers.values())))
+        return cls(rows, numbers, find, starts=starts, cuts=cuts)
+
     def at(self, row: int) -> str:
         """Where a row stands, for a message."""
-        return f"{self.path}, {self.unit} {self.places[row]}"
+        return self.find(row, None)[0]
+
+    def refuse(self, row: int, name: str, why: str = "") -> NoReturn:
+        """Raise for what stands in a row and column."""
+        place, text = self.find(row, name)
+        raise ValueError(f"{place}, column {name!r}: {why.format(text[:40]) or explained(text)}")
+
+    def refuse_unusable(self, name: str, where: NDArray[np.bool_] | None = None) -> None:
+        """Raise where a number cannot be learnt; NaN is none."""
+        unusable = ~(np.abs(self.numbers[name]) <= LARGEST_OBSERVATION)
+        if where is not None:
+            unusable &= where
+        if unusable.any():
+            self.refuse(int(np.argmax(unusable)), name)
 
 
-class Table(Protocol):
+class Wanted(NamedTuple):
+    """What is read of a table."""
+
+    numbers: Sequence[str]
+    texts: Sequence[str] = ()
+    gaps: Collection[str] = ()  #: numbers that may be missing or infinite; others are refused then
+    date: str | None = None  #: comes as a number, of microseconds
+
+
+class Table:
     """A table whose header is known and whose rows are still to be read."""
 
     path: str
-    columns: tuple[str, ...]
+    columns: Sequence[str]
 
-    def pieces(
-        self,
-        numbers: Sequence[str],
-        texts: Sequence[str],
-        dates: Sequence[str] = (),
-        gaps: Sequence[str] = (),
-    ) -> Iterator[Piece]:
-        """Read the named columns, in the order of rows.
-
-        Of the numbers those in ``gaps`` may be missing: NaN, or what whoever asked has to refuse.
-        ``dates`` come as numbers, of microseconds.
-        """
-        ...
+    def pieces(self, wanted: Wanted) -> Iterator[Piece]:
+        """Read columns, in the order of rows."""
+        raise NotImplementedError
 
     def holds_dates(self, name: str) -> bool:
         """Whether a column holds times of ISO 8601 in place of numbers, as its first row says."""
-        ...
+        return False
 
 
-class CsvTable:
-    """A CSV file, gzipped or not, with a header; fields end at a comma, a semicolon or a tab.
-
-    Compiled code reads what is plain. From the first block on that is not, Python's own reader
-    does: it knows all that a CSV file may be, and what to say of one that is none.
-    """
+class CsvTable(Table):
+    """A CSV file, gzipped or not, with a header; fields end at a comma, a semicolon or a tab."""
 
     def __init__(self, path: str, on_read: OnRead = silent) -> None:
+        with needs("polars", "tables", f"{path}: a table"):
+            import polars  # noqa: F401 (said here, before the work begins)
         self.path = path
         self._on_read = on_read
-        header: list[str] = []
-        with open_unpacked(path) as file, damage_explained(path):
-            lines = _lines(path, _text(file))
-            first = next(lines, "")
-            unmarked = first.removeprefix(BYTE_ORDER_MARK.decode())
-            self._separator = max(",;\t", key=unmarked.count)
-            of_row = _LinesOfRow(path, chain([unmarked], _kept(lines, header)))
-            rows = csv.reader(of_row, delimiter=self._separator)
-            self.columns = tuple(name.strip() for name in next(rows, []))
-            self._header_lines = rows.line_num
-            self._header_size = sum(len(line.encode()) for line in (first, *header))
-        if all(_reads(name) for name in self.columns):
+        with Source(path) as source:
+            header, _, rest = source.rows().partition(b"\n")
+        text = self._decoded(header, 0).removeprefix("\ufeff").rstrip("\r")
+        self._separator = max(",;\t", key=text.count)
+        mark = self._separator.encode()
+        self._quoted = re.compile(rb'(?<![^%b\n])"[^"]*+(?:""[^"]*+)*+"(?=[%b\r\n])' % (mark, mark))
+        if text.count('"') % 2:
+            self._refuse_quote(header + b"\n", 0)
+        try:
+            self.columns = [
+                name.strip() for name in next(csv.reader([text], delimiter=mark.decode()))
+            ]
+        except csv.Error as error:
+            raise ValueError(f"{path}, line 1: {error}") from error
+        self._first_row = rest.partition(b"\n")[0]
+        # As polars calls them, for there may be two of one name.
+        self._places = {name: f"column_{k + 1}" for k, name in enumerate(self.columns)}
+        self._has_blank_lines = False  # as far as is known
+        if all(_is_number(name) for name in self.columns):
             raise ValueError(
-                f"{path}, line 1: {unmarked.strip()[:200]!r} is no header; the first line must "
-                "name the columns"
+                f"{path}, line 1: {text.strip()[:200]!r} is no header; the first line must name "
+                "the columns"
             )
 
     def holds_dates(self, name: str) -> bool:
         """Whether the first row has a time of ISO 8601 there; what else it has is not judged."""
-        with open_unpacked(self.path) as file, suppress(ValueError, EOFError, OSError, csv.Error):
-            file.read(self._header_size)
-            text = _text(file)  # kept until the file is closed
-            lines = _lines(self.path, text, reached=self._header_lines)
-            row = next(csv.reader(lines, delimiter=self._separator), [])
-            return len(row) == len(self.columns) and looks_like_a_date(row[self._place(name)])
-        return False
+        fields: list[str] = []
+        with suppress(csv.Error):
+            row = self._first_row.decode(errors="replace").rstrip("\r")
+            fields = next(csv.reader([row], delimiter=self._separator), [])
+        return _DATE.match(dict(zip(self.columns, fields, strict=False)).get(name, "")) is not None
 
-    def pieces(
-        self,
-        numbers: Sequence[str],
-        texts: Sequence[str],
-        dates: Sequence[str] = (),
-        gaps: Sequence[str] = (),
-    ) -> Iterator[Piece]:
-        """Read the named columns, in the order of rows."""
-        numbers, texts = list(dict.fromkeys(numbers)), list(dict.fromkeys([*texts, *dates]))
-        for piece in self._pieces(numbers, texts, gaps):
-            for name in dates:
-                piece.numbers[name] = _microseconds(piece, name)
-            yield piece
+    def pieces(self, wanted: Wanted) -> Iterator[Piece]:
+        """Read columns, in the order of rows."""
+        texts = [*wanted.texts, *([wanted.date] if wanted.date else [])]
+        used = list(dict.fromkeys([*wanted.numbers, *texts]))
+        if twice := [name for name in used if self.columns.count(name) > 1]:
+            raise ValueError(f"{self.path}, line 1: two columns are called {twice[0]!r}")
+        with Source(self.path, self._on_read) as source:
+            reached = 0
+            while block := source.rows():
+                if reached == 0:
+                    block, reached = block.partition(b"\n")[2], 1
+                found = self._parsed(block, reached, used, set(wanted.numbers))
+                if rows := len(found[used[0]]):
+                    piece = Piece(rows, {}, partial(self._find, block, reached))
+                    for name in texts:
+                        has_gaps = found[name].null_count() > 0
+                        piece.texts[name] = found[name].fill_null("") if has_gaps else found[name]
+                    for name in dict.fromkeys(wanted.numbers):
+                        piece.numbers[name] = found[name].to_numpy()
+                        if found[name].null_count():
+                            self._look_again(piece, name, block, name in wanted.gaps)
+                        if name not in wanted.gaps:
+                            piece.refuse_unusable(name)
+                    if wanted.date is not None:
+                        piece.numbers[wanted.date] = _microseconds(piece, wanted.date)
+                    yield piece
+                reached = source.lines
 
-    def _pieces(
-        self, numbers: Sequence[str], texts: Sequence[str], gaps: Sequence[str]
-    ) -> Iterator[Piece]:
-        places = [self._place(name) for name in numbers], [self._place(name) for name in texts]
-        may_lack = {self._place(name) for name in gaps}
-        reached = self._header_lines
-        with open_unpacked(self.path, self._on_read) as file:
-            file.read(self._header_size)
-            while block := _whole_lines(self.path, file, reached):
-                rows = parse_plain(block, self._separator, len(self.columns), *places, may_lack)
-                if rows is None:
-                    rest = (_text(io.BytesIO(block)), _text(file))
-                    yield from self._read_carefully(rest, reached, numbers, texts, gaps)
-                    return
-                piece = Piece(self.path, "line", rows.lines + reached, {}, {})
-                for name, values in zip(numbers, rows.numbers, strict=True):
-                    if name not in gaps:
-                        refuse_unusable(piece, name, values)
-                    piece.numbers[name] = values
-                piece.texts.update(zip(texts, rows.texts, strict=True))
-                yield piece
-                reached += rows.n_lines
+    def _parsed(
+        self, block: bytes, reached: int, used: Sequence[str], numbers: Collection[str] = ()
+    ) -> dict[str, polars.Series]:
+        """The columns in use as texts or as numbers, null where there is none."""
+        import polars
 
-    def _read_carefully(
-        self,
-        parts: Iterable[io.TextIOWrapper],
-        reached: int,
-        numbers: Sequence[str],
-        texts: Sequence[str],
-        gaps: Sequence[str],
-    ) -> Iterator[Piece]:
-        """Read the lines of some parts, after those that were read before."""
-        places = {name: self._place(name) for name in (*numbers, *texts)}
-        lines = _LinesOfRow(self.path, _lines(self.path, *parts, reached=reached), reached)
-        rows = csv.reader(lines, delimiter=self._separator)
-        with damage_explained(self.path, lambda: lines.number):
-            while some := lines.some(rows):
-                fields, places_of_rows = self._columns(some)
-                piece = Piece(self.path, "line", places_of_rows, {}, {})
-                for name in numbers:
-                    piece.numbers[name] = _numbers(piece, name, fields[places[name]], name in gaps)
-                for name in texts:
-                    piece.texts[name] = Texts.of(fields[places[name]])
-                yield piece
+        bare = block
+        if b'"' in block:  # separators and line ends do not count within quotes
+            bare = self._quoted.sub(b"", block)
+            if b'"' in bare:
+                self._refuse_quote(block, reached)
+        kinds: dict[str, Any] = {f"column_{k + 1}": polars.String for k in range(len(self.columns))}
+        kinds |= {self._places[name]: polars.Float64 for name in numbers}
+        try:
+            frame = polars.read_csv(
+                _without_blank_lines(block) if self._has_blank_lines else block,
+                has_header=False,
+                separator=self._separator,
+                schema=kinds,
+                columns=[self._places[name] for name in used],
+                ignore_errors=True,
+                raise_if_empty=False,
+            )
+            n_separators = len(frame) * (len(self.columns) - 1)
+            if bare.count(self._separator.encode()) == n_separators:
+                return {name: frame[self._places[name]] for name in used}
+            why = "rows of different lengths"
+        except (polars.exceptions.PolarsError, polars.exceptions.PanicException) as error:
+            why = str(error).partition("\n")[0]
+        if not self._has_blank_lines:  # so it may have some
+            self._has_blank_lines = True
+            return self._parsed(block, reached, used, numbers)
+        self._find(block, reached)
+        raise ValueError(f"{self.path}, after line {reached}, cannot be read as CSV: {why}")
 
-    def _place(self, name: str) -> int:
-        if self.columns.count(name) > 1:
-            raise ValueError(f"{self.path}, line 1: two columns are called {name!r}")
-        return self.columns.index(name)
+    def _look_again(self, piece: Piece, name: str, block: bytes, may_lack: bool) -> None:
+        """Numbers of a column in which polars found fields that are none."""
+        import polars
 
-    def _columns(
-        self, some: list[tuple[int, list[str]]]
-    ) -> tuple[list[tuple[str, ...]], NDArray[np.int64]]:
-        """Fields column by column, and the line of each row; blank lines are passed over."""
-        filled = [(line, row) for line, row in some if row]
-        for line, row in filled:
-            if len(row) != len(self.columns):
-                raise ValueError(
-                    f"{self.path}, line {line}: {len(row)} fields, but the header names "
-                    f"{len(self.columns)} (was the file cut off, or does a field hold "
-                    f"{self._separator!r}?)"
-                )
-        fields = list(zip(*(row for _, row in filled), strict=True))
-        return fields or [()] * len(self.columns), np.array([line for line, _ in filled], np.int64)
+        fields = self._parsed(block, 0, [name])[name].fill_null("").str.strip_chars()
+        values = fields.cast(polars.Float64, strict=False)
+        wrong = values.is_null()
+        if may_lack:
+            wrong &= ~fields.str.to_lowercase().is_in(_NOTHING)
+        if wrong.any():
+            piece.refuse(int(wrong.arg_max() or 0), name)
+        piece.numbers[name] = values.to_numpy()
+
+    def _find(
+        self, block: bytes, reached: int, row: int | None = None, name: str | None = None
+    ) -> tuple[str, str]:
+        """Place of a row of a block, and its field; without a row, what is wrong is looked for."""
+        text = self._decoded(block, reached)
+        rows = csv.reader(io.StringIO(text, newline=""), delimiter=self._separator)
+        try:
+            for k, fields in enumerate(filter(None, rows)):
+                place = f"{self.path}, line {reached + rows.line_num}"
+                if len(fields) != len(self.columns):
+                    raise ValueError(
+                        f"{place}: {len(fields)} fields, but the header names {len(self.columns)} "
+                        f"(was the file cut off, or does a field hold {self._separator!r}?)"
+                    )
+                if k == row:
+                    return place, "" if name is None else fields[self.columns.index(name)]
+        except csv.Error as error:
+            line = reached + rows.line_num
+            raise ValueError(f"{self.path}, line {line}: {error} (an unclosed quote?)") from error
+        return f"{self.path}, after line {reached}", ""
+
+    def _refuse_quote(self, block: bytes, reached: int) -> NoReturn:
+        at = block.find(b'"')
+        for whole in self._quoted.finditer(block):
+            if whole.start() > at:
+                break
+            at = block.find(b'"', whole.end())
+        raise ValueError(
+            f"{self.path}, line {reached + block[:at].count(10) + 1}: a quote that does not "
+            "enclose a field (an unclosed quote? within quotes it has to be there twice)"
+        )
+
+    def _decoded(self, block: bytes, reached: int) -> str:
+        try:
+            return block.decode()
+        except UnicodeDecodeError as error:
+            line = reached + block.count(b"\n", 0, error.start)
+            raise ValueError(
+                f"{self.path}, after line {line}: this is not text in UTF-8 (a file of another "
+                "kind, or saved in another encoding?)"
+            ) from error
 
 
-class ParquetTable:
+def _without_blank_lines(block: bytes) -> bytes:
+    return re.sub(rb"\n[\r\n]*\n", b"\n", b"\n" + block)[1:]
+
+
+class ParquetTable(Table):
     """A Parquet file; read with polars because pyarrow cannot be imported beside libsumo."""
 
     def __init__(self, path: str, on_read: OnRead = silent) -> None:
@@ -201,15 +423,11 @@ class ParquetTable:
             import polars
         self.path = path
         self._on_read = on_read
-        try:
-            # polars takes other paths for addresses on the network, or of somebody's home.
-            self._scan = polars.scan_parquet(os.path.abspath(path), glob=False)
-            self._types = self._scan.collect_schema()
-            self._rows = int(self._scan.select(polars.len()).collect().item())
-        # A panic is what polars makes of some damaged files; it is no Exception.
-        except (polars.exceptions.PolarsError, polars.exceptions.PanicException) as error:
-            self._refuse(error)
-        self.columns = tuple(self._types)
+        # polars takes other paths for addresses on the network, or of somebody's home.
+        self._scan = polars.scan_parquet(os.path.abspath(path), glob=False)
+        self._types = self._read(lambda: self._scan.collect_schema())
+        self._rows = int(self._read(lambda: self._scan.select(polars.len()).collect().item()))
+        self.columns = list(self._types)
 
     def holds_dates(self, name: str) -> bool:
         """Whether its type says so, or the first of its texts."""
@@ -217,197 +435,103 @@ class ParquetTable:
 
         kind = self._types[name]
         if kind == polars.String and self._rows:
-            return looks_like_a_date(str(self._scan.select(name).head(1).collect().item() or ""))
+            first = self._read(lambda: self._scan.select(name).head(1).collect().item())
+            return _DATE.match(str(first or "")) is not None
         return isinstance(kind, polars.Datetime)
 
-    def pieces(
-        self,
-        numbers: Sequence[str],
-        texts: Sequence[str],
-        dates: Sequence[str] = (),
-        gaps: Sequence[str] = (),
-    ) -> Iterator[Piece]:
-        """Read the named columns, in the order of rows."""
+    def pieces(self, wanted: Wanted) -> Iterator[Piece]:
+        """Read columns, in the order of rows."""
         import polars
 
-        for name in numbers:
+        for name in wanted.numbers:
             if not self._types[name].is_numeric():
                 raise ValueError(
                     f"{self.path}: column {name!r} holds {self._types[name]}, not numbers"
                 )
-        texts = [*texts, *(name for name in dates if self._types[name] == polars.String)]
-        wanted = self._scan.select(list(dict.fromkeys([*numbers, *texts, *dates])))
-        size = os.path.getsize(self.path)
+        dates = [wanted.date] if wanted.date else []
+        part = self._scan.select(list(dict.fromkeys([*wanted.numbers, *wanted.texts, *dates])))
         # Not collect_batches: it reads ahead of a slow consumer without bound (polars #28569).
         for first in range(0, self._rows, _PARQUET_ROWS):
-            try:
-                frame = wanted.slice(first, _PARQUET_ROWS).collect()
-            except (polars.exceptions.PolarsError, polars.exceptions.PanicException) as error:
-                self._refuse(error)
-            rows = len(frame)
-            places = np.arange(first + 1, first + rows + 1)
-            piece = Piece(self.path, "row", places, {}, {})
-            for name in numbers:
-                values = frame[name].cast(polars.Float64).to_numpy()
-                if name not in gaps:
-                    refuse_unusable(piece, name, values)
-                piece.numbers[name] = values
-            for name in texts:
-                fields = frame[name].cast(polars.String).fill_null("")
-                firsts = fields.ne_missing(fields.shift()).arg_true()
-                piece.texts[name] = Texts(
-                    fields.gather(firsts).to_list(), firsts.to_numpy().astype(np.int64), rows
-                )
+            frame = self._read(part.slice(first, _PARQUET_ROWS).collect)
+            piece = Piece(len(frame), {}, partial(self._find, frame, first))
+            for name in wanted.numbers:
+                piece.numbers[name] = frame[name].cast(polars.Float64).to_numpy()
+                if name not in wanted.gaps:
+                    piece.refuse_unusable(name)
+            for name in wanted.texts:
+                piece.texts[name] = frame[name].cast(polars.String).fill_null("")
             for name in dates:
-                if name in piece.texts:
-                    piece.numbers[name] = _microseconds(piece, name)
-                else:
-                    ticks = frame[name].dt.epoch("us").cast(polars.Float64).to_numpy()
-                    refuse_unusable(piece, name, ticks)
-                    piece.numbers[name] = ticks
-            self._on_read(size * rows // self._rows)
+                piece.texts[name] = frame[name]
+                piece.numbers[name] = _microseconds(piece, name)
+            self._on_read(os.path.getsize(self.path) * len(frame) // self._rows)
             yield piece
 
-    def _refuse(self, error: BaseException) -> NoReturn:
-        cause = str(error).partition("\n")[0][:300]
-        raise ValueError(
-            f"{self.path} cannot be read as Parquet (was a copy or a download interrupted?): "
-            f"{cause}"
-        ) from error
+    def _find(
+        self, frame: polars.DataFrame, first: int, row: int, name: str | None
+    ) -> tuple[str, str]:
+        value = None if name is None else frame[name][row]
+        return f"{self.path}, row {first + row + 1}", "" if value is None else str(value)
 
+    def _read(self, read: Callable[[], Any]) -> Any:
+        import polars
 
-def _text(file: Any) -> io.TextIOWrapper:
-    return io.TextIOWrapper(file, encoding="utf-8", newline="")
-
-
-def _whole_lines(path: str, file: BinaryIO, reached: int) -> bytes:
-    """The next lines of a file, the last one ended whether it is in the file or not."""
-    file = cast(io.BufferedReader, file)
-    parts: list[bytes] = []
-    missing = _CSV_BYTES
-    with damage_explained(path, lambda: reached + b"".join(parts).count(b"\n")):
-        # Not `read`: where the file is damaged, it would forget what came before.
-        while missing > 0 and (part := file.read1(missing)):
-            parts.append(part)
-            missing -= len(part)
-        if parts and not parts[-1].endswith(b"\n"):
-            parts.append(file.readline(_LONGEST_CHARACTER * _LONGEST_LINE))
-            if not parts[-1].endswith(b"\n"):
-                parts.append(b"\n")
-    return b"".join(parts)
-
-
-def _lines(path: str, *parts: io.TextIOWrapper, reached: int = 0) -> Iterator[str]:
-    """The lines of the parts of a file; none is read whole that no table would hold."""
-    number = reached
-    for text in parts:
-        while line := text.readline(_LONGEST_LINE):
-            number += 1
-            if len(line) == _LONGEST_LINE and not line.endswith("\n"):
-                raise ValueError(
-                    f"{path}, line {number}: longer than {_LONGEST_LINE:,} characters; "
-                    "this is no table"
-                )
-            yield line
-
-
-class _LinesOfRow:
-    """Lines for a csv reader, which sees no end to a row whose quotes go on opening."""
-
-    def __init__(self, path: str, lines: Iterator[str], reached: int = 0) -> None:
-        self._path = path
-        self._lines = lines
-        self._size = 0  # of the row that is being read
-        self.number = reached  #: of the latest line
-
-    def __iter__(self) -> Self:
-        return self
-
-    def __next__(self) -> str:
-        line = next(self._lines)
-        self.number += 1
-        self._size += len(line)
-        if self._size > _LONGEST_ROW:
+        try:
+            return read()
+        # A panic is what polars makes of some damaged files; it is no Exception.
+        except (polars.exceptions.PolarsError, polars.exceptions.PanicException) as error:
+            cause = str(error).partition("\n")[0][:300]
             raise ValueError(
-                f"{self._path}, line {self.number}: a row of more than {_LONGEST_ROW:,} characters "
-                "(an unclosed quote?)"
-            )
-        return line
-
-    def some(self, rows: Iterator[list[str]]) -> list[tuple[int, list[str]]]:
-        """The next rows that a reader makes of these lines, each with its last line."""
-        found: list[tuple[int, list[str]]] = []
-        size = 0
-        for row in rows:
-            found.append((self.number, row))
-            size += self._size
-            self._size = 0
-            if len(found) == _CSV_ROWS or size > _CSV_CHARACTERS:
-                break
-        return found
+                f"{self.path} cannot be read as Parquet (was a copy or a download interrupted?): "
+                f"{cause}"
+            ) from error
 
 
-def _kept(lines: Iterator[str], into: list[str]) -> Iterator[str]:
-    """The same lines, each kept as well once it is read."""
-    for line in lines:
-        into.append(line)
-        yield line
+# -- Fields ---------------------------------------------------------------------------------------
 
 
-def _reads(text: str, read: Callable[[str], object] = float) -> bool:
-    """Whether a text can be read, as a number or by another function."""
-    try:
-        read(text)
-    except ValueError:
-        return False
-    return True
-
-
-def _numbers(piece: Piece, name: str, fields: Sequence[str], may_lack: bool) -> NDArray[np.float64]:
-    read = number_or_gap if may_lack else float
-    try:
-        values = np.fromiter(map(read, fields), np.float64, len(fields))
-    except ValueError:
-        row = next(row for row, field in enumerate(fields) if not _reads(field, read))
-        raise ValueError(f"{piece.at(row)}, column {name!r}: {explain_text(fields[row])}") from None
-    if not may_lack:
-        refuse_unusable(piece, name, values)
-    return values
-
-
-def _microseconds(piece: Piece, name: str) -> NDArray[np.float64]:
-    """Dates of a column of texts."""
-    texts = piece.texts[name]
-    try:
-        return np.repeat(microseconds(texts.values), texts.lengths)
-    except ValueError as error:
-        wrong = [not _reads(text, lambda one: microseconds([one])) for text in texts.values]
-        row = int(texts.firsts[wrong.index(True)]) if any(wrong) else 0
-        raise ValueError(
-            f"{piece.at(row)}, column {name!r}: {error}; the first row has a date, so all must "
-            "have one in ISO 8601, such as 2026-03-14T09:26:53.5+01:00"
-        ) from None
-
-
-def refuse_unusable(piece: Piece, name: str, values: NDArray[np.float64]) -> None:
-    """Raise where a number cannot be learnt; NaN is none."""
-    usable = np.abs(values) <= LARGEST_OBSERVATION  # false of NaN
-    if not usable.all():
-        row = int(np.argmin(usable))
-        raise ValueError(
-            f"{piece.at(row)}, column {name!r}: {values[row]} cannot be learnt "
-            "(a missing or failed measurement? leave the row out: a hole in time begins a new "
-            "episode)"
-        )
-
-
-def explain_text(text: str) -> str:
-    """Why a text is not the number it should be."""
+def explained(text: str) -> str:
+    """Why a text is not the number it should be, or one that cannot be learnt."""
     if not text.strip():
         return (
             "the field is empty (a missing measurement, or no leader? --no-leader end leaves such "
             "rows out; an episode's last action may be any number)"
         )
-    if _reads(text.replace(",", ".")):
+    if _is_number(text):
+        return (
+            f"{text[:40]} cannot be learnt (a missing or failed measurement? leave the row out: a "
+            "hole in time begins a new episode)"
+        )
+    if _is_number(text.replace(",", ".")):
         return f"{text[:40]!r} is no number (a decimal comma? write 1.5)"
     return f"{text[:40]!r} is no number (a text, a date, or a unit behind the number?)"
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text.replace("_", "x"))  # which Python reads, and nobody else
+    except ValueError:
+        return False
+    return True
+
+
+def _microseconds(piece: Piece, name: str) -> NDArray[np.float64]:
+    """Microseconds since 1970, exactly; without a zone a date is taken as UTC."""
+    import polars
+
+    dates = piece.texts.pop(name)
+    if dates.dtype == polars.String:
+        dates = dates.str.strip_chars().str.replace("[t ]", "T")
+        zoned = dates.str.contains(_ZONE)
+        if zoned.any() and not zoned.all():
+            row = int((zoned if not zoned[0] else ~zoned).arg_max() or 0)
+            piece.refuse(row, name, "{!r}: some have a zone and others have none")
+        layout = "%Y-%m-%dT%H:%M:%S%.f" + "%#z" * bool(zoned.any())
+        dates = dates.str.replace("[zZ]$", "+00:00").str.to_datetime(layout, strict=False)
+    if dates.null_count():
+        piece.refuse(
+            int(dates.is_null().arg_max() or 0),
+            name,
+            "{!r} is no date; the first row has one, so all must have one in ISO 8601, such as "
+            "2026-03-14T09:26:53.5+01:00",
+        )
+    return dates.dt.epoch("us").cast(polars.Float64).to_numpy()

@@ -20,7 +20,8 @@ if TYPE_CHECKING:
 
     from evofsm.cli.learning import Learning
     from evofsm.fsm import Category, EvolvingFSM, IntervalActions
-    from evofsm.io import Chunk, LogColumns, Noted, VehicleLengths
+    from evofsm.io.logs import Chunk, LogColumns, Noted
+    from evofsm.io.vehicles import VehicleLengths
     from evofsm.store import Checkpoint
 
 
@@ -161,7 +162,9 @@ class Learn(WithJson):
         from evofsm.cli.learning import learn_traces
         from evofsm.cli.text.learning import learning_document, print_learning
         from evofsm.driving import UNITS, VARIABLES
-        from evofsm.io import Noted, Topics, VehicleLengths, read_traces
+        from evofsm.io.logs import Noted, read_traces
+        from evofsm.io.rosbag import Topics
+        from evofsm.io.vehicles import VehicleLengths
         from evofsm.store import Checkpoint, duration, fingerprints, result_kept
 
         _check_out(self.out)
@@ -262,7 +265,7 @@ class Learn(WithJson):
 
     def _columns(self) -> LogColumns:
         from evofsm.fsm import ObservationEncoder, positive
-        from evofsm.io import Condition, LogColumns, parse_units
+        from evofsm.io.logs import LogColumns, parse_units
 
         try:
             names = split_names(self.observe)
@@ -275,7 +278,7 @@ class Learn(WithJson):
             time=self.time,
             episode=None if self.episode is None else split_names(self.episode),
             dt=None if self.dt is None else positive("--dt", self.dt),
-            failed=None if self.failed is None else Condition.parse(self.failed),
+            failed=self.failed,
             units=parse_units(self.unit or ()),
             leader_may_lack=self.no_leader is NoLeader.END,
         )

@@ -64,7 +64,7 @@ class Watch(Revised):
     def is_log(self) -> bool:
         """Whether it is a log that others wrote."""
         from evofsm.driving import FAMILIES
-        from evofsm.io import file_kind
+        from evofsm.io.tables import file_kind
 
         place = Path(self.what)
         if self.what in FAMILIES or place.suffix in (".toml", ".json"):
@@ -120,7 +120,7 @@ class Watch(Revised):
         from evofsm.cli.configuration import trace_configuration
         from evofsm.cli.watch.logged import MOST_ROWS, record_log
         from evofsm.cli.watch.recording import Recording
-        from evofsm.io import Topics
+        from evofsm.io.rosbag import Topics
 
         with TemporaryDirectory() as folder, progress() as bars:
             task = bars.add_task("Reading", total=MOST_ROWS)

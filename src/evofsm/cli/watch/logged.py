@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from evofsm.driving import VARIABLES, guard_for_cars, shadow_drive
 from evofsm.guard import TOLERANCE, Mode
-from evofsm.io import LoggedRow, Topics, read_traces, recording, rows_of
+from evofsm.io.logs import Chunk, episodes_of, read_traces
+from evofsm.io.mcap import recording
+from evofsm.io.rosbag import Topics
 
 #: More rows of a log are not watched.
 MOST_ROWS = 20_000
@@ -58,51 +57,46 @@ def record_log(
     ValueError
         If the log cannot be read, or no episode has ten rows.
     """
-    dt = np.nan
-    taken = 0
-
-    def rows() -> Iterator[LoggedRow]:
-        nonlocal dt
-        for chunk in read_traces([path], topics=topics):
-            dt = chunk.dt
-            yield from rows_of([chunk])
-
-    reading = rows()
+    reading = read_traces([path], topics=topics)
+    taken, more = 0, False
     about: dict[str, Any] = {"source": Path(path).name, "mode": "shadow", "judge": judge}
     guard = None
     with recording(out, about | {"controller": "as recorded", "tolerance": tolerance}) as log:
-        for episode in _episodes(islice(reading, MOST_ROWS)):
-            taken += len(episode)
+        for episode in episodes_of(_first(reading, MOST_ROWS + 1)):
+            more = taken + len(episode.times) > MOST_ROWS
+            episode = episode.rows(0, MOST_ROWS - taken)
+            taken += len(episode.times)
             progress(taken)
-            if len(episode) < _FEWEST_ROWS:
-                continue
-            if guard is None:
-                guard = guard_for_cars(
-                    _LOWEST, _HIGHEST, dt, mode=Mode.SHADOW, tolerance=tolerance, judge=judge
+            if len(episode.times) >= _FEWEST_ROWS:
+                if guard is None:
+                    guard = guard_for_cars(
+                        _LOWEST,
+                        _HIGHEST,
+                        episode.dt,
+                        mode=Mode.SHADOW,
+                        tolerance=tolerance,
+                        judge=judge,
+                    )
+                log.add(
+                    shadow_drive(
+                        guard,
+                        episode.times - episode.times[0],
+                        episode.observations,
+                        episode.actions,
+                        failed=episode.failures is not None and len(episode.failures) > 0,
+                    )
                 )
-            log.add(
-                shadow_drive(
-                    guard,
-                    [row.time - episode[0].time for row in episode],
-                    [[row.values[name] for name in VARIABLES] for row in episode],
-                    [row.action for row in episode],
-                    failed=episode[-1].failed,
-                )
-            )
         if guard is None:
             raise ValueError(f"{path}: nobody follows anybody for {_FEWEST_ROWS} rows")
         if guard.machine is not None:
             log.attach(guard.machine.model(names=VARIABLES))
-    return next(reading, None) is not None
+    return more
 
 
-def _episodes(rows: Iterable[LoggedRow]) -> Iterator[list[LoggedRow]]:
-    """Rows from one beginning to the next."""
-    waiting: list[LoggedRow] = []
-    for row in rows:
-        if row.begins and waiting:
-            yield waiting
-            waiting = []
-        waiting.append(row)
-    if waiting:
-        yield waiting
+def _first(chunks: Iterable[Chunk], most: int) -> Iterator[Chunk]:
+    """No more rows than that."""
+    for chunk in chunks:
+        yield chunk.rows(0, most)
+        most -= len(chunk.times)
+        if most <= 0:
+            return

@@ -1,0 +1,695 @@
+"""Logs and recordings of any size as chunks that fit a machine's `learn_many`."""
+
+from __future__ import annotations
+
+import operator
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evofsm.driving import VARIABLES
+from evofsm.fsm import Category, ObservationEncoder
+from evofsm.io import vehicles
+from evofsm.io.rosbag import BagTable, Topics
+from evofsm.io.tables import (
+    UNITS,
+    CsvTable,
+    OnRead,
+    ParquetTable,
+    Piece,
+    Table,
+    Wanted,
+    file_kind,
+    silent,
+)
+from evofsm.io.vehicles import ACTION, PairTable, VehicleLengths
+
+#: Columns that tell episodes apart where nothing else was said and they exist.
+USUAL_EPISODE = ("run", "pair", "segment")
+#: Steps longer than the usual one times this, or as much shorter, begin a new episode.
+LONGEST_STEP = 1.5
+# Rows of a file whose steps tell the usual one.
+_FIRST_ROWS = 8192
+# Share by which the usual steps of two files may differ.
+_SAME_STEP = 0.05
+# Episodes of a file that are kept in mind, some 30 MB; of those after them nothing is known.
+_MOST_EPISODES = 1 << 18
+# Speeds [m/s] and usual steps [s] beyond these are most likely in another unit.
+_FASTEST, _LONGEST_USUAL = 60.0, 10.0
+_SPEED = re.compile(r"v([_0-9]|$)|.*(speed|velocity)", re.IGNORECASE)
+_MICROSECOND = 1e-6
+
+_SIGNS = {
+    **{"<=": operator.le, ">=": operator.ge, "==": operator.eq, "!=": operator.ne},
+    **{"<": operator.lt, ">": operator.gt, "=": operator.eq},
+}
+_TRUTHS = {"true": 1, "yes": 1, "1": 1, "1.0": 1, "false": 0, "no": 0, "0": 0, "0.0": 0}
+
+
+class Chunk(NamedTuple):
+    """T consecutive rows of a trace, m variables each."""
+
+    source: str  #: file they come from
+    observations: NDArray[np.float64]  #: (T, m)
+    actions: NDArray[np.float64]  #: (T,) action taken after each, NaN where none is known
+    times: NDArray[np.float64]  #: (T,) [s]
+    starts: NDArray[np.int64]  #: (E,) rows at which an episode begins
+    dt: float  #: usual time from a row to the next [s]; NaN while no two rows belong together
+    jumps: int = 0  #: episodes that begin because of a hole in time
+    cuts: int = 0  #: episodes that end because too many pairs were on the road to wait for
+    #: (K,) rows with which an episode ended in failure; None where nothing tells of failures
+    failures: NDArray[np.int64] | None = None
+
+    def rows(self, first: int, end: int) -> Chunk:
+        """Some of its rows."""
+
+        def within(rows: NDArray[np.int64]) -> NDArray[np.int64]:
+            return rows[(rows >= first) & (rows < end)] - first
+
+        return self._replace(
+            observations=self.observations[first:end],
+            actions=self.actions[first:end],
+            times=self.times[first:end],
+            starts=within(self.starts),
+            failures=None if self.failures is None else within(self.failures),
+        )
+
+
+@dataclass
+class Noted:
+    """What was noticed while logs were read, for people."""
+
+    units: dict[str, str] = field(default_factory=dict)  #: that columns were converted from
+    leaderless: int = 0  #: rows without a leader, left out
+    after_failure: int = 0  #: rows left out because the failure before them still held
+    unplaced: int = 0  #: failures in rows without a leader, which belong to no episode
+    fastest: dict[str, float] = field(default_factory=dict)  #: by variable, beyond belief [m/s]
+    longest_step: float = 0.0  #: the usual one, beyond belief [s]
+
+    def see(self, chunk: Chunk, names: Sequence[str]) -> None:
+        """Look for speeds and steps that are beyond belief."""
+        for name, values in zip(names, chunk.observations.T, strict=True):
+            if _SPEED.match(name) and (fastest := float(np.abs(values).max())) > _FASTEST:
+                self.fastest[name] = max(fastest, self.fastest.get(name, 0.0))
+        if chunk.dt > _LONGEST_USUAL:
+            self.longest_step = max(chunk.dt, self.longest_step)
+
+    def warnings(self, time: str = "time") -> list[str]:
+        """What is most likely a mistake, and what would mend it."""
+        found = [
+            f"{name} reaches {fastest:,.0f} m/s, faster than any car on a road: is it in km/h or "
+            f"mph? --unit {name}=km/h converts it"
+            for name, fastest in self.fastest.items()
+        ]
+        if self.longest_step:
+            found.append(
+                f"there is a row every {self.longest_step:,.6g} s: is the time in ms? --unit "
+                f"{time}=ms converts it"
+            )
+        if self.unplaced:
+            found.append(
+                f"{self.unplaced:,} failures lie in rows without a leader, belong to no episode, "
+                "and were not counted"
+            )
+        return found
+
+
+# -- What columns mean ----------------------------------------------------------------------------
+
+
+def parse_units(texts: Iterable[str]) -> dict[str, str]:
+    """Units by the column, or the beginning of columns, from what --unit was given.
+
+    >>> parse_units(["v=km/h", "time=ms"])
+    {'v': 'km/h', 'time': 'ms'}
+    """
+    found: dict[str, str] = {}
+    for text in texts:
+        name, _, unit = (part.strip() for part in text.rpartition("="))
+        if not (name and unit in UNITS):
+            raise ValueError(f"--unit is {text!r}; write NAME=UNIT with one of {', '.join(UNITS)}")
+        if name in found:
+            raise ValueError(f"--unit names {name!r} twice")
+        found[name] = unit
+    return found
+
+
+def units_of(
+    units: Mapping[str, str], used: Sequence[str], existing: Sequence[str], time: str
+) -> dict[str, str]:
+    """The unit of each column in use that was given one.
+
+    A name that is no column's is the beginning of all that it fits; the longest one counts.
+
+    >>> units_of({"v": "km/h"}, ["gap", "v_follower", "time"], ["gap", "v_follower"], "time")
+    {'v_follower': 'km/h'}
+    """
+    found: dict[str, str] = {}
+    for name in sorted(units, key=lambda name: (name in existing, len(name))):
+        fit = [x for x in used if x == name or (name not in existing and x.startswith(name))]
+        if not fit:
+            raise ValueError(
+                f"--unit {name}={units[name]}: no column that is read is called so, or begins so; "
+                f"read are {', '.join(used)}"
+            )
+        found |= dict.fromkeys(fit, units[name])
+    for name, unit in found.items():
+        if (UNITS[unit][0] == "time") != (name == time):
+            raise ValueError(
+                f"--unit gives column {name!r} the unit {unit}; the column of the time needs a "
+                "unit of time, and no other one may have it"
+            )
+    return found
+
+
+class Condition(NamedTuple):
+    """What tells of failures: a column of truth values, or one that is compared with a number."""
+
+    column: str
+    sign: str  #: of the comparison; empty for truth values
+    number: float
+
+    @classmethod
+    def parse(cls, text: str) -> Condition:
+        """From ``collided`` or ``gap<=0``."""
+        column, sign, number, *_ = *re.split("(<=|>=|==|!=|<|>|=)", text, maxsplit=1), "", "0"
+        try:
+            condition = cls(column.strip(), sign, float(number))
+        except ValueError:
+            condition = cls("", "", np.nan)
+        if not (condition.column and np.isfinite(condition.number)):
+            raise ValueError(
+                f"--failed is {text!r}; write a column of truth values, such as collided, or "
+                "compare one with a number, such as 'gap<=0'"
+            )
+        return condition
+
+    def holds(self, piece: Piece) -> NDArray[np.bool_]:
+        """In which rows of a piece it holds; where a number is missing it never does."""
+        if self.sign:
+            values = piece.numbers[self.column]
+            return np.asarray(_SIGNS[self.sign](values, self.number) & ~np.isnan(values))
+        texts = piece.texts[self.column].str.strip_chars().str.to_lowercase()
+        values = texts.replace_strict(_TRUTHS, default=-1).to_numpy()
+        if (values < 0).any():
+            piece.refuse(
+                int(np.argmin(values)),
+                self.column,
+                "{!r} is no truth value; --failed needs a column of 0 and 1, true and false or yes "
+                f"and no, or a comparison such as '{self.column}>0'",
+            )
+        return values.astype(np.bool_)
+
+
+@dataclass(frozen=True)
+class LogColumns:
+    """Which columns of a log mean what.
+
+    Parameters
+    ----------
+    observe : ObservationEncoder
+        The variables, each a column of its name.
+    action : str
+        Column of the action taken from a row to the next.
+    time : str
+        Column of the time [s]; not read if ``dt`` is given.
+    episode : sequence of str, optional
+        An episode begins where one of these columns changes, and in each file; without it,
+        those of run, pair and segment that exist. The rows of an episode stand together.
+    dt : float, optional
+        Time from a row to the next [s], for a log without a clock.
+    failed : str, optional
+        A column of truth values, or a comparison such as ``"gap<=0"``. The row with which it first
+        holds ends the episode in failure; those after it in which it still holds are left out.
+        Without it nothing tells of failures.
+    units : mapping, optional
+        Units by the column, or the beginning of columns, that are not those of the SI: ``"km/h"``.
+    leader_may_lack : bool
+        Whether a row in which an observed number is missing (an empty field, NaN, infinity) ends
+        the episode, and is left out; else it is refused.
+    """
+
+    observe: ObservationEncoder = field(default_factory=lambda: ObservationEncoder(*VARIABLES))
+    action: str = ACTION
+    time: str = "time"
+    episode: Sequence[str] | None = None
+    dt: float | None = None
+    failed: str | None = None
+    units: Mapping[str, str] = field(default_factory=dict)
+    leader_may_lack: bool = False
+
+    @property
+    def condition(self) -> Condition | None:
+        """What tells of failures."""
+        return None if self.failed is None else Condition.parse(self.failed)
+
+
+# -- Reading --------------------------------------------------------------------------------------
+
+
+def read_traces(
+    paths: Iterable[str],
+    columns: LogColumns | None = None,
+    lengths: VehicleLengths | None = None,
+    on_read: OnRead = silent,
+    noted: Noted | None = None,
+    topics: Topics | None = None,
+) -> Iterator[Chunk]:
+    r"""Read logs (CSV, Parquet), and recordings in which many vehicles follow each other.
+
+    These are FCD output of SUMO (XML, CSV, Parquet), tables of objects (CSV, Parquet) and traces of
+    ASAM OSI (``.osi``, MCAP). All but Parquet and MCAP may be gzipped. Bags of ROS 2 (a folder, or
+    a single ``.mcap`` or ``.db3``) are read as a log is.
+
+    Parameters
+    ----------
+    paths : iterable of str
+        Files, in the order in which they are learnt.
+    columns : LogColumns, optional
+        What the columns of a log mean. Recordings of many vehicles give gap, v_follower, v_leader
+        and a_follower.
+    lengths : VehicleLengths, optional
+        Lengths assumed for vehicles in FCD.
+    on_read : callable, optional
+        Called with the number of bytes whenever some were read.
+    noted : Noted, optional
+        Collects what is noticed in reading.
+    topics : Topics, optional
+        What the topics of bags mean.
+
+    Yields
+    ------
+    Chunk
+        Some thousand rows, however large the files are. Every file begins an episode.
+
+    Raises
+    ------
+    ValueError
+        If a file is not what it should be; the message names file, line and likely cause. So
+        where an episode comes back after another one, of the first 262,144 episodes of a file.
+    ModuleNotFoundError
+        If what reads such a file is not installed; the message has the command that does it.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = Path(folder) / "a.csv"
+    ...     _ = path.write_text("time,gap,v_follower,v_leader,a_follower\n0,9,20,19,-1\n")
+    ...     next(read_traces([str(path)])).observations
+    array([[ 9., 20., 19.]])
+    """
+    columns = columns or LogColumns()
+    lengths = lengths or VehicleLengths()
+    noted = noted or Noted()
+    clock = _Clock(columns.dt)
+    for path in paths:
+        clock.open(path)
+        rows, left_out = 0, noted.leaderless
+        table = _open(path, columns, lengths, on_read, topics)
+        these = _columns_of_pairs(path, columns) if isinstance(table, PairTable) else columns
+        for chunk in _read_table(table, these, clock, noted):
+            rows += len(chunk.times)
+            noted.see(chunk, columns.observe.names)
+            yield chunk
+        if rows == 0 and noted.leaderless > left_out:
+            raise ValueError(
+                f"{path}: no row has a leader; {', '.join(columns.observe.names)} must all be there"
+            )
+        if rows == 0:
+            raise ValueError(f"{path} has a header but no rows")
+    lengths.refuse_unknown()
+
+
+def episodes_of(chunks: Iterable[Chunk]) -> Iterator[Chunk]:
+    """The episodes of chunks, each as one chunk, however many it was read in.
+
+    Parameters
+    ----------
+    chunks : iterable of Chunk
+        As `read_traces` yields them.
+
+    Yields
+    ------
+    Chunk
+        Its ``jumps`` and ``cuts`` are not told apart by episode.
+
+    Examples
+    --------
+    >>> chunk = Chunk("a", np.zeros((5, 1)), np.zeros(5), np.arange(5.0), np.array([0, 3]), 1.0)
+    >>> [episode.times.tolist() for episode in episodes_of([chunk.rows(0, 1), chunk.rows(1, 5)])]
+    [[0.0, 1.0, 2.0], [3.0, 4.0]]
+    """
+    parts: list[Chunk] = []
+    for chunk in chunks:
+        begins = chunk.starts.tolist()
+        for first, end in pairwise([*([] if 0 in begins else [0]), *begins, len(chunk.times)]):
+            if first in begins and parts:
+                yield _joined(parts)
+                parts = []
+            parts.append(chunk.rows(first, end))
+    if parts:
+        yield _joined(parts)
+
+
+def _joined(parts: Sequence[Chunk]) -> Chunk:
+    observations, actions, times = (
+        np.concatenate([getattr(part, name) for part in parts])
+        for name in ("observations", "actions", "times")
+    )
+    failures = parts[-1].failures  # which end an episode
+    if failures is not None:
+        failures = failures + len(times) - len(parts[-1].times)
+    return parts[0]._replace(
+        observations=observations, actions=actions, times=times, dt=parts[-1].dt, failures=failures
+    )
+
+
+def _open(
+    path: str,
+    columns: LogColumns,
+    lengths: VehicleLengths,
+    on_read: OnRead,
+    topics: Topics | None,
+) -> Table:
+    """The rows of a file, whatever it holds."""
+    kind = file_kind(path)
+    if kind == "bag":
+        if topics is None:
+            raise ValueError(
+                f"{path} is a bag of ROS 2; --topics names a file that says which field of which "
+                "topic is which variable (docs/how-to/logs-of-others.md has one)"
+            )
+        return BagTable(path, topics, on_read)
+    if kind == "run":
+        raise ValueError(
+            f"{path} is a run that evofsm drove and learnt from: evofsm watch replays it, and "
+            "evofsm inspect prints its model"
+        )
+    if kind in ("osi", "mcap"):
+        read = vehicles.scenes_of_osi if kind == "osi" else vehicles.scenes_of_mcap
+        return PairTable(path, vehicles.pairs_of_scenes(path, read(path, on_read)))
+    if kind == "xml":
+        timesteps = vehicles.fcd_of_xml(path, on_read)
+        return PairTable(path, vehicles.pairs_of_fcd(path, timesteps, lengths))
+    table: Table = CsvTable(path, on_read) if kind == "csv" else ParquetTable(path, on_read)
+    if vehicles.FCD_TIME in table.columns:
+        timesteps = vehicles.fcd_of_table(table)
+        return PairTable(path, vehicles.pairs_of_fcd(path, timesteps, lengths))
+    there = set(table.columns)
+    if set(vehicles.OBJECT_COLUMNS) <= there and not set(columns.observe.names) <= there:
+        scenes = vehicles.scenes_of_table(table)
+        return PairTable(path, vehicles.pairs_of_scenes(path, scenes))
+    return table
+
+
+def _columns_of_pairs(path: str, columns: LogColumns) -> LogColumns:
+    """What is read of a recording of many vehicles; what else was asked for is refused."""
+    asked = [f"--observe {name}" for name in columns.observe.names if name not in VARIABLES]
+    asked += [f"--action {columns.action}"] if columns.action != ACTION else []
+    asked += ["--episode"] if columns.episode is not None else []
+    asked += ["--dt"] if columns.dt is not None else []
+    asked += ["--unit"] if columns.units else []
+    failed = columns.condition
+    if failed is not None and not (failed.sign and failed.column in (*VARIABLES, ACTION)):
+        asked += [f"--failed {columns.failed} (but with 'gap<=0')"]
+    if asked:
+        raise ValueError(
+            f"{path} holds many vehicles (FCD of SUMO, objects, OSI), with a clock and episodes of "
+            f"their own; it gives {', '.join(VARIABLES)} and the action {ACTION}, and cannot be "
+            f"read with {', '.join(asked)}"
+        )
+    return replace(columns, time="time", leader_may_lack=False)
+
+
+def _read_table(table: Table, columns: LogColumns, clock: _Clock, noted: Noted) -> Iterator[Chunk]:
+    """The rows of a table that are learnt, piece by piece."""
+    variables = columns.observe.variables
+    observed = [v for v in variables if isinstance(v, str)]
+    learnt = [*observed, columns.action]
+    usual = [name for name in USUAL_EPISODE if name in table.columns]
+    episode = usual if columns.episode is None else list(columns.episode)
+    failed = columns.condition
+    compared = [failed.column] if failed is not None and failed.sign else []
+    texts = [*episode, *(v.name for v in variables if isinstance(v, Category))]
+    texts += [failed.column] if failed is not None and not failed.sign else []
+    others = [columns.time] if clock.ticks else []
+    _refuse_missing(table, columns, [*learnt, *others, *compared, *texts])
+    date = columns.time if clock.ticks and table.holds_dates(columns.time) else None
+    numbers = [*learnt, *compared, *(others if date is None else [])]
+    factors = _factors(table, columns, numbers, noted)
+    only_compared = [name for name in compared if name not in learnt]  # may be infinite
+    gaps = [*(learnt if columns.leader_may_lack else []), *only_compared]
+    blocks, sieve = _Blocks(episode), _Sieve(noted)
+    before = 0
+    for piece in table.pieces(Wanted(numbers, texts, gaps, date)):
+        for name, factor in factors.items():
+            piece.numbers[name] = piece.numbers[name] * factor
+        starts = blocks.starts(piece)
+        anew, holes = starts.copy(), np.zeros(piece.rows, np.bool_)
+        if clock.ticks:
+            times = clock.seconds(piece.numbers[columns.time], date is not None)
+            holes = clock.holes(times, starts, piece)
+            starts |= holes
+        else:
+            times = np.arange(before, before + piece.rows) * np.float64(clock.dt)
+        before += piece.rows
+        lacking = np.zeros(piece.rows, np.bool_)
+        for name in observed if columns.leader_may_lack else ():
+            lacking |= ~np.isfinite(piece.numbers[name])
+        holds = None if failed is None else failed.holds(piece)
+        kept, fails = sieve.sift(anew, starts, holds, lacking)
+        if not kept.any():
+            continue
+        _refuse_gaps(piece, columns, kept, only_compared)
+        rows = slice(None) if kept.all() else kept  # a slice copies nothing
+        yield Chunk(
+            source=table.path,
+            observations=np.column_stack([_encoded(piece, v) for v in variables])[rows],
+            actions=piece.numbers[columns.action][rows],
+            times=times[rows],
+            starts=np.flatnonzero(starts[rows]),
+            dt=clock.dt,
+            jumps=int(holes[rows].sum()),
+            cuts=piece.cuts,
+            failures=None if failed is None else np.flatnonzero(fails[rows]),
+        )
+
+
+def _refuse_missing(table: Table, columns: LogColumns, names: Sequence[str]) -> None:
+    for name in names:
+        if name not in table.columns:
+            option = {columns.action: "--action", columns.time: "--time"}.get(name)
+            option = option or ("--episode" if name in (columns.episode or ()) else "--observe")
+            if columns.condition and name == columns.condition.column:
+                option = option if name in columns.observe.names else "--failed"
+            shown = ", ".join(name[:40] for name in table.columns[:20])
+            more = f" and {len(table.columns) - 20:,} more" if len(table.columns) > 20 else ""
+            raise ValueError(
+                f"{table.path} has no column {name!r}; it has {shown}{more} ({option} names the "
+                f"right one{', and --dt stands in for a clock' if option == '--time' else ''})"
+            )
+
+
+def _refuse_gaps(
+    piece: Piece, columns: LogColumns, kept: NDArray[np.bool_], only_compared: Sequence[str]
+) -> None:
+    """Raise where something is missing in a row that is kept."""
+    for name in only_compared:
+        if (lacks := kept & np.isnan(piece.numbers[name])).any():
+            piece.refuse(int(np.argmax(lacks)), name)
+    if columns.leader_may_lack:
+        for variable in columns.observe.variables:
+            if isinstance(variable, str):
+                piece.refuse_unusable(variable, kept)
+        if piece.starts is None:  # else the action may be derived, and NaN
+            piece.refuse_unusable(columns.action, kept)
+
+
+def _factors(
+    table: Table, columns: LogColumns, numbers: Sequence[str], noted: Noted
+) -> dict[str, float]:
+    """What turns columns into units of the SI, by name, for those that need it."""
+    try:
+        given = units_of(columns.units, numbers, table.columns, columns.time)
+    except ValueError as error:
+        raise ValueError(f"{table.path}: {error}") from None
+    noted.units |= given
+    return {name: UNITS[unit][1] for name, unit in given.items()}
+
+
+def _encoded(piece: Piece, variable: str | Category) -> NDArray[np.float64]:
+    """Columns of the observation for one variable."""
+    if isinstance(variable, str):
+        return piece.numbers[variable]
+    encoder = ObservationEncoder(variable)
+    codes = np.array([encoder.encode({variable.name: value}) for value in variable.values])
+    places = {value: place for place, value in enumerate(variable.values)}
+    found = piece.texts[variable.name].replace_strict(places, default=-1).to_numpy()
+    if (found < 0).any():
+        names = ", ".join(variable.values)
+        piece.refuse(
+            int(np.argmin(found)),
+            variable.name,
+            "{!r} is none of the values that --observe names: " + names,
+        )
+    return np.asarray(codes[found], np.float64)
+
+
+# -- Episodes -------------------------------------------------------------------------------------
+
+
+class _Clock:
+    """Sees that time runs forward, and finds the holes in it.
+
+    The usual step of a file is the median of the steps in the first rows read of it.
+    """
+
+    def __init__(self, dt: float | None) -> None:
+        self.ticks = dt is None
+        self.dt = np.nan if dt is None else dt
+        self._first_path = ""
+
+    def open(self, path: str) -> None:
+        """Begin a file."""
+        self._path = path
+        self._last = self._usual = self._first_date = np.nan
+
+    def seconds(self, times: NDArray[np.float64], are_dates: bool) -> NDArray[np.float64]:
+        """The same times; of dates, which are in microseconds, those since the first one."""
+        if not are_dates:
+            return times
+        if np.isnan(self._first_date):
+            self._first_date = times[0]
+        return (times - self._first_date) * _MICROSECOND
+
+    def holes(
+        self, times: NDArray[np.float64], starts: NDArray[np.bool_], piece: Piece
+    ) -> NDArray[np.bool_]:
+        """Mark rows that come too late, or too soon, to follow the row before in its episode."""
+        steps = np.diff(times, prepend=self._last)
+        steps[starts] = np.nan
+        self._last = times[-1]
+        if (steps <= 0.0).any():
+            row = int(np.argmax(steps <= 0.0))
+            raise ValueError(
+                f"{piece.at(row)}: time goes from {times[row] - steps[row]:g} to {times[row]:g} "
+                "within an episode; it must run forward (rows not sorted by time, or several "
+                "episodes mixed? --episode names the columns that tell them apart)"
+            )
+        first = steps[:_FIRST_ROWS]
+        if np.isnan(self._usual) and not np.isnan(first).all():
+            self._settle(round(float(np.nanmedian(first)), 9))
+        unusual = (steps > LONGEST_STEP * self._usual) | (steps < self._usual / LONGEST_STEP)
+        return np.asarray(unusual)
+
+    def _settle(self, usual: float) -> None:
+        if usual <= 0.0:
+            raise ValueError(
+                f"{self._path}: a row follows the one before within less than a nanosecond; the "
+                "time must be in seconds"
+            )
+        if np.isnan(self.dt):
+            self.dt, self._first_path = usual, self._path
+        if not abs(usual / self.dt - 1.0) < _SAME_STEP:
+            raise ValueError(
+                f"{self._path} has a row every {usual:g} s, but {self._first_path} has one every "
+                f"{self.dt:g} s; a machine knows only one step: resample, or learn them apart"
+            )
+        self._usual = usual
+
+
+class _Blocks:
+    """Sees that the rows of an episode stand together in a file.
+
+    An episode that comes back after another one would be cut there, and what leads from one of its
+    rows to the next would be lost without a word.
+    """
+
+    def __init__(self, names: Sequence[str]) -> None:
+        self._names = names
+        self._episodes: set[tuple[str, ...]] = set()
+        self._blocks = 0  # of these episodes
+        self._latest: tuple[str, ...] | None = None
+
+    def starts(self, piece: Piece) -> NDArray[np.bool_]:
+        """The rows of the next piece that begin another episode."""
+        starts = np.zeros(piece.rows, np.bool_)
+        if piece.starts is not None:
+            starts[piece.starts] = True
+            return starts
+        keys = [piece.texts[name] for name in self._names]
+        for key in keys:
+            starts[1:] |= (key[1:] != key[:-1]).to_numpy()
+        starts[0] = self._latest != tuple(key[0] for key in keys)
+        self._latest = tuple(key[-1] for key in keys)
+        came_back = None
+        rows = np.flatnonzero(starts)
+        for row, *episode in zip(rows.tolist(), *(key.gather(rows) for key in keys), strict=True):
+            known = tuple(episode)
+            if known in self._episodes:
+                came_back = came_back or (row, known)
+            elif len(self._episodes) < _MOST_EPISODES:
+                self._episodes.add(known)
+            else:
+                continue
+            self._blocks += 1
+        if came_back is not None:
+            row, known = came_back
+            names = ", ".join(self._names)
+            reached = piece.at(piece.rows - 1).removeprefix(piece.at(0).rpartition(", ")[0] + ", ")
+            raise ValueError(
+                f"{piece.at(row)}: the episode {', '.join(value[:40] for value in known)} "
+                f"({names}) comes back after another one: up to {reached}, "
+                f"{len(self._episodes):,} episodes take turns in {self._blocks:,} blocks of rows, "
+                "and each block would be taken for an episode of its own; sort the file by "
+                f"{names} and then by time"
+            )
+        return starts
+
+
+class _Sieve:
+    """Finds the rows that are learnt, and where episodes begin and fail because of others.
+
+    It knows of the row before the present ones whether a condition held in it, and whether it
+    ended its episode.
+    """
+
+    def __init__(self, noted: Noted) -> None:
+        self._noted = noted
+        self._held = self._ended = False
+
+    def sift(
+        self,
+        anew: NDArray[np.bool_],
+        starts: NDArray[np.bool_],
+        holds: NDArray[np.bool_] | None,
+        lacking: NDArray[np.bool_],
+    ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+        """Which rows are kept, and which of them fail; marks ``starts`` after those that end one.
+
+        An episode begins ``anew`` where the log says so, and at ``starts``. What still ``holds``
+        is no second failure, and a hole in time does not make it one.
+        """
+        kept = ~lacking
+        fails = np.zeros(len(starts), np.bool_)
+        if holds is not None:
+            before = np.concatenate([[self._held], holds[:-1]]) & ~anew
+            self._held = bool(holds[-1])
+            fails = holds & ~before
+            still = holds & before
+            self._noted.unplaced += int((fails & ~kept).sum())
+            self._noted.after_failure += int((still & kept).sum())
+            fails &= kept
+            kept &= ~still
+        self._noted.leaderless += int(lacking.sum())
+        ends = fails | ~kept
+        starts |= np.concatenate([[self._ended], ends[:-1]])
+        self._ended = bool(ends[-1])
+        return kept, fails

@@ -1,0 +1,429 @@
+"""Recordings of many vehicles: FCD of SUMO, tables of objects, ASAM OSI."""
+
+import gzip
+import json
+import math
+import re
+import subprocess
+import sys
+from importlib.util import find_spec
+
+import numpy as np
+import pytest
+
+from evofsm.fsm.observations import ObservationEncoder
+from evofsm.io import vehicles
+from evofsm.io.logs import LogColumns, Noted, read_traces
+from evofsm.io.vehicles import VehicleLengths
+
+polars = pytest.importorskip("polars")
+
+OBJECTS = "id,t,x,y,vx,vy,length,lane"
+
+
+def write(path, text):
+    path.write_text(text)
+    return str(path)
+
+
+def episodes(path, lengths=None, **columns):
+    """Every episode as (observations, actions, times)."""
+    found = []
+    for chunk in read_traces([str(path)], LogColumns(**columns), lengths):
+        ends = [*chunk.starts[1:], len(chunk.times)]
+        for start, end in zip(chunk.starts, ends, strict=True):
+            part = slice(start, end)
+            found.append((chunk.observations[part], chunk.actions[part], chunk.times[part]))
+    return found
+
+
+def refusal(path, **columns):
+    with pytest.raises(ValueError, match=re.escape(str(path))) as caught:
+        list(read_traces([str(path)], LogColumns(**columns)))
+    return str(caught.value)
+
+
+# -- FCD ------------------------------------------------------------------------------------------
+
+
+def xml(timesteps):
+    """FCD from ``{time: [(id, lane, pos, speed[, type]), ...]}``; a row each, timestep each."""
+    lines = ["<fcd-export>"]
+    for time, present in timesteps.items():
+        lines.append(f'<timestep time="{time}">')
+        for name, lane, position, speed, *kind in present:
+            kind = f' type="{kind[0]}"' if kind else ""
+            lines.append(
+                f'<vehicle id="{name}" lane="{lane}" pos="{position}" speed="{speed}"{kind}/>'
+            )
+        lines.append("</timestep>")
+    return "\n".join([*lines, "</fcd-export>", ""])
+
+
+PAIR = [("a", "e_0", 50.0, 1.0), ("b", "e_0", 20.0, 2.0)]
+
+
+def test_gap_is_between_bumpers_and_the_action_is_what_came_next(tmp_path):
+    road = {
+        0.0: [("a", "e_0", 50.0, 8.0), ("b", "e_0", 20.0, 10.0)],
+        0.5: [("a", "e_0", 54.0, 8.0), ("b", "e_0", 25.0, 9.0)],
+        1.0: [("a", "e_0", 58.0, 9.0), ("b", "e_0", 29.5, 9.5)],
+    }
+    ((observations, actions, times),) = episodes(write(tmp_path / "a.xml", xml(road)))
+    assert observations.tolist() == [[25.0, 10.0, 8.0], [24.0, 9.0, 8.0], [23.5, 9.5, 9.0]]
+    assert actions[:2].tolist() == [-2.0, 1.0]
+    assert np.isnan(actions[2])
+    assert times.tolist() == [0.0, 0.5, 1.0]
+
+
+def test_pairs_are_neighbours_on_the_same_lane_only(tmp_path):
+    here = [("a", "e_0", 90.0, 1.0), ("b", "e_1", 60.0, 2.0), ("c", "e_0", 50.0, 3.0)]
+    here += [("d", "e_0", 46.0, 4.0), ("e", "f_0", 20.0, 5.0)]
+    found = episodes(write(tmp_path / "a.xml", xml({0.0: here, 0.1: here})))
+    first = [observations[0].tolist() for observations, _, _ in found]
+    assert first == [[-1.0, 4.0, 3.0], [35.0, 3.0, 1.0]]  # a collision is kept as it is
+
+
+def test_an_episode_ends_when_somebody_cuts_in_or_a_pair_is_away(tmp_path):
+    a, b, c = ("a", "e_0", 90.0, 1.0), ("b", "e_0", 10.0, 1.0), ("c", "e_0", 50.0, 1.0)
+    road = {0.0: [a, b], 0.1: [a, b], 0.2: [a, b, c], 0.3: [a, b], 0.4: [a], 0.5: [a, b], 0.6: []}
+    found = episodes(write(tmp_path / "a.xml", xml(road)))
+    times = sorted(times.tolist() for _, _, times in found)
+    assert times == [[0.0, 0.1], [0.2], [0.2], [0.3], [0.5]]
+
+
+def test_a_missing_timestep_is_a_hole_in_time(tmp_path):
+    path = write(tmp_path / "a.xml", xml(dict.fromkeys((0.0, 0.1, 0.2, 0.5, 0.6), PAIR)))
+    (chunk,) = read_traces([path])
+    assert (chunk.starts.tolist(), chunk.jumps) == ([0, 3], 1)
+
+
+def test_lengths_are_those_of_the_leader_s_type(tmp_path):
+    road = {0.0: [("a", "e_0", 50.0, 1.0, "truck@a"), ("b", "e_0", 20.0, 1.0, "car")]}
+    path = write(tmp_path / "a.xml", xml(road))
+    assert episodes(path, VehicleLengths.parse(["4", "truck=12"]))[0][0][0, 0] == 18.0
+    assert episodes(path, VehicleLengths.parse(["4"]))[0][0][0, 0] == 26.0
+    assert str(VehicleLengths.parse(["4", "truck=12"])) == "truck 12 m, others 4 m"
+    with pytest.raises(ValueError, match=r"has the type 'lorry' .* the types are truck"):
+        episodes(path, VehicleLengths.parse(["lorry=12"]))
+    for text in ("long", "truck=", "truck=-1", "0", "nan"):
+        with pytest.raises(ValueError, match="--vehicle-length is"):
+            VehicleLengths.parse([text])
+
+
+def test_variables_may_be_chosen_and_ordered_and_nothing_else(tmp_path):
+    path = write(tmp_path / "a.xml", xml({0.0: PAIR}))
+    ((observations, _, _),) = episodes(path, observe=ObservationEncoder("v_leader", "gap"))
+    assert observations.tolist() == [[1.0, 25.0]]
+    assert "gap, v_follower, v_leader" in refusal(path, observe=ObservationEncoder("speed"))
+    for asked in ({"action": "accel"}, {"dt": 0.1}, {"episode": ["run"]}, {"failed": "crash"}):
+        assert f"cannot be read with --{next(iter(asked))}" in refusal(path, **asked)
+    assert "cannot be read with --unit" in refusal(path, units={"v": "km/h"})
+
+
+def test_failures_are_told_of_by_a_comparison(tmp_path):
+    gaps = [2, 1, 0, -1, 3, 4]
+    road = {k / 10: [("a", "e", 50 + g, 1), ("b", "e", 45, 1)] for k, g in enumerate(gaps)}
+    path, noted = write(tmp_path / "fcd.xml", xml(road)), Noted()
+    (chunk,) = read_traces([path], LogColumns(failed="gap<=0"), noted=noted)
+    assert chunk.observations[:, 0].tolist() == [2, 1, 0, 3, 4]
+    assert (chunk.starts.tolist(), chunk.failures.tolist()) == ([0, 3], [2])
+    assert noted.after_failure == 1
+
+
+def test_so_many_waiting_rows_are_handed_on_before_the_pairs_part(tmp_path, monkeypatch):
+    monkeypatch.setattr(vehicles, "_MOST_WAITING", 100)
+    path = write(tmp_path / "a.xml", xml({k / 10: PAIR for k in range(250)}))
+    (chunk,) = read_traces([path])
+    assert len(chunk.times) == 250
+    assert (chunk.starts.tolist(), chunk.cuts) == ([0, 101, 202], 2)
+    assert np.isnan(chunk.actions).sum() == 3
+    monkeypatch.setattr(vehicles, "_ROWS_AT_ONCE", 100)
+    assert [len(chunk.times) for chunk in read_traces([path])] == [101, 101, 48]
+
+
+def test_an_acceleration_beyond_any_number_is_none(tmp_path):
+    speeds = {-3: 1, -2: 1, -1: 1, 0: 1, "1e-250": "1e90", 1: 1, 2: 1}
+    road = {t: [("a", "e", 50, 1), ("b", "e", 20, speed)] for t, speed in speeds.items()}
+    (chunk,) = read_traces([write(tmp_path / "a.xml", xml(road))])
+    assert str(chunk.actions[3]) == "nan"
+
+
+def test_persons_and_vehicles_off_the_road_are_passed_over(tmp_path):
+    text = xml({0.0: PAIR}).replace(
+        "</timestep>",
+        '<person id="p" pos="30" speed="1" edge="e"/><vehicle id="x" pos="1" speed="0"/>'
+        '<vehicle id="y" lane="" pos="-1073741824.0" speed="0"/></timestep>',
+    )
+    ((observations, _, _),) = episodes(write(tmp_path / "a.xml", text))
+    assert observations.tolist() == [[25.0, 2.0, 1.0]]
+    # SUMO names the columns after what it writes first, here a person.
+    text = """timestep_time;person_id;person_speed;person_pos;person_lane
+0.00;;;;
+0.10;p;1.00;5.00;
+0.10;a;1.00;50.00;e_0
+0.10;b;2.00;20.00;e_0
+"""
+    ((observations, _, times),) = episodes(write(tmp_path / "a.csv", text))
+    assert (observations.tolist(), times.tolist()) == ([[25.0, 2.0, 1.0]], [0.1])
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "message"),
+    [
+        (' lane="e_0"', "", "line 3: there is no 'lane'; SUMO writes it unless --fcd-output"),
+        (' speed="2.0"', "", "line 4: there is no 'speed'"),
+        (' id="b"', "", "line 4: there is no 'id'"),
+        ('pos="20.0"', 'pos="nan"', "line 4, pos: nan cannot be learnt"),
+        ('pos="20.0"', 'pos="here"', "line 4, pos: 'here' is no number"),
+        ('time="0.0"', 'time="00:00:01"', "--human-readable-time"),
+        ('time="0.1"', 'time="0.0"', "line 6: time goes from 0 to 0"),
+        ("fcd-export>", "tripinfos>", "begins with <tripinfos>"),
+        ("</fcd-export>", "", "not whole XML"),
+        ("vehicle", "person", "no vehicle on a lane"),
+        ('"e_0" pos="20', '"e_1" pos="20', "no vehicle ever follows another"),
+        ('id="b"', f'id="{"b" * 1000}"', "of 1,000 characters"),
+    ],
+)
+def test_what_is_wrong_in_xml_is_named(tmp_path, before, after, message):
+    text = xml({0.0: PAIR, 0.1: PAIR})
+    assert before in text
+    assert message in refusal(write(tmp_path / "a.xml", text.replace(before, after)))
+
+
+FCD = "timestep_time,vehicle_id,vehicle_speed,vehicle_pos,vehicle_lane"
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("timestep_time;vehicle_id;vehicle_speed;vehicle_pos\n0;a;1;1\n", "no 'vehicle_lane'"),
+        ("timestep_time\n0.00\n", "no vehicle on a lane"),
+        (f"{FCD}\n0,a,1,,e_0\n", "line 2, pos: the field is empty"),
+        (f"{FCD}\n1,a,1,1,e_0\n0,a,1,1,e_0\n", "line 3: time goes from 1 to 0"),
+    ],
+)
+def test_what_is_wrong_in_a_table_is_named(tmp_path, text, message):
+    assert message in refusal(write(tmp_path / "a.csv", text))
+
+
+NET = """<net version="1.20">
+  <location netOffset="0,0" convBoundary="0,0,2000,0" origBoundary="0,0,2000,0" projParameter="!"/>
+  <edge id="e" from="a" to="b" priority="1">
+    <lane id="e_0" index="0" speed="30" length="2000" shape="0,-4.8 2000,-4.8"/>
+    <lane id="e_1" index="1" speed="30" length="2000" shape="0,-1.6 2000,-1.6"/>
+  </edge>
+  <junction id="a" type="dead_end" x="0" y="0" incLanes="" intLanes="" shape="0,0 0,-6.4"/>
+  <junction id="b" type="dead_end" x="2000" y="0" incLanes="e_0 e_1" intLanes="" shape="0,0 0,1"/>
+</net>"""
+ROUTES = """<routes>
+  <vType id="car" length="5" sigma="0.5"/>
+  <vType id="truck" length="12" maxSpeed="20"/>
+  <route id="r" edges="e"/>
+  <vehicle id="a" type="car" route="r" depart="1" departLane="0"/>
+  <vehicle id="b" type="truck" route="r" depart="3" departLane="0"/>
+  <vehicle id="c" type="car" route="r" depart="6" departLane="0"/>
+  <vehicle id="d" type="car" route="r" depart="7" departLane="1"/>
+</routes>"""
+DRIVE = """
+import json, sys
+import libsumo
+libsumo.start(["sumo", "-n", "net.xml", "-r", "routes.xml", "--step-length", "0.1",
+               "--no-step-log", "--fcd-output", sys.argv[1], *sys.argv[2:]])
+seen = []
+while libsumo.simulation.getTime() < 20:
+    libsumo.simulationStep()
+    if {"b", "c"} <= set(libsumo.vehicle.getIDList()):
+        lanes = [libsumo.vehicle.getLaneID(name) for name in "bc"]
+        if lanes == ["e_0", "e_0"]:
+            place = libsumo.vehicle.getLanePosition
+            gap = place("b") - libsumo.vehicle.getLength("b") - place("c")
+            seen.append([gap, libsumo.vehicle.getSpeed("c"), libsumo.vehicle.getSpeed("b")])
+libsumo.close()
+json.dump(seen, open("truth.json", "w"))
+"""
+
+
+@pytest.fixture(scope="module")
+def sumo(tmp_path_factory):
+    """Writes FCD with SUMO, in a process of its own as libsumo needs."""
+    if find_spec("libsumo") is None:
+        pytest.skip("libsumo is not installed")
+    folder = tmp_path_factory.mktemp("sumo")
+    (folder / "net.xml").write_text(NET)
+    (folder / "routes.xml").write_text(ROUTES)
+
+    def drive(name, *options):
+        command = [sys.executable, "-c", DRIVE, name, *options]
+        subprocess.run(command, cwd=folder, check=True, capture_output=True)
+        return str(folder / name)
+
+    return drive
+
+
+def test_pairs_are_those_that_sumo_drove(sumo):
+    path = sumo("truth.xml", "--precision", "6")
+    with open(path.replace("truth.xml", "truth.json")) as file:
+        truth = np.array(json.load(file))
+    found = episodes(path, VehicleLengths.parse(["truck=12"]))
+    mine = np.vstack([rows for rows, _, _ in found if abs(rows[0, 0] - truth[0, 0]) < 1e-5])
+    assert len(mine) > 30
+    assert mine == pytest.approx(truth[: len(mine)], abs=2e-6)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("ending", ["xml.gz", "csv", "csv.gz", "parquet"])
+def test_all_of_sumo_s_formats_tell_the_same(sumo, ending):
+    reference = episodes(sumo("same.xml", "--precision", "6"))
+    other = episodes(sumo(f"same.{ending}", "--precision", "6"))
+    assert len(reference) == len(other) > 2
+    for mine, theirs in zip(reference, other, strict=True):
+        for a, b in zip(mine, theirs, strict=True):
+            assert a == pytest.approx(b, abs=2e-5, nan_ok=True)
+    for name in ("bare.xml", "bare.csv"):
+        path = sumo(name, "--fcd-output.attributes", "speed,pos")
+        assert "--fcd-output.attributes" in refusal(path)
+
+
+# -- Objects --------------------------------------------------------------------------------------
+
+
+def objects(path, rows, header=OBJECTS):
+    return write(path, "\n".join([header, *(",".join(map(str, row)) for row in rows)]) + "\n")
+
+
+def test_the_leader_is_the_nearest_one_ahead_on_the_same_lane(tmp_path):
+    rows = []
+    for k in range(3):
+        t = 0.1 * k
+        rows += [("ego", t, 2 * k, 0, 20 - k, 0, 4, 1), ("beside", t, 8, 4, 11, 0, 4, 2)]
+        rows += [("far", t, 60 + k, 0, 12, 0, 4, 1), ("near", t, 30 + k, 0, 13, 0, 6, 1)]
+        rows += [("off the road", t, 10, 0, 14, 0, 4, "")]
+    path = objects(tmp_path / "a.csv", rows)
+    found = sorted(episodes(path), key=lambda one: one[0][0, 1])
+    assert [len(times) for _, _, times in found] == [3, 3]
+    assert found[0][0].tolist() == [[25.0, 13.0, 12.0]] * 3
+    assert found[1][0].tolist() == [[25.0, 20.0, 13.0], [24.0, 19.0, 13.0], [23.0, 18.0, 13.0]]
+    assert found[1][1][:2] == pytest.approx([-10.0, -10.0])
+    polars.read_csv(path).write_parquet(tmp_path / "a.parquet")
+    again = sorted(episodes(tmp_path / "a.parquet"), key=lambda one: one[0][0, 1])
+    assert again[1][0].tolist() == found[1][0].tolist()
+
+
+@pytest.mark.parametrize("turned", [0.0, 0.7, math.pi / 2, math.pi, -2.0])
+def test_any_direction_of_the_road_is_alike(tmp_path, turned):
+    def row(name, t, along, speed):
+        c, s = math.cos(turned), math.sin(turned)
+        return (name, t, along * c, along * s, speed * c, speed * s, 5, 7)
+
+    rows = [r for t in (0.0, 0.1) for r in (row("b", t, 0, 10), row("a", t, 25, 12))]
+    ((observations, _, _),) = episodes(objects(tmp_path / "a.csv", rows))
+    assert observations[0] == pytest.approx([20.0, 10.0, 12.0])
+
+
+def test_who_stands_points_where_it_moved_last_or_where_it_is_said_to(tmp_path):
+    rows = [
+        row
+        for t, v in ((0.0, 1.0), (0.1, 0.0), (0.2, 0.0))
+        for row in [("b", t, 0, 0, -v, 0, 4, 1), ("a", t, -20, 0, 0, 0, 4, 1)]
+    ]
+    ((observations, _, _),) = episodes(objects(tmp_path / "a.csv", rows))
+    assert observations[:, 0].tolist() == [16.0, 16.0, 16.0]
+    told = [(*row[:4], 0, 0, *row[6:], math.pi) for row in rows]
+    assert len(episodes(objects(tmp_path / "b.csv", told, OBJECTS + ",heading"))[0][0]) == 3
+
+
+@pytest.mark.parametrize(
+    ("rows", "said"),
+    [
+        ([("a", 0, 0, 0, 1, 0, 4, ""), ("b", 0, 9, 0, 1, 0, 4, "")], "no object is on a lane"),
+        ([("a", 0, 0, 0, 1, 0, 4, 1), ("a", 0, 9, 0, 1, 0, 4, 1)], "'a' is there twice"),
+        ([("a", 0, 0, 0, 1, 0, 0, 1)], "line 2: the length is 0"),
+        ([("a", 1, 0, 0, 1, 0, 4, 1), ("a", 0, 0, 0, 1, 0, 4, 1)], "must run forward"),
+        ([("a", 0, "x", 0, 1, 0, 4, 1)], "column 'x'"),
+        ([("a", 0, 0, 0, 1, 0, 4, 1)], "no vehicle ever follows another one"),
+    ],
+)
+def test_objects_that_cannot_be_right_are_refused_in_words(tmp_path, rows, said):
+    assert said in refusal(objects(tmp_path / "a.csv", rows))
+
+
+# -- ASAM OSI -------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def osi():
+    """What the fuzzer begins with: traces of two cars and a pedestrian, by betterosi."""
+    pytest.importorskip("betterosi")
+    from tests.fuzz import fuzz
+
+    return fuzz
+
+
+def assert_pair(path):
+    (chunk,) = read_traces([str(path)])
+    gaps = 46.0 - 0.2 * np.arange(5)
+    assert chunk.observations == pytest.approx(
+        np.column_stack([gaps, gaps * 0 + 20, gaps * 0 + 18])
+    )
+    assert chunk.times == pytest.approx(5.0 + 0.1 * np.arange(5))
+
+
+def test_ground_truth_and_sensor_views_are_read_gzipped_or_not(tmp_path, osi):
+    truth, view = osi.osi_traces()
+    named = {"trace.osi": truth, "view.osi": view, "t_gt_x.osi": truth, "t_sv_x.osi": view}
+    for name, content in {**named, "trace.osi.gz": gzip.compress(truth)}.items():
+        (tmp_path / name).write_bytes(content)
+        assert_pair(tmp_path / name)
+
+
+def test_a_traffic_light_is_not_taken_for_ground_truth_in_a_view(tmp_path, osi):
+    import betterosi
+
+    messages = []
+    for k in range(5):
+        truth = betterosi.GroundTruth.from_binary(osi.osi_messages(k)[0])
+        truth.traffic_light.append(betterosi.TrafficLight(id=betterosi.Identifier(value=3)))
+        messages.append(truth.to_binary())
+    content = b"".join(len(one).to_bytes(4, "little") + one for one in messages)
+    (tmp_path / "trace.osi").write_bytes(content)
+    assert_pair(tmp_path / "trace.osi")
+
+
+def test_mcap_is_read_by_its_schema_and_named_where_it_holds_something_else(tmp_path, osi):
+    writing = pytest.importorskip("mcap.writer")
+    path = tmp_path / "trace.mcap"
+    for kind, place in (("GroundTruth", 0), ("SensorView", 1), ("SensorData", 0)):
+        with path.open("wb") as file:
+            writer = writing.Writer(file)
+            writer.start(profile="", library="another")
+            schema = writer.register_schema(f"osi3.{kind}", "protobuf", b"")
+            other = writer.register_schema("foxglove.Log", "jsonschema", b"{}")
+            data = writer.register_channel("data", "json", other)
+            channel = writer.register_channel("truth", "protobuf", schema)
+            for k in range(5):
+                writer.add_message(data, k, b"\xff", k)
+                writer.add_message(channel, k, osi.osi_messages(k)[place], k)
+            writer.finish()
+        if kind == "SensorData":
+            assert "its schemas are Log, SensorData" in refusal(path)
+        else:
+            assert_pair(path)
+
+
+def test_osi_that_cannot_be_right_is_refused_in_words(tmp_path, osi):
+    (truth, _), path = osi.osi_traces(), tmp_path / "trace.osi"
+    first, beside = truth[: 4 + truth[0] + 256 * truth[1]], next(osi.osi_traces(lane=0))
+    for content, said in (
+        (truth[:-3], "ends within message 5"),
+        (truth[:2], "ends within message 1"),
+        (b"\xff\xff\xff\xff", "no trace of OSI"),
+        (b"\2\0\0\0\x0b\0", "is not ground truth"),
+        (next(osi.osi_traces(length=0.0)), "object 2 is 0 m long, at (50, 0) m"),
+        (next(osi.osi_traces(x=math.nan)), "it needs a length, and numbers"),
+        (first + first, "must run forward"),
+        (beside, "no vehicle ever follows another one"),
+        (b"", "no object is on a lane"),
+    ):
+        path.write_bytes(content)
+        assert said in refusal(path)
