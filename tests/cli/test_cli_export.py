@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from evofsm.__main__ import application
 from evofsm.fsm.machine import EvolvingFSM
-from evofsm.io.mcap import read_run
+from evofsm.io import read_run
 
 
 def evofsm(*arguments):

@@ -145,7 +145,7 @@ def test_what_was_saved_is_gone_on_from(tmp_path):
 def recorded(tmp_path):
     """A log of two episodes, revised and not, and its drives."""
     pytest.importorskip("mcap")
-    from evofsm.io.mcap import write_run
+    from evofsm.io import recording
 
     family = PAPER.family
     machine, risk = learnt_by(learnt())
@@ -157,7 +157,10 @@ def recorded(tmp_path):
         )
     ]
     path = tmp_path / "run.mcap"
-    write_run(path, drives, model=machine.model(), about={"family": "paper"})
+    with recording(path, {"family": "paper"}) as log:
+        for drive in drives:
+            log.add(drive)
+        log.attach(machine.model())
     return path, drives
 
 

@@ -246,7 +246,7 @@ def test_of_a_file_that_grows_what_was_there_at_first_is_read(tmp_path, caplog):
         ("a.gz", gzip.compress(b"<fcd-export>", mtime=0), "xml"),
         ("a.db3", b"SQLite format 3\0", "bag"),
         ("a.csv", b"\x89MCAP0\r\n\x01" + bytes(8) + b"\4\0\0\0ros2", "bag"),
-        ("a.mcap", b"\x89MCAP0\r\n\x01" + bytes(12) + b"\x0b\0\0\0evofsm 0.1", "run"),
+        ("a.mcap", b"\x89MCAP0\r\n\x01" + bytes(8) + b"\6\0\0\0evofsm", "run"),
         ("a.mcap", b"\x89MCAP0\r\n\x01" + bytes(12) + b"\x0b\0\0\0another one", "mcap"),
         ("a.mcap", b"\x89MCAP0\r\n", "mcap"),
         ("a.osi.gz", b"anything", "osi"),

@@ -1,5 +1,6 @@
 from .foxglove import FOXGLOVE_LAYOUT as FOXGLOVE_LAYOUT
 from .foxglove import FoxgloveSink as FoxgloveSink
+from .foxglove import recording as recording
 from .graphs import to_dot as to_dot
 from .graphs import to_networkx as to_networkx
 from .graphs import to_prism as to_prism
@@ -7,11 +8,6 @@ from .logs import Chunk as Chunk
 from .logs import LogColumns as LogColumns
 from .logs import episodes_of as episodes_of
 from .logs import read_traces as read_traces
-from .mcap import RecordedEpisode as RecordedEpisode
-from .mcap import Run as Run
-from .mcap import RunWriter as RunWriter
-from .mcap import read_run as read_run
-from .mcap import recording as recording
-from .mcap import write_run as write_run
 from .rosbag import Topics as Topics
+from .runs import read_run as read_run
 from .vehicles import VehicleLengths as VehicleLengths

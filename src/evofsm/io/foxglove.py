@@ -1,49 +1,265 @@
-"""Decisions of any guard live in Foxglove or Lichtblick, or as a file for it.
+"""Decisions written as MCAP, or shown live in Foxglove or Lichtblick, by Foxglove's own library.
 
-The channels are those of logs in MCAP (`evofsm.io.write_run`), and `FOXGLOVE_LAYOUT` shows both.
-Foxglove's own library serves and writes; nothing leaves this computer unless another host is told.
+`evofsm.io.runs` says what the channels hold; `FOXGLOVE_LAYOUT` shows files and what is live alike.
+Nothing leaves this computer unless another host is told.
 """
 
 from __future__ import annotations
 
+import io
+import json
 import math
 import threading
 import time
-from collections.abc import Sequence
-from contextlib import ExitStack
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from os import PathLike, fspath
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, BinaryIO, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.driving import UNITS, VARIABLES
+from evofsm import __version__
+from evofsm.driving import VARIABLES, Episode
 from evofsm.extras import needs
-from evofsm.fsm import positive
-from evofsm.guard import Decision, Guard, Proposal, Revision, Situation
-from evofsm.io.channels import (
-    ERROR,
-    INFO,
-    WARNING,
-    encoded,
-    is_same,
-    log_message,
-    messages_of,
-    said,
+from evofsm.fsm import FSMModel, positive
+from evofsm.guard import Action, Decision, Guard, Proposal, Revision, Situation
+from evofsm.io.runs import (
+    FORMAT,
+    MODEL,
+    PROFILE,
+    columns_by_topic,
+    columns_of,
+    field_of,
     schemas_of,
 )
+from evofsm.store import storage
 
-with needs("foxglove-sdk", "foxglove", "a live view in Foxglove"):
+with needs("foxglove-sdk", "mcap", "writing MCAP, and a live view in Foxglove"):
     import foxglove
+    from foxglove.mcap import MCAPWriteOptions
     from foxglove.websocket import ServerListener
 
 #: A layout of cars, to be imported: *Layouts, Import from file*.
 FOXGLOVE_LAYOUT = Path(__file__).with_name("foxglove_layout.json")
 
+# Levels of foxglove.Log.
+_INFO, _WARNING, _ERROR = 2, 3, 4
 _SECOND = 1_000_000_000  # [ns]
-# Between two episodes [s].
-_PAUSE = 1.0
+_PAUSE = _SECOND  # from the end of an episode to the start of the next
+_SAME = 1e-9
+
+
+class _Channels:
+    """Sends what happens in episodes that follow each other on one axis of time."""
+
+    def __init__(self, names: Sequence[str], units: Sequence[str]) -> None:
+        self.names = tuple(names)
+        self.is_of_cars = self.names == VARIABLES
+        self.context = foxglove.Context()  # its channels close with it
+        self.episode = 0
+        self.begin = 0  # of the episode [ns]
+        self.file: _File | None = None
+        self._columns = columns_of(names, units)
+        self._topics = columns_by_topic(names)
+        self._channels = {
+            topic: foxglove.Channel(topic, schema=schema, context=self.context)
+            for topic, schema in schemas_of(names, units).items()
+        }
+
+    def event(self, kind: str, at: float, observation: NDArray[np.float64]) -> None:
+        """Something happened, so long after the episode began [s]."""
+        where = dict(zip(self.names, observation.tolist(), strict=False))
+        self._send("/event", at, {"kind": kind, "episode": self.episode, "time": at, **where})
+
+    def decision(self, decision: Decision) -> None:
+        """A decision, and a line where it was changed, or would have been."""
+        situation, revision = decision.situation, decision.revision
+        belief = situation.belief.tolist() if situation.state is not None else []
+        for topic, names in self._topics.items():
+            message = {
+                field_of(topic, name): self._columns[name].read(decision)
+                for name in names
+                if name != "belief"
+            }
+            message |= {"belief": belief} if topic == "/belief" else {}
+            self._send(topic, situation.time, message)
+        changed = not _is_same(revision.executed, revision.proposed)
+        if changed or not _is_same(revision.advised, revision.executed):
+            done, instead = (
+                ("executed", revision.executed) if changed else ("would advise", revision.advised)
+            )
+            unit = " m/s²" if self.is_of_cars else ""
+            text = f"proposed {_shown(revision.proposed)}, {done} {_shown(instead)}{unit}"
+            level = _WARNING if changed else _INFO
+            self.note(level, situation.time, f"{text}: {revision.reason}")
+
+    def note(self, level: int, at: float, text: str) -> None:
+        """A line for the log panel."""
+        sec, nsec = divmod(self.begin + round(at * _SECOND), _SECOND)
+        about = {"timestamp": {"sec": sec, "nsec": nsec}, "level": level, "message": text}
+        self._send("/log", at, {**about, "name": "evofsm", "file": "", "line": 0})
+
+    def next_episode(self, after: float) -> None:
+        """The present one was so long [s]."""
+        self.begin += round(after * _SECOND) + _PAUSE
+        self.episode += 1
+
+    def _send(self, topic: str, at: float, message: Mapping[str, Any]) -> None:
+        known = {name: value for name, value in message.items() if _is_known(value)}
+        data = json.dumps(known, ensure_ascii=False, allow_nan=False).encode()
+        self._channels[topic].log(data, log_time=self.begin + round(at * _SECOND))
+        if self.file is not None and self.file.error is not None:
+            raise self.file.error
+
+
+def _is_same(one: Action, other: Action) -> bool:
+    """Whether two actions are the same, but for rounding; NaN is no action."""
+    return bool(np.all(np.abs(np.subtract(one, other)) <= _SAME))
+
+
+def _shown(action: Any) -> str:
+    return f"{action:+.2f}" if isinstance(action, float) else str(action)
+
+
+def _is_known(value: Any) -> bool:
+    """Whether it is a number, a text or a list; actions that are vectors are left to the log."""
+    if isinstance(value, float):
+        return math.isfinite(value)
+    return value is not None and not isinstance(value, np.ndarray)
+
+
+class _File:
+    """A file that remembers why it could not be written: Foxglove's library goes on then."""
+
+    def __init__(self, file: BinaryIO, channels: _Channels, profile: str = "") -> None:
+        self._file = file
+        self.error: OSError | None = None
+        channels.file = self
+        options = MCAPWriteOptions(profile=profile, compression_threads=0)
+        with self.explained():
+            self.mcap = foxglove.open_mcap(self, context=channels.context, writer_options=options)
+
+    @contextmanager
+    def explained(self) -> Iterator[None]:
+        """Raise the error of writing in place of what the library makes of it."""
+        try:
+            yield
+        except RuntimeError as error:
+            raise self.error or error from None
+
+    def write(self, data: bytes | bytearray) -> int:
+        """Write, or remember why not."""
+        try:
+            return self._file.write(data)
+        except OSError as error:
+            self.error = error
+            raise
+
+    def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
+        """Go to a place."""
+        return self._file.seek(offset, whence)
+
+    def flush(self) -> None:
+        """Hand on what waits."""
+        self._file.flush()
+
+    def close(self) -> None:
+        """Write the index, which ends the log."""
+        with self.explained():
+            self.mcap.close()
+
+
+# -- Runs -----------------------------------------------------------------------------------------
+
+
+@contextmanager
+def recording(
+    path: str | PathLike[str], about: Mapping[str, Any] | None = None
+) -> Iterator[RunWriter]:
+    """A log that grows episode by episode; the file appears at the end, if all went well.
+
+    Parameters
+    ----------
+    path : str or path-like
+        A file of that name is replaced.
+    about : mapping, optional
+        What is driven: family, controller, reviser and so on. What is no text becomes JSON.
+
+    Yields
+    ------
+    RunWriter
+        ``add(episode)`` writes an episode, ``attach(model)`` what was learnt.
+
+    Raises
+    ------
+    OSError
+        If it cannot be written; what was there before is then as it was.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from evofsm.driving import drive, load_family, unrevised_guard
+    >>> from evofsm.io import read_run
+    >>> family = load_family("emergency")
+    >>> driven = drive(unrevised_guard(family), family.draw(seed=0, index=0))
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     with recording(Path(folder) / "run.mcap", {"controller": "hasty"}) as log:
+    ...         log.add(driven)
+    ...     run = read_run(Path(folder) / "run.mcap")
+    >>> run.about["controller"], run.episodes[0].collided
+    ('hasty', True)
+    >>> bool((run.episodes[0].columns["executed"] == driven.executed).all())
+    True
+    """
+    with storage.replacing(path) as file:
+        writer = RunWriter(file, about or {})
+        yield writer
+        writer.finish()
+
+
+class RunWriter:
+    """Writes episode after episode of cars; `recording` opens one."""
+
+    def __init__(self, file: BinaryIO, about: Mapping[str, Any]) -> None:
+        self._channels = _Channels(VARIABLES, ())
+        self._file = _File(file, self._channels, PROFILE)
+        told = {"library": f"evofsm {__version__}", **about, "format": FORMAT}
+        texts = {name: x if isinstance(x, str) else json.dumps(x) for name, x in told.items()}
+        with self._file.explained():
+            self._file.mcap.write_metadata(PROFILE, texts)
+
+    def add(self, episode: Episode) -> None:
+        """Write the next episode, with its decisions."""
+        channels = self._channels
+        end, last = float(episode.time[-1]), episode.observations[-1]
+        channels.event("episode started", float(episode.time[0]), episode.observations[0])
+        for decision in episode.decisions:
+            channels.decision(decision)
+        happened = {"collision": episode.collided, "rear-end collision": episode.rear_ended}
+        for kind in (kind for kind, it_did in happened.items() if it_did):
+            channels.event(kind, end, last)
+            channels.note(_ERROR, end, kind)
+        channels.event("episode ended", end, last)
+        channels.next_episode(end)
+
+    def attach(self, model: FSMModel) -> None:
+        """Attach what was learnt."""
+        file, at = io.BytesIO(), self._channels.begin
+        model.save(file)
+        media = "application/octet-stream"
+        with self._file.explained():
+            self._file.mcap.attach(
+                log_time=at, create_time=at, name=MODEL, media_type=media, data=file.getvalue()
+            )
+
+    def finish(self) -> None:
+        """Write the index, which ends the log."""
+        self._file.close()
+
+
+# -- Live -----------------------------------------------------------------------------------------
 
 
 class _Arrivals(ServerListener):
@@ -94,7 +310,6 @@ class FoxgloveSink:
     Examples
     --------
     >>> import tempfile
-    >>> from pathlib import Path
     >>> from evofsm.driving import guard_for_cars
     >>> guard = guard_for_cars(low=-4.0, high=2.5)
     >>> with tempfile.TemporaryDirectory() as folder:
@@ -111,26 +326,22 @@ class FoxgloveSink:
         file: str | PathLike[str] | None = None,
         *,
         names: Sequence[str] = VARIABLES,
-        units: Sequence[str] = UNITS,
+        units: Sequence[str] = (),
         speed: float | None = None,
         host: str = "127.0.0.1",
     ) -> None:
         if port is None and file is None:
             raise ValueError("a sink needs a port, a file, or both")
-        self.names = tuple(names)
-        self._unit = "m/s²" if self.names == VARIABLES else ""
         self._speed = None if speed is None else positive("speed", speed)
+        self._channels = _Channels(names, units)
         self._arrivals = _Arrivals()
         self._open = ExitStack()
-        context = self._context = foxglove.Context()  # its channels close with it
-        self._channels = {
-            topic: foxglove.Channel(topic, schema=schema, context=context)
-            for topic, schema in schemas_of(self.names, units if self._unit else ()).items()
-        }
         if file is not None:
-            if Path(file).exists():
-                raise FileExistsError(f"{fspath(file)} exists; it was left alone")
-            self._open.enter_context(foxglove.open_mcap(fspath(file), context=context))
+            try:
+                opened = self._open.enter_context(io.BufferedWriter(io.FileIO(file, "x")))
+            except FileExistsError:
+                raise FileExistsError(f"{fspath(file)} exists; it was left alone") from None
+            self._open.callback(_File(opened, self._channels).close)
         #: Where it is served; None without a port.
         self.address: str | None = None
         if port is not None:
@@ -138,68 +349,20 @@ class FoxgloveSink:
                 name="evofsm",
                 host=host,
                 port=port,
-                context=context,
+                context=self._channels.context,
                 server_listener=self._arrivals,
             )
             self._open.callback(server.stop)
             self.address = f"ws://{host}:{server.port}"
-        # Live, a message is now; in a file time begins with 0.
-        self._begin = 0 if port is None else time.time_ns()
-        self._episodes = -1
+            self._channels.begin = time.time_ns()  # live, a message is now; in a file time is 0
+        self._episodes = 0
         self._time = 0.0  # of the latest decision, in its episode [s]
-        self._observation: NDArray[np.float64] = np.full(len(self.names), math.nan)
+        self._observation: NDArray[np.float64] = np.full(len(names), math.nan)
         self._due = math.nan  # when time 0 of the episode was, on the clock of this computer [s]
 
     def await_someone(self, timeout: float | None = None) -> bool:
-        """Wait until somebody looks on.
-
-        Parameters
-        ----------
-        timeout : float, optional
-            At most so long [s].
-
-        Returns
-        -------
-        bool
-            Whether somebody does.
-        """
+        """Wait until somebody looks on, at most so long [s]; returns whether somebody does."""
         return self._arrivals.someone.wait(timeout)
-
-    # -- As the decision logger of a guard --------------------------------------------------------
-
-    def begin(self, guard: Guard) -> None:
-        """An episode begins."""
-        if self._episodes >= 0:
-            self._begin += round((self._time + _PAUSE) * _SECOND)
-        self._episodes += 1
-        self._time, self._due = 0.0, math.nan
-
-    def seen(self, observation: NDArray[np.float64], time: float) -> None:
-        """An observation came in."""
-        first = math.isnan(self._due)
-        self._time, self._observation = time, observation
-        self._keep_pace()
-        if first:
-            self._event("episode started")
-
-    def decided(self, situation: Situation, proposal: Proposal, revision: Revision) -> None:
-        """A decision was made."""
-        decision = Decision(situation, revision)
-        for topic, message in messages_of(decision, self.names):
-            self._send(topic, message)
-        changed = not is_same(revision.executed, revision.proposed)
-        if changed or not is_same(revision.advised, revision.executed):
-            self._log(WARNING if changed else INFO, said(revision, self._unit))
-
-    def ended(self, observation: NDArray[np.float64] | None, *, failed: bool) -> None:
-        """The episode ended."""
-        if observation is not None:
-            self._observation = observation
-        if failed:
-            kind = "collision" if self._unit else "failure"
-            self._event(kind)
-            self._log(ERROR, kind)
-        self._event("episode ended")
 
     def close(self) -> None:
         """Stop serving, and end the file."""
@@ -211,32 +374,42 @@ class FoxgloveSink:
     def __exit__(self, *error: object) -> None:
         self.close()
 
-    # -- Sending ----------------------------------------------------------------------------------
+    # -- As the decision logger of a guard --------------------------------------------------------
+
+    def begin(self, guard: Guard) -> None:
+        """An episode begins."""
+        if self._episodes:
+            self._channels.next_episode(self._time)
+        self._episodes += 1
+        self._time, self._due = 0.0, math.nan
+
+    def seen(self, observation: NDArray[np.float64], time: float) -> None:
+        """An observation came in."""
+        first = math.isnan(self._due)
+        self._time, self._observation = time, observation
+        self._keep_pace()
+        if first:
+            self._channels.event("episode started", time, observation)
+
+    def decided(self, situation: Situation, proposal: Proposal, revision: Revision) -> None:
+        """A decision was made."""
+        self._channels.decision(Decision(situation, revision))
+
+    def ended(self, observation: NDArray[np.float64] | None, *, failed: bool) -> None:
+        """The episode ended."""
+        if observation is not None:
+            self._observation = observation
+        if failed:
+            kind = "collision" if self._channels.is_of_cars else "failure"
+            self._channels.event(kind, self._time, self._observation)
+            self._channels.note(_ERROR, self._time, kind)
+        self._channels.event("episode ended", self._time, self._observation)
 
     def _keep_pace(self) -> None:
         """Wait for what is to be shown now."""
-        if self._speed is None:
-            self._due = 0.0
-            return
         now = time.monotonic()
+        speed = self._speed or math.inf
         if math.isnan(self._due):
-            self._due = now - self._time / self._speed
-        time.sleep(max(0.0, self._due + self._time / self._speed - now))
-
-    def _event(self, kind: str) -> None:
-        where = dict(zip(self.names, self._observation.tolist(), strict=False))
-        about = {"kind": kind, "episode": max(self._episodes, 0), "time": self._time}
-        self._send("/event", {**about, **where})
-
-    def _log(self, level: int, message: str) -> None:
-        self._send("/log", log_message(level, self._now, message))
-
-    @property
-    def _now(self) -> int:
-        return self._begin + round(self._time * _SECOND)
-
-    def _send(self, topic: str, message: dict[str, Any]) -> None:
-        numbers = {
-            name: value for name, value in message.items() if not isinstance(value, np.ndarray)
-        }
-        self._channels[topic].log(encoded(numbers), log_time=self._now)
+            self._due = now - self._time / speed
+        if self._speed is not None:
+            time.sleep(max(0.0, self._due + self._time / speed - now))

@@ -37,9 +37,9 @@ _PARQUET_ROWS = 1 << 16
 _BYTE_ORDER_MARK = b"\xef\xbb\xbf"
 _GZIP, _PARQUET = b"\x1f\x8b", b"PAR1"
 _SQLITE, _MCAP = b"SQLite format 3\0", b"\x89MCAP0\r\n"
-# Where an MCAP file says what it was written by: behind the mark, an opcode and two lengths.
+# Where an MCAP file has its profile: behind the mark, an opcode and two lengths.
 _PROFILE = len(_MCAP) + 1 + 8 + 4
-_ROS, _OURS = b"ros2", b"evofsm "
+_ROS, _OURS = b"ros2", b"evofsm"
 
 #: What is measured in a unit, and the factor that gives s, m, m/s or m/s².
 UNITS: Mapping[str, tuple[str, float]] = {
@@ -85,10 +85,8 @@ def file_kind(path: str) -> Kind:
     if beginning.startswith(_PARQUET):
         return "parquet"
     if beginning.startswith(_MCAP):
-        if beginning[_PROFILE:].startswith(_ROS):
-            return "bag"
-        # Ours has no profile, so that the length of what it was written by comes first.
-        return "run" if beginning[_PROFILE + 4 :].startswith(_OURS) else "mcap"
+        profile = beginning[_PROFILE:]
+        return "bag" if profile.startswith(_ROS) else "run" if profile.startswith(_OURS) else "mcap"
     if beginning.startswith(_SQLITE):
         return "bag"
     return "xml" if beginning.startswith(b"<") else "csv"

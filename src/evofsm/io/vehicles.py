@@ -521,7 +521,7 @@ def scenes_of_mcap(path: str, on_read: OnRead) -> Iterator[Scene]:
     with needs("mcap", "mcap", f"{path}: MCAP"):
         from mcap.records import Channel, Message, Schema
 
-        from evofsm.io.mcap import records
+        from evofsm.io.runs import records
     osi = _osi(path)
     kinds, channels = dict[int, str](), dict[int, str]()
     chosen, number = None, 0

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from evofsm.cli.driving import Driving, Setup
     from evofsm.driving import World
     from evofsm.guard import DecisionLogger, Guard
-    from evofsm.io import FoxgloveSink, RunWriter
+    from evofsm.io.foxglove import FoxgloveSink, RunWriter
     from evofsm.store import Checkpoint
 
 
@@ -72,8 +72,8 @@ class Drive(Driven):
         if self._is_configuration:
             return {"libsumo": "sumo"}
         written = {"polars": "tables"} if self.out else {}
-        live = {} if self.foxglove is None else {"foxglove": "foxglove"}
-        return super().packages() | written | ({"mcap": "mcap"} if self.mcap else {}) | live
+        logs = {"mcap": "mcap", "foxglove": "mcap"} if self.mcap or self.foxglove else {}
+        return super().packages() | written | logs
 
     def run(self) -> None:
         """Drive, and print what came of it."""

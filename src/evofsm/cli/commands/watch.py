@@ -76,7 +76,11 @@ class Watch(Revised):
 
     def packages(self) -> dict[str, str]:
         """What the page needs, and what is shown in it."""
-        driven = {"scipy": "study", "mcap": "mcap"} if self.is_recorded else super().packages()
+        driven = (
+            {"scipy": "study", "mcap": "mcap", "foxglove": "mcap"}
+            if self.is_recorded
+            else super().packages()
+        )
         return {"websockets": "watch", **driven}
 
     def run(self) -> None:

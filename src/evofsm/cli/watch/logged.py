@@ -8,8 +8,8 @@ from typing import Any
 
 from evofsm.driving import VARIABLES, guard_for_cars, shadow_drive
 from evofsm.guard import TOLERANCE, Mode
+from evofsm.io.foxglove import recording
 from evofsm.io.logs import Chunk, episodes_of, read_traces
-from evofsm.io.mcap import recording
 from evofsm.io.rosbag import Topics
 
 #: More rows of a log are not watched.

@@ -27,7 +27,7 @@ from evofsm.cli.watch.shown import (
 from evofsm.driving import VARIABLES
 from evofsm.driving.measures import time_headway, time_to_collision
 from evofsm.guard import RECORD, TOLERANCE
-from evofsm.io import RecordedEpisode, Run, read_run
+from evofsm.io.runs import RecordedEpisode, Run, read_run
 
 # What is accepted where a log does not say.
 # So many of a log's episodes can be chosen among.
@@ -44,7 +44,7 @@ class Recording:
     Parameters
     ----------
     path : str or path-like
-        Of a log that `evofsm.io.mcap.write_run` wrote.
+        Of a log that `evofsm.io.recording` wrote.
 
     Raises
     ------
@@ -57,15 +57,16 @@ class Recording:
     --------
     >>> import tempfile
     >>> from evofsm.driving import drive, load_family, unrevised_guard
-    >>> from evofsm.io import write_run
+    >>> from evofsm.io import recording
     >>> family = load_family("paper")
     >>> driven = drive(unrevised_guard(family), family.draw(0, 0))
     >>> with tempfile.TemporaryDirectory() as folder:
-    ...     write_run(Path(folder) / "run.mcap", [driven], about={"family": "paper"})
-    ...     recording = Recording(Path(folder) / "run.mcap")
-    >>> frame = recording.step()
+    ...     with recording(Path(folder) / "run.mcap", {"family": "paper"}) as log:
+    ...         log.add(driven)
+    ...     shown = Recording(Path(folder) / "run.mcap")
+    >>> frame = shown.step()
     >>> while not frame.over:
-    ...     frame = recording.step()
+    ...     frame = shown.step()
     >>> frame.collided, frame.time
     (True, 31.4)
     """
