@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 
 from evofsm.driving.cars import guard_for_family, learnt_by
 from evofsm.driving.episodes import drive
-from evofsm.driving.families.family import Family, load_family
+from evofsm.driving.families import load_family
+from evofsm.driving.family import Family
 from evofsm.fsm.states.novelty import Novelty
 from evofsm.guard.guard import Guard
 

@@ -24,7 +24,8 @@ import numpy as np
 from decision import teach
 from evofsm.driving.cars import guard_for_family, learnt_by
 from evofsm.driving.episodes import drive
-from evofsm.driving.families.family import Draw, Family, load_family
+from evofsm.driving.families import load_family
+from evofsm.driving.family import Draw, Family
 from evofsm.driving.sumo import SumoWorld
 from evofsm.driving.world import Episode
 from evofsm.fsm.states.novelty import Novelty
@@ -71,7 +72,7 @@ def measure_stricter(repeats: int) -> list[dict[str, Any]]:
 def _measure(id_: str, interval: float, repeats: int) -> dict[str, Any]:
     """Medians over repeats; both sides take turns. Every repeat drives the same draws."""
     family = load_family("emergency")
-    family = replace(family, tables={**family.tables, "interval": interval})
+    family = replace(family, interval=interval)
     guard = guard_for_family(family, rule=Novelty(radius=1.0, scales=(2.0, 1.0, 1.0)))
     teach(family, guard)
     draws = [family.draw(0, index, split="test") for index in range(_DRAWS)]

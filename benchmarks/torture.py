@@ -33,7 +33,7 @@ import one_machine
 import torture_audit
 from evofsm.cli.driving import Setup, drive_family, make_guard
 from evofsm.cli.learning import learn_traces
-from evofsm.driving.families.family import load_family
+from evofsm.driving.families import load_family
 from evofsm.driving.risk.latent import LatentRisk
 from evofsm.driving.world import KinematicWorld
 from evofsm.fsm.actions import IntervalActions

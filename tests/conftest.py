@@ -30,7 +30,7 @@ def spiral():
 def compiled():
     """All that a watched run needs is compiled, for tests that wait for some seconds only."""
     from evofsm.cli.watch.session import Session, Watching, learn_first, watched_guard
-    from evofsm.driving.families.family import load_family
+    from evofsm.driving.families import load_family
     from evofsm.driving.world import KinematicWorld
 
     watching = Watching(load_family("paper"))

@@ -76,10 +76,8 @@ def test_a_column():
 def test_a_family(tmp_path):
     pytest.importorskip("typer")
     pytest.importorskip("scipy")
-    source = ROOT / "src" / "evofsm" / "driving" / "families" / "emergency.toml"
-    changed = source.read_text("utf-8").replace("duration = 35.0", "duration = 31.0")
-    (tmp_path / "mine.toml").write_text(changed, encoding="utf-8")
-    said = python(tmp_path, "-m", "evofsm", "drive", "mine.toml", "--episodes", 3)
+    write("Add a family, or a world", tmp_path)
+    said = python(tmp_path, "-m", "evofsm", "drive", "mine.py", "--episodes", 3)
     assert "mine, 3 training episodes" in said
 
 

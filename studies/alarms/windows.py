@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.driving import Draw, Family, Group, load_family, measures, training
+from evofsm.driving import Draw, Family, load_family, measures, training
 from studies.alarms.amounts import Amounts
 from studies.detection.measures import Detector, Ours, Watcher, classic
 from studies.detection.watch import (
@@ -19,6 +19,7 @@ from studies.detection.watch import (
     held_out_draws,
     watch,
 )
+from studies.policies import Group
 
 #: Length of a window [s]; whether danger came is known so much later.
 LENGTH = HORIZON

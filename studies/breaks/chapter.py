@@ -45,7 +45,7 @@ _ABOUT = (
     "the same family, with an exact interval (Clopper and Pearson). How close: by the braking that "
     "was needed at the worst moment. Guards are frozen; all is driven in closed form. Sensor noise "
     "is drawn anew as a whole and cannot be searched bit by bit. What is found is written as "
-    "found-FAMILY-JUDGE.json, a family that evofsm drive and campaign take."
+    "found-FAMILY-JUDGE.py, a family that evofsm drive and campaign take."
 )
 _SOURCES = (
     Source(

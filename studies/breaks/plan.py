@@ -21,7 +21,7 @@ class Plan(Amounts, Study["Breaks"]):
 
     Adaptive multilevel splitting draws scenarios closer and closer to a collision, from a family's
     own distribution; plain sampling stands beside it. The guard is frozen. What is found is written
-    as a family (found-FAMILY-JUDGE.json) that evofsm drive and campaign take.
+    as a family (found-FAMILY-JUDGE.py) that evofsm drive and campaign take.
     """
 
     doing = "Searching"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from evofsm.driving import NamedDraw, fixed_family
+from evofsm.driving import fixed_family
 from studies.breaks.amounts import TOY
 from studies.breaks.study import Breaks
 from studies.breaks.subjects import load
@@ -31,12 +31,12 @@ def write_cases(found: Breaks, folder: Path, command: str) -> list[Path]:
         if row.family == TOY or not cases:
             continue
         family = load(row.family, plan.switches)
-        kept = [
-            NamedDraw(f"found {k}", one.about, family.draw_by(case.chance))
+        kept = {
+            f"found {k}: {one.about}": family.draw_by(case.chance)
             for k, (one, case) in enumerate(zip(cases, raw, strict=True), 1)
-        ]
+        }
         about = f"Collisions of {family.name} that were found (judge: {row.judge}) by: {command}"
-        path = folder / f"found-{family.name}-{row.judge}.json"
+        path = folder / f"found-{family.name}-{row.judge}.py"
         folder.mkdir(parents=True, exist_ok=True)
         path.write_text(fixed_family(family, kept, about), encoding="utf-8")
         written.append(path)

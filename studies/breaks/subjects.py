@@ -31,12 +31,12 @@ from evofsm.driving import (
     unrevised_guard,
 )
 from evofsm.guard import Guard
+from studies.breaks import seldom
 from studies.breaks.amounts import NOBODY, SELDOM, TOY
 from studies.breaks.splitting import Chance
 
 #: How likely the toy fails.
 KNOWN = 1e-5
-_SELDOM = Path(__file__).with_name("seldom.toml")
 _NORMAL = NormalDist()
 
 
@@ -127,7 +127,8 @@ def needed_braking(episode: Episode) -> float:
 @lru_cache(maxsize=8)
 def load(name: str, switches: tuple[str, ...] = ()) -> Family:
     """A family by its name or file, with switches."""
-    return load_family(_SELDOM if name == SELDOM else name).with_switches(switches)
+    family = seldom.family if name == SELDOM else load_family(name)
+    return family.with_switches(switches)
 
 
 def check_learnt(folder: str | None, judge: str) -> None:

@@ -30,7 +30,7 @@ class Amounts:
         "Does latent risk, learnt online, prevent collisions, at what cost, and against whom?"
     )
 
-    family: str = option("emergency", "Family of scenarios, or a TOML file of your own.")
+    family: str = option("emergency", "Family of scenarios, or a Python file of your own.")
     train: int = option(300, "Training episodes of a learning seed.", min=1)
     test: int = option(1000, "Held-out episodes of every policy.", min=1)
     seeds: int = option(20, "Learning seeds.", min=1)

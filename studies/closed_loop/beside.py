@@ -19,7 +19,6 @@ from evofsm.driving import (
     Draw,
     EnvelopeReviser,
     Family,
-    Group,
     drive,
     guard_for_family,
     held_out,
@@ -32,6 +31,7 @@ from evofsm.driving import (
 )
 from evofsm.guard import Guard, Mode, RiskMeasure
 from studies.closed_loop.amounts import Amounts
+from studies.policies import Group
 from studies.scores import Ranked, bootstrap
 
 

@@ -18,7 +18,6 @@ from evofsm.driving import (
     Family,
     KinematicWorld,
     LatentRisk,
-    OutcomeCounts,
     Unrevised,
     drive,
     guard_for_family,
@@ -30,6 +29,7 @@ from evofsm.driving import (
 from evofsm.fsm import EvolvingFSM
 from evofsm.guard import Guard, make_usable
 from studies.closed_loop.amounts import Amounts
+from studies.counts import OutcomeCounts
 from studies.scores import brier
 
 #: Looked ahead [s].

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 from evofsm.cli import NONE, Column, Table, count, listed, number, percent, seeds_text
-from evofsm.driving import Group
 from evofsm.paper.report.asked import Asked, at_most, failures, tables_of_asked
 from evofsm.paper.report.chapter import Chapter, Section
 from evofsm.paper.report.drawing import Sketch
@@ -31,6 +30,7 @@ from studies.closed_loop.tables import (
     why_not_by_state,
 )
 from studies.closed_loop.targets import machine_claims
+from studies.policies import Group
 
 # What was asked of one family; of all, that its tolerance is kept.
 _FAMILY_ASKED, _MOST_COLLISIONS, _LEAST_MOBILITY = "emergency", 0.005, 0.8

@@ -9,10 +9,11 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
-from evofsm.driving import Group, Row
+from evofsm.driving import Row
 from studies.closed_loop.machine import MACHINE
 from studies.closed_loop.over_seeds import OURS, gathered, learning_curve
 from studies.closed_loop.study import ClosedLoop, TradeOff, told
+from studies.policies import Group
 
 UNREVISED = "unrevised"
 #: Numbers that are equal but for rounding.

@@ -10,7 +10,7 @@ from itertools import cycle, pairwise
 import numpy as np
 
 from evofsm.cli import percent
-from evofsm.driving import TOLD, Group
+from evofsm.driving import TOLD
 from evofsm.extras import needs
 from evofsm.paper.report.drawing import Sketch
 from studies.closed_loop.comparison import (
@@ -31,6 +31,7 @@ from studies.closed_loop.over_seeds import (
 )
 from studies.closed_loop.stages import SAFE_RATE
 from studies.closed_loop.study import ClosedLoop, TradeOff
+from studies.policies import Group
 
 with needs("matplotlib", "plot", "drawing figures"):
     from matplotlib.axes import Axes

@@ -7,7 +7,6 @@ from itertools import pairwise
 from typing import NamedTuple
 
 from evofsm.cli import number, part, percent, seeds_text, within
-from evofsm.driving import Group
 from studies.closed_loop.beside import Separation
 from studies.closed_loop.comparison import (
     ROUNDING,
@@ -22,6 +21,7 @@ from studies.closed_loop.machine import MACHINE
 from studies.closed_loop.over_seeds import around_shift, cases_over_seeds, when
 from studies.closed_loop.stages import SAFE_RATE
 from studies.closed_loop.study import ClosedLoop
+from studies.policies import Group
 
 #: So many episodes after a shift collisions must be as rare as where it is safe.
 RECOVERED_AFTER = 30

@@ -9,12 +9,13 @@ from __future__ import annotations
 
 from typing import Any
 
-from evofsm.driving import Family, Group, drive, guard_for_family, held_out, learners_of, training
+from evofsm.driving import Family, drive, guard_for_family, held_out, learners_of, training
 from evofsm.guard import Guard
 from studies.closed_loop.amounts import Amounts
 from studies.closed_loop.beside import Check, Stream, check, revised_cases
 from studies.closed_loop.course import Course, mobility_of
 from studies.closed_loop.stages import Point, until_safe
+from studies.policies import Group
 
 #: Its name.
 MACHINE = "evofsm-machine"

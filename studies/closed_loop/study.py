@@ -16,17 +16,12 @@ from typing import Any, NamedTuple
 
 from evofsm.driving import (
     TOLD,
-    TUNED_MEASURES,
     EnvelopeReviser,
     Family,
-    Group,
     Outcome,
-    Policy,
     RiskByState,
     Row,
     drive,
-    envelope,
-    fixed_policies,
     guard_for_family,
     learnt_by,
     score,
@@ -54,6 +49,7 @@ from studies.closed_loop.course import Course, mobility_of
 from studies.closed_loop.machine import MACHINE, run_machine, run_machine_shift
 from studies.closed_loop.stages import Point, until_safe
 from studies.own_measure import own_measure
+from studies.policies import TUNED_MEASURES, Group, Policy, envelope, fixed_policies
 
 #: Held-out draws of the tests on the way.
 SAFE_EPISODES = 200

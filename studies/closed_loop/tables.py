@@ -21,7 +21,7 @@ from evofsm.cli import (
     seeds_text,
     span,
 )
-from evofsm.driving import Group, measures
+from evofsm.driving import measures
 from studies.closed_loop.comparison import (
     Line,
     chosen,
@@ -43,6 +43,7 @@ from studies.closed_loop.over_seeds import (
 )
 from studies.closed_loop.stages import SAFE_RATE
 from studies.closed_loop.study import ClosedLoop, told
+from studies.policies import Group
 
 # -- All policies ---------------------------------------------------------------------------------
 

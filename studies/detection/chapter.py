@@ -21,7 +21,6 @@ from evofsm.cli import (
     seeds_text,
     span,
 )
-from evofsm.driving import Group
 from evofsm.paper.report.against import ahead
 from evofsm.paper.report.asked import Asked, at_least, failures, tables_of_asked
 from evofsm.paper.report.chapter import Chapter
@@ -31,6 +30,7 @@ from studies.detection.measures import Ours
 from studies.detection.rows import Row
 from studies.detection.study import ASSUMED, IN_GRID, Detection
 from studies.detection.watch import HORIZON, WHAT, Target
+from studies.policies import Group
 
 # Measures that stand in the columns of tables over families.
 _AREAS = (Ours.DEFAULT, Ours.STATES, Ours.PAPER, "rss-r157", "rss-tuned", "rss-matched", "ttc")

@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from evofsm import plot
-from evofsm.driving import Group
 from evofsm.paper.report.drawing import Sketch
 from studies.closed_loop.calibration import Reliability
 from studies.detection.measures import Ours
 from studies.detection.rows import Row
 from studies.detection.study import ASSUMED, IN_GRID, Detection
 from studies.detection.watch import WHAT, Target
+from studies.policies import Group
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -15,13 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evofsm.driving import (
-    TUNED_MEASURES,
     Draw,
     Episode,
     Family,
-    Group,
     LatentRisk,
-    OutcomeCounts,
     Unrevised,
     drive,
     guard_for_family,
@@ -30,8 +27,10 @@ from evofsm.driving import (
 )
 from evofsm.fsm import EvolvingFSM
 from evofsm.guard import Guard, RiskMeasure
+from studies.counts import OutcomeCounts
 from studies.detection.watch import HORIZON, Exposure, Target, Watched
 from studies.own_measure import own_measure
+from studies.policies import TUNED_MEASURES, Group
 from studies.scores import auroc
 
 # Of a standard normal variable: the middles of seven parts that are as likely each.

@@ -13,7 +13,7 @@ from functools import partial
 from itertools import islice, product
 from typing import Any, NamedTuple
 
-from evofsm.driving import Group, measures
+from evofsm.driving import measures
 from evofsm.fleet import in_order
 from evofsm.paper.frame import Frame, Progress, silent
 from studies.detection.amounts import Amounts
@@ -37,6 +37,7 @@ from studies.detection.watch import (
     watch,
 )
 from studies.detection.worlds import World, grid_world, world
+from studies.policies import Group
 from studies.scores import auroc
 
 #: Limits that are told to the safe distance of the grid that is wrong almost everywhere [m/s²].

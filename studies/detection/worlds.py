@@ -5,16 +5,15 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import chain
-from pathlib import Path
 
-from evofsm.driving import Draw, Family, load_family, merge_tables, training
+from evofsm.driving import FAMILIES, Draw, Family, load_family, training
+from studies.detection import paper_drawn
 from studies.detection.amounts import Amounts
 
 #: Name of the worlds of the grid, in which nobody knows the limits: see `grid_world`.
 GRID = "grid"
 
 _AT_ONCE = "-at-once"
-_PAPER = Path(__file__).with_name("paper_drawn.toml")
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +68,7 @@ def world(name: str, plan: Amounts) -> World:
 
 
 def _family(name: str) -> Family:
-    return replace(load_family(_PAPER), name=name) if name == "paper" else load_family(name)
+    return paper_drawn.family if name == "paper" else load_family(name)
 
 
 def grid_world(decel: float, leader_decel: float, plan: Amounts) -> World:
@@ -87,14 +86,6 @@ def grid_world(decel: float, leader_decel: float, plan: Amounts) -> World:
     >>> cell.decel, cell.leader_decel, cell.actions.low
     (3.0, 6.0, -6.0)
     """
-    emergency = load_family("emergency")
-    lowest = -max(plan.grid)
-    changes = {
-        "actions": {"low": lowest},
-        "limits": {"decel": decel, "leader_decel": leader_decel},
-        "body": {"lowest": -decel},
-        "leader": {"brake_decel": [2.5, leader_decel]},
-        "drivers": {"aggressive": {"lowest": lowest}},
-    }
-    family = replace(emergency, name=GRID, tables=merge_tables(emergency.tables, changes))
+    made = FAMILIES["emergency"](-max(plan.grid), decel, leader_decel)
+    family = replace(made, name=GRID)
     return World(GRID, family, family, 0, family)

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.driving import OutcomeCounts
 from evofsm.extras import needs
 from evofsm.fsm import (
     NO_ACTION,
@@ -23,6 +22,7 @@ from evofsm.fsm import (
     futures,
 )
 from evofsm.guard import BELIEF_TOLERANCE, dynamics_for
+from studies.counts import OutcomeCounts
 from studies.foresight.amounts import HORIZONS
 from studies.foresight.data import Cases, Run, action_set
 from studies.systems import make_system

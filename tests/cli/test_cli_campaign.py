@@ -19,7 +19,7 @@ from evofsm.__main__ import application
 from evofsm.cli.campaign import Campaign, drive_campaign
 from evofsm.cli.driving import Setup, drive_family, make_guard
 from evofsm.driving.cars import load_learnt, save_learnt
-from evofsm.driving.families.family import load_family
+from evofsm.driving.families import load_family
 from evofsm.driving.sumo import open_world
 from evofsm.fleet.executors import Here, Processes
 from evofsm.guard.reviser import Mode
@@ -221,7 +221,7 @@ def test_an_interruption_is_quiet_and_says_how_to_go_on(tmp_path):
         ({"seed": 1}, "seed was 0 and is now 1;"),
         ({"reviser": "rss"}, 'reviser was "none" and is now "rss";'),
         ({"tolerance": 0.1}, "tolerance was 0.02 and is now 0.1;"),
-        ({"family": EMERGENCY.with_switches(["noise"])}, "family.added"),
+        ({"family": EMERGENCY.with_switches(["noise"])}, "family.switches"),
         ({"family": load_family("rare")}, 'family.name was "emergency" and is now "rare"'),
     ],
 )

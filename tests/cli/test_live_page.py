@@ -15,7 +15,7 @@ from playwright import sync_api as playwright
 from evofsm.cli.watch.live.server import LivePage
 from evofsm.cli.watch.player import Player
 from evofsm.cli.watch.session import Session, Watching, learn_first, watched_guard
-from evofsm.driving.families.family import load_family
+from evofsm.driving.families import load_family
 from evofsm.driving.world import KinematicWorld
 
 PAPER = Watching(load_family("paper"))

@@ -20,7 +20,7 @@ from evofsm.cli.watch.live.server import LivePage
 from evofsm.cli.watch.live.wire import encode, frame_message
 from evofsm.cli.watch.player import Player
 from evofsm.cli.watch.session import Session, Watching, watched_guard
-from evofsm.driving.families.family import load_family
+from evofsm.driving.families import load_family
 from evofsm.driving.world import KinematicWorld
 
 pytestmark = pytest.mark.usefixtures("compiled")

@@ -13,7 +13,7 @@ from evofsm.cli.watch.player import Player
 from evofsm.cli.watch.session import Session, Watching, learn_first, watched_guard
 from evofsm.driving.cars import guard_for_family, learnt_by, load_learnt, save_learnt
 from evofsm.driving.episodes import teach
-from evofsm.driving.families.family import load_family
+from evofsm.driving.families import load_family
 from evofsm.driving.world import KinematicWorld
 from evofsm.guard.reviser import Mode
 

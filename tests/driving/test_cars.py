@@ -8,16 +8,15 @@ pytest.importorskip("scipy")
 from evofsm.driving.cars import (
     TOLD,
     guard_for_family,
-    held_out,
     learners_of,
     learnt_by,
     load_learnt,
     name_judge,
     save_learnt,
-    training,
 )
 from evofsm.driving.episodes import teach, try_out
-from evofsm.driving.families.family import load_family
+from evofsm.driving.families import load_family
+from evofsm.driving.family import held_out, training
 from evofsm.driving.risk.latent import LatentRisk
 from evofsm.guard.guard import Guard
 from evofsm.guard.learnt.risk import LearntRisk

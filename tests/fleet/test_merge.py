@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from evofsm.driving.families.family import load_family
+from evofsm.driving.families import load_family
 from evofsm.driving.world import KinematicWorld
 from evofsm.fleet.batch import Fleet
 from evofsm.fleet.merging import merge

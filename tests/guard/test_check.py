@@ -8,14 +8,7 @@ import numpy as np
 import pytest
 
 from evofsm import EvolvingFSM
-from evofsm.driving import (
-    IDM,
-    AdaptiveCruise,
-    AlwaysBrake,
-    EnvelopeReviser,
-    LatentRisk,
-    Unrevised,
-)
+from evofsm.driving import IDM, AdaptiveCruise, AlwaysBrake, EnvelopeReviser, LatentRisk, Unrevised
 from evofsm.driving.measures import (
     DecelerationToAvoidCollision,
     FuzzySafety,

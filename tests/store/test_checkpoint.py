@@ -225,7 +225,7 @@ def drive(path=None, episodes=5, stop_after=None):
     pytest.importorskip("scipy")
     from evofsm.cli.driving import Setup, drive_family, make_guard
     from evofsm.driving.cars import learnt_by
-    from evofsm.driving.families.family import load_family
+    from evofsm.driving.families import load_family
     from evofsm.driving.world import KinematicWorld
 
     def progress(done, collisions):

@@ -19,18 +19,12 @@ from studies.closed_loop.calibration import reliability, run_calibration
 from studies.closed_loop.machine import MACHINE, run_machine, run_machine_shift
 from studies.closed_loop.plan import Plan
 from studies.closed_loop.study import run_closed_loop
+from studies.policies import fixed_policies
 from studies.scores import auroc
 
 from evofsm.driving.cars import guard_for_family, load_learnt, save_learnt
-from evofsm.driving.episodes import (
-    drive,
-    outcome_of,
-    reference_of,
-    teach,
-    unrevised_guard,
-)
-from evofsm.driving.families.family import load_family
-from evofsm.driving.policies import fixed_policies
+from evofsm.driving.episodes import drive, outcome_of, reference_of, teach, unrevised_guard
+from evofsm.driving.families import load_family
 
 pytestmark = pytest.mark.slow
 
@@ -212,56 +206,6 @@ def test_a_driver_who_proposes_nothing_usable_is_replaced_and_counted():
     found = outcome_of(drive(none, draw, controller=Broken()), base, EMERGENCY.interval)
     assert found.changed == found.decisions
     assert found.change == 0.0
-
-
-@pytest.mark.slow
-def test_gentle_traffic_does_not_make_it_bold(tmp_path):
-    """Learnt among gentle waves only, then one leader stops in earnest."""
-    text = """
-about = "waves, then perhaps a stop"
-interval = 0.25
-actions = { low = -6.0, high = 2.5, width = 0.5 }
-limits = { decel = 6.0, leader_decel = 8.0 }
-scenario = { initial_gap = [2.0, 20.0], duration = 60.0, dt = 0.01 }
-body = { lowest = -6.0, highest = 2.5 }
-[leader]
-driver = "leader"
-brake_time = TIME
-brake_decel = [7.0, 8.0]
-[leader.traffic]
-fast = [15.0, 22.0]
-slow = [5.0, 12.0]
-accel = [0.8, 1.5]
-decel = [1.2, 2.4]
-cruise = [2.0, 5.0]
-pause = [1.0, 4.0]
-[follower]
-driver = "aggressive"
-[drivers.leader]
-accel = 1.2
-desired_speed = 25.0
-min_gap = 1.0
-time_headway = 1.0
-decel = 2.5
-[drivers.aggressive]
-accel = 2.25
-desired_speed = 28.0
-min_gap = 0.8
-time_headway = 0.3
-decel = 2.0
-lowest = -6.0
-highest = 2.5
-"""
-    gentle, stop = tmp_path / "gentle.toml", tmp_path / "stop.toml"
-    gentle.write_text(text.replace("TIME", "inf"))
-    stop.write_text(text.replace("TIME", "[20.0, 50.0]"))
-    waves, stops = load_family(gentle), load_family(stop)
-    guard = guard_for_family(waves)
-    teach(guard, (waves.draw(0, index) for index in range(30)))
-    assert guard.judge.manoeuvres.gentle > 60
-    guard.freeze()
-    drives = teach(guard, (stops.draw(0, index, split="test") for index in range(40)))
-    assert not any(drive.collided for drive in drives)
 
 
 def test_what_was_learnt_is_kept(tmp_path):

@@ -5,6 +5,7 @@ import shutil
 
 import numpy as np
 import pytest
+from studies.counts import OutcomeCounts
 from studies.datasets.episodes import Episode
 from studies.real.cases import HORIZONS, Question, case_of, recent_acceleration
 from studies.real.measures import MEASURES, ComingByState, approach, learn_logistic
@@ -14,7 +15,6 @@ from studies.real.study import fold_of_runs, read_folder, run_real
 from studies.real.targets import TARGETS, coming, onsets
 from studies.scores import auroc
 
-from evofsm.driving.risk.counts import OutcomeCounts
 from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.states.novelty import Novelty
 

@@ -27,12 +27,12 @@ from studies.closed_loop.plan import Plan
 from studies.closed_loop.stages import Point
 from studies.closed_loop.study import ClosedLoop, TradeOff
 from studies.closed_loop.tables import side_tables, why_not_by_state
+from studies.policies import Group
 
 from evofsm.cli.text.documents import to_json
 from evofsm.cli.text.numbers import percent
 from evofsm.driving.episodes import Row
-from evofsm.driving.families.family import load_family
-from evofsm.driving.policies import Group
+from evofsm.driving.families import load_family
 from evofsm.paper.report.chapter import write_chapters
 
 _N = 200

@@ -17,8 +17,8 @@ from studies.detection.rows import Reliable, Row
 from studies.detection.study import IN_GRID, Detection
 from studies.detection.watch import Target
 from studies.detection.worlds import GRID
+from studies.policies import Group
 
-from evofsm.driving.policies import Group
 from evofsm.paper.report.chapter import Chapter, write_chapters
 from evofsm.paper.terminal import print_chapter
 

@@ -89,8 +89,8 @@ class Setup:
         return {
             "family": {
                 "name": self.family.name,
-                "tables": self.family.tables,
-                "added": self.family.added,
+                "switches": self.family.switches,
+                "file": self.family.source and Path(self.family.source).read_text("utf-8"),
             },
             "controller": self.controller,
             "reviser": self.reviser,

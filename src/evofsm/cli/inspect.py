@@ -107,7 +107,7 @@ def load_model(place: Path) -> tuple[FSMModel, Header | None]:
     if header.kind != "machine":
         return FSMModel.load(place), header
     family = header.provenance.get("family")
-    labels = load_family(family).labels._asdict() if family in FAMILIES else {}
+    labels = load_family(str(family)).labels._asdict() if family in FAMILIES else {}
     return EvolvingFSM.load(place).model(**labels), header
 
 

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import astuple
 from pathlib import Path
 from typing import Any, Literal
 
-from evofsm.driving.families.family import Draw, Family
+from evofsm.driving.family import Family
 from evofsm.driving.naming import UNITS, VARIABLES
 from evofsm.driving.risk.latent import LatentRisk
 from evofsm.fsm import EvolvingFSM, IntervalActions, Novelty, StateRule
@@ -123,22 +123,6 @@ def guard_for_family(family: Family, **settings: Any) -> Guard:
     """The same for a family's set of actions and interval; settings as in `guard_for_cars`."""
     low, high, width, closed, _ = astuple(family.actions)
     return guard_for_cars(low, high, family.interval, width=width, closed=closed, **settings)
-
-
-# -- In a family ----------------------------------------------------------------------------------
-
-
-def training(
-    family: Family, seed: int, learning_seed: int, episodes: int, first: int = 0
-) -> Iterator[Draw]:
-    """Draws to learn from, other ones for every learning seed."""
-    for index in range(first, first + episodes):
-        yield family.draw(seed * 1000 + learning_seed, index, split="train")
-
-
-def held_out(family: Family, seed: int, episodes: int) -> list[Draw]:
-    """Draws that nothing learns from."""
-    return [family.draw(seed, index, split="test") for index in range(episodes)]
 
 
 def learnt_by(guard: Guard) -> tuple[EvolvingFSM, LatentRisk]:

@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from evofsm.driving.families.family import Draw, Family, load_family
+from evofsm.driving.families import load_family
+from evofsm.driving.family import Draw, Family
 from evofsm.driving.sumo import open_world
 from evofsm.driving.world import Episode, OnRoad
 from evofsm.extras import needs

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from evofsm.driving.families.family import Draw, Family
+from evofsm.driving.family import Draw, Family
 from evofsm.driving.revisers import Unrevised
 from evofsm.driving.scenarios import Scenario
 from evofsm.driving.sumo import open_world

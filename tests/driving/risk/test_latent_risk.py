@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
+from studies.counts import OutcomeCounts
 
 from evofsm.driving.measures import is_dead_end
 from evofsm.driving.risk.brakes import OwnBrakes
 from evofsm.driving.risk.by_state import RiskByState, assess_states
-from evofsm.driving.risk.counts import OutcomeCounts
 from evofsm.driving.risk.latent import LatentRisk
 from evofsm.driving.risk.manoeuvres import BrakeWatch, Manoeuvres
 from evofsm.driving.risk.rehearsal import HARDEST, Body, critical_decelerations

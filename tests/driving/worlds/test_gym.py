@@ -12,7 +12,8 @@ gymnasium = pytest.importorskip("gymnasium")
 from gymnasium.utils.env_checker import check_env  # noqa: E402
 
 from evofsm.driving.env import ID, CarFollowing  # noqa: E402
-from evofsm.driving.families.family import load_family  # noqa: E402
+from evofsm.driving.families import load_family  # noqa: E402
+from evofsm.driving.scenarios import Behind  # noqa: E402
 
 NAME = f"evofsm.driving.env:{ID}"
 INFO = {"time", "gap", "distance", "failed", "rear_ended", "split", "index"}
@@ -139,8 +140,13 @@ def test_the_end_of_time_truncates():
 
 
 def test_being_rear_ended_terminates_and_costs_but_is_no_failure():
-    behind = {"driver": "aggressive", "gap": 5.0}
-    env = CarFollowing(replace(load_family("emergency"), added=({"behind": behind},)))
+    family = load_family("emergency")
+
+    def followed_closely(numbers):
+        scenario, hasty = family.make(numbers)
+        return replace(scenario, behind=Behind(hasty, 5.0)), hasty
+
+    env = CarFollowing(replace(family, make=followed_closely))
 
     def stops_dead(observation, info):
         return 2.5 if info["time"] < 3.0 else -2.5
@@ -216,7 +222,7 @@ def test_sumo_drives_the_same():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("module", ["evofsm.driving.worlds.gym", "evofsm.guard.gym"])
+@pytest.mark.parametrize("module", ["evofsm.driving.env", "evofsm.guard.gym"])
 def test_without_gymnasium_the_extra_is_named(module):
     program = f"import sys; sys.modules['gymnasium'] = None; import {module}"
     finished = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)

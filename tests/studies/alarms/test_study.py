@@ -12,8 +12,8 @@ from studies.alarms.plan import Plan
 from studies.alarms.study import run_alarms, said_by, threshold
 from studies.alarms.windows import Windows, windows
 from studies.detection.measures import Detector
+from studies.policies import Group
 
-from evofsm.driving import Group
 from evofsm.guard import ConformalAlarm
 
 

@@ -97,7 +97,7 @@ class Driven(Revised, WithJson):
     """A command that drives episodes of one family."""
 
     family: str = argument(
-        "Family of scenarios: emergency, paper, shift, ..., or a TOML file of your own."
+        "Family of scenarios: emergency, paper, shift, ..., or a Python file of your own."
     )
     mode: str = option("act", "How far least-risk goes: off, shadow, advise, act.")
 

@@ -35,7 +35,7 @@ class Watch(Revised):
     """
 
     what: str = argument(
-        "Family of scenarios: paper, emergency, ..., or a TOML file of your own; a run that "
+        "Family of scenarios: paper, emergency, ..., or a Python file of your own; a run that "
         "drive --mcap recorded; a log, as evofsm learn reads them, or what a SUMO configuration "
         "drives (.sumocfg), watched in shadow mode.",
         "paper",
@@ -67,7 +67,7 @@ class Watch(Revised):
         from evofsm.io.tables import file_kind
 
         place = Path(self.what)
-        if self.what in FAMILIES or place.suffix in (".toml", ".json"):
+        if self.what in FAMILIES or place.suffix == ".py":
             return False
         if not (place.is_file() or (place / "metadata.yaml").is_file()):
             return False

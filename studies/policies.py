@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from enum import StrEnum
 
-from evofsm.driving.families.family import Draw, Family
+from evofsm.driving.family import Draw, Family
 from evofsm.driving.measures import (
     FIXED_MEASURES,
     ResponsibilitySensitiveSafety,

@@ -1,0 +1,421 @@
+"""What a family of scenarios is: a Python function of numbers that are drawn by seed.
+
+A `Family` has a function ``make(numbers)`` that returns a scenario and who drives the follower. It
+asks `Numbers` for whatever is drawn, each number by the place that it is for, such as
+``scenario.initial_gap``. Each place has random numbers of its own: two families that differ in one
+number draw the same ones everywhere else. All numbers are SI units.
+"""
+
+from __future__ import annotations
+
+import math
+import operator
+import runpy
+from collections.abc import Callable, Iterable, Iterator, Mapping, MutableMapping, Sequence
+from dataclasses import dataclass, fields, replace
+from functools import cached_property, partial
+from pathlib import Path
+from typing import Any, NamedTuple
+from zlib import crc32
+
+import numpy as np
+
+from evofsm.driving.drivers import IDM, ChangingIDM
+from evofsm.driving.naming import UNITS, VARIABLES
+from evofsm.driving.scenarios import Behind, Scenario
+from evofsm.fsm.actions import IntervalActions
+from evofsm.fsm.naming import Labels
+
+#: Where draws come from. What is learnt on one is scored on the other; they never meet.
+SPLITS = ("train", "test")
+
+#: Says by what chance a number falls as it does: for a place, a number from 0 up to 1, the same
+#: whenever the same place is asked for.
+Chance = Callable[[str], float]
+
+# Numbers that are equal but for rounding.
+_ROUNDING = 1e-9
+
+
+# -- A draw ---------------------------------------------------------------------------------------
+
+
+class Draw(NamedTuple):
+    """One scenario of a family, and who drives the follower in it."""
+
+    scenario: Scenario
+    controller: IDM | ChangingIDM
+    variant: str  #: name of the variant; that of the family where it has none
+
+
+class Numbers:
+    """The numbers of one draw, each by the place that it is for.
+
+    Parameters
+    ----------
+    seed, index : int
+        Of the draw, from 0.
+    split : {"train", "test"}
+    chance : callable, optional
+        Decides instead of the seed: 0 is the lower end of a range, 0.5 its middle.
+    drawn : mapping, optional
+        Where each number is put by its place: of several its index, from 0.
+
+    Raises
+    ------
+    ValueError
+        If seed, index or split are none.
+
+    Examples
+    --------
+    >>> numbers = Numbers(seed=1, index=0)
+    >>> gap = numbers.between("scenario.initial_gap", 2.0, 30.0)
+    >>> 2.0 <= gap <= 30.0, gap == numbers.between("scenario.initial_gap", 2.0, 30.0)
+    (True, True)
+    >>> Numbers(0, 0, chance={"gap": 0.25, "brake.one_of": 0.9}.__getitem__).between("gap", 2, 30)
+    9.0
+    """
+
+    def __init__(
+        self,
+        seed: int,
+        index: int,
+        split: str = "train",
+        *,
+        chance: Chance | None = None,
+        drawn: MutableMapping[str, float] | None = None,
+    ) -> None:
+        if split not in SPLITS:
+            raise ValueError(f"split is {split!r}; it must be one of {', '.join(SPLITS)}")
+        for name, number in (("seed", seed), ("index", index)):
+            if not 0 <= operator.index(number) < 2**32:
+                raise ValueError(f"{name} is {number}; it must be from 0 to 2**32 - 1")
+        #: Index of the variant; 0 where the family has none.
+        self.variant = 0
+        self._key = [SPLITS.index(split), int(seed), int(index)]
+        self._chance, self._drawn = chance, {} if drawn is None else drawn
+
+    def between(self, place: str, low: float, high: float) -> float:
+        """A number from a range, evenly distributed."""
+        if self._chance is None:
+            return float(self._stream(place).uniform(low, high))
+        number = self._drawn[place] = float(low + (high - low) * self._checked(place))
+        return number
+
+    def below(self, place: str, n: int) -> int:
+        """An integer from 0 to n - 1, each as likely."""
+        if self._chance is None:
+            return int(self._stream(place).integers(n))
+        number = self._drawn[place] = int(n * self._checked(place))
+        return number
+
+    def one_of(self, place: str, choices: Sequence[Any]) -> Any:
+        """One of several, each as likely."""
+        return choices[self.below(f"{place}.one_of", len(choices))]
+
+    def _stream(self, place: str) -> np.random.Generator:
+        """The random numbers that belong to a place."""
+        return np.random.default_rng([*self._key, crc32(place.encode())])
+
+    def _checked(self, place: str) -> float:
+        chance = self._chance(place)  # type: ignore[misc]
+        if not 0.0 <= chance < 1.0:
+            raise ValueError(f"the chance of {place} is {chance}; it must be from 0 up to 1")
+        return chance
+
+
+#: What makes a draw: a scenario and who drives the follower.
+Make = Callable[[Numbers], tuple[Scenario, IDM | ChangingIDM]]
+
+
+# -- A family -------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Family:
+    """Scenarios that are drawn by seed.
+
+    Parameters
+    ----------
+    name : str
+    about : str
+        What happens, in a sentence.
+    make : callable
+        From `Numbers` to a `Scenario` and the follower's driver. The seed of the sensors' noise is
+        drawn besides.
+    low, high : float
+        Range of the actions [m/s²].
+    decel, leader_decel : float
+        The true hardest braking of the follower and of any leader [m/s²], positive: for those who
+        may know it.
+    interval : float
+        Time between decisions [s].
+    width : float
+        Of an interval of actions [m/s²].
+    variants : tuple of str
+        Names of the variants; ``numbers.variant`` is the index of the one that is drawn.
+    in_turn : bool
+        Whether variants come in turn: draw i is variant i % cases.
+    shifted : Family, optional
+        The family after its shift.
+    switches : tuple of str
+        Those of `SWITCHES` that are on.
+    fixed : bool
+        Whether nothing is drawn, the sensors' noise neither.
+    source : str
+        The file that it is from.
+
+    Raises
+    ------
+    ValueError
+        If a number is impossible, there is no such switch, or the family makes no scenario.
+
+    Examples
+    --------
+    >>> from evofsm.driving import Leader, load_family
+    >>> def make(numbers):
+    ...     calm = IDM(1.2, 25.0, 1.0, 1.0, 2.5, lowest=-4.0, highest=2.5)
+    ...     decel = numbers.between("leader.brake_decel", 2.0, 6.0)
+    ...     leader = Leader(calm, brake_decel=decel, brake_time=10.0)
+    ...     return Scenario(leader, initial_gap=10.0), calm
+    >>> family = Family("mine", "The leader stops.", make, -4.0, 2.5, decel=4.0, leader_decel=6.0)
+    >>> family.draw(seed=0, index=1) == family.draw(seed=0, index=1)
+    True
+    >>> load_family("shift").shifted.decel, load_family("paper").draw(0, 6).variant
+    (2.5, 'case 3')
+    """
+
+    name: str
+    about: str
+    make: Make
+    low: float
+    high: float
+    decel: float
+    leader_decel: float
+    interval: float = 0.25
+    width: float = 0.3
+    variants: tuple[str, ...] = ()
+    in_turn: bool = False
+    shifted: Family | None = None
+    switches: tuple[str, ...] = ()
+    fixed: bool = False
+    source: str = ""
+
+    def __post_init__(self) -> None:
+        for name in ("decel", "leader_decel", "interval"):
+            if not 0.0 < getattr(self, name) < math.inf:
+                raise ValueError(f"{name} is {getattr(self, name)}; it must be positive and finite")
+        for name in self.switches:
+            if name not in SWITCHES:
+                raise ValueError(f"there is no switch {name!r}; there are {', '.join(SWITCHES)}")
+        _ = self.actions
+
+    @cached_property
+    def actions(self) -> IntervalActions:
+        """The set of actions; made with ``outside="clip"``."""
+        return IntervalActions(self.low, self.high, self.width, outside="clip")
+
+    @property
+    def labels(self) -> Labels:
+        """What the numbers of a machine mean that drove it."""
+        return Labels(self.actions, VARIABLES, UNITS, self.interval)
+
+    @property
+    def cases(self) -> int:
+        """How many variants come in turn; 1 where none do."""
+        return max(1, len(self.variants)) if self.in_turn else 1
+
+    def with_switches(self, names: Iterable[str]) -> Family:
+        """The family with some of `SWITCHES` on; what it draws is otherwise the same.
+
+        Raises
+        ------
+        ValueError
+            If there is no such switch.
+
+        Examples
+        --------
+        >>> from evofsm.driving import load_family
+        >>> family = load_family("emergency").with_switches(["actuator", "jerk"])
+        >>> family.draw(seed=0, index=0).scenario.body
+        Body(lowest=-2.5, highest=2.5, delay=0.2, jerk=15.0)
+        """
+        on = (names,) if isinstance(names, str) else tuple(names)
+        after = None if self.shifted is None else self.shifted.with_switches(on)
+        return replace(self, switches=(*self.switches, *on), shifted=after)
+
+    def draw(self, seed: int, index: int, split: str = "train") -> Draw:
+        """One scenario: always the same for the same arguments.
+
+        Parameters
+        ----------
+        seed, index : int
+            From 0; each pair is another draw.
+        split : {"train", "test"}
+            Draws of one never are draws of the other.
+
+        Returns
+        -------
+        Draw
+
+        Raises
+        ------
+        ValueError
+            If seed, index or split are none, or the family makes no scenario of these numbers.
+
+        Examples
+        --------
+        >>> from evofsm.driving import load_family
+        >>> family = load_family("cut_in")
+        >>> train, test = (family.draw(seed=1, index=0, split=s) for s in ("train", "test"))
+        >>> train == family.draw(seed=1, index=0), train == test
+        (True, False)
+        """
+        numbers = Numbers(seed, index, split)
+        return self._draw(numbers, index % self.cases if self.cases > 1 else None)
+
+    def draw_by(self, chance: Chance, drawn: MutableMapping[str, float] | None = None) -> Draw:
+        """The scenario that given chances make, for whoever searches among all there are.
+
+        Parameters
+        ----------
+        chance : callable
+            Says for each place that is drawn for, such as ``scenario.initial_gap``, a number from 0
+            up to 1: 0 is the lower end of a range, 0.5 its middle. Independent and evenly
+            distributed ones make draws as `draw` does; which of the variants it is, is drawn for
+            ``variant``.
+        drawn : mapping, optional
+            Where each number that was drawn is put by its place: of a range the number itself, of
+            several its index, from 0.
+
+        Returns
+        -------
+        Draw
+
+        Raises
+        ------
+        ValueError
+            If a chance is out of its range, or the family makes no scenario of these numbers.
+
+        Examples
+        --------
+        >>> from evofsm.driving import load_family
+        >>> draw = load_family("emergency").draw_by(lambda place: 0.5)
+        >>> draw.scenario.initial_gap, draw.scenario.leader.brake_decel
+        (16.0, 3.5)
+        """
+        return self._draw(Numbers(0, 0, chance=chance, drawn=drawn))
+
+    def _draw(self, numbers: Numbers, variant: int | None = None) -> Draw:
+        if variant is None and self.variants:
+            variant = numbers.below("variant", len(self.variants))
+        numbers.variant = variant or 0
+        noise = None if self.fixed else numbers.below("sensors.seed", 2**32)
+        scenario, driver = self.make(numbers)
+        if noise is not None:
+            scenario = replace(scenario, sensors=replace(scenario.sensors, seed=noise))
+        for name in self.switches:
+            scenario = SWITCHES[name](scenario, numbers)
+        self._check_limits(scenario, driver)
+        return Draw(
+            scenario, driver, self.variants[numbers.variant] if self.variants else self.name
+        )
+
+    def _check_limits(self, scenario: Scenario, driver: IDM | ChangingIDM) -> None:
+        """Who is given the limits must be able to rely on them."""
+        leader = scenario.leader
+        leader_brakes = max([leader.brake_decel, *(-wave for _, wave in leader.waves)])
+        if leader_brakes > self.leader_decel + _ROUNDING:
+            raise ValueError(
+                f"{self._where}: a leader brakes by {leader_brakes:g} m/s², but leader_decel is "
+                f"{self.leader_decel:g}"
+            )
+        commanded = min(self.low, float(driver.parameters[:, 7].min()))
+        brakes = -max(scenario.body.lowest, commanded)
+        if brakes > self.decel + _ROUNDING:
+            raise ValueError(
+                f"{self._where}: the follower can brake by {brakes:g} m/s², but decel is "
+                f"{self.decel:g}; bound its body, or the driver and the actions"
+            )
+
+    @property
+    def _where(self) -> str:
+        return self.source or f"family {self.name}"
+
+    def __reduce__(self) -> Any:
+        """From a file it is read anew in other processes, which do not know its functions."""
+        if self.source:
+            return read_family, (self.source, self.switches)
+        values = {part.name: getattr(self, part.name) for part in fields(self)}
+        return partial(type(self), **values), ()
+
+
+def read_family(path: str | Path, switches: Iterable[str] = ()) -> Family:
+    """The ``family`` that a file of Python defines."""
+    try:
+        found = runpy.run_path(str(path)).get("family")
+        if not isinstance(found, Family):
+            raise ValueError("it defines no Family that is called family")
+        family = replace(found, source=str(path)).with_switches(switches)
+        for one in filter(None, (family, family.shifted)):
+            for variant in range(max(1, len(one.variants))):
+                one._draw(Numbers(0, 0), variant)  # so that a mistake shows at once
+    except Exception as error:
+        text = str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {error}"
+        where = "" if text.startswith(f"{path}: ") else f"{path}: "
+        raise ValueError(f"{where}{text}") from error
+    return family
+
+
+def training(
+    family: Family, seed: int, learning_seed: int, episodes: int, first: int = 0
+) -> Iterator[Draw]:
+    """Draws to learn from, other ones for every learning seed."""
+    for index in range(first, first + episodes):
+        yield family.draw(seed * 1000 + learning_seed, index, split="train")
+
+
+def held_out(family: Family, seed: int, episodes: int) -> list[Draw]:
+    """Draws that nothing learns from."""
+    return [family.draw(seed, index, split="test") for index in range(episodes)]
+
+
+# -- Switches -------------------------------------------------------------------------------------
+# The sizes are our own: what a production radar and brake system roughly show.
+
+
+def _noise(scenario: Scenario, numbers: Numbers) -> Scenario:
+    """White noise on gap [m] and both speeds [m/s], new at every step."""
+    return replace(scenario, sensors=replace(scenario.sensors, gap_noise=0.5, speed_noise=0.3))
+
+
+def _delay(scenario: Scenario, numbers: Numbers) -> Scenario:
+    """What is seen is 0.2 s old."""
+    return replace(scenario, sensors=replace(scenario.sensors, delay=0.2))
+
+
+def _actuator(scenario: Scenario, numbers: Numbers) -> Scenario:
+    """From a command to its effect it takes 0.2 s."""
+    return replace(scenario, body=replace(scenario.body, delay=0.2))
+
+
+def _jerk(scenario: Scenario, numbers: Numbers) -> Scenario:
+    """The realised acceleration changes by at most 15 m/s³."""
+    return replace(scenario, body=replace(scenario.body, jerk=15.0))
+
+
+def _third_car(scenario: Scenario, numbers: Numbers) -> Scenario:
+    """A car behind, with the ordinary brakes that UN R157 counts on."""
+    gap = numbers.between("behind.gap", 10.0, 40.0)
+    driver = IDM(1.25, 25.0, 2.0, 1.5, 2.0, lowest=-6.0, highest=2.5)
+    return replace(scenario, behind=Behind(driver, gap))
+
+
+#: What can be switched on in any family, by name.
+SWITCHES: Mapping[str, Callable[[Scenario, Numbers], Scenario]] = {
+    "noise": _noise,
+    "delay": _delay,
+    "actuator": _actuator,
+    "jerk": _jerk,
+    "third_car": _third_car,
+}

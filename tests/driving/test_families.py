@@ -1,0 +1,340 @@
+"""Families of scenarios: what each states, how they are drawn, and files of one's own."""
+
+import math
+import pickle
+import subprocess
+import sys
+from dataclasses import asdict, replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from evofsm.driving.drivers import IDM
+from evofsm.driving.episodes import drive, unrevised_guard
+from evofsm.driving.families import FAMILIES, fixed_family, load_family
+from evofsm.driving.family import SWITCHES
+from evofsm.driving.measures import is_dead_end
+from evofsm.paper.settings import Settings
+
+SEEDS = st.integers(0, 2**32 - 1)
+LOADED = {name: load_family(name) for name in FAMILIES}
+BEFORE_AND_AFTER = [
+    one for family in LOADED.values() for one in (family, family.shifted) if one is not None
+]
+#: In these nothing is drawn at random.
+FIXED = ("paper", "r157")
+
+MINE = """
+from evofsm.driving import IDM, Body, Family, Leader, Scenario
+
+def make(numbers):
+    speed = numbers.between("values.speed", 10.0, 20.0)
+    calm = IDM(1.5, 25.0, 1.0, 0.5, 2.0, lowest=-3.0, highest=2.0)
+    leader = Leader(calm, brake_decel=5.0, brake_time=10.0, initial_speed=speed)
+    return Scenario(leader, initial_gap=20.0, initial_speed=speed), calm
+
+family = Family("mine", "One of mine.", make, -3.0, 2.0, decel=3.0, leader_decel=5.0, interval=0.5)
+"""
+
+
+@pytest.fixture
+def mine(tmp_path):
+    """A file of the user's own, with some of its text replaced."""
+
+    def write(before="", after=""):
+        assert before in MINE
+        path = tmp_path / "mine.py"
+        path.write_text(MINE.replace(before, after, 1))
+        return path
+
+    return write
+
+
+def chances(seed):
+    """A number for each place, the same whenever it is asked for."""
+    rng, known = np.random.default_rng(seed), {}
+    return lambda place: known.setdefault(place, rng.random())
+
+
+# -- What every family is held to -----------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", FAMILIES)
+def test_every_family_drives_with_every_switch(name):
+    family = LOADED[name]
+    assert (family.name, family.interval, family.actions.outside) == (name, 0.25, "clip")
+    plain = family.draw(3, 1)
+    for switch in SWITCHES:
+        switched = load_family(f"{name}+{switch}").draw(3, 1)
+        assert switched.controller == plain.controller
+        assert switched.scenario.leader == plain.scenario.leader
+        assert switched.scenario != plain.scenario
+        drive(unrevised_guard(family), switched)
+
+
+@pytest.mark.parametrize("family", BEFORE_AND_AFTER, ids=lambda family: family.name)
+def test_limits_are_true_and_reached_and_no_run_starts_in_a_dead_end(family):
+    hardest = []
+    for index in range(200):
+        scenario, controller, _ = family.draw(1, index, "test")
+        leader = scenario.leader
+        assert (controller.parameters[:, 7] == family.actions.low).all()
+        assert (controller.parameters[:, 8] == family.actions.high).all()
+        assert max(scenario.body.lowest, family.actions.low) == -family.decel
+        hardest.append(max([leader.brake_decel, *(-wave for _, wave in leader.waves)]))
+        start = [scenario.initial_gap, scenario.initial_speed, leader.initial_speed]
+        assert not is_dead_end(np.array(start), family.decel, family.leader_decel)
+    assert 0.9 * family.leader_decel < max(hardest) <= family.leader_decel
+
+
+# -- How draws are made ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", [name for name in FAMILIES if name not in FIXED])
+def test_a_draw_is_always_the_same_and_training_and_test_never_meet(name):
+    def draws():
+        family = load_family(f"{name}+noise")
+        keys = [(s, i, of) for s in (0, 1) for i in range(60) for of in ("train", "test")]
+        return [repr(family.draw(*key)) for key in keys]
+
+    assert draws() == draws()
+    assert len(set(draws())) == 240
+
+
+def test_draws_stay_what_they_were():
+    """Numbers of the README and of the docs hang on them."""
+    gap = LOADED["emergency"].draw(0, 0, "test").scenario.initial_gap
+    cut_in = LOADED["cut_in"].draw(7, 3).scenario.leader.cut_in
+    waves = LOADED["stop_and_go"].draw(1, 2).scenario.leader.waves
+    assert gap == pytest.approx(21.710242493986346)
+    assert (cut_in.time, cut_in.gap) == pytest.approx((4.609853135459575, 8.356477535042133))
+    assert cut_in.speed == pytest.approx(5.3215488739111345)
+    assert waves[2] == pytest.approx((13.309115424828892, -1.7750361455080146))
+
+
+def test_the_noise_is_another_one_in_every_draw():
+    family = load_family("paper+noise")
+    keys = [(s, i, of) for s in (0, 1) for i in range(20) for of in ("train", "test")]
+    assert len({family.draw(*key).scenario.sensors.seed for key in keys}) == 80
+
+
+@given(seed=SEEDS, index=SEEDS)
+def test_emergency_keeps_to_its_ranges(seed, index):
+    scenario, controller, variant = LOADED["emergency"].draw(seed, index)
+    assert variant == "emergency"
+    assert 2.0 <= scenario.initial_gap <= 30.0
+    assert 5.0 <= scenario.leader.brake_time <= 30.0
+    assert 2.5 <= scenario.leader.brake_decel <= 4.5
+    assert scenario.leader.driver == IDM(1.2, 25.0, 1.0, 1.0, 2.5)
+    assert (scenario.duration, scenario.dt, scenario.initial_speed) == (35.0, 0.01, 0.0)
+    assert controller == IDM(2.25, 28.0, 0.8, 0.3, 2.0, lowest=-2.5, highest=2.5)
+
+
+@given(seed=SEEDS)
+def test_cut_ins_traffic_and_lapses_keep_to_what_they_state(seed):
+    scenario = LOADED["cut_in"].draw(seed, 0).scenario
+    car, speed = scenario.leader.cut_in, scenario.initial_speed
+    assert 20 / 3.6 - 1e-4 <= speed <= 60 / 3.6 + 1e-4
+    assert 0.0 <= car.speed <= speed <= car.speed + 50 / 3.6
+    assert scenario.leader.brake_time > car.time
+    leader = LOADED["stop_and_go"].draw(seed, 0).scenario.leader
+    times, accelerations = np.transpose(leader.waves)
+    speeds = np.cumsum(np.diff(times) * accelerations[:-1])
+    assert -1e-9 < speeds.min() <= speeds.max() < 20.0 + 1e-9
+    assert times[-1] + 8.0 >= 35.0
+    phases = LOADED["rare"].draw(seed, 0).controller.parameters
+    assert (np.diff(phases[:, 0]) > 0.0).all()
+    assert len(phases) in (1, 3, 5)
+    assert (phases[::2, 4] == 1.5).all()  # careful
+    assert (phases[1::2, 4] == 0.3).all()  # careless
+
+
+@pytest.mark.parametrize(
+    ("which", "message"),
+    [
+        ((-1, 0, "train"), "seed is -1; it must be from 0"),
+        ((0, 2**32, "train"), "index is .* it must be from 0"),
+        ((0, 0, "validation"), "one of train, test"),
+    ],
+)
+def test_a_draw_that_is_none_is_refused(which, message):
+    with pytest.raises(ValueError, match=message):
+        LOADED["emergency"].draw(*which)
+
+
+def test_given_chances_are_places_in_ranges_and_what_was_drawn_is_told():
+    family, drawn = LOADED["emergency"], {}
+    least = family.draw_by(lambda place: 0.0, drawn)
+    assert least.scenario.initial_gap == drawn["scenario.initial_gap"] == 2.0
+    assert 29.999 < family.draw_by(lambda place: np.nextafter(1.0, 0.0)).scenario.initial_gap <= 30
+    drawn, ncap = {}, LOADED["ncap"]
+    assert ncap.draw_by(lambda place: 0.999, drawn).variant == ncap.variants[-1]
+    assert drawn["variant"] == 2
+    for chance in (-0.1, 1.0, np.nan):
+        with pytest.raises(ValueError, match=r"the chance of .* must be from 0 up to 1"):
+            family.draw_by(lambda place, chance=chance: chance)
+
+
+# -- Variants, shifts, switches -------------------------------------------------------------------
+
+
+def test_variants_come_in_turn_or_at_random():
+    paper, ncap = LOADED["paper"], LOADED["ncap"]
+    assert (paper.cases, LOADED["r157"].cases, ncap.cases) == (4, 7, 1)
+    assert [paper.draw(0, i).variant for i in range(5)] == [*paper.variants, "case 1"]
+    drawn = [ncap.draw(0, i).variant for i in range(300)]
+    assert min(map(drawn.count, ("CCRs", "CCRm", "CCRb"))) > 70
+
+
+def test_ncap_is_what_euro_ncap_states():
+    for index in range(100):
+        scenario, _, variant = LOADED["ncap"].draw(0, index)
+        ego, leader = scenario.initial_speed * 3.6, scenario.leader
+        target = leader.initial_speed * 3.6
+        if variant == "CCRb":
+            assert ego == target == pytest.approx(50, abs=1e-3)
+            assert scenario.initial_gap in (12.0, 40.0)
+            assert leader.brake_decel in (2.0, 6.0)
+            assert leader.brake_time == 0.0
+            continue
+        assert target == pytest.approx({"CCRs": 0, "CCRm": 20}[variant], abs=1e-3)
+        assert {"CCRs": 10, "CCRm": 30}[variant] - 1e-3 <= ego <= 80 + 1e-3
+        assert scenario.initial_gap == pytest.approx((ego - target) / 3.6 * 4.0, abs=1e-3)
+        assert leader.brake_time == math.inf
+
+
+def test_r157_is_what_the_regulation_states():
+    pairs = [(7.2, 1.0), (10, 1.1), (20, 1.2), (30, 1.3), (40, 1.4), (50, 1.5), (60, 1.6)]
+    for index, (speed, headway) in enumerate(pairs):
+        scenario, _, variant = LOADED["r157"].draw(0, index)
+        assert variant == f"{speed:g} km/h"
+        assert scenario.initial_speed * 3.6 == pytest.approx(speed, abs=1e-3)
+        assert scenario.leader.initial_speed == scenario.initial_speed
+        assert scenario.initial_gap == pytest.approx(scenario.initial_speed * headway)
+        assert (scenario.leader.brake_decel, scenario.leader.brake_time) == (6.0, 0.0)
+
+
+@given(seed=SEEDS)
+def test_a_shift_changes_what_it_states_and_nothing_else(seed):
+    family = LOADED["shift"]
+    before, after = family.draw(seed, 0), family.shifted.draw(seed, 0)
+    body = replace(before.scenario.body, lowest=-2.5)
+    assert after == before._replace(scenario=replace(before.scenario, body=body))
+    assert (family.decel, family.shifted.decel) == (4.5, 2.5)
+    family = LOADED["shift_leader"]
+    before, after = family.draw(seed, 0), family.shifted.draw(seed, 0)
+    leader = replace(before.scenario.leader, brake_decel=after.scenario.leader.brake_decel)
+    assert after == before._replace(scenario=replace(before.scenario, leader=leader))
+    assert before.scenario.leader.brake_decel <= 6.0 <= leader.brake_decel <= 9.0
+    assert (family.leader_decel, family.shifted.leader_decel) == (6.0, 9.0)
+
+
+def test_switches_switch_on_what_they_say_before_and_after_a_shift():
+    scenario = LOADED["emergency"].with_switches(SWITCHES).draw(0, 0).scenario
+    sensors, body, behind = scenario.sensors, scenario.body, scenario.behind
+    assert (sensors.gap_noise, sensors.speed_noise, sensors.delay) == (0.5, 0.3, 0.2)
+    assert (body.lowest, body.delay, body.jerk) == (-2.5, 0.2, 15.0)
+    assert 10.0 <= behind.gap <= 40.0
+    assert behind.driver.lowest == -6.0
+    body = load_family("shift+jerk").shifted.draw(0, 0).scenario.body
+    assert body == replace(LOADED["shift"].shifted.draw(0, 0).scenario.body, jerk=15.0)
+    with pytest.raises(ValueError, match="no switch 'fog'; there are noise, delay"):
+        load_family("emergency+fog")
+
+
+# -- What happens in them -------------------------------------------------------------------------
+
+
+def test_paper_is_what_the_study_drives():
+    family, settings = LOADED["paper"], Settings.load()
+    for case in range(1, 5):
+        scenario, controller, _ = family.draw(0, case - 1)
+        assert controller == settings.drivers[case]
+        sensors = settings.scenario.sensors
+        assert replace(scenario, duration=35.0, sensors=sensors) == settings.scenario
+        driven = drive(unrevised_guard(family), family.draw(0, case - 1))
+        assert driven.collided == (case in (1, 4))
+    assert asdict(family.actions) == asdict(settings.actions) | {"low": -settings.decel}
+
+
+def test_in_emergency_the_unrevised_collide_and_in_rare_they_seldom_do():
+    for name, low, high in (("emergency", 0.93, 0.98), ("rare", 0.02, 0.16)):
+        family = LOADED[name]
+        runs = [drive(unrevised_guard(family), family.draw(1, k, "test")) for k in range(150)]
+        assert low <= np.mean([run.collided for run in runs]) <= high
+
+
+# -- Files of one's own ---------------------------------------------------------------------------
+
+
+def test_a_file_of_ones_own_is_a_family_with_switches_and_in_other_processes(mine):
+    path = mine()
+    family = load_family(f"{path}+noise")
+    assert (family.name, family.about, family.interval) == ("mine", "One of mine.", 0.5)
+    draw = family.draw(1, 2)
+    assert draw.variant == "mine"
+    assert draw.scenario.sensors.gap_noise == 0.5
+    assert drive(unrevised_guard(family), draw).decisions
+    program = "import pickle, sys; print(pickle.load(sys.stdin.buffer).draw(1, 2))"
+    told = subprocess.run(
+        [sys.executable, "-c", program], input=pickle.dumps(family), capture_output=True, check=True
+    )
+    assert told.stdout.decode().strip() == repr(draw)
+    parameters = FAMILIES["emergency"](low=-4.0, decel=3.0, leader_decel=6.0)
+    assert pickle.loads(pickle.dumps(parameters)).draw(0, 0) == parameters.draw(0, 0)
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "message"),
+    [
+        ("interval=0.5", "interval=0.0", r"mine\.py: interval is 0\.0; it must be positive"),
+        ("decel=3.0", "decel=-3.0", r"mine\.py: decel is -3\.0; it must be positive"),
+        ("leader_decel=5.0", "leader_decel=4.0", r"a leader brakes by 5 m/s², but leader_decel is"),
+        ("brake_time=10.0", "brake_time=-1.0", r"mine\.py: leader's brake_time is -1"),
+        ("initial_gap=20.0", "initial_gap='far'", r"mine\.py: TypeError: "),
+        ("return Scenario", "return Scene", r"mine\.py: NameError: .*Scene"),
+        ("family = Family", "mine = Family", "it defines no Family that is called family"),
+        ("def make", "def", r"mine\.py: SyntaxError"),
+    ],
+)
+def test_a_file_with_a_mistake_is_refused_with_its_name(mine, before, after, message):
+    with pytest.raises(ValueError, match=message):
+        load_family(mine(before, after))
+
+
+def test_a_follower_that_brakes_harder_than_it_says_is_refused(mine):
+    text = "-4.0, 2.0, decel=3.0"
+    path = mine("-3.0, 2.0, decel=3.0", text)
+    path.write_text(path.read_text().replace("lowest=-3.0", "lowest=-4.0"))
+    with pytest.raises(ValueError, match=r"can brake by 4 m/s², but decel is 3; bound its body"):
+        load_family(path)
+
+
+def test_a_family_that_is_none_is_refused(tmp_path):
+    with pytest.raises(ValueError, match="no family 'emergncy'; there are paper, emergency"):
+        load_family("emergncy")
+    with pytest.raises(ValueError, match=r"no family .*none\.py"):
+        load_family(tmp_path / "none.py")
+
+
+@pytest.mark.parametrize("name", [*FAMILIES, "cut_in+noise+delay+actuator+jerk+third_car"])
+def test_what_is_kept_is_what_was_drawn_to_the_last_bit(name, tmp_path):
+    family = load_family(name).shifted or load_family(name)
+    cases = {f"case {k}": family.draw_by(chances(k)) for k in range(4)}
+    path = tmp_path / "kept.py"
+    path.write_text(fixed_family(family, cases, "All of them."), encoding="utf-8")
+    again = load_family(path)
+    for k, (case, drawn) in enumerate(cases.items()):
+        for split in ("train", "test"):
+            draw = again.draw(seed=5, index=k, split=split)
+            assert draw == drawn._replace(variant=case)
+    for name in ("interval", "actions", "decel", "leader_decel"):
+        assert getattr(again, name) == getattr(family, name)
+    assert (again.name, again.about) == ("kept", "All of them.")
+
+
+def test_there_is_nothing_to_keep_of_nothing():
+    with pytest.raises(ValueError, match="there are no cases"):
+        fixed_family(LOADED["emergency"], {}, "Nothing.")
