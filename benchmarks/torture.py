@@ -7,6 +7,7 @@ Needs Linux or macOS: it forks a process that is warm, so that a kill costs no m
 from __future__ import annotations
 
 import argparse
+import hashlib
 import io
 import json
 import logging
@@ -18,9 +19,8 @@ import tempfile
 import threading
 import time
 import tracemalloc
-import zipfile
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
@@ -31,17 +31,19 @@ import numpy as np
 
 import one_machine
 import torture_audit
+from evofsm import store
 from evofsm.cli.driving import Setup, drive_family, make_guard
 from evofsm.cli.learning import learn_traces
 from evofsm.driving.families import load_family
 from evofsm.driving.risk.latent import LatentRisk
 from evofsm.driving.world import KinematicWorld
+from evofsm.fleet.checkpoint import KIND as CHECKPOINT
+from evofsm.fleet.checkpoint import Checkpoint, fingerprints
 from evofsm.fsm.actions import IntervalActions
+from evofsm.fsm.learnt import MACHINE
 from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.model import FSMModel
 from evofsm.io.logs import read_traces
-from evofsm.store import storage
-from evofsm.store.checkpoint import Checkpoint, fingerprints
 
 #: What must not happen, in the order in which it is printed.
 WRONG = (
@@ -152,7 +154,7 @@ def _is_broken(checkpoint: Path) -> bool:
     if not checkpoint.exists():
         return False  # it was stopped before there was anything to keep
     try:
-        storage.read(checkpoint, "checkpoint")
+        store.read(checkpoint, CHECKPOINT)
     except (ValueError, OSError):
         return True
     return False
@@ -228,12 +230,12 @@ def share(apart: bool, times: int, folder: Path, random: np.random.Generator) ->
         while found["loads"] < times:
             found["loads"] += 1
             try:
-                storage.read(path, "machine")
+                store.read(path, MACHINE)
             except (OSError, ValueError):
                 found["refused loads"] += 1
         done.set()
         found["crashes"] += sum(writer.has_crashed() for writer in writers)
-        storage.sweep(path)
+        store.sweep(path)
         found["left behind"] += len(list(Path(name).glob(".*.part")))
     return found
 
@@ -282,11 +284,10 @@ class Sample:
     name: str
     data: bytes
     load: Callable[[Path], bytes]
-    has_checksum: bool  #: whether it is of version 4 or later
 
 
 def _load_checkpoint(path: Path) -> bytes:
-    content, arrays = storage.read(path, "checkpoint")
+    content, arrays = store.read(path, CHECKPOINT)
     kept = {name: (a.dtype.str, a.shape, a.tobytes().hex()) for name, a in sorted(arrays.items())}
     return json.dumps([content, kept], sort_keys=True).encode()
 
@@ -300,8 +301,7 @@ _LOADS: dict[str, Callable[[Path], bytes]] = {
 
 
 def samples(folder: Path) -> list[Sample]:
-    """One of each kind of this version, and those of earlier ones that the tests hold."""
-    paths = sorted((Path(__file__).parents[1] / "tests" / "kept").glob("*.evofsm"))
+    """One of each kind."""
     machine = EvolvingFSM(3, radius=0.5)
     random = np.random.default_rng(0)
     machine.learn_many(random.normal(size=(60, 2)).cumsum(axis=0), np.arange(60) % 3)
@@ -312,17 +312,13 @@ def samples(folder: Path) -> list[Sample]:
     machine.model(names=("x", "y")).save(folder / "new.model")
     risk.save(folder / "new.risk")
     _drive(folder / "new.checkpoint")
-    paths += [folder / f"new.{kind}" for kind in _LOADS]
-    return [
-        Sample(path.name, path.read_bytes(), _LOADS[header.kind], header.version >= 4)
-        for path in paths
-        for header in [storage.read_header(path)]
-    ]
+    paths = {kind: folder / f"new.{kind}" for kind in _LOADS}
+    return [Sample(path.name, path.read_bytes(), _LOADS[kind]) for kind, path in paths.items()]
 
 
 def damaged(sample: Sample, random: np.random.Generator) -> bytes:
     """The file with one thing wrong."""
-    ways: list[Way] = [*_ROUGH, *(_FINE if sample.has_checksum else ())]
+    ways: list[Way] = [*_ROUGH, *_FINE]
     while (data := ways[random.integers(len(ways))](sample.data, random)) == sample.data:
         pass
     return data
@@ -371,85 +367,87 @@ def _blank(data: bytes, random: np.random.Generator) -> bytes:
 _ROUGH = (_flip, _flip, _cut, _swap, _repeat, _drop, _blank)
 
 
-def _members(data: bytes) -> dict[str, bytes]:
-    with zipfile.ZipFile(io.BytesIO(data)) as archive:
-        return {name: archive.read(name) for name in archive.namelist()}
+def _unpacked(data: bytes) -> tuple[dict[str, Any], bytes]:
+    """The header of a file, and its numbers."""
+    length = int.from_bytes(data[:8], "little")
+    header = json.loads(data[8 : 8 + length])
+    header["__metadata__"]["evofsm"] = json.loads(header["__metadata__"]["evofsm"])
+    return header, data[8 + length :]
 
 
-def _packed(members: Iterator[tuple[str, bytes]] | Any) -> bytes:
-    """An archive whose own checksums are right, whatever it holds."""
-    file = io.BytesIO()
-    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
-        for name, content in members:
-            archive.writestr(zipfile.ZipInfo(name), content, zipfile.ZIP_DEFLATED)
-    return file.getvalue()
+def _packed(header: dict[str, Any], numbers: bytes) -> bytes:
+    """A file whose checksum is right, whatever it holds."""
+    told = json.dumps(header["__metadata__"]["evofsm"])
+    header = header | {"__metadata__": {"sha256": "0" * 64, "evofsm": told}}
+    unsigned = json.dumps(header).encode()
+    digest = hashlib.sha256(unsigned + numbers).hexdigest().encode()
+    return len(unsigned).to_bytes(8, "little") + unsigned.replace(b"0" * 64, digest, 1) + numbers
 
 
-def _change_member(data: bytes, random: np.random.Generator) -> bytes:
-    members = _members(data)
-    name = random.choice(list(members))
-    members[name] = _flip(members[name], random)
-    return _packed(members.items())
+def _name(header: dict[str, Any], random: np.random.Generator) -> str:
+    return str(random.choice([name for name in header if name != "__metadata__"]))
 
 
-def _swap_members(data: bytes, random: np.random.Generator) -> bytes:
-    members = _members(data)
-    a, b = random.choice(list(members), 2, replace=False)
-    members[a], members[b] = members[b], members[a]
-    return _packed(members.items())
+def _lose_array(data: bytes, random: np.random.Generator) -> bytes:
+    header, numbers = _unpacked(data)
+    del header[_name(header, random)]
+    return _packed(header, numbers)
 
 
-def _lose_member(data: bytes, random: np.random.Generator) -> bytes:
-    members = _members(data)
-    del members[random.choice(list(members))]
-    return _packed(members.items())
-
-
-def _rename_member(data: bytes, random: np.random.Generator) -> bytes:
-    members = _members(data)
-    old = str(random.choice(list(members)))
-    names = ("../up.npy", "/etc/passwd.npy", "other.npy", "a/b.npy", "", old.upper(), old[:-4])
+def _rename_array(data: bytes, random: np.random.Generator) -> bytes:
+    header, numbers = _unpacked(data)
+    old = _name(header, random)
+    names = (
+        "../up",
+        "/etc/passwd",
+        "other",
+        "",
+        old.upper(),
+        "__metadata__",
+        _name(header, random),
+    )
     new = names[random.integers(len(names))]
-    return _packed((new if name == old else name, content) for name, content in members.items())
+    return _packed({new if name == old else name: one for name, one in header.items()}, numbers)
 
 
 def _claim(data: bytes, random: np.random.Generator) -> bytes:
-    """A shape that is far too large, in the array, in the archive's directory, or in both."""
-    members = _members(data)
-    name = str(random.choice(list(members)))
-    beginning, shape, rest = members[name].partition(b"'shape': (")
-    if random.random() < 0.7:
-        at = rest.index(b")")
-        more = b"%d," % random.integers(1 << 20, 1 << 60)
-        padding = rest[at:].split(b"\n")[0]
-        changed = more + rest[:at] + padding[: len(padding) - len(more)]
-        rest = changed + rest[len(changed) :] if len(padding) > len(more) + 3 else more + rest
-        members[name] = beginning + shape + rest
-    packed = bytearray(_packed(members.items()))
-    if random.random() < 0.7:
-        where = packed.rindex(b"PK\x01\x02", 0, packed.rindex(name.encode()))
-        size = int(random.integers(1 << 20, 1 << 32)).to_bytes(4, "little")
-        packed[where + 24 : where + 28] = size
-        if random.random() < 0.5:
-            packed[where + 20 : where + 24] = size
-    return bytes(packed)
+    """Something else about an array: most of it far too large."""
+    header, numbers = _unpacked(data)
+    entry = header[_name(header, random)]
+    large = int(random.integers(1 << 20, 1 << 60))
+    others: dict[str, tuple[Any, ...]] = {
+        "dtype": ("F32", "I64", "U8", "BOOL", None, 8),
+        "shape": ([large], [large, large], [-1, -1], [0], [], None, [None], [1.0], [[]]),
+        "data_offsets": ([0, large], [large, 0], [-8, 0], [], None, [0, 0, 0], "ab"),
+    }
+    name = str(random.choice(list(entry)))
+    entry[name] = others[name][random.integers(len(others[name]))]
+    return _packed(header, numbers)
 
 
-def _change_header(data: bytes, random: np.random.Generator) -> bytes:
-    members = _members(data)
-    text = members["header.npy"]
-    begin = text.index(b"\n") + 1
-    header = json.loads(text[begin:])
-    name = random.choice(list(header))
-    others: tuple[Any, ...] = (None, -1, 2, 3, 10**9, "x", [], {}, {"n_actions": 10**12}, 1e308)
-    header[name] = others[random.integers(len(others))]
-    file = io.BytesIO()
-    np.save(file, np.frombuffer(json.dumps(header).encode(), np.uint8))
-    members["header.npy"] = file.getvalue()
-    return _packed(members.items())
+def _change_setting(data: bytes, random: np.random.Generator) -> bytes:
+    header, numbers = _unpacked(data)
+    told = header["__metadata__"]["evofsm"]
+    if random.random() < 0.5 and told["settings"]:
+        told = told["settings"]
+    name = random.choice([name for name in told if name != "provenance"] or list(told))
+    others: tuple[Any, ...] = (
+        None,
+        -1,
+        2,
+        10**9,
+        10**400,
+        "x",
+        [],
+        {},
+        {"n_actions": 10**12},
+        1e308,
+    )
+    told[name] = others[random.integers(len(others))]
+    return _packed(header, numbers)
 
 
-_FINE = (_change_member, _swap_members, _lose_member, _rename_member, _claim, _change_header)
+_FINE = (_lose_array, _rename_array, _claim, _change_setting)
 
 
 def damage(times: int, folder: Path, random: np.random.Generator) -> Counter[str]:
@@ -506,6 +504,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     asked = parser.parse_args(arguments)
     kills, disks, loads, files = (20, 4, 100, 200) if asked.short else (500, 100, 5000, 10_000)
     shared, reading = (4, 1.0) if asked.short else (200, 20.0)  # machines; [s]
+    store._OLD = 0.0  # all that writes a file here is known
     random = np.random.default_rng(asked.seed)
     total: Counter[str] = Counter()
     with tempfile.TemporaryDirectory() as name:

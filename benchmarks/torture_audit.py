@@ -19,13 +19,13 @@ from typing import Any
 import numpy as np
 
 from evofsm.driving.risk.latent import LatentRisk
+from evofsm.fleet.sealed import NOTHING, ChainedFile, Head, Sync, records, seal, verify
 from evofsm.fsm.actions import IntervalActions
 from evofsm.fsm.machine import EvolvingFSM
 from evofsm.guard.auditing.log import AuditLog
 from evofsm.guard.auditing.replay import audit
 from evofsm.guard.guard import Guard
 from evofsm.guard.reviser import ActionReviser
-from evofsm.store.sealed import NOTHING, ChainedFile, Head, Sync, records, seal, verify
 
 #: What must not happen.
 WRONG = ("broken logs", "forgeries that pass")

@@ -12,12 +12,12 @@ from typer.testing import CliRunner
 
 from evofsm.__main__ import application
 from evofsm.driving.risk.latent import LatentRisk
+from evofsm.fleet.sealed import NOTHING, Head, seal, unseal
 from evofsm.fsm.actions import IntervalActions
 from evofsm.guard.auditing.log import AuditLog
 from evofsm.guard.guard import Guard
 from evofsm.guard.protocols import Proposal
 from evofsm.guard.reviser import ActionReviser
-from evofsm.store.sealed import NOTHING, Head, seal, unseal
 
 ACTIONS = IntervalActions(low=-2.5, high=2.5, width=0.3, outside="clip")
 

@@ -13,7 +13,7 @@ import pytest
 
 from evofsm.fleet.campaign import run_campaign
 from evofsm.fleet.executors import Here, Processes, Task, as_they_come
-from evofsm.store.journal import Journal
+from evofsm.fleet.journal import Journal
 
 SETTINGS = {"seed": 0, "family": {"limits": {"decel": 2.5}, "waves": [[1.0, -2.0]]}}
 RECORDS = {k: {"collided": k % 3 == 0, "mobility": 1.0 / (k + 1), "time": None} for k in range(9)}

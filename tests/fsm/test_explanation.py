@@ -1,7 +1,6 @@
 """What is counted of episodes, and what is said of it."""
 
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -318,7 +317,7 @@ def test_failures_that_were_told_and_never_happened_are_counted_as_none(tell, tm
     assert merge([machine, machine.copy()]).failures_told
 
 
-def test_one_failure_tells_of_failures_and_old_files_know_of_none():
+def test_one_failure_tells_of_failures():
     machine = untold()
     machine.observe([0.0])
     machine.fail()
@@ -326,8 +325,6 @@ def test_one_failure_tells_of_failures_and_old_files_know_of_none():
     fleet = Fleet(untold(), 2)
     fleet.observe([[0.0]], vehicles=[1], failures=[])
     assert [fleet[k].failures_told for k in range(2)] == [False, True]
-    files = Path(__file__).parents[1] / "kept"
-    assert not FSMModel.load(files / "model-0.1.evofsm").failures_told
 
 
 # -- What was never seen ---------------------------------------------------------------------------

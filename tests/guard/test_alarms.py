@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from evofsm.guard.alarms import ConformalAlarm
-from evofsm.store import storage
+from evofsm import store
+from evofsm.guard.alarms import _KIND, ConformalAlarm
 
 ANY = st.floats(allow_nan=True, allow_infinity=True)
 KINDS = ("false alarms", "misses")
@@ -112,8 +112,8 @@ def test_saved_and_loaded_it_goes_on_the_same(of):
 def test_a_file_that_contradicts_itself_is_refused(changed, scores, what):
     file, bad = BytesIO(), BytesIO()
     ConformalAlarm(0.1).save(file)
-    content, _ = storage.read(BytesIO(file.getvalue()), "conformalalarm")
-    storage.write(bad, "conformalalarm", content | changed, {"scores": np.array(scores)})
+    content, _ = store.read(BytesIO(file.getvalue()), _KIND)
+    store.write(bad, _KIND, content | changed, {"scores": np.array(scores, np.float64)})
     with pytest.raises(ValueError, match=what):
         ConformalAlarm.load(BytesIO(bad.getvalue()))
 

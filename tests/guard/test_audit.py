@@ -22,18 +22,8 @@ from evofsm.driving.revisers import AlwaysBrake, EnvelopeReviser, Unrevised
 from evofsm.driving.risk.by_state import RiskByState
 from evofsm.driving.risk.latent import LatentRisk
 from evofsm.driving.scenarios import Leader, Scenario, Sensors
-from evofsm.fsm.actions import IntervalActions
-from evofsm.fsm.machine import EvolvingFSM
-from evofsm.fsm.states.novelty import Novelty
-from evofsm.guard.auditing.form import SINCE
-from evofsm.guard.auditing.log import AuditLog
-from evofsm.guard.auditing.participants import describe, restore
-from evofsm.guard.auditing.replay import audit
-from evofsm.guard.guard import Guard
-from evofsm.guard.protocols import Participants, Proposal
-from evofsm.guard.reviser import ActionReviser, Mode, Way
-from evofsm.store import sealed as chain
-from evofsm.store.sealed import (
+from evofsm.fleet import sealed as chain
+from evofsm.fleet.sealed import (
     NOTHING,
     ChainedFile,
     Fault,
@@ -44,6 +34,16 @@ from evofsm.store.sealed import (
     unseal,
     verify,
 )
+from evofsm.fsm.actions import IntervalActions
+from evofsm.fsm.machine import EvolvingFSM
+from evofsm.fsm.states.novelty import Novelty
+from evofsm.guard.auditing.form import SINCE
+from evofsm.guard.auditing.log import AuditLog
+from evofsm.guard.auditing.participants import describe, restore
+from evofsm.guard.auditing.replay import audit
+from evofsm.guard.guard import Guard
+from evofsm.guard.protocols import Participants, Proposal
+from evofsm.guard.reviser import ActionReviser, Mode, Way
 
 ACTIONS = IntervalActions(low=-2.5, high=2.5, width=0.3, outside="clip")
 HASTY = IDM(2.25, 28.0, 0.8, 0.3, 2.0, lowest=-2.5, highest=2.5)

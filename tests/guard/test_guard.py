@@ -9,19 +9,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from evofsm import EvolvingFSM, Guard, IntervalActions, Labels
+from evofsm import EvolvingFSM, Guard, IntervalActions, Labels, store
 from evofsm.driving.cars import guard_for_cars
 from evofsm.driving.revisers import Unrevised
 from evofsm.driving.risk.latent import LatentRisk
+from evofsm.fleet import sealed as chain
 from evofsm.guard.actions import BoxActions, Choices, same_action
 from evofsm.guard.auditing import participants
 from evofsm.guard.auditing.log import AuditLog
 from evofsm.guard.auditing.replay import audit
-from evofsm.guard.guard import Explain
+from evofsm.guard.guard import KIND, Explain
 from evofsm.guard.protocols import Fallback, Judgement, Proposal, Search
 from evofsm.guard.reviser import Mode, Way
-from evofsm.store import sealed as chain
-from evofsm.store import storage
 
 DT = 0.1
 PUSHES = (-4.0, -1.0, 0.0, 1.0, 4.0)
@@ -328,7 +327,7 @@ def test_a_guard_of_cars_is_one_file(tmp_path):
         repr([one.decide([gap, 15.0, 12.0], 1.0) for gap in (9.0, 8.0)]) for one in (guard, again)
     ]
     assert said[0] == said[1]
-    assert storage.read_header(tmp_path / "guard.evofsm").provenance == {"roads": 3}
+    assert store.read_header(tmp_path / "guard.evofsm").provenance == {"roads": 3}
     guard.freeze()
     guard.save(tmp_path / "guard.evofsm")
     assert not Guard.load(tmp_path / "guard.evofsm").learn
@@ -351,14 +350,14 @@ def test_what_a_file_cannot_hold_has_to_be_given_again(tmp_path):
 def test_a_damaged_file_is_refused(tmp_path):
     path = tmp_path / "guard.evofsm"
     guard_for_cars(-4.0, 2.5).save(path)
-    content, arrays = storage.read(path, "guard")
+    content, arrays = store.read(path, KIND)
     for spoilt, files in (
         ({**content, "missing": "guess"}, arrays),
         ({**content, "reviser": {**content["reviser"], "class": "Nobody"}}, arrays),
         (content, {**arrays, "machine": arrays["machine"][:-7]}),
         (content, {**arrays, "judge": arrays["machine"]}),
     ):
-        storage.write(path, "guard", spoilt, files)
+        store.write(path, KIND, spoilt, files)
         with pytest.raises(ValueError, match="cannot be read as an evofsm file"):
             Guard.load(path)
 

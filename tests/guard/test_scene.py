@@ -5,9 +5,9 @@ from io import BytesIO
 import numpy as np
 import pytest
 
+from evofsm import store
 from evofsm.guard import Guard, Mode, SceneRisk, same_action
-from evofsm.guard.scene import Contact, Foreseen, Memory
-from evofsm.store import storage
+from evofsm.guard.scene import _KIND, Contact, Foreseen, Memory
 
 LEFT, STAY, RIGHT = range(3)
 THINGS = 3
@@ -231,8 +231,8 @@ def test_in_a_file_it_is_kept_as_it_is_also_between_two_fits(more):
 def test_a_file_that_contradicts_itself_is_refused(taught, name, change, what):
     file, bad = BytesIO(), BytesIO()
     taught.judge.save(file)
-    content, arrays = storage.read(BytesIO(file.getvalue()), "scenerisk")
-    storage.write(bad, "scenerisk", content, arrays | {name: change(arrays[name])})
+    content, arrays = store.read(BytesIO(file.getvalue()), _KIND)
+    store.write(bad, _KIND, content, arrays | {name: change(arrays[name])})
     with pytest.raises(ValueError, match=what):
         SceneRisk.load(BytesIO(bad.getvalue()))
 

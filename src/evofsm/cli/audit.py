@@ -12,9 +12,9 @@ from evofsm.cli.options import Json, imported
 from evofsm.cli.show import facts, print_json, show
 
 if TYPE_CHECKING:
+    from evofsm.fleet.sealed import Chain
     from evofsm.guard import Audit as Audited
     from evofsm.guard import Contents, Replay
-    from evofsm.store import Chain
 
 _KEEP = (
     "Keep the head where the log is not. Without it (--head) neither an end that is cut off nor a "
@@ -52,8 +52,8 @@ def audit(
     decision to the last bit. Ends with 0 if all is well, 1 if the log was tampered with or a
     decision comes out otherwise, and 2 if it cannot be read.
     """
+    from evofsm.fleet.sealed import Head
     from evofsm.guard import audit as examine
-    from evofsm.store import Head
 
     found = examine(
         file,

@@ -24,8 +24,9 @@ from typing import Any
 from evofsm.cli.driving import Setup, make_controller, make_guard
 from evofsm.driving import Outcome, Row, Trial, World, open_world, summarise
 from evofsm.fleet import Batch, run_campaign
+from evofsm.fleet.checkpoint import versions
+from evofsm.fleet.journal import Journal, Record, room_needed
 from evofsm.guard import Guard, LearningJudge, LearntRisk
-from evofsm.store import Journal, Record, room_needed, versions
 
 #: The journal in the folder of a campaign.
 JOURNAL = "journal.jsonl"

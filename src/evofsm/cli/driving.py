@@ -15,6 +15,7 @@ from typing import Any, Self, get_type_hints
 import numpy as np
 from numpy.typing import NDArray
 
+from evofsm import store
 from evofsm.driving import (
     DECISION_COLUMNS,
     IDM,
@@ -44,6 +45,7 @@ from evofsm.driving import (
 )
 from evofsm.driving.measures import FIXED_MEASURES
 from evofsm.extras import needs
+from evofsm.fleet.checkpoint import Checkpoint, Kept
 from evofsm.fsm import EvolvingFSM
 from evofsm.guard import (
     TOLERANCE,
@@ -55,7 +57,6 @@ from evofsm.guard import (
     Mode,
     Reviser,
 )
-from evofsm.store import Checkpoint, Kept, storage
 
 #: Controllers by name; ``family`` is the family's own.
 CONTROLLERS = ("family", "aggressive", "normal", "acc", "sumo")
@@ -288,14 +289,14 @@ def write_driving(driving: Driving, setup: Setup, out: Path) -> None:
     drove = {"family": setup.family.name, "seed": setup.seed, "first": setup.first}
     told = {**drove, "episodes": setup.episodes, "reviser": setup.reviser}
     save_learnt(driving.guard, out, told)
-    with storage.replacing(out / "decisions.parquet") as file:
+    with store.replacing(out / "decisions.parquet") as file:
         polars.DataFrame(driving.decisions).write_parquet(file)
     summary = {
         **driving.row.as_dict(),
         "lead_times": driving.lead_times,
         "episodes_learnt": setup.first + setup.episodes * setup.learn,
     }
-    with storage.replacing(out / _SUMMARY) as file:
+    with store.replacing(out / _SUMMARY) as file:
         file.write(json.dumps(summary, indent=2).encode())
 
 
@@ -342,7 +343,7 @@ class Driven:
         if checkpoint is None:
             return done, guard
         kept = checkpoint.begin(done.keep(guard))
-        with storage.explained(checkpoint.path):
+        with store.explained(checkpoint.path):
             done._restore(kept.arrays)
             files = (io.BytesIO(kept.arrays[name].tobytes()) for name in ("machine", "risk"))
             machine = EvolvingFSM.load(next(files))

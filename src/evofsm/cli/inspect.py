@@ -81,9 +81,9 @@ def load_model(place: Path) -> tuple[FSMModel, Header | None]:
 
     A machine that drove a family of scenarios is labelled as that family is.
     """
+    from evofsm import store
     from evofsm.driving import FAMILIES, load_family
     from evofsm.fsm import EvolvingFSM, FSMModel
-    from evofsm.store import storage
 
     if place.is_dir():
         found = next((place / name for name in _MODELS if (place / name).exists()), None)
@@ -98,9 +98,11 @@ def load_model(place: Path) -> tuple[FSMModel, Header | None]:
         if model is None:
             raise ValueError(f"{place}: no model is attached to this log")
         return model, None
-    header = storage.read_header(place)
+    header = store.read_header(place)
     if header.kind == "guard":
-        machine = storage.read(place, "guard")[1]["machine"].tobytes()
+        from evofsm.guard.guard import KIND
+
+        machine = store.read(place, KIND)[1]["machine"].tobytes()
         if not machine:
             raise ValueError(f"{place}: this guard has no machine")
         return EvolvingFSM.load(BytesIO(machine)).model(), header

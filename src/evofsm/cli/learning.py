@@ -17,6 +17,8 @@ from typing import NamedTuple, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from evofsm import store
+from evofsm.fleet.checkpoint import Checkpoint, Kept
 from evofsm.fsm import (
     NO_ACTION,
     NOT_OPEN,
@@ -37,7 +39,6 @@ from evofsm.fsm import (
     widen,
 )
 from evofsm.io.logs import Chunk
-from evofsm.store import Checkpoint, Kept, storage
 
 #: How far ahead the longer forecast looks [s].
 HORIZON = 1.0
@@ -172,7 +173,7 @@ def _learn_all(
             learner.learn(chunk)
         return
     kept = checkpoint.begin(learner.keep())
-    with storage.explained(checkpoint.path):
+    with store.explained(checkpoint.path):
         learner.restore(kept)
     if kept.finished and not live:
         return

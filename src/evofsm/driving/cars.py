@@ -21,7 +21,7 @@ from evofsm.guard import (
     Mode,
     dynamics_for,
 )
-from evofsm.store import Place, storage
+from evofsm.store import Place, read_header
 
 #: What each judge is told, by its name.
 TOLD: dict[str, str] = {
@@ -196,7 +196,7 @@ def load_judge(file: Place, machine: EvolvingFSM) -> LatentRisk | LearntRisk:
     ValueError
         If the file holds something else or is damaged.
     """
-    if storage.read_header(file).kind != "learntrisk":
+    if read_header(file).kind != "learntrisk":
         return LatentRisk.load(file)
     judge = LearntRisk.load(file)
     judge.bind(machine)

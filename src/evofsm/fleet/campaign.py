@@ -14,7 +14,7 @@ from functools import partial
 from itertools import islice
 
 from evofsm.fleet.executors import Task, as_they_come
-from evofsm.store import Journal, Record
+from evofsm.fleet.journal import Journal, Record
 
 # Most episodes in a batch, some 100 to 500 ms; and batches for each worker, so that all of them
 # end at about the same time.

@@ -256,6 +256,7 @@ def _blank(match: _Match) -> dict[str, NDArray[Any]]:
         "n_founded": np.array([match.n]),
         "ids": np.arange(match.n),
         "action": np.array([NO_ACTION]),
+        "before": np.array([NOT_OPEN]),
         "belief": np.full(match.n, 1.0 / match.n),
     }
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from evofsm.fsm.kernels import inner_kernel, rare_kernel
 from evofsm.fsm.layout import joined_by
+from evofsm.fsm.learnt import NOT_OPEN
 from evofsm.fsm.memory import Memory
 from evofsm.fsm.states.clusters import measure_distances
 from evofsm.fsm.transitions import merge_states, retire_state
@@ -106,6 +107,8 @@ def _merge(memory: Memory, kept: int, given: int, n: int) -> None:
     counted.joined[kept] = 1.0
     if now.state[0] == given:
         now.state[0] = kept
+    if now.before[0] == given:
+        now.before[0] = kept
     _clear(memory, given, n)
     measure_distances(
         clusters.centers,
@@ -154,6 +157,8 @@ def retire_least_useful(memory: Memory, n: int) -> int:
         now.belief[given] = 0.0
         for i in range(n):
             now.belief[i] /= kept
+        if now.before[0] == given:
+            now.before[0] = NOT_OPEN
         _clear(memory, given, n)
     return given
 

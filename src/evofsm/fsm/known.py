@@ -12,6 +12,7 @@ from typing import Any, ClassVar, Literal, NamedTuple, Self, SupportsIndex, get_
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from evofsm import store
 from evofsm.fsm import chains
 from evofsm.fsm.dynamics.dynamics import Dynamics
 from evofsm.fsm.dynamics.questions import Ahead, MayBegin, beyond, look_ahead, remembered
@@ -34,7 +35,7 @@ from evofsm.fsm.validation import (
     refuse_unusable,
     whole,
 )
-from evofsm.store import ranges, storage
+from evofsm.store import Kind, Place
 
 #: Which actions are taken: each alike, the first one again, or each as often as it was used.
 Policy = Literal["marginal", "hold", "observed"]
@@ -671,7 +672,7 @@ class Known(Counts):
 
     # -- Keeping it -----------------------------------------------------------------------------
 
-    def save(self, path: storage.Place, provenance: Mapping[str, Any] | None = None) -> None:
+    def save(self, path: Place, provenance: Mapping[str, Any] | None = None) -> None:
         """Write it to a file (arrays and a JSON header, nothing that can run).
 
         Parameters
@@ -700,10 +701,10 @@ class Known(Counts):
         >>> again.observe([1.1]).surprise == machine.observe([1.1]).surprise
         True
         """
-        storage.write(path, self._kind.name, self._content, self._kept(), provenance)
+        store.write(path, self._kind, self._content, self._kept(), provenance)
 
     @classmethod
-    def load(cls, path: storage.Place) -> Self:
+    def load(cls, path: Place) -> Self:
         """Read it from a file; a machine goes on bit for bit as if it had never been stopped.
 
         Parameters
@@ -734,14 +735,14 @@ class Known(Counts):
         ...     FSMModel.load(Path(folder) / "model.evofsm").n_actions
         2
         """
-        content, arrays = storage.read(path, cls._kind.name)
-        with storage.explained(path):
+        content, arrays = store.read(path, cls._kind)
+        with store.explained(path):
             refuse_unless_told(content.setdefault("failures_told", False))
             return cls._restored({**content, "rule": restore_rule(content["rule"])}, arrays)
 
     # -- Inside ---------------------------------------------------------------------------------
 
-    _kind: ClassVar[ranges.Kind]
+    _kind: ClassVar[Kind]
 
     @property
     def _content(self) -> dict[str, Any]:

@@ -39,7 +39,7 @@ from numba.np import arrayobj
 from numpy.typing import NDArray
 
 from evofsm.fsm.kernels import NOT_COMPILED
-from evofsm.store import ranges
+from evofsm.store import Numbers
 
 # Numba has no types for these.
 _arrays, _codegen = cast(Any, arrayobj), cast(Any, cgutils)
@@ -73,11 +73,10 @@ class Array:
     """
 
     kind: str  #: a key of `SHAPES`
-    range: ranges.Range  #: of its numbers
+    range: Numbers  #: of its numbers
     #: What becomes of it as two states are joined, and in a state that is given up: the sum, or
     #: the larger of both, and 0; or else it is set where that is done.
     joined_by: Literal["sum", "most", "hand"] = "hand"
-    since: int = 1  #: the version of the file format from which on files have it
     #: Name of the array with the time of the latest of what is counted here: what belongs to the
     #: episode that is going on is not shown yet.
     latest: str = ""

@@ -16,10 +16,20 @@ from functools import partial
 from typing import Any, cast, get_type_hints
 
 import numpy as np
-from numpy.typing import NDArray
 
 from evofsm.fsm.layout import SHAPES, Array, Floats
-from evofsm.store import ranges
+from evofsm.store import (
+    COUNT,
+    FLAG,
+    FROM_1,
+    LARGEST_OBSERVATION,
+    MOST_COUNTED,
+    SHARE,
+    SIZE,
+    SMALLEST,
+    Kind,
+    Numbers,
+)
 
 # A row with a smaller scale is multiplied out, long before it underflows.
 SMALLEST_SCALE = 1e-30
@@ -27,11 +37,14 @@ SMALLEST_SCALE = 1e-30
 NOT_OPEN = -1.0
 NO_ACTION = -1
 
-_FARTHEST = (1.0 + ranges.ROUNDING) * ranges.LARGEST_OBSERVATION
-_OBSERVED = ranges.Range(-_FARTHEST, _FARTHEST)
-_INDEX = ranges.Range(-1.0, ranges.MOST_COUNTED, whole=True)
+_FARTHEST = SHARE.most * LARGEST_OBSERVATION
+_OBSERVED = Numbers(least=-_FARTHEST, most=_FARTHEST)
+_SUM = Numbers(least=0.0, most=MOST_COUNTED)
+_STORED = Numbers(least=0.0, most=10.0 / SMALLEST_SCALE)
+_INDEX = COUNT._replace(least=-1.0)
 # Of all states together, where they were merged into one.
-_FREQUENCY = ranges.Range(0.0, ranges.LARGEST_OBSERVATION)
+_FREQUENCY = Numbers(least=0.0, most=LARGEST_OBSERVATION)
+_PRODUCT = Numbers(least=0.0, most=1e300)
 
 
 def _array(kind: str, *arguments: Any, **options: Any) -> Any:
@@ -39,11 +52,11 @@ def _array(kind: str, *arguments: Any, **options: Any) -> Any:
     return Array(kind, *arguments, **options)
 
 
-_counter = partial(_array, "counter", ranges.COUNT)
+_counter = partial(_array, "counter", COUNT)
 _per_state, _per_place = partial(_array, "state"), partial(_array, "place")
 # Counts of states, and of states and actions, that never forget.
-_of_states = partial(_per_state, ranges.COUNT, "sum")
-_of_actions = partial(_per_place, ranges.COUNT, "sum")
+_of_states = partial(_per_state, COUNT, "sum")
+_of_actions = partial(_per_place, COUNT, "sum")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -78,37 +91,37 @@ class Counts:
     #: (n,) observations in which each state was the most probable
     visits: Floats = _of_states()
     #: (n,) number of the observation that created each state, from 1
-    founded: Floats = _per_state(ranges.COUNT)
+    founded: Floats = _per_state(COUNT)
     #: (n, n) steps from the most probable state (row) to the next one (column)
-    changes: Floats = _array("change", ranges.COUNT, "sum")
+    changes: Floats = _array("change", COUNT, "sum")
     #: (q, n) for each action, transitions that began in each state, by belief
-    decisions: Floats = _per_place(ranges.SUM, "sum", since=2)
+    decisions: Floats = _per_place(_SUM, "sum")
     #: (q, n) those of `decisions` that led straight into failure
-    failures: Floats = _per_place(ranges.SUM, "sum", since=2)
+    failures: Floats = _per_place(_SUM, "sum")
     #: (n,) failures whose last observation was recognised as each state: maybe a dead end
-    endings: Floats = _of_states(since=2)
+    endings: Floats = _of_states()
     #: (n,) episodes that came to each state
-    episodes: Floats = _of_states(since=5, latest="latest_visit")
+    episodes: Floats = _of_states(latest="latest_visit")
     #: (n,) those of `episodes` that failed soon after they were there
-    failed_soon: Floats = _of_states(since=5)
+    failed_soon: Floats = _of_states()
     #: (n,) 1 where two states were joined, so that an episode may count twice
-    joined: Floats = _per_state(ranges.FLAG, "most", since=5)
+    joined: Floats = _per_state(FLAG, "most")
     #: (q, n) episodes that took each action in each state
-    tried: Floats = _of_actions(since=5, latest="latest_try")
+    tried: Floats = _of_actions(latest="latest_try")
     #: (q, n) those of `tried` that failed soon after they did
-    failed_after: Floats = _of_actions(since=5)
+    failed_after: Floats = _of_actions()
     #: (n,) times that something unexpected began in each state, where the machine has `dynamics`
-    onsets: Floats = _of_states(since=6)
+    onsets: Floats = _of_states()
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Outcomes(Counts):
     """`Counts`, and what a machine needs to go on counting. Places are those of `Transitions`."""
 
-    clock: Floats = _counter(since=5)  # observations so far, with those that lacked something
-    began: Floats = _counter(since=5)  # the clock at the present episode's first observation
-    latest_visit: Floats = _per_state(ranges.COUNT, "most", since=5)  # clock at the latest one
-    latest_try: Floats = _per_place(ranges.COUNT, "most", since=5)  # clock one observation later
+    clock: Floats = _counter()  # observations so far, with those that lacked something
+    began: Floats = _counter()  # the clock at the present episode's first observation
+    latest_visit: Floats = _per_state(COUNT, "most")  # clock at the latest one
+    latest_try: Floats = _per_place(COUNT, "most")  # clock one observation later
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -117,13 +130,13 @@ class Clusters:
 
     n_observations: Floats = _counter()
     first: Floats = _array("variable", _OBSERVED)  # z_1, the origin of `mean`
-    latest: Floats = _array("variable", _OBSERVED, since=2)  # z_t
+    latest: Floats = _array("variable", _OBSERVED)  # z_t
     #: of all observations, minus `first`
-    mean: Floats = _array("variable", ranges.Range(-2.0 * _FARTHEST, 2.0 * _FARTHEST))
-    scatter: Floats = _array("counter", ranges.PRODUCT)  # sum of squared distances to the mean
+    mean: Floats = _array("variable", Numbers(least=-2.0 * _FARTHEST, most=2.0 * _FARTHEST))
+    scatter: Floats = _array("counter", _PRODUCT)  # sum of squared distances to the mean
     centers: Floats = _array("center", _OBSERVED)
-    potentials: Floats = _per_state(ranges.SHARE, "most")
-    squared_distances: Floats = _per_state(ranges.PRODUCT)  # from the latest observation
+    potentials: Floats = _per_state(SHARE, "most")
+    squared_distances: Floats = _per_state(_PRODUCT)  # from the latest observation
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -137,10 +150,12 @@ class Transitions:
     its scale, without touching the row.
     """
 
-    places: Floats = _array("action", _INDEX, since=3)  # of each action's matrix, or NOT_OPEN
-    uses: Floats = _array("action", ranges.COUNT)  # transitions learnt with each action
-    matrices: Floats = _array("matrix", ranges.Range(0.0, 10.0 / SMALLEST_SCALE))  # over `scales`
-    scales: Floats = _per_place(ranges.Range(0.1 * SMALLEST_SCALE, ranges.SHARE.most), since=3)
+    places: Floats = _array("action", _INDEX)  # of each action's matrix, or NOT_OPEN
+    uses: Floats = _array("action", COUNT)  # transitions learnt with each action
+    matrices: Floats = _array(
+        "matrix", Numbers(least=0.0, most=10.0 / SMALLEST_SCALE)
+    )  # over `scales`
+    scales: Floats = _per_place(Numbers(least=0.1 * SMALLEST_SCALE, most=SHARE.most))
     origin_frequency: Floats = _per_place(_FREQUENCY)
 
 
@@ -149,12 +164,13 @@ class Learnt:
     """What the next step needs, and what people ask of the states."""
 
     n_states: Floats = _counter()
-    n_founded: Floats = _counter(since=3)  # states so far, with those given up
+    n_founded: Floats = _counter()  # states so far, with those given up
     action: Floats = _array("counter", _INDEX)  # after the latest observation, or NO_ACTION
-    chained: Floats = _array("counter", ranges.FLAG)  # 1: `belief` is of the present episode
+    chained: Floats = _array("counter", FLAG)  # 1: `belief` is of the present episode
     state: Floats = _counter()  # the most probable state at the latest observation
-    belief: Floats = _per_state(ranges.SHARE, "sum")
-    ids: Floats = _per_state(ranges.COUNT, since=3)  # number of its creation, from 0
+    before: Floats = _array("counter", _INDEX)  # that at the one before it; -1 where none is left
+    belief: Floats = _per_state(SHARE, "sum")
+    ids: Floats = _per_state(COUNT)  # number of its creation, from 0
     outcomes: Outcomes
     clusters: Clusters
     transitions: Transitions
@@ -172,62 +188,39 @@ def arrays_of(part: type) -> Iterator[Array]:
 # -- In files -------------------------------------------------------------------------------------
 
 
-def _member(array: Array, **sizes: str) -> ranges.Member:
+def _member(array: Array, **sizes: str) -> Numbers:
     """An array as it is kept in a file, where ``sizes`` has other letters for some sizes."""
-    letters: dict[str, int | str] = {"one": 1, "capacity": "n", **sizes}
-    shape = tuple(letters.get(size, size) for size in SHAPES[array.kind])
-    return ranges.Member(shape, array.range, array.since)
+    letters: dict[str, int | str] = {"one": 1, "capacity": "n", "q": "settings.n_actions", **sizes}
+    return array.range.of(*(letters.get(size, size) for size in SHAPES[array.kind]))
 
 
-def _upgrade_machine(
-    version: int, settings: dict[str, Any], arrays: dict[str, NDArray[Any]]
-) -> None:
-    """Version 2 held a matrix for each action; episodes count from version 5 on."""
-    _upgrade_model(version, settings, arrays)
-    if version < 3:
-        arrays["places"] = np.arange(len(arrays["uses"]), dtype=np.float64)
-        arrays["scales"] = np.ones_like(arrays["origin_frequency"])
-        arrays["n_founded"] = arrays["n_states"]
-        arrays["ids"] = np.arange(len(arrays["visits"]), dtype=np.float64)
-    if version < 5:
-        arrays["clock"] = arrays["began"] = arrays["n_observations"]
-
-
-def _upgrade_model(version: int, settings: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> None:
-    """Version 1 knew one rule; up to version 5 nobody learnt how systems move."""
-    if version < 2:
-        settings["rule"] = {"name": "paper"}
-    if version < 6:
-        arrays["dynamics"] = np.zeros(0, np.uint8)
+def _optional(numbers: Numbers) -> Numbers:
+    return numbers._replace(optional=True)
 
 
 #: The file of `Dynamics` within a file, as bytes; empty where there are none.
-_WITHIN = {"dynamics": ranges.Member(("bytes",), ranges.Range(0.0, 255.0, whole=True), since=6)}
+_WITHIN = {"dynamics": Numbers(("bytes",), dtype=np.uint8)}
 _RULE: dict[str, Any] = {
-    "memory": ranges.Range(2.0, ranges.MOST_COUNTED, whole=True),
-    **dict.fromkeys(("radius", "spread", "distance"), ranges.SIZE),
-    "scales": ranges.Range(1e-20, 1e20),
-    "share": ranges.Range(ranges.SMALLEST, 1.0),
+    "memory": _optional(FROM_1._replace(least=2.0)),
+    **dict.fromkeys(("radius", "spread", "distance"), _optional(SIZE)),
+    "scales": Numbers(("scales",), 1e-20, 1e20, optional=True),
+    "share": Numbers(least=SMALLEST, most=1.0, optional=True),
 }
-_RULE["base"] = _RULE
+_RULE["base"] = dict(_RULE)
 _BELOW_1 = math.nextafter(1.0, 0.0)
+_WEIGHT = Numbers(least=SMALLEST, most=1e50)
 _SETTINGS: dict[str, Any] = {
-    "n_actions": ranges.FROM_1,
-    **dict.fromkeys(("radius", "spread"), ranges.SIZE),
-    **dict.fromkeys(("distance_weight", "prior_frequency"), ranges.Range(ranges.SMALLEST, 1e50)),
-    "learning_rate": ranges.Range(ranges.SMALLEST, _BELOW_1),
-    "belief_tolerance": ranges.Range(0.0, _BELOW_1),
-    **dict.fromkeys(("max_states", "failure_horizon"), ranges.FROM_1),
-    "when_full": ranges.FLAG,
+    "n_actions": FROM_1,
+    **dict.fromkeys(("radius", "spread"), SIZE),
+    **dict.fromkeys(("distance_weight", "prior_frequency"), _WEIGHT),
+    "learning_rate": _WEIGHT._replace(most=_BELOW_1),
+    "belief_tolerance": Numbers(least=0.0, most=_BELOW_1, optional=True),
+    **dict.fromkeys(("max_states", "failure_horizon"), _optional(FROM_1)),
+    "when_full": _optional(FLAG),
     "rule": _RULE,
 }
-MACHINE = ranges.register(
-    ranges.Kind(
-        "machine",
-        {array.name: _member(array) for array in arrays_of(Learnt)} | _WITHIN,
-        _SETTINGS,
-        upgrade=_upgrade_machine,
-    )
+MACHINE: Kind = Kind(
+    "machine", {array.name: _member(array) for array in arrays_of(Learnt)} | _WITHIN, _SETTINGS
 )
 # What a model has beside its `Counts`, centres by state.
 _CENTRAL = cast(
@@ -235,21 +228,24 @@ _CENTRAL = cast(
 )
 #: The arrays of a model.
 OF_MODEL = {
-    "centers": ranges.Member(("n", "m"), _OBSERVED),
-    "transition_matrices": ranges.Member(("q", "n", "n"), ranges.SHARE),
-    **{array.name: _member(array, places="q") for array in (*_CENTRAL, *arrays_of(Counts))},
+    "centers": _OBSERVED.of("n", "m"),
+    "transition_matrices": SHARE.of("q", "n", "n"),
+    **{array.name: _member(array, places="q", q="q") for array in (*_CENTRAL, *arrays_of(Counts))},
 }
-MODEL = ranges.register(
-    ranges.Kind(
-        "model",
-        OF_MODEL | _WITHIN,
-        {
-            "width": ranges.Range(0.0, 1e308),
-            "dt": ranges.SIZE,
-            "rule": _RULE,
-            "settings": _SETTINGS,
-            "actions": {"low": _OBSERVED, "high": _OBSERVED, "width": ranges.SIZE},
+MODEL: Kind = Kind(
+    "model",
+    OF_MODEL | _WITHIN,
+    {
+        "width": Numbers(least=0.0),
+        "dt": _optional(SIZE),
+        "rule": _RULE,
+        "settings": {
+            name: _optional(told) if isinstance(told, Numbers) else told
+            for name, told in _SETTINGS.items()
         },
-        upgrade=_upgrade_model,
-    )
+        "actions": {
+            **dict.fromkeys(("low", "high"), _optional(_OBSERVED)),
+            "width": _optional(SIZE),
+        },
+    },
 )

@@ -85,7 +85,6 @@ from evofsm.fsm.validation import (
     refuse_unusable,
     whole,
 )
-from evofsm.store import ranges
 
 Method = TypeVar("Method", bound=Callable[..., Any])
 
@@ -247,7 +246,7 @@ class EvolvingFSM(Known):
         self._dynamics = _own(dynamics, whole("n_actions", n_actions))
         self._share()
         self._use(allocate(0, whole("n_actions", n_actions), LINE, 0, parameters))
-        ranges.refuse_others(MACHINE.name, self._content)
+        MACHINE.refuse_others(self._content)
 
     @classmethod
     def paper(cls) -> Self:
@@ -587,6 +586,25 @@ prior_frequency=0.001, spread=3.0)
         if self._dynamics is not None:
             clock = self._memory.learnt.outcomes.clock[0]
             following.follow_end(self._dynamics, clock, failed=True)
+
+    @_alone
+    def onset(self) -> None:
+        """Count that something unexpected began in the state before the latest observation's.
+
+        Whoever has a model of how the system moves says so, as `evofsm.Guard` does. Nothing is
+        counted where the episode has no earlier observation, or its state was given up.
+
+        Examples
+        --------
+        >>> machine = EvolvingFSM(n_actions=2, radius=0.5)
+        >>> trace = machine.learn_many([[0.0], [0.1], [2.0], [1.0]], [0, 0, 0, 0])
+        >>> machine.onset()
+        >>> machine.onsets
+        array([1., 0.])
+        """
+        now = self._memory.learnt
+        if now.before[0] >= 0.0:
+            now.outcomes.onsets[int(now.before[0])] += 1.0
 
     def tell_of_failures(self) -> None:
         """Say that failures are told: an episode that ends without one is known to have had none.
@@ -1125,9 +1143,7 @@ prior_frequency=0.001, spread=3.0)
     ) -> tuple[int, int, float]:
         """The same, and what dynamics make of it."""
         given = self._checked(z)
-        now = self._memory.learnt
-        chained, state = bool(now.chained[0]), int(now.state[0])
-        identity = now.ids[state] if self.n_states else 0.0
+        chained = bool(self._memory.learnt.chained[0])
         taken = self._take_alone(given, action, failed)
         now = self._memory.learnt
         began = following.follow(
@@ -1139,9 +1155,7 @@ prior_frequency=0.001, spread=3.0)
             action=None if action == NO_ACTION else inner,
         )
         if began:
-            if now.ids[state] != identity:  # it was given up for another one
-                state = Known.nearest(self, dynamics.before).state
-            now.outcomes.onsets[state] += 1.0
+            self.onset()
         return taken
 
     def _take_alone(self, z: ArrayLike, action: int, failed: bool) -> tuple[int, int, float]:

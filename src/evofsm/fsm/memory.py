@@ -91,9 +91,16 @@ _PER_ACTION = COUNTS["action"]
 _PER_VARIABLE = COUNTS["variable"]
 
 # The counters that tell where the present episode is; the first belief stands behind them all.
-_ACTION, _CHAINED, _STATE, _CLOCK, _BEGAN = (
+_ACTION, _CHAINED, _STATE, _BEFORE, _CLOCK, _BEGAN = (
     _COUNTERS + PLACES[cast(Array, array)].number
-    for array in (Learnt.action, Learnt.chained, Learnt.state, Outcomes.clock, Outcomes.began)
+    for array in (
+        Learnt.action,
+        Learnt.chained,
+        Learnt.state,
+        Learnt.before,
+        Outcomes.clock,
+        Outcomes.began,
+    )
 )
 
 
@@ -205,6 +212,7 @@ def allocate(
     memory = view(buffer)
     memory.parameters.rule.weights[:] = weights
     memory.learnt.action[0] = NO_ACTION
+    memory.learnt.before[0] = NOT_OPEN
     memory.learnt.transitions.places[:] = NOT_OPEN
     _vacate(memory.learnt.clusters, 0)
     return buffer
@@ -330,6 +338,7 @@ def believe(buffer: NDArray[np.float64], belief: NDArray[np.float64]) -> None:
     present[_CLOCK] += 1.0
     if not present[_CHAINED]:
         present[_BEGAN] = present[_CLOCK]
+    present[_BEFORE] = present[_STATE] if present[_CHAINED] else NOT_OPEN
     present[_ACTION], present[_CHAINED], present[_STATE] = NO_ACTION, 1.0, belief.argmax()
     present[_HEAD:] = belief
     buffer[: len(present)] = present
@@ -362,6 +371,8 @@ def refuse_impossible(learnt: Learnt) -> None:
         raise ValueError(f"action is {learnt.action[0]:g}, but there are {n_actions} actions")
     if learnt.state[0] not in range(n):
         raise ValueError(f"state is {learnt.state[0]:g}, but there are {n} states")
+    if learnt.before[0] not in range(-1, n):
+        raise ValueError(f"before is {learnt.before[0]:g}, but there are {n} states")
     if learnt.clusters.n_observations[0] < n:
         raise ValueError(f"n_observations is too small for {n} states")
     open_ = learnt.transitions.places[learnt.transitions.places != NOT_OPEN]

@@ -25,7 +25,6 @@ from evofsm.fsm.validation import (
     refuse_more_failures,
     refuse_unless_distribution,
 )
-from evofsm.store import ranges
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
@@ -76,7 +75,9 @@ class FSMModel(Known):
             arrays[name] = array
         if self.dynamics is not None:
             object.__setattr__(self, "dynamics", self.dynamics.frozen())
-        ranges.refuse_others(MODEL.name, self._content, arrays)
+        MODEL.refuse_others(self._content)
+        for name, array in arrays.items():
+            OF_MODEL[name].refuse_others(name, array, sizes)
         refuse_more_failures(self)
         counted = self.failures, self.endings, self.failed_soon
         told = bool(self.failures_told) or any(counts.any() for counts in counted)

@@ -172,6 +172,7 @@ def step(
         return REFUSED, 0, np.nan
     n = int(now.n_states[0])
     tick(now.outcomes, not now.chained[0])
+    now.before[0] = now.state[0] if now.chained[0] else -1.0
 
     # Section 2.2.1: does the observation move a state, or create one?
     event, nearest, potential = determine(parameters.rule, now.clusters, n, z)

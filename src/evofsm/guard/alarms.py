@@ -31,8 +31,9 @@ from typing import Any, Literal, Self, get_args
 
 import numpy as np
 
+from evofsm import store
 from evofsm.fsm.validation import positive, whole
-from evofsm.store import Place, ranges, storage
+from evofsm.store import COUNT, FROM_1, SIZE, SMALLEST, Kind, Numbers, Place
 
 #: Kinds of errors, of which one has its rate held.
 Errors = Literal["false alarms", "misses"]
@@ -40,19 +41,17 @@ Errors = Literal["false alarms", "misses"]
 # A rank this close to an integer differs from it by rounding alone.
 _ROUNDING = 1e-9
 _SETTINGS = ("rate", "of", "step", "memory")
-_KIND = ranges.register(
-    ranges.Kind(
-        "conformalalarm",
-        {"scores": ranges.Member(("n",), ranges.Range(-math.inf, math.inf))},
-        {
-            "rate": ranges.Range(ranges.SMALLEST, 1.0),
-            "step": ranges.SIZE,
-            "memory": ranges.FROM_1,
-            "counted": ranges.COUNT,
-            "errors": ranges.COUNT,
-        },
-    )
-).name
+_KIND = Kind(
+    "conformalalarm",
+    {"scores": Numbers(("n",), -math.inf, math.inf)},
+    {
+        "rate": Numbers(least=SMALLEST, most=1.0),
+        "step": SIZE,
+        "memory": FROM_1,
+        "counted": COUNT,
+        "errors": COUNT,
+    },
+)
 
 
 class ConformalAlarm:
@@ -213,7 +212,9 @@ class ConformalAlarm:
     def save(self, path: Place, provenance: Mapping[str, Any] | None = None) -> None:
         """Write it to a file, with ``provenance`` for people; it goes on where it was."""
         settings = {name: getattr(self, name) for name in (*_SETTINGS, "counted", "errors")}
-        storage.write(path, _KIND, settings, {"scores": np.array(self._latest)}, provenance)
+        store.write(
+            path, _KIND, settings, {"scores": np.array(self._latest, np.float64)}, provenance
+        )
 
     @classmethod
     def load(cls, path: Place) -> Self:
@@ -226,8 +227,8 @@ class ConformalAlarm:
         ValueError
             If the file holds something else or is damaged.
         """
-        settings, arrays = storage.read(path, _KIND)
-        with storage.explained(path):
+        settings, arrays = store.read(path, _KIND)
+        with store.explained(path):
             alarm = cls(**{name: settings[name] for name in _SETTINGS})
             alarm.counted, alarm.errors = int(settings["counted"]), int(settings["errors"])
             scores = arrays["scores"].tolist()

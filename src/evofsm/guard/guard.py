@@ -16,6 +16,7 @@ from typing import Any, Protocol, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from evofsm import store
 from evofsm.fsm import (
     DYNAMICS_PARTS,
     Dynamics,
@@ -50,7 +51,7 @@ from evofsm.guard.protocols import (
 )
 from evofsm.guard.reviser import NOTHING, ActionReviser, Mode, is_spoken
 from evofsm.guard.senses import Senses, has_gaps
-from evofsm.store import Place, ranges, storage
+from evofsm.store import Kind, Numbers, Place
 
 # Intervals that a range of actions is divided into for the machine, unless a width is given.
 _INTERVALS = 17
@@ -89,14 +90,7 @@ class DecisionLogger(Protocol):
 # What a judge has that learns.
 _LEARNS = ("dt", "learn", "watch", "follow", "start_episode", "end", "sums", "save", "load")
 # The files of the machine and of the judge, as bytes.
-_BYTE = ranges.Range(0.0, 255.0, whole=True)
-_KIND = ranges.register(
-    ranges.Kind(
-        "guard",
-        {"machine": ranges.Member(("machine",), _BYTE), "judge": ranges.Member(("judge",), _BYTE)},
-        {},
-    )
-).name
+KIND = Kind("guard", {name: Numbers((name,), dtype=np.uint8) for name in ("machine", "judge")})
 
 
 class Guard:
@@ -723,7 +717,7 @@ class Guard:
             **{name: getattr(self, name) for name in ("interval", "learn", "seed")},
         }
         files = {"machine": _bytes(self.machine), "judge": _bytes(self.judge)}
-        storage.write(path, _KIND, kept, files, provenance)
+        store.write(path, KIND, kept, files, provenance)
 
     @classmethod
     def load(
@@ -766,10 +760,10 @@ class Guard:
         >>> Guard.load(BytesIO(file.getvalue())).interval
         0.25
         """
-        kept, files = storage.read(path, _KIND)
+        kept, files = store.read(path, KIND)
         if kept["failed"] and failed is None:
             raise ValueError("this guard knew failures by a function; give it again: failed=")
-        with storage.explained(path):
+        with store.explained(path):
             actions, reviser, machine, risk = rebuild(
                 kept, files["machine"].tobytes(), files["judge"].tobytes(), judge
             )

@@ -23,13 +23,14 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from evofsm import store
 from evofsm.fsm.kernels import compiled
 from evofsm.fsm.naming import Labels
 from evofsm.fsm.proportions import wilson_bounds
 from evofsm.fsm.validation import positive, whole
 from evofsm.guard.actions import Action
 from evofsm.guard.protocols import Fallback, Judgement, Search, Situation, Trial
-from evofsm.store import Place, ranges, storage
+from evofsm.store import COUNT, FLAG, FROM_1, MOST_COUNTED, SIZE, Kind, Numbers, Place
 
 _Floats = NDArray[np.float64]
 _Ints = NDArray[np.int64]
@@ -63,29 +64,27 @@ _SHAPES = np.linspace(-3.5, 3.5, 29)
 # Closest steps that were survived, of which each counts.
 _CLOSEST = 2000
 
-_SOME = ranges.Range(-math.inf, math.inf)
-_INDEX = ranges.Range(-1.0, ranges.MOST_COUNTED, whole=True)
-_KIND = ranges.register(
-    ranges.Kind(
-        "scenerisk",
-        {
-            "own": ranges.Member(("n", "o"), _SOME),
-            "actions": ranges.Member(("n",), _INDEX),
-            "counts": ranges.Member(("n",), ranges.COUNT),
-            "lost": ranges.Member(("n",), ranges.FLAG),
-            "away": ranges.Member(("m", "p"), _SOME),
-            "other": ranges.Member(("m", "r"), _SOME),
-            "links": ranges.Member(("m",), _INDEX),
-        },
-        {
-            "dt": ranges.SIZE,
-            "n_actions": ranges.FROM_1,
-            "columns": ranges.FROM_1,
-            "failures": ranges.COUNT,
-            "fitted": ranges.COUNT,
-        },
-    )
-).name
+_SOME = Numbers(least=-math.inf, most=math.inf)
+_INDEX = Numbers(least=-1.0, most=MOST_COUNTED, whole=True)
+_KIND = Kind(
+    "scenerisk",
+    {
+        "own": _SOME.of("n", "o"),
+        "actions": _INDEX.of("n"),
+        "counts": COUNT.of("n"),
+        "lost": FLAG.of("n"),
+        "away": _SOME.of("m", "p"),
+        "other": _SOME.of("m", "r"),
+        "links": _INDEX.of("m"),
+    },
+    {
+        "dt": SIZE,
+        "n_actions": FROM_1,
+        "columns": FROM_1,
+        "failures": COUNT,
+        "fitted": COUNT,
+    },
+)
 
 
 class SceneRisk:
@@ -314,7 +313,7 @@ class SceneRisk:
         arrays = {
             name: array.astype(np.float64) for name, array in self.memory.past._asdict().items()
         }
-        storage.write(path, _KIND, settings | counts, arrays, provenance)
+        store.write(path, _KIND, settings | counts, arrays, provenance)
 
     @classmethod
     def load(cls, path: Place) -> Self:
@@ -327,8 +326,8 @@ class SceneRisk:
         ValueError
             If the file holds something else or is damaged.
         """
-        settings, arrays = storage.read(path, _KIND)
-        with storage.explained(path):
+        settings, arrays = store.read(path, _KIND)
+        with store.explained(path):
             counted = {name: int(settings.pop(name)) for name in ("failures", "fitted")}
             judge = cls(settings.pop("dt"), settings.pop("n_actions"), **settings)
             whole_numbers = ("actions", "counts", "links")

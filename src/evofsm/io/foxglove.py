@@ -20,7 +20,7 @@ from typing import Any, BinaryIO, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm import __version__
+from evofsm import __version__, store
 from evofsm.driving import VARIABLES, Episode
 from evofsm.extras import needs
 from evofsm.fsm import FSMModel, positive
@@ -34,7 +34,6 @@ from evofsm.io.runs import (
     field_of,
     schemas_of,
 )
-from evofsm.store import storage
 
 with needs("foxglove-sdk", "mcap", "writing MCAP, and a live view in Foxglove"):
     import foxglove
@@ -213,7 +212,7 @@ def recording(
     >>> bool((run.episodes[0].columns["executed"] == driven.executed).all())
     True
     """
-    with storage.replacing(path) as file:
+    with store.replacing(path) as file:
         writer = RunWriter(file, about or {})
         yield writer
         writer.finish()

@@ -6,7 +6,7 @@ from evofsm.cli.monitor.defaults import guard_of_monitor
 from evofsm.cli.monitor.state import State
 from evofsm.guard.guard import Guard
 from evofsm.guard.reviser import Mode
-from evofsm.store.storage import read_header
+from evofsm.store import read_header
 from monitor_rows import JUNK, line, scenes, traffic
 
 SETTINGS = {"learn": True, "guard": None}

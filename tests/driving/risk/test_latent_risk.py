@@ -15,6 +15,7 @@ from evofsm.driving.risk.brakes import OwnBrakes
 from evofsm.driving.risk.by_state import RiskByState, assess_states
 from evofsm.driving.risk.latent import LatentRisk
 from evofsm.driving.risk.manoeuvres import BrakeWatch, Manoeuvres
+from evofsm.driving.risk.ranges import hardest_seen
 from evofsm.driving.risk.rehearsal import HARDEST, Body, critical_decelerations
 from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.states.novelty import Novelty
@@ -452,31 +453,6 @@ def test_damaged_files_are_refused(taught, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("name", "array"),
-    [
-        ("decels", [3.0, math.nan]),
-        ("decels", [-3.0]),
-        ("brakes", [[3.0]]),
-        ("lagged", [1.0]),
-        ("onsets", [1.0]),
-        ("exposure", [-1.0, 1.0, 1.0]),
-        ("seconds", None),
-    ],
-)
-def test_files_that_cannot_be_right_are_refused(taught, tmp_path, name, array):
-    path = tmp_path / "risk"
-    taught.save(path)
-    with np.load(path) as archive:
-        members = {key: archive[key] for key in archive.files if key != name}
-    if array is not None:
-        members[name] = np.array(array)
-    with open(path, "wb") as file:
-        np.savez(file, **members)
-    with pytest.raises(ValueError, match="cannot be read"):
-        LatentRisk.load(path)
-
-
-@pytest.mark.parametrize(
     ("observation", "acceleration", "belief", "named"),
     [
         ([-math.inf, 20.0, 20.0], 0.0, [1.0], "observation"),
@@ -650,3 +626,50 @@ def test_what_was_saved_doubts_the_brakes_as_before(tmp_path):
     for name, latest in risk.brakes.doubts.items():
         assert list(again.brakes.doubts[name]) == list(latest)
     assert any(len(latest) for latest in risk.brakes.doubts.values())
+
+
+# -- In files ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "words"),
+    [
+        ("gentle", -5.0, "gentle of -5"),
+        ("gentle", 0.5, "gentle holds a fraction"),
+        ("brakes", 100.0, "brakes of 100"),
+        ("doubts_brought", 100.0, "doubts_brought of 100"),
+        ("decels", np.nan, "decels of nan"),
+        ("stretches", -1.0, "stretches of -1"),
+        ("lowest", 1.0, "lowest of 1"),
+        ("lowest", -1e308, r"lowest of -1e\+308"),
+        ("dt", 0.0, "dt of 0"),
+        ("dt", None, "lacks dt"),
+    ],
+)
+def test_a_risk_that_no_drive_could_have_left_is_refused(forge, tmp_path, name, value, words):
+    risk = LatentRisk(lowest=-2.5)
+    risk.manoeuvres.remember(4.0)
+    for step in range(12):
+        risk.learn([30.0, 30.0 - 0.625 * step, 20.0], -2.5)
+    risk.save(tmp_path / "risk")
+    forge(tmp_path / "risk", {name: value})
+    with pytest.raises(ValueError, match=words):
+        LatentRisk.load(tmp_path / "risk")
+
+
+def test_a_risk_that_saw_jumps_and_odd_numbers_is_kept_and_read_again(tmp_path):
+    random = np.random.default_rng(0)
+    odd = (0.0, 1e-9, 1.0, 30.0, 200.0, 1e9, 1e100, np.nan)
+    for dt in (0.01, 0.25, 10.0):
+        risk = LatentRisk(lowest=-2.5, dt=dt)
+        for turn in range(300):
+            risk.learn(random.choice(odd, 3), random.choice([-2.5, 1.0, -1e100, 1e100]))
+            if turn % 100 == 0:
+                risk.start_episode()
+        risk.save(tmp_path / "risk")
+        LatentRisk.load(tmp_path / "risk").save(tmp_path / "again")
+        assert (tmp_path / "again").read_bytes() == (tmp_path / "risk").read_bytes()
+
+
+def test_the_hardest_braking_is_the_same_for_leaders_and_in_files():
+    assert hardest_seen(np.inf) == HARDEST

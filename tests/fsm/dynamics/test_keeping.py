@@ -5,11 +5,12 @@ import io
 import numpy as np
 import pytest
 
+from evofsm import store
 from evofsm.fsm.dynamics.dynamics import Dynamics
-from evofsm.fsm.dynamics.keeping import from_bytes, to_bytes
+from evofsm.fsm.dynamics.keeping import _KIND, from_bytes, to_bytes
+from evofsm.fsm.learnt import MACHINE
 from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.model import FSMModel
-from evofsm.store import storage
 
 
 def parts(value):
@@ -80,14 +81,14 @@ def test_a_model_keeps_what_it_is_asked(cart):
 
 def spoilt(dynamics, **changes):
     """A file of dynamics in which something is another."""
-    content, arrays = storage.read(io.BytesIO(to_bytes(dynamics).tobytes()), "dynamics")
+    content, arrays = store.read(io.BytesIO(to_bytes(dynamics).tobytes()), _KIND)
     for name, value in changes.items():
         if callable(value):
             arrays[name] = value(arrays[name])
         else:
             content[name] = value
     file = io.BytesIO()
-    storage.write(file, "dynamics", content, arrays)
+    store.write(file, _KIND, content, arrays)
     return np.frombuffer(file.getvalue(), np.uint8)
 
 
@@ -115,8 +116,8 @@ def with_first(value):
         ({"low": [3.0]}, "low"),
         ({"ready": 2}, "ready"),
         ({"without": ["wheels"]}, "wheels"),
-        ({"low": [-1.0, -1.0], "high": [1.0, 1.0]}, "used has 1 rows"),
-        ({"stretches": lambda _: np.zeros((0, 2))}, "stretches"),
+        ({"low": [-1.0, -1.0], "high": [1.0, 1.0]}, "used has shape"),
+        ({"stretches": lambda _: np.zeros((0, 2))}, "stretch_is_of_then has shape"),
         ({"actions": lambda array: array[:0]}, "0 actions after 2 observations"),
         ({"origin": lambda array: array[:2]}, "shape"),
         ({"sum_squares": lambda array: array[:3, :3]}, "shape"),
@@ -139,7 +140,7 @@ def test_a_damaged_file_within_a_machines_file_is_refused(cart, where, tmp_path)
     arrays["dynamics"] = arrays["dynamics"].copy()
     begin = int(where * len(arrays["dynamics"]))
     arrays["dynamics"][begin : begin + 100] ^= 0x55  # more than a local header of the archive
-    storage.write(tmp_path / "machine", "machine", content, arrays)
+    store.write(tmp_path / "machine", MACHINE, content, arrays)
     with pytest.raises(ValueError, match=str(tmp_path / "machine")):
         EvolvingFSM.load(tmp_path / "machine")
 
@@ -153,6 +154,6 @@ def test_dynamics_of_another_machine_are_refused(cart, tmp_path):
             other = Dynamics(-1.0, 1.0)
             other.observe(np.zeros(5))
         arrays["dynamics"] = to_bytes(other)
-        storage.write(tmp_path / "machine", "machine", machine._content, arrays)
+        store.write(tmp_path / "machine", MACHINE, machine._content, arrays)
         with pytest.raises(ValueError, match="dynamics"):
             EvolvingFSM.load(tmp_path / "machine")

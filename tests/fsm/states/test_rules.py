@@ -18,7 +18,6 @@ from evofsm.fsm.states.failure import FailureSplit
 from evofsm.fsm.states.novelty import Novelty
 from evofsm.fsm.states.paper import Paper
 from evofsm.fsm.step import Event
-from evofsm.store import storage
 
 LEARNT = (
     *("centers", "potentials", "transition_matrices", "origin_frequency", "belief"),
@@ -183,37 +182,6 @@ def test_the_names_and_settings_in_a_file_are_these():
 def test_what_is_no_rule_is_refused(rule):
     with pytest.raises(TypeError, match=r"rule is .*; it must be an object: Paper\(...\), Edges"):
         EvolvingFSM(1, rule=rule)
-
-
-@pytest.mark.parametrize(
-    ("rule", "words"),
-    [
-        ({"name": "magic"}, "no state rule 'magic', only paper, edges"),
-        ({"name": "novelty", "gain": 1.0}, "gain"),
-        ({}, "name"),
-        (None, ""),
-    ],
-)
-def test_a_file_with_a_rule_that_makes_no_sense_is_refused_by_name(rule, words, tmp_path):
-    machine, path = EvolvingFSM(1), tmp_path / "file"
-    machine.observe([0.0])
-    for item, kind in ((machine, "machine"), (machine.model(), "model")):
-        item.save(path)
-        content, arrays = storage.read(path, kind)
-        storage.write(path, kind, {**content, "rule": rule}, arrays)
-        with pytest.raises(ValueError, match=f"{path}.*{words}"):
-            type(item).load(path)
-
-
-def test_a_rule_beyond_its_range_is_not_even_written(tmp_path):
-    machine, path = EvolvingFSM(1), tmp_path / "file"
-    machine.observe([0.0])
-    machine.save(path)
-    content, arrays = storage.read(path, "machine")
-    with pytest.raises(ValueError, match=r"rule\.radius of -1 cannot be right"):
-        storage.write(
-            path, "machine", {**content, "rule": {"name": "novelty", "radius": -1}}, arrays
-        )
 
 
 @pytest.mark.parametrize("name", ["radius", "spread"])

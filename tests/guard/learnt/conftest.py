@@ -118,15 +118,18 @@ def content():
     """All that a guard has learnt, byte for byte: what it would write to a file."""
     from io import BytesIO
 
-    from evofsm.store import storage
+    from evofsm import store
+    from evofsm.fsm.learnt import MACHINE
+    from evofsm.guard.guard import KIND as GUARD
+    from evofsm.guard.learnt.keeping import KIND
 
     def take(guard):
         file = BytesIO()
         guard.save(file)
-        _, files = storage.read(BytesIO(file.getvalue()), "guard")
+        _, files = store.read(BytesIO(file.getvalue()), GUARD)
         found = {}
-        for name, kind in (("machine", "machine"), ("judge", "learntrisk")):
-            told, arrays = storage.read(BytesIO(files[name].tobytes()), kind)
+        for name, kind in (("machine", MACHINE), ("judge", KIND)):
+            told, arrays = store.read(BytesIO(files[name].tobytes()), kind)
             found[name] = (told, {key: (a.shape, a.tobytes()) for key, a in arrays.items()})
         return found
 

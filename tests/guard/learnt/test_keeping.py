@@ -5,10 +5,10 @@ from io import BytesIO
 import numpy as np
 import pytest
 
-from evofsm import Guard
-from evofsm.guard.learnt.breaks import Breaks
+from evofsm import Guard, store
+from evofsm.guard.guard import KIND as GUARD
+from evofsm.guard.learnt.keeping import KIND
 from evofsm.guard.learnt.risk import LearntRisk
-from evofsm.store import storage
 
 
 def assert_goes_on_alike(point, guard, exactly, content):
@@ -39,19 +39,19 @@ def test_with_noisy_sensors_it_goes_on_bit_for_bit_too(noisy, exactly, content):
 def test_a_file_that_contradicts_itself_is_refused(points):
     file = BytesIO()
     points["box"].taught(3).judge.save(file)
-    content, arrays = storage.read(BytesIO(file.getvalue()), "learntrisk")
+    content, arrays = store.read(BytesIO(file.getvalue()), KIND)
     for told, spoilt, what in (
         (content, {"variables": np.zeros(2)}, "variables of the backups"),
         (content | {"n_constant": 99}, {}, "not 99 constant ones"),
         (content | {"without": ["luck"]}, {}, "without names"),
     ):
         bad = BytesIO()
-        storage.write(bad, "learntrisk", told, arrays | spoilt)
+        store.write(bad, KIND, told, arrays | spoilt)
         with pytest.raises(ValueError, match=what):
             LearntRisk.load(BytesIO(bad.getvalue()))
     others = {"variables": np.arange(3.0), "policies": np.zeros((6, 1, 4))}
     with pytest.raises(ValueError, match="variables has shape"):
-        storage.write(BytesIO(), "learntrisk", content, arrays | others)
+        store.write(BytesIO(), KIND, content, arrays | others)
 
 
 def test_what_was_learnt_of_another_system_is_put_beside_no_machine(points):
@@ -60,25 +60,10 @@ def test_what_was_learnt_of_another_system_is_put_beside_no_machine(points):
     for guard in (box, plane):
         files.append(BytesIO())
         guard.save(files[-1])
-    (content, own), (_, others) = (
-        storage.read(BytesIO(file.getvalue()), "guard") for file in files
-    )
+    (content, own), (_, others) = (store.read(BytesIO(file.getvalue()), GUARD) for file in files)
     mixed = BytesIO()
-    storage.write(mixed, "guard", content, own | {"judge": others["judge"]})
+    store.write(mixed, GUARD, content, own | {"judge": others["judge"]})
     with pytest.raises(ValueError, match="they do not belong together"):
         Guard.load(BytesIO(mixed.getvalue()))
     with pytest.raises(ValueError, match="from 4 variables and actions of 2 numbers, the machine"):
         Guard(low=-1.0, high=1.0, interval=0.1, judge=plane.judge, machine=box.machine)
-
-
-def test_a_file_of_before_breaks_were_counted_and_dead_ends_refuted_is_read(points):
-    file = BytesIO()
-    points["box"].taught(3).judge.save(file)
-    content, arrays = storage.read(BytesIO(file.getvalue()), "learntrisk")
-    kept = {
-        name: value for name, value in content.items() if name not in (*Breaks._fields, "believed")
-    }
-    old = BytesIO()
-    storage.write(old, "learntrisk", kept, arrays)
-    read = LearntRisk.load(BytesIO(old.getvalue()))
-    assert (read.breaks, read.believed) == (Breaks(), 144.0)

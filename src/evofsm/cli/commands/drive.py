@@ -17,9 +17,9 @@ from evofsm.cli.show import print_json
 if TYPE_CHECKING:
     from evofsm.cli.driving import Driving, Setup
     from evofsm.driving import World
+    from evofsm.fleet.checkpoint import Checkpoint
     from evofsm.guard import DecisionLogger, Guard
     from evofsm.io.foxglove import FoxgloveSink, RunWriter
-    from evofsm.store import Checkpoint
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,8 +84,8 @@ class Drive(Driven):
         from evofsm.cli.text.columns import console
         from evofsm.cli.text.driving import driving_document, print_driving
         from evofsm.driving import learners_of, load_learnt, open_world
+        from evofsm.fleet.checkpoint import Checkpoint, duration, result_kept
         from evofsm.guard import AuditLog
-        from evofsm.store import Checkpoint, duration, result_kept
 
         if self.learn is not None and self.frozen is not None:
             raise ValueError("--learn and --frozen exclude each other")

@@ -19,10 +19,10 @@ if TYPE_CHECKING:
     from rich.progress import Progress
 
     from evofsm.cli.learning import Learning
+    from evofsm.fleet.checkpoint import Checkpoint
     from evofsm.fsm import Category, EvolvingFSM, IntervalActions
     from evofsm.io.logs import Chunk, LogColumns, Noted
     from evofsm.io.vehicles import VehicleLengths
-    from evofsm.store import Checkpoint
 
 
 class RuleName(StrEnum):
@@ -162,10 +162,10 @@ class Learn(WithJson):
         from evofsm.cli.learning import learn_traces
         from evofsm.cli.text.learning import learning_document, print_learning
         from evofsm.driving import UNITS, VARIABLES
+        from evofsm.fleet.checkpoint import Checkpoint, duration, fingerprints, result_kept
         from evofsm.io.logs import Noted, read_traces
         from evofsm.io.rosbag import Topics
         from evofsm.io.vehicles import VehicleLengths
-        from evofsm.store import Checkpoint, duration, fingerprints, result_kept
 
         _check_out(self.out)
         interval = duration(self.every)
@@ -340,7 +340,7 @@ class Learn(WithJson):
 
 def _check_out(out: Path | None) -> None:
     """Refuse before the long work what could not be saved after it."""
-    from evofsm.store import storage
+    from evofsm import store
 
     if out is None:
         return
@@ -352,7 +352,7 @@ def _check_out(out: Path | None) -> None:
         raise IsADirectoryError(f"--out {out} is a folder; name a file in it")
     if out.exists():
         try:
-            storage.kind_of(out)
+            store.read_header(out)
         except (ValueError, OSError):
             raise ValueError(
                 f"--out {out}: exists and is no file of evofsm; it was left alone"

@@ -137,7 +137,7 @@ class Monitor(Command):
 
     def _settings(self) -> dict[str, object]:
         """What decisions depend on; a guard that is the state itself is told by nothing."""
-        from evofsm.store import fingerprints
+        from evofsm.fleet.checkpoint import fingerprints
 
         assert self.state is not None
         given = None
@@ -149,8 +149,8 @@ class Monitor(Command):
 
     def _prepare(self, guard: Guard, stack: ExitStack) -> None:
         """Set how far it goes, whether it learns, and who writes it down."""
+        from evofsm.fleet.sealed import Sync
         from evofsm.guard import ActionReviser, AuditLog, Mode
-        from evofsm.store import Sync
 
         mode = chosen_mode(self.mode)
         if isinstance(guard.reviser, ActionReviser):

@@ -14,10 +14,11 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+from evofsm import store
 from evofsm.cli.monitor.decider import Decider, Told
 from evofsm.cli.monitor.schema import End, Row
+from evofsm.fleet.sealed import ChainedFile, number, records
 from evofsm.guard import Guard
-from evofsm.store import ChainedFile, number, read_header, records, storage
 
 _log = logging.getLogger(__name__)
 
@@ -64,8 +65,8 @@ class State:
         """
         if not self.path.exists():
             return fresh()
-        storage.sweep(self.path)
-        self._provenance = dict(read_header(self.path).provenance)
+        store.sweep(self.path)
+        self._provenance = dict(store.read_header(self.path).provenance)
         kept = self._provenance.pop(_PROVENANCE, None)
         if kept is not None:
             self._check(kept["settings"])
@@ -156,7 +157,7 @@ def _opened(path: Path) -> ChainedFile:
     """A journal; a first record that was half written is none."""
     if path.exists():
         with open(path, "r+b") as file:
-            storage.only_writer(file, path, "name another file")
+            store.only_writer(file, path, "name another file")
             if b"\n" not in file.read():
                 file.truncate(0)
     return ChainedFile(path)

@@ -19,13 +19,14 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from evofsm import store
 from evofsm.driving.naming import LABELS
 from evofsm.driving.revisers import GENTLE_BRAKE
 from evofsm.driving.risk.brakes import OwnBrakes, Sample
 from evofsm.driving.risk.leaders import LeaderBrakes
 from evofsm.driving.risk.manoeuvres import BrakeWatch, Manoeuvres
 from evofsm.driving.risk.perception import Estimate, Perception, is_whole
-from evofsm.driving.risk.ranges import RISK
+from evofsm.driving.risk.ranges import RISK, refuse_other_brakes
 from evofsm.driving.risk.rehearsal import Body, Three, critical_decelerations
 from evofsm.fsm import (
     compiled,
@@ -37,7 +38,7 @@ from evofsm.fsm import (
     wilson_bounds,
 )
 from evofsm.guard import TOLERANCE, Action, Judgement, Situation, Trial
-from evofsm.store import LARGEST_OBSERVATION, ranges, storage
+from evofsm.store import LARGEST_OBSERVATION, Place
 
 # Pseudo-evidence for the pooled rate of manoeuvres, against that of a state [s].
 _POOLED = 20.0
@@ -100,7 +101,7 @@ class LatentRisk:
         self.own_brakes = positive("own_brakes", own_brakes)
         self.margin = positive("margin", margin)
         self.hard = positive("hard", hard)
-        ranges.refuse_others(RISK.name, self._settings)
+        RISK.refuse_others(self._settings)
         self.manoeuvres = Manoeuvres(leader_decel, hard)
         if leaders is not None:
             self.manoeuvres.begin_with(leaders)
@@ -522,7 +523,7 @@ class LatentRisk:
 
     # -- Keeping it -----------------------------------------------------------------------------
 
-    def save(self, path: storage.Place, provenance: Mapping[str, Any] | None = None) -> None:
+    def save(self, path: Place, provenance: Mapping[str, Any] | None = None) -> None:
         """Write what was learnt to a file (arrays and a JSON header, nothing that can run).
 
         Parameters
@@ -538,10 +539,12 @@ class LatentRisk:
             before is then as it was.
         """
         settings = {**self._settings, "own_brakes": self.brakes.assumed}
-        storage.write(path, RISK.name, settings, self._learnt(), provenance)
+        learnt = self._learnt()
+        refuse_other_brakes(self.dt, learnt)
+        store.write(path, RISK, settings, learnt, provenance)
 
     @classmethod
-    def load(cls, path: storage.Place) -> Self:
+    def load(cls, path: Place) -> Self:
         """Read what was learnt, between two episodes.
 
         Raises
@@ -562,8 +565,9 @@ class LatentRisk:
         ...     len(LatentRisk.load(Path(folder) / "risk.evofsm").manoeuvres)
         1
         """
-        settings, arrays = storage.read(path, RISK.name)
-        with storage.explained(path):
+        settings, arrays = store.read(path, RISK)
+        with store.explained(path):
+            refuse_other_brakes(settings["dt"], arrays)
             risk = cls(**settings)
             risk.manoeuvres.remember(*arrays["decels"].tolist())
             risk.manoeuvres.gentle = int(arrays["gentle"][0])
@@ -573,7 +577,7 @@ class LatentRisk:
             risk.brakes.set_lagged(*arrays["lagged"].tolist())
             risk._by_state = np.array([arrays[name] for name in ("onsets", "exposure", "seconds")])
             for name, latest in risk.brakes.doubts.items():
-                pairs = arrays.get(f"doubts_{name}", np.empty(0)).reshape(-1, 2)  # new in format 4
+                pairs = arrays[f"doubts_{name}"].reshape(-1, 2)
                 for value, begins in pairs.tolist():
                     latest.add(Sample(value, bool(begins)))
         return risk

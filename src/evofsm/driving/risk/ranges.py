@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from evofsm.store import ranges
+from numpy.typing import NDArray
+
+from evofsm.store import COUNT, FLAG, MOST_COUNTED, SIZE, SMALLEST, Kind, Numbers
 
 # No car brakes harder than this [m/s²].
 _HARDEST = 15.0
@@ -18,8 +20,10 @@ _SHORTEST = 1e-6
 # Nor farther apart [s].
 _LONGEST = 1e6
 
-_TIME = ranges.Range(0.0, _LONGEST * ranges.MOST_COUNTED)
-_ACCELERATION = ranges.Range(ranges.SMALLEST, _ASKED)
+_TIME = Numbers(least=0.0, most=_LONGEST * MOST_COUNTED)
+_ACCELERATION = Numbers(least=SMALLEST, most=_ASKED)
+_PRODUCT = Numbers(least=-1e300, most=1e300)
+_NOISE = Numbers(least=0.0, most=1e300)
 
 
 def hardest_seen(dt: float) -> float:
@@ -33,38 +37,36 @@ def hardest_seen(dt: float) -> float:
     return _HARDEST + _JUMP / dt
 
 
-def _of_brakes(settings: Mapping[str, Any]) -> dict[str, ranges.Range]:
-    most = hardest_seen(settings["dt"])
-    short = ranges.Range(-2.0 * most - _ASKED, 2.0 * most + _ASKED)
-    brought = ranges.Range(-most, most)
-    return {"brakes": brought, "doubts_brought": brought, "doubts_shortfalls": short}
+def refuse_other_brakes(dt: float, arrays: Mapping[str, NDArray[Any]]) -> None:
+    """Raise for braking that could not have been seen at this interval of time."""
+    most = hardest_seen(dt)
+    brought = Numbers(("n",), -most, most)
+    brought.refuse_others("brakes", arrays["brakes"])
+    brought.refuse_others("doubts_brought", arrays["doubts_brought"])
+    short = Numbers(("n",), -2.0 * most - _ASKED, 2.0 * most + _ASKED)
+    short.refuse_others("doubts_shortfalls", arrays["doubts_shortfalls"])
 
 
-RISK = ranges.register(
-    ranges.Kind(
-        "risk",
-        {
-            **dict.fromkeys(("onsets", "exposure", "seconds"), ranges.Member(("n",), _TIME)),
-            "brakes": ranges.Member(("samples",), None),
-            "stretches": ranges.Member(("samples",), ranges.FLAG),
-            "decels": ranges.Member(("decels",), ranges.Range(ranges.SMALLEST, _HARDEST)),
-            "gentle": ranges.Member((1,), ranges.COUNT),
-            "lagged": ranges.Member(
-                (2,), ranges.Range(-ranges.LARGEST_PRODUCT, ranges.LARGEST_PRODUCT)
-            ),
-            "noise_gap": ranges.Member(("gaps",), ranges.PRODUCT),
-            "noise_speed": ranges.Member(("speeds",), ranges.PRODUCT),
-            "noise_leader": ranges.Member(("leaders",), ranges.PRODUCT),
-            "doubts_brought": ranges.Member(("brought",), None, since=4),
-            "doubts_shortfalls": ranges.Member(("shortfalls",), None, since=4),
-        },
-        {
-            "lowest": ranges.Range(-_ASKED, -ranges.SMALLEST),
-            "dt": ranges.Range(_SHORTEST, _LONGEST),
-            **dict.fromkeys(("leader_decel", "hard"), _ACCELERATION),
-            "own_brakes": ranges.Range(ranges.SMALLEST, 10.0),
-            "margin": ranges.SIZE,
-        },
-        limits=_of_brakes,
-    )
+RISK = Kind(
+    "risk",
+    {
+        **dict.fromkeys(("onsets", "exposure", "seconds"), _TIME.of("n")),
+        "brakes": Numbers(("samples",)),
+        "stretches": FLAG.of("samples"),
+        "decels": Numbers(("decels",), SMALLEST, _HARDEST),
+        "gentle": COUNT.of(1),
+        "lagged": _PRODUCT.of(2),
+        "noise_gap": _NOISE.of("gaps"),
+        "noise_speed": _NOISE.of("speeds"),
+        "noise_leader": _NOISE.of("leaders"),
+        "doubts_brought": Numbers(("brought",)),
+        "doubts_shortfalls": Numbers(("shortfalls",)),
+    },
+    {
+        "lowest": Numbers(least=-_ASKED, most=-SMALLEST),
+        "dt": Numbers(least=_SHORTEST, most=_LONGEST),
+        **dict.fromkeys(("leader_decel", "hard"), _ACCELERATION),
+        "own_brakes": Numbers(least=SMALLEST, most=10.0),
+        "margin": SIZE,
+    },
 )

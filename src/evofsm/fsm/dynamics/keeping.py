@@ -13,22 +13,23 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from evofsm import store
 from evofsm.fsm.dynamics.consequents import Consequents, Stretch, n_features
 from evofsm.fsm.dynamics.drift import Drift, Recent
 from evofsm.fsm.dynamics.dynamics import Dynamics
 from evofsm.fsm.dynamics.following import LARGEST
-from evofsm.fsm.dynamics.observer import GAINS, untried
+from evofsm.fsm.dynamics.observer import GAINS
 from evofsm.fsm.dynamics.regression import Sums
 from evofsm.fsm.dynamics.undoing import side_by_side
-from evofsm.store import ranges, storage
+from evofsm.store import COUNT, FLAG, FROM_1, SHARE, Kind, Numbers
 
 _Shape: TypeAlias = tuple[int | str, ...]
 
-_SOME = ranges.Range(-1e300, 1e300)
-_NOT_NEGATIVE = ranges.Range(0.0, 1e308)
-_OBSERVED = ranges.Range(-LARGEST, LARGEST)
+_SOME = Numbers(least=-1e300, most=1e300)
+_NOT_NEGATIVE = Numbers(least=0.0)
+_OBSERVED = Numbers(least=-LARGEST, most=LARGEST)
 # The first ones to come are infinitely far out.
-_EXTREME = ranges.Range(-math.inf, math.inf)
+_EXTREME = Numbers(least=-math.inf, most=math.inf)
 _KNOWN = "known_"
 # Of consequents: what they were made of may have changed since.
 _CONSEQUENTS: dict[str, _Shape] = {
@@ -44,10 +45,8 @@ _CONSEQUENTS: dict[str, _Shape] = {
     "close": ("m",),
     "gains": ("m",),
 }
-# Of those, what files have from version 9 on.
-_OBSERVER = ("close", "gains")
-_SUMS: dict[str, tuple[_Shape, ranges.Range]] = {
-    "counts": ((2,), ranges.COUNT),
+_SUMS: dict[str, tuple[_Shape, Numbers]] = {
+    "counts": ((2,), COUNT),
     "squares": (("p", "p"), _SOME),
     "products": (("p", "m"), _SOME),
     "mean": (("m",), _SOME),
@@ -61,84 +60,59 @@ _SUMS: dict[str, tuple[_Shape, ranges.Range]] = {
     "noise": (("m",), _NOT_NEGATIVE),
     "low": (("m",), _OBSERVED),
     "high": (("m",), _OBSERVED),
-    "moving": (("m",), ranges.SHARE),
+    "moving": (("m",), SHARE),
 }
 # Arrays of dynamics under their own names.
-_OWN: dict[str, tuple[_Shape, ranges.Range]] = {
+_OWN: dict[str, tuple[_Shape, Numbers]] = {
     "origin": (("m",), _OBSERVED),
     "lowest": (("m",), _EXTREME),
     "highest": (("m",), _EXTREME),
-    "reached": (("m", 2), ranges.COUNT),
+    "reached": (("m", 2), COUNT),
 }
-_ARRAYS: dict[str, tuple[_Shape, ranges.Range]] = {
+_ARRAYS: dict[str, tuple[_Shape, Numbers]] = {
     **{f"sum_{name}": told for name, told in _SUMS.items()},
-    **{
-        _KNOWN + name: (shape, _EXTREME)
-        for name, shape in _CONSEQUENTS.items()
-        if name not in _OBSERVER
-    },
+    **{_KNOWN + name: (shape, _EXTREME) for name, shape in _CONSEQUENTS.items()},
     **_OWN,
-    "used": (("a", 2), ranges.COUNT),
+    "used": (("a", 2), COUNT),
     "failures": (("failures", "m"), _OBSERVED),
     "jumps": (("jumps", 2), _OBSERVED),  # variable, and where it landed
     "jumps_from": (("jumps", "m"), _OBSERVED),
-    "stretches": (("stretches", 2), ranges.COUNT),  # numbers of actions, and episodes
+    "stretches": (("stretches", 2), COUNT),  # numbers of actions, and episodes
     "stretch_observations": (("stretched", "m"), _OBSERVED),
     "stretch_actions": (("acted", "a"), _SOME),
     "observations": (("observed", "m"), _OBSERVED),
     "actions": (("done", "a"), _SOME),
 }
 # Of whether the model still holds.
-_RECENT: dict[str, tuple[_Shape, ranges.Range]] = {
+_RECENT: dict[str, tuple[_Shape, Numbers]] = {
     "squares": (("p", "p"), _SOME),
     "products": (("p", "m"), _SOME),
     "doubt": (("m",), _NOT_NEGATIVE),
-    "since": (("m",), ranges.COUNT),
-}
-# By the version from which on files have them.
-_SINCE: dict[int, dict[str, tuple[_Shape, ranges.Range]]] = {
-    1: _ARRAYS,
-    7: {
-        **{f"recent_{name}": told for name, told in _RECENT.items()},
-        "drifts": (("drifts", 3), ranges.COUNT),
-        "stretch_unforeseen": (("unforeseen", "m"), _SOME),
-        "stretch_is_of_then": (("stretches",), ranges.FLAG),
-    },
-    8: {"doubt_of_lags": ((1,), _NOT_NEGATIVE)},
-    9: {
-        **{_KNOWN + name: (_CONSEQUENTS[name], _NOT_NEGATIVE) for name in _OBSERVER},
-        "missed": (("m", len(GAINS)), _NOT_NEGATIVE),
-    },
+    "since": (("m",), COUNT),
 }
 _MEMBERS = {
-    name: ranges.Member(*told, since=version)
-    for version, more in _SINCE.items()
-    for name, told in more.items()
+    name: numbers.of(*shape)
+    for name, (shape, numbers) in {
+        **_ARRAYS,
+        **{f"recent_{name}": told for name, told in _RECENT.items()},
+        "drifts": (("drifts", 3), COUNT),
+        "stretch_unforeseen": (("unforeseen", "m"), _SOME),
+        "stretch_is_of_then": (("stretches",), FLAG),
+        "doubt_of_lags": ((1,), _NOT_NEGATIVE),
+        "missed": (("m", len(GAINS)), _NOT_NEGATIVE),
+    }.items()
 }
-
-
-def _upgrade(version: int, settings: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> None:
-    """No model was corrected before version 7, and no observation before version 9."""
-    m = len(arrays["origin"])
-    arrays.setdefault("drifts", np.zeros((0, 3)))
-    arrays.setdefault("stretch_unforeseen", np.zeros((0, m)))
-    if version < 9:
-        arrays |= {"missed": untried(m), f"{_KNOWN}gains": np.ones(m)}
-        arrays[f"{_KNOWN}close"] = 1e-9 / arrays[f"{_KNOWN}inverse"]
-
-
-_KIND = ranges.register(
-    ranges.Kind(
-        "dynamics",
-        _MEMBERS,
-        {
-            **dict.fromkeys(("horizon", "stretches", "n_actions"), ranges.FROM_1),
-            **dict.fromkeys(("n_episodes", "clock", "quiet"), ranges.COUNT),
-            **dict.fromkeys(("low", "high"), ranges.Range(-1e100, 1e100)),
-        },
-        upgrade=_upgrade,
-    )
-).name
+_ENDS = Numbers(("a",), -1e100, 1e100, optional=True)
+_KIND = Kind(
+    "dynamics",
+    _MEMBERS,
+    {
+        **dict.fromkeys(("horizon", "n_actions"), FROM_1._replace(optional=True)),
+        "stretches": FROM_1,
+        **dict.fromkeys(("n_episodes", "clock", "quiet"), COUNT),
+        **dict.fromkeys(("low", "high"), _ENDS),
+    },
+)
 
 
 def to_bytes(dynamics: Dynamics | None) -> NDArray[np.uint8]:
@@ -154,7 +128,7 @@ def to_bytes(dynamics: Dynamics | None) -> NDArray[np.uint8]:
     """
     file = BytesIO()
     if dynamics is not None:
-        storage.write(file, _KIND, _content(dynamics), _arrays(dynamics))
+        store.write(file, _KIND, _content(dynamics), _arrays(dynamics))
     return np.frombuffer(file.getvalue(), np.uint8)
 
 
@@ -168,7 +142,7 @@ def from_bytes(encoded: NDArray[Any]) -> Dynamics | None:
     """
     if not len(encoded):
         return None
-    content, arrays = storage.read(BytesIO(encoded.tobytes()), _KIND)
+    content, arrays = store.read(BytesIO(encoded.tobytes()), _KIND)
     numbers = {name: content.pop(name) for name in ("n_episodes", "clock", "quiet", "ready")}
     dynamics = Dynamics(**content)
     dynamics.n_episodes = int(numbers["n_episodes"])

@@ -168,6 +168,8 @@ def describe_rule(rule: StateRule) -> dict[str, Any]:
 
 def restore_rule(description: Mapping[str, Any]) -> StateRule:
     """The rule that `describe_rule` put into words."""
+    if not isinstance(description, Mapping) or "name" not in description:
+        raise ValueError(f"rule is {description!r}; it must have the name of a state rule")
     settings = dict(description)
     name = settings.pop("name")
     if name not in _RULES:

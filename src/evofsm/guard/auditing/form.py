@@ -12,8 +12,8 @@ from contextlib import suppress
 from datetime import UTC, datetime, timedelta
 from typing import Any, NamedTuple
 
+from evofsm.fleet.sealed import LOG_HEADER, SealedRecord
 from evofsm.guard.record import RECORD
-from evofsm.store import LOG_HEADER, SealedRecord
 
 #: Of what is written now; every version from 1 on is read.
 LOG_VERSION = 4

@@ -35,6 +35,7 @@ from typing import Any, Concatenate, ParamSpec, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from evofsm.fleet.sealed import LOG_HEADER, ChainedFile, Head, Sync, records
 from evofsm.guard.actions import written
 from evofsm.guard.auditing.form import LOG_VERSION, TOLD
 from evofsm.guard.auditing.participants import describe, learnt, settings
@@ -42,7 +43,6 @@ from evofsm.guard.guard import Guard
 from evofsm.guard.protocols import Participants, Proposal, Reviser, Revision, Situation
 from evofsm.guard.record import RECORD, Pair
 from evofsm.guard.reviser import is_spoken
-from evofsm.store import LOG_HEADER, ChainedFile, Head, Sync, records
 
 _log = logging.getLogger(__name__)
 

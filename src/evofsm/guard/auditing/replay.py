@@ -17,6 +17,15 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from evofsm.fleet.sealed import (
+    Chain,
+    Head,
+    SealedRecord,
+    canonical,
+    number,
+    records,
+    verify,
+)
 from evofsm.fsm import Missing
 from evofsm.guard.actions import Action
 from evofsm.guard.auditing.form import LOG_VERSION, SINCE, Form, Misfit
@@ -31,7 +40,6 @@ from evofsm.guard.auditing.participants import (
 from evofsm.guard.guard import Explain, Guard
 from evofsm.guard.protocols import Participants, Proposal, Revision, Situation
 from evofsm.guard.reviser import is_spoken
-from evofsm.store import Chain, Head, SealedRecord, canonical, number, records, verify
 
 # What a record that someone made up may run into.
 _NONSENSE = (

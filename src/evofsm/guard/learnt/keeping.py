@@ -9,15 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evofsm.fsm import Disturbances, Here
-from evofsm.guard.learnt.actions import LONGEST_STRETCH
 from evofsm.guard.learnt.backups import Backups
-from evofsm.guard.learnt.breaks import Breaks
 from evofsm.guard.learnt.remembering import Situations
-from evofsm.store import ranges
+from evofsm.store import COUNT, FROM_1, SIZE, Kind, Numbers
 
 # Names of the arrays of situations.
 _SITUATIONS = ("situations", "changes", "actions_before")
-_SOME = ranges.Range(-math.inf, math.inf)
+_SOME = Numbers(least=-math.inf, most=math.inf)
 _SHAPES: dict[str, tuple[int | str, ...]] = {
     "residuals": ("k", "h", "m"),
     "jump_at": ("k", "m"),
@@ -39,32 +37,21 @@ _SHAPES: dict[str, tuple[int | str, ...]] = {
 NUMBERS = ("margin", "broken", "horizon", "takes", "believed", "n_studied", "n_scanned")
 
 
-def _upgrade(version: int, settings: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> None:
-    """At first it was not asked whether disturbances get worse, and all dead ends were believed."""
-    settings.setdefault("believed", float(LONGEST_STRETCH))
-    for name, value in Breaks()._asdict().items():
-        settings.setdefault(name, value)
-
-
-KIND = ranges.register(
-    ranges.Kind(
-        "learntrisk",
-        {name: ranges.Member(shape, _SOME) for name, shape in _SHAPES.items()},
-        {
-            "dt": ranges.SIZE,
-            "margin": ranges.Range(0.0, 1e6),
-            **dict.fromkeys(("seed", "broken", "n_studied", "n_scanned"), ranges.COUNT),
-            "n_constant": ranges.COUNT,
-            "horizon": ranges.FROM_1,
-            "told_horizon": ranges.SIZE,
-            **dict.fromkeys(("takes", "believed"), ranges.Range(0.0, 1e6)),
-            "share": ranges.Range(0.0, 1.0),
-            "doubt": ranges.Range(0.0, 1e6),
-            "since": ranges.COUNT,
-            "worse": ranges.Range(-1.0, 1e15),
-        },
-        upgrade=_upgrade,
-    )
+_TIME = Numbers(least=0.0, most=1e6)
+KIND = Kind(
+    "learntrisk",
+    {name: _SOME.of(*shape) for name, shape in _SHAPES.items()},
+    {
+        "dt": SIZE,
+        **dict.fromkeys(("margin", "takes", "believed", "doubt"), _TIME),
+        **dict.fromkeys(("seed", "broken", "n_studied", "n_scanned"), COUNT),
+        "n_constant": COUNT,
+        "horizon": FROM_1,
+        "told_horizon": SIZE._replace(optional=True),
+        "share": Numbers(least=0.0, most=1.0),
+        "since": COUNT,
+        "worse": Numbers(least=-1.0, most=1e15),
+    },
 )
 
 

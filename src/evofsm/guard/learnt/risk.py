@@ -16,6 +16,7 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from evofsm import store
 from evofsm.fsm import (
     Disturbances,
     Dynamics,
@@ -37,7 +38,7 @@ from evofsm.guard.learnt.search import CHANGED, KEPT, NOTHING_PASSES, outcomes, 
 from evofsm.guard.learnt.words import Remembered
 from evofsm.guard.protocols import Fallback, Judgement, Search, Situation, Trial
 from evofsm.guard.senses import has_gaps
-from evofsm.store import Place, storage
+from evofsm.store import Place
 
 _Floats = NDArray[np.float64]
 
@@ -725,7 +726,7 @@ class LearntRisk:
         content |= self.breaks._asdict()
         content |= {"n_constant": 0 if self.backups is None else self.backups.n_constant}
         arrays = arrays_of(Kept(self.situations, self.backups, self.disturbances))
-        storage.write(path, KIND.name, content, arrays, provenance)
+        store.write(path, KIND, content, arrays, provenance)
 
     @classmethod
     def load(cls, path: Place) -> Self:
@@ -738,8 +739,8 @@ class LearntRisk:
         ValueError
             If the file holds something else or is damaged.
         """
-        content, arrays = storage.read(path, KIND.name)
-        with storage.explained(path):
+        content, arrays = store.read(path, KIND)
+        with store.explained(path):
             told = {name: content[name] for name in ("seed", "without", "names", "units")}
             judge = cls(content["dt"], horizon=content["told_horizon"], **told)
             kept = restored(int(content["n_constant"]), arrays)

@@ -23,12 +23,11 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm import __version__
-from evofsm.store import ranges, storage
+from evofsm import __version__, store
 
 _log = logging.getLogger(__name__)
 
-_KIND = ranges.register(ranges.Kind("checkpoint", None, {})).name
+KIND = store.Kind("checkpoint", None)
 _SECONDS = {"s": 1.0, "m": 60.0, "h": 3600.0}
 # Of a file so much at its beginning and at its end tells it from others [bytes].
 _END = 1 << 16
@@ -92,12 +91,12 @@ class Checkpoint:
             If it belongs to other work, is no checkpoint, or is damaged.
         """
         if self.path.parent.is_dir():
-            storage.sweep(self.path)
+            store.sweep(self.path)
         if not self.path.exists():
             self._write(start)
             return start
-        content, arrays = storage.read(self.path, _KIND)
-        with storage.explained(self.path):
+        content, arrays = store.read(self.path, KIND)
+        with store.explained(self.path):
             before, done = content["settings"], content["done"]
             kept = Kept(done, arrays, bool(content["finished"]))
             self.notes.update(content["notes"])
@@ -143,7 +142,7 @@ class Checkpoint:
             "finished": kept.finished,
             "notes": self.notes,
         }
-        storage.write(self.path, _KIND, content, kept.arrays)
+        store.write(self.path, KIND, content, kept.arrays)
         self.failed = False
 
 

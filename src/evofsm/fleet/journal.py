@@ -21,8 +21,8 @@ from pathlib import Path
 from typing import Any, BinaryIO, Self
 from zlib import crc32
 
-from evofsm.store import storage
-from evofsm.store.checkpoint import differences
+from evofsm import store
+from evofsm.fleet.checkpoint import differences
 
 _SEAL = b',"crc":"'
 
@@ -63,7 +63,7 @@ class Journal:
         self.records: dict[int, Record] = {}
         self._file: BinaryIO = open(path, "a+b", buffering=0)  # noqa: SIM115
         try:
-            storage.only_writer(self._file, self.path, "name another folder")
+            store.only_writer(self._file, self.path, "name another folder")
             header = _line({"settings": settings})
             good = self._read(header)
             self._file.truncate(good)

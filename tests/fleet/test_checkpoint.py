@@ -12,12 +12,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from evofsm import store
 from evofsm.cli.learning import learn_traces
+from evofsm.fleet.checkpoint import KIND, Checkpoint, Kept, differences, duration, fingerprints
 from evofsm.fsm.actions import IntervalActions
 from evofsm.fsm.machine import EvolvingFSM
 from evofsm.io.logs import Chunk
-from evofsm.store import storage
-from evofsm.store.checkpoint import Checkpoint, Kept, differences, duration, fingerprints
 
 ACTIONS = IntervalActions(-1.0, 1.0, 0.5, outside="clip")
 SETTINGS = {"seed": 7}
@@ -130,7 +130,10 @@ def test_fewer_rows_than_were_learnt_are_refused(chunks, tmp_path):
 
 
 def test_a_file_of_another_kind_is_left_alone(chunks, tmp_path):
-    for data, words in ((b"gap,speed\n1,2\n", "not a ZIP"), (None, "holds a machine, not a check")):
+    for data, words in (
+        (b"gap,speed\n1,2\n", "another program"),
+        (None, "holds a machine, not a check"),
+    ):
         path = tmp_path / "kept"
         path.write_bytes(data) if data else EvolvingFSM(2).save(path)
         before = path.read_bytes()
@@ -142,14 +145,14 @@ def test_a_file_of_another_kind_is_left_alone(chunks, tmp_path):
 def test_a_checkpoint_that_lacks_something_is_refused(chunks, tmp_path):
     path = tmp_path / "kept"
     learn(chunks, path)
-    content, arrays = storage.read(path, "checkpoint")
+    content, arrays = store.read(path, KIND)
     for name in arrays:
         damaged = {key: value for key, value in arrays.items() if key != name}
-        storage.write(path, "checkpoint", content, damaged)
+        store.write(path, KIND, content, damaged)
         with pytest.raises(ValueError, match=f"{path} cannot be read"):
             learn(chunks, path)
     for name in ("forecasts", "age", "one_step"):
-        storage.write(path, "checkpoint", content, {**arrays, name: np.zeros((7, 7))})
+        store.write(path, KIND, content, {**arrays, name: np.zeros((7, 7))})
         with pytest.raises(ValueError, match=f"{name} has shape"):
             learn(chunks, path)
 

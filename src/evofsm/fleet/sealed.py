@@ -26,7 +26,7 @@ from itertools import islice
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple, Self
 
-from evofsm.store import storage
+from evofsm import store
 
 _log = logging.getLogger(__name__)
 
@@ -438,7 +438,7 @@ class ChainedFile:
         self._owner = os.getpid()
         self._under_way: tuple[bytes, Head] | None = None  # what is being written: line, head
         try:
-            storage.only_writer(self._file, self.path, "name another file")
+            store.only_writer(self._file, self.path, "name another file")
             chain = verify(path)
             if chain.finding is not None:
                 raise ValueError(
@@ -527,7 +527,7 @@ class ChainedFile:
         try:
             if self.is_ours:
                 self.settle()
-                storage.let_others_write(self._file)
+                store.let_others_write(self._file)
         finally:
             self._file.close()
 

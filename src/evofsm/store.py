@@ -1,0 +1,502 @@
+"""One file format for all that is learnt: named arrays and a JSON header, nothing that can run.
+
+A file is laid out as safetensors lays one out, so that its libraries open it, too: the length of
+the header in eight bytes, lowest first; the header, JSON in UTF-8, with the type, the shape and the
+place of each array; then the numbers of all arrays, row by row. Under ``__metadata__`` stand
+``evofsm``, again JSON (kind, version, library, settings, provenance), and ``sha256``: over the
+header, with 64 zeros in its place, and all numbers.
+
+What a kind of file may hold is declared once, as a `Kind`, where it belongs. A file is held against
+it before anything is allocated: a checksum shows damage, but whoever forges a file can take it
+anew, and kernels take sizes and indices on trust.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import os
+import re
+import secrets
+import stat
+import time
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
+from functools import partial
+from pathlib import Path
+from typing import Any, BinaryIO, NamedTuple, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evofsm import __version__
+
+#: A file by its name, or one that is open.
+Place: TypeAlias = str | os.PathLike[str] | BinaryIO
+
+#: Squares of larger numbers, summed over a long run, would overflow.
+LARGEST_OBSERVATION = 1e100
+#: Counts that go up by 1 end here: above it, adding 1 changes nothing.
+MOST_COUNTED = float(1 << 53)
+#: The smallest number above 0, and the largest.
+SMALLEST, LARGEST = math.ulp(0.0), float(np.finfo(np.float64).max)
+
+_VERSION = 1
+# In place of the checksum, as that is taken.
+_UNSIGNED = "0" * 64
+# No file holds more [bytes], nor a header.
+_LARGEST_FILE, _LARGEST_HEADER = 1 << 32, 1 << 24
+# The names of types in a file. No objects: those could run.
+_TYPES = {"BOOL": np.bool_, "U8": np.uint8, "I64": np.int64, "F64": np.float64}
+_NAMES = {np.dtype(kind): name for name, kind in _TYPES.items()}
+# Nobody writes a file any more that did not change for so long [s].
+_OLD = 600.0
+# Of an error that quotes a damaged file, so many letters are told.
+_MOST_SAID = 300
+# What reading a damaged file may run into (RuntimeError: JSON that is nested too deep).
+_DAMAGE = (ValueError, LookupError, TypeError, ArithmeticError, RuntimeError, EOFError)
+
+
+class Numbers(NamedTuple):
+    """What one array or setting of a file may hold.
+
+    Examples
+    --------
+    >>> Numbers(least=0.0, most=1.0).refuse_others("share", 1.5)
+    Traceback (most recent call last):
+    ValueError: share of 1.5 cannot be right: it must lie between 0 and 1
+    """
+
+    #: Sizes of an array; a name stands for the same number throughout a file.
+    shape: tuple[int | str, ...] = ()
+    least: float = -LARGEST
+    most: float = LARGEST
+    whole: bool = False  #: whether fractions are refused
+    dtype: Any = np.float64  #: of an array; settings are whatever JSON has
+    optional: bool = False  #: whether a setting may be None, or missing
+
+    def of(self, *shape: int | str) -> Numbers:
+        """The same in an array of a shape."""
+        return self._replace(shape=shape)
+
+    def refuse_others(
+        self, name: str, given: Any, sizes: dict[int | str, int] | None = None
+    ) -> None:
+        """Raise a ValueError for another shape, or a number that is not in the range (as NaN)."""
+        numbers = np.asarray(given)
+        if numbers.dtype.kind not in "iufb" or isinstance(given, bool):
+            raise ValueError(f"{name} is {given!r}; it must be a number")
+        self.refuse_shape(name, numbers.shape, {} if sizes is None else sizes)
+        if not numbers.size or numbers.dtype.kind == "b":
+            return
+        for number in (float(numbers.min()), float(numbers.max())):
+            if not self.least <= number <= self.most:
+                raise ValueError(
+                    f"{name} of {number:g} cannot be right: it must lie between {self.least:g} and "
+                    f"{self.most:g}"
+                )
+        if self.whole and numbers.dtype.kind == "f" and (numbers != np.rint(numbers)).any():
+            raise ValueError(f"{name} holds a fraction; it must be an integer")
+
+    def refuse_shape(self, name: str, shape: tuple[int, ...], sizes: dict[int | str, int]) -> None:
+        """Raise unless a shape agrees with the ``sizes`` so far, to which it adds its own."""
+        fits = len(shape) == len(self.shape)
+        for size, have in zip(self.shape, shape, strict=False):
+            fits &= have == (size if isinstance(size, int) else sizes.setdefault(size, have))
+        if not fits:
+            wanted = tuple(sizes.get(size, size) for size in self.shape)
+            raise ValueError(f"{name} has shape {shape}, not {wanted}, as others say")
+
+
+COUNT = Numbers(least=0.0, most=MOST_COUNTED, whole=True)
+FROM_1 = COUNT._replace(least=1.0)
+FLAG = COUNT._replace(most=1.0)
+SHARE = Numbers(least=0.0, most=1.0 + 1e-6)  # with room for rounding
+SIZE = Numbers(least=SMALLEST, most=LARGEST_OBSERVATION)
+
+
+class Kind(NamedTuple):
+    """What files of one kind hold.
+
+    Settings that are not declared may be there, and have to be checked by whoever uses them. A
+    setting that is one integer may be a size in the shapes of arrays, as ``"settings.NAME"``.
+    """
+
+    name: str
+    arrays: Mapping[str, Numbers] | None  #: None: whatever its work needs
+    settings: Mapping[str, Any] = {}  #: `Numbers`, or such a mapping for settings in a setting
+
+    def refuse_others(self, settings: Mapping[str, Any]) -> None:
+        """Raise a ValueError for settings that no file of this kind may hold, naming one."""
+        _refuse_settings(settings, self.settings, {})
+
+
+class Header(NamedTuple):
+    """What a file says of itself."""
+
+    kind: str  #: such as ``"machine"``, ``"model"``, ``"guard"`` or ``"checkpoint"``
+    version: int  #: of the format
+    library: str  #: version of evofsm that wrote it
+    settings: dict[str, Any]
+    provenance: dict[str, Any]  #: what it learnt from, as far as it was told
+
+
+# -- Writing --------------------------------------------------------------------------------------
+
+
+def write(
+    place: Place,
+    kind: Kind,
+    settings: Mapping[str, Any],
+    arrays: Mapping[str, NDArray[Any]],
+    provenance: Mapping[str, Any] | None = None,
+) -> None:
+    """Write a file as a whole or not at all; when this returns, it is on the disk.
+
+    Raises an OSError where it cannot be written (what was there before is then as it was), and a
+    ValueError or TypeError where no file of this kind may hold this.
+    """
+    if not isinstance(provenance, Mapping | None):
+        raise TypeError(f"provenance is {provenance!r}; it must be a mapping of names to values")
+    header = Header(kind.name, _VERSION, __version__, dict(settings), dict(provenance or {}))
+    parts = _packed(kind, header, arrays)
+    if not isinstance(place, str | os.PathLike):
+        place.writelines(parts)
+        return
+    with replacing(place) as file:
+        file.writelines(parts)
+        try:
+            read(file, kind)
+        except ValueError as error:
+            raise OSError(
+                f"{os.fspath(place)} was left as it was: what was written cannot be read: {error}"
+            ) from error
+
+
+def _packed(kind: Kind, header: Header, arrays: Mapping[str, NDArray[Any]]) -> list[Any]:
+    """The bytes of a file, one part after the other, if it may hold all of this."""
+    entries: dict[str, _Entry] = {}
+    begin = 0
+    for name, array in arrays.items():
+        if array.dtype not in _NAMES:
+            raise ValueError(f"{name} is of {array.dtype}, which no file may hold")
+        end = begin + array.nbytes
+        entries[name] = _Entry(_NAMES[array.dtype], list(array.shape), [begin, end])
+        begin = end
+    told = json.dumps(header._asdict())
+    _refuse_numbers(kind, arrays, _refuse_unfit(kind, json.loads(told)["settings"], entries))
+    index: dict[str, Any] = {name: entry._asdict() for name, entry in entries.items()}
+    encoded = json.dumps({"__metadata__": {"sha256": _UNSIGNED, "evofsm": told}, **index}).encode()
+    encoded += b" " * (-len(encoded) % 8)  # so that numbers begin at a multiple of eight
+    if len(encoded) > _LARGEST_HEADER or begin > _LARGEST_FILE:
+        raise ValueError(f"{kind.name} is too large for a file: more than {_LARGEST_FILE:,} bytes")
+    numbers = [np.ascontiguousarray(array).data for array in arrays.values()]
+    digest = _sha256(encoded, numbers).encode()
+    signed = encoded.replace(_UNSIGNED.encode(), digest, 1)
+    return [len(signed).to_bytes(8, "little"), signed, *numbers]
+
+
+def only_writer(file: BinaryIO, path: str | os.PathLike[str], otherwise: str) -> None:
+    """Lock a file against other processes, where the system can; it is unlocked as it is closed.
+
+    Raises
+    ------
+    ValueError
+        If another process has locked it; says what to do ``otherwise``.
+    """
+    with suppress(ModuleNotFoundError):  # Windows
+        import fcntl
+
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise ValueError(
+                f"{os.fspath(path)} is being written by another process; wait for its end, or "
+                f"{otherwise}"
+            ) from None
+
+
+def let_others_write(file: BinaryIO) -> None:
+    """Undo `only_writer`, also where a child of this process still has the file open."""
+    with suppress(ModuleNotFoundError):  # Windows
+        import fcntl
+
+        fcntl.flock(file, fcntl.LOCK_UN)
+
+
+@contextmanager
+def replacing(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
+    """A file, open for writing and reading, that takes its place once it is whole and on the disk.
+
+    Whoever else writes the same path has a file of its own until then: the last one to end stays. A
+    link is followed, and the mode of a file that was there is kept. Where it cannot be written, an
+    OSError names the file, and what was there before is as it was.
+    """
+    temporary = None
+    try:
+        target, mode = _place_of(path)
+        temporary = target.with_name(f".{target.name}.{secrets.token_hex(8)}.part")
+        opener = partial(os.open, mode=0o666 if mode is None else 0o600)
+        with open(temporary, "x+b", opener=opener) as file:
+            yield file
+            file.flush()
+            os.fsync(file.fileno())
+            if mode is not None:
+                os.chmod(temporary, mode)
+            if os.name == "nt":  # where an open file cannot be renamed
+                file.close()
+            os.replace(temporary, target)
+    except BaseException as error:
+        if isinstance(error, OSError) and error.errno is not None:
+            error.filename, error.filename2 = os.fspath(path), None
+        if temporary is not None:
+            with suppress(OSError):
+                temporary.unlink(missing_ok=True)
+        raise
+    # Not all systems can flush a folder; the file is whole, if not under its name, without it.
+    with suppress(OSError):
+        folder = os.open(target.parent, os.O_RDONLY)
+        try:
+            os.fsync(folder)
+        finally:
+            os.close(folder)
+
+
+def _place_of(path: str | os.PathLike[str]) -> tuple[Path, int | None]:
+    """Where a file is once links are followed, and its mode; None where there is none yet."""
+    given = Path(path)
+    if not given.parent.is_dir():
+        raise FileNotFoundError(f"{given}: there is no folder {given.parent}")
+    target = Path(os.path.realpath(given))
+    try:
+        mode = os.stat(given).st_mode
+    except FileNotFoundError:
+        return target, None
+    if not stat.S_ISREG(mode):
+        what = "a folder" if stat.S_ISDIR(mode) else "a device, a pipe or a socket"
+        raise OSError(f"{given} is {what}, which no file may take the place of")
+    return target, stat.S_IMODE(mode)
+
+
+def sweep(path: str | os.PathLike[str]) -> None:
+    """Remove what processes that were killed while they wrote a file have left beside it."""
+    target = Path(os.path.realpath(path))
+    pattern = re.compile(rf"\.{re.escape(target.name)}\.[0-9a-f]{{16}}\.part")
+    for beside in target.parent.iterdir():
+        with suppress(OSError):
+            if pattern.fullmatch(beside.name) and time.time() - beside.stat().st_mtime > _OLD:
+                beside.unlink()
+
+
+# -- Reading --------------------------------------------------------------------------------------
+
+
+def read_header(place: Place) -> Header:
+    """Read what a file says of itself; its numbers are neither read nor checked.
+
+    Parameters
+    ----------
+    place : path-like, or file open for reading bytes
+
+    Returns
+    -------
+    Header
+        Its kind, versions, settings and provenance.
+
+    Raises
+    ------
+    OSError
+        If there is no such file, or it may not be read.
+    ValueError
+        If it is no file of evofsm, or of a newer version.
+
+    Examples
+    --------
+    >>> from io import BytesIO
+    >>> from evofsm import EvolvingFSM
+    >>> file = BytesIO()
+    >>> EvolvingFSM(n_actions=2).save(file, provenance={"drive": "Monday"})
+    >>> header = read_header(file)
+    >>> header.kind, header.provenance
+    ('machine', {'drive': 'Monday'})
+    """
+    with _opened(place) as file, explained(place):
+        return _unpacked(file).header
+
+
+def read(place: Place, kind: Kind) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+    """Read a file of a kind: its settings and its arrays, all that the kind declares checked.
+
+    Raises an OSError where it cannot be read, and a ValueError where it holds something else, is
+    damaged or of a newer version; the message says which.
+    """
+    with _opened(place) as file:
+        with explained(place):
+            header, entries, encoded, sha256 = _unpacked(file)
+        if header.kind != kind.name:
+            raise ValueError(f"{_named(place)} holds a {header.kind}, not a {kind.name}")
+        with explained(place):
+            sizes = _refuse_unfit(kind, header.settings, entries)
+            arrays = {name: _read_array(file, entry) for name, entry in entries.items()}
+            unsigned = encoded.replace(sha256.encode(), _UNSIGNED.encode(), 1)
+            if _sha256(unsigned, [array.data for array in arrays.values()]) != sha256:
+                raise ValueError("its SHA-256 is another one: it was changed or damaged")
+            _refuse_numbers(kind, arrays, sizes)
+    return header.settings, arrays
+
+
+class _Entry(NamedTuple):
+    """An array in a file, by the names that safetensors gives."""
+
+    dtype: str
+    shape: list[int]
+    data_offsets: list[int]  #: behind the header [bytes]
+
+
+class _Unpacked(NamedTuple):
+    """The header of a file, and as it was written."""
+
+    header: Header
+    entries: dict[str, _Entry]
+    encoded: bytes
+    sha256: str
+
+
+def _unpacked(file: BinaryIO) -> _Unpacked:
+    """Read the header of an open file, which is then at the first number."""
+    size = file.seek(0, os.SEEK_END)
+    file.seek(0)
+    length = int.from_bytes(file.read(8), "little")
+    if not 2 <= length <= min(size - 8, _LARGEST_HEADER):
+        raise ValueError("it is another program's file, or was cut off")
+    encoded = file.read(length)
+    try:
+        index = json.loads(encoded)
+        metadata = index.pop("__metadata__")
+        told, sha256 = json.loads(metadata["evofsm"]), str(metadata["sha256"])
+        version = told["version"]
+    except (ValueError, LookupError, TypeError, AttributeError, RecursionError):
+        raise ValueError("it is another program's file, or its header is damaged") from None
+    if type(version) is int and version > _VERSION:
+        raise ValueError(
+            f"its version {version} is newer than this library's {_VERSION}; "
+            "a newer evofsm reads it"
+        )
+    header = Header(**told)
+    types = (str, int, str, dict, dict)
+    if tuple(map(type, header)) != types or not re.fullmatch("[a-z]{1,20}", header.kind):
+        raise ValueError("its header does not say what it holds")
+    entries, begin = {name: _Entry(**one) for name, one in index.items()}, 0
+    for name, entry in entries.items():
+        begin = _end_of(name, entry, begin)
+    if begin != size - 8 - length:
+        raise ValueError(f"its arrays claim {begin:,} bytes, but it has {size - 8 - length:,}")
+    return _Unpacked(header, entries, encoded, sha256)
+
+
+def _end_of(name: str, entry: _Entry, begin: int) -> int:
+    """Where an array ends that begins where the one before it ended, if it is as it claims."""
+    lengths = [*entry.shape, *entry.data_offsets]
+    if not re.fullmatch(r"[a-z][a-z0-9_]*", name) or entry.dtype not in _TYPES:
+        raise ValueError(f"{name[:60]!r} of {entry.dtype} is no array that a file may hold")
+    if any(type(length) is not int or length < 0 for length in lengths):
+        raise ValueError(f"{name} claims to be of shape {entry.shape}")
+    end = begin + math.prod(entry.shape) * np.dtype(_TYPES[entry.dtype]).itemsize
+    if entry.data_offsets != [begin, end]:
+        raise ValueError(f"{name} does not stand where it should")
+    return end
+
+
+def _read_array(file: BinaryIO, entry: _Entry) -> NDArray[Any]:
+    array: NDArray[Any] = np.empty(entry.shape, _TYPES[entry.dtype])
+    numbers: Any = array.reshape(-1).view(np.uint8)
+    if file.readinto(numbers.data) != array.nbytes:  # type: ignore[attr-defined]
+        raise EOFError("it ends early")
+    if array.dtype == np.bool_ and (numbers > 1).any():
+        raise ValueError("a boolean is neither true nor false")
+    return array
+
+
+def _sha256(header: bytes, numbers: Iterable[Any]) -> str:
+    digest = hashlib.sha256(header)
+    for one in numbers:
+        digest.update(one)
+    return digest.hexdigest()
+
+
+# -- What must agree ------------------------------------------------------------------------------
+
+
+def _refuse_unfit(
+    kind: Kind, settings: Mapping[str, Any], entries: Mapping[str, _Entry]
+) -> dict[int | str, int]:
+    """Raise for settings out of their range, or arrays whose names, types or shapes are others.
+
+    Returns the number that each name in a shape stands for.
+    """
+    sizes: dict[int | str, int] = {}
+    _refuse_settings(settings, kind.settings, sizes)
+    if kind.arrays is None:
+        return sizes
+    if lacking := set(kind.arrays) - set(entries):
+        raise ValueError(f"it lacks {', '.join(sorted(lacking))}")
+    if unknown := set(entries) - set(kind.arrays):
+        raise ValueError(f"it has {', '.join(sorted(unknown))}, which no {kind.name} has")
+    for name, numbers in kind.arrays.items():
+        expected = _NAMES[np.dtype(numbers.dtype)]
+        if entries[name].dtype != expected:
+            raise ValueError(f"{name} is of type {entries[name].dtype}, not {expected}")
+        numbers.refuse_shape(name, tuple(entries[name].shape), sizes)
+    return sizes
+
+
+def _refuse_numbers(
+    kind: Kind, arrays: Mapping[str, NDArray[Any]], sizes: dict[int | str, int]
+) -> None:
+    for name, numbers in (kind.arrays or {}).items():
+        numbers.refuse_others(name, arrays[name], sizes)
+
+
+def _refuse_settings(
+    settings: Mapping[str, Any],
+    declared: Mapping[str, Any],
+    sizes: dict[int | str, int],
+    within: str = "",
+) -> None:
+    for name, numbers in declared.items():
+        value, full_name = settings.get(name), f"{within}{name}"
+        if not isinstance(numbers, Numbers):
+            if not isinstance(value, Mapping | None):
+                raise ValueError(f"{full_name} is {value!r}; it must be a mapping")
+            _refuse_settings(value or {}, numbers, sizes, f"{full_name}.")
+        elif value is not None:
+            numbers.refuse_others(full_name, value, sizes)
+            if numbers.whole and numbers.shape == ():
+                sizes[f"settings.{full_name}"] = int(value)
+        elif not numbers.optional:
+            raise ValueError(f"it lacks {full_name}")
+
+
+# -- Errors ---------------------------------------------------------------------------------------
+
+
+@contextmanager
+def explained(place: Place) -> Iterator[None]:
+    """Turn whatever reading a damaged file runs into into one error that names the file."""
+    try:
+        yield
+    except _DAMAGE as error:
+        why = str(error)
+        why = why if len(why) <= _MOST_SAID else f"{why[:_MOST_SAID]} ..."
+        raise ValueError(f"{_named(place)} cannot be read as an evofsm file: {why}") from error
+
+
+def _opened(place: Place) -> AbstractContextManager[BinaryIO]:
+    if isinstance(place, str | os.PathLike):
+        return open(place, "rb")
+    return nullcontext(place)
+
+
+def _named(place: Place) -> str:
+    return os.fspath(place) if isinstance(place, str | os.PathLike) else "what was given"

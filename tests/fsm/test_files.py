@@ -1,0 +1,175 @@
+import io
+import re
+from dataclasses import fields
+
+import numpy as np
+import pytest
+
+from evofsm.fsm.actions import IntervalActions
+from evofsm.fsm.crowding import WhenFull
+from evofsm.fsm.machine import EvolvingFSM
+from evofsm.fsm.model import FSMModel
+from evofsm.fsm.states.failure import FailureSplit
+from evofsm.fsm.states.novelty import Novelty
+from evofsm.fsm.states.paper import Paper
+
+
+def full_model(grown):
+    return grown.model(
+        actions=IntervalActions(-0.5, 1.0, 0.5, closed="right", outside="clip"),
+        names=("gap", "speed"),
+        units=("m", "m/s"),
+        dt=0.01,
+    )
+
+
+SITUATIONS = {
+    "new": lambda machine: EvolvingFSM(n_actions=3, radius=0.01),
+    "with an action pending": lambda machine: machine,
+    "without an action": lambda machine: machine.observe([0.1, 0.1]),
+    "between episodes": lambda machine: machine.start_episode(),
+}
+
+
+@pytest.mark.parametrize("situation", SITUATIONS.values(), ids=SITUATIONS.keys())
+def test_a_loaded_machine_goes_on_bit_for_bit(situation, grown, spiral, snapshot, tmp_path):
+    new = situation(grown)
+    machine = new if isinstance(new, EvolvingFSM) else grown
+    twin = machine.copy()
+    machine.save(tmp_path / "machine")
+    loaded = EvolvingFSM.load(tmp_path / "machine")
+    assert repr(loaded) == repr(machine)
+    Z, I = spiral(100)[::-1], np.arange(100) % 3
+    traces = [m.learn_many(Z, I, belief=True) for m in (machine, loaded, twin)]
+    for a, *others in zip(*traces, strict=True):
+        assert {b.tobytes() for b in others} == {a.tobytes()}
+    assert snapshot(loaded) == snapshot(machine) == snapshot(twin)
+
+
+@pytest.mark.parametrize("make", [full_model, EvolvingFSM.model, lambda _: EvolvingFSM(2).model()])
+def test_a_loaded_model_has_every_field_of_the_saved_one(make, grown, tmp_path):
+    model = make(grown)
+    model.save(tmp_path / "model")
+    loaded = FSMModel.load(tmp_path / "model")
+    for field in fields(FSMModel):
+        value, expected = getattr(loaded, field.name), getattr(model, field.name)
+        if isinstance(expected, np.ndarray):
+            assert (value.shape, value.tobytes()) == (expected.shape, expected.tobytes())
+            assert not value.flags.writeable
+        else:
+            assert value == expected
+            assert type(value) is type(expected) or field.name == "width"
+
+
+def test_a_machines_file_is_no_models_and_the_reverse(grown, tmp_path):
+    grown.save(tmp_path / "file")
+    with pytest.raises(ValueError, match="holds a machine, not a model"):
+        FSMModel.load(tmp_path / "file")
+    grown.model().save(tmp_path / "file")
+    with pytest.raises(ValueError, match="holds a model, not a machine"):
+        EvolvingFSM.load(tmp_path / "file")
+
+
+def test_numbers_of_every_size_are_kept_and_read_again(snapshot, tmp_path):
+    """What can be learnt can be kept: whatever the observations, the rule, and who is given up."""
+    random = np.random.default_rng(0)
+    sizes = (0.0, 5e-324, 1e-200, 1e-9, 1.0, 1e9, 1e100)
+    machines = [
+        EvolvingFSM(2, max_states=3, rule=Novelty(1.0, (1e-20, 1e20))),
+        EvolvingFSM(2, max_states=3, when_full=WhenFull.RETIRE, rule=Novelty(2.0)),
+        EvolvingFSM(2, radius=1e-9, distance_weight=1e50, prior_frequency=1e50),
+        EvolvingFSM(2, radius=1e100, spread=1e100, prior_frequency=1e-300),
+        EvolvingFSM(2, rule=Paper(memory=2), belief_tolerance=1e-3, learning_rate=0.999),
+        EvolvingFSM(2, rule=FailureSplit(Novelty(2.0), distance=1e-3), failure_horizon=2),
+    ]
+    for machine in machines:
+        for _ in range(2):
+            Z = random.choice(sizes, (60, 2)) * random.uniform(-1.0, 1.0, (60, 2))
+            machine.learn_many(Z, random.integers(-1, 2, 60), [7, 31], failures=[6, 59])
+            machine.save(tmp_path / "machine")
+            assert snapshot(EvolvingFSM.load(tmp_path / "machine")) == snapshot(machine)
+            machine.model().save(tmp_path / "model")
+            FSMModel.load(tmp_path / "model")
+
+
+MACHINES = [
+    ("n_states", 1e6, "n_states is 1e"),
+    ("n_states", -3.0, "n_states of -3"),
+    ("n_states", 0.5, "n_states holds a fraction"),
+    ("action", 1e9, "action is 1e"),
+    ("action", 0.5, "action holds a fraction"),
+    ("before", 1e9, "before is 1e"),
+    ("places", 7.0, "places"),
+    ("belief", np.nan, "belief of nan"),
+    ("belief", 0.5, "belief is no distribution"),
+    ("matrices", 7.0, "a row of matrices is no distribution"),
+    ("scatter", -1.0, "scatter of -1"),
+    ("centers", 1e308, r"centers of 1e\+308"),
+    ("visits", -1.0, "visits of -1"),
+    ("failures", 1e9, "failures cannot be more than decisions"),
+    ("radius", 1e308, r"radius of 1e\+308"),
+    ("n_actions", None, "lacks n_actions"),
+    ("n_actions", [], "n_actions has shape"),
+    ("n_actions", 10**6, r"has shape \(3,\), not \(1000000,\)"),
+    ("max_states", 0.5, "max_states of 0.5"),
+    ("learning_rate", 1.0, "learning_rate of 1"),
+    ("spread", "wide", "spread is 'wide'; it must be a number"),
+    ("radius", True, "radius is True; it must be a number"),
+    ("gain", 2.0, "gain"),
+    ("failures_told", "no", "failures_told is 'no'"),
+    ("rule", {"name": "magic"}, "no state rule 'magic', only paper, edges"),
+    ("rule", {}, "name"),
+    ("rule", None, "rule"),
+    ("rule", {"name": "novelty", "gain": 1.0}, "gain"),
+    ("rule", {"name": "novelty", "radius": -1.0}, "rule.radius of -1"),
+    ("rule", {"name": "novelty", "scales": [1e308, 1.0]}, r"rule.scales of 1e\+308"),
+    ("rule", {"name": "novelty", "scales": [1.0]}, "scales"),
+    (
+        "rule",
+        {"name": "failure", "base": {"name": "novelty", "spread": 1e308}},
+        r"rule.base.spread of 1e\+308",
+    ),
+]
+
+
+@pytest.mark.parametrize(("name", "value", "words"), MACHINES)
+def test_a_machine_that_no_learning_could_have_left_is_refused(
+    grown, forge, tmp_path, name, value, words
+):
+    path = tmp_path / "machine"
+    grown.save(path)
+    forge(path, {name: value})
+    with pytest.raises(ValueError, match=f"{path}.*{words}"):
+        EvolvingFSM.load(path)
+
+
+MODELS = [
+    ("transition_matrices", np.nan, "transition_matrices of nan"),
+    ("visits", -1.0, "visits of -1"),
+    ("centers", -1e308, r"centers of -1e\+308"),
+    ("width", np.nan, "width of nan"),
+    ("width", -1.0, "width of -1"),
+    ("dt", 1e308, r"dt of 1e\+308"),
+    ("settings", {"spread": 1e308}, r"settings.spread of 1e\+308"),
+    ("settings", {"failure_horizon": 0.5}, "settings.failure_horizon of 0.5"),
+    ("actions", {"low": -1e308, "high": 0.0, "width": 1e308}, "actions.low of -1e"),
+    ("actions", {"low": -0.5, "high": 1.0, "width": 1e-12}, "more than 3 intervals"),
+    ("names", ["gap"], r"names are \('gap',\), but there are 2 variables"),
+]
+
+
+@pytest.mark.parametrize(("name", "value", "words"), MODELS)
+def test_a_model_that_no_learning_could_have_left_is_refused(
+    grown, forge, tmp_path, name, value, words
+):
+    path = tmp_path / "model"
+    full_model(grown).save(path)
+    forge(path, {name: value})
+    with pytest.raises(ValueError, match=f"{re.escape(str(path))}.*{words}"):
+        FSMModel.load(path)
+
+
+def test_an_open_file_will_do_in_place_of_a_name(grown, snapshot):
+    file = io.BytesIO()
+    grown.save(file)
+    assert snapshot(EvolvingFSM.load(file)) == snapshot(grown)

@@ -1,0 +1,426 @@
+import io
+import json
+import os
+import resource
+import signal
+import stat
+import sys
+import threading
+import time
+import tracemalloc
+
+import numpy as np
+import pytest
+
+from evofsm import __version__, store
+from evofsm.store import COUNT, FLAG, SHARE, SIZE, Kind, Numbers
+
+DRAWS = Kind(
+    "draws",
+    {
+        "values": Numbers(("n", "m")),
+        "ranks": Numbers(("n",), 0.0, 100.0, dtype=np.int64),
+        "chosen": Numbers(("n",), dtype=np.bool_),
+        "shares": SHARE.of("settings.n_kinds"),
+        "note": Numbers(("note",), dtype=np.uint8),
+    },
+    {
+        "n_kinds": COUNT,
+        "scale": SIZE._replace(optional=True),
+        "ends": Numbers(("m",), optional=True),
+        "rule": {"width": SIZE._replace(optional=True)},
+    },
+)
+SETTINGS = {"n_kinds": 2, "scale": 0.5, "ends": [0.0, 1.0], "rule": {"width": 3}, "name": "0" * 64}
+
+
+def arrays(n=5):
+    return {
+        "values": np.arange(2.0 * n).reshape(n, 2) / 7.0,
+        "ranks": np.arange(n),
+        "chosen": np.arange(n) % 2 == 0,
+        "shares": np.array([0.25, 0.75]),
+        "note": np.frombuffer(b"once", np.uint8),
+    }
+
+
+def write(place, **others):
+    store.write(place, DRAWS, {**SETTINGS, **others}, arrays())
+
+
+@pytest.fixture
+def whole():
+    file = io.BytesIO()
+    write(file)
+    return file.getvalue()
+
+
+def read(data):
+    return store.read(io.BytesIO(data), DRAWS)
+
+
+# -- What is written is read ---------------------------------------------------------------------
+
+
+def test_what_was_written_is_read_again_bit_for_bit(tmp_path):
+    for place in (tmp_path / "file", str(tmp_path / "file"), io.BytesIO()):
+        write(place)
+        settings, found = store.read(place, DRAWS)
+        assert settings == SETTINGS
+        for name, array in arrays().items():
+            assert (found[name].dtype, found[name].shape) == (array.dtype, array.shape)
+            assert found[name].tobytes() == array.tobytes()
+
+
+def test_a_file_says_what_it_holds_who_wrote_it_and_what_it_learnt_from(tmp_path):
+    provenance = {"files": [{"name": "drive.csv", "bytes": 12}], "rows": 40}
+    store.write(tmp_path / "file", DRAWS, SETTINGS, arrays(), provenance)
+    header = store.read_header(tmp_path / "file")
+    assert header == ("draws", 1, __version__, SETTINGS, provenance)
+
+
+@pytest.mark.parametrize("provenance", ["drive 7", ["drive 7"], 7])
+def test_a_provenance_that_is_no_mapping_is_named(provenance, tmp_path):
+    with pytest.raises(TypeError, match=r"provenance is .*; it must be a mapping"):
+        store.write(tmp_path / "file", DRAWS, SETTINGS, arrays(), provenance)
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_libraries_of_safetensors_can_read_a_file(whole):
+    length = int.from_bytes(whole[:8], "little")
+    header, numbers = json.loads(whole[8 : 8 + length]), whole[8 + length :]
+    assert all(isinstance(text, str) for text in header.pop("__metadata__").values())
+    begin, end = header["values"]["data_offsets"]
+    assert header["values"]["dtype"] == "F64"
+    values = np.frombuffer(numbers[begin:end]).reshape(header["values"]["shape"])
+    assert np.array_equal(values, arrays()["values"])
+    assert sum(len(numbers[slice(*one["data_offsets"])]) for one in header.values()) == len(numbers)
+    assert (8 + length) % 8 == 0
+
+
+@pytest.mark.parametrize(
+    ("settings", "wrong", "words"),
+    [
+        ({}, {"more": np.zeros(1)}, "it has more, which no draws has"),
+        ({}, {"ranks": np.zeros(5)}, "ranks is of type F64, not I64"),
+        ({}, {"ranks": np.arange(6)}, r"ranks has shape \(6,\), not \(5,\), as others say"),
+        ({}, {"ranks": np.arange(5) - 1}, "ranks of -1 cannot be right"),
+        ({}, {"values": np.zeros((5, 2), object)}, "values is of object"),
+        ({}, {"values": np.full((5, 2), np.nan)}, "values of nan"),
+        ({}, {"values": np.full((5, 2), np.inf)}, "values of inf"),
+        ({"n_kinds": -2}, {}, "n_kinds of -2"),
+        ({"n_kinds": None}, {}, "lacks n_kinds"),
+        ({"scale": [0.5]}, {}, "scale has shape"),
+    ],
+)
+def test_what_could_not_be_read_again_is_not_written(settings, wrong, words, tmp_path):
+    with pytest.raises(ValueError, match=words):
+        store.write(tmp_path / "file", DRAWS, SETTINGS | settings, arrays() | wrong)
+    assert not list(tmp_path.iterdir())
+
+
+# -- Files that are damaged, or made to do harm ----------------------------------------------------
+
+
+def test_a_file_cut_off_anywhere_is_refused(whole, tmp_path):
+    path = tmp_path / "cut"
+    for length in range(len(whole)):
+        path.write_bytes(whole[:length])
+        with pytest.raises(ValueError, match=f"{path} cannot be read as an evofsm file"):
+            store.read(path, DRAWS)
+
+
+def test_a_file_with_one_bit_flipped_anywhere_is_refused(whole):
+    for place in range(len(whole)):
+        damaged = bytearray(whole)
+        damaged[place] ^= 1 << place % 8
+        with pytest.raises(ValueError, match="what was given"):
+            read(damaged)
+
+
+@pytest.mark.parametrize(
+    "content",
+    [b"", b"evofsm", b"\x93NUMPY\x01\x00", b"PK\x03\x04" + bytes(200), bytes(1000), b"\xff" * 1000]
+    + [len(one).to_bytes(8, "little") + one for one in (b"[]", b"{}", b"[" * 100_000, b"null")],
+)
+def test_any_other_file_is_refused_by_name(content, tmp_path):
+    (tmp_path / "other").write_bytes(content)
+    for attempt in (store.read_header, lambda path: store.read(path, DRAWS)):
+        with pytest.raises(ValueError, match=f"{tmp_path / 'other'} .*another program's file"):
+            attempt(tmp_path / "other")
+
+
+def test_a_file_of_another_kind_is_named(tmp_path):
+    write(tmp_path / "file")
+    with pytest.raises(ValueError, match=f"{tmp_path / 'file'} holds a draws, not a machine"):
+        store.read(tmp_path / "file", Kind("machine", {}))
+
+
+def test_a_missing_file_and_a_missing_folder_are_named(tmp_path):
+    with pytest.raises(FileNotFoundError, match="missing"):
+        store.read(tmp_path / "missing", DRAWS)
+    with pytest.raises(FileNotFoundError, match=f"there is no folder {tmp_path / 'missing'}"):
+        write(tmp_path / "missing" / "file")
+
+
+def header_with(**others):
+    return lambda told, entries, _: told.update(others)
+
+
+def settings_with(**others):
+    return lambda told, entries, _: told["settings"].update(others)
+
+
+def array_with(name, **others):
+    return lambda told, entries, _: entries[name].update(others)
+
+
+def claim_much(told, entries, _):
+    """A consistent header of terabytes."""
+    end, more = entries["values"]["data_offsets"][1], 1 << 44
+    entries["values"]["shape"][0] += more // 16
+    for entry in entries.values():
+        entry["data_offsets"] = [at + more * (at >= end) for at in entry["data_offsets"]]
+
+
+HARMFUL = {
+    "newer": (header_with(version=2), "version 2 is newer than this library's 1; a newer evofsm"),
+    "no version": (header_with(version=None), "does not say what it holds"),
+    "no kind": (header_with(kind=7), "does not say what it holds"),
+    "odd kind": (header_with(kind="../draws"), "does not say what it holds"),
+    "settings of none": (header_with(settings=None), "does not say what it holds"),
+    "settings in a list": (header_with(settings=[]), "does not say what it holds"),
+    "more in the header": (header_with(pickle="cos"), "pickle"),
+    "null": (settings_with(n_kinds=None), "lacks n_kinds"),
+    "an empty list": (settings_with(n_kinds=[]), r"n_kinds has shape \(0,\)"),
+    "negative": (settings_with(n_kinds=-1), "n_kinds of -1 cannot be right"),
+    "a fraction": (settings_with(n_kinds=2.5), "n_kinds holds a fraction"),
+    "huge": (settings_with(n_kinds=10**400), "n_kinds is 1000"),
+    "more kinds": (settings_with(n_kinds=3), r"shares has shape \(2,\), not \(3,\)"),
+    "true": (settings_with(scale=True), "scale is True; it must be a number"),
+    "text": (settings_with(scale="wide"), "scale is 'wide'; it must be a number"),
+    "NaN": (settings_with(scale=float("nan")), "scale of nan"),
+    "too few ends": (settings_with(ends=[1.0]), r"values has shape \(5, 2\), not \(5, 1\)"),
+    "a rule of none": (settings_with(rule=[]), r"rule is \[\]; it must be a mapping"),
+    "an odd rule": (settings_with(rule={"width": -1.0}), "rule.width of -1"),
+    "a lost array": (lambda told, entries, _: entries.pop("note"), "claim .* bytes, but it has"),
+    "another type": (array_with("values", dtype="I64"), "values is of type I64, not F64"),
+    "an unknown type": (array_with("values", dtype="F32"), "of F32 is no array that a file may"),
+    "an object": (array_with("values", dtype="O"), "of O is no array that a file may hold"),
+    "too large": (
+        array_with("values", shape=[1 << 60, 2]),
+        "values does not stand where",
+    ),
+    "far too large": (array_with("values", shape=[1 << 60] * 9), "values does not stand where"),
+    "too small": (array_with("values", shape=[1, 2]), "values does not stand where"),
+    "negative sizes": (array_with("values", shape=[-5, -2]), r"claims to be of shape \[-5, -2\]"),
+    "no shape": (array_with("values", shape=None), "cannot be read"),
+    "fractional sizes": (array_with("values", shape=[5.0, 2.0]), "claims to be of shape"),
+    "turned": (array_with("values", shape=[2, 5]), "shape"),
+    "overlapping": (array_with("ranks", data_offsets=[0, 40]), "ranks does not stand where"),
+    "beyond the end": (array_with("note", data_offsets=[0, 1 << 60]), "note does not stand"),
+    "without end": (array_with("note", data_offsets=[]), "note does not stand"),
+    "one more array": (
+        lambda told, entries, _: entries.update(extra=entries["note"] | {"shape": [0]}),
+        "extra does not stand where it should",
+    ),
+    "a path": (lambda told, entries, _: entries.update({"../x": entries.pop("note")}), "'../x'"),
+    "more than is there": (claim_much, "claim 17,592.* but it has"),
+}
+
+
+@pytest.mark.parametrize(("change", "words"), HARMFUL.values(), ids=HARMFUL.keys())
+def test_a_forged_file_is_refused_before_anything_is_allocated(change, words, forge, tmp_path):
+    path = tmp_path / "forged"
+    write(path)
+    forge(path, change)
+    tracemalloc.start()
+    began = time.process_time()
+    with pytest.raises(ValueError, match=words) as raised:
+        store.read(path, DRAWS)
+    seconds, peak = time.process_time() - began, tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert str(path) in str(raised.value)
+    assert seconds < 0.5
+    assert peak < 1 << 23
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "words"),
+    [
+        ("values", np.nan, "values of nan"),
+        ("ranks", -1, "ranks of -1"),
+        (
+            "ranks",
+            1 << 40,
+            r"ranks of 1\.09951e\+12 cannot be right: it must lie between 0",
+        ),
+        ("shares", 1.5, "shares of 1.5"),
+    ],
+)
+def test_numbers_that_are_out_of_their_range_are_refused(name, value, words, forge, tmp_path):
+    write(tmp_path / "file")
+    forge(tmp_path / "file", {name: value})
+    with pytest.raises(ValueError, match=words):
+        store.read(tmp_path / "file", DRAWS)
+
+
+def test_a_boolean_that_is_neither_true_nor_false_is_refused(forge, tmp_path):
+    def change(told, entries, numbers):
+        numbers[entries["chosen"]["data_offsets"][0]] = 2
+
+    write(tmp_path / "file")
+    forge(tmp_path / "file", change)
+    with pytest.raises(ValueError, match="neither true nor false"):
+        store.read(tmp_path / "file", DRAWS)
+
+
+def test_a_range_holds_its_ends_and_no_fraction_where_it_is_of_integers():
+    for number in (0.0, 1.0, [0.0, 1.0]):
+        FLAG.of(*np.shape(number)).refuse_others("flag", number)
+    for number in (-5e-324, 1.0000001, np.nan, 0.5):
+        with pytest.raises(ValueError, match="flag"):
+            FLAG.refuse_others("flag", number)
+
+
+# -- On the disk -----------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def full_disk():
+    """No file may grow beyond 100 bytes, which the system reports like a full disk."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100, hard))
+    yield
+    resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    signal.signal(signal.SIGXFSZ, handler)
+
+
+@pytest.mark.parametrize("old", [None, b"what was there before"])
+def test_a_full_disk_leaves_the_folder_as_it_was_and_names_the_file(old, full_disk, tmp_path):
+    path = tmp_path / "file"
+    if old is not None:
+        path.write_bytes(old)
+    try:
+        raise KeyboardInterrupt
+    except KeyboardInterrupt:  # who saves on Ctrl-C is told of the disk
+        with pytest.raises(OSError, match="File too large") as raised:
+            write(path)
+    assert raised.value.filename == str(path)
+    assert [one.read_bytes() for one in tmp_path.iterdir()] == ([] if old is None else [old])
+
+
+def test_a_file_and_its_name_are_on_the_disk_when_writing_returns(tmp_path, monkeypatch):
+    flushed = []
+
+    def fsync(descriptor):
+        flushed.append(stat.S_ISDIR(os.fstat(descriptor).st_mode))
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    write(tmp_path / "file")
+    assert flushed == [False, True]
+
+
+def test_what_cannot_be_read_again_takes_no_place(tmp_path, monkeypatch):
+    write(tmp_path / "file")
+    before, packed = (tmp_path / "file").read_bytes(), store._packed
+    monkeypatch.setattr(store, "_packed", lambda *given: [*packed(*given)[:-1], b"last"])
+    with pytest.raises(OSError, match=f"{tmp_path / 'file'} was left as it was"):
+        write(tmp_path / "file")
+    assert [one.read_bytes() for one in tmp_path.iterdir()] == [before]
+
+
+def test_an_interrupt_anywhere_in_a_write_is_an_interrupt_and_leaves_a_whole_file(tmp_path):
+    path = tmp_path / "file"
+    write(path)
+
+    def stop_at(line):
+        """Write, interrupted at a line; answers whether it came so far."""
+        lines = 0
+
+        def trace(frame, event, _):
+            nonlocal lines
+            if frame.f_code.co_filename != store.__file__:
+                return None
+            lines += event == "line"
+            if lines == line and event == "line":
+                sys.settrace(None)
+                raise KeyboardInterrupt
+            return trace
+
+        before = sys.gettrace()
+        sys.settrace(trace)
+        try:
+            write(path)
+        except KeyboardInterrupt:
+            return True
+        finally:
+            sys.settrace(before)
+        return False
+
+    line = 1
+    while stop_at(line):
+        line += 5
+        assert [one.name for one in tmp_path.iterdir()] == ["file"]
+        store.read(path, DRAWS)
+    assert line > 100
+
+
+def test_what_a_killed_process_left_behind_is_swept_and_what_is_being_written_is_not(tmp_path):
+    path = tmp_path / "file"
+    left = tmp_path / ".file.0123456789abcdef.part"
+    others = [tmp_path / ".file.7.part", tmp_path / ".other.0123456789abcdef.part"]
+    for one in (left, *others):
+        one.touch()
+        os.utime(one, (0.0, time.time() - 3600.0))
+    with store.replacing(path) as file:
+        store.sweep(path)
+        assert sorted(tmp_path.iterdir()) == sorted([tmp_path / file.name, *others])
+        file.write(b"whole")
+    assert sorted(tmp_path.iterdir()) == sorted([path, *others])
+
+
+def test_threads_that_write_one_path_leave_it_whole_at_every_moment(tmp_path):
+    write(tmp_path / "file")
+    threads = [
+        threading.Thread(target=lambda: [write(tmp_path / "file") for _ in range(30)])
+        for _ in range(2)
+    ]
+    for thread in threads:
+        thread.start()
+    while any(thread.is_alive() for thread in threads):
+        store.read(tmp_path / "file", DRAWS)
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+def test_a_file_keeps_its_mode_and_a_new_one_has_that_of_any_other(tmp_path):
+    (tmp_path / "other").touch()
+    write(tmp_path / "file")
+    assert (tmp_path / "file").stat().st_mode == (tmp_path / "other").stat().st_mode
+    for mode in (0o600, 0o640, 0o444):
+        (tmp_path / "file").chmod(mode)
+        write(tmp_path / "file")
+        assert stat.S_IMODE((tmp_path / "file").stat().st_mode) == mode
+
+
+def test_a_link_stays_and_what_it_leads_to_is_replaced(tmp_path):
+    (tmp_path / "far").mkdir()
+    link, target = tmp_path / "link", tmp_path / "far" / "file"
+    link.symlink_to(target)
+    for _ in range(2):  # where there is nothing yet, and where there is
+        write(link)
+        assert link.is_symlink()
+        assert store.read_header(target).kind == "draws"
+    assert sorted(tmp_path.rglob("*")) == sorted([link, target, target.parent])
+
+
+def test_what_is_no_file_is_left_alone(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "device").symlink_to("/dev/null")
+    for name in ("pipe", "device"):
+        with pytest.raises(OSError, match=f"{name} is a device, a pipe"):
+            write(tmp_path / name)
+    with pytest.raises(OSError, match="is a folder"):
+        write(tmp_path)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["device", "pipe"]
