@@ -91,7 +91,7 @@ def write_log(path: Path, rows: int) -> None:
     import polars
 
     from evofsm.driving.world import KinematicWorld
-    from evofsm.paper.settings import Settings
+    from evofsm.paper.runs import Settings
 
     settings = Settings.load()
     world = KinematicWorld()

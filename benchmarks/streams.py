@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from evofsm.driving.world import KinematicWorld
 from evofsm.fsm.states.novelty import Novelty
-from evofsm.paper.settings import Settings
+from evofsm.paper.runs import Settings
 
 # One state for each point of a lattice of edge 1: observations scatter by less than half the
 # radius around a point, and points lie farther apart than the radius.

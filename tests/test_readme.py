@@ -54,10 +54,7 @@ def test_the_closed_loop_table_is_what_the_study_printed(page):
 
 
 def test_the_bold_row_is_rebuilt_in_ten_lines():
-    from studies.closed_loop.plan import Plan
-    from studies.closed_loop.study import _test_learner
-
-    from evofsm.driving import load_family
+    from studies.closed_loop import OURS, ClosedLoop, _test_learner
 
     blocks = re.findall(r"```pycon\n(.*?)```", README, re.DOTALL)
     (block,) = [block for block in blocks if "try_out(" in block]
@@ -66,8 +63,7 @@ def test_the_bold_row_is_rebuilt_in_ten_lines():
     few = "\n".join(lines).replace("episodes=20", "episodes=4")
     names = {}
     exec(few.replace("learning_seed=0", "learning_seed=1"), names)
-    plan = Plan(train=4, test=4)
-    (row,) = _test_learner(load_family("emergency"), plan, 1)["rows"]
+    (row,) = _test_learner(ClosedLoop(train=4, test=4), OURS, 1)["rows"]
     ours = names["row"]
     assert ours.collisions == row.collisions == 0
     assert sum(drive.collided for drive in names["drives"]) == row.train_collisions == 0

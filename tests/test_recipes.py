@@ -79,20 +79,3 @@ def test_a_family(tmp_path):
     write("Add a family, or a world", tmp_path)
     said = python(tmp_path, "-m", "evofsm", "drive", "mine.py", "--episodes", 3)
     assert "mine, 3 training episodes" in said
-
-
-@pytest.mark.slow
-def test_a_study(tmp_path):
-    pytest.importorskip("typer")
-    pytest.importorskip("matplotlib")
-    write("Add a study", tmp_path)
-    run = (
-        "from studies.studies import STUDIES\n"
-        "from plan import Plan\n"
-        "STUDIES[Plan.id] = Plan\n"
-        "from studies.__main__ import application\n"
-        "application()(['coin', '--short', '--throws', '5', '--out', 'out'])"
-    )
-    said = python(tmp_path, "-c", run)
-    assert "of the throws are heads" in said
-    assert {path.suffix for path in (tmp_path / "out").iterdir()} >= {".html", ".json"}

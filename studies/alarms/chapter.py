@@ -6,15 +6,15 @@ from collections.abc import Iterator
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from evofsm import plot
 from evofsm.cli import Column, Table, count, listed, percent, percents, seeds_text
-from evofsm.paper.report.asked import Asked, failures, tables_of_asked
-from evofsm.paper.report.chapter import Chapter, Source
-from evofsm.paper.report.drawing import Sketch
-from evofsm.paper.report.html import Setting
 from studies.alarms.amounts import Amounts, Errors
 from studies.alarms.study import ADAPTIVE, DELAY, FIXED, Found, Row
 from studies.alarms.windows import LENGTH
+from studies.old import plot
+from studies.old.asked import Asked, failures, tables_of_asked
+from studies.old.chapter import Chapter, Source
+from studies.old.drawing import Sketch
+from studies.old.html import Setting
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

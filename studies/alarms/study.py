@@ -19,10 +19,10 @@ from numpy.typing import NDArray
 
 from evofsm.fleet import in_order
 from evofsm.guard import ConformalAlarm
-from evofsm.paper.frame import Frame, Progress, silent
 from studies.alarms.amounts import Amounts, Errors
 from studies.alarms.windows import Windows, stages
-from studies.scores import bootstrap, share_of
+from studies.old.frame import Frame, Progress, silent
+from studies.old.scores import bootstrap, share_of
 
 #: Kinds of alarms: a threshold that adapts, and one that is chosen once.
 ADAPTIVE, FIXED = "adaptive", "fixed"

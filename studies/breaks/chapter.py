@@ -7,14 +7,14 @@ from collections.abc import Callable, Iterator
 
 from evofsm.cli import NONE, Column, Table, bare_percent, count, listed, number
 from evofsm.fsm import outward, two_digits
-from evofsm.paper.report.asked import failures, tables_of_asked
-from evofsm.paper.report.chapter import Chapter, Section, Source
-from evofsm.paper.report.html import Setting
 from studies.breaks.amounts import NOBODY, TOY
 from studies.breaks.cases import FoundCase, odds
 from studies.breaks.figures import sketches
 from studies.breaks.study import SEEN, Breaks, Row
 from studies.breaks.targets import claims
+from studies.old.asked import failures, tables_of_asked
+from studies.old.chapter import Chapter, Section, Source
+from studies.old.html import Setting
 
 
 def tell(found: Breaks) -> Chapter:

@@ -7,10 +7,10 @@ from collections.abc import Iterator
 from functools import partial
 from typing import TYPE_CHECKING
 
-from evofsm import plot
-from evofsm.paper.report.drawing import Sketch
 from studies.breaks.amounts import TOY
 from studies.breaks.study import Breaks
+from studies.old import plot
+from studies.old.drawing import Sketch
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

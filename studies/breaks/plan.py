@@ -6,13 +6,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from evofsm.paper.frame import Progress, silent
-from evofsm.paper.study import Study
 from studies.breaks.amounts import Amounts
+from studies.old.frame import Progress, silent
+from studies.old.study import Study
 
 if TYPE_CHECKING:
-    from evofsm.paper.report.chapter import Chapter
     from studies.breaks.study import Breaks
+    from studies.old.chapter import Chapter
 
 
 @dataclass(frozen=True)

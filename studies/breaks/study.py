@@ -16,11 +16,11 @@ import numpy as np
 
 from evofsm.extras import needs
 from evofsm.fleet import in_order
-from evofsm.paper.frame import Frame, Progress, silent
 from studies.breaks.amounts import NOBODY, TOY, Amounts
 from studies.breaks.cases import FoundCase, found_case, ordinary
 from studies.breaks.splitting import Amount, Case, Split, plain, split
 from studies.breaks.subjects import KNOWN, Subject, check_learnt, load, subject_of
+from studies.old.frame import Frame, Progress, silent
 
 with needs("scipy", "study", "the study"):
     from scipy.stats import binomtest

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from evofsm.paper.report.asked import Asked
 from studies.breaks.study import Breaks
+from studies.old.asked import Asked
 
 
 def claims(found: Breaks) -> Iterator[Asked]:

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from typing import ClassVar, Self
 
 from evofsm.cli import option, split_names
-from studies.own_measure import ABOUT
+from studies.old.own_measure import ABOUT
 
 #: What is judged if nothing else is asked for; see `studies.detection.worlds.world`.
 FAMILIES = (

@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from evofsm import plot
-from evofsm.paper.report.drawing import Sketch
-from studies.closed_loop.calibration import Reliability
+from studies.detection.calibration import Reliability
 from studies.detection.measures import Ours
 from studies.detection.rows import Row
 from studies.detection.study import ASSUMED, IN_GRID, Detection
 from studies.detection.watch import WHAT, Target
+from studies.old import plot
+from studies.old.drawing import Sketch
 from studies.policies import Group
 
 if TYPE_CHECKING:

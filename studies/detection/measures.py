@@ -29,9 +29,9 @@ from evofsm.fsm import EvolvingFSM
 from evofsm.guard import Guard, RiskMeasure
 from studies.counts import OutcomeCounts
 from studies.detection.watch import HORIZON, Exposure, Target, Watched
-from studies.own_measure import own_measure
+from studies.old.own_measure import own_measure
+from studies.old.scores import auroc
 from studies.policies import TUNED_MEASURES, Group
-from studies.scores import auroc
 
 # Of a standard normal variable: the middles of seven parts that are as likely each.
 _QUANTILES = (-1.465, -0.792, -0.366, 0.0, 0.366, 0.792, 1.465)

@@ -5,13 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from evofsm.paper.frame import Progress, silent
-from evofsm.paper.study import Study
 from studies.detection.amounts import Amounts
+from studies.old.frame import Progress, silent
+from studies.old.study import Study
 
 if TYPE_CHECKING:
-    from evofsm.paper.report.chapter import Chapter
     from studies.detection.study import Detection
+    from studies.old.chapter import Chapter
 
 
 @dataclass(frozen=True)

@@ -8,16 +8,16 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from studies.closed_loop.calibration import Reliability, reliability
 from studies.detection.alarms import (
     choose_threshold,
     count_alarms,
     is_measurable,
     lead_times,
 )
+from studies.detection.calibration import Reliability, reliability
 from studies.detection.measures import Detector
 from studies.detection.watch import Cases, Exposure, Target
-from studies.scores import Ranked, bootstrap, interval, isotonic, resampled
+from studies.old.scores import Ranked, bootstrap, interval, isotonic, resampled
 
 #: False alarms per hour at which lead times are told [1/h].
 RATES = (1.0, 0.1)

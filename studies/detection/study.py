@@ -15,7 +15,6 @@ from typing import Any, NamedTuple
 
 from evofsm.driving import measures
 from evofsm.fleet import in_order
-from evofsm.paper.frame import Frame, Progress, silent
 from studies.detection.amounts import Amounts
 from studies.detection.measures import (
     Detector,
@@ -37,8 +36,9 @@ from studies.detection.watch import (
     watch,
 )
 from studies.detection.worlds import World, grid_world, world
+from studies.old.frame import Frame, Progress, silent
+from studies.old.scores import auroc
 from studies.policies import Group
-from studies.scores import auroc
 
 #: Limits that are told to the safe distance of the grid that is wrong almost everywhere [m/s²].
 ASSUMED = (4.0, 6.0)

@@ -7,16 +7,16 @@ from collections.abc import Callable, Iterator
 from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
 
-from evofsm import plot
 from evofsm.cli import Column, Table, count, decimals, listed, number, percent, seeds_text
-from evofsm.paper.report.against import ahead
-from evofsm.paper.report.chapter import Chapter, Source
-from evofsm.paper.report.drawing import Sketch
-from evofsm.paper.report.html import Setting
 from studies.foresight.amounts import HORIZONS, Amounts
 from studies.foresight.measures import FALSE, RECALL
 from studies.foresight.rivals import NEIGHBOURS
 from studies.foresight.study import OURS, RIVALS, Foresight, Row
+from studies.old import plot
+from studies.old.against import ahead
+from studies.old.chapter import Chapter, Source
+from studies.old.drawing import Sketch
+from studies.old.html import Setting
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

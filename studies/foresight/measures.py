@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from studies.foresight.data import Cases
-from studies.scores import brier, interval, isotonic, resampled
+from studies.old.scores import brier, interval, isotonic, resampled
 
 #: Recall at which false alarms are counted, and false-alarm rate at which lead times are.
 RECALL, FALSE = 0.95, 0.05

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from evofsm.extras import needs
 from studies.foresight.data import Cases
-from studies.scores import isotonic
+from studies.old.scores import isotonic
 
 with needs("scipy", "study", "nearest neighbours"):
     from scipy.spatial import KDTree

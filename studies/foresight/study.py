@@ -17,13 +17,13 @@ from numpy.typing import NDArray
 
 from evofsm.cli import split_names
 from evofsm.fleet import in_order
-from evofsm.paper.frame import Frame, Progress, silent
 from studies.foresight.amounts import HORIZONS, Amounts
 from studies.foresight.data import Cases, cases, gather
 from studies.foresight.measures import Scored, ece, measured, scored
 from studies.foresight.ours import Learnt
 from studies.foresight.rivals import Logistic, Neighbours, Taylor
-from studies.scores import auroc
+from studies.old.frame import Frame, Progress, silent
+from studies.old.scores import auroc
 from studies.systems import make_system
 from studies.systems.system import Start
 

@@ -5,10 +5,15 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 from evofsm.cli import NONE, Column, Table, count, listed, number, percent, seeds_text
-from evofsm.paper.report.asked import failures, tables_of_asked
-from evofsm.paper.report.chapter import Chapter, Section
-from evofsm.paper.report.html import Setting
-from evofsm.paper.report.trials import (
+from studies.judges.amounts import PARTS
+from studies.judges.figures import sketches
+from studies.judges.study import Judges
+from studies.judges.summary import Effect, Summary, Worth, effects, summary
+from studies.judges.targets import claims
+from studies.old.asked import failures, tables_of_asked
+from studies.old.chapter import Chapter, Section
+from studies.old.html import Setting
+from studies.old.trials import (
     FAILED,
     KEPT,
     TIMES,
@@ -18,11 +23,6 @@ from evofsm.paper.report.trials import (
     scores,
     settings,
 )
-from studies.judges.amounts import PARTS
-from studies.judges.figures import sketches
-from studies.judges.study import Judges
-from studies.judges.summary import Effect, Summary, Worth, effects, summary
-from studies.judges.targets import claims
 from studies.systems.trial import LATE
 
 # A score that is nearer to another one's is no worse.

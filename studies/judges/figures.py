@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from evofsm import plot
-from evofsm.paper.report.drawing import Sketch
-from evofsm.paper.report.trials import scale_failed, scale_kept
 from studies.judges.study import Judges
 from studies.judges.summary import Summary, summary
+from studies.old import plot
+from studies.old.drawing import Sketch
+from studies.old.trials import scale_failed, scale_kept
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -6,13 +6,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
-from evofsm.paper.frame import Progress, silent
-from evofsm.paper.study import Study
 from studies.judges.amounts import Amounts
+from studies.old.frame import Progress, silent
+from studies.old.study import Study
 
 if TYPE_CHECKING:
-    from evofsm.paper.report.chapter import Chapter
     from studies.judges.study import Judges
+    from studies.old.chapter import Chapter
 
 
 @dataclass(frozen=True)

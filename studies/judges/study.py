@@ -11,8 +11,8 @@ from functools import partial
 
 from evofsm.cli import ALL, split_names
 from evofsm.fleet import in_order
-from evofsm.paper.frame import Frame, Progress, silent
 from studies.judges.amounts import Amounts
+from studies.old.frame import Frame, Progress, silent
 from studies.systems import SYSTEMS, make_system
 from studies.systems.cars import Cars
 from studies.systems.trial import Row, trial

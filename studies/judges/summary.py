@@ -11,7 +11,7 @@ import numpy as np
 
 from evofsm.extras import needs
 from studies.judges.study import Judges
-from studies.scores import Share
+from studies.old.scores import Share
 from studies.systems.pooled import middle, pooled
 from studies.systems.trial import Row
 

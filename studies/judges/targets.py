@@ -7,8 +7,8 @@ from collections.abc import Iterator
 import numpy as np
 
 from evofsm.cli import count, decimals, percent
-from evofsm.paper.report.asked import Asked, at_least, at_most
 from studies.judges.study import Judges
+from studies.old.asked import Asked, at_least, at_most
 from studies.systems.trial import Row
 
 _PENDULUMS = ("pendulum", "pendulum-cos")

@@ -6,12 +6,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
-from evofsm.paper.frame import Progress, silent
-from evofsm.paper.study import Study
+from studies.old.frame import Progress, silent
+from studies.old.study import Study
 from studies.prediction.amounts import Amounts
 
 if TYPE_CHECKING:
-    from evofsm.paper.report.chapter import Chapter
+    from studies.old.chapter import Chapter
     from studies.prediction.study import Prediction
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evofsm.fsm import jensen_shannon
-from studies.scores import Interval, bootstrap
+from studies.old.scores import Interval, bootstrap
 
 # Share of every forecast, whoever makes it, that is spread evenly: a 0 would cost infinitely much.
 _SPREAD_OUT = 1e-6

@@ -15,7 +15,7 @@ from functools import partial
 from typing import NamedTuple
 
 from evofsm.fleet import in_order
-from evofsm.paper.frame import Frame, Progress, silent
+from studies.old.frame import Frame, Progress, silent
 from studies.prediction.amounts import Amounts
 from studies.prediction.forecasters import (
     REFERENCES,

@@ -9,10 +9,10 @@ from typing import Any
 
 from evofsm.cli import NONE, Column, Table, count, listed, number, percent, within
 from evofsm.driving import name_states
-from evofsm.paper.report.against import ahead
-from evofsm.paper.report.asked import Asked, failures, tables_of_asked
-from evofsm.paper.report.chapter import Chapter
-from evofsm.paper.report.html import Setting
+from studies.old.against import ahead
+from studies.old.asked import Asked, failures, tables_of_asked
+from studies.old.chapter import Chapter
+from studies.old.html import Setting
 from studies.real.cases import HORIZONS, INTERVAL
 from studies.real.figures import sketches
 from studies.real.measures import LOWEST, MEASURES, OURS, StateShare

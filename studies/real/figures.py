@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm import plot
 from evofsm.cli import percent
-from evofsm.paper.report.drawing import Sketch
+from studies.old import plot
+from studies.old.drawing import Sketch
 from studies.real.cases import HORIZONS
 from studies.real.measures import MEASURES, Group
 from studies.real.moments import ALARM_SHARE, Kind, Moment

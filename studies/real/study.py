@@ -15,9 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evofsm.fleet import in_order
-from evofsm.paper.frame import Frame, Progress, silent
 from studies.datasets.checksums import find_checksums
 from studies.datasets.layouts import Layout, read_episodes
+from studies.old.frame import Frame, Progress, silent
+from studies.old.scores import Ranked, interval, resampled
 from studies.real.amounts import Amounts
 from studies.real.cases import INTERVAL, QUESTIONS, Case, Question, case_of, runs_in
 from studies.real.measures import (
@@ -32,7 +33,6 @@ from studies.real.measures import (
 )
 from studies.real.moments import Moment, Warned, alarm_threshold, leads, telling_moments
 from studies.real.targets import Target
-from studies.scores import Ranked, interval, resampled
 
 #: Of fewer events, or events in fewer runs, nothing can be concluded.
 FEWEST_EVENTS, FEWEST_RUNS = 10, 5

@@ -7,11 +7,11 @@ from collections.abc import Iterator
 import numpy as np
 
 from evofsm.cli import NONE, Column, Table, count, listed, number, percent, percents
-from evofsm.paper.report.asked import Asked, failures, tables_of_asked
-from evofsm.paper.report.chapter import Chapter
-from evofsm.paper.report.html import Setting
-from evofsm.paper.runs import CASES
-from studies.scores import Share
+from evofsm.paper import CASES
+from studies.old.asked import Asked, failures, tables_of_asked
+from studies.old.chapter import Chapter
+from studies.old.html import Setting
+from studies.old.scores import Share
 from studies.sensitivity.designs import NEAR, PAIRS, Design
 from studies.sensitivity.figures import sketches
 from studies.sensitivity.parameters import PARAMETERS, Parameter, Standing

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm import plot
-from evofsm.paper.report.drawing import Sketch
-from studies.scores import share_of
+from studies.old import plot
+from studies.old.drawing import Sketch
+from studies.old.scores import share_of
 from studies.sensitivity.designs import PAIRS, Design
 from studies.sensitivity.parameters import PARAMETERS, Parameter, parameter
 from studies.sensitivity.setting import Row

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from evofsm.paper.runs import CASES
+from evofsm.paper import CASES
 from studies.sensitivity.setting import Scaling, Setting, recovered
 
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from evofsm.paper.frame import Progress, silent
-from evofsm.paper.study import Study
+from studies.old.frame import Progress, silent
+from studies.old.study import Study
 from studies.sensitivity.amounts import Amounts
 
 if TYPE_CHECKING:
-    from evofsm.paper.report.chapter import Chapter
+    from studies.old.chapter import Chapter
     from studies.sensitivity.study import Sensitivity
 
 

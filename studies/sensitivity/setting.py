@@ -14,9 +14,7 @@ from numpy.typing import NDArray
 
 from evofsm.driving import Episode, Road, Scenario, World
 from evofsm.guard import Controller
-from evofsm.paper.claims import check_claims
-from evofsm.paper.runs import CASES, PaperStudy, run_paper
-from evofsm.paper.settings import Settings
+from evofsm.paper import CASES, PaperStudy, Settings, check_claims, run_paper
 
 #: Standard deviations over the paper's 80 runs, rounded: gap [m], both speeds [m/s].
 SCALES = (17.0, 7.5, 7.5)

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from studies.scores import Share, share_of
+from studies.old.scores import Share, share_of
 from studies.sensitivity.designs import NEAR, Design
 from studies.sensitivity.parameters import Parameter, parameter
 from studies.sensitivity.setting import Row

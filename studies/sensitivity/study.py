@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from evofsm.driving import KinematicWorld
 from evofsm.fleet import in_order
-from evofsm.paper.claims import Claim, check_claims
-from evofsm.paper.frame import Frame, Progress, silent
+from evofsm.paper import check_claims
+from studies.old.frame import Frame, Progress, silent
 from studies.sensitivity.amounts import Amounts
 from studies.sensitivity.designs import Design, Trial, filling, maps, sweeps
 from studies.sensitivity.parameters import PARAMETERS, Parameter
@@ -43,7 +43,7 @@ class Sensitivity:
     """What became of the claims with every setting."""
 
     plan: Amounts
-    claims: tuple[Claim, ...]  #: with the recovered setting
+    claims: tuple[Any, ...]  #: with the recovered setting
     rows: tuple[Row, ...]
     reaches: tuple[Reach, ...]
 

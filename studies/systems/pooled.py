@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from studies.scores import Share, share_of
+from studies.old.scores import Share, share_of
 
 
 def pooled(rows: Sequence[Any]) -> dict[str, Any]:

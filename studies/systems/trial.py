@@ -17,7 +17,7 @@ import numpy as np
 from evofsm.cli import imported
 from evofsm.driving import TOLD, guard_for_family
 from evofsm.guard import Guard
-from studies.scores import share_of
+from studies.old.scores import share_of
 from studies.systems import make_system
 from studies.systems.cars import Cars
 from studies.systems.rivals.counted import Counted

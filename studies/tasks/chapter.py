@@ -15,10 +15,10 @@ from evofsm.cli import (
     percent,
     seeds_text,
 )
-from evofsm.paper.report.asked import failures, tables_of_asked
-from evofsm.paper.report.chapter import Chapter, Section, Source
-from evofsm.paper.report.html import Setting
-from evofsm.paper.report.trials import (
+from studies.old.asked import failures, tables_of_asked
+from studies.old.chapter import Chapter, Section, Source
+from studies.old.html import Setting
+from studies.old.trials import (
     FAILED,
     KEPT,
     TIMES,

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from evofsm import plot
-from evofsm.paper.report.drawing import Sketch
-from evofsm.paper.report.trials import scale_failed, scale_kept
+from studies.old import plot
+from studies.old.drawing import Sketch
+from studies.old.trials import scale_failed, scale_kept
 from studies.tasks.study import Tasks
 from studies.tasks.summary import Summary, summaries
 

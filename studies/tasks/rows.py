@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from studies.scores import bootstrap
+from studies.old.scores import bootstrap
 from studies.systems.trial import Ended, counted, unrevised_failures
 from studies.tasks.amounts import Amounts
 

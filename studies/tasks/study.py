@@ -11,7 +11,7 @@ from functools import partial
 
 from evofsm.cli import ALL, split_names
 from evofsm.fleet import in_order
-from evofsm.paper.frame import Frame, Progress, silent
+from studies.old.frame import Frame, Progress, silent
 from studies.systems import TASKS, lacking, make_system
 from studies.systems.trial import make_judge, try_judge
 from studies.tasks.amounts import Amounts

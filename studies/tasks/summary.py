@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
-from studies.scores import Share
+from studies.old.scores import Share
 from studies.systems.pooled import middle, pooled
 from studies.tasks.rows import Row
 from studies.tasks.study import Tasks

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from evofsm.cli import count, decimals, percent
-from evofsm.paper.report.asked import Asked, at_least, at_most
+from studies.old.asked import Asked, at_least, at_most
 from studies.tasks.rows import LATE, Row
 from studies.tasks.study import Tasks
 

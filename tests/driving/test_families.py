@@ -16,7 +16,7 @@ from evofsm.driving.episodes import drive, unrevised_guard
 from evofsm.driving.families import FAMILIES, fixed_family, load_family
 from evofsm.driving.family import SWITCHES
 from evofsm.driving.measures import is_dead_end
-from evofsm.paper.settings import Settings
+from evofsm.paper.runs import Settings
 
 SEEDS = st.integers(0, 2**32 - 1)
 LOADED = {name: load_family(name) for name in FAMILIES}

@@ -1,18 +1,18 @@
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import polars
 import pytest
 
 from evofsm.driving.sumo import SumoWorld
 from evofsm.driving.world import KinematicWorld
 from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.model import FSMModel
-from evofsm.paper.chapter import context_tables
 from evofsm.paper.claims import check_claims
-from evofsm.paper.files import write_data
-from evofsm.paper.runs import run_paper
-from evofsm.paper.settings import Settings
+from evofsm.paper.reproduction import Reproduction, divergences, reproduce
+from evofsm.paper.runs import Settings, run_paper
 
 IDS = [
     "collisions_by_case",
@@ -72,7 +72,12 @@ def test_a_follower_that_may_brake_in_full_never_collides_and_the_claims_say_so(
         assert not holds[claim]
     assert not holds["case3_leaves_dead_end"]
     assert not holds["case4_enters_dead_end"]
-    assert len(context_tables(study)) == 2
+    page = Reproduction(study, check_claims(study)).page()
+    assert (
+        page.answer
+        == f"{sum(holds.values())} of 10 claims of the paper hold in the kinematic world"
+    )
+    assert not any(table.title.startswith("How early") for table in page.tables)
 
 
 def test_a_collision_after_the_end_of_the_paper_is_not_called_safe(tmp_path):
@@ -93,13 +98,17 @@ def test_other_settings_of_the_machine_change_the_number_of_states(tmp_path):
     assert not holds["states_final"]
 
 
-def test_simple_forecasts_stand_beside_ours(study):
-    forecasts = context_tables(study)[0]
-    largest = {row[0].split(":")[0]: float(row[1].split()[0]) for row in forecasts.rows}
-    assert largest["e-FSM"] == 0.051
+def test_whoever_forecasts_better_is_where_it_loses(study):
+    largest = {row["forecast"]: row["case 1"] for row in divergences(study).to_dicts()}
+    assert round(largest["e-FSM"], 3) == 0.051
     assert largest["persistence"] < 0.001
     assert largest["e-FSM, all rounds"] > 0.15
-    assert "persistence" in forecasts.note
+    (lost,) = Reproduction(study, check_claims(study)).page().losses
+    assert ("persistence", "case 1") in lost.frame.select("forecast", "where").rows()
+    # Where the machine foresees everything nobody is better.
+    runs = tuple(replace(run, surprise=0.0 * run.surprise) for run in study.runs)
+    foreseen = replace(study, runs=runs)
+    assert Reproduction(foreseen, check_claims(foreseen)).page().losses == []
 
 
 def test_the_first_forecast_of_a_run_is_the_uniform_belief_through_the_marginal_matrix(study):
@@ -136,7 +145,6 @@ def test_a_wrong_settings_file_is_refused_by_name(tmp_path, text, message):
 def test_one_round_in_which_states_are_still_founded_is_a_study_too():
     study = run_paper(KinematicWorld(), "kinematic", Settings.load(), rounds=1)
     assert [run.belief.shape[1] for run in study.runs] == [7] * 4
-    assert len(context_tables(study)) == 3
     assert [founding.run for founding in study.foundings] == [0, 0, 0, 0, 2, 3, 3]
 
 
@@ -160,19 +168,32 @@ def test_progress_counts_up_to_all_runs():
     assert [done for done, _ in told] == sorted(done for done, _ in told)
 
 
-def test_data_can_be_read_back(study, tmp_path):
-    polars = pytest.importorskip("polars")
-    claims, context = check_claims(study), context_tables(study)
-    write_data(study, claims, context, tmp_path / "new" / "folder")
-    written = tmp_path / "new" / "folder"
-    read = json.loads((written / "claims.json").read_text())
-    assert [claim["id"] for claim in read] == IDS
-    assert all(set(claim) >= {"id", "claim", "paper", "measured", "holds"} for claim in read)
-    traces = polars.read_parquet(written / "traces.parquet")
-    assert len(traces) == sum(len(run.state) for run in (*study.runs, *study.extra_runs))
-    assert traces["run"].n_unique() == 82
-    model = FSMModel.load(written / "model.evofsm")
-    assert np.array_equal(model.centers, study.model.centers)
+@pytest.mark.slow
+def test_all_of_it_is_written_and_can_be_read_back(tmp_path, read_page):
+    found = reproduce("kinematic", rounds=2)
+    folder = tmp_path / "new" / "folder"
+    read = read_page(found.write(folder, "make paper"))
+    read.is_sound()
+    for said in (
+        "Does the paper's machine",
+        "make paper",
+        "brake_decel 9.0",
+        "#4 at 15 s",
+        "numba",
+    ):
+        assert said in read.text
+    assert [link for link in read.links if link[0] != "#"] == ["https://arxiv.org/abs/1908.10823"]
+    figures = {path.name for path in (folder / "figures").iterdir()}
+    assert {"case-1.png", "case-1.svg", "matrices.png"} <= figures
+    assert len(figures) == 18
+    claims = json.loads((folder / "claims.json").read_text())
+    assert [claim["id"] for claim in claims] == IDS
+    traces = polars.read_parquet(folder / "traces.parquet")
+    runs = (*found.study.runs, *found.study.extra_runs)
+    assert len(traces) == sum(len(run.state) for run in runs)
+    assert traces["run"].n_unique() == len(runs) == 10
+    model = FSMModel.load(folder / "model.evofsm")
+    assert np.array_equal(model.centers, found.study.model.centers)
     assert model.names == ("gap", "v_follower", "v_leader")
 
 

@@ -1,35 +1,15 @@
-"""The closed loop in its short form: the claims of the issue, on fewer draws."""
+"""The closed loop on fewer draws, and how its tables are made."""
 
-import json
 from dataclasses import replace
 
 import numpy as np
+import polars as pl
 import pytest
+from studies import closed_loop
+from studies.closed_loop import MACHINE, OURS, ClosedLoop, final, lines_of
+from studies.policies import Group, fixed_policies
 
-pytest.importorskip("scipy")
-
-from studies.closed_loop.amounts import ShiftPlan
-from studies.closed_loop.beside import (
-    run_cases,
-    run_separation,
-    run_shift,
-    run_two_worlds,
-)
-from studies.closed_loop.calibration import reliability, run_calibration
-from studies.closed_loop.machine import MACHINE, run_machine, run_machine_shift
-from studies.closed_loop.plan import Plan
-from studies.closed_loop.study import run_closed_loop
-from studies.policies import fixed_policies
-from studies.scores import auroc
-
-from evofsm.driving.cars import guard_for_family, load_learnt, save_learnt
-from evofsm.driving.episodes import drive, outcome_of, reference_of, teach, unrevised_guard
-from evofsm.driving.families import load_family
-
-pytestmark = pytest.mark.slow
-
-EMERGENCY = load_family("emergency")
-TINY = Plan(
+TINY = ClosedLoop(
     train=10,
     test=20,
     seeds=2,
@@ -38,184 +18,198 @@ TINY = Plan(
     side_train=10,
     side_test=10,
     world_test=2,
-    machine_checks=4,
+    machine_check=4,
+    machine_train=10,
 )
+SMALLEST = replace(TINY, seeds=1, rule_seeds=0, test=3, train=2, machine_train=0, side_test=4)
 
 
 @pytest.fixture(scope="module")
-def study():
-    return run_closed_loop(EMERGENCY, TINY, workers=2)
+def found():
+    return TINY.run(workers=2)
 
 
-def rows_of(study, policy):
-    return [row for row in study.rows if row.policy == policy]
-
-
-@pytest.mark.slow
-def test_the_unrevised_driver_collides_and_ours_does_not(study):
-    [unrevised] = rows_of(study, "unrevised")
-    assert unrevised.collision_rate > 0.8
-    ours = rows_of(study, "evofsm")
-    assert [row.learning_seed for row in ours] == [0, 1]
-    assert all(row.collisions == 0 and row.mobility > 0.6 for row in ours)
-    assert all(row.train_collisions == 0 for row in ours)
+def rows_of(found, policy):
+    return found["rows"].filter(policy=policy).to_dicts()
 
 
 @pytest.mark.slow
-def test_the_machine_learns_from_the_same_draws_and_is_tried_on_the_same_ones(study):
-    machine = rows_of(study, MACHINE)
-    assert [row.learning_seed for row in machine] == [0, 1]
-    told = rows_of(study, "evofsm")
-    assert {row.episodes for row in machine} == {row.episodes for row in told} == {20}
-    assert {row.train_episodes for row in machine} == {10}
+def test_the_unrevised_driver_collides_and_ours_does_not(found):
+    (unrevised,) = rows_of(found, "unrevised")
+    assert unrevised["collision_rate"] > 0.8
+    assert (unrevised["mobility"], unrevised["intervention_rate"]) == (1.0, 0.0)
+    (always,) = rows_of(found, "always-brake")
+    assert (always["mobility"], always["collisions"]) == (0.0, 0)
+    ours = rows_of(found, OURS)
+    assert [row["learning_seed"] for row in ours] == [0, 1]
+    assert all(row["collisions"] == row["train_collisions"] == 0 for row in ours)
+    assert all(row["mobility"] > 0.6 for row in ours)
+
+
+@pytest.mark.slow
+def test_every_baseline_stands_in_the_table_once(found):
+    names = [policy.name for policy in fixed_policies(TINY.drawn_from)]
+    alone = found["rows"].filter(pl.col("group") != Group.LEARNT)["policy"].to_list()
+    assert sorted(alone) == sorted([*names, "ttc-tuned", "headway-tuned", "rss-tuned"])
+
+
+@pytest.mark.slow
+def test_the_machine_is_told_nothing_but_failures_and_learns_from_the_same_draws(found):
+    machine = rows_of(found, MACHINE)
+    assert {row["told"] for row in machine} == {"nothing but failures"}
+    assert {(row["train_episodes"], row["episodes"]) for row in machine} == {(10, 20)}
     # It knows of no collision before the first, and the driver alone has hardly an episode without.
-    assert all(1 <= row.train_collisions <= 7 for row in machine)
-    assert all(row.collisions <= 2 and row.mobility > 0.5 for row in machine)
-    curve = [point for point in study.curve if point.policy == MACHINE]
-    assert {point.episodes for point in curve} == {0, 2, 5, 10}
-    assert all(point.collisions >= 3 for point in curve if point.episodes == 0)
-    documents = [row for row in study.as_dict()["rows"] if row["policy"] == MACHINE]
-    assert {row["told"] for row in documents} == {"nothing but failures"}
+    assert all(1 <= row["train_collisions"] <= 7 for row in machine)
+    assert all(row["collisions"] <= 2 and row["mobility"] > 0.5 for row in machine)
+    curve = found["curve"].filter(policy=MACHINE)
+    assert set(curve["episodes"]) == {0, 2, 5, 10}
+    assert curve.filter(episodes=0)["collisions"].min() >= 3
 
 
 @pytest.mark.slow
-def test_the_machine_goes_on_learning_after_a_shift():
-    plan = Plan(shift=ShiftPlan(before=8, after=11, held_out=6))
-    found = run_machine_shift(load_family("shift_leader"), plan, seed=0)
-    (stream,) = found["streams"]
-    assert (stream.policy, len(stream.collided)) == (MACHINE, 19)
-    assert [check.episodes_after for check in found["checks"]] == [-1, 0, 10]
-    assert {check.held_out for check in found["checks"]} == {6}
+def test_the_page_names_every_policy_and_where_ours_loses(found, tmp_path, read_page):
+    from evofsm.paper import write_page
 
-
-def test_without_training_there_is_no_row_of_the_machine():
-    none = replace(TINY, seeds=1, rule_seeds=0, test=3, train=1, machine_train=0, side_test=4)
-    assert not rows_of(run_closed_loop(EMERGENCY, none, workers=2), MACHINE)
-
-
-def test_every_baseline_stands_in_the_table_once(study):
-    expected = {policy.name for policy in fixed_policies(EMERGENCY)}
-    assert {"unrevised", "aeb-ttc", "rss-r157", "rss-matched", "oracle"} <= expected
-    for name in expected:
-        assert len(rows_of(study, name)) == 1, name
-
-
-def test_a_row_has_the_fields_that_others_rely_on(study):
-    assert {
-        *("family", "policy", "learning_seed", "train_episodes", "episodes", "collisions"),
-        *("collision_rate", "mobility", "intervention_rate", "mean_change", "jerk"),
-        "episodes_until_safe",
-    } <= set(study.rows[0].as_dict())
-    json.dumps(study.as_dict(), allow_nan=False)
-
-
-def test_the_unrevised_driver_is_the_measure_of_mobility(study):
-    [unrevised] = rows_of(study, "unrevised")
-    assert unrevised.mobility == 1.0
-    assert unrevised.intervention_rate == 0.0
-    [always] = rows_of(study, "always-brake")
-    assert always.mobility == 0.0
-    assert always.collisions == 0
+    page = TINY.page(found)
+    read = read_page(write_page(tmp_path / "index.html", [page]))
+    read.is_sound()
+    assert all(name in read.text for name in found["rows"]["policy"])
+    lost = page.losses[0].frame
+    assert "rss-matched" in set(lost["policy"])  # it changes fewer decisions
+    assert not {"oracle", "evofsm-told"} & set(lost["policy"])  # which are our own reviser
 
 
 @pytest.mark.slow
-def test_the_result_does_not_depend_on_the_number_of_workers(study):
-    small = replace(TINY, seeds=1, rule_seeds=0, test=5, train=2)
-    alone = run_closed_loop(EMERGENCY, small, workers=1)
-    together = run_closed_loop(EMERGENCY, small, workers=2)
-    assert [row.as_dict() for row in alone.rows] == [row.as_dict() for row in together.rows]
+def test_the_result_does_not_depend_on_the_number_of_workers():
+    alone, together = SMALLEST.run(workers=1), SMALLEST.run(workers=2)
+    assert MACHINE not in set(alone["rows"]["policy"])  # without training it has no row
+    assert all(alone[name].equals(together[name]) for name in alone)
 
 
+@pytest.mark.slow
 def test_the_papers_cases_are_driven_without_a_collision_and_left_alone_where_safe():
-    by_name = {case.name: case for case in run_cases(load_family("paper"), Plan())["cases"]}
-    assert by_name["case 1"].unrevised_collided
-    assert by_name["case 4"].unrevised_collided
-    assert not any(case.collided for case in by_name.values())
-    assert all(case.end > 59.9 for case in by_name.values())
-    assert {"brake at 11 s", "brake at 15 s"} <= set(by_name)
-    assert by_name["case 2"].changed <= 0.05
-    assert by_name["case 3"].changed_late <= 0.05
+    found = closed_loop._revise_cases(ClosedLoop(family="paper"))["cases"]
+    case = {row["run"]: row for row in found}
+    assert case["case 1"]["unrevised_collided"]
+    assert case["case 4"]["unrevised_collided"]
+    assert not any(row["collided"] for row in found)
+    assert all(row["end"] > 59.9 for row in found)
+    assert {"brake at 11 s", "brake at 15 s"} <= set(case)
+    assert max(case["case 2"]["changed"], case["case 3"]["changed_late"]) <= 0.05
 
 
 @pytest.mark.slow
 def test_the_machine_learns_the_papers_cases_from_nothing_but_failures():
-    found = run_machine(load_family("paper"), Plan(train=12, test=4, machine_checks=4), 0)
-    by_name = {case.name: case for case in found["machine_cases"]}
-    assert set(by_name) == {f"case {n}" for n in (1, 2, 3, 4)} | {"brake at 11 s", "brake at 15 s"}
+    study = ClosedLoop(family="paper", train=12, test=4, machine_check=4)
+    found = closed_loop._test_learner(study, MACHINE, 0)
     assert 1 <= found["rows"][0].train_collisions <= 4  # what failure is has to happen
-    assert not any(by_name[f"case {n}"].collided for n in (1, 2, 3, 4))
+    cases = [row for row in found["cases"] if row["run"].startswith("case")]
+    assert len(cases) == 4
+    assert not any(row["collided"] for row in cases)
 
 
 @pytest.mark.slow
 def test_brakes_that_weaken_are_noticed_while_unchanged_constants_collide():
-    plan = Plan(shift=ShiftPlan(before=12, after=6, held_out=25))
-    found = run_shift(load_family("shift"), plan, learning_seed=0)
-    checks = {(check.policy, check.episodes_after): check for check in found["checks"]}
-    assert checks["evofsm", 5].collisions == 0
-    assert checks["rss-unchanged", -1].collisions == 0
-    assert checks["rss-unchanged", 6].collisions > 15
+    study = ClosedLoop(family="shift", before=12, after=6, shift_test=25)
+    checks = [
+        *closed_loop._shift(study, OURS, 0)["checks"],
+        *closed_loop._shift_unchanged(study, 0)["checks"],
+    ]
+    collisions = {(row["policy"], row["after"]): row["collisions"] for row in checks}
+    assert collisions[OURS, 5] == 0
+    assert collisions["rss-unchanged", -1] == 0
+    assert collisions["rss-unchanged", 0] > 15
 
 
+@pytest.mark.slow
+def test_the_machine_goes_on_learning_after_a_shift():
+    study = ClosedLoop(family="shift_leader", before=8, after=11, shift_test=6)
+    found = closed_loop._shift(study, MACHINE, 0)
+    assert [row["place"] for row in found["stream"]] == list(range(-8, 11))
+    assert [(row["after"], row["held_out"]) for row in found["checks"]] == [
+        (-1, 6),
+        (0, 6),
+        (10, 6),
+    ]
+
+
+@pytest.mark.slow
 def test_the_same_model_revises_alike_in_both_worlds():
     pytest.importorskip("libsumo")
-    sumo, kinematic = run_two_worlds(EMERGENCY, Plan(side_train=8, world_test=4))["worlds"]
-    assert sumo.collisions == kinematic.collisions == 0
-    assert sumo.mean_speed == pytest.approx(kinematic.mean_speed, rel=1e-6)
-    assert sumo.intervention_rate == pytest.approx(kinematic.intervention_rate)
+    sumo, closed = closed_loop._drive_both_worlds(ClosedLoop(side_train=8, world_test=4))["worlds"]
+    assert sumo["collisions"] == closed["collisions"] == 0
+    assert sumo["mean_speed"] == pytest.approx(closed["mean_speed"], rel=1e-6)
+    assert sumo["intervention_rate"] == pytest.approx(closed["intervention_rate"])
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("family", ["rare", "weak_brakes"])
 def test_dead_ends_are_told_apart(family):
-    found = run_separation(load_family(family), Plan(side_train=30, side_test=40))["separations"]
-    areas = {one.measure: one.auroc for one in found}
-    assert areas["evofsm"] > 0.98
-    assert areas["evofsm"] > areas["aeb-ttc"]
+    study = ClosedLoop(family=family, side_train=30, side_test=40)
+    areas = {row["measure"]: row["auroc"] for row in closed_loop._separate(study)["separation"]}
+    assert areas[OURS] > max(0.98, areas["aeb-ttc"])
 
 
-def test_probabilities_are_better_than_the_base_rate():
-    counted, rehearsed = run_calibration(EMERGENCY, Plan(side_train=40, side_test=60))[
-        "reliabilities"
+# -- The tables, of rows that are made up ---------------------------------------------------------
+
+
+def row(policy, group, rate, mobility, seed=None, trained=0, **others):
+    values = {"collision_low": 0.0, "collision_high": 1.0, "mobility_low": 0.0}
+    values |= {"mobility_high": 1.0, "intervention_rate": 0.5, "mean_change": 1.0, "jerk": 1.0}
+    values |= {"rear_ends": 0, "episodes_until_safe": None, "train_collisions": 0, "episodes": 100}
+    values |= {"policy": policy, "group": group, "told": group, "learning_seed": seed}
+    values |= {"collisions": int(100 * rate), "collision_rate": rate, "mobility": mobility}
+    return values | {"train_episodes": trained} | others
+
+
+ROWS = pl.DataFrame(
+    [
+        row("unrevised", Group.BOUND, 0.9, 1.0),
+        row("ttc", Group.FIXED, 0.0, 0.95),
+        row("rss", Group.MATCHED, 0.1, 0.99),
+        row("rss-tuned", Group.TUNED, 0.01, 0.8, intervention_rate=0.1),
+        *(
+            row(OURS, Group.LEARNT, rate, mobility, seed, 100, episodes_until_safe=until)
+            for seed, (rate, mobility, until) in enumerate(
+                [(0.01, 0.9, 3), (0.02, 0.94, None), (0.02, 0.92, None), (0.0, 0.91, 1)]
+            )
+        ),
     ]
-    for one in (counted, rehearsed):
-        assert one.brier < 0.6 * one.base_brier
-        assert sum(part.cases for part in one.bins) == one.cases
+)
 
 
-def test_a_reliability_counts_what_it_is_told():
-    one = reliability("", [0.05, 0.05, 0.95, 0.95], [False, True, True, True])
-    assert [(part.observed, part.cases) for part in one.bins] == [(0.5, 2), (1.0, 2)]
-    assert one.failures == 3
+def test_ours_is_told_as_the_median_of_each_column_and_as_the_worst_seed():
+    lines = lines_of(ROWS)
+    assert lines["policy"].to_list() == ["unrevised", "ttc", "rss-tuned", "rss", OURS, OURS]
+    median, worst = final(lines), final(lines, which="worst")
+    assert (median["collision_rate"], median["mobility"]) == (0.015, 0.915)
+    assert median["episodes_until_safe"] == np.inf  # two of four seeds were never safe
+    assert (worst["collision_rate"], worst["mobility"]) == (0.02, 0.92)
+    assert median["which"] == "median of 4"
 
 
-def test_the_area_under_the_curve():
-    truth = np.array([False, True, False, True])
-    assert auroc(np.array([0.0, 1.0, 0.0, 1.0]), truth) == 1.0
-    assert auroc(np.zeros(4), truth) == 0.5
-    assert np.isnan(auroc(np.zeros(4), np.zeros(4, bool)))
+def test_whoever_is_better_on_an_axis_at_no_more_collisions_is_where_it_loses():
+    lines = lines_of(ROWS)
+    found = {"separation": pl.DataFrame(schema={"group": pl.String, "auroc": pl.Float64})}
+    table, *_ = closed_loop._lost(found, lines)
+    assert table.frame["policy"].to_list() == ["ttc", "rss-tuned"]  # not rss, which collides more
+    assert table.marks == ["fails", None]
+    targets = closed_loop._targets(replace(TINY, family="rare"), {}, lines)
+    assert {one.target: one.met for one in targets} == {
+        "collisions, worst seed": True,
+        "fixed constants that are better on both axes": False,
+    }
 
 
-def test_a_driver_who_proposes_nothing_usable_is_replaced_and_counted():
-    class Broken:
-        def propose(self, observation, time=0.0):
-            raise RuntimeError("no")
-
-    draw = EMERGENCY.draw(0, 0, split="test")
-    none = unrevised_guard(EMERGENCY)
-    base = reference_of(EMERGENCY, draw)
-    found = outcome_of(drive(none, draw, controller=Broken()), base, EMERGENCY.interval)
-    assert found.changed == found.decisions
-    assert found.change == 0.0
-
-
-def test_what_was_learnt_is_kept(tmp_path):
-    guard = guard_for_family(EMERGENCY, tolerance=0.01)
-    teach(guard, (EMERGENCY.draw(0, index) for index in range(3)))
-    save_learnt(guard, tmp_path)
-    machine, risk = load_learnt(tmp_path)
-    assert machine.n_states == guard.machine.n_states
-    situation = np.array([20.0, 15.0, 15.0])
-    actions = [-1.0, 0.0, 1.0]
-    assert np.array_equal(
-        risk.critical(situation, actions), guard.judge.critical(situation, actions)
+def test_an_average_along_a_stream_begins_anew_at_the_shift():
+    places = range(-20, 5)
+    stream = pl.DataFrame(
+        [
+            closed_loop._streamed(OURS, seed, at, at >= 0 and seed == 0)
+            for seed in (0, 1)
+            for at in places
+        ]
     )
+    rate = closed_loop.along_stream(stream)
+    assert rate.filter(pl.col("place") < 0)["mean"].to_list() == [0.0] * 20
+    assert rate.filter(pl.col("place") >= 0)["mean"].to_list() == [0.5] * 5

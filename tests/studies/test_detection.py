@@ -28,13 +28,13 @@ from studies.detection.watch import (
     watch,
 )
 from studies.detection.worlds import GRID, grid_world, world
+from studies.old.frame import Frame
+from studies.old.scores import Ranked, auprc, auroc, bootstrap, brier, isotonic
 from studies.policies import Group
-from studies.scores import Ranked, auprc, auroc, bootstrap, brier, isotonic
 
 from evofsm.driving import measures
 from evofsm.driving.episodes import drive, unrevised_guard
 from evofsm.driving.families import load_family
-from evofsm.paper.frame import Frame
 
 TINY = Plan(
     train=6,

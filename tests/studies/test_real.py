@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from studies.counts import OutcomeCounts
 from studies.datasets.episodes import Episode
+from studies.old.scores import auroc
 from studies.real.cases import HORIZONS, Question, case_of, recent_acceleration
 from studies.real.measures import MEASURES, ComingByState, approach, learn_logistic
 from studies.real.moments import Kind, alarm_threshold, lead_before, leads, telling_moments
 from studies.real.plan import Plan
 from studies.real.study import fold_of_runs, read_folder, run_real
 from studies.real.targets import TARGETS, coming, onsets
-from studies.scores import auroc
 
 from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.states.novelty import Novelty

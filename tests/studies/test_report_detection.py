@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 from rich.console import Console
-from studies.closed_loop.calibration import Bin, Reliability
+from studies.detection.calibration import Bin, Reliability
 from studies.detection.chapter import claims, losses
 from studies.detection.measures import Ours
 from studies.detection.plan import Plan
@@ -17,10 +17,9 @@ from studies.detection.rows import Reliable, Row
 from studies.detection.study import IN_GRID, Detection
 from studies.detection.watch import Target
 from studies.detection.worlds import GRID
+from studies.old.chapter import Chapter, write_chapters
+from studies.old.terminal import print_chapter
 from studies.policies import Group
-
-from evofsm.paper.report.chapter import Chapter, write_chapters
-from evofsm.paper.terminal import print_chapter
 
 FAMILIES = ("paper", "emergency", "weak_brakes", "rare", "shift")
 OTHERS = ("ttc", "headway", "rss-r157", "rss-matched", "rss-tuned")

@@ -4,12 +4,11 @@ import re
 from html import unescape
 
 import pytest
+from studies.old.chapter import write_chapters
 from studies.prediction.forecasters import Method, Variant
 from studies.prediction.plan import Plan
 from studies.prediction.scoring import Row
 from studies.prediction.study import Prediction
-
-from evofsm.paper.report.chapter import write_chapters
 
 
 def row(source, horizon, method, skill, **others):

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from studies.old.chapter import write_chapters
 from studies.real.cases import HORIZONS
 from studies.real.chapter import losses
 from studies.real.measures import MEASURES, StateShare
@@ -13,7 +14,6 @@ from studies.real.study import WARNED_OF, Drives, RealStudy, Row
 from studies.real.targets import TARGETS
 
 from evofsm.driving.naming import name_state, name_states
-from evofsm.paper.report.chapter import write_chapters
 
 
 def row(target, horizon, measure, area, enough):

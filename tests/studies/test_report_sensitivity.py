@@ -6,12 +6,11 @@ from dataclasses import replace
 
 import pytest
 from studies.__main__ import application
+from studies.old.chapter import write_chapters
 from studies.sensitivity.plan import Plan
 from studies.sensitivity.spaces import short_name
 from studies.sensitivity.study import Sensitivity, run_sensitivity
 from typer.testing import CliRunner
-
-from evofsm.paper.report.chapter import write_chapters
 
 pytestmark = pytest.mark.slow
 

@@ -4,7 +4,7 @@ from functools import partial
 
 import numpy as np
 import pytest
-from studies.scores import share_of
+from studies.old.scores import share_of
 from studies.sensitivity.designs import NEAR, Design, filling, maps, sweeps
 from studies.sensitivity.parameters import PARAMETERS, Parameter, Scale, Standing, parameter
 from studies.sensitivity.plan import Plan
@@ -24,8 +24,7 @@ from studies.sensitivity.study import _reach, _try_all, run_sensitivity
 from evofsm.driving.world import KinematicWorld
 from evofsm.fleet.executors import in_order
 from evofsm.paper.claims import check_claims
-from evofsm.paper.runs import CASES, run_paper
-from evofsm.paper.settings import Settings
+from evofsm.paper.runs import CASES, Settings, run_paper
 
 pytestmark = pytest.mark.slow
 

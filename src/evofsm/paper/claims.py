@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
-from evofsm.paper.frame import Frame
 from evofsm.paper.runs import PaperStudy, Run
 
 #: In which cases the paper saw a collision.
@@ -17,8 +16,7 @@ _STATES = 7
 LARGEST_DIVERGENCE = 0.15
 
 
-@dataclass(frozen=True)
-class Claim:
+class Claim(NamedTuple):
     """One claim of the paper, and what was measured."""
 
     id: str
@@ -28,28 +26,17 @@ class Claim:
     holds: bool
 
 
-@dataclass(frozen=True)
-class Reproduction:
-    """The runs, and every claim held against them."""
-
-    study: PaperStudy
-    claims: tuple[Claim, ...]
-
-    @property
-    def frame(self) -> Frame:
-        """The claims, each with its verdict."""
-        return Frame(self.claims)
-
-
 def check_claims(study: PaperStudy) -> tuple[Claim, ...]:
     """Every claim of the paper's Section 3, with a verdict each."""
-    return tuple(_claims(study))
+    return (
+        *_of_collisions(study),
+        *_of_states(study),
+        *_of_the_dead_end(study),
+        _of_divergence(study),
+    )
 
 
-def _claims(study: PaperStudy) -> Iterator[Claim]:
-    counts = [int(run.n_states[-1]) for run in study.runs]
-    collisions = [run for run in study.runs if run.episode.collided]
-
+def _of_collisions(study: PaperStudy) -> Iterator[Claim]:
     as_in_paper = sum(run.episode.collided == _COLLIDES[run.case] for run in study.runs)
     safe = all(study.safe_at_the_end.values())
     yield Claim(
@@ -61,22 +48,24 @@ def _claims(study: PaperStudy) -> Iterator[Claim]:
         f"{'are safe' if safe else 'have collided'} at {study.settings.safe_until:g} s",
         as_in_paper == len(study.runs) and safe,
     )
+    decel = study.settings.scenario.leader.brake_decel
     for time, run in zip(study.settings.brake_at, study.extra_runs, strict=True):
-        at_brake = _state_at_brake(study, run)
+        braking = np.flatnonzero(run.episode.leader_accelerations == -decel)
+        at_brake = int(run.state[braking[0]]) if len(braking) else None
+        end = f"collision at {run.episode.time[-1]:.1f} s, in {_name(run.state[-1])}"
+        came = end if run.episode.collided else "no collision"
+        braked = at_brake is not None
         yield Claim(
             f"brake_at_{time:g}",
             f"Leader brakes at {time:g} s, in the dead end: collision",
             "collision",
-            "the leader did not brake"
-            if at_brake is None
-            else f"{_name(at_brake)} at the brake; "
-            + (
-                f"collision at {run.episode.time[-1]:.1f} s, in {_name(run.state[-1])}"
-                if run.episode.collided
-                else "no collision"
-            ),
+            f"{_name(at_brake)} at the brake; {came}" if braked else "the leader did not brake",
             run.episode.collided and at_brake == study.dead_end,
         )
+
+
+def _of_states(study: PaperStudy) -> Iterator[Claim]:
+    counts = [int(run.n_states[-1]) for run in study.runs]
     yield Claim(
         "states_after_each_run",
         "States are created in the first four runs, then none",
@@ -84,13 +73,13 @@ def _claims(study: PaperStudy) -> Iterator[Claim]:
         f"{', '.join(map(str, counts[:4]))} after runs 1 to 4, {counts[-1]} after {len(counts)}",
         len(set(counts[3:])) == 1 and counts == sorted(counts),
     )
-    yield Claim(
-        "states_final",
-        "Number of states at the end",
-        str(_STATES),
-        str(counts[-1]),
-        counts[-1] == _STATES,
-    )
+    final = counts[-1]
+    what = "Number of states at the end"
+    yield Claim("states_final", what, str(_STATES), str(final), final == _STATES)
+
+
+def _of_the_dead_end(study: PaperStudy) -> Iterator[Claim]:
+    collisions = [run for run in study.runs if run.episode.collided]
     at_collisions = sorted({int(run.state[-1]) for run in collisions})
     yield Claim(
         "dead_end_state",
@@ -108,20 +97,15 @@ def _claims(study: PaperStudy) -> Iterator[Claim]:
         f"{inside} of {len(collisions)}",
         0 < inside == len(collisions),
     )
-    yield Claim(
-        "case3_leaves_dead_end",
-        "Case 3 leaves the dead end when its driver turns normal",
-        "yes",
-        *_change(study, 3, leaves=True),
-    )
-    yield Claim(
-        "case4_enters_dead_end",
-        "Case 4 comes to the dead end when its driver turns aggressive",
-        "yes",
-        *_change(study, 4, leaves=False),
-    )
+    what = "Case 3 leaves the dead end when its driver turns normal"
+    yield Claim("case3_leaves_dead_end", what, "yes", *_change(study, 3, leaves=True))
+    what = "Case 4 comes to the dead end when its driver turns aggressive"
+    yield Claim("case4_enters_dead_end", what, "yes", *_change(study, 4, leaves=False))
+
+
+def _of_divergence(study: PaperStudy) -> Claim:
     largest = [float(np.nanmax(run.surprise)) for run in study.last_round]
-    yield Claim(
+    return Claim(
         "jsd_max_by_case",
         "Largest divergence of forecast and recognised state, but for a run's first, "
         "in the last round",
@@ -147,15 +131,9 @@ def _change(study: PaperStudy, case: int, *, leaves: bool) -> tuple[str, bool]:
     return f"{text}; so in {as_in_paper} of {len(runs)} rounds", as_in_paper == len(runs)
 
 
-def _name(state: int) -> str:
-    return f"#{state + 1}"
+def _name(state: int | None) -> str:
+    return "no state" if state is None else f"#{state + 1}"
 
 
 def _outcome(run: Run) -> str:
     return f"yes ({run.episode.time[-1]:.1f} s)" if run.episode.collided else "no"
-
-
-def _state_at_brake(study: PaperStudy, run: Run) -> int | None:
-    """The state at the first row at which the leader brakes in full."""
-    braking = run.episode.leader_accelerations == -study.settings.scenario.leader.brake_decel
-    return int(run.state[np.argmax(braking)]) if braking.any() else None

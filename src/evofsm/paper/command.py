@@ -36,23 +36,16 @@ class Paper(InWorld):
 
     def run(self) -> int:
         """Drive, hold every claim against the runs, and write the page."""
-        from evofsm.cli import console
-        from evofsm.paper.files import write_data
-        from evofsm.paper.plan import Plan
-        from evofsm.paper.report.chapter import write_chapters
+        from evofsm.paper.page import print_page
+        from evofsm.paper.reproduction import reproduce
 
-        plan = Plan(self.world.value, self.rounds, self.settings)
         with progress() as bars:
-            found = plan.run(counter(bars, f"{plan.doing} ({self.world})"))
-            self.out.mkdir(parents=True, exist_ok=True)
-            drawn = counter(bars, "Drawing figures")
-            chapter = plan.chapter(found, self.out / "figures", command_line(), drawn)
-        write_data(found.study, found.claims, chapter.tables[1:], self.out)
-        page = write_chapters(self.out / "index.html", [chapter], command=command_line())
+            done = counter(bars, f"Driving and learning ({self.world})")
+            found = reproduce(self.world.value, self.rounds, self.settings, done)
+        page = found.write(self.out, command_line())
         if self.as_json:
-            print_json(found.frame.as_dicts())
+            print_json([claim._asdict() for claim in found.claims])
         else:
-            screen = console()
-            plan.say(screen, found, chapter)
-            screen.print(f"Page with all figures: {page}", soft_wrap=True)
-        return 0 if all(claim.holds for claim in found.claims) else 1
+            print_page(found.page(command_line()))
+            print(f"\nPage with all figures: {page}")
+        return 0 if found.holds else 1

@@ -1,19 +1,137 @@
-"""The runs: drive each case as often as asked, and show every row to one machine."""
+"""The runs: what they are told, each case driven as often as asked, every row shown to one machine.
+
+The settings stand, with comments, in ``settings.toml``.
+"""
 
 from __future__ import annotations
 
+import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from importlib.resources import files
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.driving import UNITS, VARIABLES, Episode, World
-from evofsm.fsm import EvolvingFSM, FSMModel, jensen_shannon, widen
-from evofsm.paper.settings import Settings
+from evofsm.driving import (
+    IDM,
+    UNITS,
+    VARIABLES,
+    ChangingIDM,
+    Episode,
+    Leader,
+    Scenario,
+    World,
+)
+from evofsm.driving.measures import is_dead_end
+from evofsm.fsm import EvolvingFSM, FSMModel, IntervalActions, jensen_shannon, widen
 
 CASES = (1, 2, 3, 4)
+
+
+# -- Settings -------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Settings:
+    """All that the runs can be told; the defaults stand in ``settings.toml``."""
+
+    tables: Mapping[str, Mapping[str, Any]]  #: as they stand there
+    scenario: Scenario
+    safe_until: float
+    drivers: Mapping[int, IDM | ChangingIDM]  #: by case
+    switch_at: Mapping[int, float]  #: when the driver changes, by case
+    brake_at: tuple[float, ...]
+    decel: float  #: hardest braking of the follower [m/s²], positive
+    machine: Mapping[str, Any]
+    actions: IntervalActions
+
+    @classmethod
+    def load(cls, path: Path | None = None) -> Settings:
+        """Read the paper's settings, with those of a TOML file in their place where it has any.
+
+        Raises
+        ------
+        ValueError
+            If the file is not TOML, or holds a name or a kind of value that is not known.
+        """
+        if path is None:
+            return cls.with_changes({})
+        try:
+            changes = tomllib.loads(path.read_text("utf-8"))
+        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+            raise ValueError(f"{path} is not TOML: {error}") from error
+        return cls.with_changes(changes, str(path))
+
+    @classmethod
+    def with_changes(cls, changes: Mapping[str, Any], where: str = "changes") -> Settings:
+        """The paper's settings with others in the place of some.
+
+        Parameters
+        ----------
+        changes : mapping
+            Tables of ``settings.toml``, with what is changed in them.
+        where : str
+            What they are called in error messages.
+
+        Raises
+        ------
+        ValueError
+            If there is a name or a kind of value that is not known.
+
+        Examples
+        --------
+        >>> settings = Settings.with_changes({"leader": {"brake_decel": 6.0}})
+        >>> settings.scenario.leader.brake_decel, settings.scenario.initial_gap
+        (6.0, 5.0)
+        """
+        tables = tomllib.loads(files(__package__).joinpath("settings.toml").read_text("utf-8"))
+        _merge(tables, changes, where)
+        scenario, leader, cases = dict(tables["scenario"]), dict(tables["leader"]), tables["cases"]
+        safe_until = scenario.pop("safe_until")
+        brake = {name: leader.pop(name) for name in ("brake_speed", "brake_decel")}
+        aggressive, normal = IDM(**tables["aggressive"]), IDM(**tables["normal"])
+        to_normal, to_aggressive = cases["to_normal_at"], cases["to_aggressive_at"]
+        return cls(
+            tables=tables,
+            scenario=Scenario(Leader(IDM(**leader), **brake), **scenario),
+            safe_until=safe_until,
+            drivers={
+                1: aggressive,
+                2: normal,
+                3: ChangingIDM(aggressive, ((to_normal, normal),)),
+                4: ChangingIDM(normal, ((to_aggressive, aggressive),)),
+            },
+            switch_at={3: to_normal, 4: to_aggressive},
+            brake_at=tuple(cases["brake_at"]),
+            decel=-min(aggressive.lowest, normal.lowest),
+            machine=tables["machine"],
+            actions=IntervalActions(**tables["actions"], outside="clip"),
+        )
+
+
+def _merge(known: dict[str, Any], changes: Mapping[str, Any], where: str) -> None:
+    """Put changes in the place of known values of the same kind."""
+    for name, value in changes.items():
+        if name not in known:
+            raise ValueError(f"{where}: there is no {name!r}; known are {', '.join(known)}")
+        if _kind(value) != _kind(known[name]):
+            raise ValueError(f"{where}: {name} is {value!r}; it must be like {known[name]!r}")
+        if isinstance(value, dict):
+            _merge(known[name], value, f"{where}, [{name}]")
+        else:
+            known[name] = value
+
+
+def _kind(value: Any) -> object:
+    if isinstance(value, list):
+        return [*{_kind(one) for one in value}]
+    return float if type(value) is int else type(value)
+
+
+# -- Runs -----------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,13 +145,13 @@ class Run:
     action: NDArray[np.int64]  #: (T,) index of the action commanded after each row
     state: NDArray[np.int64]  #: (T,) index of the most probable state
     n_states: NDArray[np.int64]  #: (T,) number of states
-    belief: NDArray[np.float64]  #: (T, n), 0 for states founded later
+    belief: NDArray[np.float64]  #: (T, n), 0 for states created later
     surprise: NDArray[np.float64]  #: (T,) [bit]
     first_surprise: float  #: of the first row, against the uniform belief and marginal matrix [bit]
 
 
 class Founding(NamedTuple):
-    """When a state was founded."""
+    """When a state was created."""
 
     state: int
     run: int  #: index of the run
@@ -54,9 +172,8 @@ class PaperStudy:
 
     @property
     def foundings(self) -> list[Founding]:
-        """When each state was founded, in the order of time."""
-        lengths = [len(run.state) for run in self.runs]
-        first_rows = np.cumsum([0, *lengths])
+        """When each state was created, in the order of time."""
+        first_rows = np.cumsum([0, *(len(run.state) for run in self.runs)])
         foundings = []
         for state, number in enumerate(self.model.founded):
             row = int(number) - 1
@@ -74,6 +191,11 @@ class PaperStudy:
     def last_round(self) -> tuple[Run, ...]:
         """The last run of each case, in the order of the cases."""
         return tuple(sorted(self.runs[-len(CASES) :], key=lambda run: run.case))
+
+    def in_dead_end(self, run: Run) -> NDArray[np.bool_]:
+        """Whether, by the oracle, a full brake of the leader could not be survived, at each row."""
+        leader = self.settings.scenario.leader
+        return is_dead_end(run.episode.observations, self.settings.decel, leader.brake_decel)
 
 
 def as_it_is(number: int, episode: Episode) -> NDArray[np.float64]:
@@ -119,31 +241,34 @@ def run_paper(
     if sorted(order) != list(CASES):
         raise ValueError(f"order is {list(order)}; it must hold each of the cases once")
     machine = EvolvingFSM(settings.actions.n_actions, **settings.machine)
-    longer = replace(settings.scenario, duration=settings.safe_until)
     total = rounds * len(CASES) + len(settings.brake_at) + 2
     runs: list[Run] = []
+
+    def learn(machine: EvolvingFSM, name: str, case: int, round_: int, scenario: Scenario) -> Run:
+        episode = world.run(scenario, settings.drivers[case])
+        seen = observe(len(runs) + len(extra_runs), episode)
+        run = _learn(machine, settings, name, case, round_, episode, seen, beliefs)
+        progress(len(runs) + len(extra_runs) + 1, total)
+        return run
+
+    extra_runs: list[Run] = []
     for round_ in range(1, rounds + 1):
         for case in order:
-            episode = world.run(settings.scenario, settings.drivers[case])
-            seen = observe(len(runs), episode)
-            name_ = f"case {case}"
-            runs.append(_learn(machine, settings, name_, case, round_, episode, seen, beliefs))
-            progress(len(runs), total)
-    extra_runs: list[Run] = []
+            runs.append(learn(machine, f"case {case}", case, round_, settings.scenario))
     for time in settings.brake_at:
         leader = replace(settings.scenario.leader, brake_time=time)
-        episode = world.run(replace(settings.scenario, leader=leader), settings.drivers[1])
-        name_ = f"brake at {time:g} s"
-        seen = observe(len(runs) + len(extra_runs), episode)
-        extra_runs.append(_learn(machine.copy(), settings, name_, 1, 0, episode, seen, beliefs))
-        progress(len(runs) + len(extra_runs), total)
+        scenario = replace(settings.scenario, leader=leader)
+        extra_runs.append(learn(machine.copy(), f"brake at {time:g} s", 1, 0, scenario))
+    longer = replace(settings.scenario, duration=settings.safe_until)
     safe = {case: not world.run(longer, settings.drivers[case]).collided for case in (2, 3)}
     progress(total, total)
     at_collisions = [run.state[-1] for run in runs if run.episode.collided]
+    if beliefs:  # over all the states there are in the end
+        runs = [replace(run, belief=widen(run.belief, machine.n_states)) for run in runs]
     return PaperStudy(
         world=name,
         settings=settings,
-        runs=tuple(_widened(run, machine.n_states) for run in runs) if beliefs else tuple(runs),
+        runs=tuple(runs),
         extra_runs=tuple(extra_runs),
         safe_at_the_end=safe,
         model=machine.model(
@@ -151,11 +276,6 @@ def run_paper(
         ),
         dead_end=int(np.bincount(at_collisions).argmax()) if at_collisions else -1,
     )
-
-
-def _widened(run: Run, n: int) -> Run:
-    """The same run with beliefs over all the states there are in the end."""
-    return replace(run, belief=widen(run.belief, n))
 
 
 def _learn(
@@ -169,7 +289,9 @@ def _learn(
     beliefs: bool,
 ) -> Run:
     """Show a run to the machine, row by row."""
-    foreseen = _first_forecast(machine) if beliefs else np.empty(0)
+    n = machine.n_states
+    # Of the first row: the uniform belief through the marginal matrix.
+    foreseen = np.full(n, 1.0 / max(n, 1)) @ machine.marginal_matrix if beliefs else np.empty(0)
     action = settings.actions.encode(episode.accelerations)
     ends = [len(seen) - 1] if episode.collided else []
     trace = machine.learn_many(seen, action, [0], ends, belief=beliefs)
@@ -189,9 +311,3 @@ def _learn(
         surprise=trace.surprise,
         first_surprise=first,
     )
-
-
-def _first_forecast(machine: EvolvingFSM) -> NDArray[np.float64]:
-    """Of a run's first row: the uniform belief through the marginal matrix; (n,)."""
-    n = machine.n_states
-    return np.full(n, 1.0 / max(n, 1)) @ machine.marginal_matrix

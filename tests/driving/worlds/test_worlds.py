@@ -11,8 +11,7 @@ from evofsm.driving.scenarios import Behind, Body, CutIn, Leader, Scenario, Sens
 from evofsm.driving.sumo import SumoWorld
 from evofsm.driving.world import REALISED, KinematicWorld
 from evofsm.guard.protocols import Proposal
-from evofsm.paper.runs import CASES
-from evofsm.paper.settings import Settings
+from evofsm.paper.runs import CASES, Settings
 
 pytest.importorskip("libsumo")
 

@@ -12,8 +12,7 @@ from rich.console import Console
 from studies.alarms.chapter import tell
 from studies.alarms.plan import Plan
 from studies.alarms.study import Found, Row
-
-from evofsm.paper.terminal import print_chapter
+from studies.old.terminal import print_chapter
 
 RATES = {"false alarms": 0.05, "misses": 0.1}
 

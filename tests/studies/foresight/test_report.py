@@ -13,8 +13,7 @@ from rich.console import Console
 from studies.foresight.chapter import tell
 from studies.foresight.plan import Plan
 from studies.foresight.study import OURS, RIVALS, Foresight, Row, run_foresight
-
-from evofsm.paper.terminal import print_chapter
+from studies.old.terminal import print_chapter
 
 
 def row(task, method, steps, brier, **others):

@@ -8,7 +8,7 @@ pytest.importorskip("gymnasium")
 from studies.judges.amounts import PARTS
 from studies.judges.plan import Plan
 from studies.judges.study import Judges
-from studies.scores import share_of
+from studies.old.scores import share_of
 from studies.systems.trial import Row
 
 #: Systems of these rows, with their controllers.

@@ -9,9 +9,8 @@ from rich.console import Console
 from studies.judges.chapter import tell
 from studies.judges.summary import Worth, effect, summary
 from studies.judges.targets import claims
-
-from evofsm.paper.report.chapter import write_chapters
-from evofsm.paper.terminal import print_chapter
+from studies.old.chapter import write_chapters
+from studies.old.terminal import print_chapter
 
 
 def change(found, system, without="", judge="learnt", **others):

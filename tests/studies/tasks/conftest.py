@@ -7,7 +7,7 @@ import pytest
 pytest.importorskip("scipy")
 pytest.importorskip("gymnasium")
 
-from studies.scores import share_of
+from studies.old.scores import share_of
 from studies.tasks.plan import Plan
 from studies.tasks.rows import Row
 from studies.tasks.study import Tasks

@@ -6,12 +6,11 @@ from dataclasses import replace
 
 import pytest
 from rich.console import Console
+from studies.old.chapter import write_chapters
+from studies.old.terminal import print_chapter
 from studies.tasks.chapter import tell
 from studies.tasks.summary import own_share, summaries, summary
 from studies.tasks.targets import claims
-
-from evofsm.paper.report.chapter import write_chapters
-from evofsm.paper.terminal import print_chapter
 
 
 def change(found, task, judge="learnt", seed=None, **others):

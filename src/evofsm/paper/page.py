@@ -1,0 +1,391 @@
+"""Pages of results: text, tables and figures in one HTML file that loads nothing.
+
+`write_page` writes one, `print_page` says the same in the terminal. The paper's page and those of
+all studies are made here.
+"""
+
+from __future__ import annotations
+
+import math
+import platform
+import re
+from base64 import b64encode
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from string import Formatter
+from typing import TYPE_CHECKING, Any
+
+import evofsm
+from evofsm.extras import needs
+
+with needs("polars", "tables", "tables of results"):
+    import polars as pl
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure as Drawn
+    from rich.console import Console
+
+#: What a cell says where there is no number.
+NONE = "–"
+_PACKAGES = ("numpy", "numba", "polars", "matplotlib")
+# A table with a longer cell is one of words, which are folded.
+_WORDS = 36
+# Where nobody watches, tables are as wide as they like, up to this.
+_WIDEST = 200
+
+
+class _Cell(Formatter):
+    """``str.format`` for cells: `NONE` for missing numbers, shares in percent, true minus signs."""
+
+    def get_field(self, name: str, args: Any, row: Any) -> Any:
+        return row[name], name  # names may hold dots and brackets
+
+    def format_field(self, value: Any, spec: str) -> str:
+        if value is None or (isinstance(value, float) and math.isnan(value)):
+            return NONE
+        if isinstance(value, bool):
+            return "yes" if value else "no"
+        if isinstance(value, list | tuple):
+            return ", ".join(self.format_field(one, spec) for one in value) or NONE
+        if not isinstance(value, int | float):
+            return str(value)
+        if math.isinf(value):
+            return "∞" if value > 0 else "−∞"
+        if spec in ("%", "p"):  # what is small, but not 0, is not shown as 0
+            text = f"{100 * value:.{2 if 0 < abs(value) < 5e-4 else 1}f}"
+            return _minus(text) + (" %" if spec == "%" else "")
+        return _minus(format(value, spec or ("," if isinstance(value, int) else "g")))
+
+
+def _minus(number: str) -> str:
+    return number.replace("-", "−") if "e" not in number else number
+
+
+def cell(template: str, row: Mapping[str, Any]) -> str:
+    """The text of one cell.
+
+    Parameters
+    ----------
+    template : str
+        As ``str.format`` takes it, with names of the row. Two formats are added: ``%`` for a share
+        in percent, and ``p`` for the same without the sign.
+    row : mapping
+        Values by name.
+
+    Examples
+    --------
+    >>> cell("{rate:%} ({low:p}–{high:p})", {"rate": 0.0, "low": 0.0, "high": 0.0037})
+    '0.0 % (0.0–0.4)'
+    >>> cell("{skill:.2f}", {"skill": -0.5}), cell("{skill:.2f}", {"skill": None})
+    ('−0.50', '–')
+    """
+    names = [name for _, name, _, _ in Formatter().parse(template) if name]
+    if names and all(_Cell().format_field(row[name], "") == NONE for name in names):
+        return NONE
+    return _Cell().vformat(template, (), row)
+
+
+@dataclass(frozen=True, eq=False)
+class Table:
+    """Rows of a frame under headers.
+
+    Parameters
+    ----------
+    title : str
+    frame : polars.DataFrame
+    columns : mapping of str to str, optional
+        By header, a template of each cell (see `cell`); without it all columns as they are.
+    note : str
+        Stands below.
+    mark : polars.Expr, optional
+        Of each row ``"ours"``, ``"holds"``, ``"fails"``, or None.
+
+    Examples
+    --------
+    >>> import polars as pl
+    >>> frame = pl.DataFrame({"policy": ["ttc"], "failed": [3], "episodes": [10]})
+    >>> Table("Failures", frame, {"who": "{policy}", "failed": "{failed} of {episodes}"}).cells
+    [('ttc', '3 of 10')]
+    """
+
+    title: str
+    frame: pl.DataFrame
+    columns: Mapping[str, str] | None = None
+    note: str = ""
+    mark: pl.Expr | None = None
+
+    @property
+    def header(self) -> tuple[str, ...]:
+        """The name of each column."""
+        return tuple(self.frame.columns if self.columns is None else self.columns)
+
+    @property
+    def cells(self) -> list[tuple[str, ...]]:
+        """The text of each row."""
+        templates = (
+            [f"{{{name}}}" for name in self.frame.columns]
+            if self.columns is None
+            else list(self.columns.values())
+        )
+        rows = self.frame.iter_rows(named=True)
+        return [tuple(cell(template, row) for template in templates) for row in rows]
+
+    @property
+    def marks(self) -> list[str | None]:
+        """The mark of each row."""
+        if self.mark is None or self.frame.is_empty():
+            return [None] * len(self.frame)
+        return self.frame.select(mark=self.mark)["mark"].to_list()
+
+    @property
+    def numeric(self) -> list[bool]:
+        """Whether a column, never the first, holds numbers."""
+        columns = list(zip(*self.cells, strict=True))[1:]
+        held = [all(re.match(r"[−–∞≤≥<>+\d]", text) for text in column) for column in columns]
+        return [False, *(held or [False] * (len(self.header) - 1))]
+
+    @property
+    def is_wordy(self) -> bool:
+        """Whether cells hold words, which may be folded."""
+        return any(len(text) > _WORDS for row in self.cells for text in row)
+
+
+@dataclass(frozen=True, eq=False)
+class Figure:
+    """A figure that `write_page` draws."""
+
+    name: str  #: of its files, without their ending
+    title: str
+    caption: str
+    draw: Callable[[], Drawn]
+    alt: str = ""  #: what it shows, for those who cannot see it; without it the title
+
+
+@dataclass(frozen=True, eq=False)
+class Page:
+    """What was asked, the tables and figures that say what came out, and where it loses."""
+
+    name: str  #: in addresses, such as ``"closed-loop"``
+    about: str  #: the question, an empty line, and what was done; a docstring
+    parts: Sequence[Table | Figure]
+    command: str  #: that makes it
+    lost: Sequence[Table] = ()  #: rows that go against us
+    #: what was asked and measured, and last whether it is met; empty where nothing was asked for
+    targets: pl.DataFrame = field(default_factory=pl.DataFrame)
+    facts: Mapping[str, str] = field(default_factory=dict)  #: seeds and sizes, by name
+    packages: tuple[str, ...] = ()  #: whose versions matter beside the usual ones
+    sources: Mapping[str, str] = field(default_factory=dict)  #: addresses by text
+    verdict: str = ""  #: in a line; without it how many targets are met
+
+    @property
+    def title(self) -> str:
+        """The question."""
+        return " ".join(self.about.strip().partition("\n\n")[0].split())
+
+    @property
+    def text(self) -> list[str]:
+        """The paragraphs below it."""
+        return [" ".join(one.split()) for one in self.about.strip().split("\n\n")[1:]]
+
+    @property
+    def holds(self) -> bool | None:
+        """Whether all targets are met; None where there is none."""
+        return None if self.targets.is_empty() else bool(self.targets[:, -1].all())
+
+    @property
+    def answer(self) -> str:
+        """The verdict."""
+        if self.verdict or self.targets.is_empty():
+            return self.verdict
+        return f"{self.targets[:, -1].sum()} of {len(self.targets)} targets are met"
+
+    @property
+    def tables(self) -> list[Table]:
+        """All tables but those of what is lost, the targets first."""
+        mark = pl.when(~pl.nth(-1)).then(pl.lit("fails"))
+        name = "" if self.targets.is_empty() else f"{self.targets.columns[0].capitalize()}s"
+        asked = [Table(name, self.targets, mark=mark)] if name else []
+        return [*asked, *(part for part in self.parts if isinstance(part, Table))]
+
+    @property
+    def figures(self) -> list[Figure]:
+        """All figures."""
+        return [part for part in self.parts if isinstance(part, Figure)]
+
+    @property
+    def losses(self) -> list[Table]:
+        """Tables of what is lost that have a row."""
+        return [table for table in self.lost if len(table.frame)]
+
+
+# -- The file -------------------------------------------------------------------------------------
+
+
+def write_page(path: Path, pages: Sequence[Page], title: str = "", about: str = "") -> Path:
+    """Draw all figures and write one file that holds all it shows.
+
+    Parameters
+    ----------
+    path : pathlib.Path
+        The file. Figures are put into ``figures`` beside it as well, as PNG and SVG; those of each
+        of many pages into a folder of its name.
+    pages : sequence of Page
+        In their order.
+    title, about : str
+        Of many pages; one that is alone has its own.
+
+    Returns
+    -------
+    pathlib.Path
+        The file.
+
+    Raises
+    ------
+    ModuleNotFoundError
+        If matplotlib or jinja2 is not installed.
+    """
+    with needs("jinja2", "plot", "writing the page"):
+        from jinja2 import Environment, PackageLoader, StrictUndefined
+    path.parent.mkdir(parents=True, exist_ok=True)
+    environment = Environment(
+        loader=PackageLoader("evofsm.paper", ""),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    packages = dict.fromkeys(package for page in pages for package in page.packages)
+    text = environment.get_template("page.html.j2").render(
+        title=title or pages[0].title,
+        about=[about] if about else pages[0].text,
+        pages=pages,
+        images={
+            page.name: _drawn(
+                page.figures, path.parent / (page.name if len(pages) > 1 else "figures")
+            )
+            for page in pages
+        },
+        summary=_summary(pages),
+        versions=_versions(packages),
+        date=datetime.now(UTC).date().isoformat(),
+    )
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def _drawn(figures: Sequence[Figure], folder: Path) -> dict[str, str]:
+    """Each figure as the address of an image that holds it, by name."""
+    import matplotlib.style
+
+    folder.mkdir(parents=True, exist_ok=True)
+    images = {}
+    with matplotlib.style.context(["default", Path(__file__).with_name("house.mplstyle")]):
+        for one in figures:
+            figure, svg = one.draw(), folder / f"{one.name}.svg"
+            figure.savefig(svg.with_suffix(".png"))
+            figure.savefig(svg, metadata={"Date": None})
+            text = b64encode(svg.read_bytes()).decode("ascii")
+            images[one.name] = f"data:image/svg+xml;base64,{text}"
+    return images
+
+
+def _summary(pages: Sequence[Page]) -> Table:
+    """What each page asks and what came out, in a line each."""
+    rows = [
+        {
+            "question": page.title,
+            "answer": page.answer,
+            "rows lost": sum(len(table.frame) for table in page.losses),
+            "mark": {True: "holds", False: "fails", None: None}[page.holds],
+        }
+        for page in pages
+    ]
+    columns = {name: f"{{{name}}}" for name in ("question", "answer", "rows lost")}
+    return Table("In short", pl.DataFrame(rows), columns, mark=pl.col("mark"))
+
+
+def _versions(more: Sequence[str] | Mapping[str, None]) -> dict[str, str]:
+    """What the numbers were computed with."""
+    found = {"evofsm": evofsm.__version__, "Python": platform.python_version()}
+    for name in (*_PACKAGES, *more):
+        try:
+            found["SUMO (libsumo)" if name == "libsumo" else name] = version(name)
+        except PackageNotFoundError:  # on the path without having been installed
+            found[name] = "unknown"
+    return {**found, "system": f"{platform.system()} on {platform.machine()}"}
+
+
+# -- The terminal ---------------------------------------------------------------------------------
+
+
+def print_page(page: Page, out: Console | None = None) -> None:
+    """Print what a page says: its targets, tables, and where it loses."""
+    out = out or _console()
+    out.print(page.title, style="bold")
+    out.print(page.answer, style="bold red" if page.holds is False else "")
+    for table in page.tables:
+        print_table(table, out)
+    out.print("\nWhere it loses", style="bold")
+    for table in page.losses:
+        print_table(table, out)
+    if not page.losses:
+        out.print("In no row of these tables.")
+
+
+def print_summary(pages: Sequence[Page]) -> None:
+    """Print what each page asks and what came out, in a line each."""
+    print_table(_summary(pages), _console())
+
+
+def print_table(table: Table, out: Console) -> None:
+    """Print a table; rows that are ours begin with ``>``, those that fail with ``!``.
+
+    One of numbers that is too wide comes in parts, each with the names of the rows.
+    """
+    from rich.box import SIMPLE_HEAD
+    from rich.table import Table as Grid
+
+    signs = {"ours": "> ", "fails": "! "}
+    styles = {"ours": "bold", "fails": "bold red"}
+    marks = [mark or "" for mark in table.marks]
+    rows = [
+        (signs.get(mark, "") + row[0], *row[1:])
+        for row, mark in zip(table.cells, marks, strict=True)
+    ]
+    out.print(f"\n{table.title}", style="bold")
+    for part in _parts(table, rows, out.width):
+        grid = Grid(box=SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=(0, 1, 0, 0))
+        for column in part:
+            justify = "right" if table.numeric[column] else "left"
+            grid.add_column(table.header[column], justify=justify, vertical="bottom")  # type: ignore[arg-type]
+        for row, mark in zip(rows, marks, strict=True):
+            grid.add_row(*(row[column] for column in part), style=styles.get(mark))
+        out.print(grid)
+    if table.note:
+        out.print(table.note, style="dim")
+
+
+def _parts(table: Table, rows: Sequence[Sequence[str]], room: int) -> list[list[int]]:
+    """Columns that stand beside one another, the first in each part."""
+    widths = [max(map(len, column)) + 2 for column in zip(table.header, *rows, strict=True)]
+    if table.is_wordy or sum(widths) <= room:
+        return [list(range(len(widths)))]
+    parts: list[list[int]] = []
+    for column in range(1, len(widths)):
+        if not parts or sum(widths[one] for one in parts[-1]) + widths[column] > room:
+            parts.append([0])
+        parts[-1].append(column)
+    return parts
+
+
+def _console() -> Console:
+    """Standard output; brackets are no markup, and a pipe has room for every column."""
+    from rich.console import Console
+
+    out = Console(markup=False, highlight=False, emoji=False)
+    if not out.is_terminal:
+        out.width = max(out.width, _WIDEST)
+    return out

@@ -1,1 +1,0 @@
-"""Reports: draw and print what studies and models hold; compute nothing."""

@@ -1,0 +1,631 @@
+"""What all studies share: their commands, work over processes, intervals, scores and figures.
+
+A study is a frozen dataclass that derives from `Study`, in a file of its own. Its fields are the
+options of its command, as Typer takes them; `run` returns rows as polars frames, one row per unit
+of evidence; `page` says which tables and figures show them, and which rows go against us. The page
+itself is `evofsm.paper.Page`; `README.md` beside this file has an example.
+"""
+
+from __future__ import annotations
+
+import inspect
+import json
+import math
+import os
+import shlex
+import sys
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from contextlib import contextmanager
+from dataclasses import MISSING, dataclass, fields
+from functools import partial
+from importlib import import_module
+from importlib.util import find_spec
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, NamedTuple, Self, TypeVar, get_origin, get_type_hints
+
+import numpy as np
+import polars as pl
+import typer
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure as Drawn
+from matplotlib.lines import Line2D
+from numpy.typing import ArrayLike, NDArray
+from scipy.optimize import isotonic_regression
+from scipy.stats import beta
+
+from evofsm.extras import install
+from evofsm.paper import Page, print_page, write_page
+
+#: Rows of a study by name; those of its main table are called ``"rows"``.
+Frames = Mapping[str, pl.DataFrame]
+R = TypeVar("R")
+
+#: What an option may take in place of names with commas: all there are, or the first one.
+ALL, FIRST = "all", "first"
+
+
+# -- A study and its command ----------------------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True)
+class Study(ABC):
+    """A question, and how much is done to answer it. The docstring is the help of its command."""
+
+    name: ClassVar[str]  #: of its command, its page and its files
+    needed: ClassVar[Mapping[str, str]] = {}  #: packages that it needs, with the extra of each
+
+    seed: Annotated[int, typer.Option(min=0, help="Seed of all random draws.")] = 0
+
+    def shortened(self) -> Self:
+        """The same in a minute or a few: too small for conclusions."""
+        return self
+
+    @abstractmethod
+    def run(self, workers: int | None = None) -> dict[str, pl.DataFrame]:
+        """Do it.
+
+        Parameters
+        ----------
+        workers : int, optional
+            Processes; one per core if not given. The numbers do not depend on it.
+        """
+
+    @abstractmethod
+    def page(self, found: Frames) -> Page:
+        """The tables and figures that show what `run` returned."""
+
+    @property
+    def facts(self) -> dict[str, str]:
+        """All its settings, for the page."""
+        return {
+            one.name.replace("_", " "): str(value)
+            for one in fields(self)
+            if (value := getattr(self, one.name)) not in (None, "")
+        }
+
+
+def command(study: type[Study]) -> Callable[..., None]:
+    """The function of which Typer makes a study's command."""
+
+    def run(
+        short: bool, workers: int | None, out: Path | None, as_json: bool, **given: Any
+    ) -> None:
+        with refused():
+            require(study.needed)
+            asked = study(**given).shortened() if short else study(**given)
+            found = asked.run(workers)
+            if as_json:
+                print(to_json({name: frame.to_dicts() for name, frame in found.items()}))
+                return
+            folder = out or Path(f"evofsm-{study.name}")
+            folder.mkdir(parents=True, exist_ok=True)
+            for name, frame in found.items():
+                file = study.name if name == "rows" else f"{study.name}-{name}"
+                frame.write_parquet(folder.absolute() / f"{file}.parquet")
+            page = asked.page(found)
+            path = write_page(folder / "index.html", [page])
+            print_page(page)
+            print(f"\nPage with all figures: {path}")
+
+    hints = get_type_hints(study, include_extras=True)
+    options = [
+        (one.name, hints[one.name], one.default)
+        for one in fields(study)
+        if get_origin(hints[one.name]) is Annotated  # others say how much is done, for `shortened`
+    ]
+    parameters = [
+        inspect.Parameter(
+            name,
+            inspect.Parameter.KEYWORD_ONLY,
+            default=inspect.Parameter.empty if default is MISSING else default,
+            annotation=hint,
+        )
+        for name, hint, default in [*options, *_SHARED]
+    ]
+    run.__name__, run.__doc__ = study.name, study.__doc__
+    run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    return run
+
+
+_SHARED: tuple[tuple[str, Any, Any], ...] = (
+    (
+        "short",
+        Annotated[bool, typer.Option("--short", help="Quick run, too small for conclusions.")],
+        False,
+    ),
+    (
+        "workers",
+        Annotated[int | None, typer.Option(min=1, help="Processes; one per core if not given.")],
+        None,
+    ),
+    (
+        "out",
+        Annotated[
+            Path | None,
+            typer.Option(help="Folder for the page, figures and rows. evofsm-NAME if not given."),
+        ],
+        None,
+    ),
+    (
+        "as_json",
+        Annotated[bool, typer.Option("--json", help="Print all rows as JSON; write nothing.")],
+        False,
+    ),
+)
+
+
+@contextmanager
+def refused() -> Iterator[None]:
+    """Print what a user can mend as one line on standard error, and end with status 2."""
+    try:
+        yield
+    except (ValueError, TypeError, OSError, ModuleNotFoundError) as error:
+        print(f"studies: {error}", file=sys.stderr)
+        raise typer.Exit(2) from None
+
+
+def require(packages: Mapping[str, str]) -> None:
+    """Refuse before the long work what lacks a package after it.
+
+    Raises
+    ------
+    ModuleNotFoundError
+        That names all that is lacking, and the command that installs it.
+    """
+    if lacking := [package for package in packages if find_spec(package) is None]:
+        extras = dict.fromkeys(packages[package] for package in lacking)
+        raise ModuleNotFoundError(f"this needs {' and '.join(lacking)}: {install(*extras)}")
+
+
+def command_line() -> str:
+    """What was typed."""
+    return shlex.join(["python", "-m", "studies", *sys.argv[1:]])
+
+
+def to_json(document: object) -> str:
+    """JSON that every parser reads: what is not a finite number becomes null."""
+
+    def plain(value: Any) -> Any:
+        if isinstance(value, dict):
+            return {name: plain(one) for name, one in value.items()}
+        if isinstance(value, list | tuple):
+            return [plain(one) for one in value]
+        return None if isinstance(value, float) and not math.isfinite(value) else value
+
+    return json.dumps(plain(document), indent=2, ensure_ascii=False, allow_nan=False)
+
+
+def names_in(text: str) -> list[str]:
+    """Names that were given with commas between them."""
+    return [name.strip() for name in text.split(",") if name.strip()]
+
+
+def imported(name: str) -> Any:
+    """What ``module:Name`` names; the module is looked for in the present folder too, and run.
+
+    Raises
+    ------
+    ValueError
+        If it is no such name, there is no such module, or nothing of that name in it.
+
+    Examples
+    --------
+    >>> imported("math:pi")
+    3.141592653589793
+    """
+    module_name, colon, thing = name.partition(":")
+    if not (module_name and colon and thing):
+        raise ValueError(f"{name!r} names nothing; write module:Name")
+    if "" not in sys.path:
+        sys.path.insert(0, "")
+    try:
+        module = import_module(module_name)
+    except ModuleNotFoundError as error:
+        raise ValueError(f"{module_name}: {error} (is it in this folder, or installed?)") from error
+    if not hasattr(module, thing):
+        raise ValueError(f"{module_name} has no {thing!r}")
+    return getattr(module, thing)
+
+
+# -- Work over processes --------------------------------------------------------------------------
+
+
+def parallel(
+    tasks: Sequence[partial[R]], workers: int | None = None, doing: str = "Driving and learning"
+) -> list[R]:
+    """Results of all tasks, in the order of the tasks, with a progress bar on standard error.
+
+    Parameters
+    ----------
+    tasks : sequence of functools.partial
+        Of functions of modules. Each should take a second or more, for it crosses a process
+        boundary.
+    workers : int, optional
+        Processes, one per core if not given; with 1 the tasks are run in this very process.
+    doing : str
+        What the bar says.
+
+    Examples
+    --------
+    >>> parallel([partial(pow, x, 2) for x in range(4)], workers=1)
+    [0, 1, 4, 9]
+    """
+    from rich.console import Console
+    from rich.progress import track
+
+    console = Console(stderr=True)
+    show = partial(
+        track,
+        description=doing,
+        total=len(tasks),
+        console=console,
+        transient=True,
+        disable=not console.is_terminal,
+    )
+    workers = min(workers or os.cpu_count() or 1, max(len(tasks), 1))
+    if workers == 1:
+        return [task() for task in show(tasks)]
+    # Forking a process that has started threads may hang; a fresh one costs a second.
+    with ProcessPoolExecutor(workers, get_context("spawn")) as pool:
+        running = {pool.submit(task): place for place, task in enumerate(tasks)}
+        try:
+            found = {running[one]: one.result() for one in show(as_completed(running))}
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise
+    return [found[place] for place in range(len(tasks))]
+
+
+# -- Rows -----------------------------------------------------------------------------------------
+
+
+def frame_of(rows: Iterable[Any]) -> pl.DataFrame:
+    """A frame of named tuples, dataclasses or dictionaries, all of one kind."""
+    plain = [
+        row
+        if isinstance(row, dict)
+        else row._asdict()
+        if hasattr(row, "_asdict")
+        else {one.name: getattr(row, one.name) for one in fields(row)}
+        for row in rows
+    ]
+    return pl.DataFrame(plain, infer_schema_length=None)
+
+
+def with_share(
+    frame: pl.DataFrame, held: str, tried: str, name: str, confidence: float = 0.95
+) -> pl.DataFrame:
+    """Add a share and its exact interval (C. Clopper, E. Pearson, Biometrika 26, 1934).
+
+    Parameters
+    ----------
+    frame : polars.DataFrame
+    held, tried : str
+        Columns: so many of so many.
+    name : str
+        Columns ``name``, ``name_low`` and ``name_high`` are added; of none tried the share is null.
+    confidence : float
+
+    Examples
+    --------
+    >>> frame = pl.DataFrame({"failed": [0, 3], "episodes": [1000, 10]})
+    >>> with_share(frame, "failed", "episodes", "rate")["rate_high"].round(4).to_list()
+    [0.0037, 0.6525]
+    """
+    low, high = exact_interval(frame[held].to_numpy(), frame[tried].to_numpy(), confidence)
+    share = pl.when(pl.col(tried) > 0).then(pl.col(held) / pl.col(tried))
+    return frame.with_columns(
+        share.alias(name), pl.Series(f"{name}_low", low), pl.Series(f"{name}_high", high)
+    )
+
+
+def exact_interval(
+    held: ArrayLike, tried: ArrayLike, confidence: float = 0.95
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Ends of the exact interval of a share, so many of so many; 0 and 1 of none."""
+    k, n = np.asarray(held, np.float64), np.asarray(tried, np.float64)
+    tail = 0.5 * (1.0 - confidence)
+    low, high = beta.ppf(tail, k, n - k + 1.0), beta.ppf(1.0 - tail, k + 1.0, n - k)
+    return np.where(k == 0.0, 0.0, low), np.where(k == n, 1.0, high)
+
+
+def compared(frame: pl.DataFrame, ours: pl.Expr, by: Sequence[str]) -> pl.DataFrame:
+    """Every other row together with ours of the same question, whose columns end in ``_ours``.
+
+    Parameters
+    ----------
+    frame : polars.DataFrame
+    ours : polars.Expr
+        Whether a row is ours; one for each question.
+    by : sequence of str
+        Columns that say what was asked.
+
+    Examples
+    --------
+    >>> frame = pl.DataFrame({"task": ["a"] * 3, "who": ["ours", "ttc", "rss"], "x": [1, 2, 0]})
+    >>> both = compared(frame, pl.col("who") == "ours", ["task"])
+    >>> both.filter(pl.col("x") > pl.col("x_ours"))["who"].to_list()
+    ['ttc']
+    """
+    return frame.filter(~ours).join(frame.filter(ours), on=list(by), suffix="_ours")
+
+
+class Target(NamedTuple):
+    """Something that was asked for before it was measured, and what came out."""
+
+    target: str
+    asked: str
+    measured: str
+    met: bool
+
+
+def at_most(target: str, value: float, most: float, show: str = "{:g}") -> Target:
+    """That a number be no larger than another one.
+
+    >>> at_most("episodes that fail", 3, 2)
+    Target(target='episodes that fail', asked='≤ 2', measured='3', met=False)
+    """
+    return Target(target, f"≤ {show.format(most)}", show.format(value), bool(value <= most))
+
+
+def at_least(target: str, value: float, least: float, show: str = "{:g}") -> Target:
+    """That a number be no smaller than another one."""
+    return Target(target, f"≥ {show.format(least)}", show.format(value), bool(value >= least))
+
+
+# -- Scores and their uncertainty -----------------------------------------------------------------
+# Rows of one episode are much alike, so whatever is uncertain is resampled by whole episodes
+# (B. Efron, R. Tibshirani, "An Introduction to the Bootstrap", 1993).
+
+
+class Interval(NamedTuple):
+    """From and to, 95 %; NaN where there is none."""
+
+    low: float
+    high: float
+
+
+def interval(values: ArrayLike) -> Interval:
+    """95 % interval of bootstrap values; NaN is left out."""
+    found = np.asarray(values, dtype=np.float64)
+    found = found[~np.isnan(found)]
+    if found.size == 0:
+        return Interval(math.nan, math.nan)
+    low, high = np.quantile(found, (0.025, 0.975))
+    return Interval(float(low), float(high))
+
+
+def resampled(episodes: int, rounds: int, seed: int = 0) -> Iterator[NDArray[np.intp]]:
+    """Indices of as many episodes as there are, drawn with replacement, round by round."""
+    rng = np.random.default_rng(seed)
+    for _ in range(rounds):
+        yield rng.integers(episodes, size=episodes)
+
+
+def bootstrap(
+    function: Callable[[NDArray[np.intp]], float], episodes: int, rounds: int = 200, seed: int = 0
+) -> Interval:
+    """95 % interval of a number that a function makes of the indices of episodes.
+
+    Examples
+    --------
+    >>> lasted = np.array([3.0, 4.0, 5.0, 6.0])
+    >>> low, high = bootstrap(lambda chosen: float(lasted[chosen].mean()), len(lasted))
+    >>> bool(low < lasted.mean() < high)
+    True
+    """
+    return interval([function(chosen) for chosen in resampled(episodes, rounds, seed)])
+
+
+class Areas(NamedTuple):
+    """Areas under both curves; NaN where cases are too much alike.
+
+    The area under the ROC curve is the probability that a dangerous case scores above another one,
+    ties counting half. The area under precision over recall is the average precision: no line is
+    drawn between thresholds, which would flatter (J. Davis, M. Goadrich, ICML 2006).
+    """
+
+    auroc: float
+    auprc: float
+
+
+class Ranked:
+    """Scores in falling order: both areas for many weightings, sorted once.
+
+    Parameters
+    ----------
+    score : (n,) array_like
+        Higher is more dangerous. Infinite scores have a rank like any others.
+    truth : (n,) array_like of bool
+        Whether it was dangerous.
+    episode : (n,) array_like of int, optional
+        Which episode each case is of, from 0; without it each is one of its own.
+
+    Raises
+    ------
+    ValueError
+        If they are not equally long, or a score is NaN, which has no rank.
+
+    Examples
+    --------
+    >>> ranked = Ranked([0.1, 0.4, 0.4, 0.8], [False, False, True, True])
+    >>> ranked.areas().auroc, round(ranked.areas().auprc, 4)
+    (0.875, 0.8333)
+    >>> ranked.areas([1, 0, 1, 1])  # the second case left out
+    Areas(auroc=1.0, auprc=1.0)
+    """
+
+    def __init__(
+        self, score: ArrayLike, truth: ArrayLike, episode: ArrayLike | None = None
+    ) -> None:
+        values, dangerous = np.asarray(score, dtype=np.float64), np.asarray(truth, dtype=np.bool_)
+        places = np.arange(len(values)) if episode is None else np.asarray(episode, dtype=np.intp)
+        if values.ndim != 1 or not values.shape == dangerous.shape == places.shape:
+            raise ValueError(
+                f"score has shape {values.shape}, truth {dangerous.shape} and episode "
+                f"{places.shape}; each must be one row, all equally long"
+            )
+        if np.isnan(values).any():
+            raise ValueError("score holds NaN, which has no rank")
+        order = np.argsort(-values, kind="stable")
+        self._truth, self._episode = dangerous[order], places[order]
+        # The last case of each score: a threshold cannot tell equal ones apart.
+        falling = values[order]
+        self._last = np.append(falling[1:] != falling[:-1], True)[: len(values)]
+        self._episodes = int(places.max(initial=-1)) + 1
+
+    def areas(self, weight: ArrayLike | None = None) -> Areas:
+        """Both areas, with each episode counted as often as ``weight`` (episodes,) says."""
+        often = np.ones(self._episodes) if weight is None else np.asarray(weight, np.float64)
+        each = often[self._episode]
+        true = np.cumsum(each * self._truth)[self._last]
+        false = np.cumsum(each * ~self._truth)[self._last]
+        if true.size == 0 or true[-1] == 0.0:
+            return Areas(math.nan, math.nan)
+        more, fewer = np.diff(true, prepend=0.0), np.diff(false, prepend=0.0)
+        gained = more > 0.0
+        precision = np.sum(more[gained] * true[gained] / (true + false)[gained])
+        under = np.sum(fewer * (true - 0.5 * more))
+        area = float(under / (true[-1] * false[-1])) if false[-1] > 0.0 else math.nan
+        return Areas(area, float(precision / true[-1]))
+
+    def interval(self, rounds: int = 200, seed: int = 0) -> tuple[Interval, Interval]:
+        """95 % intervals of both areas, by bootstrap over episodes."""
+        found = np.array(
+            [
+                self.areas(np.bincount(chosen, minlength=self._episodes))
+                for chosen in resampled(self._episodes, rounds, seed)
+            ]
+        )
+        return interval(found[:, 0]), interval(found[:, 1])
+
+
+def brier(probability: ArrayLike, truth: ArrayLike) -> float:
+    """Mean squared error of probabilities (G. W. Brier, Monthly Weather Review 78, 1950).
+
+    >>> brier([0.0, 0.5, 1.0], [False, True, True])
+    0.08333333333333333
+    """
+    error = np.asarray(probability, dtype=np.float64) - np.asarray(truth, dtype=np.float64)
+    return float((error**2).mean()) if error.size else math.nan
+
+
+class Calibration(NamedTuple):
+    """Turns a score into a probability that never falls as the score rises; see `isotonic`."""
+
+    scores: NDArray[np.float64]  #: (k,) in rising order
+    probabilities: NDArray[np.float64]  #: (k,) from each of them on
+
+    def __call__(self, score: ArrayLike) -> NDArray[np.float64]:
+        """(n,) ndarray: probability of each score."""
+        place = np.searchsorted(self.scores, np.asarray(score, dtype=np.float64), side="right") - 1
+        return np.asarray(self.probabilities[np.maximum(place, 0)])
+
+
+def isotonic(score: ArrayLike, truth: ArrayLike) -> Calibration:
+    """Calibrate scores, infinite ones too, by isotonic regression (B. Zadrozny, C. Elkan, 2002).
+
+    Raises
+    ------
+    ValueError
+        If there is no case, or a score is NaN.
+
+    Examples
+    --------
+    >>> calibrate = isotonic([1.0, 2.0, 3.0, 4.0], [False, True, False, True])
+    >>> calibrate([0.0, 2.5, 9.0])
+    array([0. , 0.5, 1. ])
+    """
+    values = np.asarray(score, dtype=np.float64)
+    if values.size == 0 or np.isnan(values).any():
+        raise ValueError("isotonic calibration needs one score or more, none of them NaN")
+    scores, which, cases = np.unique(values, return_inverse=True, return_counts=True)
+    came = np.bincount(which, weights=np.asarray(truth, dtype=np.float64)) / cases
+    fitted = isotonic_regression(came, weights=cases.astype(np.float64)).x
+    return Calibration(scores, np.clip(fitted, 0.0, 1.0))
+
+
+# -- Figures --------------------------------------------------------------------------------------
+# Colours are those of all figures of evofsm; a line differs from others in its marker or dashes as
+# well, so that neither is needed.
+
+Look = dict[str, Any]
+BLUE, GREEN, RED, PINK, INK, SOFT = (
+    *("#0072B2", "#009E73", "#D55E00", "#CC79A7"),
+    *("#222222", "#777777"),
+)
+#: Of who is ours, of fixed constants, of what is tuned or told, of another learner, and of chance.
+OURS: Look = {"color": BLUE, "marker": "o"}
+FIXED: Look = {"color": RED, "marker": "s"}
+TOLD: Look = {"color": GREEN, "marker": "D"}
+OTHER: Look = {"color": PINK, "marker": "^"}
+PLAIN: Look = {"color": SOFT, "marker": "X"}
+
+
+def panels(rows: int, columns: int, height: float, **shared: Any) -> tuple[Drawn, Any]:
+    """A figure as wide as a page, ``height`` inches high, and its (rows, columns) axes."""
+    figure = Drawn(figsize=(7.2, height), layout="constrained")
+    return figure, figure.subplots(rows, columns, squeeze=False, **shared)
+
+
+def legend(figure: Drawn, looks: Mapping[str, Look], columns: int | None = None) -> None:
+    """Explain looks above all panels."""
+    usual: Look = {"linestyle": "none", "markersize": 4.5}
+    figure.legend(
+        handles=[Line2D([], [], label=name, **{**usual, **look}) for name, look in looks.items()],
+        loc="outside upper center",
+        ncols=columns or len(looks),
+        columnspacing=1.1,
+        handletextpad=0.4,
+    )
+
+
+def level(axes: Axes, value: float, *, across: bool = True) -> None:
+    """A broken line at a height, or at a place on the lower axis, behind all else."""
+    draw = axes.axhline if across else axes.axvline
+    draw(value, color=SOFT, linewidth=0.8, linestyle=(0, (4, 2)), zorder=1.0)
+
+
+def name_lines(axes: Axes, names: Sequence[str], bold: Sequence[str] = ()) -> None:
+    """Name the lines 0, 1, ... of a panel, from above."""
+    axes.set_ylim(len(names) - 0.5, -0.5)
+    axes.set_yticks(range(len(names)), names)
+    axes.tick_params(axis="y", length=0.0)
+    axes.grid(visible=False, axis="y")
+    for label in axes.get_yticklabels():
+        label.set_fontweight("bold" if label.get_text() in bold else "normal")
+
+
+def dots(
+    axes: Axes, look: Look, lines: ArrayLike, values: ArrayLike, low: ArrayLike, high: ArrayLike
+) -> None:
+    """Dots with intervals, each on its line of the panel (see `name_lines`); NaN is left out."""
+    axes.hlines(lines, low, high, color=look["color"], linewidth=1.1, zorder=3.0)
+    usual: Look = {"linestyle": "none", "clip_on": False, "zorder": 4.0, "markersize": 4.5}
+    axes.plot(values, lines, **{**usual, **look})
+
+
+def curve(
+    axes: Axes,
+    look: Look,
+    x: ArrayLike,
+    y: ArrayLike,
+    low: ArrayLike | None = None,
+    high: ArrayLike | None = None,
+    label: str | None = None,
+) -> None:
+    """A curve, with a band from ``low`` to ``high`` where they are given."""
+    if low is not None and high is not None:
+        axes.fill_between(x, low, high, color=look["color"], alpha=0.18, linewidth=0.0)
+    axes.plot(x, y, label=label, **{"markersize": 3.5, "clip_on": False, "zorder": 4.0, **look})
+
+
+def scale_percent(axes: Axes, along: str = "x") -> None:
+    """Percent from 0 to 100 with room for what is rare: linear up to 1 %, logarithmic beyond."""
+    getattr(axes, f"set_{along}scale")("symlog", linthresh=1.0, linscale=0.7)
+    getattr(axes, f"set_{along}lim")(-0.12, 130.0)
+    getattr(axes, f"set_{along}ticks")([0, 1, 10, 100], ["0", "1", "10", "100"])
+    axes.minorticks_off()
