@@ -73,29 +73,24 @@ def main() -> None:
     )
     asked = sys.argv[1] if len(sys.argv) > 1 else ""
     if asked not in STUDIES and asked != "evidence":
-        _not_rewritten()
-        return
+        from evofsm.cli import commands
+
+        return commands.main(application)
     for name in [asked] if asked in STUDIES else STUDIES:
         app.command(name)(lib.command(study(name)))
     app.command()(evidence)
     app()
 
 
-def _not_rewritten() -> None:
+def application() -> typer.Typer:
     """Commands of studies that do not stand on `lib` yet."""
     from evofsm.cli import commands
     from studies.old.bench import command_of
     from studies.old.leaders import Leaders
     from studies.old.studies import STUDIES as OLD
 
-    commands.main(
-        lambda: commands.group(
-            "studies",
-            "Studies: ours against the baselines, on held-out scenarios.",
-            *map(command_of, OLD.values()),
-            Leaders,
-        )
-    )
+    about = "Studies: ours against the baselines, on held-out scenarios."
+    return commands.group("studies", about, *map(command_of, OLD.values()), Leaders)
 
 
 if __name__ == "__main__":

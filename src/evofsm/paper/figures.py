@@ -147,7 +147,8 @@ def draw_case(study: PaperStudy, run: Run) -> Drawn:
     for axes in panels:
         _draw_moments(axes, moments)
     for place, (at, text, _) in enumerate(moments):
-        before = at > 0.5 * settings.scenario.duration and place < len(moments) - 1
+        share, is_last = at / settings.scenario.duration, place == len(moments) - 1
+        before = share > (0.93 if is_last else 0.5)
         height = 7.0 + 13.0 * place * before  # each text that ends there in a row of its own
         look: Look = {"ha": "right" if before else "left", "xycoords": ("data", "axes fraction")}
         look["fontweight"] = "bold" if text.startswith("collision") else "normal"
