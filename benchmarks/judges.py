@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from evofsm import EvolvingFSM, Guard
 from evofsm.driving import Family, drive, guard_for_family, load_family
+from evofsm.guard import LearntRisk
 from turns import Result, Work, compare
 
 _FAMILY = "emergency"
@@ -68,7 +69,7 @@ def decision(quantile: float, repeats: int, short: bool) -> Result:
 
 
 def step(repeats: int, short: bool) -> Result:
-    """What `observe` and `act` cost a machine with dynamics, and those alone."""
+    """What `observe` and `act` cost dynamics, and a machine."""
     learnt, _, episodes = taught(short)
     machine, dynamics = learnt.machine, _dynamics(learnt)
     assert machine is not None
@@ -84,9 +85,9 @@ def step(repeats: int, short: bool) -> Result:
             for one, actions in zip(episodes, index, strict=True):
                 twin.start_episode()  # what is learnt of a whole episode is no step
                 begun = time.perf_counter()
-                for (z, action), i in zip(one, actions, strict=True):
+                for (z, _), i in zip(one, actions, strict=True):
                     twin.observe(z)
-                    twin.act(i, action)
+                    twin.act(i)
                 seconds += time.perf_counter() - begun
             return seconds / count
 
@@ -106,16 +107,15 @@ def step(repeats: int, short: bool) -> Result:
     return compare(
         "a step that learns: dynamics",
         alone,
-        "machine without them",
+        "machine",
         with_machine(bare),
         repeats,
-        beside={"machine with dynamics": with_machine(machine)},
     )
 
 
 def _dynamics(guard: Guard) -> Any:
-    assert guard.machine is not None
-    return guard.machine.dynamics
+    assert isinstance(guard.judge, LearntRisk)
+    return guard.judge.dynamics
 
 
 def _deciding(guard: Guard, episodes: list[Any], quantile: float) -> Work:

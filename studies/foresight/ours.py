@@ -13,6 +13,7 @@ from evofsm.fsm import (
     NO_ACTION,
     Consequents,
     Disturbances,
+    Dynamics,
     EvolvingFSM,
     Here,
     Novelty,
@@ -21,7 +22,7 @@ from evofsm.fsm import (
     compiled,
     futures,
 )
-from evofsm.guard import BELIEF_TOLERANCE, dynamics_for
+from evofsm.guard import BELIEF_TOLERANCE
 from studies.counts import OutcomeCounts
 from studies.foresight.amounts import HORIZONS
 from studies.foresight.data import Cases, Run, action_set
@@ -50,14 +51,17 @@ class Learnt:
 
     def __init__(self, name: str, runs: Sequence[Run]) -> None:
         self.runs = runs
-        self.actions = action_set(make_system(name))
+        system = make_system(name)
+        self.actions = action_set(system)
         seen = np.concatenate([run.observations for run in runs])
         spread = np.maximum(seen.std(axis=0), 1e-9)
         self.machine = EvolvingFSM(
             self.actions.n_actions,
             rule=Novelty(1.0, tuple((_APART * spread).tolist())),
             belief_tolerance=BELIEF_TOLERANCE,
-            dynamics=dynamics_for(self.actions, max(HORIZONS)),
+            dynamics=Dynamics(
+                **make_system(name).actions.settings, horizon=max(HORIZONS), stretches=10
+            ),
         )
         for run in runs:
             self.machine.learn_many(

@@ -466,12 +466,10 @@ def test_the_fallback_may_be_a_vector_or_a_number_for_all():
 
 def test_the_machine_is_told_the_cell(monkeypatch):
     guard, told = of_vectors(mode=Mode.OFF), []
-    monkeypatch.setattr(
-        guard.machine, "act", lambda index, executed: told.append((index, executed.tolist()))
-    )
+    monkeypatch.setattr(guard.machine, "act", told.append)
     guard.decide([0.0, 0.0], [-1.0, 0.0])
     guard.decide([0.0, 0.0], [1.0, 9.0])
-    assert told == [(0, [-1.0, 0.0]), (80, [1.0, 9.0])]
+    assert told == [0, 80]
 
 
 # -- A judge's own search -----------------------------------------------------------------------
@@ -565,25 +563,31 @@ def test_a_judge_that_cannot_learn_all_the_way_is_refused():
         Guard(low=-4.0, high=4.0, interval=DT, judge=Half())
 
 
-def test_a_judge_that_asks_the_machine_is_told_which_it_is(monkeypatch, tmp_path):
-    class Asking(Balance):
-        machine = None
+def test_a_judge_that_observes_is_told_all_and_the_machine_counts_what_began(monkeypatch, tmp_path):
+    class Observing(Balance):
+        told = ()
 
-        def bind(self, machine):
-            self.machine = machine
+        def observe(self, observation):
+            self.told = (*self.told, observation.tolist())
+            return len(self.told) == 3  # something unexpected began with the action before
 
-    known(monkeypatch, Asking)
-    guard = Guard(low=-4.0, high=4.0, interval=DT, judge=Asking())
-    assert guard.judge.machine is guard.machine
-    twin = guard.copy()
-    assert twin.judge.machine is twin.machine is not guard.machine
-    guard.save(tmp_path / "guard")
-    for again in (Guard.load(tmp_path / "guard"), Guard.load(tmp_path / "guard", judge=Asking)):
-        assert again.judge.machine is again.machine
-    with AuditLog(tmp_path / "log") as log:
-        guard.audit = log
-        balance(guard, pushes(continuous, 5))
-    assert audit(tmp_path / "log").replay.decisions == 5
+        def act(self, action):
+            self.told = (*self.told, float(action))
+
+    known(monkeypatch, Observing)
+    guard = Guard(low=-4.0, high=4.0, interval=DT, judge=Observing())
+    guard.decide([0.0, 0.0], 1.0)
+    guard.decide([0.1, 0.0], 1.5)
+    guard.decide([0.1, 0.0], 2.0, time=DT)  # the same observation once more
+    guard.end(False, [0.2, 0.0])
+    executed = [one for one in guard.judge.told if isinstance(one, float)]
+    seen = [one for one in guard.judge.told if not isinstance(one, float)]
+    assert seen == [[0.0, 0.0], [0.1, 0.0], [0.2, 0.0]]
+    assert len(executed) == 3
+    assert guard.machine.onsets.tolist() == [1.0]
+    guard.freeze()
+    guard.decide([0.0, 0.0], 1.0)
+    assert len(guard.judge.told) == 6
 
 
 # -- What is refused ----------------------------------------------------------------------------

@@ -185,9 +185,9 @@ def test_machine_and_risk_are_told_what_was_executed(learn, monkeypatch):
     acted = []
     act = EvolvingFSM.act
 
-    def listen(machine, i, executed):
-        acted.append((i, executed))
-        act(machine, i, executed)
+    def listen(machine, i):
+        acted.append(i)
+        act(machine, i)
 
     monkeypatch.setattr(EvolvingFSM, "act", listen)
     risk = Listening(lowest=-2.5)
@@ -196,7 +196,7 @@ def test_machine_and_risk_are_told_what_was_executed(learn, monkeypatch):
     assert [acceleration for _, acceleration in heard] == told.executed.tolist()
     assert [seen for seen, _ in heard] == [d.situation.observation.tolist() for d in told.decisions]
     assert deaf == []
-    assert acted == ([(0, -2.5)] * len(told.decisions) if learn else [])
+    assert acted == ([0] * len(told.decisions) if learn else [])
     assert (told.executed == -2.5).all()
 
 

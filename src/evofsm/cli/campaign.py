@@ -26,7 +26,7 @@ from evofsm.driving import Outcome, Row, Trial, World, open_world, summarise
 from evofsm.fleet import Batch, run_campaign
 from evofsm.fleet.checkpoint import versions
 from evofsm.fleet.journal import Journal, Record, room_needed
-from evofsm.guard import Guard, LearningJudge, LearntRisk
+from evofsm.guard import Guard, LearningJudge
 
 #: The journal in the folder of a campaign.
 JOURNAL = "journal.jsonl"
@@ -112,11 +112,9 @@ def _write(result: Result, records: list[Record], out: Path) -> None:
 
 
 def _digest(judge: LearningJudge) -> str:
-    """Of all that is asked: of what saving it writes, and the machine where the judge asks one."""
+    """Of all that is asked: of what saving it writes."""
     file = io.BytesIO()
     judge.save(file)
-    if isinstance(judge, LearntRisk) and judge.machine is not None:
-        judge.machine.save(file)
     return hashlib.sha256(file.getvalue()).hexdigest()
 
 

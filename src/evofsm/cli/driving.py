@@ -347,7 +347,7 @@ class Driven:
             done._restore(kept.arrays)
             files = (io.BytesIO(kept.arrays[name].tobytes()) for name in ("machine", "risk"))
             machine = EvolvingFSM.load(next(files))
-            guard = make_guard(setup, machine, load_judge(next(files), machine))
+            guard = make_guard(setup, machine, load_judge(next(files)))
         if len(done.outcomes) > setup.episodes:
             raise ValueError(
                 f"{checkpoint.path} has driven {len(done.outcomes)} episodes, more than "

@@ -19,7 +19,6 @@ from evofsm.guard import (
     LearningJudge,
     LearntRisk,
     Mode,
-    dynamics_for,
 )
 from evofsm.store import Place, read_header
 
@@ -73,7 +72,7 @@ def guard_for_cars(
     rule : StateRule, optional
         Of the machine that is made; None for the paper's.
     machine : EvolvingFSM, optional
-        One that has learnt; without it the judge's own, or a new one.
+        One that has learnt; without it a new one.
     judge : LearningJudge, "kinematic" or "learnt"
         One that has learnt, or which to make: a `LatentRisk`, which is told how cars follow each
         other, or a `LearntRisk`, which is told nothing but which episodes failed, and prevents
@@ -98,14 +97,11 @@ def guard_for_cars(
     actions = IntervalActions(low, high, width, closed, outside="clip")
     if isinstance(judge, str):
         judge = _judge(judge, actions, interval, settings.get("seed", 0))
-    if machine is None and isinstance(judge, LearntRisk):
-        machine = judge.machine
     machine = machine or EvolvingFSM(
         actions.n_actions,
         rule=rule,
         belief_tolerance=BELIEF_TOLERANCE,
         failure_horizon=round(_SOON / interval),
-        dynamics=dynamics_for(actions) if isinstance(judge, LearntRisk) else None,
     )
     reviser = ActionReviser(judge, actions, tolerance=tolerance, mode=mode)
     return Guard.of(reviser, interval=interval, machine=machine, judge=judge, **settings)
@@ -115,7 +111,9 @@ def _judge(name: str, actions: IntervalActions, interval: float, seed: int) -> L
     if name == "kinematic":
         return LatentRisk(actions.low, interval)
     if name == "learnt":
-        return LearntRisk(interval, seed=seed, names=VARIABLES, units=UNITS)
+        return LearntRisk(
+            interval, actions.low, actions.high, seed=seed, names=VARIABLES, units=UNITS
+        )
     raise ValueError(f"there is no judge {name!r}; there are {', '.join(TOLD)}")
 
 
@@ -178,16 +176,15 @@ def save_learnt(guard: Guard, folder: Path, provenance: Mapping[str, Any] | None
 def load_learnt(folder: Path) -> tuple[EvolvingFSM, LatentRisk | LearntRisk]:
     """The machine and the judge that `save_learnt` wrote."""
     machine = EvolvingFSM.load(folder / _MACHINE)
-    return machine, load_judge(folder / _RISK, machine)
+    return machine, load_judge(folder / _RISK)
 
 
-def load_judge(file: Place, machine: EvolvingFSM) -> LatentRisk | LearntRisk:
-    """One of the judges for cars, whichever was saved, beside its machine.
+def load_judge(file: Place) -> LatentRisk | LearntRisk:
+    """One of the judges for cars, whichever was saved.
 
     Parameters
     ----------
     file : path-like, or file open for reading bytes
-    machine : EvolvingFSM
 
     Raises
     ------
@@ -196,8 +193,5 @@ def load_judge(file: Place, machine: EvolvingFSM) -> LatentRisk | LearntRisk:
     ValueError
         If the file holds something else or is damaged.
     """
-    if read_header(file).kind != "learntrisk":
-        return LatentRisk.load(file)
-    judge = LearntRisk.load(file)
-    judge.bind(machine)
-    return judge
+    kind = read_header(file).kind
+    return LearntRisk.load(file) if kind == "learntrisk" else LatentRisk.load(file)

@@ -18,6 +18,8 @@ from .dynamics.following import encoded_rows as encoded_rows
 from .dynamics.following import follow as follow
 from .dynamics.following import follow_end as follow_end
 from .dynamics.following import refuse_too_large as refuse_too_large
+from .dynamics.keeping import from_bytes as from_bytes
+from .dynamics.keeping import to_bytes as to_bytes
 from .dynamics.merging import merge_dynamics as merge_dynamics
 from .dynamics.questions import Ahead as Ahead
 from .dynamics.questions import MayBegin as MayBegin

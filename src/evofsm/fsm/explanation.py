@@ -221,7 +221,7 @@ def _of_episodes(here: Tally, visits: int, soon: str, asked: Tally | None, actio
 
 
 def _of_onsets(known: Known, state: int, labels: Labels) -> str:
-    if known.dynamics is None or not known.visits[state]:
+    if not known.visits[state] or not known.onsets.any():  # or nobody tells of them
         return ""
     number, while_there = int(known.onsets[state]), labels.duration(int(known.visits[state]))
     if not number:

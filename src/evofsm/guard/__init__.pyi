@@ -26,13 +26,11 @@ from .guard import Guard as Guard
 from .guard import learnt_guard as learnt_guard
 from .gym import RevisedActions as RevisedActions
 from .gym import RevisedVectorActions as RevisedVectorActions
-from .learnt.actions import dynamics_for as dynamics_for
 from .learnt.risk import JUDGE_PARTS as JUDGE_PARTS
 from .learnt.risk import LearntRisk as LearntRisk
 from .learnt.risk import Outlook as Outlook
 from .pettingzoo import RevisedAgents as RevisedAgents
 from .protocols import ActionJudge as ActionJudge
-from .protocols import AsksMachine as AsksMachine
 from .protocols import Controller as Controller
 from .protocols import Fallback as Fallback
 from .protocols import Intake as Intake

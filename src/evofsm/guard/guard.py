@@ -18,8 +18,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from evofsm import store
 from evofsm.fsm import (
-    DYNAMICS_PARTS,
-    Dynamics,
     EvolvingFSM,
     FSMModel,
     IntervalActions,
@@ -28,21 +26,21 @@ from evofsm.fsm import (
     explain,
     positive,
     real_array,
+    refuse_too_large,
     refuse_unusable,
 )
 from evofsm.guard.actions import Action, ActionSet, BoxActions, Choices, fixed, no_action
 from evofsm.guard.auditing.participants import outline, rebuild
 from evofsm.guard.defaults import BELIEF_TOLERANCE, TOLERANCE
-from evofsm.guard.learnt.actions import dynamics_for
-from evofsm.guard.learnt.risk import JUDGE_PARTS, LearntRisk
+from evofsm.guard.learnt.risk import LearntRisk
 from evofsm.guard.protocols import (
     INCOMPLETE,
     STALE,
     ActionJudge,
-    AsksMachine,
     Fallback,
     Intake,
     LearningJudge,
+    ObservingJudge,
     Participants,
     Proposal,
     Reviser,
@@ -186,14 +184,11 @@ class Guard:
         interval = positive("interval", interval)
         soon = _steps(horizon, interval)
         if judge is None:
-            judge = LearntRisk(interval, horizon=horizon, seed=seed)
-        dynamics = None
-        if machine is None and isinstance(judge, LearntRisk):
-            dynamics = dynamics_for(actions, soon)
+            judge = LearntRisk(interval, low, high, n_actions=n_actions, horizon=horizon, seed=seed)
         self._set_up(
             ActionReviser(judge, actions, tolerance=tolerance, mode=mode),
             interval=interval,
-            machine=machine or _machine(actions, soon, dynamics),
+            machine=machine or _machine(actions, soon),
             failed=failed,
             seed=seed,
             audit=audit,
@@ -274,16 +269,21 @@ class Guard:
                 f"the machine has {machine.n_actions} actions, but the set has "
                 f"{self.actions.n_actions}"
             )
-        for one in (asked, judge):
-            if machine is not None and isinstance(one, AsksMachine):
-                one.bind(machine)
+        if isinstance(asked, LearntRisk):
+            if bool(asked.dynamics.choices) != isinstance(self.actions, Choices):
+                raise ValueError(
+                    "the judge was made for a range of actions, but the guard has n_actions, or "
+                    "the other way round"
+                )
+            asked.dynamics.told = failed
+        self._observing = judge if isinstance(judge, ObservingJudge) else None
         self.reviser = reviser
         self.machine = machine
         #: Learns from what happens; None where nothing but the machine does.
         self.judge = judge
         self.failed = failed
         self.seed = seed
-        self.audit = audit
+        self.audit: DecisionLogger | None = audit
         self.explaining = explaining
         self.missing = missing
         #: What the judge calls the variables of an observation; empty where it does not say.
@@ -294,8 +294,6 @@ class Guard:
             actions=self.actions if isinstance(self.actions, IntervalActions) else None,
             dt=interval,
         )
-        if machine is not None and machine.dynamics is not None:
-            machine.dynamics.told = failed
         self._frozen: FSMModel | None = None
         self._senses = Senses(missing, interval)
         self._latest: Situation | None = None
@@ -465,7 +463,9 @@ class Guard:
     def _checked(self, observation: ArrayLike) -> NDArray[np.float64]:
         """An observation that judge and machine can take in; NaN stays."""
         z = real_array("observation", observation, 1)
-        refuse_unusable("observation", np.where(np.isnan(z), 0.0, z))
+        known_of = np.where(np.isnan(z), 0.0, z)
+        refuse_unusable("observation", known_of)
+        refuse_too_large(known_of)
         known = len(self.variables) or (0 if self.machine is None else self.machine.n_variables)
         if known and len(z) != known:
             named = f" ({', '.join(self.variables)})" if self.variables else ""
@@ -483,20 +483,44 @@ class Guard:
             self.judge.start_episode(learn=self.learn)
 
     def _recognised(self, z: NDArray[np.float64], time: float, intake: Intake) -> Situation:
+        """Where it is; machine and judge learn the transition to it."""
         nothing = Situation(z, np.ones(1), None, math.nan, time, intake)
+        machine, known = self.machine, self._frozen
+        if known is not None:
+            if known.n_states == 0 or has_gaps(self._senses.held):
+                return nothing
+            belief = known.recognise(self._senses.held)
+            return self._in_state(nothing, belief, int(belief.argmax()), math.nan)
         incomplete = bool(intake) and bool(intake & INCOMPLETE)
-        if self.machine is None or (incomplete and self.machine.n_states == 0):
+        if machine is None or (incomplete and machine.n_states == 0):
+            self._observed(z)
             return nothing
-        if self._frozen is None:
-            policy = Missing.REJECT
-            if incomplete:
-                policy = self.missing if self.machine.state is not None else Missing.PARTIAL
-            step = self.machine.observe(z, missing=policy)
-            return Situation(z, step.belief, step.state, step.surprise, time, intake)
-        if self._frozen.n_states == 0 or has_gaps(self._senses.held):
-            return nothing
-        belief = self._frozen.recognise(self._senses.held)
-        return Situation(z, belief, int(belief.argmax()), math.nan, time, intake)
+        policy = Missing.REJECT
+        if incomplete:
+            policy = self.missing if machine.state is not None else Missing.PARTIAL
+        step = machine.observe(z, missing=policy)
+        self._observed(z)
+        return self._in_state(nothing, step.belief, step.state, step.surprise)
+
+    def _in_state(
+        self, nothing: Situation, belief: NDArray[np.float64], state: int, surprise: float
+    ) -> Situation:
+        """A situation in which a state was recognised."""
+        seen = math.nan
+        if self.machine is not None and self.interval is not None:
+            seen = float(self.machine.visits[state]) * self.interval
+        return nothing._replace(belief=belief, state=state, surprise=surprise, seen=seen)
+
+    def _observed(self, z: NDArray[np.float64], *, failed: bool = False) -> None:
+        """The judge learns from an observation; the machine counts what was not expected.
+
+        Of what ends in failure it counts nothing.
+        """
+        if self._observing is None or not self.learn:
+            return
+        began = self._observing.observe(z)
+        if began and self.machine is not None and not failed:
+            self.machine.onset()
 
     def revise(self, situation: Situation, proposal: Proposal) -> Revision:
         """The second half of `decide`: what to execute; machine and judge learn from it.
@@ -567,7 +591,9 @@ class Guard:
         self._decisions += 1
         if self.machine is not None and self.learn and self.machine.state is not None:
             index = self.actions.encode(executed)
-            self.machine.act(index, index if isinstance(self.actions, Choices) else executed)
+            self.machine.act(index)
+        if self._observing is not None and self.learn:
+            self._observing.act(executed)
         if self.judge is not None and not (situation.intake and situation.intake & STALE):
             if not self.learn:
                 self.judge.follow(situation.observation, executed)
@@ -617,14 +643,17 @@ class Guard:
         last = self._latest.observation if z is None and self._latest is not None else z
         if self.failed is not None and last is not None:
             failed = failed or bool(self.failed(last))
-        if self.machine is not None and self.learn:
-            if z is not None and (self.machine.n_states or not has_gaps(z)):
-                self.machine.observe(z, failed=failed, missing=Missing.PARTIAL)
-            elif failed and self.machine.state is not None:
-                self.machine.fail()
-            self.machine.tell_of_failures()
-            if not failed:
-                self.machine.start_episode()
+        machine = self.machine if self.learn else None
+        if machine is not None:
+            if z is not None and (machine.n_states or not has_gaps(z)):
+                machine.observe(z, failed=failed, missing=Missing.PARTIAL)
+            elif failed and machine.state is not None:
+                machine.fail()
+            machine.tell_of_failures()
+        if z is not None:
+            self._observed(z, failed=failed)
+        if machine is not None and not failed:
+            machine.start_episode()
         if self.judge is not None and self.learn:
             self.judge.end(z, failed=failed)
         elif self.judge is not None:
@@ -797,8 +826,7 @@ def learnt_guard(
     low, high, n_actions, interval, horizon, seed
         As in `Guard`.
     without : sequence of str
-        Names of `JUDGE_PARTS` and of `evofsm.fsm.DYNAMICS_PARTS`; without ``states`` the machine
-        has a single one.
+        Names of `JUDGE_PARTS`; without ``states`` the machine has a single one.
 
     Raises
     ------
@@ -811,15 +839,12 @@ def learnt_guard(
     >>> guard.judge.margin
     0.0
     """
-    if unknown := set(without) - {*JUDGE_PARTS, *DYNAMICS_PARTS, "states"}:
-        raise ValueError(f"there are no parts {sorted(unknown)}")
     actions = _actions(low, high, n_actions, None)
-    soon = _steps(horizon, positive("interval", interval))
-    judge = LearntRisk(
-        interval, horizon=horizon, seed=seed, without=[p for p in without if p in JUDGE_PARTS]
-    )
+    told: dict[str, Any] = {"n_actions": n_actions, "horizon": horizon, "seed": seed}
+    parts = [part for part in without if part != "states"]
+    judge = LearntRisk(interval, low, high, without=parts, **told)
     most = 1 if "states" in without else _MOST_STATES
-    machine = _machine(actions, soon, dynamics_for(actions, soon, without), most)
+    machine = _machine(actions, _steps(horizon, interval), most)
     return Guard(
         low, high, n_actions=n_actions, interval=interval, seed=seed, judge=judge, machine=machine
     )
@@ -830,16 +855,13 @@ def _steps(horizon: float | None, interval: float) -> int | None:
     return None if horizon is None else max(1, round(positive("horizon", horizon) / interval))
 
 
-def _machine(
-    actions: ActionSet, soon: int | None, dynamics: Dynamics | None, most: int = _MOST_STATES
-) -> EvolvingFSM:
+def _machine(actions: ActionSet, soon: int | None, most: int = _MOST_STATES) -> EvolvingFSM:
     """With recommended settings."""
     return EvolvingFSM(
         actions.n_actions,
         max_states=most,
         belief_tolerance=BELIEF_TOLERANCE,
         failure_horizon=soon,
-        dynamics=dynamics,
     )
 
 

@@ -53,6 +53,7 @@ class Situation(NamedTuple):
     surprise: float  #: divergence of forecast and belief [bit]; NaN where nothing was forecast
     time: float  #: [s]
     intake: Intake = Intake.WHOLE  #: whether the observation was whole and in time
+    seen: float = math.nan  #: time spent in this state so far [s]; NaN where that is not known
 
 
 class Revision(NamedTuple):
@@ -240,14 +241,19 @@ class LearningJudge(ActionJudge, Protocol):
 
 
 @runtime_checkable
-class AsksMachine(Protocol):
-    """A judge that asks the machine beside it, and is told which that is."""
+class ObservingJudge(LearningJudge, Protocol):
+    """A learning judge that also learns from each observation before it is asked about it."""
 
-    def bind(self, machine: EvolvingFSM, /) -> None:
-        """Ask this machine from now on.
+    def observe(self, observation: NDArray[np.float64], /) -> bool:
+        """Learn from an observation, the last of an episode included.
 
-        A guard says so as it is made, copied or read from a file; it may say the same again.
+        Whether something that was not expected began with the action before it: the guard's machine
+        counts that.
         """
+        ...
+
+    def act(self, action: Action, /) -> None:
+        """Take in what was executed after the latest observation; another one replaces it."""
         ...
 
 

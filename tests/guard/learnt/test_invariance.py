@@ -131,7 +131,7 @@ def test_noise_is_the_same_however_it_is_written(noisy, seed):
         return noisy.walk(1000 * seed + episode, steps=40)
 
     assert compare(noisy.told, walk, make, otherwise, 20) > 0.05
-    assert all(guard.machine.dynamics.is_noisy for guard in made)
+    assert all(guard.judge.dynamics.is_noisy for guard in made)
 
 
 # Where two backups are all but equal, rounding may decide, and parts the two ways of writing for

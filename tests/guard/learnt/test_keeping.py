@@ -32,7 +32,7 @@ def test_saved_and_loaded_it_goes_on_learning_bit_for_bit(point, exactly, conten
 
 def test_with_noisy_sensors_it_goes_on_bit_for_bit_too(noisy, exactly, content):
     guard = noisy.taught(20)
-    assert guard.machine.dynamics.is_noisy
+    assert guard.judge.dynamics.is_noisy
     assert_goes_on_alike(noisy, guard, exactly, content)
 
 
@@ -54,7 +54,7 @@ def test_a_file_that_contradicts_itself_is_refused(points):
         store.write(BytesIO(), KIND, content, arrays | others)
 
 
-def test_what_was_learnt_of_another_system_is_put_beside_no_machine(points):
+def test_a_judge_of_other_actions_or_variables_is_refused(points):
     box, plane = (points[name].taught(3) for name in ("box", "plane"))
     files = []
     for guard in (box, plane):
@@ -63,7 +63,10 @@ def test_what_was_learnt_of_another_system_is_put_beside_no_machine(points):
     (content, own), (_, others) = (store.read(BytesIO(file.getvalue()), GUARD) for file in files)
     mixed = BytesIO()
     store.write(mixed, GUARD, content, own | {"judge": others["judge"]})
-    with pytest.raises(ValueError, match="they do not belong together"):
+    with pytest.raises(ValueError, match="the judge was made for actions from"):
         Guard.load(BytesIO(mixed.getvalue()))
-    with pytest.raises(ValueError, match="from 4 variables and actions of 2 numbers, the machine"):
-        Guard(low=-1.0, high=1.0, interval=0.1, judge=plane.judge, machine=box.machine)
+    with pytest.raises(ValueError, match="the judge was made for a range of actions"):
+        Guard(n_actions=2, interval=0.1, judge=LearntRisk(0.1, 0.0, 1.0))
+    guard = Guard(low=-1.0, high=1.0, interval=0.1, judge=box.judge)
+    with pytest.raises(ValueError, match="observation has 3 variables, but the judge learnt of 2"):
+        guard.decide([0.0, 0.0, 0.0], 0.0)

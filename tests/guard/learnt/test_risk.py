@@ -108,7 +108,7 @@ def test_an_episode_that_goes_on_and_on_is_studied_and_goes_on(points):
         speed = 0.9 * z[1] + 0.02 * said[-1].executed + 0.002 * rng.normal()
         z = np.array([z[0] + speed, speed])
     assert z[0] < 1.0
-    assert guard.judge.n_studied == guard.machine.dynamics.n_episodes == before + 1
+    assert guard.judge.n_studied == guard.judge.dynamics.n_episodes == before + 1
     assert not all(kept(said[1030:]))
     guard.end(False, z)
     assert not point.play(guard, 7)[1]
@@ -186,7 +186,7 @@ def test_looking_on_it_changes_nothing_and_learns_no_margin(point, mode):
     assert any(not same_action(one.advised, one.executed) for one in said)
     assert guard.judge.broken == 0
     assert guard.judge.margin == pytest.approx(3.0 * 0.9**4)  # it fades, and nothing adds to it
-    assert guard.machine.dynamics.n_episodes == 4
+    assert guard.judge.dynamics.n_episodes == 4
 
 
 # -- Observations as they come in life ----------------------------------------------------------
@@ -225,12 +225,12 @@ def test_after_a_gap_in_time_nothing_follows_from_what_was(points):
     fresh = other.decide([0.5, 0.05], 1.0, time=0.0)
     assert (after.executed, after.risk_proposed) == (fresh.executed, fresh.risk_proposed)
     learning = point.taught(3)
-    episodes = learning.machine.dynamics.n_episodes
+    episodes = learning.judge.dynamics.n_episodes
     for k in range(20):
         learning.decide([0.01 * k, 0.01], 0.1, time=0.1 * k)
     learning.decide([0.9, 0.01], 0.1, time=60.0)
-    assert learning.machine.dynamics.n_episodes == learning.judge.n_studied == episodes + 1
-    assert learning.machine.dynamics.sums.most[0] < 0.3  # the leap was not learnt
+    assert learning.judge.dynamics.n_episodes == learning.judge.n_studied == episodes + 1
+    assert learning.judge.dynamics.sums.most[0] < 0.3  # the leap was not learnt
 
 
 def test_what_came_before_a_gap_in_time_is_learnt_from_as_at_an_end(points, monkeypatch):
@@ -264,8 +264,7 @@ def test_an_observation_that_comes_twice_is_taken_in_once(points, content):
         assert twice.decide(z, 1.0, time=0.1 * k).executed == said.executed
     for guard in (once, twice):
         guard.end(False, [0.5, 0.0])
-    one, other = content(once)["machine"][1], content(twice)["machine"][1]
-    assert one["dynamics"] == other["dynamics"]
+    assert content(once)["judge"] == content(twice)["judge"]
 
 
 def test_a_refused_input_leaves_it_as_it_was(point, exactly, content):
@@ -287,12 +286,12 @@ def test_a_refused_input_leaves_it_as_it_was(point, exactly, content):
 
 
 def test_by_itself_it_says_what_it_lacks():
-    with pytest.raises(ValueError, match="bind it"):
-        _ = LearntRisk(0.1).dynamics
+    with pytest.raises(ValueError, match="either low and high, or n_actions"):
+        LearntRisk(0.1)
     with pytest.raises(ValueError, match="without names"):
-        LearntRisk(0.1, without=("luck",))
+        LearntRisk(0.1, n_actions=2, without=("luck",))
     with pytest.raises(ValueError, match="dt"):
-        LearntRisk(0.0)
+        LearntRisk(0.0, n_actions=2)
 
 
 @pytest.mark.parametrize(
@@ -365,7 +364,7 @@ def test_where_nobody_knows_where_one_is_nothing_is_said(points, value):
 
 def test_after_a_drift_the_margin_begins_anew(point, monkeypatch):
     guard = point.taught(4)
-    judge, dynamics = guard.judge, guard.machine.dynamics
+    judge, dynamics = guard.judge, guard.judge.dynamics
     judge.margin = 0.1
     study = type(dynamics)._study
 
@@ -405,6 +404,6 @@ def test_where_certificates_break_in_every_episode_disturbances_are_harder_again
 
 def test_where_sensors_are_noisy_a_margin_stays(noisy):
     guard = noisy.taught(20)
-    assert guard.machine.dynamics.is_noisy
+    assert guard.judge.dynamics.is_noisy
     assert guard.judge.margin >= 1.5
     assert "sensors are noisy: variable" in guard.judge.told_by_experience

@@ -78,7 +78,7 @@ def test_a_kept_proposal_says_which_backup_survives_what_is_remembered_and_by_ho
 
 
 def test_names_are_for_words_alone_and_are_kept(point):
-    named = LearntRisk(0.1, names=VARIABLES, units=UNITS)
+    named = LearntRisk(0.1, n_actions=2, names=VARIABLES, units=UNITS)
     file = io.BytesIO()
     named.save(file)
     labels = LearntRisk.load(io.BytesIO(file.getvalue())).labels

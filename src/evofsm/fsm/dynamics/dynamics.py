@@ -47,7 +47,7 @@ from evofsm.fsm.validation import real_array, refuse_unusable, whole
 _Floats = NDArray[np.float64]
 
 #: Parts that can be left out, to see what each is worth.
-DYNAMICS_PARTS = (
+DYNAMICS_PARTS: tuple[str, ...] = (
     *("stretches", "memory", "products", "lags", "doubt", "jumps", "carried", "drift"),
     "observer",
 )
@@ -455,6 +455,39 @@ class Dynamics:
             if not failed and len(self._Z) > 2 and len(self._U) >= len(self._Z) - 1:
                 self._learn(len(self._Z) - 2)
             self._study(failed=failed)
+        self._begin()
+
+    def begins(self) -> bool:
+        """Whether the latest change is the first for a while that was not expected; ask it once.
+
+        Returns
+        -------
+        bool
+
+        Examples
+        --------
+        >>> dynamics = Dynamics(n_actions=2)
+        >>> dynamics.observe(np.array([1.0]))
+        >>> dynamics.begins()
+        False
+        """
+        self.quiet += 1.0
+        if not self.is_surprised:
+            return False
+        was_quiet, self.quiet = self.quiet > APART, 0.0
+        return was_quiet
+
+    def forget_episode(self) -> None:
+        """Nothing is under way; nothing more is learnt of what was.
+
+        Examples
+        --------
+        >>> dynamics = Dynamics(n_actions=2)
+        >>> dynamics.observe(np.array([1.0]))
+        >>> dynamics.forget_episode()
+        >>> dynamics.is_under_way
+        False
+        """
         self._begin()
 
     def break_off(self) -> None:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from evofsm.fsm.dynamics.dynamics import APART, Dynamics
+from evofsm.fsm.dynamics.dynamics import Dynamics
 from evofsm.fsm.validation import check_action, is_within, real_array, refuse_unusable
 
 #: Fourth powers of larger observations, summed over a long run, would lose all others.
@@ -104,7 +104,7 @@ def follow(
         if not (chained and is_at(dynamics, clock - 1.0) and dynamics.has_acted):
             dynamics.break_off()
         dynamics.observe(z)
-        began = _begins(dynamics)
+        began = dynamics.begins()
         dynamics.clock = clock
         if failed:
             dynamics.end(failed=True)
@@ -131,12 +131,3 @@ def follow_end(dynamics: Dynamics, clock: float, *, failed: bool) -> None:
 def is_at(dynamics: Dynamics, clock: float) -> bool:
     """Whether the latest observation of the episode was the ``clock``-th of the machine."""
     return dynamics.is_under_way and dynamics.clock == clock
-
-
-def _begins(dynamics: Dynamics) -> bool:
-    """Whether the latest change is the first for a while that was not expected."""
-    dynamics.quiet += 1.0
-    if not dynamics.is_surprised:
-        return False
-    was_quiet, dynamics.quiet = dynamics.quiet > APART, 0.0
-    return was_quiet

@@ -1,4 +1,4 @@
-"""The learnt judge in a file: what it learnt beside the machine."""
+"""The learnt judge in a file: what it learnt beside its dynamics."""
 
 from __future__ import annotations
 
@@ -40,7 +40,10 @@ NUMBERS = ("margin", "broken", "horizon", "takes", "believed", "n_studied", "n_s
 _TIME = Numbers(least=0.0, most=1e6)
 KIND = Kind(
     "learntrisk",
-    {name: _SOME.of(*shape) for name, shape in _SHAPES.items()},
+    {
+        **{name: _SOME.of(*shape) for name, shape in _SHAPES.items()},
+        "dynamics": Numbers(("bytes",), dtype=np.uint8),
+    },
     {
         "dt": SIZE,
         **dict.fromkeys(("margin", "takes", "believed", "doubt"), _TIME),

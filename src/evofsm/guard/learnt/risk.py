@@ -20,16 +20,17 @@ from evofsm import store
 from evofsm.fsm import (
     Disturbances,
     Dynamics,
-    EvolvingFSM,
     Here,
     Labels,
     action_name,
+    from_bytes,
     poisson_bounds,
     positive,
     refuse_unusable,
+    to_bytes,
 )
+from evofsm.fsm.dynamics.dynamics import DYNAMICS_PARTS
 from evofsm.guard.learnt import words
-from evofsm.guard.learnt.actions import LONGEST_STRETCH
 from evofsm.guard.learnt.backups import Backups
 from evofsm.guard.learnt.breaks import Breaks
 from evofsm.guard.learnt.keeping import KIND, NUMBERS, Kept, arrays_of, restored
@@ -42,8 +43,8 @@ from evofsm.store import Place
 
 _Floats = NDArray[np.float64]
 
-#: Parts that can be left out, to see what each is worth; others are those of `Dynamics`.
-JUDGE_PARTS = ("margin", "backups", "breaks")
+#: Parts that can be left out, to see what each is worth.
+JUDGE_PARTS = ("margin", "backups", "breaks", *DYNAMICS_PARTS)
 
 # Backups that are asked in a decision, and disturbances that mutants are tried on, beside none.
 _ASKED, _TRIED_ON = 3, 5
@@ -57,8 +58,10 @@ _NOISY = 1.5
 _CAUTION, _AGAIN = 4.0, 0.44
 # Steps that are looked ahead: at first, at least, at most; times those that it takes to fail, of
 # which so much is left an episode later, and after one in which a dead end was none.
-_HORIZON, _SHORTEST, _FARTHEST, _AHEAD = 64, 32, LONGEST_STRETCH, 1.5
+_HORIZON, _SHORTEST, _FARTHEST, _AHEAD = 64, 32, 144, 1.5
 _LATEST, _REFUTED = 0.98, 0.8
+# Disturbances that are remembered.
+_REMEMBERED = 10
 # Backups closer than this are alike; an action that was used less often is tried.
 _ALIKE, _TRIES = 0.02, 8
 
@@ -78,7 +81,7 @@ class Outlook(NamedTuple):
 
 
 class LearntRisk:
-    """Judges actions by what the machine beside it has learnt of how the system moves and fails.
+    """Judges actions by what it has learnt of how the system moves and fails.
 
     It is told neither what variables mean nor how they move. Before the first failure of an episode
     there is nothing that it could prevent, and all is kept; in the first episode also where failure
@@ -88,6 +91,10 @@ class LearntRisk:
     ----------
     dt : float
         Time between two decisions [s].
+    low, high : float or (d,) array_like, optional
+        Range of the action, or of each of its components.
+    n_actions : int, optional
+        Number of actions, where an action is an index from 0.
     horizon : float, optional
         How far it looks ahead [s]. Without it, half as far again as it takes to fail where failure
         can no longer be avoided, from 32 to 144 steps.
@@ -101,7 +108,8 @@ class LearntRisk:
     Raises
     ------
     ValueError
-        If ``dt`` is not positive and finite, or ``without`` names no part.
+        If ``dt`` is not positive and finite, ``without`` names no part, or not one of a range and
+        ``n_actions`` is given.
 
     Notes
     -----
@@ -143,7 +151,10 @@ class LearntRisk:
     def __init__(
         self,
         dt: float,
+        low: ArrayLike | None = None,
+        high: ArrayLike | None = None,
         *,
+        n_actions: int | None = None,
         horizon: float | None = None,
         seed: int = 0,
         without: Sequence[str] = (),
@@ -159,9 +170,17 @@ class LearntRisk:
             raise ValueError(f"without names {sorted(unknown)}; there are {', '.join(JUDGE_PARTS)}")
         self.without = frozenset(without)
         self.labels = Labels(names=tuple(names), units=tuple(units), dt=self.dt)
-        self.machine: EvolvingFSM | None = None
+        #: What it has learnt of how the system moves.
+        self.dynamics = Dynamics(
+            low,
+            high,
+            n_actions=n_actions,
+            horizon=_FARTHEST if horizon is None else self.horizon,
+            stretches=_REMEMBERED,
+            without=[part for part in DYNAMICS_PARTS if part in self.without],
+        )
         #: What is done without a usable proposal, and then revised like any.
-        self.fallback = Fallback(0.0, "doing nothing")
+        self.fallback = _fallback(self.dynamics)
         #: Whether it may try actions to learn what they do.
         self.learning = True
         #: What has to be left of the distance to failure [ordinary changes]; for each of them
@@ -182,40 +201,6 @@ class LearntRisk:
         self.disturbances: Disturbances | None = None
         self._forget()
 
-    def bind(self, machine: EvolvingFSM) -> None:
-        """Ask this machine from now on.
-
-        Raises
-        ------
-        ValueError
-            If it learns no dynamics, or the judge has learnt from other variables or actions.
-        """
-        dynamics = machine.dynamics
-        if dynamics is None:
-            raise ValueError("the machine learns no dynamics; make it with dynamics=Dynamics(...)")
-        if self.backups is not None:  # kernels, which check no index, are given both
-            _, size, features = self.backups.policies.shape
-            if (dynamics.n_variables, dynamics.size) != (features - 1, size):
-                raise ValueError(
-                    f"the judge has learnt from {features - 1} variables and actions of {size} "
-                    f"numbers, the machine from {dynamics.n_variables} and {dynamics.size}: they "
-                    "do not belong together"
-                )
-        self.machine = machine
-        if dynamics.choices:
-            self.fallback = Fallback(0.0, "the first action")
-        else:
-            middle = dynamics.decode(np.zeros(dynamics.size))
-            action = middle if len(middle) > 1 else float(middle[0])
-            self.fallback = Fallback(action, "the middle of the range")
-
-    @property
-    def dynamics(self) -> Dynamics:
-        """What the machine has learnt of how the system moves."""
-        if self.machine is None or self.machine.dynamics is None:
-            raise ValueError("the judge was not told which machine to ask: bind it")
-        return self.machine.dynamics
-
     def trial(self) -> Trial | None:
         """None: what it has to try, its search tries."""
         return None
@@ -225,7 +210,14 @@ class LearntRisk:
         return actions
 
     def refuse_unfit(self, low: Any, high: Any) -> None:
-        """Nothing: it counts on no action."""
+        """Raise for another range of actions than it learns of."""
+        dynamics = self.dynamics
+        own = (0, dynamics.choices - 1) if dynamics.choices else (dynamics.low, dynamics.high)
+        if not all(map(np.array_equal, map(np.atleast_1d, own), map(np.atleast_1d, (low, high)))):
+            raise ValueError(
+                f"the judge was made for actions from {own[0]} to {own[1]}, not from {low} to "
+                f"{high}: give it low and high, or n_actions, of the guard"
+            )
 
     # -- Deciding -------------------------------------------------------------------------------
 
@@ -477,11 +469,8 @@ class LearntRisk:
         soon = self._soon(remembered.seconds)
         for k, each in enumerate(lost.tolist()):
             risks[:, k] = self._risk(each, soon)
-        seen, machine, state = math.nan, self.machine, situation.state
-        if machine is not None and state is not None and state < machine.n_states:
-            seen = float(machine.visits[state]) * self.dt
         risk, low, high = risks
-        return Judgement(risk, low, high, left, float(remembered.number), seen)
+        return Judgement(risk, low, high, left, float(remembered.number), situation.seen)
 
     def _allowed(self, tolerance: float, remembered: Remembered) -> int:
         """How many of the disturbances need not be survived.
@@ -535,6 +524,32 @@ class LearntRisk:
 
     # -- Learning -------------------------------------------------------------------------------
 
+    def observe(self, observation: _Floats) -> bool:
+        """Learn the transition to an observation; whether something unexpected began with it.
+
+        One of which something was not seen ends what can be learnt from: what comes does not
+        follow from what was.
+        """
+        dynamics = self.dynamics
+        if dynamics.n_variables not in (0, len(observation)):
+            raise ValueError(
+                f"observation has {len(observation)} variables, but the judge learnt of "
+                f"{dynamics.n_variables}"
+            )
+        if has_gaps(observation):
+            dynamics.break_off()
+            return False
+        with dynamics.whole:
+            if not dynamics.has_acted:
+                dynamics.break_off()
+            dynamics.observe(observation)
+            return dynamics.begins()
+
+    def act(self, action: Any) -> None:
+        """Take in what was executed after the latest observation; another one replaces it."""
+        if self.dynamics.is_under_way:
+            self.dynamics.act(self.dynamics.encode(action))
+
     def learn(self, observation: ArrayLike, action: Any, belief: ArrayLike) -> None:
         """Take in what was executed, and whether the certificate of before still held."""
         if "margin" not in self.without and self.backups is not None:
@@ -574,13 +589,26 @@ class LearntRisk:
 
     def start_episode(self, *, learn: bool = True) -> None:
         """What comes is not a consequence of what was; the episode before is learnt from."""
-        if learn and self.machine is not None and self.dynamics.n_episodes != self.n_studied:
-            self._study()
-        self._forget()
+        if learn:
+            self._end(failed=False)
+        else:
+            self.dynamics.forget_episode()
+            self._forget()
 
     def end(self, observation: NDArray[np.float64] | None, *, failed: bool) -> None:
-        """Learn from an episode that the machine has learnt from."""
-        self.start_episode()
+        """Learn from an episode; its last observation was taken in (`observe`)."""
+        self._end(failed=failed and (observation is None or not has_gaps(observation)))
+
+    def _end(self, *, failed: bool) -> None:
+        dynamics = self.dynamics
+        with dynamics.whole:
+            if failed and dynamics.is_under_way:
+                dynamics.end(failed=True)
+            else:
+                dynamics.break_off()
+        if dynamics.n_episodes != self.n_studied:
+            self._study()
+        self._forget()
 
     def _forget(self) -> None:
         self._at, self._action = None, np.zeros(0)
@@ -707,7 +735,7 @@ class LearntRisk:
         }
 
     def save(self, path: Place, provenance: Mapping[str, Any] | None = None) -> None:
-        """Write what was learnt to a file; what the machine learnt is in the machine's.
+        """Write what was learnt to a file.
 
         Parameters
         ----------
@@ -726,11 +754,12 @@ class LearntRisk:
         content |= self.breaks._asdict()
         content |= {"n_constant": 0 if self.backups is None else self.backups.n_constant}
         arrays = arrays_of(Kept(self.situations, self.backups, self.disturbances))
+        arrays["dynamics"] = to_bytes(self.dynamics)
         store.write(path, KIND, content, arrays, provenance)
 
     @classmethod
     def load(cls, path: Place) -> Self:
-        """Read what was learnt, between two episodes; it has to be bound to the machine again.
+        """Read what was learnt, between two episodes.
 
         Raises
         ------
@@ -741,9 +770,17 @@ class LearntRisk:
         """
         content, arrays = store.read(path, KIND)
         with store.explained(path):
+            dynamics = from_bytes(arrays.pop("dynamics"))
+            if dynamics is None:
+                raise ValueError("it lacks what was learnt of how the system moves")
             told = {name: content[name] for name in ("seed", "without", "names", "units")}
+            told |= {name: dynamics.settings.get(name) for name in ("low", "high", "n_actions")}
             judge = cls(content["dt"], horizon=content["told_horizon"], **told)
+            if judge.dynamics.settings != dynamics.settings:
+                raise ValueError("judge and dynamics in it were made for different settings")
+            judge.dynamics = dynamics
             kept = restored(int(content["n_constant"]), arrays)
+            _refuse_strange(kept, dynamics)
         for name in NUMBERS:
             setattr(judge, name, content[name])
         judge.breaks = Breaks(*(content[name] for name in Breaks._fields))
@@ -753,6 +790,26 @@ class LearntRisk:
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}(dt={self.dt:g}, seed={self.seed})"
+
+
+def _fallback(dynamics: Dynamics) -> Fallback:
+    """The first of some actions, or the middle of a range."""
+    if dynamics.choices:
+        return Fallback(0.0, "the first action")
+    middle = dynamics.decode(np.zeros(dynamics.size))
+    return Fallback(middle if len(middle) > 1 else float(middle[0]), "the middle of the range")
+
+
+def _refuse_strange(kept: Kept, dynamics: Dynamics) -> None:
+    """Raise where backups are of other numbers than dynamics: kernels check no index."""
+    if kept.backups is None:
+        return
+    _, size, features = kept.backups.policies.shape
+    if (dynamics.n_variables, dynamics.size) != (features - 1, size):
+        raise ValueError(
+            f"its backups are of {features - 1} variables and actions of {size} numbers, its "
+            f"dynamics of {dynamics.n_variables} and {dynamics.size}"
+        )
 
 
 def _within(expected: float) -> float:
