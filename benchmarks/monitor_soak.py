@@ -22,9 +22,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-from evofsm.cli.monitor.decider import EPISODE, Answer, Decider
-from evofsm.cli.monitor.defaults import guard_of_monitor
-from evofsm.cli.monitor.schema import Row
+from evofsm.cli.monitor.decider import EPISODE, Answer, Decider, guard_of_monitor
+from evofsm.cli.monitor.messages import Row
 from evofsm.cli.monitor.state import State
 from evofsm.guard import Guard
 from monitor_rows import JUNK, line, traffic
@@ -65,18 +64,16 @@ class Place:
         guard.learn = self._learn
         self.decider = Decider(guard, episode=self._episode)
         self.again += self._state.begin(self.decider)
-        self.decider.keeper = self._state
 
     def die(self, row: bytes, how: int) -> None:
         """Nothing is saved any more; another one begins."""
         journal = self._state._journal
-        assert journal is not None
-        if how == 1:  # the row was taken in, but is not answered
-            self._state.before(self.decider.form.read(row))
+        if how == 1:  # the row was taken in, but nobody hears the answer
+            self.decider.answer(row)
         journal._file.close()
         if how == 2:  # a part of the next record
             with open(journal.path, "ab") as file:
-                file.write(b'{"number":1,"row":[0.')
+                file.write(b'{"told":{"type":"row","time":0.')
         self.restarts += 1
         self._begin()
 

@@ -16,11 +16,8 @@ pytest.importorskip("rich")
 from typer.testing import CliRunner
 
 from evofsm.__main__ import application
-from evofsm.cli.monitor.decider import Decider
-from evofsm.cli.monitor.defaults import guard_of_monitor
-from evofsm.guard.auditing.replay import audit
-from evofsm.guard.guard import Guard
-from evofsm.guard.reviser import Mode
+from evofsm.cli.monitor.decider import Decider, guard_of_monitor
+from evofsm.guard import Guard, Mode, audit
 from monitor_rows import JUNK, closing_in, line, traffic
 
 EXAMPLES = Path(__file__).parents[2] / "examples" / "monitor"
@@ -78,7 +75,7 @@ def test_rows_from_a_file_and_from_standard_input_are_answered_alike(tmp_path):
 
 def test_learning_says_that_it_is_not_kept():
     result = evofsm("--learn", lines=ROWS)
-    assert "--state FILE keeps it" in result.stderr
+    assert "--state FILE saves it" in result.stderr
     assert told(result) == expected()
 
 
@@ -111,7 +108,7 @@ def test_a_state_goes_on_over_runs_and_may_be_the_guards_own_file(tmp_path):
     assert "goes on after decision 90 (90 rows taken in again)" in second.stderr
     refused = evofsm("--guard", state, "--state", state, lines=rows)
     assert refused.exit_code == 2
-    assert "learn was True and is False" in refused.stderr
+    assert "learn was true and is now false" in refused.stderr
 
 
 def test_the_audit_log_is_good(tmp_path):
@@ -129,7 +126,7 @@ def test_the_audit_log_is_good(tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (("--mode", "drive"), "--mode is 'drive'"),
+        (("--mode", "drive"), "'drive' is not one of 'off', 'shadow', 'advise', 'act'"),
         (("--udp", 0, "--socket", "x"), "give one of FILE, --socket, --udp and --zenoh"),
         (("--guard", "nowhere"), "nowhere: no such file or directory"),
         (("nowhere.jsonl",), "nowhere.jsonl: no such file or directory"),

@@ -14,6 +14,7 @@ from evofsm.cli.audit import audit
 from evofsm.cli.check import check
 from evofsm.cli.export import export
 from evofsm.cli.inspect import inspect
+from evofsm.cli.monitor import monitor
 from evofsm.cli.show import message, warn
 
 # What Typer raises where a command is called wrongly, whoever it takes it from.
@@ -83,12 +84,9 @@ def application(*others: Any) -> typer.Typer:
     from evofsm.cli.commands.declared import callback
     from evofsm.cli.commands.drive import Drive
     from evofsm.cli.commands.learn import Learn
-    from evofsm.cli.commands.monitor import Monitor
     from evofsm.cli.commands.watch import Watch
 
-    learn, drive, campaign, watch, monitor, *rest = map(
-        callback, (Learn, Drive, Campaign, Watch, Monitor, *others)
-    )
+    learn, drive, campaign, watch, *rest = map(callback, (Learn, Drive, Campaign, Watch, *others))
     about = _options.__doc__ or ""
     commands = (learn, inspect, drive, campaign, watch, monitor, audit, export, check)
     app = group(about, *commands, *rest)

@@ -3,14 +3,9 @@ import json
 import numpy as np
 import pytest
 
-from evofsm.cli.monitor.decider import Decider
-from evofsm.cli.monitor.defaults import guard_of_monitor, guard_of_traffic
-from evofsm.driving.cars import guard_for_cars
-from evofsm.driving.revisers import AlwaysBrake
-from evofsm.guard.auditing.log import AuditLog
-from evofsm.guard.auditing.replay import audit
-from evofsm.guard.guard import Guard
-from evofsm.guard.reviser import Mode
+from evofsm.cli.monitor.decider import Decider, guard_of_monitor, guard_of_traffic
+from evofsm.driving import AlwaysBrake, guard_for_cars
+from evofsm.guard import AuditLog, Guard, Mode, audit
 from monitor_rows import closing_in as rows
 from monitor_rows import line
 
@@ -110,6 +105,29 @@ def test_an_episode_ends_where_it_is_told_to_and_learns_of_it():
     assert (answer["kind"], answer["failed"], answer["n"]) == ("end", True, 20)
     assert guard.machine.endings.sum() == 1.0
     assert decider.answer(b'{"end": true}')["kind"] == "end"  # nothing is under way: nothing to do
+
+
+def test_an_end_that_is_sent_again_counts_once():
+    guard = made(learn=True)
+    decider = Decider(guard)
+    for row in rows(20):
+        decider.answer(line(row))
+    last = {"gap": -0.1, "v_follower": 20.0, "v_leader": 15.0}
+    end = line({"end": True, "failed": True, **last})
+    assert decider.answer(end) == decider.answer(end)
+    assert guard.machine.endings.sum() == 1.0
+
+
+@pytest.mark.parametrize(
+    "end", [b'{"end": true, "observation": [1e100]}', b'{"end": true, "observation": [1, 2, 3]}']
+)
+def test_an_end_that_the_guard_cannot_take_is_answered_and_changes_nothing(end):
+    decider, plain = (Decider(Guard(low=-1.0, high=1.0, interval=0.1)) for _ in range(2))
+    message = b'{"time": %d, "observation": [1, 2], "proposal": 0}'
+    for k in range(3):
+        assert decider.answer(message % k) == plain.answer(message % k)
+        assert decider.answer(end)["kind"] == "error"
+    assert (decider.n, decider.rows) == (3, 3)
 
 
 def test_after_an_end_time_may_begin_anew():

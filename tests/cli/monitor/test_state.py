@@ -1,11 +1,9 @@
 import numpy as np
 import pytest
 
-from evofsm.cli.monitor.decider import Decider
-from evofsm.cli.monitor.defaults import guard_of_monitor
+from evofsm.cli.monitor.decider import Decider, guard_of_monitor
 from evofsm.cli.monitor.state import State
-from evofsm.guard.guard import Guard
-from evofsm.guard.reviser import Mode
+from evofsm.guard import Guard, Mode
 from evofsm.store import read_header
 from monitor_rows import JUNK, line, scenes, traffic
 
@@ -20,18 +18,20 @@ def made(learn=True, mode=Mode.SHADOW):
 
 def opened(path, settings=SETTINGS, episode=700, learn=True, fresh=made):
     state = State(path, settings)
-    guard = state.guard(fresh)
+    try:
+        guard = state.guard(fresh)
+    except ValueError:
+        state.close()
+        raise
     guard.learn = learn
     decider = Decider(guard, episode=episode)
     state.begin(decider)
-    decider.keeper = state
     return decider, state
 
 
 def abandoned(state):
     """As the death of the process leaves it: nothing is written, the lock is gone."""
-    if state._journal is not None:
-        state._journal._file.close()
+    state._journal._file.close()
 
 
 @pytest.mark.parametrize(
@@ -94,7 +94,7 @@ def test_a_row_that_was_taken_in_but_not_answered_is_answered_when_it_is_sent_ag
     decider, state = opened(tmp_path / "state.evofsm")
     for row in rows[:20]:
         decider.answer(row)
-    state.before(decider.form.read(rows[20]))  # and then it is killed
+    decider.answer(rows[20])  # which nobody heard: it is killed
     abandoned(state)
     decider, state = opened(tmp_path / "state.evofsm")
     assert decider.n == 21
@@ -136,18 +136,6 @@ def test_a_saved_guard_is_gone_on_from_and_keeps_where_it_came_from(tmp_path):
     state.close()
 
 
-@pytest.mark.parametrize("left", [b"", b'{"num', b'{"number":1,"pre'])
-def test_a_journal_whose_first_record_was_half_written_is_empty(tmp_path, left):
-    decider, state = opened(tmp_path / "state.evofsm")
-    decider.answer(line(next(traffic(1))))
-    journal = state._journal.path
-    abandoned(state)
-    journal.write_bytes(left)
-    decider, state = opened(tmp_path / "state.evofsm")
-    assert decider.n == 0
-    state.close()
-
-
 def test_a_last_record_that_was_half_written_is_left_out(tmp_path):
     decider, state = opened(tmp_path / "state.evofsm")
     for row in traffic(5):
@@ -160,45 +148,73 @@ def test_a_last_record_that_was_half_written_is_left_out(tmp_path):
     state.close()
 
 
-def test_a_journal_that_was_lost_is_begun_anew(tmp_path):
-    decider, state = opened(tmp_path / "state.evofsm")
-    decider.answer(line(next(traffic(1))))
-    state.close()
-    state._journal.path.unlink()
-    decider, state = opened(tmp_path / "state.evofsm")
-    assert decider.n == 0
-    state.close()
-
-
-def test_a_journal_that_was_changed_is_refused(tmp_path):
-    decider, state = opened(tmp_path / "state.evofsm")
+def test_a_journal_or_a_guard_that_was_lost_emptied_or_changed_is_said(tmp_path):
+    path = tmp_path / "state.evofsm"
+    decider, state = opened(path)
     for row in traffic(5):
         decider.answer(line(row))
     state.close()
     journal = state._journal.path
-    journal.write_bytes(journal.read_bytes().replace(b"0.1", b"0.2", 1))
-    with pytest.raises(ValueError, match="was tampered with"):
-        opened(tmp_path / "state.evofsm")
+    whole = journal.read_bytes()
+    journal.write_bytes(whole.replace(b"0.1", b"0.2", 1))
+    with pytest.raises(ValueError, match="line 3 is damaged"):
+        opened(path)
+    for lose in (lambda: journal.write_bytes(b""), journal.unlink):
+        lose()
+        with pytest.raises(ValueError, match=r"state.evofsm.journal is missing or empty: rows"):
+            opened(path)
+    journal.write_bytes(whole)
+    guard = path.read_bytes()
+    path.unlink()
+    with pytest.raises(ValueError, match=r"state\.evofsm is missing, but"):
+        opened(path)
+    path.write_bytes(guard)
+    decider, state = opened(path)
+    assert decider.n == 5
+    state.close()
+
+
+@pytest.mark.parametrize("moment", ["before the guard is saved", "after it"])
+def test_killed_as_the_guard_is_saved_it_goes_on(tmp_path, moment, monkeypatch):
+    rows = [line(row) for row in traffic(702)]
+    plain = Decider(made(), episode=700)
+    expected = [plain.answer(row) for row in rows]
+    decider, state = opened(tmp_path / "state.evofsm")
+
+    def killed(*_):
+        raise SystemExit
+
+    whose = decider.guard if moment == "before the guard is saved" else state._journal
+    monkeypatch.setattr(whose, "save" if whose is decider.guard else "begin_anew", killed)
+    with pytest.raises(SystemExit):
+        any(decider.answer(row) is None for row in rows)
+    abandoned(state)
+    decider, state = opened(tmp_path / "state.evofsm")
+    assert [decider.answer(row) for row in rows[699:]] == expected[699:]
+    state.close()
 
 
 def test_other_settings_are_refused(tmp_path):
     _, state = opened(tmp_path / "state.evofsm")
     state.close()
-    with pytest.raises(ValueError, match="learn was True and is False"):
+    with pytest.raises(ValueError, match="learn was true and is now false"):
         opened(tmp_path / "state.evofsm", {"learn": False, "guard": None})
 
 
 def test_two_monitors_do_not_keep_themselves_in_one_place(tmp_path):
     _, state = opened(tmp_path / "state.evofsm")
-    with pytest.raises(ValueError, match="is being written by another process"):
-        opened(tmp_path / "state.evofsm")
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "elsewhere" / "link.evofsm").symlink_to(tmp_path / "state.evofsm")
+    for path in (tmp_path / "state.evofsm", tmp_path / "elsewhere" / "link.evofsm"):
+        with pytest.raises(ValueError, match="is being written by another process"):
+            opened(path)
     state.close()
 
 
 def test_where_it_can_not_be_kept_it_goes_on_and_says_so(tmp_path, monkeypatch):
     decider, state = opened(tmp_path / "state.evofsm")
 
-    def full(_):
+    def full(*_, **__):
         raise OSError(28, "No space left on device")
 
     with monkeypatch.context() as patched:

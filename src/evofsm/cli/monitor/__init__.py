@@ -1,1 +1,253 @@
-"""The guard beside a stack of others: rows or scenes in, decisions out, a JSON line each."""
+"""`evofsm monitor`: the guard beside a stack of others; rows or scenes in, decisions out."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from contextlib import ExitStack, closing
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from evofsm.cli.options import ModeName, require
+from evofsm.cli.show import warn
+
+if TYPE_CHECKING:
+    from evofsm.cli.monitor.transports import Server
+    from evofsm.guard import Guard
+
+
+def monitor(
+    file: Annotated[
+        Path | None,
+        typer.Argument(
+            help="JSON lines, or a run that drive --mcap recorded. [default: standard input]"
+        ),
+    ] = None,
+    guard: Annotated[
+        Path | None,
+        typer.Option(help="A saved guard. Without one, that of a car whose brakes are given."),
+    ] = None,
+    interval: Annotated[
+        float, typer.Option(help="Time between two rows [s]; a saved guard has its own.")
+    ] = 0.1,
+    brakes: Annotated[
+        float,
+        typer.Option(
+            min=0.5, max=20.0, help="Hardest braking of the own car [m/s²], without --guard."
+        ),
+    ] = 6.0,
+    traffic: Annotated[
+        bool,
+        typer.Option(
+            "--traffic",
+            help="Judge all objects of scenes, who is behind included; nothing of it is learnt.",
+        ),
+    ] = False,
+    mode: Annotated[
+        ModeName,
+        typer.Option(
+            help="How far it goes: shadow (it executes what is proposed), advise, or act."
+        ),
+    ] = ModeName.SHADOW,
+    proposal: Annotated[
+        float | None, typer.Option(help="Taken for that of rows without one.")
+    ] = None,
+    learn: Annotated[bool, typer.Option("--learn", help="Learn from what comes.")] = False,
+    state: Annotated[
+        Path | None,
+        typer.Option(
+            help="Save all of it in this file, and go on from there; may be that of --guard."
+        ),
+    ] = None,
+    audit: Annotated[Path | None, typer.Option(help="Write an audit log to this file.")] = None,
+    episode: Annotated[
+        int,
+        typer.Option(
+            min=1, help="An episode ends after so many rows: between two it learns and is saved."
+        ),
+    ] = 6000,
+    socket: Annotated[Path | None, typer.Option(help="Listen to a UNIX socket.")] = None,
+    udp: Annotated[
+        int | None,
+        typer.Option(
+            min=0, max=65535, help="Listen to this port on 127.0.0.1; 0 for any that is free."
+        ),
+    ] = None,
+    zenoh: Annotated[
+        str | None,
+        typer.Option(help="Rows are put under KEY/row, decisions under KEY/decision."),
+    ] = None,
+    heartbeat: Annotated[
+        float | None,
+        typer.Option(help="Say so many seconds after the last message that it is there."),
+    ] = None,
+    warm: Annotated[
+        bool, typer.Option("--warm", help="Compile before the first row comes.")
+    ] = False,
+) -> int | None:
+    """Decide beside a stack of your own: rows in, decisions out, a JSON line each.
+
+    A row: {"time": 0.1, "gap": 32, "v_follower": 20, "v_leader": 18, "proposal": 0.5}, in s, m,
+    m/s and m/s²; or a scene of objects; or the variables of the guard. docs/monitor.md describes
+    all messages. What cannot be used is answered by a line that names it.
+
+    Rows come from standard input, a file, a socket, UDP or Zenoh. Nothing is learnt without
+    --learn, and nothing is changed without --mode act. Ctrl-C or SIGTERM ends it, with everything
+    saved.
+    """
+    if sum(one is not None for one in (file, socket, udp, zenoh)) > 1:
+        raise ValueError("give one of FILE, --socket, --udp and --zenoh")
+    if traffic and (guard or state or learn):
+        raise ValueError(
+            "--traffic learns nothing: it goes with none of --guard, --state and --learn"
+        )
+    require(**({} if zenoh is None else {"zenoh": "zenoh"}))
+    require(**({"mcap": "mcap"} if file is not None and file.suffix == ".mcap" else {}))
+    from evofsm.cli.monitor.decider import Decider, guard_of_monitor, guard_of_traffic
+    from evofsm.cli.monitor.state import State
+    from evofsm.cli.monitor.transports import Server, silence_output
+    from evofsm.fsm import positive
+    from evofsm.guard import Guard
+
+    def fresh() -> Guard:
+        if guard is not None:
+            return Guard.load(guard)
+        return (guard_of_traffic if traffic else guard_of_monitor)(interval, brakes)
+
+    with ExitStack() as stack:
+        saved = None
+        if state is not None:
+            given = None if guard is None or guard.resolve() == state.resolve() else _digest(guard)
+            made = {"interval": interval, "brakes": brakes} if guard is None else {}
+            told = {"mode": mode.value, "proposal": proposal, "learn": learn, "episode": episode}
+            saved = State(state, {"guard": given, **made, **told})
+            stack.callback(saved.close)
+        elif learn:
+            warn("nothing of what is learnt is saved; --state FILE saves it")
+        used = fresh() if saved is None else saved.guard(fresh)
+        _prepare(used, mode, audit, stack, learn=learn)
+        decider = Decider(used, proposal=proposal, episode=episode)
+        if warm:
+            _compile(used, scenes=decider.form.scenes)
+        if saved is not None:
+            again = saved.begin(decider)
+            if decider.n:
+                warn(f"goes on after decision {decider.n} ({again} rows taken in again)")
+        server = Server(decider, None if heartbeat is None else positive("--heartbeat", heartbeat))
+        try:
+            with server.stoppable():
+                _serve(server, stack, file, socket, udp, zenoh)
+        except BrokenPipeError:
+            silence_output()
+            warn("nobody reads the decisions any more")
+            return 1
+        finally:
+            if saved is None and decider.rows:
+                decider.end()
+    return None
+
+
+def _digest(file: Path) -> str:
+    """What tells a saved guard from another one."""
+    from hashlib import sha256
+
+    return sha256(file.read_bytes()).hexdigest()
+
+
+def _prepare(
+    guard: Guard, mode: ModeName, audit: Path | None, stack: ExitStack, *, learn: bool
+) -> None:
+    """Set how far it goes, whether it learns, and who writes it down."""
+    from evofsm.fleet.sealed import Sync
+    from evofsm.guard import ActionReviser, AuditLog, Mode
+
+    if isinstance(guard.reviser, ActionReviser):
+        guard.reviser.mode = Mode(mode.value)
+    elif mode is not ModeName.ACT:
+        name = type(guard.reviser).__name__
+        raise ValueError(f"a {name} knows no --mode {mode}: what it says is executed")
+    guard.learn = learn
+    if audit is not None:
+        guard.audit = stack.enter_context(AuditLog(audit, sync=Sync.EPISODE))
+
+
+def _serve(
+    server: Server,
+    stack: ExitStack,
+    file: Path | None,
+    socket: Path | None,
+    udp: int | None,
+    zenoh: str | None,
+) -> None:
+    from evofsm.cli.monitor.transports import (
+        SocketTransport,
+        UdpTransport,
+        ZenohTransport,
+        serve_stream,
+    )
+
+    if socket is not None:
+        by_socket = stack.enter_context(closing(SocketTransport(socket)))
+        warn(f"listens to {socket}")
+        by_socket.serve(server)
+    elif udp is not None:
+        by_udp = stack.enter_context(closing(UdpTransport(udp)))
+        warn(f"listens to UDP port {by_udp.port}")
+        by_udp.serve(server)
+    elif zenoh is not None:
+        by_zenoh = stack.enter_context(closing(ZenohTransport(zenoh)))
+        warn(f"listens to {zenoh}/row")
+        by_zenoh.serve(server)
+    elif file is not None and file.suffix == ".mcap":
+        for line in _rows_of(file):
+            with server.waiting():
+                pass
+            sys.stdout.buffer.write(server.answer([line]))
+        sys.stdout.buffer.flush()
+    elif file is not None:
+        with open(file, "rb") as source:
+            serve_stream(server, source, sys.stdout.buffer)
+    elif sys.stdin is None:
+        raise ValueError("standard input is closed; give FILE, --socket, --udp or --zenoh")
+    elif server.heartbeat is not None and sys.platform == "win32":
+        raise ValueError("on Windows --heartbeat needs --udp or --zenoh")
+    else:
+        serve_stream(server, sys.stdin.buffer, sys.stdout.buffer)
+
+
+def _compile(guard: Guard, *, scenes: bool) -> None:
+    """Decide a few times on a copy, which then is thrown away."""
+    import numpy as np
+
+    from evofsm.driving import Object, Scene
+
+    twin = guard.copy()
+    count = len(twin.variables) or (0 if twin.machine is None else twin.machine.n_variables)
+    seen = np.array([30.0, 20.0, 20.0]) if count == 3 else np.ones(max(1, count))
+    if scenes:
+        own, other = Object("", 0.0, 0.0, 20.0), Object("", 30.0, 0.0, 10.0)
+        seen = Scene(own, [other, other._replace(x=-20.0)]).rows(2)
+    for k in range(4):
+        twin.decide(seen + 0.1 * k, None)
+    twin.end(observation=seen)
+    warn("compiled")
+
+
+def _rows_of(run: Path) -> Iterator[bytes]:
+    """The rows of a recorded run, and the ends of its episodes, as messages."""
+    import json
+    import math
+
+    from evofsm.driving import VARIABLES
+    from evofsm.io import read_run
+
+    names = {"time": "time", **dict(zip(VARIABLES, VARIABLES, strict=True)), "proposed": "proposal"}
+    for episode in read_run(run).episodes:
+        columns = [episode.columns[name].tolist() for name in names]
+        for values in zip(*columns, strict=True):
+            known: Any = (None if math.isnan(value) else value for value in values)
+            yield json.dumps(dict(zip(names.values(), known, strict=True))).encode()
+        last = dict(zip(VARIABLES, episode.end.tolist(), strict=True))
+        yield json.dumps({"end": True, "failed": bool(episode.collided), **last}).encode()

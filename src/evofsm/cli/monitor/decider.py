@@ -1,59 +1,38 @@
-"""A guard that is asked by messages: a message in, a message out, and no input or output.
+"""A guard that is asked by messages: a message in, an answer out, and no input or output.
 
-The same messages bring the same answers, whatever carried them; rows that are refused leave the
-guard as it was.
+The same messages bring the same answers, whatever carried them; what is refused leaves the guard
+as it was.
 """
 
 from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Mapping
-from typing import Any, Protocol
+from collections.abc import Callable, Mapping
+from typing import Any
 
+import msgspec
 import numpy as np
 
-from evofsm.cli.monitor.schema import SCHEMA, End, Form, MessageError, Row, as_floats, is_late
-from evofsm.guard import (
-    RECORD,
-    ActionReviser,
-    BoxActions,
-    Guard,
-    Mode,
-    Pair,
-    Revision,
-    SearchingJudge,
-    is_spoken,
-)
+from evofsm.cli.monitor.messages import SCHEMA, End, Form, Message, MessageError, Row
+from evofsm.driving import REAL_DRIVES, LatentRisk, TrafficRisk, guard_for_cars, guard_for_traffic
+from evofsm.fsm import positive
+from evofsm.guard import ActionReviser, BoxActions, Guard, Mode, Revision, SearchingJudge, is_spoken
 
 _log = logging.getLogger(__name__)
 
-#: What an answer says of a decision, beside its time; `evofsm.guard.RECORD` describes each.
-SAID = (
-    *("proposed", "executed", "advised"),
-    *("risk_proposed", "risk_executed", "risk_low", "risk_high", "evidence", "reason"),
-)
 #: Rows after which an episode ends, as soon as no alarm is on; at twice as many it ends anyway.
 EPISODE = 6000
 # What is older by less is late; what is older by more comes from a sender that began anew [s].
 _LATE = 1.0
 # A gap in time, and rows that come too often, in intervals.
 _HOLE, _OFTEN = 1.5, 0.5
+# The strongest acceleration that may be proposed where no guard is given [m/s²].
+_HIGHEST = 2.5
+# The weight of one brake so hard is added to those of the table [m/s²].
+_HARDEST = 10.0
 
-Told = Row | End
 Answer = dict[str, Any]
-
-
-class Keeper(Protocol):
-    """Whoever keeps what a monitor is told, so that it can go on after its end."""
-
-    def before(self, told: Told) -> None:
-        """It was accepted, and is acted on next."""
-        ...
-
-    def after(self, decider: Decider) -> None:
-        """It was acted on."""
-        ...
 
 
 class Decider:
@@ -67,7 +46,9 @@ class Decider:
         Taken where a row has none; without it such a row is refused.
     episode : int
         Rows after which an episode ends, as soon as no alarm is on: the guard learns, and can be
-        kept, between two of them only. At twice as many it ends anyway.
+        saved, between two of them only. At twice as many it ends anyway.
+    keep : callable, optional
+        Called with each message that was acted on, before it is answered.
 
     Examples
     --------
@@ -79,23 +60,32 @@ class Decider:
     >>> answer["kind"], answer["n"], answer["alarm"], answer["executed"], answer["advised"]
     ('decision', 1, True, 1.0, -6.0)
     >>> decider.answer(b"nonsense")["error"]
-    'is no JSON: Expecting value: line 1 column 1 (char 0)'
+    'is no JSON: JSON is malformed: invalid character (byte 4)'
     """
 
     def __init__(
-        self, guard: Guard, *, proposal: float | None = None, episode: int = EPISODE
+        self,
+        guard: Guard,
+        *,
+        proposal: float | None = None,
+        episode: int = EPISODE,
+        keep: Callable[[Message], None] = lambda message: None,
     ) -> None:
         if episode < 1:
             raise ValueError(f"episode is {episode}; it must have a row at least")
         self.guard = guard
         self.episode = episode
-        self.form = Form.of(guard, proposal)
-        self.keeper: Keeper | None = None
+        self.form = Form(guard, proposal)
+        self.keep = keep
         self.n = 0  #: decisions so far
         self.refused = 0  #: messages that were refused, since the process began
         self.rows = 0  #: of the episode under way; 0 where none is
-        self._latest: tuple[Row, Answer] | None = None
-        self._told_often = self._has_failed = False
+        self._latest: tuple[Message, Answer] | None = None
+        self._said_often = self._has_failed = False
+        reviser = guard.reviser
+        self._has_margin = isinstance(reviser, ActionReviser) and not isinstance(
+            reviser.risk, SearchingJudge
+        )
 
     @property
     def mode(self) -> Mode:
@@ -108,33 +98,35 @@ class Decider:
     def answer(self, line: bytes) -> Answer:
         """What is answered to a line: a decision, an end, or an error that names the key.
 
-        A row that is sent again, as after a connection was lost, gets the answer of before.
+        A message that is sent again, as after a connection was lost, gets the answer of before.
         """
         try:
             told = self.form.read(line)
-            if isinstance(told, Row) and self._latest is not None:
-                row, answer = self._latest
-                if told == row:
+            if self._latest is not None:
+                before, answer = self._latest
+                if told == before:
                     return answer
-                _refuse_stale(told, row)
+                if isinstance(told, Row) and isinstance(before, Row):
+                    _refuse_stale(told, before)
         except MessageError as refused:
-            return self.error(refused)
-        if self.keeper is not None:
-            self.keeper.before(told)
-        answer = self.act(told)
-        if self.keeper is not None:
-            self.keeper.after(self)
+            return self.error(refused.about, str(refused), refused.time)
+        try:
+            answer = self.act(told)
+        except Exception as error:  # an end that the guard cannot take
+            return self.error("end", f"was refused: {type(error).__name__}: {error}")
+        self.keep(told)
         return answer
 
-    def error(self, refused: MessageError) -> Answer:
+    def error(self, about: str, what: str, time: float | None = None) -> Answer:
         """What is answered where a message is refused."""
         self.refused += 1
-        when = {} if refused.time is None else {"time": refused.time}
-        return self._of("error", **when, about=refused.about, error=str(refused))
+        when = {} if time is None else {"time": time}
+        return self._of("error", **when, about=about, error=what)
 
     def heartbeat(self, silent: float) -> Answer:
         """What is said where nothing came for so long [s]."""
-        time = None if self._latest is None else self._latest[0].time
+        row = None if self._latest is None else self._latest[0]
+        time = row.time if isinstance(row, Row) else None
         return self._of(
             "heartbeat", time=time, silent=silent, refused=self.refused, mode=self.mode.value
         )
@@ -144,30 +136,36 @@ class Decider:
 
     # -- What it does ---------------------------------------------------------------------------
 
-    def act(self, told: Told) -> Answer:
-        """Take in what was accepted, and answer it."""
+    def act(self, told: Message) -> Answer:
+        """Take in what was accepted, and answer it.
+
+        Raises
+        ------
+        Exception
+            If the guard cannot take an end.
+        """
         if isinstance(told, End):
-            return self._ended(told)
-        answer = self._decided(told)
+            if self.rows or (told.failed and not isinstance(self._before, End)):
+                self.end(told.failed, _numbers(told.observation))
+            answer = self._of("end", failed=told.failed)
+        else:
+            answer = self._decided(told)
         self._latest = told, answer
         if self.rows >= self.episode and (not answer.get("alarm") or self.rows >= 2 * self.episode):
             self.end()
         return answer
 
+    @property
+    def _before(self) -> Message | None:
+        return None if self._latest is None else self._latest[0]
+
     def end(self, failed: bool = False, observation: Any = None) -> None:
         """End the episode under way."""
-        self.rows, self._told_often = 0, False
         try:
             self.guard.end(failed, observation)
         except OSError as error:  # only the audit log writes
             self._lose_audit(error)
-
-    def _ended(self, told: End) -> Answer:
-        seen = None if told.observation is None else as_floats(told.observation)
-        if self.rows or told.failed:
-            self.end(told.failed, seen)
-        self._latest = None  # whatever time comes next is that of a new episode
-        return self._of("end", failed=told.failed)
+        self.rows, self._said_often = 0, False
 
     def _decided(self, row: Row) -> Answer:
         notes = self._notes(row)
@@ -182,17 +180,23 @@ class Decider:
                 _log.exception("the guard failed at %s s", row.time)
             self._has_failed = True
             self.rows += 1
-            self.refused += 1
-            what = f"failed: {type(error).__name__}: {error}"
-            return self._of("error", time=row.time, about="guard", error=what)
+            return self.error("guard", f"failed: {type(error).__name__}: {error}", row.time)
         self.rows += 1
-        said = Pair(None, revision)  # type: ignore[arg-type]  # nothing of a situation is said
+        low, high = revision.interval
         return self._of(
             "decision",
             time=row.time,
             **({} if row.ahead is None else {"ahead": row.ahead}),
             **self._worst(row),
-            **{name: _plain(RECORD[name].read(said)) for name in SAID},
+            proposed=_plain(revision.proposed),
+            executed=_plain(revision.executed),
+            advised=_plain(revision.advised),
+            risk_proposed=_plain(revision.risk_proposed),
+            risk_executed=_plain(revision.risk_executed),
+            risk_low=_plain(low),
+            risk_high=_plain(high),
+            evidence=_plain(revision.evidence),
+            reason=revision.reason,
             alarm=self._is_alarm(revision),
             mode=self.mode.value,
             **note,
@@ -209,14 +213,14 @@ class Decider:
 
     def _kept(self, row: Row, note: Answer) -> Answer:
         """Nothing is ahead: whatever is wanted is done."""
-        wanted = _plain(row.proposal)
-        unknown = dict.fromkeys(SAID[3:-1])
+        wanted = dict.fromkeys(("proposed", "executed", "advised"), _plain(row.proposal))
+        risks = ("risk_proposed", "risk_executed", "risk_low", "risk_high", "evidence")
         return self._of(
             "decision",
             time=row.time,
             ahead=None,
-            **dict.fromkeys(SAID[:3], wanted),
-            **unknown,
+            **wanted,
+            **dict.fromkeys(risks),
             reason="nothing is ahead in the lane",
             alarm=False,
             mode=self.mode.value,
@@ -225,9 +229,9 @@ class Decider:
 
     def _notes(self, row: Row) -> list[str]:
         """What is odd about when a row comes, and what it follows; may end the episode."""
-        if self._latest is None or not self.rows:
+        latest, interval = self._before, self.guard.interval
+        if not isinstance(latest, Row) or not self.rows:
             return []
-        latest, interval = self._latest[0], self.guard.interval
         step = row.time - latest.time
         if step < 0.0:
             self.end()
@@ -239,23 +243,23 @@ class Decider:
             return []
         if step > _HOLE * interval:
             return [f"{step:.3g} s without a row: nothing is learnt or carried across"]
-        if step < _OFTEN * interval and not self._told_often:
-            self._told_often = True
+        if step < _OFTEN * interval and not self._said_often:
+            self._said_often = True
             return [f"rows come every {step:.3g} s, but the guard was made for {interval:g} s"]
         return []
 
     def _revision(self, row: Row) -> Revision:
-        assert row.observation is not None
         proposal: Any = row.proposal
         if isinstance(self.guard.actions, BoxActions) and proposal is not None:
             proposal = np.array(proposal)
+        seen: Any = _numbers(row.observation)
         try:
-            return self.guard.decide(as_floats(row.observation), proposal, row.time)
+            return self.guard.decide(seen, proposal, row.time)
         except OSError as error:
             if self.guard.audit is None:
                 raise
             self._lose_audit(error)
-            return self.guard.decide(as_floats(row.observation), proposal, row.time)
+            return self.guard.decide(seen, proposal, row.time)
 
     def _lose_audit(self, error: OSError) -> None:
         """Somebody has to go on; the log says itself with which record it ends."""
@@ -264,40 +268,83 @@ class Decider:
 
     def _is_alarm(self, revision: Revision) -> bool:
         """Whether the proposal is too risky, or, where that alone does not decide, is not kept."""
-        reviser = self.guard.reviser
-        if isinstance(reviser, ActionReviser) and not isinstance(reviser.risk, SearchingJudge):
-            return revision.risk_proposed > reviser.tolerance
+        reviser: Any = self.guard.reviser
+        if self._has_margin:
+            return bool(revision.risk_proposed > reviser.tolerance)
         return is_spoken(reviser, revision)
 
     # -- Its end, and its beginning -------------------------------------------------------------
 
     def memory(self) -> dict[str, Any]:
         """What it knows between two episodes, beside the guard: for JSON."""
-        return {"n": self.n, "latest": None if self._latest is None else list(self._latest)}
+        latest = None if self._latest is None else msgspec.to_builtins(list(self._latest))
+        return {"n": self.n, "latest": latest}
 
     def remember(self, memory: Mapping[str, Any]) -> None:
         """Go on from what `memory` returned."""
         self.n = int(memory["n"])
-        latest = memory["latest"]
-        self._latest = None if latest is None else (Row.kept(latest[0]), dict(latest[1]))
+        if memory["latest"] is not None:
+            told, answer = memory["latest"]
+            self._latest = msgspec.convert(told, Message), dict(answer)
 
 
 def _refuse_stale(row: Row, latest: Row) -> None:
     """Raise if it is no newer than the latest one, unless its sender began anew."""
     if row.time == latest.time:
-        raise MessageError(
-            "time", f"{row.time:g} s was decided on before, with other values", row.time
-        )
-    if is_late(row, latest, _LATE):
-        raise MessageError(
-            "time",
-            f"{row.time:g} s comes after {latest.time:g} s: late rows are left out",
-            row.time,
-        )
+        what = f"{row.time:g} s was decided on before, with other values"
+        raise MessageError("time", what, row.time)
+    if latest.time - _LATE <= row.time < latest.time:
+        what = f"{row.time:g} s comes after {latest.time:g} s: late rows are left out"
+        raise MessageError("time", what, row.time)
+
+
+def _numbers(observation: tuple[float | None, ...] | None) -> list[float] | None:
+    """With NaN where a variable was not seen."""
+    if observation is None:
+        return None
+    return [math.nan if value is None else value for value in observation]
 
 
 def _plain(value: Any) -> Any:
     """As JSON has it: None for what is no finite number."""
-    if isinstance(value, np.ndarray | np.generic | tuple):
-        return [_plain(one) for one in value] if np.ndim(value) else _plain(value.item())  # type: ignore[union-attr]
+    if isinstance(value, np.ndarray | np.generic):
+        value = value.tolist()
+    if isinstance(value, list | tuple):
+        return [_plain(one) for one in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+# -- Where no guard is given ----------------------------------------------------------------------
+
+
+def guard_of_monitor(interval: float, brakes: float) -> Guard:
+    """A guard of car following that is given how hard its car brakes, in shadow mode.
+
+    How hard leaders brake it begins with from public drives (`evofsm.driving.REAL_DRIVES`).
+
+    Parameters
+    ----------
+    interval : float
+        Time between two rows [s].
+    brakes : float
+        Hardest braking of the own car [m/s²].
+
+    Examples
+    --------
+    >>> guard = guard_of_monitor(interval=0.1, brakes=6.0)
+    >>> guard.decide([60.0, 20.0, 20.0], proposal=0.0).reason
+    'never seen before; risk is within the tolerance'
+    """
+    judge = _ahead(interval, brakes)
+    return guard_for_cars(-brakes, _HIGHEST, interval, judge=judge, mode=Mode.SHADOW)
+
+
+def guard_of_traffic(interval: float, brakes: float) -> Guard:
+    """The same among any number of objects, who is behind included; it learns nothing."""
+    judge = TrafficRisk(_ahead(interval, brakes), -brakes, _HIGHEST)
+    return guard_for_traffic(-brakes, _HIGHEST, brakes, interval, judge=judge, mode=Mode.SHADOW)
+
+
+def _ahead(interval: float, brakes: float) -> LatentRisk:
+    braking, step = positive("brakes", brakes), positive("interval", interval)
+    return LatentRisk.told(-braking, braking, _HARDEST, step, leaders=REAL_DRIVES)

@@ -1,12 +1,11 @@
 """How messages come and go: pipes, files, a UNIX socket, UDP on this computer, Zenoh.
 
-Each carrier hands lines to a `Station` and its answers back, until the input ends or the process
+Each transport hands lines to a `Server` and its answers back, until the input ends or the process
 is asked to stop. A peer that sends junk, vanishes or does not read is no reason to end.
 """
 
 from __future__ import annotations
 
-import logging
 import os
 import queue
 import select
@@ -17,25 +16,27 @@ import stat
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import FrameType
 from typing import Any, BinaryIO, Self
 
-from evofsm.cli.monitor.decider import Answer, Decider
-from evofsm.cli.monitor.schema import LONGEST, MessageError
-from evofsm.cli.text.documents import to_json_line
-from evofsm.extras import needs
+import msgspec
 
-_log = logging.getLogger(__name__)
+from evofsm.cli.monitor.decider import Answer, Decider
+from evofsm.cli.monitor.messages import LONGEST
+from evofsm.extras import needs
+from evofsm.fsm import visible
 
 # So much is read at once; a peer that leaves more unread is cut off [byte].
 _CHUNK, _UNREAD = 1 << 16, 1 << 20
+# So many lines may come in one datagram or sample.
+_MOST_LINES = 100
 # Messages of Zenoh that wait, at most.
 _WAITING = 1000
-
-Say = Callable[[str], None]
+# Longer than this it never waits at once: the system knows no longer times [s].
+_LONGEST_WAIT = 3600.0
 
 
 class StoppedError(Exception):
@@ -48,29 +49,22 @@ class Lines:
     Examples
     --------
     >>> lines = Lines()
-    >>> [*lines.feed(b"one\r\ntw")], [*lines.feed(b"o\nthree")], [*lines.rest()]
+    >>> lines.feed(b"one\r\ntw"), lines.feed(b"o\nthree"), lines.feed(b"")
     ([b'one'], [b'two'], [b'three'])
     """
 
     def __init__(self) -> None:
         self._begun = b""
 
-    def feed(self, data: bytes) -> Iterator[bytes]:
-        """The lines that are whole with this."""
-        *whole, begun = (self._begun + data).split(b"\n")
+    def feed(self, data: bytes) -> list[bytes]:
+        """The lines that are whole with this; with nothing, which is the end, the rest."""
+        *whole, begun = (self._begun + (data or b"\n" * bool(self._begun))).split(b"\n")
         self._begun = begun[: LONGEST + 1]  # however long it gets
-        for line in whole:
-            yield line.removesuffix(b"\r")
-
-    def rest(self) -> Iterator[bytes]:
-        """What came last, without an end."""
-        if self._begun:
-            yield self._begun
-        self._begun = b""
+        return [line.removesuffix(b"\r") for line in whole]
 
 
-class Station:
-    """A decider as carriers see it: lines in, lines out, a sign of life where nothing comes.
+class Server:
+    """A decider as transports see it: lines in, lines out, a sign of life where nothing comes.
 
     Parameters
     ----------
@@ -87,20 +81,28 @@ class Station:
 
     def answer(self, lines: Iterable[bytes]) -> bytes:
         """What is answered to lines, each with an end."""
-        answers = b"".join(_line(self.decider.answer(line)) for line in lines)
+        answers = b"".join([_line(self.decider.answer(line)) for line in lines])
         self._heard = self._said = time.monotonic()
         return answers
 
+    def answer_packet(self, data: bytes) -> bytes:
+        """What is answered to some lines that came at once."""
+        lines = data.removesuffix(b"\n").split(b"\n")
+        if len(lines) > _MOST_LINES:
+            return self.refuse(f"is one of {len(lines)} at once; at most {_MOST_LINES} may be")
+        return self.answer(lines)
+
     def refuse(self, what: str) -> bytes:
-        """Say that something was wrong with messages that never came in."""
-        return _line(self.decider.error(MessageError("line", what)))
+        """Say that something was wrong with lines that are not looked at."""
+        return _line(self.decider.error("line", what))
 
     @property
     def patience(self) -> float | None:
         """How long to wait for a message [s]; None for as long as it takes."""
         if self.heartbeat is None:
             return None
-        return max(0.0, self._said + self.heartbeat - time.monotonic())
+        left = self._said + self.heartbeat - time.monotonic()
+        return min(max(0.0, left), _LONGEST_WAIT)
 
     def beat(self) -> bytes:
         """The sign of life that is due; empty where none is."""
@@ -133,13 +135,7 @@ class Station:
 
     @contextmanager
     def waiting(self) -> Iterator[None]:
-        """In this it may be stopped.
-
-        Raises
-        ------
-        StoppedError
-            If it is.
-        """
+        """In this it may be stopped, by a `StoppedError`."""
         self._waits = True
         try:
             if self._stop:
@@ -159,13 +155,14 @@ class Station:
 
 
 def _line(answer: Answer) -> bytes:
-    return to_json_line(answer).encode() + b"\n"
+    line = msgspec.json.encode(answer) + b"\n"
+    return line if line.isascii() else visible(line.decode()[:-1]).encode() + b"\n"
 
 
 # -- Pipes and files ------------------------------------------------------------------------------
 
 
-def serve_stream(station: Station, source: BinaryIO, sink: BinaryIO) -> None:
+def serve_stream(server: Server, source: BinaryIO, sink: BinaryIO) -> None:
     """Read lines to the end of a pipe or a file.
 
     Raises
@@ -174,13 +171,13 @@ def serve_stream(station: Station, source: BinaryIO, sink: BinaryIO) -> None:
         If nobody reads the answers any more.
     """
     lines = Lines()
+    for stream in (source, sink):
+        with suppress(OSError, ValueError):  # ours wait, however whoever started it left them
+            os.set_blocking(stream.fileno(), True)
     while True:
-        with station.waiting():
-            data = _read(source, station.patience)
-        if data is None:
-            answers = station.beat()
-        else:
-            answers = station.answer(lines.feed(data) if data else lines.rest())
+        with server.waiting():
+            data = _read(source, server.patience)
+        answers = server.beat() if data is None else server.answer(lines.feed(data))
         if answers:
             sink.write(answers)
             sink.flush()
@@ -193,6 +190,12 @@ def _read(source: BinaryIO, patience: float | None) -> bytes | None:
     if patience is not None and not select.select([source], [], [], patience)[0]:
         return None
     return source.read1(_CHUNK)  # type: ignore[attr-defined,no-any-return]
+
+
+def silence_output() -> None:
+    """Nobody reads it any more: nothing is to fail as the process ends."""
+    with suppress(OSError, ValueError), open(os.devnull, "wb") as nothing:
+        os.dup2(nothing.fileno(), sys.stdout.fileno())
 
 
 # -- A UNIX socket --------------------------------------------------------------------------------
@@ -219,7 +222,7 @@ class _Peer:
         return True
 
 
-class SocketServer:
+class SocketTransport:
     """Answers whoever connects to a UNIX socket; several peers speak of the same car.
 
     Parameters
@@ -238,33 +241,36 @@ class SocketServer:
     def __init__(self, path: Path) -> None:
         if not hasattr(socket, "AF_UNIX"):
             raise ValueError("this system has no UNIX sockets; --udp PORT carries the same")
-        _make_way(path)
         self.path = path
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         try:
+            _make_way(path)
             self._socket.bind(os.fspath(path))
             path.chmod(0o600)
             self._socket.listen()
             self._socket.setblocking(False)
-        except BaseException as error:
+        except OSError as error:
             self._socket.close()
-            if isinstance(error, OSError) and error.filename is None:
-                error.filename = os.fspath(path)
+            if error.filename is not None:
+                raise
+            raise OSError(error.errno, error.strerror or str(error), os.fspath(path)) from error
+        except ValueError:
+            self._socket.close()
             raise
         self._selector = selectors.DefaultSelector()
         self._selector.register(self._socket, selectors.EVENT_READ)
 
-    def serve(self, station: Station) -> None:
+    def serve(self, server: Server) -> None:
         """Serve until it is stopped."""
         while True:
-            with station.waiting():
-                ready = self._selector.select(station.patience)
+            with server.waiting():
+                ready = self._selector.select(server.patience)
             for key, events in ready:
                 if key.data is None:
                     self._accept()
                 else:
-                    self._attend(key.data, events, station)
-            if beat := station.beat():
+                    self._attend(key.data, events, server)
+            if beat := server.beat():
                 for peer in self._peers():
                     self._send(peer, beat)
 
@@ -285,7 +291,7 @@ class SocketServer:
             connection.setblocking(False)
             self._selector.register(connection, selectors.EVENT_READ, _Peer(connection))
 
-    def _attend(self, peer: _Peer, events: int, station: Station) -> None:
+    def _attend(self, peer: _Peer, events: int, server: Server) -> None:
         answers = b""
         if events & selectors.EVENT_READ:
             try:
@@ -294,7 +300,7 @@ class SocketServer:
                 return
             except OSError:
                 data = b""
-            answers = station.answer(peer.lines.feed(data) if data else peer.lines.rest())
+            answers = server.answer(peer.lines.feed(data))
             if not data:
                 peer.send(answers)
                 self._let_go(peer)
@@ -330,7 +336,7 @@ def _make_way(path: Path) -> None:
 # -- UDP ------------------------------------------------------------------------------------------
 
 
-class UdpServer:
+class UdpTransport:
     """Answers datagrams from this computer, a line or some of them in each, to their senders.
 
     Parameters
@@ -350,20 +356,16 @@ class UdpServer:
         self.port: int = self._socket.getsockname()[1]
         self._sender: Any = None
 
-    def serve(self, station: Station) -> None:
+    def serve(self, server: Server) -> None:
         """Serve until it is stopped."""
         while True:
-            self._socket.settimeout(station.patience)
+            self._socket.settimeout(server.patience or (None if server.heartbeat is None else 1e-3))
             data = None
-            try:
-                with station.waiting():
-                    data, self._sender = self._socket.recvfrom(_CHUNK)
-            except OSError:  # nothing in time; or the sender of before is gone
-                pass
-            if data is None:
-                answers = station.beat()
-            else:
-                answers = station.answer(data.removesuffix(b"\n").split(b"\n"))
+            with suppress(OSError), server.waiting():  # nothing in time; or the sender is gone
+                data, self._sender = self._socket.recvfrom(_CHUNK)
+            answers = server.beat() if data is None else server.answer_packet(data)
+            if self._sender is None:
+                continue
             for answer in answers.splitlines(keepends=True):
                 with suppress(OSError):
                     self._socket.sendto(answer, self._sender)
@@ -376,7 +378,7 @@ class UdpServer:
 # -- Zenoh ----------------------------------------------------------------------------------------
 
 
-class ZenohServer:
+class ZenohTransport:
     """Takes messages that are put under ``KEY/row``, and puts answers under ``KEY/decision``.
 
     The session is configured by the file that the variable ``ZENOH_CONFIG`` names, where it is
@@ -400,8 +402,8 @@ class ZenohServer:
         self._came: queue.Queue[bytes] = queue.Queue(_WAITING)
         self._dropped = 0
         try:
-            told = os.environ.get("ZENOH_CONFIG")
-            config = zenoh.Config.from_file(told) if told else zenoh.Config()
+            file = os.environ.get("ZENOH_CONFIG")
+            config = zenoh.Config.from_file(file) if file else zenoh.Config()
             self._session = zenoh.open(config)
         except zenoh.ZError as error:
             raise ValueError(f"Zenoh: {error}") from None
@@ -414,22 +416,16 @@ class ZenohServer:
             self.close()
             raise ValueError(f"--zenoh {key}: {error}") from None
 
-    def serve(self, station: Station) -> None:
+    def serve(self, server: Server) -> None:
         """Serve until it is stopped."""
         while True:
             data = None
-            try:
-                with station.waiting():
-                    data = self._came.get(timeout=station.patience)
-            except queue.Empty:
-                pass
-            if data is None:
-                answers = station.beat()
-            else:
-                answers = station.answer(data.removesuffix(b"\n").split(b"\n"))
+            with suppress(queue.Empty), server.waiting():
+                data = self._came.get(timeout=server.patience)
+            answers = server.beat() if data is None else server.answer_packet(data)
             dropped, self._dropped = self._dropped, 0
             if dropped:
-                answers += station.refuse(f"{dropped} messages came too fast, and were left out")
+                answers += server.refuse(f"{dropped} messages came too fast, and were left out")
             for answer in answers.splitlines():
                 self._publisher.put(answer)
 
@@ -443,9 +439,3 @@ class ZenohServer:
             self._came.put_nowait(sample.payload.to_bytes())
         except queue.Full:
             self._dropped += 1
-
-
-def silence_output() -> None:
-    """Nobody reads it any more: nothing is to fail as the process ends."""
-    with suppress(OSError, ValueError), open(os.devnull, "wb") as nothing:
-        os.dup2(nothing.fileno(), sys.stdout.fileno())

@@ -1,0 +1,216 @@
+"""A journal: what is in it survives whatever happens to the process that writes it.
+
+It is a file of JSON objects, one on each line. The first is the header, with the settings that all
+others belong to::
+
+    {"settings":{"seed":0},"crc":"0a8b2dd9"}
+    {"episode":3,"collided":false,"mobility":0.93,"crc":"1f0c4a66"}
+
+``crc`` is the CRC-32 of the line up to the comma before it, in hexadecimal: a record that was half
+written when the process was killed, or the disk full, does not have the right one. It is cut off
+when the journal is opened again.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Self
+from zlib import crc32
+
+import msgspec
+
+from evofsm import store
+
+_SEAL = b',"crc":"'
+# So many settings that differ are named in an error.
+_NAMED = 4
+
+Record = Mapping[str, Any]
+
+
+class Journal:
+    """Records in a file that no other process writes. Close it, or use it in a ``with`` statement.
+
+    Parameters
+    ----------
+    path : Path
+        Is made if it is not there.
+    settings : mapping
+        For JSON: what determines the records.
+    otherwise : str
+        What to do where the file is taken, for errors.
+
+    Raises
+    ------
+    ValueError
+        If it is no journal, is damaged elsewhere than at its end, or another process writes it.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     path = Path(folder) / "journal.jsonl"
+    ...     with Journal(path, {"seed": 0}) as journal:
+    ...         journal.append({"episode": 7, "collided": False})
+    ...     with Journal(path, {"seed": 0}) as journal:
+    ...         journal.records
+    [{'episode': 7, 'collided': False}]
+    """
+
+    def __init__(
+        self, path: Path, settings: Record, otherwise: str = "name another folder"
+    ) -> None:
+        self.path = path
+        #: Those that it was begun with: of another journal where it has records.
+        self.settings: Record = settings
+        self.records: list[dict[str, Any]] = []
+        self._file = _opened(path, otherwise)
+        try:
+            good = self._read()
+            self._file.truncate(good)
+            if good == 0:
+                self._write(_line({"settings": settings}))
+        except BaseException:
+            self.close()
+            raise
+
+    def go_on(self, settings: Record, otherwise: str) -> None:
+        """Refuse, saying what to do, where it has records of other settings."""
+        if not (found := differences(self.settings, settings)):
+            return
+        if self.records:
+            raise ValueError(f"{self.path} was begun with other settings: {found}; {otherwise}")
+        self.begin_anew(settings)
+
+    def append(self, *records: Record, sync: bool = True) -> None:
+        """Add records; when this returns they survive the process, with ``sync`` a power cut too.
+
+        Raises
+        ------
+        OSError
+            If they cannot be written. What was there before is kept.
+        """
+        self._write(b"".join(map(_line, records)), sync=sync)
+
+    def begin_anew(self, settings: Record) -> None:
+        """Replace all of it by a header, at once or not at all."""
+        fresh = self.path.with_name(f".{self.path.name}.new")
+        fresh.unlink(missing_ok=True)
+        before, self._file = self._file, _opened(fresh, "try again")
+        self._write(_line({"settings": settings}))
+        os.replace(fresh, self.path)
+        before.close()
+        self.settings, self.records = settings, []
+
+    def sync(self) -> None:
+        """Force what was written onto the disk."""
+        os.fsync(self._file.fileno())
+
+    def close(self) -> None:
+        """Let others have the file."""
+        self._file.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+    def _write(self, data: bytes, *, sync: bool = True) -> None:
+        try:
+            while data:  # a disk that gets full takes a part of it first
+                data = data[self._file.write(data) :]
+            if sync:
+                self.sync()
+        except OSError as error:
+            what = "what came before is kept: make room, and run the same command again"
+            raise OSError(error.errno, f"{error.strerror}; {what}", str(self.path)) from error
+
+    def _read(self) -> int:
+        """Read what is there, and say up to where it is good; without a record, nothing is."""
+        good, damaged, begun_with = 0, 0, self.settings
+        self._file.seek(0)
+        for number, line in enumerate(self._file.read().splitlines(keepends=True), 1):
+            record = _record(line)
+            if record is None:
+                if number == 1 and not _line({"settings": self.settings}).startswith(line):
+                    raise ValueError(f"{self.path} is no journal")
+                damaged = damaged or number
+                continue
+            if damaged:
+                raise ValueError(
+                    f"{self.path}, line {damaged} is damaged (was it edited?); delete that line, "
+                    "and what it said is done again"
+                )
+            if number == 1:
+                begun_with = record["settings"]
+            else:
+                self.records.append(record)
+            good += len(line)
+        self.settings = begun_with
+        return good
+
+
+def _opened(path: Path, otherwise: str) -> io.FileIO:
+    """A file that no other process writes."""
+    file = io.FileIO(path, "a+")
+    try:
+        store.only_writer(file, path, otherwise)
+        if os.fstat(file.fileno()).st_ino != path.stat().st_ino:  # it has just been replaced
+            raise ValueError(f"{path} is being written by another process; {otherwise}")
+    except BaseException:
+        file.close()
+        raise
+    return file
+
+
+def _line(record: Record) -> bytes:
+    text = msgspec.json.encode(record)[:-1]
+    return text + _SEAL + f'{crc32(text):08x}"}}\n'.encode()
+
+
+def _record(line: bytes) -> dict[str, Any] | None:
+    """What a line holds; None where it is not whole."""
+    text, _, seal = line.rpartition(_SEAL)
+    if seal != f'{crc32(text):08x}"}}\n'.encode():
+        return None
+    record = json.loads(text + b"}")
+    return record if isinstance(record, dict) else None
+
+
+def differences(before: Record, now: Record) -> str:
+    """In which settings two pieces of work differ, in words; empty where in none.
+
+    Examples
+    --------
+    >>> differences({"seed": 0, "family": {"name": "paper"}}, {"seed": 1, "family": {"name": "r"}})
+    'seed was 0 and is now 1, family.name was "paper" and is now "r"'
+    """
+    flat_before, flat_now = _flat(before), _flat(now)
+    found = [
+        f"{name} was {_shown(flat_before.get(name))} and is now {_shown(flat_now.get(name))}"
+        for name in flat_before | flat_now
+        if flat_before.get(name) != flat_now.get(name)
+    ]
+    more = f" and {len(found) - _NAMED} more" if len(found) > _NAMED else ""
+    return ", ".join(found[:_NAMED]) + more
+
+
+def _flat(value: Any, name: str = "") -> dict[str, Any]:
+    """Settings within settings, by names with dots, as JSON has them."""
+    if not isinstance(value, dict | list | tuple):
+        return {name: json.loads(msgspec.json.encode(value))}
+    items = value.items() if isinstance(value, dict) else enumerate(value)
+    found: dict[str, Any] = {}
+    for inner, one in items:
+        found |= _flat(one, f"{name}.{inner}" if name else str(inner))
+    return found
+
+
+def _shown(value: Any) -> str:
+    text = json.dumps(value)
+    return text if len(text) <= 24 else f"{text[:20]} ..."

@@ -1,0 +1,378 @@
+"""The messages of a monitor: what a line may hold, checked before anything is done with it.
+
+A message is a JSON object on a line of its own; ``docs/monitor.md`` describes each key. `msgspec`
+checks types and ranges; the sentences that say what was wrong are made here.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from typing import Annotated, Any, Literal
+
+import msgspec
+import numpy as np
+from msgspec import UNSET, Meta, UnsetType
+
+from evofsm.driving import VARIABLES, Object, Scene, TrafficRisk
+from evofsm.fsm import visible
+from evofsm.guard import ActionReviser, BoxActions, Choices, Guard
+from evofsm.store import LARGEST_OBSERVATION
+
+#: The version of the messages.
+SCHEMA = 1
+#: A longer line is refused unread [byte].
+LONGEST = 1 << 16
+# Objects that a guard of whole scenes has room for; of more the closest along the road count.
+_MOST = 64
+# So much of what is refused is shown, and so long may a name be [letters].
+_SHOWN = 40
+# Where a width is not given [m].
+_WIDTH = 1.8
+
+_Number = Annotated[float, Meta(ge=-LARGEST_OBSERVATION, le=LARGEST_OBSERVATION)]
+_Seen = _Number | None
+_Name = Annotated[str, Meta(max_length=_SHOWN)] | Annotated[int, Meta(ge=-(2**63), le=2**63 - 1)]
+
+_NUMBER = "a finite number"
+_NAMED = f"an int, or a text of at most {_SHOWN} letters"
+# What a value must be, by how msgspec begins to say what it expected.
+_RULES = {
+    "`float | null`": f"{_NUMBER}, or null if not seen",
+    "`float`": _NUMBER,
+    "`int | str`": _NAMED,
+    "`int | float | str`": _NAMED,
+    "`str`": _NAMED,
+    "`int`": "an int",
+    "`bool`": "true or false",
+    "`object`": "a JSON object",
+    "`array": "a list",
+}
+
+
+class MessageError(ValueError):
+    """A line that is no message.
+
+    Parameters
+    ----------
+    about : str
+        The key, such as ``objects[3].vx``; ``line`` where it is about all of it.
+    what : str
+        What is wrong with it.
+    time : float, optional
+        Of the message, where that could be read [s].
+    """
+
+    def __init__(self, about: str, what: str, time: float | None = None) -> None:
+        super().__init__(what)
+        self.about = about
+        self.time = time
+
+
+class Row(msgspec.Struct, frozen=True, tag="row"):
+    """What was seen at a time, and what somebody wants to do."""
+
+    time: float  #: [s]
+    #: of each variable, None where it was not seen; None altogether where nothing is ahead
+    observation: tuple[float | None, ...] | None
+    proposal: float | int | tuple[float, ...] | None  #: None where nothing was proposed
+    ahead: str | int | None = None  #: id of the object that is followed, in a scene
+    objects: tuple[str, ...] = ()  #: ids of all objects, where all are judged: number 1 first
+
+
+class End(msgspec.Struct, frozen=True, tag="end"):
+    """An episode is over."""
+
+    failed: bool
+    observation: tuple[float | None, ...] | None = None  #: the last one; nothing was decided on it
+
+
+Message = Row | End
+
+
+class _Vehicle(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
+    """Ego or an object of a scene, as it is sent."""
+
+    vx: _Number
+    length: _Number
+    id: _Name | UnsetType = UNSET
+    s: _Number | UnsetType = UNSET
+    x: _Number | UnsetType = UNSET
+    y: _Number | UnsetType = UNSET
+    lane: _Number | _Name | UnsetType = UNSET
+    vy: _Number = 0.0
+    width: _Number = _WIDTH
+
+
+class Form:
+    """Reads lines, for one guard.
+
+    Parameters
+    ----------
+    guard : Guard
+    proposal : float, optional
+        Taken where a row has none; without it such a row is refused.
+
+    Examples
+    --------
+    >>> from evofsm.driving import guard_for_cars
+    >>> form = Form(guard_for_cars(low=-6.0, high=2.5))
+    >>> line = b'{"time": 1.5, "gap": 30, "v_follower": 20, "v_leader": null, "proposal": 0.5}'
+    >>> form.read(line)
+    Row(time=1.5, observation=(30.0, 20.0, None), proposal=0.5, ahead=None, objects=())
+    >>> form.read(b'{"end": true, "failed": true}')
+    End(failed=True, observation=None)
+    >>> form.read(b'{"schema": 2}')
+    Traceback (most recent call last):
+    evofsm.cli.monitor.messages.MessageError: is 2; this monitor knows version 1 alone
+    """
+
+    def __init__(self, guard: Guard, proposal: float | None = None) -> None:
+        reviser = guard.reviser
+        #: Names of what is observed; empty where they have none, and come as a list.
+        self.variables: tuple[str, ...] = guard.variables
+        #: Whether the guard observes whole scenes.
+        self.scenes = isinstance(reviser, ActionReviser) and isinstance(reviser.risk, TrafficRisk)
+        known = 0 if guard.machine is None else guard.machine.n_variables
+        #: Number of variables; 0 where any will do.
+        self.count = len(self.variables) or known
+        length = Meta(min_length=self.count or 1, max_length=self.count or None)
+        several: Any = Annotated[list[_Seen], length]
+        seen = [(name, _Seen) for name in self.variables] or [("observation", several)]
+        self._names = [name for name, _ in seen]
+        action = ("proposal", _action(guard), *(() if proposal is None else (proposal,)))
+        version = ("schema", Literal[1], SCHEMA)
+        self._row = _struct("Row", ("time", _Number), action, *seen, version)
+        placed = ("ego", _Vehicle), ("objects", list[_Vehicle])
+        self._scene = _struct("Scene", ("time", _Number), action, *placed, version)
+        last = [(name, kind | UnsetType, UNSET) for name, kind in seen]
+        self._end = _struct(
+            "End", ("end", bool), ("failed", bool, False), ("time", _Seen, None), *last, version
+        )
+        self._decoders = {kind: msgspec.json.Decoder(kind) for kind in (self._row, self._scene)}
+
+    def read(self, line: bytes) -> Message:
+        """The message on a line.
+
+        Raises
+        ------
+        MessageError
+            If it is none; the error names the key.
+        """
+        if len(line) > LONGEST:
+            raise MessageError("line", f"is longer than {LONGEST} bytes")
+        kind = self._row
+        try:
+            if self.scenes or b'"objects"' in line or b'"ego"' in line:
+                kind = self._scene
+            if b'"end"' in line and "end" in (told := _parsed(line)):
+                kind = self._end
+                return self._of_end(msgspec.convert(told, kind))
+            told = self._decoders[kind].decode(line)
+            if kind is self._scene:
+                return self._of_scene(told)
+            return Row(told.time, self._observed(told), _frozen(told.proposal))
+        except MessageError as error:
+            error.time = _time(_parsed(line))
+            raise
+        except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
+            raise self._refused(line, kind, str(error)) from None
+
+    def _observed(self, told: Any) -> tuple[float | None, ...]:
+        values = [getattr(told, name) for name in self._names]
+        return tuple(values if self.variables else values[0])
+
+    def _of_end(self, told: Any) -> End:
+        if not told.end:
+            raise MessageError("end", "is false; it must be true")
+        given = [name for name in self._names if getattr(told, name) is not UNSET]
+        if not given:
+            return End(told.failed)
+        if lacking := [name for name in self._names if name not in given]:
+            raise MessageError(lacking[0], "is missing; a variable that was not seen is null")
+        return End(told.failed, self._observed(told))
+
+    def _of_scene(self, told: Any) -> Row:
+        if not (self.scenes or self.variables == VARIABLES):
+            raise MessageError(
+                "objects", "are for guards of car following; send a row of this guard's variables"
+            )
+        ego, along = told.ego, "x" if told.ego.s is UNSET else "s"
+        _refuse_nowhere(ego, "ego", along)
+        for k, one in enumerate(told.objects):
+            where = f"objects[{k}]"
+            _refuse_nowhere(one, where, along)
+            if one.id is UNSET:
+                raise MessageError(f"{where}.id", f"is missing; it must be {_NAMED}")
+            in_lanes = one.lane is not UNSET and ego.lane is not UNSET
+            if not in_lanes and (one.y is UNSET or ego.y is UNSET):
+                what = "is given for it or for ego, but not for both; nor is y"
+                raise MessageError(f"{where}.lane", what)
+        proposal = _frozen(told.proposal)
+        if self.scenes:
+            others = [_object(one, f"objects[{k}]", along) for k, one in enumerate(told.objects)]
+            scene = Scene(_object(ego, "ego", along), others)
+            names = tuple(each.id for each in scene.objects[1 : _MOST + 1])
+            return Row(told.time, tuple(scene.rows(_MOST).tolist()), proposal, objects=names)
+        ahead = _nearest_ahead(ego, told.objects, along)
+        if ahead is None:
+            return Row(told.time, None, proposal)
+        gap, one = ahead
+        return Row(told.time, (gap, ego.vx, one.vx), proposal, None if one.id is UNSET else one.id)
+
+    def _refused(self, line: bytes, kind: Any, error: str) -> MessageError:
+        """What msgspec refused, with the key and the value, in a sentence."""
+        text, _, place = error.partition(" - at `$")
+        place = place.removesuffix("`").removeprefix(".")
+        if text == "Number out of range":
+            return MessageError(place or "line", f"is too large; it must be {_NUMBER}")
+        told = _parsed(line)
+        time = _time(told)
+        if found := re.fullmatch(r"Object (missing|contains).* field `(.*)`", text):
+            about = f"{place}.{found[2]}".removeprefix(".")
+            if found[1] == "missing":
+                return MessageError(about, f"is missing{_missing(about)}", time)
+            known = msgspec.structs.fields(_Vehicle if place else kind)
+            names = ", ".join(sorted(one.name for one in known))
+            return MessageError(about[:_SHOWN], f"is not known; known are {names}", time)
+        value = _shown(_at(told, place))
+        if place == "schema":
+            what = f"is {value}; this monitor knows version {SCHEMA} alone"
+        else:
+            what = f"is {value}; it must be {_rule(text, place)}"
+        return MessageError(place or "line", what, time)
+
+
+def _struct(name: str, *fields: Any) -> Any:
+    return msgspec.defstruct(name, fields, forbid_unknown_fields=True, kw_only=True)
+
+
+def _action(guard: Guard) -> Any:
+    """The type of a proposal."""
+    actions = guard.actions
+    if isinstance(actions, Choices):
+        return Annotated[int, Meta(ge=0, le=actions.n_actions - 1)] | None
+    if isinstance(actions, BoxActions):
+        components = int(np.size(actions.low))
+        return Annotated[list[_Number], Meta(min_length=components, max_length=components)] | None
+    return _Number | None
+
+
+def _frozen(proposal: Any) -> Any:
+    return tuple(proposal) if isinstance(proposal, list) else proposal
+
+
+# -- Scenes ---------------------------------------------------------------------------------------
+
+
+def _refuse_nowhere(one: _Vehicle, where: str, along: str) -> None:
+    if getattr(one, along) is UNSET:
+        raise MessageError(f"{where}.{along}", "is missing; it must be a finite number")
+    if along == "s" and one.lane is UNSET:
+        what = "is missing: without it s does not say who follows whom"
+        raise MessageError(f"{where}.lane", what)
+    if one.lane is UNSET and one.y is UNSET:
+        raise MessageError(f"{where}.y", "is missing, and so is lane; one of them is needed")
+
+
+def _object(one: _Vehicle, where: str, along: str) -> Object:
+    """An object whose sides are known, so that it is known who is in whose way."""
+    if one.y is UNSET:
+        raise MessageError(f"{where}.y", "is missing; it says who is in whose way")
+    name = where if one.id is UNSET else str(one.id)
+    place: float = getattr(one, along)
+    return Object(name, place, one.y, one.vx, one.vy, one.length, one.width)
+
+
+def _nearest_ahead(
+    ego: _Vehicle, objects: list[_Vehicle], along: str
+) -> tuple[float, _Vehicle] | None:
+    """The closest object in the own lane whose middle is ahead, after the gap to it [m]."""
+    found: tuple[float, _Vehicle] | None = None
+    for one in objects:
+        away = getattr(one, along) - getattr(ego, along)
+        if away <= 0.0 or not _in_lane(ego, one):
+            continue
+        gap = away - 0.5 * (ego.length + one.length)
+        if found is None or gap < found[0]:
+            found = gap, one
+    return found
+
+
+def _in_lane(ego: Any, one: Any) -> bool:
+    """Whether it is in the own lane; by their widths where a lane is not given."""
+    if ego.lane is not UNSET and one.lane is not UNSET:
+        return bool(ego.lane == one.lane)
+    return bool(abs(one.y - ego.y) < 0.5 * (ego.width + one.width))
+
+
+# -- What was wrong with a line -------------------------------------------------------------------
+
+
+def _parsed(line: bytes) -> dict[str, Any]:
+    """Whatever JSON it is."""
+    try:
+        told = msgspec.json.decode(line)
+    except RecursionError:
+        raise MessageError("line", "is nested too deeply") from None
+    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+        if not line.strip():
+            raise MessageError("line", "is empty") from None
+        if found := re.search(rb"-?\b(NaN|Infinity)\b", line):
+            name = found[0].decode()
+            what = f"holds {name}, which is no JSON; a number that was not seen is null"
+            raise MessageError("line", what) from None
+        kind = "not UTF-8" if isinstance(error, UnicodeDecodeError) else "no JSON"
+        raise MessageError("line", f"is {kind}: {error}") from None
+    if not isinstance(told, dict):
+        raise MessageError("line", f"is {_shown(told)}; it must be a JSON object")
+    return told
+
+
+def _time(told: dict[str, Any]) -> float | None:
+    """The time of a message, where it can be read."""
+    time = told.get("time")
+    is_time = type(time) in (int, float) and abs(time) <= LARGEST_OBSERVATION  # type: ignore[arg-type]
+    return float(time) if is_time else None  # type: ignore[arg-type]
+
+
+def _at(told: Any, place: str) -> Any:
+    """The value at a place such as ``objects[3].vx``."""
+    for part in re.findall(r"[^.\[\]]+", place):
+        told = told[int(part)] if isinstance(told, list) else told.get(part)
+    return told
+
+
+def _rule(text: str, place: str) -> str:
+    """What a value must be, from what msgspec expected of it."""
+    expected = re.sub(r"^Expected |, got .*", "", text)
+    if found := re.fullmatch(r"`array` of length [<>]= (\d+)", expected):
+        return f"a list of {found[1]} numbers"
+    if found := re.fullmatch(r"`int` [<>]= (\d+)", expected):
+        return f"an int of at {'most' if '<' in expected else 'least'} {found[1]}"
+    is_action = place == "proposal"
+    if is_action:
+        expected = expected.replace(" | null", "")
+    rule = next((rule for begin, rule in _RULES.items() if expected.startswith(begin)), _NUMBER)
+    return f"{rule}, or null if there is none" if is_action else rule
+
+
+def _missing(about: str) -> str:
+    """What to do about a key that is missing."""
+    if about == "proposal":
+        return (
+            ": what the controller wants to do, or null if nothing; with --proposal NUMBER that is "
+            "taken for it"
+        )
+    if about in ("time", "ego", "objects", "end") or "." in about:
+        return "; every message of its kind has it"
+    return "; a variable that was not seen is null"
+
+
+def _shown(value: Any) -> str:
+    """The beginning of what was sent."""
+    try:
+        text = json.dumps(value, ensure_ascii=False)
+    except (ValueError, RecursionError):  # integers of thousands of digits
+        return "something too large to show"
+    return visible(text if len(text) <= _SHOWN else f"{text[: _SHOWN - 3]}...")
