@@ -55,7 +55,7 @@ lowest: .venv/installed         ## test the core with the lowest versions that a
 	@$(BIN)/uv venv --quiet --allow-existing --python $(BIN)/python .venv-lowest
 	@$(BIN)/uv pip install --quiet --python $(LOWEST) --resolution lowest-direct \
 	    --editable '.[tables,study]' 'pytest>=8.3' 'hypothesis>=6.100'
-	@$(LOWEST) -m pytest -q -p no:cacheprovider tests/fsm tests/fleet/test_batch.py
+	@$(LOWEST) -m pytest -q -p no:cacheprovider tests/fsm
 supply: .venv/installed         ## known holes in what is pinned, and a bill of materials: sbom.json
 	@$(BIN)/uv tool run pip-audit --disable-pip --require-hashes --requirement requirements.lock
 	@$(BIN)/uv tool run --from cyclonedx-bom cyclonedx-py requirements requirements.lock -o sbom.json

@@ -1,6 +1,6 @@
 """The step of the machine as a plain NumPy loop, vectorised over states: what it is timed against.
 
-As quick as NumPy allows, unlike `evofsm.fsm.reference`, which is written to be read.
+As quick as NumPy allows; the tests hold the compiled machine to it (tests/fsm/test_reference.py).
 """
 
 from __future__ import annotations

@@ -20,7 +20,6 @@ from pathlib import Path
 import judges
 from clusterers import db_stream, stream_k_means
 from cold import FIRST, first
-from fleets import fleet
 from single import batch, call, lock
 from table import HEADER, Row, judged, shown, worsened
 from tolerance import cost_and_memory, many_states
@@ -45,8 +44,6 @@ ROWS = {
     "call_7": Row(partial(call, 7), ">=", 40.0),
     "call_64": Row(partial(call, 64), ">="),
     "call_lock": Row(lock, "<="),
-    "fleet_1000": Row(partial(fleet, 1_000), ">=", 12.0),
-    "fleet_10000": Row(partial(fleet, 10_000), ">="),
     "river_streamkmeans": Row(stream_k_means, ">=", 25.0),
     "river_dbstream": Row(db_stream, ">=", 60.0),
     "sumo_loop": Row(late("sumo_loop"), "<=", 1.25),

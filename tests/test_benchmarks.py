@@ -1,6 +1,5 @@
 """The references are writings of the same machine, and the harness judges as it says."""
 
-import copy
 import json
 
 import numpy as np
@@ -10,17 +9,12 @@ import clusterers
 import speed
 import tolerance
 from evofsm.fsm.machine import EvolvingFSM
-from fleets import each_step, fleet, in_blocks
-from reference import NumpyFSM
 from single import pair
 from streams import LATTICE_RULE, LATTICES, PAPER_ROUND, lattice_stream, paper_stream
 from table import Row, duration, judged, shown, worsened
 from turns import compare
-from vectorised import NumpyFleet
 
 pytestmark = pytest.mark.slow
-
-VEHICLES = 6
 
 
 @pytest.fixture(scope="module")
@@ -28,69 +22,8 @@ def taught():
     return pair(7, PAPER_ROUND)
 
 
-def test_numpy_over_vehicles_is_as_many_machines(taught):
-    machine, reference, stream = taught
-    machines = [machine.copy() for _ in range(VEHICLES)]
-    for one in machines:
-        one.start_episode()
-    fleet = NumpyFleet(reference, VEHICLES)
-    rows = np.arange(VEHICLES) * 2_003 + np.arange(400)[:, None]
-    for Z, A in zip(stream.observations[rows], stream.actions[rows], strict=True):
-        states, surprises = fleet.observe(Z, A)
-        steps = [one.learn_one(z, a) for one, z, a in zip(machines, Z, A, strict=True)]
-        assert states.tolist() == [step.state for step in steps]
-        agree(surprises, [step.surprise for step in steps])
-        agree(fleet.belief, [step.belief for step in steps])
-    agree(fleet.centers.transpose(2, 1, 0), [one.centers for one in machines])
-    agree(fleet.potentials.T, [one.potentials for one in machines])
-    learnt = [one.transition_matrices for one in machines]
-    agree(fleet.matrices.reshape(np.shape(learnt)), learnt)
-    learnt = [one.origin_frequency for one in machines]
-    agree(fleet.frequencies.reshape(np.shape(learnt)), learnt)
-
-
 def agree(found, expected):
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9)
-
-
-def test_numpy_over_vehicles_moves_centers_too():
-    rng = np.random.default_rng(3)
-    reference = NumpyFSM(2, radius=0.3)
-    for z in np.cumsum(rng.normal(size=(40, 2)), axis=0):
-        reference.observe(z)
-    assert len(reference.centers) > 1
-    reference.belief, reference.radius = None, 100.0  # from now on a center moves, or none does
-    singles, fleet = [copy.deepcopy(reference) for _ in range(3)], NumpyFleet(reference, 3)
-    for Z in reference.mean + 0.3 * rng.normal(size=(300, 3, 2)):
-        A = rng.integers(0, 2, 3)
-        _, surprises = fleet.observe(Z, A)
-        agree(surprises, [one.observe(z)[2] for one, z in zip(singles, Z, strict=True)])
-        for one, action in zip(singles, A.tolist(), strict=True):
-            one.act(action)
-    agree(fleet.centers.transpose(2, 1, 0), [one.centers for one in singles])
-    agree(fleet.potentials.T, [one.potentials for one in singles])
-    assert all((one.centers != reference.centers).any() for one in singles)
-
-
-def test_numpy_over_vehicles_refuses_to_found_a_state():
-    reference = NumpyFSM(1, radius=0.01)
-    for z in (0.0, 8.0):
-        reference.observe(np.array([z]))
-    fleet = NumpyFleet(reference, 2)
-    with pytest.raises(ValueError, match="number of states is fixed"):
-        fleet.observe(np.array([[0.0], [4.0]]), np.zeros(2, np.int64))
-
-
-def test_vehicles_drive_on_through_the_stream_in_blocks(taught, monkeypatch):
-    _, reference, stream = taught
-    monkeypatch.setattr("fleets._BLOCK", 2)
-    seen = []
-    monkeypatch.setattr(NumpyFleet, "observe", lambda self, Z, A: seen.append((Z, A)))
-    work = each_step(in_blocks(reference, 5), stream, n_vehicles=5, steps=3)
-    assert work() > 0.0 < work()
-    assert [len(A) for _, A in seen] == [2, 2, 1] * 6
-    fourth = np.concatenate([Z for Z, _ in seen[9:12]])
-    np.testing.assert_array_equal(fourth, stream.observations[3 + 13 * np.arange(5)])
 
 
 @pytest.mark.parametrize("n_states", [7, 64])
@@ -273,12 +206,6 @@ def test_real_rows_run_and_the_table_is_no_wider_than_100_columns(tmp_path, caps
     assert [result["id"] for result in json.loads(file.read_text())] == QUICK.split(",")
     for result in json.loads(file.read_text()):
         assert result["ours_s"] > 0.0 < result["reference_s"]
-
-
-def test_a_fleet_is_measured_in_both_precisions():
-    result = fleet(3, 1, True)
-    assert result["ours_s"] > 0.0 < result["reference_s"]
-    assert list(result["beside"]) == ["in float32"]
 
 
 @pytest.mark.slow

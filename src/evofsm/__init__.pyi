@@ -1,5 +1,3 @@
-from .fleet import Fleet as Fleet
-from .fleet import merge as merge
 from .fsm import Category as Category
 from .fsm import Dynamics as Dynamics
 from .fsm import Edges as Edges
@@ -22,7 +20,7 @@ from .fsm import Tally as Tally
 from .fsm import Trace as Trace
 from .fsm import WhenFull as WhenFull
 from .fsm import jensen_shannon as jensen_shannon
-from .fsm import model_html as model_html
+from .fsm import merge as merge
 from .fsm import register_rule as register_rule
 from .fsm import wilson_bounds as wilson_bounds
 from .guard import Guard as Guard

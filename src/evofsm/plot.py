@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from evofsm.driving import Episode
 from evofsm.extras import needs
-from evofsm.fsm import FSMModel, Policy, Trace, variable_label
+from evofsm.fsm import FSMModel, Policy, Trace
 
 with needs("matplotlib", "plot", "plotting"):
     import matplotlib
@@ -99,8 +99,8 @@ def states(
     limits = ax.axis()
     draw_centers(ax, centers, dead_ends, size=13.0)
     ax.axis(limits)
-    ax.set_xlabel(variable_label(model, variables[0]))
-    ax.set_ylabel(variable_label(model, variables[1]))
+    ax.set_xlabel(model.labels.variable(variables[0]))
+    ax.set_ylabel(model.labels.variable(variables[1]))
     return ax
 
 

@@ -8,12 +8,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from evofsm.driving.naming import UNITS, VARIABLES
-from evofsm.fleet.batch import Fleet
-from evofsm.fleet.merging import merge
 from evofsm.fsm.actions import IntervalActions
 from evofsm.fsm.crowding import WhenFull
 from evofsm.fsm.explanation import Tally
 from evofsm.fsm.machine import EvolvingFSM
+from evofsm.fsm.merging import merge
 from evofsm.fsm.model import FSMModel
 from evofsm.fsm.naming import Labels
 from evofsm.fsm.observations import Missing
@@ -140,21 +139,6 @@ def test_where_states_were_joined_there_is_no_interval():
     other.learn_many([[0.7]], [0])
     assert merge([one, other], radius=2.0).joined.tolist() == [1.0]
     assert not merge([one, other.copy()], radius=0.1).joined.any()
-
-
-def test_a_fleet_counts_as_its_machines_would():
-    machine = EvolvingFSM(3, rule=Novelty(radius=1.0), failure_horizon=3)
-    fleet, alone = Fleet(machine, 2), [machine.copy(), machine.copy()]
-    given_ = [drives(seed) for seed in (1, 2)]
-    for row in range(60):
-        starts = [k for k, (_, _, s, _) in enumerate(given_) if row in s]
-        failed = [k for k, (_, _, _, f) in enumerate(given_) if row in f]
-        Z, I = [g[0][row] for g in given_], [g[1][row] for g in given_]
-        fleet.observe(Z, I, episode_starts=starts, failures=failed)
-    for k, one in enumerate(alone):
-        one.learn_many(*given_[k])
-        for name in COUNTS:
-            np.testing.assert_array_equal(getattr(fleet[k], name), getattr(one, name))
 
 
 def test_merging_adds_episodes_up():
@@ -312,7 +296,6 @@ def test_failures_that_were_told_and_never_happened_are_counted_as_none(tell, tm
     assert EvolvingFSM.load(tmp_path / "machine").failures_told
     assert FSMModel.load(tmp_path / "model").failures_told
     assert machine.copy().failures_told
-    assert Fleet(machine, 2)[1].failures_told
     assert not merge([machine, untold()]).failures_told
     assert merge([machine, machine.copy()]).failures_told
 
@@ -322,9 +305,6 @@ def test_one_failure_tells_of_failures():
     machine.observe([0.0])
     machine.fail()
     assert machine.failures_told
-    fleet = Fleet(untold(), 2)
-    fleet.observe([[0.0]], vehicles=[1], failures=[])
-    assert [fleet[k].failures_told for k in range(2)] == [False, True]
 
 
 # -- What was never seen ---------------------------------------------------------------------------

@@ -20,7 +20,7 @@ import sys
 import numpy as np
 from pathlib import Path
 from evofsm import EvolvingFSM, FSMModel, Novelty
-from evofsm.fleet import merge
+from evofsm import merge
 
 folder = Path(sys.argv[1])
 

@@ -1,6 +1,5 @@
 """What a notebook shows of a machine, a model and a step: well-formed, escaped, and true."""
 
-import re
 from html.parser import HTMLParser
 
 import numpy as np
@@ -20,7 +19,7 @@ class Reader(HTMLParser):
 
     def __init__(self, html):
         super().__init__()
-        self.rows, self.text, self.styles, self.tags = [], "", [], set()
+        self.rows, self.text, self.tags = [], "", set()
         self._open = []
         self.feed(html)
         self.close()
@@ -28,7 +27,6 @@ class Reader(HTMLParser):
 
     def handle_starttag(self, tag, attrs):
         self.tags.add(tag)
-        self.styles += [value for name, value in attrs if name == "style"]
         if tag == "tr":
             self.rows.append([])
         if tag in ("td", "th"):
@@ -75,16 +73,8 @@ def test_a_machine_shows_its_states_and_where_it_is(machine):
     assert column(page.rows, "variable 0") == ["0", "1"]
     assert column(page.rows, "variable 1") == ["−7.5", "−7.5"]
     assert column(page.rows, "visits") == ["3", "1"]
-    assert column(page.rows, "share") == ["75.0 %", "25.0 %"]
     assert column(page.rows, "belief") == [f"{100 * share:.1f} %" for share in machine.belief]
     assert "failures ended here" not in page.rows[0]
-
-
-def test_bars_are_as_long_as_the_belief_and_have_its_number_beside_them(machine):
-    html = machine_html(machine)
-    lengths = [float(number) for number in re.findall(r"width:([\d.]+)%;height:100%", html)]
-    assert np.allclose(lengths, 100 * machine.belief, atol=0.05)
-    assert html.count("aria-hidden='true'") == len(lengths)
 
 
 def test_failures_have_a_column_where_there_were_any(machine):
@@ -105,8 +95,6 @@ def test_a_machine_that_has_seen_nothing_has_no_table():
 def test_many_states_are_the_most_visited_and_a_row_for_all_others(crowd):
     page = Reader(machine_html(crowd))
     assert column(page.rows, "state") == [*(f"#{i}" for i in range(41, 53)), "… and 40 more"]
-    assert column(page.rows, "visits")[-1] == "40"
-    assert column(page.rows, "share")[-1] == "62.5 %"
     assert all(len(row) == len(page.rows[0]) for row in page.rows)
     crowd.observe([3.0])
     page = Reader(machine_html(crowd))
@@ -145,13 +133,6 @@ def test_what_users_name_is_escaped(machine):
     page = Reader(html)
     assert "script" not in page.tags
     assert page.rows[0][1:3] == ["<script>alert(1)</script>", "a & 'b'"]
-
-
-def test_colours_are_the_notebooks_own(machine):
-    for html in (machine_html(machine), model_html(machine.model())):
-        for style in Reader(html).styles:
-            for colour in re.findall(r"(?:color|background):([^;]+)", style):
-                assert colour in ("inherit", "none", "currentColor") or "rgba(128,128,128" in colour
 
 
 def test_a_step_shows_belief_forecast_and_surprise(machine):

@@ -1,8 +1,6 @@
-from .batch import Fleet as Fleet
 from .campaign import Batch as Batch
 from .campaign import run_campaign as run_campaign
 from .executors import Processes as Processes
 from .executors import cluster as cluster
 from .executors import cluster_threads as cluster_threads
 from .executors import in_order as in_order
-from .merging import merge as merge

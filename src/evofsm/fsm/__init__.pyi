@@ -24,7 +24,6 @@ from .dynamics.merging import merge_dynamics as merge_dynamics
 from .dynamics.questions import Ahead as Ahead
 from .dynamics.questions import MayBegin as MayBegin
 from .dynamics.questions import Remembered as Remembered
-from .elementary import fetch_ahead as fetch_ahead
 from .explanation import Explanation as Explanation
 from .explanation import Tally as Tally
 from .explanation import explain as explain
@@ -36,7 +35,6 @@ from .kernels import announce_compiling as announce_compiling
 from .kernels import compiled as compiled
 from .kernels import inner_kernel as inner_kernel
 from .kernels import kernel as kernel
-from .kernels import parallel_kernel as parallel_kernel
 from .known import Known as Known
 from .known import Nearest as Nearest
 from .known import Policy as Policy
@@ -51,18 +49,13 @@ from .machine import EvolvingFSM as EvolvingFSM
 from .memory import Memory as Memory
 from .memory import Parameters as Parameters
 from .memory import leaves as leaves
-from .memory import lengths as lengths
-from .memory import matrices_of as matrices_of
-from .memory import move as move
-from .memory import open_apart as open_apart
 from .memory import open_memory as open_memory
 from .memory import tell_of_failures as tell_of_failures
+from .merging import merge as merge
 from .model import FSMModel as FSMModel
 from .naming import Labels as Labels
 from .naming import Words as Words
 from .naming import visible as visible
-from .notebook import model_html as model_html
-from .notebook import variable_label as variable_label
 from .numbering import action_name as action_name
 from .numbering import state_name as state_name
 from .observations import Category as Category
@@ -75,7 +68,6 @@ from .proportions import wilson_bounds as wilson_bounds
 from .rates import FailureRecord as FailureRecord
 from .rates import OnsetRates as OnsetRates
 from .rates import Rate as Rate
-from .reference import Reference as Reference
 from .states.dispatch import describe_rule as describe_rule
 from .states.dispatch import register_rule as register_rule
 from .states.dispatch import restore_rule as restore_rule

@@ -169,22 +169,6 @@ def _fma_of_lines(builder: Any, x: Any, y: Any, z: Any) -> Any:
     return builder.call(function, [x, y, z])
 
 
-@intrinsic
-def _fetch_ahead(_context: Any, array: Any, i: Any) -> Any:
-    def generate(context: Any, builder: Any, _: Any, arguments: Any) -> Any:
-        values, place = arguments
-        pointer = builder.gep(_arrays.make_array(array)(context, builder, values).data, [place])
-        byte, number = ir.IntType(8).as_pointer(), ir.IntType(32)
-        kind = ir.FunctionType(ir.VoidType(), [byte, number, number, number])
-        name = "llvm.prefetch.p0i8"
-        function = builder.module.globals.get(name) or ir.Function(builder.module, kind, name)
-        to_write, soon, data = number(1), number(3), number(1)
-        builder.call(function, [builder.bitcast(pointer, byte), to_write, soon, data])
-        return context.get_dummy_value()
-
-    return types.void(array, types.intp), generate
-
-
 # The same in Python, for where nothing is compiled; a product is then rounded before its sum.
 def _multiply_add(x: float, y: float, z: float) -> float:
     return x * y + z
@@ -215,10 +199,6 @@ fma: Callable[[float, float, float], float] = (
 work_on_line: Callable[..., None] = _work if NOT_COMPILED else cast(Any, _work_on_line)
 #: The same for two rows, i and the next one, with three numbers for each: a sum is loaded once.
 work_on_two_lines: Callable[..., None] = _work if NOT_COMPILED else cast(Any, _work_on_two_lines)
-#: ``fetch_ahead(array, i)``: have the line that holds an element brought near, for a later step.
-fetch_ahead: Callable[[NDArray[Any], int], None] = (
-    (lambda array, i: None) if NOT_COMPILED else cast(Any, _fetch_ahead)
-)
 # What a kernel sees of the others.
 _bits_of: Callable[[float], int] = (
     (lambda number: int(np.float64(number).view(np.int64)))

@@ -120,11 +120,6 @@ class _InnerCompiler(CompilerBase):
         return [manager]
 
 
-def parallel_kernel(function: Function) -> Function:
-    """A kernel that shares a ``prange`` out over all cores."""
-    return compiled(function, parallel=True)
-
-
 def compiled(function: Function, *signature: object, **options: Any) -> Function:
     """Compile with Numba and keep the code on disk, where there is a place to keep it.
 

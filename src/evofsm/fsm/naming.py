@@ -94,6 +94,28 @@ class Labels(NamedTuple):
         named = zip(self.names, values, units, strict=True)
         return ", ".join(" ".join(part for part in one if part) for one in named)
 
+    def variable(self, index: int) -> str:
+        """Name and unit of a variable, as far as they are known.
+
+        Parameters
+        ----------
+        index : int
+            From 0.
+
+        Returns
+        -------
+        str
+
+        Examples
+        --------
+        >>> Labels(names=("gap",), units=("m",)).variable(0), Labels().variable(1)
+        ('gap [m]', 'variable 1')
+        """
+        if not self.names:
+            return f"variable {index}"
+        unit = self.units[index] if self.units else ""
+        return f"{self.names[index]} [{unit}]" if unit else self.names[index]
+
     def action(self, index: int) -> str:
         """An action with its interval, where that is known.
 

@@ -6,8 +6,6 @@ from __future__ import annotations
 def state_name(index: int) -> str:
     """A state as people read it, counted from 1, by its index from 0.
 
-    Examples
-    --------
     >>> state_name(3)
     '#4'
     """
@@ -17,8 +15,6 @@ def state_name(index: int) -> str:
 def action_name(index: int) -> str:
     """An action as people read it, counted from 1 as in the paper, by its index from 0.
 
-    Examples
-    --------
     >>> action_name(16)
     'a(17)'
     """

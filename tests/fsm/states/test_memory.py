@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 
-from evofsm.fleet.batch import Fleet
-from evofsm.fleet.merging import merge
 from evofsm.fsm.machine import EvolvingFSM
+from evofsm.fsm.merging import merge
 from evofsm.fsm.states.edges import Edges
 from evofsm.fsm.states.failure import FailureSplit
 from evofsm.fsm.states.paper import Paper
@@ -80,10 +79,7 @@ def test_every_path_forgets_alike_bit_for_bit(snapshot, tmp_path):
     assert loop.rule == rule
     for z, i in zip(Z[50:], I[50:], strict=True):
         loop.update(z, int(i))
-    fleet = Fleet(EvolvingFSM(2, rule=rule), 1)
-    for z, i in zip(Z, I, strict=True):
-        fleet.observe(z[None], i[None])
-    assert snapshot(loop) == snapshot(batch) == snapshot(fleet[0])
+    assert snapshot(loop) == snapshot(batch)
 
 
 @pytest.mark.parametrize("memory", [0, 1, -3, 2.5, "long"])

@@ -11,10 +11,10 @@ import pytest
 from river import checks, datasets, preprocessing, stream
 from river.checks import common
 
-from evofsm.adapters.river import RiverClusterer
 from evofsm.fsm.crowding import WhenFull
 from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.observations import Missing
+from evofsm.fsm.river import RiverClusterer
 from evofsm.fsm.states.novelty import Novelty
 
 # River's own list runs these only on models it has a data set for, and has none for clusterers.
@@ -159,6 +159,6 @@ def test_it_ends_a_pipeline():
 def test_a_missing_library_is_named(library, monkeypatch):
     for name in (library, f"{library}.base"):
         monkeypatch.setitem(sys.modules, name, None)
-    monkeypatch.delitem(sys.modules, f"evofsm.adapters.{library}", raising=False)
+    monkeypatch.delitem(sys.modules, f"evofsm.fsm.{library}", raising=False)
     with pytest.raises(ModuleNotFoundError, match=rf"pip install '.\[{library}\]'"):
-        import_module(f"evofsm.adapters.{library}")
+        import_module(f"evofsm.fsm.{library}")

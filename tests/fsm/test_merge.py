@@ -9,11 +9,10 @@ from hypothesis import strategies as st
 
 from evofsm.driving.families import load_family
 from evofsm.driving.world import KinematicWorld
-from evofsm.fleet.batch import Fleet
-from evofsm.fleet.merging import merge
 from evofsm.fsm.crowding import WhenFull
 from evofsm.fsm.dynamics.dynamics import Dynamics
 from evofsm.fsm.machine import EvolvingFSM
+from evofsm.fsm.merging import merge
 from evofsm.fsm.states.edges import Edges
 from evofsm.fsm.states.failure import FailureSplit
 from evofsm.fsm.states.novelty import Novelty
@@ -270,19 +269,6 @@ def test_it_is_saved_and_loaded_and_goes_on_learning(rule, tmp_path):
         assert np.isnan(trace.surprise[0])  # a new episode
         assert not np.isnan(trace.surprise[1:]).any()
     assert merged._buffer.tobytes() == again._buffer.tobytes()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("dtype", [np.float64, np.float32])
-def test_the_vehicles_of_a_fleet_become_one_machine(dtype):
-    random = np.random.default_rng(3)
-    fleet = Fleet(EvolvingFSM(2, rule=Novelty(1.0)), 20, dtype)
-    for _ in range(50):
-        fleet.observe(random.integers(0, 5, size=(20, 1)) * 2.0, random.integers(0, 2, 20))
-    merged = merge([fleet[vehicle] for vehicle in range(len(fleet))])
-    assert sorted(merged.centers.ravel().tolist()) == [0.0, 2.0, 4.0, 6.0, 8.0]
-    assert merged.model().uses.sum() == 20 * 49
-    np.testing.assert_allclose(merged.transition_matrices.sum(axis=-1), 1.0, atol=1e-12)
 
 
 @pytest.mark.parametrize(

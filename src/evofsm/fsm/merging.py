@@ -20,19 +20,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.fsm import (
-    NO_ACTION,
-    NOT_OPEN,
-    Counts,
-    EvolvingFSM,
-    Inside,
-    Learnt,
-    Parameters,
-    arrays_of,
-    leaves,
-    merge_dynamics,
-    positive,
-)
+from evofsm.fsm.dynamics.merging import merge_dynamics
+from evofsm.fsm.inside import Inside
+from evofsm.fsm.learnt import NO_ACTION, NOT_OPEN, Counts, Learnt, arrays_of
+from evofsm.fsm.machine import EvolvingFSM
+from evofsm.fsm.memory import Parameters, leaves
+from evofsm.fsm.validation import positive
 
 # A row with a smaller share of evidence than this is all prior, and rounding.
 _LEAST_EVIDENCE = 1e-9
@@ -80,31 +73,12 @@ def merge(machines: Sequence[EvolvingFSM], *, radius: float | None = None) -> Ev
     (`FailureSplit`). Where ``max_states`` exist, the others join the nearest. `Paper` and `Edges`
     take centres for the same only within a small radius: give a larger one, or ``max_states``.
 
-    *Rows* count by decisions, which are belief-weighted and never forget: a vehicle with a
-    hundred times the data weighs a hundred times as much. The row weight F_o forgets instead. It
-    says how recently a part was there, in its own time, which cannot be compared between parts.
-    It becomes the mean of the parts', by decisions, so that the merged machine learns on as fast
-    as they did, and forgets the fleet's rows as it would forget its own.
-
-    *The prior* of a new state weighs as much as a tenth of a decision for every state there is,
-    in every row (``prior_frequency / learning_rate``): with a hundred states that is ten
-    decisions, in each part anew. An average of rows would keep it for ever, however many agree;
-    so it is taken out, and put in once, as old as all uses of the action together. What is left
-    of it in F can be read off: between states never seen in succession there is nothing else.
-    Where beliefs are so wide that all were, as with `Paper`, it is taken to be as old as the
-    action's first use; with few states and wide beliefs it matters little.
-
-    *Order.* In any order of ``machines`` the answer is the same bit for bit. Merging merged
-    machines gives the same to rounding where the matching does, as it does where parts share
-    their centres; else it depends on which centre leads. For six shards of a family, merged one
-    after another, the number of states differed by up to a tenth, and held-out log scores by less
-    than 0.1 nat (docs/fleet.md).
-
-    *Further*: mean and scatter are pooled exactly [1]_. A centre's potential is what the recursion
-    would have made of it, had it seen the data of all other parts since; ``founded`` is one more
-    than the observations that were made before, in the parts that created it. An episode that came
-    to two states of one part that are joined is counted twice. Sums of `dynamics` add up, from one
-    origin; of stretches, failures and jumps the newest of all parts are kept.
+    *Rows* count by decisions, which are belief-weighted and never forget. Their weight F_o says how
+    recently a part was there; it becomes the mean of the parts', by decisions. *The prior* of new
+    states is taken out of each part's rows and put in once: an average would keep it, however many
+    parts agree. Mean and scatter are pooled exactly [1]_, and a centre's potential is what the
+    recursion would have made of it, had it seen the data of all other parts since. An episode that
+    came to two states of one part that are joined is counted twice.
 
     References
     ----------

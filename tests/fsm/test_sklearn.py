@@ -11,9 +11,9 @@ from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 from sklearn.utils.estimator_checks import parametrize_with_checks
 
-from evofsm.adapters.sklearn import EvolvingClusterer
 from evofsm.fsm.crowding import WhenFull
 from evofsm.fsm.machine import EvolvingFSM
+from evofsm.fsm.sklearn import EvolvingClusterer
 from evofsm.fsm.states.edges import Edges
 from evofsm.fsm.states.novelty import Novelty
 

@@ -10,7 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evofsm.extras import needs
-from evofsm.fsm import EvolvingFSM, Missing, StateRule, WhenFull
+from evofsm.fsm.crowding import WhenFull
+from evofsm.fsm.machine import EvolvingFSM
+from evofsm.fsm.observations import Missing
+from evofsm.fsm.states.rule import StateRule
 
 with needs("River", "river", "a clusterer of River"):
     from river import base
@@ -35,14 +38,8 @@ class RiverClusterer(base.Clusterer):
     radius, distance_weight, learning_rate, prior_frequency, spread : float, optional
         As `EvolvingFSM` takes them; ``radius`` in the unit of the features, which all count
         alike: scale them first.
-    rule : StateRule, optional
-        How states are determined.
-    max_states : int, optional
-        Number of states at which another one is only created where one is given up.
-    when_full : WhenFull
-        Which one is given up. Its number goes to the new state.
-    belief_tolerance : float
-        How far a belief may be from the exact one.
+    rule, max_states, when_full, belief_tolerance : optional
+        As `EvolvingFSM` takes them.
 
     Attributes
     ----------
@@ -102,25 +99,10 @@ class RiverClusterer(base.Clusterer):
         Until every feature was observed once, all at the same time, there is no state to recognise
         by the others: what is incomplete is passed over.
 
-        Parameters
-        ----------
-        x : mapping
-            A number for each feature; what is absent, None or NaN was not observed.
-
         Raises
         ------
-        TypeError
-            If a feature is no number.
-        ValueError
-            If a feature is infinite, or beyond 1e100.
-
-        Examples
-        --------
-        >>> clusterer = RiverClusterer(features=("gap", "speed"))
-        >>> clusterer.learn_one({"gap": 3.0})  # nothing to recognise it by
-        >>> clusterer.learn_one({"speed": 9.0, "gap": 3.0, "colour": "red"})
-        >>> clusterer.machine.centers
-        array([[3., 9.]])
+        TypeError, ValueError
+            If a feature is no number, is infinite, or beyond 1e100.
         """
         if not self._observed:  # sorted, so that the order of the first does not matter either
             self._observed = tuple(sorted(x, key=str))
@@ -134,56 +116,12 @@ class RiverClusterer(base.Clusterer):
             self.machine.act(_ACTION)
 
     def predict_one(self, x: Mapping[Hashable, Any]) -> int:
-        """Number of the most probable state, from 0; nothing is changed by asking.
-
-        Parameters
-        ----------
-        x : mapping
-            As `learn_one` takes it.
-
-        Returns
-        -------
-        int
-            Index of a state of the machine; 0 before anything was learnt.
-
-        Raises
-        ------
-        TypeError, ValueError
-            As `learn_one`.
-
-        Examples
-        --------
-        >>> RiverClusterer().predict_one({"gap": 3.0})
-        0
-        """
+        """Index of the most probable state; 0 before anything was learnt."""
         belief = self._recognise(x)
         return int(belief.argmax()) if len(belief) else 0
 
     def predict_proba_one(self, x: Mapping[Hashable, Any]) -> dict[int, float]:
-        """Distribution over states: how much an observation belongs to each.
-
-        Parameters
-        ----------
-        x : mapping
-            As `learn_one` takes it.
-
-        Returns
-        -------
-        dict
-            A probability for each state; empty before anything was learnt.
-
-        Raises
-        ------
-        TypeError, ValueError
-            As `learn_one`.
-
-        Examples
-        --------
-        >>> clusterer = RiverClusterer()
-        >>> clusterer.learn_one({"gap": 3.0})
-        >>> clusterer.predict_proba_one({"gap": 4.0})
-        {0: 1.0}
-        """
+        """Distribution over states: how much an observation belongs to each."""
         return dict(enumerate(self._recognise(x).tolist()))
 
     def _recognise(self, x: Mapping[Hashable, Any]) -> NDArray[np.float64]:

@@ -1,2 +1,0 @@
-from .river import RiverClusterer as RiverClusterer
-from .sklearn import EvolvingClusterer as EvolvingClusterer
