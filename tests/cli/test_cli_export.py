@@ -76,10 +76,8 @@ def test_folder_machine_and_log_give_the_same_states(driven, to, begins, tmp_pat
 def test_options_choose_what_is_drawn(driven):
     out, _ = driven
     whole = evofsm("export", out, "--to", "dot", "--least", 0, "--evidence", 0).stdout
-    few = evofsm("export", out, "--to", "dot", "--evidence", 2, "--no-loops").stdout
+    few = evofsm("export", out, "--to", "dot", "--evidence", 2).stdout
     assert whole.count("->") > 10 * few.count("->") > 0
-    marginal = evofsm("export", out, "--to", "dot", "--policy", "marginal").stdout
-    assert marginal != evofsm("export", out, "--to", "dot").stdout
     process = evofsm("export", out, "--to", "prism", "--evidence", 5).stdout
     assert "fewer than 5 decisions" in process
 
@@ -88,7 +86,6 @@ def test_options_choose_what_is_drawn(driven):
     ("arguments", "word"),
     [
         (("export", "nothing", "--to", "dot"), "nothing"),
-        (("export", "{out}", "--to", "dot", "--policy", "rarely"), "rarely"),
         (("export", "{out}/summary.json", "--to", "dot"), "summary.json"),
         (("export", "{out}/risk.evofsm", "--to", "dot"), "risk"),
         (("export", "{out}/..", "--to", "dot"), "machine.evofsm"),

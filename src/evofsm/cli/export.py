@@ -17,10 +17,8 @@ if TYPE_CHECKING:
 
 # Beside the machine, in folders of results.
 _RISK = "risk.evofsm"
-# How logs of runs begin.
-_MCAP = b"\x89MCAP"
-# Whoever draws a picture wants no more edges than were seen.
-_PICTURE_LEAST, _PICTURE_EVIDENCE = 0.001, 1.0
+# How files of evofsm and logs of runs begin.
+_LEARNT = (b"PK\x03\x04", b"\x89MCAP")
 
 
 class Format(StrEnum):
@@ -29,13 +27,6 @@ class Format(StrEnum):
     DOT = "dot"
     GRAPHML = "graphml"
     PRISM = "prism"
-
-
-class Weights(StrEnum):
-    """How actions are weighted."""
-
-    OBSERVED = "observed"
-    MARGINAL = "marginal"
 
 
 def export(
@@ -48,10 +39,6 @@ def export(
         ),
     ],
     out: Annotated[Path | None, typer.Option(help="File to write; else it is printed.")] = None,
-    policy: Annotated[
-        Weights,
-        typer.Option(help="Weights of actions in a graph: observed, as used, or marginal, alike."),
-    ] = Weights.OBSERVED,
     least: Annotated[
         float | None,
         typer.Option(
@@ -65,34 +52,26 @@ def export(
             help="Leave out edges, for prism actions, that were seen less often; 1, graphml 0.",
         ),
     ] = None,
-    loops: Annotated[
-        bool, typer.Option(help="Whether a graph shows that states lead to themselves.")
-    ] = True,
 ) -> None:
     """Write what was learnt, or driven, in the formats of other tools."""
     _refuse_learnt(out)
-    from evofsm import store
     from evofsm.fsm import visible
     from evofsm.io import graphs
+    from evofsm.store import storage
 
     model, dead_ends = _learnt(file)
     if to is Format.PRISM:
         text = graphs.to_prism(model, 1.0 if evidence is None else evidence, least or 0.0)
     else:
-        is_picture = to is Format.DOT
-        graph = (graphs.to_dot if is_picture else graphs.to_networkx)(
-            model,
-            policy.value,
-            _PICTURE_LEAST * is_picture if least is None else least,
-            _PICTURE_EVIDENCE * is_picture if evidence is None else evidence,
-            self_loops=loops,
-            dead_ends=dead_ends,
-        )
+        bounds = {"least": least, "evidence": evidence}
+        given = {name: bound for name, bound in bounds.items() if bound is not None}
+        write = graphs.to_dot if to is Format.DOT else graphs.to_networkx
+        graph = write(model, **given, dead_ends=dead_ends)
         text = graph if isinstance(graph, str) else _graphml(graph)
     if out is None:
         sys.stdout.write(visible(text))
         return
-    with store.replacing(out) as place:
+    with storage.replacing(out) as place:
         place.write(visible(text).encode())
 
 
@@ -104,30 +83,21 @@ def _graphml(graph: Any) -> str:
 
 def _refuse_learnt(out: Path | None) -> None:
     """Raise where a graph would take the place of what cannot be had again."""
-    if out is not None and out.is_file() and _is_learnt(out):
-        raise ValueError(f"--out {out}: what was learnt or driven is kept there; it was left alone")
-
-
-def _is_learnt(file: Path) -> bool:
-    from evofsm.store import read_header
-
-    with file.open("rb") as start:
-        if start.read(len(_MCAP)) == _MCAP:
-            return True
-    try:
-        read_header(file)
-    except ValueError:
-        return False
-    return True
+    if out is not None and out.is_file():
+        with out.open("rb") as file:
+            if file.read(max(map(len, _LEARNT))).startswith(_LEARNT):
+                raise ValueError(
+                    f"--out {out}: what was learnt or driven is kept there; it was left alone"
+                )
 
 
 def _learnt(file: Path) -> tuple[FSMModel, list[int] | None]:
     """The model, and its dead ends where the risk that was learnt with it is known."""
-    from evofsm import store
     from evofsm.driving import LatentRisk, assess_states
+    from evofsm.store import storage
 
     model, _ = load_model(file)
-    if not (file / _RISK).exists() or store.read_header(file / _RISK).kind != "risk":
+    if not (file / _RISK).exists() or storage.read_header(file / _RISK).kind != "risk":
         return model, None
     assessed = assess_states(model, LatentRisk.load(file / _RISK))
     return model, [one.state for one in assessed if one.is_dead_end]

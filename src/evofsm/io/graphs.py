@@ -10,19 +10,15 @@ from collections.abc import Collection, Iterator
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from evofsm.extras import needs
-from evofsm.fsm import FSMModel, Policy
+from evofsm.fsm import FSMModel
 
 if TYPE_CHECKING:
     import networkx
 
 # Vermillion of Okabe and Ito's colours; what is marked by it has another shape and words as well.
-_DEAD_END = "#D55E00"
-_DOT_MARK = (
-    f',\n      shape=hexagon, style=filled, fillcolor="{_DEAD_END}", fontcolor=white, penwidth=2'
-)
+_DOT_MARK = ',\n      shape=hexagon, style=filled, fillcolor="#D55E00", fontcolor=white, penwidth=2'
 _DOT_HEAD = """digraph evofsm {
   graph [rankdir=LR, fontname="Helvetica", fontsize=10, labelloc=b,
          label="An edge: probability (times seen); dashed: never seen"];
@@ -36,11 +32,8 @@ _DECIMALS = 12
 
 def to_dot(
     model: FSMModel,
-    policy: Policy = "observed",
     least: float = 0.001,
     evidence: float = 1.0,
-    *,
-    self_loops: bool = True,
     dead_ends: Collection[int] | None = None,
 ) -> str:
     r"""The states and transitions in Graphviz's DOT language.
@@ -48,15 +41,10 @@ def to_dot(
     Parameters
     ----------
     model : FSMModel
-    policy : {"observed", "marginal"}
-        How actions are weighed in the probabilities on the edges: each as often as it was used, or
-        all alike.
     least : float
         Edges below this probability are left out ...
     evidence : float
         ... and those whose change was seen less often than this.
-    self_loops : bool
-        Whether edges from a state to itself are drawn.
     dead_ends : collection of int, optional
         Indices of the states to be called dead ends, from 0. Without it, those in which failures
         ended are marked.
@@ -66,31 +54,26 @@ def to_dot(
     str
         The graph. A state holds its centre, its visits and the failures that ended in it, is the
         larger the more it was visited, and a hexagon where it is marked. An edge holds its
-        probability and, in brackets, how often the change was seen, after whatever action. One that
-        never was is dashed, if it is drawn: there is only the prior, or what states share.
+        probability, actions weighed by how often they were used, and in brackets how often the
+        change was seen. One that never was is dashed, if it is drawn: there is only the prior, or
+        what states share.
 
     Raises
     ------
     ValueError
-        If there is no such policy, ``least`` is no probability, or a dead end no state.
+        If ``least`` is no probability, or a dead end no state.
 
     Examples
     --------
     >>> from evofsm import EvolvingFSM
     >>> machine = EvolvingFSM(n_actions=2, radius=0.5)
     >>> trace = machine.learn_many([[0.0], [0.1], [2.0], [1.0]], [0, 0, 0, 0], failures=[3])
-    >>> print(to_dot(machine.model(names=["gap"], units=["m"]), least=0.3, evidence=0))
-    digraph evofsm {
-      graph [rankdir=LR, fontname="Helvetica", fontsize=10, labelloc=b,
-             label="An edge: probability (times seen); dashed: never seen"];
-      node [shape=ellipse, fontname="Helvetica", fontsize=10];
-      edge [fontname="Helvetica", fontsize=9];
+    >>> print(to_dot(machine.model(names=["gap"], units=["m"])).partition("fontsize=9];\n")[2])
       s1 [label="#1\ngap 0 m\n3 visits", width=1.95];
       s2 [label="#2\ngap 1 m\n1 visit\n1 failure, 100% of all", width=1.44,
           shape=hexagon, style=filled, fillcolor="#D55E00", fontcolor=white, penwidth=2];
       s1 -> s1 [label="0.771 (2)", penwidth=2.31];
-      s2 -> s1 [label="0.500 (0)", penwidth=1.50, style=dashed];
-      s2 -> s2 [label="0.500 (0)", penwidth=1.50, style=dashed];
+      s1 -> s2 [label="0.229 (1)", penwidth=0.69];
     }
     <BLANKLINE>
     """
@@ -108,7 +91,7 @@ def to_dot(
         width = 0.75 + _LARGEST_NODE * (model.visits[state] / most) ** 0.5
         mark = _DOT_MARK if state in marked else ""
         lines.append(f'  s{state + 1} [label="{label}", width={width:.2f}{mark}];')
-    for i, j, chance, seen in _edges(model, policy, least, evidence, self_loops):
+    for i, j, chance, seen in _edges(model, least, evidence):
         width, dashes = max(_WIDEST_LINE * chance, 0.3), "" if seen else ", style=dashed"
         label = f'label="{chance:.3f} ({seen:,.0f})", penwidth={width:.2f}'
         lines.append(f"  s{i + 1} -> s{j + 1} [{label}{dashes}];")
@@ -117,18 +100,15 @@ def to_dot(
 
 def to_networkx(
     model: FSMModel,
-    policy: Policy = "observed",
     least: float = 0.0,
     evidence: float = 0.0,
-    *,
-    self_loops: bool = True,
     dead_ends: Collection[int] | None = None,
 ) -> networkx.DiGraph[int]:
     """The states and transitions as a graph of networkx, which writes GraphML and more.
 
     Parameters
     ----------
-    model, policy, least, evidence, self_loops, dead_ends
+    model, least, evidence, dead_ends
         As in `to_dot`; here all edges above probability 0 are the default, seen or not.
 
     Returns
@@ -169,7 +149,7 @@ def to_networkx(
             dead_end=i in marked,
             **{f"center.{_shown(name)}": x for name, x in zip(names, center, strict=True)},
         )
-    for i, j, probability, seen in _edges(model, policy, least, evidence, self_loops):
+    for i, j, probability, seen in _edges(model, least, evidence):
         graph.add_edge(i + 1, j + 1, probability=probability, changes=seen)
     return graph
 
@@ -183,15 +163,14 @@ def _marked(model: FSMModel, dead_ends: Collection[int] | None) -> frozenset[int
 
 
 def _edges(
-    model: FSMModel, policy: Policy, least: float, evidence: float, self_loops: bool
+    model: FSMModel, least: float, evidence: float
 ) -> Iterator[tuple[int, int, float, float]]:
     """From, to, probability and how often it was seen."""
     _refuse_no_probability(least)
-    matrix = model.averaged_matrix(policy)
+    matrix = model.averaged_matrix("observed")
     drawn = (matrix >= least) & (model.changes >= evidence) & (matrix > 0.0)
     for i, j in np.argwhere(drawn).tolist():
-        if self_loops or i != j:
-            yield i, j, float(matrix[i, j]), float(model.changes[i, j])
+        yield i, j, float(matrix[i, j]), float(model.changes[i, j])
 
 
 def _refuse_no_probability(least: float) -> None:
@@ -263,11 +242,8 @@ def to_prism(
     >>> machine = EvolvingFSM(n_actions=2, radius=0.5)
     >>> trace = machine.learn_many([[0.0], [0.1], [2.0], [1.0]], [0, 0, 0, 0], failures=[3])
     >>> text = to_prism(machine.model(), evidence=2.0)
-    >>> print(text.partition("mdp")[2])
+    >>> print(text.partition("init 1;")[2].partition("endmodule")[0])
     <BLANKLINE>
-    <BLANKLINE>
-    module evofsm
-      s : [0..2] init 1;
     <BLANKLINE>
       // #1, 3 visits
       [a1] s=1 -> // 3 decisions; a1 was used 3 times
@@ -279,12 +255,6 @@ def to_prism(
       [unknown] s=2 -> 1:(s'=2);
     <BLANKLINE>
       [failed] s=0 -> 1:(s'=0);
-    endmodule
-    <BLANKLINE>
-    label "failed" = s=0;
-    label "unknown" = s=2;
-    label "state_1" = s=1;
-    label "state_2" = s=2;
     <BLANKLINE>
     """
     _refuse_no_probability(least)
@@ -318,37 +288,28 @@ def to_prism(
         *("", "  [failed] s=0 -> 1:(s'=0);", "endmodule", ""),
         *('label "failed" = s=0;', f'label "unknown" = {nowhere};'),
         *(f'label "state_{i}" = s={i};' for i in range(1, n + 1)),
-        "",
     ]
-    return "\n".join(lines)
+    return "\n".join([*lines, ""])
 
 
-def _header(model: FSMModel, evidence: float, least: float, unknown: int) -> list[str]:
+def _header(model: FSMModel, evidence: float, least: float, unknown: int) -> Iterator[str]:
     """What the process is, what its actions are, and what it lacks."""
     tried = model.decisions > 0.0
     few = tried & (model.decisions < evidence)
     lost = model.decisions[few].sum() / model.decisions.sum()
-    lines = [
-        f"A machine of {model.n_states} states and {model.n_actions} actions, learnt by evofsm.",
-        "s=0 is failure, s=i the state #i. Comments say how many decisions a command rests on, how",
-        "many of them failed, and how often a change was seen after whatever action: seen 0 is the",
-        "prior alone, or what states share. A belief over several states divides a decision.",
-        "",
-        f"Left out: {(~tried).sum():,} pairs of state and action that were never tried, and",
-        f"{few.sum():,} that rest on fewer than {evidence:g} decisions ({lost:.2%} of all).",
-        f"States left without any action, absorbing and labelled unknown: {unknown}.",
-    ]
+    yield f"// A machine of {model.n_states} states and {model.n_actions} actions, by evofsm."
+    yield "// s=0 is failure, s=i the state #i. 'seen 0' is the prior alone, or what states share."
+    yield f"// Left out: {(~tried).sum():,} pairs of state and action that were never tried, and"
+    yield f"// {few.sum():,} that rest on fewer than {evidence:g} decisions ({lost:.2%} of all);"
+    yield f"// transitions below {least:g}. States without any action, labelled unknown: {unknown}."
     if not model.failures.any():
-        lines.append("NO DECISION FAILED, or nothing told of failures: a probability of failure")
-        lines.append("that is computed from this process is 0 for want of knowledge.")
-    if least > 0.0:
-        lines.append(f"Transitions below {least:g} are left out as well.")
+        yield "// NO DECISION FAILED, or nothing told of failures: a probability of failure that is"
+        yield "// computed from this process is 0 for want of knowledge."
     if model.dt is not None:
-        lines.append(f"A step is {model.dt:g} s.")
+        yield f"// A step is {model.dt:g} s."
     if model.actions is not None:
-        lines += ["", "Actions:"]
-        lines += [f"  a{a + 1}: {model.actions.label(a)}" for a in range(model.n_actions)]
-    return [f"// {line}".rstrip() for line in lines] + [""]
+        yield from (f"//   a{a + 1}: {model.actions.label(a)}" for a in range(model.n_actions))
+    yield ""
 
 
 def _command(model: FSMModel, state: int, action: int, least: float) -> Iterator[str]:
@@ -357,18 +318,15 @@ def _command(model: FSMModel, state: int, action: int, least: float) -> Iterator
     row = model.transition_matrices[action, state]
     row = np.where(row >= min(least, row.max()), row, 0.0)
     share = failed / decided
-    parts = _parts(np.concatenate([[share], (1.0 - share) * row / row.sum()]))
+    chances = np.concatenate([[share], (1.0 - share) * row / row.sum()])
+    parts: list[int] = np.rint(chances * 10**_DECIMALS).astype(np.int64).tolist()
+    parts[int(np.argmax(parts))] += 10**_DECIMALS - sum(parts)  # to the last digit
     seen = [f"failed {failed:.4g}", *(f"seen {count:g}" for count in model.changes[state])]
     used = f"a{action + 1} was used {model.uses[action]:,.0f} times"
     yield f"  [a{action + 1}] s={state + 1} -> // {decided:.4g} decisions; {used}"
-    for target, part in parts:
+    targets = np.flatnonzero(parts).tolist()
+    for target in targets:
+        part = parts[target]
         chance = "1" if part == 10**_DECIMALS else f"0.{part:0{_DECIMALS}d}"
-        end = ";" if target == parts[-1][0] else " +"
+        end = ";" if target == targets[-1] else " +"
         yield f"    {chance}:(s'={target}){end} // {seen[target]}"
-
-
-def _parts(chances: NDArray[np.float64]) -> list[tuple[int, int]]:
-    """Places and probabilities in integer parts whose sum is 1 to the last digit."""
-    parts: list[int] = np.rint(chances * 10**_DECIMALS).astype(np.int64).tolist()
-    parts[int(np.argmax(parts))] += 10**_DECIMALS - sum(parts)
-    return [(place, part) for place, part in enumerate(parts) if part]
