@@ -7,7 +7,7 @@ import pytest
 
 from evofsm.fsm.actions import IntervalActions
 from evofsm.fsm.machine import EvolvingFSM
-from evofsm.io.graphs import to_dot, to_networkx, to_prism
+from evofsm.io.graphs import to_dot, to_prism
 
 ODD = 'v "\\#1;<b>&`x`{|}'
 
@@ -70,27 +70,11 @@ def test_what_was_never_seen_is_dashed(model):
         assert edge.attr["label"].endswith(f"({seen:,.0f})")
 
 
-def test_graphml_holds_every_state_and_edge_with_types(model):
-    networkx = pytest.importorskip("networkx")
-    text = "\n".join(networkx.generate_graphml(to_networkx(model)))
-    graph = networkx.parse_graphml(text, node_type=int)
-    matrix = model.averaged_matrix("observed")
-    for i in range(model.n_states):
-        node = graph.nodes[i + 1]
-        assert (node["visits"], node["failures"]) == (model.visits[i], model.endings[i])
-        assert (node["center.gap"], node[f"center.{ODD}"]) == tuple(model.centers[i])
-        assert node["dead_end"] is bool(model.endings[i])
-        for j in range(model.n_states):
-            edge = graph.edges[i + 1, j + 1]
-            assert (edge["probability"], edge["changes"]) == (matrix[i, j], model.changes[i, j])
-
-
-@pytest.mark.parametrize("write", [to_dot, to_networkx])
 def test_what_cannot_be_drawn_is_refused(model, write):
     with pytest.raises(ValueError, match="least is 2"):
-        write(model, least=2)
+        to_dot(model, least=2)
     with pytest.raises(ValueError, match=r"\[99\].*states, from 0"):
-        write(model, dead_ends=[0, 99])
+        to_dot(model, dead_ends=[0, 99])
     assert "s1" not in to_dot(EvolvingFSM(n_actions=1, radius=0.5).model())
 
 

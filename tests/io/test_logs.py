@@ -365,7 +365,7 @@ def test_files_with_different_steps_are_refused(tmp_path):
         (f"{HEADER}\nr,a,0,0,1,1,1,1\nr,é".encode("latin1"), "after line 2: this is not text"),
         (f"{HEADER.replace('segment', 'gap')}\n1,2".encode(), "two columns are called 'gap'"),
         (f'{HEADER}\nr,"v1,0,1\n{"x" * 90}'.encode(), "unclosed quote"),
-        (f'{HEADER}\nr,a"b,0,0,1,1,1,1\n"'.encode(), "line 2: a quote that does not"),
+        (f'{HEADER}\nr,"a"b,0,0,1,1,1,1\n'.encode(), "line 2: ',' expected after '\"'"),
         (f'"{HEADER}\nr,a,0\n'.encode(), "unclosed quote"),
         (f"{HEADER}\n{'x,' * 3_000_000}".encode(), "of more than 1,000,000 bytes"),
     ],

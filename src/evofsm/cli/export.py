@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -25,7 +25,6 @@ class Format(StrEnum):
     """What it is written as."""
 
     DOT = "dot"
-    GRAPHML = "graphml"
     PRISM = "prism"
 
 
@@ -33,23 +32,20 @@ def export(
     file: Saved,
     to: Annotated[
         Format,
-        typer.Option(
-            help="Graph for Graphviz (dot) or for graph tools (graphml); process for PRISM and "
-            "Storm."
-        ),
+        typer.Option(help="Graph for Graphviz (dot), or process for PRISM and Storm."),
     ],
     out: Annotated[Path | None, typer.Option(help="File to write; else it is printed.")] = None,
     least: Annotated[
         float | None,
         typer.Option(
-            min=0.0, max=1.0, help="Leave out what is less probable; 0.001 in a picture, else 0."
+            min=0.0, max=1.0, help="Leave out what is less probable; in a graph 0.001, else 0."
         ),
     ] = None,
     evidence: Annotated[
         float | None,
         typer.Option(
             min=0.0,
-            help="Leave out edges, for prism actions, that were seen less often; 1, graphml 0.",
+            help="Leave out edges, for prism actions, that were seen less often; 1 if not given.",
         ),
     ] = None,
 ) -> None:
@@ -60,25 +56,17 @@ def export(
     from evofsm.store import storage
 
     model, dead_ends = _learnt(file)
+    bounds = {"least": least, "evidence": evidence}
+    given = {name: bound for name, bound in bounds.items() if bound is not None}
     if to is Format.PRISM:
-        text = graphs.to_prism(model, 1.0 if evidence is None else evidence, least or 0.0)
+        text = graphs.to_prism(model, **given)
     else:
-        bounds = {"least": least, "evidence": evidence}
-        given = {name: bound for name, bound in bounds.items() if bound is not None}
-        write = graphs.to_dot if to is Format.DOT else graphs.to_networkx
-        graph = write(model, **given, dead_ends=dead_ends)
-        text = graph if isinstance(graph, str) else _graphml(graph)
+        text = graphs.to_dot(model, **given, dead_ends=dead_ends)
     if out is None:
         sys.stdout.write(visible(text))
         return
     with storage.replacing(out) as place:
         place.write(visible(text).encode())
-
-
-def _graphml(graph: Any) -> str:
-    from networkx import generate_graphml
-
-    return "\n".join([*generate_graphml(graph), ""])
 
 
 def _refuse_learnt(out: Path | None) -> None:

@@ -2,7 +2,6 @@ from .foxglove import FOXGLOVE_LAYOUT as FOXGLOVE_LAYOUT
 from .foxglove import FoxgloveSink as FoxgloveSink
 from .foxglove import recording as recording
 from .graphs import to_dot as to_dot
-from .graphs import to_networkx as to_networkx
 from .graphs import to_prism as to_prism
 from .logs import Chunk as Chunk
 from .logs import LogColumns as LogColumns

@@ -7,15 +7,10 @@ the evidence for it: a probability may come from one observation, or from the pr
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from evofsm.extras import needs
 from evofsm.fsm import FSMModel
-
-if TYPE_CHECKING:
-    import networkx
 
 # Vermillion of Okabe and Ito's colours; what is marked by it has another shape and words as well.
 _DOT_MARK = ',\n      shape=hexagon, style=filled, fillcolor="#D55E00", fontcolor=white, penwidth=2'
@@ -77,7 +72,11 @@ def to_dot(
     }
     <BLANKLINE>
     """
-    marked = _marked(model, dead_ends)
+    _refuse_no_probability(least)
+    ended = np.flatnonzero(model.endings) if dead_ends is None else dead_ends
+    marked = {int(state) for state in ended}
+    if beyond := sorted(state for state in marked if not 0 <= state < model.n_states):
+        raise ValueError(f"dead_ends names {beyond}; the model has {model.n_states} states, from 0")
     lines = [_DOT_HEAD]
     most = model.visits.max(initial=0.0) or 1.0
     for state in range(model.n_states):
@@ -91,86 +90,14 @@ def to_dot(
         width = 0.75 + _LARGEST_NODE * (model.visits[state] / most) ** 0.5
         mark = _DOT_MARK if state in marked else ""
         lines.append(f'  s{state + 1} [label="{label}", width={width:.2f}{mark}];')
-    for i, j, chance, seen in _edges(model, least, evidence):
+    matrix = model.averaged_matrix("observed")
+    drawn = (matrix >= least) & (model.changes >= evidence) & (matrix > 0.0)
+    for i, j in np.argwhere(drawn).tolist():
+        chance, seen = matrix[i, j], model.changes[i, j]
         width, dashes = max(_WIDEST_LINE * chance, 0.3), "" if seen else ", style=dashed"
         label = f'label="{chance:.3f} ({seen:,.0f})", penwidth={width:.2f}'
         lines.append(f"  s{i + 1} -> s{j + 1} [{label}{dashes}];")
     return "\n".join([*lines, "}", ""])
-
-
-def to_networkx(
-    model: FSMModel,
-    least: float = 0.0,
-    evidence: float = 0.0,
-    dead_ends: Collection[int] | None = None,
-) -> networkx.DiGraph[int]:
-    """The states and transitions as a graph of networkx, which writes GraphML and more.
-
-    Parameters
-    ----------
-    model, least, evidence, dead_ends
-        As in `to_dot`; here all edges above probability 0 are the default, seen or not.
-
-    Returns
-    -------
-    networkx.DiGraph
-        Its nodes are the states, from 1, with ``label``, ``visits``, ``created``, ``failures``,
-        ``dead_end`` and a ``center.NAME`` for each variable; edges have ``probability`` and
-        ``changes``, how often the change was seen.
-
-    Raises
-    ------
-    ModuleNotFoundError
-        If networkx is not installed.
-    ValueError
-        As `to_dot`.
-
-    Examples
-    --------
-    >>> from evofsm import EvolvingFSM
-    >>> machine = EvolvingFSM(n_actions=2, radius=0.5)
-    >>> trace = machine.learn_many([[0.0], [0.1], [2.0], [1.0]], [0, 0, 0, 0])
-    >>> graph = to_networkx(machine.model(names=["gap"], units=["m"]))
-    >>> graph.nodes[2]["center.gap"], round(graph.edges[1, 2]["probability"], 3)
-    (1.0, 0.229)
-    """
-    with needs("networkx", "graph", "GraphML"):
-        import networkx
-    marked = _marked(model, dead_ends)
-    graph = networkx.DiGraph()
-    names = model.names or [str(place) for place in range(1, model.n_variables + 1)]
-    for i, center in enumerate(model.centers.tolist()):
-        graph.add_node(
-            i + 1,
-            label=f"#{i + 1}",
-            visits=float(model.visits[i]),
-            created=float(model.founded[i]),
-            failures=float(model.endings[i]),
-            dead_end=i in marked,
-            **{f"center.{_shown(name)}": x for name, x in zip(names, center, strict=True)},
-        )
-    for i, j, probability, seen in _edges(model, least, evidence):
-        graph.add_edge(i + 1, j + 1, probability=probability, changes=seen)
-    return graph
-
-
-def _marked(model: FSMModel, dead_ends: Collection[int] | None) -> frozenset[int]:
-    ended = np.flatnonzero(model.endings) if dead_ends is None else dead_ends
-    marked = frozenset(int(state) for state in ended)
-    if beyond := sorted(state for state in marked if not 0 <= state < model.n_states):
-        raise ValueError(f"dead_ends names {beyond}; the model has {model.n_states} states, from 0")
-    return marked
-
-
-def _edges(
-    model: FSMModel, least: float, evidence: float
-) -> Iterator[tuple[int, int, float, float]]:
-    """From, to, probability and how often it was seen."""
-    _refuse_no_probability(least)
-    matrix = model.averaged_matrix("observed")
-    drawn = (matrix >= least) & (model.changes >= evidence) & (matrix > 0.0)
-    for i, j in np.argwhere(drawn).tolist():
-        yield i, j, float(matrix[i, j]), float(model.changes[i, j])
 
 
 def _refuse_no_probability(least: float) -> None:
@@ -193,16 +120,14 @@ def _counted(number: float, what: str) -> str:
 
 
 def _shown(text: str) -> str:
-    """In one line, without the control characters that no XML may hold."""
+    """In one line, without control characters."""
     return "".join(sign for sign in " ".join(text.split()) if sign.isprintable())
 
 
 # -- PRISM ----------------------------------------------------------------------------------------
 
 
-def to_prism(
-    model: FSMModel, evidence: float = 1.0, least: float = 0.0, first: int | None = None
-) -> str:
+def to_prism(model: FSMModel, evidence: float = 1.0, least: float = 0.0) -> str:
     """The model as a Markov decision process in the language of PRISM, which Storm reads as well.
 
     In state ``s=i``, which people call #i, every action that was tried there is a command. It ends
@@ -218,14 +143,11 @@ def to_prism(
     least : float
         Transitions to states below this probability are left out, and the others made to add up
         to 1; failure is never left out.
-    first : int, optional
-        The state that it begins in, from 1 as people count; the one that was created first if not
-        given.
 
     Returns
     -------
     str
-        The process. ``"failed"`` labels the failure, ``"unknown"`` states without any command,
+        The process; it begins in the state that was created first. ``"failed"`` labels the failure, ``"unknown"`` states without any command,
         from which nothing leads on (do not take them for safe), ``"state_i"`` each state.
         ``filter`` asks of other states than the first. Comments say how many decisions and failures
         a command rests on, and what was left out.
@@ -233,8 +155,8 @@ def to_prism(
     Raises
     ------
     ValueError
-        If the model has no states or counted no decisions, ``evidence`` is not positive, ``least``
-        no probability, or ``first`` no state.
+        If the model has no states or counted no decisions, ``evidence`` is not positive, or ``least``
+        no probability.
 
     Examples
     --------
@@ -266,9 +188,6 @@ def to_prism(
             "the model counted no decisions, so there is no action to choose (has its machine been "
             "told its actions?)"
         )
-    begin = int(np.argmin(model.founded)) + 1 if first is None else first
-    if not 1 <= begin <= n:
-        raise ValueError(f"there is no state #{begin}; there are #1 to #{n}")
     body, unknown = list[str](), list[int]()
     for state in range(n):
         about = [f"#{state + 1}", *(_where(model, state) if model.names else [])]
@@ -283,7 +202,7 @@ def to_prism(
     nowhere = " | ".join(f"s={i}" for i in unknown) or "false"
     lines = [
         *_header(model, evidence, least, len(unknown)),
-        *("mdp", "", "module evofsm", f"  s : [0..{n}] init {begin};"),
+        *("mdp", "", "module evofsm", f"  s : [0..{n}] init {np.argmin(model.founded) + 1};"),
         *body,
         *("", "  [failed] s=0 -> 1:(s'=0);", "endmodule", ""),
         *('label "failed" = s=0;', f'label "unknown" = {nowhere};'),

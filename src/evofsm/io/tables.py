@@ -10,7 +10,7 @@ import os
 import re
 import zlib
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from contextlib import suppress
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, NoReturn, Self
@@ -27,19 +27,18 @@ if TYPE_CHECKING:
 Kind = Literal["csv", "parquet", "xml", "osi", "mcap", "bag", "run"]
 #: Called with the number of bytes each time some were read from a file.
 OnRead = Callable[[int], object]
+#: Place of a row, for a message, and what stands there in a column.
+Find = Callable[[int, "str | None"], tuple[str, str]]
 
-# Read at once: enough that what Python does in between hardly counts.
-_CSV_BYTES = 1 << 22
+# Read at once: enough that what Python does in between hardly counts. polars decodes a whole row
+# group for each slice of it, so small slices would only cost time.
+_CSV_BYTES, _PARQUET_ROWS = 1 << 22, 1 << 16
 _LONGEST_LINE = 1_000_000
-# polars decodes a whole row group for each slice of it, so small slices would only cost time.
-_PARQUET_ROWS = 1 << 16
 
-_BYTE_ORDER_MARK = b"\xef\xbb\xbf"
-_GZIP, _PARQUET = b"\x1f\x8b", b"PAR1"
+_BYTE_ORDER_MARK, _GZIP, _PARQUET = b"\xef\xbb\xbf", b"\x1f\x8b", b"PAR1"
 _SQLITE, _MCAP = b"SQLite format 3\0", b"\x89MCAP0\r\n"
 # Where an MCAP file has its profile: behind the mark, an opcode and two lengths.
 _PROFILE = len(_MCAP) + 1 + 8 + 4
-_ROS, _OURS = b"ros2", b"evofsm"
 
 #: What is measured in a unit, and the factor that gives s, m, m/s or m/s².
 UNITS: Mapping[str, tuple[str, float]] = {
@@ -52,7 +51,6 @@ UNITS: Mapping[str, tuple[str, float]] = {
     **{"m/s2": ("acceleration", 1.0), "cm/s2": ("acceleration", 0.01)},
     **{"ft/s2": ("acceleration", 0.3048), "g": ("acceleration", 9.80665)},
 }
-
 # What stands in a field where there is no number.
 _NOTHING = ("", "na", "n/a", "null", "none")
 _DATE = re.compile(r"\s*\d{4}-?\d\d-?\d\d[Tt ]")
@@ -63,9 +61,6 @@ _log = logging.getLogger(__name__)
 
 def silent(count: int) -> None:
     """Nobody wants to know how much was read."""
-
-
-# -- Files ----------------------------------------------------------------------------------------
 
 
 def file_kind(path: str) -> Kind:
@@ -82,14 +77,12 @@ def file_kind(path: str) -> Kind:
         beginning = source.read(64).removeprefix(_BYTE_ORDER_MARK).lstrip()
     if not beginning:
         raise ValueError(f"{path} is empty")
-    if beginning.startswith(_PARQUET):
-        return "parquet"
     if beginning.startswith(_MCAP):
         profile = beginning[_PROFILE:]
-        return "bag" if profile.startswith(_ROS) else "run" if profile.startswith(_OURS) else "mcap"
-    if beginning.startswith(_SQLITE):
-        return "bag"
-    return "xml" if beginning.startswith(b"<") else "csv"
+        kinds: dict[bytes, Kind] = {b"ros2": "bag", b"evofsm": "run"}
+        return next((kind for mark, kind in kinds.items() if profile.startswith(mark)), "mcap")
+    marks: dict[bytes, Kind] = {_PARQUET: "parquet", _SQLITE: "bag", b"<": "xml"}
+    return next((kind for mark, kind in marks.items() if beginning.startswith(mark)), "csv")
 
 
 class Source:
@@ -131,21 +124,25 @@ class Source:
         """The next whole lines, some megabytes of them; no quoted field goes on behind them."""
         block = self.read(_CSV_BYTES)
         if not block:
-            self._warn_of_growth()
+            if (growth := os.fstat(self._raw.fileno()).st_size - self._size) > 0:
+                late = "rows that came meanwhile are left out"
+                _log.warning("%s grew by %d bytes while it was read; %s", self.path, growth, late)
             return block
         is_open = block.count(b'"') % 2 == 1
         parts, room = [block], _LONGEST_LINE
-        while is_open or not parts[-1].endswith(b"\n"):
+        # A quote that is never closed is left to whoever parses them.
+        while (is_open and room > 0 and parts[-1]) or not parts[-1].endswith(b"\n"):
             line = self._take(_LONGEST_LINE, to_line_end=True)
             is_open ^= line.count(b'"') % 2 == 1
-            parts.append(line or b"\n")
             room -= len(line)
             if room < 0 and not line.endswith(b"\n"):
                 raise ValueError(
                     f"{self.path}, after line {self.lines}: a line of more than {_LONGEST_LINE:,} "
                     "bytes; this is no table"
                 )
-            if room < 0 or not line:  # one that is not closed is found by whoever parses them
+            parts.append(line)
+            if not line:
+                parts.append(b"" if parts[-2].endswith(b"\n") else b"\n")
                 break
         return b"".join(parts) if len(parts) > 1 else block
 
@@ -164,15 +161,6 @@ class Source:
         self._on_read(self._raw.tell() - before)
         return data
 
-    def _warn_of_growth(self) -> None:
-        growth = os.fstat(self._raw.fileno()).st_size - self._size
-        if growth > 0:
-            _log.warning(
-                "%s grew by %s bytes while it was read; rows that came meanwhile are left out",
-                self.path,
-                f"{growth:,}",
-            )
-
 
 # -- Pieces of tables -----------------------------------------------------------------------------
 
@@ -183,8 +171,7 @@ class Piece:
 
     rows: int
     numbers: dict[str, NDArray[np.float64]]  #: NaN where one is missing
-    #: Place of a row, for a message, and what stands there in a column.
-    find: Callable[[int, str | None], tuple[str, str]]
+    find: Find
     texts: dict[str, polars.Series] = field(default_factory=dict)
     #: Rows that begin an episode, of a table that knows; None where columns tell episodes apart.
     starts: NDArray[np.int64] | None = None
@@ -217,11 +204,9 @@ class Piece:
         place, text = self.find(row, name)
         raise ValueError(f"{place}, column {name!r}: {why.format(text[:40]) or explained(text)}")
 
-    def refuse_unusable(self, name: str, where: NDArray[np.bool_] | None = None) -> None:
+    def refuse_unusable(self, name: str, where: NDArray[np.bool_] | bool = True) -> None:
         """Raise where a number cannot be learnt; NaN is none."""
-        unusable = ~(np.abs(self.numbers[name]) <= LARGEST_OBSERVATION)
-        if where is not None:
-            unusable &= where
+        unusable = ~(np.abs(self.numbers[name]) <= LARGEST_OBSERVATION) & where
         if unusable.any():
             self.refuse(int(np.argmax(unusable)), name)
 
@@ -233,6 +218,35 @@ class Wanted(NamedTuple):
     texts: Sequence[str] = ()
     gaps: Collection[str] = ()  #: numbers that may be missing or infinite; others are refused then
     date: str | None = None  #: comes as a number, of microseconds
+
+    @property
+    def all(self) -> list[str]:
+        """Columns that are read, each once."""
+        dates = [self.date] if self.date else []
+        return list(dict.fromkeys([*self.numbers, *self.texts, *dates]))
+
+    def piece(self, found: Mapping[str, polars.Series], find: Find) -> Piece:
+        """The columns of some rows as what is wanted of them; numbers may be given as texts."""
+        import polars
+
+        piece = Piece(len(found[self.all[0]]), {}, find)
+        for name in dict.fromkeys(self.numbers):
+            values = found[name]
+            if values.dtype == polars.String:
+                fields = values.str.strip_chars()
+                values = fields.cast(polars.Float64, strict=False)
+                wrong = values.is_null() & ~fields.str.to_lowercase().is_in(_NOTHING)
+                if wrong.any():
+                    piece.refuse(int(wrong.arg_max() or 0), name)
+            piece.numbers[name] = values.cast(polars.Float64).to_numpy()
+            if name not in self.gaps:
+                piece.refuse_unusable(name)
+        for name in self.texts:
+            texts = found[name].cast(polars.String)
+            piece.texts[name] = texts.fill_null("") if texts.null_count() else texts
+        if self.date is not None:
+            piece.numbers[self.date] = _microseconds(piece, self.date, found[self.date])
+        return piece
 
 
 class Table:
@@ -251,7 +265,11 @@ class Table:
 
 
 class CsvTable(Table):
-    """A CSV file, gzipped or not, with a header; fields end at a comma, a semicolon or a tab."""
+    """A CSV file, gzipped or not, with a header; fields end at a comma, a semicolon or a tab.
+
+    polars reads blocks of plain lines; Python's own reader, which is slower, blocks with quotes or
+    with anything odd, and what a message is to name.
+    """
 
     def __init__(self, path: str, on_read: OnRead = silent) -> None:
         with needs("polars", "tables", f"{path}: a table"):
@@ -259,144 +277,105 @@ class CsvTable(Table):
         self.path = path
         self._on_read = on_read
         with Source(path) as source:
-            header, _, rest = source.rows().partition(b"\n")
+            header, first, *_ = *source.rows().split(b"\n", 2), b""
         text = self._decoded(header, 0).removeprefix("\ufeff").rstrip("\r")
         self._separator = max(",;\t", key=text.count)
-        mark = self._separator.encode()
-        self._quoted = re.compile(rb'(?<![^%b\n])"[^"]*+(?:""[^"]*+)*+"(?=[%b\r\n])' % (mark, mark))
-        if text.count('"') % 2:
-            self._refuse_quote(header + b"\n", 0)
-        try:
-            self.columns = [
-                name.strip() for name in next(csv.reader([text], delimiter=mark.decode()))
-            ]
-        except csv.Error as error:
-            raise ValueError(f"{path}, line 1: {error}") from error
-        self._first_row = rest.partition(b"\n")[0]
-        # As polars calls them, for there may be two of one name.
-        self._places = {name: f"column_{k + 1}" for k, name in enumerate(self.columns)}
-        self._has_blank_lines = False  # as far as is known
+        self.columns = [name.strip() for name in self._split(text, 1)]
+        self._first_row = self._split(first.decode(errors="replace").rstrip("\r"), 2)
         if all(_is_number(name) for name in self.columns):
             raise ValueError(
                 f"{path}, line 1: {text.strip()[:200]!r} is no header; the first line must name "
                 "the columns"
             )
 
+    def _split(self, line: str, number: int) -> list[str]:
+        try:  # the first row may go on in the next line
+            return next(csv.reader([line], delimiter=self._separator, strict=number == 1), [])
+        except csv.Error as error:
+            raise self._no_csv(number, error) from error
+
+    def _no_csv(self, line: int, error: csv.Error) -> ValueError:
+        return ValueError(f"{self.path}, line {line}: {error} (an unclosed quote?)")
+
     def holds_dates(self, name: str) -> bool:
         """Whether the first row has a time of ISO 8601 there; what else it has is not judged."""
-        fields: list[str] = []
-        with suppress(csv.Error):
-            row = self._first_row.decode(errors="replace").rstrip("\r")
-            fields = next(csv.reader([row], delimiter=self._separator), [])
-        return _DATE.match(dict(zip(self.columns, fields, strict=False)).get(name, "")) is not None
+        first = dict(zip(self.columns, self._first_row, strict=False))
+        return _DATE.match(first.get(name, "")) is not None
 
     def pieces(self, wanted: Wanted) -> Iterator[Piece]:
         """Read columns, in the order of rows."""
-        texts = [*wanted.texts, *([wanted.date] if wanted.date else [])]
-        used = list(dict.fromkeys([*wanted.numbers, *texts]))
-        if twice := [name for name in used if self.columns.count(name) > 1]:
+        import polars
+
+        if twice := [name for name in wanted.all if self.columns.count(name) > 1]:
             raise ValueError(f"{self.path}, line 1: two columns are called {twice[0]!r}")
+        places = {name: self.columns.index(name) for name in wanted.all}
         with Source(self.path, self._on_read) as source:
             reached = 0
             while block := source.rows():
                 if reached == 0:
                     block, reached = block.partition(b"\n")[2], 1
-                found = self._parsed(block, reached, used, set(wanted.numbers))
-                if rows := len(found[used[0]]):
-                    piece = Piece(rows, {}, partial(self._find, block, reached))
-                    for name in texts:
-                        has_gaps = found[name].null_count() > 0
-                        piece.texts[name] = found[name].fill_null("") if has_gaps else found[name]
-                    for name in dict.fromkeys(wanted.numbers):
-                        piece.numbers[name] = found[name].to_numpy()
-                        if found[name].null_count():
-                            self._look_again(piece, name, block, name in wanted.gaps)
-                        if name not in wanted.gaps:
-                            piece.refuse_unusable(name)
-                    if wanted.date is not None:
-                        piece.numbers[wanted.date] = _microseconds(piece, wanted.date)
-                    yield piece
+                found = self._plain(block, places, wanted.numbers)
+                if found is None:
+                    rows = self._odd(block, reached)[1]
+                    found = {
+                        name: polars.Series([row[place] for row in rows], dtype=polars.String)
+                        for name, place in places.items()
+                    }
+                if len(found[wanted.all[0]]):
+                    yield wanted.piece(found, partial(self._find, block, reached))
                 reached = source.lines
 
-    def _parsed(
-        self, block: bytes, reached: int, used: Sequence[str], numbers: Collection[str] = ()
-    ) -> dict[str, polars.Series]:
-        """The columns in use as texts or as numbers, null where there is none."""
+    def _plain(
+        self, block: bytes, places: Mapping[str, int], numbers: Sequence[str]
+    ) -> dict[str, polars.Series] | None:
+        """The columns, numbers as such; None where anything is odd."""
         import polars
 
-        bare = block
-        if b'"' in block:  # separators and line ends do not count within quotes
-            bare = self._quoted.sub(b"", block)
-            if b'"' in bare:
-                self._refuse_quote(block, reached)
+        if b'"' in block:
+            return None
+        # As polars calls columns, for there may be two of one name.
         kinds: dict[str, Any] = {f"column_{k + 1}": polars.String for k in range(len(self.columns))}
-        kinds |= {self._places[name]: polars.Float64 for name in numbers}
+        kinds |= {f"column_{places[name] + 1}": polars.Float64 for name in numbers}
         try:
             frame = polars.read_csv(
-                _without_blank_lines(block) if self._has_blank_lines else block,
+                block,
                 has_header=False,
                 separator=self._separator,
                 schema=kinds,
-                columns=[self._places[name] for name in used],
+                columns=[f"column_{place + 1}" for place in places.values()],
                 ignore_errors=True,
                 raise_if_empty=False,
             )
-            n_separators = len(frame) * (len(self.columns) - 1)
-            if bare.count(self._separator.encode()) == n_separators:
-                return {name: frame[self._places[name]] for name in used}
-            why = "rows of different lengths"
-        except (polars.exceptions.PolarsError, polars.exceptions.PanicException) as error:
-            why = str(error).partition("\n")[0]
-        if not self._has_blank_lines:  # so it may have some
-            self._has_blank_lines = True
-            return self._parsed(block, reached, used, numbers)
-        self._find(block, reached)
-        raise ValueError(f"{self.path}, after line {reached}, cannot be read as CSV: {why}")
+        except (polars.exceptions.PolarsError, polars.exceptions.PanicException):
+            return None
+        found = {name: frame[f"column_{place + 1}"] for name, place in places.items()}
+        is_whole = block.count(self._separator.encode()) == len(frame) * (len(self.columns) - 1)
+        lacks = any(found[name].null_count() for name in numbers)
+        return found if is_whole and not lacks else None
 
-    def _look_again(self, piece: Piece, name: str, block: bytes, may_lack: bool) -> None:
-        """Numbers of a column in which polars found fields that are none."""
-        import polars
-
-        fields = self._parsed(block, 0, [name])[name].fill_null("").str.strip_chars()
-        values = fields.cast(polars.Float64, strict=False)
-        wrong = values.is_null()
-        if may_lack:
-            wrong &= ~fields.str.to_lowercase().is_in(_NOTHING)
-        if wrong.any():
-            piece.refuse(int(wrong.arg_max() or 0), name)
-        piece.numbers[name] = values.to_numpy()
-
-    def _find(
-        self, block: bytes, reached: int, row: int | None = None, name: str | None = None
-    ) -> tuple[str, str]:
-        """Place of a row of a block, and its field; without a row, what is wrong is looked for."""
-        text = self._decoded(block, reached)
-        rows = csv.reader(io.StringIO(text, newline=""), delimiter=self._separator)
+    def _odd(self, block: bytes, reached: int) -> tuple[list[int], list[list[str]]]:
+        """The lines of rows, and their fields."""
+        text = io.StringIO(self._decoded(block, reached), newline="")
+        rows = csv.reader(text, delimiter=self._separator, strict=True)
+        lines, found = list[int](), list[list[str]]()
         try:
-            for k, fields in enumerate(filter(None, rows)):
-                place = f"{self.path}, line {reached + rows.line_num}"
+            for fields in filter(None, rows):
+                lines.append(reached + rows.line_num)
+                found.append(fields)
                 if len(fields) != len(self.columns):
                     raise ValueError(
-                        f"{place}: {len(fields)} fields, but the header names {len(self.columns)} "
-                        f"(was the file cut off, or does a field hold {self._separator!r}?)"
+                        f"{self.path}, line {lines[-1]}: {len(fields)} fields, but the header "
+                        f"names {len(self.columns)} (was the file cut off, is a quote not closed, "
+                        f"or does a field hold {self._separator!r}?)"
                     )
-                if k == row:
-                    return place, "" if name is None else fields[self.columns.index(name)]
         except csv.Error as error:
-            line = reached + rows.line_num
-            raise ValueError(f"{self.path}, line {line}: {error} (an unclosed quote?)") from error
-        return f"{self.path}, after line {reached}", ""
+            raise self._no_csv(reached + rows.line_num, error) from error
+        return lines, found
 
-    def _refuse_quote(self, block: bytes, reached: int) -> NoReturn:
-        at = block.find(b'"')
-        for whole in self._quoted.finditer(block):
-            if whole.start() > at:
-                break
-            at = block.find(b'"', whole.end())
-        raise ValueError(
-            f"{self.path}, line {reached + block[:at].count(10) + 1}: a quote that does not "
-            "enclose a field (an unclosed quote? within quotes it has to be there twice)"
-        )
+    def _find(self, block: bytes, reached: int, row: int, name: str | None) -> tuple[str, str]:
+        lines, rows = self._odd(block, reached)
+        text = "" if name is None else rows[row][self.columns.index(name)]
+        return f"{self.path}, line {lines[row]}", text
 
     def _decoded(self, block: bytes, reached: int) -> str:
         try:
@@ -409,10 +388,6 @@ class CsvTable(Table):
             ) from error
 
 
-def _without_blank_lines(block: bytes) -> bytes:
-    return re.sub(rb"\n[\r\n]*\n", b"\n", b"\n" + block)[1:]
-
-
 class ParquetTable(Table):
     """A Parquet file; read with polars because pyarrow cannot be imported beside libsumo."""
 
@@ -423,46 +398,36 @@ class ParquetTable(Table):
         self._on_read = on_read
         # polars takes other paths for addresses on the network, or of somebody's home.
         self._scan = polars.scan_parquet(os.path.abspath(path), glob=False)
-        self._types = self._read(lambda: self._scan.collect_schema())
-        self._rows = int(self._read(lambda: self._scan.select(polars.len()).collect().item()))
+        with self._readable():
+            self._types = self._scan.collect_schema()
+            self._rows = int(self._scan.select(polars.len()).collect().item())
         self.columns = list(self._types)
 
     def holds_dates(self, name: str) -> bool:
         """Whether its type says so, or the first of its texts."""
         import polars
 
-        kind = self._types[name]
-        if kind == polars.String and self._rows:
-            first = self._read(lambda: self._scan.select(name).head(1).collect().item())
+        if self._types[name] == polars.String and self._rows:
+            with self._readable():
+                first = self._scan.select(name).head(1).collect().item()
             return _DATE.match(str(first or "")) is not None
-        return isinstance(kind, polars.Datetime)
+        return isinstance(self._types[name], polars.Datetime)
 
     def pieces(self, wanted: Wanted) -> Iterator[Piece]:
         """Read columns, in the order of rows."""
-        import polars
-
         for name in wanted.numbers:
             if not self._types[name].is_numeric():
                 raise ValueError(
                     f"{self.path}: column {name!r} holds {self._types[name]}, not numbers"
                 )
-        dates = [wanted.date] if wanted.date else []
-        part = self._scan.select(list(dict.fromkeys([*wanted.numbers, *wanted.texts, *dates])))
+        part = self._scan.select(wanted.all)
         # Not collect_batches: it reads ahead of a slow consumer without bound (polars #28569).
         for first in range(0, self._rows, _PARQUET_ROWS):
-            frame = self._read(part.slice(first, _PARQUET_ROWS).collect)
-            piece = Piece(len(frame), {}, partial(self._find, frame, first))
-            for name in wanted.numbers:
-                piece.numbers[name] = frame[name].cast(polars.Float64).to_numpy()
-                if name not in wanted.gaps:
-                    piece.refuse_unusable(name)
-            for name in wanted.texts:
-                piece.texts[name] = frame[name].cast(polars.String).fill_null("")
-            for name in dates:
-                piece.texts[name] = frame[name]
-                piece.numbers[name] = _microseconds(piece, name)
+            with self._readable():
+                frame = part.slice(first, _PARQUET_ROWS).collect()
+            found = {name: frame[name] for name in wanted.all}
+            yield wanted.piece(found, partial(self._find, frame, first))
             self._on_read(os.path.getsize(self.path) * len(frame) // self._rows)
-            yield piece
 
     def _find(
         self, frame: polars.DataFrame, first: int, row: int, name: str | None
@@ -470,18 +435,17 @@ class ParquetTable(Table):
         value = None if name is None else frame[name][row]
         return f"{self.path}, row {first + row + 1}", "" if value is None else str(value)
 
-    def _read(self, read: Callable[[], Any]) -> Any:
+    @contextmanager
+    def _readable(self) -> Iterator[None]:
         import polars
 
         try:
-            return read()
+            yield
         # A panic is what polars makes of some damaged files; it is no Exception.
         except (polars.exceptions.PolarsError, polars.exceptions.PanicException) as error:
             cause = str(error).partition("\n")[0][:300]
-            raise ValueError(
-                f"{self.path} cannot be read as Parquet (was a copy or a download interrupted?): "
-                f"{cause}"
-            ) from error
+            why = "(was a copy or a download interrupted?)"
+            raise ValueError(f"{self.path} cannot be read as Parquet {why}: {cause}") from error
 
 
 # -- Fields ---------------------------------------------------------------------------------------
@@ -512,11 +476,10 @@ def _is_number(text: str) -> bool:
     return True
 
 
-def _microseconds(piece: Piece, name: str) -> NDArray[np.float64]:
+def _microseconds(piece: Piece, name: str, dates: polars.Series) -> NDArray[np.float64]:
     """Microseconds since 1970, exactly; without a zone a date is taken as UTC."""
     import polars
 
-    dates = piece.texts.pop(name)
     if dates.dtype == polars.String:
         dates = dates.str.strip_chars().str.replace("[t ]", "T")
         zoned = dates.str.contains(_ZONE)
