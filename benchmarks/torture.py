@@ -43,7 +43,7 @@ from evofsm.fsm.actions import IntervalActions
 from evofsm.fsm.learnt import MACHINE
 from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.model import FSMModel
-from evofsm.io.logs import read_traces
+from evofsm.io.logs import Chunk, read_traces
 
 #: What must not happen, in the order in which it is printed.
 WRONG = (
@@ -83,7 +83,8 @@ def works(folder: Path) -> list[Work]:
     """Learning from files, and driving, each run once before to be warm."""
     logs = [_write_log(folder / f"log{k}.csv", seed=k) for k in range(8)]
     found = []
-    for name, run in (("learn", lambda path: _learn(logs, path)), ("drive", _drive)):
+    chunks = list(read_traces(logs))  # not in a process that is forked: polars has threads
+    for name, run in (("learn", lambda path: _learn(logs, chunks, path)), ("drive", _drive)):
         run(folder / f"{name}.warm")
         began = time.perf_counter()
         expected = run(folder / f"{name}.whole")
@@ -105,11 +106,11 @@ def _write_log(path: Path, seed: int, rows: int = 250) -> str:
     return str(path)
 
 
-def _learn(logs: Sequence[str], path: Path) -> bytes:
+def _learn(logs: Sequence[str], chunks: Sequence[Chunk], path: Path) -> bytes:
     actions = IntervalActions(-2.5, 2.5, 1.0, outside="clip")
     machine = EvolvingFSM(actions.n_actions)
     checkpoint = Checkpoint(path, {"files": fingerprints(logs)}, every=0.0)
-    learning = learn_traces(read_traces(logs), machine, actions, checkpoint=checkpoint)
+    learning = learn_traces(chunks, machine, actions, checkpoint=checkpoint)
     numbers = [value for name, value in vars(learning).items() if name not in ("machine", "model")]
     return _saved(learning.machine) + repr(numbers).encode()
 

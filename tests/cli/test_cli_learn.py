@@ -251,7 +251,7 @@ def test_ctrl_c_says_so_and_saves_nothing(evofsm, log, tmp_path, monkeypatch):
     def interrupted(*arguments):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("evofsm.io.logs._read_table", interrupted)
+    monkeypatch.setattr("evofsm.io.logs._Reader.chunks", interrupted)
     result = evofsm("learn", log, "--out", tmp_path / "model")
     assert result.exit_code == 130
     assert "stopped before the end" in result.stderr

@@ -70,7 +70,7 @@ def test_what_was_never_seen_is_dashed(model):
         assert edge.attr["label"].endswith(f"({seen:,.0f})")
 
 
-def test_what_cannot_be_drawn_is_refused(model, write):
+def test_what_cannot_be_drawn_is_refused(model):
     with pytest.raises(ValueError, match="least is 2"):
         to_dot(model, least=2)
     with pytest.raises(ValueError, match=r"\[99\].*states, from 0"):
@@ -180,5 +180,3 @@ def test_what_is_no_process_is_refused(model):
         to_prism(EvolvingFSM(n_actions=1, radius=0.5).model())
     with pytest.raises(ValueError, match="evidence is 0"):
         to_prism(model, evidence=0.0)
-    with pytest.raises(ValueError, match="there is no state #99"):
-        to_prism(model, first=99)

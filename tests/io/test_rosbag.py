@@ -73,7 +73,7 @@ def read(path, told=TOLD, **columns):
 
 
 @pytest.mark.parametrize("plugin", [SQLITE, MCAP])
-def test_rows_hold_the_latest_values_before_them(tmp_path, plugin, monkeypatch):
+def test_rows_hold_the_latest_values_before_them(tmp_path, plugin):
     path = write(tmp_path / "bag", drive(), plugin)
     (chunk,) = read(path)
     assert chunk.times[:3] == pytest.approx([0.1, 0.2, 0.3])  # at 0 s the follower is not known
@@ -84,13 +84,6 @@ def test_rows_hold_the_latest_values_before_them(tmp_path, plugin, monkeypatch):
     assert (chunk.starts.tolist(), chunk.dt) == ([0], pytest.approx(0.1))
     (file,) = (one for one in (tmp_path / "bag").iterdir() if one.suffix != ".yaml")
     assert (read(str(file))[0].observations == chunk.observations).all()  # without its folder
-    monkeypatch.setattr("evofsm.io.rosbag._ROWS_AT_ONCE", 7)
-    parts = read(path)
-    assert len(parts) == 3
-    assert (np.concatenate([one.observations for one in parts]) == chunk.observations).all()
-    actions = np.concatenate([one.actions for one in parts])
-    assert np.array_equal(actions, chunk.actions, equal_nan=True)
-    assert [one.starts.tolist() for one in parts] == [[0], [], []]
 
 
 def test_what_is_too_old_is_a_hole_in_time(tmp_path):

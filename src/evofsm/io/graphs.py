@@ -147,16 +147,16 @@ def to_prism(model: FSMModel, evidence: float = 1.0, least: float = 0.0) -> str:
     Returns
     -------
     str
-        The process; it begins in the state that was created first. ``"failed"`` labels the failure, ``"unknown"`` states without any command,
-        from which nothing leads on (do not take them for safe), ``"state_i"`` each state.
-        ``filter`` asks of other states than the first. Comments say how many decisions and failures
-        a command rests on, and what was left out.
+        The process; it begins in the state that was created first. ``"failed"`` labels the failure,
+        ``"unknown"`` states without any command, from which nothing leads on (do not take them for
+        safe), ``"state_i"`` each state, of which ``filter`` asks. Comments say how many decisions
+        and failures a command rests on, and what was left out.
 
     Raises
     ------
     ValueError
-        If the model has no states or counted no decisions, ``evidence`` is not positive, or ``least``
-        no probability.
+        If the model counted no decisions, ``evidence`` is not positive, or ``least`` no
+        probability.
 
     Examples
     --------

@@ -106,16 +106,12 @@ class Noted:
             f"mph? --unit {name}=km/h converts it"
             for name, fastest in self.fastest.items()
         ]
-        if self.longest_step:
-            found.append(
-                f"there is a row every {self.longest_step:,.6g} s: is the time in ms? --unit "
-                f"{time}=ms converts it"
-            )
+        if (step := self.longest_step) > 0.0:
+            cause = f"is the time in ms? --unit {time}=ms converts it"
+            found.append(f"there is a row every {step:,.6g} s: {cause}")
         if self.unplaced:
-            found.append(
-                f"{self.unplaced:,} failures lie in rows without a leader, belong to no episode, "
-                "and were not counted"
-            )
+            why = "lie in rows without a leader, belong to no episode, and were not counted"
+            found.append(f"{self.unplaced:,} failures {why}")
         return found
 
 
@@ -243,11 +239,6 @@ class LogColumns:
     units: Mapping[str, str] = field(default_factory=dict)
     leader_may_lack: bool = False
 
-    @property
-    def condition(self) -> Condition | None:
-        """What tells of failures."""
-        return None if self.failed is None else Condition.parse(self.failed)
-
 
 # -- Reading --------------------------------------------------------------------------------------
 
@@ -314,7 +305,7 @@ def read_traces(
         rows, left_out = 0, noted.leaderless
         table = _open(path, columns, lengths, on_read, topics)
         these = _columns_of_pairs(path, columns) if isinstance(table, PairTable) else columns
-        for chunk in _read_table(table, these, clock, noted):
+        for chunk in _Reader(table, these, clock, noted).chunks():
             rows += len(chunk.times)
             noted.see(chunk, columns.observe.names)
             yield chunk
@@ -372,20 +363,16 @@ def _joined(parts: Sequence[Chunk]) -> Chunk:
 
 
 def _open(
-    path: str,
-    columns: LogColumns,
-    lengths: VehicleLengths,
-    on_read: OnRead,
-    topics: Topics | None,
+    path: str, columns: LogColumns, lengths: VehicleLengths, on_read: OnRead, topics: Topics | None
 ) -> Table:
     """The rows of a file, whatever it holds."""
     kind = file_kind(path)
-    if kind == "bag":
-        if topics is None:
-            raise ValueError(
-                f"{path} is a bag of ROS 2; --topics names a file that says which field of which "
-                "topic is which variable (docs/how-to/logs-of-others.md has one)"
-            )
+    if kind == "bag" and topics is None:
+        raise ValueError(
+            f"{path} is a bag of ROS 2; --topics names a file that says which field of which topic "
+            "is which variable (docs/how-to/logs-of-others.md has one)"
+        )
+    if kind == "bag" and topics is not None:
         return BagTable(path, topics, on_read)
     if kind == "run":
         raise ValueError(
@@ -396,13 +383,13 @@ def _open(
         read = vehicles.scenes_of_osi if kind == "osi" else vehicles.scenes_of_mcap
         return PairTable(path, vehicles.pairs_of_scenes(path, read(path, on_read)))
     if kind == "xml":
-        timesteps = vehicles.fcd_of_xml(path, on_read)
-        return PairTable(path, vehicles.pairs_of_fcd(path, timesteps, lengths))
+        rows = vehicles.fcd_of_xml(path, on_read)
+        return PairTable(path, vehicles.pairs_of_fcd(path, rows, lengths))
     table: Table = CsvTable(path, on_read) if kind == "csv" else ParquetTable(path, on_read)
-    if vehicles.FCD_TIME in table.columns:
-        timesteps = vehicles.fcd_of_table(table)
-        return PairTable(path, vehicles.pairs_of_fcd(path, timesteps, lengths))
     there = set(table.columns)
+    if vehicles.FCD_TIME in there:
+        rows = vehicles.fcd_of_table(table)
+        return PairTable(path, vehicles.pairs_of_fcd(path, rows, lengths))
     if set(vehicles.OBJECT_COLUMNS) <= there and not set(columns.observe.names) <= there:
         scenes = vehicles.scenes_of_table(table)
         return PairTable(path, vehicles.pairs_of_scenes(path, scenes))
@@ -416,7 +403,7 @@ def _columns_of_pairs(path: str, columns: LogColumns) -> LogColumns:
     asked += ["--episode"] if columns.episode is not None else []
     asked += ["--dt"] if columns.dt is not None else []
     asked += ["--unit"] if columns.units else []
-    failed = columns.condition
+    failed = None if columns.failed is None else Condition.parse(columns.failed)
     if failed is not None and not (failed.sign and failed.column in (*VARIABLES, ACTION)):
         asked += [f"--failed {columns.failed} (but with 'gap<=0')"]
     if asked:
@@ -428,125 +415,8 @@ def _columns_of_pairs(path: str, columns: LogColumns) -> LogColumns:
     return replace(columns, time="time", leader_may_lack=False)
 
 
-def _read_table(table: Table, columns: LogColumns, clock: _Clock, noted: Noted) -> Iterator[Chunk]:
-    """The rows of a table that are learnt, piece by piece."""
-    variables = columns.observe.variables
-    observed = [v for v in variables if isinstance(v, str)]
-    learnt = [*observed, columns.action]
-    usual = [name for name in USUAL_EPISODE if name in table.columns]
-    episode = usual if columns.episode is None else list(columns.episode)
-    failed = columns.condition
-    compared = [failed.column] if failed is not None and failed.sign else []
-    texts = [*episode, *(v.name for v in variables if isinstance(v, Category))]
-    texts += [failed.column] if failed is not None and not failed.sign else []
-    others = [columns.time] if clock.ticks else []
-    _refuse_missing(table, columns, [*learnt, *others, *compared, *texts])
-    date = columns.time if clock.ticks and table.holds_dates(columns.time) else None
-    numbers = [*learnt, *compared, *(others if date is None else [])]
-    factors = _factors(table, columns, numbers, noted)
-    only_compared = [name for name in compared if name not in learnt]  # may be infinite
-    gaps = [*(learnt if columns.leader_may_lack else []), *only_compared]
-    blocks, sieve = _Blocks(episode), _Sieve(noted)
-    before = 0
-    for piece in table.pieces(Wanted(numbers, texts, gaps, date)):
-        for name, factor in factors.items():
-            piece.numbers[name] = piece.numbers[name] * factor
-        starts = blocks.starts(piece)
-        anew, holes = starts.copy(), np.zeros(piece.rows, np.bool_)
-        if clock.ticks:
-            times = clock.seconds(piece.numbers[columns.time], date is not None)
-            holes = clock.holes(times, starts, piece)
-            starts |= holes
-        else:
-            times = np.arange(before, before + piece.rows) * np.float64(clock.dt)
-        before += piece.rows
-        lacking = np.zeros(piece.rows, np.bool_)
-        for name in observed if columns.leader_may_lack else ():
-            lacking |= ~np.isfinite(piece.numbers[name])
-        holds = None if failed is None else failed.holds(piece)
-        kept, fails = sieve.sift(anew, starts, holds, lacking)
-        if not kept.any():
-            continue
-        _refuse_gaps(piece, columns, kept, only_compared)
-        rows = slice(None) if kept.all() else kept  # a slice copies nothing
-        yield Chunk(
-            source=table.path,
-            observations=np.column_stack([_encoded(piece, v) for v in variables])[rows],
-            actions=piece.numbers[columns.action][rows],
-            times=times[rows],
-            starts=np.flatnonzero(starts[rows]),
-            dt=clock.dt,
-            jumps=int(holes[rows].sum()),
-            cuts=piece.cuts,
-            failures=None if failed is None else np.flatnonzero(fails[rows]),
-        )
-
-
-def _refuse_missing(table: Table, columns: LogColumns, names: Sequence[str]) -> None:
-    for name in names:
-        if name not in table.columns:
-            option = {columns.action: "--action", columns.time: "--time"}.get(name)
-            option = option or ("--episode" if name in (columns.episode or ()) else "--observe")
-            if columns.condition and name == columns.condition.column:
-                option = option if name in columns.observe.names else "--failed"
-            shown = ", ".join(name[:40] for name in table.columns[:20])
-            more = f" and {len(table.columns) - 20:,} more" if len(table.columns) > 20 else ""
-            raise ValueError(
-                f"{table.path} has no column {name!r}; it has {shown}{more} ({option} names the "
-                f"right one{', and --dt stands in for a clock' if option == '--time' else ''})"
-            )
-
-
-def _refuse_gaps(
-    piece: Piece, columns: LogColumns, kept: NDArray[np.bool_], only_compared: Sequence[str]
-) -> None:
-    """Raise where something is missing in a row that is kept."""
-    for name in only_compared:
-        if (lacks := kept & np.isnan(piece.numbers[name])).any():
-            piece.refuse(int(np.argmax(lacks)), name)
-    if columns.leader_may_lack:
-        for variable in columns.observe.variables:
-            if isinstance(variable, str):
-                piece.refuse_unusable(variable, kept)
-        if piece.starts is None:  # else the action may be derived, and NaN
-            piece.refuse_unusable(columns.action, kept)
-
-
-def _factors(
-    table: Table, columns: LogColumns, numbers: Sequence[str], noted: Noted
-) -> dict[str, float]:
-    """What turns columns into units of the SI, by name, for those that need it."""
-    try:
-        given = units_of(columns.units, numbers, table.columns, columns.time)
-    except ValueError as error:
-        raise ValueError(f"{table.path}: {error}") from None
-    noted.units |= given
-    return {name: UNITS[unit][1] for name, unit in given.items()}
-
-
-def _encoded(piece: Piece, variable: str | Category) -> NDArray[np.float64]:
-    """Columns of the observation for one variable."""
-    if isinstance(variable, str):
-        return piece.numbers[variable]
-    encoder = ObservationEncoder(variable)
-    codes = np.array([encoder.encode({variable.name: value}) for value in variable.values])
-    places = {value: place for place, value in enumerate(variable.values)}
-    found = piece.texts[variable.name].replace_strict(places, default=-1).to_numpy()
-    if (found < 0).any():
-        names = ", ".join(variable.values)
-        piece.refuse(
-            int(np.argmin(found)),
-            variable.name,
-            "{!r} is none of the values that --observe names: " + names,
-        )
-    return np.asarray(codes[found], np.float64)
-
-
-# -- Episodes -------------------------------------------------------------------------------------
-
-
 class _Clock:
-    """Sees that time runs forward, and finds the holes in it.
+    """Sees that time runs forward, and finds the holes in it, in one file after the other.
 
     The usual step of a file is the median of the steps in the first rows read of it.
     """
@@ -559,15 +429,7 @@ class _Clock:
     def open(self, path: str) -> None:
         """Begin a file."""
         self._path = path
-        self._last = self._usual = self._first_date = np.nan
-
-    def seconds(self, times: NDArray[np.float64], are_dates: bool) -> NDArray[np.float64]:
-        """The same times; of dates, which are in microseconds, those since the first one."""
-        if not are_dates:
-            return times
-        if np.isnan(self._first_date):
-            self._first_date = times[0]
-        return (times - self._first_date) * _MICROSECOND
+        self._last = self._usual = np.nan
 
     def holes(
         self, times: NDArray[np.float64], starts: NDArray[np.bool_], piece: Piece
@@ -605,85 +467,164 @@ class _Clock:
         self._usual = usual
 
 
-class _Blocks:
-    """Sees that the rows of an episode stand together in a file.
+class _Reader:
+    """Turns one file into chunks; knows what matters of the rows before those it is given."""
 
-    An episode that comes back after another one would be cut there, and what leads from one of its
-    rows to the next would be lost without a word.
-    """
-
-    def __init__(self, names: Sequence[str]) -> None:
-        self._names = names
-        self._episodes: set[tuple[str, ...]] = set()
-        self._blocks = 0  # of these episodes
+    def __init__(self, table: Table, columns: LogColumns, clock: _Clock, noted: Noted) -> None:
+        self._table, self._columns, self._clock, self._noted = table, columns, clock, noted
+        self._variables = columns.observe.variables
+        self._observed = [v for v in self._variables if isinstance(v, str)]
+        usual = [name for name in USUAL_EPISODE if name in table.columns]
+        self._episode = usual if columns.episode is None else list(columns.episode)
+        self._failed = None if columns.failed is None else Condition.parse(columns.failed)
+        self._before = 0  # rows
+        self._first_date = np.nan
+        # Episodes that there were, their blocks of rows, and the latest one.
+        self._known: set[tuple[str, ...]] = set()
+        self._blocks = 0
         self._latest: tuple[str, ...] | None = None
+        # Whether the condition held in the row before, and whether that ended its episode.
+        self._held = self._ended = False
 
-    def starts(self, piece: Piece) -> NDArray[np.bool_]:
-        """The rows of the next piece that begin another episode."""
+    def chunks(self) -> Iterator[Chunk]:
+        """The rows that are learnt, piece by piece."""
+        columns, clock = self._columns, self._clock
+        wanted, factors = self._wanted()
+        only_compared = [x for x in wanted.gaps if x not in (*self._observed, columns.action)]
+        for piece in self._table.pieces(wanted):
+            for name, factor in factors.items():
+                piece.numbers[name] = piece.numbers[name] * factor
+            starts = self._starts(piece)
+            anew, holes = starts.copy(), np.zeros(piece.rows, np.bool_)
+            times = self._times(piece, wanted.date)
+            if clock.ticks:
+                holes = clock.holes(times, starts, piece)
+            starts |= holes
+            self._before += piece.rows
+            kept, fails = self._sift(piece, anew, starts)
+            if not kept.any():
+                continue
+            for name in only_compared:
+                if (lacks := kept & np.isnan(piece.numbers[name])).any():
+                    piece.refuse(int(np.argmax(lacks)), name)
+            if columns.leader_may_lack:
+                # Where the table knows its episodes, the action may be derived, and NaN.
+                for name in (*self._observed, *([columns.action] if piece.starts is None else [])):
+                    piece.refuse_unusable(name, kept)
+            rows = slice(None) if kept.all() else kept  # a slice copies nothing
+            yield Chunk(
+                source=self._table.path,
+                observations=np.column_stack([_encoded(piece, v) for v in self._variables])[rows],
+                actions=piece.numbers[columns.action][rows],
+                times=times[rows],
+                starts=np.flatnonzero(starts[rows]),
+                dt=clock.dt,
+                jumps=int(holes[rows].sum()),
+                cuts=piece.cuts,
+                failures=None if self._failed is None else np.flatnonzero(fails[rows]),
+            )
+
+    def _wanted(self) -> tuple[Wanted, dict[str, float]]:
+        """What is read, and what turns columns into units of the SI, for those that need it."""
+        table, columns, failed = self._table, self._columns, self._failed
+        learnt = [*self._observed, columns.action]
+        clock = [columns.time] if self._clock.ticks else []
+        compared = [failed.column] if failed is not None and failed.sign else []
+        told = [failed.column] if failed is not None and not failed.sign else []
+        categories = [v.name for v in self._variables if isinstance(v, Category)]
+        options = {
+            **dict.fromkeys([*compared, *told], "--failed"),
+            **dict.fromkeys([*self._observed, *categories], "--observe"),
+            **dict.fromkeys(self._episode, "--episode"),
+            **dict.fromkeys(clock, "--time"),
+            columns.action: "--action",
+        }
+        for name, option in options.items():
+            if name not in table.columns:
+                shown = ", ".join(name[:40] for name in table.columns[:20])
+                more = f" and {len(table.columns) - 20:,} more" if len(table.columns) > 20 else ""
+                stands_in = ", and --dt stands in for a clock" if option == "--time" else ""
+                raise ValueError(
+                    f"{table.path} has no column {name!r}; it has {shown}{more} ({option} names "
+                    f"the right one{stands_in})"
+                )
+        date = columns.time if clock and table.holds_dates(columns.time) else None
+        numbers = [*learnt, *compared, *(clock if date is None else [])]
+        try:
+            given = units_of(columns.units, numbers, table.columns, columns.time)
+        except ValueError as error:
+            raise ValueError(f"{table.path}: {error}") from None
+        self._noted.units |= given
+        gaps = [name for name in compared if name not in learnt]
+        gaps += learnt if columns.leader_may_lack else []
+        wanted = Wanted(numbers, [*self._episode, *categories, *told], gaps, date)
+        return wanted, {name: UNITS[unit][1] for name, unit in given.items()}
+
+    def _times(self, piece: Piece, date: str | None) -> NDArray[np.float64]:
+        if not self._clock.ticks:
+            rows = np.arange(self._before, self._before + piece.rows)
+            return rows * np.float64(self._clock.dt)
+        times = piece.numbers[self._columns.time]
+        if date is None:
+            return times
+        if np.isnan(self._first_date):
+            self._first_date = times[0]
+        return (times - self._first_date) * _MICROSECOND
+
+    def _starts(self, piece: Piece) -> NDArray[np.bool_]:
+        """The rows that begin another episode.
+
+        The rows of an episode have to stand together: one that comes back after another one would
+        be cut there, and what leads from one of its rows to the next be lost without a word.
+        """
         starts = np.zeros(piece.rows, np.bool_)
         if piece.starts is not None:
             starts[piece.starts] = True
             return starts
-        keys = [piece.texts[name] for name in self._names]
+        keys = [piece.texts[name] for name in self._episode]
         for key in keys:
             starts[1:] |= (key[1:] != key[:-1]).to_numpy()
         starts[0] = self._latest != tuple(key[0] for key in keys)
         self._latest = tuple(key[-1] for key in keys)
         came_back = None
         rows = np.flatnonzero(starts)
-        for row, *episode in zip(rows.tolist(), *(key.gather(rows) for key in keys), strict=True):
-            known = tuple(episode)
-            if known in self._episodes:
-                came_back = came_back or (row, known)
-            elif len(self._episodes) < _MOST_EPISODES:
-                self._episodes.add(known)
+        for row, *texts in zip(rows.tolist(), *(key.gather(rows) for key in keys), strict=True):
+            episode = tuple(texts)
+            if episode in self._known:
+                came_back = came_back or (row, episode)
+            elif len(self._known) < _MOST_EPISODES:
+                self._known.add(episode)
             else:
                 continue
             self._blocks += 1
         if came_back is not None:
-            row, known = came_back
-            names = ", ".join(self._names)
-            reached = piece.at(piece.rows - 1).removeprefix(piece.at(0).rpartition(", ")[0] + ", ")
+            row, episode = came_back
+            names, reached = ", ".join(self._episode), piece.at(piece.rows - 1).rpartition(", ")[2]
             raise ValueError(
-                f"{piece.at(row)}: the episode {', '.join(value[:40] for value in known)} "
-                f"({names}) comes back after another one: up to {reached}, "
-                f"{len(self._episodes):,} episodes take turns in {self._blocks:,} blocks of rows, "
-                "and each block would be taken for an episode of its own; sort the file by "
-                f"{names} and then by time"
+                f"{piece.at(row)}: the episode {', '.join(text[:40] for text in episode)} "
+                f"({names}) comes back after another one: up to {reached}, {len(self._known):,} "
+                f"episodes take turns in {self._blocks:,} blocks of rows, and each block would be "
+                f"taken for an episode of its own; sort the file by {names} and then by time"
             )
         return starts
 
-
-class _Sieve:
-    """Finds the rows that are learnt, and where episodes begin and fail because of others.
-
-    It knows of the row before the present ones whether a condition held in it, and whether it
-    ended its episode.
-    """
-
-    def __init__(self, noted: Noted) -> None:
-        self._noted = noted
-        self._held = self._ended = False
-
-    def sift(
-        self,
-        anew: NDArray[np.bool_],
-        starts: NDArray[np.bool_],
-        holds: NDArray[np.bool_] | None,
-        lacking: NDArray[np.bool_],
+    def _sift(
+        self, piece: Piece, anew: NDArray[np.bool_], starts: NDArray[np.bool_]
     ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
         """Which rows are kept, and which of them fail; marks ``starts`` after those that end one.
 
-        An episode begins ``anew`` where the log says so, and at ``starts``. What still ``holds``
-        is no second failure, and a hole in time does not make it one.
+        An episode begins ``anew`` where the log says so, and at ``starts``. A condition that still
+        holds is no second failure, and a hole in time does not make it one.
         """
+        lacking, fails = np.zeros((2, piece.rows), np.bool_)
+        for name in self._observed if self._columns.leader_may_lack else ():
+            lacking |= ~np.isfinite(piece.numbers[name])
         kept = ~lacking
-        fails = np.zeros(len(starts), np.bool_)
-        if holds is not None:
+        if self._failed is not None:
+            holds = self._failed.holds(piece)
             before = np.concatenate([[self._held], holds[:-1]]) & ~anew
             self._held = bool(holds[-1])
-            fails = holds & ~before
-            still = holds & before
+            fails, still = holds & ~before, holds & before
             self._noted.unplaced += int((fails & ~kept).sum())
             self._noted.after_failure += int((still & kept).sum())
             fails &= kept
@@ -693,3 +634,17 @@ class _Sieve:
         starts |= np.concatenate([[self._ended], ends[:-1]])
         self._ended = bool(ends[-1])
         return kept, fails
+
+
+def _encoded(piece: Piece, variable: str | Category) -> NDArray[np.float64]:
+    """Columns of the observation for one variable."""
+    if isinstance(variable, str):
+        return piece.numbers[variable]
+    encoder = ObservationEncoder(variable)
+    codes = np.array([encoder.encode({variable.name: value}) for value in variable.values])
+    places = {value: place for place, value in enumerate(variable.values)}
+    found = piece.texts[variable.name].replace_strict(places, default=-1).to_numpy()
+    if (found < 0).any():
+        why = "{!r} is none of the values that --observe names: " + ", ".join(variable.values)
+        piece.refuse(int(np.argmin(found)), variable.name, why)
+    return np.asarray(codes[found], np.float64)

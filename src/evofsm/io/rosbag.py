@@ -8,28 +8,25 @@ out, which makes a hole in time, and the row after it begins a new episode.
 
 from __future__ import annotations
 
-import heapq
 import math
 import re
 import tomllib
-from collections.abc import Iterable, Iterator, Mapping
+from array import array
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
-from itertools import chain, islice, pairwise
 from os import PathLike
 from pathlib import Path
 from typing import Any, NamedTuple, Self
 
 import numpy as np
+from numpy.typing import NDArray
 
 from evofsm.extras import needs
 from evofsm.fsm import positive
 from evofsm.io.tables import UNITS, OnRead, Piece, Table, Wanted
 from evofsm.io.vehicles import ACTION
 
-_ROWS_AT_ONCE = 4096
-# Messages in whose midst one may be recorded too late.
-_LATE = 256
 _SHORTEST = 1e-6  # [s]
 _NANOSECONDS = 1_000_000_000
 _STEP = re.compile(r"([A-Za-z_]\w*)((?:\[\d+\])*)")
@@ -185,119 +182,101 @@ class BagTable(Table):
         self.path = path
         self._topics = topics
         self._on_read = on_read
-        self.columns = ["time", *topics.variables]
-        self._speed = 0  # place of the speed from which the action is derived
-        if "v_follower" in topics.variables and ACTION not in topics.variables:
-            self._speed = self.columns.index("v_follower")
-            self.columns.append(ACTION)
+        self._derives = "v_follower" in topics.variables and ACTION not in topics.variables
+        self.columns = ["time", *topics.variables, *([ACTION] if self._derives else [])]
 
     def pieces(self, wanted: Wanted) -> Iterator[Piece]:
-        """All columns, whichever are wanted, some thousand rows at once."""
+        """All columns, whichever are wanted, as one piece."""
         if wanted.texts:
             raise ValueError(
                 f"{self.path}: of a bag numbers are read, and {wanted.texts[0]!r} is to be a text "
                 f"(of a truth value, which is 0 or 1, write --failed '{wanted.texts[0]}>0')"
             )
-        rows, before = self._with_action(self._rows()), 0
-        while some := list(islice(rows, _ROWS_AT_ONCE)):
-            numbers = dict(zip(self.columns, np.array(some).T, strict=True))
-            begins = np.zeros(int(before == 0), np.int64)
-            piece = Piece.of_numbers(self.path, before, numbers, begins)
-            for name in wanted.numbers:
-                if name in self._topics.variables and name not in wanted.gaps:
-                    piece.refuse_unusable(name)
-            yield piece
-            before += len(some)
-        if not before:
+        with _explained(self.path):
+            numbers = self._held(self._messages())
+        if not len(numbers["time"]):
             raise ValueError(
                 f"{self.path}: at no time are all variables known, none older than "
                 f"{self._topics.oldest:g} s (oldest in the file of --topics)"
             )
+        piece = Piece.of_numbers(self.path, 0, numbers, np.zeros(1, np.int64))
+        for name in wanted.numbers:
+            if name in self._topics.variables and name not in wanted.gaps:
+                piece.refuse_unusable(name)
+        yield piece
 
-    def _with_action(self, rows: Iterable[list[float]]) -> Iterator[list[float]]:
-        interval = self._topics.interval
-        for row, after in pairwise(chain(rows, [[math.nan] * len(self.columns)])):
-            if self._speed:
-                follows = math.isclose(after[0] - row[0], interval, rel_tol=1e-6)
-                change = after[self._speed] - row[self._speed]
-                row.append(change / interval if follows else math.nan)
-            yield row
-
-    def _rows(self) -> Iterator[list[float]]:
-        """Time and variables of each tick in which all are known."""
+    def _held(
+        self, messages: Mapping[str, tuple[NDArray[np.int64], Mapping[Field, NDArray[np.float64]]]]
+    ) -> dict[str, NDArray[np.float64]]:
+        """Of each tick in which all are known, the latest values before it."""
         topics = self._topics
         interval, oldest = (round(x * _NANOSECONDS) for x in (topics.interval, topics.oldest))
-        fields = {f for v in topics.variables.values() for f in (v.field, v.minus) if f}
-        of_topic = {
-            topic: [one for one in fields if one.topic == topic]
-            for topic in {one.topic for one in fields}
-        }
-        values: dict[Field, float] = {}
-        since: dict[str, int] = {}
-        first = tick = stamp = 0
-
-        def row() -> list[float] | None:
-            if len(since) < len(of_topic) or tick - min(since.values()) > oldest:
-                return None
-            return [(tick - first) / _NANOSECONDS] + [
-                v.factor * (values[v.field] - (values[v.minus] if v.minus else 0.0)) + v.offset
-                for v in topics.variables.values()
+        stamps = np.sort(np.concatenate([of_topic for of_topic, _ in messages.values()]))
+        # Ticks while anything was heard of lately: clocks may jump by years.
+        ends = np.append(np.flatnonzero(np.diff(stamps) > oldest + interval), len(stamps) - 1)
+        begins = np.append(0, ends[:-1] + 1)
+        ticks = np.concatenate(
+            [
+                np.arange(-((stamps[0] - begin) // interval), (end - stamps[0]) // interval + 1)
+                for begin, end in zip(stamps[begins], stamps[ends] + oldest, strict=True)
             ]
+        )
+        at = stamps[0] + interval * ticks[ticks * interval <= stamps[-1] - stamps[0]]
+        values: dict[Field, NDArray[np.float64]] = {}
+        known = np.ones(len(at), np.bool_)
+        for of_topic, fields in messages.values():
+            latest = np.searchsorted(of_topic, at, side="right") - 1
+            known &= (latest >= 0) & (at - of_topic[latest] <= oldest)
+            values |= {field: of_field[latest] for field, of_field in fields.items()}
+        numbers = {"time": (at - stamps[0])[known] / _NANOSECONDS}
+        for name, one in topics.variables.items():
+            value = values[one.field] - (values[one.minus] if one.minus else 0.0)
+            numbers[name] = (one.factor * value + one.offset)[known]
+        if self._derives:
+            action = np.diff(numbers["v_follower"], append=np.nan) / topics.interval
+            follows = np.diff(at[known], append=0) == interval
+            numbers[ACTION] = np.where(follows, action, np.nan)
+        return numbers
 
-        with _explained(self.path):
-            for stamp, topic, message in self._messages(set(of_topic)):
-                if not since:
-                    first = tick = stamp
-                while tick < stamp and (known := row()):
-                    yield known
-                    tick += interval
-                if tick < stamp:  # what is too old, or lacking, is so up to this message
-                    tick += -((tick - stamp) // interval) * interval
-                for field in of_topic[topic]:
-                    values[field] = field.read(message)
-                since[topic] = stamp
-            if tick == stamp and (known := row()):
-                yield known
-
-    def _messages(self, wanted: set[str]) -> Iterator[tuple[int, str, Any]]:
-        """When each message of a topic that is wanted was, its topic, and the message."""
+    def _messages(
+        self,
+    ) -> dict[str, tuple[NDArray[np.int64], dict[Field, NDArray[np.float64]]]]:
+        """Of each topic that is wanted, when its messages were, and what stands in their fields."""
         with needs("rosbags", "ros", f"{self.path}: a bag of ROS 2"):
             from rosbags.highlevel import AnyReader
             from rosbags.typesys import Stores, get_typestore
+        fields = {f for v in self._topics.variables.values() for f in (v.field, v.minus) if f}
+        of_topic = {one.topic: [f for f in fields if f.topic == one.topic] for one in fields}
+        stamps = {topic: array("q") for topic in of_topic}
+        values = {field: array("d") for field in fields}
         usual = get_typestore(Stores.LATEST)
         with AnyReader([Path(self.path)], default_typestore=usual) as reader:
             there = sorted({one.topic for one in reader.connections})
-            if lacking := sorted(wanted - set(there)):
+            if lacking := sorted(set(of_topic) - set(there)):
                 raise _BagError(f"it has no topic {lacking[0]!r}; it has {', '.join(there)}")
-            found = self._decoded(reader, wanted)
-            yield from _in_order(found) if self._topics.stamp == "header" else found
-
-    def _decoded(self, reader: Any, wanted: set[str]) -> Iterator[tuple[int, str, Any]]:
-        connections = [one for one in reader.connections if one.topic in wanted]
-        for connection, stamp, data in reader.messages(connections=connections):
-            self._on_read(len(data))
-            message = reader.deserialize(data, connection.msgtype)
-            if self._topics.stamp == "header":
-                header = getattr(message, "header", None)
-                if header is None:
-                    raise _BagError(
-                        f"messages of {connection.topic!r} ({connection.msgtype}) have no header; "
-                        'write stamp = "received"'
-                    )
-                stamp = header.stamp.sec * _NANOSECONDS + header.stamp.nanosec
-            yield stamp, connection.topic, message
-
-
-def _in_order(messages: Iterable[tuple[int, str, Any]]) -> Iterator[tuple[int, str, Any]]:
-    """The same in the order of their stamps, where none comes later than some hundred others."""
-    waiting: list[tuple[int, int, str, Any]] = []
-    for number, (stamp, topic, message) in enumerate(messages):
-        heapq.heappush(waiting, (stamp, number, topic, message))
-        if len(waiting) > _LATE:
-            at, _, topic, message = heapq.heappop(waiting)
-            yield at, topic, message
-    for at, _, topic, message in sorted(waiting):
-        yield at, topic, message
+            connections = [one for one in reader.connections if one.topic in of_topic]
+            for connection, stamp, data in reader.messages(connections=connections):
+                self._on_read(len(data))
+                message = reader.deserialize(data, connection.msgtype)
+                if self._topics.stamp == "header":
+                    if not hasattr(message, "header"):
+                        raise _BagError(
+                            f"messages of {connection.topic!r} ({connection.msgtype}) have no "
+                            'header; write stamp = "received"'
+                        )
+                    at = message.header.stamp
+                    stamp = at.sec * _NANOSECONDS + at.nanosec
+                stamps[connection.topic].append(stamp)
+                for field in of_topic[connection.topic]:
+                    values[field].append(field.read(message))
+        found = {}
+        for topic, of_one in stamps.items():
+            if not len(of_one):
+                raise _BagError(f"its topic {topic!r} has no messages")
+            order = np.argsort(np.array(of_one), kind="stable")
+            fields_of = {field: np.array(values[field])[order] for field in of_topic[topic]}
+            found[topic] = np.array(of_one)[order], fields_of
+        return found
 
 
 class _BagError(ValueError):
