@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 
 # Beside the machine, in folders of results.
 _RISK = "risk.evofsm"
-# How files of evofsm and logs of runs begin.
-_LEARNT = (b"PK\x03\x04", b"\x89MCAP")
+# How logs of runs begin.
+_MCAP = b"\x89MCAP"
 
 
 class Format(StrEnum):
@@ -51,9 +51,9 @@ def export(
 ) -> None:
     """Write what was learnt, or driven, in the formats of other tools."""
     _refuse_learnt(out)
+    from evofsm import store
     from evofsm.fsm import visible
     from evofsm.io import graphs
-    from evofsm.store import storage
 
     model, dead_ends = _learnt(file)
     bounds = {"least": least, "evidence": evidence}
@@ -65,27 +65,36 @@ def export(
     if out is None:
         sys.stdout.write(visible(text))
         return
-    with storage.replacing(out) as place:
+    with store.replacing(out) as place:
         place.write(visible(text).encode())
 
 
 def _refuse_learnt(out: Path | None) -> None:
     """Raise where a graph would take the place of what cannot be had again."""
-    if out is not None and out.is_file():
-        with out.open("rb") as file:
-            if file.read(max(map(len, _LEARNT))).startswith(_LEARNT):
-                raise ValueError(
-                    f"--out {out}: what was learnt or driven is kept there; it was left alone"
-                )
+    if out is not None and out.is_file() and _is_learnt(out):
+        raise ValueError(f"--out {out}: what was learnt or driven is kept there; it was left alone")
+
+
+def _is_learnt(file: Path) -> bool:
+    from evofsm.store import read_header
+
+    with file.open("rb") as start:
+        if start.read(len(_MCAP)) == _MCAP:
+            return True
+    try:
+        read_header(file)
+    except ValueError:
+        return False
+    return True
 
 
 def _learnt(file: Path) -> tuple[FSMModel, list[int] | None]:
     """The model, and its dead ends where the risk that was learnt with it is known."""
+    from evofsm import store
     from evofsm.driving import LatentRisk, assess_states
-    from evofsm.store import storage
 
     model, _ = load_model(file)
-    if not (file / _RISK).exists() or storage.read_header(file / _RISK).kind != "risk":
+    if not (file / _RISK).exists() or store.read_header(file / _RISK).kind != "risk":
         return model, None
     assessed = assess_states(model, LatentRisk.load(file / _RISK))
     return model, [one.state for one in assessed if one.is_dead_end]
