@@ -367,7 +367,7 @@ def test_files_with_different_steps_are_refused(tmp_path):
         (f'{HEADER}\nr,"v1,0,1\n{"x" * 90}'.encode(), "unclosed quote"),
         (f'{HEADER}\nr,"a"b,0,0,1,1,1,1\n'.encode(), "line 2: ',' expected after '\"'"),
         (f'"{HEADER}\nr,a,0\n'.encode(), "unclosed quote"),
-        (f"{HEADER}\n{'x,' * 3_000_000}".encode(), "of more than 1,000,000 bytes"),
+        (f"{HEADER}\n{'x,' * 3_000_000}".encode(), "a line of more than 1,000,000 bytes"),
     ],
 )
 def test_what_is_no_table_is_refused(tmp_path, content, said):

@@ -32,7 +32,7 @@ Find = Callable[[int, "str | None"], tuple[str, str]]
 
 # Read at once: enough that what Python does in between hardly counts. polars decodes a whole row
 # group for each slice of it, so small slices would only cost time.
-_CSV_BYTES, _PARQUET_ROWS = 1 << 22, 1 << 16
+_CSV_BYTES, _PARQUET_ROWS = 1 << 21, 1 << 16
 _LONGEST_LINE = 1_000_000
 
 _BYTE_ORDER_MARK, _GZIP, _PARQUET = b"\xef\xbb\xbf", b"\x1f\x8b", b"PAR1"
@@ -98,7 +98,7 @@ class Source:
         if os.path.exists(path) and not os.path.isfile(path):
             raise ValueError(f"{path} is a pipe or a device; write it to a file first")
         self.path = path
-        self.lines = 0  #: read so far
+        self.lines = 0  # read so far of one that is gzipped
         self._on_read = on_read
         self._raw = io.BufferedReader(io.FileIO(path))
         self._size = os.fstat(self._raw.fileno()).st_size
@@ -128,22 +128,26 @@ class Source:
                 late = "rows that came meanwhile are left out"
                 _log.warning("%s grew by %d bytes while it was read; %s", self.path, growth, late)
             return block
-        is_open = block.count(b'"') % 2 == 1
+        is_open = b'"' in block and block.count(b'"') % 2 == 1
         parts, room = [block], _LONGEST_LINE
-        # A quote that is never closed is left to whoever parses them.
-        while (is_open and room > 0 and parts[-1]) or not parts[-1].endswith(b"\n"):
+        while True:
+            is_whole = parts[-1].endswith(b"\n")
+            # A quote that is never closed is left to whoever parses them.
+            if is_whole and not (is_open and room > 0):
+                break
             line = self._take(_LONGEST_LINE, to_line_end=True)
+            if not line:
+                parts += [] if is_whole else [b"\n"]
+                break
+            parts.append(line)
             is_open ^= line.count(b'"') % 2 == 1
             room -= len(line)
             if room < 0 and not line.endswith(b"\n"):
+                where = f"line {self.lines}" if self._packed else f"byte {self._raw.tell():,}"
                 raise ValueError(
-                    f"{self.path}, after line {self.lines}: a line of more than {_LONGEST_LINE:,} "
-                    "bytes; this is no table"
+                    f"{self.path}, about {where}: a line of more than {_LONGEST_LINE:,} bytes; "
+                    "this is no table"
                 )
-            parts.append(line)
-            if not line:
-                parts.append(b"" if parts[-2].endswith(b"\n") else b"\n")
-                break
         return b"".join(parts) if len(parts) > 1 else block
 
     def _take(self, most: int, to_line_end: bool = False) -> bytes:
@@ -157,7 +161,8 @@ class Source:
                 f"{self.path}, after line {self.lines}: the gzip data ends early or is damaged "
                 f"(was a copy or a download interrupted, or is it still being written?): {error}"
             ) from error
-        self.lines += data.count(b"\n")
+        if self._packed:
+            self.lines += data.count(b"\n")
         self._on_read(self._raw.tell() - before)
         return data
 
@@ -315,15 +320,16 @@ class CsvTable(Table):
                 if reached == 0:
                     block, reached = block.partition(b"\n")[2], 1
                 found = self._plain(block, places, wanted.numbers)
+                is_plain = found is not None
                 if found is None:
                     rows = self._odd(block, reached)[1]
                     found = {
                         name: polars.Series([row[place] for row in rows], dtype=polars.String)
                         for name, place in places.items()
                     }
-                if len(found[wanted.all[0]]):
+                if n_rows := len(found[wanted.all[0]]):
                     yield wanted.piece(found, partial(self._find, block, reached))
-                reached = source.lines
+                reached += n_rows if is_plain else block.count(b"\n")
 
     def _plain(
         self, block: bytes, places: Mapping[str, int], numbers: Sequence[str]
