@@ -3,7 +3,7 @@
 They are not part of the package: run them from a checkout, ``python -m studies NAME``.
 """
 
-from studies.systems.rivals.rival import Rival
-from studies.systems.system import Box, Discrete, System
+from studies.rivals import Rival
+from studies.systems import Box, Discrete, System
 
 __all__ = ["Box", "Discrete", "Rival", "System"]

@@ -16,6 +16,8 @@ from studies import lib
 #: Where each study is, in the order in which the evidence tells them.
 STUDIES = {
     "closed-loop": "closed_loop:ClosedLoop",
+    "judges": "judges:Judges",
+    "tasks": "judges:Tasks",
 }
 _ABOUT = (
     "Each study asks one question and shows the numbers that its answer rests on, and which rows "

@@ -3,8 +3,8 @@
     pip install torch highway-env
     python tools/train_dqn.py highway-fast
 
-Weights go to ``studies/systems/weights/NAME.npz``; NumPy alone reads them from then on
-(``studies.systems.highway``). Deep Q-learning with a replay memory and a target network
+Weights go to ``studies/weights/NAME.npz``; NumPy alone reads them from then on
+(``studies.systems.read_weights``). Deep Q-learning with a replay memory and a target network
 (Mnih et al., "Human-level control through deep reinforcement learning", Nature 2015), and double
 Q-learning (van Hasselt et al. 2016). Its reward is the environment's own; it knows no guard.
 """
@@ -23,7 +23,7 @@ import numpy as np
 import torch
 from torch import nn
 
-WEIGHTS = Path(__file__).parents[1] / "studies/systems/weights"
+WEIGHTS = Path(__file__).parents[1] / "studies/weights"
 # Of each task: decisions to learn from, and the discount of what comes a decision later.
 TASKS = {"highway-fast": (20_000, 0.8), "merge": (15_000, 0.8), "intersection": (12_000, 0.95)}
 HIDDEN, BATCH, MEMORY = 128, 64, 15_000

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from evofsm.fsm import IntervalActions
 from evofsm.guard import ActionSet, BoxActions, Choices
-from studies.systems import make_system
-from studies.systems.system import Action, Box, Start, System, Vector
+from studies.systems import Action, Box, Start, System, Vector, make_system
 
 #: Controllers beside those of the system: actions drawn anew in each step, or held for a while, and
 #: feedback that would hold the system, were three in ten of its actions not drawn.
@@ -78,16 +77,16 @@ def _run(system: System, start: Start, kinds: Sequence[str]) -> Run:
     kind = kinds[int(draw.integers(len(kinds)))]
     propose = _controller(system, kind, draw)
     share = _DRAWN_HOLDING if kind == HOLDS else _DRAWN
-    observations, over, failed = [system.reset(start)], False, False
+    observations, over, failed = [system.reset(options={"start": start})[0]], False, False
     executed: list[Action] = []
     while not over:
         action = propose(observations[-1])
         if draw.random() < share:
             action = drawn(system, draw)
-        step = system.step(action)
+        observation, _, failed, truncated, _ = system.step(action)
         executed.append(action)
-        observations.append(step.observation)
-        over, failed = step.over, step.failed
+        observations.append(observation)
+        over = failed or truncated
     actions = np.array([encoded(system, one) for one in executed])
     return Run(np.array(observations), actions, tuple(executed), failed)
 
@@ -110,11 +109,7 @@ def _controller(system: System, kind: str, draw: np.random.Generator) -> Callabl
 
 def drawn(system: System, draw: np.random.Generator) -> Action:
     """Any action of a system, each alike."""
-    actions = system.actions
-    if not isinstance(actions, Box):
-        return int(draw.integers(actions.n_actions))
-    found = draw.uniform(actions.low, actions.high)
-    return float(found[0]) if len(found) == 1 else found
+    return system.actions.drawn(draw)
 
 
 def encoded(system: System, action: Action) -> NDArray[np.float64]:

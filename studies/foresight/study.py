@@ -24,8 +24,7 @@ from studies.foresight.ours import Learnt
 from studies.foresight.rivals import Logistic, Neighbours, Taylor
 from studies.old.frame import Frame, Progress, silent
 from studies.old.scores import auroc
-from studies.systems import make_system
-from studies.systems.system import Start
+from studies.systems import Start, make_system
 
 #: Who foresees: ours first, and of ours the one that all others are held against.
 OURS = ("evofsm-replay", "evofsm-counts", "evofsm-chain")

@@ -8,19 +8,15 @@ from studies.alarms.plan import Plan as Alarms
 from studies.breaks.plan import Plan as Breaks
 from studies.detection.plan import Plan as Detection
 from studies.foresight.plan import Plan as Foresight
-from studies.judges.plan import Plan as Judges
 from studies.old.study import Study
 from studies.prediction.plan import Plan as Prediction
 from studies.real.plan import Plan as Real
 from studies.sensitivity.plan import Plan as Sensitivity
-from studies.tasks.plan import Plan as Tasks
 
 #: By id.
 STUDIES: dict[str, type[Study[Any]]] = {
     study.id: study
     for study in (
-        Judges,
-        Tasks,
         Breaks,
         Detection,
         Alarms,

@@ -141,8 +141,7 @@ def test_noise_is_the_same_however_it_is_written(noisy, seed):
 @pytest.mark.parametrize("name", ["acc", "cartpole", "pendulum", "tanks", "reactor", "emergency"])
 def test_systems_are_learnt_however_they_are_written(name, seed):
     pytest.importorskip("gymnasium")
-    from studies.systems import make_system
-    from studies.systems.system import Start
+    from studies.systems import Start, make_system
 
     from evofsm.guard import Guard
 
@@ -156,11 +155,12 @@ def test_systems_are_learnt_however_they_are_written(name, seed):
         return Guard(**told, interval=system.interval, seed=seed)
 
     def walk(episode):
-        z = system.reset(Start.training(1, seed, episode))
+        z, _ = system.reset(options={"start": Start.training(1, seed, episode)})
         over = failed = False
         while not over:
             executed = yield z, system.propose(z), False
-            z, _, failed, over = system.step(executed)
+            z, _, failed, truncated, _ = system.step(executed)
+            over = failed or truncated
         yield z, None, failed
 
     assert compare(told, walk, make, otherwise, 4) > 0.0

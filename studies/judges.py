@@ -1,0 +1,660 @@
+"""Judges that are told nothing but failures: on ten systems, and on tasks that others set.
+
+A judge learns a system while controlling it, is frozen, and is tried on held-out episodes, the same
+ones for every judge. `Judges` takes each part of the learnt judge away; `Tasks` compares it with
+judges that are told more.
+
+Frame ``rows``: one judge on one system with one controller and one learning seed. ``failed``
+counts held-out ``episodes``, ``failed_while_learning`` and ``failed_late`` training ones
+(``failures`` says which, from 1); ``kept`` is the share of proposals that were executed exactly,
+``mean_change`` that of an action in halves of its range (of discrete ones the share changed);
+``score`` is the mean return, or mobility, with a bootstrap interval over episodes; ``p50_ms`` and
+``p99_ms`` are of a held-out decision, and alone depend on the machine.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Annotated, Any, ClassVar, NamedTuple, Self
+
+import numpy as np
+import polars as pl
+from matplotlib.figure import Figure as Drawn
+from typer import Option
+
+from evofsm.driving import TOLD, guard_for_family
+from evofsm.guard import Guard, SceneRisk, learnt_guard, run_episode
+from evofsm.paper import Figure, Page, Table
+from studies import lib
+from studies.lib import ALL, FIRST, Frames, Study, Target, at_least, at_most, frame_of
+from studies.rivals import Counted, Unrevised, rivals_of
+from studies.systems import SYSTEMS, TASKS, Cars, Start, System, lacking, make_system
+
+#: Parts of the learnt judge that can be taken away, each with what is left then.
+PARTS: dict[str, str] = {
+    "stretches": "no disturbances at all",
+    "memory": "independent residuals in place of remembered stretches",
+    "products": "no products of variables and actions",
+    "lags": "no latest change and previous action",
+    "doubt": "lags are used even where they foresaw failure that never came",
+    "jumps": "jumps are learnt like all else",
+    "carried": "no residual is carried on where a variable saturates",
+    "drift": "the model is not corrected where the system has changed",
+    "observer": "variables are taken as they are seen, however noisy sensors are",
+    "margin": "no margin",
+    "backups": "constant backups alone",
+    "breaks": "it is not noticed where disturbances get worse",
+    "states": "one state only: nothing may change",
+}
+#: Our judges: of variables, and of scenes.
+OURS = ("learnt", "scene")
+#: Tasks of which more was asked: learning seeds, and training episodes.
+ACC, ACC_SEEDS, ACC_TRAIN = ("acc", "acc-5"), 20, 200
+
+
+# -- Judges by name -------------------------------------------------------------------------------
+
+
+def make_judge(name: str, system: System, without: Sequence[str] = (), seed: int = 0) -> Any:
+    """A judge by its name.
+
+    Parameters
+    ----------
+    name : str
+        ``learnt``, ``scene``, ``kinematic``, ``counted``, ``unrevised``, one of `rivals_of` the
+        system, or ``module:Name`` of a class that is made with the system and a seed. It has the
+        methods of a `Rival`, or, as an `ActionJudge`, says how dangerous actions are: then a guard
+        is made of it.
+    system : System
+    without : sequence of str
+        Parts of the learnt judge that are taken away.
+    seed : int
+
+    Raises
+    ------
+    ValueError
+        If there is no such judge, or it knows nothing of the system.
+    TypeError
+        If what is named makes no judge.
+    """
+    told: dict[str, Any] = {**system.actions.settings, "interval": system.interval, "seed": seed}
+    if ":" in name:
+        own = lib.imported(name)(system, seed)
+        if all(hasattr(own, method) for method in ("begin", "decide", "end", "freeze")):
+            return own  # a guard, too, which has a judge beside
+        if hasattr(own, "judge"):
+            return Guard(**told, judge=own)
+        raise TypeError(
+            f"{name} makes a {type(own).__name__}, which is no judge: it has neither judge, "
+            "nor begin, decide, end and freeze"
+        )
+    if name == "learnt":
+        if system.horizon is not None:
+            told["horizon"] = system.horizon
+        return learnt_guard(**told, without=tuple(without))
+    if name == "kinematic":
+        if not isinstance(system, Cars):
+            raise ValueError(f"{system.name} has no cars; the kinematic judge knows nothing else")
+        return guard_for_family(system.family, seed=seed)
+    if name == "scene":
+        shown: Any = system
+        if not hasattr(shown, "columns"):
+            raise ValueError(f"{system.name} shows no objects; the judge of scenes knows no others")
+        layout = {"columns": shown.columns, "relative": shown.relative}
+        judge = SceneRisk(shown.interval, shown.actions.n_actions, **layout)
+        return Guard(**told, judge=judge)
+    known: dict[str, Callable[[], Any]] = {
+        "unrevised": Unrevised,
+        "counted": partial(Counted, system),
+        **rivals_of(system),
+    }
+    if name not in known:
+        names = ", ".join(("learnt", "kinematic", "scene", *known))
+        raise ValueError(f"{system.name} has no judge {name!r}; there are {names}")
+    return known[name]()
+
+
+# What judges of ours are told that stand in a guard.
+_TOLD = {
+    "LearntRisk": TOLD["learnt"],
+    "LatentRisk": TOLD["kinematic"],
+    "SceneRisk": f"{TOLD['learnt']}, and how a row is laid out",
+}
+
+
+def told_to(judge: Any) -> str:
+    """What a judge is told, in a few words: as it says itself in ``told``, if it is not ours."""
+    if isinstance(judge, Guard):  # its own judge is None where that does not learn
+        judge = getattr(judge.reviser, "risk", judge.judge)
+    return str(getattr(judge, "told", _TOLD.get(type(judge).__name__, "not said")))
+
+
+# -- A trial --------------------------------------------------------------------------------------
+
+
+class Ended(NamedTuple):
+    """What came of one episode."""
+
+    failed: bool
+    score: float
+    kept: int  #: proposals that were executed exactly
+    changes: float  #: sum over decisions
+    times: list[float]  #: of each decision [s]
+    speed: float  #: mean [m/s]; NaN where nothing drives
+
+
+def run(system: System, judge: Any, start: Start) -> Ended:
+    """One episode of a system under a judge, which learns from it unless it is frozen."""
+    times: list[float] = []
+    kept, changes = 0, 0.0
+    for one in run_episode(system, judge, system, options={"start": start}):
+        executed, proposed = one.revision.executed, system.proposed
+        times.append(one.seconds)
+        kept += np.array_equal(executed, proposed)
+        changes += system.actions.change(executed, proposed)
+    return Ended(one.failed, system.score, kept, changes, times, system.speed)
+
+
+def trial(
+    name: str,
+    controller: str | None = None,
+    judge: str = "learnt",
+    without: str = "",
+    seed: int = 0,
+    train: int | None = None,
+    test: int = 100,
+    base: int = 0,
+    late: int = 30,
+    rounds: int = 100,
+) -> dict[str, Any]:
+    """Let a judge learn a system while controlling it, freeze it, and try it on held-out episodes.
+
+    Parameters
+    ----------
+    name, controller : str
+        As `make_system` takes them.
+    judge, without : str
+        As `make_judge` takes them; parts that are taken away with commas.
+    seed : int
+        Of the training episodes, and of the judge.
+    train : int, optional
+        Training episodes; without it as many as the system's own.
+    test : int
+        Held-out episodes, the same for every seed.
+    base : int
+        Of everything: another one draws other episodes, held-out ones too.
+    late : int
+        A failure after so many training episodes is a late one.
+    rounds : int
+        Of the bootstrap.
+
+    Examples
+    --------
+    >>> row = trial("acc", judge="unrevised", train=2, test=5)
+    >>> row["failed"], row["kept"], row["mean_change"]
+    (5, 1.0, 0.0)
+    """
+    system = make_system(name, controller)
+    made = make_judge(judge, system, lib.names_in(without), seed)
+    train = system.train if train is None else train
+    learnt = [run(system, made, Start.training(base, seed, k)) for k in range(train)]
+    made.freeze()
+    held_out = [run(system, made, Start.held_out(base, k)) for k in range(test)]
+    failures = [place for place, one in enumerate(learnt, start=1) if one.failed]
+    by_late = [one.score for one in learnt[max(0, late - 10) : late]]
+    scores = np.array([one.score for one in held_out])
+    low, high = lib.bootstrap(lambda chosen: float(scores[chosen].mean()), test, rounds)
+    times = 1e3 * np.array([took for one in held_out for took in one.times])
+    speed = float(np.mean([one.speed for one in held_out]))
+    return {
+        "system": name,
+        "controller": system.controller,
+        "judge": judge,
+        "told": told_to(made),
+        "without": without,
+        "seed": seed,
+        "trained": train,
+        "failed_while_learning": len(failures),
+        "failed_late": sum(place > late for place in failures),
+        "failures": failures,
+        "score_by_late": float(np.mean(by_late)) if by_late else None,
+        "episodes": test,
+        "failed": sum(one.failed for one in held_out),
+        "measure": system.measure,
+        "score": float(scores.mean()),
+        "score_low": low,
+        "score_high": high,
+        "kept": sum(one.kept for one in held_out) / len(times),
+        "mean_change": sum(one.changes for one in held_out) / len(times),
+        "p50_ms": float(np.quantile(times, 0.5)),
+        "p99_ms": float(np.quantile(times, 0.99)),
+        "speed": None if math.isnan(speed) else speed,
+    }
+
+
+_WHOLE = pl.col("without") == ""
+_BY = ["system", "controller", "judge", "without"]
+
+
+def summary(rows: pl.DataFrame, by: Sequence[str] = _BY) -> pl.DataFrame:
+    """Learning seeds of one judge as one line: counts of all, the worst, the run in the middle."""
+    middle = (pl.len() - 1) // 2
+    of_middle = [pl.col(one).sort_by("score").get(middle) for one in ("score", *_ENDS)]
+    medians = [pl.col(name).median() for name in ("kept", "mean_change", "p50_ms", "speed")]
+    lines = rows.group_by(by, maintain_order=True).agg(
+        pl.col("told", "trained", "measure").first(),
+        pl.col("failed", "episodes").sum(),
+        pl.col("failed_while_learning").sum().alias("learning"),
+        (pl.col("failed") / pl.col("episodes")).max().alias("worst"),
+        pl.col("failed_while_learning", "failed_late", "p99_ms").max(),
+        pl.col("score").min().alias("score_worst"),
+        *of_middle,
+        *medians,
+        runs=pl.len(),
+    )
+    return lib.with_share(lines, "failed", "episodes", "rate")
+
+
+_ENDS = ("score_low", "score_high")
+_FAILS = {
+    "failed": "{failed} of {episodes}",
+    "rate (95 %)": "{rate:%} ({rate_low:p}–{rate_high:p})",
+    "failed, worst seed": "{worst:%}",
+    "trained": "{trained}",
+    "failed while learning": "{failed_while_learning}",
+    "late": "{failed_late}",
+}
+_COSTS = {
+    "score (95 %)": "{score:.4g} ({score_low:.4g}–{score_high:.4g})",
+    "score, worst seed": "{score_worst:.4g}",
+    "kept": "{kept:%}",
+    "change": "{mean_change:.2f}",
+    "speed [m/s]": "{speed:.1f}",
+    "p50 [ms]": "{p50_ms:.2f}",
+    "p99 [ms]": "{p99_ms:.2f}",
+}
+_WHO = {"system": "{system}", "controller": "{controller}", "judge": "{judge}"}
+_NOTE = (
+    "Failed: held-out episodes of all learning seeds, which share them; intervals by Clopper and "
+    "Pearson as if they were independent. Failed while learning, late, p99: of the worst seed. "
+    "Score: mobility of cars, else the sum of rewards, of the seed in the middle, with a bootstrap "
+    "interval over episodes. Kept: proposals that were executed exactly; change: of the action, in "
+    "halves of its range. Times are those of a machine with all cores at work."
+)
+_IS_OURS = pl.col("judge").is_in(OURS) & _WHOLE
+_MARK = pl.when(_IS_OURS).then(pl.lit("ours"))
+
+
+def _draw_failed(lines: pl.DataFrame) -> Drawn:
+    """Held-out episodes that failed, a line for each system and controller."""
+    who = lines.select("system", "controller").unique(maintain_order=True)
+    names = [f"{system}, {controller}" for system, controller in who.iter_rows()]
+    figure, ((axes,),) = lib.panels(1, 1, 0.8 + 0.26 * len(names))
+    told = (pl.col("judge") == "unrevised", ~pl.col("told").str.starts_with("nothing"))
+    looks: dict[str, tuple[lib.Look, pl.Expr]] = {
+        "controller alone": (lib.PLAIN, told[0]),
+        "told more": (lib.TOLD, told[1]),
+        "counted matrices": (lib.OTHER, pl.col("judge") == "counted"),
+        "ours, told nothing but failures": (lib.OURS, _IS_OURS),
+    }
+    for shift, (look, which) in zip((-0.24, -0.08, 0.08, 0.24), looks.values(), strict=True):
+        some = lines.filter(which)
+        at = [names.index(f"{one['system']}, {one['controller']}") for one in some.to_dicts()]
+        rate, low, high = (100.0 * some[name].to_numpy() for name in ("rate", *_RATE))
+        lib.dots(axes, look, np.array(at) + shift, rate, low, high)
+    lib.name_lines(axes, names)
+    lib.scale_percent(axes)
+    axes.set_xlabel("failed [% of held-out episodes]")
+    shown = {name: look for name, (look, which) in looks.items() if len(lines.filter(which))}
+    lib.legend(figure, shown)
+    return figure
+
+
+_RATE = ("rate_low", "rate_high")
+
+
+# -- The study of judges --------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True)
+class Judges(Study):
+    """How often systems fail under the learnt judge, whole and with each part taken away.
+
+    It is told the range of the action, the interval, and which episodes failed. It learns while it
+    decides; then it is frozen and tried on held-out episodes.
+    """
+
+    name = "judges"
+    needed: ClassVar[dict[str, str]] = {"gymnasium": "gym"}
+
+    systems: Annotated[
+        str, Option(help="Systems with commas, or families of scenarios; all is ten.")
+    ] = ALL
+    without: Annotated[
+        str, Option(help="Parts to take away, each by itself, with commas; all, or none.")
+    ] = ALL
+    controllers: Annotated[
+        str, Option(help="Controllers with commas; all, or first: the first one of each system.")
+    ] = ALL
+    seeds: Annotated[int, Option(min=1, help="Learning seeds.")] = 5
+    train: Annotated[
+        int | None, Option(min=1, help="Training episodes; as many as suit a system if not given.")
+    ] = None
+    test: Annotated[int, Option(min=1, help="Held-out episodes.")] = 100
+
+    def shortened(self) -> Self:
+        """One seed, one controller of each system, no part taken away."""
+        return replace(
+            self,
+            without="none" if self.without == ALL else self.without,
+            controllers=FIRST if self.controllers == ALL else self.controllers,
+            seeds=1,
+            train=min(self.train or 30, 30),
+            test=min(self.test, 20),
+        )
+
+    @property
+    def parts(self) -> tuple[str, ...]:
+        """Parts that are taken away.
+
+        Raises
+        ------
+        ValueError
+            If there is no such part.
+        """
+        if self.without in (ALL, "none"):
+            return tuple(PARTS) if self.without == ALL else ()
+        named = tuple(dict.fromkeys(lib.names_in(self.without)))
+        if wrong := [part for part in named if part not in PARTS]:
+            raise ValueError(f"there is no part {wrong[0]!r}; there are {', '.join(PARTS)}")
+        return named
+
+    def run(self, workers: int | None = None) -> dict[str, pl.DataFrame]:
+        """Try all that is named, system by system."""
+        tasks: list[partial[dict[str, Any]]] = []
+        names = SYSTEMS if self.systems == ALL else lib.names_in(self.systems)
+        for name in dict.fromkeys(names):
+            system = make_system(name)
+            for controller in system.chosen(self.controllers):
+                one = partial(trial, name, controller, test=self.test, base=self.seed)
+                tasks.append(partial(one, "unrevised", train=0))
+                for seed in range(self.seeds):
+                    learning = partial(one, seed=seed, train=self.train)
+                    if isinstance(system, Cars):
+                        tasks.append(partial(learning, judge="kinematic"))
+                    tasks += [partial(learning, without=part) for part in ("", *self.parts)]
+        return {"rows": frame_of(lib.parallel(tasks, workers, "Learning and trying"))}
+
+    def page(self, found: Frames) -> Page:
+        """What fails, what each part is worth, and where it loses."""
+        rows = found["rows"]
+        whole = summary(rows.filter(_WHOLE))
+        parts: list[Table | Figure] = [
+            Table("The judges on every system", whole, _WHO | _FAILS | _COSTS, _NOTE, _MARK),
+            Figure(
+                "judges-failed",
+                "How often systems fail",
+                "Held-out episodes of all learning seeds, with 95 % intervals as if they were "
+                "independent; linear up to 1 %, logarithmic beyond.",
+                partial(_draw_failed, whole),
+            ),
+        ]
+        if self.parts:
+            learnt = summary(rows.filter(judge="learnt"), ["system", "without"])
+            left = pl.col("without").replace_strict(PARTS, default="whole")
+            parts.append(
+                Table(
+                    "What each part is worth",
+                    learnt.with_columns(left=left),
+                    {"system": "{system}", "without": "{without}", "that is": "{left}"}
+                    | {"failed": "{failed} of {episodes}", "while learning": "{learning}"}
+                    | {"worst seed": "{worst:%}", **_COSTS},
+                    "All controllers and learning seeds of a system together; failures while "
+                    "learning of all of them.",
+                    pl.when(_WHOLE).then(pl.lit("ours")),
+                )
+            )
+        ours = whole.filter(judge="learnt")
+        few = (pl.col("failed") > 0) | (pl.col("kept") < 0.25) | (pl.col("p99_ms") > 1.5)
+        both = lib.compared(
+            whole.filter(pl.col("judge").is_in(["learnt", "kinematic"])), _IS_OURS, _BY[:2]
+        )
+        told = (pl.col("rate") < pl.col("rate_ours")) | (
+            pl.col("score") > pl.col("score_ours") + 0.01
+        )
+        return Page(
+            name=self.name,
+            about=_ABOUT_JUDGES,
+            parts=parts,
+            command=lib.command_line(),
+            lost=[
+                Table(
+                    "Failures held out, less than a quarter of the proposals kept, or one decision "
+                    "of a hundred above 1.5 ms",
+                    ours.filter(few),
+                    _WHO | _FAILS | _COSTS,
+                ),
+                Table(
+                    "The kinematic judge, which is told the physics, fails less or gets further",
+                    both.filter(told),
+                    {"system": "{system}", "failed": "{rate:%} against {rate_ours:%}"}
+                    | {"mobility": "{score:.3f} against {score_ours:.3f}"},
+                    "The kinematic judge against the learnt one.",
+                ),
+            ],
+            facts=self.facts,
+            packages=("scipy", "gymnasium"),
+        )
+
+
+_ABOUT_JUDGES = """Does the learnt judge keep any system from failing, and which of its parts does
+that?
+
+The learnt judge is told the range of the action, the time between decisions, and which episodes
+failed; nothing else, and the same settings everywhere. It learns while it decides; then it is
+frozen, and decides held-out episodes, the same ones for every judge. Nothing is safe before the
+first failure of each kind, as long as nobody tells of it."""
+
+# -- The study of tasks ---------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True)
+class Tasks(Study):
+    """How often tasks that others set fail under ours, and under judges that are told more."""
+
+    name = "tasks"
+    needed: ClassVar[dict[str, str]] = {"gymnasium": "gym"}
+
+    tasks: Annotated[
+        str, Option(help="Tasks with commas; all, or none where --task is given, if not named.")
+    ] = ""
+    task: Annotated[str, Option(help="A task of your own, module:Class; see docs/tasks.md.")] = ""
+    judge: Annotated[str, Option(help="A judge of your own on every task, module:Class.")] = ""
+    controllers: Annotated[
+        str, Option(help="Controllers with commas; all, or first: the first one of each task.")
+    ] = ALL
+    seeds: Annotated[int, Option(min=1, help="Learning seeds; of acc 20 at least.")] = 5
+    train: Annotated[
+        int | None,
+        Option(min=1, help="Training episodes; 200 of acc, as many as suit others if not given."),
+    ] = None
+    test: Annotated[int, Option(min=1, help="Held-out episodes.")] = 100
+    acc_seeds: int = ACC_SEEDS
+    rounds: int = 1000  #: of the bootstrap
+
+    def shortened(self) -> Self:
+        """One seed of 20 training episodes on three tasks."""
+        return replace(
+            self,
+            tasks=self.tasks or ("" if self.task else "acc,cartpole,pendulum"),
+            controllers=FIRST if self.controllers == ALL else self.controllers,
+            seeds=1,
+            train=min(self.train or 20, 20),
+            test=min(self.test, 10),
+            acc_seeds=1,
+            rounds=100,
+        )
+
+    def named(self) -> tuple[list[str], list[str]]:
+        """Tasks to run, and a sentence on those whose package is missing."""
+        wanted = self.tasks or ("" if self.task else ALL)
+        names = list(TASKS) if wanted == ALL else lib.names_in(wanted)
+        left_out = [f"{name} is left out: {lacking(name)}" for name in names if lacking(name)]
+        named = [name for name in names if not lacking(name)]
+        return list(dict.fromkeys([self.task, *named] if self.task else named)), left_out
+
+    def run(self, workers: int | None = None) -> dict[str, pl.DataFrame]:
+        """Try all that is named, task by task.
+
+        Raises
+        ------
+        ValueError
+            If there is no such task or judge.
+        TypeError
+            If a class of one's own makes none.
+        """
+        names, left_out = self.named()
+        if not names:
+            raise ValueError(f"nothing to run: {'; '.join(left_out)}")
+        tasks: list[partial[dict[str, Any]]] = []
+        for name in names:
+            system = make_system(name)
+            rivals = ["unrevised", *rivals_of(system)]
+            own = [self.judge] if self.judge and self.judge not in rivals else []
+            for judge in own:
+                make_judge(judge, system)  # so that a wrong one shows at once
+            train = ACC_TRAIN if self.train is None and name in ACC else self.train
+            train = train or system.train
+            late = min(50, train // 2)
+            for controller in system.chosen(self.controllers):
+                one = partial(trial, name, controller, test=self.test, base=self.seed)
+                one = partial(one, rounds=self.rounds, late=late)
+                tasks += [partial(one, judge, train=0, late=0) for judge in rivals]
+                for seed in range(max(self.seeds, self.acc_seeds) if name in ACC else self.seeds):
+                    learners = dict.fromkeys([*own, *system.learners])
+                    tasks += [partial(one, judge, seed=seed, train=train) for judge in learners]
+        return {"rows": frame_of(lib.parallel(tasks, workers, "Learning and trying"))}
+
+    def page(self, found: Frames) -> Page:
+        """What fails, what it costs, and where it loses."""
+        rows = found["rows"]
+        lines = summary(rows)
+        told = ~pl.col("told").str.starts_with("nothing")
+        unfailing = lines.filter(told & (pl.col("failed") == 0))
+        best = unfailing.group_by("system", "controller").agg(best=pl.col("score").max())
+        lines = lines.join(best, on=["system", "controller"], how="left", maintain_order="left")
+        above = (pl.col("best") > 0) & (pl.col("score") > 0)
+        lines = lines.with_columns(of_told=pl.when(above).then(pl.col("score") / pl.col("best")))
+        who, ours = {**_WHO, "told": "{told}"}, rows.filter(pl.col("judge").is_in(OURS))
+        left_out = self.named()[1]
+        return Page(
+            name=self.name,
+            about=_ABOUT_TASKS,
+            parts=[
+                Table("What fails", lines, who | _FAILS, _NOTE, _MARK),
+                Table(
+                    "What it costs",
+                    lines,
+                    who | _COSTS | {"of told": "{of_told:%}"},
+                    "Of told: the score, as a share of the highest one of those judges that are "
+                    "told more and never failed.",
+                    _MARK,
+                ),
+                Figure(
+                    "tasks-failed",
+                    "How often tasks fail",
+                    "Held-out episodes of all learning seeds, with 95 % intervals as if they were "
+                    "independent; linear up to 1 %, logarithmic beyond.",
+                    partial(_draw_failed, lines),
+                ),
+                Table(
+                    "While learning, seed by seed",
+                    ours,
+                    {"task": "{system}", "controller": "{controller}", "seed": "{seed}"}
+                    | {"episodes": "{trained}", "failed": "{failures}"}
+                    | {
+                        "return by then": "{score_by_late:.4g}",
+                        "held out": "{failed} of {episodes}",
+                    },
+                    "Training episodes that failed, counted from 1. Return by then: mean of the "
+                    "ten up to episode 50, or up to half of fewer than 100.",
+                ),
+            ],
+            command=lib.command_line(),
+            lost=list(_lost(lines)),
+            targets=frame_of([*_of_acc(ours), *_of_crashes(rows)]),
+            facts=self.facts | ({"left out": "; ".join(left_out)} if left_out else {}),
+            packages=("scipy", "gymnasium"),
+            sources={
+                "ACC: G. Anderson et al., Guiding Safe Exploration with Weakest Preconditions, "
+                "2023, arXiv:2209.14148": "https://arxiv.org/abs/2209.14148",
+                "Labelled tasks: A. W. Goodall et al., MASA-Safe-RL, 2025": (
+                    "https://github.com/sacktock/MASA-Safe-RL"
+                ),
+            },
+        )
+
+
+_ABOUT_TASKS = """Does it keep the tasks of others from failing, and at what cost?
+
+Tasks as others set them, with their equations, actions and rewards. The learnt judge is told the
+range of the action, the time between decisions, and which episodes failed; the same settings
+everywhere. Those that learn do so while they decide; then all are tried on the same held-out
+episodes. A failure ends an episode. Nothing is safe before the first failure of each kind, as long
+as nobody tells of it."""
+
+
+def _lost(lines: pl.DataFrame) -> Iterator[Table]:
+    """Rows in which ours fails, keeps little, or another judge does better."""
+    few = (pl.col("failed") > 0) | (pl.col("failed_late") > 0) | (pl.col("kept") < 0.25)
+    yield Table(
+        "Ours: failures held out or late in learning, or less than a quarter of proposals kept",
+        lines.filter(_IS_OURS & few),
+        _WHO | _FAILS | {"kept": "{kept:%}"},
+    )
+    both = lib.compared(lines, _IS_OURS, ["system", "controller"])
+    none = (pl.col("failed") == 0) & (pl.col("failed_ours") == 0)
+    same = 0.01 * pl.col("score_ours").abs()
+    more = pl.col("score") > pl.col("score_ours") + same
+    kept = pl.col("kept") > pl.col("kept_ours") + 0.05
+    kept &= pl.col("score") > pl.col("score_ours") - same
+    better = (pl.col("rate") < pl.col("rate_ours")) | (none & (more | kept))
+    yield Table(
+        "Judges that fail less often, or return more or keep more while none fails",
+        both.filter((pl.col("judge") != "unrevised") & better),
+        {**_WHO, "told": "{told}", "failed": "{rate:%} against {rate_ours:%}"}
+        | {"score": "{score:.4g} against {score_ours:.4g}"}
+        | {"kept": "{kept:%} against {kept_ours:%}"}
+        | {"p50 [ms]": "{p50_ms:.2f} against {p50_ms_ours:.2f}"},
+        "Theirs against ours.",
+    )
+
+
+def _of_acc(ours: pl.DataFrame) -> Iterator[Target]:
+    """What was asked of acc, with as many seeds and episodes as it was asked of."""
+    for task, least in (("acc", 545.0), ("acc-5", 520.0)):
+        rows = ours.filter(pl.col("trained") >= ACC_TRAIN, system=task)
+        if len(rows) < ACC_SEEDS:
+            continue
+        learning = rows["failed_while_learning"].to_numpy().max()
+        yield at_most(f"{task}: failures while learning, worst seed", learning, 2)
+        clean = float((rows["failed_late"] == 0).to_numpy().mean())
+        what = f"{task}: seeds without a failure after episode 50"
+        yield at_least(what, clean, 0.95, "{:.0%}")
+        by_late = float(np.median(rows["score_by_late"].to_numpy()))
+        yield at_least(f"{task}: return by episode 50, median seed", by_late, least, "{:.0f}")
+
+
+def _of_crashes(rows: pl.DataFrame) -> Iterator[Target]:
+    """Of highway-env: how many crashes fewer there are than without a guard, and at what speed."""
+    lines = summary(rows.filter(pl.col("judge").is_in(["scene", "unrevised"])))
+    both = lib.compared(lines, _IS_OURS, ["system", "controller"])
+    for one in both.filter(pl.col("episodes") >= 200).to_dicts():
+        who, fewer = f"{one['system']}, {one['controller']}", 1.0 - one["rate_ours"] / one["rate"]
+        least = 0.7 if one["system"] == "intersection" else 0.9
+        yield at_least(f"{who}: crashes fewer", fewer, least, "{:.0%}")
+        kept = one["speed_ours"] / one["speed"]
+        yield at_least(f"{who}: speed kept", kept, 0.85, "{:.0%}")

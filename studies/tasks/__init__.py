@@ -1,1 +1,0 @@
-"""Tasks that others set: how often each judge lets them fail, and what it was told."""

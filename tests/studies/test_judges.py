@@ -1,0 +1,318 @@
+"""A trial learns, is frozen, and counts what it does held out; the studies run what they name."""
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+import pytest
+from studies import judges
+from studies.judges import PARTS, Judges, Tasks, make_judge, run, summary, told_to, trial
+from studies.rivals import Rival
+from studies.systems import CartPole, Start, make_system
+
+PAGE = Path(__file__).parents[2] / "docs" / "tasks.md"
+
+
+class Timid(Rival):
+    """Always the lowest action once it has seen a failure; it writes down what it is told."""
+
+    told = "to be careful"
+
+    def __init__(self, **given):
+        self.given = given
+        self.frozen = self.afraid = False
+        self.ended = []
+
+    def begin(self):
+        self.decisions = 0
+
+    def action(self, observation, proposal):
+        self.decisions += 1
+        return self.given.get("low", 0) if self.afraid else proposal
+
+    def end(self, failed=False, observation=None):
+        self.ended.append((failed, self.decisions, self.frozen))
+        self.afraid = self.afraid or (failed and not self.frozen)
+
+    def freeze(self):
+        self.frozen = True
+
+
+@pytest.fixture
+def made(monkeypatch):
+    """The timid one in place of the learnt guard."""
+    every = []
+
+    def learnt_guard(**given):
+        every.append(Timid(**given))
+        return every[-1]
+
+    monkeypatch.setattr(judges, "learnt_guard", learnt_guard)
+    return every
+
+
+def test_failures_are_counted_while_learning_and_held_out(made):
+    row = trial("acc", train=4, test=6, without="margin,lags", seed=3)
+    assert (row["failures"], row["failed"], row["episodes"]) == ([1], 0, 6)
+    assert (row["kept"], row["mean_change"], row["told"]) == (0.0, 2.0, "to be careful")
+    (guard,) = made
+    given = {"low": -2.0, "high": 2.0, "interval": 0.02, "seed": 3, "without": ("margin", "lags")}
+    assert guard.given == given
+    assert [frozen for *_, frozen in guard.ended] == [False] * 4 + [True] * 6
+    failed, decisions, _ = guard.ended[0]
+    assert failed
+    assert decisions < 100
+
+
+def test_failures_after_so_many_episodes_are_late():
+    row = trial("acc", train=33, test=1, judge="unrevised")
+    assert (row["failed_while_learning"], row["failed_late"]) == (33, 3)
+
+
+def test_a_system_may_tell_its_horizon_and_actions_of_any_kind(made, monkeypatch):
+    monkeypatch.setattr("studies.systems.Acc.horizon", 1.2)
+    for name in ("acc", "tanks", "reactor"):
+        trial(name, train=0, test=1)
+    assert made[0].given["horizon"] == 1.2
+    assert made[1].given["high"].tolist() == [1.0, 1.0]
+    assert made[2].given["n_actions"] == 3
+
+
+def test_proposals_that_are_kept_change_nothing_and_cars_score_mobility():
+    for name in ("tanks", "reactor", "emergency"):
+        row = trial(name, judge="unrevised", train=0, test=2)
+        assert (row["kept"], row["mean_change"]) == (1.0, 0.0)
+    assert row["measure"] == "mobility"
+    assert row["score"] == pytest.approx(1.0)
+
+
+def test_the_kinematic_judge_drives_as_it_does_elsewhere():
+    from evofsm.driving import drive, guard_for_family
+
+    system = make_system("emergency")
+    start = Start.training(0, 0, 4)
+    guard, other = guard_for_family(system.family), guard_for_family(system.family)
+    ended = run(system, guard, start)
+    driven = drive(other, system.family.draw(start.seed, start.episode, split="train"))
+    assert ended.kept == len(driven.decisions) - int(driven.changed.sum())
+    np.testing.assert_array_equal(system.road.episode().record, driven.record)
+
+
+@pytest.mark.parametrize("seed", [0, *(pytest.param(k, marks=pytest.mark.slow) for k in (1, 2))])
+def test_an_episode_of_ten_decisions_is_enough_to_learn_from(seed):
+    """It fails once, as it must, and then no more."""
+    row = trial("acc-5", train=6, test=4, base=7, seed=seed)
+    assert (row["failed_while_learning"], row["failed"]) == (1, 0)
+
+
+@pytest.mark.slow
+def test_it_turns_back_before_full_torque_only_just_holds():
+    """Leaning that far is no failure yet, but then the last digits of a model decide."""
+    assert trial("pendulum-cos", "random", train=30, test=40, base=7, seed=2)["failed"] <= 1
+
+
+class Blurred(CartPole):
+    """CartPole, seen with noise: of a hundredth of a radian, of 5 cm, and as much a second."""
+
+    def _begin(self, start):
+        super()._begin(start)
+        self.blur = start.rng(7)
+
+    def _observation(self):
+        return super()._observation() + self.blur.normal(0.0, [0.05, 0.05, 0.01, 0.05])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [1, 4])
+def test_failures_that_noise_shows_amid_what_was_survived_are_understood(seed, monkeypatch):
+    monkeypatch.setitem(judges.SYSTEMS, "blurred", Blurred)
+    assert trial("blurred", train=30, test=20, base=7, seed=seed)["failed"] <= 1
+
+
+@pytest.mark.slow
+def test_lags_that_foresee_failure_that_never_comes_are_left_out():
+    """Else nothing passes any more on the reactor, and what lasts longest is picked blindly."""
+    assert trial("reactor", train=30, test=10, base=7)["failed"] == 0
+    assert trial("reactor", without="doubt", train=30, test=10, base=7)["failed"] >= 3
+
+
+# -- The studies ----------------------------------------------------------------------------------
+
+
+def test_every_judge_part_and_seed_has_a_row(made):
+    study = Judges(systems="acc,emergency", without="margin,states", seeds=2, train=2, test=2)
+    found = study.run(workers=1)
+    tried = found["rows"].select("system", "judge", "without", "seed").rows()
+    assert tried[:4] == [
+        ("acc", "unrevised", "", 0),
+        ("acc", "learnt", "", 0),
+        ("acc", "learnt", "margin", 0),
+        ("acc", "learnt", "states", 0),
+    ]
+    assert tried.count(("emergency", "kinematic", "", 1)) == 1
+    assert len(tried) == len(set(tried)) == 7 + 9
+    parts = study.page(found).tables[-1]
+    assert parts.cells[1][:4] == ("acc", "margin", "no margin", "0 of 4")
+
+
+def test_parts_are_named_or_refused():
+    assert Judges().parts == tuple(PARTS)
+    assert Judges(without="none").parts == Judges().shortened().parts == ()
+    assert Judges(without="lags, jumps, lags").parts == ("lags", "jumps")
+    with pytest.raises(ValueError, match="no part 'wheels'; there are stretches"):
+        _ = Judges(without="wheels").parts
+
+
+@pytest.mark.slow
+def test_numbers_do_not_depend_on_the_number_of_processes():
+    judged = Judges(systems="acc,reactor", without="margin", seeds=1, train=3, test=3)
+    tasks = Tasks(tasks="acc-5", seeds=1, acc_seeds=1, train=6, test=4, rounds=9)
+    for study in (replace(judged, controllers="first"), tasks):
+        one, two = (study.run(workers=n)["rows"].drop("p50_ms", "p99_ms") for n in (1, 2))
+        assert one.equals(two)
+    assert one["judge"].to_list() == [
+        *("unrevised", "stopping-distance", "barrier"),
+        *("learnt", "counted"),
+    ]
+    assert one.filter(judge="learnt")["failed"].item() == 0
+
+
+def rows(judge, **columns):
+    frame = pl.DataFrame(columns)
+    told = {"learnt": "nothing but failures", "rss": "brakes", "unrevised": "nothing"}[judge]
+    given = {"system": "acc", "controller": "c", "judge": judge, "told": told, "without": ""}
+    given |= {"trained": 200, "measure": "return", "episodes": 100, "failed_while_learning": 1}
+    given |= {"failed_late": 0, "score_by_late": 550.0, "kept": 0.5, "mean_change": 0.1}
+    given |= {"p50_ms": 1.0, "p99_ms": 2.0, "speed": 20.0, "failed": 0, "score": 1.0}
+    given |= {"score_low": 0.0, "score_high": 2.0, "failures": None, "seed": 0}
+    missing = [pl.lit(value).alias(name) for name, value in given.items() if name not in columns]
+    return frame.with_columns(missing).select(*given)
+
+
+def test_learning_seeds_are_one_line_of_counts_the_worst_and_the_one_in_the_middle():
+    line = summary(rows("learnt", failed=[0, 3, 0], score=[5.0, 1.0, 3.0], kept=[0.1, 0.9, 0.2]))
+    (one,) = line.to_dicts()
+    assert (one["failed"], one["episodes"], one["worst"]) == (3, 300, 0.03)
+    assert (one["score"], one["score_worst"], one["kept"]) == (3.0, 1.0, 0.2)
+
+
+def test_whoever_fails_less_or_returns_more_is_where_it_loses_and_targets_follow():
+    found = pl.concat(
+        [
+            rows("unrevised", failed=[100]),
+            rows("rss", score=[2.0], kept=[0.6]),
+            rows("learnt", failed=[0] * 20, kept=[0.2] * 20, failed_late=[1, 1] + [0] * 18),
+        ],
+        how="vertical_relaxed",
+    )
+    page = Tasks(task="acc").page({"rows": found})
+    own, others = page.losses
+    assert own.frame["judge"].to_list() == ["learnt"]
+    assert others.frame["judge"].to_list() == ["rss"]
+    assert page.targets.select("measured", "met").rows() == [
+        ("1", True),
+        ("90%", False),
+        ("550", True),
+    ]
+    seconds = dict(zip(page.tables[2].header, page.tables[2].cells[-1], strict=True))
+    assert (seconds["judge"], seconds["of told"]) == ("learnt", "50.0 %")
+
+
+def test_crashes_and_speed_are_judged_where_enough_episodes_were_driven():
+    given = {"system": ["merge"], "episodes": [200]}
+    alone = rows("unrevised", failed=[100], speed=[25.0], **given)
+    ours = rows("learnt", failed=[5], speed=[20.0], **given)
+    targets = list(judges._of_crashes(pl.concat([alone, ours.with_columns(judge=pl.lit("scene"))])))
+    assert [(one.measured, one.met) for one in targets] == [("95%", True), ("80%", False)]
+
+
+# -- Tasks and judges of one's own ----------------------------------------------------------------
+
+
+@pytest.fixture
+def in_page(tmp_path, monkeypatch):
+    """The modules of the page, in the present folder."""
+    for name, text in re.findall(
+        r"```python\n# (\w+\.py)\n(.*?)```", PAGE.read_text("utf-8"), re.S
+    ):
+        (tmp_path / name).write_text(text, encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.mark.slow
+def test_the_task_and_the_judge_of_the_page_are_tried(in_page):
+    study = Tasks(task="my_task:Kettle", judge="my_judge:Careful", seeds=1, test=5, rounds=10)
+    found = {row["judge"]: row for row in study.run(workers=1)["rows"].to_dicts()}
+    assert list(found) == ["unrevised", "my_judge:Careful", "learnt", "counted"]
+    assert found["unrevised"]["failed"] == 5
+    careful = found["my_judge:Careful"]
+    assert (careful["failed"], careful["told"], careful["trained"]) == (0, "where it boils", 30)
+    assert found["learnt"]["failed"] == 0
+
+
+def test_a_guard_or_a_judge_of_actions_of_ones_own_is_tried(in_page):
+    recipe = (PAGE.parents[1] / "CONTRIBUTING.md").read_text("utf-8")
+    (text,) = re.findall(r"# my_judge\.py\n(.*?)```", recipe, re.S)
+    text = re.sub(r"^   ", "", text, flags=re.M) + (
+        "\nfrom evofsm.guard import Guard\n"
+        "def kettle(system, seed):\n    return Kettle()\nKettle.told = 'where it boils'\n"
+        "def timid(system, seed):\n"
+        "    return Guard(**system.actions.settings, interval=0.02, tolerance=0.01)\n"
+        "def made(system, seed):\n    return 3\n"
+    )
+    (in_page / "own.py").write_text(text, encoding="utf-8")
+    kettle, timid = (make_judge(f"own:{name}", make_system("acc")) for name in ("kettle", "timid"))
+    assert kettle.decide([50.0], 1.0).executed == 1.0
+    assert told_to(kettle) == "where it boils"
+    assert (timid.reviser.tolerance, told_to(timid)) == (0.01, "nothing but failures")
+    with pytest.raises(TypeError, match="own:made makes a int, which is no judge"):
+        make_judge("own:made", make_system("acc"))
+
+
+@pytest.mark.parametrize(
+    ("given", "text"),
+    [
+        ({"tasks": "aac"}, "there is no system 'aac'; there are acc, acc-5"),
+        ({"task": "nowhere:Task"}, "is it in this folder, or installed?"),
+        ({"tasks": "pendulum", "judge": "barrier"}, "pendulum has no judge 'barrier'"),
+        ({"tasks": "acc", "judge": "kinematic"}, "acc has no cars"),
+        ({"tasks": "acc", "judge": "scene"}, "acc shows no objects"),
+        ({"tasks": "acc", "controllers": "dqn"}, "acc has no controller 'dqn'; it has"),
+    ],
+)
+def test_wrong_names_show_at_once(given, text):
+    with pytest.raises(ValueError, match=re.escape(text)):
+        Tasks(**given, seeds=1, test=1).run(workers=1)
+
+
+def test_what_lacks_its_package_is_left_out_and_told(monkeypatch):
+    monkeypatch.setattr("studies.systems.find_spec", lambda name: None)
+    with pytest.raises(ValueError, match="nothing to run: masa-obstacle is left out: it needs"):
+        Tasks(tasks="masa-obstacle").run(workers=1)
+    named, left_out = Tasks(tasks="masa-obstacle,acc").named()
+    assert (named, len(left_out)) == (["acc"], 1)
+
+
+def test_nothing_is_tried_twice_and_controllers_are_those_that_are_named(monkeypatch):
+    asked = []
+    monkeypatch.setattr(judges.lib, "parallel", lambda tasks, *_: asked.append(tasks) or [{}])
+
+    def tried(**given):
+        Tasks(seeds=1, acc_seeds=2, **given).run(workers=1)
+        return [(one.args, tuple(one.keywords.items())) for one in asked.pop()]
+
+    for judge in ("", "learnt", "barrier", "unrevised"):
+        every = tried(tasks="acc,acc", task="acc", judge=judge)
+        assert len(every) == len(set(every)) == 3 + 2 * 2
+    for wanted, names in (
+        ("all", ["random", "hasty", "badgain"]),
+        ("first", ["random"]),
+        ("badgain, random, badgain", ["badgain", "random"]),
+    ):
+        assert (
+            list(dict.fromkeys(a[1] for a, _ in tried(tasks="cartpole", controllers=wanted)))
+            == names
+        )

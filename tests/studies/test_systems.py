@@ -1,0 +1,368 @@
+"""Systems start by seed, fail under their controllers, and can be kept from it; rivals do that."""
+
+import copy
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from studies import systems
+from studies.judges import make_judge, run, trial
+from studies.rivals import BackupShield, Counted, Rival, obstacle_shield, rivals_of, tried
+from studies.systems import HIGHWAY, SYSTEMS, TASKS, Box, Discrete, Start, System, make_system
+
+EVERY = [(name, controller) for name in SYSTEMS for controller in make_system(name).controllers]
+STARTS = [Start.held_out(11, episode) for episode in range(20)]
+
+
+def play(system, start, policy=None):
+    """Observations, actions and rewards of an episode, and whether it failed."""
+    observation, _ = system.reset(options={"start": start})
+    seen, done, paid, over = [observation], [], [], False
+    while not over:
+        action = system.propose(observation) if policy is None else policy(observation)
+        observation, reward, failed, truncated, info = system.step(action)
+        over = failed or truncated
+        assert info == {"failed": failed}
+        seen.append(observation)
+        done.append(action)
+        paid.append(reward)
+    return np.array(seen), np.array(done), np.array(paid), failed
+
+
+@pytest.mark.parametrize("name", SYSTEMS)
+def test_an_episode_is_drawn_by_its_start_alone_and_is_what_is_said_of_it(name):
+    system, other = make_system(name), make_system(name)
+    start = Start.training(0, 3, 1)
+    first = play(system, start)
+    play(system, Start.training(0, 3, 2))
+    for again in (play(system, start), play(other, start)):
+        assert all(np.array_equal(a, b) for a, b in zip(first, again, strict=True))
+    assert not np.array_equal(first[0][0], play(system, Start.held_out(0, 1))[0][0])
+    seen, done, _, failed = first
+    assert seen.shape[1] == len(system.variables)
+    assert len(done) == system.steps or (failed and len(done) < system.steps)
+    if isinstance(system.actions, Box):
+        assert (done >= system.actions.low).all()
+        assert (done <= system.actions.high).all()
+    else:
+        assert set(done) <= set(range(system.actions.n_actions))
+
+
+@pytest.mark.parametrize(("name", "controller"), EVERY)
+def test_a_controller_alone_fails_nearly_always(name, controller):
+    system = make_system(name, controller)
+    failed = sum(play(system, start)[3] for start in STARTS)
+    assert failed <= 6 if name == "cut_in" else failed >= 15
+
+
+def test_training_and_held_out_episodes_are_others():
+    starts = {Start.training(0, seed, one) for seed in range(3) for one in range(5)}
+    starts |= {Start.held_out(0, one) for one in range(5)}
+    assert len({start.rng(0).random() for start in starts}) == len(starts) == 20
+    assert STARTS[0].rng(0).random() != STARTS[0].rng(1).random()
+
+
+@pytest.mark.parametrize(
+    ("name", "controller", "error", "message"),
+    [
+        ("boat", None, ValueError, "no system 'boat'; there are acc"),
+        ("tanks", "shy", ValueError, "tanks has no controller 'shy'; it has full"),
+        ("collections:Counter", None, TypeError, "makes a Counter, which is no System"),
+    ],
+)
+def test_an_unknown_system_or_controller_is_refused(name, controller, error, message):
+    with pytest.raises(error, match=message):
+        make_system(name, controller)
+
+
+def test_a_change_is_told_in_halves_of_the_range():
+    assert Box((-2.0,), (2.0,)).change(1.0, 2.0) == 0.5
+    assert Box((0.0, 0.0), (1.0, 4.0)).change(np.array([0.5, 4.0]), np.array([1.0, 4.0])) == 0.5
+    assert [Discrete(3).change(*pair) for pair in ((1, 1), (1, 2))] == [0.0, 1.0]
+
+
+def test_acc_is_the_published_one():
+    seen, done, paid, failed = play(make_system("acc"), STARTS[1])
+    assert failed
+    np.testing.assert_allclose(np.diff(seen[:, 0]), 0.02 * seen[:-1, 1], atol=1e-12)
+    noise = np.diff(seen[:, 1]) / 0.02 - done
+    assert abs(noise.mean()) < 0.3
+    assert 0.35 < noise.std() < 0.65
+    np.testing.assert_allclose(paid[:-1], 2.0 + seen[1:-1, 0])
+    assert seen[-1, 0] >= 0.0
+    assert paid[-1] == -10.0 * (300 - len(done) + 1)
+    held = make_system("acc-5")
+    assert len(play(held, STARTS[0], lambda z: -2.0)[1]) == held.steps == 60
+    assert held.interval == pytest.approx(0.1)
+
+
+def test_gusts_push_for_a_while():
+    windy = make_system("cartpole-gusts")
+    windy.reset(options={"start": STARTS[2]})
+    pushes = np.array([windy._pushed() for _ in range(2000)])
+    pushed = pushes != 0.0
+    assert 0.03 < pushed.mean() < 0.2
+    assert ((np.abs(pushes[pushed]) >= 2.0) & (np.abs(pushes[pushed]) <= 5.0)).all()
+    changes = np.flatnonzero(np.diff(pushes, prepend=0.0, append=0.0))
+    lasted = [b - a for a, b in pairwise(changes) if pushed[a]]
+    assert 5 <= min(lasted) <= max(lasted) <= 15
+
+
+def careful_pumps(z):
+    """Steer the flows towards what keeps both levels at 1 m, ahead of the pumps' lag."""
+    levels, flows = z[:2], z[2:]
+    wanted = 0.03 * np.sqrt(levels) + 0.03 * (1.0 - levels)
+    return np.clip((flows + 3.0 * (wanted - flows)) / 0.15, 0.0, 1.0)
+
+
+def careful_feed(z):
+    """Feed only what the reactor could take if nothing cooled it any more."""
+    for action, fed in ((2, 0.04), (1, 0.015)):
+        if z[0] + 80.0 * (z[1] + fed) < 97.0:
+            return action
+    return 0
+
+
+def hold(z):
+    angle = z[0] if len(z) == 2 else np.arctan2(z[1], z[0])
+    return float(np.clip(-10.0 * angle - 2.0 * z[-1], -2.0, 2.0))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "careful"),
+    [
+        ("acc", lambda z: 2.0 if max(z[1] + 0.04, 0.0) ** 2 / 3.0 < -z[0] - 0.1 else -2.0),
+        *((name, lambda z: int(z @ [0.5, 1.0, 15.0, 3.0] > 0.0)) for name in list(SYSTEMS)[2:4]),
+        *((name, hold) for name in ("pendulum", "pendulum-cos")),
+        ("tanks", careful_pumps),
+        ("reactor", careful_feed),
+    ],
+)
+def test_who_knows_the_equations_keeps_it(name, careful):
+    system = make_system(name)
+    starts = [Start.held_out(12, episode) for episode in range(60)]
+    assert not any(play(system, start, careful)[3] for start in starts)
+
+
+@pytest.mark.parametrize(
+    ("name", "controller", "ways"),
+    [
+        ("tanks", "full", [np.zeros(2), np.ones(2), np.array([0.0, 1.0]), np.array([1.0, 0.0])]),
+        ("reactor", "hurried", [0]),
+        ("reactor", "thermostat", [0]),
+    ],
+)
+def test_a_failure_is_decided_many_steps_before(name, controller, ways):
+    """Neither of the ways out saves it any more, though nobody can see that it has failed."""
+
+    def saves(action):
+        tried = copy.deepcopy(system)
+        for _ in range(25):
+            _, _, failed, over, _ = tried.step(action)
+            if failed or over:
+                return not failed
+        return True
+
+    system, steps = make_system(name, controller), []
+    for start in STARTS[:8]:
+        (observation, _), lost, over = system.reset(options={"start": start}), [], False
+        while not over:
+            lost.append(not any(saves(way) for way in ways))
+            observation, _, failed, truncated, _ = system.step(system.propose(observation))
+            over = failed or truncated
+        steps.append(len(lost) - 1 - max(np.flatnonzero(~np.array(lost))))
+    assert np.median(steps) >= 5
+
+
+def test_failed_cooling_is_not_observed_at_once():
+    """The step after it failed looks like others; twenty steps later it is far hotter."""
+    system, other = make_system("reactor"), make_system("reactor")
+    for one in (system, other):
+        one.reset(options={"start": STARTS[0]})
+    other._fails_for = 40
+    apart = [other.step(2)[0][0] - system.step(2)[0][0] for _ in range(20)]
+    assert abs(apart[0]) < 3.0
+    assert max(apart) > 10.0
+
+
+# -- Rivals ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("task", "controller", "judge", "returns"),
+    [
+        *(("acc", None, judge, 545.0) for judge in ("stopping-distance", "barrier")),
+        *(("acc-5", None, judge, 545.0) for judge in ("stopping-distance", "barrier")),
+        ("cartpole", "random", "lqr-shield", 500.0),
+        ("pendulum", "random", "lqr-shield", 200.0),
+        ("pendulum-cos", "badpd", "lqr-shield", 200.0),
+    ],
+)
+def test_judges_that_are_told_the_equations_save_and_come_close(task, controller, judge, returns):
+    row = trial(task, controller, judge, train=0, test=5)
+    assert row["failed"] == 0
+    assert row["score"] >= returns
+    assert row["kept"] > 0.1
+    assert row["told"] in ("dynamics and noise", "linear model and limits")
+
+
+def test_a_regulator_leaves_alone_what_is_upright():
+    for task, upright, proposal in (
+        ("cartpole", np.zeros(4), 1),
+        ("pendulum", np.zeros(2), 0.5),
+        ("pendulum-cos", np.array([1.0, 0.0, 0.0]), 0.5),
+    ):
+        shield = rivals_of(make_system(task))["lqr-shield"]()
+        assert shield.decide(upright, proposal).executed == proposal
+
+
+def test_a_backup_shield_takes_the_closest_action_that_can_still_be_saved():
+    """A point that moves by its speed; braking takes 1 off it, the wall is at 10."""
+    shield = BackupShield(
+        Box((-1.0,), (1.0,)),
+        move=lambda states, taken: np.column_stack(
+            [states[:, 0] + states[:, 1], states[:, 1] + taken.reshape(-1)]
+        ),
+        fails=lambda states: states[:, 0] >= 10.0,
+        backup=lambda states: np.where(states[:, 1] > 0.0, -1.0, 0.0),
+        steps=20,
+    )
+    assert shield.action(np.array([0.0, 0.0]), 1.0) == 1.0
+    assert shield.action(np.array([5.0, 2.5]), 1.0) == pytest.approx(-0.75, abs=0.3)
+    assert shield.action(np.array([9.0, 5.0]), 1.0) == 1.0  # lost, whatever is done
+    obstacle = obstacle_shield(Box((-2.0, -2.0), (2.0, 2.0)))
+    far, near = np.array([0.5, 0.5, 0.0, 0.05]), np.array([0.5, 1.85, 0.0, 0.05])
+    assert np.array_equal(obstacle.action(far, np.ones(2)), np.ones(2))
+    assert not np.array_equal(obstacle.action(near, np.ones(2)), np.ones(2))
+
+
+def test_actions_that_are_tried_or_counted_reach_every_end():
+    assert tried(Discrete(3)).tolist() == [0.0, 1.0, 2.0]
+    assert [1.0, 2.0] in tried(Box((0.0, 0.0), (1.0, 2.0))).tolist()
+    for size in (1, 2, 3):
+        ladder = Ladder()
+        ladder.actions = Box((-1.0,) * size, (1.0,) * size)
+        judge = Counted(ladder)
+        for sign in np.ndindex(*(2,) * size):
+            corner = 2.0 * np.array(sign) - 1.0
+            judge.decide(np.array([8.0]), corner if size > 1 else float(corner[0]))
+            assert np.array_equal(judge._actions[judge._done[-1]], corner)
+
+
+class Ladder(System):
+    """Up or down a ladder of ten rungs, from the middle; the top one breaks."""
+
+    name, variables = "ladder", ("rung",)
+    actions, interval, steps = Discrete(2), 1.0, 30
+
+    @property
+    def controllers(self):
+        return {"random": lambda z: int(self.whim.integers(2))}
+
+    def _begin(self, start):
+        self._rung = 5
+
+    def _observation(self):
+        return np.array([float(self._rung)])
+
+    def _advance(self, action):
+        self._rung = max(self._rung + (1 if action else -1), 0)
+        return 1.0, self._rung >= 9
+
+
+@pytest.mark.slow
+def test_a_shield_by_counts_learns_which_rung_breaks():
+    ladder, judge = Ladder(), Counted(Ladder())
+    assert any(run(ladder, judge, Start.training(0, 0, k)).failed for k in range(40))
+    judge.freeze()
+    tested = [run(ladder, judge, Start.held_out(0, k)) for k in range(30)]
+    assert sum(one.failed for one in tested) <= 2
+    assert judge.decide(np.array([8.0]), 1).executed == 0
+    assert judge.decide(np.array([5.0]), 0).executed == 0
+    assert sum(one.kept for one in tested) > 0.4 * sum(len(one.times) for one in tested)
+
+
+def test_every_rival_is_told_something_and_what_lacks_its_package_says_so(monkeypatch):
+    for name in TASKS:
+        if not systems.lacking(name):
+            system = make_system(name)
+            assert system.name == name
+            for make in rivals_of(system).values():
+                made = make()
+                assert isinstance(made, Rival)
+                assert made.told not in ("", "nothing")
+    monkeypatch.setattr(systems, "find_spec", lambda name: None)
+    assert systems.lacking("masa-obstacle") == (
+        "it needs masa-safe-rl (pip install --no-deps masa-safe-rl)"
+    )
+    assert systems.lacking("merge").startswith("it needs highway-env (pip install '.[highway]'")
+
+
+# -- highway-env ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("task", HIGHWAY)
+def test_a_task_of_highway_env_is_drawn_by_its_start_alone_and_seen_as_rows(task):
+    pytest.importorskip("highway_env")
+    system = make_system(task, "dqn")
+    starts = [Start.held_out(3, k) for k in (1, 1, *range(2, 30))]
+    seen = [system.reset(options={"start": start})[0] for start in starts]
+    assert np.array_equal(seen[0], seen[1])
+    assert not np.array_equal(seen[0], seen[2])
+    assert len(seen[0]) == len(system.variables)
+    assert len(seen[0]) % system.columns == 0
+    assert len({system.propose(one) for one in seen}) > 1  # the network looks
+    assert task not in SYSTEMS
+
+
+def test_an_episode_does_not_hang_on_what_the_process_ran_before():
+    """The intersection sets how cars drive, for every environment there is."""
+    pytest.importorskip("highway_env")
+
+    def passed(between=lambda: None):
+        merge.reset(options={"start": Start.held_out(3, 1)})
+        between()
+        return [merge.step(1)[0] for _ in range(3)]
+
+    def visit():
+        make_system("intersection").reset(options={"start": Start.held_out(3, 1)})
+
+    merge = make_system("merge", "idle")
+    before, amid, after = passed(), passed(visit), passed()
+    assert np.array_equal(before, amid)
+    assert np.array_equal(before, after)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("task", HIGHWAY)
+def test_it_drives_to_the_end_under_each_rival(task):
+    pytest.importorskip("highway_env")
+    system = make_system(task)
+    for judge in ("unrevised", *rivals_of(system)):
+        ended = run(system, make_judge(judge, system), Start.held_out(3, 1))
+        assert 0 < len(ended.times) <= system.steps
+        assert 0.0 <= ended.speed <= 40.0
+
+
+def test_the_driver_of_the_environment_is_not_in_its_own_way():
+    """Else it changes lanes with every decision, away from itself."""
+    pytest.importorskip("highway_env")
+    system = make_system("highway-fast", "idle")
+    driver = rivals_of(system)["idm-mobil"]()
+    (observation, _), lanes = system.reset(options={"start": Start.held_out(3, 1)}), []
+    for _ in range(12):
+        observation, _, failed, _, _ = system.step(driver.decide(observation, 1).executed)
+        lanes.append(system.env.vehicle.target_lane_index[2])
+        assert not failed
+    assert np.count_nonzero(np.diff(lanes)) <= 3
+
+
+@pytest.mark.slow
+def test_the_judge_of_scenes_learns_to_merge():
+    pytest.importorskip("highway_env")
+    alone = trial("merge", judge="unrevised", train=0, test=10, base=9)
+    guarded = trial("merge", judge="scene", train=20, test=10, base=9)
+    assert alone["failed"] >= 7
+    assert guarded["failed"] <= 3
+    assert guarded["speed"] > 0.85 * alone["speed"]
