@@ -11,7 +11,7 @@ pytest.importorskip("gymnasium")
 from studies.foresight.data import Cases, Run, cases, gather
 from studies.foresight.measures import leads, measured, scored
 from studies.foresight.rivals import Logistic, Neighbours, Taylor
-from studies.systems.system import Start
+from studies.systems import Start
 
 
 def run(steps, *, failed):
