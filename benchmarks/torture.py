@@ -35,7 +35,7 @@ from evofsm import store
 from evofsm.cli.driving import Setup, drive_family, make_guard
 from evofsm.cli.learning import learn_traces
 from evofsm.driving.families import load_family
-from evofsm.driving.risk.latent import LatentRisk
+from evofsm.driving.judge import LatentRisk
 from evofsm.driving.world import KinematicWorld
 from evofsm.fleet.checkpoint import KIND as CHECKPOINT
 from evofsm.fleet.checkpoint import Checkpoint, fingerprints

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from evofsm.driving.risk.latent import LatentRisk
+from evofsm.driving.judge import LatentRisk
 from evofsm.fleet.sealed import NOTHING, ChainedFile, Head, Sync, records, seal, verify
 from evofsm.fsm.actions import IntervalActions
 from evofsm.fsm.machine import EvolvingFSM

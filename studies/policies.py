@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 from evofsm.driving.family import Draw, Family
+from evofsm.driving.judge import LatentRisk
 from evofsm.driving.measures import (
     FIXED_MEASURES,
     ResponsibilitySensitiveSafety,
@@ -14,7 +15,6 @@ from evofsm.driving.measures import (
     TimeToCollision,
 )
 from evofsm.driving.revisers import AlwaysBrake, EnvelopeReviser, Unrevised
-from evofsm.driving.risk.latent import LatentRisk
 from evofsm.guard import ActionReviser, Reviser, RiskMeasure
 
 
@@ -46,7 +46,7 @@ def envelope(name: str, group: Group, measure: RiskMeasure) -> Policy:
 
 def oracle(family: Family, draw: Draw) -> Reviser:
     """Ours, told how hard this very leader will brake and how well the own brakes work."""
-    risk = LatentRisk.told(
+    risk = LatentRisk.given(
         family.actions.low, family.decel, draw.scenario.leader.brake_decel, family.interval
     )
     return ActionReviser(risk, family.actions)
@@ -54,7 +54,7 @@ def oracle(family: Family, draw: Draw) -> Reviser:
 
 def told_limits(family: Family, draw: Draw) -> Reviser:
     """Ours, told the true limits of the family instead of learning them."""
-    risk = LatentRisk.told(family.actions.low, family.decel, family.leader_decel, family.interval)
+    risk = LatentRisk.given(family.actions.low, family.decel, family.leader_decel, family.interval)
     return ActionReviser(risk, family.actions)
 
 

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from evofsm import plot
 from evofsm.driving.drivers import IDM
 from evofsm.driving.episodes import drive
-from evofsm.driving.risk.latent import LatentRisk
+from evofsm.driving.judge import LatentRisk
 from evofsm.driving.scenarios import Leader, Scenario
 from evofsm.fsm.actions import IntervalActions
 from evofsm.fsm.machine import EvolvingFSM

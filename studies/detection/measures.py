@@ -220,7 +220,7 @@ def _estimates(risk: LatentRisk, one: Watched) -> tuple[NDArray[np.float64], NDA
     where, doubt = [], []
     for row, command in zip(one.seen, one.commands.tolist(), strict=True):
         estimate = perception.see(
-            row, brakes.expected(before, last), sure=brakes.known, learn=False
+            tuple(row.tolist()), brakes.expected(before, last), sure=brakes.known, learn=False
         )
         _, speed, leader_speed = estimate.mean
         where.append(estimate.mean)

@@ -50,7 +50,7 @@ def leader_tables(study: LeaderStudy, limits: Limits) -> tuple[Table, ...]:
     return (
         brakes,
         Table.of(
-            "The same by how hard they were, as evofsm.driving.risk.leaders holds it",
+            "The same by how hard they were, as evofsm.driving.leaders holds it",
             bins,
             rows,
             f"Shipped: {REAL_DRIVES.source}; {REAL_DRIVES.hours:g} h.",

@@ -11,7 +11,7 @@ pytest.importorskip("rich")
 from typer.testing import CliRunner
 
 from evofsm.__main__ import application
-from evofsm.driving.risk.latent import LatentRisk
+from evofsm.driving.judge import LatentRisk
 from evofsm.fleet.sealed import NOTHING, Head, seal, unseal
 from evofsm.fsm.actions import IntervalActions
 from evofsm.guard.auditing.log import AuditLog

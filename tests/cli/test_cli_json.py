@@ -13,7 +13,7 @@ import typer.main
 from typer.testing import CliRunner
 
 from evofsm.__main__ import application
-from evofsm.driving.risk.latent import LatentRisk
+from evofsm.driving.judge import LatentRisk
 from evofsm.fsm.actions import IntervalActions
 from evofsm.fsm.machine import EvolvingFSM
 from evofsm.guard.auditing.log import AuditLog

@@ -17,7 +17,7 @@ from evofsm.driving.cars import (
 from evofsm.driving.episodes import teach, try_out
 from evofsm.driving.families import load_family
 from evofsm.driving.family import held_out, training
-from evofsm.driving.risk.latent import LatentRisk
+from evofsm.driving.judge import LatentRisk
 from evofsm.guard.guard import Guard
 from evofsm.guard.learnt.risk import LearntRisk
 

@@ -54,7 +54,7 @@ def test_rows_hold_the_closest_and_zeros_where_there_is_none():
 
 
 def judge():
-    return TrafficRisk.told(LOW, HIGH, DECEL, INTERVAL)
+    return TrafficRisk.given(LOW, HIGH, DECEL, INTERVAL)
 
 
 def scene(*others):
@@ -78,7 +78,7 @@ def behind(gap, speed):
 
 
 def test_one_leader_is_judged_as_by_the_kinematic_judge():
-    alone = LatentRisk.told(-DECEL, DECEL, 9.0, INTERVAL)
+    alone = LatentRisk.given(-DECEL, DECEL, 9.0, INTERVAL)
     expected = alone.judge(at([22.0, 15.0, 12.0]), ACTIONS)
     found = judge().judge(at(scene(ahead(22, 12))), ACTIONS)
     np.testing.assert_array_equal(found.risk, expected.risk)
@@ -174,8 +174,8 @@ def test_what_was_taught_of_leaders_is_used():
 @pytest.mark.parametrize(
     ("make", "why"),
     [
-        (lambda: TrafficRisk.told(0.0, 1.0, DECEL, INTERVAL), "around 0"),
-        (lambda: TrafficRisk.told(-np.inf, 1.0, DECEL, INTERVAL), "around 0"),
+        (lambda: TrafficRisk.given(0.0, 1.0, DECEL, INTERVAL), "around 0"),
+        (lambda: TrafficRisk.given(-np.inf, 1.0, DECEL, INTERVAL), "around 0"),
         (lambda: guard_for_traffic(-5.0, HIGH, DECEL, INTERVAL, judge=judge()), "looks at"),
         (lambda: decide([1.0, 2.0]), "no rows of 7"),
     ],

@@ -245,7 +245,7 @@ def drive(path=None, episodes=5, stop_after=None):
     risk.save(files[1])
     brakes = risk.brakes
     told = [driving.row.as_dict(), driving.lead_times, dict(driving.decisions), driving.states]
-    told += [list(brakes._shortfalls), list(brakes._brought)]
+    told += [brakes.shortfalls.rows.tolist(), brakes.brought.rows.tolist()]
     return [file.getvalue() for file in files], repr(told)
 
 

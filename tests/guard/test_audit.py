@@ -16,11 +16,11 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from evofsm.driving import episodes
+from evofsm.driving.by_state import RiskByState
 from evofsm.driving.drivers import IDM
+from evofsm.driving.judge import LatentRisk
 from evofsm.driving.measures import TimeToCollision
 from evofsm.driving.revisers import AlwaysBrake, EnvelopeReviser, Unrevised
-from evofsm.driving.risk.by_state import RiskByState
-from evofsm.driving.risk.latent import LatentRisk
 from evofsm.driving.scenarios import Leader, Scenario, Sensors
 from evofsm.fleet import sealed as chain
 from evofsm.fleet.sealed import (

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 from evofsm import EvolvingFSM, Guard, IntervalActions, Labels, store
 from evofsm.driving.cars import guard_for_cars
+from evofsm.driving.judge import LatentRisk
 from evofsm.driving.revisers import Unrevised
-from evofsm.driving.risk.latent import LatentRisk
 from evofsm.fleet import sealed as chain
 from evofsm.guard.actions import BoxActions, Choices, same_action
 from evofsm.guard.auditing import participants

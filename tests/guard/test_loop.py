@@ -8,8 +8,8 @@ import pytest
 
 from evofsm.driving.drivers import IDM
 from evofsm.driving.episodes import drive
+from evofsm.driving.judge import LatentRisk
 from evofsm.driving.revisers import AlwaysBrake, Unrevised
-from evofsm.driving.risk.latent import LatentRisk
 from evofsm.driving.scenarios import Body, Leader, Scenario, Sensors
 from evofsm.driving.world import COMMANDED, SPEED
 from evofsm.fsm.actions import IntervalActions
@@ -241,7 +241,7 @@ def shadowed(risk, mode=Mode.SHADOW, drives=2):
 
 
 def test_ordinary_driving_raises_few_alarms_and_none_that_speaks_of_braking_not_done():
-    told = LatentRisk.told(-8.0, decel=7.0, leader_decel=8.0, dt=0.1)
+    told = LatentRisk.given(-8.0, decel=7.0, leader_decel=8.0, dt=0.1)
     unlearnt = LatentRisk(-8.0, dt=0.1)
     for risk, least, most in ((told, 0.0, 0.05), (unlearnt, 0.05, 1.0)):
         reviser, said = shadowed(risk)
@@ -253,7 +253,7 @@ def test_ordinary_driving_raises_few_alarms_and_none_that_speaks_of_braking_not_
 
 @pytest.mark.parametrize("mode", [Mode.SHADOW, Mode.ADVISE, Mode.OFF])
 def test_brakes_that_were_told_stay_as_told_beside_a_driver(mode):
-    risk = LatentRisk.told(-8.0, decel=7.0, leader_decel=8.0, dt=0.1)
+    risk = LatentRisk.given(-8.0, decel=7.0, leader_decel=8.0, dt=0.1)
     shadowed(risk, mode)
     assert risk.brakes.known
     assert risk.brakes.decel == pytest.approx(7.0)
@@ -344,7 +344,7 @@ def test_of_an_episode_that_was_broken_off_nothing_follows():
     guard.revise(situation, Proposal(0.0))
     guard.end(failed=False)
     assert risk.manoeuvres.decels == before.manoeuvres.decels
-    assert list(risk.brakes.samples) == list(before.brakes.samples)
+    np.testing.assert_array_equal(risk.brakes.full.rows, before.brakes.full.rows)
 
 
 def test_two_runs_of_the_same_are_the_same():

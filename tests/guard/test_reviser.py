@@ -7,9 +7,9 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
+from evofsm.driving.judge import LatentRisk
 from evofsm.driving.measures import TimeToCollision
 from evofsm.driving.revisers import AlwaysBrake, EnvelopeReviser, Unrevised
-from evofsm.driving.risk.latent import LatentRisk
 from evofsm.fsm.actions import IntervalActions
 from evofsm.guard.protocols import Judgement, Proposal, Situation
 from evofsm.guard.reviser import ActionReviser, Mode, Way

@@ -8,9 +8,9 @@ import pytest
 
 from evofsm.driving.drivers import IDM
 from evofsm.driving.episodes import drive
+from evofsm.driving.judge import LatentRisk
 from evofsm.driving.measures import TimeToCollision
 from evofsm.driving.revisers import EnvelopeReviser
-from evofsm.driving.risk.latent import LatentRisk
 from evofsm.driving.scenarios import Leader, Scenario
 from evofsm.driving.world import KinematicWorld
 from evofsm.fsm.actions import IntervalActions
@@ -59,7 +59,7 @@ def machine():
 
 
 def guard(learn=True, **options):
-    risk = LatentRisk.told(-4.0, 4.0, 8.0)
+    risk = LatentRisk.given(-4.0, 4.0, 8.0)
     reviser = ActionReviser(risk, ACTIONS)
     return Guard.of(reviser, machine=machine(), learn=learn, interval=0.25, **options)
 
@@ -197,7 +197,7 @@ def test_rejecting_is_an_error_that_names_the_variables():
 def test_the_reviser_keeps_its_promise_with_a_gap_sensor_that_fails_half_the_time():
     hasty = IDM(2.25, 28.0, 0.8, 0.3, 2.0, lowest=-4.0, highest=2.5)
     leader = Leader(IDM(1.2, 25.0, 1.0, 1.0, 2.5), brake_decel=8.0, brake_time=12.0)
-    risk = LatentRisk.told(-4.0, 4.0, 8.0)
+    risk = LatentRisk.given(-4.0, 4.0, 8.0)
     guard = Guard.of(ActionReviser(risk, ACTIONS), learn=False, interval=0.25)
     driven = drive(guard, Scenario(leader, initial_gap=5.0), FlickeringWorld(), hasty)
     assert any(decision.situation.intake for decision in driven.decisions)

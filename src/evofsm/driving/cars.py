@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 from evofsm.driving.family import Family
+from evofsm.driving.judge import LatentRisk
 from evofsm.driving.naming import UNITS, VARIABLES
-from evofsm.driving.risk.latent import LatentRisk
 from evofsm.fsm import EvolvingFSM, IntervalActions, Novelty, StateRule
 from evofsm.guard import (
     BELIEF_TOLERANCE,

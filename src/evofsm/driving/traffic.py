@@ -16,7 +16,7 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from evofsm.driving.risk.latent import LatentRisk
+from evofsm.driving.judge import LatentRisk
 from evofsm.fsm.actions import IntervalActions
 from evofsm.fsm.naming import Labels
 from evofsm.fsm.validation import positive, real_array
@@ -235,7 +235,7 @@ class TrafficRisk:
         self.low, self.high = float(low), float(high)
         decel = positive("behind_decel", behind_decel)
         #: Judges the one that follows, of which oneself is the leader.
-        self.behind = LatentRisk.told(-decel, decel, decel, positive("reaction", reaction))
+        self.behind = LatentRisk.given(-decel, decel, decel, positive("reaction", reaction))
         self.labels = Labels(dt=ahead.dt)
         steps = max(2, round((self.high - self.low) / _STEP) + 1)
         self._grid = np.linspace(self.low, self.high, steps)
@@ -243,7 +243,7 @@ class TrafficRisk:
         self.worst: Pair | None = None
 
     @classmethod
-    def told(
+    def given(
         cls,
         low: float,
         high: float,
@@ -255,7 +255,7 @@ class TrafficRisk:
         reaction: float = 1.0,
     ) -> Self:
         """Given the limits: braking that is counted on, and the hardest of leaders [m/s²]."""
-        ahead = LatentRisk.told(-decel, decel, leader_decel, interval)
+        ahead = LatentRisk.given(-decel, decel, leader_decel, interval)
         return cls(ahead, low, high, behind_decel=behind_decel, reaction=reaction)
 
     def judge(self, situation: Situation, actions: ArrayLike) -> Judgement:
@@ -418,7 +418,7 @@ def guard_for_traffic(
         Highest risk that is accepted, in (0, 1).
     mode : Mode
     **settings
-        As in `TrafficRisk.told`: ``leader_decel``, ``behind_decel``, ``reaction``.
+        As in `TrafficRisk.given`: ``leader_decel``, ``behind_decel``, ``reaction``.
 
     Returns
     -------
@@ -433,7 +433,7 @@ def guard_for_traffic(
     >>> guard.decide(alone.rows(most=4), proposal=1.0).executed
     1.0
     """
-    judge = judge or TrafficRisk.told(low, high, decel, interval, **settings)
+    judge = judge or TrafficRisk.given(low, high, decel, interval, **settings)
     actions = IntervalActions(low, high, _WIDTH, outside="clip")
     reviser = ActionReviser(judge, actions, tolerance=tolerance, mode=mode)
     return Guard.of(reviser, interval=interval, learn=False)

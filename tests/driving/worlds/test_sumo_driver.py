@@ -5,8 +5,8 @@ import pytest
 
 from evofsm.driving.drivers import IDM
 from evofsm.driving.episodes import drive
+from evofsm.driving.judge import LatentRisk
 from evofsm.driving.revisers import Unrevised
-from evofsm.driving.risk.latent import LatentRisk
 from evofsm.driving.scenarios import CutIn, Leader, Scenario, Sensors
 from evofsm.driving.sumo import MODELS, SumoDriver, SumoWorld
 from evofsm.driving.world import KinematicWorld

@@ -347,4 +347,4 @@ def guard_of_traffic(interval: float, brakes: float) -> Guard:
 
 def _ahead(interval: float, brakes: float) -> LatentRisk:
     braking, step = positive("brakes", brakes), positive("interval", interval)
-    return LatentRisk.told(-braking, braking, _HARDEST, step, leaders=REAL_DRIVES)
+    return LatentRisk.given(-braking, braking, _HARDEST, step, leaders=REAL_DRIVES)

@@ -74,7 +74,7 @@ class Watching:
     ----------
     family : Family
     world : str
-        One of `evofsm.driving.worlds.WORLDS`.
+        One of `evofsm.driving.WORLDS`.
     case : int
         Which one of the family's cases, or of its draws, from 0.
     controller, reviser : str

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from evofsm.driving.risk.latent import LatentRisk
+from evofsm.driving.judge import LatentRisk
 from evofsm.fsm import EvolvingFSM, FSMModel
 from evofsm.guard import Action, Judgement, Situation, Trial
 

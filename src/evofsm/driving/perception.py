@@ -9,15 +9,15 @@ what kinematics leave unexplained; as long as that is nothing, the estimate is t
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Mapping, Sequence
 from math import isnan, nan, sqrt
-from typing import NamedTuple, TypeAlias, cast
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from evofsm.driving.risk.manoeuvres import latest_of_each
-from evofsm.driving.risk.rehearsal import Three
+from evofsm.driving.leaders import latest_of_each
+from evofsm.driving.rehearsal import Three
 from evofsm.fsm import compiled, kernel
 
 # Gap [m], speed of the follower and of the leader [m/s], or what is said of each of them.
@@ -49,56 +49,9 @@ class Estimate(NamedTuple):
     mean: Three  #: gap [m], speed of the follower and of the leader [m/s]
     covariance: Matrix
 
-    def deviation(self, weights: Iterable[float]) -> float:
+    def deviation(self, weights: Three) -> float:
         """Standard deviation of a weighed sum of the three."""
-        if self.covariance == _EXACT:
-            return 0.0
-        of_gap, of_own, of_leader = weights
-        return _deviation(self.covariance, (of_gap, of_own, of_leader))
-
-
-class Spreads:
-    """Standard deviations of the latest residuals of gap, own speed and leader's speed.
-
-    From their medians: few odd ones do not matter.
-
-    Examples
-    --------
-    >>> spreads = Spreads()
-    >>> sizes = np.array(10 * [1.0, 0.5, 0.6745, 50.0, 0.6745])
-    >>> spreads.restore([sizes, 2.0 * sizes, sizes[:9]])
-    >>> spreads.deviations  # of the third there are few
-    (1.0, 2.0, 0.0)
-    """
-
-    def __init__(self) -> None:
-        self._sizes = np.empty((3, _MEMORY))  # absolute values, in a ring
-        self._sorted = np.empty((3, _MEMORY))
-        self._added = np.zeros(3, np.int64)
-
-    @property
-    def deviations(self) -> Three:
-        """Of the residuals; 0 while there are few."""
-        return _deviations(self._sorted, self._added)
-
-    def take_in(
-        self, before: Three, now: Three, realised: float, changes: tuple[float, float], dt: float
-    ) -> tuple[Three, tuple[float, float]]:
-        """Add what kinematics do not explain; returns the noise, and the `changes` of now."""
-        return _take_in(self._sizes, self._sorted, self._added, before, now, realised, changes, dt)
-
-    def restore(self, sizes: Iterable[NDArray[np.float64]]) -> None:
-        """Take over what `sizes` returned."""
-        for k, latest in enumerate(np.abs(given[-_MEMORY:]) for given in sizes):
-            count = self._added[k] = len(latest)
-            self._sizes[k, :count], self._sorted[k, :count] = latest, np.sort(latest)
-
-    def sizes(self) -> list[NDArray[np.float64]]:
-        """Absolute values, the oldest first."""
-        return [
-            np.roll(ring, -added)[-added:] if added > _MEMORY else ring[:added].copy()
-            for ring, added in zip(self._sizes, self._added.tolist(), strict=True)
-        ]
+        return 0.0 if self.covariance == _EXACT else _deviation(self.covariance, weights)
 
 
 class Perception:
@@ -113,17 +66,20 @@ class Perception:
     --------
     >>> perception = Perception(dt=0.25)
     >>> for step in range(3):
-    ...     estimate = perception.see([30.0 - 2.5 * step, 20.0, 10.0], 0.0)
+    ...     estimate = perception.see((30.0 - 2.5 * step, 20.0, 10.0), 0.0)
     >>> estimate.mean, perception.noise  # nothing is left unexplained
     ((25.0, 20.0, 10.0), (0.0, 0.0, 0.0))
     """
 
     def __init__(self, dt: float) -> None:
         self.dt = dt
-        #: Of what gap, own speed and leader's speed did that kinematics do not explain.
-        self.spreads = Spreads()
         #: Standard deviations of observed gap [m], own and leader's speed [m/s].
         self.noise = _NOTHING
+        # Of the latest residuals that kinematics do not explain, of gap and both speeds: their
+        # absolute values in rings, and sorted; from the medians, so that a few odd ones do
+        # not matter.
+        self._sizes, self._sorted = np.empty((3, _MEMORY)), np.empty((3, _MEMORY))
+        self._added = np.zeros(3, np.int64)
         self.clear()
 
     def clear(self) -> None:
@@ -134,18 +90,13 @@ class Perception:
         self._changes = nan, nan  # of both speeds, beyond what was expected
 
     def see(
-        self,
-        observation: ArrayLike | Three,
-        realised: float,
-        *,
-        sure: bool = True,
-        learn: bool = True,
+        self, now: Three, realised: float, *, sure: bool = True, learn: bool = True
     ) -> Estimate:
         """Take in an observation, and learn the noise from it if told to.
 
         Parameters
         ----------
-        observation : (3,) array_like
+        now : tuple of three floats
             Gap [m], speed of the follower and of the leader [m/s]; NaN where it was not seen,
             which is then estimated from what was seen before, and teaches nothing of the noise.
         realised : float
@@ -154,13 +105,14 @@ class Perception:
             Whether that is known well.
         learn : bool
         """
-        estimate, now = self.estimate(observation, realised, sure=sure), _three(observation)
+        estimate = self.estimate(now, realised, sure=sure)
         if not is_whole(now):
             self._seen, self._changes = None, (nan, nan)
         else:
             if learn and self._seen is not None:
-                self.noise, self._changes = self.spreads.take_in(
-                    self._seen, now, realised, self._changes, self.dt
+                rings, before = (self._sizes, self._sorted, self._added), self._seen
+                self.noise, self._changes = _take_in(
+                    *rings, before, now, realised, self._changes, self.dt
                 )
             self._seen = now
         self._asked = None
@@ -168,11 +120,8 @@ class Perception:
             self._latest = estimate
         return estimate
 
-    def estimate(
-        self, observation: ArrayLike | Three, realised: float, *, sure: bool = True
-    ) -> Estimate:
+    def estimate(self, now: Three, realised: float, *, sure: bool = True) -> Estimate:
         """What `see` would answer; nothing changes. NaN stays where nothing was seen before."""
-        now = _three(observation)
         if self.noise == _NOTHING and is_whole(now):
             return Estimate(now, _EXACT)
         if self._latest is None:
@@ -183,22 +132,25 @@ class Perception:
             self._asked, self._answer = (now, realised, sure), Estimate(*filtered)
         return self._answer
 
-    # -- Keeping it -----------------------------------------------------------------------------
-
     def learnt(self) -> dict[str, NDArray[np.float64]]:
-        """The residuals by name, for a file."""
-        return dict(zip(_NAMES, self.spreads.sizes(), strict=True))
+        """The residuals by name, the oldest first, for a file."""
+        return {
+            name: np.roll(ring, -added)[-added:] if added > _MEMORY else ring[:added].copy()
+            for name, ring, added in zip(_NAMES, self._sizes, self._added.tolist(), strict=True)
+        }
 
     def merge(self, others: Sequence[Perception]) -> None:
         """Take in what others' sensors left unexplained; of too many the latest of each."""
-        every = zip(*(one.spreads.sizes() for one in (*others, self)), strict=True)
-        merged = [np.array(latest_of_each(sizes)) for sizes in every]
-        self.restore(dict(zip(_NAMES, merged, strict=True)))
+        every = [one.learnt() for one in (*others, self)]
+        self.restore({name: np.array(latest_of_each([e[name] for e in every])) for name in _NAMES})
 
-    def restore(self, arrays: dict[str, NDArray[np.float64]]) -> None:
+    def restore(self, arrays: Mapping[str, NDArray[np.float64]]) -> None:
         """Take over what `learnt` returned."""
-        self.spreads.restore([arrays[name] for name in _NAMES])
-        self.noise = _noise(self.spreads.deviations, self.dt)
+        for k, name in enumerate(_NAMES):
+            latest = np.abs(arrays[name][-_MEMORY:])
+            count = self._added[k] = len(latest)
+            self._sizes[k, :count], self._sorted[k, :count] = latest, np.sort(latest)
+        self.noise = _noise(_deviations(self._sorted, self._added), self.dt)
         self._asked = None
 
 
@@ -206,13 +158,6 @@ def is_whole(observation: Three) -> bool:
     """Whether all three are there."""
     gap, own, leader = observation
     return not isnan(gap + own + leader)
-
-
-def _three(observation: ArrayLike | Three) -> Three:
-    if isinstance(observation, tuple):
-        return cast(Three, observation)
-    gap, own, leader = np.asarray(observation, dtype=np.float64).tolist()
-    return gap, own, leader
 
 
 # -- The filter ---------------------------------------------------------------------------------

@@ -1,28 +1,33 @@
-"""Cars that are guarded in a simulation of someone else's.
+"""Cars in a SUMO simulation of someone else's that are guarded.
 
 SUMO goes on driving them. A guard says how hard a car may accelerate in the next step, at most;
 where that is less than its own driver might want, the speed is set, and SUMO still minds all else:
 red lights, right of way, stops. What a driver wanted shows in what SUMO does; only where it is held
 back, its car-following model is asked.
+
+SUMO's ``getLeader`` and ``getFollower`` take off minGap of whoever follows; where it counts a
+collision before the bumpers touch (``--collision.mingap-factor``), the gap ends there.
 """
 
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.driving.attached.seen import Neighbour, Seeing
+from evofsm.driving.judge import LatentRisk
+from evofsm.driving.leaders import BrakeWatch, Manoeuvres
 from evofsm.driving.naming import VARIABLES
-from evofsm.driving.risk.latent import LatentRisk
-from evofsm.driving.risk.manoeuvres import BrakeWatch, Manoeuvres
-from evofsm.driving.traffic import Role, TrafficRisk, guard_for_traffic
+from evofsm.driving.traffic import COLUMNS, Role, TrafficRisk, guard_for_traffic
 from evofsm.guard import ActionReviser, Guard, Mode, Revision
 
+# How far one looks at least [m]; further by what it takes to stop.
+_NEAR, _GENTLE = 30.0, 3.0
+_WIDTH = 1.8
 # Leaders are assumed to brake so hard until they were seen to: SUMO's emergencyDecel [m/s²].
 _LEADER_DECEL = 9.0
 # A speed that is lower by no more is what the driver wanted [m/s].
@@ -32,7 +37,134 @@ _SAME = 1e-6
 _ON, _OFF = 0b011, 0b100
 
 
-class Told(NamedTuple):
+# -- What SUMO says of the cars around one --------------------------------------------------------
+
+
+class Neighbour(NamedTuple):
+    """Another car in one's lane."""
+
+    id: str
+    gap: float  #: from bumper to bumper [m]
+    room: float  #: what is left of it until SUMO counts a collision, in its step [m]
+    speed: float  #: [m/s]
+
+
+class _Facts(NamedTuple):
+    """What does not change about a car."""
+
+    length: float  #: [m]
+    min_gap: float  #: [m]
+    decel: float  #: [m/s²]
+
+
+class Seeing:
+    """Reads the cars around one of them.
+
+    Parameters
+    ----------
+    sumo : module or connection
+        libsumo or traci.
+    """
+
+    def __init__(self, sumo: Any) -> None:
+        self._vehicle = sumo.vehicle
+        factor = float(sumo.simulation.getOption("collision.mingap-factor"))
+        # Share of minGap that SUMO wants kept; below 0 each model has its own, at most all of it.
+        self._factor = factor if factor >= 0.0 else 1.0
+        #: Time of a step [s].
+        self.dt = float(sumo.simulation.getDeltaT())
+        ballistic = str(sumo.simulation.getOption("step-method.ballistic")).lower() in ("true", "1")
+        # In SUMO's Euler step a car drives all of it at the speed of its end. Against what is
+        # rehearsed, a slower follower is nearer by half a step's worth of the difference; and
+        # whoever brakes to a standstill within a step gets further by up to an eighth of its
+        # braking over the square of the step. What the Euler step adds to the gap is not counted:
+        # with an actionStepLength in any type SUMO steps ballistically, and no option says so.
+        self._euler = 0.0 if ballistic else self.dt
+        self._bodies: dict[str, _Facts] = {}
+
+    def forget(self, car: str) -> None:
+        """It has left."""
+        self._bodies.pop(car, None)
+
+    def body(self, car: str) -> _Facts:
+        """Of a car; that its type changes is not noticed."""
+        body = self._bodies.get(car)
+        if body is None:
+            vehicle = self._vehicle
+            facts = vehicle.getLength(car), vehicle.getMinGap(car), vehicle.getDecel(car)
+            body = self._bodies[car] = _Facts(*facts)
+        return body
+
+    def pair(self, car: str) -> tuple[float, float, float] | None:
+        """Gap from bumper to bumper [m], its speed and that of whoever is ahead [m/s]."""
+        speed = self._vehicle.getSpeed(car)
+        found = self._vehicle.getLeader(car, _far(speed))
+        if not found or not found[0]:
+            return None
+        return found[1] + self.body(car).min_gap, speed, self._vehicle.getSpeed(found[0])
+
+    def ahead(self, car: str, speed: float) -> Neighbour | None:
+        """Whoever is ahead on its route, if near enough to matter."""
+        found = self._vehicle.getLeader(car, _far(speed))
+        if not found or not found[0]:
+            return None
+        leader, gap = found
+        its, body = self._vehicle.getSpeed(leader), self.body(car)
+        return Neighbour(leader, gap + body.min_gap, self._room(gap, body, speed - its), its)
+
+    def behind(self, car: str, speed: float) -> Neighbour | None:
+        """Whoever is behind."""
+        follower, gap = self._vehicle.getFollower(car, _far(speed))
+        if not follower:
+            return None
+        its, body = self._vehicle.getSpeed(follower), self.body(follower)
+        return Neighbour(follower, gap + body.min_gap, self._room(gap, body, its - speed), its)
+
+    def wish(self, car: str, speed: float, ahead: Neighbour | None) -> float:
+        """The speed that a car's own model wants after the next step [m/s].
+
+        By whoever is ahead, the limit and what the car can do. Red lights and right of way may make
+        it lower, dawdling too.
+        """
+        vehicle = self._vehicle
+        fastest = min(vehicle.getAllowedSpeed(car), speed + vehicle.getAccel(car) * self.dt)
+        if ahead is None:
+            return float(fastest)
+        gap = ahead.gap - self.body(car).min_gap  # as SUMO's models take it
+        decel = vehicle.getApparentDecel(ahead.id)
+        wanted = vehicle.getFollowSpeed(car, speed, gap, ahead.speed, decel, ahead.id)
+        slowest = speed - vehicle.getEmergencyDecel(car) * self.dt
+        return float(max(min(wanted, fastest), slowest, 0.0))
+
+    def _room(self, gap: float, follower: _Facts, closing: float) -> float:
+        euler = self._euler
+        late = 0.125 * follower.decel * euler * euler - 0.5 * euler * min(0.0, closing)
+        return gap + (1.0 - self._factor) * follower.min_gap - late
+
+    def rows(
+        self, car: str, speed: float, ahead: Neighbour | None, behind: Neighbour | None
+    ) -> NDArray[np.float64]:
+        """The scene as `Scene.rows` has it, x counted from the front bumper of the car."""
+        rows = np.zeros((3, len(COLUMNS)))  # oneself, ahead and behind
+        length = self.body(car).length
+        rows[0] = 1.0, -0.5 * length, 0.0, speed, 0.0, length, _WIDTH
+        if ahead is not None:
+            its = self.body(ahead.id).length
+            rows[1] = 1.0, ahead.room + 0.5 * its, 0.0, ahead.speed, 0.0, its, _WIDTH
+        if behind is not None:
+            its = self.body(behind.id).length
+            rows[2] = 1.0, -length - behind.room - 0.5 * its, 0.0, behind.speed, 0.0, its, _WIDTH
+        return rows.ravel()
+
+
+def _far(speed: float) -> float:
+    return _NEAR + speed + 0.5 * speed * speed / _GENTLE
+
+
+# -- Guarding ---------------------------------------------------------------------------------
+
+
+class GuardedStep(NamedTuple):
     """What a guard said of a car for one step, and what came of it."""
 
     time: float  #: at which it was decided [s]
@@ -71,7 +203,7 @@ class Guarding:
     decisions : int
     revised : int
         Steps in which a car drove slower than its driver wanted; in shadow, would have.
-    latest : dict from str to Told
+    latest : dict from str to GuardedStep
         What was said last of each car that is there.
     """
 
@@ -84,9 +216,9 @@ class Guarding:
         acts: bool,
         tolerance: float,
         learn: bool,
-        tell: Callable[[Told], None] | None,
+        report: Callable[[GuardedStep], None] | None,
     ) -> None:
-        self._vehicle, self._seeing, self._acts, self._tell = sumo.vehicle, seeing, acts, tell
+        self._vehicle, self._seeing, self._acts, self._report = sumo.vehicle, seeing, acts, report
         self._template, self._tolerance, self._learn = guard, tolerance, learn
         self._judges: dict[tuple[float, float, float], TrafficRisk] = {}
         self._cars: dict[str, _Car] = {}
@@ -98,12 +230,12 @@ class Guarding:
         self._every = _steps(self.interval, seeing.dt)
         self._steps = 0
         self.decisions = self.revised = 0
-        self.latest: dict[str, Told] = {}
+        self.latest: dict[str, GuardedStep] = {}
 
     def __len__(self) -> int:
         return len(self._cars)
 
-    def __iter__(self) -> Any:
+    def __iter__(self) -> Iterator[str]:
         return iter(self._cars)
 
     def add(self, car: str) -> None:
@@ -129,12 +261,12 @@ class Guarding:
         """0 to 2 of each car: free, held back, or at a risk that is not tolerable."""
         return {car: self._urgency(self.latest.get(car)) for car in self._cars}
 
-    def _urgency(self, told: Told | None) -> int:
-        if told is None:
+    def _urgency(self, step: GuardedStep | None) -> int:
+        if step is None:
             return 0
-        if told.revision.risk_executed > self._tolerance:
+        if step.revision.risk_executed > self._tolerance:
             return 2
-        return int(told.deed < told.wish - _SAME)
+        return int(step.deed < step.wish - _SAME)
 
     def step(self, time: float) -> int:
         """Say what came of the step that is over, and decide on the next; returns how often."""
@@ -229,10 +361,10 @@ class Guarding:
             self.revised += speed < wanted - _SAME
         else:
             self.revised += bool(revision.advised < wish - _SAME)
-        told = Told(one.time, one.id, wish, deed, revision, *one.about)
-        self.latest[one.id] = told
-        if self._tell is not None:
-            self._tell(told)
+        step = GuardedStep(one.time, one.id, wish, deed, revision, *one.about)
+        self.latest[one.id] = step
+        if self._report is not None:
+            self._report(step)
 
     def _watch(self, speeds: dict[str, float]) -> None:
         """Learn how hard leaders brake, each by itself, whoever follows it."""
@@ -275,7 +407,7 @@ class Guarding:
         """One for all cars that can do the same: it remembers nothing of any."""
         judge = self._judges.get((low, high, decel))
         if judge is None:
-            judge = TrafficRisk.told(low, high, decel, self.interval, leader_decel=_LEADER_DECEL)
+            judge = TrafficRisk.given(low, high, decel, self.interval, leader_decel=_LEADER_DECEL)
             judge.ahead.manoeuvres = self.leaders
             self._judges[low, high, decel] = judge
         return judge

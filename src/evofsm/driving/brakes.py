@@ -1,15 +1,17 @@
-"""How well one brakes oneself: learnt from what was commanded and what came of it."""
+"""How well one brakes oneself: learnt from what was commanded and what came of it.
+
+Full braking shows what it brings, as a lower bound on its mean. Ordinary braking shows whether the
+brakes have weakened since, and how late commands take effect is told by least squares.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from math import sqrt
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.driving.risk.ranges import hardest_seen
 from evofsm.fsm import compiled, kernel
 
 # Full braking is judged by so many of the latest decisions, and by no fewer than the second number;
@@ -28,46 +30,39 @@ _GENTLE, _SHORTFALL = 1.0, 0.1
 _SAME = 0.05
 # Slower than this one may stand still, and only noise moves [m/s].
 _STANDING = 1.0
+# No car brakes harder than this [m/s²], nor does its speed jump by more in a decision [m/s].
+_HARDEST, _JUMP = 15.0, 5.0
 
 
-class Sample(NamedTuple):
-    """What came of a steady command within one decision."""
-
-    value: float  #: [m/s²]
-    begins: bool  #: whether a stretch of steady decisions begins with it
-
-
-class Latest:
-    """The latest samples, the oldest first, and what can be said of their mean.
-
-    Parameters
-    ----------
-    most : int
-        How many are kept.
+def hardest_seen(dt: float) -> float:
+    """Braking beyond which a change of one's own speed is no braking, but a sensor's jump [m/s²].
 
     Examples
     --------
-    >>> latest = Latest(2)
-    >>> for value in (9.0, 2.0, 4.0):
-    ...     latest.add(Sample(value, begins=True))
-    >>> latest.mean_and_bound(errors=0.0)
-    (3.0, 3.0)
+    >>> hardest_seen(0.25)
+    35.0
     """
+    return _HARDEST + _JUMP / dt
+
+
+class Latest:
+    """The latest samples, the oldest first, and what can be said of their mean."""
 
     def __init__(self, most: int) -> None:
-        self._rows = np.empty((most, 2))  # value, and 1 where a stretch begins
+        self._rows = np.empty((most, 2))  # value, and 1 where a run begins
         self._count = 0
 
     def __len__(self) -> int:
         return self._count
 
-    def __iter__(self) -> Iterator[Sample]:
-        for value, begins in self._rows[: self._count].tolist():
-            yield Sample(value, bool(begins))
+    @property
+    def rows(self) -> NDArray[np.float64]:
+        """(n, 2) ndarray: of each its value, and 1 where a run begins."""
+        return self._rows[: self._count].copy()
 
-    def add(self, sample: Sample) -> None:
+    def add(self, value: float, begins: bool) -> None:
         """Take in one more; the oldest goes where there is no room."""
-        self._count = _add(self._rows, self._count, *sample)
+        self._count = _add(self._rows, self._count, value, begins)
 
     def clear(self) -> None:
         """Forget them."""
@@ -77,7 +72,7 @@ class Latest:
         """Mean, and so many standard errors below it; of all, or of the ``latest``.
 
         A decision's acceleration is a difference of two speeds, and what noise does to one it
-        undoes in the next: the mean of a stretch has the noise of its two ends only.
+        undoes in the next: the mean of a run has the noise of its two ends only.
         """
         first = 0 if latest is None else self._count - latest
         return _mean_and_bound(self._rows, first, self._count, errors)
@@ -109,24 +104,17 @@ class OwnBrakes:
     """
 
     def __init__(self, lowest: float, assumed: float, dt: float) -> None:
-        self.lowest = lowest
-        self.assumed = assumed
-        self.dt = dt
+        self.lowest, self.assumed, self.dt = lowest, assumed, dt
         self._most_change = hardest_seen(dt) * dt  # of a speed within a decision [m/s]
-        self.samples = Latest(_MEMORY)  #: of full braking
-        self._shortfalls = Latest(_SUSPECT)  # of any braking against what was to be expected
-        self._brought = Latest(_FEWEST)  # by the latest of it
+        self.full = Latest(_MEMORY)  #: samples of full braking
+        self.shortfalls = Latest(_SUSPECT)  #: of any braking against what was to be expected
+        self.brought = Latest(_FEWEST)  #: by the latest of it
         #: Whether full braking was seen often and clearly enough to count on what was seen.
         self.known = False
         #: Full braking that can be counted on [m/s²], positive; and as it most likely is.
         self.decel = self._likely = max(assumed, _WEAKEST) * -lowest
         self.set_lagged(0.0, 0.0)
         self.clear()
-
-    @property
-    def doubts(self) -> dict[str, Latest]:
-        """What may yet show that the brakes have weakened, by name."""
-        return {"brought": self._brought, "shortfalls": self._shortfalls}
 
     def set_lagged(self, products: float, squares: float) -> None:
         """Tell the lag by least squares, from sums of products and of squares."""
@@ -136,26 +124,26 @@ class OwnBrakes:
 
     def trust(self, decel: float) -> None:
         """Take full braking as known [m/s²], positive."""
-        self.remember([Sample(decel, begins=True)] * _FEWEST)
+        self.remember([(decel, True)] * _FEWEST)
 
-    def remember(self, samples: Iterable[Sample]) -> None:
-        """Take in what full braking brought, the oldest first."""
-        for sample in samples:
-            self.samples.add(sample)
-        if len(self.samples) < _FEWEST:
+    def remember(self, samples: Iterable[tuple[float, float]] | NDArray[np.float64]) -> None:
+        """Take in what full braking brought, the oldest first, and where a run begins."""
+        for value, begins in samples:
+            self.full.add(float(value), bool(begins))
+        if len(self.full) < _FEWEST:
             return
-        mean, bound = self.samples.mean_and_bound(_BOUND)
-        self.known = len(self.samples) == _MEMORY or bound >= _CLEAR * mean
+        mean, bound = self.full.mean_and_bound(_BOUND)
+        self.known = len(self.full) == _MEMORY or bound >= _CLEAR * mean
         counted_on = bound if self.known else min(bound, -self.assumed * self.lowest)
         self.decel = max(counted_on, -_WEAKEST * self.lowest)
         self._likely = mean if self.known else self.decel
 
     def merge(self, others: Iterable[OwnBrakes]) -> None:
         """Take in what full braking brought others, of the same brakes; one's own is the latest."""
-        own, (products, squares) = list(self.samples), self.lagged
-        self.samples.clear()
+        own, (products, squares) = self.full.rows, self.lagged
+        self.full.clear()
         for other in others:
-            self.remember(other.samples)
+            self.remember(other.full.rows)
             products, squares = products + other.lagged[0], squares + other.lagged[1]
         self.remember(own)
         self.set_lagged(products, squares)
@@ -167,7 +155,7 @@ class OwnBrakes:
         no harder is not shown by it.
         """
         share = min(decel / -self.lowest, 1.0)
-        if share > self.assumed and len(self.samples) < _FEWEST:
+        if share > self.assumed and len(self.full) < _FEWEST:
             self.assumed = share
             self.decel = self._likely = max(share, _WEAKEST) * -self.lowest
 
@@ -228,43 +216,36 @@ class OwnBrakes:
             self.set_lagged(products + (estimated - asked) * change, squares + change * change)
         # However late commands take effect, it was one of the latest three that ruled.
         ruled = max(self._commands) if len(self._commands) == 3 else 0.0
-        self._learn_full(max(ruled, now), realised)
+        # What is commanded now must be full braking, too: commands answer to noise, and of braking
+        # that noise has ended the brakes would seem better than they are.
+        is_full = max(ruled, now) < self.lowest + _SAME
+        if is_full:
+            self.remember([(-realised, not self._was_full)])
+        self._was_full = is_full
         if watched:
             self._was_braking = False
         else:
             self._learn_shortfall(ruled, realised)
 
-    def _learn_full(self, ruled: float, realised: float) -> None:
-        """Braking in full shows what it brings.
-
-        What is commanded now must be it, too: commands answer to noise, and of braking that noise
-        has ended the brakes would seem better than they are.
-        """
-        is_full = ruled < self.lowest + _SAME
-        if is_full:
-            self.remember([Sample(-realised, begins=not self._was_full)])
-        self._was_full = is_full
-
     def _learn_shortfall(self, ruled: float, realised: float) -> None:
         """Any braking shows whether the brakes are weaker than they were."""
-        is_braking = ruled < -_GENTLE and len(self.samples) >= _FEWEST
+        is_braking = ruled < -_GENTLE and len(self.full) >= _FEWEST
         if is_braking:
-            brought = Sample(-realised, begins=not self._was_braking)
-            self._brought.add(brought)
-            shortfall = min(-ruled, self.decel) - brought.value
-            self._shortfalls.add(brought._replace(value=shortfall))
+            begins = not self._was_braking
+            self.brought.add(-realised, begins)
+            self.shortfalls.add(min(-ruled, self.decel) + realised, begins)
         self._was_braking = is_braking
         if is_braking and self._is_sure_to_fall_short():  # begin anew
-            self.samples.clear()
-            self.remember(self._brought)
-            self._shortfalls.clear()
+            self.full.clear()
+            self.remember(self.brought.rows)
+            self.shortfalls.clear()
 
     def _is_sure_to_fall_short(self) -> bool:
         """Without noise the latest few tell; in noise it takes more."""
-        if len(self._shortfalls) < _FEWEST:
+        if len(self.shortfalls) < _FEWEST:
             return False
-        _, of_few = self._shortfalls.mean_and_bound(_SURE, _FEWEST)
-        return of_few > _SHORTFALL or self._shortfalls.mean_and_bound(_SURE)[1] > _SHORTFALL
+        _, of_few = self.shortfalls.mean_and_bound(_SURE, _FEWEST)
+        return of_few > _SHORTFALL or self.shortfalls.mean_and_bound(_SURE)[1] > _SHORTFALL
 
 
 @compiled
@@ -285,9 +266,9 @@ def _mean_and_bound(
     values, count = rows[first:end, 0], end - first
     mean = _sum(values) / count
     variance = _sum((values - mean) ** 2) / (count - 1)
-    stretches = max(1.0, rows[first:end, 1].sum())
+    runs = max(1.0, rows[first:end, 1].sum())
     few = 1.0 + 1.2 / (count - 1)  # roughly what Student's t adds: few say little of their variance
-    return mean, mean - few * errors * sqrt(variance * stretches) / count
+    return mean, mean - few * errors * sqrt(variance * runs) / count
 
 
 @kernel

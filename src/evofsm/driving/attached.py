@@ -1,25 +1,153 @@
-"""Attach guards to a running SUMO simulation: which cars come and go, and what it took."""
+"""Attach guards to a running SUMO simulation, or only watch: which cars, and what came of it."""
 
 from __future__ import annotations
 
 import math
 import time as clock
-from collections.abc import Callable, Iterable
+import zlib
+from collections.abc import Callable, Iterable, Iterator
 from importlib import import_module
 from typing import Any, NamedTuple
 
-from evofsm.driving.attached.chosen import choose
-from evofsm.driving.attached.guarded import Guarding, Told
-from evofsm.driving.attached.seen import Seeing
-from evofsm.driving.attached.watched import Watching
+import numpy as np
+
+from evofsm.driving.guarding import GuardedStep, Guarding, Seeing
+from evofsm.driving.measures import deceleration_to_avoid_collision, time_to_collision
 from evofsm.guard import TOLERANCE, Guard
 
-#: What is done with the chosen cars.
-ATTACH_MODES = ("act", "shadow", "watch")
-
+# What is done with the chosen cars.
+_MODES = ("act", "shadow", "watch")
+_TYPE = "type:"
 _GREEN, _AMBER, _RED = (40, 160, 70, 255), (240, 160, 0, 255), (215, 40, 40, 255)
+# Needed decelerations from which on a car that is watched is amber, or red [m/s²].
+_CAREFUL, _HARD = 1.0, 3.35
 # Two that touched within this time before still do [s].
 _SAME_COLLISION = 5.0
+
+
+def choose(vehicles: str | float | Iterable[str], seed: int = 0) -> Callable[[Any, str], bool]:
+    """A test of whether a vehicle is one of those that are meant.
+
+    Parameters
+    ----------
+    vehicles : str, float or iterable of str
+        ``"all"``, ``"type:NAME"``, a share in (0, 1], also as ``"10%"``, or their ids.
+    seed : int
+        Other vehicles make up the share for another one.
+
+    Returns
+    -------
+    callable
+        From libsumo or traci and an id to whether it is meant. Of a share, the id alone decides:
+        the same vehicles are meant in every run.
+
+    Raises
+    ------
+    ValueError
+        If it is none of these.
+
+    Examples
+    --------
+    >>> chosen = choose(0.5)
+    >>> [chosen(None, car) for car in ("a", "b", "c", "d")]
+    [False, True, True, False]
+    """
+    if isinstance(vehicles, str):
+        return _named(vehicles, seed)
+    if isinstance(vehicles, (int, float)):
+        return _share(float(vehicles), seed)
+    ids = frozenset(vehicles)
+    return lambda _, car: car in ids
+
+
+def _named(vehicles: str, seed: int) -> Callable[[Any, str], bool]:
+    if vehicles == "all":
+        return lambda sumo, car: True
+    if vehicles.startswith(_TYPE):
+        kind = vehicles.removeprefix(_TYPE)
+        return lambda sumo, car: sumo.vehicle.getTypeID(car) == kind
+    if vehicles.endswith("%"):
+        try:
+            return _share(float(vehicles[:-1]) / 100.0, seed)
+        except ValueError:
+            pass
+    raise ValueError(
+        f"vehicles is {vehicles!r}; it is 'all', 'type:NAME', a share such as 0.1 or '10%', or a "
+        "list of ids"
+    )
+
+
+def _share(share: float, seed: int) -> Callable[[Any, str], bool]:
+    if not 0.0 < share <= 1.0 or math.isnan(share):
+        raise ValueError(f"vehicles is {share}; a share lies above 0, up to 1")
+    limit = share * 2.0**32
+    return lambda _, car: zlib.crc32(f"{seed}:{car}".encode()) < limit
+
+
+class Watching:
+    """Measures each car against whoever is ahead of it.
+
+    Attributes
+    ----------
+    ids : list of str
+        Cars with somebody ahead, now.
+    observations : (len(ids), 3) ndarray
+        Gap [m], speed of the car and of the one ahead [m/s], of each.
+    ttc, drac : (len(ids),) ndarray
+        Time to collision [s] and deceleration to avoid it [m/s²], of each.
+    lowest_ttc, highest_drac : dict from str to float
+        Of each car that ever closed in, so far.
+    """
+
+    def __init__(self, seeing: Seeing) -> None:
+        self._seeing = seeing
+        self._cars: dict[str, None] = {}
+        self.ids: list[str] = []
+        self.observations = np.empty((0, 3))
+        self.ttc = self.drac = np.empty(0)
+        self.lowest_ttc: dict[str, float] = {}
+        self.highest_drac: dict[str, float] = {}
+
+    def __len__(self) -> int:
+        return len(self._cars)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._cars)
+
+    def add(self, car: str) -> None:
+        """Watch it from now on."""
+        self._cars[car] = None
+
+    def remove(self, car: str) -> None:
+        """Watch it no longer; what was measured stays."""
+        self._cars.pop(car, None)
+
+    def leave(self, car: str) -> None:
+        """It has left the simulation."""
+        self.remove(car)
+
+    def urgency(self) -> dict[str, int]:
+        """0 to 2 of each car."""
+        needed = dict(zip(self.ids, self.drac.tolist(), strict=True))
+        drac = {car: needed.get(car, 0.0) for car in self._cars}
+        return {car: (each > _CAREFUL) + (each > _HARD) for car, each in drac.items()}
+
+    def step(self) -> int:
+        """Look at every car; returns how many there are."""
+        ids, rows, pair_of = [], [], self._seeing.pair
+        for car in self._cars:
+            pair = pair_of(car)
+            if pair is not None:
+                ids.append(car)
+                rows.append(pair)
+        self.ids, self.observations = ids, np.array(rows) if rows else np.empty((0, 3))
+        self.ttc = time_to_collision(self.observations)
+        self.drac = deceleration_to_avoid_collision(self.observations)
+        for k in np.flatnonzero(np.isfinite(self.ttc)).tolist():
+            car, ttc, drac = ids[k], float(self.ttc[k]), float(self.drac[k])
+            self.lowest_ttc[car] = min(ttc, self.lowest_ttc.get(car, ttc))
+            self.highest_drac[car] = max(drac, self.highest_drac.get(car, drac))
+        return len(self._cars)
 
 
 class Collision(NamedTuple):
@@ -61,7 +189,7 @@ class Attachment:
         tolerance: float,
         learn: bool,
         color: bool,
-        tell: Callable[[Told], None] | None,
+        report: Callable[[GuardedStep], None] | None,
     ) -> None:
         self._sumo, self._chosen, self.mode = sumo, chosen, mode
         seeing = self._seeing = Seeing(sumo)
@@ -78,7 +206,7 @@ class Attachment:
                 acts=mode == "act",
                 tolerance=tolerance,
                 learn=learn,
-                tell=tell,
+                report=report,
             )
         self._colors: dict[str, tuple[int, ...]] | None = {} if color else None
         self._now = -math.inf
@@ -176,7 +304,7 @@ def attach(
     learn: bool = True,
     color: bool = False,
     seed: int = 0,
-    tell: Callable[[Told], None] | None = None,
+    report: Callable[[GuardedStep], None] | None = None,
 ) -> Attachment:
     """Guard, or watch, cars of a SUMO simulation that runs.
 
@@ -192,7 +320,7 @@ def attach(
         ``"all"``, ``"type:NAME"``, a share such as 0.1 or ``"10%"``, or ids; those to come as well.
     guard : Guard, optional
         Each car gets a copy, frozen. It observes scenes (`guard_for_traffic`) or gap and speeds
-        (`guard_for_cars`). Without one, each is told the car's own limits: it counts on SUMO's
+        (`guard_for_cars`). Without one, each knows the car's own limits: it counts on SUMO's
         ``decel`` and brakes up to ``emergencyDecel`` where it has to.
     mode : {"act", "shadow", "watch"}
         Whether guards act, only say what they would do, or there are none: then only time to
@@ -206,8 +334,8 @@ def attach(
         tolerable. Those that are only watched by the deceleration that they need.
     seed : int
         Of the share.
-    tell : callable, optional
-        Called with each `Told`.
+    report : callable, optional
+        Called with each `GuardedStep`: what a car's driver wanted, what it did, and why.
 
     Returns
     -------
@@ -244,8 +372,8 @@ def attach(
     >>> watch.looked
     50
     """
-    if mode not in ATTACH_MODES:
-        raise ValueError(f"there is no mode {mode!r}; there are {', '.join(ATTACH_MODES)}")
+    if mode not in _MODES:
+        raise ValueError(f"there is no mode {mode!r}; there are {', '.join(_MODES)}")
     if mode == "watch" and guard is not None:
         raise ValueError("mode 'watch' asks no guard; use mode 'shadow'")
     attachment = Attachment(
@@ -256,7 +384,7 @@ def attach(
         tolerance=tolerance,
         learn=learn,
         color=color,
-        tell=tell,
+        report=report,
     )
     attachment.listen()
     return attachment

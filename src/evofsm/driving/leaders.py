@@ -1,24 +1,26 @@
-"""How hard others brake: every braking manoeuvre seen is remembered, pooled over situations.
+"""How hard leaders brake: every braking manoeuvre seen is remembered, pooled over situations.
 
 What a leader does next hardly depends on the follower, so each hard manoeuvre seen anywhere counts
 everywhere. The chance that the next one is harder than some deceleration is read from a kernel
 density over those remembered (Epanechnikov's kernel, Silverman's bandwidth), together with one
 manoeuvre that was only assumed, as hard as a cautious engineer would have it: with N remembered it
-weighs 1 / (N + 1), which is also the chance that the next one is harder than all before it.
+weighs 1 / (N + 1), which is also the chance that the next one is harder than all before it. So it
+takes 49 hard brakes until a risk of 2 % can be told from the assumption, unless one begins with a
+table of them (`LeaderBrakes`).
 """
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Iterable, Sequence
 from itertools import zip_longest
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from evofsm.driving.risk.leaders import LeaderBrakes
-from evofsm.driving.risk.rehearsal import HARDEST
+from evofsm.driving.rehearsal import HARDEST
 from evofsm.fsm import positive
 
 # Of a manoeuvre the hardest second counts; it shows in the latest half, and takes at least three
@@ -34,6 +36,81 @@ _BLUR, _BLUR_HARDEST, _DOUBT = 0.4, 0.15, 3.0
 _ANOTHER_GAP, _ANOTHER_SPEED = 3.0, 1.0
 # Between two points of the table of `Manoeuvres.harder` [m/s²], and its narrowest kernel.
 _GRID, _NARROWEST = 0.05, 0.1
+# Of a bin of `LeaderBrakes` [m/s²].
+_WIDTH = 0.25
+
+
+class LeaderBrakes(NamedTuple):
+    """Hard brakes of leaders in some drives, counted by their deceleration.
+
+    ``python -m studies leaders --data FOLDER`` prints such a table of any folder of drives.
+
+    Examples
+    --------
+    >>> brakes = LeaderBrakes.counted([2.6, 3.1, 2.7], gentle=20, hours=0.5, source="our own cars")
+    >>> brakes.counts, brakes.decels
+    ((2, 0, 1), (2.75, 2.75, 3.25))
+    >>> brakes.hours_until(tolerance=0.02)
+    8.166666666666666
+    """
+
+    hard: float  #: from which deceleration on they count as hard [m/s²]
+    counts: tuple[int, ...]  #: of hard ones, by bins of 0.25 m/s² from there on
+    gentle: int  #: number of softer ones
+    hours: float  #: of following a leader that they were seen in
+    source: str  #: whose drives, for people
+
+    @classmethod
+    def counted(
+        cls, decels: Sequence[float], gentle: int, hours: float, source: str, hard: float = 2.5
+    ) -> Self:
+        """Count decelerations of at least ``hard`` [m/s²]."""
+        bins = [int((decel - hard) / _WIDTH) for decel in decels]
+        counts = np.bincount(np.array(bins, dtype=np.int64)).tolist()
+        return cls(hard, tuple(counts), gentle, positive("hours", hours), source)
+
+    @property
+    def decels(self) -> tuple[float, ...]:
+        """Each as hard as its bin may hold, the softest first [m/s²]."""
+        ends = self.hard + _WIDTH * np.arange(1, len(self.counts) + 1)
+        return tuple(np.repeat(ends, self.counts).tolist())
+
+    def hours_until(self, tolerance: float) -> float:
+        """Hours of driving until so many are seen that a tolerance can be met without a table."""
+        seen = sum(self.counts)
+        return brakes_needed(tolerance) * self.hours / seen if seen else math.inf
+
+    @property
+    def at_most_harder(self) -> float:
+        """Share of hard brakes that may be harder than all that were seen (95 %, one-sided).
+
+        If each were drawn by itself; those of one platoon are not, so the share may be larger.
+        """
+        seen = sum(self.counts)
+        return 1.0 - 0.05 ** (1.0 / seen) if seen else 1.0
+
+
+def brakes_needed(tolerance: float) -> int:
+    """Hard brakes to be seen until the assumed one weighs no more than the tolerance.
+
+    Examples
+    --------
+    >>> brakes_needed(0.02)
+    49
+    """
+    return max(math.ceil(1.0 / tolerance - 1e-9) - 1, 0)
+
+
+#: Public drives: 46 waves of braking, the hardest 6.1 m/s². Hardly anyone brakes hard in them, and
+#: no one in an emergency: how hard leaders brake then, they do not tell.
+REAL_DRIVES = LeaderBrakes(
+    hard=2.5,
+    counts=(25, 15, 14, 14, 7, 7, 3, 2, 1, 1, 1, 0, 0, 0, 2),
+    gentle=977,
+    hours=16.1,
+    source="OpenACC, ZalaZONE campaign (JRC; Makridis et al. 2021), NGSIM (FHWA; events of Zhu et "
+    "al. 2020), one platoon of FHWA; 42 runs",
+)
 
 
 class Manoeuvres:
@@ -143,14 +220,6 @@ def latest_of_each(series: Iterable[Iterable[float]]) -> list[float]:
     return [value for column in columns for value in column if value is not None][::-1]
 
 
-class Seen(NamedTuple):
-    """One observation, as far as others' braking is concerned."""
-
-    gap: float
-    speed: float
-    leader_speed: float
-
-
 class BrakeWatch:
     """Watches a leader's speed, and tells a manoeuvre when it has ended.
 
@@ -185,7 +254,8 @@ class BrakeWatch:
 
     def clear(self) -> None:
         """Forget the leader: another comes, or an episode begins."""
-        self._recent: deque[Seen] = deque(maxlen=4 * self._recently + 1)
+        # Gap, own speed and leader's speed.
+        self._recent: deque[tuple[float, float, float]] = deque(maxlen=4 * self._recently + 1)
         self._braking: list[float] = []
         self._noise = 0.0
 
@@ -196,7 +266,7 @@ class BrakeWatch:
 
         ``noise`` is the standard deviation of that on the difference of two speeds [m/s].
         """
-        now = Seen(gap, speed, leader_speed)
+        now = gap, speed, leader_speed
         if self._recent and self._is_another(self._recent[-1], now):
             ended = self.end()
             self.clear()
@@ -207,7 +277,7 @@ class BrakeWatch:
         span = min(self._long_enough(self._recently, _BLUR), 4 * self._recently)
         if len(self._recent) <= span:
             return None
-        lost = self._recent[-1 - span].leader_speed - leader_speed
+        lost = self._recent[-1 - span][2] - leader_speed
         seconds = span * self.dt
         if self._braking:
             self._braking.append(leader_speed)
@@ -216,7 +286,7 @@ class BrakeWatch:
             if lost < _ENDS * seconds or leader_speed <= 0.0:
                 return self.end()
         elif lost >= _BEGINS * seconds + _DOUBT * noise:
-            self._braking = [seen.leader_speed for seen in self._recent][-1 - span :]
+            self._braking = [speed for _, _, speed in self._recent][-1 - span :]
         return None
 
     def end(self) -> float | None:
@@ -236,10 +306,10 @@ class BrakeWatch:
         """So many decisions, or more if noise blurs a deceleration over them."""
         return max(span, round(self._noise / (blur * self.dt)))
 
-    def _is_another(self, before: Seen, now: Seen) -> bool:
-        expected = before.gap + 0.5 * self.dt * (
-            before.leader_speed + now.leader_speed - before.speed - now.speed
-        )
-        if abs(now.leader_speed - before.leader_speed) > HARDEST * self.dt + _ANOTHER_SPEED:
+    def _is_another(
+        self, before: tuple[float, float, float], now: tuple[float, float, float]
+    ) -> bool:
+        expected = before[0] + 0.5 * self.dt * (before[2] + now[2] - before[1] - now[1])
+        if abs(now[2] - before[2]) > HARDEST * self.dt + _ANOTHER_SPEED:
             return True
-        return abs(now.gap - expected) > _ANOTHER_GAP
+        return abs(now[0] - expected) > _ANOTHER_GAP

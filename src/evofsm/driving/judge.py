@@ -2,12 +2,12 @@
 
 A failure is rare and its causes are long past when it comes, so counting failures says too little
 and too late. What leads to it can be learnt from every ordinary minute: how hard leaders brake
-(`risk.manoeuvres`), how often they begin to (by state, here), and how well one brakes
-oneself (`risk.brakes`). An action is then *rehearsed* (`evofsm.driving.risk.rehearsal`): it is
-taken, full braking follows, and the leader brakes. The hardest braking of the leader that still
-ends well is the critical deceleration, and the latent risk is the probability that the leader
-brakes harder than that. A situation is a dead end where, if the leader braked hard now, even
-braking in full at once would be too late; while the leader does not, it can still be left.
+(`leaders`), how often they begin to (by state, here), and how well one brakes oneself (`brakes`).
+An action is then *rehearsed* (`rehearsal`): it is taken, full braking follows, and the leader
+brakes. The hardest braking of the leader that still ends well is the critical deceleration, and the
+latent risk is the probability that the leader brakes harder than that. A situation is a dead end
+where, if the leader braked hard now, even braking in full at once would be too late; while the
+leader does not, it can still be left.
 """
 
 from __future__ import annotations
@@ -20,14 +20,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from evofsm import store
+from evofsm.driving.brakes import OwnBrakes, hardest_seen
+from evofsm.driving.leaders import BrakeWatch, LeaderBrakes, Manoeuvres
 from evofsm.driving.naming import LABELS
+from evofsm.driving.perception import Perception, is_whole
+from evofsm.driving.rehearsal import HARDEST, Body, Three, critical_decelerations
 from evofsm.driving.revisers import GENTLE_BRAKE
-from evofsm.driving.risk.brakes import OwnBrakes, Sample
-from evofsm.driving.risk.leaders import LeaderBrakes
-from evofsm.driving.risk.manoeuvres import BrakeWatch, Manoeuvres
-from evofsm.driving.risk.perception import Estimate, Perception, is_whole
-from evofsm.driving.risk.ranges import RISK, refuse_other_brakes
-from evofsm.driving.risk.rehearsal import Body, Three, critical_decelerations
 from evofsm.fsm import (
     compiled,
     inner_kernel,
@@ -38,7 +36,17 @@ from evofsm.fsm import (
     wilson_bounds,
 )
 from evofsm.guard import TOLERANCE, Action, Judgement, Situation, Trial
-from evofsm.store import LARGEST_OBSERVATION, Place
+from evofsm.store import (
+    COUNT,
+    FLAG,
+    LARGEST_OBSERVATION,
+    MOST_COUNTED,
+    SIZE,
+    SMALLEST,
+    Kind,
+    Numbers,
+    Place,
+)
 
 # Pseudo-evidence for the pooled rate of manoeuvres, against that of a state [s].
 _POOLED = 20.0
@@ -46,6 +54,48 @@ _POOLED = 20.0
 _STANDS = 0.1
 # Where a situation is not sure, it may be worse by so many standard deviations.
 _CAUTION = 2.5
+
+
+# -- What a file may hold -------------------------------------------------------------------------
+# No car is asked to brake harder [m/s²]; decisions are no closer nor farther apart [s].
+
+_ASKED, _SHORTEST, _LONGEST = 100.0, 1e-6, 1e6
+_TIME = Numbers(least=0.0, most=_LONGEST * MOST_COUNTED)
+_ACCELERATION = Numbers(least=SMALLEST, most=_ASKED)
+_PRODUCT, _NOISE = Numbers(least=-1e300, most=1e300), Numbers(least=0.0, most=1e300)
+_RISK = Kind(
+    "risk",
+    {
+        **dict.fromkeys(("onsets", "exposure", "seconds"), _TIME.of("n")),
+        "brakes": Numbers(("samples",)),
+        "stretches": FLAG.of("samples"),
+        "decels": Numbers(("decels",), SMALLEST, HARDEST),
+        "gentle": COUNT.of(1),
+        "lagged": _PRODUCT.of(2),
+        "noise_gap": _NOISE.of("gaps"),
+        "noise_speed": _NOISE.of("speeds"),
+        "noise_leader": _NOISE.of("leaders"),
+        "doubts_brought": Numbers(("brought",)),
+        "doubts_shortfalls": Numbers(("shortfalls",)),
+    },
+    {
+        "lowest": Numbers(least=-_ASKED, most=-SMALLEST),
+        "dt": Numbers(least=_SHORTEST, most=_LONGEST),
+        **dict.fromkeys(("leader_decel", "hard"), _ACCELERATION),
+        "own_brakes": Numbers(least=SMALLEST, most=10.0),
+        "margin": SIZE,
+    },
+)
+
+
+def _refuse_other_brakes(dt: float, arrays: Mapping[str, NDArray[Any]]) -> None:
+    """Raise for braking that could not have been seen at this interval of time."""
+    most = hardest_seen(dt)
+    brought = Numbers(("n",), -most, most)
+    brought.refuse_others("brakes", arrays["brakes"])
+    brought.refuse_others("doubts_brought", arrays["doubts_brought"])
+    short = Numbers(("n",), -2.0 * most - _ASKED, 2.0 * most + _ASKED)
+    short.refuse_others("doubts_shortfalls", arrays["doubts_shortfalls"])
 
 
 class LatentRisk:
@@ -101,7 +151,7 @@ class LatentRisk:
         self.own_brakes = positive("own_brakes", own_brakes)
         self.margin = positive("margin", margin)
         self.hard = positive("hard", hard)
-        RISK.refuse_others(self._settings)
+        _RISK.refuse_others(self._settings)
         self.manoeuvres = Manoeuvres(leader_decel, hard)
         if leaders is not None:
             self.manoeuvres.begin_with(leaders)
@@ -114,7 +164,7 @@ class LatentRisk:
         self._commands = (0.0, 0.0)  # the latest two
 
     @classmethod
-    def told(
+    def given(
         cls,
         lowest: float,
         decel: float,
@@ -123,7 +173,7 @@ class LatentRisk:
         *,
         leaders: LeaderBrakes | None = None,
     ) -> Self:
-        """Told the limits instead of learning them: the best that could be learnt.
+        """Given the limits instead of learning them: the best that could be learnt.
 
         Parameters
         ----------
@@ -195,7 +245,7 @@ class LatentRisk:
             return
         was_braking = self._watch.braking
         self._count(states, was_braking)
-        estimate = self._perceive(seen, learn=True)
+        estimate = self.perception.see(seen, self._expected, sure=self.brakes.known)
         self._remember(self._follow(seen, command))
         if self._watch.braking and not was_braking:
             self._by_state[0, : len(states)] += states
@@ -203,7 +253,7 @@ class LatentRisk:
         if watched:
             if not self._watched:
                 self._own_watch.clear()
-            self._show(self._own_watch.see(0.0, seen[1], seen[1], self._of_change(1)))
+            self._remember(None, self._own_watch.see(0.0, seen[1], seen[1], self._of_change(1)))
         self._watched = watched
 
     def follow(self, observation: ArrayLike, acceleration: float) -> None:
@@ -211,7 +261,7 @@ class LatentRisk:
         command = _one_finite("acceleration", acceleration)
         seen = _three_finite(observation, whole=False)
         self._watched = False
-        self._perceive(seen, learn=False)
+        self.perception.see(seen, self._expected, sure=self.brakes.known, learn=False)
         if is_whole(seen):
             self._follow(seen, command)
         else:
@@ -223,8 +273,7 @@ class LatentRisk:
         """What comes is not a consequence of what was; a manoeuvre under way counts as it is."""
         ended, shown = self._watch.end(), self._own_watch.end()
         if learn:
-            self._remember(ended)
-            self._show(shown)
+            self._remember(ended, shown)
         self._watch.clear()
         self._own_watch.clear()
         self.brakes.clear()
@@ -234,9 +283,6 @@ class LatentRisk:
     def end(self, observation: ArrayLike | None, *, failed: bool) -> None:
         """What comes is not a consequence of what was; how it ended teaches nothing."""
         self.start_episode(learn=True)
-
-    def _perceive(self, seen: Three, *, learn: bool) -> Estimate:
-        return self.perception.see(seen, self._expected, sure=self.brakes.known, learn=learn)
 
     def _follow(self, seen: Three, acceleration: float) -> float | None:
         self._commands = (self._commands[1], acceleration)
@@ -251,13 +297,12 @@ class LatentRisk:
         """What the latest command brings until the next decision, most likely [m/s²]."""
         return self.brakes.expected(*self._commands)
 
-    def _remember(self, decel: float | None) -> None:
-        if decel is not None:
-            self.manoeuvres.remember(decel)
-
-    def _show(self, decel: float | None) -> None:
-        if decel is not None:
-            self.brakes.show(decel)
+    def _remember(self, leaders: float | None, own: float | None = None) -> None:
+        """Take in manoeuvres that have ended [m/s²]."""
+        if leaders is not None:
+            self.manoeuvres.remember(leaders)
+        if own is not None:
+            self.brakes.show(own)
 
     def _count(self, belief: NDArray[np.float64], braking: bool) -> None:
         counts, missing = self._by_state, len(belief) - self._by_state.shape[1]
@@ -540,8 +585,8 @@ class LatentRisk:
         """
         settings = {**self._settings, "own_brakes": self.brakes.assumed}
         learnt = self._learnt()
-        refuse_other_brakes(self.dt, learnt)
-        store.write(path, RISK, settings, learnt, provenance)
+        _refuse_other_brakes(self.dt, learnt)
+        store.write(path, _RISK, settings, learnt, provenance)
 
     @classmethod
     def load(cls, path: Place) -> Self:
@@ -565,21 +610,19 @@ class LatentRisk:
         ...     len(LatentRisk.load(Path(folder) / "risk.evofsm").manoeuvres)
         1
         """
-        settings, arrays = store.read(path, RISK)
+        settings, arrays = store.read(path, _RISK)
         with store.explained(path):
-            refuse_other_brakes(settings["dt"], arrays)
+            _refuse_other_brakes(settings["dt"], arrays)
             risk = cls(**settings)
             risk.manoeuvres.remember(*arrays["decels"].tolist())
             risk.manoeuvres.gentle = int(arrays["gentle"][0])
-            samples = zip(arrays["brakes"].tolist(), arrays["stretches"].tolist(), strict=True)
-            risk.brakes.remember(Sample(decel, bool(begins)) for decel, begins in samples)
+            risk.brakes.remember(np.column_stack([arrays["brakes"], arrays["stretches"]]))
             risk.perception.restore(arrays)
             risk.brakes.set_lagged(*arrays["lagged"].tolist())
             risk._by_state = np.array([arrays[name] for name in ("onsets", "exposure", "seconds")])
-            for name, latest in risk.brakes.doubts.items():
-                pairs = arrays[f"doubts_{name}"].reshape(-1, 2)
-                for value, begins in pairs.tolist():
-                    latest.add(Sample(value, bool(begins)))
+            for latest in ("brought", "shortfalls"):
+                for value, begins in arrays[f"doubts_{latest}"].reshape(-1, 2).tolist():
+                    getattr(risk.brakes, latest).add(value, bool(begins))
         return risk
 
     @property
@@ -591,14 +634,12 @@ class LatentRisk:
         return {
             "decels": np.array(self.manoeuvres.decels),
             "gentle": np.array([self.manoeuvres.gentle], dtype=np.float64),
-            "brakes": np.array([sample.value for sample in self.brakes.samples]),
-            "stretches": np.array([float(sample.begins) for sample in self.brakes.samples]),
+            "brakes": self.brakes.full.rows[:, 0],
+            "stretches": self.brakes.full.rows[:, 1],
             **self.perception.learnt(),
             "lagged": np.array(self.brakes.lagged),
-            **{
-                f"doubts_{name}": np.array(list(latest), dtype=np.float64).reshape(-1)
-                for name, latest in self.brakes.doubts.items()
-            },
+            "doubts_brought": self.brakes.brought.rows.reshape(-1),
+            "doubts_shortfalls": self.brakes.shortfalls.rows.reshape(-1),
             **dict(zip(("onsets", "exposure", "seconds"), self._by_state, strict=True)),
         }
 

@@ -18,11 +18,13 @@ from evofsm.driving.measures import (
     critical_fuzzy,
     deceleration_to_avoid_collision,
     distance_to_avoid,
+    is_dead_end,
     modified_time_to_collision,
     picud,
     proactive_fuzzy,
     safe_distance,
     time_headway,
+    time_to_collision,
 )
 
 MEASURES = [
@@ -42,6 +44,7 @@ EVERY_MEASURE = pytest.mark.parametrize("measure", MEASURES, ids=repr)
 
 DT = 0.1
 SPEEDS = st.floats(0.0, 60.0)
+DECELS = st.floats(1.0, 10.0)
 ROWS = st.tuples(st.floats(-10.0, 500.0), SPEEDS, SPEEDS)
 EPISODES = st.lists(ROWS, min_size=1, max_size=8).map(np.array)
 AT_EQUAL_SPEED = np.array([[10.0, 24.0, 24.0]])
@@ -292,3 +295,36 @@ def test_fuzzy_safety_takes_the_more_dangerous_of_the_two():
     pfs = proactive_fuzzy(rows, 0.75, 4.0, 6.0, 7.0, 2.0)
     cfs = critical_fuzzy(rows, DT, 0.75, 4.0, 6.0)
     assert model.score(rows, DT).tolist() == (np.maximum(pfs, cfs) - 0.25).tolist()
+
+
+# -- Dead ends --------------------------------------------------------------------------------
+
+
+def smallest_gap(gap, speed, leader_speed, decel, leader_decel):
+    """Gap when both brake, on a fine grid of time."""
+    time = np.linspace(0.0, 45.0, 200_001)
+    travelled = [
+        np.where(time < v / b, v * time - b * time**2 / 2, v**2 / (2 * b))
+        for v, b in ((speed, decel), (leader_speed, leader_decel))
+    ]
+    return (gap + travelled[1] - travelled[0]).min()
+
+
+@given(st.floats(0.1, 100.0), SPEEDS, SPEEDS, DECELS, DECELS)
+def test_the_oracle_agrees_with_driving_it_out(gap, speed, leader_speed, decel, leader_decel):
+    smallest = smallest_gap(gap, speed, leader_speed, decel, leader_decel)
+    dead_end = is_dead_end(np.array([gap, speed, leader_speed]), decel, leader_decel)
+    if abs(smallest) > 1e-4:
+        assert dead_end == (smallest < 0.0)
+
+
+def test_close_at_equal_speed_is_a_dead_end_that_ttc_does_not_see():
+    observation = np.array([10.0, 24.0, 24.0])
+    assert is_dead_end(observation, 4.0, 9.0)
+    assert time_to_collision(observation) == np.inf
+
+
+def test_measures_take_whole_numbers_and_cars_that_have_met():
+    assert time_to_collision(np.array([10, 25, 20])) == 2.0
+    assert time_to_collision(np.array([-0.5, 25.0, 20.0])) == 0.0
+    assert is_dead_end(np.array([0, 10, 10]), 4, 9)

@@ -1,23 +1,82 @@
 """Guards attached to a SUMO simulation of someone else's."""
 
+import runpy
 import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from evofsm.driving import LatentRisk, Role, attach, guard_for_cars, guard_for_traffic
+from evofsm.driving.attached import choose
 from evofsm.driving.measures import deceleration_to_avoid_collision, time_to_collision
 
-from .conftest import drive
+libsumo = pytest.importorskip("libsumo")
 
+EXAMPLE = Path(__file__).parents[2] / "examples" / "your-own-sumo"
 NO_GAP = ("--collision.mingap-factor", "0")
+NET = """<net version="1.20">
+    <location netOffset="0,0" convBoundary="0,0,3000,0" origBoundary="0,0,3000,0"
+              projParameter="!"/>
+    <edge id="road" from="begin" to="end" priority="1">
+        <lane id="road_0" index="0" speed="20" length="3000" shape="0,0 3000,0"/>
+    </edge>
+    <junction id="begin" type="dead_end" x="0" y="0" incLanes="" intLanes="" shape="0,0 0,3.2"/>
+    <junction id="end" type="dead_end" x="3000" y="0" incLanes="road_0" intLanes=""
+              shape="3000,0 3000,3.2"/>
+</net>"""
+CARS = """<routes>
+    <vType id="calm" sigma="0" speedFactor="0.7" speedDev="0"/>
+    <vType id="hasty" tau="0.2" minGap="0.5" accel="3.5" sigma="0" speedDev="0"
+           actionStepLength="1.0"/>
+    <route id="along" edges="road"/>
+    <vehicle id="lead" type="calm" route="along" depart="0" departPos="150" departSpeed="14"/>
+    <vehicle id="ego" type="hasty" route="along" depart="0" departPos="60" departSpeed="20">
+        {ssm}
+    </vehicle>
+    {others}
+</routes>"""
+
+
+@pytest.fixture
+def road(tmp_path):
+    """Starts the simulation anew; returns libsumo."""
+
+    def start(*options, others="", ssm=""):
+        if libsumo.simulation.isLoaded():
+            libsumo.close()
+        (tmp_path / "road.net.xml").write_text(NET)
+        (tmp_path / "cars.rou.xml").write_text(CARS.format(others=others, ssm=ssm))
+        files = ["-n", str(tmp_path / "road.net.xml"), "-r", str(tmp_path / "cars.rou.xml")]
+        quiet = ["--no-step-log", "--no-warnings", "--collision.action", "warn"]
+        libsumo.start(["sumo", *files, *quiet, "--step-length", "0.1", *options])
+        return libsumo
+
+    yield start
+    if libsumo.simulation.isLoaded():
+        libsumo.close()
+
+
+def drive(sumo, seconds, brakes_at=15.0):
+    """Drive on; the first car brakes in full at a time, to a standstill. Returns ego's speeds."""
+    speeds = []
+    for _ in range(round(seconds / sumo.simulation.getDeltaT())):
+        if sumo.simulation.getTime() >= brakes_at and "lead" in sumo.vehicle.getIDList():
+            sumo.vehicle.setSpeedMode("lead", 0)
+            speed = sumo.vehicle.getSpeed("lead")
+            sumo.vehicle.setSpeed("lead", max(0.0, speed - 8.0 * sumo.simulation.getDeltaT()))
+        sumo.simulationStep()
+        if "ego" in sumo.vehicle.getIDList():
+            speeds.append(sumo.vehicle.getSpeed("ego"))
+    return speeds
 
 
 def test_shadow_changes_nothing(road):
     alone = drive(road(*NO_GAP), 25.0)
     sumo = road(*NO_GAP)
     told = []
-    guards = attach(sumo, ["ego"], mode="shadow", tell=told.append)
+    guards = attach(sumo, ["ego"], mode="shadow", report=told.append)
     assert drive(sumo, 25.0) == alone
     assert guards.guarding.revised > 0
     assert [each.collider for each in guards.collisions] == ["ego"]
@@ -29,7 +88,7 @@ def test_shadow_changes_nothing(road):
 def test_a_guarded_car_does_not_collide(road, options, ballistic):
     sumo = road(*options, "--step-method.ballistic", ballistic)
     told = []
-    guards = attach(sumo, ["ego"], tell=told.append)
+    guards = attach(sumo, ["ego"], report=told.append)
     speeds = drive(sumo, 25.0)
     assert guards.collisions == []
     assert speeds[-1] == 0.0
@@ -44,7 +103,7 @@ def test_a_guarded_car_does_not_collide(road, options, ballistic):
 def test_the_wish_of_a_car_that_is_held_back_is_that_of_its_own_model(road):
     sumo = road(*NO_GAP)
     told = []
-    attach(sumo, ["ego"], tell=told.append)
+    attach(sumo, ["ego"], report=told.append)
     drive(sumo, 14.0)
     held = [one for one in told if one.deed < one.wish - 1e-6]
     assert held
@@ -118,7 +177,7 @@ def test_a_guard_of_ones_own_is_copied_and_left_as_it_was(road):
 
 def test_a_guard_that_knows_one_leader_will_do(road):
     sumo = road(*NO_GAP)
-    mine = guard_for_cars(-4.5, 3.5, interval=0.1, judge=LatentRisk.told(-4.5, 4.5, 9.0, 0.1))
+    mine = guard_for_cars(-4.5, 3.5, interval=0.1, judge=LatentRisk.given(-4.5, 4.5, 9.0, 0.1))
     guards = attach(sumo, ["ego"], guard=mine)
     drive(sumo, 25.0)
     assert guards.collisions == []
@@ -139,7 +198,7 @@ def test_two_runs_are_the_same(road):
     for _ in range(2):
         sumo = road(*NO_GAP)
         told = []
-        attach(sumo, "all", tell=told.append)
+        attach(sumo, "all", report=told.append)
         drive(sumo, 20.0)
         runs.append([(one.car, one.wish, one.deed, one.revision.reason) for one in told])
     assert runs[0] == runs[1]
@@ -236,3 +295,67 @@ def test_watching_measures_every_car_with_one_ahead(road):
 def test_what_cannot_be_is_refused(road, given, said):
     with pytest.raises(ValueError, match=said):
         attach(road(*NO_GAP), "all", **given)
+
+
+# -- Which vehicles are meant ---------------------------------------------------------------------
+
+
+IDS = [str(k) for k in range(2000)]
+TYPES = SimpleNamespace(vehicle=SimpleNamespace(getTypeID=lambda car: "bus" if car == "7" else "x"))
+
+
+def chosen(vehicles, seed=0):
+    test = choose(vehicles, seed)
+    return {car for car in IDS if test(TYPES, car)}
+
+
+def test_all_some_or_those_of_a_type():
+    assert chosen("all") == set(IDS)
+    assert chosen(["1", "2", "gone"]) == {"1", "2"}
+    assert chosen("type:bus") == {"7"}
+
+
+def test_a_share_is_the_same_in_every_run():
+    assert chosen(0.1) == chosen("10%")
+    assert 150 < len(chosen(0.1)) < 250
+    assert chosen(0.1) != chosen(0.1, seed=1)
+    assert chosen(1) == set(IDS)
+
+
+@pytest.mark.parametrize("vehicles", ["none", "x%", "120%", 0.0, -0.1, 1.5, float("nan")])
+def test_anything_else_is_refused(vehicles):
+    with pytest.raises(ValueError, match="vehicles is"):
+        choose(vehicles)
+
+
+# -- The example: a grid of streets by netgenerate, 600 cars, one in ten hasty --------------------
+
+
+def drive_grid(configuration, mode):
+    """The attachment, mean speed of the hasty cars, and their names."""
+    libsumo.start(["sumo", "-c", str(configuration), "--seed", "0"])
+    guards = attach(libsumo, "type:hasty", mode=mode)
+    distance = cars = 0
+    while libsumo.simulation.getTime() < 150.0:
+        libsumo.simulationStep()
+        distance += sum(map(libsumo.vehicle.getSpeed, guards.cars))
+        cars += len(guards.cars)
+    libsumo.close()
+    return guards, distance / cars
+
+
+@pytest.mark.slow
+def test_collisions_of_hasty_cars_are_prevented_and_none_is_caused_behind_them(tmp_path):
+    made = runpy.run_path(str(EXAMPLE / "make.py"))
+    configuration = made["write_cars"](tmp_path, seed=0)
+    alone, speed_alone = drive_grid(configuration, "shadow")
+    guarded, speed = drive_grid(configuration, "act")
+    hasty = alone.ever
+    before = sum(each.collider in hasty for each in alone.collisions)
+    after = sum(each.collider in hasty for each in guarded.collisions)
+    assert before >= 10
+    assert after <= 0.1 * before
+    assert not any(
+        each.victim in hasty for each in guarded.collisions if each.collider not in hasty
+    )
+    assert speed >= 0.9 * speed_alone

@@ -8,15 +8,14 @@ import numpy as np
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
-from studies.counts import OutcomeCounts
 
+from evofsm.driving import IDM, Body, Family, Leader, Scenario, guard_for_family, teach
+from evofsm.driving.by_state import RiskByState, assess_states
+from evofsm.driving.judge import LatentRisk
+from evofsm.driving.leaders import REAL_DRIVES
 from evofsm.driving.measures import is_dead_end
-from evofsm.driving.risk.brakes import OwnBrakes
-from evofsm.driving.risk.by_state import RiskByState, assess_states
-from evofsm.driving.risk.latent import LatentRisk
-from evofsm.driving.risk.manoeuvres import BrakeWatch, Manoeuvres
-from evofsm.driving.risk.ranges import hardest_seen
-from evofsm.driving.risk.rehearsal import HARDEST, Body, critical_decelerations
+from evofsm.driving.rehearsal import HARDEST, critical_decelerations
+from evofsm.driving.rehearsal import Body as Follower
 from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.states.novelty import Novelty
 from evofsm.guard.protocols import Situation
@@ -39,7 +38,7 @@ ONSETS = st.integers(0, 12)
 def critical(gap, speed, leader_speed, action, *, before=0.0, decel=4.0, lag=0.0, onset=0):
     answer = np.empty(1)
     observation = np.array([gap, speed, leader_speed])
-    body = Body(decel, lag, MARGIN)
+    body = Follower(decel, lag, MARGIN)
     critical_decelerations(observation, np.array([action]), before, body, onset, DT, answer)
     return float(answer[0])
 
@@ -68,7 +67,7 @@ def smallest_gap(gap, speed, leader_speed, action, before, decel, lag, onset, le
         tick += 1
 
 
-# -- Rehearsal ----------------------------------------------------------------------------------
+# -- Rehearsal ------------------------------------------------------------------------------
 
 
 @pytest.mark.slow
@@ -142,198 +141,7 @@ def test_a_sensor_that_shows_a_standing_car_as_rolling_back_changes_nothing(
     assert critical(gap, rolling, speed, action) == critical(gap, 0.0, speed, action)
 
 
-# -- One's own brakes ---------------------------------------------------------------------------
-
-
-def drive(brakes, true_decel, *, rounds=1, speed=25.0, noise=0.0, seed=0, late=0):
-    """Speed up and brake in full, in turn; answers what was counted on after each decision."""
-    rng = np.random.default_rng(seed)
-    counted_on, given = [], [0.0] * (late + 1)
-    for _ in range(rounds):
-        brakes.clear()
-        v = speed
-        for k in range(40):
-            command = 1.0 if k < 10 else brakes.lowest
-            given.append(command)
-            brakes.see(max(0.0, v + rng.normal(0.0, noise)), command)
-            counted_on.append(brakes.decel)
-            v = max(0.0, v + DT * max(given[-1 - late], -true_decel))
-    return np.array(counted_on)
-
-
-def test_full_braking_is_learnt_as_it_is_and_not_as_commanded():
-    brakes = OwnBrakes(lowest=-4.5, assumed=0.6, dt=DT)
-    assert brakes.decel == pytest.approx(2.7)
-    assert not brakes.known
-    drive(brakes, 2.5)
-    assert brakes.known
-    assert brakes.decel == pytest.approx(2.5)
-
-
-def test_brakes_that_weaken_show_within_seconds_of_braking():
-    brakes = OwnBrakes(lowest=-4.5, assumed=0.6, dt=DT)
-    drive(brakes, 4.5, rounds=3)
-    assert brakes.decel == pytest.approx(4.5)
-    brakes.clear()
-    speed = 30.0
-    for _ in range(round(3.0 / DT)):
-        brakes.see(speed, -4.5)
-        speed -= DT * 2.5
-    assert brakes.decel <= 2.5 + 1e-9
-
-
-def test_weaker_brakes_show_in_ordinary_braking_too():
-    brakes = OwnBrakes(lowest=-4.5, assumed=0.6, dt=DT)
-    drive(brakes, 4.5, rounds=3)
-    brakes.clear()
-    speed = 30.0
-    for _ in range(20):
-        brakes.see(speed, -3.0)
-        speed -= DT * 2.0
-    assert brakes.decel <= 2.0 + 1e-9
-
-
-@given(st.lists(st.floats(0.0, 8.0), min_size=10, max_size=80))
-def test_it_never_counts_on_more_than_was_shown(realised):
-    brakes = OwnBrakes(lowest=-8.0, assumed=0.6, dt=DT)
-    speed = 300.0
-    for did in realised:
-        brakes.see(speed, -8.0)
-        speed -= DT * did
-    brakes.see(speed, -8.0)
-    least = 0.2 * 8.0  # what calls itself a brake
-    assert brakes.decel <= max(*realised[-40:], least) + 1e-9
-
-
-@pytest.mark.parametrize("seed", range(8))
-@pytest.mark.parametrize("noise", [0.05, 0.3])
-def test_noise_on_the_speed_never_makes_brakes_look_good(seed, noise):
-    brakes = OwnBrakes(lowest=-4.5, assumed=0.5, dt=DT)
-    counted_on = drive(brakes, 2.5, rounds=30, noise=noise, seed=seed)
-    assert counted_on.max() <= 1.15 * 2.5
-    if noise < 0.1:
-        assert counted_on[-1] > 0.7 * 2.5
-
-
-def test_nothing_is_learnt_from_noise_at_a_standstill():
-    rng = np.random.default_rng(0)
-    brakes = OwnBrakes(lowest=-2.5, assumed=0.6, dt=DT)
-    drive(brakes, 2.5, rounds=3)
-    for speed in np.maximum(rng.normal(0.0, 0.3, 2000), 0.0):
-        brakes.see(speed, -2.5)
-    assert brakes.decel > 2.3
-
-
-@pytest.mark.parametrize(("late", "lag"), [(0, 0.0), (1, 1.0)])
-def test_it_learns_how_late_commands_take_effect(late, lag):
-    brakes = OwnBrakes(lowest=-2.5, assumed=0.6, dt=DT)
-    drive(brakes, 2.5, rounds=6, late=late)
-    assert brakes.lag == pytest.approx(lag, abs=0.05)
-    assert brakes.decel == pytest.approx(2.5)
-
-
-def test_what_is_assumed_of_brakes_is_never_nothing():
-    assert OwnBrakes(lowest=-4.0, assumed=1e-9, dt=DT).decel > 0.5
-
-
-# -- How hard others brake ----------------------------------------------------------------------
-
-
-@given(st.lists(st.floats(2.5, 30.0), max_size=60), st.floats(1.0, 20.0))
-def test_harder_manoeuvres_are_less_likely(decels, assumed):
-    manoeuvres = Manoeuvres(assumed)
-    manoeuvres.remember(*decels)
-    chance = manoeuvres.harder(np.linspace(0.0, HARDEST, 400))
-    assert ((chance >= 0.0) & (chance <= 1.0)).all()
-    assert (np.diff(chance) <= 1e-12).all()
-    assert manoeuvres.harder(HARDEST) == 0.0  # beyond physics
-    if decels:
-        beyond = max(decels) + 4.0 * np.std(decels) + 0.2
-        if beyond < min(assumed, HARDEST) - 0.1:
-            assert manoeuvres.harder(beyond) == pytest.approx(1.0 / (len(decels) + 1))
-
-
-def test_gentle_braking_does_not_water_down_what_hard_braking_may_be():
-    manoeuvres = Manoeuvres(assumed=10.0)
-    manoeuvres.remember(*[1.5] * 400)
-    assert manoeuvres.harder(9.0) == 1.0  # nothing is known of hard braking yet
-    manoeuvres.remember(*[7.5] * 30)
-    assert manoeuvres.harder(6.0) == pytest.approx(1.0)
-    assert manoeuvres.any_harder(6.0) == pytest.approx(31.0 / 431.0)
-    assert manoeuvres.any_harder(2.0) == 1.0
-
-
-def test_old_manoeuvres_are_forgotten():
-    manoeuvres = Manoeuvres(assumed=10.0, memory=20)
-    manoeuvres.remember(*[8.0] * 20)
-    manoeuvres.remember(*[3.0] * 20)
-    assert len(manoeuvres) == 20
-    assert manoeuvres.harder(5.0) == pytest.approx(1.0 / 21.0)
-
-
-@pytest.mark.parametrize("decel", [math.nan, math.inf, -1.0])
-def test_what_is_no_manoeuvre_is_refused(decel):
-    manoeuvres = Manoeuvres(assumed=10.0)
-    with pytest.raises(ValueError, match="decel"):
-        manoeuvres.remember(3.0, decel)
-    assert len(manoeuvres) == 0
-
-
-def watch_it(watch, speeds, gap=60.0, own=10.0):
-    """Manoeuvres of a leader with these speeds; the gap follows from them."""
-    told, last = [], speeds[0]
-    for speed in speeds:
-        gap += 0.5 * watch.dt * (last + speed - 2.0 * own)
-        told.append(watch.see(gap, own, speed))
-        last = speed
-    return [decel for decel in told if decel is not None]
-
-
-@pytest.mark.parametrize("dt", [0.1, 0.25, 0.5])
-@given(decel=st.floats(1.2, 12.0), speed=st.floats(8.0, 40.0))
-def test_constant_brakes_are_measured_as_they_are(dt, decel, speed):
-    steps = int(speed / (decel * dt))
-    assume(steps * dt >= 1.0 + 2 * dt)
-    braking = speed - decel * dt * np.arange(steps + 1)
-    watch = BrakeWatch(dt)
-    told = watch_it(watch, np.concatenate([[speed] * 12, braking, [0.0] * 8]))
-    assert told == [pytest.approx(decel)]
-    assert not watch.braking
-
-
-def test_a_manoeuvre_under_way_counts_when_the_episode_ends():
-    risk = LatentRisk(lowest=-2.5)
-    for k in range(14):
-        risk.learn([40.0, 20.0, 20.0 - max(0, k - 5) * DT * 5.0], 0.0)
-    assert len(risk.manoeuvres) == 0
-    risk.start_episode()
-    assert list(risk.manoeuvres.decels) == [pytest.approx(5.0)]
-
-
-@pytest.mark.parametrize("dt", [0.1, 0.25])
-@pytest.mark.parametrize("speed", [0.0, 20.0])
-def test_noise_is_no_manoeuvre(dt, speed):
-    rng = np.random.default_rng(0)
-    watch, told = BrakeWatch(dt), 0
-    for noise, own in rng.normal(0.0, 0.2, (round(3600 / dt), 2)):
-        seen = watch.see(30.0, max(0.0, speed + own), max(0.0, speed + noise))
-        told += seen is not None
-    assert told <= 1  # in an hour
-
-
-@pytest.mark.parametrize("cut_in", [(12.0, 12.0), (30.0, 8.0), (12.0, 20.0), (29.0, 5.0)])
-def test_a_car_that_cuts_in_has_not_braked(cut_in):
-    watch = BrakeWatch(DT)
-    gap, speed = cut_in
-    for _ in range(8):
-        assert watch.see(30.0, 20.0, 20.0) is None
-    for _ in range(8):
-        assert watch.see(gap, 20.0, speed) is None
-        gap += DT * (speed - 20.0)
-    assert watch.end() is None
-
-
-# -- Latent risk --------------------------------------------------------------------------------
+# -- Latent risk ------------------------------------------------------------------------------
 
 
 def situation(gap, speed, leader_speed, belief=(1.0,)):
@@ -385,7 +193,7 @@ def test_dangerous_and_never_seen_are_told_apart(taught):
 
 
 def test_frozen_it_still_knows_what_was_commanded_last():
-    risk = LatentRisk.told(-4.0, 4.0, 8.0)
+    risk = LatentRisk.given(-4.0, 4.0, 8.0)
     risk.brakes.set_lagged(0.8, 1.0)
     here, chances = situation(30.0, 20.0, 20.0), []
     for command in (-4.0, 2.0):
@@ -436,20 +244,6 @@ def test_saved_and_loaded_it_judges_identically(taught, tmp_path, snapshot):
             for risk in (taught, loaded)
         ]
         assert chances[0] == chances[1]
-
-
-def test_damaged_files_are_refused(taught, tmp_path):
-    path = tmp_path / "risk"
-    taught.save(path)
-    whole = path.read_bytes()
-    path.write_bytes(whole[: len(whole) // 2])
-    with pytest.raises(ValueError, match="risk"):
-        LatentRisk.load(path)
-    EvolvingFSM(n_actions=2).save(path)
-    with pytest.raises(ValueError, match="holds a machine, not a risk"):
-        LatentRisk.load(path)
-    with pytest.raises(FileNotFoundError):
-        LatentRisk.load(tmp_path / "none")
 
 
 @pytest.mark.parametrize(
@@ -513,7 +307,7 @@ def test_settings_that_cannot_be_right_are_refused(settings_):
 def test_limits_that_cannot_be_right_are_refused():
     for decel in (-2.5, math.nan):
         with pytest.raises(ValueError, match="decel"):
-            LatentRisk.told(-2.5, decel, 4.5)
+            LatentRisk.given(-2.5, decel, 4.5)
 
 
 @given(GAPS, SPEEDS, SPEEDS, ACTIONS, st.booleans())
@@ -549,83 +343,6 @@ def test_leaders_brake_more_often_where_they_were_seen_to():
         belief = [0.0, 1.0] if 10 <= at < 16 else [1.0, 0.0]
         risk.learn([60.0, 20.0, 20.0 - max(0, at - 12)], 0.0, belief)
     assert risk.onset_rate([0.0, 1.0]) > risk.onset_rate() > risk.onset_rate([1.0, 0.0])
-
-
-# -- By state -----------------------------------------------------------------------------------
-
-
-def test_states_are_judged_at_their_centres_weighed_by_the_belief():
-    machine = EvolvingFSM(n_actions=1, rule=Novelty(radius=1.0, scales=(4.0, 2.0, 2.0)))
-    machine.learn_many([[80.0, 5.0, 5.0], [3.0, 25.0, 25.0]], [0, 0])
-    assert machine.n_states == 2
-    risk = LatentRisk.told(-4.0, 4.0, 8.0)
-    by_state = RiskByState(risk, machine, caution=0.0)
-    judged = [
-        by_state.judge(situation(20.0, 10.0, 10.0, belief), [-4.0]).risk[0]
-        for belief in ([1.0, 0.0], [0.5, 0.5], [0.0, 1.0])
-    ]
-    assert judged == pytest.approx([0.0, 0.5, 1.0])
-    cautious = RiskByState(risk, machine, caution=1.0)
-    assert cautious.judge(situation(20.0, 10.0, 10.0, [0.5, 0.5]), [-4.0]).risk[0] == 1.0
-    assert [state.is_dead_end for state in assess_states(machine.model(), risk)] == [False, True]
-
-
-# -- Counts -------------------------------------------------------------------------------------
-
-EPISODES = st.lists(
-    st.tuples(st.lists(st.tuples(st.integers(0, 2), st.integers(0, 1)), max_size=9), st.booleans()),
-    max_size=8,
-)
-
-
-@pytest.mark.slow
-@given(EPISODES, st.integers(1, 5))
-def test_counts_agree_with_looking_ahead(episodes, steps):
-    counts = OutcomeCounts(n_actions=2, horizon=steps * DT, dt=DT)
-    cases, failures = np.zeros((3, 2)), np.zeros((3, 2))
-    for decisions, failed in episodes:
-        for i, (state, action) in enumerate(decisions):
-            counts.learn(np.eye(3)[state], action)
-            left = len(decisions) - i  # until the end, in decisions
-            if failed or left > steps:
-                cases[state, action] += 1
-                failures[state, action] += failed and left <= steps
-        counts.end_episode(failed=failed)
-    for state in range(3):
-        for action in range(2):
-            outcome = counts.outcome(np.eye(3)[state], action)
-            n = cases[state, action]
-            assert outcome.evidence == n
-            low, high = outcome.interval
-            assert 0.0 <= low <= outcome.probability <= high <= 1.0
-            if n:  # it leans on all the others by a few cases
-                share = failures[state, action] / n
-                assert abs(outcome.probability - share) <= 2.0 / (n + 2.0) + 1e-12
-
-
-def test_counts_refuse_what_they_cannot_count():
-    with pytest.raises(ValueError, match="horizon"):
-        OutcomeCounts(n_actions=1, horizon=0.1, dt=0.25)
-    counts = OutcomeCounts(n_actions=1)
-    for belief in ([math.nan], [[1.0]], [0.2, 0.2]):
-        with pytest.raises(ValueError, match="belief"):
-            counts.learn(belief, 0)
-    with pytest.raises(ValueError, match="action"):
-        counts.learn([1.0], 1)
-    counts.end_episode(failed=True)
-    assert counts.outcome([1.0], 0).evidence == 0.0
-
-
-def test_what_was_saved_doubts_the_brakes_as_before(tmp_path):
-    risk = LatentRisk(lowest=-4.0)
-    drive(risk.brakes, 4.0)
-    for k in range(3):  # weaker than they were, but not yet for sure
-        risk.learn([80.0, 20.0 - 0.5 * k, 20.0], -4.0)
-    risk.save(tmp_path / "risk")
-    again = LatentRisk.load(tmp_path / "risk")
-    for name, latest in risk.brakes.doubts.items():
-        assert list(again.brakes.doubts[name]) == list(latest)
-    assert any(len(latest) for latest in risk.brakes.doubts.values())
 
 
 # -- In files ----------------------------------------------------------------------------------
@@ -671,5 +388,177 @@ def test_a_risk_that_saw_jumps_and_odd_numbers_is_kept_and_read_again(tmp_path):
         assert (tmp_path / "again").read_bytes() == (tmp_path / "risk").read_bytes()
 
 
-def test_the_hardest_braking_is_the_same_for_leaders_and_in_files():
-    assert hardest_seen(np.inf) == HARDEST
+# -- By state ---------------------------------------------------------------------------------
+
+
+def test_states_are_judged_at_their_centres_weighed_by_the_belief():
+    machine = EvolvingFSM(n_actions=1, rule=Novelty(radius=1.0, scales=(4.0, 2.0, 2.0)))
+    machine.learn_many([[80.0, 5.0, 5.0], [3.0, 25.0, 25.0]], [0, 0])
+    assert machine.n_states == 2
+    risk = LatentRisk.given(-4.0, 4.0, 8.0)
+    by_state = RiskByState(risk, machine, caution=0.0)
+    judged = [
+        by_state.judge(situation(20.0, 10.0, 10.0, belief), [-4.0]).risk[0]
+        for belief in ([1.0, 0.0], [0.5, 0.5], [0.0, 1.0])
+    ]
+    assert judged == pytest.approx([0.0, 0.5, 1.0])
+    cautious = RiskByState(risk, machine, caution=1.0)
+    assert cautious.judge(situation(20.0, 10.0, 10.0, [0.5, 0.5]), [-4.0]).risk[0] == 1.0
+    assert [state.is_dead_end for state in assess_states(machine.model(), risk)] == [False, True]
+
+
+# -- Sharing, and a table to begin with -------------------------------------------------------
+
+
+# Survived only up to some 9 m/s² of the leader.
+HERE = Situation(np.array([10.0, 20.0, 20.0]), np.ones(1), 0, np.nan, 0.0)
+DRIVES = [(3.0, 1.5), (4.0, 5.0, 2.0), (6.0,)]
+
+
+def follow(risk, *decels, seed=0, speed=25.0, belief=(1.0,)):
+    """Drives behind leaders who brake so hard, one after another, seen with noise."""
+    rng = np.random.default_rng(seed)
+    for decel in decels:
+        gap = 40.0
+        leader = np.concatenate([np.full(8, speed), speed - decel * DT * np.arange(1, 9)])
+        leader = np.concatenate([leader, np.full(4, leader[-1])])
+        for v in leader:
+            seen = np.array([gap, speed, v]) + rng.normal(0.0, 0.1, 3)
+            risk.learn(seen, 0.0, belief)
+            gap += DT * (v - speed)
+        risk.start_episode()
+    return risk
+
+
+def learnt(risk):
+    """What others may be told of, in no order."""
+    noise = [np.sort(sizes) for sizes in risk.perception.learnt().values()]
+    return (
+        sorted(risk.manoeuvres.decels),
+        risk.manoeuvres.gentle,
+        [sizes.tolist() for sizes in noise],
+        risk.perception.noise,
+        risk.onset_rate(),
+    )
+
+
+def test_with_a_table_of_real_drives_a_tolerance_can_be_met_at_once():
+    cautious, begun = (
+        LatentRisk.given(-8.0, decel=7.0, leader_decel=10.0, leaders=leaders)
+        for leaders in (None, REAL_DRIVES)
+    )
+    assert cautious.judge(HERE, [0.0]).risk[0] == 1.0
+    judged = begun.judge(HERE, [0.0])
+    assert 0.0 < judged.risk[0] <= 0.02
+    assert judged.high[0] > 0.02  # it is not sure
+    assert judged.evidence == sum(REAL_DRIVES.counts)
+
+
+def test_a_table_that_lacks_what_is_hard_here_is_refused():
+    with pytest.raises(ValueError, match=r"from 2\.5 m/s² on, but hard is 2"):
+        LatentRisk(-8.0, hard=2.0, leaders=REAL_DRIVES)
+    higher = LatentRisk(-8.0, hard=3.5, leaders=REAL_DRIVES).manoeuvres
+    assert len(higher) + higher.gentle == sum(REAL_DRIVES.counts) + REAL_DRIVES.gentle
+
+
+def test_merged_they_know_what_one_car_would_that_saw_all():
+    cars = [follow(LatentRisk(-8.0, DT), *drive, seed=k) for k, drive in enumerate(DRIVES)]
+    one = LatentRisk(-8.0, DT)
+    for k, drive in enumerate(DRIVES):
+        follow(one, *drive, seed=k)
+    before = learnt(cars[1])
+    first, *others = cars
+    first.merge(others)
+    assert learnt(first) == learnt(one)
+    np.testing.assert_allclose(first.manoeuvres.table, one.manoeuvres.table)
+    assert first.judge(HERE, [0.0]).risk == pytest.approx(one.judge(HERE, [0.0]).risk)
+    assert learnt(cars[1]) == before
+
+
+def test_onsets_add_up_by_state_only_where_states_are_the_same():
+    def car(seed, belief):
+        return follow(LatentRisk(-8.0, DT), 4.0, 3.0, seed=seed, belief=belief)
+
+    mine, yours = car(1, (0.0, 1.0)), car(2, (0.5, 0.5))
+    alone = mine.onset_rate((0.0, 1.0)), mine.seconds_seen((1.0, 0.0))
+    mine.merge([yours])
+    assert (mine.onset_rate((0.0, 1.0)), mine.seconds_seen((1.0, 0.0))) == alone
+    again = car(1, (0.0, 1.0))
+    again.merge([yours], same_states=True)
+    seconds = 2 * 20 * DT
+    assert again.seconds_seen((1.0, 0.0)) == pytest.approx(0.5 * seconds)
+    assert again.seconds_seen((0.0, 1.0)) == pytest.approx(1.5 * seconds)
+
+
+def test_own_brakes_are_ones_own_unless_told_otherwise():
+    mine, yours = LatentRisk(-8.0), LatentRisk(-8.0)
+    yours.brakes.trust(6.5)
+    mine.merge([yours])
+    assert not mine.brakes.known
+    mine.merge([yours], brakes=True)
+    assert mine.brakes.known
+    assert mine.brakes.decel == pytest.approx(6.5)
+
+
+@pytest.mark.parametrize(
+    ("other", "how", "says"),
+    [
+        (LatentRisk(-8.0, dt=0.1), {}, "dt is 0.25 here and 0.1 there"),
+        (LatentRisk(-8.0, hard=3.0), {}, "hard is 2.5 here and 3 there"),
+        (LatentRisk(-4.0), {"brakes": True}, "lowest is -8 here and -4 there"),
+        ("a file", {}, "only a LatentRisk can be merged, not str"),
+    ],
+)
+def test_what_cannot_be_merged_is_refused_and_nothing_is_changed(other, how, says):
+    risk, fine = LatentRisk(-8.0), LatentRisk(-8.0)
+    fine.manoeuvres.remember(4.0)
+    with pytest.raises((TypeError, ValueError), match=says):
+        risk.merge([fine, other], **how)
+    assert len(risk.manoeuvres) == 0
+    with pytest.raises(ValueError, match="itself"):
+        risk.merge([fine, risk])
+    assert len(risk.manoeuvres) == 0
+
+
+# -- In traffic -------------------------------------------------------------------------------
+
+
+def waves(numbers):
+    """Of a leader who goes between a slow and a fast speed and brakes gently."""
+    rng = np.random.default_rng(numbers.below("waves", 2**32))
+    time, speed, found = 0.0, 0.0, []
+    while time < 60.0:
+        rates = {1: rng.uniform(0.8, 1.5), -1: rng.uniform(1.2, 2.4)}
+        for wanted, hold in ((rng.uniform(15, 22), 3.5), (rng.uniform(5, 12), 2.5)):
+            sign = 1 if wanted > speed else -1
+            found.append((time, sign * rates[sign]))
+            time += abs(wanted - speed) / rates[sign]
+            found.append((time, 0.0))
+            time, speed = time + hold, wanted
+    return tuple(found)
+
+
+def make(numbers, stops):
+    leader = Leader(
+        IDM(1.2, 25.0, 1.0, 1.0, 2.5),
+        brake_time=numbers.between("leader.brake_time", 20.0, 50.0) if stops else math.inf,
+        brake_decel=numbers.between("leader.brake_decel", 7.0, 8.0),
+        waves=waves(numbers),
+    )
+    gap = numbers.between("scenario.initial_gap", 2.0, 20.0)
+    hasty = IDM(2.25, 28.0, 0.8, 0.3, 2.0, lowest=-6.0, highest=2.5)
+    return Scenario(leader, gap, duration=60.0, body=Body(-6.0, 2.5)), hasty
+
+
+@pytest.mark.slow
+def test_gentle_traffic_does_not_make_it_bold():
+    gentle, stop = (
+        Family("waves", "", lambda n, s=stops: make(n, s), -6.0, 2.5, decel=6.0, leader_decel=8.0)
+        for stops in (False, True)
+    )
+    guard = guard_for_family(gentle)
+    teach(guard, (gentle.draw(0, index) for index in range(30)))
+    assert guard.judge.manoeuvres.gentle > 60
+    guard.freeze()
+    drives = teach(guard, (stop.draw(0, index, split="test") for index in range(40)))
+    assert not any(drive.collided for drive in drives)

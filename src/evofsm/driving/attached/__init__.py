@@ -1,1 +1,0 @@
-"""Guards in a SUMO simulation of someone else's: chosen cars are guarded, or only watched."""

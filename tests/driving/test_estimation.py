@@ -1,0 +1,488 @@
+"""What is learnt of brakes, of leaders and of the noise of sensors."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
+
+from evofsm.driving.brakes import Latest, OwnBrakes
+from evofsm.driving.judge import LatentRisk
+from evofsm.driving.leaders import (
+    REAL_DRIVES,
+    BrakeWatch,
+    LeaderBrakes,
+    Manoeuvres,
+    brakes_needed,
+)
+from evofsm.driving.perception import Perception
+from evofsm.driving.rehearsal import HARDEST
+from evofsm.guard.protocols import Situation
+
+DT = 0.25
+NOISE = np.array([0.5, 0.3, 0.3])
+ACTIONS = np.linspace(-2.5, 2.5, 11)
+
+
+# -- One's own brakes -------------------------------------------------------------------------
+
+
+def drive(brakes, true_decel, *, rounds=1, speed=25.0, noise=0.0, seed=0, late=0):
+    """Speed up and brake in full, in turn; answers what was counted on after each decision."""
+    rng = np.random.default_rng(seed)
+    counted_on, given = [], [0.0] * (late + 1)
+    for _ in range(rounds):
+        brakes.clear()
+        v = speed
+        for k in range(40):
+            command = 1.0 if k < 10 else brakes.lowest
+            given.append(command)
+            brakes.see(max(0.0, v + rng.normal(0.0, noise)), command)
+            counted_on.append(brakes.decel)
+            v = max(0.0, v + DT * max(given[-1 - late], -true_decel))
+    return np.array(counted_on)
+
+
+def test_full_braking_is_learnt_as_it_is_and_not_as_commanded():
+    brakes = OwnBrakes(lowest=-4.5, assumed=0.6, dt=DT)
+    assert brakes.decel == pytest.approx(2.7)
+    assert not brakes.known
+    drive(brakes, 2.5)
+    assert brakes.known
+    assert brakes.decel == pytest.approx(2.5)
+
+
+def test_brakes_that_weaken_show_within_seconds_of_braking():
+    brakes = OwnBrakes(lowest=-4.5, assumed=0.6, dt=DT)
+    drive(brakes, 4.5, rounds=3)
+    assert brakes.decel == pytest.approx(4.5)
+    brakes.clear()
+    speed = 30.0
+    for _ in range(round(3.0 / DT)):
+        brakes.see(speed, -4.5)
+        speed -= DT * 2.5
+    assert brakes.decel <= 2.5 + 1e-9
+
+
+def test_weaker_brakes_show_in_ordinary_braking_too():
+    brakes = OwnBrakes(lowest=-4.5, assumed=0.6, dt=DT)
+    drive(brakes, 4.5, rounds=3)
+    brakes.clear()
+    speed = 30.0
+    for _ in range(20):
+        brakes.see(speed, -3.0)
+        speed -= DT * 2.0
+    assert brakes.decel <= 2.0 + 1e-9
+
+
+@given(st.lists(st.floats(0.0, 8.0), min_size=10, max_size=80))
+def test_it_never_counts_on_more_than_was_shown(realised):
+    brakes = OwnBrakes(lowest=-8.0, assumed=0.6, dt=DT)
+    speed = 300.0
+    for did in realised:
+        brakes.see(speed, -8.0)
+        speed -= DT * did
+    brakes.see(speed, -8.0)
+    least = 0.2 * 8.0  # what calls itself a brake
+    assert brakes.decel <= max(*realised[-40:], least) + 1e-9
+
+
+@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("noise", [0.05, 0.3])
+def test_noise_on_the_speed_never_makes_brakes_look_good(seed, noise):
+    brakes = OwnBrakes(lowest=-4.5, assumed=0.5, dt=DT)
+    counted_on = drive(brakes, 2.5, rounds=30, noise=noise, seed=seed)
+    assert counted_on.max() <= 1.15 * 2.5
+    if noise < 0.1:
+        assert counted_on[-1] > 0.7 * 2.5
+
+
+def test_nothing_is_learnt_from_noise_at_a_standstill():
+    rng = np.random.default_rng(0)
+    brakes = OwnBrakes(lowest=-2.5, assumed=0.6, dt=DT)
+    drive(brakes, 2.5, rounds=3)
+    for speed in np.maximum(rng.normal(0.0, 0.3, 2000), 0.0):
+        brakes.see(speed, -2.5)
+    assert brakes.decel > 2.3
+
+
+@pytest.mark.parametrize(("late", "lag"), [(0, 0.0), (1, 1.0)])
+def test_it_learns_how_late_commands_take_effect(late, lag):
+    brakes = OwnBrakes(lowest=-2.5, assumed=0.6, dt=DT)
+    drive(brakes, 2.5, rounds=6, late=late)
+    assert brakes.lag == pytest.approx(lag, abs=0.05)
+    assert brakes.decel == pytest.approx(2.5)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_noise_makes_brakes_seem_neither_better_nor_much_weaker(seed):
+    rng = np.random.default_rng(seed)
+    brakes = OwnBrakes(lowest=-4.0, assumed=0.6, dt=DT)
+    for _ in range(40):
+        brakes.clear()
+        speed = 25.0
+        for k in range(30):
+            command = -4.0 if k > 8 else 0.0
+            brakes.see(speed + rng.normal(0.0, NOISE[1]), command)
+            assert brakes.decel <= 1.1 * 3.0
+            speed = max(speed + DT * max(command, -3.0), 0.0)
+    assert brakes.known
+    assert brakes.decel >= 0.85 * 3.0
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_what_brakes_bring_is_what_all_samples_in_full_precision_say(seed):
+    rng = np.random.default_rng(seed)
+    latest, given = Latest(30), []
+    for _ in range(70):
+        given.append((round(rng.normal(3.0, 0.5), seed), bool(rng.random() < 0.2)))
+        latest.add(*given[-1])
+        values = [value for value, _ in given[-30:]]
+        assert latest.rows.tolist() == [list(one) for one in given[-30:]]
+        mean, bound = latest.mean_and_bound(2.0) if len(values) > 1 else (values[0], values[0])
+        assert mean == math.fsum(values) / len(values)
+        if len(values) > 1:
+            stretches = max(1, sum(begins for _, begins in given[-30:]))
+            error = np.sqrt(np.var(values, ddof=1) * stretches) / len(values)
+            few = 1.0 + 1.2 / (len(values) - 1)
+            assert bound == pytest.approx(mean - few * 2.0 * error, abs=1e-9)
+
+
+def test_what_was_saved_doubts_the_brakes_as_before(tmp_path):
+    risk = LatentRisk(lowest=-4.0)
+    drive(risk.brakes, 4.0)
+    for k in range(3):  # weaker than they were, but not yet for sure
+        risk.learn([80.0, 20.0 - 0.5 * k, 20.0], -4.0)
+    risk.save(tmp_path / "risk")
+    again = LatentRisk.load(tmp_path / "risk")
+    for name in ("brought", "shortfalls"):
+        before, after = (getattr(one.brakes, name).rows for one in (risk, again))
+        assert len(before) > 0
+        np.testing.assert_array_equal(before, after)
+
+
+# -- How hard leaders brake -------------------------------------------------------------------
+
+
+@given(st.lists(st.floats(2.5, 30.0), max_size=60), st.floats(1.0, 20.0))
+def test_harder_manoeuvres_are_less_likely(decels, assumed):
+    manoeuvres = Manoeuvres(assumed)
+    manoeuvres.remember(*decels)
+    chance = manoeuvres.harder(np.linspace(0.0, HARDEST, 400))
+    assert ((chance >= 0.0) & (chance <= 1.0)).all()
+    assert (np.diff(chance) <= 1e-12).all()
+    assert manoeuvres.harder(HARDEST) == 0.0  # beyond physics
+    if decels:
+        beyond = max(decels) + 4.0 * np.std(decels) + 0.2
+        if beyond < min(assumed, HARDEST) - 0.1:
+            assert manoeuvres.harder(beyond) == pytest.approx(1.0 / (len(decels) + 1))
+
+
+def test_gentle_braking_does_not_water_down_what_hard_braking_may_be():
+    manoeuvres = Manoeuvres(assumed=10.0)
+    manoeuvres.remember(*[1.5] * 400)
+    assert manoeuvres.harder(9.0) == 1.0  # nothing is known of hard braking yet
+    manoeuvres.remember(*[7.5] * 30)
+    assert manoeuvres.harder(6.0) == pytest.approx(1.0)
+    assert manoeuvres.any_harder(6.0) == pytest.approx(31.0 / 431.0)
+    assert manoeuvres.any_harder(2.0) == 1.0
+
+
+def test_old_manoeuvres_are_forgotten():
+    manoeuvres = Manoeuvres(assumed=10.0, memory=20)
+    manoeuvres.remember(*[8.0] * 20)
+    manoeuvres.remember(*[3.0] * 20)
+    assert len(manoeuvres) == 20
+    assert manoeuvres.harder(5.0) == pytest.approx(1.0 / 21.0)
+
+
+@pytest.mark.parametrize("decel", [math.nan, math.inf, -1.0])
+def test_what_is_no_manoeuvre_is_refused(decel):
+    manoeuvres = Manoeuvres(assumed=10.0)
+    with pytest.raises(ValueError, match="decel"):
+        manoeuvres.remember(3.0, decel)
+    assert len(manoeuvres) == 0
+
+
+def watch_it(watch, speeds, gap=60.0, own=10.0):
+    """Manoeuvres of a leader with these speeds; the gap follows from them."""
+    told, last = [], speeds[0]
+    for speed in speeds:
+        gap += 0.5 * watch.dt * (last + speed - 2.0 * own)
+        told.append(watch.see(gap, own, speed))
+        last = speed
+    return [decel for decel in told if decel is not None]
+
+
+@pytest.mark.parametrize("dt", [0.1, 0.25, 0.5])
+@given(decel=st.floats(1.2, 12.0), speed=st.floats(8.0, 40.0))
+def test_constant_brakes_are_measured_as_they_are(dt, decel, speed):
+    steps = int(speed / (decel * dt))
+    assume(steps * dt >= 1.0 + 2 * dt)
+    braking = speed - decel * dt * np.arange(steps + 1)
+    watch = BrakeWatch(dt)
+    told = watch_it(watch, np.concatenate([[speed] * 12, braking, [0.0] * 8]))
+    assert told == [pytest.approx(decel)]
+    assert not watch.braking
+
+
+def test_a_manoeuvre_under_way_counts_when_the_episode_ends():
+    risk = LatentRisk(lowest=-2.5)
+    for k in range(14):
+        risk.learn([40.0, 20.0, 20.0 - max(0, k - 5) * DT * 5.0], 0.0)
+    assert len(risk.manoeuvres) == 0
+    risk.start_episode()
+    assert list(risk.manoeuvres.decels) == [pytest.approx(5.0)]
+
+
+@pytest.mark.parametrize("dt", [0.1, 0.25])
+@pytest.mark.parametrize("speed", [0.0, 20.0])
+def test_noise_is_no_manoeuvre(dt, speed):
+    rng = np.random.default_rng(0)
+    watch, told = BrakeWatch(dt), 0
+    for noise, own in rng.normal(0.0, 0.2, (round(3600 / dt), 2)):
+        seen = watch.see(30.0, max(0.0, speed + own), max(0.0, speed + noise))
+        told += seen is not None
+    assert told <= 1  # in an hour
+
+
+@pytest.mark.parametrize("cut_in", [(12.0, 12.0), (30.0, 8.0), (12.0, 20.0), (29.0, 5.0)])
+def test_a_car_that_cuts_in_has_not_braked(cut_in):
+    watch = BrakeWatch(DT)
+    gap, speed = cut_in
+    for _ in range(8):
+        assert watch.see(30.0, 20.0, 20.0) is None
+    for _ in range(8):
+        assert watch.see(gap, 20.0, speed) is None
+        gap += DT * (speed - 20.0)
+    assert watch.end() is None
+
+
+@pytest.mark.parametrize("decel", [3.0, 4.5])
+def test_a_leaders_braking_is_measured_well_in_spite_of_noise(decel):
+    rng = np.random.default_rng(0)
+    found = []
+    for _ in range(50):
+        watch = BrakeWatch(DT)
+        for k in range(60):
+            speed = max(0.0, 20.0 - max(0.0, decel * DT * (k - 20)))
+            seen = max(0.0, speed + rng.normal(0.0, NOISE[2]))
+            found.append(watch.see(50.0, speed, seen, np.sqrt(2.0) * NOISE[2]))
+        found.append(watch.end())
+    told = np.array([one for one in found if one is not None])
+    assert 50 <= len(told) <= 55
+    assert np.median(told) == pytest.approx(decel, rel=0.1)
+    assert np.quantile(told, 0.95) < 1.15 * decel
+
+
+def test_by_assumption_alone_49_are_needed_for_two_percent():
+    table, risk = LatentRisk(-8.0).manoeuvres, 1.0
+    for seen in range(1, brakes_needed(0.02) + 1):
+        assert risk > 0.02
+        table.remember(3.0)
+        risk = float(table.harder(9.0))
+        assert risk == pytest.approx(1.0 / (seen + 1))
+    assert risk <= 0.02
+
+
+def test_the_shipped_table_says_no_more_than_was_seen():
+    seen, hardest = sum(REAL_DRIVES.counts), max(REAL_DRIVES.decels)
+    assert 6.1 <= hardest < 6.1 + 0.25
+    assert len(REAL_DRIVES.decels) == seen == 92
+    assert REAL_DRIVES.at_most_harder > 0.03
+    assert 8.0 < REAL_DRIVES.hours_until(0.02) < 9.0
+    assert float(LatentRisk(-8.0, leaders=REAL_DRIVES).manoeuvres.harder(9.9)) > 0.0
+
+
+def test_a_table_counts_each_as_at_least_as_hard_as_it_was():
+    decels = np.random.default_rng(1).uniform(2.5, 9.0, 200)
+    counted = LeaderBrakes.counted(decels, gentle=7, hours=2.0, source="made up")
+    np.testing.assert_array_less(np.sort(decels), np.array(counted.decels) + 1e-12)
+    assert np.max(np.array(counted.decels) - np.sort(decels)) <= 0.25 + 1e-9
+
+
+def test_none_seen_is_a_table_too():
+    none = LeaderBrakes.counted([], gentle=3, hours=2.0, source="made up")
+    assert none.decels == ()
+    assert (none.hours_until(0.02), none.at_most_harder) == (float("inf"), 1.0)
+    assert LatentRisk(-8.0, leaders=none).manoeuvres.gentle == 3
+
+
+def test_of_more_than_are_remembered_the_latest_of_each_stay():
+    cars = [LatentRisk(-8.0) for _ in range(3)]
+    for k, car in enumerate(cars):
+        car.manoeuvres.remember(*(3.0 + k + 0.001 * np.arange(400)))
+    cars[0].merge(cars[1:])
+    kept = np.array(cars[0].manoeuvres.decels)
+    assert len(kept) == 500
+    for k in range(3):
+        mine = kept[(kept >= 3.0 + k) & (kept < 4.0 + k)]
+        assert 166 <= len(mine) <= 167
+        assert mine.max() == pytest.approx(3.399 + k)
+
+
+# -- Where one is -----------------------------------------------------------------------------
+
+
+def traffic(decisions, seed=0):
+    """Truth of a follower behind a leader in waves: observations, and what was done after each."""
+    rng = np.random.default_rng(seed)
+    rows, done = [], []
+    gap, speed, leader = 40.0, 15.0, 15.0
+    leads = 0.0
+    for k in range(decisions):
+        if k % 16 == 0:
+            leads = rng.uniform(-3.0, 1.5) if leader > 12.0 else rng.uniform(0.5, 2.0)
+        does = float(np.clip(0.1 * (gap - 2.0 * speed) + 0.8 * (leader - speed), -2.5, 2.0))
+        rows.append((gap, speed, leader))
+        done.append(does)
+        reached, led = max(speed + does * DT, 0.0), max(leader + leads * DT, 0.0)
+        gap += 0.5 * DT * (leader + led - speed - reached)
+        speed, leader = reached, led
+    return np.array(rows), done
+
+
+def noisy(rows, seed=1):
+    seen = rows + np.random.default_rng(seed).normal(scale=NOISE, size=rows.shape)
+    seen[:, 1:] = np.maximum(seen[:, 1:], 0.0)
+    return seen
+
+
+def estimates(perception, seen, done):
+    before = [0.0, *done[:-1]]
+    return [perception.see(tuple(row), did) for row, did in zip(seen, before, strict=True)]
+
+
+def taught(decisions=600):
+    """A risk that has followed noisy traffic."""
+    risk = LatentRisk(lowest=-2.5)
+    risk.brakes.trust(2.5)
+    rows, done = traffic(decisions)
+    for row, did in zip(noisy(rows), done, strict=True):
+        risk.learn(row, did)
+    return risk, rows[-1]
+
+
+def situation(row):
+    return Situation(np.asarray(row), np.ones(1), 0, np.nan, 0.0)
+
+
+def test_without_noise_the_estimate_is_the_observation():
+    rows, done = traffic(600)
+    perception = Perception(DT)
+    for row, estimate in zip(rows, estimates(perception, rows, done), strict=True):
+        assert estimate.mean == tuple(row)
+        assert not np.any(estimate.covariance)
+    assert perception.noise == (0.0, 0.0, 0.0)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_noise_is_learnt_as_it_is(seed):
+    rows, done = traffic(500, seed)
+    perception = Perception(DT)
+    estimates(perception, noisy(rows, seed + 100), done)
+    assert np.array(perception.noise) == pytest.approx(NOISE, rel=0.2)
+
+
+def test_estimates_are_better_than_observations_and_know_how_good_they_are():
+    rows, done = traffic(2000)
+    seen = noisy(rows)
+    found = estimates(Perception(DT), seen, done)[500:]
+    off = np.array([estimate.mean for estimate in found]) - rows[500:]
+    raw = seen[500:] - rows[500:]
+    assert np.all(off.std(axis=0) < [0.6, 0.6, 1.0] * raw.std(axis=0))
+    claimed = np.array([[one.deviation(axis) for axis in np.eye(3)] for one in found])
+    assert np.all(np.abs(off).mean(axis=0) < claimed.mean(axis=0))
+    assert (off[:, 0] > 3.0 * claimed[:, 0]).mean() < 0.01
+
+
+def test_a_cut_in_is_believed_at_once():
+    rows, done = traffic(500)
+    perception = Perception(DT)
+    seen = noisy(rows)
+    estimates(perception, seen, done)
+    cut_in = seen[-1] - [20.0, 0.0, 5.0]
+    assert perception.see(tuple(cut_in), done[-1]).mean == tuple(cut_in)
+
+
+def test_an_episode_begins_afresh_but_knows_its_sensors():
+    risk, _ = taught()
+    noise = risk.perception.noise
+    assert min(noise) > 0.0
+    risk.start_episode()
+    assert risk.perception.noise == noise
+    elsewhere = np.array([3.0, 5.0, 5.0])
+    assert risk.perception.estimate(tuple(elsewhere), 0.0).mean == tuple(elsewhere)
+
+
+def test_following_without_learning_leaves_the_noise_as_it_is():
+    risk, _ = taught()
+    noise = risk.perception.noise
+    rows, done = traffic(100, seed=9)
+    for row, did in zip(rows, done, strict=True):
+        risk.follow(row, did)
+    assert risk.perception.noise == noise
+
+
+def test_rows_that_are_scored_are_taken_as_they_are():
+    risk, row = taught()
+    scores = risk.score(np.array([row, row - [5.0, 0.0, 0.0]]))
+    risk.start_episode()
+    risk.learn(row, 0.0)
+    assert risk.score(np.array([row]))[0] == pytest.approx(scores[0], abs=0.5)
+    assert scores[1] > scores[0]
+
+
+def test_a_situation_that_is_not_sure_is_judged_with_more_distance():
+    risk, _ = taught()
+    risk.start_episode()
+    row = np.array([30.0, 15.0, 15.0])
+    assert np.all(risk.judge(situation(row), ACTIONS).critical < risk.critical(row, ACTIONS))
+    sharp = LatentRisk(lowest=-2.5)
+    np.testing.assert_array_equal(
+        sharp.judge(situation(row), ACTIONS).critical, sharp.critical(row, ACTIONS)
+    )
+
+
+def test_what_was_learnt_of_noise_is_kept_in_the_file(tmp_path):
+    risk, _ = taught()
+    risk.save(tmp_path / "risk.evofsm")
+    again = LatentRisk.load(tmp_path / "risk.evofsm")
+    assert again.perception.noise == risk.perception.noise
+    np.testing.assert_array_equal(again.brakes.full.rows, risk.brakes.full.rows)
+
+
+@pytest.mark.parametrize("decimals", [1, 9])
+def test_noise_is_that_of_the_latest_residuals_and_of_no_others(decimals):
+    rng = np.random.default_rng(2)
+    speeds = np.round(20.0 + rng.normal(size=(1200, 2)), decimals)  # many sizes are equal
+    perception = Perception(DT)
+    for k, (own, leader) in enumerate(speeds):
+        perception.see((50.0, own, leader), 0.0)
+        residuals = np.abs(np.diff(speeds[: k + 1], n=2, axis=0))[-500:]
+        if len(residuals) < 20:
+            assert perception.noise[1:] == (0.0, 0.0)
+            continue
+        found = np.sort(residuals, axis=0)[len(residuals) // 2] / 0.6745 / np.sqrt(6.0)
+        assert perception.noise[1:] == pytest.approx(tuple(found), rel=1e-12)
+    kept = perception.learnt()["noise_speed"]
+    np.testing.assert_array_equal(kept, residuals[:, 0])
+    again = Perception(DT)
+    again.restore(perception.learnt())
+    assert again.noise == perception.noise
+
+
+def test_asked_twice_it_answers_the_same_and_asked_otherwise_it_does_not():
+    risk, row = taught()
+    perception, row, off = risk.perception, tuple(row), tuple(row + 0.1)
+    first = perception.estimate(row, 0.5)
+    assert perception.estimate(row, 0.5) == first
+    for other in (
+        perception.estimate(off, 0.5),
+        perception.estimate(row, 0.0),
+        perception.estimate(row, 0.5, sure=False),
+    ):
+        assert other != first
+    perception.see(row, 0.5)
+    assert perception.estimate(row, 0.5) != first
