@@ -106,10 +106,10 @@ def test_units_offsets_and_places_in_arrays(tmp_path):
     variables = {
         "v_follower": {"field": "/n.data[0]", "unit": "km/h"},
         "v_leader": {"field": "/n.data[1]", "unit": "km/h"},
-        "gap": {"field": "/n.data[0]", "offset": 4.0},
+        "gap": {"field": "/n.data[0]", "unit": "km/h", "offset": -8.0},
     }
     (chunk,) = read(path, {"variables": variables})
-    assert chunk.observations[0] == pytest.approx([40.0, 10.0, 2.0])
+    assert chunk.observations[0] == pytest.approx([2.0, 10.0, 2.0])
     assert chunk.actions[:-1] == pytest.approx(np.zeros(len(chunk.times) - 1))
     beyond = {"variables": {**variables, "gap": "/n.data[2]"}}
     with pytest.raises(ValueError, match="row 1, column 'gap': nan cannot be learnt"):
