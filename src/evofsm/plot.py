@@ -27,26 +27,21 @@ with needs("matplotlib", "plot", "plotting"):
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.axis import Axis
-    from matplotlib.image import AxesImage
     from matplotlib.text import Annotation
 
 __all__ = ["COLORS", "accelerations", "belief", "graph", "risk", "states", "transitions"]
 
-#: How something is drawn, as matplotlib is told; and indices of states.
-Look = dict[str, Any]
-States = Collection[int]
+Look = dict[str, Any]  # how something is drawn, as matplotlib is told
+States = Collection[int]  # indices
 
 #: Okabe and Ito's colours, which colour-blind readers can tell apart.
 COLORS = {
     **{"ink": "#222222", "soft": "#777777", "third": "#CC79A7"},
     **{"follower": "#0072B2", "leader": "#009E73", "dead end": "#D55E00"},
 }
-#: Of probabilities, from 0 on.
-HEAT_MAP = "Blues"
-#: Up to so many states are drawn as discs with numbers, and a matrix has room for its values.
-MOST_DISCS, MOST_VALUES = 20, 8
-# Up to so many states each has its number on an axis, beyond about 8 have.
-_MOST_TICKS = 12
+# Up to so many states are drawn as discs with numbers, a matrix has room for its values, and each
+# state has its number on an axis.
+_DISCS, _VALUES, _TICKS = 20, 8, 12
 # -- Of a model -----------------------------------------------------------------------------------
 
 
@@ -60,8 +55,7 @@ def states(
     """Centres of the states in the plane of two variables.
 
     A state is recognised by the distance in all variables, so that no plane alone decides. Where
-    discs would overlap they are moved apart and point to their place. What is on the axes before,
-    observations for example, sets their limits as well.
+    discs would overlap they are moved apart. What is on the axes before sets their limits as well.
 
     Parameters
     ----------
@@ -154,12 +148,25 @@ def transitions(
         raise ValueError(f"there is no action {action}: the model has {model.n_actions}")
     ax = _given_or_new(ax)
     matrix = model.averaged_matrix() if action is None else model.transition_matrices[action]
-    image = draw_matrix(ax, matrix, Normalize(0.0, float(matrix.max())), size=7.0)
-    ax.set_title("all actions, as used" if action is None else describe_action(model, action))
+    scale = Normalize(0.0, float(matrix.max()))
+    image = ax.imshow(matrix, cmap="Blues", norm=scale, interpolation="nearest")
+    ax.grid(False)
+    ax.spines[:].set_visible(False)
+    for i, j in np.ndindex(matrix.shape) if len(matrix) <= _VALUES else ():
+        look: Look = {"ha": "center", "va": "center_baseline", "fontsize": points(7.0)}
+        color = "white" if scale(matrix[i, j]) > 0.68 else COLORS["ink"]
+        ax.text(j, i, f"{100 * matrix[i, j]:.0f}", color=color, **look)
+    title = "all actions, as used"
+    if action is not None:
+        name = f"a({action + 1})"
+        if model.actions is not None:
+            name += f"  {model.actions.label(action)}".replace("-", "−") + " m/s²"
+        title = f"{name}\n{model.uses[action]:,.0f} transitions"
+    ax.set_title(title)
     for axis, way in ((ax.xaxis, "to"), (ax.yaxis, "from")):
         label_states(axis, model.n_states, dead_ends)
         axis.set_label_text(f"{way} state" + (" (bold: dead end)" if dead_ends else ""))
-    written = ", written in %" if model.n_states <= MOST_VALUES else ""
+    written = ", written in %" if model.n_states <= _VALUES else ""
     ax.figure.colorbar(image, ax=ax, label=f"probability of the next state{written}")
     return ax
 
@@ -212,10 +219,10 @@ def belief(
     if when.shape != (len(rows),):
         raise ValueError(f"time has shape {when.shape}; {len(rows)} beliefs need ({len(rows)},)")
     ax = _given_or_new(ax)
-    look: Look = {"cmap": HEAT_MAP, "norm": Normalize(0.0, 1.0), "shading": "nearest"}
+    look: Look = {"cmap": "Blues", "norm": Normalize(0.0, 1.0), "shading": "nearest"}
     mesh = ax.pcolormesh(when, range(n), rows.T, rasterized=True, **look)
     ax.grid(False)
-    if n <= MOST_DISCS:  # among more it would hide the belief
+    if n <= _DISCS:  # among more it would hide the belief
         look = {"where": "mid", "color": COLORS["ink"], "label": "most probable state"}
         (line,) = ax.step(when, rows.argmax(axis=1), **look)
         line.set_path_effects([withStroke(linewidth=3.0, foreground="white")])
@@ -256,8 +263,6 @@ def risk(drive: Episode, ax: Axes | None = None, *, tolerance: float | None = No
 
 def accelerations(drive: Episode, ax: Axes | None = None) -> Axes:
     """What was proposed and what was executed, over time; where they differ it is shaded.
-
-    Axes and result are as in `states`.
 
     Raises
     ------
@@ -392,7 +397,7 @@ def draw_state(
 def draw_centers(axes: Axes, centers: NDArray[np.float64], dead_ends: States, size: float) -> None:
     """Draw centres (n, 2); discs that would meet move apart and point to their place."""
     places = centers
-    numbered = len(centers) <= MOST_DISCS
+    numbered = len(centers) <= _DISCS
     if numbered:
         scale = axes.figure.dpi / 72.0
         moved = _apart(axes.transData.transform(centers) / scale, size + 1.0)
@@ -435,7 +440,7 @@ def draw_chain(
     n = len(notes)
     angle = 0.5 * np.pi - 2.0 * np.pi * np.arange(n) / max(n, 1)
     places = np.column_stack([np.cos(angle), np.sin(angle)])  # from the top, clockwise
-    numbered = n <= MOST_DISCS
+    numbered = n <= _DISCS
     for state, ((x, y), note) in enumerate(zip(places, notes, strict=True)):
         dead_end = state in dead_ends
         draw_state(axes, x, y, state, 13.0, dead_end=dead_end, numbered=numbered)
@@ -474,39 +479,14 @@ def draw_chain(
             write(axes, f"{weights[i, j]:.0f}", tuple(middle), bbox=box, **look)
 
 
-def draw_matrix(
-    axes: Axes, matrix: NDArray[np.float64], scale: Normalize, size: float
-) -> AxesImage:
-    """Draw a transition matrix, its values in type of this ``size`` where there is room."""
-    image = axes.imshow(matrix, cmap=HEAT_MAP, norm=scale, interpolation="nearest")
-    axes.grid(False)
-    axes.spines[:].set_visible(False)
-    if len(matrix) <= MOST_VALUES:
-        look: Look = {"ha": "center", "va": "center_baseline", "fontsize": points(size)}
-        for i, j in np.ndindex(matrix.shape):
-            color = "white" if scale(matrix[i, j]) > 0.68 else COLORS["ink"]
-            axes.text(j, i, f"{100 * matrix[i, j]:.0f}", color=color, **look)
-    return image
-
-
-def describe_action(model: FSMModel, action: int) -> str:
-    """What an action is, and how many transitions were learnt with it."""
-    name = f"a({action + 1})"
-    if model.actions is not None:
-        name += f"  {model.actions.label(action)}".replace("-", "−") + " m/s²"
-    return f"{name}\n{model.uses[action]:,.0f} transitions"
-
-
-def label_states(
-    axis: Axis, n: int, dead_ends: States = (), *, shown: bool = True, called: str = ""
-) -> None:
+def label_states(axis: Axis, n: int, dead_ends: States = (), *, called: str = "") -> None:
     """Put the states' numbers, from 1, on an axis that counts them from 0; the dead ends' bold.
 
     On an upward axis the rows of dead ends are tinted as well where they are ``called`` something.
     """
-    numbered = range(0, n, 1 if n <= _MOST_TICKS else math.ceil(n / 8))
+    numbered = range(0, n, 1 if n <= _TICKS else math.ceil(n / 8))
     sign = "" if axis is axis.axes.xaxis else "#"  # which there is no room for
-    axis.set_ticks(numbered, [f"{sign}{state + 1}" for state in numbered] if shown else [])
+    axis.set_ticks(numbered, [f"{sign}{state + 1}" for state in numbered])
     axis.set_tick_params(length=0, labelsize=points(7.0), pad=2.0)
     for state, label in zip(numbered, axis.get_ticklabels(), strict=False):
         if state in dead_ends:

@@ -42,7 +42,7 @@ def test_the_folder_holds_page_claims_traces_model_and_figures(reproduced):
     for figure in figures:
         assert (folder / "figures" / f"{figure}.png").stat().st_size > 10_000
         assert (folder / "figures" / f"{figure}.svg").stat().st_size > 10_000
-    assert len(figures) == 9
+    assert len(figures) == 7
     claims = json.loads((folder / "claims.json").read_text())
     assert all(claim["holds"] for claim in claims)
     assert claims[0]["claim"] in (folder / "index.html").read_text()

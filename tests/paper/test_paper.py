@@ -184,8 +184,8 @@ def test_all_of_it_is_written_and_can_be_read_back(tmp_path, read_page):
         assert said in read.text
     assert [link for link in read.links if link[0] != "#"] == ["https://arxiv.org/abs/1908.10823"]
     figures = {path.name for path in (folder / "figures").iterdir()}
-    assert {"case-1.png", "case-1.svg", "matrices.png"} <= figures
-    assert len(figures) == 18
+    assert {"case-1.png", "case-1.svg", "graph.png"} <= figures
+    assert len(figures) == 14
     claims = json.loads((folder / "claims.json").read_text())
     assert [claim["id"] for claim in claims] == IDS
     traces = polars.read_parquet(folder / "traces.parquet")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Sequence
 from functools import partial
 from typing import Any
@@ -19,12 +18,9 @@ from evofsm.plot import COLORS, Look
 
 with needs("matplotlib", "plot", "drawing figures"):
     from matplotlib.axes import Axes
-    from matplotlib.cm import ScalarMappable
-    from matplotlib.colors import Normalize
     from matplotlib.figure import Figure as Drawn
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
-    from matplotlib.ticker import MaxNLocator
 
 #: Width of a figure [inch]: that of a page's text.
 WIDTH = 7.2
@@ -37,13 +33,7 @@ _END: Look = {"marker": "s", "markerfacecolor": "none", "color": COLORS["ink"]}
 
 
 def figures(study: PaperStudy) -> Iterator[Figure]:
-    """The figures in the order in which a reader wants them, still to be drawn.
-
-    Parameters
-    ----------
-    study : PaperStudy
-        With any number of rounds, states and collisions.
-    """
+    """The figures of any study, in the order in which a reader wants them, still to be drawn."""
     for run in study.last_round:
         yield Figure(
             f"case-{run.case}",
@@ -65,13 +55,6 @@ def figures(study: PaperStudy) -> Iterator[Figure]:
         partial(draw_divergence, study),
     )
     yield Figure(
-        "growth",
-        "Growth of the number of states",
-        "Discs are numbered in the order of creation and stand where it happened, with the time "
-        "within the run; the hexagon is the dead end. After these runs no state was created.",
-        partial(draw_growth, study),
-    )
-    yield Figure(
         "space",
         "States and trajectories in the space of observations",
         "The last round over the gap: the follower's speed above (solid), the leader's below "
@@ -87,14 +70,6 @@ def figures(study: PaperStudy) -> Iterator[Figure]:
         "next step, over all actions as often as each was used; staying is written beside the "
         "state. Right, how often the most probable state changed from one to another.",
         partial(draw_graph, study),
-    )
-    yield Figure(
-        "matrices",
-        "Transition matrices by action",
-        "One matrix for each action that was used, all on one scale. A row holds the probabilities "
-        "of the next state, given the present one. Where the rows of a matrix look alike, the "
-        "forecast hardly depends on the present state.",
-        partial(draw_matrices, study),
     )
 
 
@@ -234,32 +209,7 @@ def draw_divergence(study: PaperStudy) -> Drawn:
     return figure
 
 
-def draw_growth(study: PaperStudy) -> Drawn:
-    """Number of states over the runs in which they were created."""
-    figure, ((axes,),) = _panels(1, 1, 3.0)
-    n, runs = study.model.n_states, min(max(4, study.foundings[-1].run + 1), len(study.runs))
-    at = [one.run + one.time / study.settings.scenario.duration for one in study.foundings]
-    axes.step([0.0, *at, runs], [*range(n + 1), n], where="post", color=COLORS["ink"])
-    for count, (x, one) in enumerate(zip(at, study.foundings, strict=True), 1):
-        dead_end, numbered = one.state in study.dead_ends, n <= plot.MOST_DISCS
-        plot.draw_state(axes, x, count, one.state, 9.0, dead_end=dead_end, numbered=numbered)
-        if numbered:
-            plot.write(axes, f"{one.time:.1f} s", (x, count), (7.0, -2.5), va="top")
-    axes.grid(False, axis="x")
-    for run in range(1, runs, 2):
-        axes.axvspan(run, run + 1, color=COLORS["soft"], alpha=0.1, linewidth=0.0, zorder=0.4)
-    if runs <= 2 * len(CASES):
-        names = [f"run {run + 1}: case {study.runs[run].case}" for run in range(runs)]
-        axes.set_xticks(np.arange(runs) + 0.5, names)
-        axes.tick_params(axis="x", length=0)
-    else:
-        axes.set_xlabel("runs driven")
-    axes.set(xlim=(-0.015 * runs, runs), ylim=(0.0, n + 0.9), ylabel="number of states")
-    axes.yaxis.set_major_locator(MaxNLocator(8, integer=True))
-    return figure
-
-
-# -- In the space of observations, as a graph, and as matrices ------------------------------------
+# -- In the space of observations, and as a graph -------------------------------------------------
 
 
 def draw_space(study: PaperStudy) -> Drawn:
@@ -317,25 +267,4 @@ def draw_graph(study: PaperStudy) -> Drawn:
     notes = [f"{100 * value:.0f} % of time" for value in share]
     plot.draw_chain(recognised, changes, notes, study.dead_ends, widest=3.0, counted=True)
     recognised.set_title(f"recognised: changes of state in {len(study.runs)} runs", x=0.03)
-    return figure
-
-
-def draw_matrices(study: PaperStudy) -> Drawn:
-    """The transition matrix of each action that was used, all on one scale."""
-    model, columns = study.model, 4
-    shown = np.flatnonzero(model.uses > 0.0).tolist() or [0]
-    rows = math.ceil(len(shown) / columns)
-    figure = Drawn(figsize=(WIDTH, 0.95 + 2.05 * rows), layout="compressed")
-    scale = Normalize(0.0, float(model.transition_matrices[shown].max(initial=0.0)) or 1.0)
-    for place, action in enumerate(shown):
-        axes = figure.add_subplot(rows, columns, place + 1)
-        plot.draw_matrix(axes, model.transition_matrices[action], scale, size=5.8)
-        axes.set_title(plot.describe_action(model, action), fontsize=7.0, pad=3.0)
-        lowest, leftmost = place + columns >= len(shown), place % columns == 0
-        plot.label_states(axes.xaxis, model.n_states, study.dead_ends, shown=lowest)
-        plot.label_states(axes.yaxis, model.n_states, study.dead_ends, shown=leftmost)
-        axes.set(xlabel="to state" if lowest else "", ylabel="from state" if leftmost else "")
-    above: Look = {"location": "top", "shrink": 0.5, "aspect": 40, "anchor": (0.0, 1.0)}
-    label = "probability of the next state, in the cells in %"
-    figure.colorbar(ScalarMappable(scale, plot.HEAT_MAP), ax=figure.axes, label=label, **above)
     return figure

@@ -67,13 +67,8 @@ def _minus(number: str) -> str:
 def cell(template: str, row: Mapping[str, Any]) -> str:
     """The text of one cell.
 
-    Parameters
-    ----------
-    template : str
-        As ``str.format`` takes it, with names of the row. Two formats are added: ``%`` for a share
-        in percent, and ``p`` for the same without the sign.
-    row : mapping
-        Values by name.
+    The template is as ``str.format`` takes it, with names of the row. Two formats are added: ``%``
+    for a share in percent, and ``p`` for the same without the sign.
 
     Examples
     --------
@@ -92,17 +87,6 @@ def cell(template: str, row: Mapping[str, Any]) -> str:
 class Table:
     """Rows of a frame under headers.
 
-    Parameters
-    ----------
-    title : str
-    frame : polars.DataFrame
-    columns : mapping of str to str, optional
-        By header, a template of each cell (see `cell`); without it all columns as they are.
-    note : str
-        Stands below.
-    mark : polars.Expr, optional
-        Of each row ``"ours"``, ``"holds"``, ``"fails"``, or None.
-
     Examples
     --------
     >>> import polars as pl
@@ -113,23 +97,20 @@ class Table:
 
     title: str
     frame: pl.DataFrame
+    #: by header, a template of each cell (see `cell`); without it all columns as they are
     columns: Mapping[str, str] | None = None
-    note: str = ""
-    mark: pl.Expr | None = None
+    note: str = ""  #: stands below
+    mark: pl.Expr | None = None  #: of each row ``"ours"``, ``"holds"``, ``"fails"``, or null
 
     @property
-    def header(self) -> tuple[str, ...]:
+    def header(self) -> list[str]:
         """The name of each column."""
-        return tuple(self.frame.columns if self.columns is None else self.columns)
+        return list(self.columns or self.frame.columns)
 
     @property
     def cells(self) -> list[tuple[str, ...]]:
         """The text of each row."""
-        templates = (
-            [f"{{{name}}}" for name in self.frame.columns]
-            if self.columns is None
-            else list(self.columns.values())
-        )
+        templates = (self.columns or {name: f"{{{name}}}" for name in self.frame.columns}).values()
         rows = self.frame.iter_rows(named=True)
         return [tuple(cell(template, row) for template in templates) for row in rows]
 
@@ -211,11 +192,6 @@ class Page:
         return [*asked, *(part for part in self.parts if isinstance(part, Table))]
 
     @property
-    def figures(self) -> list[Figure]:
-        """All figures."""
-        return [part for part in self.parts if isinstance(part, Figure)]
-
-    @property
     def losses(self) -> list[Table]:
         """Tables of what is lost that have a row."""
         return [table for table in self.lost if len(table.frame)]
@@ -227,20 +203,8 @@ class Page:
 def write_page(path: Path, pages: Sequence[Page], title: str = "", about: str = "") -> Path:
     """Draw all figures and write one file that holds all it shows.
 
-    Parameters
-    ----------
-    path : pathlib.Path
-        The file. Figures are put into ``figures`` beside it as well, as PNG and SVG; those of each
-        of many pages into a folder of its name.
-    pages : sequence of Page
-        In their order.
-    title, about : str
-        Of many pages; one that is alone has its own.
-
-    Returns
-    -------
-    pathlib.Path
-        The file.
+    Figures are put into ``figures`` beside it as well, as PNG and SVG; those of each of many pages
+    into a folder of its name. Many pages have a ``title`` and an ``about`` together.
 
     Raises
     ------
@@ -257,33 +221,30 @@ def write_page(path: Path, pages: Sequence[Page], title: str = "", about: str = 
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    packages = dict.fromkeys(package for page in pages for package in page.packages)
     text = environment.get_template("page.html.j2").render(
         title=title or pages[0].title,
         about=[about] if about else pages[0].text,
         pages=pages,
         images={
-            page.name: _drawn(
-                page.figures, path.parent / (page.name if len(pages) > 1 else "figures")
-            )
+            page.name: _drawn(page, path.parent / (page.name if len(pages) > 1 else "figures"))
             for page in pages
         },
         summary=_summary(pages),
-        versions=_versions(packages),
+        versions=_versions([one for page in pages for one in page.packages]),
         date=datetime.now(UTC).date().isoformat(),
     )
     path.write_text(text, encoding="utf-8")
     return path
 
 
-def _drawn(figures: Sequence[Figure], folder: Path) -> dict[str, str]:
+def _drawn(page: Page, folder: Path) -> dict[str, str]:
     """Each figure as the address of an image that holds it, by name."""
     import matplotlib.style
 
     folder.mkdir(parents=True, exist_ok=True)
     images = {}
     with matplotlib.style.context(["default", Path(__file__).with_name("house.mplstyle")]):
-        for one in figures:
+        for one in (part for part in page.parts if isinstance(part, Figure)):
             figure, svg = one.draw(), folder / f"{one.name}.svg"
             figure.savefig(svg.with_suffix(".png"))
             figure.savefig(svg, metadata={"Date": None})
@@ -294,20 +255,18 @@ def _drawn(figures: Sequence[Figure], folder: Path) -> dict[str, str]:
 
 def _summary(pages: Sequence[Page]) -> Table:
     """What each page asks and what came out, in a line each."""
-    rows = [
-        {
-            "question": page.title,
-            "answer": page.answer,
-            "rows lost": sum(len(table.frame) for table in page.losses),
-            "mark": {True: "holds", False: "fails", None: None}[page.holds],
-        }
-        for page in pages
-    ]
-    columns = {name: f"{{{name}}}" for name in ("question", "answer", "rows lost")}
-    return Table("In short", pl.DataFrame(rows), columns, mark=pl.col("mark"))
+    lost = [sum(len(table.frame) for table in page.losses) for page in pages]
+    rows = {
+        "question": [page.title for page in pages],
+        "answer": [page.answer for page in pages],
+        "rows lost": lost,
+    }
+    holds = pl.Series([page.holds for page in pages], dtype=pl.Boolean)
+    mark = pl.when(holds).then(pl.lit("holds")).when(~holds).then(pl.lit("fails"))
+    return Table("In short", pl.DataFrame(rows), mark=mark)
 
 
-def _versions(more: Sequence[str] | Mapping[str, None]) -> dict[str, str]:
+def _versions(more: Sequence[str]) -> dict[str, str]:
     """What the numbers were computed with."""
     found = {"evofsm": evofsm.__version__, "Python": platform.python_version()}
     for name in (*_PACKAGES, *more):

@@ -77,13 +77,7 @@ class Reproduction:
         )
 
     def write(self, folder: Path, command: str = "evofsm paper") -> Path:
-        """Write the page, its figures, ``claims.json``, ``traces.parquet`` and ``model.evofsm``.
-
-        Returns
-        -------
-        pathlib.Path
-            The page.
-        """
+        """Write page, figures, ``claims.json``, ``traces.parquet`` and ``model.evofsm``."""
         folder.mkdir(parents=True, exist_ok=True)
         claims = [claim._asdict() for claim in self.claims]
         text = json.dumps(claims, indent=2, ensure_ascii=False)

@@ -5,6 +5,7 @@ The settings stand, with comments, in ``settings.toml``.
 
 from __future__ import annotations
 
+import math
 import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -244,14 +245,24 @@ def run_paper(
     total = rounds * len(CASES) + len(settings.brake_at) + 2
     runs: list[Run] = []
 
+    extra_runs: list[Run] = []
+
     def learn(machine: EvolvingFSM, name: str, case: int, round_: int, scenario: Scenario) -> Run:
+        """Drive a run and show it to the machine, row by row."""
         episode = world.run(scenario, settings.drivers[case])
         seen = observe(len(runs) + len(extra_runs), episode)
-        run = _learn(machine, settings, name, case, round_, episode, seen, beliefs)
+        n, action = machine.n_states, settings.actions.encode(episode.accelerations)
+        # Of the first row: the uniform belief through the marginal matrix.
+        foreseen = np.full(n, 1.0 / max(n, 1)) @ machine.marginal_matrix
+        ends = [len(seen) - 1] if episode.collided else []
+        trace = machine.learn_many(seen, action, [0], ends, belief=beliefs)
+        belief = np.empty((len(action), 0)) if trace.belief is None else trace.belief
+        known = beliefs and n > 0
+        first = jensen_shannon(widen(foreseen, machine.n_states), belief[0]) if known else math.nan
         progress(len(runs) + len(extra_runs) + 1, total)
-        return run
+        found = action, trace.state, trace.n_states, belief, trace.surprise, float(first)
+        return Run(name, case, round_, episode, *found)
 
-    extra_runs: list[Run] = []
     for round_ in range(1, rounds + 1):
         for case in order:
             runs.append(learn(machine, f"case {case}", case, round_, settings.scenario))
@@ -275,39 +286,4 @@ def run_paper(
             actions=settings.actions, names=VARIABLES, units=UNITS, dt=settings.scenario.dt
         ),
         dead_end=int(np.bincount(at_collisions).argmax()) if at_collisions else -1,
-    )
-
-
-def _learn(
-    machine: EvolvingFSM,
-    settings: Settings,
-    name: str,
-    case: int,
-    round_: int,
-    episode: Episode,
-    seen: NDArray[np.float64],
-    beliefs: bool,
-) -> Run:
-    """Show a run to the machine, row by row."""
-    n = machine.n_states
-    # Of the first row: the uniform belief through the marginal matrix.
-    foreseen = np.full(n, 1.0 / max(n, 1)) @ machine.marginal_matrix if beliefs else np.empty(0)
-    action = settings.actions.encode(episode.accelerations)
-    ends = [len(seen) - 1] if episode.collided else []
-    trace = machine.learn_many(seen, action, [0], ends, belief=beliefs)
-    belief = np.empty((len(action), 0)) if trace.belief is None else trace.belief
-    first = float("nan")
-    if len(foreseen):
-        first = float(jensen_shannon(widen(foreseen, machine.n_states), belief[0]))
-    return Run(
-        name=name,
-        case=case,
-        round=round_,
-        episode=episode,
-        action=action,
-        state=trace.state,
-        n_states=trace.n_states,
-        belief=belief,
-        surprise=trace.surprise,
-        first_surprise=first,
     )
