@@ -6,15 +6,15 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from enum import StrEnum
 
-from evofsm.driving.family import Draw, Family
-from evofsm.driving.judge import LatentRisk
-from evofsm.driving.measures import (
-    FIXED_MEASURES,
-    ResponsibilitySensitiveSafety,
-    TimeHeadway,
-    TimeToCollision,
+from evofsm.driving import (
+    AlwaysBrake,
+    Draw,
+    EnvelopeReviser,
+    Family,
+    LatentRisk,
+    Unrevised,
+    measures,
 )
-from evofsm.driving.revisers import AlwaysBrake, EnvelopeReviser, Unrevised
 from evofsm.guard import ActionReviser, Reviser, RiskMeasure
 
 
@@ -46,37 +46,35 @@ def envelope(name: str, group: Group, measure: RiskMeasure) -> Policy:
 
 def oracle(family: Family, draw: Draw) -> Reviser:
     """Ours, told how hard this very leader will brake and how well the own brakes work."""
-    risk = LatentRisk.given(
-        family.actions.low, family.decel, draw.scenario.leader.brake_decel, family.interval
-    )
-    return ActionReviser(risk, family.actions)
+    return _told(family, draw.scenario.leader.brake_decel)
 
 
-def told_limits(family: Family, draw: Draw) -> Reviser:
-    """Ours, told the true limits of the family instead of learning them."""
-    risk = LatentRisk.given(family.actions.low, family.decel, family.leader_decel, family.interval)
+def _told(family: Family, leader_decel: float) -> Reviser:
+    """Ours, told limits instead of learning them."""
+    risk = LatentRisk.told(family.actions.low, family.decel, leader_decel, family.interval)
     return ActionReviser(risk, family.actions)
 
 
 def fixed_policies(family: Family) -> list[Policy]:
     """All that learn nothing, but for those that are tuned."""
-    rss = ResponsibilitySensitiveSafety
+    rss = measures.ResponsibilitySensitiveSafety.matched(family.decel, family.leader_decel)
+    fixed = measures.FIXED_MEASURES.items()
     return [
         Policy("unrevised", Group.BOUND, lambda family, draw: Unrevised(family.actions)),
         Policy("always-brake", Group.BOUND, lambda family, draw: AlwaysBrake(family.actions)),
         Policy("oracle", Group.BOUND, oracle),
-        *(envelope(name, Group.FIXED, measure) for name, measure in FIXED_MEASURES.items()),
-        envelope("rss-matched", Group.MATCHED, rss.matched(family.decel, family.leader_decel)),
-        Policy("evofsm-told", Group.MATCHED, told_limits),
+        *(envelope(name, Group.FIXED, measure) for name, measure in fixed),
+        envelope("rss-matched", Group.MATCHED, rss),
+        Policy("evofsm-told", Group.MATCHED, lambda f, draw: _told(f, f.leader_decel)),
     ]
 
 
 #: What is tried in tuning, from bold to cautious.
 TUNED_MEASURES: dict[str, tuple[RiskMeasure, ...]] = {
-    "ttc-tuned": tuple(TimeToCollision(threshold) for threshold in (1.5, 2, 3, 4, 6, 8, 12)),
-    "headway-tuned": tuple(TimeHeadway(t) for t in (0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 4.0)),
+    "ttc-tuned": tuple(measures.TimeToCollision(t) for t in (1.5, 2, 3, 4, 6, 8, 12)),
+    "headway-tuned": tuple(measures.TimeHeadway(t) for t in (0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 4.0)),
     "rss-tuned": tuple(
-        ResponsibilitySensitiveSafety(0.25, 2.5, decel, leader_decel)
+        measures.ResponsibilitySensitiveSafety(0.25, 2.5, decel, leader_decel)
         for leader_decel in (4.0, 5.0, 6.0, 8.0, 10.0)
         for decel in (6.0, 5.0, 4.0, 3.0, 2.5, 2.0)
     ),
