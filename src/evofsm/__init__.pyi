@@ -1,5 +1,4 @@
 from .fsm import Category as Category
-from .fsm import Dynamics as Dynamics
 from .fsm import Edges as Edges
 from .fsm import Event as Event
 from .fsm import EvolvingFSM as EvolvingFSM

@@ -9,20 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evofsm.extras import needs
-from evofsm.fsm import (
-    NO_ACTION,
-    Consequents,
-    Disturbances,
-    Dynamics,
-    EvolvingFSM,
-    Here,
-    Novelty,
-    advance,
-    begin_at,
-    compiled,
-    futures,
-)
-from evofsm.guard import BELIEF_TOLERANCE
+from evofsm.fsm import NO_ACTION, EvolvingFSM, Novelty
+from evofsm.guard import BELIEF_TOLERANCE, LearntRisk
+from evofsm.guard.learnt.replay import Ends, replay
 from studies.counts import OutcomeCounts
 from studies.foresight.amounts import HORIZONS
 from studies.foresight.data import Cases, Run, action_set
@@ -59,19 +48,20 @@ class Learnt:
             self.actions.n_actions,
             rule=Novelty(1.0, tuple((_APART * spread).tolist())),
             belief_tolerance=BELIEF_TOLERANCE,
-            dynamics=Dynamics(
-                **make_system(name).actions.settings, horizon=max(HORIZONS), stretches=10
-            ),
         )
+        judge = LearntRisk(1.0, **system.actions.settings, horizon=float(max(HORIZONS)))
+        self.dynamics = judge.dynamics
         for run in runs:
-            self.machine.learn_many(
-                run.observations,
-                self._indices(run),
-                [0],
-                [len(run.actions)] if run.failed else [],
-                executed=[*run.executed, run.executed[-1]],
-            )
-        self.machine.start_episode()
+            for t, z in enumerate(run.observations):
+                last = t == len(run.actions)
+                self.machine.observe(z, failed=last and run.failed)
+                if judge.observe(z) and not (last and run.failed):
+                    self.machine.onset()
+                if not last:
+                    self.machine.act(int(self.actions.encode(run.executed[t])))
+                    judge.act(run.executed[t])
+            self.dynamics.end(failed=run.failed)
+            self.machine.start_episode()
         self.model = self.machine.model()
         self.beliefs = [self.model.recognise(run.observations) for run in runs]
         self._replayed: dict[int, _Floats] = {}
@@ -82,11 +72,9 @@ class Learnt:
 
     def _index(self, some: Cases) -> NDArray[np.intp]:
         """(n,) index of the action of each case."""
-        dynamics = self.machine.dynamics
-        assert dynamics is not None
         found = []
         for row in some.action:
-            one = dynamics.decode(row)
+            one = self.dynamics.decode(row)
             action: Any = one if len(one) > 1 else float(one[0])
             found.append(int(self.actions.encode(action)))
         return np.array(found, np.intp)
@@ -94,8 +82,7 @@ class Learnt:
     @property
     def sides(self) -> _Floats:
         """(k, 4) where it fails, as far as it was seen."""
-        assert self.machine.dynamics is not None
-        return self.machine.dynamics.consequents.sides
+        return self.dynamics.model.thresholds
 
     def chain(self, some: Cases, steps: int) -> _Floats:
         """(n,) by the machine's own matrices: one step under the action, the others under any.
@@ -138,23 +125,19 @@ class Learnt:
         that are remembered; these count by how often one begins within the horizon.
         """
         lasts = self._lasts(some)
-        dynamics = self.machine.dynamics
-        assert dynamics is not None
         failed = lasts <= steps
         alone = failed[:, :, 0].mean(axis=1)
         if failed.shape[2] == 1:
             return np.asarray(alone)
         amid = failed[:, :, 1:].mean(axis=(1, 2))
-        rate = self.machine.may_begin().rate.rate
-        begins = -np.expm1(-rate * steps) if np.isfinite(rate) else 0.0
+        rate = self.machine.onsets.sum() / self.machine.visits.sum()
+        begins = -np.expm1(-rate * steps)
         return np.asarray((1.0 - begins) * alone + begins * amid)
 
     def _lasts(self, some: Cases) -> _Floats:
         """(n, behaviours, disturbances) steps until it fails, in each replay; for all horizons."""
         if id(some) in self._replayed:
             return self._replayed[id(some)]
-        dynamics = self.machine.dynamics
-        assert dynamics is not None
         lengths = [len(run.actions) for run in self.runs]
         done = np.concatenate([run.actions for run in self.runs])
         ends = np.repeat(np.cumsum(lengths), lengths)  # of the episode of each action
@@ -164,50 +147,20 @@ class Learnt:
         count = min(_BEHAVIOURS, len(done))
         _, near = tree.query(np.column_stack([some.z / scale, some.action]), count)
         near = np.reshape(near, (-1, count))
-        disturbances = dynamics.disturbances(max(HORIZONS))
-        found = np.full((*near.shape, len(disturbances.residuals)), np.inf)
-        _replay_all(
-            dynamics.consequents,
-            disturbances,
-            some.z,
-            some.change,
-            some.before,
-            some.action,
-            done,
-            near,
-            ends[near],
-            found,
-        )
+        horizon = max(HORIZONS)
+        disturbances = self.dynamics.disturbances(horizon)
+        count = disturbances.residuals.shape[2]
+        found, ends_of = np.empty((*near.shape, count)), Ends.of(count)
+        nobody = np.zeros((done.shape[1], 1 + some.z.shape[1]))  # the whole horizon is planned
+        for r, behaviours in enumerate(near):
+            situation = np.concatenate([some.z[r], some.change[r], some.before[r]])[None]
+            for s, begin in enumerate(behaviours):
+                rows = np.minimum(begin + np.arange(horizon), ends[begin] - 1)
+                plan = done[rows]
+                plan[0] = some.action[r]
+                world = situation, plan, nobody, disturbances, 1.0, 0.0, count, ends_of
+                replay(self.dynamics.model, *world)
+                survives = ends_of.survived == horizon
+                found[r, s] = np.where(survives, np.inf, ends_of.survived + 1.0)
         self._replayed[id(some)] = found
         return found
-
-
-@compiled
-def _replay_all(
-    known: Consequents,
-    disturbances: Disturbances,
-    z: _Floats,
-    change: _Floats,
-    before: _Floats,
-    action: _Floats,
-    done: _Floats,
-    begin: NDArray[np.intp],
-    end: NDArray[np.intp],
-    found: _Floats,
-) -> None:
-    """Steps until failure, into ``found``; recorded actions go on from ``begin`` up to ``end``."""
-    count = found.shape[2]
-    room = futures(known, action.shape[1], np.arange(count), disturbances)
-    for r in range(len(z)):
-        for s in range(begin.shape[1]):
-            begin_at(room, Here(z[r], change[r], before[r]))
-            for t in range(disturbances.residuals.shape[1]):
-                at = min(begin[r, s] + t, end[r, s] - 1)
-                for i in range(action.shape[1]):
-                    room.action[i] = action[r, i] if t == 0 else done[at, i]
-                advance(known, disturbances, t, 1.0, room)
-                for side in range(len(known.sides)):
-                    one = known.sides[side]
-                    for k in range(count):
-                        if one[1] * (room.z[int(one[0]), k] - one[2]) >= 0.0:
-                            found[r, s, k] = min(found[r, s, k], t + 1.0)

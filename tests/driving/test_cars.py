@@ -19,7 +19,7 @@ from evofsm.driving.families import load_family
 from evofsm.driving.family import held_out, training
 from evofsm.driving.judge import LatentRisk
 from evofsm.guard.guard import Guard
-from evofsm.guard.learnt.risk import LearntRisk
+from evofsm.guard.learnt.judge import LearntRisk
 
 pytestmark = pytest.mark.usefixtures("compiled")
 

@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 from evofsm.driving.families import load_family
 from evofsm.driving.world import KinematicWorld
 from evofsm.fsm.crowding import WhenFull
-from evofsm.fsm.dynamics.dynamics import Dynamics
 from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.merging import merge
 from evofsm.fsm.states.edges import Edges
@@ -356,44 +355,3 @@ def test_it_forecasts_held_out_episodes_better_than_the_best_part(name):
     one_by_one = functools.reduce(lambda a, b: merge([a, b]), parts)
     difference = log_scores(one_by_one, held_out) - log_scores(merge(parts), held_out)
     assert abs(difference.mean()) < 0.1
-
-
-def moving(seed, rows=150, actions=3, **settings):
-    """A machine that learnt how its system moves, too."""
-    random = np.random.default_rng(seed)
-    machine = EvolvingFSM(actions, radius=1.0, dynamics=Dynamics(n_actions=actions, **settings))
-    Z = np.cumsum(random.normal(size=(rows, 2)) * [0.8, 0.4], axis=0)
-    Z[120:, 0] += 30.0
-    machine.learn_many(Z, random.integers(0, actions, rows), [0, rows // 3], [rows // 2])
-    return machine
-
-
-def test_merged_machines_have_merged_dynamics(snapshot):
-    parts = [moving(seed) for seed in range(3)]
-    before = [snapshot(part) for part in parts]
-    merged = merge(parts)
-    assert [snapshot(part) for part in parts] == before
-    assert merged.dynamics.n_episodes == sum(1 + part.dynamics.n_episodes for part in parts)
-    assert merged.dynamics.sums.counts[0] == 450
-    assert merged.onsets.sum() == sum(part.onsets.sum() for part in parts) > 0
-    assert snapshot(merge(parts[::-1])) == snapshot(merged)
-    trace = merged.learn_many(np.zeros((9, 2)), np.zeros(9, int))
-    assert len(trace.state) == 9
-    assert merged.what_next(0).mean.shape == (1, 2)
-
-
-def test_of_a_single_part_with_dynamics_the_answer_is_a_copy():
-    fresh = EvolvingFSM(3, radius=1.0, dynamics=Dynamics(n_actions=3))
-    part = moving(0)
-    merged = merge([fresh, part])
-    assert merged.dynamics is not part.dynamics
-    np.testing.assert_array_equal(merged.dynamics.sums.counts, part.dynamics.sums.counts)
-    assert not merged.dynamics.is_under_way
-
-
-@pytest.mark.parametrize(
-    "other", [EvolvingFSM(3, radius=1.0), moving(1, horizon=9), moving(1, stretches=3)]
-)
-def test_machines_whose_dynamics_differ_are_refused(other):
-    with pytest.raises(ValueError, match="dynamics of machine 1"):
-        merge([moving(0), other])

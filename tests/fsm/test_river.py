@@ -53,7 +53,7 @@ def test_settings_have_the_names_and_defaults_of_the_machine():
     of_machine = dict(signature(EvolvingFSM).parameters)
     of_clusterer = dict(signature(RiverClusterer).parameters)
     # A clusterer has one action, and learns neither failures nor how that moves what it clusters.
-    del of_machine["n_actions"], of_machine["failure_horizon"], of_machine["dynamics"]
+    del of_machine["n_actions"], of_machine["failure_horizon"]
     del of_clusterer["features"]
     assert {name: each.default for name, each in of_clusterer.items()} == {
         name: each.default for name, each in of_machine.items()

@@ -45,7 +45,7 @@ def test_settings_have_the_names_and_defaults_of_the_machine():
     of_machine = dict(signature(EvolvingFSM).parameters)
     of_clusterer = dict(signature(EvolvingClusterer).parameters)
     # A clusterer has one action, and learns neither failures nor how that moves what it clusters.
-    del of_machine["n_actions"], of_machine["failure_horizon"], of_machine["dynamics"]
+    del of_machine["n_actions"], of_machine["failure_horizon"]
     assert of_clusterer.keys() == of_machine.keys()
     for name, setting in of_clusterer.items():
         assert setting.default in (None, of_machine[name].default)

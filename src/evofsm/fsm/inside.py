@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from evofsm.fsm.dynamics.dynamics import Dynamics
 from evofsm.fsm.learnt import Learnt
 from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.memory import Memory
@@ -69,15 +68,6 @@ class Inside:
     def use(self, buffer: NDArray[np.float64]) -> None:
         """Go on with another buffer."""
         self.machine._use(buffer)
-
-    @property
-    def dynamics(self) -> Dynamics | None:
-        """What the machine learns of how its system moves."""
-        return self.machine.dynamics
-
-    @dynamics.setter
-    def dynamics(self, dynamics: Dynamics | None) -> None:
-        self.machine._dynamics = dynamics
 
     def trimmed(self) -> Learnt:
         """A copy of all that was learnt, without spare room."""

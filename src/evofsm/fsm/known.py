@@ -14,12 +14,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from evofsm import store
 from evofsm.fsm import chains
-from evofsm.fsm.dynamics.dynamics import Dynamics
-from evofsm.fsm.dynamics.questions import Ahead, MayBegin, beyond, look_ahead, remembered
 from evofsm.fsm.kernels import kernel
 from evofsm.fsm.layout import Floats
 from evofsm.fsm.learnt import Clusters, Counts, Transitions
-from evofsm.fsm.rates import OnsetRates, Rate, shrunk_rates
+from evofsm.fsm.rates import OnsetRates, shrunk_rates
 from evofsm.fsm.states.clusters import measure_distances, nearest_center
 from evofsm.fsm.states.dispatch import reach, restore_rule, weights
 from evofsm.fsm.states.paper import Paper
@@ -54,19 +52,6 @@ class Nearest(NamedTuple):
         return self.distance > self.reach
 
 
-class Unseen(NamedTuple):
-    """Whether an observation is unlike all that was seen."""
-
-    #: variables that lie outside of the box of all that was survived in the episodes that are over
-    variables: tuple[int, ...]
-    nearest: Nearest  #: the state that it is nearest to
-
-    @property
-    def is_unseen(self) -> bool:
-        """Whether it lies outside of that box, or beyond the reach of all states."""
-        return bool(self.variables) or self.nearest.is_beyond
-
-
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
 class Known(Counts):
     """The states, the transitions and the counts, and what can be asked of them.
@@ -97,7 +82,6 @@ class Known(Counts):
     failures_told: bool = False
     settings: Mapping[str, Any] = field(default_factory=dict)  #: of the machine, by name
     #: how the system moves, what disturbs it and where it fails; None where nobody asked for that
-    dynamics: Dynamics | None = None
 
     @property
     def n_states(self) -> int:
@@ -504,105 +488,13 @@ class Known(Counts):
             first = check_state(start, self.n_states)
         return chains.path(P, first, steps, rng)
 
-    # -- How the system moves ---------------------------------------------------------------------
-
-    def what_next(
-        self,
-        action: ArrayLike,
-        steps: int | None = None,
-        *,
-        observation: ArrayLike | None = None,
-    ) -> Ahead:
-        """What is observed next under an action, or under several one after another.
-
-        What was learnt of the system's motion is followed step by step: the mean without any
-        disturbance, and how far remembered disturbances would lead from it.
-
-        Parameters
-        ----------
-        action : int, float or array_like
-            Of dynamics with a number of actions, an index that is held, or (steps,) indices. Of
-            those with a range of d numbers, one action that is held (a number or (d,)), or
-            (steps, d) of them.
-        steps : int, optional
-            Number of steps; 1 for an action that is held, unless it is given.
-        observation : (m,) array_like, optional
-            Where it begins, at rest; without it at the latest observation, as it was moving.
-
-        Returns
-        -------
-        Ahead
-            Observations ahead and their standard deviations, (steps, m).
-
-        Raises
-        ------
-        TypeError
-            If an action is no real number, or no integer where it is an index.
-        ValueError
-            If there are no `dynamics`, or they have learnt too little; if there is no such action,
-            or another number of them than of steps; or if nothing was observed in this episode and
-            no ``observation`` is given, or one that cannot be used.
-
-        Examples
-        --------
-        >>> from evofsm import Dynamics, EvolvingFSM
-        >>> machine = EvolvingFSM(n_actions=2, radius=0.5, dynamics=Dynamics(n_actions=2))
-        >>> draw, z = np.random.default_rng(0), 0.0
-        >>> for t in range(60):
-        ...     i = int(draw.integers(2))
-        ...     step = machine.learn_one([z], i)
-        ...     z += 0.5 if i else -0.5
-        >>> before = machine.dynamics.here.z
-        >>> (machine.what_next(1, steps=2).mean - before).ravel().round(2)
-        array([0.5, 1. ])
-        """
-        count = None if steps is None else whole("steps", steps)
-        z = None if observation is None else self._observations(observation)[1][0]
-        return look_ahead(self._moves(), action, count, z)
-
-    def may_begin(self, state: SupportsIndex | None = None, dt: float | None = None) -> MayBegin:
-        """What may begin that is not expected, as far as it was seen, and how often such began.
-
-        Parameters
-        ----------
-        state : int, optional
-            How often in this state; without it in all of them. Where such an onset was seen does
-            not say that it could not be elsewhere: all stretches are told of every state.
-        dt : float, optional
-            Time between two observations [s]; without it rates are per observation.
-
-        Returns
-        -------
-        MayBegin
-            Remembered stretches, and the rate of all onsets, with its 90 % interval.
-
-        Raises
-        ------
-        TypeError
-            If ``state`` is not an integer.
-        ValueError
-            If there are no `dynamics`, there is no such state, or ``dt`` is not positive.
-
-        Examples
-        --------
-        >>> from evofsm import Dynamics, EvolvingFSM
-        >>> machine = EvolvingFSM(n_actions=2, radius=0.5, dynamics=Dynamics(n_actions=2))
-        >>> trace = machine.learn_many([[0.0], [0.1], [2.0], [1.0]], [0, 0, 0, 0])
-        >>> machine.may_begin(dt=0.5)
-        MayBegin(stretches=(), rate=Rate(onsets=0, exposure=2.0, rate=0, low=0, high=1.5))
-        """
-        moves, step = self._moves(), 1.0 if dt is None else positive("dt", dt)
-        onsets, visits = self.onsets, self.visits
-        if state is not None:
-            index = check_state(state, self.n_states)
-            onsets, visits = onsets[index : index + 1], visits[index : index + 1]
-        return MayBegin(remembered(moves), Rate.of(float(onsets.sum()), visits.sum() * step))
+    # -- What was not expected --------------------------------------------------------------------
 
     def onset_rates(self, dt: float | None = None) -> OnsetRates:
         """How often something unexpected began in each state, shrunk towards the rate of all.
 
-        An onset is a residual of more than four ordinary ones, after some steps without such. The
-        more was observed in a state, the more its own count says: see `evofsm.fsm.rates`.
+        Whoever has a model of how the system moves says so (`EvolvingFSM.onset`). The more was
+        observed in a state, the more its own count says: see `evofsm.fsm.rates`.
 
         Parameters
         ----------
@@ -617,58 +509,23 @@ class Known(Counts):
         Raises
         ------
         ValueError
-            If there are no `dynamics`, or ``dt`` is not positive.
+            If ``dt`` is not positive.
 
         Notes
         -----
-        Exposure is all observations in a state, the first episode included, in which it is not
-        known yet what is ordinary and no onset is counted.
+        Exposure is all observations in a state.
 
         Examples
         --------
-        >>> from evofsm import Dynamics, EvolvingFSM
-        >>> machine = EvolvingFSM(n_actions=2, radius=0.5, dynamics=Dynamics(n_actions=2))
+        >>> from evofsm import EvolvingFSM
+        >>> machine = EvolvingFSM(n_actions=2, radius=0.5)
         >>> trace = machine.learn_many([[0.0], [0.1], [2.0], [1.0]], [0, 0, 0, 0])
-        >>> machine.onset_rates().rate
-        array([0., 0.])
+        >>> machine.onset()
+        >>> machine.onset_rates().rate.round(2)
+        array([0.25, 0.25])
         """
-        self._moves()
         step = 1.0 if dt is None else positive("dt", dt)
         return shrunk_rates(self.onsets, self.visits * step)
-
-    def never_seen(self, observation: ArrayLike | None = None) -> Unseen:
-        """Whether an observation is unlike all that was seen: of that nothing is known.
-
-        Parameters
-        ----------
-        observation : (m,) array_like, optional
-            Without it the latest one.
-
-        Returns
-        -------
-        Unseen
-            Which variables lie outside of all that was survived, and the nearest state.
-
-        Raises
-        ------
-        TypeError, ValueError
-            As `nearest`; a ValueError if there are no `dynamics`, or nothing was observed yet in
-            this episode and no ``observation`` is given.
-
-        Examples
-        --------
-        >>> from evofsm import Dynamics, EvolvingFSM
-        >>> machine = EvolvingFSM(n_actions=2, radius=0.5, dynamics=Dynamics(n_actions=2))
-        >>> trace = machine.learn_many([[0.0], [0.1], [2.0], [1.0]], [0, 0, 0, 0])
-        >>> machine.start_episode()
-        >>> machine.never_seen([0.5]).is_unseen, machine.never_seen([2.5]).variables
-        (False, (0,))
-        """
-        moves = self._moves()
-        if observation is None and not moves.is_under_way:
-            raise ValueError("nothing was observed yet in this episode; give an observation")
-        z = moves.here.z if observation is None else self._observations(observation)[1][0]
-        return Unseen(beyond(moves, z), Known.nearest(self, z))
 
     # -- Keeping it -----------------------------------------------------------------------------
 
@@ -757,14 +614,6 @@ class Known(Counts):
     def _restored(cls, content: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> Self:
         """What was kept so."""
         raise NotImplementedError
-
-    def _moves(self) -> Dynamics:
-        """The dynamics, or an error that there are none."""
-        if self.dynamics is None:
-            raise ValueError(
-                "nobody asked to learn how the system moves: EvolvingFSM(..., dynamics=Dynamics())"
-            )
-        return self.dynamics
 
     def _matrix(self, i: int) -> NDArray[np.float64]:
         """(n, n) transition probabilities under an action."""

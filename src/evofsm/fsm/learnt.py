@@ -15,8 +15,6 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any, cast, get_type_hints
 
-import numpy as np
-
 from evofsm.fsm.layout import SHAPES, Array, Floats
 from evofsm.store import (
     COUNT,
@@ -110,7 +108,7 @@ class Counts:
     tried: Floats = _of_actions(latest="latest_try")
     #: (q, n) those of `tried` that failed soon after they did
     failed_after: Floats = _of_actions()
-    #: (n,) times that something unexpected began in each state, where the machine has `dynamics`
+    #: (n,) times that something unexpected began in each state, as somebody said (`onset`)
     onsets: Floats = _of_states()
 
 
@@ -198,8 +196,6 @@ def _optional(numbers: Numbers) -> Numbers:
     return numbers._replace(optional=True)
 
 
-#: The file of `Dynamics` within a file, as bytes; empty where there are none.
-_WITHIN = {"dynamics": Numbers(("bytes",), dtype=np.uint8)}
 _RULE: dict[str, Any] = {
     "memory": _optional(FROM_1._replace(least=2.0)),
     **dict.fromkeys(("radius", "spread", "distance"), _optional(SIZE)),
@@ -220,7 +216,7 @@ _SETTINGS: dict[str, Any] = {
     "rule": _RULE,
 }
 MACHINE: Kind = Kind(
-    "machine", {array.name: _member(array) for array in arrays_of(Learnt)} | _WITHIN, _SETTINGS
+    "machine", {array.name: _member(array) for array in arrays_of(Learnt)}, _SETTINGS
 )
 # What a model has beside its `Counts`, centres by state.
 _CENTRAL = cast(
@@ -234,7 +230,7 @@ OF_MODEL = {
 }
 MODEL: Kind = Kind(
     "model",
-    OF_MODEL | _WITHIN,
+    OF_MODEL,
     {
         "width": Numbers(least=0.0),
         "dt": _optional(SIZE),

@@ -27,9 +27,6 @@ from numpy.typing import ArrayLike, NDArray
 from evofsm.fsm.actions import IntervalActions
 from evofsm.fsm.crowding import WhenFull
 from evofsm.fsm.divergence import jensen_shannon
-from evofsm.fsm.dynamics import following
-from evofsm.fsm.dynamics.dynamics import Dynamics
-from evofsm.fsm.dynamics.keeping import from_bytes, to_bytes
 from evofsm.fsm.explanation import Explanation, explain, nothing_known
 from evofsm.fsm.kernels import LINE, lanes
 from evofsm.fsm.known import Known, Nearest, Policy, recognise_rows
@@ -159,22 +156,16 @@ class EvolvingFSM(Known):
     failure_horizon : int, optional
         A failure within this many observations of a visit is counted in `failed_soon`; without
         it, every failure later in the same episode.
-    dynamics : Dynamics, optional
-        Learns how the system moves, what disturbs it and where it fails, beside the states. The
-        machine goes on with a copy of it, between two episodes: `EvolvingFSM.dynamics`. Then a
-        machine with a range of actions has to be told what was ``executed``, and no observation
-        may have a number beyond 1e30. Without it nothing of that is learnt, and no time is spent.
 
     Raises
     ------
     TypeError
-        If ``rule`` is no rule (or the class of one), or ``dynamics`` is something else.
+        If ``rule`` is no rule (or the class of one).
     ValueError
         If ``n_actions`` is no whole number of at least 1, another setting is not positive, or
         beyond its range in ``evofsm.fsm.learnt``, ``learning_rate`` is 1 or more, ``radius`` or
         ``spread`` contradicts the rule's, ``belief_tolerance`` is not in its range, or
-        ``failure_horizon`` is no whole number of at least 1, or ``dynamics`` has another number of
-        actions.
+        ``failure_horizon`` is no whole number of at least 1.
 
     Notes
     -----
@@ -184,8 +175,7 @@ class EvolvingFSM(Known):
     Threads may share a machine: each method is whole, and no observation is lost. But its episode
     is one stream; observations of two threads are learnt as if one followed the other, so give each
     source of observations a machine of its own. An interrupt (Ctrl-C) leaves a machine as it was
-    before the observation or as it is after; `learn_many` has then learnt its first rows. Dynamics
-    may lack that observation, which is then a gap to them.
+    before the observation or as it is after; `learn_many` has then learnt its first rows.
 
     Examples
     --------
@@ -199,7 +189,6 @@ class EvolvingFSM(Known):
     """
 
     _kind = MACHINE
-    _dynamics: Dynamics | None
     _update: Callable[..., float]  # the quickest kernel that takes a step, once it is loaded
 
     def __init__(
@@ -215,7 +204,6 @@ class EvolvingFSM(Known):
         when_full: WhenFull = WhenFull.MERGE,
         belief_tolerance: float = 0.0,
         failure_horizon: int | None = None,
-        dynamics: Dynamics | None = None,
     ) -> None:
         self._rule = Paper() if rule is None else check_rule("rule", rule)
         given = RuleSettings(
@@ -243,7 +231,6 @@ class EvolvingFSM(Known):
         )
         if parameters.learning_rate >= 1.0:
             raise ValueError(f"learning_rate is {learning_rate}; it must lie below 1")
-        self._dynamics = _own(dynamics, whole("n_actions", n_actions))
         self._share()
         self._use(allocate(0, whole("n_actions", n_actions), LINE, 0, parameters))
         MACHINE.refuse_others(self._content)
@@ -336,7 +323,7 @@ prior_frequency=0.001, spread=3.0)
         return step._replace(explanation=text)
 
     @_alone
-    def act(self, i: SupportsIndex, executed: ArrayLike | None = None) -> None:
+    def act(self, i: SupportsIndex) -> None:
         """Say which action was commanded after the latest observation.
 
         It labels exactly one transition, the one to the next observation; a second call
@@ -346,18 +333,13 @@ prior_frequency=0.001, spread=3.0)
         ----------
         i : int
             Index of the action, from 0; `IntervalActions.encode` gives it for a number.
-        executed : float or (d,) array_like, optional
-            The action itself, for `dynamics` that have a range of actions; what lies beyond it is
-            taken for its end. For dynamics with a number of actions the index of what was
-            executed, where that was not ``i``. A machine without dynamics does not use it.
 
         Raises
         ------
         TypeError
-            If ``i`` is not an integer, or ``executed`` no real number.
+            If ``i`` is not an integer.
         ValueError
-            If there is no such action, nothing was observed yet in this episode, or ``executed``
-            is missing, not finite, or of another number of dimensions.
+            If there is no such action, or nothing was observed yet in this episode.
 
         Examples
         --------
@@ -372,13 +354,10 @@ prior_frequency=0.001, spread=3.0)
         now = self._memory.learnt
         if not now.chained[0]:
             raise ValueError("act before observe: this episode has no observation to act on yet")
-        inner = self._encoded(i, executed)
         now.action[0] = i
-        if self._dynamics is not None and inner is not None:
-            following.follow_act(self._dynamics, now.outcomes.clock[0], inner)
 
     @_alone
-    def learn_one(self, z: ArrayLike, i: SupportsIndex, executed: ArrayLike | None = None) -> Step:
+    def learn_one(self, z: ArrayLike, i: SupportsIndex) -> Step:
         """Observe ``z``, then act with ``i``.
 
         Parameters
@@ -387,8 +366,6 @@ prior_frequency=0.001, spread=3.0)
             Observation, as `observe` takes it.
         i : int
             Index of the action commanded after it, from 0, as `act` takes it.
-        executed : float or (d,) array_like, optional
-            The action itself, as `act` takes it.
 
         Returns
         -------
@@ -407,9 +384,9 @@ prior_frequency=0.001, spread=3.0)
         [0, 0, 0, 1]
         """
         i = check_action(i, self.n_actions)
-        return self._step(z, i, False, self._encoded(i, executed))
+        return self._step(z, i, False)
 
-    def update(self, z: NDArray[np.float64], i: int, executed: ArrayLike | None = None) -> float:
+    def update(self, z: NDArray[np.float64], i: int) -> float:
         """Observe ``z``, then act with ``i``, and return nothing but the surprise.
 
         The same step as `learn_one`, for those who count nanoseconds: most of the time of that
@@ -421,9 +398,6 @@ prior_frequency=0.001, spread=3.0)
             Observation; quickest as an array of float64.
         i : int
             Index of the action commanded after it, from 0.
-        executed : float or (d,) array_like, optional
-            The action itself, as `act` takes it; with `dynamics` this is no quicker than
-            `learn_one`.
 
         Returns
         -------
@@ -451,12 +425,11 @@ prior_frequency=0.001, spread=3.0)
                 surprise = DECLINED
             if surprise != DECLINED:
                 return surprise
-            if self._dynamics is None:
-                self._update = updater(self._limit)
+            self._update = updater(self._limit)
         i = check_action(i, self.n_actions)
         with self._lock:
             close(self._held.buffer)
-            surprise = self._take(z, i, False, self._encoded(i, executed))[2]
+            surprise = self._take(z, i, False)[2]
             reopen(self._held.buffer)  # also where an error or an interrupt had left it closed
         return surprise
 
@@ -468,7 +441,6 @@ prior_frequency=0.001, spread=3.0)
         episode_starts: Sequence[int] | NDArray[np.integer] = (),
         failures: Sequence[int] | NDArray[np.integer] | None = None,
         *,
-        executed: ArrayLike | None = None,
         belief: bool = False,
     ) -> Trace:
         """Learn from many observations at once, bit for bit as `observe` and `act` would.
@@ -485,8 +457,6 @@ prior_frequency=0.001, spread=3.0)
             Rows with which an episode ended in failure, as ``observe(z, failed=True)`` tells it.
             The action in such a row is not used, and the next row begins an episode. An empty one
             tells that there was none; without it nothing is said of failures.
-        executed : (T,) or (T, d) array_like, optional
-            The actions themselves, as `act` takes them; not looked at in rows without an action.
         belief : bool
             Whether the trace holds the belief of every row as well.
 
@@ -510,10 +480,6 @@ prior_frequency=0.001, spread=3.0)
         actions = check_actions(I, len(observations), self.n_actions)
         starts = check_rows("episode_starts", episode_starts, len(observations))
         ends = check_rows("failures", () if failures is None else failures, len(observations))
-        inner: list[NDArray[np.float64] | None] = []
-        if self._dynamics is not None:
-            following.refuse_too_large(observations)
-            inner = following.encoded_rows(self._dynamics, actions, executed)
         if len(observations):
             self._fit(observations[0])
         if failures is not None:
@@ -527,9 +493,6 @@ prior_frequency=0.001, spread=3.0)
         )
         beliefs = np.zeros((rows if belief else 0, self._capacity))
         given = observations, actions, starts, ends
-        if self._dynamics is not None:
-            beliefs = self._learn_each(*given, inner, trace, beliefs)
-            return trace._replace(belief=beliefs[:, : self.n_states]) if belief else trace
         row = learn_rows(self._buffer, *given, 0, trace, beliefs, self._limit)
         while row < rows:
             self._grow()
@@ -552,16 +515,13 @@ prior_frequency=0.001, spread=3.0)
         (2, None, array([0.5, 0.5]))
         """
         forget_present(self._buffer)
-        if self._dynamics is not None:
-            following.follow_end(self._dynamics, 0.0, failed=False)
 
     @_alone
     def fail(self) -> None:
         """End the episode in failure, without a further observation.
 
         The action commanded after the latest observation led there; where none was, the failure
-        is counted for the state alone. The next observation begins a new episode. `dynamics` take
-        the latest observation for that of the failure.
+        is counted for the state alone. The next observation begins a new episode.
 
         Raises
         ------
@@ -583,9 +543,6 @@ prior_frequency=0.001, spread=3.0)
             self._grow()
             fail(self._buffer, self._limit)
         tell_of_failures(self._buffer)
-        if self._dynamics is not None:
-            clock = self._memory.learnt.outcomes.clock[0]
-            following.follow_end(self._dynamics, clock, failed=True)
 
     @_alone
     def onset(self) -> None:
@@ -720,10 +677,7 @@ prior_frequency=0.001, spread=3.0)
     committor_forward = _alone(Known.committor_forward)
     mfpt = _alone(Known.mfpt)
     simulate = _alone(Known.simulate)
-    what_next = _alone(Known.what_next)
-    may_begin = _alone(Known.may_begin)
     onset_rates = _alone(Known.onset_rates)
-    never_seen = _alone(Known.never_seen)
     joint_frequency = property(_alone(cast(Any, Known.joint_frequency).fget))
 
     # -- What it was told -----------------------------------------------------------------------
@@ -792,14 +746,6 @@ prior_frequency=0.001, spread=3.0)
         return None if most == np.inf else int(most)
 
     # -- What it knows --------------------------------------------------------------------------
-
-    @property
-    def dynamics(self) -> Dynamics | None:
-        """How the system moves, as far as it was learnt; None where that was not asked for.
-
-        It is the machine's own, and goes on learning: do not teach it by yourself.
-        """
-        return self._dynamics
 
     @property
     def nbytes(self) -> int:
@@ -967,15 +913,12 @@ prior_frequency=0.001, spread=3.0)
 
     def _kept(self) -> dict[str, NDArray[Any]]:
         # Without spare room the shapes of the arrays tell the sizes, and nothing else is stored.
-        return {**dict(leaves(self._trimmed())), "dynamics": to_bytes(self._dynamics)}
+        return dict(leaves(self._trimmed()))
 
     @classmethod
     def _restored(cls, content: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> Self:
         told = content.pop("failures_told")
         machine = cls(**content)
-        own = from_bytes(arrays.pop("dynamics"))
-        _refuse_unlike(own, machine.n_actions, arrays["centers"].shape[0])
-        machine._dynamics = own
         machine = machine._holding(arrays) if arrays["centers"].shape[1] else machine
         if told:
             tell_of_failures(machine._buffer)
@@ -987,11 +930,10 @@ prior_frequency=0.001, spread=3.0)
     def __getstate__(self) -> dict[str, Any]:
         buffer = self._buffer.copy()
         reopen(buffer)
-        dynamics = None if self._dynamics is None else self._dynamics.copy()
-        return {"rule": self._rule, "buffer": buffer, "dynamics": dynamics}
+        return {"rule": self._rule, "buffer": buffer}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        self._rule, self._dynamics = state["rule"], state["dynamics"]
+        self._rule = state["rule"]
         self._share()
         self._use(np.require(state["buffer"], requirements="W"))  # a file mapped for reading is not
 
@@ -1001,8 +943,6 @@ prior_frequency=0.001, spread=3.0)
 
     def __repr__(self) -> str:
         shown = self.settings | ({} if self._rule == Paper() else {"rule": self._rule})
-        if self._dynamics is not None:
-            shown["dynamics"] = self._dynamics
         settings = ", ".join(f"{name}={value}" for name, value in shown.items())
         return f"{type(self).__name__}({settings})"
 
@@ -1067,10 +1007,9 @@ prior_frequency=0.001, spread=3.0)
         z: ArrayLike,
         action: int,
         failed: bool,
-        inner: NDArray[np.float64] | None = None,
     ) -> Step:
         """Observe, then act; return the whole step."""
-        event, state, surprise = self._take(z, action, failed, inner)
+        event, state, surprise = self._take(z, action, failed)
         memory = self._held.memory
         parameters, now, scratch = memory.parameters, memory.learnt, memory.scratch
         n = int(now.n_states[0])
@@ -1107,8 +1046,6 @@ prior_frequency=0.001, spread=3.0)
             rows = filled[None], self.width
             recognise_rows(centers, counted, *rows, distances, belief[None])
         surprise = jensen_shannon(predicted, belief) if len(predicted) else np.nan
-        if self._dynamics is not None:
-            following.follow_end(self._dynamics, 0.0, failed=False)
         if failed:  # both, or neither
             grown = self._grown()
             believe(grown, belief)
@@ -1118,47 +1055,7 @@ prior_frequency=0.001, spread=3.0)
             believe(self._buffer, belief)
         return Step(int(belief.argmax()), belief, Event.NONE, predicted, surprise, gone)
 
-    def _take(
-        self,
-        z: ArrayLike,
-        action: int,
-        failed: bool,
-        inner: NDArray[np.float64] | None = None,
-    ) -> tuple[int, int, float]:
-        """A step of the kernel: event, state and surprise, once it has a plain vector and room.
-
-        ``inner`` is the action as dynamics learn it, which follow.
-        """
-        if self._dynamics is not None:
-            return self._take_and_follow(self._dynamics, z, action, failed, inner)
-        return self._take_alone(z, action, failed)
-
-    def _take_and_follow(
-        self,
-        dynamics: Dynamics,
-        z: ArrayLike,
-        action: int,
-        failed: bool,
-        inner: NDArray[np.float64] | None,
-    ) -> tuple[int, int, float]:
-        """The same, and what dynamics make of it."""
-        given = self._checked(z)
-        chained = bool(self._memory.learnt.chained[0])
-        taken = self._take_alone(given, action, failed)
-        now = self._memory.learnt
-        began = following.follow(
-            dynamics,
-            given,
-            float(now.outcomes.clock[0]),
-            chained=chained,
-            failed=failed,
-            action=None if action == NO_ACTION else inner,
-        )
-        if began:
-            self.onset()
-        return taken
-
-    def _take_alone(self, z: ArrayLike, action: int, failed: bool) -> tuple[int, int, float]:
+    def _take(self, z: ArrayLike, action: int, failed: bool) -> tuple[int, int, float]:
         if not self.n_variables or type(z) is not np.ndarray or z.dtype is not _FLOAT64:
             z = self._checked(z)
         while True:
@@ -1178,40 +1075,7 @@ prior_frequency=0.001, spread=3.0)
         """An observation as a vector of its own, of as many variables as the first one had."""
         vector = self._fit(real_array("observation", z, ndim=1))
         refuse_unusable("observation", vector)
-        if self._dynamics is not None:
-            following.refuse_too_large(vector)
         return vector
-
-    def _encoded(self, i: int, executed: ArrayLike | None) -> NDArray[np.float64] | None:
-        """What was executed, as dynamics learn it; None without them."""
-        if self._dynamics is None:
-            return None
-        return following.encoded(self._dynamics, i, executed)
-
-    def _learn_each(
-        self,
-        observations: NDArray[np.float64],
-        actions: NDArray[np.int64],
-        starts: NDArray[np.bool_],
-        ends: NDArray[np.bool_],
-        inner: Sequence[NDArray[np.float64] | None],
-        trace: Trace,
-        beliefs: NDArray[np.float64],
-    ) -> NDArray[np.float64]:
-        """Learn row by row, into a trace; returns beliefs as wide as they came to be."""
-        for row, z in enumerate(observations):
-            if starts[row]:
-                self.start_episode()
-            failed, action = bool(ends[row]), int(actions[row])
-            acted = NO_ACTION if failed else action
-            event, state, surprise = self._take(z, acted, failed, inner[row])
-            n = self.n_states
-            trace.event[row], trace.state[row], trace.surprise[row] = event, state, surprise
-            trace.n_states[row] = n
-            if len(beliefs):
-                beliefs = widen(beliefs, self._capacity)
-                beliefs[row, :n] = self._memory.learnt.belief[:n]
-        return beliefs
 
     def _grow(self) -> None:
         """Make room for what the next step may need."""
@@ -1277,7 +1141,6 @@ prior_frequency=0.001, spread=3.0)
         """Settle the number of variables with the first observation, and hold to it after."""
         if self.n_states == 0:
             refuse_unusable("observation", z)
-            _refuse_unlike(self._dynamics, self.n_actions, len(z))
             parameters = self._parameters(len(z))
             buffer = allocate(len(z), self.n_actions, LINE, 0, parameters)
             if failures_told(self._buffer):
@@ -1320,30 +1183,3 @@ def _tolerance(tolerance: float) -> float:
     if positive("belief_tolerance", tolerance) >= 1.0:
         raise ValueError(f"belief_tolerance is {tolerance}; it must lie below 1")
     return float(tolerance)
-
-
-def _own(dynamics: Dynamics | None, n_actions: int) -> Dynamics | None:
-    """A machine's own, between two episodes."""
-    if dynamics is None:
-        return None
-    if not isinstance(dynamics, Dynamics):
-        raise TypeError(f"dynamics is {dynamics!r}; it must be Dynamics, or None")
-    _refuse_unlike(dynamics, n_actions, dynamics.n_variables)
-    own = dynamics.copy()
-    own.break_off()
-    return own
-
-
-def _refuse_unlike(dynamics: Dynamics | None, n_actions: int, n_variables: int) -> None:
-    """Raise where dynamics are of another system than the machine."""
-    if dynamics is None:
-        return
-    if dynamics.choices not in (0, n_actions):
-        raise ValueError(
-            f"dynamics has {dynamics.choices} actions, but the machine has {n_actions}"
-        )
-    if dynamics.n_variables not in (0, n_variables):
-        raise ValueError(
-            f"observation has {n_variables} variables, but dynamics learnt from "
-            f"{dynamics.n_variables}"
-        )

@@ -20,7 +20,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.fsm.dynamics.merging import merge_dynamics
 from evofsm.fsm.inside import Inside
 from evofsm.fsm.learnt import NO_ACTION, NOT_OPEN, Counts, Learnt, arrays_of
 from evofsm.fsm.machine import EvolvingFSM
@@ -113,8 +112,6 @@ def merge(machines: Sequence[EvolvingFSM], *, radius: float | None = None) -> Ev
             **_transitions(learnt, match, parameters),
         }
     )
-    if moves := [part.dynamics for part in experienced if part.dynamics is not None]:
-        Inside(merged).dynamics = merge_dynamics(moves)
     if all(part.failures_told for part in experienced):
         merged.tell_of_failures()
     return merged
@@ -135,13 +132,6 @@ def _refuse_unlike(machines: Iterable[EvolvingFSM]) -> list[EvolvingFSM]:
             f"machine {one} has {m} variables, and machine {other} has {other_m}; "
             "machines to merge must have observed the same"
         )
-    moves = [None if part.dynamics is None else part.dynamics.settings for part in parts]
-    for number, its in enumerate(moves):
-        if its != moves[0]:
-            raise ValueError(
-                f"dynamics of machine {number} are {its}, but {moves[0]} of machine 0; machines to "
-                "merge must have the same settings"
-            )
     settings = [part.settings | {"rule": part.rule} for part in parts]
     for number, own in enumerate(settings):
         for name in sorted(own.keys() | settings[0].keys()):

@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from evofsm.fsm.actions import IntervalActions
-from evofsm.fsm.dynamics.keeping import from_bytes, to_bytes
 from evofsm.fsm.explanation import Explanation, explain
 from evofsm.fsm.known import Known
 from evofsm.fsm.layout import Array
@@ -73,8 +72,6 @@ class FSMModel(Known):
             array.setflags(write=False)
             object.__setattr__(self, name, array)
             arrays[name] = array
-        if self.dynamics is not None:
-            object.__setattr__(self, "dynamics", self.dynamics.frozen())
         MODEL.refuse_others(self._content)
         for name, array in arrays.items():
             OF_MODEL[name].refuse_others(name, array, sizes)
@@ -239,8 +236,7 @@ class FSMModel(Known):
         }
 
     def _kept(self) -> dict[str, NDArray[Any]]:
-        arrays = {name: getattr(self, name) for name in OF_MODEL}
-        return {**arrays, "dynamics": to_bytes(self.dynamics)}
+        return {name: getattr(self, name) for name in OF_MODEL}
 
     @classmethod
     def _restored(cls, content: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> Self:
@@ -248,8 +244,7 @@ class FSMModel(Known):
             content["actions"] = _actions(content["actions"], len(arrays["uses"]))
         for name in ("names", "units"):
             content[name] = tuple(content[name])
-        dynamics = from_bytes(arrays.pop("dynamics"))
-        values: dict[str, Any] = {**content, **arrays, "dynamics": dynamics}
+        values: dict[str, Any] = {**content, **arrays}
         if lacking := {entry.name for entry in fields(cls)} - set(values):
             raise ValueError(f"it lacks {', '.join(sorted(lacking))}")
         return cls(**values)

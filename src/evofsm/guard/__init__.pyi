@@ -26,9 +26,9 @@ from .guard import Guard as Guard
 from .guard import learnt_guard as learnt_guard
 from .gym import RevisedActions as RevisedActions
 from .gym import RevisedVectorActions as RevisedVectorActions
-from .learnt.risk import JUDGE_PARTS as JUDGE_PARTS
-from .learnt.risk import LearntRisk as LearntRisk
-from .learnt.risk import Outlook as Outlook
+from .learnt.judge import JUDGE_PARTS as JUDGE_PARTS
+from .learnt.judge import LearntRisk as LearntRisk
+from .learnt.judge import Outlook as Outlook
 from .pettingzoo import RevisedAgents as RevisedAgents
 from .protocols import ActionJudge as ActionJudge
 from .protocols import Controller as Controller

@@ -26,13 +26,12 @@ from evofsm.fsm import (
     explain,
     positive,
     real_array,
-    refuse_too_large,
     refuse_unusable,
 )
 from evofsm.guard.actions import Action, ActionSet, BoxActions, Choices, fixed, no_action
 from evofsm.guard.auditing.participants import outline, rebuild
 from evofsm.guard.defaults import BELIEF_TOLERANCE, TOLERANCE
-from evofsm.guard.learnt.risk import LearntRisk
+from evofsm.guard.learnt.judge import LearntRisk
 from evofsm.guard.protocols import (
     INCOMPLETE,
     STALE,
@@ -55,6 +54,8 @@ from evofsm.store import Kind, Numbers, Place
 _INTERVALS = 17
 # States of the machine that is made where none is given.
 _MOST_STATES = 200
+# Fourth powers of larger observations, summed over a long run, would lose all others.
+_LARGEST = 1e30
 
 
 class Explain(Enum):
@@ -275,7 +276,7 @@ class Guard:
                     "the judge was made for a range of actions, but the guard has n_actions, or "
                     "the other way round"
                 )
-            asked.dynamics.told = failed
+            asked.dynamics.failed = failed
         self._observing = judge if isinstance(judge, ObservingJudge) else None
         self.reviser = reviser
         self.machine = machine
@@ -463,9 +464,13 @@ class Guard:
     def _checked(self, observation: ArrayLike) -> NDArray[np.float64]:
         """An observation that judge and machine can take in; NaN stays."""
         z = real_array("observation", observation, 1)
-        known_of = np.where(np.isnan(z), 0.0, z)
-        refuse_unusable("observation", known_of)
-        refuse_too_large(known_of)
+        if not np.abs(z).max(initial=0.0) <= _LARGEST:  # or something was not observed
+            seen = np.where(np.isnan(z), 0.0, z)
+            refuse_unusable("observation", seen)
+            if (largest := np.abs(seen).max()) > _LARGEST:
+                raise ValueError(
+                    f"observation holds {largest:g}; a guard takes numbers of at most {_LARGEST:g}"
+                )
         known = len(self.variables) or (0 if self.machine is None else self.machine.n_variables)
         if known and len(z) != known:
             named = f" ({', '.join(self.variables)})" if self.variables else ""

@@ -121,7 +121,7 @@ def content():
     from evofsm import store
     from evofsm.fsm.learnt import MACHINE
     from evofsm.guard.guard import KIND as GUARD
-    from evofsm.guard.learnt.keeping import KIND
+    from evofsm.guard.learnt.judge import KIND
 
     def take(guard):
         file = BytesIO()

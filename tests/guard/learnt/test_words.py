@@ -8,7 +8,7 @@ import pytest
 from evofsm.driving.naming import UNITS, VARIABLES
 from evofsm.guard.actions import same_action
 from evofsm.guard.learnt import words
-from evofsm.guard.learnt.risk import LearntRisk
+from evofsm.guard.learnt.judge import LearntRisk
 from evofsm.guard.learnt.words import Remembered
 
 NONE, ONE, MANY = Remembered(0, 5.0), Remembered(1, 61.0), Remembered(10, 3050.0)

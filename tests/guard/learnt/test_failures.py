@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from evofsm.fsm.dynamics.failures import explain_failures
+from evofsm.guard.learnt.failures import explain_failures
 
 EXACT = np.zeros((2, 2))
 

@@ -68,7 +68,8 @@ def explain_failures(
         tied, best = _most_telling(explained, perhaps, beyond)
         left &= ~explained[:, best]
         undecided = len(failures) <= _FIRST and len(tied) == 2
-        found |= {k: float(ends[k]) for k in (tied if undecided else [best])}
+        for k in tied if undecided else [best]:
+            found[k] = float(ends[k])
     while (explained := perhaps & left[:, None]).any():
         _, best = _most_telling(explained, perhaps, beyond)
         left &= ~explained[:, best]
@@ -82,10 +83,13 @@ def _most_telling(
 ) -> tuple[list[int], int]:
     """Ends that explain most failures, and of them the one that may explain most, and by most."""
     votes = explained.sum(0)
-    tied = [int(k) for k in np.flatnonzero(votes == votes.max())]
-    return tied, max(
-        tied, key=lambda k: (perhaps[:, k].sum(), np.median(beyond[explained[:, k], k]))
-    )
+    tied = np.flatnonzero(votes == votes.max()).tolist()
+    best, most = tied[0], (-1.0, 0.0)
+    for k in tied:
+        tells = float(perhaps[:, k].sum()), float(np.median(beyond[explained[:, k], k]))
+        if tells > most:
+            best, most = k, tells
+    return tied, best
 
 
 def probe(

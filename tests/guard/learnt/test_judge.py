@@ -8,13 +8,14 @@ from contextlib import suppress
 import numpy as np
 import pytest
 
-from evofsm.fsm.dynamics.drift import Drift
 from evofsm.guard import Mode, same_action
 from evofsm.guard.auditing.log import AuditLog
 from evofsm.guard.auditing.replay import audit
-from evofsm.guard.learnt.breaks import Breaks
-from evofsm.guard.learnt.remembering import Situations
-from evofsm.guard.learnt.risk import LearntRisk
+from evofsm.guard.learnt import library
+from evofsm.guard.learnt.dynamics import Dynamics
+from evofsm.guard.learnt.judge import LearntRisk
+from evofsm.guard.learnt.library import Violations
+from evofsm.guard.learnt.regression import Drift
 
 
 def kept(said):
@@ -62,13 +63,13 @@ def test_its_risk_lies_in_its_interval_and_rests_on_what_is_remembered(point):
 
 def test_where_all_that_it_may_remember_are_lost_its_interval_has_no_end(points):
     judge = points["box"].taught(10).judge
-    most = judge.dynamics.n_stretches
-    assert len(judge.dynamics.stretches) == most
+    most = judge.dynamics.remembered
+    assert len(judge.dynamics.sequences) == most
     outlooks = [judge.assess([0.5, speed]) for speed in np.linspace(0.0, 0.2, 400)]
-    assert {one.dead_end or one.lost == most for one in outlooks} == {False, True}
-    assert any(0 < one.lost < most for one in outlooks)
+    assert {one.dead_end or one.unsurvived == most for one in outlooks} == {False, True}
+    assert any(0 < one.unsurvived < most for one in outlooks)
     for one in outlooks:
-        assert (one.risk[2] == 1.0) == math.isinf(one.per_hour[2]) == (one.lost == most)
+        assert (one.risk[2] == 1.0) == math.isinf(one.per_hour[2]) == (one.unsurvived == most)
         assert one.risk[0] == 1.0 if one.dead_end else one.risk[0] < one.risk[2]
 
 
@@ -76,13 +77,13 @@ def test_where_all_that_it_may_remember_are_lost_its_interval_has_no_end(points)
 def test_what_is_noted_of_a_decision_belongs_to_its_observation(points, monkeypatch, steps):
     """Although the first observations lack something, and a long episode is studied in parts."""
     guard, noted, refused = points["box"].taught(4), [], {}
-    add = Situations.add
+    add = library.noted
 
     def note(situations, episode, tight, *others):
         noted.extend(zip(episode.observations[:-1], tight, strict=False))
-        add(situations, episode, tight, *others)
+        return add(situations, episode, tight, *others)
 
-    monkeypatch.setattr(Situations, "add", note)
+    monkeypatch.setattr(library, "noted", note)
     rng = np.random.default_rng(3)
     z = np.zeros(2)
     for t in range(steps):
@@ -184,7 +185,7 @@ def test_looking_on_it_changes_nothing_and_learns_no_margin(point, mode):
     said = [one for k in range(4) for one in point.play(guard, k)[0]]
     assert all(kept(said))
     assert any(not same_action(one.advised, one.executed) for one in said)
-    assert guard.judge.broken == 0
+    assert guard.judge.n_violated == 0
     assert guard.judge.margin == pytest.approx(3.0 * 0.9**4)  # it fades, and nothing adds to it
     assert guard.judge.dynamics.n_episodes == 4
 
@@ -235,14 +236,14 @@ def test_after_a_gap_in_time_nothing_follows_from_what_was(points):
 
 def test_what_came_before_a_gap_in_time_is_learnt_from_as_at_an_end(points, monkeypatch):
     """With all that the judge noted on the way, such as which proposals were refused."""
-    noted, add = [], Situations.add
+    noted, add = [], library.noted
 
-    def listen(self, episode, tight, horizon, random):
+    def listen(situations, episode, tight, horizon, random):
         noted.append((len(episode.actions), list(tight)))
-        add(self, episode, tight, horizon, random)
+        return add(situations, episode, tight, horizon, random)
 
     guards = [points["box"].taught(4) for _ in range(2)]
-    monkeypatch.setattr(Situations, "add", listen)
+    monkeypatch.setattr(library, "noted", listen)
     for guard in guards:
         for k in range(40):
             guard.decide([0.024 * k, 0.08], 1.0, time=0.1 * k)
@@ -294,50 +295,43 @@ def test_by_itself_it_says_what_it_lacks():
         LearntRisk(0.0, n_actions=2)
 
 
+def look(judge, after, *, refuted=False, fails_after=0.0, failed=False):
+    """How long it takes to fail, after an episode."""
+    judge._fails_after = fails_after
+    judge._look_ahead(after, refuted=refuted, failed=failed)
+    return judge.time_to_failure
+
+
 @pytest.mark.parametrize(
-    ("dead_ends", "took", "failed", "looks"),
+    ("told", "looks"),
     [
-        ([True] * 100, 0.0, False, "less far"),  # it went on for the whole horizon
-        ([False] * 80 + [True] * 20, 0.0, False, "as far"),  # nobody knows how those ended
-        ([True] * 100, 0.0, True, "as far"),  # they were dead ends
-        ([False] * 100, 90.0, False, "farther"),  # what was refused would have failed as late
+        ({"refuted": True}, "less far"),  # it went on for the whole horizon
+        ({}, "as far"),
+        ({"refuted": True, "failed": True}, "as far"),  # they were dead ends
+        ({"fails_after": 90.0}, "farther"),  # what was refused would have failed as late
     ],
 )
-def test_the_horizon_follows_what_became_of_dead_ends(point, dead_ends, took, failed, looks):
-    guard = point.guard(horizon=None)
-    for episode in range(6):
-        point.play(guard, episode)
-    judge = guard.judge
-    judge.takes, judge.horizon, judge.believed = 40.0, 60, 144.0
-    judge._dead_ends, judge._took = dead_ends, took
-    judge._look_ahead(judge.backups.policies[:1], failed=failed)
-    ratio = judge.takes / 40.0
+def test_the_horizon_follows_what_became_of_dead_ends(points, told, looks):
+    judge = points["box"].guard(horizon=None).judge
+    judge.time_to_failure, judge.horizon, judge.believed = 40.0, 60, 144.0
+    ratio = look(judge, 5, **told) / 40.0
     expected = {"less far": ratio < 0.9, "as far": 0.95 < ratio < 1.05, "farther": ratio > 2.0}
     assert expected[looks]
-    assert judge.horizon == int(min(max(1.5 * judge.takes, 32), 144))
+    assert judge.horizon == int(min(max(1.5 * judge.time_to_failure, 32), 144))
 
 
-def test_what_was_refuted_is_believed_again_little_by_little(point):
+def test_what_was_refuted_is_believed_again_little_by_little(points):
     """Else a model that says that all fails late looks as far again an episode later."""
-    guard = point.guard(horizon=None)
-    for episode in range(6):
-        point.play(guard, episode)
-    judge, policies = guard.judge, guard.judge.backups.policies[:1]
-
-    def look(dead_ends=(), took=0.0, failed=False):
-        judge._dead_ends, judge._took = list(dead_ends), took
-        judge._look_ahead(policies, failed=failed)
-        return judge.takes
-
-    judge.takes, judge.horizon, judge.believed = 90.0, 135, 144.0
-    refuted = look([True] * 200)
+    judge = points["box"].guard(horizon=None).judge
+    judge.time_to_failure, judge.horizon, judge.believed = 90.0, 135, 144.0
+    refuted = look(judge, 130, refuted=True)
     assert refuted < 90.0
-    later = [look(took=130.0) for _ in range(40)]
+    later = [look(judge, 130) for _ in range(40)]
     assert refuted < later[0] < 1.05 * refuted
     assert later == sorted(later)
     assert later[-1] == 130.0
-    judge.takes, judge.believed, judge._was_certified = 40.0, 30.0, True
-    assert look(failed=True) > 50.0  # who failed although it was certified not to looks farther
+    judge.time_to_failure, judge.believed, judge._was_certified = 40.0, 30.0, True
+    assert look(judge, 5, failed=True) > 50.0  # who failed although certified looks farther
 
 
 def test_a_question_changes_nothing_of_what_is_learnt(point, content):
@@ -362,6 +356,35 @@ def test_where_nobody_knows_where_one_is_nothing_is_said(points, value):
             judge.assess(z, moved)
 
 
+@pytest.mark.parametrize("name", ["begins", "_learn", "_study", "disturbances", "keep"])
+def test_what_an_interrupt_breaks_off_is_not_learnt_at_all(points, content, monkeypatch, name):
+    """Of an observation, or of how an episode ended; then it goes on as if nothing had happened."""
+    guard, other = points["box"].taught(9), points["box"].taught(9)
+    judges = guard.judge, other.judge
+    draw = np.random.default_rng(1)
+    rows = np.cumsum(0.02 * draw.normal(size=(40, 2)), axis=0)
+
+    def interrupt(*given, **told):
+        raise KeyboardInterrupt
+
+    def broken_off(act, *given, **told):
+        with monkeypatch.context() as patch, suppress(KeyboardInterrupt):
+            patch.setattr(Dynamics, name, interrupt)
+            act(*given, **told)
+            return  # it is not asked for here
+        act(*given, **told)
+
+    for z in rows:
+        broken_off(judges[0].observe, z)
+        judges[1].observe(z)
+        for judge in judges:
+            judge.act(0.1)
+            judge.learn(z, 0.1, np.ones(1))
+    broken_off(judges[0].end, rows[-1], failed=False)
+    judges[1].end(rows[-1], failed=False)
+    assert content(guard)["judge"] == content(other)["judge"]
+
+
 def test_after_a_drift_the_margin_begins_anew(point, monkeypatch):
     guard = point.taught(4)
     judge, dynamics = guard.judge, guard.judge.dynamics
@@ -381,24 +404,24 @@ def test_after_a_drift_the_margin_begins_anew(point, monkeypatch):
     assert judge.margin < 3.0
 
 
-def test_where_certificates_break_in_every_episode_disturbances_are_harder_again(
+def test_where_certificates_are_violated_in_every_episode_disturbances_are_harder_again(
     point, monkeypatch
 ):
     guard = point.taught(4)
     judge = guard.judge
-    judge.breaks, judge.margin = Breaks(share=0.0), 0.1
+    judge.violations, judge.margin = Violations(share=0.0), 0.1
     learn = type(judge).learn
 
-    def broken(self, *given):
+    def violated(self, *given):
         learn(self, *given)
-        self._broke = True  # as by what was never seen before
+        self._violated = True  # as by what was never seen before
 
-    monkeypatch.setattr(type(judge), "learn", broken)
+    monkeypatch.setattr(type(judge), "learn", violated)
     for episode in range(40, 43):
         point.play(guard, episode)
-    assert judge.breaks.worse == 4
+    assert judge.violations.worse == 4
     assert "since episode 5 disturbances are worse" in judge.told_by_experience
-    assert judge.harder == 1.44
+    assert judge.disturbance_scale == 1.44
     assert judge.margin > 2.0
 
 

@@ -1,1 +1,0 @@
-"""What a machine learns of how its system moves, beside its states: see `dynamics.Dynamics`."""

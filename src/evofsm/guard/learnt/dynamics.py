@@ -1,0 +1,771 @@
+"""How a system moves, what disturbs it and where it fails: learnt online, told only what failed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from evofsm.fsm.validation import real_array, refuse_unusable, whole
+from evofsm.guard.learnt import regression
+from evofsm.guard.learnt.failures import explain_failures, probe
+from evofsm.guard.learnt.regression import MOVING, ONSET, Drift, Recent, Sums
+from evofsm.guard.learnt.replay import (
+    Disturbances,
+    Floats,
+    Ints,
+    Model,
+    features,
+    lags,
+    n_features,
+    n_products,
+    residuals,
+)
+from evofsm.store import COUNT, SHARE, Numbers
+
+#: Parts that can be left out, to see what each is worth.
+DYNAMICS_PARTS: tuple[str, ...] = (
+    *("stretches", "memory", "products", "lags", "doubt", "jumps", "carried", "drift"),
+    "observer",
+)
+
+# Observations before anything is expected: an episode may fail after so few.
+_FIRST = 8
+# Of what was learnt so far, what still counts an episode later.
+_KEPT = 0.999
+# Until it is ready, weights are solved for after so many steps; then after so many more, until.
+_UNREADY, _SCHEDULE = 20, ((300, 5), (1500, 20))
+# Onsets of sequences in an episode, at most, and so far apart.
+_ONSETS, _APART = 3, 3
+# A sequence has at least so many steps.
+_SHORTEST = 4
+# An episode that goes on for so many steps is studied, and goes on; with the last of them, as the
+# last transition is learnt next.
+_LONGEST, _LAST = 1024, 3
+# An episode of fewer steps says nothing as a whole.
+_STUDIED = 5
+# An extreme is a saturation if it was reached, by moving, in so many episodes, or if a variable
+# rested there although it was expected to go on.
+_REACHED = 2
+# Failures, and jumps of each variable, that are remembered.
+_MOST = 200
+# Jumps that would have shown no dependence, for each variable.
+_JUMP_PRIOR = 3.0
+# Of one that is where it saturates, a noisy sensor may say that it is so many residuals from there.
+_CLOSE = 3.0
+# So many times the sequences that are kept there may be until somebody chooses.
+_SPARE = 4
+
+
+class Episode(NamedTuple):
+    """An episode that is over, without the transition that failed."""
+
+    observations: Floats  #: (T + 1, m)
+    actions: Floats  #: (T, a)
+    residuals: Floats  #: (T - 1, m) what was not expected, from the second observation on
+    failed: bool
+
+
+class DisturbanceSequence(NamedTuple):
+    """What happened for a while, as it was observed: residuals follow from it at any time.
+
+    Unless it was observed of a system that moves otherwise now: then they are kept with it.
+    """
+
+    observations: Floats  #: (L + 2, m), the first one step before it began
+    actions: Floats  #: (L + 1, a), the first one step before it began
+    episode: int  #: in which it was seen, from 0
+    unforeseen: Floats  #: (L, m) residuals of then; (0, m) where they follow from the rest
+
+
+class Dynamics:
+    """Learns how a system moves under actions, what disturbs it for a while, and where it fails.
+
+    It is told nothing of the system but observations, actions and which episodes failed.
+
+    Parameters
+    ----------
+    low, high : array_like, optional
+        Range of the action, where that is one number or several, in the unit of the action.
+    n_actions : int, optional
+        Number of actions, where they are told apart by their index alone.
+    horizon : int
+        Most steps of a disturbance sequence.
+    remembered : int
+        Sequences that are kept where somebody chooses among them (`keep`); of those that nobody has
+        chosen yet, the newest, so that there are at most four times as many.
+    without : sequence of str
+        Parts of `DYNAMICS_PARTS` that are left out.
+
+    Raises
+    ------
+    ValueError
+        If not one of a range and ``n_actions`` is given, ``low`` is not below ``high`` or not
+        finite, or a number is no positive int.
+
+    Notes
+    -----
+    Each variable's change is linear in the observation, its latest change, the action, the one
+    before, bends of the action and products of variables and actions, learnt by sums
+    (`evofsm.guard.learnt.regression`). Where a system fails is known only after it failed there
+    once, or where it is given; nothing here says that something is safe.
+
+    What is in lists, and all arrays but those of ``sums``, never change in place.
+
+    Examples
+    --------
+    A cart that is pushed by the action, to the left, not at all or to the right:
+
+    >>> dynamics = Dynamics(n_actions=3)
+    >>> draw, speed = np.random.default_rng(0), 0.0
+    >>> for t in range(80):
+    ...     i = int(draw.integers(3))
+    ...     dynamics.observe(np.array([speed]))
+    ...     dynamics.act(dynamics.encode(i))
+    ...     speed += 0.1 * (i - 1) - 0.1 * speed
+    >>> dynamics.end(failed=False)
+    >>> dynamics.n_episodes, dynamics.ready
+    (1, True)
+    """
+
+    sums: Sums
+    model: Model  #: what is expected, as kernels see it
+
+    def __init__(
+        self,
+        low: ArrayLike | None = None,
+        high: ArrayLike | None = None,
+        *,
+        n_actions: int | None = None,
+        horizon: int = 48,
+        remembered: int = 16,
+        without: Sequence[str] = (),
+    ) -> None:
+        self.choices = 0 if n_actions is None else whole("n_actions", n_actions)
+        self.low, self.high = _range(low, high, is_none=n_actions is not None)
+        self._middle, self._half = 0.5 * (self.low + self.high), 0.5 * (self.high - self.low)
+        self.size = self.choices or len(self.low)
+        self.horizon = whole("horizon", horizon)
+        self.remembered = whole("remembered", remembered)
+        self.without = frozenset(without)
+        self._carried = "carried" not in self.without
+        self.n_variables = 0
+        #: Whether an observation is a failure, where that is given.
+        self.failed: Callable[[Floats], bool] | None = None
+        self.sequences: list[DisturbanceSequence] = []
+        self.n_episodes = 0
+        #: The episode that was studied last, if it was long enough.
+        self.latest: Episode | None = None
+        #: (a, 2) how often each number of an action was near an end of its range.
+        self.used = np.zeros((self.size, 2))
+        self.quiet = 0  #: observations since one that was not expected
+        self.is_noisy = False  #: whether some variables are not taken as they are seen
+        self.forget_episode()
+
+    # -- Actions --------------------------------------------------------------------------------
+
+    def encode(self, action: Any) -> Floats:
+        """(a,) an action in [-1, 1], or a one among zeros.
+
+        Examples
+        --------
+        >>> Dynamics(-2.5, 2.5).encode(1.25), Dynamics(n_actions=3).encode(2)
+        (array([0.5]), array([0., 0., 1.]))
+        """
+        if self.choices:
+            chosen = np.zeros(self.choices)
+            chosen[int(action)] = 1.0
+            return chosen
+        return np.asarray((np.asarray(action, np.float64) - self._middle) / self._half)
+
+    def decode(self, inner: Floats) -> Floats:
+        """(d,) the action itself; the index of a choice.
+
+        Examples
+        --------
+        >>> Dynamics(-2.5, 2.5).decode(np.array([0.5]))
+        array([1.25])
+        """
+        if self.choices:
+            return np.array([float(inner.argmax())])
+        found = self._middle + self._half * inner
+        return np.minimum(np.maximum(found, self.low), self.high)
+
+    # -- An episode -----------------------------------------------------------------------------
+
+    def forget_episode(self) -> None:
+        """Nothing is under way; nothing more is learnt of what was."""
+        self.n_under_way = 0  #: observations of this episode that are not studied yet
+        self.has_acted = False  #: whether it is known what was done after the latest of them
+        self._z, self._u = np.empty((0, self.n_variables)), np.empty((0, self.size))
+        self._row = np.empty((0, 0))  # features of the latest transition
+        self._surprised = False  # whether something in it was not expected
+
+    def _begin(self, z: Floats) -> None:
+        """Make room for what is learnt; variables are counted from the first observation on."""
+        m, a = len(z), self.size
+        p = n_features(m, a, box=not self.choices)
+        self.n_variables, self.origin = m, z.copy()
+        self.sums, self.weights, self.ready = Sums.none(z, p), np.zeros((p, m)), False
+        #: (m,) of all that was survived, and (m, 2) in how many episodes those ends were reached.
+        self.lowest, self.highest = np.full(m, np.inf), np.full(m, -np.inf)
+        self.reached = np.zeros((m, 2))
+        self.failures = np.empty((0, m))  #: (k, m) observations in which episodes failed
+        self.jumps = [np.empty((0, m + 1)) for _ in range(m)]  #: from where, and to where
+        self.thresholds: list[tuple[int, float, float]] = []  #: variable, sign, and where it fails
+        #: What the last episodes say of the model, and where it was corrected, by time.
+        self.recent = Recent.none(p, m, self.n_episodes)
+        self.drifts: list[Drift] = []
+        self.missed = regression.untried(m)  #: by gains of the observer
+        self.doubt_of_lags = 0.0
+        self.rebuild()
+        self.forget_episode()
+
+    def observe(self, z: Floats) -> None:
+        """Take in an observation (m,), all finite, and learn the transition before the one to it.
+
+        Examples
+        --------
+        >>> dynamics = Dynamics(n_actions=2)
+        >>> dynamics.observe(np.array([1.0]))
+        >>> dynamics.n_under_way, dynamics.has_acted
+        (1, False)
+        """
+        if not self.n_variables:
+            self._begin(z)
+        if self.n_under_way >= _LONGEST:
+            self._study(failed=False)
+            last = slice(self.n_under_way - _LAST, self.n_under_way)
+            self._z, self._u, self.n_under_way = self._z[last].copy(), self._u[last].copy(), _LAST
+        n, sums = self.n_under_way, self.sums
+        if n == len(self._z):
+            room = max(64, n)
+            self._z = np.vstack([self._z, np.empty((room, self.n_variables))])
+            self._u = np.vstack([self._u, np.empty((room, self.size))])
+        self._z[n], self.n_under_way, self.has_acted = z, n + 1, False
+        sums.observe(z - self.origin)
+        self._surprised = False
+        if self.failed is not None and not self.thresholds and sums.counts[1] >= 1.0:
+            self.thresholds = probe(self.failed, z, np.where(sums.unit > 0.0, sums.unit, 1e-9))
+            self.rebuild()
+        if n:
+            self._learn(n - 1)
+        if self._is_due(float(sums.counts[0])):
+            self._solve()
+
+    def _is_due(self, n: float) -> bool:
+        """Whether weights are solved for, after so many observations."""
+        if not self.ready:
+            return n % _UNREADY == 0
+        every = next((each for until, each in _SCHEDULE if n < until), 0)
+        return every > 0 and n % every == 0
+
+    def act(self, action: Floats) -> None:
+        """What was done after the latest observation, encoded; a second one replaces the first."""
+        last = self.n_under_way - 1
+        if self.has_acted:
+            self.used = self.used - self._ends(self._u[last])
+        self.used = self.used + self._ends(action)
+        self._u[last], self.has_acted = action, True
+
+    def _ends(self, action: Floats) -> Floats:
+        """(a, 2) which numbers of an action are near an end of their range."""
+        lowest = -1.0 if self.choices else -0.6
+        return np.column_stack([action < lowest, action > 0.6])
+
+    def end(self, *, failed: bool) -> None:
+        """The episode is over, or what comes does not follow from what was.
+
+        Parameters
+        ----------
+        failed : bool
+            Whether it ended in failure with the latest observation.
+
+        Examples
+        --------
+        >>> dynamics = Dynamics(n_actions=2)
+        >>> for t in range(40):
+        ...     dynamics.observe(np.array([t % 7.0]))
+        ...     dynamics.act(dynamics.encode(t % 2))
+        >>> dynamics.observe(np.array([9.0]))
+        >>> dynamics.end(failed=True)
+        >>> dynamics.thresholds
+        [(0, 1.0, 6.0)]
+        """
+        if self.n_under_way > 2 or (failed and self.n_under_way):
+            self._study(failed=failed)
+        self.forget_episode()
+
+    def begins(self) -> bool:
+        """Whether the latest change is the first for a while that was not expected; ask it once."""
+        self.quiet += 1
+        if not self._surprised:
+            return False
+        was_quiet, self.quiet = self.quiet > _APART, 0
+        return was_quiet
+
+    # -- The model ------------------------------------------------------------------------------
+
+    def _learn(self, i: int) -> None:
+        """Take in the transition i -> i + 1, and learn the one before it."""
+        z, u, before = self._z[i : i + 1], self._u[i : i + 1], slice(max(i - 1, 0), max(i, 1))
+        row = features(self.model, z, z - self._z[before], self._u[before], u)
+        rows, self._row = np.vstack([self._row, row]) if i else row, row
+        if not i:
+            return
+        sums, z = self.sums, self._z
+        jumped, self._surprised = regression.learn(sums, self.model, self.close, z, rows, i - 1)
+        for j in jumped if i > 1 else ():
+            jump = np.append(z[i - 1], z[i, j])
+            more = np.vstack([self.jumps[j][1 - _MOST :], jump])
+            self.jumps = [more if k == j else one for k, one in enumerate(self.jumps)]
+
+    def _solve(self) -> None:
+        if self.sums.counts[0] < _FIRST:
+            return
+        with suppress(np.linalg.LinAlgError):  # numbers of sizes that have nothing in common
+            misleading = regression.are_misleading(self.doubt_of_lags)
+            weights = self._solved("lags" in self.without or misleading)
+            if np.isfinite(weights).all():
+                self.weights, self.ready = weights, True
+        self.rebuild()
+
+    def _solved(self, without_lags: bool) -> Floats:
+        m, a, p = self.n_variables, self.size, len(self.weights)
+        left_out = np.zeros(p)
+        if "products" in self.without:
+            left_out[p - n_products(m, a) :] = 1.0
+        if without_lags:
+            left_out[lags(m, a)] = 1.0
+        return regression.solve(self.sums, a, left_out)
+
+    def rebuild(self) -> None:
+        """Make the model of weights and sums."""
+        sums = self.sums
+        variance = sums.scatter / max(1.0, sums.counts[0] - 1.0)
+        worth = 1.0 / (1.25 * sums.unit + 1e-300)
+        inverse = 1.0 / np.sqrt(np.where(variance > 0.0, variance, 1.0))
+        thresholds = [[j, sign, at, worth[j]] for j, sign, at in self.thresholds]
+        lowest = np.where(self.reached[:, 0] >= _REACHED, self.lowest, -np.inf)
+        highest = np.where(self.reached[:, 1] >= _REACHED, self.highest, np.inf)
+        for j, sign, _ in self.thresholds:  # one does not saturate where one fails
+            (lowest if sign < 0.0 else highest)[j] = sign * np.inf
+        drifted = np.full(self.n_variables, -1.0 if self.drifts else 0.0)
+        drifted[[one.variable for one in self.drifts]] = 1.0
+        self.model = Model(
+            weights=self.weights,
+            origin=self.origin,
+            reach=1.5 * np.maximum(np.abs(sums.least), np.abs(sums.most)),
+            lowest=lowest,
+            highest=highest,
+            least=sums.least.copy(),
+            most=sums.most.copy(),
+            thresholds=np.array(thresholds, np.float64).reshape(-1, 4),
+            drifted=drifted,
+            mean=self.origin + sums.mean,
+            inverse=inverse,
+            choices=self.choices,
+        )
+        #: (m,) gains of the observer, and how far from where it saturates one that is there is seen
+        self.gains = regression.best_gains(self.missed)
+        self.is_noisy = bool((self.gains < 1.0).any())
+        self.close = np.where(self.gains < 1.0, _CLOSE * np.sqrt(sums.noise), 1e-9 / inverse)
+
+    def corrected(self, situation: Floats, action: Floats, seen: Floats) -> Floats:
+        """(m,) where one is, a step after a situation and an action, from what was expected.
+
+        That is ``seen`` itself as long as no sensor is known to be noisy.
+        """
+        if not self.is_noisy:
+            return seen
+        return regression.corrected(self.model, self.gains, situation, action, seen, self.sums.unit)
+
+    def refute(self, starts: Ints, steps: int) -> None:
+        """Compare the model with what came where it had foreseen failure that never came.
+
+        ``starts`` (k,) are observations of the latest episode from which it went on for so many
+        steps.
+        """
+        assert self.latest is not None
+        z, u = self.latest.observations, self.latest.actions
+        starts = starts[starts <= len(u) - steps]
+        if not len(starts) or "doubt" in self.without:
+            return
+        was = regression.are_misleading(self.doubt_of_lags)
+        with suppress(np.linalg.LinAlgError):
+            asked = [self.model._replace(weights=self._solved(each)) for each in (False, True)]
+            worse = regression.misled_by_lags(asked, z, u, starts, steps, self.sums.unit)
+            if self.latest.failed:
+                worse = max(0.0, worse)
+            self.doubt_of_lags = max(0.0, self.doubt_of_lags + worse)
+        if regression.are_misleading(self.doubt_of_lags) != was:
+            self._solve()
+
+    # -- A whole episode ------------------------------------------------------------------------
+
+    def _study(self, *, failed: bool) -> None:
+        """Learn from an episode as a whole."""
+        z, u = self._z[: self.n_under_way].copy(), self._u[: self.n_under_way].copy()
+        safe = z[:-1] if failed else z
+        self._extend(safe)
+        if failed:
+            self.failures = np.vstack([self.failures[1 - _MOST :], z[-1]])
+        self.settle()
+        self.sums.squares[:] *= _KEPT
+        self.sums.products[:] *= _KEPT
+        self.latest = None
+        T = len(safe) - 1
+        if self.ready and T >= _STUDIED:
+            if self.sums.scale[0] > 0.0:
+                if "drift" not in self.without:
+                    self._follow_drift(safe, u[:T])
+                if "observer" not in self.without:
+                    self.missed = regression.tried(
+                        self.missed, self.model, safe, u[:T], self.sums.unit
+                    )
+                    self.rebuild()
+            found = residuals(self.model, self.close, safe, u[:T])
+            self._saturate(found, safe)
+            self._rescale(found, safe)
+            self.latest = Episode(safe, u[:T], found, failed)
+            self.rebuild()
+            if "stretches" not in self.without:
+                self.remember(self.onsets(found))
+        self.n_episodes += 1
+
+    def settle(self) -> None:
+        """Make of all sums what is known: weights, and where it fails."""
+        self._solve()
+        if self.failed is None:
+            sums = self.sums
+            blur = np.where(self.reached < _REACHED, sums.scale[:, None], 0.0)
+            unit = np.maximum(sums.unit, 1e-300)
+            self.thresholds = explain_failures(self.failures, self.lowest, self.highest, unit, blur)
+        self.rebuild()
+
+    def _extend(self, safe: Floats) -> None:
+        """How far variables went, and in how many episodes they came to those ends by moving."""
+        if not len(safe):
+            return
+        low, high = safe.min(0), safe.max(0)
+        close = 1e-9 * (high - low)
+        new = np.column_stack([low < self.lowest - close, high > self.highest + close])
+        self.lowest = np.where(new[:, 0], low, self.lowest)
+        self.highest = np.where(new[:, 1], high, self.highest)
+        moving = np.abs(np.diff(safe, axis=0)) > close  # it arrived there, and did not start there
+        at_lowest = ((safe[1:] <= self.lowest + close) & moving).any(0)
+        at_highest = ((safe[1:] >= self.highest - close) & moving).any(0)
+        self.reached = np.where(new, 0.0, self.reached) + np.column_stack([at_lowest, at_highest])
+
+    def _follow_drift(self, z: Floats, u: Floats) -> None:
+        """Correct the model of what moves otherwise; what was unforeseen before stays so."""
+        sums, before, close, young = self.sums, self.model, self.close, self._young
+        recent = regression.compared(
+            self.recent, before, sums, close, z, u, self.n_episodes, bool(young)
+        )
+        begun = recent.overthrown()
+        self.recent = recent
+        self.drifts = self.drifts + [Drift(j, int(recent.since[j]), self.n_episodes) for j in begun]
+        moved = sorted({*begun, *young})
+        if not moved:
+            return
+        change = np.diff(z, axis=0)
+        change[regression.jumps(change, sums.unit)] = 0.0
+        sums.least[begun], sums.most[begun] = change.min(0)[begun], change.max(0)[begun]
+        self.weights = self.weights.copy()
+        more = regression.correction(recent, before.weights, sums, self.size)
+        self.weights[:, moved] += more[:, moved]
+        sums.products[:, moved] = sums.squares @ self.weights[:, moved]
+        self._solve()
+        self.sequences = [self._as_it_was(one, before, close, moved) for one in self.sequences]
+        doubt, since = recent.doubt.copy(), recent.since.copy()
+        doubt[moved], since[moved] = 0.0, float(self.n_episodes)
+        self.recent = recent._replace(doubt=doubt, since=since)
+
+    def _as_it_was(
+        self, one: DisturbanceSequence, before: Model, close: Floats, moved: list[int]
+    ) -> DisturbanceSequence:
+        """A sequence with what was unforeseen in it by the model of then, if it is of then.
+
+        It is not if the new model foresees better what those variables did that moved otherwise.
+        """
+        if len(one.unforeseen):
+            return one
+        seen, carried = (one.observations, one.actions), self._carried
+        was = residuals(before, close, *seen, carried=carried)
+        now = residuals(self.model, self.close, *seen, carried=carried)
+        larger = np.abs(now[:, moved]).sum(0) > np.abs(was[:, moved]).sum(0)
+        return one._replace(unforeseen=was) if larger.any() else one
+
+    @property
+    def _young(self) -> list[int]:
+        """Variables of which the model was corrected a short while ago."""
+        n = self.n_episodes
+        return [one.variable for one in self.drifts if n - one.noticed < regression.LEARNT]
+
+    def _saturate(self, found: Floats, safe: Floats) -> None:
+        """Know ends by variables that rested there although they were expected to go on.
+
+        Whoever never leaves an end does not come to it by moving.
+        """
+        rests, far = safe[1:-1] == safe[2:], ONSET * self.sums.scale
+        held = np.column_stack(
+            [
+                (rests & (safe[2:] == self.lowest) & (found > far)).any(0),
+                (rests & (safe[2:] == self.highest) & (found < -far)).any(0),
+            ]
+        )
+        held[(self.sums.moving <= MOVING) | (self.sums.scale[0] == 0.0)] = False
+        if held.any():
+            self.reached = np.where(held, np.maximum(self.reached, _REACHED), self.reached)
+            self.rebuild()
+
+    def _rescale(self, found: Floats, safe: Floats) -> None:
+        """How large residuals are, but for those of variables that rest at an extreme."""
+        sums, size = self.sums, np.abs(found)
+        at_end = (safe[2:] == sums.low) | (safe[2:] == sums.high)
+        size[(safe[1:-1] == safe[2:]) & at_end & (sums.moving > MOVING)] = 0.0
+        scale, square = 1.4826 * np.median(size, 0), (size**2).mean(0)
+        known = sums.scale[0] > 0.0
+        new = 0.8 * sums.scale + 0.2 * scale if known else scale
+        if young := self._young:  # what is learnt anew is no outlier
+            jumped = regression.jumps(np.diff(safe[1:], axis=0), sums.unit)
+            ordinary = np.where(jumped, 0.0, size**2).mean(0)
+            new[young] = np.maximum(new, np.sqrt(ordinary))[young]
+        sums.scale[:] = np.maximum(new, 1e-3 * np.sqrt(sums.variance) + 1e-300)
+        sums.noise[:] = 0.8 * sums.noise + 0.2 * square if known else square
+
+    # -- Disturbances ---------------------------------------------------------------------------
+
+    def onsets(self, found: Floats) -> list[int]:
+        """Steps of an episode at which something large began, of what was not expected (T, m)."""
+        size = np.abs(found / self.sums.scale).max(1)
+        starts: list[int] = []
+        while len(starts) < _ONSETS and size.max() >= ONSET:
+            t = int(size.argmax())
+            starts.append(t)
+            size[max(0, t - _APART) : t + _APART + 1] = 0.0
+        return starts
+
+    def remember(self, starts: Sequence[int]) -> None:
+        """Keep the sequences of the latest episode that begin at these steps of its residuals."""
+        assert self.latest is not None
+        z, u = self.latest.observations, self.latest.actions
+        more = []
+        for t in starts:
+            steps = min(self.horizon, len(u) - 1 - t)
+            if steps >= _SHORTEST:
+                observed, done = z[t : t + steps + 2].copy(), u[t : t + steps + 1].copy()
+                nothing = np.empty((0, self.n_variables))
+                more.append(DisturbanceSequence(observed, done, self.n_episodes, nothing))
+        self.sequences = [*self.sequences, *more][-_SPARE * self.remembered :]
+
+    def keep(self, which: Sequence[int]) -> None:
+        """Forget all sequences but these, by their numbers from 0."""
+        self.sequences = [self.sequences[k] for k in which]
+
+    def disturbances(self, steps: int) -> Disturbances:
+        """Residuals of what is remembered, as they are seen now; number 0 is none at all.
+
+        Examples
+        --------
+        >>> dynamics = Dynamics(n_actions=2)
+        >>> for t in range(40):
+        ...     dynamics.observe(np.array([t % 7.0]))
+        ...     dynamics.act(dynamics.encode(t % 2))
+        >>> dynamics.end(failed=False)
+        >>> found = dynamics.disturbances(20)
+        >>> found.residuals.shape[2] - len(dynamics.sequences)
+        1
+        """
+        found = Disturbances.none(1 + len(self.sequences), steps, self.n_variables)
+        for k, one in enumerate(self.sequences, 1):
+            L = min(len(one.actions) - 1, steps)
+            missed = one.unforeseen[:L]
+            if not len(missed):
+                rows = one.observations[: L + 2], one.actions[: L + 1]
+                missed = residuals(self.model, self.close, *rows, carried=self._carried)
+            found.residuals[:L, :, k] = missed
+        for j, seen in enumerate(self.jumps if "jumps" not in self.without else ()):
+            if len(seen):
+                for k, one in enumerate(self.sequences, 1):
+                    self._find_jump(found, k, j, one.observations)
+        return found
+
+    def _find_jump(self, found: Disturbances, k: int, j: int, z: Floats) -> None:
+        """What a variable of a sequence jumps to: after on before, of jumps in that direction."""
+        seen, moved = self.jumps[j], np.diff(z[:, [j]], axis=0)
+        alone = regression.jumps(moved, self.sums.unit[[j]])[1:, 0]
+        size = np.abs(moved[1:, 0])
+        left = np.abs(found.residuals[: len(size), j, k])
+        n = len(left)
+        at = np.flatnonzero(alone[:n] & (left > 0.5 * size[:n]))
+        if not len(at):
+            return
+        t = int(at[0])
+        before, after = z[t + 1], z[t + 2, j]
+        alike = seen[(seen[:, -1] > seen[:, j]) == (after > before[j])]
+        if not len(alike):
+            return
+        origins, landed = alike[:, :-1], alike[:, -1]
+        slopes = _slopes(origins, landed)
+        found.jump_at[k, j] = t
+        found.jump_slope[k, j] = slopes
+        found.jump_to[k, j] = after - slopes @ before
+        found.jump_from[k, j] = np.stack([origins.min(0), origins.max(0)], 1)
+        found.landing[k, j] = landed.min(), landed.max()
+
+    # -- In a file ------------------------------------------------------------------------------
+
+    def numbers(self) -> dict[str, Any]:
+        """What it goes on with, besides `arrays`."""
+        known = self.n_variables > 0
+        return {
+            "n_episodes": self.n_episodes,
+            "quiet": self.quiet,
+            "doubt_of_lags": self.doubt_of_lags if known else 0.0,
+            "ready": int(known and self.ready),
+        }
+
+    def arrays(self) -> dict[str, Floats]:
+        """All arrays that it goes on with, but for the episode under way (`restore`)."""
+        m, a = self.n_variables, self.size
+        if not m:  # nothing was observed: all that depends on it is empty
+            sizes = {"a": a}
+            return {
+                name: np.zeros([n if isinstance(n, int) else sizes.get(n, 0) for n in one.shape])
+                for name, one in ARRAYS.items()
+            } | {"used": self.used}
+        jumps = [np.insert(rows, 0, j, axis=1) for j, rows in enumerate(self.jumps)]
+        told, rows = [], [np.empty((0, 2 * m + a))]
+        for one in self.sequences:
+            told.append((len(one.observations), one.episode, len(one.unforeseen) > 0))
+            row = np.zeros((len(one.observations), 2 * m + a))
+            row[:, :m], row[:-1, m : m + a] = one.observations, one.actions
+            row[: len(one.unforeseen), m + a :] = one.unforeseen
+            rows.append(row)
+        return {
+            **{f"sums_{name}": array for name, array in self.sums._asdict().items()},
+            **{f"recent_{name}": array for name, array in self.recent._asdict().items()},
+            **{name: getattr(self, name) for name in _OWN},
+            "thresholds": np.array(self.thresholds, np.float64).reshape(-1, 3),
+            "drifts": np.array(self.drifts, np.float64).reshape(-1, 3),
+            "jumps": np.vstack(jumps),
+            "sequences": np.array(told, np.float64).reshape(-1, 3),
+            "sequence_rows": np.vstack(rows),
+        }
+
+    def restore(self, numbers: Mapping[str, Any], arrays: Mapping[str, Floats]) -> None:
+        """Be what `numbers` and `arrays` were of, between two episodes.
+
+        Raises
+        ------
+        ValueError
+            If arrays contradict each other, or the actions: kernels trust their sizes.
+        """
+        m, a, p = len(arrays["origin"]), self.size, len(arrays["sums_squares"])
+        self.n_episodes, self.quiet = int(numbers["n_episodes"]), int(numbers["quiet"])
+        if len(arrays["used"]) != a:
+            raise ValueError(f"used has {len(arrays['used'])} rows, but an action has {a} numbers")
+        if not m:
+            self.used = arrays["used"]
+            return
+        told, rows, jumps = arrays["sequences"], arrays["sequence_rows"], arrays["jumps"]
+        if p != n_features(m, a, box=not self.choices):
+            raise ValueError(f"sums of {p} features are not of {m} variables and {a} numbers")
+        for name in ("thresholds", "drifts", "jumps"):
+            if not np.isin(arrays[name][:, 0], np.arange(m)).all():
+                raise ValueError(f"{name} are of variables that there are not")
+        if jumps.shape[1] != m + 2 or rows.shape[1] != 2 * m + a:
+            raise ValueError("jumps or sequences are of another number of variables")
+        if told[:, 0].sum() != len(rows) or (told[:, 0] < 3.0).any():
+            raise ValueError(f"sequences have {len(rows)} rows, not those that they say")
+        self._begin(arrays["origin"])
+        self.sums = Sums(**{name: arrays[f"sums_{name}"].copy() for name in Sums._fields})
+        self.recent = Recent(**{name: arrays[f"recent_{name}"] for name in Recent._fields})
+        for name in _OWN:
+            setattr(self, name, arrays[name])
+        self.ready, self.doubt_of_lags = bool(numbers["ready"]), float(numbers["doubt_of_lags"])
+        self.thresholds = [(int(j), sign, at) for j, sign, at in arrays["thresholds"].tolist()]
+        self.drifts = [Drift(*map(int, row)) for row in arrays["drifts"]]
+        self.jumps = [jumps[jumps[:, 0] == j, 1:] for j in range(m)]
+        parts = np.split(rows, np.cumsum(told[:, 0]).astype(int)[:-1])
+        self.sequences = [
+            DisturbanceSequence(
+                part[:, :m].copy(),
+                part[:-1, m : m + a].copy(),
+                int(episode),
+                part[: -2 if of_then else 0, m + a :].copy(),
+            )
+            for part, (_, episode, of_then) in zip(parts if len(told) else (), told, strict=True)
+        ]
+        self.rebuild()
+
+
+# What files hold, by name; an array of each kind that dynamics have under their own names.
+_OBSERVED, _NOT_NEGATIVE = Numbers(least=-1e30, most=1e30), Numbers(least=0.0)
+_EXTREME = Numbers(least=-np.inf, most=np.inf)  # the first ones to come are infinitely far out
+_OWN: dict[str, Numbers] = {
+    "weights": Numbers(("p", "m")),
+    "origin": _OBSERVED.of("m"),
+    "lowest": _EXTREME.of("m"),
+    "highest": _EXTREME.of("m"),
+    "reached": COUNT.of("m", 2),
+    "failures": _OBSERVED.of("failed", "m"),
+    "missed": _NOT_NEGATIVE.of("m", len(regression.GAINS)),
+    "used": COUNT.of("a", 2),
+}
+_OF_SUMS: dict[str, Numbers] = {
+    **{name: Numbers(("m",)) for name in ("mean", "least", "most")},
+    **{name: _NOT_NEGATIVE.of("m") for name in ("scatter", "variance", "unit", "scale", "noise")},
+    **{name: _OBSERVED.of("m") for name in ("low", "high")},
+    "counts": COUNT.of(2),
+    "squares": Numbers(("p", "p")),
+    "products": Numbers(("p", "m")),
+    "early": _NOT_NEGATIVE.of(200, "m"),
+    "moving": SHARE.of("m"),
+}
+ARRAYS: dict[str, Numbers] = {
+    **_OWN,
+    **{f"sums_{name}": _OF_SUMS[name] for name in Sums._fields},
+    "recent_squares": Numbers(("p", "p")),
+    "recent_products": Numbers(("p", "m")),
+    "recent_doubt": _NOT_NEGATIVE.of("m"),
+    "recent_since": COUNT.of("m"),
+    "thresholds": Numbers(("thresholds", 3)),
+    "drifts": COUNT.of("drifts", 3),
+    "jumps": _OBSERVED.of("jumps", "jump"),
+    "sequences": COUNT.of("sequences", 3),
+    "sequence_rows": Numbers(("rows", "row")),
+}
+
+
+def _slopes(before: Floats, after: Floats) -> Floats:
+    """(m,) how where a variable lands depends on where all were, as far as jumps tell."""
+    off = before - before.mean(0)
+    squares = off.T @ off
+    size = np.diag(squares)
+    if len(after) < 3 or not size.any():
+        return np.zeros(len(size))
+    scale = np.sqrt(np.where(size > 0.0, size, 1.0))  # variables have units of their own
+    held = squares / np.outer(scale, scale) + (_JUMP_PRIOR / len(after) + 1e-9) * np.eye(len(size))
+    return np.asarray(np.linalg.solve(held, off.T @ (after - after.mean()) / scale) / scale)
+
+
+def _range(
+    low: ArrayLike | None, high: ArrayLike | None, *, is_none: bool
+) -> tuple[Floats, Floats]:
+    """The ends of the range of actions, (d,) each; empty where there is to be none."""
+    if is_none != (low is None) or (low is None) != (high is None):
+        raise ValueError("give either low and high, or n_actions")
+    if low is None or high is None:
+        return np.zeros(0), np.zeros(0)
+    ends = [real_array(name, np.atleast_1d(end), 1) for name, end in (("low", low), ("high", high))]
+    for name, end in zip(("low", "high"), ends, strict=True):
+        refuse_unusable(name, end)
+    if ends[0].shape != ends[1].shape or not (ends[0] < ends[1]).all():
+        raise ValueError(f"low is {low} and high is {high}; low must be below high")
+    return ends[0], ends[1]

@@ -1,0 +1,899 @@
+"""What decides: an action passes if after it some backup survives all that is remembered.
+
+A predictive safety filter (Wabersich & Zeilinger, "A predictive safety filter for learning-based
+control of constrained nonlinear dynamical systems", Automatica 2021), with model, disturbances and
+backup policies learnt online. The guard feeds it: each observation, what was executed, and whether
+the episode failed.
+"""
+
+from __future__ import annotations
+
+import math
+import operator
+from collections.abc import Callable, Mapping, Sequence
+from functools import wraps
+from typing import Any, NamedTuple, ParamSpec, Self, TypeVar
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from evofsm import store
+from evofsm.fsm.naming import Labels
+from evofsm.fsm.numbering import action_name
+from evofsm.fsm.proportions import poisson_bounds
+from evofsm.fsm.validation import positive, refuse_unusable
+from evofsm.guard.learnt import library, words
+from evofsm.guard.learnt.dynamics import ARRAYS, DYNAMICS_PARTS, Dynamics
+from evofsm.guard.learnt.library import Violations
+from evofsm.guard.learnt.policies import Backups
+from evofsm.guard.learnt.replay import Disturbances, Floats, Ints, acts, search
+from evofsm.guard.learnt.words import Remembered
+from evofsm.guard.protocols import Fallback, Judgement, Search, Situation, Trial
+from evofsm.guard.senses import has_gaps
+from evofsm.store import COUNT, FLAG, FROM_1, SHARE, SIZE, Kind, Numbers, Place
+
+_P = ParamSpec("_P")
+_T = TypeVar("_T")
+
+#: Parts that can be left out, to see what each is worth.
+JUDGE_PARTS: tuple[str, ...] = ("margin", "backups", "breaks", *DYNAMICS_PARTS)
+
+# Disturbances that are remembered.
+_REMEMBERED = 10
+# Backups that are asked in a decision, and disturbances that mutants are tried on, besides none.
+_ASKED, _TRIED_ON = 3, 5
+# The margin [ordinary changes]: at first, at most, what is left of it an episode later, and what a
+# violated certificate adds, which is also the least, for so many that may be.
+_MARGIN, _LARGEST, _FADES, _ADDED, _RATE = 3.0, 8.0, 0.9, 0.25, 0.001
+# The least margin where sensors are noisy: one is not quite where one seems to be.
+_NOISY = 1.5
+# Disturbances are taken to be harder than they were by so many over the number of episodes; by so
+# much at most after a change: a change half as large again as any there was has no sequel.
+_CAUTION, _AGAIN = 4.0, 0.44
+# Steps that are looked ahead: at first, at least, at most; times those that it takes to fail, of
+# which so much is left an episode later, and after one in which a dead end was none.
+_HORIZON, _SHORTEST, _FARTHEST, _AHEAD = 64, 32, 144, 1.5
+_LATEST, _REFUTED = 0.98, 0.8
+# An action that was used less often is tried.
+_TRIES = 8
+# From so many situations on backups evolve, and disturbances are looked for.
+_ENOUGH = 3
+
+
+class Outlook(NamedTuple):
+    """How it stands somewhere, if the best backup is followed from now on."""
+
+    dead_end: bool  #: no known backup survives it, even if nothing disturbs it
+    unsurvived: int  #: remembered disturbances that no backup survives
+    remembered: int  #: disturbances that were tried
+    safety_margin: float  #: distance to failure under the worst of them [ordinary changes]
+    #: probability, with its 90 % interval, that within the horizon one begins that is unsurvived
+    risk: tuple[float, float, float]
+    #: how often such begin [1/h], with its 90 % interval; its end is infinite where all that it
+    #: may remember are unsurvived, as it is not known what was forgotten
+    per_hour: tuple[float, float, float]
+
+
+def _atomic(learn: Callable[_P, _T]) -> Callable[_P, _T]:
+    """All of it is learnt, or nothing: after an error or an interrupt the judge is as it was."""
+
+    @wraps(learn)
+    def wrapped(*given: _P.args, **named: _P.kwargs) -> _T:
+        judge: Any = given[0]
+        before = judge._snapshot()
+        try:
+            return learn(*given, **named)
+        except BaseException:
+            judge._put_back(*before)
+            raise
+
+    return wrapped
+
+
+class LearntRisk:
+    """Judges actions by what it has learnt of how the system moves and fails.
+
+    It is told neither what variables mean nor how they move. Before the first failure of an episode
+    there is nothing that it could prevent, and all is kept; in the first episode also where failure
+    was given as a function.
+
+    Parameters
+    ----------
+    dt : float
+        Time between two decisions [s].
+    low, high : float or (d,) array_like, optional
+        Range of the action, or of each of its components.
+    n_actions : int, optional
+        Number of actions, where an action is an index from 0.
+    horizon : float, optional
+        How far it looks ahead [s]. Without it, half as far again as it takes to fail where failure
+        can no longer be avoided, from 32 to 144 steps.
+    seed : int
+        Of the draws with which backups evolve and situations are chosen.
+    without : sequence of str
+        Parts of `JUDGE_PARTS` that are left out.
+    names, units : sequence of str
+        Of the variables, for what people read; nothing is decided by them.
+
+    Raises
+    ------
+    ValueError
+        If ``dt`` is not positive and finite, ``without`` names no part, or not one of a range and
+        ``n_actions`` is given.
+
+    Notes
+    -----
+    The risk of an action is the probability that within the horizon something begins that no
+    backup survives after it: ``1 - exp(-unsurvived / exposure * horizon)``, from the number of
+    remembered disturbances that are not survived and the time in which they were seen; 1 where not
+    even an undisturbed future is survived. Its 90 % interval is that of a Poisson count (Garwood
+    1936); it ends at 1 where all disturbances that it may remember are unsurvived, as those that it
+    forgot may be, too. It speaks of what was seen: what never began is not in it.
+
+    The margin follows adaptive conformal inference (Gibbs & Candes 2021): each violated certificate
+    (a step ago some backup survived all, now none does even without a margin) adds to it, and it
+    fades else.
+
+    Examples
+    --------
+    >>> from evofsm.guard import Guard
+    >>> guard = Guard(low=-2.0, high=2.0, interval=0.02)
+    >>> guard.judge
+    LearntRisk(dt=0.02, seed=0)
+    """
+
+    # Of the present episode.
+    _at: Floats | None  # the situation in which one was last, by all that was seen
+    _action: Floats  # what was done there
+    _certified: bool  # whether at the decision before some backup survived all
+    _was_certified: bool  # and at any before
+    _holds: bool  # and at this one
+    _violated: bool  # whether a certificate was violated
+    _refused: bool  # whether the latest proposal was
+    _dead_end: bool  # whether nothing helped, even without any disturbance
+    _notes: list[tuple[bool, bool]]  # both, of each observation that is to be studied
+    _fails_after: float  # steps after which what was refused fails, at the latest
+    _unsurvived: int
+    _ranks: Ints  # of backups, those first that passed last
+
+    def __init__(
+        self,
+        dt: float,
+        low: ArrayLike | None = None,
+        high: ArrayLike | None = None,
+        *,
+        n_actions: int | None = None,
+        horizon: float | None = None,
+        seed: int = 0,
+        without: Sequence[str] = (),
+        names: Sequence[str] = (),
+        units: Sequence[str] = (),
+    ) -> None:
+        self.dt = positive("dt", dt)
+        self.given_horizon = None if horizon is None else positive("horizon", horizon)
+        #: Steps that it looks ahead.
+        self.horizon = _HORIZON if horizon is None else max(1, round(horizon / self.dt))
+        self.seed = operator.index(seed)
+        if unknown := set(without) - set(JUDGE_PARTS):
+            raise ValueError(f"without names {sorted(unknown)}; there are {', '.join(JUDGE_PARTS)}")
+        self.without = frozenset(without)
+        self.labels = Labels(names=tuple(names), units=tuple(units), dt=self.dt)
+        #: What it has learnt of how the system moves.
+        self.dynamics = Dynamics(
+            low,
+            high,
+            n_actions=n_actions,
+            horizon=_FARTHEST if horizon is None else self.horizon,
+            remembered=_REMEMBERED,
+            without=without,
+        )
+        #: What is done without a usable proposal, and then revised like any.
+        self.fallback = _fallback(self.dynamics)
+        #: Whether it may try actions to learn what they do.
+        self.learning = True
+        #: What has to be left of the distance to failure [ordinary changes]; for each of them
+        #: backups leave 1 % of half the range of actions unused.
+        self.margin = 0.0 if "margin" in self.without else _MARGIN
+        #: Certificates that were violated, and whether more are than used to be.
+        self.n_violated, self.violations = 0, Violations()
+        self.n_studied = self.n_scanned = 0
+        #: Steps that it takes to fail at the latest, where that cannot be avoided.
+        self.time_to_failure = _HORIZON / _AHEAD
+        #: Steps in which a dead end is believed to fail, at most: the model was refuted beyond.
+        self.believed = float(_FARTHEST)
+        #: (s, 2m + a) situations on which backups and disturbances are tried: some anywhere, some
+        #: tight.
+        self.situations = np.empty((0, 0))
+        self.backups: Backups | None = None
+        self.disturbances: Disturbances | None = None
+        self._pool = np.empty((0, 0))  # residuals, only for disturbances without memory
+        self._forget()
+
+    def trial(self) -> Trial | None:
+        """None: what it has to try, its search tries."""
+        return None
+
+    def effective(self, situation: Situation, actions: Floats) -> Floats:
+        """All actions as they are."""
+        return actions
+
+    def refuse_unfit(self, low: Any, high: Any) -> None:
+        """Raise for another range of actions than it learns of."""
+        dynamics = self.dynamics
+        own = (0, dynamics.choices - 1) if dynamics.choices else (dynamics.low, dynamics.high)
+        if not all(map(np.array_equal, map(np.atleast_1d, own), map(np.atleast_1d, (low, high)))):
+            raise ValueError(
+                f"the judge was made for actions from {own[0]} to {own[1]}, not from {low} to "
+                f"{high}: give it low and high, or n_actions, of the guard"
+            )
+
+    # -- Deciding -------------------------------------------------------------------------------
+
+    @property
+    def disturbance_scale(self) -> float:
+        """How much harder than they were disturbances are taken to be, while little was seen."""
+        most = _AGAIN if self._began_anew else 0.5 * _CAUTION
+        return 1.0 + min(most, _CAUTION / max(1, self.n_scanned))
+
+    @property
+    def exposure(self) -> float:
+        """Time in which all that is remembered was seen [s]."""
+        dynamics = self.dynamics
+        return float(dynamics.sums.counts[0]) * self.dt if dynamics.n_variables else 0.0
+
+    @property
+    def remembered(self) -> Remembered:
+        """Disturbances that it counts on, and the time in which they were seen."""
+        return Remembered(len(self.dynamics.sequences), self.exposure)
+
+    @property
+    def told_by_experience(self) -> str:
+        """What was learnt so far, in words."""
+        dynamics, names = self.dynamics, self.labels.names
+        if not dynamics.n_variables:
+            return words.experience((), self.remembered, self.margin)
+        called = names or [f"variable {j + 1}" for j in range(dynamics.n_variables)]
+        fails = [(called[j], sign < 0.0, at) for j, sign, at in dynamics.thresholds]
+        latest = {one.variable: one.since + 1 for one in dynamics.drifts}
+        drifts = [(called[j], since) for j, since in latest.items()]
+        noisy = [name for name, gain in zip(called, dynamics.gains, strict=True) if gain < 1.0]
+        worse = self.violations.worse + 1
+        return words.experience(fails, self.remembered, self.margin, drifts, worse, noisy)
+
+    def search(
+        self, situation: Situation, wanted: Any, *, tolerance: float, revising: bool
+    ) -> Search:
+        """The closest action to ``wanted`` that passes, or else that of the longest-lasting backup.
+
+        Parameters
+        ----------
+        situation : Situation
+        wanted : float or (d,) array
+        tolerance : float
+            Share of the disturbances that need not be survived, where so much was seen that the
+            upper bound of the risk is within it as well.
+        revising : bool
+            Not used: a band in which a proposal is refused longer was tried, and gained nothing.
+
+        Returns
+        -------
+        Search
+        """
+        dynamics, here, one = self.dynamics, self._here(situation.observation), np.array([wanted])
+        disturbances, backups = self.disturbances, self.backups
+        if disturbances is None or backups is None:
+            return Search(one, _unjudged(1), 0, words.NOTHING_LEARNT)
+        if here is None:
+            return Search(one, _unjudged(1), 0, words.NOTHING_SEEN)
+        if not dynamics.thresholds:
+            return Search(one, _unjudged(1), 0, words.NO_FAILURE)
+        proposal, remembered, scale = (
+            dynamics.encode(wanted),
+            self.remembered,
+            self.disturbance_scale,
+        )
+        allowed, ranks = self._allowed(tolerance, remembered), self._ranks[:_ASKED]
+        asked = dynamics.model, here, backups.policies, ranks, disturbances, scale
+        found = search(*asked, proposal, self.margin, allowed)
+        if found.backup != ranks[0]:  # what passed now is asked first the next time
+            others = self._ranks[self._ranks != found.backup]
+            self._ranks = np.append(found.backup, others)
+        best = found.action
+        self._holds = best is not None
+        if best is None:
+            best = acts(
+                dynamics.model, backups.policies[found.backup], here[: dynamics.n_variables]
+            )
+            if self._certified:
+                self._holds = search(*asked, best, 0.0, allowed).action is not None
+        kept = found.action is proposal
+        self._refused = not kept
+        tried = self._untried(best) if self.learning and found.alike else None
+        then = self._backup_text(found.backup)
+        judged, self._dead_end, fails_after = self._judged(
+            situation,
+            here,
+            proposal[None] if kept else np.array((proposal, best if tried is None else tried)),
+            None if found.action is None or allowed else found.safety_margin,
+        )
+        self._fails_after = max(self._fails_after, fails_after)
+        if kept:
+            return Search(
+                one, judged, 0, words.kept(then, remembered, found.safety_margin, allowed)
+            )
+        action = np.reshape(dynamics.decode(best if tried is None else tried), np.shape(wanted))
+        if tried is not None:
+            instead = words.tried()
+        elif found.action is not None:
+            instead = words.changed(then, remembered, self.margin, allowed)
+        else:
+            instead = words.lasting(then)
+        why = words.refused(self._unsurvived, remembered, self.margin, scale, allowed)
+        return Search(np.array((one[0], action)), judged, 1, f"{why}; {instead}")
+
+    def judge(self, situation: Situation, actions: ArrayLike) -> Judgement:
+        """Risk of each action.
+
+        Parameters
+        ----------
+        situation : Situation
+        actions : (k,) or (k, d) array_like
+
+        Returns
+        -------
+        Judgement
+            NaN as long as nothing can be said.
+        """
+        given, here = np.asarray(actions, np.float64), self._here(situation.observation)
+        if here is None or not self._can_judge:
+            return _unjudged(len(given))
+        inner = np.array([self.dynamics.encode(one) for one in given])
+        return self._judged(situation, here, inner)[0]
+
+    def assess(self, observation: ArrayLike, change: ArrayLike | None = None) -> Outlook:
+        """How it stands somewhere if the best backup is followed from now on.
+
+        Parameters
+        ----------
+        observation : (m,) array_like
+        change : (m,) array_like, optional
+            Since the observation before; without it nothing moved.
+
+        Returns
+        -------
+        Outlook
+
+        Raises
+        ------
+        ValueError
+            If no failure is known yet, or an array is of another length than observations, or
+            holds NaN or infinity.
+
+        Examples
+        --------
+        A point that coasts to a wall at 1, and may push back in time:
+
+        >>> from evofsm.guard import Guard
+        >>> guard = Guard(low=-1.0, high=1.0, interval=0.1)
+        >>> for episode in range(8):
+        ...     x, v = -1.0, 0.0
+        ...     for t in range(60):
+        ...         u = guard.decide([x, v], proposal=1.0).executed
+        ...         x, v = x + 0.1 * v, v + 0.1 * u
+        ...         if x >= 1.0:
+        ...             break
+        ...     guard.end(failed=x >= 1.0, observation=[x, v])
+        >>> guard.judge.assess([-1.0, 0.0]).dead_end, guard.judge.assess([0.7, 2.0]).dead_end
+        (False, True)
+        """
+        dynamics = self.dynamics
+        if not self._can_judge or self.backups is None:
+            raise ValueError("no failure is known yet: there is nothing to judge by")
+        z = np.asarray(observation, np.float64)
+        moved = np.zeros_like(z) if change is None else np.asarray(change, np.float64)
+        if not z.shape == moved.shape == (dynamics.n_variables,):
+            raise ValueError(
+                f"observation and change have shapes {z.shape} and {moved.shape}; both must be "
+                f"({dynamics.n_variables},)"
+            )
+        refuse_unusable("observation", z)
+        refuse_unusable("change", moved)
+        here = library.situation(z, moved, np.zeros(dynamics.size))
+        unsurvived, left, _ = self._foresee(here, None, self.backups.ranks)
+        dead_end, hours, remembered = (
+            math.isinf(unsurvived),
+            self.exposure / 3600.0,
+            self.remembered,
+        )
+        count = remembered.number if dead_end else int(unsurvived)
+        expected = self._expected(count)
+        return Outlook(
+            dead_end=dead_end,
+            unsurvived=count,
+            remembered=remembered.number,
+            safety_margin=left,
+            risk=self._risk(unsurvived, self._soon(self.exposure)),
+            per_hour=(expected[0] / hours, expected[1] / hours, expected[2] / hours),
+        )
+
+    @property
+    def _can_judge(self) -> bool:
+        return self.disturbances is not None and bool(self.dynamics.thresholds)
+
+    def why(self, judged: Judgement) -> str:
+        """Why the first action that was judged is dangerous, in a few words."""
+        scale = self.disturbance_scale
+        return words.refused(self._unsurvived, self.remembered, self.margin, scale)
+
+    def _judged(
+        self, situation: Situation, here: Floats, actions: Floats, passes: float | None = None
+    ) -> tuple[Judgement, bool, float]:
+        """Of some actions; ``passes`` is what is left after the last, if that is known to pass.
+
+        And whether the last is lost for good, and after how many steps any of them fails at the
+        latest.
+        """
+        asked = actions if passes is None else actions[:-1]
+        each = [self._foresee(here, action[None], self._ranks[:_ASKED]) for action in asked]
+        if passes is not None:
+            each.append((0.0, passes, 0.0))
+        unsurvived, left, after = zip(*each, strict=True)
+        self._unsurvived = -1 if math.isinf(unsurvived[0]) else int(unsurvived[0])
+        remembered = self.remembered
+        soon = self._soon(remembered.seconds)
+        risk, low, high = np.array([self._risk(one, soon) for one in unsurvived]).T
+        judged = Judgement(
+            risk, low, high, np.array(left), float(remembered.number), situation.seen
+        )
+        return judged, math.isinf(unsurvived[-1]), max(after)
+
+    def _foresee(
+        self, here: Floats, plan: Floats | None, ranks: Ints
+    ) -> tuple[float, float, float]:
+        """What comes of a situation and an action if the best of some backups follows.
+
+        How many disturbances are not survived, infinite if it fails without any; the least distance
+        to failure under the worst of them; and the steps after which it fails at the latest.
+        """
+        assert self.disturbances is not None
+        assert self.backups is not None
+        policies, steps = self.backups.policies[ranks], self.disturbances.residuals.shape[0]
+        model = self.dynamics.model
+        ends = library.harm(model, here[None], policies, self.disturbances, 1.0, plan, 0.0)[:, 0]
+        fails = ends[ends < 0.0]
+        unsurvived = math.inf if ends[0] < 0.0 else float(len(fails))
+        return unsurvived, float(ends.min()), float(fails.max(initial=-1.0 - steps)) + 1.0 + steps
+
+    def _soon(self, exposure: float) -> float:
+        """The horizon, as a share of the time in which all that is remembered was seen."""
+        return self.horizon * self.dt / max(exposure, 1e-300)
+
+    def _expected(self, unsurvived: int) -> tuple[float, float, float]:
+        """Disturbances that are not survived, in the time observed, with their 90 % interval.
+
+        Where all that it may remember are not, those that it forgot may not be either, and it is
+        not known how many they were.
+        """
+        low, high = poisson_bounds(unsurvived)
+        return float(unsurvived), low, high if unsurvived < _REMEMBERED else math.inf
+
+    def _risk(self, unsurvived: float, soon: float) -> tuple[float, float, float]:
+        """Probability, with its 90 % interval, that within the horizon something begins of those.
+
+        Certain where nothing helps by the model, of which nobody knows how good it is.
+        """
+        if math.isinf(unsurvived):
+            return 1.0, 0.0, 1.0
+        expected, low, high = self._expected(int(unsurvived))
+        return -math.expm1(-expected * soon), -math.expm1(-low * soon), -math.expm1(-high * soon)
+
+    def _allowed(self, tolerance: float, remembered: Remembered) -> int:
+        """How many of the disturbances need not be survived.
+
+        No larger share of them than the tolerance, and no more than keep the upper bound of the
+        risk within it.
+        """
+        soon, most, allowed = self._soon(remembered.seconds), tolerance * remembered.number, 0
+        while allowed + 1 <= most and self._risk(allowed + 1, soon)[2] <= tolerance:
+            allowed += 1
+        return allowed
+
+    def _here(self, z: Floats) -> Floats | None:
+        """The situation, if that is seen; what was not is taken to have gone on as before."""
+        at, m = self._at, len(z)
+        if at is None:
+            if has_gaps(z):
+                return None
+            return library.situation(z, np.zeros(m), np.zeros(self.dynamics.size))
+        if has_gaps(z):
+            z = np.where(np.isnan(z), at[:m] + at[m : 2 * m], z)
+        z = self.dynamics.corrected(at, self._action, z)
+        return library.situation(z, z - at[:m], self._action)
+
+    def _untried(self, best: Floats) -> Floats | None:
+        """An action whose effect is hardly known, if there is one."""
+        assert self.backups is not None
+        used, order = self.dynamics.used, self.backups.actions  # of equals the first in that order
+        if self.dynamics.choices:
+            i = int(order[used[order, 1].argmin()])
+            if used[i, 1] < _TRIES and used[i, 1] < used[:, 1].max():
+                return np.asarray(np.eye(len(used))[i])
+            return None
+        # The end that the controller seldom went to comes first.
+        turned = np.where(self.backups.turns[:, None] > 0.0, used, used[:, ::-1])[order]
+        k, end = divmod(int(turned.argmin()), 2)
+        if turned[k, end] < _TRIES and turned[k, end] < turned[k, 1 - end]:
+            best, i = best.copy(), order[k]
+            best[i] = (-1.0, 1.0)[end] * self.backups.turns[i]
+            return best
+        return None
+
+    def _backup_text(self, backup: int) -> str:
+        assert self.backups is not None
+        if backup >= self.backups.n_constant:
+            return words.feedback(backup - self.backups.n_constant)
+        action = self.dynamics.decode(self.backups.policies[backup, :, 0])
+        if self.dynamics.choices:
+            return words.choice(action_name(int(action[0])))
+        return words.constant(action.tolist())
+
+    # -- Learning -------------------------------------------------------------------------------
+
+    @_atomic
+    def observe(self, observation: Floats) -> bool:
+        """Learn the transition to an observation; whether something unexpected began with it.
+
+        One of which something was not seen ends what can be learnt from: what comes does not
+        follow from what was.
+        """
+        dynamics = self.dynamics
+        if dynamics.n_variables not in (0, len(observation)):
+            raise ValueError(
+                f"observation has {len(observation)} variables, but the judge learnt of "
+                f"{dynamics.n_variables}"
+            )
+        if has_gaps(observation) or not dynamics.has_acted:
+            dynamics.end(failed=False)
+        if has_gaps(observation):
+            return False
+        dynamics.observe(observation)
+        return dynamics.begins()
+
+    def act(self, action: Any) -> None:
+        """Take in what was executed after the latest observation; another one replaces it."""
+        if self.dynamics.n_under_way:
+            self.dynamics.act(self.dynamics.encode(action))
+
+    def learn(self, observation: ArrayLike, action: Any, belief: ArrayLike) -> None:
+        """Take in what was executed, and whether the certificate of before still held."""
+        if "margin" not in self.without and self.backups is not None:
+            violated = self._certified and not self._holds
+            self.n_violated += violated
+            self._violated |= violated
+            margin = self.margin + _ADDED * (violated - _RATE)
+            self.margin = min(_LARGEST, max(self._least_margin, margin))
+        self._certified = self._holds
+        self._was_certified |= self._holds
+        self._take_in(observation, action)
+
+    @property
+    def _least_margin(self) -> float:
+        return _NOISY if self.dynamics.is_noisy else _ADDED
+
+    def watch(self, observation: ArrayLike, action: Any, belief: ArrayLike) -> None:
+        """Take in what someone else does: then nothing was certified."""
+        self._certified = False
+        self._take_in(observation, action)
+
+    def _take_in(self, observation: ArrayLike, action: Any) -> None:
+        self.follow(observation, action)
+        self._notes.append((self._refused, self._dead_end))
+        if self.dynamics.n_episodes != self.n_studied:  # it goes on, but was long enough to study
+            self._study()
+        del self._notes[: max(0, len(self._notes) - self.dynamics.n_under_way)]
+
+    def follow(self, observation: ArrayLike, action: Any) -> None:
+        """Keep up with what happens, without learning from it."""
+        here = self._here(np.array(observation, np.float64))
+        if here is not None:
+            self._at, self._action = here, self.dynamics.encode(action)
+
+    def start_episode(self, *, learn: bool = True) -> None:
+        """What comes is not a consequence of what was; the episode before is learnt from."""
+        if learn:
+            self._end(failed=False)
+        else:
+            self.dynamics.forget_episode()
+            self._forget()
+
+    def end(self, observation: Floats | None, *, failed: bool) -> None:
+        """Learn from an episode; its last observation was taken in (`observe`)."""
+        self._end(failed=failed and (observation is None or not has_gaps(observation)))
+
+    @_atomic
+    def _end(self, *, failed: bool) -> None:
+        self.dynamics.end(failed=failed)
+        if self.dynamics.n_episodes != self.n_studied:
+            self._study()
+        self._forget()
+
+    def _forget(self) -> None:
+        self._at, self._action = None, np.zeros(0)
+        self._certified = self._was_certified = self._holds = self._violated = False
+        self._refused = self._dead_end = False
+        self._notes = []
+        self._unsurvived, self._fails_after = 0, 0.0
+        self._ranks = np.zeros(0, int) if self.backups is None else self.backups.ranks
+
+    @_atomic
+    def _study(self) -> None:
+        """Learn from the latest episode: what to remember, and what to do about it."""
+        dynamics = self.dynamics
+        self.n_studied = dynamics.n_episodes
+        if "margin" not in self.without:
+            self.margin = max(self._least_margin, _FADES * self.margin)
+        moved = any(one.noticed == dynamics.n_episodes - 1 for one in dynamics.drifts)
+        if moved or self._is_worse():
+            self._begin_anew()
+        episode = dynamics.latest
+        if episode is None or not dynamics.ready:
+            return
+        random = np.random.default_rng([self.seed, dynamics.n_episodes])
+        if self.backups is None:
+            self.backups = Backups.of(
+                episode.observations,
+                episode.actions,
+                choices=bool(dynamics.choices),
+                evolving="backups" not in self.without,
+            )
+        best, refuted = self.backups.policies[self.backups.ranks], self._refuted
+        tight = [refused for refused, _ in self._notes]
+        situations = library.noted(self.situations, episode, tight, self.horizon, random)
+        self.situations, knows = situations, bool(dynamics.thresholds)
+        if "stretches" not in dynamics.without and knows and len(situations) > _ENOUGH:
+            library.scan(dynamics, situations, self.horizon, best[:1], random)
+            self.n_scanned += 1
+        dynamics.refute(refuted, self.horizon)
+        if self.given_horizon is None and self.disturbances is not None and knows:
+            after = library.failing_after(
+                dynamics.model, situations, best[:_ASKED], self.disturbances
+            )
+            self._look_ahead(after, refuted=len(refuted) > 0, failed=episode.failed)
+        if "memory" in dynamics.without:
+            self.disturbances, self._pool = library.shuffled(
+                dynamics, self._pool, self.horizon, random
+            )
+        else:
+            self.disturbances = library.choose(
+                dynamics, situations, self.horizon, best[:2], self.disturbance_scale
+            )
+        if knows and len(situations) >= _ENOUGH:
+            self.backups = self._evolved(self.backups, self.disturbances, random)
+        self._ranks = self.backups.ranks
+
+    def _is_worse(self) -> bool:
+        """Whether disturbances got worse than those that are remembered."""
+        if "breaks" in self.without:
+            return False
+        before, violated, latest = self.violations, self._violated, self.dynamics.latest
+        failed = violated and latest is not None and latest.failed
+        self.violations = before.after(self.n_studied - 1, violated=violated, failed=failed)
+        self._violated = False
+        return self.violations.worse != before.worse
+
+    @property
+    def _began_anew(self) -> bool:
+        dynamics = self.dynamics
+        return self.violations.worse >= 0 or (dynamics.n_variables > 0 and bool(dynamics.drifts))
+
+    def _begin_anew(self) -> None:
+        """How far model and memory are to be trusted is not known yet.
+
+        Disturbances are taken to be harder again than they were, and it may take longer to fail.
+        """
+        self.violations = Violations(worse=self.violations.worse)
+        longer = _AHEAD * max(self.time_to_failure, _HORIZON / _AHEAD)
+        self.time_to_failure = min(longer, _FARTHEST / _AHEAD)
+        self.believed = float(_FARTHEST)
+        self.n_scanned = 0
+        if "margin" not in self.without:
+            self.margin = max(self.margin, _MARGIN)
+
+    @property
+    def _refuted(self) -> Ints:
+        """From which observations it went on for the horizon although nothing seemed to help."""
+        return np.flatnonzero([dead_end for _, dead_end in self._notes[: -self.horizon]])
+
+    def _look_ahead(self, after: int, *, refuted: bool, failed: bool) -> None:
+        """As far as it takes to fail where nothing helps, and half as far again.
+
+        That is ``after`` so many steps in the latest replays. Half as far again, too, after an
+        episode that failed although it was certified not to; less far after one that went on for
+        the whole horizon from where nothing seemed to help. What the model says of dead ends
+        farther away than that is believed again little by little.
+        """
+        if not failed and refuted:  # it sees less far than it looks
+            self.time_to_failure *= _REFUTED
+            self.believed = max(self.time_to_failure, _SHORTEST / _AHEAD)
+        else:
+            self.believed = min(self.believed / _LATEST, float(_FARTHEST))
+            longest = max(_LATEST * self.time_to_failure, min(self._fails_after, self.believed))
+            if failed and self._was_certified:  # it did not look far enough
+                longest = min(_AHEAD * longest, _FARTHEST / _AHEAD)
+                self.believed = max(self.believed, longest)
+            self.time_to_failure = max(min(float(after), self.believed), longest)
+        self.horizon = int(min(max(_AHEAD * self.time_to_failure, _SHORTEST), _FARTHEST))
+
+    def _evolved(
+        self, backups: Backups, disturbances: Disturbances, random: np.random.Generator
+    ) -> Backups:
+        """Backups that are worth more in the situations that are kept."""
+        count = disturbances.residuals.shape[2]
+        if count > 1 + _TRIED_ON:
+            some = 1 + random.permutation(count - 1)[:_TRIED_ON]
+            disturbances = disturbances.of(np.append(0, some))
+        scale, model = self.disturbance_scale, self.dynamics.model
+        return backups.evolved(model, self.situations, disturbances, scale, random)
+
+    def _snapshot(self) -> tuple[dict[str, Any], dict[str, Any], list[Floats]]:
+        """All that may change while it learns: sums and notes change in place."""
+        sums = self.dynamics.sums if self.dynamics.n_variables else ()
+        own = {**self.__dict__, "_notes": list(self._notes)}
+        return own, dict(self.dynamics.__dict__), [array.copy() for array in sums]
+
+    def _put_back(self, own: dict[str, Any], dynamics: dict[str, Any], sums: list[Floats]) -> None:
+        self.__dict__ = own
+        self.dynamics.__dict__ = dynamics
+        for array, before in zip(dynamics["sums"] if sums else (), sums, strict=True):
+            array[:] = before
+
+    # -- In a file ------------------------------------------------------------------------------
+
+    def sums(self, n_states: int) -> dict[str, float]:
+        """A few sums that whatever is learnt changes."""
+        backups, disturbances = self.backups, self.disturbances
+        return {
+            "margin": self.margin,
+            "violated": float(self.n_violated),
+            "backups": 0.0 if backups is None else float(backups.policies.sum()),
+            "disturbances": 0.0 if disturbances is None else float(disturbances.residuals.sum()),
+        }
+
+    def save(self, path: Place, provenance: Mapping[str, Any] | None = None) -> None:
+        """Write what was learnt to a file.
+
+        Parameters
+        ----------
+        path : path-like, or file open for writing bytes
+        provenance : mapping, optional
+            What it learnt from, for people; kept in the file.
+
+        Raises
+        ------
+        OSError
+            If it cannot be written.
+        """
+        dynamics, own, backups = self.dynamics, self.__dict__, self.backups
+        settings = {name: own[name] for name in ("dt", "seed", "given_horizon", *_NUMBERS)}
+        settings |= {"without": sorted(self.without), "violations": self.violations._asdict()}
+        settings |= {"names": list(self.labels.names), "units": list(self.labels.units)}
+        settings |= {"n_actions": dynamics.choices or None}
+        settings |= {"low": dynamics.low.tolist(), "high": dynamics.high.tolist()}
+        settings |= {"dynamics": dynamics.numbers()}
+        settings |= {"n_constant": 0 if backups is None else backups.n_constant}
+        arrays = {"situations": self.situations, **dynamics.arrays()}
+        sizes = {"b": 0, "a": dynamics.size, "m": dynamics.n_variables}
+        sizes["f"] = 1 + dynamics.n_variables
+        for name, shape in _BACKUPS.items():
+            nothing = np.zeros([sizes[letter] for letter in shape])
+            array = nothing if backups is None else getattr(backups, name)
+            arrays[f"backups_{name}"] = array.astype(np.float64)
+        store.write(path, KIND, settings, arrays, provenance)
+
+    @classmethod
+    def load(cls, path: Place) -> Self:
+        """Read what was learnt, between two episodes.
+
+        Parameters
+        ----------
+        path : path-like, or file open for reading bytes
+
+        Returns
+        -------
+        LearntRisk
+
+        Raises
+        ------
+        OSError
+            If there is no such file, or it may not be read.
+        ValueError
+            If the file holds something else or is damaged.
+        """
+        settings, arrays = store.read(path, KIND)
+        with store.explained(path):
+            return cls._restored(settings, arrays)
+
+    @classmethod
+    def _restored(cls, settings: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> Self:
+        """Of settings and arrays that were read, and hold to `KIND`."""
+        given = {
+            name: settings[name] for name in ("n_actions", "seed", "without", "names", "units")
+        }
+        if given["n_actions"] is None:
+            given |= {"low": settings["low"], "high": settings["high"]}
+        judge = cls(settings["dt"], horizon=settings["given_horizon"], **given)
+        judge.dynamics.restore(settings["dynamics"], arrays)
+        for name in _NUMBERS:
+            setattr(judge, name, settings[name])
+        judge.violations = Violations(**settings["violations"])
+        m, a = judge.dynamics.n_variables, judge.dynamics.size
+        judge.situations = arrays["situations"]
+        if len(judge.situations) and judge.situations.shape[1] != 2 * m + a:
+            raise ValueError(f"situations are not of {m} variables and actions of {a} numbers")
+        if len(arrays["backups_policies"]):
+            found = {name: arrays[f"backups_{name}"] for name in _BACKUPS}
+            judge.backups = Backups.restored(int(settings["n_constant"]), m, a, found)
+            judge.disturbances = judge.dynamics.disturbances(judge.horizon)
+        judge._forget()
+        return judge
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}(dt={self.dt:g}, seed={self.seed})"
+
+
+# Numbers that it goes on with, and the arrays of backups: each action has features of its own.
+_NUMBERS = (
+    *("margin", "n_violated", "horizon", "time_to_failure", "believed", "n_studied"),
+    "n_scanned",
+)
+_BACKUPS: dict[str, tuple[str, ...]] = {
+    "policies": ("b", "a", "f"),
+    "scores": ("b",),
+    "variables": ("m",),
+    "flips": ("m",),
+    "actions": ("a",),
+    "turns": ("a",),
+}
+_TIME, _SOME = Numbers(least=0.0, most=1e6), Numbers(least=-math.inf, most=math.inf)
+_ENDS = Numbers(("ends",), -1e100, 1e100)
+KIND = Kind(
+    "learntrisk",
+    {
+        "situations": Numbers(("s", "w")),
+        **{f"backups_{name}": _SOME.of(*shape) for name, shape in _BACKUPS.items()},
+        **ARRAYS,
+    },
+    {
+        "dt": SIZE,
+        "given_horizon": SIZE._replace(optional=True),
+        "n_actions": FROM_1._replace(optional=True),
+        **dict.fromkeys(("low", "high"), _ENDS),
+        **dict.fromkeys(("margin", "time_to_failure", "believed"), _TIME),
+        **dict.fromkeys(("seed", "n_violated", "n_studied", "n_scanned", "n_constant"), COUNT),
+        "horizon": FROM_1,
+        "violations": {
+            "share": SHARE,
+            "doubt": _TIME,
+            "since": COUNT,
+            "worse": COUNT._replace(least=-1.0),
+        },
+        "dynamics": {
+            **dict.fromkeys(("n_episodes", "quiet"), COUNT),
+            "doubt_of_lags": Numbers(least=0.0),
+            "ready": FLAG,
+        },
+    },
+)
+
+
+def _fallback(dynamics: Dynamics) -> Fallback:
+    """The first of some actions, or the middle of a range."""
+    if dynamics.choices:
+        return Fallback(0.0, "the first action")
+    middle = dynamics.decode(np.zeros(dynamics.size))
+    return Fallback(middle if len(middle) > 1 else float(middle[0]), "the middle of the range")
+
+
+def _unjudged(count: int) -> Judgement:
+    nothing = np.full(count, math.nan)
+    return Judgement(nothing, nothing, nothing, nothing, 0.0)

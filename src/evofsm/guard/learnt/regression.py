@@ -1,0 +1,482 @@
+"""How the model is learnt, and doubted: sums to which every transition adds, solved now and then.
+
+With features phi (`evofsm.guard.learnt.replay.features`) and changes dz of all transitions,
+
+    W = (sum phi phi' + R)^-1 sum phi dz',
+
+where R is a weak prior in each feature's own variance (`solve`). Sums of two models add up. A
+transition is learnt when the one after it is known, for only then does it show whether it was a
+jump: one that is far larger than what came before, what came after and what is ordinary. Jumps are
+no dynamics: they enter neither sums, nor units, nor limits.
+
+Once an episode it is asked whether the model still holds, whether its lags mislead, and whether
+sensors are noisy. Doubts are cumulative sums of log likelihood ratios (Page, "Continuous inspection
+schemes", Biometrika 1954): they grow with every episode that another model would have foreseen
+better, and count from a threshold on.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import suppress
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evofsm.guard.learnt.replay import (
+    Floats,
+    Ints,
+    Model,
+    along,
+    features,
+    inner_kernel,
+    kernel,
+    lags,
+    limited,
+    n_products,
+)
+
+# A change so many times those around it, and the ordinary one, is a jump; so many more of the first
+# ones, of which it is not known what is ordinary.
+_JUMP, _FIRST_JUMP, _FIRST = 8.0, 32.0, 8.0
+# The ordinary change is the median of so many, then a mean; of what is larger, so much counts.
+_EARLY, _CLIP, _SLOWEST = 200, 6.0, 5000.0
+# From so many on what is larger counts in the mean.
+_MEAN = 20
+#: What changes in more than this share of transitions may have saturated where it rests.
+MOVING = 0.5
+#: Residuals of so many scales are the onset of a disturbance.
+ONSET = 4.0
+# Residuals beyond so many of their scale weigh less.
+_OUTLIER = 4.0
+# Of the variance of a feature: what every weight is held to 0 by; so many times that holds those
+# that are asked only if they have to be, and the latest changes among them still more.
+_RIDGE, _SHY, _LAGS = 1e-6, 30.0, 10.0
+# The same over the number of transitions, if all is noise; the least share of that.
+_PRIOR, _SHY_PRIOR, _CLEAREST = 0.01, 20.0, 1e-3
+# The least variance of a feature, and what all weights are held to 0 by, of its mean square: far
+# more than rounding, so that features that did not vary yet always share what they explain alike.
+_LEAST, _ALL_ALIKE = 1e-6, 1e-10
+
+
+class Sums(NamedTuple):
+    """What is learnt with every transition, in place: m variables, p features."""
+
+    counts: Floats  #: (2,) observations, and transitions
+    squares: Floats  #: (p, p) sum of products of features
+    products: Floats  #: (p, m) and of features with changes
+    mean: Floats  #: (m,) of observations, from the origin
+    scatter: Floats  #: (m,) sum of squared distances to the mean
+    variance: Floats  #: (m,) mean square of a change
+    unit: Floats  #: (m,) ordinary change
+    early: Floats  #: (200, m) the first changes
+    least: Floats  #: (m,) most negative change that was no jump
+    most: Floats  #: (m,) most positive one
+    scale: Floats  #: (m,) of residuals; 0 as long as it is not known
+    noise: Floats  #: (m,) their mean square; 0 as long as it is not known
+    low: Floats  #: (m,) least observation
+    high: Floats  #: (m,) greatest one
+    moving: Floats  #: (m,) share of transitions in which it changed, but for rests at an extreme
+
+    @classmethod
+    def none(cls, first: Floats, p: int) -> Sums:
+        """Of nothing but a first observation."""
+        m = len(first)
+        rows = {"squares": (p, p), "products": (p, m), "early": (_EARLY, m), "counts": (2,)}
+        arrays = {name: np.zeros(rows.get(name, (m,))) for name in cls._fields}
+        return cls(**arrays | {"low": first.copy(), "high": first.copy()})
+
+    def observe(self, off: Floats) -> None:
+        """Count an observation, from the origin: mean and scatter (Welford 1962)."""
+        self.counts[0] += 1.0
+        before = off - self.mean
+        self.mean[:] += before / self.counts[0]
+        self.scatter[:] += before * (off - self.mean)
+
+
+def learn(
+    sums: Sums, model: Model, close: Floats, z: Floats, rows: Floats, i: int
+) -> tuple[list[int], bool]:
+    """Learn the transition i -> i + 1, amid observations (T, m), in ``sums``.
+
+    ``rows`` (2, p) are the features of that transition and the next, ``close`` (m,) says how far
+    from where it saturates a variable may be seen that is there. Returns the variables that jumped,
+    and whether something of the next transition was not expected.
+    """
+    n, jumped = int(sums.counts[1]), np.zeros(z.shape[1])
+    surprised = _learn(sums, model, close, z, rows, i, jumped)
+    if n < _EARLY:
+        _note_early(sums, np.abs(z[i + 1] - z[i]), n)
+    return np.flatnonzero(jumped).tolist() if jumped.any() else [], bool(surprised)
+
+
+def _note_early(sums: Sums, change: Floats, n: int) -> None:
+    """The ordinary change as long as few are known: mostly a median."""
+    sums.early[n] = change
+    unit = np.maximum(1.2 * np.median(sums.early[: n + 1], 0), _floor(sums))
+    if n >= _MEAN:
+        unit = np.maximum(unit, np.minimum(sums.early[: n + 1], _CLIP * unit).sum(0) / (n + 1))
+    sums.unit[:] = unit
+
+
+def _floor(sums: Sums) -> Floats:
+    """No ordinary change is smaller than this, of the spread of a variable."""
+    return np.asarray(1e-3 * np.sqrt(sums.scatter / max(1.0, sums.counts[0])))
+
+
+@inner_kernel
+def _is_beyond(expected: float, seen: float, low: float, high: float, close: float) -> bool:
+    """Whether it is expected beyond where it saturates, and stays there."""
+    return (expected < low and seen <= low + close) or (expected > high and seen >= high - close)
+
+
+@kernel
+def _learn(
+    sums: Sums, model: Model, close: Floats, z: Floats, rows: Floats, i: int, jumped: Floats
+) -> bool:
+    (p, m), n, first = model.weights.shape, sums.counts[1], i == 0
+    move, known, jump = np.zeros((2, m)), sums.scale[0] > 0.0, False
+    moved, surprised = False, False
+    for r in range(2 if known else 0):
+        for k in range(p):
+            for j in range(m):
+                move[r, j] += rows[r, k] * model.weights[k, j]
+    for j in range(m):
+        if first:
+            move[0, j] = 0.0
+        now, after = z[i + 1, j] - z[i, j], z[i + 2, j] - z[i + 1, j]
+        before = 0.0 if first else z[i, j] - z[i - 1, j]
+        sums.variance[j] += (now * now - sums.variance[j]) / (n + 1.0)
+        around = max(abs(before), abs(after), sums.unit[j])
+        stands_out = abs(now) > (_JUMP if n > _FIRST else _FIRST_JUMP) * around
+        if n > 0.0 and stands_out and abs(now - move[0, j]) > 0.5 * abs(now):
+            jumped[j], jump = 1.0, True
+    weight, worst = 1.0, 0.0
+    for j in range(m):
+        x, y = z[i + 2, j], z[i + 1, j] + move[1, j]
+        moved |= x != z[i + 1, j]
+        beyond = _is_beyond(y, x, model.lowest[j], model.highest[j], close[j])
+        surprised |= known and not beyond and abs(x - y) > ONSET * sums.scale[j]
+    for j in range(m):
+        x, now = z[i + 1, j], z[i + 1, j] - z[i, j]
+        y, low, high = z[i, j] + move[0, j], model.lowest[j], model.highest[j]
+        if jumped[j] == 0.0:
+            sums.least[j], sums.most[j] = min(sums.least[j], now), max(sums.most[j], now)
+        if n >= _EARLY:
+            floor = 1e-3 * np.sqrt(sums.scatter[j] / max(1.0, sums.counts[0]))
+            grown = (min(abs(now), _CLIP * sums.unit[j]) - sums.unit[j]) / min(n, _SLOWEST)
+            sums.unit[j] = max(sums.unit[j] + grown, floor)
+        sums.low[j], sums.high[j] = min(sums.low[j], x, z[i, j]), max(sums.high[j], x, z[i, j])
+        if now == 0.0 and (x == sums.low[j] or x == sums.high[j]) and sums.moving[j] > MOVING:
+            if not ((x == low and y > x) or (x == high and y < x)):
+                weight = 0.0  # it may have come to its end: what it would have done is not known
+        else:
+            sums.moving[j] += ((now != 0.0) - sums.moving[j]) / min(n + 1.0, _SLOWEST)
+        if known:
+            if _is_beyond(y, x, low, high, close[j]):
+                weight = 0.0  # it cannot be known how far it would have gone
+            else:
+                worst = max(worst, abs(x - y) / sums.scale[j])
+    sums.counts[1] += 1.0
+    if first or jump:
+        return surprised and moved
+    weight *= min(1.0, _OUTLIER / max(worst, 1e-12)) ** 2
+    for j in range(m):  # lags, as far as they have a sequel by now
+        before = z[i, j] - z[i - 1, j]
+        reach = 1.5 * max(abs(sums.least[j]), abs(sums.most[j]))
+        rows[0, 1 + m + j] = before if abs(before) <= reach else 0.0
+    for k in range(p):
+        f = weight * rows[0, k]
+        if f != 0.0:
+            for r in range(p):
+                sums.squares[k, r] += f * rows[0, r]
+            for j in range(m):
+                sums.products[k, j] += f * (z[i + 1, j] - z[i, j])
+    return surprised and moved
+
+
+def jumps(change: Floats, unit: Floats) -> NDArray[np.bool_]:
+    """(T, m) which changes (T, m) are far larger than those around them and the ordinary ones."""
+    size = np.abs(change)
+    before, after = np.vstack([size[:1], size[:-1]]), np.vstack([size[1:], 0.0 * size[-1:]])
+    return np.asarray(size > _JUMP * np.maximum(np.maximum(before, after), unit))
+
+
+def solve(sums: Sums, a: int, without: Floats) -> Floats:
+    """(p, m) weights: ridge regression, about 0, in units of each feature's own variance.
+
+    What is true for all times is found soonest if bends, products and, last of all, latest changes
+    are asked only if they have to be; else the first episodes say that one's own throttle speeds
+    others up. The less of a variable's changes is noise, the less evidence its weights need.
+    ``without`` (p,) is 1 for features that are left out, of actions of ``a`` numbers.
+    """
+    squares, n, m = sums.squares, max(1.0, float(sums.squares[0, 0])), len(sums.mean)
+    size = np.diag(squares)
+    variance = np.maximum(size - squares[0] ** 2 / n, _LEAST * size)
+    variance[0] = 0.0
+    shy = np.ones(len(size), bool)
+    shy[: 1 + m] = shy[1 + 2 * m : 1 + 2 * m + a] = False
+    times = np.ones(len(size))
+    times[lags(m, a)] = _LAGS
+    left_out = np.where(without > 0.0, 1e12 * np.maximum(size, 1.0), 0.0)
+    known = sums.noise > 0.0
+    noisy = np.where(known, sums.noise / np.where(known, sums.variance, 1.0), 1.0)
+    weights = np.empty_like(sums.products)
+    for j, share in enumerate(noisy.clip(_CLEAREST, 1.0).tolist()):
+        prior = np.where(shy, _SHY * _RIDGE + share * _SHY_PRIOR / n, _RIDGE + share * _PRIOR / n)
+        held = prior * times * variance + left_out
+        weights[:, j] = ridge(squares, sums.products[:, j], held)
+    return weights
+
+
+def ridge(squares: Floats, products: Floats, held: Floats) -> Floats:
+    """(p,) or (p, k) weights that are held to 0 by ``held`` (p,), as by so many squares more."""
+    size = np.diag(squares)
+    scale = 1.0 / np.sqrt(np.where(size > 0.0, size + held, 1.0))
+    scaled = scale[:, None] * (squares + np.diag(held)) * scale
+    scaled[np.diag_indices_from(scaled)] += _ALL_ALIKE
+    found: Floats = (scale * np.linalg.solve(scaled, (scale * products.T).T).T).T
+    return found
+
+
+# -- Drift: whether the system still moves as was learnt ------------------------------------------
+#
+# What a hundred episodes taught outweighs ten, and what contradicts it counts as an outlier. So a
+# correction of the model is learnt alongside, from the last few episodes alone. Where that would
+# have foreseen, an episode ahead, what surprised the model, the doubt grows:
+#
+#     d = max(0, d + sum ln(1 + r^2 / s^2) - 2 ln(1 + r'^2 / s^2)),
+#
+# of residuals r of the model and r' of the corrected one.
+
+# Of what the last episodes said since a doubt began, what still counts an episode later.
+_FADES = 0.95
+# What is unforeseen counts from this share of an ordinary change on; a correction has to halve it.
+_MATTERS, _HALVES = 0.5, 2.0
+# Doubt from which on a model is corrected; and the number of episodes before which it is still
+# being learnt.
+_DOUBT = 30.0
+LEARNT = 20
+# What corrections are held to 0 by: as many transitions, of products more; and how many there have
+# to be.
+_HELD, _HELD_MORE, _ENOUGH_ROWS = 0.3, 30.0, 15
+
+
+class Recent(NamedTuple):
+    """What the last episodes said of the model: m variables, p features."""
+
+    squares: Floats  #: (p, p) sum of products of features
+    products: Floats  #: (p, m) and of features with changes
+    doubt: Floats  #: (m,) that a variable still moves as was learnt
+    since: Floats  #: (m,) the episode that brought it up, from 0
+
+    @classmethod
+    def none(cls, p: int, m: int, episode: int) -> Recent:
+        """Before anything was seen, in this episode."""
+        return cls(np.zeros((p, p)), np.zeros((p, m)), np.zeros(m), np.full(m, float(episode)))
+
+    def overthrown(self) -> list[int]:
+        """Variables that do not move any more as was learnt."""
+        return np.flatnonzero(self.doubt > _DOUBT).tolist()
+
+
+class Drift(NamedTuple):
+    """A variable moves otherwise than it did."""
+
+    variable: int
+    since: int  #: the first episode in which it did, from 0
+    noticed: int  #: the last episode before it was believed
+
+
+def compared(
+    recent: Recent,
+    model: Model,
+    sums: Sums,
+    close: Floats,
+    z: Floats,
+    u: Floats,
+    episode: int,
+    young: bool,
+) -> Recent:
+    """Take in an episode: observations (T + 1, m), and actions (T, a).
+
+    Rows in which something rests at an end, or changes more than it ordinarily does, say nothing.
+    """
+    found, move = along(model, z[:-1], u)
+    after, change = z[2:], np.diff(z[1:], axis=0)
+    says = (after > model.lowest + close) & (after < model.highest - close)
+    says &= (change >= sums.least) & (change <= sums.most)
+    rows = says.all(1)
+    found, change = found[rows], change[rows]
+    missed = change - move[rows]
+    size = np.maximum(np.maximum(sums.scale, _MATTERS * sums.unit), 1e-300)
+    left = missed - found @ correction(recent, model.weights, sums, u.shape[1])
+    gained = np.log1p((missed / size) ** 2) - _HALVES * np.log1p((left / size) ** 2)
+    doubt = np.maximum(recent.doubt + gained.sum(0), 0.0) * (episode >= LEARNT)
+    fades = _FADES if young or doubt.any() else 0.0  # before a doubt it moved as ever
+    return Recent(
+        fades * recent.squares + found.T @ found,
+        fades * recent.products + found.T @ change,
+        doubt,
+        np.where(doubt > 0.0, recent.since, float(episode)),
+    )
+
+
+def correction(recent: Recent, weights: Floats, sums: Sums, a: int) -> Floats:
+    """(p, m) what is to be added to the weights of the model.
+
+    By ridge regression, about 0, in units of each feature's own variance. Latest
+    changes and the action before, of ``a`` numbers, are not asked: they would foresee that what
+    disturbs goes on. Products are asked only if they have to be.
+    """
+    found, m, n = np.zeros_like(weights), weights.shape[1], max(1.0, float(sums.squares[0, 0]))
+    if recent.squares[0, 0] < _ENOUGH_ROWS:
+        return found
+    size = np.diag(sums.squares) / n
+    variance = np.maximum(size - (sums.squares[0] / n) ** 2, 1e-6 * size)
+    variance[0] = 1.0
+    held = _HELD * variance
+    held[len(held) - n_products(m, a) :] *= _HELD_MORE
+    latest = lags(m, a)
+    held[latest] = 1e12 * np.maximum(size[latest], 1e-12)
+    missed = recent.products - recent.squares @ weights
+    with suppress(np.linalg.LinAlgError):  # numbers of sizes that have nothing in common
+        found = ridge(recent.squares, missed, held)
+    return found if np.isfinite(found).all() else np.zeros_like(found)
+
+
+# -- Lags: whether latest changes, and the action before, foresee more than one step --------------
+#
+# A feature may help one step ahead and mislead over many: that what just changed goes on is never
+# contradicted in a replay. So where an episode went on although nothing seemed to help, the model
+# is compared with what came: if it had foreseen more without lags, those are doubted.
+
+# Steps of an episode from which it is tried how much was foreseen.
+_STARTS = 12
+# What an episode says of lags counts no more than this, and so much of doubt is enough.
+_MOST, _ENOUGH = 1.0, 1.0
+
+
+def misled_by_lags(
+    models: Sequence[Model], z: Floats, u: Floats, starts: Ints, steps: int, unit: Floats
+) -> float:
+    """How much more is missed with lags than without, the two ``models``, in [-1, 1].
+
+    Of an episode of observations (T + 1, m) and actions (T, a), from each of ``starts``, of which
+    the last is at most T - ``steps``.
+    """
+    some = starts[np.unique(np.linspace(0, len(starts) - 1, _STARTS).astype(int))]
+    missed, less = (_missed_ahead(model, z, u, some, steps, unit) for model in models)
+    return min(_MOST, max(-_MOST, missed - less))
+
+
+def are_misleading(doubt: float) -> bool:
+    """Whether lags are left out."""
+    return doubt >= _ENOUGH
+
+
+def _missed_ahead(
+    model: Model, z: Floats, u: Floats, starts: Ints, steps: int, unit: Floats
+) -> float:
+    """Mean of ln(1 + square) of what is missed [ordinary changes], over starts and steps."""
+    at, before = z[starts], np.where(starts[:, None] > 0, u[starts - 1], 0.0)
+    change = at - z[np.maximum(starts - 1, 0)]
+    total = 0.0
+    for k in range(steps):
+        action = u[starts + k]
+        move = features(model, at, change, before, action) @ model.weights
+        after = np.clip(at + limited(model, move), model.lowest, model.highest)
+        at, change, before = after, after - at, action
+        off = (at - z[starts + k + 1]) / np.maximum(unit, 1e-300)
+        total += float(np.log1p(off * off).sum())
+    return total / (len(starts) * steps)
+
+
+# -- The observer: where one is, if sensors are noisy ---------------------------------------------
+#
+# What is expected of a variable is corrected by a share of what it misses, the gain (Luenberger,
+# "An introduction to observers", IEEE Transactions on Automatic Control 16, 1971). A gain of 1
+# takes a variable as it is seen; below it the model smooths. Which gain foresees most is tried on
+# every episode, as in prediction error methods (Ljung, "System Identification", 1999).
+
+#: Gains that are tried.
+GAINS = np.array([1.0, 0.7, 0.5, 0.35, 0.25, 0.15])
+# Of what gains missed, what still counts an episode later; what those below 1 are said to have
+# missed before any was tried; and up to how much more than the least is hardly more.
+_GAINS_FADE, _AT_FIRST, _HARDLY = 0.9, 0.05, 0.005
+
+
+def untried(m: int) -> Floats:
+    """(m, g) what gains of m variables miss as long as none was tried: all is taken as seen."""
+    missed = np.full((m, len(GAINS)), _AT_FIRST)
+    missed[:, GAINS == 1.0] = 0.0
+    return missed
+
+
+def best_gains(missed: Floats) -> Floats:
+    """(m,) for each variable the largest gain that misses hardly more than the best one.
+
+    Examples
+    --------
+    >>> best_gains(np.array([[0.44, 0.41, 0.391, 0.388, 0.39, 0.41]]))
+    array([0.5])
+    """
+    hardly_more = missed <= missed.min(1, keepdims=True) + _HARDLY
+    return np.asarray(GAINS[hardly_more.argmax(1)])
+
+
+def tried(missed: Floats, model: Model, z: Floats, u: Floats, unit: Floats) -> Floats:
+    """(m, g) what gains miss, after an episode of observations (T + 1, m) and actions (T, a).
+
+    Mean of ln(1 + square) of what a variable's next observation misses [ordinary changes] of what
+    was expected, the others being taken as they are seen; the last episodes count most.
+    """
+    unit = np.maximum(unit, 1e-300)[:, None]
+    calm, slope, curve, lag = _of_itself(model, z, u)
+    low, high = (model.lowest - model.origin)[:, None], (model.highest - model.origin)[:, None]
+    reach, off = model.reach[:, None], np.repeat((z[0] - model.origin)[:, None], len(GAINS), 1)
+    change, found = np.zeros_like(off), np.zeros_like(off)
+    for t in range(len(u)):
+        sequel = np.where(np.abs(change) <= reach, lag * change, 0.0)
+        move = calm[t, :, None] + (slope[t, :, None] + curve * off) * off + sequel
+        seen = (z[t + 1] - model.origin)[:, None]
+        off_by = seen - np.minimum(np.maximum(off + move, low), high)
+        gain = np.where(np.abs(off_by) > _JUMP * unit, 1.0, GAINS)
+        after = seen + (gain - 1.0) * off_by
+        change, off = after - off, after
+        found += np.log1p((off_by / unit) ** 2)
+    return _GAINS_FADE * missed + (1.0 - _GAINS_FADE) * found / len(u)
+
+
+def _of_itself(model: Model, z: Floats, u: Floats) -> tuple[Floats, Floats, Floats, Floats]:
+    """How each variable's expected change depends on that variable, the others being as seen.
+
+    The change of variable j at time t is calm + slope x + curve x^2 + lag dx, of its distance x to
+    the origin and its latest change dx: (T, m), (T, m), (m, 1) and (m, 1).
+    """
+    m = z.shape[1]
+    change = np.diff(z[:-1], axis=0, prepend=z[:1])
+    before = np.vstack([np.zeros_like(u[:1]), u[:-1]])
+    parts, spread = np.empty((3, len(u), m)), 1.0 / model.inverse
+    for j in range(m):
+        for part, at in zip(parts, (0.0, spread[j], -spread[j]), strict=True):
+            seen, moved = z[:-1].copy(), change.copy()
+            seen[:, j], moved[:, j] = model.origin[j] + at, 0.0
+            part[:, j] = features(model, seen, moved, before, u) @ model.weights[:, j]
+    calm, above, below = parts
+    lag = np.diag(model.weights[1 + m : 1 + 2 * m])[:, None]
+    curve = ((0.5 * (above[:1] + below[:1]) - calm[:1]) / spread**2).T
+    return calm, 0.5 * (above - below) / spread, curve, lag
+
+
+def corrected(
+    model: Model, gains: Floats, situation: Floats, action: Floats, seen: Floats, unit: Floats
+) -> Floats:
+    """(m,) where one is, a step after a situation and an action (a,), if that is ``seen`` (m,)."""
+    m = len(seen)
+    z, change, before = (part[None] for part in np.split(situation, [m, 2 * m]))
+    expected = (z + features(model, z, change, before, action[None]) @ model.weights)[0]
+    missed = seen - np.minimum(np.maximum(expected, model.lowest), model.highest)
+    gains = np.where(np.abs(missed) > _JUMP * unit, 1.0, gains)
+    return np.asarray(seen + (gains - 1.0) * missed)

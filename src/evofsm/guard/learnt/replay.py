@@ -1,0 +1,493 @@
+"""A replay: what comes of a situation amid a disturbance that was seen before, by the learnt model.
+
+An action is taken, then what a backup policy (b, K) says, until the horizon or failure. With the
+features phi of a situation and an action (`features`), the weights W, and the residuals r of a
+disturbance times its scale eta,
+
+    z' = z + sat(W'phi + eta r),    u = sat(b + K'(z - mean) / spread).
+
+Each variable's change is linear in the features, as the consequents of eTS are (Angelov & Filev,
+"An approach to online identification of Takagi-Sugeno fuzzy models", 2004), of which the paper uses
+the antecedents alone.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import NamedTuple
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+kernel = numba.njit(cache=True, error_model="numpy")
+inner_kernel = numba.njit(inline="always", error_model="numpy")
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+#: Where the effect of an action may bend, in each dimension of a box.
+KNOTS = (-0.5, 0.0, 0.5)
+
+# After a change, so many times the largest change there was may be foreseen.
+_FARTHER = 3.0
+# So much of half the range of actions a policy leaves unused for each ordinary change of margin.
+_RESERVE = 0.01
+# What the distance to failure counts compared with the time survived.
+_DISTANCE, _FAR = 0.05, 0.05
+# Halvings between a proposal and an action that passes.
+_HALVINGS = 4
+# Of two backups that last as long up to so much the first is taken; closer than so much are alike.
+_EQUAL, _ALIKE = 1e-9, 0.02
+# Numbers in a cache line: loops over whole lines have no rest to work off one by one.
+_LINE = 8
+
+
+class Model(NamedTuple):
+    """What is expected, as kernels see it: m variables, a numbers of an action, p features."""
+
+    weights: Floats  #: (p, m) change of each variable for each feature
+    origin: Floats  #: (m,) from which variables are counted: the first observation
+    reach: Floats  #: (m,) a latest change beyond this has no sequel
+    lowest: Floats  #: (m,) where variables saturate; infinite where they do not
+    highest: Floats  #: (m,)
+    least: Floats  #: (m,) most negative ordinary change there was
+    most: Floats  #: (m,) most positive one
+    #: (k, 4) failure: variable, sign, threshold, and ordinary changes in a unit of the variable
+    thresholds: Floats
+    drifted: Floats  #: (m,) 1 of a variable that moves otherwise than it did, -1 of others then
+    mean: Floats  #: (m,) of what policies take for their middle
+    inverse: Floats  #: (m,) and one over their spread
+    choices: int  #: number of actions; 0 where the action is a box
+
+
+class Disturbances(NamedTuple):
+    """K sequences of what was not expected, H steps each; number 0 is none at all."""
+
+    residuals: Floats  #: (H, m, K)
+    jump_at: Floats  #: (K, m) step at which a variable jumps; -1: at none
+    jump_to: Floats  #: (K, m) to where, from 0
+    jump_slope: Floats  #: (K, m, m) and so much of where each variable was
+    jump_from: Floats  #: (K, m, m, 2) least and most from which such jumps were seen
+    landing: Floats  #: (K, m, 2) least and most to which such jumps led
+
+    @classmethod
+    def none(cls, count: int, steps: int, m: int) -> Disturbances:
+        """So many that are none, of m variables."""
+        still = np.zeros((count, m))
+        slopes, ranges = np.zeros((count, m, m)), np.zeros((count, m, m, 2))
+        residuals = np.zeros((steps, m, count))
+        return cls(residuals, still - 1.0, still, slopes, ranges, np.zeros((count, m, 2)))
+
+    def of(self, which: Ints) -> Disturbances:
+        """Some of them."""
+        residuals = np.ascontiguousarray(self.residuals[:, :, which])
+        return Disturbances(residuals, *(array[which] for array in self[1:]))
+
+
+class Ends(NamedTuple):
+    """How replays ended: for each of S situations those of K disturbances."""
+
+    survived: Floats  #: (S K,) steps until failure, or all of them
+    least: Floats  #: (S K,) least distance to failure until then [ordinary changes]
+    last: Floats  #: (S K,) distance where the replay ended
+
+    @classmethod
+    def of(cls, count: int) -> Ends:
+        """Room for so many replays."""
+        return cls(np.empty(count), np.empty(count), np.empty(count))
+
+
+# -- What is expected -----------------------------------------------------------------------------
+
+
+def n_features(m: int, a: int, *, box: bool) -> int:
+    """Number of features: 1, z, latest change, action, previous action, bends, products."""
+    return 1 + 2 * m + 2 * a + (len(KNOTS) * a if box else 0) + n_products(m, a)
+
+
+def n_products(m: int, a: int) -> int:
+    """Number of products: of actions with variables, and of two variables; they come last."""
+    return a * m + m * (m + 1) // 2
+
+
+def lags(m: int, a: int) -> Ints:
+    """Indices of features that say what was just before: latest changes, and the action before."""
+    return np.append(np.arange(1 + m, 1 + 2 * m), np.arange(1 + 2 * m + a, 1 + 2 * m + 2 * a))
+
+
+def features(model: Model, z: Floats, change: Floats, before: Floats, action: Floats) -> Floats:
+    """(T, p) features of situations and actions: [1, z, dz, u, u before, |u - knot|, u z, z z].
+
+    ``z`` and ``change`` (T, m), ``before`` and ``action`` (T, a).
+    """
+    off, m = z - model.origin, z.shape[1]
+    lagged = np.where(np.abs(change) <= model.reach, change, 0.0)
+    parts = [np.ones((len(z), 1)), off, lagged, action, before]
+    if not model.choices:
+        parts.append(np.abs(action[:, :, None] - KNOTS).reshape(len(z), -1))
+    parts.append((action[:, :, None] * off[:, None]).reshape(len(z), -1))
+    one, other = _pairs(m)
+    return np.concatenate([*parts, off[:, one] * off[:, other]], axis=1)
+
+
+@cache
+def _pairs(m: int) -> tuple[Ints, Ints]:
+    """Of which variables products are features."""
+    return np.triu_indices(m)
+
+
+def along(model: Model, observations: Floats, actions: Floats) -> tuple[Floats, Floats]:
+    """Features (T, p), and changes that were expected (T, m), from each observation but the first.
+
+    ``observations`` (T + 1, m) begin one before; ``actions`` (T + 1, a) too.
+    """
+    found = features(
+        model, observations[1:], np.diff(observations, axis=0), actions[:-1], actions[1:]
+    )
+    return found, found @ model.weights
+
+
+def residuals(
+    model: Model, close: Floats, observations: Floats, actions: Floats, *, carried: bool = False
+) -> Floats:
+    """(L, m) what was not expected from the second of L + 2 observations on, under L + 1 actions.
+
+    Where a variable is expected beyond where it saturates and stays there (but for ``close``), its
+    residual is censored; if it is ``carried``, the one before goes on, for its cause may not have
+    ended. Where nothing moves at all, what was expected is the model's own error.
+    """
+    z, x = observations[1:-1], observations[2:]
+    expected = z + along(model, observations[:-1], actions)[1]
+    low, high = x <= model.lowest + close, x >= model.highest - close
+    beyond = ((expected < model.lowest) & low) | ((expected > model.highest) & high)
+    found = np.where(beyond | (x == z).all(1, keepdims=True), 0.0, x - expected)
+    if carried:
+        for t in np.flatnonzero((low | high)[1:].any(1)) + 1:
+            ends = np.where(low[t], np.minimum(found[t], found[t - 1]), found[t])
+            found[t] = np.where(high[t] & ~low[t], np.maximum(found[t], found[t - 1]), ends)
+    return found
+
+
+def limited(model: Model, move: Floats) -> Floats:
+    """Changes (n, m), of which no larger ones are foreseen than there were, as in replays."""
+    least, most, farther = model.least, model.most, model.drifted < 0.0
+    low = np.where(farther, np.minimum(least, np.maximum(move, _FARTHER * least)), least)
+    high = np.where(farther, np.maximum(most, np.minimum(move, _FARTHER * most)), most)
+    return np.minimum(np.maximum(move, low), high)
+
+
+@inner_kernel
+def fill_features(
+    z: Floats,
+    change: Floats,
+    before: Floats,
+    action: Floats,
+    origin: Floats,
+    reach: Floats,
+    harder: float,
+    box: bool,
+    found: Floats,
+) -> None:
+    """`features` of n situations and actions side by side, into ``found`` (p, n)."""
+    (m, n), a = z.shape, len(action)
+    for l in range(n):
+        found[0, l] = 1.0
+    for j in range(m):
+        for l in range(n):
+            found[1 + j, l] = z[j, l] - origin[j]
+            found[1 + m + j, l] = change[j, l] if abs(change[j, l]) <= harder * reach[j] else 0.0
+    k = 1 + 2 * m
+    for i in range(a):
+        for l in range(n):
+            found[k + i, l] = action[i, l]
+            found[k + a + i, l] = before[i, l]
+    k += 2 * a
+    if box:
+        for i in range(a):
+            for knot in KNOTS:
+                for l in range(n):
+                    found[k, l] = abs(action[i, l] - knot)
+                k += 1
+    for i in range(a):
+        for j in range(m):
+            for l in range(n):
+                found[k, l] = action[i, l] * found[1 + j, l]
+            k += 1
+    for i in range(m):
+        for j in range(i, m):
+            for l in range(n):
+                found[k, l] = found[1 + i, l] * found[1 + j, l]
+            k += 1
+
+
+@inner_kernel
+def expect(weights: Floats, found: Floats, move: Floats) -> None:
+    """The changes (m, n) that are expected of features (p, n), into ``move``."""
+    (p, n), m = found.shape, len(move)
+    for j in range(m):
+        for l in range(n):
+            move[j, l] = 0.0
+    fours = p - p % 4
+    for k in range(0, fours, 4):  # four at once: the sums are the same, and written less often
+        for j in range(m):
+            u, v, w, x = weights[k, j], weights[k + 1, j], weights[k + 2, j], weights[k + 3, j]
+            for l in range(n):
+                y = move[j, l] + found[k, l] * u + found[k + 1, l] * v
+                move[j, l] = y + found[k + 2, l] * w + found[k + 3, l] * x
+    for k in range(fours, p):
+        for j in range(m):
+            weight = weights[k, j]
+            for l in range(n):
+                move[j, l] += found[k, l] * weight
+
+
+# -- Replays --------------------------------------------------------------------------------------
+
+
+def acts(model: Model, policy: Floats, z: Floats) -> Floats:
+    """(a,) what a policy (a, 1 + m) does at an observation (m,): see `_follow_policy`."""
+    action = policy[:, 0] + policy[:, 1:] @ ((z - model.mean) * model.inverse)
+    if not model.choices:
+        return np.minimum(1.0, np.maximum(-1.0, action))
+    return np.asarray(np.eye(len(action))[action.argmax()])
+
+
+@inner_kernel
+def _follow_policy(model: Model, policy: Floats, z: Floats, end: float, action: Floats) -> None:
+    """Actions (a, n) of a linear policy (a, 1 + m): saturated at ``end``, or the largest of few."""
+    (a, n), m, choices = action.shape, len(z), model.choices
+    for i in range(a):
+        for l in range(n):
+            action[i, l] = policy[i, 0]
+        for j in range(m):
+            slope, mean, inverse = policy[i, 1 + j], model.mean[j], model.inverse[j]
+            for l in range(n):
+                action[i, l] += slope * (z[j, l] - mean) * inverse
+        if choices == 0:
+            for l in range(n):
+                action[i, l] = min(end, max(-end, action[i, l]))
+    if choices > 0:
+        for l in range(n):
+            best = 0
+            for i in range(1, a):
+                if action[i, l] > action[best, l]:
+                    best = i
+            for i in range(a):
+                action[i, l] = 1.0 if i == best else 0.0
+
+
+@kernel
+def replay(
+    model: Model,
+    situations: Floats,
+    plan: Floats,
+    policy: Floats,
+    disturbances: Disturbances,
+    harder: float,
+    enough: float,
+    allowed: int,
+    ends: Ends,
+) -> int:
+    """Replay each of K disturbances in each of S situations, into ``ends``; how many are lost.
+
+    A situation is an observation, its change, and the action before (2m + a). First the actions of
+    the ``plan`` (T, a) are taken, if it has any, then what the ``policy`` (a, 1 + m) says. A replay
+    ends where the distance to failure falls below ``enough``, and the larger that is, the more of
+    the range of actions the policy leaves unused: where full action just holds, no distance says
+    how near the point of no return is. All end as soon as more than ``allowed`` did, or number 0
+    did, that is no disturbance at all; if all are allowed, each goes on as far as it can.
+
+    Replays lie side by side, so that loops over them (``l``) are vector instructions. No slice is
+    assigned: that takes a second of compiling each.
+    """
+    m, (a, _), p = len(model.origin), policy.shape, len(model.weights)
+    (steps, _, each), sides = disturbances.residuals.shape, len(model.thresholds)
+    count = len(situations) * each
+    n = (count + _LINE - 1) // _LINE * _LINE
+    z, change, move, after = np.empty((m, n)), np.empty((m, n)), np.empty((m, n)), np.empty((m, n))
+    before, action, found = np.empty((a, n)), np.empty((a, n)), np.empty((p, n))
+    which, alive, near = np.zeros(n, np.int64), np.zeros(n, np.int64), np.empty(n)
+    jumps = False
+    for l in range(n):
+        start = l // each if l < count else 0
+        for j in range(m):
+            z[j, l], change[j, l] = situations[start, j], situations[start, m + j]
+        for i in range(a):
+            before[i, l] = situations[start, 2 * m + i]
+        near[l] = np.inf
+        if l < count:
+            which[l], alive[l], ends.survived[l] = l % each, 1, steps
+            for j in range(m):
+                jumps |= disturbances.jump_at[which[l], j] >= 0.0
+    lost, end = 0, 1.0 - _RESERVE * enough
+    for t in range(steps):
+        if t < len(plan):
+            for i in range(a):
+                for l in range(n):
+                    action[i, l] = plan[t, i]
+        else:
+            _follow_policy(model, policy, z, end, action)
+        fill_features(
+            z, change, before, action, model.origin, model.reach, harder, model.choices == 0, found
+        )
+        expect(model.weights, found, move)
+        for j in range(m):
+            least, most = model.least[j], model.most[j]
+            if model.drifted[j] > 0.0:  # little was seen of it: no more is foreseen than there was
+                for l in range(n):
+                    move[j, l] = min(max(move[j, l], least), most)
+            if model.drifted[j] < 0.0:  # it moves as ever, but may have to go farther than it did
+                for l in range(n):
+                    low = min(harder * least, max(move[j, l], _FARTHER * least))
+                    high = max(harder * most, min(move[j, l], _FARTHER * most))
+                    y = move[j, l] + harder * disturbances.residuals[t, j, which[l]]
+                    after[j, l] = z[j, l] + min(max(y, low), high)
+            else:
+                for l in range(n):
+                    y = move[j, l] + harder * disturbances.residuals[t, j, which[l]]
+                    after[j, l] = z[j, l] + min(max(y, harder * least), harder * most)
+        if jumps:
+            for l in range(count):
+                k = which[l]
+                for j in range(m):
+                    if disturbances.jump_at[k, j] == t:
+                        y = disturbances.jump_to[k, j]
+                        for i in range(m):
+                            low = disturbances.jump_from[k, j, i, 0]
+                            high = disturbances.jump_from[k, j, i, 1]
+                            y += disturbances.jump_slope[k, j, i] * min(max(z[i, l], low), high)
+                        low, high = disturbances.landing[k, j, 0], disturbances.landing[k, j, 1]
+                        after[j, l] = min(max(y, low), high)
+        for j in range(m):
+            lowest, highest = model.lowest[j], model.highest[j]
+            for l in range(n):
+                y = min(max(after[j, l], lowest), highest)
+                change[j, l] = y - z[j, l]
+                z[j, l] = y
+        for i in range(a):
+            for l in range(n):
+                before[i, l] = action[i, l]
+        for s in range(sides):
+            j, sign = int(model.thresholds[s, 0]), model.thresholds[s, 1]
+            threshold, worth = model.thresholds[s, 2], model.thresholds[s, 3]
+            for l in range(n):
+                left = sign * (threshold - z[j, l]) * worth
+                nearer = left if left < near[l] else near[l]
+                near[l] = nearer if alive[l] == 1 else near[l]
+        fails = 0
+        for l in range(n):
+            fails += 1 if (alive[l] == 1) & (near[l] < enough) else 0
+        if fails == 0:
+            continue
+        for l in range(count):
+            if alive[l] == 1 and near[l] < enough:
+                alive[l], ends.survived[l] = 0, t
+                lost += 1
+                if allowed < count and which[l] == 0:
+                    lost = count
+        if lost >= count or lost > allowed:
+            break
+    for l in range(count):
+        ends.least[l], ends.last[l] = near[l], np.inf
+        for s in range(sides):
+            j, sign = int(model.thresholds[s, 0]), model.thresholds[s, 1]
+            left = sign * (model.thresholds[s, 2] - z[j, l]) * model.thresholds[s, 3]
+            ends.last[l] = min(ends.last[l], left)
+    return lost
+
+
+def worth(
+    model: Model,
+    situations: Floats,
+    policy: Floats,
+    disturbances: Disturbances,
+    scale: float,
+    ends: Ends,
+) -> Floats:
+    """(S,) how well a policy ends in each situation, in the mean of all disturbances.
+
+    The share of the horizon that is survived, and a little for the distance to failure: the least
+    one and, where all is survived, that at the end as well, as who comes back does better than who
+    hovers beside failure. ``ends`` is room for all replays.
+    """
+    (steps, _, each), nothing = disturbances.residuals.shape, np.empty((0, len(policy)))
+    count = len(ends.least)
+    replay(model, situations, nothing, policy, disturbances, scale, 0.0, count, ends)
+    left = np.where(ends.survived == steps, 0.5 * (ends.least + ends.last), ends.least)
+    left = np.minimum(1.0, np.maximum(-1.0, _FAR * left))
+    total = (ends.survived / steps + _DISTANCE * left).reshape(-1, each).sum(1)
+    return np.asarray(total / each)
+
+
+# -- What decides ---------------------------------------------------------------------------------
+
+
+class Found(NamedTuple):
+    """What a search found."""
+
+    action: Floats | None  #: (a,) the closest to the proposal that passes; None where none does
+    backup: int  #: after which it passes; where none does, the one that lasts longest
+    safety_margin: float  #: least distance to failure that is then left [ordinary changes]
+    alike: bool  #: whether no action passes, and all backups last as long
+
+
+def search(
+    model: Model,
+    situation: Floats,
+    policies: Floats,
+    ranks: Ints,
+    disturbances: Disturbances,
+    scale: float,
+    proposal: Floats,
+    margin: float,
+    allowed: int,
+) -> Found:
+    """The closest action to a proposal (a,) after which a backup survives by the margin.
+
+    The proposal itself if one does; else what the first of ``ranks`` does that survives, and from
+    there as near to the proposal as halvings come. All disturbances have to be survived but
+    ``allowed``, and that none begins.
+    """
+    z, count = situation[: len(model.origin)], disturbances.residuals.shape[2]
+    situations, ends = situation[None], Ends.of(count)
+
+    def left(action: Floats, q: int) -> float:
+        """Least distance to failure; negative infinity if it is not survived."""
+        policy = policies[q]
+        if allowed < replay(
+            model, situations, action[None], policy, disturbances, scale, margin, allowed, ends
+        ):
+            return -np.inf
+        return float(ends.least[ends.least >= margin].min())
+
+    for q in ranks:
+        least = left(proposal, q)
+        if least >= margin:
+            return Found(proposal, q, least, False)
+    for q in ranks:
+        own = acts(model, policies[q], z)
+        if model.choices and (own == proposal).all():
+            continue  # it was refused
+        least = left(own, q)
+        if least < margin:
+            continue
+        best, share, refused = own, 1.0, 0.0
+        for _ in range(_HALVINGS if not model.choices else 0):
+            half = 0.5 * (refused + share)
+            middle = proposal + half * (own - proposal)
+            closer = left(middle, q)
+            if closer >= margin:
+                share, least, best = half, closer, middle
+            else:
+                refused = half
+        return Found(best, q, least, False)
+    worths = [
+        float(worth(model, situations, policies[q], disturbances, scale, ends)[0]) for q in ranks
+    ]
+    which, longest = 0, worths[0]
+    for k, lasts in enumerate(worths):
+        if lasts > longest + _EQUAL:
+            which, longest = k, lasts
+    apart = (longest - min(worths)) / (abs(longest) + 1e-12)
+    return Found(None, int(ranks[which]), -np.inf, apart < _ALIKE)

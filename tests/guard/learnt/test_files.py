@@ -1,0 +1,106 @@
+"""What was learnt is kept in a file, and goes on from there as if nothing had happened."""
+
+from io import BytesIO
+
+import numpy as np
+import pytest
+
+from evofsm import Guard, store
+from evofsm.guard.guard import KIND as GUARD
+from evofsm.guard.learnt.judge import KIND, LearntRisk
+
+
+def assert_goes_on_alike(point, guard, exactly, content):
+    guard.save(file := BytesIO())
+    again = Guard.load(BytesIO(file.getvalue()))
+    assert content(again) == content(guard)
+    for episode in range(40, 43):
+        assert exactly(point.play(again, episode)[0]) == exactly(point.play(guard, episode)[0])
+        assert content(again) == content(guard)
+    again.freeze()
+    guard.freeze()
+    assert exactly(point.play(again, 50)[0]) == exactly(point.play(guard, 50)[0])
+
+
+@pytest.mark.parametrize(
+    "episodes", [0, *(pytest.param(k, marks=pytest.mark.slow) for k in (1, 3))]
+)
+def test_saved_and_loaded_it_goes_on_learning_bit_for_bit(point, exactly, content, episodes):
+    assert_goes_on_alike(point, point.taught(episodes), exactly, content)
+
+
+def test_with_noisy_sensors_it_goes_on_bit_for_bit_too(noisy, exactly, content):
+    guard = noisy.taught(20)
+    assert guard.judge.dynamics.is_noisy
+    assert_goes_on_alike(noisy, guard, exactly, content)
+
+
+def with_first(value):
+    def change(array):
+        array = array.copy()
+        array.flat[0] = value
+        return array
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("settings", "arrays", "why"),
+    [
+        ({}, {"backups_variables": lambda one: one * 0.0}, "variables of the backups"),
+        ({"n_constant": 99}, {}, "not 99 constant ones"),
+        ({"without": ["luck"]}, {}, "without names"),
+        ({"low": [3.0]}, {}, "below high"),
+        ({"n_actions": 4}, {}, "an action has 4 numbers"),
+        ({}, {"situations": lambda one: one[:, 1:]}, "situations are not of 2 variables"),
+        ({}, {"thresholds": with_first(7.0)}, "thresholds are of variables that there are not"),
+        ({}, {"sequence_rows": lambda one: one[1:]}, "not those that they say"),
+        ({}, {"sequence_rows": lambda one: one[:, 1:]}, "another number of variables"),
+        ({}, {"jumps": lambda one: np.zeros((1, 9))}, "another number of variables"),
+    ],
+)
+def test_a_file_that_contradicts_itself_is_refused(points, settings, arrays, why):
+    file, bad = BytesIO(), BytesIO()
+    points["box"].taught(3).judge.save(file)
+    content, own = store.read(BytesIO(file.getvalue()), KIND)
+    own |= {name: change(own[name]) for name, change in arrays.items()}
+    store.write(bad, KIND, content | settings, own)
+    with pytest.raises(ValueError, match=why):
+        LearntRisk.load(BytesIO(bad.getvalue()))
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "why"),
+    [
+        ("sums_squares", with_first(np.nan), "sums_squares of nan"),
+        ("sums_unit", with_first(-1.0), "sums_unit of -1"),
+        ("sums_counts", with_first(0.5), "fraction"),
+        ("sums_squares", lambda one: one[:3, :3], "shape"),
+        ("origin", lambda one: one[:1], "shape"),
+        ("used", lambda one: one[:0], "used has shape"),
+    ],
+)
+def test_what_no_learning_could_have_left_is_refused(points, name, change, why):
+    file, bad = BytesIO(), BytesIO()
+    points["box"].taught(3).judge.save(file)
+    content, own = store.read(BytesIO(file.getvalue()), KIND)
+    with pytest.raises(ValueError, match=why):  # a file that holds it cannot even be written
+        store.write(bad, KIND, content, own | {name: change(own[name])})
+
+
+def test_a_judge_of_other_actions_or_variables_is_refused(points):
+    box, plane = (points[name].taught(3) for name in ("box", "plane"))
+    files = []
+    for guard in (box, plane):
+        files.append(BytesIO())
+        guard.save(files[-1])
+    (content, own), (_, others) = (store.read(BytesIO(file.getvalue()), GUARD) for file in files)
+    mixed = BytesIO()
+    store.write(mixed, GUARD, content, own | {"judge": others["judge"]})
+    with pytest.raises(ValueError, match="the judge was made for actions from"):
+        Guard.load(BytesIO(mixed.getvalue()))
+    with pytest.raises(ValueError, match="the judge was made for a range of actions"):
+        Guard(n_actions=2, interval=0.1, judge=LearntRisk(0.1, 0.0, 1.0))
+    guard = Guard(low=-1.0, high=1.0, interval=0.1, judge=box.judge)
+    with pytest.raises(ValueError, match="observation has 3 variables, but the judge learnt of 2"):
+        guard.decide([0.0, 0.0, 0.0], 0.0)

@@ -1,0 +1,244 @@
+"""Replays, and which action passes by them."""
+
+import numpy as np
+import pytest
+
+from evofsm.guard.learnt.library import harm
+from evofsm.guard.learnt.policies import Backups
+from evofsm.guard.learnt.replay import (
+    Disturbances,
+    Ends,
+    Model,
+    acts,
+    features,
+    limited,
+    n_features,
+    replay,
+    search,
+)
+
+STEPS, WALL = 20, 100.0
+ACTION = 3  # index of the first one among the features: after 1, the variable, its latest change
+
+
+def mover(choices=0, **others):
+    """One variable, moved by the action, or by the last of two choices; fails at a wall."""
+    a = max(1, choices)
+    weights = np.zeros((n_features(1, a, box=not choices), 1))
+    weights[ACTION + a - 1] = 1.0
+    one, none = np.ones(1), np.zeros(1)
+    model = Model(
+        weights=weights,
+        origin=none,
+        reach=one,
+        lowest=-np.inf * one,
+        highest=np.inf * one,
+        least=-9.0 * one,
+        most=9.0 * one,
+        thresholds=np.array([[0.0, 1.0, WALL, 1.0]]),
+        drifted=none,
+        mean=none,
+        inverse=one,
+        choices=choices,
+    )
+    return model._replace(**others)
+
+
+def random_model(draw, m, a, choices):
+    """Something that moves, saturates, drifted in part and fails on two sides."""
+    one = np.ones(m)
+    return Model(
+        weights=0.05 * draw.normal(size=(n_features(m, a, box=not choices), m)),
+        origin=draw.normal(size=m),
+        reach=0.5 * one,
+        lowest=np.append(-0.8, np.full(m - 1, -np.inf)),
+        highest=np.append(np.full(m - 1, np.inf), 0.9),
+        least=-0.2 * one,
+        most=0.3 * one,
+        thresholds=np.array([[0.0, 1.0, 0.7, 2.0], [m - 1.0, -1.0, -1.5, 0.5]]),
+        drifted=np.resize([1.0, -1.0, 0.0], m),
+        mean=draw.normal(size=m),
+        inverse=1.0 + draw.random(m),
+        choices=a if choices else 0,
+    )
+
+
+def plainly(model, situation, plan, policy, disturbances, k, scale, enough):
+    """One replay, step by step in NumPy: steps survived, least distance, and that at its end."""
+    m = len(model.origin)
+    z, change, before = situation[:m], situation[m : 2 * m], situation[2 * m :]
+    (steps, _, _), near = disturbances.residuals.shape, np.inf
+    for t in range(steps):
+        u = plan[t] if t < len(plan) else acts(model, policy, z)
+        if t >= len(plan) and not model.choices:
+            u = np.clip(policy[:, 0] + policy[:, 1:] @ ((z - model.mean) * model.inverse), -1, 1)
+            u = np.clip(u, -1.0 + 0.01 * enough, 1.0 - 0.01 * enough)
+        reach = model._replace(reach=scale * model.reach)
+        move = (features(reach, z[None], change[None], before[None], u[None]) @ model.weights)[0]
+        move = np.where(model.drifted > 0.0, np.clip(move, model.least, model.most), move)
+        far = model.drifted < 0.0
+        low = np.minimum(scale * model.least, np.maximum(move, 3.0 * model.least))
+        high = np.maximum(scale * model.most, np.minimum(move, 3.0 * model.most))
+        low, high = np.where(far, low, scale * model.least), np.where(far, high, scale * model.most)
+        after = z + np.clip(move + scale * disturbances.residuals[t, :, k], low, high)
+        for j in np.flatnonzero(disturbances.jump_at[k] == t):
+            seen = np.clip(z, *disturbances.jump_from[k, j].T)
+            to = disturbances.jump_to[k, j] + disturbances.jump_slope[k, j] @ seen
+            after[j] = np.clip(to, *disturbances.landing[k, j])
+        after = np.clip(after, model.lowest, model.highest)
+        z, change, before = after, after - z, u
+        left = [s * (at - z[int(j)]) * worth for j, s, at, worth in model.thresholds]
+        near = min(near, *left)
+        if near < enough:
+            return t, near
+    return steps, near
+
+
+@pytest.mark.parametrize("choices", [False, True])
+@pytest.mark.parametrize("planned", [0, 1, 3])
+def test_the_kernel_replays_as_a_plain_loop_does(choices, planned):
+    draw, m, a, K = np.random.default_rng(planned), 3, 2, 5
+    model, disturbances = random_model(draw, m, a, choices), Disturbances.none(K, STEPS, m)
+    disturbances.residuals[:, :, 1:] = 0.1 * draw.normal(size=(STEPS, m, K - 1))
+    disturbances.jump_at[2, 1], disturbances.jump_to[2, 1] = 4.0, 0.3
+    disturbances.jump_slope[2, 1] = draw.normal(size=m)
+    disturbances.jump_from[2, 1] = np.sort(draw.normal(size=(m, 2)))
+    disturbances.landing[2, 1] = -0.2, 0.4
+    situations = 0.3 * draw.normal(size=(4, 2 * m + a))
+    plan, policy = draw.uniform(-1.0, 1.0, (planned, a)), draw.normal(size=(a, 1 + m))
+    ends, found = Ends.of(4 * K), []
+    lost = replay(model, situations, plan, policy, disturbances, 1.3, 0.2, 4 * K, ends)
+    for s in range(4):
+        for k in range(K):
+            found.append(plainly(model, situations[s], plan, policy, disturbances, k, 1.3, 0.2))
+    survived, least = np.array(found).T
+    np.testing.assert_array_equal(ends.survived, survived)
+    np.testing.assert_allclose(ends.least, least, atol=1e-9)
+    assert lost == (survived < STEPS).sum() > 0
+
+
+def test_changes_are_limited_as_in_replays():
+    model = random_model(np.random.default_rng(0), 3, 2, choices=False)
+    move = np.array([[5.0, 5.0, 5.0], [-5.0, -5.0, -5.0], [0.1, 0.1, 0.1]])
+    expected = [[0.3, 0.9, 0.3], [-0.2, -0.6, -0.2], [0.1, 0.1, 0.1]]
+    np.testing.assert_allclose(limited(model, move), expected)
+
+
+def test_a_harder_disturbance_still_has_a_sequel():
+    """What coasts goes on as it did; a push beyond all that there were would end at once."""
+    weights = np.zeros((n_features(1, 1, box=True), 1))
+    weights[2] = 0.9  # so much of the latest change
+    model = mover(weights=weights)
+    pushed = Disturbances.none(1, 6, 1)
+    pushed.residuals[0] = 0.9
+    gone = []
+    for scale in (1.0, 3.0):
+        left = harm(model, np.zeros((1, 3)), np.zeros((1, 1, 2)), pushed, scale)
+        gone.append(WALL - float(left[0, 0]))
+    assert gone[0] > 3.0 * 0.9  # it goes on for six steps
+    assert gone[1] == pytest.approx(3.0 * gone[0])
+
+
+# -- Which action passes ------------------------------------------------------------------------
+
+
+def search_for(model, proposal, policies, margin=0.0, place=0.0, disturbances=None, allowed=0):
+    """What is found there, if nothing disturbs."""
+    policies, a = np.array(policies), len(proposal)
+    disturbances = Disturbances.none(1, STEPS, 1) if disturbances is None else disturbances
+    here = np.concatenate([[place, 0.0], np.zeros(a)])
+    ranks = np.arange(len(policies))
+    world = here, policies, ranks, disturbances, 1.0, np.array(proposal), margin, allowed
+    return search(model, *world)
+
+
+@pytest.mark.parametrize("margin", [0.0, 0.25, 8.0])
+@pytest.mark.parametrize("to_wall", [True, False])
+def test_the_larger_the_margin_the_less_a_backup_is_counted_on_to_do(margin, to_wall):
+    policy = [[5.0 if to_wall else -5.0, 0.0]]  # beyond both ends of the range
+    used = 1.0 - 0.01 * margin
+    found = search_for(mover(), [0.5], [policy], margin)
+    assert found.action.tolist() == [0.5]
+    assert found.safety_margin == pytest.approx(WALL - 0.5 - (STEPS - 1) * used * to_wall)
+
+
+def test_where_full_action_only_just_holds_nothing_passes():
+    """No distance says that: it is as far from the wall as ever."""
+    model = mover()
+    model.weights[0] = 0.999  # what it withstands
+    policies = [[[-1.0, 0.0]]]
+    assert search_for(model, [-1.0], policies, 0.0, place=80.0).action is not None
+    assert search_for(model, [-1.0], policies, 0.25, place=99.0).action is not None
+    assert search_for(model, [-1.0], policies, 0.25, place=99.74).action is None
+
+
+def test_of_choices_nothing_is_held_back():
+    found = search_for(mover(choices=2), [0.0, 1.0], [[[0.0, 0.0], [1.0, 0.0]]], 8.0)
+    assert found.action.tolist() == [0.0, 1.0]
+    assert found.safety_margin == WALL - STEPS
+
+
+def test_what_is_refused_is_changed_by_no_more_than_it_takes():
+    found = search_for(mover(), [1.0], [[[-1.0, 0.0]]], place=WALL - 0.2)
+    assert 0.0 < found.action[0] <= 0.2
+    assert found.safety_margin == pytest.approx(0.2 - found.action[0])
+    choices = search_for(mover(choices=2), [0.0, 1.0], [[[1.0, 0.0], [0.0, 0.0]]], place=WALL - 0.2)
+    assert choices.action.tolist() == [1.0, 0.0]
+
+
+def test_where_nothing_passes_the_backup_that_lasts_longest_is_told_and_whether_all_are_alike():
+    to, still, away = [[1.0, 0.0]], [[0.0, 0.0]], [[-0.1, 0.0]]
+    model = mover()
+    model.weights[0] = 0.5
+    found = search_for(model, [1.0], [to, still, away], place=WALL - 2.0)
+    assert (found.action, found.backup, found.alike) == (None, 2, False)
+    assert search_for(model, [1.0], [to, to], place=WALL - 2.0).alike
+
+
+def test_so_many_disturbances_need_not_be_survived_but_that_none_begins():
+    pushed = Disturbances.none(3, STEPS, 1)
+    pushed.residuals[0, 0, 1:] = 5.0, 8.0
+    asked = {"place": WALL - 3.0, "disturbances": pushed}
+    assert search_for(mover(), [0.0], [[[0.0, 0.0]]], allowed=1, **asked).action is None
+    found = search_for(mover(), [0.0], [[[0.0, 0.0]]], allowed=2, **asked)
+    assert found.safety_margin == pytest.approx(3.0)  # of those that are
+    doomed = mover()
+    doomed.weights[0] = 1.0
+    assert search_for(doomed, [0.0], [[[0.0, 0.0]]], allowed=2, **asked).action is None
+
+
+# -- Backups ------------------------------------------------------------------------------------
+
+
+def backups(**options):
+    random = np.random.default_rng(0)
+    seen, done = random.normal(size=(30, 1)).cumsum(0), random.uniform(-1.0, 1.0, (29, 1))
+    return Backups.of(seen, done, choices=False, **options)
+
+
+def evolved(episodes, **options):
+    """Between two walls it takes feedback: each constant one runs into one of them."""
+    walls = np.array([[0.0, 1.0, 3.0, 1.0], [0.0, -1.0, -3.0, 1.0]])
+    model, found, random = mover(thresholds=walls), backups(**options), np.random.default_rng(1)
+    pushed = Disturbances.none(3, STEPS, 1)
+    pushed.residuals[:, 0, 1], pushed.residuals[:, 0, 2] = 0.5, -0.5
+    situations = np.array([[-2.0, 0.0, 0.0], [2.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
+    for _ in range(episodes):
+        found = found.evolved(model, situations, pushed, 1.0, random)
+    best = found.policies[found.ranks[:1]]
+    return found, harm(model, situations, best, pushed)
+
+
+def test_feedback_evolves_where_no_constant_action_survives():
+    found, ends = evolved(10)
+    assert found.ranks[0] >= found.n_constant
+    assert found.policies[found.ranks[0], 0, 1] < 0.0  # back to the middle
+    assert (ends >= 0.0).all()
+    assert (np.diff(found.scores[found.ranks]) <= 0.0).all()
+
+
+def test_without_evolving_there_are_constant_ones_alone():
+    found, ends = evolved(3, evolving=False)
+    assert len(found.policies) == found.n_constant == 3
+    assert (found.policies[:, :, 1:] == 0.0).all()
+    assert (ends < 0.0).any()
