@@ -51,7 +51,7 @@ def oracle(family: Family, draw: Draw) -> Reviser:
 
 def _told(family: Family, leader_decel: float) -> Reviser:
     """Ours, told limits instead of learning them."""
-    risk = LatentRisk.told(family.actions.low, family.decel, leader_decel, family.interval)
+    risk = LatentRisk.given(family.actions.low, family.decel, leader_decel, family.interval)
     return ActionReviser(risk, family.actions)
 
 
