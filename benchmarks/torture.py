@@ -30,7 +30,6 @@ from typing import Any
 import numpy as np
 
 import one_machine
-import torture_audit
 from evofsm import store
 from evofsm.cli.driving import Setup, drive_family, make_guard
 from evofsm.cli.learning import learn_traces
@@ -54,7 +53,6 @@ WRONG = (
     "crashes",
     "over-allocations",
     "left behind",
-    *torture_audit.WRONG,
     "lost observations",
     "locks held",
 )
@@ -504,7 +502,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=0)
     asked = parser.parse_args(arguments)
     kills, disks, loads, files = (20, 4, 100, 200) if asked.short else (500, 100, 5000, 10_000)
-    shared, reading = (4, 1.0) if asked.short else (200, 20.0)  # machines; [s]
+    shared = 4 if asked.short else 200  # machines
     store._OLD = 0.0  # all that writes a file here is known
     random = np.random.default_rng(asked.seed)
     total: Counter[str] = Counter()
@@ -521,9 +519,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
             ("two threads on one file", partial(share, False, loads)),
             ("two processes on one file", partial(share, True, loads)),
             ("damaged files", partial(damage, files)),
-            ("logs interrupted", partial(torture_audit.interrupt, every=30 if asked.short else 1)),
-            ("logs forged", torture_audit.forge),
-            ("logs read meanwhile", partial(torture_audit.read_meanwhile, seconds=reading)),
             ("four threads a machine", partial(one_machine.threads, shared)),
             (
                 "interrupted at a line",

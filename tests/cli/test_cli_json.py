@@ -16,7 +16,7 @@ from evofsm.__main__ import application
 from evofsm.driving.judge import LatentRisk
 from evofsm.fsm.actions import IntervalActions
 from evofsm.fsm.machine import EvolvingFSM
-from evofsm.guard.auditing.log import AuditLog
+from evofsm.guard.audit_log import AuditLog
 from evofsm.guard.guard import Guard
 from evofsm.guard.protocols import Proposal
 from evofsm.guard.reviser import ActionReviser
@@ -65,7 +65,7 @@ def a_log(folder: Path) -> Path:
 
 def test_audit(tmp_path):
     found = document("audit", a_log(tmp_path))
-    assert found.keys() >= {"is_good", "head", "finding", "contents", "replay"}
+    assert found.keys() >= {"is_good", "head", "finding", "contents", "replayed"}
 
 
 def test_check():

@@ -12,9 +12,7 @@ from evofsm.cli.options import Json, imported
 from evofsm.cli.show import facts, print_json, show
 
 if TYPE_CHECKING:
-    from evofsm.fleet.sealed import Chain
-    from evofsm.guard import Audit as Audited
-    from evofsm.guard import Contents, Replay
+    from evofsm.guard.replay import Audit, Contents
 
 _KEEP = (
     "Keep the head where the log is not. Without it (--head) neither an end that is cut off nor a "
@@ -47,12 +45,12 @@ def audit(
 ) -> int:
     """Verify an audit log, and replay it.
 
-    Finds the first record that was altered, removed, moved, repeated or inserted; then gives the
-    machine and the risk that the log began with what was observed and proposed, and compares each
-    decision to the last bit. Ends with 0 if all is well, 1 if the log was tampered with or a
+    Finds the first record that was altered, removed, repeated or inserted; then gives the guard
+    that the log began with what was observed and proposed, and compares each decision to the last
+    bit. Ends with 0 if all is well, 1 if the log was tampered with or a
     decision comes out otherwise, and 2 if it cannot be read.
     """
-    from evofsm.fleet.sealed import Head
+    from evofsm.guard import Head
     from evofsm.guard import audit as examine
 
     found = examine(
@@ -62,10 +60,8 @@ def audit(
         failed=None if failed is None else imported(failed),
     )
     if as_json:
-        chain = found.chain
-        parts = {name: getattr(found, name) for name in ("misfit", "remarks", "contents", "replay")}
-        known = {"is_good": found.is_good, "head": str(chain.head), "finding": chain.finding}
-        print_json({"file": file, **known, "half_written": chain.half_written, **parts})
+        told = {**found._asdict(), "head": str(found.head), "is_good": found.is_good}
+        print_json({"file": file, **told})
     else:
         show(facts(str(file), list(_facts(found))))
         if found.is_good and head is None:
@@ -73,32 +69,23 @@ def audit(
     return 0 if found.is_good else 1
 
 
-def _facts(found: Audited) -> Iterator[tuple[str, str]]:
+def _facts(found: Audit) -> Iterator[tuple[str, str]]:
     """What was found, line by line."""
-    chain, contents = found.chain, found.contents
-    yield "chain", _of_chain(chain)
-    if chain.half_written:
+    finding, contents = found.finding, found.contents
+    if finding is None:
+        yield "chain", f"unbroken: {_count(found.head.number, 'record')}"
+    else:
+        yield "chain", f"TAMPERED WITH at record {finding.record}: {finding.explanation}"
+    if found.half_written:
         cause = "as by a crash, or it is being written now"
-        yield "", f"its last line is half written ({chain.half_written} bytes): {cause}"
-    if found.misfit is not None:
-        yield "form", f"FORGED at record {found.misfit.record}: {found.misfit.explanation}"
-    yield "holds", _of_contents(contents) + ("" if chain.finding is None else ", so far")
-    if found.replay is not None:
-        yield from _of_replay(found.replay, contents.decisions)
-    elif chain.finding is None and found.misfit is None:
+        yield "", f"its last line is half written ({found.half_written} bytes): {cause}"
+    yield "holds", _of_contents(contents) + ("" if finding is None else ", so far")
+    if found.replayed is None:
         yield "replay", "not done"
     else:
-        yield "replay", "not done, since the log was tampered with"
-    yield from (("note", remark) for remark in found.remarks)
-    if chain.finding is None:
-        yield "head", str(chain.head)
-
-
-def _of_chain(chain: Chain) -> str:
-    if chain.finding is None:
-        return f"unbroken: {_count(chain.head.number or 0, 'record')}"
-    _, record, line, explanation = chain.finding
-    return f"TAMPERED WITH at record {record} (line {line}): {explanation}"
+        yield from _of_replay(found, found.replayed)
+    if finding is None:
+        yield "head", str(found.head)
 
 
 def _of_contents(contents: Contents) -> str:
@@ -113,22 +100,22 @@ def _of_contents(contents: Contents) -> str:
     return ", ".join(parts)
 
 
-def _of_replay(replay: Replay, decisions: int) -> Iterator[tuple[str, str]]:
-    difference = replay.difference
-    good = f"{_count(replay.decisions, 'decision')} as recorded, to the last bit"
+def _of_replay(found: Audit, replayed: int) -> Iterator[tuple[str, str]]:
+    difference, decisions = found.difference, found.contents.decisions
+    good = f"{_count(replayed, 'decision')} as recorded, to the last bit"
     if difference is None:
         yield "replay", good
     else:
         yield "replay", f"DIFFERS at record {difference.record}: {difference.explanation}"
-        for name, recorded, replayed in difference.fields[:_FIELDS]:
-            yield "", f"{name}: recorded {_short(recorded)}, replayed {_short(replayed)}"
+        for name, recorded, again in difference.fields[:_FIELDS]:
+            yield "", f"{name}: recorded {_short(recorded)}, replayed {_short(again)}"
         yield "", f"before it {good}"
-    for why in dict.fromkeys(replay.not_replayed):
-        yield "", f"{_count(replay.not_replayed.count(why), 'session')} not replayed: {why}"
-    if difference is None and replay.decisions < decisions:
-        yield "", f"{_count(decisions - replay.decisions, 'decision')} compared with nothing"
-    if difference is not None and replay.other_makers:
-        then = ", ".join(f"{one.name} {one.recorded}" for one in replay.other_makers)
+    for why in dict.fromkeys(found.not_replayed):
+        yield "", f"{_count(found.not_replayed.count(why), 'session')} not replayed: {why}"
+    if difference is None and replayed < decisions:
+        yield "", f"{_count(decisions - replayed, 'decision')} compared with nothing"
+    if difference is not None and found.other_makers:
+        then = ", ".join(f"{one.name} {one.recorded}" for one in found.other_makers)
         yield "", f"it was recorded with {then}: floats may differ there"
 
 

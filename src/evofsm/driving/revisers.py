@@ -20,11 +20,10 @@ from evofsm.guard import (
     RiskMeasure,
     Situation,
     make_usable,
-    participant_class,
-    participant_name,
     unjudged_revision,
     unseen_text,
 )
+from evofsm.guard.parts import part_class, part_name
 
 #: Without a usable proposal a car brakes gently [m/s²].
 GENTLE_BRAKE = Fallback(-1.0, "braking gently")
@@ -83,7 +82,7 @@ class EnvelopeReviser:
     def described(self) -> dict[str, Any] | None:
         """What it takes to make it again; None where its measure is someone's own."""
         cls = type(self.measure)
-        if cls is not _own_measure(cls.__name__) and participant_name(self.measure) is None:
+        if cls is not _own_measure(cls.__name__) and part_name(self.measure) is None:
             return None
         return {"dt": self.dt, "measure": {"class": cls.__name__, **asdict(self.measure)}}  # type: ignore[call-overload]
 
@@ -92,9 +91,7 @@ class EnvelopeReviser:
         """The one that was `described`."""
         given = dict(described["measure"])
         name = given.pop("class")
-        return cls(
-            (_own_measure(name) or participant_class(name))(**given), actions, described["dt"]
-        )
+        return cls((_own_measure(name) or part_class(name))(**given), actions, described["dt"])
 
 
 def _own_measure(name: str) -> Any:

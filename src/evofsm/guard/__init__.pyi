@@ -4,16 +4,8 @@ from .actions import BoxActions as BoxActions
 from .actions import Choices as Choices
 from .actions import same_action as same_action
 from .alarms import ConformalAlarm as ConformalAlarm
-from .auditing.form import Misfit as Misfit
-from .auditing.log import AuditLog as AuditLog
-from .auditing.participants import participant_class as participant_class
-from .auditing.participants import participant_name as participant_name
-from .auditing.replay import Audit as Audit
-from .auditing.replay import Contents as Contents
-from .auditing.replay import Difference as Difference
-from .auditing.replay import Field as Field
-from .auditing.replay import Replay as Replay
-from .auditing.replay import audit as audit
+from .audit_log import AuditLog as AuditLog
+from .audit_log import Head as Head
 from .check import check_contract as check_contract
 from .defaults import BELIEF_TOLERANCE as BELIEF_TOLERANCE
 from .defaults import TOLERANCE as TOLERANCE
@@ -47,6 +39,7 @@ from .protocols import Trial as Trial
 from .record import RECORD as RECORD
 from .record import Column as Column
 from .record import Pair as Pair
+from .replay import audit as audit
 from .reviser import ActionReviser as ActionReviser
 from .reviser import Mode as Mode
 from .reviser import Way as Way

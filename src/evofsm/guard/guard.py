@@ -29,9 +29,9 @@ from evofsm.fsm import (
     refuse_unusable,
 )
 from evofsm.guard.actions import Action, ActionSet, BoxActions, Choices, fixed, no_action
-from evofsm.guard.auditing.participants import outline, rebuild
 from evofsm.guard.defaults import BELIEF_TOLERANCE, TOLERANCE
 from evofsm.guard.learnt.judge import LearntRisk
+from evofsm.guard.parts import outline, part_class, rebuild
 from evofsm.guard.protocols import (
     INCOMPLETE,
     STALE,
@@ -740,9 +740,8 @@ class Guard:
         -2.5
         """
         described = outline(self.participants)
-        reviser = described["reviser"]
-        if not (reviser["known"] or isinstance(self.reviser, ActionReviser)):
-            raise ValueError(f"a {reviser['class']} is no reviser that a file can hold")
+        if described["reviser"] is None:
+            raise ValueError(f"a {type(self.reviser).__name__} is no reviser that a file can hold")
         kept = {
             **described,
             "explaining": None if self.explaining is None else self.explaining.value,
@@ -798,14 +797,13 @@ class Guard:
         if kept["failed"] and failed is None:
             raise ValueError("this guard knew failures by a function; give it again: failed=")
         with store.explained(path):
-            actions, reviser, machine, risk = rebuild(
-                kept, files["machine"].tobytes(), files["judge"].tobytes(), judge
-            )
+            given = None if isinstance(judge, type) else judge
+            parts = rebuild(kept, *_loaded(kept, files, judge), given)
             return cls.of(
-                reviser,
-                actions=actions,
-                machine=machine,
-                judge=risk,
+                parts.reviser,
+                actions=parts.actions,
+                machine=parts.machine,
+                judge=parts.risk,
                 failed=failed,
                 audit=audit,
                 explaining=None if kept["explaining"] is None else Explain(kept["explaining"]),
@@ -894,6 +892,24 @@ def _as_long(low: ArrayLike, high: ArrayLike) -> tuple[Any, Any]:
         return low, high
     either = np.broadcast(low, high).shape
     return np.broadcast_to(low, either), np.broadcast_to(high, either)
+
+
+def _loaded(
+    kept: Mapping[str, Any],
+    files: Mapping[str, NDArray[Any]],
+    judge: ActionJudge | type[LearningJudge] | None,
+) -> tuple[EvolvingFSM | None, LearningJudge | None]:
+    """Machine and judge from their files, of which one may be empty."""
+    machine = risk = None
+    if files["machine"].size:
+        machine = EvolvingFSM.load(BytesIO(files["machine"].tobytes()))
+    if files["judge"].size:
+        kind = judge if isinstance(judge, type) else None
+        if kind is None and kept["judge"] is None:
+            raise ValueError("no installed package declares its judge; give the judge's class")
+        kind = kind or part_class(kept["judge"])
+        risk = kind.load(BytesIO(files["judge"].tobytes()))
+    return machine, risk
 
 
 def _bytes(saved: EvolvingFSM | LearningJudge | None) -> NDArray[np.uint8]:

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from evofsm.guard import Mode, same_action
-from evofsm.guard.auditing.log import AuditLog
-from evofsm.guard.auditing.replay import audit
+from evofsm.guard.audit_log import AuditLog
 from evofsm.guard.learnt import library
 from evofsm.guard.learnt.dynamics import Dynamics
 from evofsm.guard.learnt.judge import LearntRisk
 from evofsm.guard.learnt.library import Violations
 from evofsm.guard.learnt.regression import Drift
+from evofsm.guard.replay import audit
 
 
 def kept(said):
@@ -156,9 +156,9 @@ def test_a_log_is_replayed_learning_and_frozen(point, tmp_path):
         for episode in range(2):
             point.play(guard, 70 + episode)
     found = audit(tmp_path / "log", log.head)
-    assert found.is_good, found.replay
-    assert found.replay.decisions == found.contents.decisions > 150
-    assert not found.replay.not_replayed
+    assert found.is_good, found
+    assert found.replayed == found.contents.decisions > 150
+    assert not found.not_replayed
     assert found.contents.spoke > 20
 
 
@@ -171,8 +171,8 @@ def test_told_what_failure_is_a_log_is_replayed_by_whoever_tells_it_again(points
         for episode in range(3):
             points["box"].play(guard, episode)
     assert audit(tmp_path / "log", log.head, failed=failed).is_good
-    without = audit(tmp_path / "log", log.head).replay
-    assert without.decisions == 0
+    without = audit(tmp_path / "log", log.head)
+    assert without.replayed == 0
     assert "--failed" in without.not_replayed[0]
 
 

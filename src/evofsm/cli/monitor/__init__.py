@@ -160,7 +160,6 @@ def _prepare(
     guard: Guard, mode: ModeName, audit: Path | None, stack: ExitStack, *, learn: bool
 ) -> None:
     """Set how far it goes, whether it learns, and who writes it down."""
-    from evofsm.fleet.sealed import Sync
     from evofsm.guard import ActionReviser, AuditLog, Mode
 
     if isinstance(guard.reviser, ActionReviser):
@@ -170,7 +169,7 @@ def _prepare(
         raise ValueError(f"a {name} knows no --mode {mode}: what it says is executed")
     guard.learn = learn
     if audit is not None:
-        guard.audit = stack.enter_context(AuditLog(audit, sync=Sync.EPISODE))
+        guard.audit = stack.enter_context(AuditLog(audit, sync="episode"))
 
 
 def _serve(

@@ -1,0 +1,638 @@
+"""The audit log of a guard: what it decided, so that nobody can change it unnoticed.
+
+A record is a JSON object on a line of its own, and its number is that of the line::
+
+    {"clock":...,"kind":"begin",...,"number":2,"previous":"9c1e...","hash":"51b0..."}
+
+``hash`` is the SHA-256 of the line up to the comma before it, in hexadecimal, and ``previous`` that
+of the record before (zeros for the first): a hash chain as in Haber and Stornetta (J. Cryptology
+3, 1991). Whoever changes, removes, moves or inserts a record breaks the chain there, unless
+everything after it is written anew, or cut off. That is shown by the *head*, the number and hash of
+the last record, where someone has kept it elsewhere.
+
+``FIELDS`` has the names in each kind of record, docs/audit.md what they are. An action is a number,
+or a list of them where the set of actions is a box. ``before`` holds what happened since the last
+record, where the proposal was executed as it was: ``[time, observation, proposal]``, with the
+candidates after that if there were any, and without a proposal where none was made.
+"""
+
+from __future__ import annotations
+
+import base64
+import errno
+import json
+import logging
+import math
+import os
+import platform
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from datetime import UTC, datetime
+from hashlib import sha256
+from io import BytesIO
+from pathlib import Path
+from typing import Any, Literal, NamedTuple, Self
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+import evofsm
+from evofsm import store
+from evofsm.guard.actions import written
+from evofsm.guard.guard import Explain, Guard
+from evofsm.guard.parts import can_be_made_again, settings_of
+from evofsm.guard.protocols import Proposal, Revision, Situation
+from evofsm.guard.record import RECORD, Pair
+from evofsm.guard.reviser import is_spoken
+
+_log = logging.getLogger(__name__)
+
+LOG_VERSION = 1
+# So many states of a belief are written, the most probable first.
+_STATES = 3
+# Decisions of which nothing is to be said that are held back at most: what a kill may lose.
+_MOST_QUIET = 240
+# A longer line is no record: it holds a machine at most.
+_LONGEST = 1 << 29
+_SEAL, _END = b',"hash":"', b'"}\n'
+# How a log begins: so a half-written one is told from other people's files.
+_ABOUT = "evofsm audit log"
+_OPENING = b'{"about":"evofsm audit log",'
+# What a decision tells as it is recorded elsewhere, too.
+_TOLD = tuple(name for name in RECORD if name not in ("time", "n_states", "risk_low", "risk_high"))
+#: The names in a record of each kind, beside ``kind`` and ``clock``.
+FIELDS: Mapping[str, set[str]] = {
+    "start": {"about", "cut_off", "guard", "made_by", "reviser", "told_failures", "version"},
+    "begin": {"settings"},
+    "decision": {"before", "belief", "candidates", "interval", "observation", "time", *_TOLD},
+    "quiet": {"before"},
+    "settings": {"settings"},
+    "end": {"before", "failed", "learnt", "observation"},
+}
+
+
+# -- Records --------------------------------------------------------------------------------------
+
+
+def canonical(content: Any) -> str:
+    """JSON that is the same for equal content: sorted keys, no spaces, floats to the last bit.
+
+    What JSON has no number for is written as ``"NaN"``, ``"Infinity"`` or ``"-Infinity"``.
+
+    Examples
+    --------
+    >>> canonical({"b": 0.1, "a": [float("nan"), -0.0]})
+    '{"a":["NaN",-0.0],"b":0.1}'
+    """
+    try:
+        return _dumped(content)
+    except ValueError:
+        return _dumped(_finite(content))
+
+
+def _dumped(content: Any) -> str:
+    return json.dumps(content, sort_keys=True, separators=(",", ":"), allow_nan=False)
+
+
+def _finite(content: Any) -> Any:
+    """With words for numbers that are not finite."""
+    if isinstance(content, float) and not math.isfinite(content):
+        return "NaN" if math.isnan(content) else "Infinity" if content > 0.0 else "-Infinity"
+    if isinstance(content, Mapping):
+        return {name: _finite(value) for name, value in content.items()}
+    if isinstance(content, list | tuple):
+        return [_finite(value) for value in content]
+    return content
+
+
+class Head(NamedTuple):
+    """The last record of a log at some time: keep it where the log is not.
+
+    Examples
+    --------
+    >>> head = Head(12, "ab" * 32)
+    >>> Head.parse(str(head)) == head
+    True
+    """
+
+    number: int
+    digest: str
+
+    def __str__(self) -> str:
+        return f"{self.number}:{self.digest}"
+
+    @classmethod
+    def parse(cls, text: str) -> Self:
+        """From ``NUMBER:HASH``; a ValueError if it is something else."""
+        number, _, digest = text.strip().lower().partition(":")
+        if not (number.isascii() and number.isdigit()) or len(digest) != len(NOTHING.digest):
+            raise ValueError(f"head is {text!r}; it must be NUMBER:HASH, as `evofsm audit` says it")
+        return cls(int(number), digest)
+
+
+#: What the first record follows.
+NOTHING = Head(0, "0" * 64)
+
+
+class Record(NamedTuple):
+    """One line of a log that is a whole record."""
+
+    number: int
+    previous: str
+    digest: str
+    content: dict[str, Any]
+
+
+def seal(content: Mapping[str, Any], after: Head) -> tuple[bytes, Head]:
+    """The line of the record that follows ``after``, and the head that it makes."""
+    number = after.number + 1
+    text = canonical({**content, "number": number, "previous": after.digest}).encode()[:-1]
+    digest = sha256(text).hexdigest()
+    return text + _SEAL + digest.encode() + _END, Head(number, digest)
+
+
+def unseal(line: bytes) -> Record | None:
+    """The record that a line holds; None where it is not as `seal` writes it."""
+    text, _, end = line.rpartition(_SEAL)
+    digest = sha256(text).hexdigest()
+    if end != digest.encode() + _END:
+        return None
+    try:
+        content = json.loads(text + b"}", parse_constant=_refuse)
+        # Of the ways to write it, names given twice among them, only one is `seal`'s.
+        if canonical(content).encode()[:-1] != text:
+            return None
+        number, previous = content.pop("number"), content.pop("previous")
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
+        return None
+    whole = type(number) is int and isinstance(previous, str)
+    return Record(number, previous, digest, content) if whole else None
+
+
+def _refuse(constant: str) -> float:
+    raise ValueError(f"{constant} is no JSON")
+
+
+# -- The chain ------------------------------------------------------------------------------------
+
+
+class Field(NamedTuple):
+    """What differs, as JSON."""
+
+    name: str
+    recorded: str
+    replayed: str
+
+
+class Finding(NamedTuple):
+    """The first record that is not what was written, or does not come out again."""
+
+    record: int  #: its number, from 1
+    explanation: str  #: with the likely cause
+    fields: tuple[Field, ...] = ()  #: of a decision that comes out otherwise
+
+
+class Chain:
+    """Follows a log from its first record to its last, or to the first that was tampered with.
+
+    A ``kept`` head must be one of the records; more may have come after it.
+    """
+
+    def __init__(self, path: Path, kept: Head | None = None) -> None:
+        self.path = path
+        self.head = NOTHING  #: the last record so far
+        self.size = 0  #: up to there [byte]
+        self.half_written = 0  #: what a last line without an end holds [byte]
+        self.finding: Finding | None = None  #: None where nothing was tampered with
+        self._kept = kept
+
+    def records(self) -> Iterator[Record]:
+        """The records; after the last one `finding` is known.
+
+        Raises
+        ------
+        OSError
+            If there is no such file, or it may not be read.
+        ValueError
+            If no line of it is a record.
+        """
+        known = self._kept in (None, NOTHING)
+        reading = lines(self.path)
+        for line in reading:
+            if not line.endswith(b"\n"):
+                self.half_written = len(line)
+                break
+            record = unseal(line)
+            if record is None or (record.number - 1, record.previous) != self.head:
+                self.finding = self._broken(record, unseal(next(reading, b"")), reading)
+                return
+            self.head, self.size = Head(record.number, record.digest), self.size + len(line)
+            known = known or self._kept == self.head
+            yield record
+        if not known and self._kept is not None:
+            self.finding = _against(self._kept, self.head)
+
+    def _broken(self, here: Record | None, after: Record | None, rest: Iterator[bytes]) -> Finding:
+        """What is wrong with the line after the head, which holds ``here``."""
+        at = self.head.number + 1
+        if at == 1 and here is None and after is None and not any(map(unseal, rest)):
+            raise ValueError(f"{self.path} is no audit log: no line of it is a record")
+        if here is None:
+            why = "its hash is not that of what it says"
+        elif here.previous == self.head.digest:
+            why = f"it says that it is record {here.number}"
+        elif here.number > at:
+            return Finding(at, f"record {at} is missing: it was removed, or moved elsewhere")
+        elif here.number < at:
+            return Finding(
+                here.number,
+                f"line {at} holds a record {here.number} once more: it was repeated, or one of the "
+                "two was inserted",
+            )
+        elif at > 1 and (after is None or after.previous == here.digest):
+            # The next record says that this one is as it was; of the last one nothing does.
+            at, why = at - 1, f"record {at} is chained to another hash than it has"
+        else:
+            why = f"it is not chained to record {at - 1}, or was inserted"
+        return Finding(at, f"record {at} was altered: {why}")
+
+
+def lines(path: Path) -> Iterator[bytes]:
+    """The lines of a log, the last perhaps without an end; of one that grows, those there are now.
+
+    Raises a ValueError if one is longer than any record.
+    """
+    with open(path, "rb") as file:
+        left = os.fstat(file.fileno()).st_size
+        while line := file.readline(min(_LONGEST, left)):
+            if len(line) == _LONGEST:
+                raise ValueError(f"{path} has a line of more than {_LONGEST >> 20} MiB")
+            left -= len(line)
+            yield line
+
+
+def _against(kept: Head, head: Head) -> Finding:
+    """Why a whole chain has not the head that was kept."""
+    last, known = head.number, kept.number
+    if known > last:
+        why = f"the head was record {known}, but the log ends with {last}: its end was cut off"
+        return Finding(last + 1, why)
+    why = f"record {known} is not the one that the head is of: records up to it were written anew"
+    return Finding(known, why)
+
+
+# -- Logging --------------------------------------------------------------------------------------
+
+
+class AuditLog:
+    """Logs what a guard decides, so that nobody can change it unnoticed: ``Guard(..., audit=log)``.
+
+    Where the disk fails while driving, someone has to go on driving: the log is broken off there,
+    which is logged, and raised as the episode ends.
+
+    Parameters
+    ----------
+    path : Path
+        A file that is there is gone on with; a half-written end, as of a process that was killed,
+        is cut off.
+    sync : {"record", "episode"}
+        When records are forced onto the disk: each, before its action is executed, or those of an
+        episode at its end, which takes no time while driving.
+
+    Raises
+    ------
+    OSError
+        If the file cannot be written.
+    ValueError
+        If it was tampered with, is no log, or is being written by another process. It is then
+        left as it is.
+
+    Notes
+    -----
+    Between the episodes of a log anything may teach machine or judge: they are written anew then.
+    During one nothing else may. An interrupt (Ctrl-C) while something is written breaks the
+    episode off in the log, which goes on with the next one. Where a process forks, the log stays
+    with the parent: a child that has something to write fails as if the disk did.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> from evofsm.driving import guard_for_cars
+    >>> from evofsm.guard import audit
+    >>> with TemporaryDirectory() as folder:
+    ...     path = Path(folder) / "audit.jsonl"
+    ...     with AuditLog(path) as log:
+    ...         guard = guard_for_cars(low=-2.5, high=2.5, audit=log)
+    ...         revision = guard.decide([9.0, 20.0, 10.0], proposal=1.0)
+    ...         guard.end(observation=[7.0, 19.0, 10.0])
+    ...     found = audit(path, log.head)
+    >>> revision.executed, found.head.number, found.replayed, found.is_good
+    (-2.5, 4, 1, True)
+    """
+
+    def __init__(self, path: Path, *, sync: Literal["record", "episode"] = "record") -> None:
+        if sync not in ("record", "episode"):
+            raise ValueError(f"sync is {sync!r}; it must be 'record' or 'episode'")
+        self.path = path
+        self.sync = sync
+        self._file = open(path, "a+b", buffering=0)  # noqa: SIM115
+        self._owner = os.getpid()
+        self._failure: OSError | None = None
+        self._guard: Guard | None = None
+        self._who: tuple[Any, ...] = ()  # what the guard of the latest episode was made of
+        self._learnt: dict[str, float] | None = None  # as that episode ended
+        self._settings: dict[str, Any] = {}
+        self._before: list[list[Any]] = []
+        self._seen: list[Any] = []  # what a proposal is waited for
+        self._busy = False  # longer than a call lasts: an interrupt has left a hole in the episode
+        try:
+            store.only_writer(self._file, path, "name another file")
+            self._find_end()
+        except BaseException:
+            self._file.close()
+            raise
+
+    @property
+    def head(self) -> Head:
+        """The last record. Keep it elsewhere: it shows what is cut off or written anew later."""
+        return self._head
+
+    def close(self) -> None:
+        """Write what was held back, and let others have the file.
+
+        Raises
+        ------
+        OSError
+            If something could not be written, now or before.
+        """
+        if self._file.closed:
+            return
+        try:
+            if os.getpid() == self._owner:  # what is held back is the parent's to write
+                if self._busy:
+                    self._recover()
+                self._flush()
+                self._force()
+                store.let_others_write(self._file)
+        finally:
+            self._file.close()
+        self._raise()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+    # -- As a guard's decision logger -------------------------------------------------------------
+
+    def begin(self, guard: Guard) -> None:
+        """An episode begins."""
+        self._raise()
+        if self._busy:
+            self._recover()
+            _log.error(
+                "the audit log %s was interrupted at record %s: the rest of that episode is not "
+                "in it",
+                self.path,
+                self.head.number,
+            )
+        self._busy = True
+        self._flush()  # of an episode that was broken off
+        self._seen = []
+        who = (*guard.participants, guard.failed)
+        if list(map(id, who)) != list(map(id, self._who)) or self._learnt != sums_of(guard):
+            self._write("start", cut_off=self.cut_off, **_start(guard))
+        self._guard, self._who, self._learnt = guard, who, None
+        self._settings = settings_now(guard)
+        self._write("begin", settings=self._settings)
+        self._force()
+        self._busy = False
+        self._raise()
+
+    def seen(self, observation: NDArray[np.float64], time: float) -> None:
+        """An observation came in, at ``time`` [s]."""
+        if self._guard is None:
+            raise ValueError("the log was given to a guard within an episode; give it before one")
+        if self._busy:
+            return
+        self._busy = True
+        self._keep_seen()
+        self._seen = [float(time), _floats(observation)]
+        self._busy = False
+
+    def decided(self, situation: Situation, proposal: Proposal, revision: Revision) -> None:
+        """A decision was made. When this returns it is written down, if it said something."""
+        if self._busy or self._guard is None:
+            return
+        self._busy = True
+        now = settings_now(self._guard)
+        if now != self._settings:
+            self._flush()
+            self._write("settings", settings=now)
+            self._settings = now
+        (time, observation), self._seen = self._seen, []
+        if is_spoken(self._guard.reviser, revision):
+            decision = decision_of(situation, proposal, revision)
+            before = self._take_before()
+            self._write("decision", before=before, time=time, observation=observation, **decision)
+        else:
+            candidates = _candidates(proposal)
+            row = [time, observation, written(proposal.action)]
+            self._before.append([*row, candidates] if candidates else row)
+            if len(self._before) >= _MOST_QUIET:
+                self._flush()
+        self._busy = False
+
+    def ended(self, observation: NDArray[np.float64] | None, *, failed: bool) -> None:
+        """The episode ended.
+
+        Raises
+        ------
+        OSError
+            If something could not be written since it began.
+        """
+        if self._busy or self._guard is None:
+            return
+        self._busy = True
+        self._keep_seen()
+        self._learnt = sums_of(self._guard)
+        last = None if observation is None else _floats(observation)
+        before = self._take_before()
+        self._write("end", before=before, failed=failed, learnt=self._learnt, observation=last)
+        self._force()
+        self._guard, self._busy = None, False
+        self._raise()
+
+    # -- Writing ----------------------------------------------------------------------------------
+
+    def _recover(self) -> None:
+        """After an interrupt the file alone knows what was written."""
+        self._who = ()
+        try:
+            self._refuse_child()
+            self._find_end()
+        except OSError as error:
+            self._fail(error)
+
+    def _refuse_child(self) -> None:
+        if os.getpid() != self._owner:
+            why = "the log belongs to the process that opened it; a child of that needs its own"
+            raise PermissionError(errno.EPERM, why, str(self.path))
+
+    def _find_end(self) -> None:
+        """Where the last whole record ends; a part of one after it is cut off."""
+        chain = Chain(self.path)
+        for _ in chain.records():
+            pass
+        if chain.finding is not None:
+            why = chain.finding.explanation
+            raise ValueError(
+                f"{self.path} was tampered with, and is left as it is: {why}; name another file"
+            )
+        if chain.half_written:
+            with open(self.path, "rb") as file:
+                start = file.read(len(_OPENING))
+            if not chain.size and not _OPENING.startswith(start):
+                raise ValueError(f"{self.path} is no audit log; it was left alone")
+            self._file.truncate(chain.size)
+            _log.warning("%s: a half-written record was cut off", self.path)
+        #: What was cut off from a half-written end [byte].
+        self.cut_off = chain.half_written
+        self._head, self._size = chain.head, chain.size
+
+    def _keep_seen(self) -> None:
+        """Nothing was proposed to what came in last."""
+        if self._seen:
+            self._before.append(self._seen)
+            self._seen = []
+
+    def _flush(self) -> None:
+        if self._before:
+            self._write("quiet", before=self._take_before())
+
+    def _take_before(self) -> list[list[Any]]:
+        rows, self._before = self._before, []
+        return rows
+
+    def _write(self, kind: str, **content: Any) -> None:
+        if self._failure is not None:
+            return
+        clock = datetime.now(UTC).isoformat()
+        line, head = seal({"kind": kind, "clock": clock, **content}, self._head)
+        try:
+            self._refuse_child()
+            try:
+                data = line
+                while data:  # a disk that gets full takes a part of it first
+                    data = data[self._file.write(data) :]
+            except OSError:
+                with suppress(OSError):
+                    self._file.truncate(self._size)
+                raise
+            self._head, self._size = head, self._size + len(line)
+            if self.sync == "record":
+                os.fsync(self._file.fileno())
+        except OSError as error:
+            self._fail(error)
+
+    def _force(self) -> None:
+        if self._failure is None and self.sync == "episode":
+            try:
+                os.fsync(self._file.fileno())
+            except OSError as error:
+                self._fail(error)
+
+    def _fail(self, error: OSError) -> None:
+        self._failure = error
+        _log.error("the audit log %s ends with record %s: %s", self.path, self.head.number, error)
+
+    def _raise(self) -> None:
+        if self._failure is not None:
+            raise OSError(
+                self._failure.errno,
+                f"{self._failure.strerror}; the audit log ends with record {self.head.number}",
+                str(self.path),
+            ) from self._failure
+
+
+# -- What is written ------------------------------------------------------------------------------
+
+
+def made_by() -> dict[str, str]:
+    """What computes: floats are the same to the last bit only where this is."""
+    return {
+        "evofsm": evofsm.__version__,
+        "numba": numba.__version__,
+        "numpy": np.__version__,
+        "processor": platform.machine(),
+        "python": platform.python_version(),
+    }
+
+
+def _start(guard: Guard) -> dict[str, Any]:
+    """Who decides, as it is before the episode."""
+    file = BytesIO()
+    if known := can_be_made_again(guard.participants):
+        guard.save(file)
+    return {
+        "about": _ABOUT,
+        "guard": base64.b64encode(file.getvalue()).decode() if known else None,
+        "made_by": made_by(),
+        "reviser": type(guard.reviser).__name__,
+        "told_failures": guard.failed is not None,
+        "version": LOG_VERSION,
+    }
+
+
+def settings_now(guard: Guard) -> dict[str, Any]:
+    """What may be changed between episodes; and, of the reviser, while driving."""
+    return {
+        "explaining": (guard.explaining or Explain.SPOKEN).value,
+        "interval": guard.interval,
+        "learn": guard.learn,
+        "missing": guard.missing.value,
+        "reviser": settings_of(guard.reviser),
+    }
+
+
+def sums_of(guard: Guard) -> dict[str, float]:
+    """A few sums that change with whatever is learnt."""
+    sums: dict[str, float] = {}
+    machine = guard.machine
+    if machine is not None:
+        sums["states"] = machine.n_states
+        sums["failures"] = math.fsum(machine.endings.tolist())
+        sums["potential"] = math.fsum(machine.potentials.tolist())
+        sums["transitions"] = math.fsum(machine.decisions.ravel().tolist())
+    if guard.judge is not None:
+        sums |= guard.judge.sums(0 if machine is None else machine.n_states)
+    return sums
+
+
+def decision_of(situation: Situation, proposal: Proposal, revision: Revision) -> dict[str, Any]:
+    """A decision, as it is written, but for what came in."""
+    likely = np.argsort(-situation.belief, kind="stable")[:_STATES].tolist()
+    decided = Pair(situation, revision._replace(proposed=proposal.action))
+    return {
+        **{name: _plain(RECORD[name].kind, RECORD[name].read(decided)) for name in _TOLD},
+        "belief": [[state, float(situation.belief[state])] for state in likely],
+        "candidates": _candidates(proposal),
+        "interval": [float(bound) for bound in revision.interval],
+    }
+
+
+def _plain(kind: type, value: Any) -> Any:
+    if isinstance(value, np.ndarray):
+        return written(value)
+    return None if value is None else kind(value)
+
+
+def _candidates(proposal: Proposal) -> list[Any]:
+    return [written(candidate) for candidate in proposal.candidates]
+
+
+def _floats(observation: NDArray[np.float64]) -> list[float]:
+    floats: list[float] = np.asarray(observation, dtype=np.float64).tolist()
+    return floats

@@ -1,0 +1,136 @@
+"""The parts that a guard is made of, as plain data: no file and no log holds code.
+
+Judges, revisers and measures stand in it by name: that of their class, which an installed package
+declares as an entry point of the group ``evofsm.participants``. What machine and judge have learnt
+stands elsewhere, in arrays of their own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict
+from functools import cache
+from importlib.metadata import EntryPoint, entry_points
+from typing import Any
+
+from evofsm.fsm.actions import IntervalActions
+from evofsm.fsm.machine import EvolvingFSM
+from evofsm.guard.actions import ActionSet, BoxActions, Choices
+from evofsm.guard.protocols import ActionJudge, LearningJudge, Participants, Reviser
+from evofsm.guard.reviser import ActionReviser, Mode, Way
+
+
+@cache
+def _entry_points() -> Mapping[str, EntryPoint]:
+    return {point.name: point for point in entry_points(group="evofsm.participants")}
+
+
+def part_class(name: Any) -> Any:
+    """The class that a name stands for; a ValueError if no installed package declares it."""
+    if name not in _entry_points():
+        raise ValueError(f"no installed package declares a guard part {name!r}")
+    return _entry_points()[name].load()
+
+
+def part_name(one: object) -> str | None:
+    """The name of a thing's class, if that stands for this very class."""
+    name = type(one).__name__
+    return name if name in _entry_points() and part_class(name) is type(one) else None
+
+
+def outline(parts: Participants) -> dict[str, Any]:
+    """All of a guard but what machine and judge have learnt; None for what is not known here."""
+    return {
+        "actions": asdict(parts.actions),
+        "judge": None if parts.risk is None else part_name(parts.risk),
+        "reviser": _reviser(parts),
+    }
+
+
+def can_be_made_again(parts: Participants) -> bool:
+    """Whether `rebuild` needs no more than the `outline`."""
+    reviser = _reviser(parts)
+    if reviser is None or (parts.risk is not None and part_name(parts.risk) is None):
+        return False
+    if not isinstance(parts.reviser, ActionReviser):
+        return True
+    return reviser["judge"] is not None and parts.reviser.actions == parts.actions
+
+
+def _reviser(parts: Participants) -> dict[str, Any] | None:
+    reviser = parts.reviser
+    if type(reviser) is ActionReviser:
+        judge = _judge(reviser.risk, parts)
+        return {"class": "ActionReviser", "judge": judge, "settings": settings_of(reviser)}
+    name = part_name(reviser)
+    told = reviser.described() if name else None  # type: ignore[attr-defined]
+    return None if told is None else {"class": name, **told}
+
+
+def _judge(judge: ActionJudge, parts: Participants) -> dict[str, Any] | None:
+    """Whom the reviser asks, if those who learn are whom it asks."""
+    name = part_name(judge)
+    if name is None:
+        return None
+    if judge is parts.risk:
+        return {"class": name}
+    asked = getattr(judge, "risk", None), getattr(judge, "machine", None)
+    known = asked[0] is parts.risk and asked[1] is parts.machine and parts.machine is not None
+    return {"class": name, **judge.described()} if known else None  # type: ignore[attr-defined]
+
+
+def rebuild(
+    told: Mapping[str, Any],
+    machine: EvolvingFSM | None,
+    risk: LearningJudge | None,
+    judge: ActionJudge | None = None,
+) -> Participants:
+    """The parts of an `outline`, with a machine and a judge that were read from elsewhere.
+
+    ``judge`` is asked where the outline knows none, and none that learns was read.
+    """
+    actions, reviser = _actions(told["actions"]), told["reviser"]
+    if reviser["class"] != "ActionReviser":
+        again: Reviser = part_class(reviser["class"]).restored(reviser, actions)
+        return Participants(actions, again, machine, risk)
+    named = reviser["judge"]
+    asked = judge if risk is None else risk
+    if named is not None and part_class(named["class"]) is not type(risk):
+        asked = part_class(named["class"]).restored(named, machine, risk)
+    if asked is None:
+        raise ValueError("no installed package declares its judge; give the judge as it is")
+    again = ActionReviser(asked, actions)
+    set_again(again, reviser["settings"])
+    return Participants(actions, again, machine, risk)
+
+
+def _actions(told: Mapping[str, Any]) -> ActionSet:
+    """Of the class that has these fields."""
+    if "n_actions" in told:
+        return Choices(**told)
+    return BoxActions(**told) if "levels" in told else IntervalActions(**told)
+
+
+def settings_of(reviser: Reviser) -> dict[str, Any]:
+    """What may be changed about a reviser while driving."""
+    if not isinstance(reviser, ActionReviser):
+        return {}
+    return {
+        "mode": reviser.mode.value,
+        "overridden": reviser.overridden,
+        "release": reviser.release,
+        "tolerance": reviser.tolerance,
+        "way": reviser.way.value,
+    }
+
+
+def set_again(reviser: Reviser, settings: Mapping[str, Any]) -> None:
+    """Give a reviser the `settings_of` another time."""
+    if not isinstance(reviser, ActionReviser):
+        return
+    reviser.mode, reviser.way = Mode(settings["mode"]), Way(settings["way"])
+    reviser.release, reviser.tolerance = float(settings["release"]), float(settings["tolerance"])
+    if settings["overridden"]:
+        reviser.take_over()
+    else:
+        reviser.hand_back()

@@ -1,0 +1,333 @@
+"""Audit a log: whether it is what was written, and whether those were the decisions.
+
+The second question is answered by deciding again, without a world: what was observed and proposed
+is told to the guard that the log began with, and each decision must come out as it was recorded, to
+the last bit. So neither a forged decision nor a forged model hides behind a chain that was made
+anew.
+"""
+
+from __future__ import annotations
+
+import base64
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from io import BytesIO
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evofsm.fsm.observations import Missing
+from evofsm.guard.actions import Action
+from evofsm.guard.audit_log import (
+    FIELDS,
+    LOG_VERSION,
+    NOTHING,
+    Chain,
+    Field,
+    Finding,
+    Head,
+    Record,
+    canonical,
+    decision_of,
+    made_by,
+    settings_now,
+    sums_of,
+)
+from evofsm.guard.guard import Explain, Guard
+from evofsm.guard.parts import set_again
+from evofsm.guard.protocols import Proposal, Situation
+from evofsm.guard.reviser import is_spoken
+
+# What a record that someone made up may run into.
+_NONSENSE = (ValueError, TypeError, LookupError, AttributeError, ArithmeticError)
+_NO_FUNCTION = (
+    "a function told the guard where it fails, and no log holds code; give it as failed "
+    "(--failed MODULE:FUNCTION)"
+)
+_Failed = Callable[[NDArray[np.float64]], bool]
+
+
+class Contents(NamedTuple):
+    """What a log holds."""
+
+    sessions: int  #: times that the guard was written down
+    episodes: int
+    decisions: int
+    spoke: int  #: decisions that changed something or raised an alarm
+    settings: int  #: times that settings were changed while driving
+
+
+class Audit(NamedTuple):
+    """All that is found out about a log."""
+
+    head: Head  #: the last record up to which it is what was written
+    half_written: int  #: what a last line without an end holds, as after a crash [byte]
+    finding: Finding | None  #: None where nothing was tampered with
+    contents: Contents  #: of the records up to there
+    replayed: int | None  #: decisions that came out as they were recorded; None if not asked for
+    difference: Finding | None  #: the first record that does not come out again
+    not_replayed: tuple[str, ...]  #: why not, of each session that could not be
+    other_makers: tuple[Field, ...]  #: what computed then and what does now, where that differs
+
+    @property
+    def is_good(self) -> bool:
+        """Whether nothing was tampered with, and nothing came out otherwise."""
+        return self.finding is None and self.difference is None
+
+
+def audit(
+    path: Path, kept: Head | None = None, *, replay: bool = True, failed: _Failed | None = None
+) -> Audit:
+    """Verify the chain of a log and the form of its records, and decide again.
+
+    Parameters
+    ----------
+    path : Path
+        A log that is being written is audited up to where it is now.
+    kept : Head, optional
+        A head that was kept elsewhere.
+    replay : bool
+    failed : callable, optional
+        As the guard had it. No log holds code: without it episodes of a guard that was told by a
+        function where it fails are not replayed, which is said.
+
+    Returns
+    -------
+    Audit
+
+    Raises
+    ------
+    OSError
+        If there is no such file, or it may not be read.
+    ValueError
+        If it is no audit log, or one of a newer version.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> from evofsm.driving import guard_for_cars
+    >>> from evofsm.guard import AuditLog
+    >>> with TemporaryDirectory() as folder:
+    ...     path = Path(folder) / "audit.jsonl"
+    ...     with AuditLog(path) as log:
+    ...         guard = guard_for_cars(low=-2.5, high=2.5, audit=log)
+    ...         revision = guard.decide([9.0, 20.0, 10.0], proposal=1.0)
+    ...     forged = path.read_text().replace('"executed":-2.5', '"executed":2.5')
+    ...     _ = path.write_text(forged)
+    ...     audit(path).finding
+    Finding(record=3, explanation='record 3 was altered: its hash is not that of what it says', \
+fields=())
+    """
+    chain, counts, player = Chain(path, kept), Counter[str](), _Player(failed)
+    finding = difference = None
+    for record in chain.records():
+        finding = _misfit(path, record, started=counts["start"] > 0)
+        if finding is not None:
+            break
+        counts[record.content["kind"]] += 1
+        counts["quiet rows"] += len(record.content.get("before", ()))
+        if replay and difference is None:
+            difference = player.play(record)
+    finding = finding or chain.finding
+    if chain.head == NOTHING and finding is None:
+        raise ValueError(f"{path} is no audit log, or no record of it was finished")
+    spoke = counts["decision"]
+    contents = Contents(
+        counts["start"], counts["begin"], spoke + counts["quiet rows"], spoke, counts["settings"]
+    )
+    others = tuple(Field(name, *both) for name, both in player.other_makers.items())
+    return Audit(
+        head=chain.head,
+        half_written=chain.half_written,
+        finding=finding,
+        contents=contents,
+        replayed=player.decisions if replay else None,
+        difference=difference,
+        not_replayed=tuple(player.not_replayed),
+        other_makers=others,
+    )
+
+
+def _misfit(path: Path, record: Record, *, started: bool) -> Finding | None:
+    """What no log holds: a chain says nothing about it, nor does replaying."""
+    content = record.content
+    kind, version = content.get("kind"), content.get("version", LOG_VERSION)
+    why = ""
+    if not isinstance(kind, str) or kind not in FIELDS:
+        why = f"there is no kind {str(kind)[:40]!r}"
+    elif type(version) is int and version > LOG_VERSION:
+        raise ValueError(
+            f"{path}: its version {version} is newer than this library's {LOG_VERSION}; "
+            "a newer evofsm reads it"
+        )
+    elif type(version) is not int or version != LOG_VERSION:
+        why = f"there is no version {version!r}"
+    elif kind != "start" and not started:
+        why = "it comes before the guard that decides"
+    elif differing := sorted((FIELDS[kind] | {"kind", "clock"}) ^ content.keys()):
+        has = "has" if differing[0] in content else "lacks"
+        why = f"a record of kind {kind!r} {has} {differing[0][:40]!r}"
+    elif not isinstance(content.get("before", []), list):
+        why = "what it holds before it is no list"
+    return Finding(record.number, f"record {record.number} was forged: {why}") if why else None
+
+
+class _DiffersError(Exception):
+    """Something came out otherwise: an explanation, and the fields."""
+
+
+class _Player:
+    """The guard that a log began with, told again what happened."""
+
+    def __init__(self, failed: _Failed | None) -> None:
+        self.decisions = 0
+        self.not_replayed: list[str] = []
+        self.other_makers: dict[str, tuple[str, str]] = {}
+        self._failed = failed
+        self._guard: Guard | None = None  # None while a session cannot be replayed
+        self._is_under_way = False
+
+    def play(self, record: Record) -> Finding | None:
+        """What differs; None where it comes out as it was recorded."""
+        try:
+            self._play(record.content)
+        except _DiffersError as differs:
+            return Finding(record.number, *differs.args)
+        except _NONSENSE as error:
+            said = f"there is no {error}" if isinstance(error, KeyError) else str(error)
+            return Finding(record.number, f"it cannot be replayed: {said}")
+        return None
+
+    def _play(self, content: Mapping[str, Any]) -> None:
+        kind = content["kind"]
+        if kind == "start":
+            self._start(content)
+        if self._guard is None or kind == "start":
+            return
+        for row in content.get("before", ()):
+            self._silent(self._guard, *row)
+        if kind == "begin":
+            self._set(self._guard, content["settings"])
+            self._guard.begin()
+            self._is_under_way = True
+        elif kind == "settings":
+            self._set(self._guard, content["settings"])
+        elif kind == "decision":
+            self._decision(self._guard, content)
+        elif kind == "end":
+            self._end(self._guard, content)
+
+    def _start(self, content: Mapping[str, Any]) -> None:
+        now = made_by()
+        for name, then in content["made_by"].items():
+            if then != now.get(name):
+                self.other_makers[name] = str(then), now.get(name, "")
+        self._guard, self._is_under_way = None, False
+        told = content["told_failures"]
+        if content["guard"] is None:
+            self.not_replayed.append(
+                f"{content['reviser']} is no reviser that is known here, or asks a judge that is "
+                "not, or that was not told what happened"
+            )
+        elif told and self._failed is None:
+            self.not_replayed.append(_NO_FUNCTION)
+        else:
+            file = BytesIO(base64.b64decode(content["guard"], validate=True))
+            self._guard = Guard.load(file, failed=self._failed if told else None)
+
+    @staticmethod
+    def _set(guard: Guard, settings: Mapping[str, Any]) -> None:
+        guard.explaining, guard.missing = (
+            Explain(settings["explaining"]),
+            Missing(settings["missing"]),
+        )
+        guard.interval = settings["interval"]
+        if guard.learn != settings["learn"]:
+            guard.learn = settings["learn"]
+        set_again(guard.reviser, settings["reviser"])
+        if fields := _differing(settings, settings_now(guard)):
+            raise _DiffersError("there are no such settings", fields)
+
+    def _silent(
+        self,
+        guard: Guard,
+        time: Any,
+        observation: Sequence[Any],
+        action: Any = None,
+        candidates: Sequence[Any] = (),
+    ) -> None:
+        """What was executed as it was proposed, or nothing was proposed to."""
+        if action is None:
+            self._recognise(guard, time, observation)
+            return
+        proposal = _proposal(action, candidates)
+        situation = self._recognise(guard, time, observation)
+        revision = guard.revise(situation, proposal)
+        if is_spoken(guard.reviser, revision):
+            told = decision_of(situation, proposal, revision)
+            raise _DiffersError(
+                f"the decision at {situation.time:g} s was recorded as nothing to speak of, but "
+                f"{revision.reason}",
+                (Field("executed", canonical(told["proposed"]), canonical(told["executed"])),),
+            )
+        self.decisions += 1
+
+    def _decision(self, guard: Guard, content: Mapping[str, Any]) -> None:
+        proposal = _proposal(content["proposed"], content["candidates"])
+        situation = self._recognise(guard, content["time"], content["observation"])
+        revision = guard.revise(situation, proposal)
+        again = decision_of(situation, proposal, revision)
+        when = f"the decision at {situation.time:g} s"
+        if fields := _differing({name: content[name] for name in again}, again):
+            raise _DiffersError(f"{when} comes out otherwise", fields)
+        if not is_spoken(guard.reviser, revision):
+            raise _DiffersError(f"{when} changed nothing")
+        self.decisions += 1
+
+    def _recognise(self, guard: Guard, time: Any, observation: Sequence[Any]) -> Situation:
+        if not self._is_under_way:
+            raise ValueError("it belongs to no episode")
+        return guard.recognise(_floats(observation), _number(time))
+
+    def _end(self, guard: Guard, content: Mapping[str, Any]) -> None:
+        if not self._is_under_way:
+            raise ValueError("it belongs to no episode")
+        last, failed = content["observation"], content["failed"]
+        if not isinstance(failed, bool):
+            raise ValueError(f"failed is {failed!r}")
+        guard.end(failed, None if last is None else _floats(last))
+        self._is_under_way = False
+        if fields := _differing(content["learnt"], sums_of(guard)):
+            raise _DiffersError("something else was learnt until its end", fields)
+
+
+def _number(value: Any) -> float:
+    """A number as `canonical` writes it."""
+    if value in ("NaN", "Infinity", "-Infinity"):
+        return float(value)
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise ValueError(f"{value!r} stands where a number should")
+    return float(value)
+
+
+def _floats(values: Sequence[Any]) -> NDArray[np.float64]:
+    return np.array([_number(value) for value in values])
+
+
+def _proposal(action: Any, candidates: Sequence[Any]) -> Proposal:
+    return Proposal(_action(action), tuple(_action(candidate) for candidate in candidates))
+
+
+def _action(action: Any) -> Action:
+    return _floats(action) if isinstance(action, list) else _number(action)
+
+
+def _differing(recorded: Mapping[str, Any], again: Mapping[str, Any]) -> tuple[Field, ...]:
+    """What is not the same to the last bit."""
+    both = {
+        name: tuple(canonical(each[name]) if name in each else "" for each in (recorded, again))
+        for name in sorted(recorded.keys() | again.keys())
+    }
+    return tuple(Field(name, *values) for name, values in both.items() if values[0] != values[1])
