@@ -115,12 +115,12 @@ def test_the_audit_log_is_good(tmp_path):
     log, state = tmp_path / "audit.jsonl", tmp_path / "state.evofsm"
     assert evofsm("--audit", log, lines=ROWS).exit_code == 0
     found = audit(log)
-    assert (found.is_good, found.replay.decisions) == (True, 40)
+    assert (found.is_good, found.replayed) == (True, 40)
     log.unlink()
     for part in (ROWS[:25], ROWS[25:]):  # its rows are taken in again, and written again
         assert evofsm("--learn", "--audit", log, "--state", state, lines=part).exit_code == 0
     found = audit(log)
-    assert (found.is_good, found.replay.decisions) == (True, 65)
+    assert (found.is_good, found.replayed) == (True, 65)
 
 
 @pytest.mark.parametrize(

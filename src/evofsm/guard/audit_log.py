@@ -460,7 +460,9 @@ class AuditLog:
         self._learnt = sums_of(self._guard)
         last = None if observation is None else _floats(observation)
         before = self._take_before()
-        self._write("end", before=before, failed=failed, learnt=self._learnt, observation=last)
+        self._write(
+            "end", before=before, failed=bool(failed), learnt=self._learnt, observation=last
+        )
         self._force()
         self._guard, self._busy = None, False
         self._raise()
