@@ -202,7 +202,6 @@ def learn(
         units=parse_units(unit or ()),
         leader_may_lack=no_leader is NoLeader.END,
     )
-    _ = columns.condition  # a comparison that is none is refused before the long work
     lengths, noted = VehicleLengths.parse(vehicle_length or ()), Noted()
     known = [{"name": file, "bytes": _size(file)} for file in files]
     keeper = None
