@@ -13,9 +13,9 @@ from typer.testing import CliRunner
 from evofsm.__main__ import application
 from evofsm.driving.judge import LatentRisk
 from evofsm.fsm.actions import IntervalActions
+from evofsm.guard.api import Proposal
 from evofsm.guard.audit_log import NOTHING, AuditLog, seal, unseal
 from evofsm.guard.guard import Guard
-from evofsm.guard.protocols import Proposal
 from evofsm.guard.reviser import ActionReviser
 
 ACTIONS = IntervalActions(low=-2.5, high=2.5, width=0.3, outside="clip")

@@ -18,7 +18,7 @@ from evofsm.driving.leaders import (
 )
 from evofsm.driving.perception import Perception
 from evofsm.driving.rehearsal import HARDEST
-from evofsm.guard.protocols import Situation
+from evofsm.guard.api import Situation
 
 DT = 0.25
 NOISE = np.array([0.5, 0.3, 0.3])

@@ -18,7 +18,7 @@ from evofsm.driving.rehearsal import HARDEST, critical_decelerations
 from evofsm.driving.rehearsal import Body as Follower
 from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.states.novelty import Novelty
-from evofsm.guard.protocols import Situation
+from evofsm.guard.api import Situation
 
 DT = 0.25
 MARGIN = 0.5

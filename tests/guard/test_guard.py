@@ -15,9 +15,9 @@ from evofsm.driving.judge import LatentRisk
 from evofsm.driving.revisers import Unrevised
 from evofsm.guard import parts
 from evofsm.guard.actions import BoxActions, Choices, same_action
+from evofsm.guard.api import Fallback, Judgement, Proposal, Search
 from evofsm.guard.audit_log import AuditLog
 from evofsm.guard.guard import KIND, Explain
-from evofsm.guard.protocols import Fallback, Judgement, Proposal, Search
 from evofsm.guard.replay import audit
 from evofsm.guard.reviser import Mode, Way
 

@@ -14,8 +14,8 @@ from evofsm.driving.scenarios import Body, Leader, Scenario, Sensors
 from evofsm.driving.world import COMMANDED, SPEED
 from evofsm.fsm.actions import IntervalActions
 from evofsm.fsm.machine import EvolvingFSM
+from evofsm.guard.api import Proposal
 from evofsm.guard.guard import Guard
-from evofsm.guard.protocols import Proposal
 from evofsm.guard.reviser import ActionReviser, Mode, is_spoken
 
 ACTIONS = IntervalActions(low=-2.5, high=2.5, width=0.3, outside="clip")

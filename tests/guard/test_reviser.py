@@ -11,7 +11,7 @@ from evofsm.driving.judge import LatentRisk
 from evofsm.driving.measures import TimeToCollision
 from evofsm.driving.revisers import AlwaysBrake, EnvelopeReviser, Unrevised
 from evofsm.fsm.actions import IntervalActions
-from evofsm.guard.protocols import Judgement, Proposal, Situation
+from evofsm.guard.api import Judgement, Proposal, Situation
 from evofsm.guard.reviser import ActionReviser, Mode, Way
 
 LOW, HIGH, TOLERANCE = -2.5, 2.5, 0.02

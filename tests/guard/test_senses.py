@@ -17,10 +17,9 @@ from evofsm.fsm.actions import IntervalActions
 from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.observations import Missing
 from evofsm.fsm.states.novelty import Novelty
-from evofsm.guard.guard import Guard
-from evofsm.guard.protocols import Intake, Proposal, Situation
+from evofsm.guard.api import Intake, Proposal, Situation
+from evofsm.guard.guard import Guard, InputMonitor
 from evofsm.guard.reviser import ActionReviser
-from evofsm.guard.senses import Senses
 
 NAN = math.nan
 ACTIONS = IntervalActions(low=-4.0, high=2.5, width=0.5, outside="clip")
@@ -241,5 +240,5 @@ def test_after_a_hole_in_time_no_transition_is_learnt():
 
 
 def test_a_hole_is_told_only_where_the_interval_is_known():
-    senses = Senses()
-    assert [senses.take(np.zeros(1), time) for time in (0.0, 100.0)] == 2 * [Intake.WHOLE]
+    monitor = InputMonitor()
+    assert [monitor.take(np.zeros(1), time) for time in (0.0, 100.0)] == 2 * [Intake.WHOLE]

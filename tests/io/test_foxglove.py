@@ -22,9 +22,9 @@ from evofsm.driving.measures import time_headway, time_to_collision
 from evofsm.driving.naming import VARIABLES
 from evofsm.driving.world import Episode
 from evofsm.guard import Guard
+from evofsm.guard.api import Intake
 from evofsm.guard.episodes import Decision
 from evofsm.guard.guard import Explain
-from evofsm.guard.protocols import Intake
 from evofsm.guard.reviser import Mode
 from evofsm.io.foxglove import FOXGLOVE_LAYOUT, FoxgloveSink, RunWriter, recording
 from evofsm.io.runs import _column, read_run, schemas_of

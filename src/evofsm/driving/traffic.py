@@ -21,9 +21,8 @@ from evofsm.fsm.actions import IntervalActions
 from evofsm.fsm.naming import Labels
 from evofsm.fsm.validation import positive, real_array
 from evofsm.guard.actions import Action
-from evofsm.guard.defaults import TOLERANCE
+from evofsm.guard.api import TOLERANCE, Fallback, Judgement, Search, Situation, Trial
 from evofsm.guard.guard import Guard
-from evofsm.guard.protocols import Fallback, Judgement, Search, Situation, Trial
 from evofsm.guard.reviser import ActionReviser, Mode
 
 _Floats = NDArray[np.float64]

@@ -11,7 +11,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, TypeAlias
+from typing import Any, ClassVar, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -50,16 +50,12 @@ class Choices:
     """
 
     n_actions: int
+    low: ClassVar[float] = 0.0  #: the first index
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "n_actions", whole("n_actions", self.n_actions))
 
-    @property
-    def low(self) -> float:
-        """The first index."""
-        return 0.0
-
-    @property
+    @cached_property
     def high(self) -> float:
         """The last index."""
         return self.n_actions - 1.0

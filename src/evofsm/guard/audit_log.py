@@ -40,9 +40,9 @@ from numpy.typing import NDArray
 import evofsm
 from evofsm import store
 from evofsm.guard.actions import written
+from evofsm.guard.api import Proposal, Revision, Situation
 from evofsm.guard.guard import Explain, Guard
 from evofsm.guard.parts import can_be_made_again, settings_of
-from evofsm.guard.protocols import Proposal, Revision, Situation
 from evofsm.guard.record import RECORD, Pair
 from evofsm.guard.reviser import is_spoken
 

@@ -20,8 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evofsm.fsm import EvolvingFSM
+from evofsm.guard.api import Judgement, Proposal, Revision, Situation
 from evofsm.guard.guard import Guard
-from evofsm.guard.protocols import Judgement, Proposal, Revision, Situation
 
 Make = Callable[[], Any]
 Rows = Sequence[NDArray[np.float64]]

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evofsm.guard.actions import Action
+from evofsm.guard.api import Controller, Proposal, Revision, Situation
 from evofsm.guard.guard import Guard
-from evofsm.guard.protocols import Controller, Proposal, Revision, Situation
 
 _log = logging.getLogger(__name__)
 

@@ -29,12 +29,11 @@ from evofsm.fsm import (
     refuse_unusable,
 )
 from evofsm.guard.actions import Action, ActionSet, BoxActions, Choices, fixed, no_action
-from evofsm.guard.defaults import BELIEF_TOLERANCE, TOLERANCE
-from evofsm.guard.learnt.judge import LearntRisk
-from evofsm.guard.parts import outline, part_class, rebuild
-from evofsm.guard.protocols import (
+from evofsm.guard.api import (
+    BELIEF_TOLERANCE,
     INCOMPLETE,
     STALE,
+    TOLERANCE,
     ActionJudge,
     Fallback,
     Intake,
@@ -46,14 +45,18 @@ from evofsm.guard.protocols import (
     Revision,
     Situation,
 )
+from evofsm.guard.learnt.judge import LearntRisk
+from evofsm.guard.parts import outline, part_class, rebuild
 from evofsm.guard.reviser import NOTHING, ActionReviser, Mode, is_spoken
-from evofsm.guard.senses import Senses, has_gaps
 from evofsm.store import Kind, Numbers, Place
 
 # Intervals that a range of actions is divided into for the machine, unless a width is given.
 _INTERVALS = 17
 # States of the machine that is made where none is given.
 _MOST_STATES = 200
+# Longer than so many intervals is a gap in time.
+_GAP = 1.5
+_LACKING = {Missing.PARTIAL: Intake.PARTIAL, Missing.HOLD: Intake.HELD}
 # Fourth powers of larger observations, summed over a long run, would lose all others.
 _LARGEST = 1e30
 
@@ -64,6 +67,64 @@ class Explain(Enum):
     NONE = "none"
     SPOKEN = "spoken"  #: those that change a proposal or warn
     ALL = "all"
+
+
+class InputMonitor:
+    """Tells what is wrong with observations: late, twice, after a gap in time, or incomplete.
+
+    What is done about it is decided here, and told with the situation, so that a reviser knows when
+    it decides on less.
+
+    Parameters
+    ----------
+    missing : Missing
+        What to do where a variable was not observed (NaN).
+    interval : float, optional
+        Time between observations [s]; without it no gap in time is told.
+
+    Examples
+    --------
+    >>> monitor = InputMonitor(interval=0.25)
+    >>> monitor.take(np.array([30.0, 20.0, 20.0]), 0.0)
+    <Intake.WHOLE: 0>
+    >>> monitor.take(np.array([np.nan, 20.0, 20.0]), 0.25), monitor.held
+    (<Intake.PARTIAL: 1>, array([30., 20., 20.]))
+    >>> monitor.take(np.array([29.0, 20.0, 20.0]), 0.25), monitor.take(np.zeros(3), 0.1)
+    (<Intake.REPEATED: 8>, <Intake.LATE: 16>)
+    >>> monitor.take(np.array([25.0, 20.0, 20.0]), 2.0)
+    <Intake.GAP: 4>
+    """
+
+    def __init__(self, missing: Missing = Missing.PARTIAL, interval: float | None = None) -> None:
+        self.missing = missing
+        self.interval = interval
+        #: The latest value of each variable; NaN of one that was never seen.
+        self.held: NDArray[np.float64] = np.empty(0)
+        self._time = math.nan
+
+    def take(self, observation: NDArray[np.float64], time: float) -> Intake:
+        """What is wrong with an observation at ``time`` [s]; one out of order is not taken in.
+
+        Raises
+        ------
+        ValueError
+            If a variable is missing, and that is to be rejected.
+        """
+        if time <= self._time:
+            return Intake.REPEATED if time == self._time else Intake.LATE
+        found, held = Intake.WHOLE, observation
+        if math.isnan(observation.dot(observation)):  # the quickest way to ask for NaN
+            absent = np.isnan(observation)
+            if self.missing is Missing.REJECT:
+                gone = np.flatnonzero(absent).tolist()
+                raise ValueError(f"variables {gone} of the observation at {time:g} s are missing")
+            if len(self.held) == len(observation):  # what was seen of them before is still held
+                held = np.where(absent, self.held, observation)
+            found = _LACKING[self.missing]
+        if self.interval is not None and time - self._time > _GAP * self.interval:
+            found |= Intake.GAP
+        self.held, self._time = held.copy(), time
+        return found
 
 
 class DecisionLogger(Protocol):
@@ -296,7 +357,7 @@ class Guard:
             dt=interval,
         )
         self._frozen: FSMModel | None = None
-        self._senses = Senses(missing, interval)
+        self._monitor = InputMonitor(missing, interval)
         self._latest: Situation | None = None
         self._under_way = False
         self.learn = learn
@@ -337,7 +398,7 @@ class Guard:
     @property
     def held(self) -> NDArray[np.float64]:
         """(m,) ndarray: the latest value of each variable; NaN of one that was never observed."""
-        return self._senses.held.copy()
+        return self._monitor.held.copy()
 
     @property
     def situation(self) -> Situation:
@@ -355,13 +416,13 @@ class Guard:
         >>> guard = guard_for_cars(low=-2.5, high=2.5)
         >>> guard.begin()
         """
-        self._senses = Senses(self.missing, self.interval)
+        self._monitor = InputMonitor(self.missing, self.interval)
         self._latest = None
         self._decisions = 0
         self.reviser.start_episode()
         if self.judge is not None:
             self.judge.start_episode(learn=False)
-        if self.machine is not None and self.learn:
+        if self.machine is not None and self._learn:
             self.machine.start_episode()
         if self.audit is not None:
             self.audit.begin(self)
@@ -450,7 +511,7 @@ class Guard:
         z = self._checked(observation)
         if not self._under_way:
             self.begin()
-        intake = self._senses.take(z, time)
+        intake = self._monitor.take(z, time)
         if intake and intake & STALE and self._latest is not None:
             situation = self._latest._replace(intake=intake)
         else:
@@ -482,50 +543,34 @@ class Guard:
 
         The machine first, as at an end: a judge learns from what the machine made of it.
         """
-        if self.machine is not None and self.learn:
+        if self.machine is not None and self._learn:
             self.machine.start_episode()
         if self.judge is not None:
-            self.judge.start_episode(learn=self.learn)
+            self.judge.start_episode(learn=self._learn)
 
     def _recognised(self, z: NDArray[np.float64], time: float, intake: Intake) -> Situation:
         """Where it is; machine and judge learn the transition to it."""
-        nothing = Situation(z, np.ones(1), None, math.nan, time, intake)
-        machine, known = self.machine, self._frozen
-        if known is not None:
-            if known.n_states == 0 or has_gaps(self._senses.held):
-                return nothing
-            belief = known.recognise(self._senses.held)
-            return self._in_state(nothing, belief, int(belief.argmax()), math.nan)
+        machine, known, held = self.machine, self._frozen, self._monitor.held
+        belief, surprise, seen = np.ones(1), math.nan, math.nan
+        state: int | None = None
         incomplete = bool(intake) and bool(intake & INCOMPLETE)
-        if machine is None or (incomplete and machine.n_states == 0):
-            self._observed(z)
-            return nothing
-        policy = Missing.REJECT
-        if incomplete:
-            policy = self.missing if machine.state is not None else Missing.PARTIAL
-        step = machine.observe(z, missing=policy)
-        self._observed(z)
-        return self._in_state(nothing, step.belief, step.state, step.surprise)
-
-    def _in_state(
-        self, nothing: Situation, belief: NDArray[np.float64], state: int, surprise: float
-    ) -> Situation:
-        """A situation in which a state was recognised."""
-        seen = math.nan
-        if self.machine is not None and self.interval is not None:
-            seen = float(self.machine.visits[state]) * self.interval
-        return nothing._replace(belief=belief, state=state, surprise=surprise, seen=seen)
-
-    def _observed(self, z: NDArray[np.float64], *, failed: bool = False) -> None:
-        """The judge learns from an observation; the machine counts what was not expected.
-
-        Of what ends in failure it counts nothing.
-        """
-        if self._observing is None or not self.learn:
-            return
-        began = self._observing.observe(z)
-        if began and self.machine is not None and not failed:
-            self.machine.onset()
+        if known is not None:
+            if known.n_states and not math.isnan(held.dot(held)):
+                belief = known.recognise(held)
+                state = int(belief.argmax())
+        elif machine is not None and not (incomplete and machine.n_states == 0):
+            policy = Missing.REJECT
+            if incomplete:
+                policy = self.missing if machine.state is not None else Missing.PARTIAL
+            step = machine.observe(z, missing=policy)
+            belief, state, surprise = step.belief, step.state, step.surprise
+        if self._observing is not None and self._learn:
+            began = self._observing.observe(z)
+            if began and machine is not None:
+                machine.onset()
+        if machine is not None and state is not None and self.interval is not None:
+            seen = float(machine.visits[state]) * self.interval
+        return Situation(z, belief, state, surprise, time, intake, seen)
 
     def revise(self, situation: Situation, proposal: Proposal) -> Revision:
         """The second half of `decide`: what to execute; machine and judge learn from it.
@@ -549,7 +594,9 @@ class Guard:
         >>> guard.revise(here, Proposal(1.0)).executed
         -2.5
         """
-        revision = self._explained(situation, self.reviser.revise(situation, proposal))
+        revision = self.reviser.revise(situation, proposal)
+        if self.explaining is not None or self.audit is not None:
+            revision = self._explained(situation, revision)
         if self.audit is not None:
             self.audit.decided(situation, proposal, revision)
         self._take_in(situation, revision.executed)
@@ -593,24 +640,25 @@ class Guard:
         self._take_in(situation, fixed(executed))
 
     def _take_in(self, situation: Situation, executed: Action) -> None:
+        """Machine and judge learn what was executed."""
         self._decisions += 1
-        if self.machine is not None and self.learn and self.machine.state is not None:
-            index = self.actions.encode(executed)
-            self.machine.act(index)
-        if self._observing is not None and self.learn:
+        if self.machine is not None and self._learn and self.machine.state is not None:
+            self.machine.act(self.actions.encode(executed))
+        if self._observing is not None and self._learn:
             self._observing.act(executed)
-        if self.judge is not None and not (situation.intake and situation.intake & STALE):
-            if not self.learn:
-                self.judge.follow(situation.observation, executed)
-            else:
-                watched = isinstance(self.reviser, ActionReviser) and not self.reviser.acts
-                take_in = self.judge.watch if watched else self.judge.learn
-                take_in(situation.observation, executed, situation.belief)
+        if self.judge is None or (situation.intake and situation.intake & STALE):
+            return
+        if not self._learn:
+            self.judge.follow(situation.observation, executed)
+        elif isinstance(self.reviser, ActionReviser) and not self.reviser.acts:
+            self.judge.watch(situation.observation, executed, situation.belief)
+        else:
+            self.judge.learn(situation.observation, executed, situation.belief)
 
     def _explained(self, situation: Situation, revision: Revision) -> Revision:
         """With what the machine has seen come of what is executed, where that is asked for."""
         explaining = self.explaining or (Explain.NONE if self.audit is None else Explain.SPOKEN)
-        if explaining is Explain.NONE or self.machine is None or situation.state is None:
+        if self.machine is None or situation.state is None or explaining is Explain.NONE:
             return revision
         if explaining is Explain.SPOKEN and not is_spoken(self.reviser, revision):
             return revision
@@ -618,7 +666,7 @@ class Guard:
         if self._frozen is None:
             text = self.machine.explain(action, self._labels).text
         else:
-            nearest = self._frozen.nearest(self._senses.held)
+            nearest = self._frozen.nearest(self._monitor.held)
             text = explain(self._frozen, situation.belief, action, self._labels, nearest).text
         return revision._replace(explanation=text)
 
@@ -648,21 +696,26 @@ class Guard:
         last = self._latest.observation if z is None and self._latest is not None else z
         if self.failed is not None and last is not None:
             failed = failed or bool(self.failed(last))
-        machine = self.machine if self.learn else None
+        machine = self.machine if self._learn else None
         if machine is not None:
-            if z is not None and (machine.n_states or not has_gaps(z)):
-                machine.observe(z, failed=failed, missing=Missing.PARTIAL)
+            has_gaps = z is not None and math.isnan(z.dot(z))
+            if z is not None and (machine.n_states or not has_gaps):
+                policy = Missing.PARTIAL if has_gaps else Missing.REJECT
+                machine.observe(z, failed=failed, missing=policy)
             elif failed and machine.state is not None:
                 machine.fail()
             machine.tell_of_failures()
-        if z is not None:
-            self._observed(z, failed=failed)
+        if z is not None and self._observing is not None and self._learn:
+            began = self._observing.observe(z)
+            if began and machine is not None and not failed:  # of what failed it counts nothing
+                machine.onset()
         if machine is not None and not failed:
             machine.start_episode()
-        if self.judge is not None and self.learn:
-            self.judge.end(z, failed=failed)
-        elif self.judge is not None:
-            self.judge.start_episode(learn=False)
+        if self.judge is not None:
+            if self._learn:
+                self.judge.end(z, failed=failed)
+            else:
+                self.judge.start_episode(learn=False)
         self._under_way = False
         if self.audit is not None:
             self.audit.ended(z, failed=failed)

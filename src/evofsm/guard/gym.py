@@ -25,8 +25,8 @@ from evofsm.guard.actions import (
     put_into,
     same_action,
 )
+from evofsm.guard.api import Proposal, Revision
 from evofsm.guard.guard import Guard
-from evofsm.guard.protocols import Proposal, Revision
 from evofsm.guard.reviser import make_usable, unjudged_revision
 
 with needs("gymnasium", "gym", "a wrapper for Gymnasium"):

@@ -16,7 +16,7 @@ from typing import Any
 from evofsm.fsm.actions import IntervalActions
 from evofsm.fsm.machine import EvolvingFSM
 from evofsm.guard.actions import ActionSet, BoxActions, Choices
-from evofsm.guard.protocols import ActionJudge, LearningJudge, Participants, Reviser
+from evofsm.guard.api import ActionJudge, LearningJudge, Participants, Reviser
 from evofsm.guard.reviser import ActionReviser, Mode, Way
 
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 from evofsm.extras import needs
+from evofsm.guard.api import Revision
 from evofsm.guard.guard import Guard
 from evofsm.guard.gym import Failed, Lane, Observe, Terms
-from evofsm.guard.protocols import Revision
 
 with needs("pettingzoo", "pettingzoo", "a wrapper for PettingZoo"):
     from pettingzoo import ParallelEnv

@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping
 from operator import attrgetter
 from typing import Any, NamedTuple
 
-from evofsm.guard.protocols import Intake, Revision, Situation
+from evofsm.guard.api import Intake, Revision, Situation
 
 
 class Pair(NamedTuple):

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from evofsm.fsm.observations import Missing
 from evofsm.guard.actions import Action
+from evofsm.guard.api import Proposal, Situation
 from evofsm.guard.audit_log import (
     FIELDS,
     LOG_VERSION,
@@ -37,7 +38,6 @@ from evofsm.guard.audit_log import (
 )
 from evofsm.guard.guard import Explain, Guard
 from evofsm.guard.parts import set_again
-from evofsm.guard.protocols import Proposal, Situation
 from evofsm.guard.reviser import is_spoken
 
 # What a record that someone made up may run into.

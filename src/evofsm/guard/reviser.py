@@ -1,9 +1,8 @@
 """The action reviser: it keeps what a controller proposes, or replaces it by something better.
 
 The module of the paper's Section 4.2, in both of its ways: to choose among the candidates that a
-controller offers, or to improve on its proposal with any action of the set. The authors' own
-sequel tests an action by predicting the states it leads to, and looks at others where those are
-not appropriate (Han, Filev, Ozguner, arXiv:2006.08092).
+controller offers, or to improve on its proposal with any action of the set. The authors' own sequel
+tests an action by predicting the states it leads to (Han, Filev, Ozguner, arXiv:2006.08092).
 """
 
 from __future__ import annotations
@@ -16,7 +15,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.fsm import compiled
 from evofsm.guard.actions import (
     Action,
     ActionSet,
@@ -31,9 +29,9 @@ from evofsm.guard.actions import (
     put_into,
     same_action,
 )
-from evofsm.guard.defaults import TOLERANCE
-from evofsm.guard.protocols import (
+from evofsm.guard.api import (
     STALE,
+    TOLERANCE,
     ActionJudge,
     Fallback,
     Judgement,
@@ -91,6 +89,11 @@ def make_usable(proposal: Proposal, actions: ActionSet, fallback: Fallback = NOT
     >>> make_usable(Proposal(float("nan")), actions)
     Usable(action=0.0, remark='no usable proposal (nan): doing nothing')
     """
+    wanted, is_box = proposal.action, isinstance(actions, BoxActions)
+    if not is_box and actions.low <= wanted <= actions.high:  # the usual case, at once
+        is_choice = isinstance(actions, Choices)
+        if not is_choice or wanted == int(wanted):
+            return Usable(float(wanted), "")
     if not is_usable(actions, proposal.action):
         nothing = f"no usable proposal ({action_text(proposal.action)}): {fallback.doing}"
         return Usable(put_into(actions, fallback.action), nothing)
@@ -106,11 +109,11 @@ class ActionReviser:
 
     By the least change: the action closest to the proposal whose risk is within the tolerance;
     where there is none, the least risky one. Where the judge has to try an action first
-    (`protocols.Trial`), that is held for a while instead: so a car's own brakes are learnt. Once it
+    (`api.Trial`), that is held for a while instead: so a car's own brakes are learnt. Once it
     has begun to revise, it keeps on until the proposal is safe by a margin, so that it does not
     chatter.
 
-    A judge that looks for an action itself (`protocols.SearchingJudge`) is asked for it where any
+    A judge that looks for an action itself (`api.SearchingJudge`) is asked for it where any
     action of the set will do (`Way.IMPROVE`); how it goes about that is its own.
 
     Where nothing of what it decides is executed (any mode but `Mode.ACT`, or the driver has taken
@@ -211,38 +214,36 @@ class ActionReviser:
         -------
         Revision
         """
+        acts, names = self.acts, self.risk.labels.names
         wanted, remark = make_usable(proposal, self.actions, self.risk.fallback)
-        if not self.acts:
+        if not acts:
             self._trial = 0
         if self.mode is Mode.OFF:
             return unjudged_revision(wanted, proposal, remark or "reviser is off")
-        options, judged, best, reason = self._search(situation, wanted, proposal)
-        executed = best if self.acts else 0
-        if not self.acts and best != 0:
+        options, judged, best, reason = self._search(situation, wanted, proposal, acts)
+        executed = best if acts else 0
+        is_number = options.ndim == 1
+        if not acts and best != 0:
             who = "driver has taken over" if self._overridden else self.mode.value
             reason = f"{who}: {reason}"
+        unseen = unseen_text(situation, names) if situation.intake else ""
+        # Of a situation that is new: whether it is dangerous is another question.
+        new = "never seen before" if judged.seen < _NEW else ""
         return Revision(
-            executed=fixed(options[executed]),
-            proposed=fixed(proposal.action),
+            executed=float(options[executed]) if is_number else fixed(options[executed]),
+            proposed=float(proposal.action) if is_number else fixed(proposal.action),
             risk_proposed=float(judged.risk[0]),
             risk_executed=float(judged.risk[executed]),
             interval=(float(judged.low[executed]), float(judged.high[executed])),
-            reason="; ".join(
-                part
-                for part in (
-                    remark,
-                    unseen_text(situation, self.risk.labels.names),
-                    _novelty(judged),
-                    reason,
-                )
-                if part
-            ),
+            reason="; ".join(filter(None, (remark, unseen, new, reason))),
             evidence=judged.evidence,
             seen=judged.seen,
-            advised=fixed(options[best]),
+            advised=float(options[best]) if is_number else fixed(options[best]),
         )
 
-    def _search(self, situation: Situation, wanted: Action, proposal: Proposal) -> Search:
+    def _search(
+        self, situation: Situation, wanted: Action, proposal: Proposal, acts: bool
+    ) -> Search:
         """Which option should be executed: the judge's own, or the best of those it is given."""
         if self.way is Way.IMPROVE and self._searches:
             found: Search = self.risk.search(  # type: ignore[attr-defined]
@@ -252,10 +253,10 @@ class ActionReviser:
             within = np.minimum(np.maximum(found.options, self._low), self._high)
             return found._replace(options=within)
         options = self._options(wanted, proposal)
-        if not self.acts and self.way is Way.IMPROVE:
+        if not acts and self.way is Way.IMPROVE:
             options = self.risk.effective(situation, options)
         judged = self.risk.judge(situation, options)
-        return Search(options, judged, *self._decide(options, judged))
+        return Search(options, judged, *self._decide(options, judged, acts))
 
     def _options(self, wanted: Action, proposal: Proposal) -> NDArray[np.float64]:
         """What could be executed, the proposal first."""
@@ -264,20 +265,23 @@ class ActionReviser:
         offered = (make_usable(Proposal(one), self.actions) for one in proposal.candidates)
         return np.array([wanted, *(one.action for one in offered if not one.remark)])
 
-    def _decide(self, options: NDArray[np.float64], judged: Judgement) -> tuple[int, str]:
+    def _decide(
+        self, options: NDArray[np.float64], judged: Judgement, acts: bool
+    ) -> tuple[int, str]:
         """Index of the best option, and why."""
         limit = self.tolerance * (self.release if self._revising else 1.0)
         trial = self.risk.trial()
         if self._trial > 0 and trial is not None:
             self._trial -= 1
             return self._closest_to(trial.action, options), f"{trial.unknown}: {trial.doing}"
-        if judged.risk[0] <= limit:
+        if not judged.risk[0] > limit:
             self._revising = False
-            return 0, "risk is within the tolerance"
+            known = judged.risk[0] <= limit
+            return 0, "risk is within the tolerance" if known else "its risk is not known yet"
         self._revising = True
         why = self.risk.why(judged)
         if trial is not None:
-            if self.acts:
+            if acts:
                 self._trial = _TRIAL
                 tried = self._closest_to(trial.action, options)
                 return tried, f"{why}; {trial.unknown}, so {trial.how}"
@@ -285,47 +289,21 @@ class ActionReviser:
         # Once revising, what is safe by the margin; else whatever is tolerable.
         change = distances(self.actions, options, options[0])
         # Of several that are least risky the lowest, in a box that of the least change.
-        least = _least_risky(
-            change if isinstance(self.actions, BoxActions) else options, judged.risk
-        )
+        rank = change if isinstance(self.actions, BoxActions) else options
+        least = int(np.lexsort((rank, judged.risk))[0])
         if isinstance(self.actions, Choices) and judged.risk[least] <= self.tolerance:
             return least, f"{why}; the least risky that can"
         for tolerated in (limit, self.tolerance):
-            closest = _closest_within(change, judged.risk, tolerated)
-            if closest >= 0:
-                return closest, f"{why}; the closest that can"
+            if (tolerable := np.flatnonzero(judged.risk <= tolerated)).size:
+                return int(tolerable[change[tolerable].argmin()]), f"{why}; the closest that can"
         return least, f"{why}; nothing can, the least risky"
 
     def _closest_to(self, action: Action, options: NDArray[np.float64]) -> int:
         return int(distances(self.actions, options, action).argmin())
 
 
-@compiled
-def _closest_within(
-    change: NDArray[np.float64], risk: NDArray[np.float64], tolerated: float
-) -> int:
-    """Index of the tolerable option of the least change; -1 where none is."""
-    best, least = -1, np.inf
-    for k in range(len(change)):
-        if risk[k] <= tolerated and change[k] < least:
-            best, least = k, change[k]
-    return best
-
-
-@compiled
-def _least_risky(rank: NDArray[np.float64], risk: NDArray[np.float64]) -> int:
-    """Index of the option of the lowest risk; of several that of the lowest rank."""
-    best = 0
-    for k in range(len(rank)):
-        if risk[k] < risk[best] or (risk[k] == risk[best] and rank[k] < rank[best]):
-            best = k
-    return best
-
-
 def unseen_text(situation: Situation, variables: Sequence[str]) -> str:
     """What is said of a situation that was not seen whole, or not in time."""
-    if not situation.intake:
-        return ""
     missing = [
         name
         for name, value in zip(variables, situation.observation, strict=False)
@@ -334,11 +312,6 @@ def unseen_text(situation: Situation, variables: Sequence[str]) -> str:
     if missing:
         return f"not seen: {', '.join(missing)}"
     return "nothing new was seen" if situation.intake & STALE else ""
-
-
-def _novelty(judged: Judgement) -> str:
-    """Said of a situation that is new; whether it is dangerous is another question."""
-    return "never seen before" if judged.seen < _NEW else ""
 
 
 def is_spoken(reviser: Reviser, revision: Revision) -> bool:

@@ -29,7 +29,7 @@ from evofsm.fsm.naming import Labels
 from evofsm.fsm.proportions import wilson_bounds
 from evofsm.fsm.validation import positive, whole
 from evofsm.guard.actions import Action
-from evofsm.guard.protocols import Fallback, Judgement, Search, Situation, Trial
+from evofsm.guard.api import Fallback, Judgement, Search, Situation, Trial
 from evofsm.store import COUNT, FLAG, FROM_1, MOST_COUNTED, SIZE, Kind, Numbers, Place
 
 _Floats = NDArray[np.float64]

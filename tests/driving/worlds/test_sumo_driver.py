@@ -11,8 +11,8 @@ from evofsm.driving.scenarios import CutIn, Leader, Scenario, Sensors
 from evofsm.driving.sumo import MODELS, SumoDriver, SumoWorld
 from evofsm.driving.world import KinematicWorld
 from evofsm.fsm.actions import IntervalActions
+from evofsm.guard.api import Proposal
 from evofsm.guard.guard import Guard
-from evofsm.guard.protocols import Proposal
 from evofsm.guard.reviser import ActionReviser
 
 libsumo = pytest.importorskip("libsumo")

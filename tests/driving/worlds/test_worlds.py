@@ -10,7 +10,7 @@ from evofsm.driving.drivers import IDM
 from evofsm.driving.scenarios import Behind, Body, CutIn, Leader, Scenario, Sensors
 from evofsm.driving.sumo import SumoWorld
 from evofsm.driving.world import REALISED, KinematicWorld
-from evofsm.guard.protocols import Proposal
+from evofsm.guard.api import Proposal
 from evofsm.paper.runs import CASES, Settings
 
 pytest.importorskip("libsumo")

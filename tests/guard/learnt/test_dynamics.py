@@ -298,8 +298,7 @@ def test_something_unexpected_begins_once_and_then_not_for_a_while():
     Z, U = drive(np.random.default_rng(1), braking=50)
     begun = []
     for t, z in enumerate(Z[:-1]):
-        dynamics.observe(z)
-        if dynamics.begins():
+        if dynamics.observe(z):
             begun.append(t)
         dynamics.act(dynamics.encode(U[t]))
     assert begun == [51]

@@ -356,7 +356,7 @@ def test_where_nobody_knows_where_one_is_nothing_is_said(points, value):
             judge.assess(z, moved)
 
 
-@pytest.mark.parametrize("name", ["begins", "_learn", "_study", "disturbances", "keep"])
+@pytest.mark.parametrize("name", ["_begins", "_learn", "_study", "disturbances", "keep"])
 def test_what_an_interrupt_breaks_off_is_not_learnt_at_all(points, content, monkeypatch, name):
     """Of an observation, or of how an episode ended; then it goes on as if nothing had happened."""
     guard, other = points["box"].taught(9), points["box"].taught(9)

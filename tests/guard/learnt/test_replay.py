@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from evofsm.guard.learnt.library import harm
-from evofsm.guard.learnt.policies import Backups
+from evofsm.guard.learnt.library import Backups, harm
 from evofsm.guard.learnt.replay import (
     Disturbances,
     Ends,

@@ -12,14 +12,19 @@ from numpy.typing import ArrayLike
 from evofsm.fsm.validation import real_array, refuse_unusable, whole
 from evofsm.guard.learnt import regression
 from evofsm.guard.learnt.failures import explain_failures, probe
-from evofsm.guard.learnt.regression import MOVING, ONSET, Drift, Recent, Sums
+from evofsm.guard.learnt.regression import Drift, Recent
 from evofsm.guard.learnt.replay import (
+    EARLY,
+    MOVING,
+    ONSET,
     Disturbances,
     Floats,
     Ints,
     Model,
+    Sums,
     features,
     lags,
+    learn_transition,
     n_features,
     n_products,
     residuals,
@@ -36,8 +41,9 @@ DYNAMICS_PARTS: tuple[str, ...] = (
 _FIRST = 8
 # Of what was learnt so far, what still counts an episode later.
 _KEPT = 0.999
-# Until it is ready, weights are solved for after so many steps; then after so many more, until.
-_UNREADY, _SCHEDULE = 20, ((300, 5), (1500, 20))
+# Weights are solved for after every so many observations: until they could be, then among the first
+# ones, then among some more; after those only between episodes.
+_UNREADY, (_EARLY, _OFTEN), (_LATE, _SELDOM) = 20, (300, 5), (1500, 20)
 # Onsets of sequences in an episode, at most, and so far apart.
 _ONSETS, _APART = 3, 3
 # A sequence has at least so many steps.
@@ -123,7 +129,7 @@ class Dynamics:
     >>> draw, speed = np.random.default_rng(0), 0.0
     >>> for t in range(80):
     ...     i = int(draw.integers(3))
-    ...     dynamics.observe(np.array([speed]))
+    ...     begins = dynamics.observe(np.array([speed]))
     ...     dynamics.act(dynamics.encode(i))
     ...     speed += 0.1 * (i - 1) - 0.1 * speed
     >>> dynamics.end(failed=False)
@@ -224,15 +230,10 @@ class Dynamics:
         self.rebuild()
         self.forget_episode()
 
-    def observe(self, z: Floats) -> None:
+    def observe(self, z: Floats) -> bool:
         """Take in an observation (m,), all finite, and learn the transition before the one to it.
 
-        Examples
-        --------
-        >>> dynamics = Dynamics(n_actions=2)
-        >>> dynamics.observe(np.array([1.0]))
-        >>> dynamics.n_under_way, dynamics.has_acted
-        (1, False)
+        Returns whether something that was not expected began with it, the first for a while.
         """
         if not self.n_variables:
             self._begin(z)
@@ -246,22 +247,30 @@ class Dynamics:
             self._z = np.vstack([self._z, np.empty((room, self.n_variables))])
             self._u = np.vstack([self._u, np.empty((room, self.size))])
         self._z[n], self.n_under_way, self.has_acted = z, n + 1, False
-        sums.observe(z - self.origin)
+        sums.counts[0] += 1.0  # mean and scatter as Welford (1962) has them
+        off = z - self.origin - sums.mean
+        sums.mean[:] += off / sums.counts[0]
+        sums.scatter[:] += off * (z - self.origin - sums.mean)
         self._surprised = False
         if self.failed is not None and not self.thresholds and sums.counts[1] >= 1.0:
             self.thresholds = probe(self.failed, z, np.where(sums.unit > 0.0, sums.unit, 1e-9))
             self.rebuild()
         if n:
             self._learn(n - 1)
-        if self._is_due(float(sums.counts[0])):
+        n_seen = float(sums.counts[0])
+        every = _OFTEN if n_seen < _EARLY else _SELDOM
+        every = every if self.ready else _UNREADY
+        if n_seen % every == 0 and (n_seen < _LATE or not self.ready):
             self._solve()
+        return self._begins()
 
-    def _is_due(self, n: float) -> bool:
-        """Whether weights are solved for, after so many observations."""
-        if not self.ready:
-            return n % _UNREADY == 0
-        every = next((each for until, each in _SCHEDULE if n < until), 0)
-        return every > 0 and n % every == 0
+    def _begins(self) -> bool:
+        """Whether the latest change is the first for a while that was not expected."""
+        self.quiet += 1
+        if not self._surprised:
+            return False
+        was_quiet, self.quiet = self.quiet > _APART, 0
+        return was_quiet
 
     def act(self, action: Floats) -> None:
         """What was done after the latest observation, encoded; a second one replaces the first."""
@@ -288,9 +297,9 @@ class Dynamics:
         --------
         >>> dynamics = Dynamics(n_actions=2)
         >>> for t in range(40):
-        ...     dynamics.observe(np.array([t % 7.0]))
+        ...     begins = dynamics.observe(np.array([t % 7.0]))
         ...     dynamics.act(dynamics.encode(t % 2))
-        >>> dynamics.observe(np.array([9.0]))
+        >>> begins = dynamics.observe(np.array([9.0]))
         >>> dynamics.end(failed=True)
         >>> dynamics.thresholds
         [(0, 1.0, 6.0)]
@@ -298,14 +307,6 @@ class Dynamics:
         if self.n_under_way > 2 or (failed and self.n_under_way):
             self._study(failed=failed)
         self.forget_episode()
-
-    def begins(self) -> bool:
-        """Whether the latest change is the first for a while that was not expected; ask it once."""
-        self.quiet += 1
-        if not self._surprised:
-            return False
-        was_quiet, self.quiet = self.quiet > _APART, 0
-        return was_quiet
 
     # -- The model ------------------------------------------------------------------------------
 
@@ -316,12 +317,18 @@ class Dynamics:
         rows, self._row = np.vstack([self._row, row]) if i else row, row
         if not i:
             return
-        sums, z = self.sums, self._z
-        jumped, self._surprised = regression.learn(sums, self.model, self.close, z, rows, i - 1)
-        for j in jumped if i > 1 else ():
-            jump = np.append(z[i - 1], z[i, j])
-            more = np.vstack([self.jumps[j][1 - _MOST :], jump])
-            self.jumps = [more if k == j else one for k, one in enumerate(self.jumps)]
+        sums, z, jumped = self.sums, self._z, np.zeros(self.n_variables)
+        n = int(sums.counts[1])
+        args = sums, self.model, self.close, z, rows, i - 1, jumped
+        self._surprised = bool(learn_transition(*args))
+        if n < EARLY:
+            sums.early[n] = np.abs(z[i] - z[i - 1])
+            sums.unit[:] = regression.early_unit(sums, n + 1)
+        if i > 1 and jumped.any():
+            for j in np.flatnonzero(jumped):
+                jump = np.append(z[i - 1], z[i, j])
+                more = np.vstack([self.jumps[j][1 - _MOST :], jump])
+                self.jumps = [more if k == j else one for k, one in enumerate(self.jumps)]
 
     def _solve(self) -> None:
         if self.sums.counts[0] < _FIRST:
@@ -574,7 +581,7 @@ class Dynamics:
         --------
         >>> dynamics = Dynamics(n_actions=2)
         >>> for t in range(40):
-        ...     dynamics.observe(np.array([t % 7.0]))
+        ...     begins = dynamics.observe(np.array([t % 7.0]))
         ...     dynamics.act(dynamics.encode(t % 2))
         >>> dynamics.end(failed=False)
         >>> found = dynamics.disturbances(20)

@@ -22,14 +22,12 @@ from evofsm.fsm.naming import Labels
 from evofsm.fsm.numbering import action_name
 from evofsm.fsm.proportions import poisson_bounds
 from evofsm.fsm.validation import positive, refuse_unusable
+from evofsm.guard.api import Fallback, Judgement, Search, Situation, Trial
 from evofsm.guard.learnt import library, words
 from evofsm.guard.learnt.dynamics import ARRAYS, DYNAMICS_PARTS, Dynamics
-from evofsm.guard.learnt.library import Violations
-from evofsm.guard.learnt.policies import Backups
+from evofsm.guard.learnt.library import Backups, Violations
 from evofsm.guard.learnt.replay import Disturbances, Floats, Ints, acts, search
 from evofsm.guard.learnt.words import Remembered
-from evofsm.guard.protocols import Fallback, Judgement, Search, Situation, Trial
-from evofsm.guard.senses import has_gaps
 from evofsm.store import COUNT, FLAG, FROM_1, SHARE, SIZE, Kind, Numbers, Place
 
 _P = ParamSpec("_P")
@@ -232,7 +230,8 @@ class LearntRisk:
     @property
     def disturbance_scale(self) -> float:
         """How much harder than they were disturbances are taken to be, while little was seen."""
-        most = _AGAIN if self._began_anew else 0.5 * _CAUTION
+        began_anew = self.violations.worse >= 0 or (self.exposure > 0.0 and self.dynamics.drifts)
+        most = _AGAIN if began_anew else 0.5 * _CAUTION
         return 1.0 + min(most, _CAUTION / max(1, self.n_scanned))
 
     @property
@@ -398,7 +397,7 @@ class LearntRisk:
             )
         refuse_unusable("observation", z)
         refuse_unusable("change", moved)
-        here = library.situation(z, moved, np.zeros(dynamics.size))
+        here = np.concatenate([z, moved, np.zeros(dynamics.size)])
         unsurvived, left, _ = self._foresee(here, None, self.backups.ranks)
         dead_end, hours, remembered = (
             math.isinf(unsurvived),
@@ -500,15 +499,14 @@ class LearntRisk:
 
     def _here(self, z: Floats) -> Floats | None:
         """The situation, if that is seen; what was not is taken to have gone on as before."""
-        at, m = self._at, len(z)
+        at, m, has_gaps = self._at, len(z), math.isnan(z.dot(z))
         if at is None:
-            if has_gaps(z):
-                return None
-            return library.situation(z, np.zeros(m), np.zeros(self.dynamics.size))
-        if has_gaps(z):
+            return None if has_gaps else np.append(z, np.zeros(m + self.dynamics.size))
+        if has_gaps:
             z = np.where(np.isnan(z), at[:m] + at[m : 2 * m], z)
-        z = self.dynamics.corrected(at, self._action, z)
-        return library.situation(z, z - at[:m], self._action)
+        if self.dynamics.is_noisy:
+            z = self.dynamics.corrected(at, self._action, z)
+        return np.concatenate([z, z - at[:m], self._action])
 
     def _untried(self, best: Floats) -> Floats | None:
         """An action whose effect is hardly known, if there is one."""
@@ -552,12 +550,10 @@ class LearntRisk:
                 f"observation has {len(observation)} variables, but the judge learnt of "
                 f"{dynamics.n_variables}"
             )
-        if has_gaps(observation) or not dynamics.has_acted:
+        has_gaps = math.isnan(observation.dot(observation))
+        if has_gaps or not dynamics.has_acted:
             dynamics.end(failed=False)
-        if has_gaps(observation):
-            return False
-        dynamics.observe(observation)
-        return dynamics.begins()
+        return False if has_gaps else dynamics.observe(observation)
 
     def act(self, action: Any) -> None:
         """Take in what was executed after the latest observation; another one replaces it."""
@@ -570,15 +566,11 @@ class LearntRisk:
             violated = self._certified and not self._holds
             self.n_violated += violated
             self._violated |= violated
-            margin = self.margin + _ADDED * (violated - _RATE)
-            self.margin = min(_LARGEST, max(self._least_margin, margin))
+            margin, least = self.margin + _ADDED * (violated - _RATE), _ADDED
+            self.margin = min(_LARGEST, max(_NOISY if self.dynamics.is_noisy else least, margin))
         self._certified = self._holds
         self._was_certified |= self._holds
         self._take_in(observation, action)
-
-    @property
-    def _least_margin(self) -> float:
-        return _NOISY if self.dynamics.is_noisy else _ADDED
 
     def watch(self, observation: ArrayLike, action: Any, belief: ArrayLike) -> None:
         """Take in what someone else does: then nothing was certified."""
@@ -608,7 +600,8 @@ class LearntRisk:
 
     def end(self, observation: Floats | None, *, failed: bool) -> None:
         """Learn from an episode; its last observation was taken in (`observe`)."""
-        self._end(failed=failed and (observation is None or not has_gaps(observation)))
+        seen_whole = observation is None or not math.isnan(observation.dot(observation))
+        self._end(failed=failed and seen_whole)
 
     @_atomic
     def _end(self, *, failed: bool) -> None:
@@ -631,7 +624,8 @@ class LearntRisk:
         dynamics = self.dynamics
         self.n_studied = dynamics.n_episodes
         if "margin" not in self.without:
-            self.margin = max(self._least_margin, _FADES * self.margin)
+            least = _NOISY if dynamics.is_noisy else _ADDED
+            self.margin = max(least, _FADES * self.margin)
         moved = any(one.noticed == dynamics.n_episodes - 1 for one in dynamics.drifts)
         if moved or self._is_worse():
             self._begin_anew()
@@ -680,11 +674,6 @@ class LearntRisk:
         self.violations = before.after(self.n_studied - 1, violated=violated, failed=failed)
         self._violated = False
         return self.violations.worse != before.worse
-
-    @property
-    def _began_anew(self) -> bool:
-        dynamics = self.dynamics
-        return self.violations.worse >= 0 or (dynamics.n_variables > 0 and bool(dynamics.drifts))
 
     def _begin_anew(self) -> None:
         """How far model and memory are to be trusted is not known yet.
@@ -739,7 +728,7 @@ class LearntRisk:
         """All that may change while it learns: sums and notes change in place."""
         sums = self.dynamics.sums if self.dynamics.n_variables else ()
         own = {**self.__dict__, "_notes": list(self._notes)}
-        return own, dict(self.dynamics.__dict__), [array.copy() for array in sums]
+        return own, dict(self.dynamics.__dict__), list(map(np.copy, sums))
 
     def _put_back(self, own: dict[str, Any], dynamics: dict[str, Any], sums: list[Floats]) -> None:
         self.__dict__ = own

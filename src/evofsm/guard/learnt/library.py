@@ -1,20 +1,35 @@
-"""The disturbance library: what is worth remembering, and whether it is still a measure.
+"""What is remembered, and what would be done about it: disturbances, situations, and backups.
 
-Disturbances are kept that would harm most in situations that are kept as well, some of them tight.
+*The disturbance library* keeps what would harm most in situations that are kept as well, some of
+them tight. A situation is a row: an observation, its change, and the action before.
 
-A situation is a row: an observation, its change since the one before, and the action before.
+*Backup policies* are constant, or linear feedback that evolves. With the share v_q(s) of the
+horizon that backup q survives from situation s, over some disturbances, and a little for the
+distance to failure (`replay.worth`), the backups Q together are worth
+
+    F(Q) = mean_s max_q v_q(s) + 0.01 sum_q mean_s v_q(s).
+
+A mutant takes the place of the linear backup for which F grows most, if it grows. They are asked in
+the order in which each adds most to F of those before it, the greedy order for a submodular
+function (Nemhauser, Wolsey & Fisher 1978).
+
+*Certificate violations* tell whether disturbances are still those that are remembered: a cumulative
+sum (Page, "Continuous inspection schemes", Biometrika 1954).
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from dataclasses import dataclass
+from dataclasses import replace as replaced
+from itertools import product
+from typing import NamedTuple, Self
 
 import numpy as np
 
 from evofsm.guard.learnt.dynamics import Dynamics, Episode
-from evofsm.guard.learnt.replay import Disturbances, Ends, Floats, Model, replay
+from evofsm.guard.learnt.replay import Disturbances, Ends, Floats, Ints, Model, replay, worth
 
 # Situations that are kept, and those on which the starts of an episode are tried.
 _KEPT, _TRIED = 32, 8
@@ -26,11 +41,21 @@ _MOST_STARTS, _APART = 160, 3
 _AT_ONCE, _BY_FAR = 3, 100.0
 # Residuals that disturbances without memory are drawn from.
 _POOL = 3000
+# Linear policies; mutants that are tried an episode, and of those how many of the best one.
+_LINEAR, _MUTANTS, _OF_BEST = 3, 40, 0.8
+# A mutant differs in this share of its numbers, by a size of 10 to a power between these.
+_CHANGED, _SIZES = 0.6, (-1.5, 0.7)
+# What a policy is worth by itself counts so much, compared with what it adds to the others.
+_BY_ITSELF = 0.01
+# By so much less a linear policy wants the next of the choices.
+_PREFERRED = 1e-9
+# Digits of actions and scores: what differs by rounding alone is equal, in whatever units it comes.
+_ROUNDED = 9
+# Boxes of more dimensions have an action along each axis, not one in each corner.
+_MOST_CORNERS = 3
 
 
-def situation(z: Floats, change: Floats, before: Floats) -> Floats:
-    """(2m + a,) where one is, and how one got there."""
-    return np.concatenate([z, change, before])
+# -- Disturbances and situations ------------------------------------------------------------------
 
 
 def harm(
@@ -78,7 +103,7 @@ def noted(
         back = random.integers(2, max(3, min(T, horizon)), _BEFORE_FAILURE)
         steps += list(np.maximum(1, T - 1 - back))
     for t in steps:
-        one = situation(z[t], z[t] - z[t - 1], u[t - 1])
+        one = np.concatenate([z[t], z[t] - z[t - 1], u[t - 1]])
         if len(situations) < _KEPT:
             situations = np.vstack([situations.reshape(-1, len(one)), one])
         else:
@@ -160,7 +185,145 @@ def failing_after(
     return int(ends[ends < 0.0].max(initial=-1.0 - steps) + 1 + steps)
 
 
-# -- Certificate violations: whether disturbances are still those that are remembered --------------
+# -- Backup policies ------------------------------------------------------------------------------
+
+
+@dataclass
+class Backups:
+    """Constant policies, and linear ones u = sat(b + K'z) that evolve by mutation.
+
+    An order of variables and actions, and a direction of each, come from the first episode: so it
+    makes no difference to what evolves in which order, unit or sign they come.
+    """
+
+    policies: Floats  #: (b, a, 1 + m), the constant ones first
+    n_constant: int
+    scores: Floats  #: (b,) what each adds to those before it
+    variables: Ints  #: (m,) in their order
+    flips: Floats  #: (m,) their directions, 1 or -1
+    actions: Ints  #: (a,) in their order
+    turns: Floats  #: (a,) their directions
+
+    @classmethod
+    def of(cls, z: Floats, u: Floats, *, choices: bool, evolving: bool = True) -> Backups:
+        """Those that nothing was learnt of yet.
+
+        Parameters
+        ----------
+        z, u : ndarray
+            Observations and actions of the first episode.
+        choices : bool
+            Whether an action is one of a few: then the largest of b + K'z is taken.
+        evolving : bool
+            Whether there are linear ones.
+        """
+        a, m = u.shape[1], z.shape[1]
+        off = z - z.mean(0)
+        spread = np.sqrt((off**2).mean(0))
+        pace = np.abs(np.diff(z, axis=0)).mean(0) / np.where(spread > 0.0, spread, 1.0)
+        if choices:
+            actions, turns, corners = _order(-u), np.ones(a), np.eye(a)
+        else:
+            actions, turns = _order(np.abs(u)), np.where(u.sum(0) < 0.0, -1.0, 1.0)
+            ends = np.vstack([-np.eye(a), np.eye(a)])
+            if a <= _MOST_CORNERS:
+                ends = np.array(list(product((-1.0, 1.0), repeat=a)))
+            corners = np.vstack([ends, np.zeros(a)])
+        constants = np.empty_like(corners)
+        constants[:, actions] = corners
+        policies = np.zeros((len(constants) + (_LINEAR if evolving else 0), a, 1 + m))
+        policies[: len(constants), :, 0] = constants * turns
+        if choices:  # of equals the first in that order, whatever its index
+            policies[:, actions, 0] -= _PREFERRED * np.arange(a)
+        return cls(
+            policies=policies,
+            n_constant=len(constants),
+            scores=np.full(len(policies), -np.inf),
+            variables=np.argsort(pace, kind="stable"),
+            flips=np.where((off**3).sum(0) < 0.0, -1.0, 1.0),
+            actions=actions,
+            turns=turns,
+        )
+
+    @classmethod
+    def restored(cls, n_constant: int, m: int, a: int, arrays: dict[str, Floats]) -> Self:
+        """Those that arrays of a file hold, of m variables and actions of a numbers.
+
+        Raises
+        ------
+        ValueError
+            If arrays contradict that, or each other: kernels check no index.
+        """
+        count, size, features = arrays["policies"].shape
+        if (size, features) != (a, 1 + m):
+            raise ValueError(f"backups are not of {m} variables and actions of {a} numbers")
+        orders = {name: arrays[name].astype(int) for name in ("variables", "actions")}
+        for name, order in orders.items():
+            if sorted(order.tolist()) != list(range(len(order))):
+                raise ValueError(f"{name} of the backups are in no order")
+        if n_constant > count:
+            raise ValueError(f"there are {count} backups, not {n_constant} constant ones")
+        return cls(n_constant=n_constant, **{**arrays, **orders})
+
+    @property
+    def ranks(self) -> Ints:
+        """(b,) ndarray of int: those first that add most to the ones before them."""
+        return np.argsort(-self.scores, kind="stable")
+
+    def evolved(
+        self,
+        model: Model,
+        situations: Floats,
+        disturbances: Disturbances,
+        scale: float,
+        random: np.random.Generator,
+    ) -> Backups:
+        """With mutants in the place of linear ones where all together are worth more then."""
+        policies, ranks = self.policies.copy(), self.ranks
+        linear = np.arange(self.n_constant, len(policies))
+        ends = Ends.of(len(situations) * disturbances.residuals.shape[2])
+        world = disturbances, scale, ends
+        values = np.array([worth(model, situations, one, *world) for one in policies])
+        for mutation in self._mutations(random) if len(linear) else ():
+            parent = linear[values[linear].mean(1).round(_ROUNDED).argmax()]
+            if random.random() >= _OF_BEST:
+                parent = ranks[int(random.integers(len(policies)))]
+            child = policies[parent] + mutation
+            reached = worth(model, situations, child, *world)
+            tried = np.repeat(values[None], 1 + len(linear), 0)  # as they are, and with the child
+            tried[1 + np.arange(len(linear)), linear] = reached
+            together = tried.max(1).mean(1) + _BY_ITSELF * tried.mean(2).sum(1)
+            best = int(together.round(_ROUNDED).argmax())  # of equals the first: nothing changes
+            if best:
+                policies[linear[best - 1]], values[linear[best - 1]] = child, reached
+        scores = np.empty(len(policies))
+        left, most = list(range(len(values))), np.full(values.shape[1], -1.0)
+        while left:  # first the one that is worth most, then whichever adds most
+            adds = np.maximum(values[left] - most, 0.0).mean(1)
+            adds = (adds + _BY_ITSELF * values[left].mean(1)).round(_ROUNDED)
+            q = left.pop(int(adds.argmax()))
+            scores[q] = adds.max()  # never more than that of the one before
+            most = np.maximum(most, values[q])
+        return replaced(self, policies=policies, scores=scores)
+
+    def _mutations(self, random: np.random.Generator) -> Floats:
+        """(n, a, 1 + m) what mutants differ by."""
+        shape = (_MUTANTS, *self.policies.shape[1:])
+        size = 10.0 ** random.uniform(*_SIZES, _MUTANTS)[:, None, None]
+        drawn = (random.random(shape) < _CHANGED) * size * random.standard_normal(shape)
+        put: Floats = np.empty_like(drawn)
+        put[:, self.actions[:, None], np.append(0, 1 + self.variables)] = drawn
+        put *= np.append(1.0, self.flips) * self.turns[:, None]
+        return put
+
+
+def _order(rows: Floats) -> Ints:
+    """Of columns by their mean, of equals by the first rows in which they differ."""
+    exact = rows.round(_ROUNDED)
+    return np.lexsort((*exact[::-1], exact.mean(0).round(_ROUNDED)))
+
+
+# -- Certificate violations -----------------------------------------------------------------------
 #
 # A certificate says that all that is remembered is survived. It is violated where something begins
 # that is worse than all of that. That happens now and then; where it suddenly happens in every

@@ -25,31 +25,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evofsm.guard.learnt.replay import (
+    CLIP,
+    JUMP,
     Floats,
     Ints,
     Model,
-    along,
+    Sums,
     features,
-    inner_kernel,
-    kernel,
     lags,
     limited,
     n_products,
 )
 
-# A change so many times those around it, and the ordinary one, is a jump; so many more of the first
-# ones, of which it is not known what is ordinary.
-_JUMP, _FIRST_JUMP, _FIRST = 8.0, 32.0, 8.0
-# The ordinary change is the median of so many, then a mean; of what is larger, so much counts.
-_EARLY, _CLIP, _SLOWEST = 200, 6.0, 5000.0
-# From so many on what is larger counts in the mean.
+# From more on, large ones count in the ordinary change.
 _MEAN = 20
-#: What changes in more than this share of transitions may have saturated where it rests.
-MOVING = 0.5
-#: Residuals of so many scales are the onset of a disturbance.
-ONSET = 4.0
-# Residuals beyond so many of their scale weigh less.
-_OUTLIER = 4.0
 # Of the variance of a feature: what every weight is held to 0 by; so many times that holds those
 # that are asked only if they have to be, and the latest changes among them still more.
 _RIDGE, _SHY, _LAGS = 1e-6, 30.0, 10.0
@@ -60,147 +49,20 @@ _PRIOR, _SHY_PRIOR, _CLEAREST = 0.01, 20.0, 1e-3
 _LEAST, _ALL_ALIKE = 1e-6, 1e-10
 
 
-class Sums(NamedTuple):
-    """What is learnt with every transition, in place: m variables, p features."""
-
-    counts: Floats  #: (2,) observations, and transitions
-    squares: Floats  #: (p, p) sum of products of features
-    products: Floats  #: (p, m) and of features with changes
-    mean: Floats  #: (m,) of observations, from the origin
-    scatter: Floats  #: (m,) sum of squared distances to the mean
-    variance: Floats  #: (m,) mean square of a change
-    unit: Floats  #: (m,) ordinary change
-    early: Floats  #: (200, m) the first changes
-    least: Floats  #: (m,) most negative change that was no jump
-    most: Floats  #: (m,) most positive one
-    scale: Floats  #: (m,) of residuals; 0 as long as it is not known
-    noise: Floats  #: (m,) their mean square; 0 as long as it is not known
-    low: Floats  #: (m,) least observation
-    high: Floats  #: (m,) greatest one
-    moving: Floats  #: (m,) share of transitions in which it changed, but for rests at an extreme
-
-    @classmethod
-    def none(cls, first: Floats, p: int) -> Sums:
-        """Of nothing but a first observation."""
-        m = len(first)
-        rows = {"squares": (p, p), "products": (p, m), "early": (_EARLY, m), "counts": (2,)}
-        arrays = {name: np.zeros(rows.get(name, (m,))) for name in cls._fields}
-        return cls(**arrays | {"low": first.copy(), "high": first.copy()})
-
-    def observe(self, off: Floats) -> None:
-        """Count an observation, from the origin: mean and scatter (Welford 1962)."""
-        self.counts[0] += 1.0
-        before = off - self.mean
-        self.mean[:] += before / self.counts[0]
-        self.scatter[:] += before * (off - self.mean)
-
-
-def learn(
-    sums: Sums, model: Model, close: Floats, z: Floats, rows: Floats, i: int
-) -> tuple[list[int], bool]:
-    """Learn the transition i -> i + 1, amid observations (T, m), in ``sums``.
-
-    ``rows`` (2, p) are the features of that transition and the next, ``close`` (m,) says how far
-    from where it saturates a variable may be seen that is there. Returns the variables that jumped,
-    and whether something of the next transition was not expected.
-    """
-    n, jumped = int(sums.counts[1]), np.zeros(z.shape[1])
-    surprised = _learn(sums, model, close, z, rows, i, jumped)
-    if n < _EARLY:
-        _note_early(sums, np.abs(z[i + 1] - z[i]), n)
-    return np.flatnonzero(jumped).tolist() if jumped.any() else [], bool(surprised)
-
-
-def _note_early(sums: Sums, change: Floats, n: int) -> None:
-    """The ordinary change as long as few are known: mostly a median."""
-    sums.early[n] = change
-    unit = np.maximum(1.2 * np.median(sums.early[: n + 1], 0), _floor(sums))
-    if n >= _MEAN:
-        unit = np.maximum(unit, np.minimum(sums.early[: n + 1], _CLIP * unit).sum(0) / (n + 1))
-    sums.unit[:] = unit
-
-
-def _floor(sums: Sums) -> Floats:
-    """No ordinary change is smaller than this, of the spread of a variable."""
-    return np.asarray(1e-3 * np.sqrt(sums.scatter / max(1.0, sums.counts[0])))
-
-
-@inner_kernel
-def _is_beyond(expected: float, seen: float, low: float, high: float, close: float) -> bool:
-    """Whether it is expected beyond where it saturates, and stays there."""
-    return (expected < low and seen <= low + close) or (expected > high and seen >= high - close)
-
-
-@kernel
-def _learn(
-    sums: Sums, model: Model, close: Floats, z: Floats, rows: Floats, i: int, jumped: Floats
-) -> bool:
-    (p, m), n, first = model.weights.shape, sums.counts[1], i == 0
-    move, known, jump = np.zeros((2, m)), sums.scale[0] > 0.0, False
-    moved, surprised = False, False
-    for r in range(2 if known else 0):
-        for k in range(p):
-            for j in range(m):
-                move[r, j] += rows[r, k] * model.weights[k, j]
-    for j in range(m):
-        if first:
-            move[0, j] = 0.0
-        now, after = z[i + 1, j] - z[i, j], z[i + 2, j] - z[i + 1, j]
-        before = 0.0 if first else z[i, j] - z[i - 1, j]
-        sums.variance[j] += (now * now - sums.variance[j]) / (n + 1.0)
-        around = max(abs(before), abs(after), sums.unit[j])
-        stands_out = abs(now) > (_JUMP if n > _FIRST else _FIRST_JUMP) * around
-        if n > 0.0 and stands_out and abs(now - move[0, j]) > 0.5 * abs(now):
-            jumped[j], jump = 1.0, True
-    weight, worst = 1.0, 0.0
-    for j in range(m):
-        x, y = z[i + 2, j], z[i + 1, j] + move[1, j]
-        moved |= x != z[i + 1, j]
-        beyond = _is_beyond(y, x, model.lowest[j], model.highest[j], close[j])
-        surprised |= known and not beyond and abs(x - y) > ONSET * sums.scale[j]
-    for j in range(m):
-        x, now = z[i + 1, j], z[i + 1, j] - z[i, j]
-        y, low, high = z[i, j] + move[0, j], model.lowest[j], model.highest[j]
-        if jumped[j] == 0.0:
-            sums.least[j], sums.most[j] = min(sums.least[j], now), max(sums.most[j], now)
-        if n >= _EARLY:
-            floor = 1e-3 * np.sqrt(sums.scatter[j] / max(1.0, sums.counts[0]))
-            grown = (min(abs(now), _CLIP * sums.unit[j]) - sums.unit[j]) / min(n, _SLOWEST)
-            sums.unit[j] = max(sums.unit[j] + grown, floor)
-        sums.low[j], sums.high[j] = min(sums.low[j], x, z[i, j]), max(sums.high[j], x, z[i, j])
-        if now == 0.0 and (x == sums.low[j] or x == sums.high[j]) and sums.moving[j] > MOVING:
-            if not ((x == low and y > x) or (x == high and y < x)):
-                weight = 0.0  # it may have come to its end: what it would have done is not known
-        else:
-            sums.moving[j] += ((now != 0.0) - sums.moving[j]) / min(n + 1.0, _SLOWEST)
-        if known:
-            if _is_beyond(y, x, low, high, close[j]):
-                weight = 0.0  # it cannot be known how far it would have gone
-            else:
-                worst = max(worst, abs(x - y) / sums.scale[j])
-    sums.counts[1] += 1.0
-    if first or jump:
-        return surprised and moved
-    weight *= min(1.0, _OUTLIER / max(worst, 1e-12)) ** 2
-    for j in range(m):  # lags, as far as they have a sequel by now
-        before = z[i, j] - z[i - 1, j]
-        reach = 1.5 * max(abs(sums.least[j]), abs(sums.most[j]))
-        rows[0, 1 + m + j] = before if abs(before) <= reach else 0.0
-    for k in range(p):
-        f = weight * rows[0, k]
-        if f != 0.0:
-            for r in range(p):
-                sums.squares[k, r] += f * rows[0, r]
-            for j in range(m):
-                sums.products[k, j] += f * (z[i + 1, j] - z[i, j])
-    return surprised and moved
+def early_unit(sums: Sums, n: int) -> Floats:
+    """(m,) the ordinary change as long as only n changes are known: mostly their median."""
+    known, spread = sums.early[:n], np.sqrt(sums.scatter / max(1.0, sums.counts[0]))
+    unit = np.maximum(1.2 * np.median(known, 0), 1e-3 * spread)
+    if n > _MEAN:
+        unit = np.maximum(unit, np.minimum(known, CLIP * unit).sum(0) / n)
+    return np.asarray(unit)
 
 
 def jumps(change: Floats, unit: Floats) -> NDArray[np.bool_]:
     """(T, m) which changes (T, m) are far larger than those around them and the ordinary ones."""
     size = np.abs(change)
     before, after = np.vstack([size[:1], size[:-1]]), np.vstack([size[1:], 0.0 * size[-1:]])
-    return np.asarray(size > _JUMP * np.maximum(np.maximum(before, after), unit))
+    return np.asarray(size > JUMP * np.maximum(np.maximum(before, after), unit))
 
 
 def solve(sums: Sums, a: int, without: Floats) -> Floats:
@@ -303,7 +165,8 @@ def compared(
 
     Rows in which something rests at an end, or changes more than it ordinarily does, say nothing.
     """
-    found, move = along(model, z[:-1], u)
+    found = features(model, z[1:-1], np.diff(z[:-1], axis=0), u[:-1], u[1:])
+    move = found @ model.weights
     after, change = z[2:], np.diff(z[1:], axis=0)
     says = (after > model.lowest + close) & (after < model.highest - close)
     says &= (change >= sums.least) & (change <= sums.most)
@@ -442,7 +305,7 @@ def tried(missed: Floats, model: Model, z: Floats, u: Floats, unit: Floats) -> F
         move = calm[t, :, None] + (slope[t, :, None] + curve * off) * off + sequel
         seen = (z[t + 1] - model.origin)[:, None]
         off_by = seen - np.minimum(np.maximum(off + move, low), high)
-        gain = np.where(np.abs(off_by) > _JUMP * unit, 1.0, GAINS)
+        gain = np.where(np.abs(off_by) > JUMP * unit, 1.0, GAINS)
         after = seen + (gain - 1.0) * off_by
         change, off = after - off, after
         found += np.log1p((off_by / unit) ** 2)
@@ -478,5 +341,5 @@ def corrected(
     z, change, before = (part[None] for part in np.split(situation, [m, 2 * m]))
     expected = (z + features(model, z, change, before, action[None]) @ model.weights)[0]
     missed = seen - np.minimum(np.maximum(expected, model.lowest), model.highest)
-    gains = np.where(np.abs(missed) > _JUMP * unit, 1.0, gains)
+    gains = np.where(np.abs(missed) > JUMP * unit, 1.0, gains)
     return np.asarray(seen + (gains - 1.0) * missed)

@@ -14,6 +14,7 @@ the antecedents alone.
 from __future__ import annotations
 
 from functools import cache
+from operator import itemgetter
 from typing import NamedTuple
 
 import numba
@@ -39,6 +40,17 @@ _DISTANCE, _FAR = 0.05, 0.05
 _HALVINGS = 4
 # Of two backups that last as long up to so much the first is taken; closer than so much are alike.
 _EQUAL, _ALIKE = 1e-9, 0.02
+# A change so many times those around it, and the ordinary one, is a jump; so many more of the first
+# ones, of which it is not known what is ordinary.
+JUMP, _FIRST_JUMP, _FIRST = 8.0, 32.0, 8.0
+# The ordinary change is the median of so many, then a mean; of what is larger, so much counts.
+EARLY, CLIP, _SLOWEST = 200, 6.0, 5000.0
+#: What changes in more than this share of transitions may have saturated where it rests.
+MOVING = 0.5
+#: Residuals of so many scales are the onset of a disturbance.
+ONSET = 4.0
+# Residuals beyond so many of their scale weigh less.
+_OUTLIER = 4.0
 # Numbers in a cache line: loops over whole lines have no rest to work off one by one.
 _LINE = 8
 
@@ -82,7 +94,7 @@ class Disturbances(NamedTuple):
     def of(self, which: Ints) -> Disturbances:
         """Some of them."""
         residuals = np.ascontiguousarray(self.residuals[:, :, which])
-        return Disturbances(residuals, *(array[which] for array in self[1:]))
+        return Disturbances(residuals, *map(itemgetter(which), self[1:]))
 
 
 class Ends(NamedTuple):
@@ -137,17 +149,6 @@ def _pairs(m: int) -> tuple[Ints, Ints]:
     return np.triu_indices(m)
 
 
-def along(model: Model, observations: Floats, actions: Floats) -> tuple[Floats, Floats]:
-    """Features (T, p), and changes that were expected (T, m), from each observation but the first.
-
-    ``observations`` (T + 1, m) begin one before; ``actions`` (T + 1, a) too.
-    """
-    found = features(
-        model, observations[1:], np.diff(observations, axis=0), actions[:-1], actions[1:]
-    )
-    return found, found @ model.weights
-
-
 def residuals(
     model: Model, close: Floats, observations: Floats, actions: Floats, *, carried: bool = False
 ) -> Floats:
@@ -157,8 +158,8 @@ def residuals(
     residual is censored; if it is ``carried``, the one before goes on, for its cause may not have
     ended. Where nothing moves at all, what was expected is the model's own error.
     """
-    z, x = observations[1:-1], observations[2:]
-    expected = z + along(model, observations[:-1], actions)[1]
+    z, x, change = observations[1:-1], observations[2:], np.diff(observations[:-1], axis=0)
+    expected = z + features(model, z, change, actions[:-1], actions[1:]) @ model.weights
     low, high = x <= model.lowest + close, x >= model.highest - close
     beyond = ((expected < model.lowest) & low) | ((expected > model.highest) & high)
     found = np.where(beyond | (x == z).all(1, keepdims=True), 0.0, x - expected)
@@ -240,6 +241,114 @@ def expect(weights: Floats, found: Floats, move: Floats) -> None:
             weight = weights[k, j]
             for l in range(n):
                 move[j, l] += found[k, l] * weight
+
+
+# -- Learning a transition ------------------------------------------------------------------------
+
+
+class Sums(NamedTuple):
+    """What is learnt with every transition, in place: m variables, p features."""
+
+    counts: Floats  #: (2,) observations, and transitions
+    squares: Floats  #: (p, p) sum of products of features
+    products: Floats  #: (p, m) and of features with changes
+    mean: Floats  #: (m,) of observations, from the origin
+    scatter: Floats  #: (m,) sum of squared distances to the mean
+    variance: Floats  #: (m,) mean square of a change
+    unit: Floats  #: (m,) ordinary change
+    early: Floats  #: (200, m) the first changes
+    least: Floats  #: (m,) most negative change that was no jump
+    most: Floats  #: (m,) most positive one
+    scale: Floats  #: (m,) of residuals; 0 as long as it is not known
+    noise: Floats  #: (m,) their mean square; 0 as long as it is not known
+    low: Floats  #: (m,) least observation
+    high: Floats  #: (m,) greatest one
+    moving: Floats  #: (m,) share of transitions in which it changed, but for rests at an extreme
+
+    @classmethod
+    def none(cls, first: Floats, p: int) -> Sums:
+        """Of nothing but a first observation."""
+        m = len(first)
+        rows = {"squares": (p, p), "products": (p, m), "early": (EARLY, m), "counts": (2,)}
+        arrays = {name: np.zeros(rows.get(name, (m,))) for name in cls._fields}
+        return cls(**arrays | {"low": first.copy(), "high": first.copy()})
+
+
+@inner_kernel
+def _is_beyond(expected: float, seen: float, low: float, high: float, close: float) -> bool:
+    """Whether it is expected beyond where it saturates, and stays there."""
+    return (expected < low and seen <= low + close) or (expected > high and seen >= high - close)
+
+
+@kernel
+def learn_transition(
+    sums: Sums, model: Model, close: Floats, z: Floats, rows: Floats, i: int, jumped: Floats
+) -> bool:
+    """Learn the transition i -> i + 1, amid observations (T, m), in ``sums``.
+
+    ``rows`` (2, p) are the features of that transition and the next, ``close`` (m,) says how far
+    from where it saturates a variable may be seen that is there. ``jumped`` (m,) gets 1 where a
+    variable jumped. Returns whether something of the next transition was not expected.
+    """
+    (p, m), n, first = model.weights.shape, sums.counts[1], i == 0
+    move, known, jump = np.zeros((2, m)), sums.scale[0] > 0.0, False
+    moved, surprised = False, False
+    for r in range(2 if known else 0):
+        for k in range(p):
+            for j in range(m):
+                move[r, j] += rows[r, k] * model.weights[k, j]
+    for j in range(m):
+        if first:
+            move[0, j] = 0.0
+        now, after = z[i + 1, j] - z[i, j], z[i + 2, j] - z[i + 1, j]
+        before = 0.0 if first else z[i, j] - z[i - 1, j]
+        sums.variance[j] += (now * now - sums.variance[j]) / (n + 1.0)
+        around = max(abs(before), abs(after), sums.unit[j])
+        stands_out = abs(now) > (JUMP if n > _FIRST else _FIRST_JUMP) * around
+        if n > 0.0 and stands_out and abs(now - move[0, j]) > 0.5 * abs(now):
+            jumped[j], jump = 1.0, True
+    weight, worst = 1.0, 0.0
+    for j in range(m):
+        x, y = z[i + 2, j], z[i + 1, j] + move[1, j]
+        moved |= x != z[i + 1, j]
+        beyond = _is_beyond(y, x, model.lowest[j], model.highest[j], close[j])
+        surprised |= known and not beyond and abs(x - y) > ONSET * sums.scale[j]
+    for j in range(m):
+        x, now = z[i + 1, j], z[i + 1, j] - z[i, j]
+        y, low, high = z[i, j] + move[0, j], model.lowest[j], model.highest[j]
+        if jumped[j] == 0.0:
+            sums.least[j], sums.most[j] = min(sums.least[j], now), max(sums.most[j], now)
+        if n >= EARLY:
+            floor = 1e-3 * np.sqrt(sums.scatter[j] / max(1.0, sums.counts[0]))
+            grown = (min(abs(now), CLIP * sums.unit[j]) - sums.unit[j]) / min(n, _SLOWEST)
+            sums.unit[j] = max(sums.unit[j] + grown, floor)
+        sums.low[j], sums.high[j] = min(sums.low[j], x, z[i, j]), max(sums.high[j], x, z[i, j])
+        if now == 0.0 and (x == sums.low[j] or x == sums.high[j]) and sums.moving[j] > MOVING:
+            if not ((x == low and y > x) or (x == high and y < x)):
+                weight = 0.0  # it may have come to its end: what it would have done is not known
+        else:
+            sums.moving[j] += ((now != 0.0) - sums.moving[j]) / min(n + 1.0, _SLOWEST)
+        if known:
+            if _is_beyond(y, x, low, high, close[j]):
+                weight = 0.0  # it cannot be known how far it would have gone
+            else:
+                worst = max(worst, abs(x - y) / sums.scale[j])
+    sums.counts[1] += 1.0
+    if first or jump:
+        return surprised and moved
+    weight *= min(1.0, _OUTLIER / max(worst, 1e-12)) ** 2
+    for j in range(m):  # lags, as far as they have a sequel by now
+        before = z[i, j] - z[i - 1, j]
+        reach = 1.5 * max(abs(sums.least[j]), abs(sums.most[j]))
+        rows[0, 1 + m + j] = before if abs(before) <= reach else 0.0
+    for k in range(p):
+        f = weight * rows[0, k]
+        if f != 0.0:
+            for r in range(p):
+                sums.squares[k, r] += f * rows[0, r]
+            for j in range(m):
+                sums.products[k, j] += f * (z[i + 1, j] - z[i, j])
+    return surprised and moved
 
 
 # -- Replays --------------------------------------------------------------------------------------

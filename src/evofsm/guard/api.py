@@ -5,14 +5,22 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from enum import IntFlag
-from typing import Any, NamedTuple, Protocol, Self, runtime_checkable
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol, Self, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from evofsm.fsm import EvolvingFSM, Labels
-from evofsm.guard.actions import Action, ActionSet
-from evofsm.store import Place
+if TYPE_CHECKING:  # whoever asks for a number here waits for no compiler
+    from evofsm.fsm.machine import EvolvingFSM
+    from evofsm.fsm.naming import Labels
+    from evofsm.guard.actions import Action, ActionSet
+    from evofsm.store import Place
+
+#: The highest risk, a probability of failure, that a reviser lets pass.
+TOLERANCE: Final = 0.02
+#: Share of a belief that a machine may leave out (`EvolvingFSM.belief_tolerance`): it saves most of
+#: the time.
+BELIEF_TOLERANCE: Final = 1e-6
 
 
 class Proposal(NamedTuple):
