@@ -22,6 +22,7 @@ import tracemalloc
 from collections import Counter
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -31,17 +32,18 @@ import numpy as np
 
 import one_machine
 from evofsm import store
-from evofsm.cli.driving import Setup, drive_family, make_guard
-from evofsm.cli.learning import learn_traces
+from evofsm.cli import driving as driving_module
+from evofsm.cli.driving import GUARD, Results, Setup, drive_in_turn, make_guard
+from evofsm.cli.learning import Checkpoint, learn_traces
+from evofsm.driving.cars import guard_for_cars
 from evofsm.driving.families import load_family
 from evofsm.driving.judge import LatentRisk
 from evofsm.driving.world import KinematicWorld
-from evofsm.fleet.checkpoint import KIND as CHECKPOINT
-from evofsm.fleet.checkpoint import Checkpoint, fingerprints
 from evofsm.fsm.actions import IntervalActions
 from evofsm.fsm.learnt import MACHINE
 from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.model import FSMModel
+from evofsm.guard import Guard
 from evofsm.io.logs import Chunk, read_traces
 
 #: What must not happen, in the order in which it is printed.
@@ -106,20 +108,19 @@ def _write_log(path: Path, seed: int, rows: int = 250) -> str:
 
 def _learn(logs: Sequence[str], chunks: Sequence[Chunk], path: Path) -> bytes:
     actions = IntervalActions(-2.5, 2.5, 1.0, outside="clip")
-    machine = EvolvingFSM(actions.n_actions)
-    checkpoint = Checkpoint(path, {"files": fingerprints(logs)}, every=0.0)
-    learning = learn_traces(chunks, machine, actions, checkpoint=checkpoint)
-    numbers = [value for name, value in vars(learning).items() if name not in ("machine", "model")]
-    return _saved(learning.machine) + repr(numbers).encode()
+    checkpoint = Checkpoint(path / GUARD, {"files": list(logs)}, every=0.0)
+    path.mkdir(exist_ok=True)
+    learning = learn_traces(chunks, EvolvingFSM(actions.n_actions), actions, checkpoint=checkpoint)
+    return _saved(learning.machine) + repr((learning.read, learning.skills)).encode()
 
 
 def _drive(path: Path) -> bytes:
-    setup = Setup(load_family("emergency"), episodes=4)
-    guard = make_guard(setup)
-    checkpoint = Checkpoint(path, setup.settings("kinematic", guard), every=0.0)
-    driving = drive_family(setup, guard, KinematicWorld(), checkpoint=checkpoint)
-    told = json.dumps([driving.row.as_dict(), driving.lead_times, dict(driving.decisions)])
-    return _saved(driving.guard.machine) + _saved(driving.guard.judge) + told.encode()
+    setup = Setup(load_family("emergency"))
+    with closing(Results(setup, make_guard(setup), path)) as results:
+        driving = drive_in_turn(results, 4, KinematicWorld())
+    told = json.dumps([driving.row.as_dict(), driving.lead_times])
+    files = [(path / name).read_bytes() for name in ("episodes.csv", "summary.json")]
+    return b"".join(files) + _saved(driving.guard.machine) + told.encode()
 
 
 def _saved(learnt: Any) -> bytes:
@@ -149,11 +150,15 @@ def _fork(work: Work, checkpoint: Path, result: Path, room: int | None) -> int:
         os._exit(code)
 
 
-def _is_broken(checkpoint: Path) -> bool:
-    if not checkpoint.exists():
+def _is_broken(folder: Path) -> bool:
+    file = folder / GUARD
+    if not file.exists():
         return False  # it was stopped before there was anything to keep
     try:
-        store.read(checkpoint, CHECKPOINT)
+        if store.read_header(file).kind == "guard":
+            Guard.load(file)
+        else:
+            store.read(file, MACHINE)
     except (ValueError, OSError):
         return True
     return False
@@ -180,7 +185,7 @@ def kill(work: Work, times: int, folder: Path, random: np.random.Generator) -> C
                 return found
             found["results"] += 1
             found["results that differ"] += result.read_bytes() != work.expected
-            found["left behind"] += len(list(Path(name).glob(".*.part")))
+            found["left behind"] += len(list(Path(name).rglob(".*.part")))
     return found
 
 
@@ -189,7 +194,7 @@ def fill(work: Work, times: int, folder: Path, random: np.random.Generator) -> C
     found: Counter[str] = Counter()
     with tempfile.TemporaryDirectory(dir=folder) as name:
         work.run(whole := Path(name) / "whole")
-        size = whole.stat().st_size
+        size = (whole / GUARD).stat().st_size
     for _ in range(times):
         with tempfile.TemporaryDirectory(dir=folder) as name:
             checkpoint, result = Path(name) / "checkpoint", Path(name) / "result"
@@ -197,15 +202,15 @@ def fill(work: Work, times: int, folder: Path, random: np.random.Generator) -> C
                 result.unlink(missing_ok=True)
                 _, status = os.waitpid(_fork(work, checkpoint, result, room), 0)
                 code = os.WEXITSTATUS(status) if os.WIFEXITED(status) else _CRASHED
-                # Without room for the first one it says so before it begins.
-                refused = code == _REFUSED and room is not None and not checkpoint.exists()
-                found["refused at once"] += refused
+                # Where what was done cannot be kept it says so, and ends.
+                refused = code == _REFUSED and room is not None
+                found["refused"] += refused
                 found["crashes"] += code != 0 and not refused
                 found["broken files"] += _is_broken(checkpoint)
                 if code == 0:
                     found["results"] += 1
                     found["results that differ"] += result.read_bytes() != work.expected
-            found["left behind"] += len(list(Path(name).glob(".*.part")))
+            found["left behind"] += len(list(Path(name).rglob(".*.part")))
         found["full disks"] += 1
     return found
 
@@ -235,7 +240,7 @@ def share(apart: bool, times: int, folder: Path, random: np.random.Generator) ->
         done.set()
         found["crashes"] += sum(writer.has_crashed() for writer in writers)
         store.sweep(path)
-        found["left behind"] += len(list(Path(name).glob(".*.part")))
+        found["left behind"] += len(list(Path(name).rglob(".*.part")))
     return found
 
 
@@ -285,17 +290,11 @@ class Sample:
     load: Callable[[Path], bytes]
 
 
-def _load_checkpoint(path: Path) -> bytes:
-    content, arrays = store.read(path, CHECKPOINT)
-    kept = {name: (a.dtype.str, a.shape, a.tobytes().hex()) for name, a in sorted(arrays.items())}
-    return json.dumps([content, kept], sort_keys=True).encode()
-
-
 _LOADS: dict[str, Callable[[Path], bytes]] = {
     "machine": lambda path: _saved(EvolvingFSM.load(path)),
     "model": lambda path: _saved(FSMModel.load(path)),
     "risk": lambda path: _saved(LatentRisk.load(path)),
-    "checkpoint": _load_checkpoint,
+    "guard": lambda path: _saved(Guard.load(path)),
 }
 
 
@@ -310,7 +309,10 @@ def samples(folder: Path) -> list[Sample]:
     machine.save(folder / "new.machine", {"files": ["a.csv"]})
     machine.model(names=("x", "y")).save(folder / "new.model")
     risk.save(folder / "new.risk")
-    _drive(folder / "new.checkpoint")
+    guard = guard_for_cars(low=-2.5, high=2.5)
+    for k in range(20):
+        guard.decide([30.0 - k, 20.0, 18.0], 0.5)
+    guard.save(folder / "new.guard")
     paths = {kind: folder / f"new.{kind}" for kind in _LOADS}
     return [Sample(path.name, path.read_bytes(), _LOADS[kind]) for kind, path in paths.items()]
 
@@ -504,6 +506,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     kills, disks, loads, files = (20, 4, 100, 200) if asked.short else (500, 100, 5000, 10_000)
     shared = 4 if asked.short else 200  # machines
     store._OLD = 0.0  # all that writes a file here is known
+    driving_module._EVERY = 0.0
     random = np.random.default_rng(asked.seed)
     total: Counter[str] = Counter()
     with tempfile.TemporaryDirectory() as name:

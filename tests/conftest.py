@@ -32,14 +32,13 @@ def spiral():
 @pytest.fixture(scope="session")
 def compiled():
     """All that a watched run needs is compiled, for tests that wait for some seconds only."""
-    from evofsm.cli.watch.session import Session, Watching, learn_first, watched_guard
-    from evofsm.driving.families import load_family
-    from evofsm.driving.world import KinematicWorld
+    from evofsm.cli.watch.session import Session, learn_first, watched_guard
+    from evofsm.driving import KinematicWorld, load_family
 
-    watching = Watching(load_family("paper"))
-    guard = watched_guard(watching.family)
-    learn_first(watching, guard, 2)
-    with Session(watching, guard, KinematicWorld()) as session:
+    family = load_family("paper")
+    guard = watched_guard(family)
+    learn_first(guard, family, 2)
+    with Session(family, guard, KinematicWorld()) as session:
         while not session.step().over:
             session.graph()
 

@@ -1,142 +1,391 @@
+"""`evofsm drive`: in turn and learning, or many at once; whatever stops it, it goes on."""
+
 import json
+import os
+import shutil
+import signal
 import subprocess
 import sys
+import time
+from contextlib import closing
+from pathlib import Path
 
 import pytest
 
-from evofsm.cli.driving import DECISION_TABLE
-
-pytest.importorskip("typer")
 pytest.importorskip("scipy")
 
+from evofsm.cli.driving import (
+    DECISION_TABLE,
+    Results,
+    Setup,
+    drive_at_once,
+    drive_in_turn,
+    make_guard,
+)
+from evofsm.driving import KinematicWorld, load_family, open_world
+from evofsm.guard import Guard, Mode
 
-def evofsm(*arguments):
-    command = [sys.executable, "-m", "evofsm", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, check=False)
+EMERGENCY = load_family("emergency")
+EPISODES = 400
 
 
-@pytest.mark.slow
-def test_drive_learns_saves_and_drives_frozen(tmp_path):
-    learnt = tmp_path / "learnt"
+def command(*words):
+    return [sys.executable, "-m", "evofsm", "drive", *map(str, words)]
+
+
+def begun(folder, setup):
+    return closing(Results(setup, make_guard(setup), folder))
+
+
+def in_turn(folder=None, episodes=6, place=None, **options):
+    setup = Setup(options.pop("family", EMERGENCY), **options)
+    with begun(folder, setup) as results:
+        return drive_in_turn(results, episodes, place or KinematicWorld())
+
+
+def at_once(folder=None, episodes=6, workers=2, **options):
+    setup = Setup(options.pop("family", EMERGENCY), learn=False, **options)
+    with begun(folder, setup) as results:
+        return drive_at_once(results, episodes, workers)
+
+
+def failure(result, says):
+    assert result.exit_code == 2
+    assert says in result.stderr
+    assert result.stderr.count("\n") == 1
+
+
+# -- In turn --------------------------------------------------------------------------------------
+
+
+def test_it_learns_saves_and_drives_frozen(evofsm, tmp_path):
+    polars = pytest.importorskip("polars")
+    learnt, further = tmp_path / "learnt", tmp_path / "further"
     first = evofsm("drive", "emergency", "--episodes", 12, "--out", learnt)
-    assert first.returncode == 0, first.stderr
+    assert first.exit_code == 0, first.stderr
     assert "0 of 12" in first.stdout
     assert {path.name for path in learnt.iterdir()} == {
-        *("machine.evofsm", "risk.evofsm", "summary.json", "decisions.parquet"),
+        *("guard.evofsm", "episodes.jsonl", "episodes.csv", "summary.json", "decisions.parquet"),
     }
+    table = polars.read_parquet(learnt / "decisions.parquet")
+    assert table.columns == ["episode", *DECISION_TABLE]
+    changed = table.filter(polars.col("proposed") != polars.col("executed"))
+    assert changed["reason"].str.len_chars().min() > 10
     frozen = evofsm("drive", "emergency", "--episodes", 5, "--frozen", learnt, "--json")
     row = json.loads(frozen.stdout)
-    assert row["episodes"] == 5
-    assert row["collisions"] == 0
-    further = tmp_path / "further"
+    assert (row["episodes"], row["collisions"]) == (5, 0)
     again = evofsm("drive", "emergency", "--episodes", 2, "--learn", learnt, "--out", further)
-    assert again.returncode == 0, again.stderr
-    assert json.loads((further / "summary.json").read_text())["episodes_learnt"] == 14
+    assert again.exit_code == 0, again.stderr
+    numbers = polars.read_csv(further / "episodes.csv")["episode"].to_list()
+    assert numbers == [12, 13]
+    graph = evofsm("export", further, "--to", "dot")
+    assert graph.stdout.startswith("digraph")
 
 
 @pytest.mark.slow
-def test_a_judge_that_is_told_nothing_but_failures_is_driven_kept_and_gone_on_with(tmp_path):
-    polars = pytest.importorskip("polars")
+def test_a_judge_that_is_given_nothing_but_failures_is_driven_saved_and_gone_on_with(
+    evofsm, tmp_path
+):
     drive, out = ("drive", "emergency", "--judge", "learnt"), tmp_path / "learnt"
-    keeping = ("--checkpoint", tmp_path / "checkpoint", "--every", "0s")
-    first = evofsm(*drive, "--episodes", 6, "--out", out, "--audit", tmp_path / "log", *keeping)
-    assert first.returncode == 0, first.stderr
-    assert "learnt, told nothing but failures" in first.stdout
-    assert "fails where gap is below" in first.stdout
-    assert "disturbances remembered" in " ".join(first.stdout.split())
-    reasons = polars.read_parquet(out / "decisions.parquet")["reason"]
-    assert reasons[0].endswith("nothing was learnt yet")
-    assert reasons.str.contains("no backup survives").any()
-    assert evofsm("audit", tmp_path / "log").returncode == 0
+    first = evofsm(*drive, "--episodes", 6, "--out", out, "--audit", tmp_path / "log")
+    assert first.exit_code == 0, first.stderr
+    text = " ".join(first.stdout.split())
+    assert "learnt, given nothing but failures" in text
+    assert "fails where gap is below" in text
+    assert evofsm("audit", tmp_path / "log").exit_code == 0
     whole = json.loads(evofsm(*drive, "--episodes", 8, "--json").stdout)
-    again = json.loads(evofsm(*drive, "--episodes", 8, "--json", *keeping).stdout)
+    again = json.loads(evofsm(*drive, "--episodes", 8, "--json", "--out", out).stdout)
     assert again == whole
     frozen = evofsm(*drive, "--episodes", 3, "--frozen", out)
     assert "held-out episodes" in frozen.stdout, frozen.stderr
     wrong = evofsm("drive", "emergency", "--episodes", 3, "--frozen", out)
-    assert "of the judge 'learnt', not of 'kinematic'" in wrong.stderr
-    graph = evofsm("export", out, "--to", "dot")
-    assert graph.returncode == 0, graph.stderr
+    failure(wrong, "of the judge 'learnt', not of 'kinematic'")
+
+
+def test_left_to_itself_the_driver_collides_and_in_shadow_there_was_an_alarm():
+    alone = in_turn(reviser="none", learn=False)
+    assert alone.row.collision_rate > 0.5
+    shadow = in_turn(mode=Mode.SHADOW, learn=False)
+    assert shadow.row.intervention_rate == 0.0
+    assert len(shadow.lead_times) == shadow.row.collisions
+    assert min(shadow.lead_times) > 1.0
 
 
 def test_the_table_of_decisions_has_its_columns_in_their_order():
     assert DECISION_TABLE == (
-        *("episode", "time", "gap", "v_follower", "v_leader", "intake", "state", "n_states"),
+        *("time", "gap", "v_follower", "v_leader", "intake", "state", "n_states"),
         *("surprise", "proposed", "executed", "advised", "risk_proposed", "risk_executed"),
         *("risk_low", "risk_high", "evidence", "seen", "realised", "reason"),
     )
 
 
-@pytest.mark.slow
-def test_decisions_are_recorded_with_their_reasons(tmp_path):
-    polars = pytest.importorskip("polars")
-    evofsm("drive", "emergency", "--episodes", 2, "--out", tmp_path / "out")
-    table = polars.read_parquet(tmp_path / "out" / "decisions.parquet")
-    assert {"proposed", "executed", "realised", "reason", "risk_proposed"} <= set(table.columns)
-    changed = table.filter(polars.col("proposed") != polars.col("executed"))
-    assert len(changed) > 0
-    assert changed["reason"].str.len_chars().min() > 10
-
-
-@pytest.mark.slow
-def test_left_to_itself_the_driver_collides_and_in_shadow_there_was_an_alarm():
-    row = json.loads(
-        evofsm("drive", "emergency", "--reviser", "none", "--episodes", 5, "--json").stdout
-    )
-    assert row["collision_rate"] > 0.5
-    shadow = evofsm("drive", "emergency", "--mode", "shadow", "--episodes", 5, "--json")
-    row = json.loads(shadow.stdout)
-    assert row["intervention_rate"] == 0.0
-    assert len(row["lead_times"]) == row["collisions"]
-    assert min(row["lead_times"]) > 1.0
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("controller", ["aggressive", "normal", "acc"])
-def test_any_controller_is_revised(controller):
-    result = evofsm("drive", "emergency", "--controller", controller, "--episodes", 3, "--json")
-    assert json.loads(result.stdout)["collisions"] == 0
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize(
-    ("arguments", "word"),
+    ("words", "says"),
     [
         (("nowhere",), "nowhere"),
         (("emergency", "--reviser", "magic"), "magic"),
-        (("emergency", "--controller", "magic"), "magic"),
         (("emergency", "--controller", "sumo"), "sumo"),
-        (("emergency", "--mode", "maybe"), "maybe"),
         (("emergency", "--mode", "shadow", "--reviser", "rss"), "rss"),
         (("emergency", "--with", "rain"), "rain"),
         (("emergency", "--frozen", "nothing-here"), "nothing-here"),
         (("emergency", "--tolerance", "2"), "tolerance"),
+        (("emergency", "--learn", "a", "--workers", "2"), "one after the other"),
+        (("emergency", "--mcap", "a", "--workers", "2"), "workers send no decisions"),
+        (("emergency", "--cluster", "tcp://127.0.0.1:1"), "no Dask scheduler answers"),
     ],
 )
-def test_what_cannot_be_driven_is_refused_in_one_line(arguments, word):
-    result = evofsm("drive", *arguments, "--episodes", 1)
-    assert result.returncode == 2
-    assert word in result.stderr
-    assert len(result.stderr.splitlines()) == 1
+def test_what_cannot_be_driven_is_refused_in_one_line(evofsm, words, says, monkeypatch):
+    monkeypatch.setattr("evofsm.cli.driving._PATIENCE", 0.5)
+    failure(evofsm("drive", *words, "--episodes", 1), says)
+
+
+# -- Whatever stops it ----------------------------------------------------------------------------
+
+
+def results_of(folder):
+    """What does not depend on the order in which episodes were done."""
+    return [(folder / name).read_bytes() for name in ("episodes.csv", "summary.json")]
+
+
+class StoppedError(Exception):
+    pass
+
+
+@pytest.mark.parametrize("every", [0.0, 1e9])
+def test_learning_that_is_stopped_goes_on_bit_for_bit(tmp_path, snapshot, monkeypatch, every):
+    monkeypatch.setattr("evofsm.cli.driving._EVERY", every)
+    plain = in_turn(tmp_path / "plain", 5)
+    folder, setup = tmp_path / "stopped", Setup(EMERGENCY)
+
+    def show(done, _):
+        if done in stops:
+            stops.remove(done)
+            raise StoppedError
+
+    stops = [1, 2, 4]
+    while stops:
+        with begun(folder, setup) as results, pytest.raises(StoppedError):
+            drive_in_turn(results, 5, KinematicWorld(), show)
+    again = in_turn(folder, 5)
+    assert results_of(folder) == results_of(tmp_path / "plain")
+    assert snapshot(again.guard.machine) == snapshot(plain.guard.machine)
+    assert again.guard.judge.sums(3) == plain.guard.judge.sums(3)
+    more = in_turn(folder, 7)
+    assert more.row == in_turn(episodes=7).row
+    with pytest.raises(ValueError, match="has driven 7 episodes, more than 5"):
+        in_turn(folder, 5)
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"seed": 1}, "seed was 0 and is now 1;"),
+        ({"reviser": "rss"}, 'reviser was "none" and is now "rss";'),
+        ({"tolerance": 0.1}, "tolerance was 0.02 and is now 0.1;"),
+        ({"family": EMERGENCY.with_switches(["noise"])}, "family.switches"),
+        ({"learn": True}, "learn was false and is now true"),
+    ],
+)
+def test_a_folder_of_other_settings_is_refused(tmp_path, changes, says):
+    in_turn(tmp_path, 1, reviser="none", learn=False)
+    with pytest.raises(ValueError, match="begun with other settings") as caught:
+        in_turn(tmp_path, 1, **({"reviser": "none", "learn": False} | changes))
+    assert says in str(caught.value)
+    assert "or name another folder" in str(caught.value)
+
+
+def test_what_was_learnt_is_one_of_the_settings(evofsm, tmp_path):
+    for name in ("a", "b"):
+        in_turn(tmp_path / name, 1, seed=ord(name))
+    out = ("--episodes", 1, "--out", tmp_path / "out")
+    assert evofsm("drive", "emergency", "--frozen", tmp_path / "a", *out).exit_code == 0
+    failure(evofsm("drive", "emergency", "--frozen", tmp_path / "b", *out), "digest was")
+
+
+def test_two_at_once_are_refused(tmp_path):
+    with begun(tmp_path, Setup(EMERGENCY)), pytest.raises(ValueError, match="another process"):
+        in_turn(tmp_path, 1)
+
+
+def test_a_full_disk_is_named_and_what_was_driven_is_kept(tmp_path, monkeypatch):
+    in_turn(tmp_path, 2)
+    with monkeypatch.context() as patched:
+        patched.setattr(Guard, "save", lambda *_: (_ for _ in ()).throw(OSError(28, "No space")))
+        with pytest.raises(OSError, match="No space") as caught:
+            in_turn(tmp_path, 3)
+    assert "what was driven is kept" in caught.value.__notes__[0]
+    assert in_turn(tmp_path, 3).row.episodes == 3
+
+
+# -- At once --------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory):
+    """The folder of many episodes that nothing happened to."""
+    out = tmp_path_factory.mktemp("undisturbed")
+    in_turn(out, EPISODES, reviser="none", learn=False)
+    return out
+
+
+def unrevised(out, *words):
+    return ("emergency", "--reviser", "none", "--episodes", EPISODES, "--out", out, *words)
+
+
+def lines(journal):
+    return journal.read_bytes().count(b"\n") if journal.exists() else 0
+
+
+def wait_for(journal, count, process):
+    while lines(journal) < count:
+        assert process.poll() is None, process.stderr.read()
+        time.sleep(0.005)
+
+
+def workers_of(process):
+    children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
+    return [
+        int(child)
+        for child in children
+        if b"spawn_main" in Path(f"/proc/{child}/cmdline").read_bytes()
+    ]
+
+
+def wait_until(condition, seconds=60.0):
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.005)
+
+
+def is_alive(process):
+    try:
+        return "\nState:\tZ" not in Path(f"/proc/{process}/status").read_text()
+    except FileNotFoundError:
+        return False
 
 
 @pytest.mark.slow
-def test_a_run_waits_for_whoever_looks_on_in_foxglove():
+@pytest.mark.parametrize("world", ["kinematic", "sumo"])
+def test_it_is_what_driving_in_turn_makes_of_the_same_episodes(tmp_path, world):
+    if world == "sumo":
+        pytest.importorskip("libsumo")
+    asked = {"family": load_family("rare"), "reviser": "aeb", "seed": 3, "world": world}
+    with open_world(world) as place:
+        plain = in_turn(place=place, learn=False, **asked)
+    driven = at_once(tmp_path, **asked)
+    assert driven.row == plain.row
+    assert driven.lead_times == plain.lead_times
+    assert at_once(tmp_path, 3, **asked).row.episodes == 3  # the first ones are summed up
+
+
+@pytest.mark.slow
+def test_killed_workers_and_a_killed_parent_change_nothing(tmp_path, undisturbed):
+    journal, words = tmp_path / "episodes.jsonl", unrevised(tmp_path, "--workers", 2)
+    with subprocess.Popen(
+        command(*words), stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    ) as process:
+        wait_for(journal, 2, process)
+        os.kill(workers_of(process)[0], signal.SIGKILL)
+        wait_for(journal, lines(journal) + 60, process)
+        workers = workers_of(process)
+        process.kill()
+    assert workers
+    assert lines(journal) <= EPISODES
+    wait_until(lambda: not any(map(is_alive, workers)))
+    with open(journal, "ab") as file:
+        file.write(b'{"episode":5,"varia')
+    again = subprocess.run(command(*words, "--json"), capture_output=True, text=True)
+    assert again.returncode == 0, again.stderr
+    assert results_of(tmp_path) == results_of(undisturbed)
+    assert json.loads(again.stdout)["episodes"] == EPISODES
+
+
+@pytest.mark.slow
+def test_a_killed_worker_of_a_cluster_changes_nothing(tmp_path, undisturbed):
+    pytest.importorskip("distributed")
+    where, started = tmp_path / "scheduler.json", []
+
+    def start(module, *options):
+        words = [sys.executable, "-m", f"distributed.cli.{module}", "--scheduler-file", where]
+        with open(tmp_path / f"{len(started)}.log", "wb") as log:
+            started.append(
+                subprocess.Popen([*words, "--no-dashboard", *options], stdout=log, stderr=log)
+            )
+
+    out = tmp_path / "out"
+    try:
+        start("dask_scheduler", "--host", "127.0.0.1", "--port", "0", "--no-show")
+        for name in ("one", "two"):
+            local = ("--no-nanny", "--host", "127.0.0.1", "--local-directory", tmp_path / name)
+            start("dask_worker", "--nthreads", "1", *local)
+        wait_until(lambda: where.exists() and where.stat().st_size)
+        address = json.loads(where.read_text())["address"]
+        words = unrevised(out, "--cluster", address, "--workers", 2)
+        with subprocess.Popen(
+            command(*words), stdout=subprocess.PIPE, stderr=subprocess.PIPE
+        ) as process:
+            wait_for(out / "episodes.jsonl", 2, process)
+            started[1].kill()
+            assert process.wait() == 0, process.stderr.read()
+    finally:
+        for process in started:
+            process.kill()
+            process.wait()
+    assert results_of(out) == results_of(undisturbed)
+
+
+@pytest.mark.slow
+def test_an_interruption_is_quiet_and_says_how_to_go_on(tmp_path):
+    words = unrevised(tmp_path, "--workers", 2, "--episodes", 10_000)
+    with subprocess.Popen(
+        command(*words), stderr=subprocess.PIPE, text=True, start_new_session=True
+    ) as process:
+        wait_for(tmp_path / "episodes.jsonl", 2, process)
+        os.killpg(process.pid, signal.SIGINT)
+        said = process.stderr.read()
+    assert process.returncode == 130
+    assert "the same command goes on from there" in said
+    assert len(said.strip().splitlines()) == 1
+    assert lines(tmp_path / "episodes.jsonl") > 1
+
+
+def fatal(numbers):
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+@pytest.mark.slow
+def test_episodes_that_kill_every_worker_are_named(monkeypatch):
+    from evofsm.cli.driving import _in_processes
+
+    with pytest.raises(ChildProcessError, match="5 times a worker died over episodes 3 to 4"):
+        list(_in_processes(fatal, [[3, 4]], 1))
+
+
+@pytest.mark.slow
+def test_more_episodes_are_added_to_those_that_are_there(tmp_path, undisturbed):
+    shutil.copytree(undisturbed, tmp_path, dirs_exist_ok=True)
+    before = lines(tmp_path / "episodes.jsonl")
+    at_once(tmp_path, EPISODES + 3, reviser="none")
+    assert lines(tmp_path / "episodes.jsonl") == before + 3
+
+
+# -- In Foxglove ----------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_a_run_waits_for_whoever_looks_on_in_foxglove(evofsm):
     pytest.importorskip("foxglove")
     connect = pytest.importorskip("websockets.sync.client").connect
-    refused = evofsm("drive", "emergency", "--foxglove", 0, "--audit", "log")
-    assert "exclude each other" in refused.stderr
-    command = ("drive", "emergency", "--episodes", "1", "--foxglove", "0", "--json")
+    failure(evofsm("drive", "emergency", "--foxglove", 0, "--audit", "log"), "exclude each other")
+    words = ("emergency", "--episodes", "1", "--foxglove", "0", "--json")
     process = subprocess.Popen(
-        [sys.executable, "-m", "evofsm", *command],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
+        command(*words), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )
     line = ""
-    while "Open ws://" not in line:  # it may say first that it compiles
+    while "open ws://" not in line:  # it may say first that it compiles
         line = process.stderr.readline()
-    address = line.split()[1]
+    address = line.partition("open ")[2].split()[0]
     with connect(address, subprotocols=["foxglove.sdk.v1"], proxy=None) as client:
         topics = {}
         while "/risk" not in topics:

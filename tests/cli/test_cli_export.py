@@ -58,7 +58,7 @@ def test_drive_logs_every_episode_and_what_was_learnt(driven):
 def test_folder_machine_and_log_give_the_same_states(driven, to, begins, tmp_path):
     out, log = driven
     printed = {}
-    for file in (out, out / "machine.evofsm", log):
+    for file in (out, out / "guard.evofsm", log):
         result = evofsm("export", file, "--to", to)
         assert result.exit_code == 0, result.stderr
         assert result.stdout.startswith(begins)
@@ -86,14 +86,15 @@ def test_options_choose_what_is_drawn(driven):
     [
         (("export", "nothing", "--to", "dot"), "nothing"),
         (("export", "{out}/summary.json", "--to", "dot"), "summary.json"),
-        (("export", "{out}/risk.evofsm", "--to", "dot"), "risk"),
-        (("export", "{out}/..", "--to", "dot"), "machine.evofsm"),
+        (("export", "{out}/..", "--to", "dot"), "neither guard.evofsm"),
         (("export", "{out}", "--to", "prism", "--evidence", 0), "evidence"),
-        (("export", "{out}", "--to", "dot", "--out", "{out}/machine.evofsm"), "left alone"),
-        (("export", "{out}", "--to", "dot", "--out", "{out}/risk.evofsm"), "left alone"),
+        (("export", "{out}", "--to", "dot", "--out", "{out}/guard.evofsm"), "left alone"),
         (("export", "{log}", "--to", "dot", "--out", "{log}"), "left alone"),
         (("export", "{out}", "--to", "dot", "--out", "/dev/null"), "is a device"),
-        (("drive", "emergency", "--mcap", "a", "--checkpoint", "b"), "--mcap"),
+        (
+            ("drive", "emergency", "--mcap", "a", "--out", "{out}", "--mode", "shadow"),
+            "name another",
+        ),
         (("drive", "emergency", "--mcap", "no/folder/a.mcap"), "no/folder"),
     ],
 )

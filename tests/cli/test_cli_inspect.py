@@ -5,7 +5,7 @@ import json
 import pytest
 
 from evofsm import EvolvingFSM, Guard
-from evofsm.driving import Unrevised, guard_for_family, learners_of, load_family, save_learnt, teach
+from evofsm.driving import Unrevised, guard_for_family, learners_of, load_family, teach
 
 
 @pytest.fixture(scope="module")
@@ -16,7 +16,7 @@ def saved(tmp_path_factory):
     reviser = Unrevised(family.actions)
     guard = Guard.of(reviser, interval=family.interval, machine=machine, judge=risk)
     teach(guard, [family.draw(0, index, split="train") for index in range(6)])
-    save_learnt(guard, folder, {"family": "emergency"})
+    guard.save(folder / "guard.evofsm", {"family": "emergency"})
     return folder, machine
 
 

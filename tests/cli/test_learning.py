@@ -1,19 +1,20 @@
-"""Learning from chunks: the same as row by row, and scored as the definitions say."""
+"""Learning from chunks: the same as row by row, scored as the definitions say, and resumable."""
 
 import math
+import os
 
 import numpy as np
 import pytest
 
+from evofsm import EvolvingFSM, IntervalActions, jensen_shannon
+from evofsm.cli import learning as module
 from evofsm.cli.inspect import passages
-from evofsm.cli.learning import learn_traces
-from evofsm.fsm.actions import IntervalActions
-from evofsm.fsm.divergence import jensen_shannon
-from evofsm.fsm.machine import EvolvingFSM
-from evofsm.io.logs import Chunk
+from evofsm.cli.learning import Checkpoint, learn_traces
+from evofsm.io import Chunk
 
 ACTIONS = IntervalActions(-1.0, 1.0, 0.5, outside="clip")
 STARTS = [0, 37, 38, 150]
+SETTINGS = {"rule": "paper", "files": [{"name": "a", "bytes": 3}]}
 
 
 @pytest.fixture
@@ -40,130 +41,96 @@ def chunks(Z, actions, starts=STARTS, dt=0.1, size=1000):
         yield Chunk("made up", Z[rows], actions[rows], times, inside, dt)
 
 
-def by_hand(Z, actions, starts=STARTS, steps=10):
-    """The same one row at a time, with divergences of forecasts and of persistence, and beliefs."""
+def by_hand(Z, actions):
+    """A machine taught one row at a time."""
     fsm = machine()
-    one, ahead = [], []
-    beliefs, looks = [], {}
     for t, z in enumerate(Z):
-        if t in starts:
+        if t in STARTS:
             fsm.start_episode()
-            begun = t
-        step = fsm.observe(z)
-        beliefs.append(step.belief)
-        n = len(step.belief)
-        if not math.isnan(step.surprise):
-            one.append((step.surprise, jensen_shannon(wide(beliefs[t - 1], n), step.belief)))
-        if (t - begun) % steps == 0:
-            if t - steps >= begun and t - steps in looks:
-                forecasts = [beliefs[t - steps], *looks[t - steps]]
-                ahead.append([jensen_shannon(wide(f, n), step.belief) for f in forecasts])
-            if not math.isnan(actions[t]):
-                i = ACTIONS.encode(actions[t])
-                looks[t] = [fsm.predict(i, steps, p) for p in ("marginal", "hold", "observed")]
+        fsm.observe(z)
         if not math.isnan(actions[t]):
             fsm.act(ACTIONS.encode(actions[t]))
-    return fsm, np.array(one), np.array(ahead), beliefs
+    return fsm
 
 
-def wide(belief, n):
-    return np.pad(belief, (0, n - len(belief)))
-
-
-@pytest.mark.parametrize("size", [1, 7, 10, 64, 1000])
+@pytest.mark.parametrize("size", [1, 7, 64, 1000])
 def test_chunks_of_any_size_learn_what_single_rows_do(trace, snapshot, size):
-    learning = learn_traces(chunks(*trace, size=size), machine(), ACTIONS)
-    fsm, *_ = by_hand(*trace)
+    learnt = learn_traces(chunks(*trace, size=size), machine(), ACTIONS)
+    fsm = by_hand(*trace)
     assert fsm.n_states > 3
-    assert snapshot(learning.machine) == snapshot(fsm)
+    assert snapshot(learnt.machine) == snapshot(fsm)
 
 
-@pytest.mark.parametrize("size", [1, 7, 10, 64, 1000])
-def test_skill_is_what_its_definition_says(trace, size):
-    learning = learn_traces(chunks(*trace, size=size), machine(), ACTIONS)
-    _, one, ahead, _ = by_hand(*trace)
-    first, *others = learning.skills
-    assert first.forecasts == len(one) > 150
-    assert first.divergence == pytest.approx(one[:, 0].mean())
-    assert first.persistence == pytest.approx(one[:, 1].mean())
-    assert first.skill == pytest.approx(1 - one[:, 0].mean() / one[:, 1].mean())
-    assert [skill.policy for skill in others] == ["marginal", "hold", "observed"]
-    for k, skill in enumerate(others, 1):
-        assert (skill.steps, skill.seconds) == (10, 1.0)
-        assert skill.forecasts == len(ahead) > 10
-        assert skill.persistence == pytest.approx(ahead[:, 0].mean())
-        assert skill.divergence == pytest.approx(ahead[:, k].mean())
-
-
-@pytest.mark.parametrize("rows_at_once", [1, 3, 50])
-@pytest.mark.parametrize(("dt", "steps"), [(0.02, 50), (0.1, 10), (2.0, 0)])
-def test_scores_are_the_same_however_many_rows_are_learnt_at_once(
-    trace, monkeypatch, rows_at_once, dt, steps
-):
-    monkeypatch.setattr("evofsm.cli.learning._ROWS_AT_ONCE", rows_at_once)
-    learning = learn_traces(chunks(*trace, dt=dt), machine(), ACTIONS)
-    _, one, ahead, beliefs = by_hand(*trace, steps=steps or 10)
-    first, *others = learning.skills
-    assert first.forecasts == len(one)
-    assert (first.divergence, first.persistence) == pytest.approx(tuple(one.mean(axis=0)))
-    assert len(others) == (3 if steps else 0)
-    for k, skill in enumerate(others, 1):
-        assert skill.forecasts == len(ahead) > 0
-        wanted = ahead[:, k].mean(), ahead[:, 0].mean()
-        assert (skill.divergence, skill.persistence) == pytest.approx(wanted)
-    assert learning.certainty == pytest.approx(np.mean([belief.max() for belief in beliefs]))
-
-
-def test_rows_that_no_machine_takes_are_refused(trace):
+@pytest.mark.parametrize(("dt", "steps"), [(0.1, 10), (0.3, 3), (2.0, 0)])
+def test_skill_is_what_its_definition_says(trace, monkeypatch, dt, steps):
+    """Of each block the forecasts of the machine before it, against the beliefs that it has."""
+    monkeypatch.setattr(module, "_LARGEST_BLOCK", 64)
     Z, actions = trace
-    Z[130, 1] = math.nan
-    with pytest.raises(ValueError, match="row 30, variable 1: nan"):
-        learn_traces(chunks(Z, actions, size=100), machine(), ACTIONS)
+    one, ahead, certainty = [], [], []
+    for first in range(64, 200, 64):
+        before = [start for start in STARTS if start < first]
+        model = learn_traces(chunks(Z[:first], actions[:first], before), machine(), ACTIONS).model
+        rows = range(first, min(first + 64, 200))
+        belief = {t: model.recognise(Z[t]) for t in rows}
+        certainty += [belief[t].max() for t in rows]
+
+        def scores(t, steps, policies, model=model, belief=belief):
+            here, i = belief[t], ACTIONS.encode(actions[t])
+            made = [here, *(model.propagate(here, i, steps, policy) for policy in policies)]
+            return [jensen_shannon(forecast, belief[t + steps]) for forecast in made]
+
+        def goes_on(t, steps, rows=rows):
+            within = t + steps in rows and not any(t < start <= t + steps for start in STARTS)
+            return within and not math.isnan(actions[t])
+
+        one += [scores(t, 1, ["hold"]) for t in rows if goes_on(t, 1)]
+        if steps:
+            longer = [t for t in rows if goes_on(t, steps)][::steps]
+            ahead += [scores(t, steps, ["marginal", "hold", "observed"]) for t in longer]
+    learnt = learn_traces(chunks(Z, actions, dt=dt), machine(), ACTIONS)
+    first, *others = learnt.skills
+    assert first.forecasts == len(one) > 100
+    assert (first.persistence, first.divergence) == pytest.approx(tuple(np.mean(one, axis=0)))
+    assert first.skill == pytest.approx(1 - first.divergence / first.persistence)
+    assert learnt.certainty == pytest.approx(np.mean(certainty))
+    wanted = ["marginal", "hold", "observed"] if steps else []
+    assert [skill.policy for skill in others] == wanted
+    for k, skill in enumerate(others, 1):
+        assert (skill.steps, skill.forecasts) == (steps, len(ahead))
+        found = np.mean(ahead, axis=0)
+        assert (skill.persistence, skill.divergence) == pytest.approx((found[0], found[k]))
 
 
 def test_counts_say_what_was_learnt(trace):
     Z, actions = trace
-    learning = learn_traces(chunks(Z, actions, size=50), machine(), ACTIONS)
-    assert learning.rows == 200
-    assert learning.episodes == 4
-    assert learning.seconds == pytest.approx(0.1 * (200 - 4))
+    marked = [one._replace(jumps=1, cuts=2) for one in chunks(Z, actions, size=50)]
+    learnt = learn_traces(marked, machine(), ACTIONS, ["x", "y"], ["m", "s"])
+    read, model = learnt.read, learnt.model
+    assert (read.rows, read.episodes, read.jumps, read.cuts) == (200, 4, 4, 8)
+    assert read.seconds == pytest.approx(0.1 * (200 - 4))
     # After rows 36, 149 and 199 no row of the episode follows anyway; after 37 neither.
-    assert learning.transitions == 200 - 4 - 1 == learning.model.uses.sum()
-    assert learning.clipped_below == np.nansum(actions < -1.0) > 0
-    assert learning.clipped_above == np.nansum(actions > 1.0) > 0
-    assert 0.0 < learning.certainty <= 1.0
-    assert learning.model.visits.sum() == 200
-
-
-def test_the_model_knows_its_actions_names_units_and_step(trace):
-    model = learn_traces(chunks(*trace), machine(), ACTIONS, ["x", "y"], ["m", "s"]).model
+    assert learnt.transitions == 200 - 4 - 1 == model.uses.sum()
+    assert read.clipped_below == np.nansum(actions < -1.0) > 0
+    assert read.clipped_above == np.nansum(actions > 1.0) > 0
+    assert model.visits.sum() == 200
     assert (model.actions, model.names, model.units, model.dt) == (
-        ACTIONS,
-        ("x", "y"),
-        ("m", "s"),
-        0.1,
+        *(ACTIONS, ("x", "y"), ("m", "s"), 0.1),
     )
-
-
-def test_jumps_and_cuts_of_chunks_add_up(trace):
-    marked = [chunk._replace(jumps=1, cuts=2) for chunk in chunks(*trace, size=100)]
-    learning = learn_traces(marked, machine(), ACTIONS)
-    assert (learning.jumps, learning.cuts) == (2, 4)
 
 
 def test_where_the_action_tells_what_comes_forecasts_beat_persistence():
     # A switch: the action says where to go, so the belief never stays and is always foreseen.
     places = np.random.default_rng(3).integers(0, 2, 4000)
     Z = 10.0 * places[:-1, None].astype(float)
-    learning = learn_traces(
+    learnt = learn_traces(
         chunks(Z, np.where(places[1:], 0.9, -0.9), [0]), machine(spread=0.01), ACTIONS
     )
-    assert learning.model.n_states == 2
-    assert learning.skills[0].skill > 0.9
-    found = passages(learning.model)
+    assert learnt.model.n_states == 2
+    assert learnt.skills[0].skill > 0.9
+    found = passages(learnt.model)
     assert {(p.origin, p.target) for p in found} == {(0, 1), (1, 0)}
     up, down = ACTIONS.encode(0.9), ACTIONS.encode(-0.9)
-    rising = int(learning.model.centers[1, 0] > 5.0)
+    rising = int(learnt.model.centers[1, 0] > 5.0)
     assert {p.target: p.action for p in found} == {rising: up, 1 - rising: down}
     assert all(p.under_action > 0.95 for p in found)
     happened = sum(places[k] != places[k + 1] for k in range(len(Z) - 1))
@@ -171,50 +138,100 @@ def test_where_the_action_tells_what_comes_forecasts_beat_persistence():
     assert sum(p.taken for p in found) == pytest.approx(2000, rel=0.2)
 
 
-@pytest.mark.parametrize(("dt", "steps"), [(0.5, 2), (0.3, 3), (0.04, 25), (1.0, 0), (5.0, 0)])
-def test_the_longer_forecast_is_of_about_a_second_or_left_out(trace, dt, steps):
-    skills = learn_traces(chunks(*trace, dt=dt), machine(), ACTIONS).skills
-    assert [skill.steps for skill in skills] == [1, *[steps] * 3 * (steps > 0)]
-    assert all(skill.seconds == pytest.approx(skill.steps * dt) for skill in skills)
-
-
-def test_one_state_has_no_skill_and_no_passages():
-    Z = np.zeros((30, 2))
-    learning = learn_traces(chunks(Z, np.zeros(30), [0]), machine(), ACTIONS)
-    assert learning.model.n_states == 1
-    assert all(math.isnan(skill.skill) for skill in learning.skills)
-    assert passages(learning.model) == []
-
-
-def test_an_action_hardly_ever_tried_says_nothing(trace):
+def test_one_state_has_no_skill_and_an_action_hardly_tried_says_nothing(trace):
+    learnt = learn_traces(chunks(np.zeros((200, 2)), np.zeros(200), [0]), machine(), ACTIONS)
+    assert learnt.model.n_states == 1
+    assert all(math.isnan(skill.skill) for skill in learnt.skills)
+    assert passages(learnt.model) == []
     Z, actions = trace
     rare = learn_traces(chunks(Z[:9], actions[:9], [0]), machine(), ACTIONS)
     assert rare.model.n_states > 1
     assert all(p.action is None for p in passages(rare.model))
 
 
-@pytest.mark.parametrize("starts", [range(200), [0]])
-def test_where_nothing_follows_nothing_is_learnt(trace, starts):
+def test_what_cannot_be_learnt_is_refused(trace):
     Z, actions = trace
-    if len(starts) == 1:
-        actions = np.full(200, np.nan)
     with pytest.raises(ValueError, match="no transition could be learnt"):
-        learn_traces(chunks(Z, actions, starts), machine(), ACTIONS)
+        learn_traces(chunks(Z, actions, range(200)), machine(), ACTIONS)
+    with pytest.raises(ValueError, match="the machine has 3 actions, but there are 4 intervals"):
+        learn_traces(chunks(Z, actions), EvolvingFSM(3), ACTIONS)
+    Z[130, 1] = math.nan
+    with pytest.raises(ValueError, match="variable 1: nan"):
+        learn_traces(chunks(Z, actions, size=100), machine(), ACTIONS)
 
 
-def test_a_failure_on_the_way_leaves_the_machine_as_it_was(trace, snapshot):
-    def broken():
-        yield from chunks(*trace, size=100)
-        raise ValueError("line 77 is bad")
-
-    fsm = machine()
-    fsm.learn_many(trace[0][:20], np.zeros(20, int), [0])
-    before = snapshot(fsm)
-    with pytest.raises(ValueError, match="line 77"):
-        learn_traces(broken(), fsm, ACTIONS)
-    assert snapshot(fsm) == before
+# -- Checkpoints ----------------------------------------------------------------------------------
 
 
-def test_a_machine_with_other_actions_is_refused(trace):
-    with pytest.raises(ValueError, match="17 actions, but there are 4 intervals"):
-        learn_traces(chunks(*trace), EvolvingFSM.paper(), ACTIONS)
+class StoppedError(Exception):
+    pass
+
+
+def stopping(chunks, after):
+    """As if the process were killed after so many chunks."""
+    for k, chunk in enumerate(chunks):
+        if k == after:
+            raise StoppedError
+        yield chunk
+
+
+def everything(learnt, snapshot):
+    return snapshot(learnt.machine), learnt.read, learnt.skills
+
+
+@pytest.mark.parametrize("after", [0, 1, 2, 3, 7])
+def test_learning_that_is_stopped_goes_on_bit_for_bit(trace, tmp_path, snapshot, after):
+    plain = learn_traces(chunks(*trace, size=25), machine(), ACTIONS)
+    path = tmp_path / "checkpoint"
+    for stop in range(after):
+        work = stopping(chunks(*trace, size=25), stop)
+        with pytest.raises(StoppedError):
+            learn_traces(work, machine(), ACTIONS, checkpoint=Checkpoint(path, SETTINGS, 0.0))
+    for _ in range(2):  # the second one prints what is finished, and reads nothing
+        again = Checkpoint(path, SETTINGS, 0.0)
+        learnt = learn_traces(chunks(*trace, size=25), machine(), ACTIONS, checkpoint=again)
+        assert everything(learnt, snapshot) == everything(plain, snapshot)
+    nothing = learn_traces([], machine(), ACTIONS, checkpoint=Checkpoint(path, SETTINGS))
+    assert nothing.read.rows == 200
+    assert EvolvingFSM.load(path).n_states == plain.machine.n_states
+
+
+def test_checkpoints_of_other_work_other_rows_and_other_files_are_refused(trace, tmp_path):
+    path = tmp_path / "checkpoint"
+    with pytest.raises(StoppedError):
+        learn_traces(
+            stopping(chunks(*trace, size=50), 2),
+            machine(),
+            ACTIONS,
+            checkpoint=Checkpoint(path, SETTINGS, 0.0),
+        )
+    other = SETTINGS | {"rule": "novelty"}
+    with pytest.raises(ValueError, match='rule was "paper" and is now "novelty"; run it with'):
+        learn_traces([], machine(), ACTIONS, checkpoint=Checkpoint(path, other))
+    with pytest.raises(ValueError, match="has learnt 100 rows, where there are 80 now"):
+        learn_traces(
+            chunks(*trace, size=40), machine(), ACTIONS, checkpoint=Checkpoint(path, SETTINGS)
+        )
+    machine().save(path)
+    with pytest.raises(ValueError, match="is no checkpoint; name another file"):
+        learn_traces([], machine(), ACTIONS, checkpoint=Checkpoint(path, SETTINGS))
+
+
+def test_a_full_disk_stops_nothing_but_is_refused_at_first(trace, tmp_path, monkeypatch, caplog):
+    path = tmp_path / "checkpoint"
+    kept = Checkpoint(path, SETTINGS, 0.0)
+
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    def filling(chunks):
+        for chunk in chunks:
+            yield chunk
+            monkeypatch.setattr(os, "fsync", full)
+
+    learnt = learn_traces(filling(chunks(*trace, size=25)), machine(), ACTIONS, checkpoint=kept)
+    assert learnt.read.rows == 200
+    assert "the work goes on" in caplog.text
+    path.unlink()
+    with pytest.raises(OSError, match="No space left"):
+        learn_traces([], machine(), ACTIONS, checkpoint=Checkpoint(path, SETTINGS))

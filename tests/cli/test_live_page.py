@@ -12,13 +12,12 @@ pytest.importorskip("playwright.sync_api")
 
 from playwright import sync_api as playwright
 
-from evofsm.cli.watch.live.server import LivePage
 from evofsm.cli.watch.player import Player
-from evofsm.cli.watch.session import Session, Watching, learn_first, watched_guard
-from evofsm.driving.families import load_family
-from evofsm.driving.world import KinematicWorld
+from evofsm.cli.watch.server import LivePage
+from evofsm.cli.watch.session import Session, learn_first, watched_guard
+from evofsm.driving import KinematicWorld, load_family
 
-PAPER = Watching(load_family("paper"))
+PAPER = load_family("paper")
 
 pytestmark = pytest.mark.usefixtures("compiled")
 
@@ -30,8 +29,8 @@ def seen(browser):
 
     @contextmanager
     def session():
-        guard = watched_guard(PAPER.family)
-        learn_first(PAPER, guard, 6)
+        guard = watched_guard(PAPER)
+        learn_first(guard, PAPER, 6)
         with Session(PAPER, guard, KinematicWorld()) as opened:
             yield opened
 

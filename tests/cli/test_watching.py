@@ -3,33 +3,32 @@
 import math
 import threading
 from contextlib import contextmanager
-from dataclasses import replace
 from itertools import pairwise
 
 import pytest
 
-from evofsm.cli.watch.live.words import tell
+from evofsm.cli.watch import recorded as module
 from evofsm.cli.watch.player import Player
-from evofsm.cli.watch.session import Session, Watching, learn_first, watched_guard
-from evofsm.driving.cars import guard_for_family, learnt_by, load_learnt, save_learnt
-from evofsm.driving.episodes import teach
-from evofsm.driving.families import load_family
-from evofsm.driving.world import KinematicWorld
-from evofsm.guard.reviser import Mode
+from evofsm.cli.watch.recorded import Recording, record_log
+from evofsm.cli.watch.session import Session, learn_first, watched_guard
+from evofsm.cli.watch.words import tell
+from evofsm.driving import KinematicWorld, guard_for_family, learners_of, load_family, teach
+from evofsm.guard import Mode
+from evofsm.io import read_run, recording
 
 pytestmark = pytest.mark.usefixtures("compiled")
 
-PAPER = Watching(load_family("paper"))
+PAPER = load_family("paper")
 
 
 def learnt(episodes=6):
-    guard = watched_guard(PAPER.family)
-    learn_first(PAPER, guard, episodes)
+    guard = watched_guard(PAPER)
+    learn_first(guard, PAPER, episodes)
     return guard
 
 
-def opened(watching=PAPER, guard=None):
-    return Session(watching, guard or learnt(), KinematicWorld())
+def opened(family=PAPER, guard=None, **settings):
+    return Session(family, guard or learnt(), KinematicWorld(), **settings)
 
 
 def drive(session):
@@ -67,10 +66,10 @@ def test_switched_on_in_time_it_still_prevents_it_and_switched_off_it_says_what_
 
 
 def test_danger_shows_long_before_time_to_collision_notices_and_is_told_from_when_it_began():
-    session = opened(Watching(PAPER.family, reviser="none"))
+    session = opened(on=False)
     frames = drive(session)
     story = frames[-1].story
-    risky = next(frame for frame in frames if frame.proposed_risk.risk > PAPER.tolerance)
+    risky = next(frame for frame in frames if frame.proposed_risk.risk > 0.02)
     assert story.first == story.danger.since == risky.time
     assert story.danger.critical < story.danger.brakes_to
     assert story.danger.since < story.danger.dead_end < story.leader_brakes
@@ -92,7 +91,7 @@ def test_the_same_run_is_shown_the_same_and_restarting_begins_anew():
     assert [frame.number for frame in frames] == list(range(len(frames)))
     assert frames[0].x_follower == 0.0
     assert frames[0].story.danger is None
-    with pytest.raises(ValueError, match="case is 5; there are 1 to 4"):
+    with pytest.raises(ValueError, match="case is 5; paper has 1 to 4"):
         session.restart(4)
 
 
@@ -105,7 +104,7 @@ def test_positions_follow_from_speeds():
 
 
 def test_states_grow_from_empty_and_keep_their_numbers():
-    session = Session(PAPER, watched_guard(PAPER.family), KinematicWorld())
+    session = Session(PAPER, watched_guard(PAPER), KinematicWorld())
     assert session.graph().states == ()
     created = [frame for frame in drive(session) if frame.event == "created"]
     graph = session.graph()
@@ -124,36 +123,18 @@ def test_a_finished_run_does_not_go_on_and_counts_as_learnt_from():
     assert session.restart().learnt == 1
 
 
-@pytest.mark.parametrize("reviser", ["aeb", "rss"])
-def test_other_revisers_are_judged_by_the_same_risk(reviser):
-    frames = drive(opened(Watching(PAPER.family, reviser=reviser)))
-    assert all(0.0 <= frame.proposed_risk.risk <= 1.0 for frame in frames[:-1])
-
-
-def test_what_was_saved_is_gone_on_from(tmp_path):
-    save_learnt(learnt(), tmp_path)
-    machine, risk = load_learnt(tmp_path)
-    loaded = guard_for_family(PAPER.family, machine=machine, judge=risk)
-    session = opened(guard=loaded)
-    assert len(session.graph().states) == loaded.machine.n_states > 3
-
-
 # -- A recording ----------------------------------------------------------------------------------
 
 
 @pytest.fixture
 def recorded(tmp_path):
     """A log of two episodes, revised and not, and its drives."""
-    pytest.importorskip("mcap")
-    from evofsm.io import recording
-
-    family = PAPER.family
-    machine, risk = learnt_by(learnt())
+    machine, risk = learners_of(learnt())
     drives = [
         drive
         for mode in (Mode.ACT, Mode.SHADOW)
         for drive in teach(
-            guard_for_family(family, mode=mode, machine=machine, judge=risk), [family.draw(0, 0)]
+            guard_for_family(PAPER, mode=mode, machine=machine, judge=risk), [PAPER.draw(0, 0)]
         )
     ]
     path = tmp_path / "run.mcap"
@@ -165,13 +146,11 @@ def recorded(tmp_path):
 
 
 def test_a_recording_shows_what_was_decided(recorded):
-    from evofsm.cli.watch.recording import Recording
-
     path, drives = recorded
-    recording = Recording(path)
+    shown = Recording(path)
     for case, drive_ in enumerate(drives):
-        recording.restart(case)
-        frames = drive(recording)
+        shown.restart(case)
+        frames = drive(shown)
         assert [frame.executed for frame in frames[:-1]] == drive_.executed.tolist()
         assert frames[-1].collided == drive_.collided == bool(case)
         assert frames[-1].time == drive_.time[-1]
@@ -181,18 +160,56 @@ def test_a_recording_shows_what_was_decided(recorded):
         )
         assert frames[-1].story.leader_brakes == pytest.approx(29.75, abs=0.3)
         assert math.isnan(frames[-1].story.danger.dead_end)  # which the log does not hold
-    assert [state.is_dead_end for state in recording.graph().states].count(True) == 1
+    assert [state.is_dead_end for state in shown.graph().states].count(True) == 1
     with pytest.raises(ValueError, match="there are 1 to 2"):
-        recording.restart(2)
+        shown.restart(2)
 
 
 def test_no_recording_is_made_of_something_else(tmp_path):
-    pytest.importorskip("mcap")
-    from evofsm.cli.watch.recording import Recording
-
     (tmp_path / "no.mcap").write_bytes(b"junk")
     with pytest.raises(ValueError, match=r"no\.mcap"):
         Recording(tmp_path / "no.mcap")
+
+
+# -- A log of others ------------------------------------------------------------------------------
+
+
+def objects(path, rows=80):
+    """Two cars at 20 m/s, of which the one ahead brakes with 5 m/s² after 4 s."""
+    lines, x, v = ["id,t,x,y,vx,vy,length,lane"], 40.0, 20.0
+    for k in range(rows):
+        lines.append(f"ego,{0.1 * k:.1f},{2.0 * k:.2f},0,20,0,4,1")
+        lines.append(f"other,{0.1 * k:.1f},{x:.3f},0,{v:.2f},0,4,1")
+        x, v = x + 0.1 * v, max(0.0, v - (0.5 if k >= 40 else 0.0))
+    path.write_text("\n".join(lines) + "\n")
+    return str(path)
+
+
+def test_a_guard_decides_on_each_row_of_a_log_and_changes_nothing(tmp_path):
+    out = tmp_path / "run.mcap"
+    assert not record_log(objects(tmp_path / "objects.csv"), out)
+    columns = read_run(out).episodes[0].columns
+    assert (columns["executed"] == columns["proposed"]).all()
+    assert columns["gap"][0] == pytest.approx(36.0)
+    # The leader brakes, nobody else does: in the end the guard would have.
+    assert columns["advised"][60] < -2.0
+    assert columns["risk_proposed"][60] > columns["risk_proposed"][0]
+    shown = Recording(out)
+    assert shown.start.about == "recorded in objects.csv"
+    assert not shown.revising
+    assert shown.step().v_follower == pytest.approx(20.0)
+
+
+def test_a_log_too_long_is_cut_and_one_too_short_refused(tmp_path, monkeypatch):
+    path = objects(tmp_path / "objects.csv")
+    monkeypatch.setattr(module, "MOST_ROWS", 50)
+    assert record_log(path, tmp_path / "run.mcap")
+    (episode,) = read_run(tmp_path / "run.mcap").episodes
+    assert len(episode.columns["time"]) == 49
+    short = objects(tmp_path / "short.csv", rows=4)
+    with pytest.raises(ValueError, match="nobody follows anybody for 10 rows"):
+        record_log(short, tmp_path / "other.mcap")
+    assert not (tmp_path / "other.mcap").exists()
 
 
 # -- The clock ------------------------------------------------------------------------------------
@@ -323,20 +340,20 @@ def test_no_speed_of_nothing():
 
 # -- A judge that was told nothing but which episodes failed --------------------------------------
 
-LEARNING = Watching(load_family("emergency"), judge="learnt", case=1)
+EMERGENCY = load_family("emergency")
 LEADERS = ("leader brake", "leaders", "latent risk", "braking in full")
 
 
-def told_over(watching, episodes):
+def told_over(episodes, *, on=True):
     """Frames of a run under a learnt judge, each with its story in words."""
-    guard = watched_guard(watching.family, "learnt")
-    learn_first(watching, guard, episodes)
-    with opened(watching, guard) as session:
+    guard = watched_guard(EMERGENCY, judge="learnt")
+    learn_first(guard, EMERGENCY, episodes)
+    with opened(EMERGENCY, guard, case=1, on=on) as session:
         return [(frame, tell(frame, session.start)) for frame in drive(session)]
 
 
 def test_before_the_first_failure_nothing_is_called_safe():
-    for frame, told in told_over(LEARNING, 0)[:-1]:
+    for frame, told in told_over(0)[:-1]:
         assert math.isnan(frame.proposed_risk.risk)
         assert (told.status, told.headline) == ("unjudged", "Nothing is judged yet")
         assert told.why == "Nothing was judged, for no failure was known yet."
@@ -345,8 +362,7 @@ def test_before_the_first_failure_nothing_is_called_safe():
 
 @pytest.mark.slow
 def test_a_learnt_judge_is_not_said_to_know_how_leaders_brake():
-    alone = replace(LEARNING, reviser="none")
-    frames = [*told_over(LEARNING, 12), *told_over(alone, 12)]
+    frames = [*told_over(12), *told_over(12, on=False)]
     for frame, told in frames:
         assert math.isnan(frame.brakes_to)
         assert math.isnan(frame.critical)
@@ -357,16 +373,3 @@ def test_a_learnt_judge_is_not_said_to_know_how_leaders_brake():
     for frame, told in frames:  # what it changes where it sees no danger, it changes for the margin
         story = frame.story
         assert ("by a margin" in told.done) == (story.danger is None and story.revised > 0)
-
-
-def test_what_a_learnt_judge_changes_where_it_sees_no_danger_it_changes_for_the_margin():
-    with opened(LEARNING, watched_guard(LEARNING.family, "learnt")) as session:
-        frame = session.step()
-        quiet = frame._replace(story=frame.story._replace(danger=None, revised=2))
-        done = tell(quiet, session.start).done
-    assert done == "The reviser changed 2 decisions, to survive all that it remembers by a margin."
-
-
-def test_what_was_learnt_is_of_the_judge_that_is_asked_for():
-    with pytest.raises(ValueError, match="of the judge 'kinematic', not of 'learnt'"):
-        opened(LEARNING, watched_guard(LEARNING.family))

@@ -39,7 +39,3 @@ from .text.numbers import span as span
 from .text.numbers import within as within
 from .text.table import Column as Column
 from .text.table import Table as Table
-from .watch.session import Session as Session
-from .watch.session import Watching as Watching
-from .watch.session import learn_first as learn_first
-from .watch.session import watched_guard as watched_guard

@@ -12,10 +12,13 @@ from typer.core import TyperGroup
 
 from evofsm.cli.audit import audit
 from evofsm.cli.check import check
+from evofsm.cli.drive import drive
 from evofsm.cli.export import export
 from evofsm.cli.inspect import inspect
+from evofsm.cli.learn import learn
 from evofsm.cli.monitor import monitor
 from evofsm.cli.show import message, warn
+from evofsm.cli.watch import watch
 
 # What Typer raises where a command is called wrongly, whoever it takes it from.
 _CalledWrongly: type[Any] = typer.BadParameter.__mro__[2]
@@ -80,16 +83,11 @@ def _options(
 
 def application(*others: Any) -> typer.Typer:
     """All commands, in the order in which the help names them."""
-    from evofsm.cli.commands.campaign import Campaign
     from evofsm.cli.commands.declared import callback
-    from evofsm.cli.commands.drive import Drive
-    from evofsm.cli.commands.learn import Learn
-    from evofsm.cli.commands.watch import Watch
 
-    learn, drive, campaign, watch, *rest = map(callback, (Learn, Drive, Campaign, Watch, *others))
     about = _options.__doc__ or ""
-    commands = (learn, inspect, drive, campaign, watch, monitor, audit, export, check)
-    app = group(about, *commands, *rest)
+    commands = (learn, inspect, drive, watch, monitor, audit, export, check)
+    app = group(about, *commands, *map(callback, others))
     app.callback()(_options)
     return app
 

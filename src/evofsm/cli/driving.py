@@ -1,25 +1,33 @@
-"""Drive a family of scenarios under a reviser, episode by episode, and learn on the way."""
+"""Drive a family of scenarios under a reviser: in turn and learning, or many episodes at once.
+
+What came of an episode is a row. Where there is a folder, rows are written as they come, and the
+same work goes on from them after whatever ended it.
+"""
 
 from __future__ import annotations
 
-import hashlib
+import csv
 import io
 import json
+import logging
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import os
+import signal
+import time
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import BrokenExecutor, ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from functools import partial
+from multiprocessing import get_context
 from pathlib import Path
-from typing import Any, Self, get_type_hints
-
-import numpy as np
-from numpy.typing import NDArray
+from threading import Thread
+from typing import Any, NamedTuple
 
 from evofsm import store
+from evofsm.cli.journal import Journal
 from evofsm.driving import (
     DECISION_COLUMNS,
     IDM,
-    TOLD,
     AdaptiveCruise,
     Draw,
     EnvelopeReviser,
@@ -29,44 +37,44 @@ from evofsm.driving import (
     Outcome,
     Row,
     StateRisk,
+    SumoDriver,
+    SumoWorld,
+    Trial,
     Unrevised,
     World,
     assess_states,
-    drive,
     guard_for_family,
-    lead_time,
     learners_of,
-    load_judge,
     name_judge,
-    outcome_of,
-    reference_of,
-    save_learnt,
     summarise,
 )
 from evofsm.driving.measures import FIXED_MEASURES
 from evofsm.extras import needs
-from evofsm.fleet.checkpoint import Checkpoint, Kept
-from evofsm.fsm import EvolvingFSM
-from evofsm.guard import (
-    TOLERANCE,
-    Controller,
-    DecisionLogger,
-    Explain,
-    Guard,
-    LearningJudge,
-    Mode,
-    Reviser,
-)
+from evofsm.guard import TOLERANCE, Controller, DecisionLogger, Explain, Guard, Mode, Reviser
+
+_log = logging.getLogger(__name__)
 
 #: Controllers by name; ``family`` is the family's own.
 CONTROLLERS = ("family", "aggressive", "normal", "acc", "sumo")
-#: Judges by name; `evofsm.driving.TOLD` says what each was told.
-JUDGES: tuple[str, ...] = tuple(TOLD)
 #: Revisers by name: none, ours, and the classic measures.
 REVISERS = ("least-risk", "none", "rss", "aeb", *FIXED_MEASURES)
+#: The columns of ``decisions.parquet`` after ``episode``; `driving/record.py` says which they are.
+DECISION_TABLE = tuple(name for name, column in DECISION_COLUMNS.items() if column.in_table)
+#: The guard in a folder of results.
+GUARD = "guard.evofsm"
 
+_JOURNAL, _DECISIONS, _EPISODES = "episodes.jsonl", "decisions.parquet", "episodes.csv"
 _SUMMARY = "summary.json"
 _ALIASES = {"rss": "rss-r157", "aeb": "aeb-ttc"}
+# The guard is saved so often while it learns [s].
+_EVERY = 60.0
+# So many episodes are one task of a worker: some 500 ms.
+_BATCH = 20
+# So often may workers die over the same episodes, and so long may a scheduler take [s].
+_LIVES, _PATIENCE = 5, 15
+
+Outcomes = dict[str, Any]
+Show = Callable[[int, int], None]
 
 
 @dataclass(frozen=True)
@@ -79,139 +87,55 @@ class Setup:
     judge: str = "kinematic"
     mode: Mode = Mode.ACT
     tolerance: float = TOLERANCE
-    episodes: int = 100
     seed: int = 0
+    world: str = "kinematic"
     learn: bool = True
-    first: int = 0  #: episodes driven before, which are not driven again
+    learnt: int = 0  #: episodes that were learnt from before
+    digest: str = ""  #: of the guard that learnt from them
 
     @property
-    def told(self) -> dict[str, Any]:
-        """Who drives what and how, for JSON."""
-        return {
-            "family": {
-                "name": self.family.name,
-                "switches": self.family.switches,
-                "file": self.family.source and Path(self.family.source).read_text("utf-8"),
-            },
-            "controller": self.controller,
-            "reviser": self.reviser,
-            "judge": self.judge,
-            "mode": self.mode.value,
-            "tolerance": self.tolerance,
-            "seed": self.seed,
+    def first(self) -> int:
+        """Number of the first episode: training draws are not driven again."""
+        return self.learnt if self.learn else 0
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """All that an episode depends on, for JSON."""
+        of_family = {
+            "name": self.family.name,
+            "switches": list(self.family.switches),
+            "file": self.family.source and Path(self.family.source).read_text("utf-8"),
         }
+        names = (
+            "controller",
+            "reviser",
+            "judge",
+            "tolerance",
+            "seed",
+            "world",
+            "learn",
+            "learnt",
+            "digest",
+        )
+        own = {name: getattr(self, name) for name in names}
+        return {"family": of_family, **own, "mode": self.mode.value}
 
-    def settings(self, world: str, guard: Guard) -> dict[str, Any]:
-        """All that an episode depends on, for JSON; not how many there are.
-
-        Parameters
-        ----------
-        world : str
-            Where is driven.
-        guard : Guard
-            With what was learnt before.
-        """
-        machine, risk = _files(guard)
-        return {
-            **self.told,
-            "learn": self.learn,
-            "first": self.first,
-            "world": world,
-            "learnt": hashlib.sha256(machine + risk).hexdigest(),
-        }
+    def trial(self, guard: Guard, world: World | str) -> Trial:
+        """Its episodes, by their number: training draws while it learns, held-out ones else."""
+        split, controller = "train" if self.learn else "test", partial(make_controller, self)
+        return Trial(self.family, guard, world, self.seed, split, controller)
 
 
-@dataclass(frozen=True)
-class Driving:
+class Driving(NamedTuple):
     """What came of it."""
 
     row: Row
     lead_times: tuple[float, ...]  #: from the last alarm that stayed on to the collision [s]
     states: list[StateRisk]
     guard: Guard  #: with what it learnt
-    decisions: Mapping[str, Sequence[Any]]  #: columns of the table of all decisions
 
 
-def drive_family(
-    setup: Setup,
-    guard: Guard,
-    world: World,
-    progress: Callable[[int, int], None] = lambda done, collisions: None,
-    checkpoint: Checkpoint | None = None,
-    audit: DecisionLogger | None = None,
-    record: Callable[[Episode], None] | None = None,
-) -> Driving:
-    """Drive the episodes in turn.
-
-    Parameters
-    ----------
-    setup : Setup
-    guard : Guard
-        Of `make_guard`.
-    world : World
-    progress : callable
-        Told how many episodes are done, and how many ended in a collision.
-    checkpoint : Checkpoint, optional
-        Keeps, between two episodes, all that came of those before. Where its file exists, it is
-        gone on from, with a guard that has learnt what was learnt until then. The result is the
-        same, bit for bit; there may be more episodes than before.
-    audit : DecisionLogger, optional
-        Writes down what is decided; also in episodes that are driven again after a stop.
-    record : callable, optional
-        Given each episode that is driven here, none of those before a stop; every decision is then
-        explained.
-
-    Raises
-    ------
-    ValueError
-        If the checkpoint is of other work, or of more episodes.
-    """
-    family = setup.family
-    done, guard = Driven.resumed(setup, guard, checkpoint)
-    guard.audit, guard.explaining = audit, None if record is None else Explain.ALL
-    for draw in draws(setup, len(done.outcomes)):
-        controller = make_controller(setup, draw, world)
-        alone = reference_of(family, draw, world, controller)
-        driven = drive(guard, draw, world, controller)
-        if record is not None:
-            record(driven)
-        done.add(driven, outcome_of(driven, alone, family.interval), setup.tolerance)
-        if checkpoint is not None:
-            checkpoint.offer(partial(done.keep, guard))
-        progress(len(done.outcomes), sum(o.collided for o in done.outcomes))
-    if checkpoint is not None:
-        checkpoint.keep(done.keep(guard, finished=True))
-    return Driving(
-        summarise(family.name, setup.reviser, "", done.outcomes, family.interval),
-        tuple(done.lead_times),
-        _assessed(guard),
-        guard,
-        done.decisions,
-    )
-
-
-def _assessed(guard: Guard) -> list[StateRisk]:
-    """The states; how dangerous each is by itself is known to a judge of leaders alone."""
-    machine, judge = learners_of(guard)
-    if isinstance(judge, LatentRisk):
-        return assess_states(machine, judge)
-    nan, seconds = math.nan, machine.visits * judge.dt
-    return [
-        StateRisk(state, nan, nan, nan, float(seen), float(failures))
-        for state, (seen, failures) in enumerate(zip(seconds, machine.endings, strict=True))
-    ]
-
-
-def draws(setup: Setup, done: int = 0) -> Iterator[Draw]:
-    """What is driven: training draws while learning, held-out ones else; but those done."""
-    split = "train" if setup.learn else "test"
-    for index in range(setup.first + done, setup.first + setup.episodes):
-        yield setup.family.draw(setup.seed, index, split=split)
-
-
-def make_guard(
-    setup: Setup, machine: EvolvingFSM | None = None, judge: LearningJudge | None = None
-) -> Guard:
+def make_guard(setup: Setup, before: Guard | None = None) -> Guard:
     """A guard whose reviser and judge have the setup's names, with what was learnt before.
 
     Raises
@@ -220,6 +144,9 @@ def make_guard(
         If there is no such reviser or judge, or what was learnt is of another judge.
     """
     family, name = setup.family, _ALIASES.get(setup.reviser, setup.reviser)
+    if name not in ("least-risk", "none", *FIXED_MEASURES):
+        raise ValueError(f"there is no reviser {name!r}; there are {', '.join(REVISERS)}")
+    machine, judge = (None, None) if before is None else learners_of(before)
     if judge is not None and (found := name_judge(judge)) != setup.judge:
         raise ValueError(f"what was learnt is of the judge {found!r}, not of {setup.judge!r}")
     ours = guard_for_family(
@@ -233,20 +160,13 @@ def make_guard(
     )
     if name == "least-risk":
         return ours
-    if name not in ("none", *FIXED_MEASURES):
-        raise ValueError(f"there is no reviser {name!r}; there are {', '.join(REVISERS)}")
     reviser: Reviser = Unrevised(family.actions)
     if name != "none":
         if setup.mode is not Mode.ACT:
             raise ValueError(f"reviser {setup.reviser!r} can only act; modes are for least-risk")
         reviser = EnvelopeReviser(FIXED_MEASURES[name], family.actions, family.interval)
-    return Guard.of(
-        reviser,
-        interval=family.interval,
-        machine=ours.machine,
-        judge=ours.judge,
-        learn=setup.learn,
-    )
+    learners: dict[str, Any] = {"machine": ours.machine, "judge": ours.judge}
+    return Guard.of(reviser, interval=family.interval, learn=setup.learn, **learners)
 
 
 def make_controller(setup: Setup, draw: Draw, world: World) -> Controller:
@@ -262,153 +182,324 @@ def make_controller(setup: Setup, draw: Draw, world: World) -> Controller:
         case "acc":
             return AdaptiveCruise(25.0, 2.0, 1.1, lowest=low, highest=high)
         case "sumo":
-            return _sumo_driver(world)
+            if not isinstance(world, SumoWorld):
+                raise ValueError("the controller 'sumo' is SUMO's own; it needs --world sumo")
+            return SumoDriver(world)
     raise ValueError(
         f"there is no controller {setup.controller!r}; there are {', '.join(CONTROLLERS)}"
     )
 
 
-def _sumo_driver(world: World) -> Controller:
-    from evofsm.driving import SumoDriver, SumoWorld
-
-    if not isinstance(world, SumoWorld):
-        raise ValueError("the controller 'sumo' is SUMO's own; it needs the world 'sumo'")
-    return SumoDriver(world)
+# -- What has been driven so far ------------------------------------------------------------------
 
 
-def write_driving(driving: Driving, setup: Setup, out: Path) -> None:
-    """Write what was learnt, every decision as a table, and the summary; each whole or not at all.
+class Results:
+    """Rows of episodes, in a folder if there is one. Close it after use.
+
+    Parameters
+    ----------
+    setup : Setup
+    guard : Guard
+        Of `make_guard`, with what was learnt before.
+    folder : Path, optional
 
     Raises
     ------
-    OSError
-        If one of them cannot be written; those before it are, and it is as it was.
+    ValueError
+        If the folder has episodes of other settings, or another process drives into it.
     """
+
+    def __init__(self, setup: Setup, guard: Guard, folder: Path | None = None) -> None:
+        self.setup = setup
+        self.folder = folder
+        #: As the guard is after `done` episodes, where it learns.
+        self.guard = guard
+        self.rows: dict[int, Outcomes] = {}
+        self._journal: Journal | None = None
+        self._saved = time.monotonic()
+        if folder is None:
+            return
+        folder.mkdir(parents=True, exist_ok=True)
+        self._journal = Journal(folder / _JOURNAL, setup.settings)
+        try:
+            self._journal.go_on(setup.settings, "run it with those, or name another folder")
+            self.rows = {int(row["episode"]): row for row in self._journal.records}
+            if setup.learn and self.rows:
+                self._go_on(folder / GUARD)
+        except BaseException:
+            self._journal.close()
+            raise
+
+    def _go_on(self, saved: Path) -> None:
+        """Take what was learnt, and leave out the rows of episodes that came after it."""
+        learnt = 0
+        if saved.exists():
+            learnt = int(store.read_header(saved).provenance.get("episodes", 0))
+            self.guard = make_guard(self.setup, Guard.load(saved))
+        done = range(self.setup.first, learnt)
+        self.rows = {number: row for number, row in self.rows.items() if number in done}
+
+    def add(self, row: Outcomes) -> None:
+        """Take in what came of an episode."""
+        self.rows[row["episode"]] = row
+        if self._journal is not None:
+            self._journal.append(row)
+
+    def save_guard(self, *, now: bool = False) -> None:
+        """Write what was learnt from all rows, if it was not for a while."""
+        if self.folder is None or not (now or time.monotonic() - self._saved >= _EVERY):
+            return
+        setup = self.setup
+        told = {"family": setup.family.name, "seed": setup.seed, "reviser": setup.reviser}
+        reached = setup.learnt + len(self.rows) * setup.learn
+        try:
+            self.guard.save(self.folder / GUARD, {**told, "episodes": reached})
+        except OSError as error:
+            if now:
+                error.add_note("what was driven is kept: make room, and run the same command again")
+                raise
+            _log.warning("%s is not saved for now: %s", self.folder / GUARD, error)
+        self._saved = time.monotonic()
+
+    def summed_up(self, episodes: int) -> Driving:
+        """What came of so many episodes; written to the folder, if there is one."""
+        setup, numbers = self.setup, range(self.setup.first, self.setup.first + episodes)
+        rows = [self.rows[number] for number in numbers]
+        outcomes = [Outcome(*(row[name] for name in Outcome._fields)) for row in rows]
+        row = summarise(setup.family.name, setup.reviser, "", outcomes, setup.family.interval)
+        leads = tuple(row["lead_time"] for row in rows if row["lead_time"] is not None)
+        if self.folder is not None:
+            self._write(self.folder, rows, {**row.as_dict(), "lead_times": leads})
+        return Driving(row, leads, _assessed(self.guard), self.guard)
+
+    def _write(self, folder: Path, rows: Sequence[Outcomes], summary: dict[str, Any]) -> None:
+        self.save_guard(now=True)
+        names = [name for name in rows[0] if name != "decided"]
+        text = io.StringIO()
+        table = csv.writer(text, lineterminator="\n")
+        table.writerows([names, *([row[name] for name in names] for row in rows)])
+        with store.replacing(folder / _EPISODES) as file:
+            file.write(text.getvalue().encode())
+        with store.replacing(folder / _SUMMARY) as file:
+            file.write(json.dumps(summary, indent=2).encode())
+        if all("decided" in row for row in rows):
+            _write_decisions(folder / _DECISIONS, rows)
+        else:  # workers send none
+            (folder / _DECISIONS).unlink(missing_ok=True)
+
+    def close(self) -> None:
+        """Let others drive into the folder."""
+        if self._journal is not None:
+            self._journal.close()
+
+
+def _write_decisions(path: Path, rows: Sequence[Outcomes]) -> None:
+    """Every decision, as a table."""
     with needs("polars", "tables", "writing decisions as Parquet"):
         import polars
-    drove = {"family": setup.family.name, "seed": setup.seed, "first": setup.first}
-    told = {**drove, "episodes": setup.episodes, "reviser": setup.reviser}
-    save_learnt(driving.guard, out, told)
-    with store.replacing(out / "decisions.parquet") as file:
-        polars.DataFrame(driving.decisions).write_parquet(file)
-    summary = {
-        **driving.row.as_dict(),
-        "lead_times": driving.lead_times,
-        "episodes_learnt": setup.first + setup.episodes * setup.learn,
+    columns: dict[str, Any] = {
+        "episode": [row["episode"] for row in rows for _ in row["decided"]["time"]]
     }
-    with store.replacing(out / _SUMMARY) as file:
-        file.write(json.dumps(summary, indent=2).encode())
+    for name in DECISION_TABLE:
+        kind = DECISION_COLUMNS[name].kind
+        values = [value for row in rows for value in row["decided"][name]]
+        if kind is float:  # JSON has no NaN
+            values = [math.nan if value is None else value for value in values]
+        columns[name] = polars.Series(values, dtype=polars.Int64 if kind is int else None)
+    table = polars.DataFrame(columns)
+    with store.replacing(path) as file:
+        table.write_parquet(file)
 
 
-def episodes_learnt(folder: Path) -> int:
-    """How many episodes what was saved in a folder has learnt from."""
-    return int(json.loads((folder / _SUMMARY).read_text("utf-8"))["episodes_learnt"])
+def _decided(driven: Episode) -> dict[str, list[Any]]:
+    """The columns of an episode's decisions; None where a number is not known."""
+    columns = {}
+    for name in DECISION_TABLE:
+        values = [DECISION_COLUMNS[name].read(one) for one in driven.decisions]
+        is_unknown = [isinstance(value, float) and math.isnan(value) for value in values]
+        pairs = zip(values, is_unknown, strict=True)
+        columns[name] = [None if unknown else value for value, unknown in pairs]
+    return columns
 
 
-# -- What has been driven so far ------------------------------------------------------------------
-
-#: The columns of ``decisions.parquet``; `driving/record.py` says which they are.
-DECISION_TABLE = (
-    "episode",
-    *(name for name, column in DECISION_COLUMNS.items() if column.in_table),
-)
-# Where there is no state.
-_NONE = -1
-
-
-class Driven:
-    """Outcomes of the episodes so far, and the columns of the table of their decisions."""
-
-    def __init__(self) -> None:
-        self.outcomes: list[Outcome] = []
-        self.lead_times: list[float] = []
-        self.decisions: dict[str, list[Any]] = {name: [] for name in DECISION_TABLE}
-
-    def add(self, drive: Episode, came_of_it: Outcome, tolerance: float) -> None:
-        """Take in the next episode."""
-        self.decisions["episode"] += [len(self.outcomes)] * len(drive.decisions)
-        for name in DECISION_TABLE[1:]:
-            self.decisions[name] += map(DECISION_COLUMNS[name].read, drive.decisions)
-        self.outcomes.append(came_of_it)
-        lead = lead_time(drive, tolerance)
-        if lead is not None:
-            self.lead_times.append(lead)
-
-    @classmethod
-    def resumed(
-        cls, setup: Setup, guard: Guard, checkpoint: Checkpoint | None
-    ) -> tuple[Self, Guard]:
-        """What was driven before, if anything was, and the guard as it was after it."""
-        done = cls()
-        if checkpoint is None:
-            return done, guard
-        kept = checkpoint.begin(done.keep(guard))
-        with store.explained(checkpoint.path):
-            done._restore(kept.arrays)
-            files = (io.BytesIO(kept.arrays[name].tobytes()) for name in ("machine", "risk"))
-            machine = EvolvingFSM.load(next(files))
-            guard = make_guard(setup, machine, load_judge(next(files)))
-        if len(done.outcomes) > setup.episodes:
-            raise ValueError(
-                f"{checkpoint.path} has driven {len(done.outcomes)} episodes, more than "
-                f"{setup.episodes}"
-            )
-        return done, guard
-
-    def keep(self, guard: Guard, finished: bool = False) -> Kept:
-        """All of it and what was learnt, for a checkpoint."""
-        machine, risk = _files(guard)
-        columns = {
-            f"decided_{name}": _column(name, self.decisions[name]) for name in DECISION_TABLE
-        }
-        return Kept(
-            {"episodes": len(self.outcomes)},
-            {
-                "machine": np.frombuffer(machine, np.uint8),
-                "risk": np.frombuffer(risk, np.uint8),
-                "outcomes": np.array(self.outcomes, np.float64).reshape(-1, len(Outcome._fields)),
-                "lead_times": np.array(self.lead_times, np.float64),
-                **columns,
-            },
-            finished,
-        )
-
-    def _restore(self, arrays: Mapping[str, NDArray[Any]]) -> None:
-        kinds = get_type_hints(Outcome).values()
-        for row in arrays["outcomes"].tolist():
-            self.outcomes.append(Outcome(*(kind(v) for kind, v in zip(kinds, row, strict=True))))
-        self.lead_times = arrays["lead_times"].tolist()
-        for name in DECISION_TABLE:
-            self.decisions[name] = _values(name, arrays[f"decided_{name}"])
-        if len({len(column) for column in self.decisions.values()}) != 1:
-            raise ValueError("columns of decisions are of different lengths")
-
-
-def _kind(name: str) -> type:
-    return int if name == "episode" else DECISION_COLUMNS[name].kind
-
-
-def _column(name: str, values: Sequence[Any]) -> NDArray[Any]:
-    """A column of decisions as an array; texts as JSON."""
-    if _kind(name) is str:
-        return np.frombuffer(json.dumps(values).encode(), np.uint8)
-    if _kind(name) is int:
-        return np.array([_NONE if value is None else value for value in values], np.int64)
-    return np.array(values, np.float64)
-
-
-def _values(name: str, column: NDArray[Any]) -> list[Any]:
-    """The column that `_column` made an array of."""
-    if _kind(name) is str:
-        return [str(text) for text in json.loads(column.tobytes())]
-    values: list[Any] = column.tolist()
-    return values if _kind(name) is float else [None if one == _NONE else one for one in values]
-
-
-def _files(guard: Guard) -> tuple[bytes, bytes]:
-    """The files of its machine and of its judge."""
-    files = io.BytesIO(), io.BytesIO()
+def _assessed(guard: Guard) -> list[StateRisk]:
+    """The states; how dangerous each is by itself is known to a judge of leaders alone."""
     machine, judge = learners_of(guard)
-    machine.save(files[0])
-    judge.save(files[1])
-    return files[0].getvalue(), files[1].getvalue()
+    if isinstance(judge, LatentRisk):
+        return assess_states(machine, judge)
+    nan, seconds = math.nan, machine.visits * judge.dt
+    return [
+        StateRisk(state, nan, nan, nan, float(seen), float(failures))
+        for state, (seen, failures) in enumerate(zip(seconds, machine.endings, strict=True))
+    ]
+
+
+# -- In turn --------------------------------------------------------------------------------------
+
+
+def drive_in_turn(
+    results: Results,
+    episodes: int,
+    world: World,
+    show: Show = lambda done, collisions: None,
+    audit: DecisionLogger | None = None,
+    record: Callable[[Episode], None] | None = None,
+) -> Driving:
+    """Drive those episodes that the results lack, one after the other.
+
+    Parameters
+    ----------
+    results : Results
+    episodes : int
+        How many there shall be.
+    world : World
+    show : callable
+        Given how many are done, and how many ended in a collision.
+    audit : DecisionLogger, optional
+        Writes down what is decided; also in episodes that are driven again after a stop.
+    record : callable, optional
+        Given each episode that is driven here; every decision is then explained.
+
+    Raises
+    ------
+    ValueError
+        If a guard that learns has driven more than so many.
+    """
+    setup, guard, done = results.setup, results.guard, len(results.rows)
+    if setup.learn and done > episodes:
+        raise ValueError(f"{results.folder} has driven {done} episodes, more than {episodes}")
+    guard.audit, guard.explaining = audit, None if record is None else Explain.ALL
+    trial = setup.trial(guard, world)
+    for number in range(setup.first, setup.first + episodes):
+        if number in results.rows:
+            continue
+        driven, row = trial.drive(number)
+        if record is not None:
+            record(driven)
+        results.add({**row, "decided": _decided(driven)})
+        if setup.learn:
+            results.save_guard()
+        show(len(results.rows), sum(row["collided"] for row in results.rows.values()))
+    return results.summed_up(episodes)
+
+
+# -- At once --------------------------------------------------------------------------------------
+
+
+def drive_at_once(
+    results: Results,
+    episodes: int,
+    workers: int,
+    cluster: str | None = None,
+    show: Show = lambda done, collisions: None,
+) -> Driving:
+    """Drive those held-out episodes that the results lack, by many workers.
+
+    What comes of it does not depend on who drives, nor on what happens to them.
+
+    Parameters
+    ----------
+    results : Results
+        Of a setup that does not learn.
+    episodes, show
+        As in `drive_in_turn`.
+    workers : int
+        Processes of this computer; of a cluster, how many to wait for.
+    cluster : str, optional
+        Address of Dask's scheduler, such as ``"tcp://10.0.0.1:8786"``.
+
+    Raises
+    ------
+    ChildProcessError
+        If workers die over the same episodes again and again.
+    ConnectionError
+        If no scheduler answers, or there are too few workers.
+    """
+    guard = results.guard.copy(states=False)  # what is decided does not depend on them
+    guard.freeze()
+    trial = results.setup.trial(guard, results.setup.world)
+    missing = [number for number in range(episodes) if number not in results.rows]
+    size = max(1, min(_BATCH, len(missing) // (8 * workers)))
+    batches = [missing[place : place + size] for place in range(0, len(missing), size)]
+    drive = partial(_drive_batch, trial)
+    driven = _in_processes(drive, batches, workers)
+    if cluster is not None:
+        driven = _on_cluster(drive, batches, cluster, workers)
+    show(len(results.rows), sum(row["collided"] for row in results.rows.values()))
+    for rows in driven:
+        for row in rows:
+            results.add(row)
+        show(len(results.rows), sum(row["collided"] for row in results.rows.values()))
+    return results.summed_up(episodes)
+
+
+def _drive_batch(trial: Trial, numbers: Sequence[int]) -> list[Outcomes]:
+    return [trial(number) for number in numbers]
+
+
+Drive = Callable[[Sequence[int]], list[Outcomes]]
+
+
+def _in_processes(drive: Drive, batches: list[list[int]], workers: int) -> Iterator[list[Outcomes]]:
+    """What comes of batches, as it comes; those of a worker that is killed are driven again."""
+    lives = _LIVES
+    while batches:
+        before = len(batches)
+        # Forking a process that has started threads may hang; a fresh one costs a second.
+        pool = ProcessPoolExecutor(workers, get_context("spawn"), _begin_work, (os.getpid(),))
+        try:
+            futures = {pool.submit(drive, batch): batch for batch in batches}
+            for future in as_completed(futures):
+                rows = future.result()
+                batches.remove(futures[future])
+                yield rows
+        except BrokenExecutor:
+            lives = _LIVES if len(batches) < before else lives - 1
+            if lives == 0:
+                which = f"episodes {batches[0][0]} to {batches[0][-1]}"
+                raise ChildProcessError(
+                    f"{_LIVES} times a worker died over {which}, or over others that were driven "
+                    "meanwhile (out of memory?)"
+                ) from None
+        finally:
+            pool.shutdown(wait=False, cancel_futures=True)
+
+
+def _begin_work(parent: int) -> None:
+    """In a worker: Ctrl-C is left to the parent, and no worker outlives it."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+    def end_with_parent() -> None:
+        while os.getppid() == parent:
+            time.sleep(0.2)
+        os._exit(1)
+
+    Thread(target=end_with_parent, daemon=True).start()
+
+
+def _on_cluster(
+    drive: Drive, batches: list[list[int]], address: str, workers: int
+) -> Iterator[list[Outcomes]]:
+    """The same by the workers of a Dask scheduler, which gives tasks of the dead to others."""
+    with needs("distributed", "cluster", "--cluster"):
+        import distributed
+    try:
+        client = distributed.Client(address, timeout=_PATIENCE)  # type: ignore[no-untyped-call]
+    except (OSError, ValueError) as error:
+        raise ConnectionError(f"no Dask scheduler answers at {address}: {error}") from error
+    with client:
+        try:
+            client.wait_for_workers(workers, timeout=_PATIENCE)
+        except TimeoutError:
+            raise ConnectionError(
+                f"fewer than {workers} workers have joined {address}; start them with: dask worker "
+                f"{address} --nthreads 1"
+            ) from None
+        try:
+            futures = client.map(drive, batches, pure=False)
+            for _, rows in distributed.as_completed(  # type: ignore[no-untyped-call]
+                futures, with_results=True
+            ):
+                yield rows
+        except distributed.KilledWorker as error:
+            raise ChildProcessError(f"workers died over a task again and again: {error}") from error

@@ -15,8 +15,6 @@ from evofsm.cli.options import Saved
 if TYPE_CHECKING:
     from evofsm.fsm import FSMModel
 
-# Beside the machine, in folders of results.
-_RISK = "risk.evofsm"
 # How logs of runs begin.
 _MCAP = b"\x89MCAP"
 
@@ -90,11 +88,12 @@ def _is_learnt(file: Path) -> bool:
 
 def _learnt(file: Path) -> tuple[FSMModel, list[int] | None]:
     """The model, and its dead ends where the risk that was learnt with it is known."""
-    from evofsm import store
+    from evofsm.cli.driving import GUARD
     from evofsm.driving import LatentRisk, assess_states
+    from evofsm.guard import Guard
 
     model, _ = load_model(file)
-    if not (file / _RISK).exists() or store.read_header(file / _RISK).kind != "risk":
+    judge = Guard.load(file / GUARD).judge if (file / GUARD).exists() else None
+    if not isinstance(judge, LatentRisk):
         return model, None
-    assessed = assess_states(model, LatentRisk.load(file / _RISK))
-    return model, [one.state for one in assessed if one.is_dead_end]
+    return model, [one.state for one in assess_states(model, judge) if one.is_dead_end]

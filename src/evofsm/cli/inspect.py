@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import textwrap
 from collections.abc import Iterator, Mapping
-from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
@@ -23,7 +22,7 @@ if TYPE_CHECKING:
     from evofsm.store import Header
 
 # What folders of results hold, in the order in which it is looked for.
-_MODELS = ("machine.evofsm", "model.evofsm")
+_MODELS = ("guard.evofsm", "model.evofsm")
 # So many files that something was learnt from are named.
 _MOST_FILES = 3
 # An action taken less often in a state than this says nothing about where it leads.
@@ -84,6 +83,7 @@ def load_model(place: Path) -> tuple[FSMModel, Header | None]:
     from evofsm import store
     from evofsm.driving import FAMILIES, load_family
     from evofsm.fsm import EvolvingFSM, FSMModel
+    from evofsm.guard import Guard
 
     if place.is_dir():
         found = next((place / name for name in _MODELS if (place / name).exists()), None)
@@ -100,17 +100,16 @@ def load_model(place: Path) -> tuple[FSMModel, Header | None]:
         return model, None
     header = store.read_header(place)
     if header.kind == "guard":
-        from evofsm.guard.guard import KIND
-
-        machine = store.read(place, KIND)[1]["machine"].tobytes()
-        if not machine:
+        machine = Guard.load(place, failed=lambda seen: False).machine
+        if machine is None:
             raise ValueError(f"{place}: this guard has no machine")
-        return EvolvingFSM.load(BytesIO(machine)).model(), header
-    if header.kind != "machine":
+    elif header.kind == "machine":
+        machine = EvolvingFSM.load(place)
+    else:
         return FSMModel.load(place), header
-    family = header.provenance.get("family")
-    labels = load_family(str(family)).labels._asdict() if family in FAMILIES else {}
-    return EvolvingFSM.load(place).model(**labels), header
+    family = str(header.provenance.get("family"))
+    labels = load_family(family).labels._asdict() if family in FAMILIES else {}
+    return machine.model(**labels), header
 
 
 # -- As a whole -----------------------------------------------------------------------------------

@@ -1,57 +1,40 @@
 """Learn a machine from a stream of traces, and score its forecasts before it learns from them.
 
-Every forecast is made before the rows it is about are learnt, so the scores are of data the
-machine had not seen. The rival is persistence: the belief stays as it is. A forecast's distance
-from the belief that came is measured by the Jensen-Shannon divergence.
+Rows are learnt in blocks. The forecasts of a block are made by the machine as it was before, so
+the scores are of rows that it had not seen; of long blocks the first rows are scored. The rival is
+persistence: the belief stays as it is. A forecast's distance from the belief that came is measured
+by the Jensen-Shannon divergence.
 """
 
 from __future__ import annotations
 
-import io
-from collections.abc import Iterable, Iterator, Sequence
+import logging
+import time
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
-from itertools import islice
-from typing import NamedTuple, get_args
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, get_args
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from evofsm import store
-from evofsm.fleet.checkpoint import Checkpoint, Kept
-from evofsm.fsm import (
-    NO_ACTION,
-    NOT_OPEN,
-    EvolvingFSM,
-    FSMModel,
-    Inside,
-    IntervalActions,
-    Limit,
-    Policy,
-    Trace,
-    Transitions,
-    check_rows,
-    compiled,
-    jensen_shannon_kernel,
-    kernel,
-    learn_rows,
-    open_memory,
-    widen,
-)
-from evofsm.io.logs import Chunk
+from evofsm.cli.journal import differences
+from evofsm.fsm import EvolvingFSM, FSMModel, IntervalActions, Policy, jensen_shannon
+from evofsm.io import Chunk
+
+_log = logging.getLogger(__name__)
 
 #: How far ahead the longer forecast looks [s].
 HORIZON = 1.0
+POLICIES: tuple[Policy, ...] = get_args(Policy)
 
-_POLICIES: tuple[Policy, ...] = get_args(Policy)
-_HOLD, _OBSERVED = _POLICIES.index("hold"), _POLICIES.index("observed")
-# What a learner counts.
-_COUNTS = (
-    *("chunks", "rows", "episodes", "jumps", "cuts", "failures"),
-    *("clipped_below", "clipped_above"),
-)
-# Rows whose beliefs are kept at a time.
-_ROWS_AT_ONCE = 1024
+# Blocks grow from so many rows to so many; of each so many are scored at most.
+_FIRST_BLOCK, _LARGEST_BLOCK, _SCORED = 64, 8192, 512
+# A checkpoint is written so often [s].
+_EVERY = 60.0
 
 
 @dataclass(frozen=True)
@@ -74,23 +57,101 @@ class Skill:
         return 1.0 - self.divergence / self.persistence if self.persistence > 0.0 else np.nan
 
 
+class Progress(msgspec.Struct):
+    """How far it has come; for JSON."""
+
+    chunks: int = 0
+    blocks: int = 0
+    rows: int = 0  #: observations
+    episodes: int = 0
+    seconds: float = 0.0  #: time between the first and the last row of the episodes, together [s]
+    clipped_below: int = 0  #: actions below the range, put into its first interval
+    clipped_above: int = 0  #: actions above the range, put into its last interval
+    jumps: int = 0  #: episodes that began because of a hole in time
+    cuts: int = 0  #: episodes cut because too many pairs were on the road at once
+    failures: int = 0  #: episodes that ended in failure
+    dt: float | None = None  #: usual time between two rows [s]
+    last_time: float | None = None
+    finished: bool = False
+    scored: int = 0  #: rows of which forecasts were scored
+    certainty: float = 0.0  #: sum over them of the share that the most probable state has
+    #: number, divergence of persistence, then of each kind of forecast: one step, and `HORIZON`
+    one_step: list[float] = msgspec.field(default_factory=lambda: [0.0] * 3)
+    ahead: list[float] = msgspec.field(default_factory=lambda: [0.0] * (2 + len(POLICIES)))
+
+
 @dataclass(frozen=True)
 class Learning:
     """What was learnt, and from what."""
 
     machine: EvolvingFSM  #: can go on learning
     model: FSMModel
-    rows: int  #: observations
-    episodes: int
-    seconds: float  #: time between the first and the last row of the episodes, together [s]
-    transitions: int  #: learnt
-    clipped_below: int  #: actions below the range, put into its first interval
-    clipped_above: int  #: actions above the range, put into its last interval
-    jumps: int  #: episodes that began because of a hole in time
-    cuts: int  #: episodes cut because too many pairs were on the road at once
-    failures: int | None  #: episodes that ended in failure; None where nothing told of failures
+    read: Progress
+    transitions: int
     certainty: float  #: mean share of the belief that the most probable state has
     skills: tuple[Skill, ...]  #: of one step, then of `HORIZON` under each policy
+    notes: Mapping[str, Any] = field(default_factory=dict)  #: of whoever read the rows
+
+
+class Checkpoint:
+    """A machine in a file, with how far it has come, to be gone on from.
+
+    Parameters
+    ----------
+    path : Path
+        Made where there is none.
+    settings : mapping
+        For JSON: what determines the result.
+    every : float
+        Time between two checkpoints [s].
+    """
+
+    def __init__(self, path: Path, settings: Mapping[str, Any], every: float = _EVERY) -> None:
+        self.path, self.settings, self.every = path, dict(settings), every
+        #: What else is kept, by whoever reads the rows; what was, once it has begun.
+        self.notes: dict[str, Any] = {}
+        self._latest = time.monotonic()
+
+    def begin(self, machine: EvolvingFSM) -> tuple[EvolvingFSM, Progress]:
+        """What was learnt, and how far it has come.
+
+        Raises
+        ------
+        OSError
+            If the file cannot be read, or could not be written.
+        ValueError
+            If it is of other work, no checkpoint, or damaged.
+        """
+        if not self.path.exists():
+            self.save(machine, Progress(), first=True)
+            return machine, Progress()
+        store.sweep(self.path)
+        kept = store.read_header(self.path).provenance.get("learning")
+        if kept is None:
+            raise ValueError(f"{self.path} is no checkpoint; name another file")
+        if found := differences(kept["settings"], self.settings):
+            raise ValueError(
+                f"{self.path} is the checkpoint of other work: {found}; run it with those, name "
+                "another file, or delete this one to begin anew"
+            )
+        self.notes.update(kept["notes"])
+        return EvolvingFSM.load(self.path), msgspec.convert(kept["read"], Progress)
+
+    def offer(self, machine: EvolvingFSM, read: Progress) -> None:
+        """Save, if that was not done for a while."""
+        if time.monotonic() - self._latest >= self.every:
+            self.save(machine, read)
+
+    def save(self, machine: EvolvingFSM, read: Progress, *, first: bool = False) -> None:
+        """Replace the file; where that fails, the work goes on, with a warning."""
+        kept = {"settings": self.settings, "notes": self.notes, "read": msgspec.to_builtins(read)}
+        try:
+            machine.save(self.path, {"learning": kept})
+        except OSError as error:
+            if first:
+                raise
+            _log.warning("%s cannot be written (%s): the work goes on", self.path, error)
+        self._latest = time.monotonic()
 
 
 def learn_traces(
@@ -100,8 +161,6 @@ def learn_traces(
     names: Sequence[str] = (),
     units: Sequence[str] = (),
     checkpoint: Checkpoint | None = None,
-    *,
-    live: bool = False,
 ) -> Learning:
     """Learn all chunks in their order, each row once.
 
@@ -116,13 +175,8 @@ def learn_traces(
     names, units : sequence of str, optional
         Of the variables, for the model.
     checkpoint : Checkpoint, optional
-        Keeps what was learnt between two chunks. Where its file exists, what was learnt before is
-        gone on with: as many of the chunks, which must be the same, are passed over; none is read
-        where all were learnt. The result is the same, bit for bit.
-    live : bool
-        Whether chunks come as things happen, so that none comes again. Then none is passed over:
-        what was learnt before is gone on with, and what came after the latest checkpoint and
-        before a stop is lost; `Learning.rows` counts what is not.
+        Where its file exists, what was learnt before is gone on with, and so many rows, which must
+        be the same, are passed over. The result is the same, bit for bit.
 
     Returns
     -------
@@ -132,68 +186,35 @@ def learn_traces(
     ------
     ValueError
         If no row follows another in any episode, so that there is no transition to learn, or the
-        checkpoint is of other work, or the chunks are others than it knows.
+        checkpoint is of other work.
     """
     if actions.n_actions != machine.n_actions:
         raise ValueError(
-            f"the machine has {machine.n_actions} actions, but there are "
-            f"{actions.n_actions} intervals"
+            f"the machine has {machine.n_actions} actions, but there are {actions.n_actions} "
+            "intervals"
         )
-    learner = _Learner(machine.copy(), actions)
-    _learn_all(chunks, learner, checkpoint, live)
-    machine = learner.machine
-    if learner.transitions == 0:
+    machine, read = machine.copy(), Progress()
+    if checkpoint is not None:
+        machine, read = checkpoint.begin(machine)
+    if not read.finished:
+        coming = _ahead(chunks)
+        _pass_over(coming, read, checkpoint)
+        for chunk in coming:
+            _learn(machine, actions, chunk, read)
+            if checkpoint is not None:
+                checkpoint.offer(machine, read)
+        read.finished = True
+        if checkpoint is not None:
+            checkpoint.save(machine, read)
+    model = machine.model(actions=actions, names=names, units=units, dt=read.dt)
+    if (transitions := int(model.uses.sum())) == 0:
         raise ValueError(
             "no transition could be learnt: no row with an action is followed by another row of "
             "its episode (is every row an episode? are the rows sorted by episode and time?)"
         )
-    return Learning(
-        machine=machine,
-        model=machine.model(actions=actions, names=names, units=units, dt=learner.dt),
-        rows=learner.rows,
-        episodes=learner.episodes,
-        seconds=learner.seconds,
-        transitions=learner.transitions,
-        clipped_below=learner.clipped_below,
-        clipped_above=learner.clipped_above,
-        jumps=learner.jumps,
-        cuts=learner.cuts,
-        failures=learner.failures if learner.machine.failures_told else None,
-        certainty=learner.certainty / learner.rows,
-        skills=learner.skills(),
-    )
-
-
-def _learn_all(
-    chunks: Iterable[Chunk], learner: _Learner, checkpoint: Checkpoint | None, live: bool
-) -> None:
-    """Learn what was not learnt before, and keep it."""
-    if checkpoint is None:
-        for chunk in _ahead(chunks):
-            learner.learn(chunk)
-        return
-    kept = checkpoint.begin(learner.keep())
-    with store.explained(checkpoint.path):
-        learner.restore(kept)
-    if kept.finished and not live:
-        return
-    coming = _ahead(chunks)
-    if not live:
-        _pass_over(coming, learner, checkpoint)
-    for chunk in coming:
-        learner.learn(chunk)
-        checkpoint.offer(learner.keep)
-    checkpoint.keep(learner.keep(finished=True))
-
-
-def _pass_over(coming: Iterator[Chunk], learner: _Learner, checkpoint: Checkpoint) -> None:
-    """Leave out the chunks that were learnt before."""
-    rows = sum(len(chunk.times) for chunk in islice(coming, learner.chunks))
-    if rows != learner.rows:
-        raise ValueError(
-            f"{checkpoint.path} has learnt {learner.rows:,} rows, where there are {rows:,} now; "
-            "the files were changed, or are read in other pieces: delete it to begin anew"
-        )
+    certainty = read.certainty / read.scored if read.scored else np.nan
+    notes = {} if checkpoint is None else checkpoint.notes
+    return Learning(machine, model, read, transitions, certainty, tuple(_skills(read)), notes)
 
 
 def _ahead(chunks: Iterable[Chunk]) -> Iterator[Chunk]:
@@ -206,371 +227,125 @@ def _ahead(chunks: Iterable[Chunk]) -> Iterator[Chunk]:
             yield chunk
 
 
-class _Scores(NamedTuple):
-    """Sums over all rows so far, and what the next row needs; the first axis of most is of 1."""
-
-    #: number of forecasts, divergence of persistence, then of each kind of forecast [bit]
-    one_step: NDArray[np.float64]
-    ahead: NDArray[np.float64]
-    certainty: NDArray[np.float64]
-    age: NDArray[np.int64]  # of the present episode [rows]
-    waiting: NDArray[np.bool_]  # whether the forecasts below are still to be scored
-    belief: NDArray[np.float64]  # (capacity,) in the latest row
-    forecasts: NDArray[np.float64]  # (1 + policies, capacity) persistence, then each policy's
-
-
-class _Room(NamedTuple):
-    """Room in which to learn R rows at a time; worth nothing after it."""
-
-    beliefs: NDArray[np.float64]  # (R, capacity)
-    state: NDArray[np.int64]  # (R,)
-    n_states: NDArray[np.int64]  # (R,)
-    event: NDArray[np.int8]  # (R,)
-    surprise: NDArray[np.float64]  # (R,)
-    vector: NDArray[np.float64]  # (capacity,)
-    matrix: NDArray[np.float64]  # (capacity, capacity)
-    square: NDArray[np.float64]  # (capacity, capacity)
-
-
-class _Learner:
-    """Learns chunk by chunk; holds counts and sums, and of the rows only the last belief."""
-
-    def __init__(self, machine: EvolvingFSM, actions: IntervalActions) -> None:
-        self.machine = machine
-        self.actions = actions
-        self.dt = np.nan
-        self.rows = self.episodes = self.jumps = self.cuts = self.chunks = self.failures = 0
-        self.clipped_below = self.clipped_above = 0
-        self.seconds = 0.0
-        self._last_time = np.nan
-        kinds = len(_POLICIES)
-        self._scores = _Scores(
-            one_step=np.zeros(3),
-            ahead=np.zeros(2 + kinds),
-            certainty=np.zeros(1),
-            age=np.zeros(1, np.int64),
-            waiting=np.zeros(1, np.bool_),
-            belief=np.zeros(0),
-            forecasts=np.zeros((1 + kinds, 0)),
-        )
-        self._make_room()
-
-    @property
-    def transitions(self) -> int:
-        """Number learnt."""
-        return int(self._scores.one_step[0])
-
-    @property
-    def certainty(self) -> float:
-        """Sum over all rows."""
-        return float(self._scores.certainty[0])
-
-    def learn(self, chunk: Chunk) -> None:
-        """Learn a chunk and score the forecasts of it."""
-        self.dt = chunk.dt
-        self._learn_rows(chunk)
-        steps = np.diff(chunk.times, prepend=self._last_time)
-        steps[chunk.starts] = 0.0
-        self._last_time = chunk.times[-1]
-        self.seconds += float(steps.sum())
-        self.chunks += 1
-        self.rows += len(steps)
-        self.episodes += len(chunk.starts)
-        self.jumps += chunk.jumps
-        self.cuts += chunk.cuts
-        self.failures += 0 if chunk.failures is None else len(chunk.failures)
-        self.clipped_below += int((chunk.actions < self.actions.low).sum())
-        self.clipped_above += int((chunk.actions > self.actions.high).sum())
-
-    def skills(self) -> tuple[Skill, ...]:
-        """Of all forecasts so far."""
-        steps = self._steps_ahead
-        ahead = _skills(self._scores.ahead, steps, self.dt, _POLICIES) if steps else ()
-        return (*_skills(self._scores.one_step, 1, self.dt, [None]), *ahead)
-
-    def keep(self, finished: bool = False) -> Kept:
-        """All of it, for a checkpoint."""
-        machine = io.BytesIO()
-        self.machine.save(machine)
-        n = self.machine.n_states
-        return Kept(
-            {name: getattr(self, name) for name in _COUNTS},
-            {
-                "machine": np.frombuffer(machine.getvalue(), np.uint8),
-                "clock": np.array([self.dt, self.seconds, self._last_time]),
-                **self._scores._replace(
-                    belief=self._scores.belief[:n], forecasts=self._scores.forecasts[:, :n]
-                )._asdict(),
-            },
-            finished,
-        )
-
-    def restore(self, kept: Kept) -> None:
-        """Take over what `keep` returned."""
-        arrays = kept.arrays
-        self.machine = type(self.machine).load(io.BytesIO(arrays["machine"].tobytes()))
-        if self.machine.n_actions != self.actions.n_actions:
-            raise ValueError(f"its machine has {self.machine.n_actions} actions")
-        scores = _Scores(*(np.array(arrays[name]) for name in _Scores._fields))
-        for name in _COUNTS:
-            setattr(self, name, int(kept.content.get(name, 0)))
-        self.dt, self.seconds, self._last_time = arrays["clock"].tolist()
-        n, kinds = self.machine.n_states, len(_POLICIES)
-        for name, shape in (
-            ("one_step", (3,)),
-            ("ahead", (2 + kinds,)),
-            ("belief", (n,)),
-            ("forecasts", (1 + kinds, n)),
-            *((name, (1,)) for name in ("certainty", "age", "waiting")),
-        ):
-            now, old = getattr(scores, name), getattr(self._scores, name)
-            if now.shape != shape or now.dtype != old.dtype:
-                raise ValueError(f"{name} has shape {now.shape} of {now.dtype}, not {shape}")
-        self._scores = scores
-        self._make_room()
-
-    @property
-    def _steps_ahead(self) -> int:
-        """Steps of the longer forecast; 0 where one step is about as long, or longer."""
-        steps = 0 if np.isnan(self.dt) else round(HORIZON / self.dt)
-        return steps if steps > 1 else 0
-
-    def _learn_rows(self, chunk: Chunk) -> None:
-        known = ~np.isnan(chunk.actions)
-        indices = np.full(len(known), NO_ACTION)
-        indices[known] = self.actions.encode(chunk.actions[known])
-        inside = Inside(self.machine)
-        observations = inside.check(chunk.observations)
-        starts = check_rows("starts", chunk.starts, len(observations))
-        failures = np.zeros(len(observations), np.bool_)
-        if chunk.failures is not None:
-            failures = check_rows("failures", chunk.failures, len(observations))
-            self.machine.tell_of_failures()
-        row = 0
-        while row < len(observations):
-            if len(self._scores.belief) < inside.capacity:
-                self._make_room()
-            row = _learn_and_score(
-                inside.buffer,
-                observations,
-                indices,
-                starts,
-                failures,
-                row,
-                self._steps_ahead,
-                self._scores,
-                self._room,
-                inside.limit,
-            )
-            if row < len(observations):
-                inside.grow()
-
-    def _make_room(self) -> None:
-        """Make room for as many states as the machine has room for."""
-        rows, capacity = _ROWS_AT_ONCE, Inside(self.machine).capacity
-        self._scores = self._scores._replace(
-            belief=widen(self._scores.belief, capacity),
-            forecasts=widen(self._scores.forecasts, capacity),
-        )
-        self._room = _Room(
-            beliefs=np.zeros((rows, capacity)),
-            state=np.zeros(rows, np.int64),
-            n_states=np.zeros(rows, np.int64),
-            event=np.zeros(rows, np.int8),
-            surprise=np.zeros(rows),
-            vector=np.zeros(capacity),
-            matrix=np.zeros((capacity, capacity)),
-            square=np.zeros((capacity, capacity)),
+def _pass_over(coming: Iterator[Chunk], read: Progress, checkpoint: Checkpoint | None) -> None:
+    """Leave out the chunks that were learnt before."""
+    rows = sum(len(next(coming).times) for _ in range(read.chunks))
+    if rows != read.rows:
+        where = checkpoint.path if checkpoint is not None else "it"
+        raise ValueError(
+            f"{where} has learnt {read.rows:,} rows, where there are {rows:,} now; the files were "
+            "changed: delete it to begin anew"
         )
 
 
-def _skills(
-    sums: NDArray[np.float64], steps: int, dt: float, policies: Sequence[Policy | None]
-) -> tuple[Skill, ...]:
-    """The means, for each kind of forecast."""
-    forecasts, persistence, *totals = sums.tolist()
-    rows = forecasts or np.nan
-    return tuple(
-        Skill(steps, steps * dt, policy, int(forecasts), total / rows, persistence / rows)
-        for policy, total in zip(policies, totals, strict=True)
-    )
+def _learn(machine: EvolvingFSM, actions: IntervalActions, chunk: Chunk, read: Progress) -> None:
+    """Learn a chunk block by block, and score the forecasts of each before."""
+    read.dt = None if np.isnan(chunk.dt) else chunk.dt
+    indices = np.full(len(chunk.times), -1)
+    known = ~np.isnan(chunk.actions)
+    indices[known] = actions.encode(chunk.actions[known])
+    if chunk.failures is not None:
+        machine.tell_of_failures()
+    first = 0
+    while first < len(indices):
+        end = first + min(_FIRST_BLOCK << min(read.blocks, 20), _LARGEST_BLOCK)
+        block, taken = chunk.rows(first, end), indices[first:end]
+        if machine.n_states:
+            _score(machine.model(), block.rows(0, _SCORED), taken[:_SCORED], read)
+        machine.learn_many(block.observations, taken, block.starts, block.failures)
+        first, read.blocks = end, read.blocks + 1
+    last = np.nan if read.last_time is None else read.last_time
+    steps = np.diff(chunk.times, prepend=last)
+    steps[chunk.starts] = 0.0
+    read.last_time = float(chunk.times[-1])
+    read.seconds += float(steps.sum())
+    read.chunks += 1
+    read.rows += len(steps)
+    read.episodes += len(chunk.starts)
+    read.jumps += chunk.jumps
+    read.cuts += chunk.cuts
+    read.failures += 0 if chunk.failures is None else len(chunk.failures)
+    read.clipped_below += int((chunk.actions < actions.low).sum())
+    read.clipped_above += int((chunk.actions > actions.high).sum())
 
 
-# -- Kernels --------------------------------------------------------------------------------------
+# -- Scores ---------------------------------------------------------------------------------------
 
 
-def _learn_and_score_rows(
-    buffer: NDArray[np.float64],
-    observations: NDArray[np.float64],
-    actions: NDArray[np.int64],
-    starts: NDArray[np.bool_],
-    failures: NDArray[np.bool_],
-    row: int,
-    steps_ahead: int,
-    scores: _Scores,
-    room: _Room,
-    limit: Limit,
-) -> int:
-    """Learn and score rows from ``row`` on; returns the row for which the machine had no room.
-
-    Every ``steps_ahead`` rows of an episode it halts, to score the longer forecasts made at the
-    halt before, and to make others.
-    """
-    while row < len(observations):
-        most = min(len(observations) - row, len(room.beliefs))
-        rows, halts = _until_halt(starts[row : row + most], scores.age[0], steps_ahead)
-        these = slice(row, row + rows)
-        room.beliefs[:rows] = 0.0
-        learnt = learn_rows(
-            buffer,
-            observations[these],
-            actions[these],
-            starts[these],
-            failures[these],
-            0,
-            Trace(room.state, room.n_states, room.event, room.surprise),
-            room.beliefs,
-            limit,
-        )
-        _score_rows(starts[these], learnt, scores, room)
-        row += learnt
-        if learnt < rows:
-            break
-        if halts:
-            _score_ahead(room.n_states[rows - 1], scores, room)
-            if actions[row - 1] != NO_ACTION and not failures[row - 1]:
-                _look_ahead(buffer, actions[row - 1], steps_ahead, scores, room)
-    return row
+def _score(model: FSMModel, block: Chunk, taken: NDArray[np.int64], read: Progress) -> None:
+    """Add the divergences of forecasts that a model makes of rows."""
+    beliefs = np.atleast_2d(model.recognise(block.observations))
+    read.scored += len(beliefs)
+    read.certainty += float(beliefs.max(axis=1).sum())
+    episode = np.zeros(len(beliefs), np.int64)
+    episode[block.starts] = 1
+    episode = episode.cumsum()
+    then = _pairs(episode, taken, 1)
+    one = _advanced(model, beliefs[then], taken[then])
+    _add(read.one_step, beliefs[then + 1], beliefs[then], [one])
+    if (steps := _steps_ahead(read.dt)) and len(then := _pairs(episode, taken, steps)[::steps]):
+        first = _advanced(model, beliefs[then], taken[then])
+        forecasts = [_held(model, first, taken[then], policy, steps - 1) for policy in POLICIES]
+        _add(read.ahead, beliefs[then + steps], beliefs[then], forecasts)
 
 
-@kernel
-def _until_halt(starts: NDArray[np.bool_], age: int, steps_ahead: int) -> tuple[int, bool]:
-    """Number of rows up to the next halt, that one included, and whether there is one."""
-    since = age % max(steps_ahead, 1)
-    for row in range(len(starts)):
-        if starts[row]:
-            since = 0
-        if since == 0 and steps_ahead > 0:
-            return row + 1, True
-        since += 1
-        if since == steps_ahead:
-            since = 0
-    return len(starts), False
+def _pairs(episode: NDArray[np.int64], taken: NDArray[np.int64], steps: int) -> NDArray[np.int64]:
+    """Rows with an action that so many others of their episode follow."""
+    return np.flatnonzero((episode[:-steps] == episode[steps:]) & (taken[:-steps] >= 0))
 
 
-@kernel
-def _score_rows(starts: NDArray[np.bool_], rows: int, scores: _Scores, room: _Room) -> None:
-    """Score the forecasts of one step of the rows just learnt."""
-    before = scores.belief
-    for row in range(rows):
-        n, belief = room.n_states[row], room.beliefs[row]
-        if starts[row]:
-            scores.age[0] = 0
-            scores.waiting[0] = False
-        scores.age[0] += 1
-        scores.certainty[0] += belief[room.state[row]]
-        surprise = room.surprise[row]
-        if surprise == surprise:  # a forecast was made
-            scores.one_step[0] += 1.0
-            scores.one_step[1] += jensen_shannon_kernel(before, belief, n, room.vector)
-            scores.one_step[2] += surprise
-        before = belief
-    for i in range(len(before)):
-        scores.belief[i] = before[i]
+def _advanced(
+    model: FSMModel, beliefs: NDArray[np.float64], taken: NDArray[np.int64], steps: int = 1
+) -> NDArray[np.float64]:
+    """Beliefs after some steps, each under its own action."""
+    after = beliefs.copy()
+    for action in np.unique(taken):
+        for _ in range(steps):
+            after[taken == action] @= model.transition_matrices[action]
+    return after
 
 
-@kernel
-def _score_ahead(n: int, scores: _Scores, room: _Room) -> None:
-    """Score the longer forecasts that wait for the latest row."""
-    if scores.waiting[0]:
-        scores.ahead[0] += 1.0
-        for kind in range(len(scores.forecasts)):
-            scores.ahead[1 + kind] += jensen_shannon_kernel(
-                scores.forecasts[kind], scores.belief, n, room.vector
-            )
-    scores.waiting[0] = False
+def _held(
+    model: FSMModel,
+    beliefs: NDArray[np.float64],
+    taken: NDArray[np.int64],
+    policy: Policy,
+    steps: int,
+) -> NDArray[np.float64]:
+    """Beliefs after more steps, as `FSMModel.propagate` has them."""
+    if policy == "hold":
+        return _advanced(model, beliefs, taken, steps)
+    matrix = model.averaged_matrix(policy)
+    for _ in range(steps):
+        beliefs = beliefs @ matrix
+    return beliefs
 
 
-@kernel
-def _look_ahead(
-    buffer: NDArray[np.float64], action: int, steps: int, scores: _Scores, room: _Room
-) -> None:
-    """Forecast as `FSMModel.propagate` does, under each policy."""
-    now = open_memory(buffer).learnt
-    n = int(now.n_states[0])
-    scores.waiting[0] = True
-    for forecast in scores.forecasts:
-        for i in range(len(forecast)):
-            forecast[i] = scores.belief[i]
-    for policy in range(len(scores.forecasts) - 1):
-        forecast = scores.forecasts[1 + policy]
-        room.matrix[:n, :n] = 0.0
-        _add(now.transitions, action, 1.0, n, room.matrix)
-        _advance(forecast, 1, n, room)
-        if policy != _HOLD:
-            _average(now.transitions, policy == _OBSERVED, n, room.matrix)
-        _advance(forecast, steps - 1, n, room)
-
-
-@kernel
-def _average(transitions: Transitions, observed: bool, n: int, matrix: NDArray[np.float64]) -> None:
-    """Average the matrices of all actions: each alike, or as often as it was used."""
-    total = transitions.uses.sum()
-    matrix[:n, :n] = 0.0
-    for action in range(len(transitions.uses)):
-        if observed and total > 0.0:
-            weight = transitions.uses[action] / total
-        else:
-            weight = 1.0 / len(transitions.uses)
-        _add(transitions, action, weight, n, matrix)
-
-
-@kernel
 def _add(
-    transitions: Transitions, action: int, weight: float, n: int, matrix: NDArray[np.float64]
+    sums: list[float],
+    came: NDArray[np.float64],
+    before: NDArray[np.float64],
+    forecasts: list[NDArray[np.float64]],
 ) -> None:
-    """Add an action's matrix, times a weight."""
-    place = int(transitions.places[action])
-    for i in range(n):
-        for j in range(n):
-            if place == NOT_OPEN:
-                share = 1.0 / n
-            else:
-                share = transitions.scales[place, i] * transitions.matrices[place, i, j]
-            matrix[i, j] += weight * share
+    if len(came):
+        found = [float(jensen_shannon(one, came).sum()) for one in (before, *forecasts)]
+        sums[:] = [a + b for a, b in zip(sums, [float(len(came)), *found], strict=True)]
 
 
-@kernel
-def _advance(belief: NDArray[np.float64], steps: int, n: int, room: _Room) -> None:
-    """Multiply a belief by the matrix in ``room``, as often as there are steps.
-
-    The matrix is squared where this saves more than it costs.
-    """
-    while steps > 0:
-        if steps % 2 == 0 and steps > 2 * n:
-            for i in range(n):
-                _multiply(room.matrix[i], room.matrix, n, room.square[i])
-            for i in range(n):
-                for j in range(n):
-                    room.matrix[i, j] = room.square[i, j]
-            steps //= 2
-        else:
-            _multiply(belief, room.matrix, n, room.vector)
-            for i in range(n):
-                belief[i] = room.vector[i]
-            steps -= 1
+def _steps_ahead(dt: float | None) -> int:
+    """Steps of the longer forecast; 0 where one step is about as long, or longer."""
+    steps = 0 if dt is None else round(HORIZON / dt)
+    return steps if 1 < steps < _SCORED else 0
 
 
-@kernel
-def _multiply(
-    vector: NDArray[np.float64], matrix: NDArray[np.float64], n: int, product: NDArray[np.float64]
-) -> None:
-    for j in range(n):
-        product[j] = 0.0
-    for i in range(n):
-        for j in range(n):
-            product[j] += vector[i] * matrix[i, j]
-
-
-# Without the lock of the interpreter, so that the next rows can be read meanwhile.
-_learn_and_score = compiled(_learn_and_score_rows, nogil=True, _nrt=False)
+def _skills(read: Progress) -> Iterator[Skill]:
+    """The means, for each kind of forecast."""
+    dt = np.nan if read.dt is None else read.dt
+    kinds: list[tuple[int, Policy | None, list[float], float]] = [
+        (1, None, read.one_step, read.one_step[2])
+    ]
+    if steps := _steps_ahead(read.dt):
+        kinds += [(steps, one, read.ahead, read.ahead[2 + k]) for k, one in enumerate(POLICIES)]
+    for steps, policy, (count, persistence, *_), total in kinds:
+        rows = count or np.nan
+        yield Skill(steps, steps * dt, policy, int(count), total / rows, persistence / rows)

@@ -14,7 +14,7 @@ import typer
 from evofsm.extras import install
 
 if TYPE_CHECKING:
-    pass
+    from evofsm.driving import Family
 
 
 class World(StrEnum):
@@ -86,3 +86,53 @@ def imported(name: str) -> Any:
 def split_names(text: str) -> list[str]:
     """Names that were given with commas between them."""
     return [name.strip() for name in text.split(",") if name.strip()]
+
+
+# -- Of drives ------------------------------------------------------------------------------------
+
+#: Driving in either world needs SciPy, for SUMO's distributions and exact intervals.
+WorldOption = Annotated[World, typer.Option(help="SUMO itself, or the same motion in closed form.")]
+ControllerOption = Annotated[
+    str,
+    typer.Option(
+        help="Who proposes: the family's own (family), aggressive, normal, acc, or sumo (SUMO's "
+        "IDM)."
+    ),
+]
+ReviserOption = Annotated[
+    str,
+    typer.Option(
+        help="Who revises: least-risk (what was learnt), none, rss, aeb, or another measure."
+    ),
+]
+JudgeOption = Annotated[
+    Judge,
+    typer.Option(
+        help="Who judges for least-risk: kinematic (given how cars follow each other) or learnt "
+        "(given nothing but which episodes failed)."
+    ),
+]
+ToleranceOption = Annotated[
+    float,
+    typer.Option(
+        help="Share of leaders' hard brakes that need not be survived; for a learnt judge, of the "
+        "disturbances that it remembers."
+    ),
+]
+SwitchesOption = Annotated[
+    str,
+    typer.Option("--with", help="noise, delay, actuator, jerk, third_car; with commas."),
+]
+SeedOption = Annotated[int, typer.Option(min=0, help="Seed of all random draws.")]
+
+
+def require_world(world: World, **extras: str) -> None:
+    """Refuse before the long work what a drive lacks."""
+    require(scipy="study", **({"libsumo": "sumo"} if world is World.SUMO else {}), **extras)
+
+
+def family_of(name: str, switches: str) -> Family:
+    """The family of this name or file, with the switches."""
+    from evofsm.driving import load_family
+
+    return load_family(name).with_switches(split_names(switches))

@@ -6,7 +6,7 @@ import dataclasses
 import json
 import math
 import sys
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from enum import Enum
 from pathlib import PurePath
@@ -55,7 +55,7 @@ def warn(text: object) -> None:
     print(f"evofsm: {visible(str(text))}", file=sys.stderr, flush=True)
 
 
-def facts(title: str, pairs: Sequence[tuple[str, str]]) -> RenderableType:
+def facts(title: str, pairs: Iterable[tuple[str, str]]) -> RenderableType:
     """Names with a text each, which is folded below itself."""
     from rich.table import Table
     from rich.text import Text

@@ -1,1 +1,204 @@
-"""A run that is looked at while it is driven: decision by decision, with a clock of its own."""
+"""`evofsm watch`: a run in the browser, while it is driven or as it was recorded."""
+
+from __future__ import annotations
+
+import threading
+import webbrowser
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager, suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from evofsm.cli.options import (
+    Judge,
+    JudgeOption,
+    SeedOption,
+    SwitchesOption,
+    ToleranceOption,
+    World,
+    WorldOption,
+    family_of,
+    require,
+    require_world,
+)
+from evofsm.cli.show import progress, say, warn
+
+if TYPE_CHECKING:
+    from evofsm.cli.watch.player import Watched
+    from evofsm.cli.watch.session import Session
+    from evofsm.driving import Family
+    from evofsm.guard import Guard
+
+# Of a simulation of somebody else's that are watched [s].
+_SECONDS = 600.0
+
+Opening = Callable[[], "AbstractContextManager[Watched]"]
+
+
+def watch(
+    what: Annotated[
+        str,
+        typer.Argument(
+            metavar="FAMILY|FILE",
+            help="Family of scenarios: paper, emergency, ..., or a Python file with one of your "
+            "own; a run that drive --mcap recorded; a log, as evofsm learn reads them, or what a "
+            "SUMO configuration drives (.sumocfg), watched in shadow mode.",
+        ),
+    ] = "paper",
+    case: Annotated[
+        int, typer.Option(min=1, help="Which of the family's cases, or of its draws.")
+    ] = 1,
+    world: WorldOption = World.KINEMATIC,
+    off: Annotated[bool, typer.Option("--off", help="Begin with the reviser off.")] = False,
+    judge: JudgeOption = Judge.KINEMATIC,
+    tolerance: ToleranceOption = 0.02,
+    switches: SwitchesOption = "",
+    seed: SeedOption = 0,
+    learn_first: Annotated[
+        int, typer.Option(min=0, help="Episodes to learn from before it is watched.")
+    ] = 60,
+    learn: Annotated[
+        Path | None, typer.Option(help="Begin with what this folder of drive --out holds.")
+    ] = None,
+    topics: Annotated[
+        Path | None,
+        typer.Option(help="Of a bag of ROS 2: which field of which topic is which variable."),
+    ] = None,
+    speed: Annotated[float, typer.Option(help="At first, as a multiple of real time.")] = 1.0,
+    paused: Annotated[
+        bool, typer.Option("--paused", help="Show the first frame, and wait.")
+    ] = False,
+    port: Annotated[
+        int, typer.Option(min=0, max=65535, help="Of the page; 0 for any that is free.")
+    ] = 0,
+    no_browser: Annotated[
+        bool, typer.Option("--no-browser", help="Print the address; open nothing.")
+    ] = False,
+) -> None:
+    """Watch a run in the browser while it is driven, and act on it; or one that was recorded.
+
+    The page shows the cars, what the machine believes, risk and time to collision, and what was
+    done about it. It is served to this computer only, at the address that is printed, and the run
+    begins when the page is first opened. Ctrl-C ends it.
+    """
+    require(websockets="watch")
+    is_log = _is_log(what)
+    is_recorded = is_log or what.endswith(".mcap")
+    if is_recorded:
+        require(scipy="study", mcap="mcap")
+    else:
+        require_world(world)
+    from evofsm.cli.watch.player import SPEEDS, Player
+    from evofsm.cli.watch.server import LivePage
+
+    if speed not in SPEEDS:
+        speeds = ", ".join(f"{one:g}" for one in SPEEDS)
+        raise ValueError(f"--speed is {speed:g}; it must be one of {speeds}")
+    if is_recorded:
+        opened = _recorded(what, case, topics, judge, tolerance, is_log=is_log)
+    else:
+        family = family_of(what, switches)
+        guard, learnt = _guard(family, judge, tolerance, seed, learn_first, learn)
+        opened = _driven(family, guard, world, case, seed, learnt, off=off)
+    with (
+        LivePage(port, live=not is_recorded) as page,
+        # Whoever comes to a run that waits finds its first frame.
+        Player(opened, page, paused=paused, speed=speed, awaits=not paused) as player,
+    ):
+        page.player = player
+        if paused:
+            player.step()
+        with suppress(KeyboardInterrupt):  # as soon as the address is read
+            say("Watch it here (Ctrl-C ends it); whoever has this address may steer the run:")
+            print(f"  {page.address}", flush=True)
+            if not no_browser:
+                webbrowser.open(page.address)
+            threading.Event().wait()
+    say("\nThe page is closed.")
+
+
+def _is_log(what: str) -> bool:
+    """Whether it is a log that others wrote."""
+    from evofsm.driving import FAMILIES
+    from evofsm.io.tables import file_kind
+
+    place = Path(what)
+    if what in FAMILIES or place.suffix == ".py":
+        return False
+    if not (place.is_file() or (place / "metadata.yaml").is_file()):
+        return False
+    # What is damaged is no kind of MCAP: whoever reads runs says so.
+    return place.suffix != ".mcap" or file_kind(what) in ("mcap", "bag")
+
+
+def _recorded(
+    what: str, case: int, topics: Path | None, judge: Judge, tolerance: float, *, is_log: bool
+) -> Opening:
+    """A run that was recorded, or a log with what a guard would have said; read beforehand."""
+    from tempfile import TemporaryDirectory
+
+    from evofsm.cli.sumocfg import trace_configuration
+    from evofsm.cli.watch.recorded import MOST_ROWS, Recording, record_log
+    from evofsm.io.rosbag import Topics
+
+    if not is_log:
+        recording = Recording(what)
+    else:
+        with TemporaryDirectory() as folder, progress("Reading", MOST_ROWS) as move:
+            run, log = Path(folder) / "run.mcap", what
+            if log.endswith(".sumocfg"):
+                log = str(Path(folder) / f"{Path(what).stem}.xml")
+                trace_configuration(Path(what), Path(log), seconds=_SECONDS)
+            given = None if topics is None else Topics.load(topics)
+            if record_log(
+                log, run, topics=given, judge=judge.value, tolerance=tolerance, show=move
+            ):
+                warn(f"watched are the first {MOST_ROWS:,} rows; there are more")
+            recording = Recording(run)
+    recording.restart(case - 1)
+    return lambda: recording
+
+
+def _guard(
+    family: Family, judge: Judge, tolerance: float, seed: int, episodes: int, learn: Path | None
+) -> tuple[Guard, int]:
+    """One that has learnt something, and from how many episodes."""
+    from evofsm import store
+    from evofsm.cli.driving import GUARD
+    from evofsm.cli.watch.session import learn_first, watched_guard
+    from evofsm.driving import guard_for_family, learners_of
+    from evofsm.guard import Guard
+
+    if learn is not None:
+        machine, known = learners_of(Guard.load(learn / GUARD))
+        guard = guard_for_family(family, machine=machine, judge=known, tolerance=tolerance)
+        return guard, int(store.read_header(learn / GUARD).provenance.get("episodes", 0))
+    guard = watched_guard(family, judge=judge.value, tolerance=tolerance)
+    with progress("Learning first", episodes) as move:
+        learn_first(guard, family, episodes, seed, move)
+    return guard, episodes
+
+
+def _driven(
+    family: Family, guard: Guard, world: World, case: int, seed: int, learnt: int, *, off: bool
+) -> Opening:
+    """A session in a world of its own."""
+    from evofsm.cli.watch.session import Session, cases_of
+    from evofsm.driving import open_world
+
+    if case > len(cases_of(family)):
+        raise ValueError(f"--case is {case}; {family.name} has 1 to {len(cases_of(family))}")
+
+    @contextmanager
+    def session() -> Iterator[Session]:
+        with (
+            open_world(world.value) as place,
+            Session(
+                family, guard, place, case=case - 1, seed=seed, on=not off, learnt=learnt
+            ) as opened,
+        ):
+            yield opened
+
+    return session

@@ -111,11 +111,11 @@ class Player:
         self._paused = paused
         self._speed = _checked(speed)
         self._over = False
-        self._steps = 0  # to be taken although paused
+        self._steps: float = 0  # to be taken although paused
         self._due = 0.0  # when the next frame is [s]
         self._since = 0  # frames since the latest graph
         self._told = threading.Condition()
-        self._orders: dict[str, Callable[[Watched], None]] = {}  # the latest of each kind
+        self._orders: dict[str, Callable[[Watched], object]] = {}  # the latest of each kind
         self._closed = False
         self._opened = threading.Event()
         self._refused: Exception | None = None  # why it could not be opened
@@ -126,27 +126,15 @@ class Player:
     def attend(self) -> None:
         """Someone looks on: play, if that was waited for."""
         if self._awaits:
-
-            def order(watched: Watched) -> None:
-                self._awaits, self._due = False, time.monotonic()
-
-            self._tell("attend", order)
+            self._tell("attend", lambda watched: self._set(awaits=False))
 
     def pause(self, paused: bool) -> None:
         """Wait, or go on."""
-
-        def order(watched: Watched) -> None:
-            self._paused, self._due = paused, time.monotonic()
-
-        self._tell("pause", order)
+        self._tell("pause", lambda watched: self._set(paused=paused))
 
     def step(self) -> None:
         """One decision, then wait."""
-
-        def order(watched: Watched) -> None:
-            self._paused, self._steps = True, 1
-
-        self._tell("step", order)
+        self._tell("step", lambda watched: self._set(paused=True, steps=1))
 
     def speed(self, speed: float) -> None:
         """Play so many times as fast as real time.
@@ -157,19 +145,11 @@ class Player:
             If the speed is not positive.
         """
         _checked(speed)
-
-        def order(watched: Watched) -> None:
-            self._speed, self._due = speed, time.monotonic()
-
-        self._tell("speed", order)
+        self._tell("speed", lambda watched: self._set(speed=speed))
 
     def revise(self, on: bool) -> None:
         """Switch the reviser on or off."""
-
-        def order(watched: Watched) -> None:
-            watched.revising = on
-
-        self._tell("revise", order)
+        self._tell("revise", lambda watched: setattr(watched, "revising", on))
 
     def restart(self, case: int | None = None) -> None:
         """Begin anew, or another case; and go on if it waited."""
@@ -181,7 +161,12 @@ class Player:
 
         self._tell("restart", order)
 
-    def _tell(self, kind: str, order: Callable[[Watched], None]) -> None:
+    def _set(self, **changes: bool | float) -> None:
+        for name, value in changes.items():
+            setattr(self, f"_{name}", value)
+        self._due = time.monotonic()
+
+    def _tell(self, kind: str, order: Callable[[Watched], object]) -> None:
         with self._told:
             self._orders.pop(kind, None)  # what was told last comes last
             self._orders[kind] = order

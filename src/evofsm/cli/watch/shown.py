@@ -23,6 +23,13 @@ _MOST_BELIEVED, _LEAST_BELIEF = 12, 0.002
 # Of each state so many ways out are shown, and none that is rarer.
 _MOST_WAYS, _LEAST_SHARE = 3, 0.02
 
+# Danger is over once the driver's wishes were tolerable for so long [s].
+_CALM = 2.0
+# A dead end: if the leader braked hard now, full braking would as likely as not be too late.
+_DEAD_END = 0.5
+# Actions that differ by less are the same, and softer braking is no full brake [m/s²].
+_SAME, _LEADER_BRAKES = 0.05, -2.5
+
 
 class Danger(NamedTuple):
     """A stretch of time in which the driver's wishes were not tolerable."""
@@ -180,54 +187,24 @@ class Graph(NamedTuple):
     transitions: tuple[Transition, ...]
 
 
-def graph_of(known: EvolvingFSM | FSMModel, judge: LearningJudge, number: int = 0) -> Graph:
-    """The states of a machine or a model, and their usual ways out.
+def graph_of(
+    known: EvolvingFSM | FSMModel, judge: LearningJudge | None = None, number: int = 0
+) -> Graph:
+    """The states, and their usual ways out, from a frame on.
 
-    Parameters
-    ----------
-    known : EvolvingFSM or FSMModel
-    judge : LearningJudge
-        A `LatentRisk` says which states are dead ends.
-    number : int
-        Of the frame from which on it holds.
-
-    Examples
-    --------
-    >>> from evofsm import EvolvingFSM
-    >>> machine = EvolvingFSM(n_actions=1, radius=0.5)
-    >>> trace = machine.learn_many([[50.0, 5.0, 5.0], [9.0, 20.0, 20.0]], [0, 0])
-    >>> graph_of(machine, LatentRisk(lowest=-4.0)).transitions
-    ()
+    Only a `LatentRisk` says which are dead ends; else those are marked in which a collision ended.
     """
-    ways = tuple(usual_ways(known))
-    if not isinstance(judge, LatentRisk):
-        return Graph(number, states_of(known), ways)
-    centers, visits = known.centers, known.visits
-    states = tuple(
-        StateShown(
-            one.state,
-            tuple(centers[one.state].tolist()),
-            float(visits[one.state]),
-            one.risk,
-            one.is_dead_end,
-            one.failures,
-        )
-        for one in assess_states(known, judge)
-    )
-    return Graph(number, states, ways)
+    places, visits, ways = known.centers.tolist(), known.visits.tolist(), tuple(_usual_ways(known))
+    if isinstance(judge, LatentRisk):
+        found = [(one.risk, one.is_dead_end, one.failures) for one in assess_states(known, judge)]
+    else:
+        found = [(math.nan, ended > 0.0, ended) for ended in known.endings.tolist()]
+    states = enumerate(zip(places, visits, found, strict=True))
+    shown = (StateShown(k, tuple(place), seen, *how) for k, (place, seen, how) in states)
+    return Graph(number, tuple(shown), ways)
 
 
-def states_of(known: EvolvingFSM | FSMModel) -> tuple[StateShown, ...]:
-    """The states, those marked in which a collision ended: how dangerous each is nobody says."""
-    return tuple(
-        StateShown(state, tuple(center), float(visits), math.nan, bool(ended > 0.0), float(ended))
-        for state, (center, visits, ended) in enumerate(
-            zip(known.centers.tolist(), known.visits, known.endings, strict=True)
-        )
-    )
-
-
-def usual_ways(known: EvolvingFSM | FSMModel) -> list[Transition]:
+def _usual_ways(known: EvolvingFSM | FSMModel) -> list[Transition]:
     """How one state follows another, of each state the most usual ways."""
     changes = known.changes * ~np.eye(known.n_states, dtype=bool)
     ways = []
@@ -245,3 +222,106 @@ def most_believed(belief: NDArray[np.float64]) -> tuple[tuple[int, float], ...]:
     """The most probable states, and how probable they are."""
     most = np.argsort(-belief, kind="stable")[:_MOST_BELIEVED].tolist()
     return tuple((k, float(belief[k])) for k in most if belief[k] >= _LEAST_BELIEF)
+
+
+# -- The story ------------------------------------------------------------------------------------
+
+
+class Chronicle:
+    """Writes the story of a run, frame by frame: when danger began, and what was done about it.
+
+    ``alone`` is when the driver collides if left to itself [s].
+    """
+
+    def __init__(self, tolerance: float, alone: float = math.nan) -> None:
+        self.tolerance = tolerance
+        self.story = Story(alone=alone)
+
+    def tell(self, frame: Frame) -> Story:
+        """The story with one more frame."""
+        story = self._warnings(frame, self._leader(frame, self.story))
+        story = story._replace(
+            revised=story.revised + _is_revised(frame),
+            judged=story.judged or not math.isnan(frame.proposed_risk.risk),
+        )
+        if frame.over:
+            story = story._replace(ended=frame.time)
+            if frame.collided:
+                impact = frame.v_follower - frame.v_leader
+                story = story._replace(collision=frame.time, impact=impact)
+        else:
+            story = self._danger(frame, story)
+        self.story = story
+        return story
+
+    def _leader(self, frame: Frame, story: Story) -> Story:
+        if not frame.a_leader <= _LEADER_BRAKES:
+            return story
+        if math.isnan(story.leader_brakes):
+            story = story._replace(leader_brakes=frame.time, leader_decel=0.0)
+        return story._replace(leader_decel=max(story.leader_decel, -frame.a_leader))
+
+    def _warnings(self, frame: Frame, story: Story) -> Story:
+        if frame.v_follower == 0.0:  # who stands hits nobody
+            return story
+        if math.isnan(story.time_to_collision) and frame.time_to_collision < TTC.threshold:
+            story = story._replace(time_to_collision=frame.time)
+        if math.isnan(story.time_headway) and frame.time_headway < HEADWAY.threshold:
+            story = story._replace(time_headway=frame.time)
+        return story
+
+    def _danger(self, frame: Frame, story: Story) -> Story:
+        is_tolerable = not frame.proposed_risk.risk > self.tolerance
+        danger = story.danger if story.in_danger else None
+        if danger is None:
+            if is_tolerable:
+                return story
+            danger = _began(frame)
+            first = frame.time if math.isnan(story.first) else story.first
+            story = story._replace(in_danger=True, first=first)
+        elif is_tolerable and frame.time - danger.last >= _CALM:
+            return story._replace(in_danger=False)
+        return story._replace(danger=_went_on(danger, frame, is_tolerable))
+
+
+def _began(frame: Frame) -> Danger:
+    gap, speed, leader_speed = frame.observation
+    return Danger(
+        since=frame.time,
+        gap=gap,
+        speed=speed,
+        closing=speed - leader_speed,
+        risk=frame.proposed_risk.risk,
+        critical=frame.critical,
+        brakes_to=frame.brakes_to,
+        decel=frame.decel,
+        proposed=frame.proposed,
+        advised=frame.advised,
+        why=frame.why,
+    )
+
+
+def _is_revised(frame: Frame) -> bool:
+    return abs(frame.executed - frame.proposed) > _SAME
+
+
+def _went_on(danger: Danger, frame: Frame, is_tolerable: bool) -> Danger:
+    revised = _is_revised(frame)
+    if revised and danger.revised == 0:
+        danger = danger._replace(
+            stepped_in=frame.time, wished=frame.proposed, instead=frame.executed
+        )
+    dead_end = danger.dead_end
+    if not frame.braking_risk > _DEAD_END:  # or it is not known
+        dead_end = math.nan
+    elif math.isnan(dead_end):
+        dead_end = frame.time
+    return danger._replace(
+        decisions=danger.decisions + 1,
+        revised=danger.revised + revised,
+        change=danger.change + (abs(frame.executed - frame.proposed) if revised else 0.0),
+        off=danger.off if frame.revising else frame.time,
+        hardest=min(danger.hardest, frame.executed) if revised else danger.hardest,
+        dead_end=dead_end,
+        last=danger.last if is_tolerable else frame.time,
+    )

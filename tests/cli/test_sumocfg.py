@@ -7,13 +7,9 @@ import pytest
 pytest.importorskip("typer")
 pytest.importorskip("libsumo")
 
-from typer.testing import CliRunner
-
-from evofsm.__main__ import application
-from evofsm.cli.commands.watch import Watch
-from evofsm.cli.configuration import trace_configuration
-from evofsm.cli.watch.logged import record_log
-from evofsm.cli.watch.recording import Recording
+from evofsm.cli.sumocfg import trace_configuration
+from evofsm.cli.watch import _is_log
+from evofsm.cli.watch.recorded import Recording, record_log
 
 NET = """<net version="1.20">
     <location netOffset="0,0" convBoundary="0,0,1500,0" origBoundary="0,0,1500,0"
@@ -51,11 +47,7 @@ def configuration(tmp_path):
     return tmp_path / "my.sumocfg"
 
 
-def evofsm(*arguments):
-    return CliRunner().invoke(application(), [str(argument) for argument in arguments])
-
-
-def test_guards_act_where_they_are_told_to(configuration):
+def test_guards_act_where_they_are_told_to(evofsm, configuration):
     found = {}
     for mode in ("shadow", "act"):
         asked = ("drive", configuration, "--vehicles", "type:hasty", "--mode", mode, "--json")
@@ -66,7 +58,7 @@ def test_guards_act_where_they_are_told_to(configuration):
     assert found["act"]["speed"] > 0.9 * found["shadow"]["speed"]
 
 
-def test_what_came_of_it_is_said(configuration):
+def test_what_came_of_it_is_said(evofsm, configuration):
     result = evofsm("drive", configuration, "--vehicles", "ego,lead")
     assert result.exit_code == 0
     assert "2 cars (ego,lead), act" in result.output
@@ -81,13 +73,13 @@ def test_what_came_of_it_is_said(configuration):
         (["--out", "folder"], "--out is for families"),
     ],
 )
-def test_what_does_not_hold_for_a_configuration_is_refused(configuration, options, said):
+def test_what_does_not_hold_for_a_configuration_is_refused(evofsm, configuration, options, said):
     result = evofsm("drive", configuration, *options)
     assert result.exit_code == 2
     assert said in result.output
 
 
-def test_a_configuration_that_sumo_refuses_is_one_line(configuration):
+def test_a_configuration_that_sumo_refuses_is_one_line(evofsm, configuration):
     (configuration.parent / "cars.rou.xml").unlink()
     result = evofsm("drive", configuration)
     assert result.exit_code == 2
@@ -95,7 +87,7 @@ def test_a_configuration_that_sumo_refuses_is_one_line(configuration):
     assert evofsm("drive", configuration.parent / "none.sumocfg").exit_code == 2
 
 
-def test_a_choice_of_no_car_is_said(configuration):
+def test_a_choice_of_no_car_is_said(evofsm, configuration):
     result = evofsm("drive", configuration, "--vehicles", "type:hatsy")
     assert "no car was type:hatsy: is it the name of a type or car?" in result.output
 
@@ -108,7 +100,7 @@ def test_what_a_configuration_drives_is_watched_in_shadow_mode(configuration, tm
     recorded.restart(0)
     frames = [recorded.step() for _ in range(20)]
     assert frames[-1].time > frames[0].time
-    assert Watch(what=str(configuration)).is_log
+    assert _is_log(str(configuration))
 
 
 def test_a_configuration_that_is_not_there_is_named(tmp_path):

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import asyncio
 import hmac
-import json
 import logging
 import secrets
 import socket
@@ -19,17 +18,14 @@ from collections import deque
 from http import HTTPStatus
 from importlib.resources import files
 from types import TracebackType
-from typing import Any, NamedTuple, Self
+from typing import Annotated, Any, Self
 
-from evofsm.cli.watch.live.wire import (
-    clock_message,
-    encode,
-    frame_message,
-    graph_message,
-    start_message,
-)
+import msgspec
+
 from evofsm.cli.watch.player import SPEEDS, Clock, Player
-from evofsm.cli.watch.shown import Frame, Graph, Start
+from evofsm.cli.watch.shown import Frame, Graph, Start, Transition
+from evofsm.cli.watch.words import tell
+from evofsm.driving import name_state, name_states
 from evofsm.extras import needs
 
 with needs("websockets", "watch", "the live page"):
@@ -59,15 +55,42 @@ _log = logging.getLogger(__name__)
 _log.addHandler(logging.NullHandler())  # junk on the socket is nobody's traceback
 
 
+def frame_message(frame: Frame, start: Start) -> dict[str, Any]:
+    """A frame, with the story so far in words."""
+    story, danger = frame.story, frame.story.danger
+    dead_end = None if danger is None else danger.dead_end  # since when no braking helps [s]
+    return {
+        **frame._asdict(),
+        "here": name_state(frame.observation),
+        "danger": danger._asdict() if danger and story.in_danger else None,
+        "story": {**story._asdict(), "danger": None, "dead_end": dead_end},
+        "told": tell(frame, start)._asdict(),
+    }
+
+
+def encode(message: Any) -> str:
+    """As JSON, numbers with five decimals; what is no finite number becomes null.
+
+    >>> encode({"kind": "clock", "speed": float("inf")})
+    '{"kind":"clock","speed":null}'
+    """
+    return msgspec.json.encode(_rounded(message)).decode()
+
+
+def _rounded(value: Any) -> Any:
+    if isinstance(value, float):
+        return round(value, 5)
+    if hasattr(value, "_asdict") and not isinstance(value, Transition):
+        value = value._asdict()
+    if isinstance(value, dict):
+        return {name: _rounded(part) for name, part in value.items()}
+    return [_rounded(part) for part in value] if isinstance(value, list | tuple) else value
+
+
 class LivePage:
     """Serves a run to browsers on this computer; the audience of a `Player`.
 
-    Parameters
-    ----------
-    port : int
-        0 for any that is free.
-    live : bool
-        Whether it can be acted on, or was recorded.
+    ``port`` may be 0, for any that is free; ``live`` says whether the run can be acted on.
 
     Examples
     --------
@@ -87,7 +110,7 @@ class LivePage:
         self._ready = threading.Event()
         self._error: Exception | None = None
         self._thread = threading.Thread(target=self._serve, name="evofsm-live-page", daemon=True)
-        self._files = {name: files(__package__).joinpath(name).read_bytes() for name in _WELCOME}
+        self._files = {name: (files(__package__) / "live" / name).read_bytes() for name in _WELCOME}
 
     @property
     def port(self) -> int:
@@ -126,7 +149,7 @@ class LivePage:
     def began(self, start: Start, clock: Clock) -> None:
         """A run begins."""
         self._start = start
-        self._hand_over("start", start_message(start, live=self._live))
+        self._hand_over("start", {**start._asdict(), "live": self._live, "speeds": SPEEDS})
         self.ticked(clock)
 
     def saw(self, frame: Frame) -> None:
@@ -136,18 +159,21 @@ class LivePage:
 
     def grew(self, graph: Graph) -> None:
         """States, or ways between them, have changed."""
-        self._hand_over("graph", graph_message(graph))
+        names = name_states([state.center for state in graph.states])
+        pairs = zip(graph.states, names, strict=True)
+        states = [{**state._asdict(), "name": name} for state, name in pairs]
+        self._hand_over("graph", {**graph._asdict(), "states": states})
 
     def ticked(self, clock: Clock) -> None:
         """It is played otherwise."""
-        self._hand_over("clock", clock_message(clock))
+        self._hand_over("clock", clock._asdict())
 
     def failed(self, text: str) -> None:
         """It broke off with an error."""
-        self._hand_over("failed", {"kind": "failed", "text": text})
+        self._hand_over("failed", {"text": text})
 
     def _hand_over(self, kind: str, message: dict[str, Any]) -> None:
-        self._loop.call_soon_threadsafe(self._publish, kind, encode(message))
+        self._loop.call_soon_threadsafe(self._publish, kind, encode({"kind": kind, **message}))
 
     # -- In the server's own thread ---------------------------------------------------------------
 
@@ -242,7 +268,7 @@ class LivePage:
     def _obey(self, command: Command) -> None:
         if self.player is None or self._start is None:
             return
-        match command:
+        match (command.do, command.value):
             case ("pause", bool(paused)):
                 self.player.pause(paused)
             case ("step", None):
@@ -256,14 +282,14 @@ class LivePage:
             case ("case", float(case)) if case in range(len(self._start.cases)):
                 self.player.restart(int(case))
             case _:
-                raise ValueError(f"no such command: {command.name}")
+                raise ValueError(f"no such command: {command.do}")
 
 
-class Command(NamedTuple):
+class Command(msgspec.Struct, forbid_unknown_fields=True):
     """What a page asks for."""
 
-    name: str
-    value: bool | float | None
+    do: Annotated[str, msgspec.Meta(max_length=20, pattern="^[a-z]+$")]
+    value: bool | float | None = None
 
     @classmethod
     def parse(cls, text: str) -> Command:
@@ -277,25 +303,15 @@ class Command(NamedTuple):
         Examples
         --------
         >>> Command.parse('{"do": "pause", "value": true}')
-        Command(name='pause', value=True)
+        Command(do='pause', value=True)
         >>> Command.parse("hello")
         Traceback (most recent call last):
         ValueError: not a command
         """
         try:
-            match json.loads(text):
-                # Whatever is no command is told its name, which may hold no half of a character.
-                case {"do": str(name), **rest} if (
-                    len(rest) <= 1 and len(name) <= 20 and name.isascii()
-                ):
-                    match rest.get("value"):
-                        case bool() | None as value:
-                            return cls(name, value)
-                        case int() | float() as number:
-                            return cls(name, float(number))
-        except (ValueError, RecursionError, OverflowError):
-            pass
-        raise ValueError("not a command")
+            return msgspec.json.decode(text, type=cls)
+        except (msgspec.MsgspecError, ValueError, RecursionError):
+            raise ValueError("not a command") from None
 
 
 class _Shown:

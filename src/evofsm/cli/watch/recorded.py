@@ -1,8 +1,9 @@
-"""A run that was recorded, shown as one that is driven: nothing is computed anew."""
+"""A run that was recorded, shown as one that is driven; a log of others is made such a run."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Iterable, Iterator
 from os import PathLike
 from pathlib import Path
 from typing import Any, Self
@@ -10,29 +11,37 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.cli.watch.chronicle import Chronicle
 from evofsm.cli.watch.shown import (
     CAR_LENGTH,
     HEADWAY,
     RECORDED,
     TTC,
+    Chronicle,
     Frame,
     Graph,
     Judged,
     Start,
+    graph_of,
     most_believed,
-    states_of,
-    usual_ways,
 )
-from evofsm.driving import VARIABLES
+from evofsm.driving import VARIABLES, guard_for_cars, shadow_drive
 from evofsm.driving.measures import time_headway, time_to_collision
-from evofsm.guard import RECORD, TOLERANCE
+from evofsm.guard import RECORD, TOLERANCE, Mode
+from evofsm.io.foxglove import recording
+from evofsm.io.logs import Chunk, episodes_of, read_traces
+from evofsm.io.rosbag import Topics
 from evofsm.io.runs import RecordedEpisode, Run, read_run
 
-# What is accepted where a log does not say.
+#: More rows of a log are not watched.
+MOST_ROWS = 20_000
+
 # So many of a log's episodes can be chosen among.
 _MOST_EPISODES = 500
 _NONE = -1
+# What a car can do at most [m/s²]; nobody says of a log what this one could.
+_LOWEST, _HIGHEST = -8.0, 4.0
+# Whoever wants to see something needs as many.
+_FEWEST_ROWS = 10
 
 
 class Recording:
@@ -95,7 +104,7 @@ class Recording:
         self._episode = self._episodes[case]
         self._cars = _cars(self._episode)
         self._number = 0
-        self._chronicle = Chronicle(self._tolerance, (TTC.threshold, HEADWAY.threshold))
+        self._chronicle = Chronicle(self._tolerance)
         self.start = self._start(case)
         return self.start
 
@@ -123,9 +132,7 @@ class Recording:
     def graph(self) -> Graph:
         """The states as they were after the last episode."""
         model = self._run.model
-        if model is None:
-            return Graph(self._number, (), ())
-        return Graph(self._number, states_of(model), tuple(usual_ways(model)))
+        return Graph(self._number, (), ()) if model is None else graph_of(model, None, self._number)
 
     def __enter__(self) -> Self:
         return self
@@ -235,3 +242,70 @@ def _number(text: str | None, default: float) -> float:
         return default if text is None else float(text)
     except ValueError:
         return default
+
+
+# -- A log of others -------------------------------------------------------------------------------
+
+
+def record_log(
+    path: str,
+    out: Path,
+    *,
+    topics: Topics | None = None,
+    judge: str = "kinematic",
+    tolerance: float = TOLERANCE,
+    show: Callable[[int], object] = lambda rows: None,
+) -> bool:
+    """Write the episodes of a log of cars as a run, decided on by a guard that learns on the way.
+
+    Returns whether rows after the first `MOST_ROWS` were left out; ``show`` is told how many
+    were decided on.
+
+    Raises
+    ------
+    ValueError
+        If the log cannot be read, or no episode has ten rows.
+    """
+    reading = read_traces([path], topics=topics)
+    taken, more = 0, False
+    about: dict[str, Any] = {"source": Path(path).name, "mode": "shadow", "judge": judge}
+    guard = None
+    with recording(out, about | {"controller": "as recorded", "tolerance": tolerance}) as log:
+        for episode in episodes_of(_first(reading, MOST_ROWS + 1)):
+            more = taken + len(episode.times) > MOST_ROWS
+            episode = episode.rows(0, MOST_ROWS - taken)
+            taken += len(episode.times)
+            show(taken)
+            if len(episode.times) >= _FEWEST_ROWS:
+                if guard is None:
+                    guard = guard_for_cars(
+                        _LOWEST,
+                        _HIGHEST,
+                        episode.dt,
+                        mode=Mode.SHADOW,
+                        tolerance=tolerance,
+                        judge=judge,
+                    )
+                log.add(
+                    shadow_drive(
+                        guard,
+                        episode.times - episode.times[0],
+                        episode.observations,
+                        episode.actions,
+                        failed=episode.failures is not None and len(episode.failures) > 0,
+                    )
+                )
+        if guard is None:
+            raise ValueError(f"{path}: nobody follows anybody for {_FEWEST_ROWS} rows")
+        if guard.machine is not None:
+            log.attach(guard.machine.model(names=VARIABLES))
+    return more
+
+
+def _first(chunks: Iterable[Chunk], most: int) -> Iterator[Chunk]:
+    """No more rows than that."""
+    for chunk in chunks:
+        yield chunk.rows(0, most)
+        most -= len(chunk.times)
+        if most <= 0:
+            return

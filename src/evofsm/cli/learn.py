@@ -1,0 +1,502 @@
+"""`evofsm learn`."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from evofsm.cli.inspect import model_document, tables_of
+from evofsm.cli.options import Json, split_names
+from evofsm.cli.show import facts, print_json, progress, say, show, table, warn
+
+if TYPE_CHECKING:
+    from rich.console import RenderableType
+
+    from evofsm.cli.learning import Learning, Skill
+    from evofsm.fsm import EvolvingFSM, IntervalActions, ObservationEncoder
+    from evofsm.io import Chunk, VehicleLengths
+    from evofsm.io.logs import Noted
+
+
+class RuleName(StrEnum):
+    """How states are made."""
+
+    PAPER = "paper"
+    EDGES = "edges"
+    NOVELTY = "novelty"
+    FAILURE = "failure"
+
+
+class NoLeader(StrEnum):
+    """What to do where there is no leader."""
+
+    REFUSE = "refuse"
+    END = "end"
+
+
+_MOST_ACTIONS = 1000
+_SECOND_STEPS = {
+    "marginal": "all alike, as in the paper",
+    "hold": "the same, held",
+    "observed": "as often as they were used",
+}
+# With less of the belief, the most probable state is hardly told apart from the others.
+_UNCERTAIN = 0.5
+
+
+def learn(
+    files: Annotated[
+        list[str],
+        typer.Argument(
+            help="Logs or tables of objects (CSV, Parquet), FCD output of SUMO (XML, CSV, "
+            "Parquet), traces of ASAM OSI (.osi, MCAP), bags of ROS 2 (folder, MCAP, db3)."
+        ),
+    ],
+    observe: Annotated[
+        str,
+        typer.Option(
+            help="Columns to observe. A discrete one is written with its values: light=red/green."
+        ),
+    ] = "gap,v_follower,v_leader",
+    action: Annotated[
+        str, typer.Option(help="Column of the action taken from a row to the next.")
+    ] = "a_follower",
+    action_range: Annotated[
+        str,
+        typer.Option(
+            help="Intervals of the action, LOW:HIGH:WIDTH. What lies beyond goes into the end "
+            "intervals and is counted."
+        ),
+    ] = "-2.5:2.5:0.3",
+    time: Annotated[str, typer.Option(help="Column of the time, in seconds.")] = "time",
+    episode: Annotated[
+        str | None,
+        typer.Option(
+            help="An episode begins where one of these columns changes, and in each file; none of "
+            "them: ''. [default: those of run,pair,segment that exist]"
+        ),
+    ] = None,
+    dt: Annotated[
+        float | None,
+        typer.Option(help="Seconds from a row to the next, for a log without a clock."),
+    ] = None,
+    failed: Annotated[
+        str | None,
+        typer.Option(
+            help="What tells of failures: a column of truth values, or a comparison such as "
+            "'gap<=0'. The row with which it becomes true ends the episode in failure; rows in "
+            "which it stays so are left out. Compared after --unit."
+        ),
+    ] = None,
+    unit: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Unit of a column, or of all read that begin so: v=km/h, time=ms. May be "
+            "repeated. Learnt are s, m, m/s, m/s²."
+        ),
+    ] = None,
+    topics: Annotated[
+        Path | None,
+        typer.Option(
+            help="File in TOML that says which field of which topic of a bag is which variable."
+        ),
+    ] = None,
+    no_leader: Annotated[
+        NoLeader,
+        typer.Option(
+            help="A row in which an observed number is missing, as where there is no leader: "
+            "refuse the log, or end the episode there and leave the row out."
+        ),
+    ] = NoLeader.REFUSE,
+    vehicle_length: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="FCD: length of vehicles in metres, or of a type: truck=12. May be repeated. "
+            "[default: 5.0]"
+        ),
+    ] = None,
+    rule: Annotated[
+        RuleName,
+        typer.Option(
+            help="How states are made: as in the paper; with states at edges too; one wherever "
+            "nothing like it was seen (novelty, recommended for logs); or that and at failures."
+        ),
+    ] = RuleName.PAPER,
+    radius: Annotated[
+        float | None,
+        typer.Option(
+            help="The paper's ε, which parts states; of novelty, in --scale. [default: 0.3; of "
+            "novelty and failure 1.0]"
+        ),
+    ] = None,
+    scale: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Novelty and failure: the difference that counts as 1, by the column, such as "
+            "gap=4. May be repeated. [default: gap=4, v_follower=2, v_leader=2]"
+        ),
+    ] = None,
+    spread: Annotated[
+        float | None,
+        typer.Option(
+            help="Width of recognition; smaller is sharper. [default: 3.0; of novelty and failure "
+            "1.0]"
+        ),
+    ] = None,
+    max_states: Annotated[
+        int | None,
+        typer.Option(
+            help="Where there are so many states, two are merged for each new one. [default: no "
+            "limit]"
+        ),
+    ] = None,
+    out: Annotated[Path | None, typer.Option(help="File to save the model to.")] = None,
+    checkpoint: Annotated[
+        Path | None,
+        typer.Option(
+            help="Save what was learnt so far in this file every minute; where it exists, go on "
+            "from it."
+        ),
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Learn a machine from logs of your own, of any size, row by row.
+
+    A log holds a row per time step. A step longer than 1.5 times the usual one (the median in the
+    first rows of a file) is a hole in time: it begins a new episode.
+
+    In FCD output of SUMO, a vehicle and the next one ahead of it on the same lane are a pair (a
+    leader beyond the end of the lane is not seen). A pair is observed by gap (bumper to bumper),
+    v_follower and v_leader; its action a_follower is what the follower did until the next time
+    step. SUMO rounds to 2 decimals unless told --precision 6. So are tables of objects (id, t, x,
+    y, vx, vy, length, lane) and traces of ASAM OSI read.
+
+    The time may be seconds, or dates of ISO 8601. Without --failed a log tells nothing of failures,
+    and evofsm inspect --at says so.
+
+    With --checkpoint, the same command goes on where it was stopped, whatever stopped it, and comes
+    to the same result. The file stays at the end: run again, the command prints it at once.
+    """
+    from evofsm.cli.learning import Checkpoint, learn_traces
+    from evofsm.driving import UNITS, VARIABLES
+    from evofsm.fsm import positive
+    from evofsm.io import LogColumns, Topics, VehicleLengths, read_traces
+    from evofsm.io.logs import Noted, parse_units
+
+    _check_out(out)
+    actions, encoder = _actions(action_range), _encoder(observe)
+    machine = _machine(actions.n_actions, rule, radius, spread, scale, max_states, failed, encoder)
+    columns = LogColumns(
+        observe=encoder,
+        action=action,
+        time=time,
+        episode=None if episode is None else split_names(episode),
+        dt=None if dt is None else positive("--dt", dt),
+        failed=failed,
+        units=parse_units(unit or ()),
+        leader_may_lack=no_leader is NoLeader.END,
+    )
+    lengths, noted = VehicleLengths.parse(vehicle_length or ()), Noted()
+    known = [{"name": file, "bytes": _size(file)} for file in files]
+    keeper = None
+    if checkpoint is not None:
+        _check_apart(checkpoint, out, files)
+        names = ("action", "time", "failed", "dt", "leader_may_lack")
+        settings = {name: getattr(columns, name) for name in names}
+        settings |= {"observe": observe, "episode": columns.episode, "units": unit or []}
+        settings |= {"files": known, "actions": action_range, "lengths": vehicle_length or []}
+        settings |= {"machine": repr(machine), "topics": topics and topics.read_text("utf-8")}
+        keeper = Checkpoint(checkpoint, settings)
+    read_topics = None if topics is None else Topics.load(topics)
+    units = dict(zip(VARIABLES, UNITS, strict=True))
+    with progress("Learning", sum(file["bytes"] for file in known)) as move:  # type: ignore[misc]
+        chunks = read_traces(
+            files, columns, lengths, lambda count: move(advance=count), noted, read_topics
+        )
+        learning = learn_traces(
+            _noting(chunks, lengths, noted, keeper.notes if keeper else {}),
+            machine,
+            actions,
+            encoder.names,
+            [units.get(name, "") for name in encoder.names],
+            keeper,
+        )
+    noted = Noted(**learning.notes["noted"]) if learning.notes else noted
+    assumed = learning.notes.get("lengths") or (str(lengths) if lengths.seen else None)
+    provenance = _provenance(learning, known, action, failed, unit)
+    warnings = noted.warnings(time)
+    for warning in warnings:
+        warn(f"warning: {warning}")
+    if out is not None:
+        _save(learning, out, provenance, checkpoint)
+    if as_json:
+        document = _document(learning, provenance)
+        print_json({"files": files, "saved": out, **document, "noted": noted, "warnings": warnings})
+        return
+    read = [*_read(learning, action), *_read_otherwise(noted, failed, learning)]
+    if assumed:
+        read.append(("vehicle lengths", f"assumed, for FCD has none: {assumed}"))
+    show(facts("What was read", read), *tables_of(learning.model))
+    if learning.model.n_states > 1 and learning.certainty < _UNCERTAIN:
+        show(
+            f"\nStates are hardly told apart: the most probable one has {learning.certainty:.0%} "
+            f"of the belief on average ({1 / learning.model.n_states:.0%} is a blind guess). A "
+            "smaller --spread sharpens recognition."
+        )
+    show("", *_skills(learning.skills), "")
+    if out is None:
+        say("Nothing was saved; --out MODEL saves the model.")
+    else:
+        say(f"Saved to {out}. Look at it again: evofsm inspect {out}")
+
+
+# -- What was asked for ---------------------------------------------------------------------------
+
+
+def _actions(text: str) -> IntervalActions:
+    from evofsm.fsm import IntervalActions
+
+    try:
+        low, high, width = (float(number) for number in text.split(":"))
+    except ValueError:
+        what = "write LOW:HIGH:WIDTH, such as -2.5:2.5:0.3"
+        raise ValueError(f"--action-range is {text!r}; {what}") from None
+    try:
+        if width > 0.0 and (high - low) / width > _MOST_ACTIONS:
+            raise ValueError(f"more than {_MOST_ACTIONS} intervals; make them wider")
+        return IntervalActions(low, high, width, outside="clip")
+    except ValueError as error:
+        raise ValueError(f"--action-range {text}: {error}") from None
+
+
+def _encoder(text: str) -> ObservationEncoder:
+    from evofsm.fsm import Category, ObservationEncoder
+
+    def variable(name: str) -> str | Category:
+        name, discrete, values = name.partition("=")
+        return Category(name, values.split("/")) if discrete else name
+
+    try:
+        return ObservationEncoder(*map(variable, split_names(text)))
+    except ValueError as error:
+        raise ValueError(f"--observe {text}: {error}") from None
+
+
+def _machine(
+    n_actions: int,
+    rule: RuleName,
+    radius: float | None,
+    spread: float | None,
+    scale: list[str] | None,
+    max_states: int | None,
+    failed: str | None,
+    encoder: ObservationEncoder,
+) -> EvolvingFSM:
+    from evofsm.fsm import Edges, EvolvingFSM, FailureSplit, Novelty
+
+    has_novelty = rule in (RuleName.NOVELTY, RuleName.FAILURE)
+    if rule is RuleName.FAILURE and failed is None:
+        raise ValueError("--rule failure makes states at failures; --failed has to tell of them")
+    if scale and not has_novelty:
+        raise ValueError(f"--scale is for --rule novelty or failure, not {rule.value}")
+    if has_novelty:
+        one = 1.0 if radius is None else radius
+        novelty = Novelty(one, _scales(scale, encoder, rule), 1.0 if spread is None else spread)
+        used = FailureSplit(novelty) if rule is RuleName.FAILURE else novelty
+        return EvolvingFSM(n_actions, rule=used, max_states=max_states)
+    return EvolvingFSM(
+        n_actions,
+        radius=0.3 if radius is None else radius,
+        spread=3.0 if spread is None else spread,
+        max_states=max_states,
+        rule=Edges() if rule is RuleName.EDGES else None,
+    )
+
+
+def _scales(scale: list[str] | None, encoder: ObservationEncoder, rule: RuleName) -> list[float]:
+    """The difference that counts as 1, for each number that is observed."""
+    from evofsm.driving import SAFETY_RULE, VARIABLES
+    from evofsm.fsm import positive
+
+    given = {}
+    for text in scale or ():
+        column, _, number = text.rpartition("=")
+        try:
+            given[column] = positive("it", float(number))
+        except ValueError:
+            what = "write COLUMN=NUMBER, such as gap=4"
+            raise ValueError(f"--scale is {text!r}; {what}") from None
+    single = [one for one in encoder.variables if isinstance(one, str)]
+    if unknown := [column for column in given if column not in single]:
+        raise ValueError(f"--scale names {unknown[0]!r}; observed are {', '.join(single)}")
+    given = dict(zip(VARIABLES, SAFETY_RULE.scales, strict=True)) | given
+    if lacking := [column for column in single if column not in given]:
+        raise ValueError(
+            f"--rule {rule.value} has to know the difference that counts as 1 in {lacking[0]!r}: "
+            f"--scale {lacking[0]}=2 (4 m of a gap and 2 m/s of a speed are usual)"
+        )
+    return [given.get(name, 1.0) for name in encoder.names]
+
+
+def _size(file: str) -> int:
+    """Bytes of a file, or of those in a folder."""
+    if not os.path.isdir(file):
+        return os.path.getsize(file)
+    return sum(entry.stat().st_size for entry in os.scandir(file))
+
+
+def _check_out(out: Path | None) -> None:
+    """Refuse before the long work what could not be saved after it."""
+    from evofsm import store
+
+    if out is None:
+        return
+    if not out.parent.is_dir():
+        raise FileNotFoundError(f"--out {out}: there is no folder {out.parent}")
+    if not os.access(out.parent, os.W_OK):
+        raise PermissionError(f"--out {out}: the folder {out.parent} may not be written")
+    if out.is_dir():
+        raise IsADirectoryError(f"--out {out} is a folder; name a file in it")
+    if out.exists():
+        try:
+            store.read_header(out)
+        except (ValueError, OSError):
+            what = "exists and is no file of evofsm; it was left alone"
+            raise ValueError(f"--out {out}: {what}") from None
+
+
+def _check_apart(checkpoint: Path, out: Path | None, files: Sequence[str]) -> None:
+    """Refuse a checkpoint that would take the place of something else."""
+    others = [*files, *([] if out is None else [str(out)])]
+    if checkpoint.resolve() in {Path(other).resolve() for other in others}:
+        raise ValueError(f"--checkpoint {checkpoint} is named twice; give it a file of its own")
+
+
+def _noting(
+    chunks: Iterator[Chunk], lengths: VehicleLengths, noted: Noted, notes: dict[str, Any]
+) -> Iterator[Chunk]:
+    """The same chunks; at their end, what was assumed and noticed in reading them is noted."""
+    from dataclasses import asdict
+
+    yield from chunks
+    notes |= {"noted": asdict(noted), "lengths": str(lengths) if lengths.seen else None}
+
+
+# -- What came of it ------------------------------------------------------------------------------
+
+
+def _provenance(
+    learning: Learning, files: list[Any], action: str, failed: str | None, unit: list[str] | None
+) -> dict[str, Any]:
+    """What the model's file says of where it comes from."""
+    read = learning.read
+    provenance = {"files": files, "rows": read.rows, "episodes": read.episodes}
+    provenance |= {"transitions": learning.transitions, "action": action}
+    if failed is not None:
+        provenance |= {"failed": failed, "failures": read.failures}
+    if unit:
+        provenance["units converted"] = ", ".join(unit)
+    return provenance
+
+
+def _save(
+    learning: Learning, out: Path, provenance: Mapping[str, Any], checkpoint: Path | None
+) -> None:
+    try:
+        learning.model.save(out, provenance)
+    except OSError as error:
+        what = "the result is lost with it; --checkpoint FILE would have saved it"
+        if checkpoint is not None:
+            what = f"the result is in {checkpoint}: make room, and run the same command again"
+        error.add_note(what)
+        raise
+
+
+def _document(learning: Learning, provenance: Mapping[str, Any]) -> dict[str, Any]:
+    """All that is printed, for JSON; states and actions from 0."""
+    read = learning.read
+    names = ("rows", "episodes", "seconds", "clipped_below", "clipped_above", "jumps", "cuts")
+    known = read.failures if learning.model.failures_told else None
+    return {
+        **{name: getattr(read, name) for name in names},
+        "transitions": learning.transitions,
+        "failures": known,
+        "certainty": learning.certainty,
+        "skills": [{**vars(skill), "skill": skill.skill} for skill in learning.skills],
+        "model": {**model_document(learning.model), "provenance": provenance},
+    }
+
+
+def _read(learning: Learning, action: str) -> Iterator[tuple[str, str]]:
+    read, actions = learning.read, learning.model.actions
+    yield "rows", f"{read.rows:,}, one every {learning.model.dt:g} s"
+    yield "episodes", f"{read.episodes:,}, together {_duration(read.seconds)}"
+    yield "transitions", f"{learning.transitions:,}"
+    if read.jumps:
+        yield "time jumps", f"{read.jumps:,}; each begins an episode"
+    if read.cuts:
+        yield "pairs cut", f"{read.cuts:,} long ones go on in an episode of their own"
+    assert actions is not None
+    text = f"{actions.n_actions} intervals of {action} from {actions.low:g} to {actions.high:g}"
+    if clipped := read.clipped_below + read.clipped_above:
+        text += f"; {read.clipped_below:,} below and {read.clipped_above:,} above "
+        text += f"({clipped / read.rows:.1%} of rows) were put into the end intervals"
+    yield "actions", text if clipped else f"{text}; none was beyond"
+
+
+def _read_otherwise(
+    noted: Noted, failed: str | None, learning: Learning
+) -> Iterator[tuple[str, str]]:
+    """What was not learnt as it stands in the files."""
+    if failed is None:
+        yield "failures", "not told; --failed COLUMN or --failed 'gap<=0' tells of them"
+    else:
+        text = f"{learning.read.failures:,} episodes ended with {failed}"
+        left_out = f"; {noted.after_failure:,} rows after them, still so, were left out"
+        yield "failures", text + (left_out if noted.after_failure else "")
+    if noted.leaderless:
+        yield "no leader", f"in {noted.leaderless:,} rows, left out; there an episode ends"
+    if noted.units:
+        given = (f"{name} from {one}" for name, one in noted.units.items())
+        yield "converted", f"{', '.join(given)} to units of the SI"
+
+
+def _duration(seconds: float) -> str:
+    if seconds < 120.0:
+        return f"{seconds:.1f} s"
+    minutes = seconds / 60.0
+    return f"{minutes:.1f} min" if minutes < 120.0 else f"{minutes / 60.0:.1f} h"
+
+
+def _skills(skills: Sequence[Skill]) -> Iterator[RenderableType]:
+    rows = [
+        (
+            f"{one.seconds:g} s",
+            "-" if one.policy is None else _SECOND_STEPS[one.policy],
+            f"{one.divergence:.2g}",
+            f"{one.persistence:.2g}",
+            _skill_text(one.skill),
+        )
+        for one in skills
+    ]
+    header = ("ahead", "actions after the first", "forecast [bit]", "persistence [bit]", "skill")
+    yield table("Forecasts compared with persistence", header, rows, left=(0, 1))
+    yield (
+        "\nMean Jensen-Shannon divergence from the belief that came, of rows that were not learnt "
+        "yet. Persistence: the belief stays as it is. Skill: 1 is perfect, 0 as good as "
+        "persistence, below 0 worse."
+    )
+    if len(skills) == 1:
+        yield "The step is too long for a separate forecast of 1 s ahead."
+
+
+def _skill_text(skill: float) -> str:
+    if math.isnan(skill):
+        return "none"
+    return f"{skill:+.2f}" if abs(skill) < 10.0 else f"{skill:+,.0f}"

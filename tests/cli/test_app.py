@@ -1,0 +1,135 @@
+"""The command line as a whole: its help, its errors, and what it says where a package lacks."""
+
+import json
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+import typer
+
+from evofsm.cli import options
+from evofsm.cli.app import group
+from evofsm.extras import OF_COMMANDS
+
+
+def python(code):
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+
+
+@pytest.mark.parametrize("missing", ["typer", "rich"])
+def test_without_the_extra_one_line_says_what_to_install(missing):
+    result = python(
+        f"import sys; sys.modules[{missing!r}] = None\n"
+        "sys.argv = ['evofsm', 'paper']\nfrom evofsm.__main__ import main\nmain()"
+    )
+    assert result.returncode == 2
+    assert result.stderr == (
+        "evofsm: the command line needs typer and rich: pip install '.[cli,plot,sumo,tables]' in a "
+        "clone of evofsm\n"
+    )
+
+
+def test_all_that_a_command_lacks_is_named_at_once(evofsm, monkeypatch):
+    monkeypatch.setattr(options, "find_spec", lambda name: None)
+    told = evofsm("drive", "paper", "--world", "sumo").stderr
+    assert told == (
+        "evofsm: this needs scipy and libsumo: pip install '.[cli,study,sumo]' in a clone of "
+        "evofsm\n"
+    )
+
+
+def test_extras_of_commands_exist():
+    project = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())["project"]
+    needed = {one for extras in OF_COMMANDS.values() for one in extras}
+    assert needed <= set(project["optional-dependencies"])
+
+
+def test_python_m_evofsm_is_the_command():
+    command = [sys.executable, "-m", "evofsm", "--version"]
+    run = subprocess.run(command, capture_output=True, text=True)
+    assert run.returncode == 0, run.stderr
+    assert run.stdout.startswith("evofsm 0.")
+
+
+@pytest.mark.parametrize("command", ["", "drive", "monitor"])
+def test_help_loads_nothing_heavy(command):
+    words = [*command.split(), "--help"]
+    result = python(
+        "import sys\n"
+        "from evofsm.__main__ import application\n"
+        f"application()({words}, standalone_mode=False)\n"
+        "print(sorted({'numpy', 'numba', 'polars', 'libsumo', 'rich'} & set(sys.modules)))"
+    )
+    assert result.stdout.splitlines()[-1] == "[]"
+    assert "Options:" in result.stdout
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["nosuch"], "No such command 'nosuch'"),
+        (["check"], "Missing argument 'name'"),
+        (["inspect", "x", "--colour", "red"], "No such option: --colour"),
+        (["drive", "paper", "--episodes", "0"], "Invalid value for '--episodes'"),
+        (["drive", "paper", "--world", "moon"], "'moon' is not one of 'sumo', 'kinematic'"),
+    ],
+)
+def test_a_command_that_is_called_wrongly_says_so_in_one_line(evofsm, words, says):
+    result = evofsm(*words)
+    assert result.exit_code == 2
+    assert result.stderr.startswith("evofsm: ")
+    assert says in result.stderr
+    assert result.stderr.count("\n") == 1
+
+
+def run(body):
+    app = group("Tests.", body)
+    app.callback()(lambda: None)
+    return typer.testing.CliRunner().invoke(app, ["body"])
+
+
+def test_errors_are_one_line_and_what_a_command_returns_is_the_status(tmp_path):
+    def fails():
+        error = ValueError("a bad\nthing \x1b[2J")
+        error.add_note("in the file")
+        raise error
+
+    def body():
+        return 3
+
+    assert run(body).exit_code == 3
+    fails.__name__ = "body"
+    result = run(fails)
+    assert result.exit_code == 2
+    assert result.stderr == "evofsm: a bad thing \\u001b[2J, in the file\n"
+
+
+# These answer with a page that lives, in formats of others, and in lines of JSON whatever is asked.
+ELSEWISE = ("watch", "export", "monitor")
+
+
+def test_every_command_but_three_answers_programs():
+    from evofsm.__main__ import application
+
+    commands = typer.main.get_command(application()).commands
+    lacking = {
+        name
+        for name, command in commands.items()
+        if "--json" not in {option for one in command.params for option in one.opts}
+    }
+    assert lacking == set(ELSEWISE)
+    assert len(commands) <= 10
+
+
+def test_what_programs_are_told_is_strict_json(evofsm):
+    def refuse(constant):
+        raise AssertionError(f"{constant} is no JSON")
+
+    told = evofsm("check", "evofsm.driving.measures:TimeHeadway", "--json").stdout
+    assert all(one["passed"] for one in json.loads(told, parse_constant=refuse))
+    told = evofsm("drive", "emergency", "--episodes", 2, "--json").stdout
+    driven = json.loads(told, parse_constant=refuse)
+    assert driven["episodes"] == 2
+    assert [state["state"] for state in driven["states"]] == list(range(len(driven["states"])))
