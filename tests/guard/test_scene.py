@@ -220,10 +220,10 @@ def test_in_a_file_it_is_kept_as_it_is_also_between_two_fits(more):
 @pytest.mark.parametrize(
     ("name", "change", "what"),
     [
-        ("counts", lambda array: array + 1.0, "not as many"),
+        ("counts", lambda array: array + 1, "not as many"),
         ("links", lambda array: np.full_like(array, len(array)), "not as many"),
         ("links", lambda array: np.zeros_like(array), "another moment"),
-        ("actions", lambda array: np.full_like(array, 7.0), "an action is none"),
+        ("actions", lambda array: np.full_like(array, 7), "an action is none"),
         ("lost", lambda array: np.ones_like(array), "end of an episode"),
         ("own", lambda array: array[:, :2], "other columns"),
     ],

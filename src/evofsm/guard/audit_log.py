@@ -210,12 +210,7 @@ class Chain:
     def records(self) -> Iterator[Record]:
         """The records; after the last one `finding` is known.
 
-        Raises
-        ------
-        OSError
-            If there is no such file, or it may not be read.
-        ValueError
-            If no line of it is a record.
+        Raises an OSError if it cannot be read, and a ValueError if no line of it is a record.
         """
         known = self._kept in (None, NOTHING)
         reading = lines(self.path)
@@ -297,8 +292,8 @@ class AuditLog:
         A file that is there is gone on with; a half-written end, as of a process that was killed,
         is cut off.
     sync : {"record", "episode"}
-        When records are forced onto the disk: each, before its action is executed, or those of an
-        episode at its end, which takes no time while driving.
+        When records are forced onto the disk: each, before its action is executed, or at the end
+        of the episode, which takes no time while driving.
 
     Raises
     ------
@@ -310,10 +305,9 @@ class AuditLog:
 
     Notes
     -----
-    Between the episodes of a log anything may teach machine or judge: they are written anew then.
-    During one nothing else may. An interrupt (Ctrl-C) while something is written breaks the
-    episode off in the log, which goes on with the next one. Where a process forks, the log stays
-    with the parent: a child that has something to write fails as if the disk did.
+    Between two episodes anything may teach machine or judge: they are written anew then. An
+    interrupt (Ctrl-C) while something is written costs the rest of the episode in the log. Where a
+    process forks, the log stays with the parent: in a child writing fails as if the disk did.
 
     Examples
     --------
@@ -359,13 +353,7 @@ class AuditLog:
         return self._head
 
     def close(self) -> None:
-        """Write what was held back, and let others have the file.
-
-        Raises
-        ------
-        OSError
-            If something could not be written, now or before.
-        """
+        """Write what was held back; an OSError if something could not be written so far."""
         if self._file.closed:
             return
         try:
@@ -419,7 +407,7 @@ class AuditLog:
             return
         self._busy = True
         self._keep_seen()
-        self._seen = [float(time), _floats(observation)]
+        self._seen = [float(time), written(observation)]
         self._busy = False
 
     def decided(self, situation: Situation, proposal: Proposal, revision: Revision) -> None:
@@ -446,19 +434,13 @@ class AuditLog:
         self._busy = False
 
     def ended(self, observation: NDArray[np.float64] | None, *, failed: bool) -> None:
-        """The episode ended.
-
-        Raises
-        ------
-        OSError
-            If something could not be written since it began.
-        """
+        """The episode ended; an OSError if something could not be written since it began."""
         if self._busy or self._guard is None:
             return
         self._busy = True
         self._keep_seen()
         self._learnt = sums_of(self._guard)
-        last = None if observation is None else _floats(observation)
+        last = None if observation is None else written(observation)
         before = self._take_before()
         self._write(
             "end", before=before, failed=bool(failed), learnt=self._learnt, observation=last
@@ -633,8 +615,3 @@ def _plain(kind: type, value: Any) -> Any:
 
 def _candidates(proposal: Proposal) -> list[Any]:
     return [written(candidate) for candidate in proposal.candidates]
-
-
-def _floats(observation: NDArray[np.float64]) -> list[float]:
-    floats: list[float] = np.asarray(observation, dtype=np.float64).tolist()
-    return floats
