@@ -39,14 +39,13 @@ from evofsm.guard.api import (
     Intake,
     LearningJudge,
     ObservingJudge,
-    Participants,
     Proposal,
     Reviser,
     Revision,
     Situation,
 )
 from evofsm.guard.learnt.judge import LearntRisk
-from evofsm.guard.parts import outline, part_class, rebuild
+from evofsm.guard.parts import Parts, outline, part_class, rebuild
 from evofsm.guard.reviser import NOTHING, ActionReviser, Mode, is_spoken
 from evofsm.store import Kind, Numbers, Place
 
@@ -723,9 +722,9 @@ class Guard:
     # -- Keeping it -----------------------------------------------------------------------------
 
     @property
-    def participants(self) -> Participants:
+    def parts(self) -> Parts:
         """All that its decisions depend on but observations and proposals."""
-        return Participants(self.actions, self.reviser, self.machine, self.judge)
+        return Parts(self.actions, self.reviser, self.machine, self.judge)
 
     def copy(self, *, states: bool = True) -> Self:
         """A twin that learns for itself, as between two episodes; without the audit log.
@@ -792,7 +791,7 @@ class Guard:
         >>> again.decide([9.0, 20.0, 20.0], 1.0).executed
         -2.5
         """
-        described = outline(self.participants)
+        described = outline(self.parts)
         if described["reviser"] is None:
             raise ValueError(f"a {type(self.reviser).__name__} is no reviser that a file can hold")
         kept = {
@@ -856,7 +855,7 @@ class Guard:
                 parts.reviser,
                 actions=parts.actions,
                 machine=parts.machine,
-                judge=parts.risk,
+                judge=parts.judge,
                 failed=failed,
                 audit=audit,
                 explaining=None if kept["explaining"] is None else Explain(kept["explaining"]),
