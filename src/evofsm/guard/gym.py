@@ -243,7 +243,7 @@ class RevisedVectorActions(VectorWrapper[Any, Any, Any, Any, Any]):
         for k, (lane, observation) in enumerate(zip(self._lanes, each, strict=True)):
             ends = bool(terminated[k]), bool(truncated[k])
             if not lane.is_open:
-                if self._mode == "NextStep" and not any(ends):  # this step was the reset
+                if self._mode == "NextStep":  # this step was the reset
                     lane.begin(observation)
                 continue
             info, last, resets = _of_one(infos, k), observation, False
