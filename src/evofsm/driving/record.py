@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from operator import attrgetter
 
 from evofsm.driving.measures import time_headway, time_to_collision
-from evofsm.guard import RECORD, Column
+from evofsm.guard.record import RECORD, Column
 
 #: By name, in the order of ``decisions.parquet``, which has those that are `Column.in_table`: what
 #: was observed, the numbers of every decision, what came of it, and texts.

@@ -37,9 +37,6 @@ from .learnt.judge import JUDGE_PARTS as JUDGE_PARTS
 from .learnt.judge import LearntRisk as LearntRisk
 from .learnt.judge import Outlook as Outlook
 from .pettingzoo import RevisedAgents as RevisedAgents
-from .record import RECORD as RECORD
-from .record import Column as Column
-from .record import Pair as Pair
 from .replay import audit as audit
 from .reviser import ActionReviser as ActionReviser
 from .reviser import Mode as Mode

@@ -41,9 +41,10 @@ import evofsm
 from evofsm import store
 from evofsm.guard.actions import written
 from evofsm.guard.api import Proposal, Revision, Situation
+from evofsm.guard.episodes import Decision
 from evofsm.guard.guard import Explain, Guard
 from evofsm.guard.parts import can_be_made_again, settings_of
-from evofsm.guard.record import RECORD, Pair
+from evofsm.guard.record import RECORD
 from evofsm.guard.reviser import is_spoken
 
 _log = logging.getLogger(__name__)
@@ -598,7 +599,7 @@ def sums_of(guard: Guard) -> dict[str, float]:
 def decision_of(situation: Situation, proposal: Proposal, revision: Revision) -> dict[str, Any]:
     """A decision, as it is written, but for what came in."""
     likely = np.argsort(-situation.belief, kind="stable")[:_STATES].tolist()
-    decided = Pair(situation, revision._replace(proposed=proposal.action))
+    decided = Decision(situation, revision._replace(proposed=proposal.action))
     return {
         **{name: _plain(RECORD[name].kind, RECORD[name].read(decided)) for name in _TOLD},
         "belief": [[state, float(situation.belief[state])] for state in likely],

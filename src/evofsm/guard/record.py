@@ -10,14 +10,7 @@ from collections.abc import Callable, Mapping
 from operator import attrgetter
 from typing import Any, NamedTuple
 
-from evofsm.guard.api import Intake, Revision, Situation
-
-
-class Pair(NamedTuple):
-    """A situation and what was decided in it."""
-
-    situation: Situation
-    revision: Revision
+from evofsm.guard.api import Intake
 
 
 class Column(NamedTuple):

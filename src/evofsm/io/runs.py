@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from evofsm.driving import DECISION_COLUMNS, VARIABLES
 from evofsm.extras import needs
 from evofsm.fsm import FSMModel
-from evofsm.guard import RECORD, Column
+from evofsm.guard.record import RECORD, Column
 
 if TYPE_CHECKING:
     from mcap.records import Chunk, McapRecord

@@ -26,7 +26,8 @@ from evofsm.cli.watch.shown import (
 )
 from evofsm.driving import VARIABLES, guard_for_cars, shadow_drive
 from evofsm.driving.measures import time_headway, time_to_collision
-from evofsm.guard import RECORD, TOLERANCE, Mode
+from evofsm.guard import TOLERANCE, Mode
+from evofsm.guard.record import RECORD
 from evofsm.io.foxglove import recording
 from evofsm.io.logs import Chunk, episodes_of, read_traces
 from evofsm.io.rosbag import Topics

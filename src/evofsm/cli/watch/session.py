@@ -42,7 +42,8 @@ from evofsm.driving import (
 )
 from evofsm.driving.measures import time_headway, time_to_collision
 from evofsm.fsm import Novelty
-from evofsm.guard import RECORD, Explain, Guard, Judgement, Mode, Pair
+from evofsm.guard import Decision, Explain, Guard, Judgement, Mode
+from evofsm.guard.record import RECORD
 
 #: The state rule for looking on: coarse enough that each state can be told from the others.
 WATCHED_RULE = Novelty(radius=2.0, scales=(4.0, 2.0, 2.0))
@@ -233,7 +234,7 @@ class Session:
         else:
             said = {"why": self.judge.why(judged) if judged.risk[0] > self._tolerance else ""}
         return self._seen()._replace(
-            **{name: RECORD[name].read(Pair(situation, revision)) for name in RECORDED},
+            **{name: RECORD[name].read(Decision(situation, revision)) for name in RECORDED},
             belief=most_believed(situation.belief),
             event="created" if created else "moved" if moved else "",
             proposed_risk=_judged(judged, 0),
