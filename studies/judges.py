@@ -26,7 +26,8 @@ from matplotlib.figure import Figure as Drawn
 from typer import Option
 
 from evofsm.driving import TOLD, guard_for_family
-from evofsm.guard import Guard, SceneRisk, learnt_guard, run_episode
+from evofsm.fsm import EvolvingFSM
+from evofsm.guard import Guard, LearntRisk, SceneRisk, run_episode
 from evofsm.paper import Figure, Page, Table
 from studies import lib
 from studies.lib import ALL, FIRST, Frames, Study, Target, at_least, at_most, frame_of
@@ -123,6 +124,18 @@ _TOLD = {
     "LatentRisk": TOLD["kinematic"],
     "SceneRisk": f"{TOLD['learnt']}, and how a row is laid out",
 }
+
+
+def learnt_guard(
+    *, interval: float, seed: int, without: Sequence[str], horizon: float | None = None, **told: Any
+) -> Guard:
+    """With the learnt judge without some parts; without ``states`` its machine has a single one."""
+    parts = [part for part in without if part != "states"]
+    judge = LearntRisk(interval, **told, horizon=horizon, seed=seed, without=parts)
+    guard = Guard(**told, interval=interval, horizon=horizon, judge=judge, seed=seed)
+    if "states" in without:
+        guard.machine = EvolvingFSM(guard.actions.n_actions, max_states=1)
+    return guard
 
 
 def told_to(judge: Any) -> str:

@@ -76,18 +76,6 @@ def test_only_the_order_of_scores_matters_and_nan_is_the_most_dangerous(of):
     assert not one.alarms(-math.inf)
 
 
-@pytest.mark.parametrize(("of", "at_it"), [("false alarms", False), ("misses", True)])
-def test_the_threshold_is_the_stated_quantile_of_what_was_seen(of, at_it):
-    alarm = ConformalAlarm(0.3, of=of, step=1e-12, memory=9)
-    for score in [100.0, *range(1, 10)]:  # the first is forgotten
-        alarm.update(float(score), of == "misses")
-    threshold = 7.0 if of == "false alarms" else 3.0
-    assert alarm.threshold == threshold
-    assert alarm.alarms(threshold) is at_it
-    assert alarm.alarms(threshold + 0.1)
-    assert not alarm.alarms(threshold - 0.1)
-
-
 def test_until_enough_was_seen_it_is_silent_or_always_on():
     alarm = ConformalAlarm(0.1)
     assert not alarm.alarms(5.0)

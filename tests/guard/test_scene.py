@@ -187,14 +187,14 @@ def test_neither_the_order_of_objects_nor_rows_that_are_not_seen_make_a_differen
 
 
 def test_the_oldest_episodes_are_forgotten(monkeypatch):
-    monkeypatch.setattr("evofsm.guard.scene._MOST", 200)
-    world = Rain(steps=10)
+    monkeypatch.setattr("evofsm.guard.scene._MOST", 60)
+    world = Rain(steps=6)
     guard = world.guard(mode=Mode.OFF)
-    for seed in range(14):
+    for seed in range(8):
         world.play(guard, seed)
     past = guard.judge.memory.past
-    assert 100 < len(past.away) <= 200
-    assert guard.judge.memory.fitted <= len(past.ends) - 1 < 14
+    assert 30 < len(past.away) <= 60
+    assert guard.judge.memory.fitted <= len(past.ends) - 1 < 8
     assert ((past.moment[past.links] == past.moment + 1) | (past.links < 0)).all()
 
 
@@ -220,10 +220,10 @@ def test_in_a_file_it_is_kept_as_it_is_also_between_two_fits(more):
 @pytest.mark.parametrize(
     ("name", "change", "what"),
     [
-        ("counts", lambda array: array + 1, "not as many"),
+        ("counts", lambda array: array + 1.0, "not as many"),
         ("links", lambda array: np.full_like(array, len(array)), "not as many"),
         ("links", lambda array: np.zeros_like(array), "another moment"),
-        ("actions", lambda array: np.full_like(array, 7), "an action is none"),
+        ("actions", lambda array: np.full_like(array, 7.0), "an action is none"),
         ("lost", lambda array: np.ones_like(array), "end of an episode"),
         ("own", lambda array: array[:, :2], "other columns"),
     ],

@@ -90,6 +90,11 @@ class Pair(NamedTuple):
 class Scene:
     """Oneself and the objects around.
 
+    Parameters
+    ----------
+    own : Object
+    others : sequence of Object
+
     Examples
     --------
     >>> own = Object("me", x=0.0, y=0.0, vx=25.0)
@@ -110,7 +115,8 @@ class Scene:
     def pairs(self) -> list[Pair]:
         """With whom one may meet, the closest first.
 
-        Who is in one's lane overlaps sideways; who cuts in, or crosses, will within 2 s.
+        An object is in one's lane where their sides overlap; it cuts in, or crosses if it moves
+        across more than along the road, where they will within 2 s.
         """
         return pairs_of(self.rows(len(self.objects) - 1))
 
@@ -252,9 +258,18 @@ class TrafficRisk:
         return cls(ahead, low, high, behind_decel=behind_decel, reaction=reaction)
 
     def judge(self, situation: Situation, actions: ArrayLike) -> Judgement:
-        """Risk of each acceleration [m/s²]: the highest of all pairs.
+        """Risk of each acceleration: the highest of all pairs.
 
-        ``critical`` is the hardest braking of whoever is ahead that is survived.
+        Parameters
+        ----------
+        situation : Situation
+        actions : (k,) array_like
+            [m/s²]
+
+        Returns
+        -------
+        Judgement
+            Its ``critical`` is the hardest braking of whoever is ahead that is survived.
         """
         given = np.ascontiguousarray(actions, np.float64)
         return self._judge(pairs_of(situation.observation), given)[0]

@@ -30,12 +30,12 @@ from .guard import DecisionLogger as DecisionLogger
 from .guard import Explain as Explain
 from .guard import Guard as Guard
 from .guard import InputMonitor as InputMonitor
-from .guard import learnt_guard as learnt_guard
 from .gym import RevisedActions as RevisedActions
 from .gym import RevisedVectorActions as RevisedVectorActions
 from .learnt.judge import JUDGE_PARTS as JUDGE_PARTS
 from .learnt.judge import LearntRisk as LearntRisk
 from .learnt.judge import Outlook as Outlook
+from .learnt.merge import merge_judges as merge_judges
 from .pettingzoo import RevisedAgents as RevisedAgents
 from .replay import audit as audit
 from .reviser import ActionReviser as ActionReviser

@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 if TYPE_CHECKING:  # whoever asks for a number here waits for no compiler
+    from evofsm.fsm.machine import EvolvingFSM
     from evofsm.fsm.naming import Labels
-    from evofsm.guard.actions import Action
+    from evofsm.guard.actions import Action, ActionSet
     from evofsm.store import Place
 
 #: The highest risk, a probability of failure, that a reviser lets pass.
@@ -262,6 +263,15 @@ class ObservingJudge(LearningJudge, Protocol):
     def act(self, action: Action, /) -> None:
         """Take in what was executed after the latest observation; another one replaces it."""
         ...
+
+
+class Participants(NamedTuple):
+    """Everything that a decision depends on but the observation and the proposal."""
+
+    actions: ActionSet
+    reviser: Reviser
+    machine: EvolvingFSM | None
+    risk: LearningJudge | None
 
 
 class RiskMeasure(Protocol):

@@ -211,7 +211,12 @@ class Chain:
     def records(self) -> Iterator[Record]:
         """The records; after the last one `finding` is known.
 
-        Raises an OSError if it cannot be read, and a ValueError if no line of it is a record.
+        Raises
+        ------
+        OSError
+            If there is no such file, or it may not be read.
+        ValueError
+            If no line of it is a record.
         """
         known = self._kept in (None, NOTHING)
         reading = lines(self.path)
@@ -293,8 +298,8 @@ class AuditLog:
         A file that is there is gone on with; a half-written end, as of a process that was killed,
         is cut off.
     sync : {"record", "episode"}
-        When records are forced onto the disk: each, before its action is executed, or at the end
-        of the episode, which takes no time while driving.
+        When records are forced onto the disk: each, before its action is executed, or those of an
+        episode at its end, which takes no time while driving.
 
     Raises
     ------
@@ -306,9 +311,10 @@ class AuditLog:
 
     Notes
     -----
-    Between two episodes anything may teach machine or judge: they are written anew then. An
-    interrupt (Ctrl-C) while something is written costs the rest of the episode in the log. Where a
-    process forks, the log stays with the parent: in a child writing fails as if the disk did.
+    Between the episodes of a log anything may teach machine or judge: they are written anew then.
+    During one nothing else may. An interrupt (Ctrl-C) while something is written breaks the
+    episode off in the log, which goes on with the next one. Where a process forks, the log stays
+    with the parent: a child that has something to write fails as if the disk did.
 
     Examples
     --------
@@ -354,7 +360,13 @@ class AuditLog:
         return self._head
 
     def close(self) -> None:
-        """Write what was held back; an OSError if something could not be written so far."""
+        """Write what was held back, and let others have the file.
+
+        Raises
+        ------
+        OSError
+            If something could not be written, now or before.
+        """
         if self._file.closed:
             return
         try:
@@ -390,7 +402,7 @@ class AuditLog:
         self._busy = True
         self._flush()  # of an episode that was broken off
         self._seen = []
-        who = (*guard.parts, guard.failed)
+        who = (*guard.participants, guard.failed)
         if list(map(id, who)) != list(map(id, self._who)) or self._learnt != sums_of(guard):
             self._write("start", cut_off=self.cut_off, **_start(guard))
         self._guard, self._who, self._learnt = guard, who, None
@@ -408,7 +420,7 @@ class AuditLog:
             return
         self._busy = True
         self._keep_seen()
-        self._seen = [float(time), written(observation)]
+        self._seen = [float(time), _floats(observation)]
         self._busy = False
 
     def decided(self, situation: Situation, proposal: Proposal, revision: Revision) -> None:
@@ -435,13 +447,19 @@ class AuditLog:
         self._busy = False
 
     def ended(self, observation: NDArray[np.float64] | None, *, failed: bool) -> None:
-        """The episode ended; an OSError if something could not be written since it began."""
+        """The episode ended.
+
+        Raises
+        ------
+        OSError
+            If something could not be written since it began.
+        """
         if self._busy or self._guard is None:
             return
         self._busy = True
         self._keep_seen()
         self._learnt = sums_of(self._guard)
-        last = None if observation is None else written(observation)
+        last = None if observation is None else _floats(observation)
         before = self._take_before()
         self._write(
             "end", before=before, failed=bool(failed), learnt=self._learnt, observation=last
@@ -559,7 +577,7 @@ def made_by() -> dict[str, str]:
 def _start(guard: Guard) -> dict[str, Any]:
     """Who decides, as it is before the episode."""
     file = BytesIO()
-    if known := can_be_made_again(guard.parts):
+    if known := can_be_made_again(guard.participants):
         guard.save(file)
     return {
         "about": _ABOUT,
@@ -616,3 +634,8 @@ def _plain(kind: type, value: Any) -> Any:
 
 def _candidates(proposal: Proposal) -> list[Any]:
     return [written(candidate) for candidate in proposal.candidates]
+
+
+def _floats(observation: NDArray[np.float64]) -> list[float]:
+    floats: list[float] = np.asarray(observation, dtype=np.float64).tolist()
+    return floats

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from enum import Enum
 from io import BytesIO
 from typing import Any, Protocol, Self
@@ -39,13 +39,14 @@ from evofsm.guard.api import (
     Intake,
     LearningJudge,
     ObservingJudge,
+    Participants,
     Proposal,
     Reviser,
     Revision,
     Situation,
 )
 from evofsm.guard.learnt.judge import LearntRisk
-from evofsm.guard.parts import Parts, outline, part_class, rebuild
+from evofsm.guard.parts import outline, part_class, rebuild
 from evofsm.guard.reviser import NOTHING, ActionReviser, Mode, is_spoken
 from evofsm.store import Kind, Numbers, Place
 
@@ -722,9 +723,9 @@ class Guard:
     # -- Keeping it -----------------------------------------------------------------------------
 
     @property
-    def parts(self) -> Parts:
+    def participants(self) -> Participants:
         """All that its decisions depend on but observations and proposals."""
-        return Parts(self.actions, self.reviser, self.machine, self.judge)
+        return Participants(self.actions, self.reviser, self.machine, self.judge)
 
     def copy(self, *, states: bool = True) -> Self:
         """A twin that learns for itself, as between two episodes; without the audit log.
@@ -791,7 +792,7 @@ class Guard:
         >>> again.decide([9.0, 20.0, 20.0], 1.0).executed
         -2.5
         """
-        described = outline(self.parts)
+        described = outline(self.participants)
         if described["reviser"] is None:
             raise ValueError(f"a {type(self.reviser).__name__} is no reviser that a file can hold")
         kept = {
@@ -855,7 +856,7 @@ class Guard:
                 parts.reviser,
                 actions=parts.actions,
                 machine=parts.machine,
-                judge=parts.judge,
+                judge=parts.risk,
                 failed=failed,
                 audit=audit,
                 explaining=None if kept["explaining"] is None else Explain(kept["explaining"]),
@@ -864,57 +865,16 @@ class Guard:
             )
 
 
-def learnt_guard(
-    low: ArrayLike | None = None,
-    high: ArrayLike | None = None,
-    *,
-    n_actions: int | None = None,
-    interval: float,
-    horizon: float | None = None,
-    seed: int = 0,
-    without: Sequence[str] = (),
-) -> Guard:
-    """A guard with the learnt judge, of which parts may be left out: to see what they are worth.
-
-    Parameters
-    ----------
-    low, high, n_actions, interval, horizon, seed
-        As in `Guard`.
-    without : sequence of str
-        Names of `JUDGE_PARTS`; without ``states`` the machine has a single one.
-
-    Raises
-    ------
-    ValueError
-        If a part is of another name, or as in `Guard`.
-
-    Examples
-    --------
-    >>> guard = learnt_guard(low=-2.0, high=2.0, interval=0.02, without=("margin",))
-    >>> guard.judge.margin
-    0.0
-    """
-    actions = _actions(low, high, n_actions, None)
-    told: dict[str, Any] = {"n_actions": n_actions, "horizon": horizon, "seed": seed}
-    parts = [part for part in without if part != "states"]
-    judge = LearntRisk(interval, low, high, without=parts, **told)
-    most = 1 if "states" in without else _MOST_STATES
-    machine = _machine(actions, _steps(horizon, interval), most)
-    return Guard(
-        low, high, n_actions=n_actions, interval=interval, seed=seed, judge=judge, machine=machine
-    )
-
-
 def _steps(horizon: float | None, interval: float) -> int | None:
     """A time as a number of decisions."""
     return None if horizon is None else max(1, round(positive("horizon", horizon) / interval))
 
 
-def _machine(actions: ActionSet, soon: int | None, most: int = _MOST_STATES) -> EvolvingFSM:
+def _machine(actions: ActionSet, soon: int | None) -> EvolvingFSM:
     """With recommended settings."""
     return EvolvingFSM(
         actions.n_actions,
-        max_states=most,
+        max_states=_MOST_STATES,
         belief_tolerance=BELIEF_TOLERANCE,
         failure_horizon=soon,
     )

@@ -45,9 +45,11 @@ class RevisedActions(gymnasium.Wrapper[Any, Any, Any, Any]):
     """Executes a guard's revision of each action, and forwards all else as it is.
 
     The guard learns while the environment runs. ``info`` holds ``reviser/proposed_action`` and
-    ``reviser/executed_action`` as the environment takes them, ``reviser/reason``,
-    ``reviser/risk_proposed`` and ``reviser/risk``, the probability of failure under each (NaN
-    where nothing was judged), and ``reviser/penalty``, the size of the change.
+    ``reviser/executed_action``, both as the environment takes them, ``reviser/reason``,
+    ``reviser/risk``, the probability of failure under the executed action,
+    ``reviser/risk_proposed``, that under the proposed one (both NaN where nothing was judged), and
+    ``reviser/penalty``, the size of the change. All else about the latest decision is in
+    `revision`.
 
     Parameters
     ----------
@@ -56,7 +58,7 @@ class RevisedActions(gymnasium.Wrapper[Any, Any, Any, Any]):
     guard : Guard
         What is executed always lies in its set of actions.
     observe : callable, optional
-        From an observation of ``env`` to the guard's, or to None where there is nothing to judge,
+        From an observation of ``env`` to the guard's; to None where there is nothing to judge,
         such as no car ahead: then nothing is revised or learnt. Without it a box is flattened, and
         each value of ``Discrete`` is a variable that is 1 or 0.
     failed : callable, optional
@@ -66,7 +68,7 @@ class RevisedActions(gymnasium.Wrapper[Any, Any, Any, Any]):
         terminates on success (MountainCar, LunarLander); ``lambda info: False`` stands for never.
     penalty : float
         Subtracted from the reward per unit of ``reviser/penalty``: half ranges of the action, in a
-        box the root of the sum of their squares; 1 for another index.
+        box the root of the sum of squares over its components; 1 for another index.
 
     Raises
     ------
@@ -134,12 +136,13 @@ class RevisedActions(gymnasium.Wrapper[Any, Any, Any, Any]):
 class RevisedVectorActions(VectorWrapper[Any, Any, Any, Any, Any]):
     """Many environments at once under one guard, as `RevisedActions` does it for one.
 
-    The guard learns every environment's episode **as a whole when it ends**, those that end in the
-    same step in the order of the environments: no transition is taken for one of another
-    environment, or across a reset. Within an episode a twin of the guard (`Guard.copy`) decides,
-    made as the episode begins: it knows the episodes that had ended by then and learns from its
-    own. With one environment that comes to the same as `RevisedActions`, bit for bit. What you
-    change about the guard counts in each environment from its next episode on.
+    All profit from what each meets: the guard learns every environment's episode **as a whole when
+    it ends**, those that end in the same step in the order of the environments. So no transition
+    is taken for one of another environment, or across a reset. Within an episode a twin of the
+    guard (`Guard.copy`) decides, made as the episode begins: it knows the episodes that had ended
+    by then and learns from its own, but not from those that run alongside. With one environment
+    it comes to the same as `RevisedActions`, bit for bit. What you change about the guard, its
+    mode for example, counts in each environment from its next episode on.
 
     Parameters
     ----------
@@ -159,10 +162,11 @@ class RevisedVectorActions(VectorWrapper[Any, Any, Any, Any, Any]):
 
     Notes
     -----
-    ``infos`` has the names of a single environment, as arrays with masks: ``_reviser/reason`` and
-    so on are False where nothing was decided, in a step that only resets
-    (``AutoresetMode.NEXT_STEP``) or after an episode that was not reset (``DISABLED``). With
-    ``SAME_STEP`` they describe the step that ended the episode.
+    ``infos`` has the names of a single environment, as arrays over the environments, each with a
+    mask as Gymnasium has it: ``_reviser/reason`` and so on are False where nothing was decided, in
+    a step that only resets (``AutoresetMode.NEXT_STEP``) or after an episode that was not reset
+    (``DISABLED``). With ``SAME_STEP`` they describe the step that ended the episode. `revisions`
+    has the latest decisions.
 
     All that begin together know equally little: with nothing learnt yet, each of them may fail
     where one environment after another would have failed once.
@@ -243,7 +247,7 @@ class RevisedVectorActions(VectorWrapper[Any, Any, Any, Any, Any]):
         for k, (lane, observation) in enumerate(zip(self._lanes, each, strict=True)):
             ends = bool(terminated[k]), bool(truncated[k])
             if not lane.is_open:
-                if self._mode == "NextStep":  # this step was the reset
+                if self._mode == "NextStep" and not any(ends):  # this step was the reset
                     lane.begin(observation)
                 continue
             info, last, resets = _of_one(infos, k), observation, False

@@ -11,22 +11,13 @@ from collections.abc import Mapping
 from dataclasses import asdict
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
-from typing import Any, NamedTuple
+from typing import Any
 
 from evofsm.fsm.actions import IntervalActions
 from evofsm.fsm.machine import EvolvingFSM
 from evofsm.guard.actions import ActionSet, BoxActions, Choices
-from evofsm.guard.api import ActionJudge, LearningJudge, Reviser
+from evofsm.guard.api import ActionJudge, LearningJudge, Participants, Reviser
 from evofsm.guard.reviser import ActionReviser, Mode, Way
-
-
-class Parts(NamedTuple):
-    """Everything that a decision depends on but the observation and the proposal."""
-
-    actions: ActionSet
-    reviser: Reviser
-    machine: EvolvingFSM | None
-    judge: LearningJudge | None  #: that learns
 
 
 @cache
@@ -47,26 +38,26 @@ def part_name(one: object) -> str | None:
     return name if name in _entry_points() and part_class(name) is type(one) else None
 
 
-def outline(parts: Parts) -> dict[str, Any]:
+def outline(parts: Participants) -> dict[str, Any]:
     """All of a guard but what machine and judge have learnt; None for what is not known here."""
     return {
         "actions": asdict(parts.actions),
-        "judge": None if parts.judge is None else part_name(parts.judge),
+        "judge": None if parts.risk is None else part_name(parts.risk),
         "reviser": _reviser(parts),
     }
 
 
-def can_be_made_again(parts: Parts) -> bool:
+def can_be_made_again(parts: Participants) -> bool:
     """Whether `rebuild` needs no more than the `outline`."""
     reviser = _reviser(parts)
-    if reviser is None or (parts.judge is not None and part_name(parts.judge) is None):
+    if reviser is None or (parts.risk is not None and part_name(parts.risk) is None):
         return False
     if not isinstance(parts.reviser, ActionReviser):
         return True
     return reviser["judge"] is not None and parts.reviser.actions == parts.actions
 
 
-def _reviser(parts: Parts) -> dict[str, Any] | None:
+def _reviser(parts: Participants) -> dict[str, Any] | None:
     reviser = parts.reviser
     if type(reviser) is ActionReviser:
         judge = _judge(reviser.risk, parts)
@@ -76,24 +67,24 @@ def _reviser(parts: Parts) -> dict[str, Any] | None:
     return None if told is None else {"class": name, **told}
 
 
-def _judge(judge: ActionJudge, parts: Parts) -> dict[str, Any] | None:
+def _judge(judge: ActionJudge, parts: Participants) -> dict[str, Any] | None:
     """Whom the reviser asks, if those who learn are whom it asks."""
     name = part_name(judge)
     if name is None:
         return None
-    if judge is parts.judge:
+    if judge is parts.risk:
         return {"class": name}
     asked = getattr(judge, "risk", None), getattr(judge, "machine", None)
-    known = asked[0] is parts.judge and asked[1] is parts.machine and parts.machine is not None
+    known = asked[0] is parts.risk and asked[1] is parts.machine and parts.machine is not None
     return {"class": name, **judge.described()} if known else None  # type: ignore[attr-defined]
 
 
 def rebuild(
     told: Mapping[str, Any],
     machine: EvolvingFSM | None,
-    learnt: LearningJudge | None,
+    risk: LearningJudge | None,
     judge: ActionJudge | None = None,
-) -> Parts:
+) -> Participants:
     """The parts of an `outline`, with a machine and a judge that were read from elsewhere.
 
     ``judge`` is asked where the outline knows none, and none that learns was read.
@@ -101,16 +92,16 @@ def rebuild(
     actions, reviser = _actions(told["actions"]), told["reviser"]
     if reviser["class"] != "ActionReviser":
         again: Reviser = part_class(reviser["class"]).restored(reviser, actions)
-        return Parts(actions, again, machine, learnt)
+        return Participants(actions, again, machine, risk)
     named = reviser["judge"]
-    asked = judge if learnt is None else learnt
-    if named is not None and part_class(named["class"]) is not type(learnt):
-        asked = part_class(named["class"]).restored(named, machine, learnt)
+    asked = judge if risk is None else risk
+    if named is not None and part_class(named["class"]) is not type(risk):
+        asked = part_class(named["class"]).restored(named, machine, risk)
     if asked is None:
         raise ValueError("no installed package declares its judge; give the judge as it is")
     again = ActionReviser(asked, actions)
     set_again(again, reviser["settings"])
-    return Parts(actions, again, machine, learnt)
+    return Participants(actions, again, machine, risk)
 
 
 def _actions(told: Mapping[str, Any]) -> ActionSet:

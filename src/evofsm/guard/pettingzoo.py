@@ -19,9 +19,9 @@ _Each = dict[Any, Any]
 class RevisedAgents(BaseParallelWrapper[Any, Any, Any]):  # type: ignore[misc]
     """Executes a guard's revision of each agent's action, and forwards all else as it is.
 
-    The guard learns each agent's episode **as a whole when it ends**, and meanwhile a twin decides
-    for the agent, as in `RevisedVectorActions`. All agents observe and act alike. The ``info`` of
-    an agent holds what `RevisedActions` says.
+    All profit from what any agent meets: the guard learns each agent's episode **as a whole when
+    it ends**, and meanwhile a twin decides for the agent, as in `RevisedVectorActions`. All agents
+    observe and act alike. The ``info`` of an agent holds what `RevisedActions` says.
 
     Parameters
     ----------

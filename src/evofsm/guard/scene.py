@@ -30,7 +30,7 @@ from evofsm.fsm.proportions import wilson_bounds
 from evofsm.fsm.validation import positive, whole
 from evofsm.guard.actions import Action
 from evofsm.guard.api import Fallback, Judgement, Search, Situation, Trial
-from evofsm.store import COUNT, FROM_1, MOST_COUNTED, SIZE, Kind, Numbers, Place
+from evofsm.store import COUNT, FLAG, FROM_1, MOST_COUNTED, SIZE, Kind, Numbers, Place
 
 _Floats = NDArray[np.float64]
 _Ints = NDArray[np.int64]
@@ -65,19 +65,25 @@ _SHAPES = np.linspace(-3.5, 3.5, 29)
 _CLOSEST = 2000
 
 _SOME = Numbers(least=-math.inf, most=math.inf)
-_INDEX = Numbers(least=-1.0, most=MOST_COUNTED, dtype=np.int64)
+_INDEX = Numbers(least=-1.0, most=MOST_COUNTED, whole=True)
 _KIND = Kind(
     "scenerisk",
     {
         "own": _SOME.of("n", "o"),
         "actions": _INDEX.of("n"),
-        "counts": _INDEX._replace(least=0.0).of("n"),
-        "lost": Numbers(("n",), dtype=np.bool_),
+        "counts": COUNT.of("n"),
+        "lost": FLAG.of("n"),
         "away": _SOME.of("m", "p"),
         "other": _SOME.of("m", "r"),
         "links": _INDEX.of("m"),
     },
-    {"dt": SIZE, "n_actions": FROM_1, "columns": FROM_1, "failures": COUNT, "fitted": COUNT},
+    {
+        "dt": SIZE,
+        "n_actions": FROM_1,
+        "columns": FROM_1,
+        "failures": COUNT,
+        "fitted": COUNT,
+    },
 )
 
 
@@ -304,7 +310,10 @@ class SceneRisk:
         """Write what is remembered to a file; all else follows from it."""
         settings = {name: getattr(self, name) for name in ("dt", "columns", "place", "relative")}
         counts = {name: getattr(self.memory, name) for name in ("n_actions", "failures", "fitted")}
-        store.write(path, _KIND, settings | counts, self.memory.past._asdict(), provenance)
+        arrays = {
+            name: array.astype(np.float64) for name, array in self.memory.past._asdict().items()
+        }
+        store.write(path, _KIND, settings | counts, arrays, provenance)
 
     @classmethod
     def load(cls, path: Place) -> Self:
@@ -321,7 +330,9 @@ class SceneRisk:
         with store.explained(path):
             counted = {name: int(settings.pop(name)) for name in ("failures", "fitted")}
             judge = cls(settings.pop("dt"), settings.pop("n_actions"), **settings)
-            past = Past(**arrays)
+            whole_numbers = ("actions", "counts", "links")
+            arrays |= {name: arrays[name].astype(np.int64) for name in whole_numbers}
+            past = Past(**arrays | {"lost": arrays["lost"].astype(bool)})
             past.refuse_damaged(judge.memory.past, judge.memory.n_actions)
             judge.memory.restore(past, **counted)
         return judge
@@ -407,9 +418,7 @@ class Past(NamedTuple):
         linked, last = self.links >= 0, self.actions < 0
         if [array.shape[1:] for array in self] != [array.shape[1:] for array in none]:
             raise ValueError("its rows are of other columns than it says")
-        most = len(self.links)
-        many = (self.counts > most).any() or (self.links >= most).any()
-        if many or self.counts.sum() != most:
+        if self.counts.sum() != len(self.links) or (self.links >= len(self.links)).any():
             raise ValueError("moments and objects are not as many as counted")
         if (self.moment[self.links[linked]] != self.moment[linked] + 1).any():
             raise ValueError("an object is linked to another moment than the next one")

@@ -41,9 +41,9 @@ DYNAMICS_PARTS: tuple[str, ...] = (
 _FIRST = 8
 # Of what was learnt so far, what still counts an episode later.
 _KEPT = 0.999
-# Weights are solved for after every so many observations: until they could be, then among the first
-# ones, then among some more; after those only between episodes.
-_UNREADY, (_EARLY, _OFTEN), (_LATE, _SELDOM) = 20, (300, 5), (1500, 20)
+# Weights are solved for after every so many observations, more often among the first ones once they
+# could be, and in the end only between episodes.
+_SELDOM, _OFTEN, _FIRST_ONES, _NEVER = 20, 5, 300, 1500
 # Onsets of sequences in an episode, at most, and so far apart.
 _ONSETS, _APART = 3, 3
 # A sequence has at least so many steps.
@@ -57,7 +57,7 @@ _STUDIED = 5
 # rested there although it was expected to go on.
 _REACHED = 2
 # Failures, and jumps of each variable, that are remembered.
-_MOST = 200
+MOST = 200
 # Jumps that would have shown no dependence, for each variable.
 _JUMP_PRIOR = 3.0
 # Of one that is where it saturates, a noisy sensor may say that it is so many residuals from there.
@@ -92,32 +92,15 @@ class Dynamics:
 
     It is told nothing of the system but observations, actions and which episodes failed.
 
-    Parameters
-    ----------
-    low, high : array_like, optional
-        Range of the action, where that is one number or several, in the unit of the action.
-    n_actions : int, optional
-        Number of actions, where they are told apart by their index alone.
-    horizon : int
-        Most steps of a disturbance sequence.
-    remembered : int
-        Sequences that are kept where somebody chooses among them (`keep`); of those that nobody has
-        chosen yet, the newest, so that there are at most four times as many.
-    without : sequence of str
-        Parts of `DYNAMICS_PARTS` that are left out.
+    Actions are in a range from ``low`` to ``high``, (d,) each, or ``n_actions`` told apart by their
+    index. A disturbance sequence has at most ``horizon`` steps; so many are ``remembered`` where
+    somebody chooses among them (`keep`), of those that nobody has chosen yet the newest, four times
+    as many. Parts of `DYNAMICS_PARTS` may be left out (``without``).
 
-    Raises
-    ------
-    ValueError
-        If not one of a range and ``n_actions`` is given, ``low`` is not below ``high`` or not
-        finite, or a number is no positive int.
-
-    Notes
-    -----
     Each variable's change is linear in the observation, its latest change, the action, the one
-    before, bends of the action and products of variables and actions, learnt by sums
-    (`evofsm.guard.learnt.regression`). Where a system fails is known only after it failed there
-    once, or where it is given; nothing here says that something is safe.
+    before, bends of the action and products of variables and actions (`replay.features`), learnt by
+    sums (`regression`). Where a system fails is known only after it failed there once, or where it
+    is given; nothing here says that something is safe.
 
     What is in lists, and all arrays but those of ``sums``, never change in place.
 
@@ -162,6 +145,8 @@ class Dynamics:
         #: Whether an observation is a failure, where that is given.
         self.failed: Callable[[Floats], bool] | None = None
         self.sequences: list[DisturbanceSequence] = []
+        self.thresholds: list[tuple[int, float, float]] = []  #: variable, sign, and where it fails
+        self.drifts: list[Drift] = []  #: variables that move otherwise than they did, by time
         self.n_episodes = 0
         #: The episode that was studied last, if it was long enough.
         self.latest: Episode | None = None
@@ -174,13 +159,7 @@ class Dynamics:
     # -- Actions --------------------------------------------------------------------------------
 
     def encode(self, action: Any) -> Floats:
-        """(a,) an action in [-1, 1], or a one among zeros.
-
-        Examples
-        --------
-        >>> Dynamics(-2.5, 2.5).encode(1.25), Dynamics(n_actions=3).encode(2)
-        (array([0.5]), array([0., 0., 1.]))
-        """
+        """(a,) an action in [-1, 1], or a one among zeros."""
         if self.choices:
             chosen = np.zeros(self.choices)
             chosen[int(action)] = 1.0
@@ -188,13 +167,7 @@ class Dynamics:
         return np.asarray((np.asarray(action, np.float64) - self._middle) / self._half)
 
     def decode(self, inner: Floats) -> Floats:
-        """(d,) the action itself; the index of a choice.
-
-        Examples
-        --------
-        >>> Dynamics(-2.5, 2.5).decode(np.array([0.5]))
-        array([1.25])
-        """
+        """(d,) the action itself; the index of a choice."""
         if self.choices:
             return np.array([float(inner.argmax())])
         found = self._middle + self._half * inner
@@ -221,10 +194,7 @@ class Dynamics:
         self.reached = np.zeros((m, 2))
         self.failures = np.empty((0, m))  #: (k, m) observations in which episodes failed
         self.jumps = [np.empty((0, m + 1)) for _ in range(m)]  #: from where, and to where
-        self.thresholds: list[tuple[int, float, float]] = []  #: variable, sign, and where it fails
-        #: What the last episodes say of the model, and where it was corrected, by time.
-        self.recent = Recent.none(p, m, self.n_episodes)
-        self.drifts: list[Drift] = []
+        self.recent = Recent.none(p, m, self.n_episodes)  #: what the last episodes say of the model
         self.missed = regression.untried(m)  #: by gains of the observer
         self.doubt_of_lags = 0.0
         self.rebuild()
@@ -257,10 +227,9 @@ class Dynamics:
             self.rebuild()
         if n:
             self._learn(n - 1)
-        n_seen = float(sums.counts[0])
-        every = _OFTEN if n_seen < _EARLY else _SELDOM
-        every = every if self.ready else _UNREADY
-        if n_seen % every == 0 and (n_seen < _LATE or not self.ready):
+        seen = float(sums.counts[0])
+        every = _OFTEN if self.ready and seen < _FIRST_ONES else _SELDOM
+        if seen % every == 0 and (seen < _NEVER or not self.ready):
             self._solve()
         return self._begins()
 
@@ -288,21 +257,7 @@ class Dynamics:
     def end(self, *, failed: bool) -> None:
         """The episode is over, or what comes does not follow from what was.
 
-        Parameters
-        ----------
-        failed : bool
-            Whether it ended in failure with the latest observation.
-
-        Examples
-        --------
-        >>> dynamics = Dynamics(n_actions=2)
-        >>> for t in range(40):
-        ...     begins = dynamics.observe(np.array([t % 7.0]))
-        ...     dynamics.act(dynamics.encode(t % 2))
-        >>> begins = dynamics.observe(np.array([9.0]))
-        >>> dynamics.end(failed=True)
-        >>> dynamics.thresholds
-        [(0, 1.0, 6.0)]
+        ``failed`` says whether it ended in failure with the latest observation.
         """
         if self.n_under_way > 2 or (failed and self.n_under_way):
             self._study(failed=failed)
@@ -327,7 +282,7 @@ class Dynamics:
         if i > 1 and jumped.any():
             for j in np.flatnonzero(jumped):
                 jump = np.append(z[i - 1], z[i, j])
-                more = np.vstack([self.jumps[j][1 - _MOST :], jump])
+                more = np.vstack([self.jumps[j][1 - MOST :], jump])
                 self.jumps = [more if k == j else one for k, one in enumerate(self.jumps)]
 
     def _solve(self) -> None:
@@ -419,7 +374,7 @@ class Dynamics:
         safe = z[:-1] if failed else z
         self._extend(safe)
         if failed:
-            self.failures = np.vstack([self.failures[1 - _MOST :], z[-1]])
+            self.failures = np.vstack([self.failures[1 - MOST :], z[-1]])
         self.settle()
         self.sums.squares[:] *= _KEPT
         self.sums.products[:] *= _KEPT
@@ -575,19 +530,7 @@ class Dynamics:
         self.sequences = [self.sequences[k] for k in which]
 
     def disturbances(self, steps: int) -> Disturbances:
-        """Residuals of what is remembered, as they are seen now; number 0 is none at all.
-
-        Examples
-        --------
-        >>> dynamics = Dynamics(n_actions=2)
-        >>> for t in range(40):
-        ...     begins = dynamics.observe(np.array([t % 7.0]))
-        ...     dynamics.act(dynamics.encode(t % 2))
-        >>> dynamics.end(failed=False)
-        >>> found = dynamics.disturbances(20)
-        >>> found.residuals.shape[2] - len(dynamics.sequences)
-        1
-        """
+        """Residuals of what is remembered, as they are seen now; number 0 is none at all."""
         found = Disturbances.none(1 + len(self.sequences), steps, self.n_variables)
         for k, one in enumerate(self.sequences, 1):
             L = min(len(one.actions) - 1, steps)

@@ -1,8 +1,9 @@
-"""Where a system fails, from where it did: sides of the box of all that was survived.
+"""How a threshold is learnt: where a system fails, from where it did.
 
-The fewest sides that explain the failures; of two that explain the first ones alike, both hold
-until another failure tells them apart. Where noise blurs the ends of the box, a failure may lie
-within it: then the side is where the innermost of such failures was seen.
+Thresholds are sides of the box of all that was survived, the fewest that explain the failures; of
+two that explain the first ones alike, both hold until another failure tells them apart. Where noise
+blurs the ends of the box, a failure may lie within it: then the threshold is where the innermost of
+such failures was seen.
 """
 
 from __future__ import annotations
@@ -25,19 +26,12 @@ _BEYOND, _BLUR = 1e-12, 5.0
 def explain_failures(
     failures: _Floats, lowest: _Floats, highest: _Floats, unit: _Floats, blur: _Floats
 ) -> list[tuple[int, float, float]]:
-    """Sides as (variable, sign, threshold): a variable beyond its threshold is failure.
+    """Thresholds as (variable, sign, where): a variable beyond its threshold is failure.
 
-    Parameters
-    ----------
-    failures : (k, m) ndarray
-        Observations in which episodes failed.
-    lowest, highest : (m,) ndarray
-        Of all observations that were survived.
-    unit : (m,) ndarray
-        Ordinary change of each variable.
-    blur : (m, 2) ndarray
-        How far noise may blur the lowest and the highest in a step: a failure within five times
-        that of an end may have been beyond it. 0 where a variable saturates.
+    Of ``failures`` (k, m), observations in which episodes failed, amid all that was survived from
+    ``lowest`` to ``highest`` (m,). ``unit`` (m,) is the ordinary change of each variable. A failure
+    within five times ``blur`` (m, 2) of the lowest or the highest may have been beyond it, as noise
+    blurs them; 0 where a variable saturates.
 
     Examples
     --------
@@ -95,14 +89,7 @@ def _most_telling(
 def probe(
     failed: Callable[[_Floats], bool], safe: _Floats, unit: _Floats
 ) -> list[tuple[int, float, float]]:
-    """Sides of a failure set that was told as a function, along each variable from ``safe``.
-
-    Examples
-    --------
-    >>> [(j, sign, at)] = probe(lambda z: z[0] <= 0.0, np.array([5.0, 1.0]), np.ones(2))
-    >>> j, sign, round(at, 9)
-    (0, -1.0, 0.0)
-    """
+    """Thresholds of a failure set that is a function, along each variable from ``safe``."""
     found: list[tuple[int, float, float]] = []
     for j in range(len(safe)):
         for sign in (-1.0, 1.0):

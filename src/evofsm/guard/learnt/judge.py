@@ -217,20 +217,27 @@ class LearntRisk:
 
     def refuse_unfit(self, low: Any, high: Any) -> None:
         """Raise for another range of actions than it learns of."""
-        dynamics = self.dynamics
-        own = (0, dynamics.choices - 1) if dynamics.choices else (dynamics.low, dynamics.high)
+        own = self.range
         if not all(map(np.array_equal, map(np.atleast_1d, own), map(np.atleast_1d, (low, high)))):
             raise ValueError(
                 f"the judge was made for actions from {own[0]} to {own[1]}, not from {low} to "
                 f"{high}: give it low and high, or n_actions, of the guard"
             )
 
+    @property
+    def range(self) -> tuple[Any, Any]:
+        """The lowest and the highest action; the first and the last index of choices."""
+        dynamics = self.dynamics
+        if dynamics.choices:
+            return 0, dynamics.choices - 1
+        return dynamics.low, dynamics.high
+
     # -- Deciding -------------------------------------------------------------------------------
 
     @property
     def disturbance_scale(self) -> float:
         """How much harder than they were disturbances are taken to be, while little was seen."""
-        began_anew = self.violations.worse >= 0 or (self.exposure > 0.0 and self.dynamics.drifts)
+        began_anew = self.violations.worse >= 0 or self.dynamics.drifts
         most = _AGAIN if began_anew else 0.5 * _CAUTION
         return 1.0 + min(most, _CAUTION / max(1, self.n_scanned))
 
@@ -286,49 +293,39 @@ class LearntRisk:
             return Search(one, _unjudged(1), 0, words.NOTHING_SEEN)
         if not dynamics.thresholds:
             return Search(one, _unjudged(1), 0, words.NO_FAILURE)
-        proposal, remembered, scale = (
-            dynamics.encode(wanted),
-            self.remembered,
-            self.disturbance_scale,
-        )
-        allowed, ranks = self._allowed(tolerance, remembered), self._ranks[:_ASKED]
-        asked = dynamics.model, here, backups.policies, ranks, disturbances, scale
+        model, proposal, scale = dynamics.model, dynamics.encode(wanted), self.disturbance_scale
+        remembered, ranks = self.remembered, self._ranks[:_ASKED]
+        allowed = self._allowed(tolerance, remembered)
+        asked = model, here, backups.policies, ranks, disturbances, scale
         found = search(*asked, proposal, self.margin, allowed)
         if found.backup != ranks[0]:  # what passed now is asked first the next time
-            others = self._ranks[self._ranks != found.backup]
-            self._ranks = np.append(found.backup, others)
-        best = found.action
-        self._holds = best is not None
-        if best is None:
-            best = acts(
-                dynamics.model, backups.policies[found.backup], here[: dynamics.n_variables]
-            )
+            self._ranks = np.append(found.backup, self._ranks[self._ranks != found.backup])
+        passes, action, tried = found.action is not None, found.action, None
+        self._holds, self._refused = passes, action is not proposal
+        if action is None:
+            action = acts(model, backups.policies[found.backup], here[: dynamics.n_variables])
             if self._certified:
-                self._holds = search(*asked, best, 0.0, allowed).action is not None
-        kept = found.action is proposal
-        self._refused = not kept
-        tried = self._untried(best) if self.learning and found.alike else None
-        then = self._backup_text(found.backup)
+                self._holds = search(*asked, action, 0.0, allowed).action is not None
+            tried = self._untried(action) if self.learning and found.alike else None
+            action = action if tried is None else tried
+        left = found.safety_margin
         judged, self._dead_end, fails_after = self._judged(
             situation,
             here,
-            proposal[None] if kept else np.array((proposal, best if tried is None else tried)),
-            None if found.action is None or allowed else found.safety_margin,
+            np.array((proposal, action) if self._refused else (proposal,)),
+            left if passes and not allowed else None,
         )
         self._fails_after = max(self._fails_after, fails_after)
-        if kept:
-            return Search(
-                one, judged, 0, words.kept(then, remembered, found.safety_margin, allowed)
-            )
-        action = np.reshape(dynamics.decode(best if tried is None else tried), np.shape(wanted))
-        if tried is not None:
-            instead = words.tried()
-        elif found.action is not None:
-            instead = words.changed(then, remembered, self.margin, allowed)
-        else:
-            instead = words.lasting(then)
+        backup = self._backup_text(found.backup)
+        if not self._refused:
+            return Search(one, judged, 0, words.kept(backup, remembered, left, allowed))
         why = words.refused(self._unsurvived, remembered, self.margin, scale, allowed)
-        return Search(np.array((one[0], action)), judged, 1, f"{why}; {instead}")
+        if passes:
+            instead = words.changed(backup, remembered, self.margin, allowed)
+        else:
+            instead = words.TRIED if tried is not None else words.lasting(backup)
+        executed = np.reshape(dynamics.decode(action), np.shape(wanted))
+        return Search(np.array((one[0], executed)), judged, 1, f"{why}; {instead}")
 
     def judge(self, situation: Situation, actions: ArrayLike) -> Judgement:
         """Risk of each action.
@@ -399,20 +396,16 @@ class LearntRisk:
         refuse_unusable("change", moved)
         here = np.concatenate([z, moved, np.zeros(dynamics.size)])
         unsurvived, left, _ = self._foresee(here, None, self.backups.ranks)
-        dead_end, hours, remembered = (
-            math.isinf(unsurvived),
-            self.exposure / 3600.0,
-            self.remembered,
-        )
-        count = remembered.number if dead_end else int(unsurvived)
-        expected = self._expected(count)
+        number, seconds = self.remembered
+        count = number if math.isinf(unsurvived) else int(unsurvived)
+        expected, low, high = (one / (seconds / 3600.0) for one in self._expected(count))
         return Outlook(
-            dead_end=dead_end,
+            dead_end=math.isinf(unsurvived),
             unsurvived=count,
-            remembered=remembered.number,
+            remembered=number,
             safety_margin=left,
-            risk=self._risk(unsurvived, self._soon(self.exposure)),
-            per_hour=(expected[0] / hours, expected[1] / hours, expected[2] / hours),
+            risk=self._risk(unsurvived, self._soon(seconds)),
+            per_hour=(expected, low, high),
         )
 
     @property
@@ -529,10 +522,10 @@ class LearntRisk:
     def _backup_text(self, backup: int) -> str:
         assert self.backups is not None
         if backup >= self.backups.n_constant:
-            return words.feedback(backup - self.backups.n_constant)
+            return f"feedback {backup - self.backups.n_constant + 1}"
         action = self.dynamics.decode(self.backups.policies[backup, :, 0])
         if self.dynamics.choices:
-            return words.choice(action_name(int(action[0])))
+            return f"always {action_name(int(action[0]))}"
         return words.constant(action.tolist())
 
     # -- Learning -------------------------------------------------------------------------------
@@ -662,7 +655,7 @@ class LearntRisk:
                 dynamics, situations, self.horizon, best[:2], self.disturbance_scale
             )
         if knows and len(situations) >= _ENOUGH:
-            self.backups = self._evolved(self.backups, self.disturbances, random)
+            self.backups = self.evolved(random)
         self._ranks = self.backups.ranks
 
     def _is_worse(self) -> bool:
@@ -713,10 +706,11 @@ class LearntRisk:
             self.time_to_failure = max(min(float(after), self.believed), longest)
         self.horizon = int(min(max(_AHEAD * self.time_to_failure, _SHORTEST), _FARTHEST))
 
-    def _evolved(
-        self, backups: Backups, disturbances: Disturbances, random: np.random.Generator
-    ) -> Backups:
+    def evolved(self, random: np.random.Generator) -> Backups:
         """Backups that are worth more in the situations that are kept."""
+        disturbances, backups = self.disturbances, self.backups
+        assert disturbances is not None
+        assert backups is not None
         count = disturbances.residuals.shape[2]
         if count > 1 + _TRIED_ON:
             some = 1 + random.permutation(count - 1)[:_TRIED_ON]

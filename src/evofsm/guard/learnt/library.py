@@ -5,7 +5,7 @@ them tight. A situation is a row: an observation, its change, and the action bef
 
 *Backup policies* are constant, or linear feedback that evolves. With the share v_q(s) of the
 horizon that backup q survives from situation s, over some disturbances, and a little for the
-distance to failure (`replay.worth`), the backups Q together are worth
+distance to failure, the backups Q together are worth
 
     F(Q) = mean_s max_q v_q(s) + 0.01 sum_q mean_s v_q(s).
 
@@ -32,7 +32,7 @@ from evofsm.guard.learnt.dynamics import Dynamics, Episode
 from evofsm.guard.learnt.replay import Disturbances, Ends, Floats, Ints, Model, replay, worth
 
 # Situations that are kept, and those on which the starts of an episode are tried.
-_KEPT, _TRIED = 32, 8
+KEPT, _TRIED = 32, 8
 # Of an episode that failed, so many of its last ones.
 _BEFORE_FAILURE = 3
 # Starts of an episode that are tried, and how far those are apart that are remembered.
@@ -104,11 +104,11 @@ def noted(
         steps += list(np.maximum(1, T - 1 - back))
     for t in steps:
         one = np.concatenate([z[t], z[t] - z[t - 1], u[t - 1]])
-        if len(situations) < _KEPT:
+        if len(situations) < KEPT:
             situations = np.vstack([situations.reshape(-1, len(one)), one])
         else:
             situations = situations.copy()
-            situations[int(random.integers(_KEPT))] = one
+            situations[int(random.integers(KEPT))] = one
     return situations
 
 

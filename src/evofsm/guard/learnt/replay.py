@@ -129,7 +129,7 @@ def lags(m: int, a: int) -> Ints:
 
 
 def features(model: Model, z: Floats, change: Floats, before: Floats, action: Floats) -> Floats:
-    """(T, p) features of situations and actions: [1, z, dz, u, u before, |u - knot|, u z, z z].
+    """(T, p) features of situations and actions: ``[1, z, dz, u, u before, |u - knot|, u z, z z]``.
 
     ``z`` and ``change`` (T, m), ``before`` and ``action`` (T, a).
     """
