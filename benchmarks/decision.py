@@ -19,7 +19,7 @@ from evofsm.driving.cars import guard_for_family, learnt_by
 from evofsm.driving.episodes import drive
 from evofsm.driving.families import load_family
 from evofsm.driving.family import Family
-from evofsm.fsm.states.novelty import Novelty
+from evofsm.fsm.rules import Novelty
 from evofsm.guard.guard import Guard
 
 _STATES = 200

@@ -20,9 +20,8 @@ from numpy.typing import NDArray
 
 import evofsm
 from evofsm.fsm.machine import EvolvingFSM
-from evofsm.fsm.memory import leaves
 from evofsm.fsm.observations import Missing
-from evofsm.fsm.states.novelty import Novelty
+from evofsm.fsm.rules import Novelty
 
 _PACKAGE = str(Path(evofsm.__file__).parent)
 _ACTIONS, _VARIABLES = 3, 2
@@ -52,7 +51,6 @@ def growing() -> EvolvingFSM:
 def compile_all() -> None:
     """Call all that `share` calls once: threads would slow the compiler."""
     machine, z = growing(), np.zeros(_VARIABLES)
-    machine.update(z, 0)
     machine.learn_one(z, 0)
     machine.observe(z, failed=True)
     machine.learn_many([z], [0])
@@ -71,13 +69,11 @@ def share(machine: EvolvingFSM, threads: int, rows: int, interval: float, seed: 
     def learn(which: int) -> None:
         waiting.wait()
         for k, z in enumerate(spread_out(rows, seed + which)):
-            match k % 4:
+            match k % 3:
                 case 0:
-                    machine.update(z, k % _ACTIONS)
-                case 1:
                     machine.learn_one(z, k % _ACTIONS)
-                case 2:
-                    machine.observe(z, failed=k % 8 == 2)
+                case 1:
+                    machine.observe(z, failed=k % 6 == 1)
                 case _:
                     machine.learn_many([z], [k % _ACTIONS])
 
@@ -208,10 +204,8 @@ _ROWS_ACTIONS = np.arange(len(_ROWS)) % _ACTIONS
 
 DEEDS = {
     "first observation": at_once(growing, lambda machine: machine.learn_one(_NEXT, 2)),
-    "first update": at_once(growing, lambda machine: machine.update(_NEXT, 2)),
     "observe": at_once(full, lambda machine: machine.observe(_NEXT)),
     "learn_one": at_once(full, lambda machine: machine.learn_one(_NEXT, 2)),
-    "update": at_once(full, lambda machine: machine.update(_NEXT, 2)),
     "failed": at_once(full, lambda machine: machine.observe(_NEXT, failed=True)),
     "missing": at_once(
         full, lambda machine: machine.observe([np.nan, 4.0], missing=Missing.PARTIAL)
@@ -288,10 +282,7 @@ def _content(machine: EvolvingFSM) -> object:
     """All that a machine has learnt; None where that cannot be told."""
     if machine.n_states == 0:
         return ()
-    try:
-        return [(name, array.tobytes()) for name, array in leaves(machine._trimmed())]
-    except ValueError:
-        return None
+    return saved(machine)
 
 
 def _loads(machine: EvolvingFSM) -> bool:

@@ -20,9 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evofsm.fsm.machine import EvolvingFSM
-from evofsm.fsm.states.novelty import Novelty
-from evofsm.fsm.states.paper import Paper
-from evofsm.fsm.states.rule import StateRule
+from evofsm.fsm.rules import Novelty, Paper, StateRule
 from streams import paper_stream
 
 # 1e9 steps are 116 days of decisions every 10 ms, or eight years of decisions every 0.25 s.
@@ -125,7 +123,7 @@ def look(name: str, machine: EvolvingFSM, steps: int) -> Health:
         belief_off=float(abs(belief.sum() - 1.0)),
         lowest=float(matrices.min()),
         finite=all(bool(np.isfinite(array).all()) for array in held),
-        newest=int(machine.model().founded.max()),
+        newest=int(machine.model().created.max()),
         kilobytes=machine.nbytes / 1e3,
     )
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evofsm.driving.world import KinematicWorld
-from evofsm.fsm.states.novelty import Novelty
+from evofsm.fsm.rules import Novelty
 from evofsm.paper.runs import Settings
 
 # One state for each point of a lattice of edge 1: observations scatter by less than half the

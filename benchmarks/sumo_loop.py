@@ -28,7 +28,7 @@ from evofsm.driving.families import load_family
 from evofsm.driving.family import Draw, Family
 from evofsm.driving.sumo import SumoWorld
 from evofsm.driving.world import Episode
-from evofsm.fsm.states.novelty import Novelty
+from evofsm.fsm.rules import Novelty
 from evofsm.guard.guard import Guard
 
 _PROMISED = 1.25

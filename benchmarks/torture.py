@@ -40,7 +40,7 @@ from evofsm.driving.families import load_family
 from evofsm.driving.judge import LatentRisk
 from evofsm.driving.world import KinematicWorld
 from evofsm.fsm.actions import IntervalActions
-from evofsm.fsm.learnt import MACHINE
+from evofsm.fsm.arrays import MACHINE
 from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.model import FSMModel
 from evofsm.guard import Guard

@@ -14,13 +14,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from evofsm.fsm import (
+from evofsm.fsm import wilson_bounds
+from evofsm.fsm.validation import (
     check_action,
     positive,
     real_array,
     refuse_unless_distribution,
     whole,
-    wilson_bounds,
 )
 
 # Cases of a more general kind that are added to those that were seen.

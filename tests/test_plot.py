@@ -16,7 +16,7 @@ from evofsm.driving.judge import LatentRisk
 from evofsm.driving.scenarios import Leader, Scenario
 from evofsm.fsm.actions import IntervalActions
 from evofsm.fsm.machine import EvolvingFSM
-from evofsm.fsm.states.novelty import Novelty
+from evofsm.fsm.rules import Novelty
 from evofsm.guard.guard import Guard
 from evofsm.guard.reviser import ActionReviser, Mode
 

@@ -16,7 +16,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from evofsm.driving import Episode
 from evofsm.extras import needs
-from evofsm.fsm import FSMModel, Policy, Trace
+from evofsm.fsm.model import FSMModel, Policy
+from evofsm.fsm.step import Trace
 
 with needs("matplotlib", "plot", "plotting"):
     import matplotlib

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Iterator
 
 from evofsm.cli import NONE, Column, Table, bare_percent, count, listed, number
-from evofsm.fsm import outward, two_digits
+from evofsm.fsm.proportions import outward, two_digits
 from studies.breaks.amounts import NOBODY, TOY
 from studies.breaks.cases import FoundCase, odds
 from studies.breaks.figures import sketches

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.fsm import compiled
+from evofsm.fsm.kernels import compiled
 from studies.detection.watch import Cases, Exposure
 
 #: An alarm holds for so long after it was raised [s].

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evofsm.extras import needs
-from evofsm.fsm import NO_ACTION, EvolvingFSM, Novelty
+from evofsm.fsm import EvolvingFSM, Novelty
+from evofsm.fsm.arrays import NO_ACTION
 from evofsm.guard import BELIEF_TOLERANCE, LearntRisk
 from evofsm.guard.learnt.replay import Ends, replay
 from studies.counts import OutcomeCounts

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from evofsm.extras import needs
-from evofsm.fsm import compiled
+from evofsm.fsm.kernels import compiled
 
 with needs("scipy", "study", "calibrating scores"):
     from scipy.optimize import isotonic_regression

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from evofsm.driving import SAFETY_RULE
 from evofsm.extras import needs
-from evofsm.fsm import NO_ACTION, EvolvingFSM, Forecasts, FSMModel, Novelty, Policy, StateRule
+from evofsm.fsm import EvolvingFSM, Forecasts, FSMModel, Novelty, Policy, StateRule
+from evofsm.fsm.arrays import NO_ACTION
 from evofsm.guard import BELIEF_TOLERANCE
 from studies.prediction.scoring import Forecaster
 from studies.prediction.sources import Episode, Source

@@ -13,7 +13,8 @@ import polars
 from numpy.typing import NDArray
 
 from evofsm.driving import VARIABLES, Draw, Family, KinematicWorld, held_out, load_family, training
-from evofsm.fsm import NO_ACTION, IntervalActions
+from evofsm.fsm import IntervalActions
+from evofsm.fsm.arrays import NO_ACTION
 from evofsm.io import episodes_of, read_traces
 
 #: Families that are driven.

@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evofsm.driving import SAFETY_RULE, BrakeWatch, LatentRisk, measures
-from evofsm.fsm import NO_ACTION, EvolvingFSM, FSMModel, Novelty
+from evofsm.fsm import EvolvingFSM, FSMModel, Novelty
+from evofsm.fsm.arrays import NO_ACTION
 from evofsm.guard import BELIEF_TOLERANCE, RiskMeasure
 from studies.real.cases import INTERVAL, QUESTIONS, Case, Question, recent_acceleration
 

@@ -7,10 +7,7 @@ import pytest
 
 from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.model import FSMModel
-from evofsm.fsm.states.edges import Edges
-from evofsm.fsm.states.failure import FailureSplit
-from evofsm.fsm.states.novelty import Novelty
-from evofsm.fsm.states.paper import Paper
+from evofsm.fsm.rules import Edges, FailureSplit, Novelty, Paper
 
 pytest.importorskip("typer")
 pytest.importorskip("rich")

@@ -17,7 +17,7 @@ from evofsm.driving.measures import is_dead_end
 from evofsm.driving.rehearsal import HARDEST, critical_decelerations
 from evofsm.driving.rehearsal import Body as Follower
 from evofsm.fsm.machine import EvolvingFSM
-from evofsm.fsm.states.novelty import Novelty
+from evofsm.fsm.rules import Novelty
 from evofsm.guard.api import Situation
 
 DT = 0.25

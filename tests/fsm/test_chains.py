@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from evofsm.fsm import chains
 from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.model import FSMModel
-from evofsm.fsm.states.novelty import Novelty
+from evofsm.fsm.rules import Novelty
 
 
 @st.composite
@@ -122,40 +122,11 @@ def test_without_a_failure_nothing_fails(grown):
         (lambda model: model.committor_forward(action=1), "action is 1"),
         (lambda model: model.committor_forward(policy="hold"), "policy is 'hold'"),
         (lambda model: model.mfpt([-1]), "state is -1"),
-        (lambda model: model.submodel([0, 0]), "named once"),
-        (lambda model: model.simulate(0), "n is 0"),
-        (lambda model: model.simulate(1, start=2), "state is 2"),
     ],
 )
 def test_what_there_is_not_is_not_asked_for(ask, words):
     with pytest.raises(ValueError, match=words):
         ask(model_of(np.full((2, 2), 0.5)))
-
-
-@given(matrices(least=2), st.integers(0, 2**32 - 1))
-def test_a_submodel_is_the_chain_where_it_stays_in_some_states(P, seed):
-    rng = np.random.default_rng(seed)
-    chosen = rng.permutation(len(P))[: rng.integers(1, len(P))]
-    model = model_of(P)
-    part = model.submodel(chosen)
-    inside = P[np.ix_(chosen, chosen)]
-    sums = inside.sum(axis=1)
-    np.testing.assert_allclose(
-        part.origin_frequency[0][:, None] * part.transition_matrices[0],
-        inside,
-        atol=1e-12,
-    )
-    np.testing.assert_array_equal(part.origin_frequency[0], sums)
-    assert part.centers.ravel().tolist() == chosen.tolist()
-
-
-def test_a_run_is_the_same_for_a_seed_and_goes_where_the_chain_goes():
-    model = model_of(np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]]))
-    assert model.simulate(5, start=1).tolist() == [1, 2, 0, 1, 2]
-    other = model_of(np.array([[0.9, 0.1], [0.3, 0.7]]))
-    run = other.simulate(20000, seed=3)
-    assert (run == other.simulate(20000, seed=np.random.default_rng(3))).all()
-    assert np.bincount(run) / len(run) == pytest.approx([0.75, 0.25], abs=0.02)
 
 
 def test_a_machine_is_asked_as_its_model_is():
@@ -167,12 +138,11 @@ def test_a_machine_is_asked_as_its_model_is():
         lambda known: known.committor_forward(),
         lambda known: known.committor_forward(action=1, before=[0]),
         lambda known: known.mfpt([0, 2]),
-        lambda known: known.simulate(50, seed=1),
         lambda known: known.stationary_distribution("observed"),
         lambda known: known.recognise([[0.2], [2.0]]),
         lambda known: known.propagate(np.eye(known.n_states)[0], 1, 3, "observed"),
         lambda known: known.nearest([1.0]),
         lambda known: known.joint_frequency,
-        lambda known: (known.width, known.failure_horizon, known.failures_told, known.settings),
+        lambda known: (known.width, known.failures_told, known.settings),
     ):
         np.testing.assert_equal(ask(machine), ask(model))

@@ -9,15 +9,14 @@ from hypothesis import strategies as st
 
 from evofsm.driving.naming import UNITS, VARIABLES
 from evofsm.fsm.actions import IntervalActions
-from evofsm.fsm.crowding import WhenFull
 from evofsm.fsm.explanation import Tally
+from evofsm.fsm.limit import WhenFull
 from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.merging import merge
 from evofsm.fsm.model import FSMModel
 from evofsm.fsm.naming import Labels
 from evofsm.fsm.observations import Missing
-from evofsm.fsm.states.failure import FailureSplit
-from evofsm.fsm.states.novelty import Novelty
+from evofsm.fsm.rules import FailureSplit, Novelty
 
 COUNTS = ("episodes", "failed_soon", "tried", "failed_after")
 
@@ -208,15 +207,6 @@ def test_an_explanation_tells_where_how_often_what_came_of_it_and_what_was_bette
     assert (found.state, found.visits, found.reached_from, found.better) == (1, 24, 0, 0)
 
 
-def test_the_step_tells_the_same_as_the_machine(crash):
-    machine, labels = crash
-    machine.start_episode()
-    step = machine.observe([5.0, 20.0, 20.0], explained=labels)
-    assert step.explanation == machine.explain(labels=labels).text
-    assert step.explanation.startswith("#2: close (5 m)")
-    assert machine.observe([5.0, 20.0, 20.0]).explanation == ""
-
-
 def test_what_is_new_is_said_to_be(crash):
     machine, labels = crash
     machine.start_episode()
@@ -334,9 +324,8 @@ def test_what_lies_far_from_every_state_was_never_seen_whatever_the_belief(rule,
 def test_the_machine_says_so_of_what_founds_no_state():
     machine = EvolvingFSM(1, radius=0.5)
     machine.learn_many([[0.0], [0.1], [-0.1]] * 20, [0] * 60)
-    step = machine.observe([3.0], explained=Labels())
+    step = machine.observe([3.0])
     assert step.belief[step.state] > 0.9
-    assert "Never seen" in step.explanation
     assert machine.explain().never_seen
     machine.observe([np.nan], missing=Missing.PARTIAL)
     assert not machine.explain().never_seen  # nothing is known of it

@@ -6,12 +6,10 @@ import numpy as np
 import pytest
 
 from evofsm.fsm.actions import IntervalActions
-from evofsm.fsm.crowding import WhenFull
+from evofsm.fsm.limit import WhenFull
 from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.model import FSMModel
-from evofsm.fsm.states.failure import FailureSplit
-from evofsm.fsm.states.novelty import Novelty
-from evofsm.fsm.states.paper import Paper
+from evofsm.fsm.rules import FailureSplit, Novelty, Paper
 
 
 def full_model(grown):
@@ -93,16 +91,14 @@ def test_numbers_of_every_size_are_kept_and_read_again(snapshot, tmp_path):
 
 
 MACHINES = [
-    ("n_states", 1e6, "n_states is 1e"),
+    ("n_states", 1e6, "n_states is 1000000"),
     ("n_states", -3.0, "n_states of -3"),
-    ("n_states", 0.5, "n_states holds a fraction"),
-    ("action", 1e9, "action is 1e"),
-    ("action", 0.5, "action holds a fraction"),
-    ("before", 1e9, "before is 1e"),
-    ("places", 7.0, "places"),
+    ("action", 1e9, "action is 1000000000"),
+    ("before", 1e9, "before is 1000000000"),
+    ("place", 7.0, "place of an action"),
     ("belief", np.nan, "belief of nan"),
     ("belief", 0.5, "belief is no distribution"),
-    ("matrices", 7.0, "a row of matrices is no distribution"),
+    ("matrices", 0.7, "a row of matrices is no distribution"),
     ("scatter", -1.0, "scatter of -1"),
     ("centers", 1e308, r"centers of 1e\+308"),
     ("visits", -1.0, "visits of -1"),
@@ -116,7 +112,7 @@ MACHINES = [
     ("spread", "wide", "spread is 'wide'; it must be a number"),
     ("radius", True, "radius is True; it must be a number"),
     ("gain", 2.0, "gain"),
-    ("failures_told", "no", "failures_told is 'no'"),
+    ("failures_told", 2, "failures_told of 2"),
     ("rule", {"name": "magic"}, "no state rule 'magic', only paper, edges"),
     ("rule", {}, "name"),
     ("rule", None, "rule"),

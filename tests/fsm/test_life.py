@@ -1,5 +1,6 @@
 """The whole public life of a machine, in any order, with what cannot be right mixed in."""
 
+import io
 import tempfile
 from pathlib import Path
 
@@ -16,13 +17,10 @@ from hypothesis.stateful import (
     run_state_machine_as_test,
 )
 
-from evofsm.fsm.crowding import WhenFull
+from evofsm.fsm.limit import WhenFull
 from evofsm.fsm.machine import EvolvingFSM
-from evofsm.fsm.memory import leaves
 from evofsm.fsm.model import FSMModel
-from evofsm.fsm.states.failure import FailureSplit
-from evofsm.fsm.states.novelty import Novelty
-from evofsm.fsm.states.paper import Paper
+from evofsm.fsm.rules import FailureSplit, Novelty, Paper
 
 M, Q = 2, 3
 ROUNDING = 1e-9
@@ -61,7 +59,9 @@ QUESTIONS = (
 
 def everything(machine):
     """All that a machine holds, byte for byte; room for what is to come is no part of it."""
-    return [(name, array.tobytes()) for name, array in leaves(machine._trimmed())]
+    file = io.BytesIO()
+    machine.save(file)
+    return file.getvalue()
 
 
 def assert_distributions(rows):
@@ -115,15 +115,6 @@ class Life(RuleBasedStateMachine):
     @rule(z=OBSERVATIONS, i=ACTIONS)
     def learn_one(self, z, i):
         self.both(lambda machine: machine.learn_one(z, i))
-
-    @rule(z=OBSERVATIONS, i=ACTIONS)
-    def update(self, z, i):
-        self.both(lambda machine: machine.update(np.array(z), i))
-
-    @rule(z=OBSERVATIONS, i=ACTIONS)
-    def update_is_learn_one(self, z, i):
-        self.machine.update(np.array(z), i)
-        self.twin.learn_one(z, i)
 
     @rule(
         data=st.data(), rows=st.lists(st.tuples(OBSERVATIONS, st.integers(-1, Q - 1)), max_size=8)
@@ -217,15 +208,13 @@ class Life(RuleBasedStateMachine):
     def observe_nonsense(self, z, i, failed):
         self.refused(lambda machine: machine.observe(z, failed=failed))
         self.refused(lambda machine: machine.learn_one(z, i))
-        self.refused(lambda machine: machine.update(z, i))
         if isinstance(z, list) and z and isinstance(z[0], float):
-            self.refused(lambda machine: machine.update(np.array(z), i))
+            self.refused(lambda machine: machine.learn_one(np.array(z), i))
 
     @rule(z=OBSERVATIONS, i=BAD_ACTIONS)
     def act_nonsense(self, z, i):
         self.refused(lambda machine: machine.act(i))
         self.refused(lambda machine: machine.learn_one(z, i))
-        self.refused(lambda machine: machine.update(np.array(z), i))
         self.refused(lambda machine: machine.predict(i))
 
     @rule(

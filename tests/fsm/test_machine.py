@@ -6,9 +6,9 @@ import sys
 import numpy as np
 import pytest
 
-from evofsm.fsm.crowding import WhenFull
+from evofsm.fsm.limit import WhenFull
 from evofsm.fsm.machine import EvolvingFSM
-from evofsm.fsm.states.novelty import Novelty
+from evofsm.fsm.rules import Novelty
 from evofsm.fsm.step import Event
 
 LEARNT = (
@@ -464,19 +464,6 @@ def test_what_happened_to_states_may_be_combined():
     assert Event(12) == Event.MERGED | Event.RETIRED
 
 
-# -- The quick call ----------------------------------------------------------------------------
-
-
-def test_update_is_learn_one_with_a_shorter_answer(grown, spiral, snapshot):
-    twin = grown.copy()
-    for row, z in enumerate(spiral(60)):
-        surprise = grown.update(z, row % 3)
-        assert (
-            np.array(surprise).tobytes() == np.array(twin.learn_one(z, row % 3).surprise).tobytes()
-        )
-    assert snapshot(grown) == snapshot(twin)
-
-
 GIVEN = {
     "a list": lambda z: z.tolist(),
     "single precision": lambda z: z.astype(np.float32),
@@ -488,39 +475,13 @@ GIVEN = {
 
 
 @pytest.mark.parametrize("given", GIVEN.values(), ids=GIVEN.keys())
-def test_observations_of_any_kind_are_the_same_once_kernels_are_loaded(given, grown, snapshot):
+def test_observations_of_any_kind_are_the_same(given, grown, snapshot):
     z = np.array([2.0, 1.0])
-    machines = [grown.copy() for _ in range(4)]
-    for machine in machines:
-        machine.update(z, 0)
-    machines[0].update(z, 1)
-    machines[1].update(given(z), 1)
-    machines[2].learn_one(given(z), 1)
-    machines[3].observe(given(z))
-    machines[3].act(1)
-    assert all(snapshot(machine) == snapshot(machines[0]) for machine in machines)
-
-
-@pytest.mark.parametrize(
-    ("z", "i", "error"),
-    [
-        ([0.0, 1.0], -1, ValueError),
-        ([0.0, 1.0], 3, ValueError),
-        ([0.0, 1.0], 2**70, ValueError),
-        ([0.0, 1.0], 1.0, TypeError),
-        ([0.0, np.nan], 0, ValueError),
-        ([0.0], 0, ValueError),
-        ([[0.0, 1.0]], 0, ValueError),
-        (1.0, 0, ValueError),
-    ],
-)
-def test_update_refuses_what_learn_one_refuses_and_changes_nothing(z, i, error, grown, snapshot):
-    grown.update(np.array([2.0, 1.0]), 0)
-    before = snapshot(grown)
-    for call in (grown.update, grown.learn_one):
-        with pytest.raises(error):
-            call(np.array(z), i)
-        assert snapshot(grown) == before
+    plain, other = grown.copy(), grown.copy()
+    for machine, observed in ((plain, z), (other, given(z))):
+        machine.learn_one(observed, 1)
+        machine.observe(observed)
+    assert snapshot(plain) == snapshot(other)
 
 
 def test_a_width_beyond_all_bounds_leaves_no_belief_to_states_that_are_not_there():
@@ -534,12 +495,12 @@ def test_a_width_beyond_all_bounds_leaves_no_belief_to_states_that_are_not_there
 def test_threads_may_begin_at_once():
     program = """
 import threading, numpy as np
-from evofsm.fsm.crowding import WhenFull
+from evofsm.fsm.limit import WhenFull
 from evofsm.fsm.machine import EvolvingFSM
 failed = []
 def work():
     try:
-        EvolvingFSM(1).update(np.zeros(1), 0)
+        EvolvingFSM(1).learn_one(np.zeros(1), 0)
     except Exception as error:
         failed.append(error)
 threads = [threading.Thread(target=work) for _ in range(4)]

@@ -1,6 +1,7 @@
 """Machines that learnt apart become one: states matched, evidence added up, order of no matter."""
 
 import functools
+import io
 
 import numpy as np
 import pytest
@@ -9,13 +10,11 @@ from hypothesis import strategies as st
 
 from evofsm.driving.families import load_family
 from evofsm.driving.world import KinematicWorld
-from evofsm.fsm.crowding import WhenFull
-from evofsm.fsm.machine import EvolvingFSM
+from evofsm.fsm.arrays import by_name
+from evofsm.fsm.limit import WhenFull
+from evofsm.fsm.machine import EvolvingFSM, opened
 from evofsm.fsm.merging import merge
-from evofsm.fsm.states.edges import Edges
-from evofsm.fsm.states.failure import FailureSplit
-from evofsm.fsm.states.novelty import Novelty
-from evofsm.fsm.states.paper import Paper
+from evofsm.fsm.rules import Edges, FailureSplit, Novelty, Paper
 
 RULES = [
     Novelty(1.0, (2.0, 1.0)),
@@ -56,7 +55,7 @@ def assert_alike(one, other, atol):
     model, expected = one.model(), other.model()
     assert model.centers.shape == expected.centers.shape
     a, b = np.lexsort(model.centers.T), np.lexsort(expected.centers.T)
-    for name in ("centers", "potentials", "visits", "founded", "endings"):
+    for name in ("centers", "potentials", "visits", "created", "endings"):
         left, right = getattr(model, name)[a], getattr(expected, name)[b]
         np.testing.assert_allclose(left, right, atol=atol, err_msg=name)
     for name in ("origin_frequency", "decisions", "failures"):
@@ -68,6 +67,12 @@ def assert_alike(one, other, atol):
     assert (model.uses == expected.uses).all()
 
 
+def saved(machine):
+    file = io.BytesIO()
+    machine.save(file)
+    return file.getvalue()
+
+
 seeds = st.lists(st.integers(0, 10_000), min_size=2, max_size=4, unique=True)
 
 
@@ -77,7 +82,7 @@ def test_order_of_the_parts_does_not_matter(rule, seeds, random):
     parts = [taught(rule, seed, rows=20 + seed % 150) for seed in seeds]
     shuffled = random.sample(parts, len(parts))
     one, other = merge(parts), merge(shuffled)
-    assert one._buffer.tobytes() == other._buffer.tobytes()
+    assert saved(one) == saved(other)
 
 
 @settings(max_examples=30)
@@ -96,7 +101,7 @@ def test_evidence_adds_up_and_rows_remain_distributions(rule, seeds):
     np.testing.assert_allclose(model.transition_matrices.sum(axis=-1), 1.0, atol=1e-12)
     assert ((merged.potentials > 0.0) & (merged.potentials <= 1.0)).all()
     rows = sum(one.visits.sum() for one in models)
-    assert ((model.founded >= 1.0) & (model.founded <= rows)).all()
+    assert ((model.created >= 1.0) & (model.created <= rows)).all()
     assert max(part.n_states for part in parts) <= sum(one.n_states for one in models)
     assert {tuple(c) for c in merged.centers} <= {tuple(c) for one in parts for c in one.centers}
 
@@ -108,7 +113,7 @@ def test_what_has_observed_nothing_contributes_nothing(rule, seed):
     before = part.copy()
     merged = merge([nothing, part, nothing])
     before.start_episode()
-    assert merged._buffer.tobytes() == before._buffer.tobytes()
+    assert saved(merged) == saved(before)
     assert merge([nothing, nothing]).n_states == 0
 
 
@@ -132,11 +137,13 @@ def test_mean_scatter_and_potentials_are_those_of_all_the_data():
         part.learn_many(Z, np.zeros(len(Z), int))
     merged = merge(parts)
     Z = np.concatenate(shards)
-    now = merged._memory.learnt.clusters
-    assert now.n_observations == len(Z)
-    np.testing.assert_allclose(now.first + now.mean, Z.mean(axis=0), rtol=1e-14)
+    now = by_name(opened(merged)[0])
+    assert now["n_observations"] == len(Z)
+    np.testing.assert_allclose(now["first"] + now["mean"], Z.mean(axis=0), rtol=1e-14)
     scaled = Z / rule.scales
-    np.testing.assert_allclose(now.scatter, ((scaled - scaled.mean(axis=0)) ** 2).sum(), rtol=1e-9)
+    np.testing.assert_allclose(
+        now["scatter"], ((scaled - scaled.mean(axis=0)) ** 2).sum(), rtol=1e-9
+    )
     merged.observe([1e4, 1e4])  # takes the latest into the potentials
     n = len(merged.centers)
     offsets = ((merged.centers[:, None] / rule.scales - scaled) ** 2).sum(axis=-1)
@@ -203,7 +210,7 @@ def test_rows_count_by_decisions_and_a_row_of_no_decision_is_uniform():
     other.learn_many([[0.0], [0.0], [9.0], [9.0]], [1, 1, -1, -1])
     both = merge([never, other])
     assert both.n_states == 3
-    assert both._memory.learnt.transitions.places.tolist() == [0.0, 1.0, -1.0]
+    assert by_name(opened(both)[0])["place"].tolist() == [0, 1, -1]
     lonely = np.flatnonzero(both.decisions[0] == 0.0)
     assert (both.transition_matrices[0, lonely] == 1.0 / 3.0).all()
 
@@ -267,7 +274,7 @@ def test_it_is_saved_and_loaded_and_goes_on_learning(rule, tmp_path):
         np.testing.assert_allclose(machine.transition_matrices.sum(axis=-1), 1.0, atol=1e-9)
         assert np.isnan(trace.surprise[0])  # a new episode
         assert not np.isnan(trace.surprise[1:]).any()
-    assert merged._buffer.tobytes() == again._buffer.tobytes()
+    assert saved(merged) == saved(again)
 
 
 @pytest.mark.parametrize(

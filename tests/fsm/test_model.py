@@ -10,7 +10,7 @@ from evofsm.fsm.actions import IntervalActions
 from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.model import FSMModel
 from evofsm.fsm.observations import Missing
-from evofsm.fsm.states.novelty import Novelty
+from evofsm.fsm.rules import Novelty
 from evofsm.fsm.step import Event
 
 ACTIONS = IntervalActions(low=-1.0, high=1.0, width=1.0)
@@ -27,7 +27,7 @@ def chain(*matrices, uses=None):
         origin_frequency=np.ones((q, n)),
         uses=np.ones(q) if uses is None else uses,
         visits=np.ones(n),
-        founded=np.arange(1.0, n + 1),
+        created=np.arange(1.0, n + 1),
         changes=np.zeros((n, n)),
     )
 
@@ -56,7 +56,7 @@ def test_it_counts_founding_visits_and_uses(spiral):
     trace = machine.learn_many(spiral(120), [1] * 30 + [0] * 20 + [-1] * 10 + [0] * 60)
     model = machine.model()
     assert model.n_states > 32
-    assert model.founded.tolist() == (np.flatnonzero(trace.event == Event.CREATED) + 1).tolist()
+    assert model.created.tolist() == (np.flatnonzero(trace.event == Event.CREATED) + 1).tolist()
     assert model.visits.tolist() == np.bincount(trace.state).tolist()
     assert model.uses.tolist() == [79, 30]
 

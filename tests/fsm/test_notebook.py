@@ -5,11 +5,11 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
-from evofsm.fsm.crowding import WhenFull
+from evofsm.fsm.limit import WhenFull
 from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.notebook import machine_html, model_html, step_html
 from evofsm.fsm.observations import Missing
-from evofsm.fsm.states.novelty import Novelty
+from evofsm.fsm.rules import Novelty
 
 _VOID = {"br"}
 

@@ -11,8 +11,6 @@ import numpy as np
 import pytest
 
 import one_machine
-from evofsm.fsm.machine import EvolvingFSM
-from evofsm.fsm.memory import resize
 
 needs_fork = pytest.mark.skipif(not hasattr(os, "fork"), reason="this system cannot fork")
 
@@ -37,7 +35,6 @@ def test_threads_on_one_machine_lose_no_observation(interval):
     [
         ("first observation", 7),
         ("learn_one", 1),
-        ("update", 7),
         ("failed", 7),
         ("missing", 1),
         ("missing, failed", 7),
@@ -52,23 +49,6 @@ def test_an_interrupt_at_any_line_leaves_a_whole_machine(deed, every):
     found = Counter(one_machine.harms(one_machine.DEEDS[deed], every))
     assert found.total() >= 5
     assert set(found) == {""}
-
-
-def test_a_buffer_without_its_views_would_be_found():
-    class Apart(EvolvingFSM):
-        def _use(self, buffer):
-            if hasattr(self, "_held"):
-                self._held = type(self._held)(buffer, self._held.memory)
-            super()._use(buffer)
-
-    def start():
-        machine = Apart(3, rule=one_machine.growing().rule)
-        machine.learn_many([[3.0 * k, 0.0] for k in range(8)], [0] * 8)
-        machine.act(1)
-        return machine
-
-    deed = one_machine.DEEDS["learn_one"]._replace(start=start)
-    assert "results that differ" in one_machine.harms(deed, 11)
 
 
 @pytest.mark.parametrize(
@@ -98,15 +78,6 @@ def test_a_forked_process_is_not_kept_waiting_by_a_thread_that_it_lacks(grown):
     over.set()
     thread.join()
     assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
-
-
-def test_a_buffer_is_never_given_less_room_than_is_used(grown):
-    n = grown.n_states
-    with pytest.raises(ValueError, match=f"room for {n - 1} states and 3 .*but {n} and 3 are in"):
-        resize(grown._buffer, n - 1, 3)
-    with pytest.raises(ValueError, match=f"room for {n} states and 2 matrices"):
-        resize(grown._buffer, n, 2)
-    assert len(resize(grown._buffer, n, 3)) <= len(grown._buffer)
 
 
 def test_learning_by_missing_and_failing_counts_as_ever(grown):

@@ -11,11 +11,11 @@ import pytest
 from river import checks, datasets, preprocessing, stream
 from river.checks import common
 
-from evofsm.fsm.crowding import WhenFull
+from evofsm.fsm.limit import WhenFull
 from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.observations import Missing
 from evofsm.fsm.river import RiverClusterer
-from evofsm.fsm.states.novelty import Novelty
+from evofsm.fsm.rules import Novelty
 
 # River's own list runs these only on models it has a data set for, and has none for clusterers.
 _ON_DATA = [
@@ -52,7 +52,6 @@ def test_rivers_checks_on_data_pass_as_well(check):
 def test_settings_have_the_names_and_defaults_of_the_machine():
     of_machine = dict(signature(EvolvingFSM).parameters)
     of_clusterer = dict(signature(RiverClusterer).parameters)
-    # A clusterer has one action, and learns neither failures nor how that moves what it clusters.
     del of_machine["n_actions"], of_machine["failure_horizon"]
     del of_clusterer["features"]
     assert {name: each.default for name, each in of_clusterer.items()} == {

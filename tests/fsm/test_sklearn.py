@@ -11,11 +11,10 @@ from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 from sklearn.utils.estimator_checks import parametrize_with_checks
 
-from evofsm.fsm.crowding import WhenFull
+from evofsm.fsm.limit import WhenFull
 from evofsm.fsm.machine import EvolvingFSM
+from evofsm.fsm.rules import Edges, Novelty
 from evofsm.fsm.sklearn import EvolvingClusterer
-from evofsm.fsm.states.edges import Edges
-from evofsm.fsm.states.novelty import Novelty
 
 # docs/river-and-scikit-learn.md lists it as well.
 _EXCEPTIONS = {
@@ -44,7 +43,6 @@ def test_scikit_learns_checks_pass(estimator, check):
 def test_settings_have_the_names_and_defaults_of_the_machine():
     of_machine = dict(signature(EvolvingFSM).parameters)
     of_clusterer = dict(signature(EvolvingClusterer).parameters)
-    # A clusterer has one action, and learns neither failures nor how that moves what it clusters.
     del of_machine["n_actions"], of_machine["failure_horizon"]
     assert of_clusterer.keys() == of_machine.keys()
     for name, setting in of_clusterer.items():

@@ -19,5 +19,5 @@ def test_what_does_not_hold_is_told():
     machine = soak.EvolvingFSM(1)
     machine.learn_many([[0.0], [1.0]], [0, 0])
     assert soak.look("fine", machine, 2).holds
-    machine._memory.learnt.transitions.scales[:] *= 1.0 + 1e-8
+    machine._learnt.matrices[:] *= 1.0 + 1e-8
     assert not soak.look("off", machine, 2).holds

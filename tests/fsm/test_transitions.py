@@ -1,11 +1,10 @@
 """Transition matrices and forecasts, worked out by hand on two states and two actions."""
 
-from collections import namedtuple
-
 import numba
 import numpy as np
 import pytest
 
+from evofsm.fsm.arrays import blank
 from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.transitions import retire_state
 
@@ -92,12 +91,9 @@ def test_the_step_reports_the_forecast_made_one_step_before(machine):
     np.testing.assert_allclose(step.predicted, forecast, rtol=1e-15)
 
 
-Rows = namedtuple("Rows", "places uses matrices scales origin_frequency")
-
-
 @numba.njit
-def retire(transitions, given, n, prior):
-    retire_state(transitions, given, n, prior)
+def retire(learnt, given, n, prior):
+    retire_state(learnt, given, n, prior)
 
 
 def test_a_row_that_led_almost_surely_to_a_state_that_is_retired_still_sums_to_1():
@@ -107,8 +103,9 @@ def test_a_row_that_led_almost_surely_to_a_state_that_is_retired_still_sums_to_1
         row[given] = 0.0
         row *= other / row.sum()
         row[given] = 1.0 - row.sum()
-        matrices = np.tile(row, (1, n, 1))
-        one, rows = np.zeros(1), np.ones((1, n))
-        retire(Rows(one, one, matrices, rows, rows.copy()), given, n, 1e-3)
-        sums = np.delete(matrices[0], given, axis=0).sum(axis=1)
+        learnt = blank(1, 1, n, 1)
+        learnt.now["n_places"] = 1
+        learnt.matrices[0], learnt.origin_frequency[0] = row, 1.0
+        retire(learnt, given, n, 1e-3)
+        sums = np.delete(learnt.matrices[0], given, axis=0).sum(axis=1)
         np.testing.assert_allclose(sums, 1.0, atol=1e-6, rtol=0)  # else no file of it would load

@@ -19,7 +19,8 @@ from evofsm.driving.measures import (
     TimeHeadway,
     TimeToCollision,
 )
-from evofsm.fsm import Edges, FailureSplit, IntervalActions, Novelty, Paper
+from evofsm.fsm.actions import IntervalActions
+from evofsm.fsm.rules import Edges, FailureSplit, Novelty, Paper
 from evofsm.guard import ActionReviser, Mode, Proposal
 from evofsm.guard.check import check_contract, check_results, kind_of
 

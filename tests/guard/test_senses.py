@@ -16,7 +16,7 @@ from evofsm.driving.world import KinematicWorld
 from evofsm.fsm.actions import IntervalActions
 from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.observations import Missing
-from evofsm.fsm.states.novelty import Novelty
+from evofsm.fsm.rules import Novelty
 from evofsm.guard.api import Intake, Proposal, Situation
 from evofsm.guard.guard import Guard, InputMonitor
 from evofsm.guard.reviser import ActionReviser

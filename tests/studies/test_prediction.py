@@ -18,7 +18,7 @@ from studies.prediction.sources import (
 )
 from studies.prediction.study import run_prediction as run
 
-from evofsm.fsm.states.novelty import Novelty
+from evofsm.fsm.rules import Novelty
 
 pytestmark = pytest.mark.slow
 

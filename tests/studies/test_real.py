@@ -16,7 +16,7 @@ from studies.real.study import fold_of_runs, read_folder, run_real
 from studies.real.targets import TARGETS, coming, onsets
 
 from evofsm.fsm.machine import EvolvingFSM
-from evofsm.fsm.states.novelty import Novelty
+from evofsm.fsm.rules import Novelty
 
 TINY = Plan(folds=2, rounds=20)
 TTC_3, BRAKING = Question("ttc-3", 2.0), Question("braking-3", 2.0)

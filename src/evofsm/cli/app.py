@@ -98,7 +98,7 @@ def run(make: Callable[[], typer.Typer]) -> None:
         if isinstance(stream, TextIOWrapper):  # no letter that a terminal lacks ends a command
             stream.reconfigure(errors="replace")
     if not {"--help", "--version"} & set(sys.argv):  # which should not wait for Numba
-        from evofsm.fsm import announce_compiling
+        from evofsm.fsm.kernels import announce_compiling
 
         announce_compiling()
     make()()

@@ -13,7 +13,7 @@ from evofsm.cli.inspect import load_model
 from evofsm.cli.options import Saved
 
 if TYPE_CHECKING:
-    from evofsm.fsm import FSMModel
+    from evofsm.fsm.model import FSMModel
 
 # How logs of runs begin.
 _MCAP = b"\x89MCAP"
@@ -50,7 +50,7 @@ def export(
     """Write what was learnt, or driven, in the formats of other tools."""
     _refuse_learnt(out)
     from evofsm import store
-    from evofsm.fsm import visible
+    from evofsm.fsm.naming import visible
     from evofsm.io import graphs
 
     model, dead_ends = _learnt(file)

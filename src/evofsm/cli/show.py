@@ -43,14 +43,14 @@ def show(*parts: RenderableType) -> None:
 
 def say(text: object) -> None:
     """Print a line, however long, that may hold texts from files."""
-    from evofsm.fsm import visible
+    from evofsm.fsm.naming import visible
 
     print(visible(str(text)))
 
 
 def warn(text: object) -> None:
     """Print a line on standard error."""
-    from evofsm.fsm import visible
+    from evofsm.fsm.naming import visible
 
     print(f"evofsm: {visible(str(text))}", file=sys.stderr, flush=True)
 
@@ -60,7 +60,7 @@ def facts(title: str, pairs: Iterable[tuple[str, str]]) -> RenderableType:
     from rich.table import Table
     from rich.text import Text
 
-    from evofsm.fsm import visible
+    from evofsm.fsm.naming import visible
 
     grid = Table.grid(padding=(0, 2))
     grid.title, grid.title_justify, grid.title_style = Text(title, "bold"), "left", ""
@@ -84,7 +84,7 @@ def table(
     from rich.table import Table
     from rich.text import Text
 
-    from evofsm.fsm import visible
+    from evofsm.fsm.naming import visible
 
     made = Table(box=box.SIMPLE_HEAD, pad_edge=False, show_edge=False, padding=(0, 1, 0, 0))
     made.title, made.title_justify, made.title_style = Text(title, "bold"), "left", ""
@@ -103,7 +103,7 @@ def table(
 
 def print_json(document: object) -> None:
     """Print one document for programs, with null for NaN and the infinite."""
-    from evofsm.fsm import visible
+    from evofsm.fsm.naming import visible
 
     text = json.dumps(plain(document), allow_nan=False, ensure_ascii=False, indent=2)
     print(visible(text))

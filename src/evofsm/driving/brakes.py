@@ -12,7 +12,7 @@ from math import sqrt
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.fsm import compiled, kernel
+from evofsm.fsm.kernels import compiled, kernel
 
 # Full braking is judged by so many of the latest decisions, and by no fewer than the second number;
 # that it is weaker than before shows in as few, and in no more than the third number.

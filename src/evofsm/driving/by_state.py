@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from evofsm.driving.judge import LatentRisk
-from evofsm.fsm import EvolvingFSM, FSMModel
+from evofsm.fsm.machine import EvolvingFSM
+from evofsm.fsm.model import FSMModel
 from evofsm.guard import Action, Judgement, Situation, Trial
 
 # States of a smaller belief are left out.

@@ -10,7 +10,9 @@ from typing import Any, Literal
 from evofsm.driving.family import Family
 from evofsm.driving.judge import LatentRisk
 from evofsm.driving.naming import UNITS, VARIABLES
-from evofsm.fsm import EvolvingFSM, IntervalActions, Novelty, StateRule
+from evofsm.fsm.actions import IntervalActions
+from evofsm.fsm.machine import EvolvingFSM
+from evofsm.fsm.rules import Novelty, StateRule
 from evofsm.guard import (
     BELIEF_TOLERANCE,
     TOLERANCE,

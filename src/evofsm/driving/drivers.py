@@ -16,7 +16,7 @@ import numpy as np
 from numba import types
 from numpy.typing import NDArray
 
-from evofsm.fsm import compiled
+from evofsm.fsm.kernels import compiled
 from evofsm.guard import Proposal
 
 #: ``kernel(parameters, time, gap, speed, leader_speed) -> acceleration``: a driver that has one,

@@ -35,7 +35,7 @@ from evofsm.driving.world import (
     World,
 )
 from evofsm.extras import needs
-from evofsm.fsm import FailureRecord
+from evofsm.fsm.proportions import FailureRecord
 from evofsm.guard import TOLERANCE, BoxActions, Guard, Mode, Proposal, run_episode
 
 

@@ -26,15 +26,9 @@ from evofsm.driving.naming import LABELS
 from evofsm.driving.perception import Perception, is_whole
 from evofsm.driving.rehearsal import HARDEST, Body, Three, critical_decelerations
 from evofsm.driving.revisers import GENTLE_BRAKE
-from evofsm.fsm import (
-    compiled,
-    inner_kernel,
-    positive,
-    real_array,
-    refuse_unless_distribution,
-    refuse_unusable,
-    wilson_bounds,
-)
+from evofsm.fsm.kernels import compiled, inner_kernel
+from evofsm.fsm.proportions import wilson_bounds
+from evofsm.fsm.validation import positive, real_array, refuse_unless_distribution, refuse_unusable
 from evofsm.guard import TOLERANCE, Action, Judgement, Situation, Trial
 from evofsm.store import (
     COUNT,

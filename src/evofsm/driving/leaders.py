@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from evofsm.driving.rehearsal import HARDEST
-from evofsm.fsm import positive
+from evofsm.fsm.validation import positive
 
 # Of a manoeuvre the hardest second counts; it shows in the latest half, and takes at least three
 # quarters: less may be noise [s].

@@ -14,7 +14,7 @@ from typing import ClassVar, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.fsm import positive
+from evofsm.fsm.validation import positive
 from evofsm.guard import RiskMeasure
 
 Floats = NDArray[np.float64]

@@ -8,7 +8,8 @@ from itertools import groupby
 import numpy as np
 from numpy.typing import ArrayLike
 
-from evofsm.fsm import Labels, Words, real_array
+from evofsm.fsm.naming import Labels, Words
+from evofsm.fsm.validation import real_array
 
 #: What is observed of car following, and its units.
 VARIABLES, UNITS = ("gap", "v_follower", "v_leader"), ("m", "m/s", "m/s")

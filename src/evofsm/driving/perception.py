@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from evofsm.driving.leaders import latest_of_each
 from evofsm.driving.rehearsal import Three
-from evofsm.fsm import compiled, kernel
+from evofsm.fsm.kernels import compiled, kernel
 
 # Gap [m], speed of the follower and of the leader [m/s], or what is said of each of them.
 Matrix: TypeAlias = tuple[Three, Three, Three]

@@ -18,7 +18,7 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.fsm import compiled, kernel
+from evofsm.fsm.kernels import compiled, kernel
 
 #: A leader who brakes harder is beyond physics; no critical deceleration is higher [m/s²].
 HARDEST = 15.0

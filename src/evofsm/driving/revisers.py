@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from evofsm.driving import measures
 from evofsm.driving.naming import VARIABLES
-from evofsm.fsm import IntervalActions, positive
+from evofsm.fsm.actions import IntervalActions
+from evofsm.fsm.validation import positive
 from evofsm.guard import (
     Fallback,
     Proposal,

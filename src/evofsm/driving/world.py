@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from evofsm.driving.drivers import DRIVER_KERNEL, Kernel, idm_kernel
 from evofsm.driving.scenarios import Scenario
-from evofsm.fsm import compiled
+from evofsm.fsm.kernels import compiled
 from evofsm.guard import Controller, Decision, Proposal
 
 #: What a row of the record holds.

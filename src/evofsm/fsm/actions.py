@@ -106,30 +106,22 @@ class IntervalActions:
     @overload
     def encode(self, a: ArrayLike) -> NDArray[np.int64]: ...
     def encode(self, a: ArrayLike) -> int | NDArray[np.int64]:
-        """Index of the interval in which each value lies: the paper's Section 2.1.2.
+        """Index, from 0, of the interval in which each value lies: the paper's Section 2.1.2.
 
         Parameters
         ----------
         a : float or array_like
             Values of the action, in the unit of ``low`` and ``high``.
 
-        Returns
-        -------
-        int or ndarray of int
-            Index from 0, in the shape of ``a``.
-
         Raises
         ------
-        TypeError
-            If ``a`` does not hold real numbers.
-        ValueError
-            If a value is NaN, or beyond the range and ``outside`` is ``"error"``.
+        TypeError, ValueError
+            If ``a`` does not hold real numbers, or a value is NaN, or beyond the range and
+            ``outside`` is ``"error"``.
 
         Examples
         --------
         >>> actions = IntervalActions(low=-2.5, high=2.5, width=0.3)
-        >>> actions.encode(0.05), actions.label(8)
-        (8, '[-0.1, 0.2)')
         >>> actions.encode([-2.2, 2.5])  # an edge opens the next interval, but for the last one
         array([ 1, 16])
         """
@@ -151,57 +143,22 @@ class IntervalActions:
         return int(index) if values.ndim == 0 else index.astype(np.int64)
 
     def beyond(self, a: ArrayLike) -> NDArray[np.bool_]:
-        """Which values lie outside ``[low, high]``.
+        """Which values lie outside ``[low, high]``; NaN does not.
 
         Parameters
         ----------
         a : float or array_like
-            Values of the action, in the unit of ``low`` and ``high``.
-
-        Returns
-        -------
-        ndarray of bool
-            In the shape of ``a``; False for NaN.
-
-        Raises
-        ------
-        TypeError
-            If ``a`` does not hold real numbers.
-
-        Examples
-        --------
-        >>> actions = IntervalActions(low=-2.5, high=2.5, width=0.3)
-        >>> actions.beyond([-9.0, 0.0, 2.5])
-        array([ True, False, False])
         """
         values = _real_numbers(a)
         return np.asarray((values < self.low) | (values > self.high))
 
     def interval(self, i: SupportsIndex) -> tuple[float, float]:
-        """Lower and upper edge of interval ``i``.
+        """Lower and upper edge of interval ``i``, in the unit of ``low`` and ``high``.
 
         Parameters
         ----------
         i : int
             Index of the interval, from 0.
-
-        Returns
-        -------
-        (float, float)
-            The edges, in the unit of ``low`` and ``high``.
-
-        Raises
-        ------
-        TypeError
-            If ``i`` is not an integer.
-        ValueError
-            If there is no such interval.
-
-        Examples
-        --------
-        >>> actions = IntervalActions(low=-2.5, high=2.5, width=0.3)
-        >>> actions.interval(0), actions.interval(16)  # the last one is cut at `high`
-        ((-2.5, -2.2), (2.3, 2.5))
         """
         i = self._index(i)
         return float(self.edges[i]), float(self.edges[i + 1])
@@ -213,22 +170,6 @@ class IntervalActions:
         ----------
         i : int
             Index of the interval, from 0.
-
-        Returns
-        -------
-        float
-            In the unit of ``low`` and ``high``.
-
-        Raises
-        ------
-        TypeError, ValueError
-            As `interval`.
-
-        Examples
-        --------
-        >>> actions = IntervalActions(low=-2.5, high=2.5, width=0.3)
-        >>> actions.center(actions.encode(1.0))
-        0.95
         """
         lower, upper = self.interval(i)
         return round((lower + upper) / 2.0, _DIGITS)
@@ -242,16 +183,6 @@ class IntervalActions:
         ----------
         i : int
             Index of the interval, from 0.
-
-        Returns
-        -------
-        str
-            The edges in the unit of ``low`` and ``high``.
-
-        Raises
-        ------
-        TypeError, ValueError
-            As `interval`.
 
         Examples
         --------

@@ -9,8 +9,7 @@ from typing import Any, overload
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from evofsm.fsm.elementary import fma, logarithm, total
-from evofsm.fsm.kernels import inner_kernel, kernel
+from evofsm.fsm.kernels import inner_kernel, kernel, lanes, logarithm, total
 from evofsm.fsm.validation import refuse_unless_distribution
 
 # Stands in for 0 in a divisor or a logarithm whose result is multiplied by 0.
@@ -26,7 +25,7 @@ _OPEN = -1.0
 def jensen_shannon_kernel(
     p: NDArray[np.float64], q: NDArray[np.float64], n: int, terms: NDArray[np.float64]
 ) -> float:
-    """Divergence in bits of the first ``n`` entries of two distributions.
+    """Divergence in bits of the first ``n`` entries (whole lines) of two distributions.
 
     A state's ``p ln(p/m) + q ln(q/m)``, where m is the mean of p and q, is ``(p + q) / 2`` times
     ``(1 + d) ln(1 + d) + (1 - d) ln(1 - d)`` with ``d = |p - q| / (p + q)``. As p nears q the
@@ -54,8 +53,8 @@ def jensen_shannon_kernel(
 def _series(x: float) -> float:
     """Of ``x = d^2``, seven terms."""
     x2 = x * x
-    last = fma(x2, 1.0 / 91.0, fma(x, 1.0 / 66.0, 1.0 / 45.0))
-    return x * fma(x2, fma(x2, last, fma(x, 1.0 / 28.0, 1.0 / 15.0)), fma(x, 1.0 / 6.0, 1.0))
+    last = 1 / 45 + x * (1 / 66) + x2 * (1 / 91)
+    return x * (1.0 + x * (1 / 6) + x2 * (1 / 15 + x * (1 / 28) + x2 * last))
 
 
 @inner_kernel
@@ -67,7 +66,7 @@ def _use_logarithms(
         both = p[i] + q[i]
         less = 2.0 * min(p[i], q[i]) / max(both, _TINY)  # 1 - d, with all of its digits
         more = 2.0 - less
-        term = both * fma(more, logarithm(more), less * logarithm(max(less, _TINY)))
+        term = both * (more * logarithm(more) + less * logarithm(max(less, _TINY)))
         terms[i] = terms[i] if terms[i] >= 0.0 else term
 
 
@@ -83,12 +82,7 @@ def jensen_shannon(p: ArrayLike, q: ArrayLike) -> Any:
     Parameters
     ----------
     p, q : (..., n) array_like
-        Distributions over the same n states; leading axes are broadcast.
-
-    Returns
-    -------
-    float or (...) ndarray
-        Divergence [bit]; a number for two single distributions.
+        Distributions over the same n states; leading axes are broadcast, and those of the result.
 
     Raises
     ------
@@ -113,10 +107,11 @@ def jensen_shannon(p: ArrayLike, q: ArrayLike) -> Any:
     refuse_unless_distribution("q", q)
     shape = np.broadcast_shapes(p.shape, q.shape)
     n = shape[-1]
-    rows_p = np.ascontiguousarray(np.broadcast_to(p, shape)).reshape(-1, n)
-    rows_q = np.ascontiguousarray(np.broadcast_to(q, shape)).reshape(-1, n)
+    rows = np.zeros((2, *shape[:-1], lanes(n)))
+    rows[..., :n] = np.broadcast_to(p, shape), np.broadcast_to(q, shape)
+    rows_p, rows_q = rows.reshape(2, -1, lanes(n))
     result = np.empty(len(rows_p))
-    _jensen_shannon_rows(rows_p, rows_q, np.empty(n), result)
+    _jensen_shannon_rows(rows_p, rows_q, np.empty(lanes(n)), result)
     return float(result[0]) if len(shape) == 1 else result.reshape(shape[:-1])
 
 

@@ -9,7 +9,7 @@ Where nobody ever told of failures, none can be counted, and that is said instea
 Beliefs are normalised: one that lies far from every state still belongs to the nearest of them. So
 an observation that is farther from the nearest centre than a state reaches is *never seen*, and
 nothing that was counted is told of it. How far a state reaches is the rule's
-(`states.dispatch.reach`): the radius beyond which `Novelty` would make a new state; with the
+(`rules.reach`): the radius beyond which `Novelty` would make a new state; with the
 paper's rule, which makes none of what is rare, the distance at which the similarity has fallen to
 2 %, twice the root of the width of recognition. With that rule the states may have passed over
 something rare that was seen, hence "as far as the states tell".
@@ -18,18 +18,30 @@ something rare that was seen, hence "as far as the states tell".
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.fsm.known import Known, Nearest
 from evofsm.fsm.naming import Labels
-from evofsm.fsm.numbering import state_name
 from evofsm.fsm.proportions import bounds_text, wilson_bounds
+from evofsm.fsm.validation import state_name
 
 # A belief above this is not worth a word.
 _SURE = 0.995
+
+
+class Nearest(NamedTuple):
+    """The state that an observation is nearest to, in the scales of the rule."""
+
+    state: int  #: its index
+    distance: float  #: from its centre
+    reach: float  #: how far from a centre an observation still belongs to the state
+
+    @property
+    def is_beyond(self) -> bool:
+        """Whether no state reaches as far as the observation."""
+        return self.distance > self.reach
 
 
 class Tally(NamedTuple):
@@ -108,7 +120,7 @@ class Explanation(NamedTuple):
 
 
 def explain(
-    known: Known,
+    known: Any,
     belief: NDArray[np.float64],
     action: int | None,
     labels: Labels,
@@ -137,7 +149,7 @@ def explain(
     arrivals = np.where(np.arange(len(arrivals)) == state, 0.0, arrivals)
     came_from = int(arrivals.argmax()) if arrivals.any() else None
 
-    horizon = known.failure_horizon
+    horizon = known.settings.get("failure_horizon")
     soon = "later on" if horizon is None else f"within {labels.duration(horizon)}"
     sentences = [
         _of_place(known, belief, state, labels),
@@ -166,7 +178,7 @@ def nothing_known(text: str) -> Explanation:
 
 
 def _never_seen(
-    known: Known, belief: NDArray[np.float64], nearest: Nearest, labels: Labels
+    known: Any, belief: NDArray[np.float64], nearest: Nearest, labels: Labels
 ) -> Explanation:
     state, none = nearest.state, Tally(0, 0, is_told=known.failures_told)
     place = labels.place(known.centers[state])
@@ -191,7 +203,7 @@ def _best(after: Sequence[Tally], than: Tally) -> int | None:
 # -- In words -------------------------------------------------------------------------------------
 
 
-def _of_place(known: Known, belief: NDArray[np.float64], state: int, labels: Labels) -> str:
+def _of_place(known: Any, belief: NDArray[np.float64], state: int, labels: Labels) -> str:
     place = f"{state_name(state)}: {labels.place(known.centers[state])}"
     if belief[state] > _SURE or len(belief) == 1:
         return place
@@ -220,7 +232,7 @@ def _of_episodes(here: Tally, visits: int, soon: str, asked: Tally | None, actio
     return f"{text}, and {asked} after {action}"
 
 
-def _of_onsets(known: Known, state: int, labels: Labels) -> str:
+def _of_onsets(known: Any, state: int, labels: Labels) -> str:
     if not known.visits[state] or not known.onsets.any():  # or nobody tells of them
         return ""
     number, while_there = int(known.onsets[state]), labels.duration(int(known.visits[state]))

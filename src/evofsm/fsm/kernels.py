@@ -1,11 +1,15 @@
-"""How kernels are compiled: one decorator, so that every kernel is built and cached alike."""
+"""How kernels are compiled and cached, and the functions of mathematics that compile to vectors.
+
+A kernel is a plain function under a decorator of this file. Constants that it uses stand in its own
+file, or in another one of kernels: so a cache that is out of date is seen.
+"""
 
 from __future__ import annotations
 
 import json
+import logging
 import os
 import re
-import sys
 from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
@@ -16,148 +20,164 @@ from time import monotonic
 from typing import Any, ClassVar, TypeVar, cast
 
 import numba
-from numba.core import event, types
-from numba.core.codegen import JITCodeLibrary
-from numba.core.compiler import CompilerBase, DefaultPassBuilder
-from numba.core.compiler_machinery import AnalysisPass, register_pass
-from numba.core.typed_passes import AnnotateTypes
-from numba.extending import register_jitable
+import numpy as np
+from llvmlite import ir
+from numba import types
+from numba.core import event
+from numba.extending import intrinsic, register_jitable
+from numpy.typing import NDArray
 
 Function = TypeVar("Function", bound=Callable[..., object])
 
-
-#: Whether kernels are plain Python, to be debugged or covered (``NUMBA_DISABLE_JIT=1``).
-NOT_COMPILED: bool = cast(Any, numba.config).DISABLE_JIT
-
-_INLINED = {"forceinline": True, "_nrt": False}
-
-
-def kernel(function: Function) -> Function:
-    """Compile a module-level function with Numba on its first call, and keep the code on disk.
-
-    Kernels are inlined into each other and own no memory: they work in arrays they are given,
-    so counting references (``_nrt``) would only cost time, a fifth of a step. Division by zero
-    is NumPy's. ``fastmath`` stays off: it reorders sums, and then a single step and a batch
-    would no longer agree bit for bit.
-    """
-    return compiled(function, no_cfunc_wrapper=True, **_INLINED)
-
-
-def inner_kernel(function: Function) -> Function:
-    """A kernel that only kernels call: without a way in from Python it is compiled sooner."""
-    return _inside(function, **_INLINED)
-
-
-def rare_kernel(function: Function) -> Function:
-    """An inner kernel that is seldom needed, compiled once and not into each of its callers."""
-    return _inside(function, _nrt=False)
-
-
-def _inside(function: Function, **options: Any) -> Function:
-    """Compile with Numba as a part of the kernels that call it."""
-    njit: Any = numba.njit
-    options |= {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
-    options |= {"pipeline_class": _InnerCompiler, "error_model": "numpy"}
-    return cast(Function, njit(**options)(function))
-
-
-class _Linkable(JITCodeLibrary):
-    """The code of an inner kernel: it is optimised, and made machine code, in its callers alone.
-
-    Numba would do both for each kernel by itself, and then again with all that it calls in each
-    of its callers: of a chain of calls the innermost kernel as often as the chain is long.
-    """
-
-    def _optimize_final_module(self) -> None:
-        pass
-
-    def _finalize_final_module(self) -> None:
-        cast(Any, self)._finalize_dynamic_globals()
-        self._finalized = True
-
-    def get_pointer_to_function(self, name: str) -> int:
-        return 0
-
-    @property
-    def codegen(self) -> Any:
-        return _WithoutEnvironment(self._codegen)
-
-
-class _WithoutEnvironment:
-    """Numba's code generator, for what has no place in memory where its environment would stand.
-
-    Only code that raises or prints asks for that.
-    """
-
-    def __init__(self, codegen: Any) -> None:
-        self._codegen = codegen
-
-    def set_env(self, name: str, environment: object) -> None:
-        pass
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._codegen, name)
-
-
-@register_pass(mutates_CFG=False, analysis_only=True)
-class _LinkOnly(AnalysisPass):
-    _name = "evofsm_link_only"
-
-    def __init__(self) -> None:
-        AnalysisPass.__init__(self)
-
-    def run_pass(self, state: Any) -> bool:
-        state.library = cast(Any, _Linkable)(state.targetctx.codegen(), state.func_id.func_qualname)
-        state.library.enable_object_caching()
-        return False
-
-
-class _InnerCompiler(CompilerBase):
-    def define_pipelines(self) -> list[Any]:
-        manager = DefaultPassBuilder.define_nopython_pipeline(self.state)
-        manager.add_pass_after(_LinkOnly, AnnotateTypes)
-        manager.finalize()
-        return [manager]
+# Kernels own no memory, so that there is nothing to count references of. A product and a sum may be
+# one instruction, but sums are in the order in which they are written: a batch and single steps
+# agree bit for bit.
+_OPTIONS = {"fastmath": {"contract"}, "_nrt": False, "no_cfunc_wrapper": True}
 
 
 def compiled(function: Function, *signature: object, **options: Any) -> Function:
-    """Compile with Numba and keep the code on disk, where there is a place to keep it.
-
-    What a kernel sees of it is compiled as a part of that kernel.
-    """
-    compile_ = partial(numba.njit, *signature, error_model="numpy", **options)
+    """Compile with Numba on the first call, and keep the code on disk where there is a place."""
+    compile_: Any = partial(numba.njit, *signature, error_model="numpy", **options)
     try:
-        dispatcher = compile_(cache=True)(function)
+        return cast(Function, compile_(cache=True)(function))
     except RuntimeError:  # neither the package nor the user's cache folder may be written
-        dispatcher = compile_()(function)
-    if not NOT_COMPILED:
-        inlined = {name: value for name, value in options.items() if name in _INLINED}
-        for_kernels: Any = _inside(function, **inlined)
-        known = dispatcher.typingctx
-        known._remove_global(dispatcher)
-        known.insert_global(dispatcher, types.Dispatcher(for_kernels))
-    return cast(Function, dispatcher)
+        return cast(Function, compile_()(function))
 
 
-#: Numbers in a cache line; the arrays in which a step works are whole lines.
+def kernel(function: Function) -> Function:
+    """A function that Python calls, in arrays that it is given."""
+    return compiled(function, **_OPTIONS)
+
+
+def inner_kernel(function: Function) -> Function:
+    """A kernel that only kernels call, as a part of each of them."""
+    return _inside(function, forceinline=True)
+
+
+def spliced_kernel(function: Function) -> Function:
+    """A long kernel that is called in one place: it is compiled there, and not by itself."""
+    return _inside(function, inline="always")
+
+
+def rare_kernel(function: Function) -> Function:
+    """A kernel that only kernels call, and seldom."""
+    return _inside(function)
+
+
+def _inside(function: Function, **options: Any) -> Function:
+    njit: Any = partial(numba.njit, error_model="numpy", no_cpython_wrapper=True)
+    return cast(Function, njit(**_OPTIONS, **options)(function))
+
+
+#: Numbers in a cache line.
 LINE = 8
 
 
 @register_jitable
 def lanes(n: int) -> int:
-    """``n`` rounded up to whole cache lines.
+    """``n`` rounded up to whole cache lines, as the room for states is.
 
-    A loop of so many turns is compiled to vector instructions alone, without a rest to work off
-    one by one. What such loops do to states that are not there does no harm: these have no
-    belief, and no transition leads to them.
+    A loop of so many turns is all vector instructions, without a rest that is worked off one by
+    one. What it does to states that are not there does no harm: nothing is believed of them.
     """
     return (n + LINE - 1) // LINE * LINE
 
 
-class Announcement(event.Listener):
-    """Says once, on stderr, that kernels are compiled, where that takes longer than a second."""
+# -- Mathematics ----------------------------------------------------------------------------------
+# Calls of the C library would keep loops from being vectors, and take three times as long.
 
-    _PATIENCE: ClassVar = 1.0  # [s], over all kernels
+_LOG2_E = 1.4426950408889634
+# The first part of ln 2, of which products with up to 2^11 are exact, and the rest.
+_LN_2_HIGH, _LN_2_LOW = 6.93147180369123816490e-01, 1.90821492927058770002e-10
+# Added to an integer below 2^51, it leaves that in the lowest bits.
+_INTEGER, _INTEGER_BITS = 1.5 * 2.0**52, 0x4338_0000_0000_0000
+# A float holds its exponent plus a bias above the bits of its mantissa.
+_BIAS, _MANTISSA = 1023, 52
+# The bits of 1 less those of the root of 1/2: what it takes to split off a mantissa around 1.
+_TO_ROOT = 0x3FF0_0000_0000_0000 - 0x3FE6_A09E_667F_3BCD
+
+
+@intrinsic
+def _bits_of_float(_context: Any, _number: Any) -> Any:
+    def generate(_: Any, builder: Any, __: Any, arguments: Any) -> Any:
+        return builder.bitcast(arguments[0], ir.IntType(64))
+
+    return types.int64(types.float64), generate
+
+
+@intrinsic
+def _float_of_bits(_context: Any, _bits: Any) -> Any:
+    def generate(_: Any, builder: Any, __: Any, arguments: Any) -> Any:
+        return builder.bitcast(arguments[0], ir.DoubleType())
+
+    return types.float64(types.int64), generate
+
+
+# As kernels see them.
+_bits_of, _float_of = cast(Any, _bits_of_float), cast(Any, _float_of_bits)
+
+
+@inner_kernel
+def exponential(x: float) -> float:
+    """``exp(x)`` to two units in the last place, for x from -700 to 700.
+
+    ``exp(x) = 2^k exp(r)`` with ``|r| <= ln(2) / 2``: 14 terms of the Taylor series.
+    """
+    rounded = x * _LOG2_E + _INTEGER
+    k = rounded - _INTEGER
+    r = (x - k * _LN_2_HIGH) - k * _LN_2_LOW
+    r2 = r * r
+    r4 = r2 * r2
+    first = (1.0 + r) + r2 * (1 / 2 + r * (1 / 6))
+    second = 1 / 24 + r * (1 / 120) + r2 * (1 / 720 + r * (1 / 5040))
+    third = 1 / 40320 + r * (1 / 362880) + r2 * (1 / 3628800 + r * (1 / 39916800))
+    fourth = 1 / 479001600 + r * (1 / 6227020800)
+    series = first + r4 * (second + r4 * (third + r4 * fourth))
+    return float(series * _float_of((_bits_of(rounded) + _BIAS) << _MANTISSA))
+
+
+@inner_kernel
+def logarithm(x: float) -> float:
+    """``ln(x)`` to 1e-15, for normal x above 0.
+
+    ``x = 2^k m`` with m between the roots of 1/2 and 2; ``ln m = 2 atanh(s)`` with
+    ``s = (m - 1) / (m + 1)``: eleven terms of the series.
+    """
+    bits = _bits_of(x)
+    k = ((bits + _TO_ROOT) >> _MANTISSA) - _BIAS
+    m = _float_of(bits - (k << _MANTISSA))
+    s = (m - 1.0) / (m + 1.0)
+    z = s * s
+    z2 = z * z
+    z4 = z2 * z2
+    first = 1 / 3 + z * (1 / 5) + z2 * (1 / 7 + z * (1 / 9))
+    second = 1 / 11 + z * (1 / 13) + z2 * (1 / 15 + z * (1 / 17))
+    series = first + z4 * (second + z4 * (1 / 19 + z * (1 / 21)))
+    exponent = _float_of(_INTEGER_BITS + k) - _INTEGER
+    return float(exponent * _LN_2_HIGH + (2.0 * s * z * series + (exponent * _LN_2_LOW + 2.0 * s)))
+
+
+@inner_kernel
+def total(values: NDArray[np.float64], n: int) -> float:
+    """Sum of the first ``n``, a whole number of lines, in four sums that run abreast."""
+    a = b = c = d = 0.0
+    for i in range(0, n, 4):
+        a += values[i]
+        b += values[i + 1]
+        c += values[i + 2]
+        d += values[i + 3]
+    return (a + b) + (c + d)
+
+
+# -- Saying that kernels are compiled -------------------------------------------------------------
+
+_log = logging.getLogger("evofsm")
+
+
+class _Announcement(event.Listener):
+    """Says once that kernels are compiled, where all that takes longer than a second."""
+
+    _PATIENCE: ClassVar = 1.0  # [s]
 
     def __init__(self) -> None:
         self._depth = 0
@@ -165,7 +185,6 @@ class Announcement(event.Listener):
         self._timer = Timer(0.0, self._say)
 
     def on_start(self, event: object) -> None:
-        """A kernel is compiled, perhaps for another one."""
         if self._depth == 0 and self._spent < self._PATIENCE:
             self._begun = monotonic()
             self._timer = Timer(self._PATIENCE - self._spent, self._say)
@@ -174,7 +193,6 @@ class Announcement(event.Listener):
         self._depth += 1
 
     def on_end(self, event: object) -> None:
-        """It is done."""
         self._depth -= 1
         if self._depth == 0 and self._spent < self._PATIENCE:
             self._timer.cancel()
@@ -182,76 +200,47 @@ class Announcement(event.Listener):
 
     def _say(self) -> None:
         self._spent = self._PATIENCE
-        print("compiling kernels, once ...", file=sys.stderr, flush=True)
+        _log.warning("compiling kernels, once; this takes some seconds ...")
+
+
+_announced: list[_Announcement] = []
 
 
 def announce_compiling() -> None:
-    """From now on say where compiling takes long; for commands."""
-    event.register("numba:compile", Announcement())
+    """From now on, log once (on stderr, unless told otherwise) where compiling takes long."""
+    if not _announced:
+        _announced.append(_Announcement())
+        event.register("numba:compile", _announced[0])
 
 
-# A name that a face offers, and its module.
-_OFFERS = re.compile(r"^from \.([\w.]+) import (\w+)", re.MULTILINE)
-
-
-def sources_of_kernels(package: Path) -> list[Path]:
-    """The files of a package that kernels are made of, in the order of their names.
-
-    Those that import this file, which has the decorators, and what they import in turn: constants
-    that a kernel uses are a part of it.
-    """
-    modules = {
-        ".".join(path.relative_to(package).with_suffix("").parts): path
-        for path in sorted(package.rglob("*.py"))
-    }
-    homes = {
-        (room, name): f"{room}.{module}"
-        for face in package.rglob("__init__.pyi")
-        for room in [".".join(face.parent.relative_to(package).parts)]
-        for module, name in _OFFERS.findall(face.read_text("utf-8"))
-    }
-    imports = re.compile(rf"^from {package.name}\.?([\w.]*) import (\([^)]*\)|.*)", re.MULTILINE)
-    found: set[str] = set()
-    for name, path in modules.items():
-        imported = {
-            part
-            for room, names in imports.findall(path.read_text("utf-8"))
-            for one in re.findall(r"\w+", names)
-            for part in (room, homes.get((room, one), f"{room}.{one}".strip(".")))
-        }
-        if any(part.rpartition(".")[2] == Path(__file__).stem for part in imported):
-            found |= {name} | (imported & set(modules))
-    return [path for name, path in modules.items() if name in found]
+# -- Caches ---------------------------------------------------------------------------------------
 
 
 def _drop_stale_caches(package: Path) -> None:
-    """Delete cached code that was made from other sources than those there are.
+    """Delete cached code where a file of kernels has changed.
 
-    Numba compares a cached kernel with the file it stands in only, not with the files of the
-    kernels it calls, so editing one of those would silently leave the old code running. What the
-    caches were made from is kept beside them, as a digest. Caches that Numba keeps elsewhere
-    (``NUMBA_CACHE_DIR``) are for those who set it to clear.
+    Numba compares a cached kernel with its own file only, not with those of the kernels it calls.
     """
-    kept = package / "__pycache__" / "kernels.json"
-    stats = ((path, path.stat()) for path in sorted(package.rglob("*.py")))
-    times = [
-        [str(path.relative_to(package)), stat.st_size, stat.st_mtime_ns] for path, stat in stats
-    ]
+    noted = package / "__pycache__" / "kernels.json"
+    files = [(path, path.stat()) for path in sorted(package.rglob("*.py"))]
+    times = [[str(path), stat.st_size, stat.st_mtime_ns] for path, stat in files]
     before: dict[str, Any] = {}
     with suppress(OSError, ValueError):
-        before = json.loads(kept.read_text("utf-8"))
+        before = json.loads(noted.read_text("utf-8"))
     if before.get("times") == times:
         return
-    digest = sha256(b"".join(path.read_bytes() for path in sources_of_kernels(package)))
-    if before.get("digest") != digest.hexdigest():
+    sources = [path.read_bytes() for path, _ in files]
+    uses = re.compile(rb"^@(kernel|inner_kernel|rare_kernel|compiled)\b", re.MULTILINE)
+    digest = sha256(b"".join(source for source in sources if uses.search(source))).hexdigest()
+    if before.get("digest") != digest:
         for path in package.rglob("__pycache__/*.nb[ic]"):
             path.unlink(missing_ok=True)
-    kept.parent.mkdir(exist_ok=True)
-    written = kept.with_name(f"{kept.name}.{os.getpid()}")
-    written.write_text(json.dumps({"times": times, "digest": digest.hexdigest()}), "utf-8")
-    written.replace(kept)
+    noted.parent.mkdir(exist_ok=True)
+    written = noted.with_name(f"{noted.name}.{os.getpid()}")
+    written.write_text(json.dumps({"times": times, "digest": digest}), "utf-8")
+    written.replace(noted)
 
 
-# Not possible where the installation may not be written or another process cleans up too.
+# Not possible where the installation may not be written, or another process cleans up too.
 with suppress(OSError):
     _drop_stale_caches(Path(__file__).parents[1])

@@ -14,18 +14,18 @@ order they are given, the answer is the same bit for bit.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.fsm.inside import Inside
-from evofsm.fsm.learnt import NO_ACTION, NOT_OPEN, Counts, Learnt, arrays_of
-from evofsm.fsm.machine import EvolvingFSM
-from evofsm.fsm.memory import Parameters, leaves
+from evofsm.fsm.arrays import NO_ACTION, NOT_OPEN, SUMS, Settings, by_name
+from evofsm.fsm.machine import EvolvingFSM, opened
 from evofsm.fsm.validation import positive
 
+# All that a part has learnt, by name, without spare room.
+_Part: TypeAlias = Mapping[str, NDArray[Any]]
 # A row with a smaller share of evidence than this is all prior, and rounding.
 _LEAST_EVIDENCE = 1e-9
 # Frequencies that differ by less than this part of themselves are of the same prior.
@@ -100,21 +100,17 @@ def merge(machines: Sequence[EvolvingFSM], *, radius: float | None = None) -> Ev
         alone = (experienced or parts)[0].copy()
         alone.start_episode()
         return alone
-    parameters = Inside(experienced[0]).memory.parameters
-    within = parameters.rule.radius if radius is None else positive("radius", radius)
-    learnt = sorted((Inside(part).trimmed() for part in experienced), key=_content)
-    match = _match(learnt, parameters, within)
-    merged = Inside(experienced[0]).holding(
-        {
-            **_blank(match),
-            **_counts(learnt, match),
-            **_densities(learnt, match, parameters),
-            **_transitions(learnt, match, parameters),
-        }
-    )
-    if all(part.failures_told for part in experienced):
-        merged.tell_of_failures()
-    return merged
+    settings = opened(experienced[0])[1]
+    within = settings.radius if radius is None else positive("radius", radius)
+    learnt = sorted((by_name(opened(part)[0]) for part in experienced), key=_content)
+    match = _match(learnt, settings, within)
+    merged = {
+        **_blank(match),
+        **_counts(learnt, match),
+        **_densities(learnt, match, settings),
+        **_transitions(learnt, match, settings),
+    }
+    return experienced[0]._with_arrays(merged)
 
 
 def _refuse_unlike(machines: Iterable[EvolvingFSM]) -> list[EvolvingFSM]:
@@ -141,7 +137,7 @@ def _refuse_unlike(machines: Iterable[EvolvingFSM]) -> list[EvolvingFSM]:
                     f"{name} of machine {number} is {given!r}, but {expected!r} of machine 0; "
                     "machines to merge must have the same settings"
                 )
-    if np.isfinite(Inside(parts[0]).memory.parameters.rule.memory):
+    if np.isfinite(opened(parts[0])[1].memory):
         raise ValueError(
             f"machines with {parts[0].rule} cannot be merged: what each still remembers depends on "
             "when it saw it"
@@ -149,9 +145,9 @@ def _refuse_unlike(machines: Iterable[EvolvingFSM]) -> list[EvolvingFSM]:
     return parts
 
 
-def _content(part: Learnt) -> bytes:
+def _content(part: _Part) -> bytes:
     """What puts parts in an order that does not depend on how they were given."""
-    return b"".join(array.tobytes() for _, array in leaves(part))
+    return b"".join(array.tobytes() for array in part.values())
 
 
 # -- Match ----------------------------------------------------------------------------------------
@@ -166,21 +162,21 @@ class _Match(NamedTuple):
     leader_state: NDArray[np.int64]  #: (n,) its index there
 
 
-def _match(learnt: Sequence[Learnt], parameters: Parameters, radius: float) -> _Match:
-    weights = parameters.rule.weights
-    places = [part.clusters.centers.T * weights for part in learnt]
+def _match(learnt: Sequence[_Part], settings: Settings, radius: float) -> _Match:
+    weights = settings.weights
+    places = [part["centers"].T * weights for part in learnt]
     sizes = np.array([len(place) for place in places])
-    rivals = _rivals(places, parameters.rule.radius)
+    rivals = _rivals(places, settings.radius)
     points, visits = (
         np.concatenate(places),
-        np.concatenate([part.outcomes.visits for part in learnt]),
+        np.concatenate([part["visits"] for part in learnt]),
     )
     group = np.full(len(points), -1, np.int64)
     leaders: list[int] = []
     led = np.empty_like(points)
     for i in np.lexsort((*points.T, -visits)).tolist():
         squared_distances = ((led[: len(leaders)] - points[i]) ** 2).sum(axis=1)
-        is_full = len(leaders) >= parameters.max_states
+        is_full = len(leaders) >= settings.max_states
         if not is_full:
             squared_distances[[group[k] for k in rivals.get(i, ()) if group[k] >= 0]] = np.inf
         if is_full or (leaders and squared_distances.min() <= radius * radius):
@@ -212,80 +208,89 @@ def _rivals(places: Sequence[NDArray[np.float64]], radius: float) -> dict[int, l
 
 
 def _blank(match: _Match) -> dict[str, NDArray[Any]]:
-    """Zeros of the merged states' sizes, for all that stands for one episode."""
+    """All that stands for one episode, or for one machine, as a new one has it."""
+    n = match.n
+    none = ("chained", "state", "clock", "began")
     return {
-        **{array.name: np.zeros(match.n) for array in arrays_of(Learnt) if array.kind == "state"},
-        **{array.name: np.zeros(1) for array in arrays_of(Learnt) if array.kind == "counter"},
-        "n_states": np.array([match.n]),
-        "n_founded": np.array([match.n]),
-        "ids": np.arange(match.n),
+        **{name: np.zeros(1, np.int64) for name in none},
+        "n_states": np.array([n]),
+        "n_created": np.array([n]),
         "action": np.array([NO_ACTION]),
-        "before": np.array([NOT_OPEN]),
-        "belief": np.full(match.n, 1.0 / match.n),
+        "before": np.array([-1]),
+        "id": np.arange(n, dtype=np.float64),
+        "belief": np.full(n, 1.0 / n),
+        "latest_visit": np.zeros(n),
     }
 
 
-def _counts(learnt: Sequence[Learnt], match: _Match) -> dict[str, NDArray[Any]]:
-    """What was counted, as the table says that it is joined."""
+def _counts(learnt: Sequence[_Part], match: _Match) -> dict[str, NDArray[Any]]:
+    """What was counted."""
     n, is_open = match.n, _is_open(learnt)
     places = np.cumsum(is_open) - 1
-    shapes = {"state": (n,), "change": (n, n), "place": (int(is_open.sum()), n)}
-    summed = [array for array in arrays_of(Counts) if array.joined_by == "sum"]
-    merged = {array.name: np.zeros(shapes[array.kind]) for array in summed}
-    joined, founded = np.zeros(n), np.ones(n)
+    shapes: dict[str, tuple[int, ...]] = {
+        **dict.fromkeys(SUMS, (n,)),
+        "changes": (n, n),
+        **dict.fromkeys(("failures", "tried", "failed_after"), (int(is_open.sum()), n)),
+    }
+    merged = {name: np.zeros(shape) for name, shape in shapes.items()}
+    joined, created = np.zeros(n), np.ones(n)
     for part, group in zip(learnt, match.groups, strict=True):
         of_place = places[_actions_of(part)][:, None]
-        where: dict[str, Any] = {
-            "state": group,
-            "change": (group[:, None], group),
-            "place": (of_place, group),
-        }
-        for array in summed:
-            np.add.at(merged[array.name], where[array.kind], getattr(part.outcomes, array.name))
+        for name, sums in merged.items():
+            where: Any = group if sums.shape == (n,) and name in SUMS else (of_place, group)
+            where = (group[:, None], group) if name == "changes" else where
+            np.add.at(sums, where, part[name])
         of_part = np.bincount(group, minlength=n) > 1
-        np.maximum.at(joined, group, np.maximum(part.outcomes.joined, of_part[group]))
+        np.maximum.at(joined, group, np.maximum(part["joined"], of_part[group]))
         earliest = np.full(n, np.inf)
-        np.minimum.at(earliest, group, part.outcomes.founded)
-        founded += np.where(np.isfinite(earliest), earliest - 1.0, 0.0)
-    latest_try = np.zeros(shapes["place"])
-    return {**merged, "joined": joined, "founded": founded, "latest_try": latest_try}
+        np.minimum.at(earliest, group, part["created"])
+        created += np.where(np.isfinite(earliest), earliest - 1.0, 0.0)
+    told = min(int(part["failures_told"][0]) for part in learnt)
+    return {
+        **merged,
+        "joined": joined,
+        "created": created,
+        "latest_try": np.zeros(shapes["tried"]),
+        "failures_told": np.array([told]),
+    }
 
 
 def _densities(
-    learnt: Sequence[Learnt], match: _Match, parameters: Parameters
+    learnt: Sequence[_Part], match: _Match, settings: Settings
 ) -> dict[str, NDArray[Any]]:
     """Pool the data's mean, scatter and potentials.
 
     ``(t - 1) / potential`` is a sum over z_1 .. z_{t-1}, of ``1 + rho |z - centre|^2`` for each
-    observation since the centre was created; see `clusters.update_potentials`. That
+    observation since the centre was created; see `clusters.determine`. That
     sum over another part's data is known from their mean and scatter.
     """
-    rho, weights = parameters.rule.distance_weight, parameters.rule.weights
-    clusters = [part.clusters for part in learnt]
-    counts = np.array([part.n_observations[0] for part in clusters])
-    main = clusters[counts.argmax()]
-    means = np.array([part.first - main.first + part.mean for part in clusters])
+    rho, weights = settings.distance_weight, settings.weights
+    counts = np.array([part["n_observations"][0] for part in learnt], np.float64)
+    main = learnt[int(counts.argmax())]
+    means = np.array([part["first"] - main["first"] + part["mean"] for part in learnt])
     mean = counts @ means / counts.sum()
     between = counts @ (((means - mean) * weights) ** 2).sum(axis=1)
 
     led = list(zip(match.leader_part.tolist(), match.leader_state.tolist(), strict=True))
-    centers = np.array([clusters[k].centers[:, i] for k, i in led])
+    centers = np.array([learnt[k]["centers"][:, i] for k, i in led])
     sums = np.zeros(match.n)
-    for k, part in enumerate(clusters):
-        from_mean = (((centers - main.first - means[k]) * weights) ** 2).sum(axis=1)
-        total = counts[k] + rho * (counts[k] * from_mean + part.scatter[0])
+    for k, part in enumerate(learnt):
+        from_mean = (((centers - main["first"] - means[k]) * weights) ** 2).sum(axis=1)
+        total = counts[k] + rho * (counts[k] * from_mean + part["scatter"][0])
         own = match.leader_part == k
         i = match.leader_state[own]
-        total[own] = (counts[k] - 1.0) / part.potentials[i] + 1.0 + rho * part.squared_distances[i]
+        total[own] = (
+            (counts[k] - 1.0) / part["potentials"][i] + 1.0 + rho * part["squared_distances"][i]
+        )
         sums += total
-    from_latest = (((centers - main.latest) * weights) ** 2).sum(axis=1)
+    from_latest = (((centers - main["latest"]) * weights) ** 2).sum(axis=1)
     others = counts.sum() - 1.0  # the latest one counts in the next step
     return {
-        "n_observations": counts.sum(keepdims=True),
-        "first": main.first,
-        "latest": main.latest,
+        "n_observations": counts.sum(keepdims=True).astype(np.int64),
+        "first": main["first"],
+        "latest": main["latest"],
         "mean": mean,
-        "scatter": np.sum([part.scatter for part in clusters], axis=0) + between,
+        "scatter": np.sum([part["scatter"] for part in learnt], axis=0) + between,
         "centers": centers.T,
         "potentials": others / np.maximum(sums - 1.0 - rho * from_latest, others),
         "squared_distances": from_latest,
@@ -296,18 +301,18 @@ def _densities(
 
 
 def _transitions(
-    learnt: Sequence[Learnt], match: _Match, parameters: Parameters
+    learnt: Sequence[_Part], match: _Match, settings: Settings
 ) -> dict[str, NDArray[Any]]:
     n, is_open = match.n, _is_open(learnt)
-    uses = np.sum([part.transitions.uses for part in learnt], axis=0)
-    places = np.where(is_open, np.cumsum(is_open) - 1.0, NOT_OPEN)
+    uses = np.sum([part["uses"] for part in learnt], axis=0)
+    places = np.where(is_open, np.cumsum(is_open) - 1, NOT_OPEN)
     open_ = int(is_open.sum())
     joint = np.zeros((open_, n, n))
     decisions, frequencies = np.zeros((2, open_, n))
     for part, group in zip(learnt, match.groups, strict=True):
-        shares, weight = _evidence(part, parameters)
-        counts = part.outcomes.decisions
-        place = places[_actions_of(part)].astype(np.int64)
+        shares, weight = _evidence(part, settings)
+        counts = part["decisions"]
+        place = places[_actions_of(part)]
         np.add.at(joint, (place[:, None, None], group[:, None], group), counts[..., None] * shares)
         np.add.at(decisions, (place[:, None], group), counts)
         np.add.at(frequencies, (place[:, None], group), counts * weight)
@@ -315,43 +320,39 @@ def _transitions(
     known = joint.sum(axis=-1)
     seen = known > 0.0
     frequencies = np.divide(frequencies, decisions, out=np.zeros_like(known), where=seen)
-    prior = n * _aged_prior(parameters, uses[is_open])[:, None]
+    prior = n * _aged_prior(settings, uses[is_open])[:, None]
     together = frequencies + prior
     of_prior = np.divide(prior, together, out=np.zeros_like(known), where=together > 0.0)
     of_prior[~seen] = 1.0
     rows = np.divide(joint, known[..., None], out=np.zeros_like(joint), where=seen[..., None])
     return {
-        "places": places,
+        "place": places,
+        "n_places": np.array([open_]),
         "uses": uses,
         "matrices": rows + of_prior[..., None] * (1.0 / n - rows),
-        "scales": np.ones((open_, n)),
         "origin_frequency": together,
+        "decisions": decisions,
     }
 
 
-def _is_open(learnt: Sequence[Learnt]) -> NDArray[np.bool_]:
+def _is_open(learnt: Sequence[_Part]) -> NDArray[np.bool_]:
     """(q,) whether any part has a matrix of an action."""
-    opened: NDArray[np.bool_] = np.any(
-        [part.transitions.places != NOT_OPEN for part in learnt], axis=0
-    )
+    opened: NDArray[np.bool_] = np.any([part["place"] != NOT_OPEN for part in learnt], axis=0)
     return opened
 
 
-def _actions_of(part: Learnt) -> NDArray[np.int64]:
+def _actions_of(part: _Part) -> NDArray[np.int64]:
     """The action of each of a part's matrices, in their order."""
-    places = part.transitions.places
+    places = part["place"]
     used = np.flatnonzero(places != NOT_OPEN)
     return used[places[used].argsort()]
 
 
-def _evidence(
-    part: Learnt, parameters: Parameters
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _evidence(part: _Part, settings: Settings) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Rows (s, n, n) of a part's matrices without the prior, and their frequencies (s, n)."""
-    stored = part.transitions
-    matrices, frequency = stored.scales[..., None] * stored.matrices, stored.origin_frequency
+    matrices, frequency = part["matrices"].copy(), part["origin_frequency"]
     joint = frequency[..., None] * matrices
-    joint -= _prior_left(joint, part.transitions.uses[_actions_of(part)], parameters)
+    joint -= _prior_left(joint, part["uses"][_actions_of(part)], settings)
     weight = joint.sum(axis=-1)
     is_known = weight > _LEAST_EVIDENCE * frequency
     shares = np.divide(joint, weight[..., None], out=matrices, where=is_known[..., None])
@@ -359,7 +360,7 @@ def _evidence(
 
 
 def _prior_left(
-    joint: NDArray[np.float64], uses: NDArray[np.float64], parameters: Parameters
+    joint: NDArray[np.float64], uses: NDArray[np.float64], settings: Settings
 ) -> NDArray[np.float64]:
     """What the prior has left in joint frequencies (s, n, n); no more than they are.
 
@@ -374,15 +375,13 @@ def _prior_left(
     out_of = np.minimum.accumulate(between, axis=2).diagonal(axis1=1, axis2=2)
     least = np.minimum(into, out_of)
     agree = np.isfinite(least) & (np.maximum(into, out_of) <= (1.0 + _SAME) * least)
-    oldest = _aged_prior(parameters, uses)[:, None]
-    left = np.where(agree, np.minimum(least, parameters.prior_frequency), oldest)
+    oldest = _aged_prior(settings, uses)[:, None]
+    left = np.where(agree, np.minimum(least, settings.prior_frequency), oldest)
     left = np.minimum.accumulate(left[:, ::-1], axis=1)[:, ::-1]
     return np.minimum(left[:, np.maximum.outer(states, states)], joint)
 
 
-def _aged_prior(parameters: Parameters, uses: NDArray[np.float64]) -> NDArray[np.float64]:
+def _aged_prior(settings: Settings, uses: NDArray[np.float64]) -> NDArray[np.float64]:
     """The prior frequency, after so many uses."""
-    aged: NDArray[np.float64] = (
-        parameters.prior_frequency * (1.0 - parameters.learning_rate) ** uses
-    )
+    aged: NDArray[np.float64] = settings.prior_frequency * (1.0 - settings.learning_rate) ** uses
     return aged

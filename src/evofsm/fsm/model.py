@@ -1,45 +1,115 @@
-"""A frozen snapshot of a machine: what it knew, with labels, as a file can hold it."""
+"""A frozen snapshot of a machine, and every question that can be asked of what was learnt."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, fields, replace
-from typing import Any, Self
+from dataclasses import asdict, dataclass, field, fields
+from typing import Any, Literal, Self, SupportsIndex, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from evofsm import store
+from evofsm.fsm import chains
 from evofsm.fsm.actions import IntervalActions
-from evofsm.fsm.explanation import Explanation, explain
-from evofsm.fsm.known import Known
-from evofsm.fsm.layout import Array
-from evofsm.fsm.learnt import MODEL, OF_MODEL
+from evofsm.fsm.arrays import MODEL, OF_MODEL, Floats
+from evofsm.fsm.clusters import recognise_rows
+from evofsm.fsm.explanation import Explanation, Nearest, explain
+from evofsm.fsm.kernels import lanes
 from evofsm.fsm.naming import Labels
 from evofsm.fsm.notebook import model_html
-from evofsm.fsm.states.dispatch import describe_rule
+from evofsm.fsm.rules import (
+    Paper,
+    StateRule,
+    describe_rule,
+    reach,
+    restore_rule,
+    weights_of,
+)
 from evofsm.fsm.validation import (
     check_action,
     check_state,
     positive,
+    real_array,
     refuse_more_failures,
     refuse_unless_distribution,
+    refuse_unusable,
+    whole,
 )
+from evofsm.store import Place
+
+#: Which actions are taken: each alike, the first one again, or each as often as it was used.
+Policy = Literal["marginal", "hold", "observed"]
+
+# -- What was learnt ------------------------------------------------------------------------------
+
+# In place of counts that are not given.
+_NONE: Any = None
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
-class FSMModel(Known):
+class Counts:
+    """What was counted; machines and models have it under these names.
+
+    n is the number of states, q of actions. Counts never forget: a rare failure must not fade, and
+    they are the evidence that there is. An episode is counted once for each state it came to, and
+    each action it took there, for observations of one episode are no independent evidence; the one
+    that is going on is not shown yet. It failed *soon* after it was in a state if no more than
+    ``failure_horizon`` observations lay between; where that is not set, if it failed at all.
+
+    Examples
+    --------
+    >>> from evofsm import EvolvingFSM
+    >>> machine = EvolvingFSM(n_actions=2, radius=0.5)
+    >>> trace = machine.learn_many([[0.0], [0.1], [2.0], [1.0]], [0, 1, 0, 0], [0, 2], [3])
+    >>> machine.visits, machine.endings, machine.episodes, machine.failed_soon
+    (array([3., 1.]), array([0., 1.]), array([2., 1.]), array([1., 1.]))
+    >>> machine.decisions, machine.failures
+    (array([[2., 0.],
+           [0., 0.]]), array([[1., 0.],
+           [0., 0.]]))
+    >>> machine.tried, machine.failed_after
+    (array([[2., 0.],
+           [0., 0.]]), array([[1., 0.],
+           [0., 0.]]))
+    """
+
+    visits: Floats = _NONE  #: (n,) observations in which each state was the most probable
+    created: Floats = _NONE  #: (n,) number of the observation that created each state, from 1
+    changes: Floats = (
+        _NONE  #: (n, n) steps from the most probable state (row) to the next one (column)
+    )
+    decisions: Floats = (
+        _NONE  #: (q, n) transitions that began in each state under each action, by belief
+    )
+    failures: Floats = _NONE  #: (q, n) those of `decisions` that led straight into failure
+    endings: Floats = _NONE  #: (n,) failures whose last observation was recognised as each state
+    episodes: Floats = _NONE  #: (n,) episodes that came to each state
+    failed_soon: Floats = _NONE  #: (n,) those of `episodes` that failed soon after they were there
+    joined: Floats = (
+        _NONE  #: (n,) 1 where two states were joined, so that an episode may count twice
+    )
+    tried: Floats = _NONE  #: (q, n) episodes that took each action in each state
+    failed_after: Floats = _NONE  #: (q, n) those of `tried` that failed soon after they did
+    onsets: Floats = _NONE  #: (n,) times that something unexpected began there, as it was told
+
+
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
+class FSMModel(Counts):
     """States and transitions as they stood when the snapshot was taken.
 
-    Its parts are given by name; see `Known` and `Counts` for what they are. Arrays are read-only,
-    and counts that are not given are 0.
+    n is the number of states, m of variables, q of actions. Centres are in the units of the
+    observations; distances and potentials as if all had the same unit, or are those of observations
+    divided by the rule's scales. Rows of a matrix are "from", columns "to". Parts are given by
+    name; arrays are read-only, and counts that are not given are 0.
 
     Raises
     ------
     ValueError
-        If an array has not its shape, a number is out of its range in `core.learnt`, such as NaN
-        or a count below 0, a row of a transition matrix is no distribution, more decisions failed
-        than were taken, ``actions``, ``names`` or ``units`` are of another number than the arrays
-        say, or ``dt`` is not positive and finite.
+        If an array has not its shape, a number is out of its range, such as NaN or a count below 0,
+        a row of a transition matrix is no distribution, more decisions failed than were taken,
+        ``actions``, ``names`` or ``units`` are of another number than the arrays say, or ``dt`` is
+        not positive and finite.
 
     Examples
     --------
@@ -49,37 +119,43 @@ class FSMModel(Known):
     >>> model = machine.model(names=["gap"], units=["m"])
     >>> model
     FSMModel(2 states of gap, 2 actions, 4 observations, Paper(memory=None))
-    >>> model.n_states, model.visits, model.founded
+    >>> model.n_states, model.visits, model.created
     (2, array([3., 1.]), array([1., 4.]))
     """
 
+    centers: Floats  #: (n, m) the observation at the centre of each state
+    potentials: Floats  #: (n,) density of all observations at each centre
+    width: float  #: of recognition: a squared distance, as the rule makes it of the spread
+    #: (q, n, n) for each action, probabilities from state (row) to state (column); 1 / n where it
+    #: was never used
+    transition_matrices: Floats
+    origin_frequency: Floats  #: (q, n) the paper's F_o, recency-weighted frequency of each row
+    uses: Floats  #: (q,) transitions learnt with each action
+    rule: StateRule = field(default_factory=Paper)  #: how states are determined
+    #: whether anybody told of failures; where not, episodes without one are not known to be safe
+    failures_told: bool = False
+    settings: Mapping[str, Any] = field(default_factory=dict)  #: of the machine, by name
     actions: IntervalActions | None = None  #: what the action indices mean
     names: tuple[str, ...] = ()  #: of the m variables
     units: tuple[str, ...] = ()  #: of the m variables
     dt: float | None = None  #: time between two observations [s]
-    _kind = MODEL
 
     def __post_init__(self) -> None:
-        m, q = self.n_variables, self.n_actions
-        sizes: dict[int | str, int] = {"n": self.n_states, "m": m, "q": q}
-        arrays = {}
-        for name, member in OF_MODEL.items():
-            shape = tuple(sizes[letter] for letter in member.shape)
+        m, q, n = self.n_variables, self.n_actions, self.n_states
+        sizes: dict[int | str, int] = {"n": n, "m": m, "q": q}
+        for name, numbers in OF_MODEL.items():
             given = getattr(self, name)
-            array = np.zeros(shape) if isinstance(given, Array) else np.array(given, np.float64)
-            if array.shape != shape:
-                raise ValueError(f"{name} has shape {array.shape}, not {shape}")
+            shape = [sizes[size] for size in numbers.shape]
+            array = np.zeros(shape) if given is None else np.array(given, np.float64)
+            numbers.refuse_others(name, array, sizes)
             array.setflags(write=False)
             object.__setattr__(self, name, array)
-            arrays[name] = array
         MODEL.refuse_others(self._content)
-        for name, array in arrays.items():
-            OF_MODEL[name].refuse_others(name, array, sizes)
-        refuse_more_failures(self)
+        refuse_more_failures({name: getattr(self, name) for name in OF_MODEL})
         counted = self.failures, self.endings, self.failed_soon
         told = bool(self.failures_told) or any(counts.any() for counts in counted)
         object.__setattr__(self, "failures_told", told)
-        if self.n_states:
+        if n:
             refuse_unless_distribution("a row of transition_matrices", self.transition_matrices)
         for name in ("names", "units"):
             if len(getattr(self, name)) not in (0, m):
@@ -90,9 +166,313 @@ class FSMModel(Known):
             raise ValueError(f"actions has {self.actions.n_actions} intervals for {q} matrices")
 
     @property
+    def n_states(self) -> int:
+        """Number n of states."""
+        return len(self.centers)
+
+    @property
+    def n_variables(self) -> int:
+        """Number m of variables in an observation."""
+        return int(np.shape(self.centers)[1])
+
+    @property
+    def n_actions(self) -> int:
+        """Number q of actions."""
+        return len(self.uses)
+
+    @property
     def labels(self) -> Labels:
         """What its numbers mean."""
         return Labels(self.actions, self.names, self.units, self.dt)
+
+    @property
+    def joint_frequency(self) -> NDArray[np.float64]:
+        """(q, n, n) ndarray: the paper's F, recency-weighted frequencies of transitions."""
+        return np.asarray(self.origin_frequency[:, :, None] * self.transition_matrices)
+
+    @property
+    def marginal_matrix(self) -> NDArray[np.float64]:
+        """(n, n) ndarray: the paper's P*, transition probabilities if all actions are alike."""
+        return self.averaged_matrix("marginal")
+
+    # -- Where it is ----------------------------------------------------------------------------
+
+    def recognise(self, z: ArrayLike) -> NDArray[np.float64]:
+        """Distribution over states for one observation (m,), or for each of many (N, m).
+
+        The paper's Section 2.2.2, with the width that the snapshot holds; the states stay as they
+        are.
+
+        Parameters
+        ----------
+        z : (m,) or (N, m) array_like
+            One observation, or one per row, in the units of the machine's.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If ``z`` does not hold real numbers up to 1e100 in size, or not m variables, or the
+            model has no states.
+
+        Examples
+        --------
+        >>> from evofsm import EvolvingFSM
+        >>> machine = EvolvingFSM(n_actions=2, radius=0.5)
+        >>> trace = machine.learn_many([[0.0], [0.1], [2.0], [1.0]], [0, 0, 0, 0])
+        >>> machine.model().recognise([[0.0], [0.5], [1.0]]).round(3)
+        array([[0.625, 0.375], [0.5  , 0.5  ], [0.375, 0.625]])
+        """
+        given, rows = self._observations(z)
+        weights = weights_of(self.rule, self.n_variables)
+        belief = believed(self.centers.T, weights, rows, self.width)
+        return belief if given.ndim == 2 else belief[0]
+
+    def nearest(self, z: ArrayLike) -> Nearest:
+        """Which state an observation is nearest to, how far that is, and how far a state reaches.
+
+        Distances are those of observations divided by the rule's scales.
+
+        Parameters
+        ----------
+        z : (m,) array_like
+            Observation, as `recognise` takes it.
+
+        Examples
+        --------
+        >>> from evofsm import EvolvingFSM, Novelty
+        >>> machine = EvolvingFSM(n_actions=1, rule=Novelty(radius=1.0, scales=(2.0,)))
+        >>> trace = machine.learn_many([[0.0], [1.9], [4.0]], [0, 0, 0])
+        >>> machine.model().nearest([9.0])
+        Nearest(state=1, distance=2.5, reach=1.0)
+        """
+        _, rows = self._observations(z)
+        if len(rows) != 1:
+            raise ValueError(f"z holds {len(rows)} observations; one is asked for")
+        offsets = (self.centers - rows[0]) * weights_of(self.rule, self.n_variables)
+        distances = np.sqrt(np.square(offsets).sum(axis=1))
+        state = int(distances.argmin())
+        return Nearest(state, float(distances[state]), reach(self.rule, self.width))
+
+    # -- What comes next --------------------------------------------------------------------------
+
+    def propagate(
+        self,
+        belief: ArrayLike,
+        action: SupportsIndex | None = None,
+        horizon: int = 1,
+        policy: Policy = "marginal",
+    ) -> NDArray[np.float64]:
+        """(n,) distribution over states ``horizon`` steps after ``belief``.
+
+        The forecast equations of the paper's Section 2.3.2: ``belief @ P[action] @ P*^(horizon -
+        1)``.
+
+        Parameters
+        ----------
+        belief : (n,) array_like
+            Present distribution over states.
+        action : int, optional
+            Index of the first step's action, from 0; without it ``policy`` rules that step too.
+        horizon : int
+            Number of steps, at least 1.
+        policy : {"marginal", "hold", "observed"}
+            Actions after the first step: each alike (the paper's k-step equation), the first one
+            again, or each as often as it was used.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If ``belief`` is no distribution over the n states, there is no such action or policy,
+            ``horizon`` is no integer of at least 1, or ``"hold"`` has no action.
+
+        Examples
+        --------
+        >>> from evofsm import EvolvingFSM
+        >>> machine = EvolvingFSM(n_actions=2, radius=0.5)
+        >>> trace = machine.learn_many([[0.0], [0.1], [2.0], [1.0]], [0, 0, 0, 0])
+        >>> machine.model().propagate([1.0, 0.0], 0, horizon=20, policy="hold").round(3)
+        array([0.686, 0.314])
+        """
+        there, steps = self._belief(belief), check_forecast(horizon, policy)
+        if action is None and policy == "hold":
+            raise ValueError("policy 'hold' needs the action that is held")
+        if action is not None:
+            there, steps = there @ self._matrix(action), steps - 1
+        if steps:
+            held = action if policy == "hold" else None
+            then = self.averaged_matrix(policy) if held is None else self._matrix(held)
+            there = there @ np.linalg.matrix_power(then, steps)
+        return there
+
+    def averaged_matrix(self, policy: Policy = "observed") -> NDArray[np.float64]:
+        """(n, n) transition probabilities from state (row) to state (column), over all actions.
+
+        Parameters
+        ----------
+        policy : {"observed", "marginal"}
+            Each action as often as it was used, or all alike (the paper's P*, Section 2.3.2). Where
+            none was used yet, both are alike.
+
+        Examples
+        --------
+        >>> from evofsm import EvolvingFSM
+        >>> machine = EvolvingFSM(n_actions=2, radius=0.5)
+        >>> trace = machine.learn_many([[0.0], [0.1], [2.0], [1.0]], [0, 0, 0, 0])
+        >>> model = machine.model()
+        >>> model.averaged_matrix("observed")[0].round(3)  # action 0 was all it saw
+        array([0.771, 0.229])
+        >>> model.averaged_matrix("marginal")[0].round(3)
+        array([0.636, 0.364])
+        """
+        if policy not in ("marginal", "observed"):
+            raise ValueError(f"policy is {policy!r}; an average is 'marginal' or 'observed'")
+        if policy == "observed" and self.uses.sum() > 0.0:
+            shares = self.uses / self.uses.sum()
+            return np.asarray(np.tensordot(shares, self.transition_matrices, axes=1))
+        return np.asarray(self.transition_matrices.mean(axis=0))
+
+    def stationary_distribution(self, policy: Policy = "marginal") -> NDArray[np.float64]:
+        """(n,) share of time that the chain would spend in each state if it ran on for ever.
+
+        Parameters
+        ----------
+        policy : {"marginal", "observed"}
+            How actions are weighed, as in `averaged_matrix`, which leaves this distribution as it
+            is.
+
+        Raises
+        ------
+        ValueError
+            If the chain falls apart into sets of states that never meet, and so has more than one.
+        """
+        return chains.stationary(self.averaged_matrix(policy))
+
+    def committor_forward(
+        self,
+        failure: Sequence[int] | None = None,
+        before: Sequence[int] = (),
+        action: SupportsIndex | None = None,
+        policy: Policy = "observed",
+    ) -> NDArray[np.float64]:
+        """(n,) probability to fail before the episode ends, from each state: 1 is a dead end.
+
+        An observation in state i, of the ``visits[i]`` that there were, was the last of an episode
+        that failed (``endings[i]``), the last of one that did not, or was followed by another (the
+        sum of ``changes[i]``). With these shares f_i, s_i and c_i, the least solution of ::
+
+            q_i = f_i + c_i sum_j P_ij q_j,        q_i = 0 in the states ``before``
+
+        Parameters
+        ----------
+        failure : sequence of int, optional
+            States that count as failure in place of failures that were counted: q is 1 there, and
+            an episode that ended elsewhere did not fail.
+        before : sequence of int
+            States that are safe: whoever gets there first has not failed.
+        action : int, optional
+            Index of the action that is taken in every state, from 0.
+        policy : {"observed", "marginal"}
+            Without an action, how actions are weighed, as in `averaged_matrix`.
+
+        Examples
+        --------
+        >>> from evofsm import EvolvingFSM, Novelty
+        >>> machine = EvolvingFSM(n_actions=1, rule=Novelty(radius=1.0, spread=0.01))
+        >>> Z = [[0.0], [2.0], [4.0], [0.0], [2.0], [0.0]]  # it failed at 4, and ended at 0
+        >>> trace = machine.learn_many(Z, [0] * 6, episode_starts=[0, 3], failures=[2])
+        >>> machine.model().committor_forward().round(2)
+        array([0.5 , 0.75, 1.  ])
+        """
+        P = self.averaged_matrix(policy) if action is None else self._matrix(action)
+        # Incomplete observations are no visits, and may lead to more changes than there were.
+        followed = self.changes.sum(axis=1)
+        cases = np.maximum(self.visits, followed + self.endings)
+        cases = np.where(cases > 0.0, cases, 1.0)
+        fails = self.endings / cases
+        ends = np.maximum(self.visits - followed - self.endings, 0.0) / cases
+        if failure is not None:
+            fails, ends = self._marked(failure).astype(np.float64), fails + ends
+        safe = self._marked(before)
+        fails = np.where(safe, 0.0, fails)
+        goes_on = np.where(safe, 0.0, np.clip(1.0 - fails - ends, 0.0, 1.0))
+        return chains.committor(goes_on[:, None] * P, fails)
+
+    def mfpt(
+        self,
+        targets: Sequence[int],
+        action: SupportsIndex | None = None,
+        policy: Policy = "observed",
+    ) -> NDArray[np.float64]:
+        """(n,) mean first passage time: observations until one of the targets, from each state.
+
+        ``m_i = 1 + sum_j P_ij m_j``, and 0 in a target; the chain runs on without an end. Infinity
+        where it is not certain that a target is reached.
+
+        Parameters
+        ----------
+        targets : sequence of int
+            States, from 0.
+        action, policy
+            As `committor_forward` takes them.
+        """
+        P = self.averaged_matrix(policy) if action is None else self._matrix(action)
+        return chains.passage_times(P, self._marked(targets))
+
+    # -- In words ---------------------------------------------------------------------------------
+
+    def explain(
+        self,
+        situation: int | ArrayLike | None = None,
+        action: SupportsIndex | None = None,
+        *,
+        observation: ArrayLike | None = None,
+    ) -> Explanation:
+        """What experience says of a situation: where it lies, and what came of being there.
+
+        All of it was counted, once for each episode; see `evofsm.fsm.explanation`.
+
+        Parameters
+        ----------
+        situation : int or (n,) array_like, optional
+            A state, or a distribution over states, of which the most probable one is explained.
+        action : int, optional
+            Index of an action, from 0: what came of taking it there.
+        observation : (m,) array_like, optional
+            What was observed, in place of a situation: it is recognised, unless it is farther from
+            every state than a state reaches, and so was never seen.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If there is no such state or action, a belief is no distribution over the states, or not
+            one of ``situation`` and ``observation`` is given.
+
+        Examples
+        --------
+        >>> from evofsm import EvolvingFSM
+        >>> machine = EvolvingFSM(n_actions=2, radius=0.5)
+        >>> Z, I = [[0.0], [0.1], [2.0], [1.0]], [0, 1, 0, 0]
+        >>> trace = machine.learn_many(Z, I, episode_starts=[0, 2], failures=[3])
+        >>> model = machine.model(names=["gap"], units=["m"], dt=0.1)
+        >>> print(model.explain([0.2, 0.8], action=1))
+        #2: gap 1 m (belief 80 %, next #1 20 %). 1 episode came here (1 observation);
+        1 of 1 (at least 26 %) failed later on; none of them is known to have tried a(2) here.
+        Most often reached from #1: 1 of 1 times.
+        >>> print(model.explain(observation=[30.0]))
+        Never seen, as far as the states tell: 29 from the nearest, #2 (gap 1 m), where a state
+        reaches 2.8.
+        """
+        index = None if action is None else check_action(action, self.n_actions)
+        if (situation is None) == (observation is None):
+            raise ValueError("give either a situation or an observation")
+        if observation is not None:
+            belief = np.ravel(self.recognise(observation))
+            return explain(self, belief, index, self.labels, self.nearest(observation))
+        if np.ndim(situation) == 0:  # type: ignore[arg-type] # it is given
+            belief = np.eye(self.n_states)[check_state(situation, self.n_states)]
+        else:
+            belief = self._belief(situation)
+        return explain(self, belief, index, self.labels)
 
     def __repr__(self) -> str:
         variables = ", ".join(self.names) or f"{self.n_variables} variables"
@@ -108,118 +488,38 @@ class FSMModel(Known):
         """Itself: nothing in it ever changes."""
         return self
 
-    def explain(
-        self,
-        situation: int | ArrayLike | None = None,
-        action: int | None = None,
-        *,
-        observation: ArrayLike | None = None,
-    ) -> Explanation:
-        """What experience says of a situation: where it lies, and what came of being there.
+    # -- Files ------------------------------------------------------------------------------------
 
-        All of it was counted, once for each episode; see `evofsm.fsm.explanation`.
+    def save(self, path: Place, provenance: Mapping[str, Any] | None = None) -> None:
+        """Write it to a file, as `EvolvingFSM.save` does.
 
         Parameters
         ----------
-        situation : int or (n,) array_like, optional
-            A state, or a distribution over states, of which the most probable one is explained.
-        action : int, optional
-            Index of an action, from 0: what came of taking it there.
-        observation : (m,) array_like, optional
-            What was observed, in place of a situation: it is recognised, unless it is farther
-            from every state than a state reaches, and so was never seen.
-
-        Returns
-        -------
-        Explanation
-            Its text is a sentence or two; its fields hold the numbers.
-
-        Raises
-        ------
-        TypeError
-            If ``action`` or a state is not an integer.
-        ValueError
-            If there is no such state or action, a belief is no distribution over the states, or
-            not one of ``situation`` and ``observation`` is given.
-
-        Examples
-        --------
-        >>> from evofsm import EvolvingFSM
-        >>> machine = EvolvingFSM(n_actions=2, radius=0.5)
-        >>> Z, I = [[0.0], [0.1], [2.0], [1.0]], [0, 1, 0, 0]
-        >>> trace = machine.learn_many(Z, I, episode_starts=[0, 2], failures=[3])
-        >>> model = machine.model(names=["gap"], units=["m"], dt=0.1)
-        >>> print(model.explain(0))
-        #1: gap 0 m. 2 episodes came here (3 observations); 1 of 2 (12 to 88 %) failed later on.
-        >>> print(model.explain([0.2, 0.8], action=1))
-        #2: gap 1 m (belief 80 %, next #1 20 %). 1 episode came here (1 observation);
-        1 of 1 (at least 26 %) failed later on; none of them is known to have tried a(2) here.
-        Most often reached from #1: 1 of 1 times.
-        >>> print(model.explain(observation=[30.0]))
-        Never seen, as far as the states tell: 29 from the nearest, #2 (gap 1 m), where a state
-        reaches 2.8.
+        path : str, path-like or binary file
+        provenance : mapping, optional
         """
-        if action is not None:
-            action = check_action(action, self.n_actions)
-        if (situation is None) == (observation is None):
-            raise ValueError("give either a situation or an observation")
-        if situation is None:
-            assert observation is not None
-            nearest, belief = self.nearest(observation), self.recognise(observation)
-            return explain(self, np.ravel(belief), action, self.labels, nearest)
-        if np.ndim(situation) == 0:
-            belief = np.eye(self.n_states)[check_state(situation, self.n_states)]
-        else:
-            belief = self._belief(situation)
-        return explain(self, belief, action, self.labels)
+        arrays = {name: getattr(self, name) for name in OF_MODEL}
+        store.write(path, MODEL, self._content, arrays, provenance)
 
-    def submodel(self, states: Sequence[int]) -> Self:
-        """The model of some of its states, in the order in which they are named.
-
-        Rows are those of the chain where it stays among these states: what leads elsewhere is left
-        out, and the rest sums to 1. A row that leads only elsewhere has equal shares.
+    @classmethod
+    def load(cls, path: Place) -> Self:
+        """Read it from a file, as `EvolvingFSM.load` does.
 
         Parameters
         ----------
-        states : sequence of int
-            Indices, from 0, each once.
-
-        Returns
-        -------
-        FSMModel
-            With the counts of these states; steps from and to others are left out of ``changes``.
-
-        Raises
-        ------
-        TypeError
-            If a state is not an integer.
-        ValueError
-            If there is no such state, or one is named twice.
-
-        Examples
-        --------
-        >>> from evofsm import EvolvingFSM
-        >>> machine = EvolvingFSM(n_actions=2, radius=0.5)
-        >>> trace = machine.learn_many([[0.0], [0.1], [2.0], [1.0]], [0, 0, 0, 0])
-        >>> part = machine.model().submodel([1])
-        >>> part.centers, part.visits, part.transition_matrices.ravel()
-        (array([[1.]]), array([1.]), array([1., 1.]))
+        path : str, path-like or binary file
         """
-        chosen = [check_state(state, self.n_states) for state in states]
-        if len(set(chosen)) < len(chosen):
-            raise ValueError(f"states are {chosen}; each may be named once")
-        parts: dict[str, Any] = {}
-        for name, member in OF_MODEL.items():
-            part = getattr(self, name)
-            for axis, letter in enumerate(member.shape):
-                part = part.take(chosen, axis) if letter == "n" else part
-            parts[name] = part
-        sums = parts["transition_matrices"].sum(axis=2, keepdims=True)
-        rows = np.full_like(parts["transition_matrices"], 1.0 / max(len(chosen), 1))
-        np.divide(parts["transition_matrices"], sums, out=rows, where=sums > 0.0)
-        parts["transition_matrices"] = rows
-        parts["origin_frequency"] = parts["origin_frequency"] * sums[..., 0]
-        return replace(self, **parts)
+        content, arrays = store.read(path, MODEL)
+        with store.explained(path):
+            if content["actions"] is not None:
+                content["actions"] = _actions(content["actions"], len(arrays["uses"]))
+            for name in ("names", "units"):
+                content[name] = tuple(content[name])
+            content["rule"] = restore_rule(content["rule"])
+            if lacking := {entry.name for entry in fields(cls)} - set(content) - set(arrays):
+                raise ValueError(f"it lacks {', '.join(sorted(lacking))}")
+            parts: dict[str, Any] = {**content, **arrays}
+            return cls(**parts)
 
     @property
     def _content(self) -> dict[str, Any]:
@@ -235,19 +535,54 @@ class FSMModel(Known):
             "failures_told": self.failures_told,
         }
 
-    def _kept(self) -> dict[str, NDArray[Any]]:
-        return {name: getattr(self, name) for name in OF_MODEL}
+    # -- Inside ---------------------------------------------------------------------------------
 
-    @classmethod
-    def _restored(cls, content: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> Self:
-        if content["actions"] is not None:
-            content["actions"] = _actions(content["actions"], len(arrays["uses"]))
-        for name in ("names", "units"):
-            content[name] = tuple(content[name])
-        values: dict[str, Any] = {**content, **arrays}
-        if lacking := {entry.name for entry in fields(cls)} - set(values):
-            raise ValueError(f"it lacks {', '.join(sorted(lacking))}")
-        return cls(**values)
+    def _matrix(self, action: SupportsIndex) -> NDArray[np.float64]:
+        return np.asarray(self.transition_matrices[check_action(action, self.n_actions)])
+
+    def _marked(self, states: Sequence[int]) -> NDArray[np.bool_]:
+        """Whether each state is one of these."""
+        marked = np.zeros(self.n_states, np.bool_)
+        marked[[check_state(state, self.n_states) for state in states]] = True
+        return marked
+
+    def _observations(self, z: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """One observation or many, as given and row by row; refused where it is none."""
+        given = real_array("z", z, ndim=np.ndim(z))
+        rows = np.atleast_2d(given)
+        if rows.ndim != 2 or rows.shape[1] != self.n_variables:
+            raise ValueError(f"z has shape {given.shape}; a row needs {self.n_variables} variables")
+        refuse_unusable("z", rows)
+        if self.n_states == 0:
+            raise ValueError("this model has no states: its machine had observed nothing")
+        return given, rows
+
+    def _belief(self, belief: Any) -> NDArray[np.float64]:
+        """Refuse what is no distribution over the states."""
+        given = np.asarray(belief, dtype=np.float64)
+        if given.shape != (self.n_states,):
+            raise ValueError(
+                f"belief has shape {given.shape}; the model has {self.n_states} states"
+            )
+        if self.n_states:
+            refuse_unless_distribution("belief", given)
+        return given
+
+
+def believed(centers: Floats, weights: Floats, rows: Floats, width: float) -> Floats:
+    """(N, n) beliefs of rows (N, m), given centres (m, n) and 1 / scale of each variable."""
+    n = centers.shape[1]
+    belief = np.empty((len(rows), lanes(n)))
+    given = np.array(centers, order="C"), weights, np.array(rows, order="C"), float(width), n
+    recognise_rows(*given, belief)
+    return belief[:, :n].copy()
+
+
+def check_forecast(horizon: SupportsIndex, policy: str) -> int:
+    """A number of steps, if there is such a policy."""
+    if policy not in get_args(Policy):
+        raise ValueError(f"policy is {policy!r}; it must be one of {', '.join(get_args(Policy))}")
+    return whole("horizon", horizon)
 
 
 def _actions(settings: Mapping[str, Any], q: int) -> IntervalActions:

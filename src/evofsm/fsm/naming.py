@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from evofsm.fsm.actions import IntervalActions
-from evofsm.fsm.numbering import action_name
+from evofsm.fsm.validation import action_name
 
 # What a terminal obeys, or cannot print: control characters but for tab and newline, ends of lines
 # and directions of Unicode, halves of characters.
@@ -67,16 +67,12 @@ class Labels(NamedTuple):
     dt: float | None = None  #: time between two observations [s]
 
     def place(self, center: ArrayLike) -> str:
-        """Where a centre lies: in words where a package declares some, else by its numbers.
+        """Where a centre (m,) lies: in words where a package declares some, else by its numbers.
 
         Parameters
         ----------
         center : (m,) array_like
             In the units of the observations.
-
-        Returns
-        -------
-        str
 
         Examples
         --------
@@ -101,15 +97,6 @@ class Labels(NamedTuple):
         ----------
         index : int
             From 0.
-
-        Returns
-        -------
-        str
-
-        Examples
-        --------
-        >>> Labels(names=("gap",), units=("m",)).variable(0), Labels().variable(1)
-        ('gap [m]', 'variable 1')
         """
         if not self.names:
             return f"variable {index}"
@@ -124,10 +111,6 @@ class Labels(NamedTuple):
         index : int
             From 0.
 
-        Returns
-        -------
-        str
-
         Examples
         --------
         >>> actions = IntervalActions(low=-2.5, high=2.5, width=0.3)
@@ -141,16 +124,11 @@ class Labels(NamedTuple):
         return f"{name} {self.actions.label(index)}{f' {words.unit}' if words else ''}"
 
     def duration(self, observations: int) -> str:
-        """How long so many observations last.
+        """How long so many observations last: in seconds where that is known, else their number.
 
         Parameters
         ----------
         observations : int
-
-        Returns
-        -------
-        str
-            In seconds where the time between two is known, else their number.
 
         Examples
         --------

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.fsm.numbering import state_name
+from evofsm.fsm.validation import state_name
 
 # More states than these have no row, and more variables no column.
 _MOST_STATES, _MOST_VARIABLES = 12, 6
@@ -58,7 +58,7 @@ def step_html(step: Any) -> str:
         surprise = f"surprise {step.surprise:.3f} bit"
     names = (step.event.name or "NONE").split("|")
     happened = _NOT_CREATED if names == ["MERGED"] else ", ".join(_EVENTS[one] for one in names)
-    details = step.explanation
+    details = ""
     if step.missing:
         which = ", ".join(map(str, step.missing))
         details = f"not observed: variable {which}; so nothing was learnt"

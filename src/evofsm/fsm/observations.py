@@ -93,11 +93,6 @@ class ObservationEncoder:
     names : tuple of str
         Name of each entry of the vector; ``light=red`` for a category.
 
-    Raises
-    ------
-    ValueError
-        If there is no variable, or two entries would have the same name.
-
     Examples
     --------
     >>> encoder = ObservationEncoder("gap", Category("light", ("red", "green")))
@@ -122,7 +117,9 @@ class ObservationEncoder:
         self.names = tuple(names)
 
     def encode(self, values: Mapping[str, float | str]) -> NDArray[np.float64]:
-        """Vector for one observation: the paper's Section 2.1.1.
+        """(len(names),) vector for one observation: the paper's Section 2.1.1.
+
+        Numbers are as they are; a present category is ``distance / sqrt(2)``, others are 0.
 
         Parameters
         ----------
@@ -130,23 +127,10 @@ class ObservationEncoder:
             A number for each continuous variable, in the unit you observe it in; a category for
             each discrete one. Others are left out.
 
-        Returns
-        -------
-        (len(names),) ndarray
-            The numbers as they are, ``distance / sqrt(2)`` for a present category, 0 for others.
-
         Raises
         ------
-        TypeError
-            If a continuous variable is no number.
-        ValueError
-            If a variable is missing, or a category unknown.
-
-        Examples
-        --------
-        >>> encoder = ObservationEncoder("gap", Category("light", ("red", "green"), distance=2.0))
-        >>> encoder.encode({"light": "red", "gap": 12.0}).round(3)
-        array([12.   ,  1.414,  0.   ])
+        TypeError, ValueError
+            If a continuous variable is no number, a variable is missing, or a category unknown.
         """
         encoded: list[float] = []
         for variable in self.variables:

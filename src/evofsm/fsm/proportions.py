@@ -1,10 +1,11 @@
-"""How well a share is known that was counted."""
+"""How well a share or a rate is known that was counted."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
 from functools import cache
+from typing import NamedTuple
 
 from evofsm.fsm.kernels import compiled
 
@@ -17,7 +18,7 @@ _HALVINGS = 60
 
 @compiled
 def wilson_bounds(share: float, count: float) -> tuple[float, float]:
-    """90 % interval of a share that was counted (Wilson 1927).
+    """90 % interval, lower and upper, of a share that was counted (Wilson 1927).
 
     Parameters
     ----------
@@ -25,11 +26,6 @@ def wilson_bounds(share: float, count: float) -> tuple[float, float]:
         Of the cases, in [0, 1].
     count : float
         Number of cases, above 0.
-
-    Returns
-    -------
-    (float, float)
-        Lower and upper bound.
 
     Examples
     --------
@@ -48,16 +44,6 @@ def poisson_bounds(count: int) -> tuple[float, float]:
     """90 % interval of the number of events to be expected where ``count`` were seen.
 
     Exact (Garwood 1936): the bounds are where as few, and as many, are seen in 5 % of cases.
-
-    Parameters
-    ----------
-    count : int
-        At least 0.
-
-    Returns
-    -------
-    (float, float)
-        Lower and upper bound.
 
     Examples
     --------
@@ -102,16 +88,8 @@ def _gamma_below(x: float, shape: float) -> float:
 def bounds_text(low: float, high: float) -> str:
     """Bounds of a share in percent, rounded outward, so that what is said of it holds.
 
-    Whole percents; within one percent of 0 or of 1, with the first digit that shows them.
-
-    Parameters
-    ----------
-    low, high : float
-        In [0, 1]; a bound of 0 from below, or of 1 from above, says nothing and is left out.
-
-    Returns
-    -------
-    str
+    Whole percents; within one percent of 0 or of 1, with the first digit that shows them. A bound
+    of 0 from below, or of 1 from above, says nothing and is left out.
 
     Examples
     --------
@@ -168,3 +146,71 @@ def _decimals(share: float) -> int:
     """How many show how far it is from 0 and from 1."""
     apart = 100.0 * min(share, 1.0 - share)
     return max(-math.floor(math.log10(apart)), 0) if 1e-9 < apart < 1.0 else 0
+
+
+# -- Failures -------------------------------------------------------------------------------------
+
+
+class FailureRecord(NamedTuple):
+    """How often it failed, in the words of a safety review, with what that rests on.
+
+    The intervals are Garwood's (1936), exact if failures come at a constant rate and independently
+    of each other (of more than 50 failures they are right to four digits). Each end by itself holds
+    with 95 %. They speak of the conditions in which it was run, and of nothing else.
+
+    Examples
+    --------
+    >>> print(FailureRecord(0, hours=12.0))
+    0 failures in 12 h: at most 0.25 per hour, 95 %
+    >>> record = FailureRecord(3, hours=40.0, kilometres=2500.0, episodes=4000)
+    >>> print(record)  # doctest: +NORMALIZE_WHITESPACE
+    3 failures in 4,000 episodes, 40 h, 2,500 km: 0.075 per hour (0.020 to 0.20),
+    1.2 per 1,000 km (0.32 to 3.2), 90 %
+    """
+
+    failures: int
+    hours: float  #: that were run [h]
+    kilometres: float | None = None  #: that were driven [km]; None where nothing drives
+    episodes: int | None = None
+
+    def __str__(self) -> str:
+        ran = [] if self.episodes is None else [_counted(self.episodes, "episode")]
+        rates = [(self.hours, "h", 1.0, "per hour")]
+        if self.kilometres is not None:
+            rates.append((self.kilometres, "km", 1000.0, "per 1,000 km"))
+        ran += [f"{_exposure(done)} {unit}" for done, unit, *_ in rates]
+        said = [
+            _rate(self.failures, done / per, words) for done, _, per, words in rates if done > 0.0
+        ]
+        text = f"{_counted(self.failures, 'failure')} in {', '.join(ran)}"
+        if not said:
+            return f"{text}: nothing is known"
+        if self.failures == 0:
+            return f"{text}: at most {', '.join(said)}, 95 %"
+        return f"{text}: {', '.join(said)}, 90 %"
+
+
+def _counted(number: int, what: str) -> str:
+    return f"{number:,} {what}{'s' * (number != 1)}"
+
+
+def _rate(failures: int, exposure: float, words: str) -> str:
+    """A rate and its bounds, rounded outward."""
+    low, high = (bound / exposure for bound in poisson_bounds(failures))
+    if failures == 0:
+        return f"{_two_digits(high, math.ceil)} {words}"
+    bounds = f"{_two_digits(low, math.floor)} to {_two_digits(high, math.ceil)}"
+    return f"{_two_digits(failures / exposure, round)} {words} ({bounds})"
+
+
+def _two_digits(value: float, rounded: Callable[[float], int]) -> str:
+    """Of a number above 0."""
+    places = max(1 - math.floor(math.log10(value)), 0)
+    return f"{two_digits(value, rounded):,.{places}f}"
+
+
+def _exposure(value: float) -> str:
+    """Rounded down: less would not be claimed."""
+    if value < 10.0:
+        return f"{outward(math.floor, value, 2):g}"
+    return f"{math.floor(round(value, 6)):,}"

@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evofsm.extras import needs
-from evofsm.fsm.crowding import WhenFull
+from evofsm.fsm.limit import WhenFull
 from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.observations import Missing
-from evofsm.fsm.states.rule import StateRule
+from evofsm.fsm.rules import StateRule
 
 with needs("River", "river", "a clusterer of River"):
     from river import base

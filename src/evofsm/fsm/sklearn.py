@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from evofsm.extras import needs
-from evofsm.fsm.crowding import WhenFull
+from evofsm.fsm.limit import WhenFull
 from evofsm.fsm.machine import EvolvingFSM
-from evofsm.fsm.states.rule import StateRule
+from evofsm.fsm.rules import StateRule
 
 with needs("scikit-learn", "sklearn", "a clusterer of scikit-learn"):
     from sklearn.base import BaseEstimator, ClusterMixin

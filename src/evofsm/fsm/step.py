@@ -1,75 +1,295 @@
 """One observation through the machine: the paper's Section 2 on one screen.
 
-An observation may create a state (`states.paper`, or another rule), is recognised as a distribution
-over states (`states.spread`), and, where an action was taken after the observation before it,
-teaches that action's transition matrix (`transitions`). An episode may end in failure, which is no
-state of the machine: it is counted, and the next observation begins another episode.
+An observation may create a state and is recognised as a distribution over states (`clusters`), and,
+where an action was taken after the observation before it, teaches that action's transition matrix
+(`transitions`). An episode may end in failure, which is no state of the machine: it is counted, and
+the next observation begins another episode.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from enum import IntFlag
-from functools import cache
-from threading import Lock
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
-from numba.extending import register_jitable
 from numpy.typing import NDArray
 
-from evofsm.fsm import crowding
-from evofsm.fsm.crowding import (
-    MERGED,
-    NEWCOMER,
-    RETIRE,
-    RETIRED,
-    merge_closest,
-    retire_least_useful,
+from evofsm.fsm.arrays import (
+    ENDINGS,
+    EPISODES,
+    FAILED_SOON,
+    NO_ACTION,
+    VISITS,
+    Floats,
+    Learnt,
+    Settings,
+    room_for,
+)
+from evofsm.fsm.clusters import (
+    CREATED,
+    MOVED,
+    UNCHANGED,
+    determine,
+    recognise,
+    splits,
+    width_of,
 )
 from evofsm.fsm.divergence import jensen_shannon_kernel
-from evofsm.fsm.kernels import NOT_COMPILED, inner_kernel, kernel, lanes, rare_kernel
-from evofsm.fsm.learnt import NO_ACTION, NOT_OPEN
-from evofsm.fsm.memory import Memory, Parameters, is_closed, open_memory
+from evofsm.fsm.kernels import inner_kernel, kernel, lanes, rare_kernel, spliced_kernel
+from evofsm.fsm.limit import MERGED, RETIRED, merge_closest, retire_least_useful
 from evofsm.fsm.notebook import step_html
-from evofsm.fsm.states import clusters, spread
-from evofsm.fsm.states.clusters import place_center, potential_of, total_variance
-from evofsm.fsm.states.dispatch import determine, width
-from evofsm.fsm.states.failure import splits
-from evofsm.fsm.transitions import (
-    count,
-    count_failure,
-    count_open,
-    count_try,
-    count_visit,
-    expand,
-    forecast,
-    forecast_and_identify,
-    place_of,
-    tick,
-)
-from evofsm.store import LARGEST_OBSERVATION
+from evofsm.fsm.transitions import expand, forecast_and_identify, place_of
 
-# Returned by `step` instead of an event: it did nothing, for there was no room for a state.
-FULL = -1
-# The same, for the observation or the action is none that the machine knows.
-REFUSED = -2
-# Returned by `_update` where it did nothing [bit]; no surprise is below 0.
-DECLINED = -1.0
-_COMPILING = Lock()
-# Whether a machine may have to give up states (`evofsm.fsm.crowding`): a number, or None. Numba
-# compiles a kernel for each of the two, and that without a limit in a fraction of the time.
+#: The most states, or None. Numba compiles a kernel for each of the two kinds of machine, and that
+#: without a limit in half of the time.
 Limit: TypeAlias = int | None
+
+#: Rows of the room in which a step works, (3, capacity).
+RECOGNISED, PREDICTED, TERMS = 0, 1, 2
+
+
+@spliced_kernel
+def step(
+    learnt: Learnt, settings: Settings, limit: Limit, scratch: Floats, z: Floats, failed: bool
+) -> tuple[int, int, float]:
+    """Take in one observation; returns event, state and surprise. There must be room for it.
+
+    Where the episode ``failed`` it ends in failure after this observation.
+    """
+    now, recognised, predicted = learnt.now[0], scratch[RECOGNISED], scratch[PREDICTED]
+    _tick(now)
+
+    # Section 2.2.1: does the observation move a state, or create one?
+    event, nearest, potential = determine(learnt, settings, z)
+    if event == CREATED:
+        event, nearest = _create(learnt, settings, limit, nearest, potential)
+    elif event == UNCHANGED and failed and splits(learnt, settings, nearest):
+        event, nearest = _create(
+            learnt, settings, limit, nearest, _potential_of_latest(learnt, settings)
+        )
+    n = now.n_states
+
+    # Section 2.2.2: which state is this?
+    _recognise(learnt, settings, nearest, recognised)
+
+    # Section 2.3: was it foreseen, and what does it teach about the action taken before it?
+    surprise = np.nan
+    if now.chained and now.action != NO_ACTION:
+        place = place_of(learnt, now.action, settings.prior_frequency)
+        forecast_and_identify(
+            learnt.matrices[place],
+            learnt.origin_frequency[place],
+            n,
+            learnt.belief,
+            recognised,
+            settings.learning_rate,
+            predicted,
+        )
+        surprise = jensen_shannon_kernel(predicted, recognised, lanes(n), scratch[TERMS])
+        learnt.actions[now.action].uses += 1.0
+        _count_decision(learnt, place, n, failed)
+
+    if now.chained:
+        learnt.changes[now.state, nearest] += 1.0
+    for i in range(lanes(n)):
+        learnt.belief[i] = recognised[i]
+    learnt.sums[VISITS, nearest] += 1.0
+    _count_visit(learnt, nearest)
+    now.state, now.action, now.chained = nearest, NO_ACTION, 1
+    if failed:
+        _end(learnt, settings)
+    return event, nearest, surprise
+
+
+@kernel
+def learn_rows(
+    learnt: Learnt,
+    settings: Settings,
+    limit: Limit,
+    observations: Floats,
+    actions: NDArray[np.int64],
+    starts: NDArray[np.bool_],
+    failures: NDArray[np.bool_],
+    told: bool,
+    scratch: Floats,
+    row: int,
+    trace: Trace,
+    beliefs: Floats,
+) -> int:
+    """Step through the rows from ``row`` on; returns where it stopped for want of room.
+
+    Failures are ``told`` where there may be some in these rows; ``beliefs`` is (T, capacity), or
+    empty where nobody wants them.
+    """
+    now, room = learnt.now[0], (len(learnt.belief), len(learnt.matrices))
+    while row < len(observations) and room_for(learnt, settings) == room:
+        now.chained = 0 if starts[row] else now.chained
+        now.failures_told = 1 if told else now.failures_told
+        event, state, surprise = step(
+            learnt, settings, limit, scratch, observations[row], failures[row]
+        )
+        now.action = NO_ACTION if failures[row] else actions[row]
+        trace.state[row], trace.n_states[row] = state, now.n_states
+        trace.event[row], trace.surprise[row] = event, surprise
+        if len(beliefs) > 0:
+            for i in range(now.n_states):
+                beliefs[row, i] = learnt.belief[i]
+        row += 1
+    return row
+
+
+@kernel
+def fail(learnt: Learnt, settings: Settings, limit: Limit, scratch: Floats) -> None:
+    """End the episode in failure, to which the pending action led from the latest observation.
+
+    There must be room for what this may create.
+    """
+    now, nearest = learnt.now[0], learnt.now[0].state
+    is_whole = learnt.states[nearest].latest_visit == now.clock
+    if is_whole and splits(learnt, settings, nearest):
+        potential = _potential_of_latest(learnt, settings)
+        nearest = _create(learnt, settings, limit, nearest, potential)[1]
+        now.state = nearest
+        _recognise(learnt, settings, nearest, scratch[RECOGNISED])
+        _count_visit(learnt, nearest)
+        for i in range(now.n_states):
+            learnt.belief[i] = scratch[RECOGNISED, i]
+    if now.action != NO_ACTION:
+        place = place_of(learnt, now.action, settings.prior_frequency)
+        _count_decision(learnt, place, now.n_states, True)
+    _end(learnt, settings)
+
+
+@kernel
+def believe(learnt: Learnt, belief: Floats) -> None:
+    """Go on in the episode with a belief over all states, from which nothing else is learnt."""
+    now = learnt.now[0]
+    _tick(now)
+    for i in range(len(belief)):
+        learnt.belief[i] = belief[i]
+    now.state, now.action, now.chained = np.argmax(belief), NO_ACTION, 1
+
+
+@rare_kernel
+def _create(
+    learnt: Learnt, settings: Settings, limit: Limit, nearest: int, potential: float
+) -> tuple[int, int]:
+    """Create a state on the latest observation; returns what happened and the nearest state.
+
+    Where there are as many states as allowed, one of them, or the newcomer, is given up.
+    """
+    now, n = learnt.now[0], learnt.now[0].n_states
+    new, event = n, CREATED
+    if (
+        limit is None or n < limit
+    ):  # known as this is compiled: what gives up states is left out then
+        now.n_states += 1
+    else:
+        if settings.retires:
+            new, event = retire_least_useful(learnt, settings), CREATED | RETIRED
+        else:
+            new, event = merge_closest(learnt, settings, nearest), CREATED | MERGED
+        if new == n:
+            return MERGED, nearest
+    for j in range(len(learnt.variables)):
+        learnt.centers[j, new] = learnt.variables[j].latest
+    learnt.potentials[new] = potential
+    learnt.squared_distances[new] = 0.0
+    expand(learnt, new, now.n_states, settings.prior_frequency)
+    learnt.states[new].id = now.n_created
+    learnt.states[new].created = now.n_observations
+    now.n_created += 1
+    return event, new
+
+
+@rare_kernel
+def _potential_of_latest(learnt: Learnt, settings: Settings) -> float:
+    """The density at the latest observation, which is absorbed already and counts in it."""
+    variance = learnt.now[0].scatter / learnt.now[0].n_observations
+    squared_distance = 0.0
+    for j in range(len(learnt.variables)):
+        variable = learnt.variables[j]
+        offset = (variable.latest - variable.first - variable.mean) * settings.weights[j]
+        squared_distance += offset * offset
+    return float(1.0 / (1.0 + squared_distance + variance))
+
+
+@inner_kernel
+def _recognise(learnt: Learnt, settings: Settings, nearest: int, recognised: Floats) -> None:
+    """Recognise the latest observation."""
+    now = learnt.now[0]
+    width = width_of(settings, now.scatter / now.n_observations)
+    recognise(
+        learnt.squared_distances,
+        lanes(now.n_states),
+        nearest,
+        width,
+        settings.belief_tolerance,
+        recognised,
+    )
+
+
+# -- Counts ---------------------------------------------------------------------------------------
+
+
+@inner_kernel
+def _tick(now: Any) -> None:
+    """Count an observation, with which an episode may begin."""
+    now.clock += 1
+    now.before = now.state if now.chained else -1
+    now.began = now.began if now.chained else now.clock
+
+
+@inner_kernel
+def _count_visit(learnt: Learnt, state: int) -> None:
+    """Count that the present episode is in a state; once for each episode."""
+    there, now = learnt.states[state], learnt.now[0]
+    learnt.sums[EPISODES, state] += there.latest_visit < now.began
+    there.latest_visit = now.clock
+
+
+@inner_kernel
+def _count_decision(learnt: Learnt, place: int, n: int, failed: bool) -> None:
+    """Count that the pending action was taken from the belief, and whether it led to failure."""
+    now, belief = learnt.now[0], learnt.belief
+    for i in range(lanes(n)):
+        learnt.decisions[place, i] += belief[i]
+    if failed:
+        for i in range(n):
+            learnt.failures[place, i] += belief[i]
+    tries = learnt.tries[place, now.state]
+    tries.tried += tries.latest_try < now.began
+    tries.latest_try = now.clock
+
+
+@rare_kernel
+def _end(learnt: Learnt, settings: Settings) -> None:
+    """Count the failure where the episode was last and what it did before; clear the chain.
+
+    So failed all that the episode did within the horizon before.
+    """
+    now = learnt.now[0]
+    learnt.sums[ENDINGS, now.state] += 1.0
+    since = max(float(now.began), now.clock - settings.failure_horizon)
+    for i in range(now.n_states):
+        learnt.sums[FAILED_SOON, i] += learnt.states[i].latest_visit >= since
+        for place in range(now.n_places):
+            tries = learnt.tries[place, i]
+            tries.failed_after += tries.latest_try >= since
+    now.action, now.chained, now.failures_told = NO_ACTION, 0, 1
+
+
+# -- What people get ------------------------------------------------------------------------------
 
 
 class Event(IntFlag):
     """What an observation did to the states (the paper's Section 2.2.1).
 
     ``NONE`` left them as they were, ``MOVED`` put the nearest one on the observation, and
-    ``CREATED`` founded a new one there. Where there were ``max_states`` before, two were
-    ``MERGED`` or one was ``RETIRED`` to make room, and the new one has the index that became
-    free; ``MERGED`` alone says that none was created, for the nearest one was close enough.
+    ``CREATED`` put a new one there. Where there were ``max_states`` before, two were ``MERGED`` or
+    one was ``RETIRED`` to make room, and the new one has the index that became free; ``MERGED``
+    alone says that none was created, for the nearest one was close enough.
 
     Examples
     --------
@@ -81,11 +301,11 @@ class Event(IntFlag):
     <Event.NONE: 0>
     """
 
-    NONE = clusters.UNCHANGED
-    MOVED = clusters.MOVED
-    CREATED = clusters.CREATED
-    MERGED = crowding.MERGED
-    RETIRED = crowding.RETIRED
+    NONE = UNCHANGED
+    MOVED = MOVED
+    CREATED = CREATED
+    MERGED = MERGED
+    RETIRED = RETIRED
 
 
 #: By value: looking one up is quicker than making one.
@@ -114,7 +334,6 @@ class Step(NamedTuple):
     predicted: NDArray[np.float64]  #: (n,) forecast made one step before; empty where none was
     surprise: float  #: divergence of `predicted` and `belief` [bit]; NaN where none was
     missing: tuple[int, ...] = ()  #: variables that were not observed, so that nothing was learnt
-    explanation: str = ""  #: what experience says of the state, where that was asked for
 
     def __repr__(self) -> str:
         belief = float(self.belief[self.state]) if len(self.belief) else math.nan
@@ -150,350 +369,13 @@ class Trace(NamedTuple):
     belief: NDArray[np.float64] | None = None  #: (T, n), 0 for states not yet created
 
 
+def blank_trace(rows: int) -> Trace:
+    """Room for what is made of so many observations."""
+    integers = np.empty(rows, np.int64), np.empty(rows, np.int64), np.empty(rows, np.int8)
+    return Trace(*integers, np.empty(rows))
+
+
 def widen(belief: NDArray[np.float64], n: int) -> NDArray[np.float64]:
     """Beliefs (..., n) over n states, 0 for those created since."""
     missing = n - belief.shape[-1]
     return np.pad(belief, [(0, 0)] * (belief.ndim - 1) + [(0, missing)]) if missing else belief
-
-
-@inner_kernel
-def step(
-    memory: Memory, z: NDArray[np.float64], failed: bool, whole: bool, limit: Limit
-) -> tuple[int, int, float]:
-    """Take in one observation; returns event, state and surprise.
-
-    Where the episode ``failed`` it ends in failure after this observation. If the ``whole``
-    forecast is wanted it stands in ``scratch``.
-    """
-    parameters, now, scratch = memory.parameters, memory.learnt, memory.scratch
-    if not _has_room(memory):
-        return FULL, 0, np.nan
-    if not _is_usable(memory, z):
-        return REFUSED, 0, np.nan
-    n = int(now.n_states[0])
-    tick(now.outcomes, not now.chained[0])
-    now.before[0] = now.state[0] if now.chained[0] else -1.0
-
-    # Section 2.2.1: does the observation move a state, or create one?
-    event, nearest, potential = determine(parameters.rule, now.clusters, n, z)
-    if event == clusters.CREATED:
-        event, nearest = _found(memory, n, nearest, potential, limit)
-    elif event == clusters.UNCHANGED and failed and _splits(memory, nearest):
-        event, nearest = _split(memory, n, nearest, limit)
-    n = int(now.n_states[0])
-
-    # Section 2.2.2: which state is this?
-    _recognise(memory, n, nearest)
-
-    # Section 2.3: was it foreseen, and what does it teach about the action taken before it?
-    surprise = np.nan
-    action = int(now.action[0])
-    if now.chained[0] and action != NO_ACTION:
-        place = place_of(now.transitions, action, n, parameters.prior_frequency)
-        surprise = _learn(memory, place, n, whole)
-        now.transitions.uses[action] += 1.0
-        _decide(memory, place, n, failed)
-
-    if now.chained[0]:
-        now.outcomes.changes[int(now.state[0]), nearest] += 1.0
-    for i in range(lanes(n)):
-        now.belief[i] = scratch.recognised[i]
-    now.state[0] = nearest
-    now.outcomes.visits[nearest] += 1.0
-    count_visit(now.outcomes, nearest)
-    now.action[0] = NO_ACTION
-    now.chained[0] = 1.0
-    if failed:
-        _end(memory)
-    return event, nearest, surprise
-
-
-@inner_kernel
-def _learn(memory: Memory, place: int, n: int, whole: bool) -> float:
-    """Learn the transition from the belief to what was recognised; returns the surprise.
-
-    Where few states take part, all of the forecast is only made if asked for: a state that was
-    not reached adds half of its forecast to the divergence, whichever it is.
-    """
-    parameters, now, scratch = memory.parameters, memory.learnt, memory.scratch
-    tolerant = parameters.belief_tolerance > 0.0
-    if tolerant and whole:
-        forecast(now.transitions, place, n, now.belief, scratch.forecast)
-    predicted, reached = scratch.predicted, scratch.recognised
-    elsewhere = forecast_and_identify(
-        now.transitions,
-        place,
-        n,
-        now.belief,
-        reached,
-        parameters.learning_rate,
-        tolerant,
-        predicted,
-        scratch.rates,
-        scratch.lines,
-    )
-    divergence = jensen_shannon_kernel(predicted, reached, lanes(n), scratch.terms)
-    return min(divergence + 0.5 * elsewhere, 1.0)
-
-
-@inner_kernel
-def step_and_act(
-    memory: Memory,
-    z: NDArray[np.float64],
-    action: int,
-    starts: bool,
-    failed: bool,
-    whole: bool,
-    limit: Limit,
-) -> tuple[int, int, float]:
-    """`step`, in a new episode if it ``starts`` one, then an action (or `NO_ACTION`).
-
-    After a failure there is nobody to act.
-    """
-    now = memory.learnt
-    if starts:
-        now.chained[0] = 0.0
-    event, state, surprise = step(memory, z, failed, whole, limit)
-    if event >= 0 and not failed:
-        now.action[0] = action
-    return event, state, surprise
-
-
-@kernel
-def _observe(
-    buffer: NDArray[np.float64], z: NDArray[np.float64], action: int, failed: bool, limit: Limit
-) -> tuple[int, int, float]:
-    """`step_and_act`, with the whole machine in a single argument."""
-    memory = open_memory(buffer)
-    if not NO_ACTION <= action < len(memory.learnt.transitions.uses):
-        return REFUSED, 0, np.nan
-    return step_and_act(memory, z, action, False, failed, True, limit)
-
-
-@kernel
-def _update(
-    buffer: NDArray[np.float64], z: NDArray[np.float64], action: int, limit: Limit
-) -> float:
-    """The same with fewer things to hand over: only the surprise, or `DECLINED`.
-
-    It takes no lock: a call of a kernel is one step for the interpreter, between which and the
-    next one threads take turns. A buffer that somebody is at work on is closed to it.
-    """
-    if is_closed(buffer):
-        return DECLINED
-    memory = open_memory(buffer)
-    if not 0 <= action < len(memory.learnt.transitions.uses):
-        return DECLINED
-    event, _, surprise = step_and_act(memory, z, action, False, False, False, limit)
-    return surprise if event >= 0 else DECLINED
-
-
-@cache
-def observer(limit: Limit) -> Callable[..., tuple[int, int, float]]:
-    """`_observe`, for arrays of float64 without gaps only.
-
-    For any other type of array it raises a TypeError, where Numba would compile it once more.
-    """
-    _compile_plain(_observe, "float64[::1], float64[::1], int64, boolean", limit)
-    return _observe
-
-
-@cache
-def updater(limit: Limit) -> Callable[..., float]:
-    """`_update`, in the same way; the quickest call there is to take one step."""
-    _compile_plain(_update, "float64[::1], float64[::1], int64", limit)
-    return _update
-
-
-def _compile_plain(kernel: Any, arguments: str, limit: Limit) -> None:
-    if NOT_COMPILED:
-        return
-    with _COMPILING:  # whichever thread comes first
-        kernel.disable_compile(False)
-        kernel.compile(f"({arguments}, {'none' if limit is None else 'int64'})")
-        kernel.disable_compile()
-
-
-@kernel
-def fail(buffer: NDArray[np.float64], limit: Limit) -> bool:
-    """End the episode in failure, to which the pending action led from the latest observation.
-
-    Returns whether there was room for what this may found.
-    """
-    memory = open_memory(buffer)
-    now = memory.learnt
-    if not _has_room(memory):
-        return False
-    n = int(now.n_states[0])
-    nearest = int(now.state[0])
-    is_whole = now.outcomes.latest_visit[nearest] == now.outcomes.clock[0]
-    if is_whole and _splits(memory, nearest):
-        nearest = _split(memory, n, nearest, limit)[1]
-        n = int(now.n_states[0])
-        now.state[0] = nearest
-        _recognise(memory, n, nearest)
-        count_visit(now.outcomes, nearest)
-        for i in range(n):
-            now.belief[i] = memory.scratch.recognised[i]
-    action = int(now.action[0])
-    if action != NO_ACTION:
-        place = place_of(now.transitions, action, n, memory.parameters.prior_frequency)
-        _decide(memory, place, n, True)
-    _end(memory)
-    return True
-
-
-def limit_of(parameters: Parameters) -> Limit:
-    """What a machine tells its kernels of a limit to its states."""
-    return None if parameters.max_states == np.inf else 1
-
-
-@register_jitable
-def room_for(memory: Memory) -> tuple[int, int]:
-    """Numbers of states and of matrices with which the next step cannot lack room."""
-    now = memory.learnt
-    capacity, places = len(now.belief), len(now.transitions.matrices)
-    action = int(now.action[0])
-    if action != NO_ACTION and now.transitions.places[action] == NOT_OPEN:
-        places = max(places, count_open(now.transitions) + 1)
-    if now.n_states[0] == capacity and capacity < memory.parameters.max_states:
-        capacity = lanes(capacity + capacity // 2)
-    return capacity, places
-
-
-@inner_kernel
-def _has_room(memory: Memory) -> bool:
-    """Whether another state could be created, and the pending action have a matrix."""
-    capacity, places = room_for(memory)
-    now = memory.learnt
-    return capacity == len(now.belief) and places == len(now.transitions.matrices)
-
-
-@inner_kernel
-def _is_usable(memory: Memory, z: NDArray[np.float64]) -> bool:
-    """Whether the observation has the machine's variables, all of them finite numbers."""
-    if len(z) == 0 or len(z) != len(memory.learnt.clusters.first):
-        return False
-    usable = True
-    for value in z:
-        usable &= abs(value) <= LARGEST_OBSERVATION  # false of NaN
-    return usable
-
-
-@inner_kernel
-def _splits(memory: Memory, nearest: int) -> bool:
-    """Whether a failure at the latest observation creates a state, amid its nearest one."""
-    now = memory.learnt
-    return splits(
-        memory.parameters.rule,
-        now.clusters.squared_distances[nearest],
-        now.outcomes.visits[nearest],
-        now.outcomes.changes[nearest, nearest],
-        now.outcomes.endings[nearest],
-    )
-
-
-@inner_kernel
-def _split(memory: Memory, n: int, nearest: int, limit: Limit) -> tuple[int, int]:
-    """Create a state for a failure; the observation is absorbed and counts in its potential."""
-    held = memory.learnt.clusters
-    potential = potential_of(held, memory.parameters.rule.weights, held.latest)
-    return _found(memory, n, nearest, potential, limit)
-
-
-@rare_kernel
-def _found(memory: Memory, n: int, nearest: int, potential: float, limit: Limit) -> tuple[int, int]:
-    """Create a state on the latest observation; returns what happened and the nearest state.
-
-    Where there are as many states as allowed, one of them, or the newcomer, is given up.
-    """
-    parameters, now = memory.parameters, memory.learnt
-    new, event = n, clusters.CREATED
-    if limit is None:  # known as this is compiled: what gives up states is left out then
-        n += 1
-    elif n >= parameters.max_states:
-        if parameters.when_full == RETIRE:
-            new, event = retire_least_useful(memory, n), clusters.CREATED | RETIRED
-        else:
-            new, event = merge_closest(memory, n, nearest), clusters.CREATED | MERGED
-        if new == NEWCOMER:
-            return MERGED, nearest
-    else:
-        n += 1
-    place_center(now.clusters, new, now.clusters.latest, potential)
-    expand(now.transitions, new, n, parameters.prior_frequency)
-    now.ids[new] = now.n_founded[0]
-    now.outcomes.founded[new] = now.clusters.n_observations[0]
-    now.n_founded[0] += 1.0
-    now.n_states[0] = n
-    return event, new
-
-
-@inner_kernel
-def _recognise(memory: Memory, n: int, nearest: int) -> None:
-    """Recognise the latest observation, into ``scratch.recognised``."""
-    parameters, held = memory.parameters, memory.learnt.clusters
-    spread.recognise(
-        held.squared_distances,
-        lanes(n),
-        nearest,
-        width(parameters.rule, total_variance(held)),
-        parameters.belief_tolerance,
-        memory.scratch.recognised,
-    )
-
-
-@inner_kernel
-def _decide(memory: Memory, place: int, n: int, failed: bool) -> None:
-    """Count that the pending action was taken from the belief, and whether it led to failure."""
-    now, outcomes = memory.learnt, memory.learnt.outcomes
-    count(outcomes.decisions[place], now.belief, lanes(n))
-    if failed:
-        count(outcomes.failures[place], now.belief, lanes(n))
-    count_try(outcomes, place, int(now.state[0]))
-
-
-@inner_kernel
-def _end(memory: Memory) -> None:
-    """Count the failure where the episode was last and what it did before; clear the chain."""
-    now = memory.learnt
-    now.outcomes.endings[int(now.state[0])] += 1.0
-    count_failure(now.outcomes, int(now.n_states[0]), memory.parameters.failure_horizon)
-    now.action[0] = NO_ACTION
-    now.chained[0] = 0.0
-
-
-@kernel
-def learn_rows(
-    buffer: NDArray[np.float64],
-    observations: NDArray[np.float64],
-    actions: NDArray[np.int64],
-    starts: NDArray[np.bool_],
-    failures: NDArray[np.bool_],
-    row: int,
-    trace: Trace,
-    beliefs: NDArray[np.float64],
-    limit: Limit,
-) -> int:
-    """Step through the rows from ``row`` on; returns where it stopped for want of room.
-
-    ``beliefs`` is (T, capacity), or empty where nobody wants them.
-    """
-    memory = open_memory(buffer)
-    now = memory.learnt
-    while row < len(observations):
-        event, state, surprise = step_and_act(
-            memory, observations[row], actions[row], starts[row], failures[row], False, limit
-        )
-        if event == FULL:
-            break
-        n = int(now.n_states[0])
-        trace.state[row] = state
-        trace.n_states[row] = n
-        trace.event[row] = event
-        trace.surprise[row] = surprise
-        if len(beliefs) > 0:
-            for i in range(n):
-                beliefs[row, i] = now.belief[i]
-        row += 1
-    return row

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import operator
+from collections.abc import Mapping
 from typing import Any, SupportsFloat, SupportsIndex
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from evofsm.fsm.numbering import action_name, state_name
 from evofsm.store import LARGEST_OBSERVATION
 
 # Cases, and failures among them.
@@ -17,6 +17,30 @@ _OUTCOMES = (("decisions", "failures"), ("episodes", "failed_soon"), ("tried", "
 
 # NumPy is quicker for longer vectors.
 _SHORT = 16
+
+
+# -- States and actions are counted from 0 in code and data, and from 1 in what people read -------
+
+
+def state_name(index: int) -> str:
+    """A state as people read it, counted from 1, by its index from 0.
+
+    >>> state_name(3)
+    '#4'
+    """
+    return f"#{index + 1}"
+
+
+def action_name(index: int) -> str:
+    """An action as people read it, counted from 1 as in the paper, by its index from 0.
+
+    >>> action_name(16)
+    'a(17)'
+    """
+    return f"a({index + 1})"
+
+
+# -- Settings and numbers -------------------------------------------------------------------------
 
 
 def positive(name: str, value: SupportsFloat) -> float:
@@ -31,13 +55,13 @@ def positive(name: str, value: SupportsFloat) -> float:
 
 
 def whole(name: str, value: SupportsIndex) -> int:
-    """A whole number of at least 1."""
+    """A positive integer."""
     try:
         number = operator.index(value)
     except TypeError:
         number = 0
     if number < 1:
-        raise ValueError(f"{name} is {value!r}; it must be a whole number of at least 1")
+        raise ValueError(f"{name} is {value!r}; it must be a positive integer")
     return number
 
 
@@ -132,10 +156,10 @@ def refuse_unless_distribution(name: str, rows: NDArray[np.float64]) -> None:
         raise ValueError(f"{name} is no distribution: entries must be 0 or more and sum to 1")
 
 
-def refuse_more_failures(learnt: Any) -> None:
+def refuse_more_failures(arrays: Mapping[str, NDArray[np.float64]]) -> None:
     """Raise where there are more failures than cases, in what has the outcomes by name."""
     for cases, failures in _OUTCOMES:
-        if (getattr(learnt, failures) > getattr(learnt, cases)).any():
+        if (arrays[failures] > arrays[cases]).any():
             raise ValueError(f"{failures} cannot be more than {cases}")
 
 
@@ -200,9 +224,3 @@ def check_rows(name: str, numbers: ArrayLike, rows: int) -> NDArray[np.bool_]:
     marked = np.zeros(rows, np.bool_)
     marked[given.astype(np.int64)] = True
     return marked
-
-
-def refuse_unless_told(told: object) -> None:
-    """Raise where a file says neither yes nor no."""
-    if not isinstance(told, bool):
-        raise ValueError(f"failures_told is {told!r}; it must be true or false")

@@ -16,7 +16,8 @@ from typing import Any, ClassVar, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from evofsm.fsm import IntervalActions, real_array, whole
+from evofsm.fsm.actions import IntervalActions
+from evofsm.fsm.validation import real_array, whole
 
 # Cells that a box is divided into for the machine, at most, unless levels are given: 9 x 9.
 _CELLS = 81

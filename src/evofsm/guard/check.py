@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.fsm import EvolvingFSM
+from evofsm.fsm.machine import EvolvingFSM
 from evofsm.guard.api import Judgement, Proposal, Revision, Situation
 from evofsm.guard.guard import Guard
 

@@ -17,17 +17,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from evofsm import store
-from evofsm.fsm import (
-    EvolvingFSM,
-    FSMModel,
-    IntervalActions,
-    Labels,
-    Missing,
-    explain,
-    positive,
-    real_array,
-    refuse_unusable,
-)
+from evofsm.fsm.actions import IntervalActions
+from evofsm.fsm.explanation import explain
+from evofsm.fsm.machine import EvolvingFSM
+from evofsm.fsm.model import FSMModel
+from evofsm.fsm.naming import Labels
+from evofsm.fsm.observations import Missing
+from evofsm.fsm.validation import positive, real_array, refuse_unusable
 from evofsm.guard.actions import Action, ActionSet, BoxActions, Choices, fixed, no_action
 from evofsm.guard.api import (
     BELIEF_TOLERANCE,

@@ -23,7 +23,8 @@ from numpy.typing import NDArray
 from evofsm import __version__, store
 from evofsm.driving import VARIABLES, Episode
 from evofsm.extras import needs
-from evofsm.fsm import FSMModel, positive
+from evofsm.fsm.model import FSMModel
+from evofsm.fsm.validation import positive
 from evofsm.guard import Action, Decision, Guard, Proposal, Revision, Situation
 from evofsm.io.runs import (
     FORMAT,

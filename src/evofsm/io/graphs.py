@@ -10,7 +10,7 @@ from collections.abc import Collection, Iterator
 
 import numpy as np
 
-from evofsm.fsm import FSMModel
+from evofsm.fsm.model import FSMModel
 
 # Vermillion of Okabe and Ito's colours; what is marked by it has another shape and words as well.
 _DOT_MARK = ',\n      shape=hexagon, style=filled, fillcolor="#D55E00", fontcolor=white, penwidth=2'
@@ -202,7 +202,7 @@ def to_prism(model: FSMModel, evidence: float = 1.0, least: float = 0.0) -> str:
     nowhere = " | ".join(f"s={i}" for i in unknown) or "false"
     lines = [
         *_header(model, evidence, least, len(unknown)),
-        *("mdp", "", "module evofsm", f"  s : [0..{n}] init {np.argmin(model.founded) + 1};"),
+        *("mdp", "", "module evofsm", f"  s : [0..{n}] init {np.argmin(model.created) + 1};"),
         *body,
         *("", "  [failed] s=0 -> 1:(s'=0);", "endmodule", ""),
         *('label "failed" = s=0;', f'label "unknown" = {nowhere};'),

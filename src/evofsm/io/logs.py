@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evofsm.driving import VARIABLES
-from evofsm.fsm import Category, ObservationEncoder
+from evofsm.fsm.observations import Category, ObservationEncoder
 from evofsm.io import vehicles
 from evofsm.io.rosbag import BagTable, Topics
 from evofsm.io.tables import (

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evofsm.extras import needs
-from evofsm.fsm import positive
+from evofsm.fsm.validation import positive
 from evofsm.io.tables import UNITS, OnRead, Piece, Table, Wanted
 from evofsm.io.vehicles import ACTION
 

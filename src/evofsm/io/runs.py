@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from evofsm.driving import DECISION_COLUMNS, VARIABLES
 from evofsm.extras import needs
-from evofsm.fsm import FSMModel
+from evofsm.fsm.model import FSMModel
 from evofsm.guard.record import RECORD, Column
 
 if TYPE_CHECKING:

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from evofsm.driving import VARIABLES
 from evofsm.extras import needs
-from evofsm.fsm import positive
+from evofsm.fsm.validation import positive
 from evofsm.io.tables import OnRead, Piece, Source, Table, Wanted, explained
 from evofsm.store import LARGEST_OBSERVATION
 

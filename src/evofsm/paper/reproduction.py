@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from evofsm.driving import UNITS, VARIABLES, open_world
 from evofsm.driving.measures import time_to_collision
-from evofsm.fsm import jensen_shannon
+from evofsm.fsm.divergence import jensen_shannon
 from evofsm.paper.claims import LARGEST_DIVERGENCE, Claim, check_claims
 from evofsm.paper.figures import figures
 from evofsm.paper.page import Page, Table, write_page

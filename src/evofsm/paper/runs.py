@@ -27,7 +27,11 @@ from evofsm.driving import (
     World,
 )
 from evofsm.driving.measures import is_dead_end
-from evofsm.fsm import EvolvingFSM, FSMModel, IntervalActions, jensen_shannon, widen
+from evofsm.fsm.actions import IntervalActions
+from evofsm.fsm.divergence import jensen_shannon
+from evofsm.fsm.machine import EvolvingFSM
+from evofsm.fsm.model import FSMModel
+from evofsm.fsm.step import widen
 
 CASES = (1, 2, 3, 4)
 
@@ -176,7 +180,7 @@ class PaperStudy:
         """When each state was created, in the order of time."""
         first_rows = np.cumsum([0, *(len(run.state) for run in self.runs)])
         foundings = []
-        for state, number in enumerate(self.model.founded):
+        for state, number in enumerate(self.model.created):
             row = int(number) - 1
             run = int(np.searchsorted(first_rows, row, side="right")) - 1
             time = float(self.runs[run].episode.time[row - first_rows[run]])

@@ -119,7 +119,7 @@ def content():
     from io import BytesIO
 
     from evofsm import store
-    from evofsm.fsm.learnt import MACHINE
+    from evofsm.fsm.arrays import MACHINE
     from evofsm.guard.guard import KIND as GUARD
     from evofsm.guard.learnt.judge import KIND
 

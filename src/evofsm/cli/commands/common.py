@@ -76,7 +76,7 @@ def counter(bars: Progress, text: str) -> Callable[[int, int], None]:
 
 def say(text: object) -> None:
     """Print what may hold texts from files."""
-    from evofsm.fsm import visible
+    from evofsm.fsm.naming import visible
 
     print(visible(str(text)))
 

@@ -108,7 +108,7 @@ def monitor(
     from evofsm.cli.monitor.decider import Decider, guard_of_monitor, guard_of_traffic
     from evofsm.cli.monitor.state import State
     from evofsm.cli.monitor.transports import Server, silence_output
-    from evofsm.fsm import positive
+    from evofsm.fsm.validation import positive
     from evofsm.guard import Guard
 
     def fresh() -> Guard:

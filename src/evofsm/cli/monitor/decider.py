@@ -16,7 +16,7 @@ import numpy as np
 
 from evofsm.cli.monitor.messages import SCHEMA, End, Form, Message, MessageError, Row
 from evofsm.driving import REAL_DRIVES, LatentRisk, TrafficRisk, guard_for_cars, guard_for_traffic
-from evofsm.fsm import positive
+from evofsm.fsm.validation import positive
 from evofsm.guard import ActionReviser, BoxActions, Guard, Mode, Revision, SearchingJudge, is_spoken
 
 _log = logging.getLogger(__name__)

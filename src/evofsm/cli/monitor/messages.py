@@ -15,7 +15,7 @@ import numpy as np
 from msgspec import UNSET, Meta, UnsetType
 
 from evofsm.driving import VARIABLES, Object, Scene, TrafficRisk
-from evofsm.fsm import visible
+from evofsm.fsm.naming import visible
 from evofsm.guard import ActionReviser, BoxActions, Choices, Guard
 from evofsm.store import LARGEST_OBSERVATION
 

@@ -27,7 +27,7 @@ import msgspec
 from evofsm.cli.monitor.decider import Answer, Decider
 from evofsm.cli.monitor.messages import LONGEST
 from evofsm.extras import needs
-from evofsm.fsm import visible
+from evofsm.fsm.naming import visible
 
 # So much is read at once; a peer that leaves more unread is cut off [byte].
 _CHUNK, _UNREAD = 1 << 16, 1 << 20

@@ -17,7 +17,7 @@ from rich.padding import Padding
 from rich.text import Text
 
 from evofsm.cli.text.table import Table
-from evofsm.fsm import visible
+from evofsm.fsm.naming import visible
 
 # Narrower than this, words do not stand beside one another.
 _WORDS_WIDTH = 66

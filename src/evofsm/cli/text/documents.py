@@ -7,7 +7,7 @@ import math
 from enum import Enum
 from typing import Any
 
-from evofsm.fsm import visible
+from evofsm.fsm.naming import visible
 
 
 def to_json(document: Any) -> str:
@@ -37,7 +37,7 @@ def to_json_line(document: Any) -> str:
 def spelled_out(value: Any) -> Any:
     """The same, with named tuples as dictionaries and members of enumerations as their values.
 
-    >>> from evofsm.fsm import Tally
+    >>> from evofsm.fsm.explanation import Tally
     >>> spelled_out({"here": [Tally(3, 12)]})
     {'here': [{'failed': 3, 'episodes': 12, 'is_exact': True, 'is_told': True}]}
     """

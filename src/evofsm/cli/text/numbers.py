@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable
 
-from evofsm.fsm import outward
+from evofsm.fsm.proportions import outward
 
 #: Where a number does not apply.
 NONE = "–"

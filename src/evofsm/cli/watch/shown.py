@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from evofsm.driving import LatentRisk, assess_states
 from evofsm.driving.measures import TimeHeadway, TimeToCollision
-from evofsm.fsm import EvolvingFSM, FSMModel
+from evofsm.fsm.machine import EvolvingFSM
+from evofsm.fsm.model import FSMModel
 from evofsm.guard import LearningJudge
 
 #: What is drawn of a car; worlds need no length [m].

@@ -19,9 +19,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from evofsm import store
 from evofsm.fsm.naming import Labels
-from evofsm.fsm.numbering import action_name
 from evofsm.fsm.proportions import poisson_bounds
-from evofsm.fsm.validation import positive, refuse_unusable
+from evofsm.fsm.validation import action_name, positive, refuse_unusable
 from evofsm.guard.api import Fallback, Judgement, Search, Situation, Trial
 from evofsm.guard.learnt import library, words
 from evofsm.guard.learnt.dynamics import ARRAYS, DYNAMICS_PARTS, Dynamics

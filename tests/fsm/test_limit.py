@@ -5,11 +5,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from evofsm.fsm.crowding import WhenFull
+from evofsm.fsm.limit import WhenFull
 from evofsm.fsm.machine import EvolvingFSM
-from evofsm.fsm.states.failure import FailureSplit
-from evofsm.fsm.states.novelty import Novelty
-from evofsm.fsm.states.paper import Paper
+from evofsm.fsm.rules import FailureSplit, Novelty, Paper
 from evofsm.fsm.step import Event
 
 
@@ -130,7 +128,7 @@ def test_the_present_state_is_not_retired():
 @pytest.mark.parametrize(
     ("settings", "words"),
     [
-        ({"max_states": 0}, "max_states is 0; it must be a whole number"),
+        ({"max_states": 0}, "max_states is 0; it must be a positive integer"),
         ({"max_states": 2.5}, "max_states is 2.5"),
         ({"when_full": "merge"}, "'merge' is not a valid WhenFull"),
         ({"belief_tolerance": 1.0}, "belief_tolerance is 1.0; it must lie below 1"),

@@ -1,0 +1,298 @@
+"""All that a machine has learnt, as named arrays, and its settings, as numbers: what kernels see.
+
+What belongs together and is touched together stands in one array of records; `by_name` gives each
+field as an array of its own, as it stands in files. There is room for ``capacity`` states, of which
+the first n are in use, and for the matrices of the actions that were used.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any, NamedTuple, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evofsm.fsm.kernels import kernel, lanes
+from evofsm.fsm.validation import refuse_more_failures, refuse_unless_distribution
+from evofsm.store import (
+    COUNT,
+    FLAG,
+    FROM_1,
+    LARGEST_OBSERVATION,
+    SHARE,
+    SIZE,
+    SMALLEST,
+    Kind,
+    Numbers,
+)
+
+Floats: TypeAlias = NDArray[np.float64]
+Records: TypeAlias = NDArray[Any]
+
+#: The action where there is none, and the place of an action without a matrix.
+NO_ACTION = NOT_OPEN = -1
+
+#: Where the machine is.
+NOW = np.dtype(
+    [
+        ("n_states", np.int64),
+        ("n_created", np.int64),  # states so far, with those given up
+        ("n_places", np.int64),  # actions that have a matrix
+        ("action", np.int64),  # after the latest observation, or NO_ACTION
+        ("chained", np.int64),  # 1: `belief` is of the present episode
+        ("state", np.int64),  # the most probable one at the latest observation
+        ("before", np.int64),  # at the one before it; -1 where none is left
+        ("clock", np.int64),  # observations so far, with those that lacked something
+        ("began", np.int64),  # the clock at the present episode's first observation
+        ("n_observations", np.int64),
+        ("failures_told", np.int64),  # 1: of one, or that there was none
+        ("scatter", np.float64),  # sum of squared distances of all observations to their mean
+    ]
+)
+#: Counts of each state, which add up where two states become one; and their rows.
+SUMS: tuple[str, ...] = ("visits", "endings", "episodes", "failed_soon", "onsets")
+VISITS, ENDINGS, EPISODES, FAILED_SOON, ONSETS = range(len(SUMS))
+#: Of a state: the number of its creation (from 0) and of the observation that created it (from 1),
+#: whether two were joined in it, and the clock at the latest visit.
+STATE = np.dtype([(name, np.float64) for name in ("id", "created", "joined", "latest_visit")])
+#: Of a variable: its first and latest value, and the mean of all, less the first.
+VARIABLE = np.dtype([(name, np.float64) for name in ("first", "latest", "mean")])
+#: Of an action: the place of its matrix, and how many transitions were learnt with it.
+ACTION = np.dtype([("place", np.int64), ("uses", np.float64)])
+#: Of an action in a state: episodes that tried it, those of them that failed soon after, and the
+#: clock one observation after the latest time.
+TRY = np.dtype([(name, np.float64) for name in ("tried", "failed_after", "latest_try")])
+
+
+class Learnt(NamedTuple):
+    """What the next step needs, and what people ask of the states; s actions have a place."""
+
+    now: Records  #: (1,) of `NOW`
+    states: Records  #: (capacity,) of `STATE`
+    variables: Records  #: (m,) of `VARIABLE`
+    actions: Records  #: (q,) of `ACTION`
+    sums: Floats  #: (len(SUMS), capacity)
+    belief: Floats  #: (capacity,)
+    potentials: Floats  #: (capacity,) density of all observations at each centre
+    squared_distances: Floats  #: (capacity,) of each centre from the latest observation
+    centers: Floats  #: (m, capacity)
+    changes: Floats  #: (capacity, capacity) steps from the most probable state to the next one
+    matrices: Floats  #: (s, capacity, capacity) of transitions, each row a distribution
+    origin_frequency: Floats  #: (s, capacity) the paper's F_o, the weight of each row
+    decisions: Floats  #: (s, capacity) transitions that began in each state, by belief
+    failures: Floats  #: (s, capacity) those of `decisions` that led straight into failure
+    tries: Records  #: (s, capacity) of `TRY`
+
+
+class Settings(NamedTuple):
+    """What a machine was told; the paper's symbols are epsilon, rho, phi, epsilon-bar."""
+
+    radius: float
+    distance_weight: float
+    learning_rate: float
+    prior_frequency: float
+    spread: float
+    belief_tolerance: float
+    max_states: float  #: infinity for no limit
+    retires: bool  #: whether the least useful state is given up, and not two of them joined
+    failure_horizon: float  #: observations; infinity for all of an episode
+    rule: int  #: which rule judges an observation, see `evofsm.fsm.rules`
+    memory: float  #: number of observations after which older ones fade; infinity: never
+    failure_share: float  #: a failure creates a state where fewer stays ended so; 0: none does
+    failure_distance: float  #: and only farther than this from the nearest centre
+    weights: Floats  #: (m,) 1 / scale of each variable
+
+
+def blank(m: int, q: int, capacity: int, places: int) -> Learnt:
+    """What a machine has learnt that has seen nothing, with room for so much."""
+    learnt = Learnt(
+        np.zeros(1, NOW),
+        np.zeros(capacity, STATE),
+        np.zeros(m, VARIABLE),
+        np.zeros(q, ACTION),
+        np.zeros((len(SUMS), capacity)),
+        np.zeros(capacity),
+        np.zeros(capacity),
+        # A state that is not there is too far for any belief.
+        np.full(capacity, np.inf),
+        np.full((m, capacity), np.inf),
+        np.zeros((capacity, capacity)),
+        np.zeros((places, capacity, capacity)),
+        np.zeros((places, capacity)),
+        np.zeros((places, capacity)),
+        np.zeros((places, capacity)),
+        np.zeros((places, capacity), TRY),
+    )
+    learnt.now["action"] = NO_ACTION
+    learnt.now["before"] = -1
+    learnt.actions["place"] = NOT_OPEN
+    return learnt
+
+
+def resized(learnt: Learnt, capacity: int, places: int) -> Learnt:
+    """A copy with room for another number of states and of matrices."""
+    copy = blank(len(learnt.variables), len(learnt.actions), capacity, places)
+    for old, new in zip(learnt, copy, strict=True):
+        common = tuple(slice(min(pair)) for pair in zip(old.shape, new.shape, strict=True))
+        new[common] = old[common]
+    return copy
+
+
+@kernel
+def room_for(learnt: Learnt, settings: Settings) -> tuple[int, int]:
+    """Numbers of states and of matrices with which the next step cannot lack room."""
+    now, capacity, places = learnt.now[0], len(learnt.belief), len(learnt.matrices)
+    if now.action != NO_ACTION and learnt.actions[now.action].place == NOT_OPEN:
+        places = max(places, now.n_places + 1)
+    if now.n_states == capacity and capacity < settings.max_states:
+        capacity = lanes(capacity + max(capacity // 2, 1))
+    return capacity, places
+
+
+# -- By name --------------------------------------------------------------------------------------
+
+
+def by_name(learnt: Learnt) -> dict[str, NDArray[Any]]:
+    """Every array and every field of records, without spare room, as a copy."""
+    n, s = int(learnt.now["n_states"][0]), int(learnt.now["n_places"][0])
+    trimmed = resized(learnt, n, s)
+    found: dict[str, NDArray[Any]] = {}
+    for name, array in trimmed._asdict().items():
+        if name == "sums":
+            found |= dict(zip(SUMS, array, strict=True))
+        elif array.dtype.names is None:
+            found[name] = array
+        else:
+            found |= {field: array[field].copy() for field in array.dtype.names}
+    return found
+
+
+def from_names(arrays: Mapping[str, NDArray[Any]], m: int, q: int) -> Learnt:
+    """What `by_name` gave, if its numbers do not contradict each other."""
+    n, s = len(arrays["belief"]), len(arrays["matrices"])
+    learnt = blank(m, q, n, s)
+    for name, array in learnt._asdict().items():
+        if name == "sums":
+            array[...] = [arrays[one] for one in SUMS]
+        elif array.dtype.names is None:
+            array[...] = arrays[name]
+        else:
+            for field in array.dtype.names:
+                array[field] = arrays[field]
+    _refuse_impossible(learnt)
+    return resized(learnt, lanes(n), s)
+
+
+def _refuse_impossible(learnt: Learnt) -> None:
+    """Raise where numbers contradict each other: kernels take counts and indices on trust."""
+    now, (n, s), q = learnt.now[0], learnt.origin_frequency.shape[::-1], len(learnt.actions)
+    for name, limits in (
+        ("n_states", range(n, n + 1)),
+        ("n_places", range(s, s + 1)),
+        ("action", range(NO_ACTION, q)),
+        ("state", range(max(n, 1))),
+        ("before", range(-1, n)),
+    ):
+        if int(now[name]) not in limits:
+            raise ValueError(
+                f"{name} is {now[name]}, but there are {n} states, {q} actions and {s} matrices"
+            )
+    if now["n_observations"] < n:
+        raise ValueError(f"n_observations is {now['n_observations']}, but there are {n} states")
+    if sorted(learnt.actions["place"][learnt.actions["place"] != NOT_OPEN]) != list(range(s)):
+        raise ValueError("place of an action is not that of a matrix")
+    refuse_more_failures(by_name(learnt))
+    refuse_unless_distribution("belief", learnt.belief)
+    refuse_unless_distribution("a row of matrices", learnt.matrices)
+
+
+# -- What files may hold --------------------------------------------------------------------------
+
+_FARTHEST = SHARE.most * LARGEST_OBSERVATION
+_OBSERVED = Numbers(least=-_FARTHEST, most=_FARTHEST)
+_FREQUENCY = Numbers(least=0.0, most=LARGEST_OBSERVATION)
+#: Of decisions, which are counted by belief.
+_SUM = COUNT._replace(whole=False)
+
+
+def _optional(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """The same settings, each of which may be missing."""
+    return {
+        name: told._replace(optional=True) if isinstance(told, Numbers) else told
+        for name, told in settings.items()
+    }
+
+
+_RULE: dict[str, Any] = {
+    "memory": FROM_1._replace(least=2.0),
+    **dict.fromkeys(("radius", "spread", "distance"), SIZE),
+    "scales": Numbers(("scales",), 1e-20, 1e20),
+    "share": Numbers(least=SMALLEST, most=1.0),
+}
+_RULE = _optional(_RULE) | {"base": _optional(_RULE)}
+_BELOW_1, _WEIGHT = math.nextafter(1.0, 0.0), Numbers(least=SMALLEST, most=1e50)
+_OPTIONAL: dict[str, Any] = {
+    "belief_tolerance": Numbers(least=0.0, most=_BELOW_1),
+    **dict.fromkeys(("max_states", "failure_horizon"), FROM_1),
+    "when_full": FLAG,
+}
+#: Of a machine, with those of its rule.
+_SETTINGS: dict[str, Any] = {
+    "n_actions": FROM_1,
+    **dict.fromkeys(("radius", "spread"), SIZE),
+    **dict.fromkeys(("distance_weight", "prior_frequency"), _WEIGHT),
+    "learning_rate": _WEIGHT._replace(most=_BELOW_1),
+    **_optional(_OPTIONAL),
+    "rule": _RULE,
+}
+OF_MODEL = {
+    "centers": _OBSERVED.of("n", "m"),
+    "potentials": SHARE.of("n"),
+    "uses": COUNT.of("q"),
+    "transition_matrices": SHARE.of("q", "n", "n"),
+    "origin_frequency": _FREQUENCY.of("q", "n"),
+    **dict.fromkeys((*SUMS, "created"), COUNT.of("n")),
+    "joined": FLAG.of("n"),
+    "changes": COUNT.of("n", "n"),
+    **dict.fromkeys(("decisions", "failures"), _SUM.of("q", "n")),
+    **dict.fromkeys(("tried", "failed_after"), COUNT.of("q", "n")),
+}
+MODEL = Kind(
+    "model",
+    OF_MODEL,
+    {
+        "width": Numbers(least=0.0),
+        **_optional({"dt": SIZE}),
+        "rule": _RULE,
+        "settings": _optional(_SETTINGS),
+        "actions": _optional({"low": _OBSERVED, "high": _OBSERVED, "width": SIZE}),
+    },
+)
+_INDEX, _PRODUCT = COUNT._replace(least=-1.0, dtype=np.int64), Numbers(least=0.0, most=1e300)
+_COUNTERS = ("n_states", "n_created", "n_places", "state", "clock", "began", "n_observations")
+MACHINE = Kind(
+    "machine",
+    {
+        **dict.fromkeys(_COUNTERS, COUNT._replace(dtype=np.int64).of(1)),
+        **dict.fromkeys(("action", "before"), _INDEX.of(1)),
+        **dict.fromkeys(("chained", "failures_told"), FLAG._replace(dtype=np.int64).of(1)),
+        "scatter": _PRODUCT.of(1),
+        **dict.fromkeys(("first", "latest"), _OBSERVED.of("m")),
+        "mean": Numbers(("m",), 2.0 * _OBSERVED.least, 2.0 * _OBSERVED.most),
+        "centers": _OBSERVED.of("m", "n"),
+        **dict.fromkeys((*SUMS, "id", "created", "latest_visit"), COUNT.of("n")),
+        "joined": FLAG.of("n"),
+        **dict.fromkeys(("belief", "potentials"), SHARE.of("n")),
+        "squared_distances": _PRODUCT.of("n"),
+        "changes": COUNT.of("n", "n"),
+        "place": _INDEX.of("settings.n_actions"),
+        "uses": COUNT.of("settings.n_actions"),
+        "matrices": SHARE.of("s", "n", "n"),
+        "origin_frequency": _FREQUENCY.of("s", "n"),
+        **dict.fromkeys(("decisions", "failures"), _SUM.of("s", "n")),
+        **dict.fromkeys(("tried", "failed_after", "latest_try"), COUNT.of("s", "n")),
+    },
+    _SETTINGS,
+)

@@ -1,0 +1,242 @@
+"""Determine and recognise states: the paper's Sections 2.2.1 and 2.2.2.
+
+The density of observations at a place is its *potential*, a Cauchy kernel summed over the whole
+past, by two recursions: one for the present observation, one for the centres. The paper keeps
+running sums of z and z'z (its a_t, b_t, c_t). Those lose all digits where observations lie far from
+zero, so here are the same quantities in the form of mean and variance, the mean relative to the
+first observation::
+
+    potential of z_t = 1 / (1 + |z_t - mean|^2 + variance),   both over z_1 .. z_{t-1}
+
+Differences are multiplied by ``weights``, 1 / scale of each variable: 1 in the paper.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from evofsm.fsm.arrays import ENDINGS, VISITS, Floats, Learnt, Records, Settings
+from evofsm.fsm.kernels import exponential, inner_kernel, kernel, lanes, rare_kernel, total
+
+# What may happen to the states: bits of an `Event`.
+UNCHANGED: int = 0
+MOVED: int = 1
+CREATED: int = 2
+#: Which rule judges an observation.
+PAPER: int = 0
+EDGES: int = 1
+NOVELTY: int = 2
+
+# A share that no rounding comes to, and that no two observations tell apart either.
+_ROUNDING = 1e-12
+# Below exp(-690) a belief is taken as 0: smaller numbers are denormal and slow every sum.
+_LOWEST_EXPONENT = -690.0
+# In place of 1 / width where that would overflow: only the nearest centres keep a belief.
+_SHARPEST = 1e300
+
+
+@inner_kernel
+def determine(learnt: Learnt, settings: Settings, z: Floats) -> tuple[int, int, float]:
+    """Judge one observation against the centres; the nearest may be moved onto it.
+
+    Returns the event, the nearest centre, and the potential of the observation. Where the event is
+    ``CREATED``, whoever asked has to place the new centre.
+    """
+    now, n, weights = learnt.now[0], learnt.now[0].n_states, settings.weights
+    if now.n_observations == 0:
+        for j in range(len(z)):
+            learnt.variables[j].first = z[j]
+        event, nearest, potential = CREATED, 0, 1.0
+    else:
+        potential = potential_of(now, learnt.variables, weights, z)
+        highest = _update_potentials(learnt, settings, n)
+        measure_distances(learnt.centers, weights, lanes(n), z, learnt.squared_distances)
+        nearest = nearest_center(learnt.squared_distances, n)
+        event = _judge(learnt, settings, n, potential, highest, nearest)
+        if event == MOVED:
+            for j in range(len(z)):
+                learnt.centers[j, nearest] = z[j]
+            learnt.potentials[nearest] = potential
+            learnt.squared_distances[nearest] = 0.0
+    _absorb(now, learnt.variables, weights, z, settings.memory)
+    return event, nearest, potential
+
+
+@inner_kernel
+def _judge(
+    learnt: Learnt, settings: Settings, n: int, potential: float, highest: float, nearest: int
+) -> int:
+    """Leave the states as they are, move the nearest, or create one."""
+    squared_distance, limit = learnt.squared_distances[nearest], settings.radius**2
+    if settings.rule == NOVELTY:
+        return CREATED if exceeds(squared_distance, limit) else UNCHANGED
+    if exceeds(potential, highest):
+        return MOVED if exceeds(limit, squared_distance) else CREATED
+    if settings.rule == EDGES and exceeds(squared_distance, limit):
+        for i in range(n):
+            if not exceeds(learnt.potentials[i], potential):
+                return UNCHANGED
+        return CREATED
+    return UNCHANGED
+
+
+@inner_kernel
+def exceeds(value: float, other: float) -> bool:
+    """Whether a value of 0 or more is the greater one, and not by rounding alone.
+
+    Observations from a grid are often exactly as dense as a centre, or exactly a radius away.
+    """
+    return value > other * (1.0 + _ROUNDING)
+
+
+@inner_kernel
+def measure_distances(
+    centers: Floats, weights: Floats, n: int, z: Floats, squared_distances: Floats
+) -> None:
+    """Squared Euclidean distance from ``z`` to each of the first ``n`` centres, (m, capacity)."""
+    for i in range(n):
+        offset = (z[0] - centers[0, i]) * weights[0]
+        squared_distances[i] = offset * offset
+    for j in range(1, len(z)):
+        value, weight = z[j], weights[j]
+        for i in range(n):
+            offset = (value - centers[j, i]) * weight
+            squared_distances[i] += offset * offset
+
+
+@inner_kernel
+def nearest_center(squared_distances: Floats, n: int) -> int:
+    """Index of the smallest of the first ``n`` distances; the oldest centre wins a tie."""
+    nearest = 0
+    for i in range(1, n):
+        if squared_distances[i] < squared_distances[nearest]:
+            nearest = i
+    return nearest
+
+
+@inner_kernel
+def potential_of(now: Any, variables: Records, weights: Floats, z: Floats) -> float:
+    """Density at ``z`` of the observations so far, in its mean and variance form."""
+    squared_distance = 0.0
+    for j in range(len(z)):
+        offset = (z[j] - variables[j].first - variables[j].mean) * weights[j]
+        squared_distance += offset * offset
+    return float(1.0 / (1.0 + squared_distance + now.scatter / now.n_observations))
+
+
+@inner_kernel
+def _update_potentials(learnt: Learnt, settings: Settings, n: int) -> float:
+    """Recursion of the centres' potentials; returns the highest.
+
+    It needs the distances to z_{t-1}, which are still at hand from the step before.
+    """
+    potentials, squared_distances = learnt.potentials, learnt.squared_distances
+    t = min(float(learnt.now[0].n_observations), settings.memory) + 1.0
+    for i in range(lanes(n)):
+        potential = potentials[i]
+        far = 1.0 + settings.distance_weight * squared_distances[i]
+        potentials[i] = (t - 1.0) * potential / ((t - 2.0) + potential * far)
+    highest = 0.0
+    for i in range(n):
+        highest = max(highest, potentials[i])
+    return highest
+
+
+@inner_kernel
+def _absorb(now: Any, variables: Records, weights: Floats, z: Floats, memory: float) -> None:
+    """Add the observation to the running mean and scatter (Welford 1962).
+
+    Beyond ``memory`` observations both are exponentially weighted (West 1979): each new one takes
+    the place of a share of all before it.
+    """
+    n_observations = now.n_observations + 1.0
+    share = 1.0 / min(n_observations, memory)
+    added = 0.0
+    for j in range(len(z)):
+        variable = variables[j]
+        variable.latest = z[j]
+        offset = z[j] - variable.first
+        before = offset - variable.mean
+        mean = variable.mean + before * share
+        variable.mean = mean
+        added += (before * weights[j]) * ((offset - mean) * weights[j])
+    if n_observations > memory:  # the scatter is always the variance times their number
+        grown = n_observations / (n_observations - 1.0)
+        now.scatter *= (1.0 - share) * grown
+        added *= share * n_observations
+    now.n_observations += 1
+    now.scatter += added
+
+
+@rare_kernel
+def splits(learnt: Learnt, settings: Settings, nearest: int) -> bool:
+    """Whether a failure at the latest observation creates a state, amid its nearest one.
+
+    Of all visits of that, those that did not come from the state itself began a stay.
+    """
+    if not exceeds(learnt.squared_distances[nearest], settings.failure_distance**2):
+        return False
+    stays = learnt.sums[VISITS, nearest] - learnt.changes[nearest, nearest]
+    return bool(learnt.sums[ENDINGS, nearest] < settings.failure_share * stays)
+
+
+# -- Recognise ------------------------------------------------------------------------------------
+
+
+@kernel
+def width_of(settings: Settings, variance: float) -> float:
+    """Width of recognition, where observations so far have this total variance.
+
+    The paper leaves its var(z*) open.
+    """
+    if settings.rule == NOVELTY:
+        return settings.spread * settings.radius * settings.radius
+    return settings.spread * variance
+
+
+@inner_kernel
+def recognise(
+    squared_distances: Floats,
+    n: int,
+    nearest: int,
+    width: float,
+    tolerance: float,
+    belief: Floats,
+) -> None:
+    """Write the belief over the first ``n`` states, of which ``nearest`` is the nearest.
+
+    The similarity to a centre is ``exp(-distance^2 / width)``, normalised over the centres.
+    Where the width is 0 the nearest centres share the belief.
+
+    States too unlikely to matter get none: what is left out, missing in them and spread over the
+    others, is at most ``tolerance`` in all.
+    """
+    smallest = squared_distances[nearest]
+    scale = 1.0 / width if width * _SHARPEST > 1.0 else _SHARPEST
+    for i in range(n):
+        exponent = (smallest - squared_distances[i]) * scale
+        similarity = exponential(max(exponent, _LOWEST_EXPONENT))
+        belief[i] = similarity if exponent > _LOWEST_EXPONENT else 0.0
+    if tolerance > 0.0:
+        least = 0.5 * tolerance * total(belief, n) / n
+        for i in range(n):
+            belief[i] = belief[i] if belief[i] >= least else 0.0
+    share = 1.0 / total(belief, n)
+    for i in range(n):
+        belief[i] *= share
+
+
+@kernel
+def recognise_rows(
+    centers: Floats, weights: Floats, rows: Floats, width: float, n: int, belief: Floats
+) -> None:
+    """Write the belief (N, lanes of n) of each row, given centres (m, n) and 1 / scale of each."""
+    for row in range(len(rows)):
+        squared_distances = belief[row]  # which is written over
+        measure_distances(centers, weights, n, rows[row], squared_distances)
+        for i in range(n, len(squared_distances)):
+            squared_distances[i] = np.inf
+        nearest = nearest_center(squared_distances, n)
+        recognise(squared_distances, len(squared_distances), nearest, width, 0.0, squared_distances)

@@ -1,0 +1,305 @@
+"""State rules: when an observation creates or moves a state, and how wide a state is recognised.
+
+A rule is a frozen dataclass of settings. Its ``table`` has the numbers by which the kernel judges
+an observation (`evofsm.fsm.clusters.determine`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields, is_dataclass
+from typing import Any, ClassVar, Protocol, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evofsm.fsm.clusters import EDGES, NOVELTY, PAPER
+from evofsm.fsm.validation import positive, whole
+
+# Squares of observations over the scales, summed over a long run, must not overflow.
+_SCALES = 1e-20, 1e20
+# Where a rule has no radius that says so, a state reaches so many roots of the width.
+_WIDTHS = 2.0
+
+
+class StateRule(Protocol):
+    """When an observation creates or moves a state, and how wide a state is recognised.
+
+    A rule is a frozen dataclass of settings, made known with `register_rule`: a small table of
+    numbers for the kernel that judges an observation, which is that of a rule there is or, in the
+    package, one of its own. All distances are those of observations divided by the rule's scales.
+
+    Examples
+    --------
+    >>> from evofsm import Novelty
+    >>> Novelty(radius=0.5, scales=(4.0, 2.0, 2.0)).scales
+    (4.0, 2.0, 2.0)
+    """
+
+    @property
+    def scales(self) -> Sequence[float]:
+        """Difference that counts as 1, for each of the m variables; empty: 1 for each."""
+        ...
+
+    @property
+    def table(self) -> Mapping[str, float]:
+        """What its kernel judges by: fields of `Settings`, in place of the machine's.
+
+        At least ``rule``, unless it is that of the paper's.
+        """
+        ...
+
+
+@dataclass(frozen=True)
+class Paper:
+    """The paper's rule: evolving Takagi-Sugeno (eTS) clustering, Sections 2.2.1 and 2.2.2.
+
+    An observation that is denser than every centre moves the nearest one if that is closer than the
+    machine's ``radius``, else it creates a state. The width of recognition is ``spread`` times the
+    total variance of all observations: the more data vary, the wider states are recognised.
+
+    Parameters
+    ----------
+    memory : int, optional
+        Number of observations, at least 2, after which older ones fade, so that densities and
+        variances are those of the recent past: for regimes that change. Without it, as in the
+        paper, all count alike, and the more were seen the less a new one changes.
+
+    Examples
+    --------
+    >>> from evofsm import EvolvingFSM
+    >>> machine = EvolvingFSM(n_actions=1, radius=0.5, rule=Paper())
+    >>> machine.learn_many([[0.0], [0.1], [2.0], [1.0]], [0, 0, 0, 0]).n_states
+    array([1, 1, 1, 2])
+    """
+
+    memory: int | None = None
+    scales: ClassVar[Sequence[float]] = ()
+    _rule: ClassVar[int] = PAPER
+
+    def __post_init__(self) -> None:
+        if self.memory is not None:
+            object.__setattr__(self, "memory", whole("memory", self.memory))
+            if self.memory == 1:
+                raise ValueError("memory is 1; of one observation nothing can be said to vary")
+
+    @property
+    def table(self) -> Mapping[str, float]:
+        """What the kernel judges by, in place of the machine's settings."""
+        return {"rule": self._rule, "memory": self.memory or math.inf}
+
+
+@dataclass(frozen=True)
+class Edges(Paper):
+    """The paper's rule, and a state at each edge of the data.
+
+    The paper's condition takes only observations nearer the mean of everything seen than any
+    centre, so a rare corner never gets a state. Here an observation also creates a state where its
+    potential lies below every centre's and it is farther than ``radius`` from every centre.
+
+    Parameters
+    ----------
+    memory : int, optional
+        As `Paper` has it.
+
+    Examples
+    --------
+    >>> from evofsm import EvolvingFSM
+    >>> machine = EvolvingFSM(n_actions=1, radius=0.5, rule=Edges())
+    >>> machine.learn_many([[0.0], [0.1], [2.0], [1.0]], [0, 0, 0, 0]).n_states
+    array([1, 1, 2, 3])
+    """
+
+    _rule: ClassVar[int] = EDGES
+
+
+@dataclass(frozen=True)
+class Novelty:
+    """Create a state where every centre is farther than a radius; no centre ever moves.
+
+    Distances are those of observations divided by ``scales``, so that a metre and a metre per
+    second may count differently; observations and centres themselves stay in their units. The width
+    of recognition is ``spread * radius**2``: beliefs stay local, however much was seen.
+
+    Parameters
+    ----------
+    radius : float
+        Distance, in scales, beyond which an observation creates a state. It takes the place of the
+        machine's.
+    scales : sequence of float
+        For each of the m variables, the difference that counts as 1, in the variable's unit, from
+        1e-20 to 1e20; empty: 1 for each.
+    spread : float
+        Width of recognition in squared radii: the similarity to a centre is
+        ``exp(-distance^2 / (spread * radius^2))``. It takes the place of the machine's.
+
+    Examples
+    --------
+    >>> from evofsm import EvolvingFSM
+    >>> machine = EvolvingFSM(n_actions=1, rule=Novelty(radius=1.0, scales=(2.0,)))
+    >>> machine.learn_many([[0.0], [1.9], [2.1], [4.0]], [0, 0, 0, 0]).n_states
+    array([1, 1, 2, 2])
+    """
+
+    radius: float = 1.0
+    scales: Sequence[float] = ()
+    spread: float = 1.0
+
+    def __post_init__(self) -> None:
+        scales = tuple(positive("a scale", scale) for scale in self.scales)
+        for scale in scales:
+            if not _SCALES[0] <= scale <= _SCALES[1]:
+                raise ValueError(f"a scale is {scale}; it must lie between 1e-20 and 1e20")
+        object.__setattr__(self, "scales", scales)
+        object.__setattr__(self, "radius", positive("radius", self.radius))
+        object.__setattr__(self, "spread", positive("spread", self.spread))
+
+    @property
+    def table(self) -> Mapping[str, float]:
+        """What the kernel judges by, in place of the machine's settings."""
+        return {"rule": NOVELTY, "radius": self.radius, "spread": self.spread}
+
+
+@dataclass(frozen=True)
+class FailureSplit:
+    """Create states as another rule does, and at failures in states that were mostly safe.
+
+    A state that holds both safe situations and failures says little about either. Where an episode
+    ends in failure, let s be the most probable state at its last observation. If, of the stays in s
+    that began before the failure, fewer than ``share`` ended in a failure, and the observation is
+    farther than ``distance`` from the centre of s, it creates a state. A *stay* is a run of
+    observations of one episode that are all recognised as s.
+
+    Parameters
+    ----------
+    base : StateRule
+        The rule that creates and moves all other states, and says how wide they are recognised.
+    share : float
+        Share of stays that end in failure from which on a state is no longer safe, in (0, 1].
+    distance : float
+        Least distance from the centre, in the scales of ``base``.
+
+    Examples
+    --------
+    >>> from evofsm import EvolvingFSM
+    >>> machine = EvolvingFSM(n_actions=1, rule=FailureSplit(Novelty(radius=2.0), distance=0.5))
+    >>> trace = machine.learn_many([[0.0], [1.5], [0.0]], [0, 0, 0])
+    >>> machine.observe([1.5], failed=True).event.name
+    'CREATED'
+    """
+
+    base: StateRule = field(default_factory=Novelty)
+    share: float = 0.5
+    distance: float = 0.25
+
+    def __post_init__(self) -> None:
+        if isinstance(self.base, type | FailureSplit) or not hasattr(self.base, "table"):
+            raise TypeError(f"base is {self.base!r}; it must be another rule, as an object")
+        object.__setattr__(self, "share", positive("share", self.share))
+        object.__setattr__(self, "distance", positive("distance", self.distance))
+        if self.share > 1.0:
+            raise ValueError(f"share is {self.share}; it must be at most 1")
+
+    @property
+    def scales(self) -> Sequence[float]:
+        """Those of ``base``."""
+        return self.base.scales
+
+    @property
+    def table(self) -> Mapping[str, float]:
+        """What the kernel judges by, in place of the machine's settings."""
+        of_failures = {"failure_share": self.share, "failure_distance": self.distance}
+        return {**self.base.table, **of_failures}
+
+
+# -- Which rules there are ------------------------------------------------------------------------
+
+# By name in files.
+_RULES: dict[str, Any] = {}
+
+
+def register_rule(name: str, rule: type) -> None:
+    """Let machines take a state rule, and files name it.
+
+    Parameters
+    ----------
+    name : str
+        Its name in files.
+    rule : type
+        A frozen dataclass as `StateRule`, whose settings JSON has words for.
+
+    Examples
+    --------
+    >>> from dataclasses import dataclass
+    >>> from evofsm import EvolvingFSM, Novelty
+    >>> @dataclass(frozen=True)
+    ... class Fine(Novelty):
+    ...     radius: float = 0.1
+    >>> register_rule("fine", Fine)
+    >>> EvolvingFSM(n_actions=1, rule=Fine()).radius
+    0.1
+    """
+    is_frozen = is_dataclass(rule) and cast(Any, rule).__dataclass_params__.frozen
+    if not (is_frozen and hasattr(rule, "table")):
+        raise TypeError(f"{rule!r} is no state rule: a frozen dataclass with a `table`")
+    known = _RULES.get(name, rule)
+    if (known.__module__, known.__qualname__) != (rule.__module__, rule.__qualname__):
+        raise ValueError(f"there is a state rule {name!r} already: {known.__name__}")
+    _RULES[name] = rule  # anew where its module, or a cell of a notebook, was run again
+
+
+register_rule("paper", Paper)
+register_rule("edges", Edges)
+register_rule("novelty", Novelty)
+register_rule("failure", FailureSplit)
+
+
+def check_rule(rule: StateRule) -> StateRule:
+    """One of the rules, as an object."""
+    if type(rule) not in _RULES.values():
+        known = ", ".join(f"{kind.__name__}(...)" for kind in _RULES.values())
+        raise TypeError(f"rule is {rule!r}; it must be an object: {known}")
+    return rule
+
+
+def weights_of(rule: StateRule, m: int) -> NDArray[np.float64]:
+    """(m,) 1 / scale of each variable."""
+    scales = np.array(rule.scales or [1.0] * m)
+    if len(scales) != m:
+        raise ValueError(f"observation has {m} variables, but there are {len(scales)} in {rule}")
+    return 1.0 / scales
+
+
+def reach(rule: StateRule, width: float) -> float:
+    """Distance from a centre, in scales, beyond which an observation is like no state.
+
+    The radius of `Novelty`, beyond which it makes a new one. Other rules make no state of what is
+    rare: twice the root of the width of recognition, where the similarity is 1/e⁴, or 2 %.
+    """
+    rule = rule.base if isinstance(rule, FailureSplit) else rule
+    return rule.radius if isinstance(rule, Novelty) else _WIDTHS * math.sqrt(width)
+
+
+def describe_rule(rule: StateRule) -> dict[str, Any]:
+    """A rule in plain JSON: its name and its settings, but for those that are None."""
+    name, kind = next(item for item in _RULES.items() if item[1] is type(rule))
+    given = {entry.name: getattr(rule, entry.name) for entry in fields(kind)}
+    settings = {name: value for name, value in given.items() if value is not None}
+    if "base" in settings:
+        settings["base"] = describe_rule(settings["base"])
+    return {"name": name, **settings}
+
+
+def restore_rule(description: Mapping[str, Any]) -> StateRule:
+    """The rule that `describe_rule` put into words."""
+    if not isinstance(description, Mapping) or "name" not in description:
+        raise ValueError(f"rule is {description!r}; it must have the name of a state rule")
+    settings = dict(description)
+    name = settings.pop("name")
+    if name not in _RULES:
+        raise ValueError(f"there is no state rule {name!r}, only {', '.join(_RULES)}")
+    if "base" in settings:
+        settings["base"] = restore_rule(settings["base"])
+    rule: StateRule = _RULES[name](**settings)
+    return rule

@@ -1,0 +1,607 @@
+"""State rules: what each makes of observations, and what holds for all of them."""
+
+import json
+from dataclasses import FrozenInstanceError, fields
+from fractions import Fraction
+from random import Random
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from evofsm.fsm.machine import EvolvingFSM
+from evofsm.fsm.model import FSMModel
+from evofsm.fsm.rules import (
+    Edges,
+    FailureSplit,
+    Novelty,
+    Paper,
+    describe_rule,
+    register_rule,
+    restore_rule,
+)
+from evofsm.fsm.step import Event
+
+RULES = {
+    "paper": Paper(),
+    "edges": Edges(),
+    "novelty": Novelty(radius=1.5, scales=(2.0, 0.5), spread=0.7),
+    "failure": FailureSplit(Novelty(radius=3.0), share=0.8, distance=0.3),
+    "failure on edges, forgetting": FailureSplit(Edges(memory=30), distance=0.1),
+}
+
+
+@pytest.fixture(params=RULES.values(), ids=RULES.keys())
+def rule(request):
+    return request.param
+
+
+@pytest.fixture(scope="session")
+def walk():
+    """Observations of a random walk, actions with gaps, starts and failures of episodes."""
+
+    def make(rows, seed=0):
+        rng = np.random.default_rng(seed)
+        Z = np.cumsum(rng.normal(size=(rows, 2)), axis=0)
+        failures = np.flatnonzero(rng.random(rows) < 0.1)
+        return Z, rng.integers(-1, 3, rows), [rows // 3], failures
+
+    return make
+
+
+# -- All rules -------------------------------------------------------------------------------------
+
+
+LEARNT = (
+    *("centers", "potentials", "transition_matrices", "origin_frequency", "belief"),
+    *("decisions", "failures", "endings"),
+)
+
+
+def learn_in_a_loop(machine, Z, I, starts, failures):
+    steps = []
+    for row, (z, i) in enumerate(zip(Z, I, strict=True)):
+        if row in starts:
+            machine.start_episode()
+        steps.append(machine.observe(z, failed=row in failures))
+        if i >= 0 and row not in failures:
+            machine.act(i)
+    return steps
+
+
+def assert_same_trace(trace, steps):
+    assert trace.state.tolist() == [s.state for s in steps]
+    assert trace.n_states.tolist() == [len(s.belief) for s in steps]
+    assert trace.event.tolist() == [s.event for s in steps]
+    assert trace.surprise.tobytes() == np.array([s.surprise for s in steps]).tobytes()
+
+
+bases = st.one_of(
+    st.just(Paper()),
+    st.just(Edges()),
+    st.builds(
+        Novelty,
+        radius=st.sampled_from([0.3, 1.0, 3.0]),
+        scales=st.sampled_from([(), (1.0, 1.0), (0.5, 3.0)]),
+        spread=st.sampled_from([0.1, 1.0]),
+    ),
+)
+rules = bases | st.builds(
+    FailureSplit,
+    base=bases,
+    share=st.sampled_from([0.1, 0.5, 1.0]),
+    distance=st.sampled_from([0.01, 0.5]),
+)
+
+
+@st.composite
+def streams(draw):
+    """Observations on a coarse grid (so that many are equal), actions, starts and failures."""
+    number = st.integers(-32, 32).map(lambda k: k / 8)
+    rows = draw(st.lists(st.tuples(number, number), min_size=1, max_size=50))
+    I = draw(st.lists(st.integers(-1, 2), min_size=len(rows), max_size=len(rows)))
+    some = st.lists(st.integers(0, len(rows) - 1), max_size=5)
+    return np.array(rows), np.array(I), draw(some), draw(some)
+
+
+@given(rules, streams())
+def test_that_holds_for_every_stream_and_what_is_learnt_is_sound(rule, stream):
+    batch, loop = EvolvingFSM(3, rule=rule), EvolvingFSM(3, rule=rule)
+    trace = batch.learn_many(*stream, belief=True)
+    assert_same_trace(trace, learn_in_a_loop(loop, *stream))
+    for name in LEARNT:
+        assert getattr(batch, name).tobytes() == getattr(loop, name).tobytes()
+    assert (np.diff(trace.n_states, prepend=0) == (trace.event == Event.CREATED)).all()
+    for rows in (batch.transition_matrices, batch.belief, trace.belief):
+        np.testing.assert_allclose(rows.sum(axis=-1), 1.0, rtol=0, atol=1e-9)
+    assert ((batch.potentials > 0.0) & (batch.potentials <= 1.0)).all()
+    assert batch.decisions.sum() == pytest.approx((~np.isnan(trace.surprise)).sum())
+    assert (batch.failures <= batch.decisions).all()
+    assert batch.endings.sum() == len(set(stream[3]))
+
+
+@given(rules, streams(), st.permutations(range(3)))
+def test_other_labels_for_the_actions_permute_what_is_learnt(rule, stream, labels):
+    Z, I, starts, failures = stream
+    machine, relabelled = EvolvingFSM(3, rule=rule), EvolvingFSM(3, rule=rule)
+    a = machine.learn_many(Z, I, starts, failures)
+    b = relabelled.learn_many(Z, np.array([*labels, -1])[I], starts, failures)
+    for one, other in zip(a[:4], b[:4], strict=True):
+        assert one.tobytes() == other.tobytes()
+    for name in ("transition_matrices", "origin_frequency", "decisions", "failures"):
+        assert getattr(relabelled, name)[list(labels)].tobytes() == getattr(machine, name).tobytes()
+    assert relabelled.endings.tobytes() == machine.endings.tobytes()
+
+
+def test_a_model_keeps_the_rule_and_recognises_by_it(rule, walk, tmp_path):
+    machine = EvolvingFSM(3, rule=rule)
+    Z, I, starts, failures = walk(300)
+    machine.learn_many(Z, I, starts, failures)
+    machine.model().save(tmp_path / "model")
+    model = FSMModel.load(tmp_path / "model")
+    assert model.rule == rule
+    assert model.recognise(Z[-1]).tobytes() == machine.model().recognise(Z[-1]).tobytes()
+    z = machine.centers[0] + 0.1
+    belief = machine.observe(z).belief
+    assert machine.model().recognise(z).tobytes() == belief.tobytes()
+    for name in ("decisions", "failures", "endings"):
+        assert getattr(model, name).any()
+    assert repr(EvolvingFSM(**model.settings, rule=model.rule)) == repr(machine)
+
+
+def test_a_machine_shows_its_rule_and_can_be_made_again_from_that(rule):
+    machine = EvolvingFSM(3, rule=rule)
+    assert repr(eval(repr(machine))) == repr(machine)
+    assert (f", rule={rule}" in repr(machine)) == (rule != Paper())
+
+
+def test_rules_are_frozen(rule):
+    for field in fields(rule):
+        with pytest.raises(FrozenInstanceError):
+            setattr(rule, field.name, 1.0)
+
+
+def test_a_rule_is_plain_json_in_a_file(rule):
+    assert restore_rule(json.loads(json.dumps(describe_rule(rule)))) == rule
+
+
+def test_the_names_and_settings_in_a_file_are_these():
+    rule = FailureSplit(Novelty(2.0, (1.0, 4.0)), share=0.25, distance=0.5)
+    base = {"name": "novelty", "radius": 2.0, "scales": (1.0, 4.0), "spread": 1.0}
+    assert describe_rule(rule) == {"name": "failure", "base": base, "share": 0.25, "distance": 0.5}
+    assert describe_rule(Paper()) == {"name": "paper"}
+    assert describe_rule(Edges()) == {"name": "edges"}
+
+
+@pytest.mark.parametrize("rule", [Novelty, "novelty", 1, object()])
+def test_what_is_no_rule_is_refused(rule):
+    with pytest.raises(TypeError, match=r"rule is .*; it must be an object: Paper\(...\), Edges"):
+        EvolvingFSM(1, rule=rule)
+
+
+def test_a_rule_is_registered_once_under_its_name():
+    register_rule("novelty", Novelty)
+    with pytest.raises(ValueError, match="a state rule 'novelty' already: Novelty"):
+        register_rule("novelty", Edges)
+    with pytest.raises(TypeError, match="is no state rule"):
+        register_rule("something", int)
+
+
+# -- Paper -----------------------------------------------------------------------------------------
+
+
+def test_the_papers_rule_is_the_default(walk, snapshot):
+    Z, I, starts, failures = walk(200)
+    told, untold = EvolvingFSM(3, rule=Paper()), EvolvingFSM(3)
+    for machine in (told, untold):
+        machine.learn_many(Z, I, starts, failures)
+    assert snapshot(told) == snapshot(untold)
+    assert repr(told) == repr(untold)
+    assert told.rule == Paper()
+
+
+def test_a_failure_founds_no_state_by_the_papers_rule(walk):
+    Z, I, starts, failures = walk(200)
+    with_failures, without = EvolvingFSM(3), EvolvingFSM(3)
+    a = with_failures.learn_many(Z, I, starts, failures)
+    b = without.learn_many(Z, I, starts)
+    assert a.event.tolist() == b.event.tolist()
+    assert with_failures.centers.tobytes() == without.centers.tobytes()
+
+
+# -- Edges -----------------------------------------------------------------------------------------
+
+
+def outward(rule):
+    """A dense cloud, and then observations farther and farther out."""
+    machine = EvolvingFSM(n_actions=1, radius=1.0, rule=rule)
+    cloud = np.random.default_rng(0).normal(0.0, 0.1, size=(200, 2))
+    machine.learn_many(cloud, [0] * 200)
+    return machine, [machine.observe([x, 0.0]).event for x in (3.0, 6.0, 9.0)]
+
+
+def test_a_state_is_founded_at_the_edges_where_the_papers_rule_founds_none():
+    assert outward(None)[1] == [Event.NONE] * 3
+    machine, events = outward(Edges())
+    assert events == [Event.CREATED] * 3
+    assert machine.centers[-3:].tolist() == [[3.0, 0.0], [6.0, 0.0], [9.0, 0.0]]
+
+
+def test_an_edge_within_the_radius_of_a_centre_founds_none():
+    machine, _ = outward(Edges())
+    assert machine.observe([10.0, 0.0]).event == Event.NONE  # at exactly the radius
+    assert machine.observe([10.1, 0.0]).event == Event.CREATED
+
+
+def test_what_lies_between_the_edges_is_judged_as_by_the_papers_rule():
+    machine, _ = outward(Edges())
+    assert machine.observe([4.5, 0.0]).event == Event.NONE
+
+
+def test_an_edge_has_the_potential_of_its_observation():
+    machine = EvolvingFSM(n_actions=1, radius=1.0, rule=Edges())
+    cloud = np.random.default_rng(0).normal(0.0, 0.1, size=(200, 2))
+    machine.learn_many(cloud, [0] * 200)
+    assert machine.observe([3.0, 0.0]).event == Event.CREATED
+    squared_distance = ((cloud.mean(axis=0) - [3.0, 0.0]) ** 2).sum()
+    potential = 1.0 / (1.0 + squared_distance + cloud.var(axis=0).sum())
+    assert machine.potentials[-1] == pytest.approx(potential)
+
+
+# -- Novelty ---------------------------------------------------------------------------------------
+
+
+@given(st.integers(0, 2**32 - 1), st.sampled_from([0.3, 1.0, 4.0]))
+def test_no_observation_is_farther_than_the_radius_from_every_centre(seed, radius):
+    scales = np.array([2.0, 0.25])
+    machine = EvolvingFSM(n_actions=1, rule=Novelty(radius, tuple(scales)))
+    Z = np.cumsum(np.random.default_rng(seed).normal(size=(100, 2)), axis=0)
+    for z in Z:
+        event = machine.observe(z).event
+        distances = np.linalg.norm((machine.centers - z) / scales, axis=1)
+        assert distances.min() <= radius
+        assert (event == Event.CREATED) == (
+            distances[-1] == 0.0 and (distances[:-1] > radius).all()
+        )
+
+
+def test_centres_never_move_and_are_observations_to_the_last_bit():
+    machine = EvolvingFSM(n_actions=1, rule=Novelty(radius=1.0, scales=(0.3, 7.0)))
+    Z = np.random.default_rng(0).normal(size=(500, 2)) * [1.0, 20.0]
+    trace = machine.learn_many(Z, [0] * 500)
+    assert set(trace.event.tolist()) == {Event.NONE, Event.CREATED}
+    assert machine.centers.tobytes() == Z[trace.event == Event.CREATED].tobytes()
+
+
+def test_exactly_the_radius_away_is_not_farther():
+    machine = EvolvingFSM(n_actions=1, rule=Novelty(radius=2.0))
+    assert machine.learn_many([[0.0], [2.0], [-2.0]], [0] * 3).n_states.tolist() == [1, 1, 1]
+    assert machine.observe([2.0001]).event == Event.CREATED
+
+
+def test_belief_falls_with_scaled_distance_however_much_was_seen():
+    machine = EvolvingFSM(n_actions=1, rule=Novelty(radius=2.0, scales=(10.0, 1.0), spread=0.5))
+    for wide in (10.0, 1000.0):
+        machine.learn_many(np.random.default_rng(0).normal(size=(50, 2)) * wide, [0] * 50)
+        z = np.array([7.0, 3.0])
+        belief = machine.observe(z).belief
+        squared = (((machine.centers - z) / [10.0, 1.0]) ** 2).sum(axis=1)
+        similarity = np.exp(-squared / (0.5 * 2.0**2))
+        np.testing.assert_allclose(belief, similarity / similarity.sum(), rtol=1e-10, atol=1e-300)
+
+
+def test_scales_do_as_if_the_observations_had_been_divided():
+    Z = np.random.default_rng(1).normal(size=(300, 2)) * [4.0, 1.0]
+    I = np.arange(300) % 2
+    scaled = EvolvingFSM(n_actions=2, rule=Novelty(1.0, scales=(4.0, 0.5)))
+    divided = EvolvingFSM(n_actions=2, rule=Novelty(1.0))
+    a = scaled.learn_many(Z, I, belief=True)
+    b = divided.learn_many(Z / [4.0, 0.5], I, belief=True)
+    for one, other in zip(a, b, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-12, atol=0.0)  # powers of 2: exact
+    np.testing.assert_array_equal(scaled.centers, divided.centers * [4.0, 0.5])
+    np.testing.assert_allclose(scaled.potentials, divided.potentials, rtol=1e-12)
+
+
+def test_the_machine_shows_the_radius_and_spread_of_the_rule():
+    machine = EvolvingFSM(n_actions=1, rule=Novelty(radius=2.0, spread=0.5))
+    assert (machine.radius, machine.spread) == (2.0, 0.5)
+
+
+@pytest.mark.parametrize("name", ["radius", "spread"])
+def test_a_machine_and_its_rule_may_not_contradict_each_other(name):
+    rule = Novelty(radius=2.0, spread=2.0)
+    with pytest.raises(ValueError, match=rf"{name} is 5.0, but the rule has its own: Novelty\("):
+        EvolvingFSM(1, rule=rule, **{name: 5.0})
+    assert getattr(EvolvingFSM(1, rule=rule, **{name: 2.0}), name) == 2.0
+
+
+def test_as_many_scales_as_variables(snapshot):
+    machine = EvolvingFSM(n_actions=1, rule=Novelty(scales=(1.0, 2.0, 3.0)))
+    before = snapshot(machine)
+    for learn in (lambda z: machine.observe(z), lambda z: machine.learn_many([z], [0])):
+        with pytest.raises(ValueError, match="observation has 2 variables, but there are 3 in Nov"):
+            learn([0.0, 1.0])
+    assert snapshot(machine) == before
+    assert machine.observe([0.0, 1.0, 2.0]).event == Event.CREATED
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"radius": 0.0}, "radius is 0.0; it must be a positive"),
+        ({"spread": -1.0}, "spread is -1.0; it must be a positive"),
+        ({"scales": (1.0, 0.0)}, "a scale is 0.0; it must be a positive"),
+        ({"scales": (1e-30,)}, "a scale is 1e-30; it must lie between"),
+        ({"scales": (1e30,)}, r"a scale is 1e\+30; it must lie between"),
+    ],
+)
+def test_settings_that_cannot_be_right(settings, words):
+    with pytest.raises(ValueError, match=words):
+        Novelty(**settings)
+
+
+@pytest.mark.parametrize("size", [1e100, 1e-100])
+def test_numbers_of_every_size_leave_distributions(size):
+    machine = EvolvingFSM(n_actions=1, rule=Novelty(radius=1e3, scales=(1e-20,)))
+    machine.learn_many(np.linspace(-size, size, 9)[:, None], [0] * 9)
+    assert machine.belief.sum() == pytest.approx(1.0)
+    np.testing.assert_allclose(machine.transition_matrices.sum(axis=2), 1.0)
+
+
+# -- FailureSplit ----------------------------------------------------------------------------------
+
+
+def machine_with(**settings):
+    """One state at 0, which holds everything up to 10, in which there were four stays."""
+    machine = EvolvingFSM(n_actions=2, rule=FailureSplit(Novelty(radius=10.0), **settings))
+    machine.learn_many([[0.0], [1.0]] * 4, [0] * 8, [0, 2, 4, 6])
+    assert machine.n_states == 1
+    return machine
+
+
+def fail_at(machine, z):
+    machine.start_episode()
+    return machine.observe([z], failed=True).event
+
+
+def test_a_failure_in_a_mostly_safe_state_founds_one():
+    machine = machine_with(distance=0.5)
+    assert fail_at(machine, 4.0) == Event.CREATED
+    assert machine.centers.tolist() == [[0.0], [4.0]]
+    assert machine.endings.tolist() == [0.0, 1.0]
+
+
+def test_a_safe_observation_at_the_same_place_founds_none():
+    machine = machine_with(distance=0.5)
+    assert machine.observe([4.0]).event == Event.NONE
+
+
+def test_no_failure_founds_a_state_within_the_distance_of_a_centre():
+    machine = machine_with(distance=0.5)
+    assert [fail_at(machine, z) for z in (0.5, 0.51)] == [Event.NONE, Event.CREATED]
+
+
+def test_a_state_is_split_only_while_fewer_stays_than_the_share_ended_in_failure():
+    machine = machine_with(distance=0.5, share=0.4)
+    for _ in range(4):
+        assert fail_at(machine, 0.1) == Event.NONE
+    assert fail_at(machine.copy(), 4.0) == Event.NONE  # 4 failures in 8 stays
+    for _ in range(2):
+        machine.start_episode()
+        machine.observe([0.0])
+    assert fail_at(machine.copy(), 4.0) == Event.NONE  # in 10 stays: exactly the share
+    machine.start_episode()
+    machine.observe([0.0])
+    assert fail_at(machine.copy(), 4.0) == Event.CREATED  # in 11
+
+
+def test_long_stays_count_once_each():
+    machine = machine_with(distance=0.5)
+    for _ in range(4):
+        fail_at(machine, 0.1)
+    machine.start_episode()
+    machine.learn_many(np.zeros((100, 1)), [0] * 100)
+    assert fail_at(machine.copy(), 4.0) == Event.CREATED  # 4 failures in 9 stays
+    fail_at(machine, 0.1)
+    assert fail_at(machine.copy(), 4.0) == Event.NONE  # 5 in 10
+
+
+def test_a_failure_without_a_further_observation_splits_at_the_latest():
+    machine = machine_with(distance=0.5)
+    machine.start_episode()
+    machine.observe([4.0])
+    machine.act(1)
+    machine.fail()
+    assert machine.centers.tolist() == [[0.0], [4.0]]
+    assert machine.endings.tolist() == [0.0, 1.0]
+    assert machine.model().created.tolist() == [1.0, 9.0]
+    belief = np.exp(np.array([-16.0, 0.0]) / 100.0)
+    np.testing.assert_allclose(machine.failures[1], belief / belief.sum())
+    np.testing.assert_allclose(machine.transition_matrices.sum(axis=2), 1.0)
+
+
+def test_a_failure_that_the_base_answers_is_left_to_it():
+    machine = machine_with(distance=0.5)
+    assert fail_at(machine, 11.0) == Event.CREATED
+    assert machine.n_states == 2
+
+
+def test_distance_is_measured_in_the_scales_of_the_base():
+    rule = FailureSplit(Novelty(radius=10.0, scales=(4.0,)), distance=1.0)
+    machine = EvolvingFSM(n_actions=1, rule=rule)
+    machine.observe([0.0])
+    assert [fail_at(machine.copy(), z) for z in (4.0, 4.1)] == [Event.NONE, Event.CREATED]
+    assert rule.scales == (4.0,)
+
+
+def test_many_splits_outgrow_the_first_room():
+    rule = FailureSplit(Novelty(radius=1000.0), distance=0.5)
+    machine = EvolvingFSM(n_actions=1, rule=rule)
+    machine.observe([0.0])
+    for k in range(1, 20):
+        machine.start_episode()
+        machine.observe([float(k)])
+        machine.fail()
+        for _ in range(3):  # safe from now on
+            machine.start_episode()
+            machine.observe([float(k)])
+    assert machine.centers.ravel().tolist() == list(range(20))
+    np.testing.assert_allclose(machine.transition_matrices.sum(axis=2), 1.0)
+
+
+def test_the_settings_are_looked_at():
+    with pytest.raises(ValueError, match=r"share is 1.5; it must be at most 1"):
+        FailureSplit(share=1.5)
+    with pytest.raises(ValueError, match=r"distance is 0.0; it must be a positive"):
+        FailureSplit(distance=0.0)
+    for base in (FailureSplit(), Novelty, "novelty", None):
+        with pytest.raises(TypeError, match=r"base is .*; it must be another rule, as an object"):
+            FailureSplit(base)
+    assert FailureSplit(Paper()).base == Paper()
+
+
+# -- Forgetting ------------------------------------------------------------------------------------
+
+
+def two_regimes(rows=4000, seed=0):
+    rng = np.random.default_rng(seed)
+    before = rng.normal([0.0, 0.0], 1.0, (rows, 2))
+    after = rng.normal([30.0, -20.0], 1.0, (rows, 2))
+    return np.concatenate([before, after]), rng.integers(0, 2, 2 * rows)
+
+
+def variance(machine):
+    return machine.width / machine.spread
+
+
+@pytest.mark.parametrize("rule", [Paper, Edges])
+def test_up_to_its_memory_nothing_is_forgotten(rule, snapshot):
+    Z, I = two_regimes(300)
+    machines = EvolvingFSM(2, rule=rule()), EvolvingFSM(2, rule=rule(memory=600))
+    for machine in machines:
+        machine.learn_many(Z, I)
+    np.testing.assert_array_equal(machines[0].centers, machines[1].centers)
+    np.testing.assert_array_equal(machines[0].transition_matrices, machines[1].transition_matrices)
+    np.testing.assert_array_equal(machines[0].potentials, machines[1].potentials)
+
+
+def test_mean_and_variance_are_those_of_the_recent_past():
+    Z, I = two_regimes()
+    forgetful, faithful = EvolvingFSM(2, rule=Paper(memory=200)), EvolvingFSM(2)
+    for machine in (forgetful, faithful):
+        machine.learn_many(Z, I)
+    assert variance(forgetful) == pytest.approx(2.0, rel=0.25)  # of the second regime alone
+    assert variance(faithful) > 300.0
+
+
+def test_mean_and_variance_are_weighted_exponentially():
+    Z, I = two_regimes(100)
+    machine = EvolvingFSM(2, rule=Paper(memory=50))
+    machine.learn_many(Z, I)
+    share = 1.0 / 50.0
+    mean, var = Z[:50].mean(axis=0), Z[:50].var(axis=0).sum()
+    for z in Z[50:]:
+        off = z - mean
+        mean = mean + share * off
+        var = (1.0 - share) * (var + share * off @ off)
+    assert variance(machine) == pytest.approx(var, rel=1e-12)
+
+
+def test_a_new_regime_gets_states_where_the_paper_has_hardly_any():
+    Z, I = two_regimes(20_000)
+    founded = {}
+    for memory in (None, 500):
+        machine = EvolvingFSM(2, radius=0.3, rule=Paper(memory=memory))
+        machine.learn_many(Z, I)
+        founded[memory] = int((np.abs(machine.centers - [30.0, -20.0]).max(axis=1) < 5.0).sum())
+    assert founded[500] > founded[None]
+
+
+@pytest.mark.parametrize("memory", [0, 1, -3, 2.5, "long"])
+def test_a_memory_that_is_none_is_refused(memory):
+    with pytest.raises(ValueError, match="memory"):
+        Paper(memory=memory)
+
+
+# -- Ties ----------------------------------------------------------------------------------------
+# Observations from a grid are often exactly as dense as a centre, or exactly a radius away. What
+# then happens to the states must not depend on rounding: it is held against exact arithmetic.
+
+
+STREAMS = 60
+
+
+def exact(number):
+    """The number that was meant: of 0.1 a tenth."""
+    return Fraction(repr(number))
+
+
+def events_by_the_paper(Z, radius, distance_weight):
+    """The paper's equations (1) to (6) in fractions; also whether anything was a tie."""
+    rows = [[exact(value) for value in z] for z in Z]
+    radius, distance_weight = exact(radius), exact(distance_weight)
+    centers, potentials, distances = [rows[0]], [Fraction(1)], [Fraction(0)]
+    events, ties = [Event.CREATED], 0
+    for t, z in enumerate(rows[1:], 2):
+        before = rows[: t - 1]
+        a, b = sum(value**2 for value in z), sum(value**2 for row in before for value in row)
+        c = sum(value * sum(row[j] for row in before) for j, value in enumerate(z))
+        potential = Fraction(t - 1) / ((t - 1) * (a + 1) - 2 * c + b)
+        potentials = [
+            (t - 1) * p / ((t - 2) + p * (1 + distance_weight * d))
+            for p, d in zip(potentials, distances, strict=True)
+        ]
+        distances = [sum((x - y) ** 2 for x, y in zip(z, other, strict=True)) for other in centers]
+        nearest = distances.index(min(distances))
+        ties += potential == max(potentials) or distances[nearest] == radius**2
+        events.append(Event.NONE)
+        if potential > max(potentials):
+            if distances[nearest] < radius**2:
+                events[-1] = Event.MOVED
+            else:
+                nearest, events[-1] = len(centers), Event.CREATED
+                for held in (centers, potentials, distances):
+                    held.append(0)
+            centers[nearest], potentials[nearest], distances[nearest] = z, potential, 0
+    return events, ties
+
+
+def on_a_grid(seed, grid):
+    """Short streams on a grid: the observations, a radius and a distance weight."""
+    random = Random(seed)
+    for _ in range(STREAMS):
+        m, rows, far = random.choice([1, 2]), random.randint(4, 24), random.choice([2, 4])
+        origin = random.choice([0, 0, 160])
+        Z = [[(origin + random.randint(-far, far)) / grid for _ in range(m)] for _ in range(rows)]
+        yield Z, random.choice([0.25, 0.3, 0.5, 1.0]), random.choice([0.5, 0.85, 1.0])
+
+
+@pytest.mark.parametrize("grid", [1, 8, 10])
+def test_the_papers_rule_decides_ties_as_exact_arithmetic_does(grid):
+    tied = 0
+    for Z, radius, distance_weight in on_a_grid(grid, grid):
+        machine = EvolvingFSM(1, radius=radius, distance_weight=distance_weight)
+        expected, ties = events_by_the_paper(Z, radius, distance_weight)
+        assert machine.learn_many(Z, [0] * len(Z)).event.tolist() == expected
+        tied += ties
+    assert tied > STREAMS / 4
+
+
+def test_exactly_a_radius_away_is_not_farther():
+    pairs = [(k / 10, (k + 3) / 10) for k in range(-40, 200)]
+    assert len({np.sign(abs(a - b) - 0.3) for a, b in pairs}) == 3  # by rounding it is all three
+    for rule in (Novelty(radius=0.3), Edges()):
+        for a, b in pairs:
+            machine = EvolvingFSM(1, rule=rule)
+            machine.learn_many([[a], [b]], [0, 0])
+            assert machine.n_states == 1
+
+
+def test_a_failure_exactly_at_the_distance_creates_no_state():
+    rule = FailureSplit(Novelty(radius=1.0), distance=0.3)
+    for k in range(-40, 200):
+        machine = EvolvingFSM(1, rule=rule)
+        machine.learn_many([[k / 10], [(k + 3) / 10]], [0, 0], failures=[1])
+        assert machine.n_states == 1
