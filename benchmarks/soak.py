@@ -45,7 +45,7 @@ class Health(NamedTuple):
     belief_off: float  #: the same of the belief
     lowest: float  #: smallest probability in any matrix
     finite: bool  #: whether all that it holds is
-    newest: int  #: observation that founded the newest state
+    newest: int  #: observation that created the newest state
     kilobytes: float  #: size of the machine
 
     @property

@@ -109,7 +109,7 @@ def test_an_action_never_seen_goes_where_all_go(machine, walk):
     np.testing.assert_array_equal(forecasts.matrix(2, 5), forecasts.matrix(None, 5))
 
 
-def test_states_founded_later_are_taken_in(walk):
+def test_states_created_later_are_taken_in(walk):
     Z, actions = walk
     machine = EvolvingFSM(n_actions=2, rule=RULE)
     forecasts = Forecasts(n_actions=2, steps=[1])

@@ -153,7 +153,7 @@ def test_a_tolerant_belief_is_that_close_to_the_exact_one(rule, tolerance):
     Z, I = wander(2000)
     exact, tolerant = (EvolvingFSM(3, rule=rule, belief_tolerance=t) for t in (0.0, tolerance))
     a, b = (machine.learn_many(Z, I, belief=True) for machine in (exact, tolerant))
-    assert a.n_states.tolist() == b.n_states.tolist()  # beliefs have no say in what is founded
+    assert a.n_states.tolist() == b.n_states.tolist()  # beliefs have no say in what is created
     assert np.abs(a.belief - b.belief).sum(axis=1).max() <= tolerance
     np.testing.assert_allclose(b.belief.sum(axis=1), 1.0)
     if isinstance(rule, Novelty):  # most states take no part

@@ -221,7 +221,7 @@ def outward(rule):
     return machine, [machine.observe([x, 0.0]).event for x in (3.0, 6.0, 9.0)]
 
 
-def test_a_state_is_founded_at_the_edges_where_the_papers_rule_founds_none():
+def test_a_state_is_created_at_the_edges_where_the_papers_rule_creates_none():
     assert outward(None)[1] == [Event.NONE] * 3
     machine, events = outward(Edges())
     assert events == [Event.CREATED] * 3
@@ -511,12 +511,12 @@ def test_mean_and_variance_are_weighted_exponentially():
 
 def test_a_new_regime_gets_states_where_the_paper_has_hardly_any():
     Z, I = two_regimes(20_000)
-    founded = {}
+    created = {}
     for memory in (None, 500):
         machine = EvolvingFSM(2, radius=0.3, rule=Paper(memory=memory))
         machine.learn_many(Z, I)
-        founded[memory] = int((np.abs(machine.centers - [30.0, -20.0]).max(axis=1) < 5.0).sum())
-    assert founded[500] > founded[None]
+        created[memory] = int((np.abs(machine.centers - [30.0, -20.0]).max(axis=1) < 5.0).sum())
+    assert created[500] > created[None]
 
 
 @pytest.mark.parametrize("memory", [0, 1, -3, 2.5, "long"])

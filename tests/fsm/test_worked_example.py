@@ -1,4 +1,4 @@
-"""The paper's worked example (Sections 2.1.4 and 2.3.2): states founded at t = 1, 3 and 12."""
+"""The paper's worked example (Sections 2.1.4 and 2.3.2): states created at t = 1, 3 and 12."""
 
 import numpy as np
 import pytest
@@ -51,7 +51,7 @@ def eleven():
     return machine, steps
 
 
-def test_states_are_founded_at_1_3_and_12():
+def test_states_are_created_at_1_3_and_12():
     trace = new_machine().learn_many(OBSERVATIONS, [*ACTIONS, 0])
     assert (np.flatnonzero(trace.event == Event.CREATED) + 1).tolist() == [1, 3, 12]
     assert trace.n_states.tolist() == [1, 1, 2, 2, 2, 2, 2, 2, 2, 2, 2, 3]

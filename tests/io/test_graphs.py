@@ -114,7 +114,7 @@ def parsed(text):
 
 def test_commands_are_distributions_and_stand_for_what_was_tried(model):
     first, commands, labels = parsed(to_prism(model, evidence=2.0))
-    assert first == 1 + np.argmin(model.founded)
+    assert first == 1 + np.argmin(model.created)
     for row in commands.values():
         assert row.sum() == pytest.approx(1.0, abs=1e-14)
     tried = {(s + 1, f"a{a + 1}") for a, s in np.argwhere(model.decisions >= 2.0).tolist()}

@@ -142,7 +142,7 @@ def test_a_wrong_settings_file_is_refused_by_name(tmp_path, text, message):
     assert "changes.toml" in str(refusal.value)
 
 
-def test_one_round_in_which_states_are_still_founded_is_a_study_too():
+def test_one_round_in_which_states_are_still_created_is_a_study_too():
     study = run_paper(KinematicWorld(), "kinematic", Settings.load(), rounds=1)
     assert [run.belief.shape[1] for run in study.runs] == [7] * 4
     assert [founding.run for founding in study.foundings] == [0, 0, 0, 0, 2, 3, 3]

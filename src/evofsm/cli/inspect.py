@@ -18,7 +18,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
     from rich.console import RenderableType
 
-    from evofsm.fsm import Explanation, FSMModel
+    from evofsm.fsm.explanation import Explanation
+    from evofsm.fsm.model import FSMModel
     from evofsm.store import Header
 
 # What folders of results hold, in the order in which it is looked for.
@@ -82,7 +83,8 @@ def load_model(place: Path) -> tuple[FSMModel, Header | None]:
     """
     from evofsm import store
     from evofsm.driving import FAMILIES, load_family
-    from evofsm.fsm import EvolvingFSM, FSMModel
+    from evofsm.fsm.machine import EvolvingFSM
+    from evofsm.fsm.model import FSMModel
     from evofsm.guard import Guard
 
     if place.is_dir():
@@ -166,7 +168,7 @@ def model_document(model: FSMModel) -> dict[str, Any]:
                 "state": i,
                 "center": model.centers[i],
                 "visits": float(model.visits[i]),
-                "first_seen": int(model.founded[i]),
+                "first_seen": int(model.created[i]),
             }
             for i in range(model.n_states)
         ],
@@ -193,9 +195,9 @@ def tables_of(model: FSMModel) -> Iterator[RenderableType]:
     heads = [f"{name} [{unit}]" if unit else name for name, unit in zip(names, units, strict=True)]
     centers = zip(*map(_aligned, model.centers.T), strict=True)
     states = [
-        (f"#{i + 1}", *center, f"{visits / total:.1%}", f"{stays[i]:.3f}", f"{founded:,.0f}")
-        for i, (center, visits, founded) in enumerate(
-            zip(centers, model.visits.tolist(), model.founded.tolist(), strict=True)
+        (f"#{i + 1}", *center, f"{visits / total:.1%}", f"{stays[i]:.3f}", f"{created:,.0f}")
+        for i, (center, visits, created) in enumerate(
+            zip(centers, model.visits.tolist(), model.created.tolist(), strict=True)
         )
     ]
     title = "States (stays: share of its steps; first seen: at which row)"

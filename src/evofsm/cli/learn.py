@@ -19,7 +19,9 @@ if TYPE_CHECKING:
     from rich.console import RenderableType
 
     from evofsm.cli.learning import Learning, Skill
-    from evofsm.fsm import EvolvingFSM, IntervalActions, ObservationEncoder
+    from evofsm.fsm.actions import IntervalActions
+    from evofsm.fsm.machine import EvolvingFSM
+    from evofsm.fsm.observations import ObservationEncoder
     from evofsm.io import Chunk, VehicleLengths
     from evofsm.io.logs import Noted
 
@@ -185,7 +187,7 @@ def learn(
     """
     from evofsm.cli.learning import Checkpoint, learn_traces
     from evofsm.driving import UNITS, VARIABLES
-    from evofsm.fsm import positive
+    from evofsm.fsm.validation import positive
     from evofsm.io import LogColumns, Topics, VehicleLengths, read_traces
     from evofsm.io.logs import Noted, parse_units
 
@@ -260,7 +262,7 @@ def learn(
 
 
 def _actions(text: str) -> IntervalActions:
-    from evofsm.fsm import IntervalActions
+    from evofsm.fsm.actions import IntervalActions
 
     try:
         low, high, width = (float(number) for number in text.split(":"))
@@ -276,7 +278,7 @@ def _actions(text: str) -> IntervalActions:
 
 
 def _encoder(text: str) -> ObservationEncoder:
-    from evofsm.fsm import Category, ObservationEncoder
+    from evofsm.fsm.observations import Category, ObservationEncoder
 
     def variable(name: str) -> str | Category:
         name, discrete, values = name.partition("=")
@@ -298,7 +300,8 @@ def _machine(
     failed: str | None,
     encoder: ObservationEncoder,
 ) -> EvolvingFSM:
-    from evofsm.fsm import Edges, EvolvingFSM, FailureSplit, Novelty
+    from evofsm.fsm.machine import EvolvingFSM
+    from evofsm.fsm.rules import Edges, FailureSplit, Novelty
 
     has_novelty = rule in (RuleName.NOVELTY, RuleName.FAILURE)
     if rule is RuleName.FAILURE and failed is None:
@@ -322,7 +325,7 @@ def _machine(
 def _scales(scale: list[str] | None, encoder: ObservationEncoder, rule: RuleName) -> list[float]:
     """The difference that counts as 1, for each number that is observed."""
     from evofsm.driving import SAFETY_RULE, VARIABLES
-    from evofsm.fsm import positive
+    from evofsm.fsm.validation import positive
 
     given = {}
     for text in scale or ():

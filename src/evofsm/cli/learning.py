@@ -22,7 +22,10 @@ from numpy.typing import NDArray
 
 from evofsm import store
 from evofsm.cli.journal import differences
-from evofsm.fsm import EvolvingFSM, FSMModel, IntervalActions, Policy, jensen_shannon
+from evofsm.fsm.actions import IntervalActions
+from evofsm.fsm.divergence import jensen_shannon
+from evofsm.fsm.machine import EvolvingFSM
+from evofsm.fsm.model import FSMModel, Policy
 from evofsm.io import Chunk
 
 _log = logging.getLogger(__name__)

@@ -87,13 +87,3 @@ def passage_times(P: NDArray[np.float64], targets: NDArray[np.bool_]) -> NDArray
     among = np.eye(len(surely)) - P[np.ix_(surely, surely)]
     times[surely] = np.linalg.solve(among, np.ones(len(surely)))
     return times
-
-
-def path(P: NDArray[np.float64], start: int, n: int, rng: np.random.Generator) -> NDArray[np.int64]:
-    """(n,) states of a chain that begins in one."""
-    limits = np.cumsum(P, axis=1)
-    limits /= limits[:, -1:]
-    states = np.empty(n, np.int64)
-    for k, drawn in enumerate(rng.random(n)):
-        start = states[k] = start if k == 0 else np.searchsorted(limits[start], drawn, "right")
-    return states

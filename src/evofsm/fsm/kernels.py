@@ -230,7 +230,7 @@ def _drop_stale_caches(package: Path) -> None:
     if before.get("times") == times:
         return
     sources = [path.read_bytes() for path, _ in files]
-    uses = re.compile(rb"^@(kernel|inner_kernel|rare_kernel|compiled)\b", re.MULTILINE)
+    uses = re.compile(rb"^@(\w*kernel|compiled)\b", re.MULTILINE)
     digest = sha256(b"".join(source for source in sources if uses.search(source))).hexdigest()
     if before.get("digest") != digest:
         for path in package.rglob("__pycache__/*.nb[ic]"):

@@ -41,7 +41,7 @@ from evofsm.driving import (
     unrevised_guard,
 )
 from evofsm.driving.measures import time_headway, time_to_collision
-from evofsm.fsm import Novelty
+from evofsm.fsm.rules import Novelty
 from evofsm.guard import Decision, Explain, Guard, Judgement, Mode
 from evofsm.guard.record import RECORD
 
