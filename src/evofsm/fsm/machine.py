@@ -946,17 +946,8 @@ def _row_kernel(learnt: Learnt, settings: Settings, limit: Limit, *given: Any) -
     return cast(int, entry(learnt, settings, limit, *given))
 
 
-def opened(
-    machine: EvolvingFSM, observations: NDArray[np.float64] | None = None, *, grown: bool = False
-) -> tuple[Learnt, Settings]:
-    """What kernels of other rooms take of a machine; with room for its next step where ``grown``.
-
-    It is the machine's until there is other room. Observations that are to be learnt are looked at.
-    """
-    if observations is not None and len(observations):
-        machine._fit(machine._checked_rows(observations).shape[1])
-    if grown:
-        machine._make_room()
+def opened(machine: EvolvingFSM) -> tuple[Learnt, Settings]:
+    """What a machine has learnt and was told, itself."""
     return machine._learnt, machine._settings
 
 
