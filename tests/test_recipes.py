@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import pytest
 
 from evofsm.driving import DECISION_COLUMNS
-from evofsm.guard import Column
+from evofsm.guard.record import Column
 
 pytestmark = pytest.mark.slow
 
@@ -54,7 +54,7 @@ def test_a_state_rule(tmp_path):
     pytest.importorskip("typer")
     write("Add a state rule", tmp_path)
     said = python(tmp_path, "-m", "evofsm", "check", "my_rule:Coarse")
-    assert "a_file_keeps_it" in said
+    assert "a_machine_takes_it" in said
     assert "failed" not in said
 
 

@@ -1,4 +1,4 @@
-"""A counter that is added as CONTRIBUTING.md says works, and files hold what their page says."""
+"""A counter that is added as CONTRIBUTING.md says works."""
 
 import os
 import re
@@ -8,8 +8,6 @@ import sys
 from pathlib import Path
 
 import pytest
-
-from evofsm.fsm.arrays import MACHINE, MODEL
 
 ROOT = Path(__file__).parents[2]
 # Run where the counter was added; prints nothing where all is well.
@@ -58,21 +56,3 @@ def test_the_counter_of_the_recipe_counts_is_kept_joined_and_cleared(recipe, tmp
     command = [sys.executable, "-W", "ignore", "-c", SCRIPT, str(tmp_path)]
     done = subprocess.run(command, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-
-
-def row_of(kind):
-    page = (ROOT / "docs" / "files.md").read_text("utf-8")
-    return re.search(rf"^\| {kind.name} \| (.*) \|$", page, re.MULTILINE)[1]
-
-
-@pytest.mark.parametrize("kind", [MACHINE, MODEL], ids=lambda kind: kind.name)
-def test_the_page_on_files_has_every_array_with_its_shape(kind):
-    told = {}
-    for group in row_of(kind).split(";"):
-        names, shape = re.fullmatch(r"\s*(.*) \(([^()]*)\)\s*", group).groups()
-        told |= dict.fromkeys(re.findall(r"`(\w+)`", names), shape)
-    letters = {1: "1", "settings.n_actions": "q"}
-    assert told == {
-        name: ", ".join(str(letters.get(size, size)) for size in numbers.shape)
-        for name, numbers in kind.arrays.items()
-    }
