@@ -33,10 +33,10 @@ LENGTHS = {
 }
 ACTIONS = {
     "a number": (1.0, TypeError, "action is 1.0; it must be an integer index"),
-    "NaN": (NAN, TypeError, "action is nan; it must be a positive integer"),
-    "a text": ("1", TypeError, "action is '1'; it must be a positive integer"),
-    "nothing": (None, TypeError, "action is None; it must be a positive integer"),
-    "a list": ([1], TypeError, r"action is \[1\]; it must be a positive integer"),
+    "NaN": (NAN, TypeError, "action is nan; it must be an integer index"),
+    "a text": ("1", TypeError, "action is '1'; it must be an integer index"),
+    "nothing": (None, TypeError, "action is None; it must be an integer index"),
+    "a list": ([1], TypeError, r"action is \[1\]; it must be an integer index"),
     "too high": (3, ValueError, "action is 3; there are actions 0 to 2"),
     "below zero": (-1, ValueError, "action is -1; there are actions 0 to 2"),
 }

@@ -10,10 +10,10 @@ import pytest
 from evofsm.fsm import kernels
 
 CALLER = """
-from compiled.core import kernels
+from compiled.core.kernels import kernel
 from compiled.callee import callee
 
-@kernels.kernel
+@kernel
 def caller(x: float) -> float:
     return callee(x) + 1.0
 
@@ -21,9 +21,9 @@ if __name__ == "__main__":
     print(caller(1.0), sum(caller.stats.cache_hits.values()))
 """
 CALLEE = """
-from compiled.core import kernels
+from compiled.core.kernels import kernel
 
-@kernels.kernel
+@kernel
 def callee(x: float) -> float:
     return x * FACTOR
 """

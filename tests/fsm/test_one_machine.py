@@ -47,7 +47,7 @@ def test_threads_on_one_machine_lose_no_observation(interval):
 )
 def test_an_interrupt_at_any_line_leaves_a_whole_machine(deed, every):
     found = Counter(one_machine.harms(one_machine.DEEDS[deed], every))
-    assert found.total() >= 5
+    assert found.total() >= 3
     assert set(found) == {""}
 
 

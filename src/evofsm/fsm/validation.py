@@ -127,7 +127,7 @@ def _masked(values: ArrayLike) -> NDArray[np.bool_] | None:
 
 def is_within(values: NDArray[np.float64], largest: float) -> bool:
     """Whether this is a short vector of numbers of at most that size: the quick way to ask it."""
-    if values.ndim != 1 or len(values) > _SHORT:
+    if values.ndim != 1 or not 0 < len(values) <= _SHORT:
         return False
     return all([-largest <= value <= largest for value in values.tolist()])  # noqa: C419
 
