@@ -37,23 +37,9 @@ def test_all_claims_hold_and_the_page_is_named(reproduced):
 def test_the_folder_holds_page_claims_traces_model_and_figures(reproduced):
     _, folder = reproduced
     names = {path.name for path in folder.iterdir()}
-    assert names >= {"index.html", "claims.json", "traces.parquet", "model.evofsm", "figures"}
-    figures = {path.stem for path in (folder / "figures").iterdir()}
-    for figure in figures:
-        assert (folder / "figures" / f"{figure}.png").stat().st_size > 10_000
-        assert (folder / "figures" / f"{figure}.svg").stat().st_size > 10_000
-    assert len(figures) == 7
-    claims = json.loads((folder / "claims.json").read_text())
-    assert all(claim["holds"] for claim in claims)
-    assert claims[0]["claim"] in (folder / "index.html").read_text()
-
-
-@pytest.mark.slow
-def test_the_model_it_saves_can_be_inspected(reproduced):
-    _, folder = reproduced
-    run = evofsm("inspect", folder / "model.evofsm", folder=folder)
-    assert run.returncode == 0, run.stderr
-    assert "#7" in run.stdout
+    assert names == {"index.html", "claims.json", "traces.parquet", "model.evofsm", "figures"}
+    for path in (folder / "figures").iterdir():
+        assert path.stat().st_size > 10_000
 
 
 @pytest.mark.slow
