@@ -113,6 +113,14 @@ def test_the_graph_says_how_likely_states_stay(model):
     assert f"dead end\nstays {100 * stays[2]:.0f} %" in said
 
 
+def test_the_two_likeliest_ways_out_of_each_state_are_dark():
+    machine = EvolvingFSM(n_actions=1, rule=Novelty(radius=0.5))
+    machine.learn_many([[0], [9], [0], [9], [3], [0], [6], [9], [0]], [0] * 9)
+    arrows = plot.graph(machine.model(), new()).patches
+    assert machine.n_states == 4
+    assert sum(arrow.get_zorder() == 2.0 for arrow in arrows) == 4 * 2 < len(arrows)
+
+
 @pytest.mark.parametrize("action", [None, 0, 1])
 def test_transitions_are_those_of_the_action_or_of_all(model, action):
     ax = plot.transitions(model, new(), action=action, dead_ends=[2])

@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 import textwrap
+import time
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -121,6 +122,8 @@ def test_the_study_of_the_readme_runs(tmp_path):
 def test_results_keep_the_order_of_the_tasks_whatever_the_number_of_workers():
     tasks = [partial(divmod, number, 3) for number in range(6)]
     assert lib.parallel(tasks, 1) == lib.parallel(tasks, 2) == [divmod(n, 3) for n in range(6)]
+    slow_first = [partial(time.sleep, 1.0), partial(int, 7)]
+    assert lib.parallel(slow_first, 2) == [None, 7]
     with pytest.raises(ZeroDivisionError):
         lib.parallel([*tasks, partial(divmod, 1, 0)], 2)
 
@@ -197,6 +200,7 @@ def test_calibrated_probabilities_never_fall_and_come_true():
     calibrate = lib.isotonic(score, truth)
     probability = calibrate(np.sort(score))
     assert (np.diff(probability) >= 0.0).all()
+    assert lib.isotonic([1.0, 2.0], [False, True])([1.0, 2.0]).tolist() == [0.0, 1.0]
     assert lib.brier(calibrate(score), truth) < lib.brier(np.full(2000, truth.mean()), truth)
     with pytest.raises(ValueError, match="one score or more"):
         lib.isotonic([], [])

@@ -95,6 +95,15 @@ def test_acc_is_the_published_one():
     assert held.interval == pytest.approx(0.1)
 
 
+def test_tanks_fail_where_one_overflows_or_runs_dry_and_not_before():
+    tanks = make_system("tanks", "full")
+    seen, _, _, failed = play(tanks, STARTS[0])
+    assert failed
+    assert seen[-2, :2].max() < 2.0 <= seen[-1, :2].max() < 2.3
+    dry = play(tanks, STARTS[0], lambda z: np.zeros(2))[0]
+    assert dry[-2, :2].min() > 0.1 >= dry[-1, :2].min()
+
+
 def careful_pumps(z):
     """Steer the flows towards what keeps both levels at 1 m, ahead of the pumps' lag."""
     levels, flows = z[:2], z[2:]
