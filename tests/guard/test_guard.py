@@ -361,21 +361,6 @@ def test_a_damaged_file_is_refused(tmp_path):
             Guard.load(path)
 
 
-def test_choices_are_audited_and_replayed(tmp_path):
-    with AuditLog(tmp_path / "log") as log:
-        balance(discrete(audit=log), pushes(discrete, 12))
-    found = audit(tmp_path / "log")
-    assert found.is_good
-    assert found.contents.decisions == 12
-    assert found.not_replayed  # its judge is of this test
-    with AuditLog(tmp_path / "other") as log:
-        guard = Guard.of(Unrevised(Choices(5)), interval=DT, audit=log)
-        for action in (0, 3, 9):
-            guard.decide([0.0, 0.0], action)
-        guard.end()
-    assert audit(tmp_path / "other").replayed == 3
-
-
 def known(monkeypatch, *judges):
     """As if an installed package declared these judges."""
     points = dict(parts._entry_points())

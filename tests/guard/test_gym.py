@@ -215,14 +215,6 @@ def test_gymnasium_finds_nothing_to_complain_of():
     check_env(env, skip_render_check=True)
 
 
-def test_environments_that_are_wrapped_one_by_one_make_a_vector():
-    cars = SyncVectorEnv([lambda: of_cars(CarFollowing())] * 2)
-    cars.reset(seed=1)
-    *_, info = cars.step(np.full((2, 1), 2.5))
-    assert info["reviser/executed_action"].shape == (2, 1)
-    cars.close()
-
-
 def test_a_failure_is_learnt_and_the_end_of_time_is_none():
     for failed in (True, False):
         env = of_cars(Script(FAR, NEAR, HIT, failed=failed))

@@ -162,20 +162,6 @@ def test_a_log_is_replayed_learning_and_frozen(point, tmp_path):
     assert found.contents.spoke > 20
 
 
-def test_told_what_failure_is_a_log_is_replayed_by_whoever_tells_it_again(points, tmp_path):
-    def failed(z):
-        return z[0] >= 1.0
-
-    with AuditLog(tmp_path / "log") as log:
-        guard = points["box"].guard(audit=log, failed=failed)
-        for episode in range(3):
-            points["box"].play(guard, episode)
-    assert audit(tmp_path / "log", log.head, failed=failed).is_good
-    without = audit(tmp_path / "log", log.head)
-    assert without.replayed == 0
-    assert "--failed" in without.not_replayed[0]
-
-
 # -- Looking on ---------------------------------------------------------------------------------
 
 
