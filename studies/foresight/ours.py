@@ -161,7 +161,7 @@ class Learnt:
                 plan[0] = some.action[r]
                 world = situation, plan, nobody, disturbances, 1.0, 0.0, count, ends_of
                 replay(self.dynamics.model, *world)
-                survives = ends_of.survived == horizon
-                found[r, s] = np.where(survives, np.inf, ends_of.survived + 1.0)
+                left = ends_of.value
+                found[r, s] = np.where(left >= 0.0, np.inf, left + horizon + 2.0)
         self._replayed[id(some)] = found
         return found

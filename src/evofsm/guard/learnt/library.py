@@ -29,7 +29,7 @@ from typing import NamedTuple, Self
 import numpy as np
 
 from evofsm.guard.learnt.dynamics import Dynamics, Episode
-from evofsm.guard.learnt.replay import Disturbances, Ends, Floats, Ints, Model, replay, worth
+from evofsm.guard.learnt.replay import Disturbances, Ends, Floats, Ints, Model, replay
 
 # Situations that are kept, and those on which the starts of an episode are tried.
 KEPT, _TRIED = 32, 8
@@ -69,18 +69,17 @@ def harm(
 ) -> Floats:
     """(K, S) how each disturbance ends in each situation under the best of the policies.
 
-    The least distance to failure; where none escapes, the steps left as it fails, negative, less 1.
-    The first policy after which it is ``enough`` will do. A ``plan`` (T, a) is executed first.
+    As `Ends.value` has it; once all are ``enough`` no other policy is asked. A ``plan`` (T, a) is
+    executed first.
     """
-    steps, _, each = disturbances.residuals.shape
+    each = disturbances.residuals.shape[2]
     count = len(situations) * each
     plan = np.empty((0, policies.shape[1])) if plan is None else plan
     found, ends = np.full(count, -np.inf), Ends.of(count)
     for policy in policies:
         replay(model, situations, plan, policy, disturbances, scale, 0.0, count, ends)
-        value = np.where(ends.survived == steps, ends.least, ends.survived - steps - 1.0)
-        found = np.where(found < enough, np.maximum(found, value), found)
-        if found.min() >= enough:
+        np.maximum(found, ends.value, out=found)
+        if enough < math.inf and found.min() >= enough:
             break
     return found.reshape(len(situations), each).T
 
@@ -281,15 +280,22 @@ class Backups:
         """With mutants in the place of linear ones where all together are worth more then."""
         policies, ranks = self.policies.copy(), self.ranks
         linear = np.arange(self.n_constant, len(policies))
-        ends = Ends.of(len(situations) * disturbances.residuals.shape[2])
-        world = disturbances, scale, ends
-        values = np.array([worth(model, situations, one, *world) for one in policies])
+        each, nothing = disturbances.residuals.shape[2], np.empty((0, policies.shape[1]))
+        count = len(situations) * each
+        ends = Ends.of(count)
+
+        def worth(policy: Floats) -> Floats:
+            """(S,) how well it ends in each situation, in the mean of all disturbances."""
+            replay(model, situations, nothing, policy, disturbances, scale, 0.0, count, ends)
+            return np.asarray(ends.worth.reshape(-1, each).mean(1))
+
+        values = np.array([worth(policy) for policy in policies])
         for mutation in self._mutations(random) if len(linear) else ():
             parent = linear[values[linear].mean(1).round(_ROUNDED).argmax()]
             if random.random() >= _OF_BEST:
                 parent = ranks[int(random.integers(len(policies)))]
             child = policies[parent] + mutation
-            reached = worth(model, situations, child, *world)
+            reached = worth(child)
             tried = np.repeat(values[None], 1 + len(linear), 0)  # as they are, and with the child
             tried[1 + np.arange(len(linear)), linear] = reached
             together = tried.max(1).mean(1) + _BY_ITSELF * tried.mean(2).sum(1)

@@ -98,16 +98,20 @@ class Disturbances(NamedTuple):
 
 
 class Ends(NamedTuple):
-    """How replays ended: for each of S situations those of K disturbances."""
+    """How replays ended: for each of S situations those of K disturbances, (S K,) each."""
 
-    survived: Floats  #: (S K,) steps until failure, or all of them
-    least: Floats  #: (S K,) least distance to failure until then [ordinary changes]
-    last: Floats  #: (S K,) distance where the replay ended
+    #: least distance to failure [ordinary changes]; of one that failed the steps left, negative,
+    #: less 1
+    value: Floats
+    #: the share of the horizon that is survived, and a little for the distance to failure: the
+    #: least one and, where all is survived, that at the end as well, as who comes back does better
+    #: than who hovers beside failure
+    worth: Floats
 
     @classmethod
     def of(cls, count: int) -> Ends:
         """Room for so many replays."""
-        return cls(np.empty(count), np.empty(count), np.empty(count))
+        return cls(np.empty(count), np.empty(count))
 
 
 # -- What is expected -----------------------------------------------------------------------------
@@ -397,8 +401,10 @@ def replay(
     enough: float,
     allowed: int,
     ends: Ends,
-) -> int:
-    """Replay each of K disturbances in each of S situations, into ``ends``; how many are lost.
+) -> tuple[int, float]:
+    """Replay each of K disturbances in each of S situations, into ``ends``.
+
+    Returns how many are not survived, and the least distance to failure of the others.
 
     A situation is an observation, its change, and the action before (2m + a). First the actions of
     the ``plan`` (T, a) are taken, if it has any, then what the ``policy`` (a, 1 + m) says. A replay
@@ -416,7 +422,7 @@ def replay(
     n = (count + _LINE - 1) // _LINE * _LINE
     z, change, move, after = np.empty((m, n)), np.empty((m, n)), np.empty((m, n)), np.empty((m, n))
     before, action, found = np.empty((a, n)), np.empty((a, n)), np.empty((p, n))
-    which, alive, near = np.zeros(n, np.int64), np.zeros(n, np.int64), np.empty(n)
+    which, survived, near = np.zeros(n, np.int64), np.empty(n, np.int64), np.empty(n)
     jumps = False
     for l in range(n):
         start = l // each if l < count else 0
@@ -424,9 +430,9 @@ def replay(
             z[j, l], change[j, l] = situations[start, j], situations[start, m + j]
         for i in range(a):
             before[i, l] = situations[start, 2 * m + i]
-        near[l] = np.inf
+        near[l], survived[l] = np.inf, steps if l < count else -1
         if l < count:
-            which[l], alive[l], ends.survived[l] = l % each, 1, steps
+            which[l] = l % each
             for j in range(m):
                 jumps |= disturbances.jump_at[which[l], j] >= 0.0
     lost, end = 0, 1.0 - _RESERVE * enough
@@ -483,50 +489,35 @@ def replay(
             for l in range(n):
                 left = sign * (threshold - z[j, l]) * worth
                 nearer = left if left < near[l] else near[l]
-                near[l] = nearer if alive[l] == 1 else near[l]
+                near[l] = nearer if survived[l] == steps else near[l]
         fails = 0
         for l in range(n):
-            fails += 1 if (alive[l] == 1) & (near[l] < enough) else 0
+            fails += 1 if (survived[l] == steps) & (near[l] < enough) else 0
         if fails == 0:
             continue
         for l in range(count):
-            if alive[l] == 1 and near[l] < enough:
-                alive[l], ends.survived[l] = 0, t
+            if survived[l] == steps and near[l] < enough:
+                survived[l] = t
                 lost += 1
                 if allowed < count and which[l] == 0:
                     lost = count
         if lost >= count or lost > allowed:
             break
+    left = np.inf
     for l in range(count):
-        ends.least[l], ends.last[l] = near[l], np.inf
-        for s in range(sides):
-            j, sign = int(model.thresholds[s, 0]), model.thresholds[s, 1]
-            left = sign * (model.thresholds[s, 2] - z[j, l]) * model.thresholds[s, 3]
-            ends.last[l] = min(ends.last[l], left)
-    return lost
-
-
-def worth(
-    model: Model,
-    situations: Floats,
-    policy: Floats,
-    disturbances: Disturbances,
-    scale: float,
-    ends: Ends,
-) -> Floats:
-    """(S,) how well a policy ends in each situation, in the mean of all disturbances.
-
-    The share of the horizon that is survived, and a little for the distance to failure: the least
-    one and, where all is survived, that at the end as well, as who comes back does better than who
-    hovers beside failure. ``ends`` is room for all replays.
-    """
-    (steps, _, each), nothing = disturbances.residuals.shape, np.empty((0, len(policy)))
-    count = len(ends.least)
-    replay(model, situations, nothing, policy, disturbances, scale, 0.0, count, ends)
-    left = np.where(ends.survived == steps, 0.5 * (ends.least + ends.last), ends.least)
-    left = np.minimum(1.0, np.maximum(-1.0, _FAR * left))
-    total = (ends.survived / steps + _DISTANCE * left).reshape(-1, each).sum(1)
-    return np.asarray(total / each)
+        share, distance = survived[l] / steps, near[l]
+        if near[l] >= enough:
+            left = min(left, near[l])
+        ends.value[l] = near[l] if survived[l] == steps else survived[l] - steps - 1.0
+        if survived[l] == steps:
+            last = np.inf
+            for s in range(sides):
+                j, sign = int(model.thresholds[s, 0]), model.thresholds[s, 1]
+                at, worth = model.thresholds[s, 2], model.thresholds[s, 3]
+                last = min(last, sign * (at - z[j, l]) * worth)
+            distance = 0.5 * (near[l] + last)
+        ends.worth[l] = share + _DISTANCE * min(1.0, max(-1.0, _FAR * distance))
+    return lost, left
 
 
 # -- What decides ---------------------------------------------------------------------------------
@@ -563,12 +554,11 @@ def search(
 
     def left(action: Floats, q: int) -> float:
         """Least distance to failure; negative infinity if it is not survived."""
-        policy = policies[q]
-        if allowed < replay(
-            model, situations, action[None], policy, disturbances, scale, margin, allowed, ends
-        ):
-            return -np.inf
-        return float(ends.least[ends.least >= margin].min())
+        plan, policy = action[None], policies[q]
+        lost, least = replay(
+            model, situations, plan, policy, disturbances, scale, margin, allowed, ends
+        )
+        return least if lost <= allowed else -np.inf
 
     for q in ranks:
         least = left(proposal, q)
@@ -591,9 +581,10 @@ def search(
             else:
                 refused = half
         return Found(best, q, least, False)
-    worths = [
-        float(worth(model, situations, policies[q], disturbances, scale, ends)[0]) for q in ranks
-    ]
+    worths, nothing = [], np.empty((0, len(proposal)))
+    for q in ranks:
+        replay(model, situations, nothing, policies[q], disturbances, scale, 0.0, count, ends)
+        worths.append(float(ends.worth.mean()))
     which, longest = 0, worths[0]
     for k, lasts in enumerate(worths):
         if lasts > longest + _EQUAL:
