@@ -19,7 +19,7 @@ from urllib.parse import unquote, urlsplit
 import pytest
 import typer.testing
 
-from evofsm.__main__ import application
+from evofsm.cli.app import application
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"

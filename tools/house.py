@@ -79,7 +79,7 @@ def words_in(folder: Path) -> int:
 
 def commands() -> int:
     """Commands of ``evofsm``."""
-    from evofsm.__main__ import application
+    from evofsm.cli.app import application
 
     app = application()
     return len(app.registered_commands) + len(app.registered_groups)

@@ -10,6 +10,6 @@ def evofsm():
     pytest.importorskip("rich")
     from typer.testing import CliRunner
 
-    from evofsm.__main__ import application
+    from evofsm.cli.app import application
 
     return lambda *words: CliRunner().invoke(application(), [*map(str, words)])

@@ -58,7 +58,7 @@ def test_help_loads_nothing_heavy(command):
     words = [*command.split(), "--help"]
     result = python(
         "import sys\n"
-        "from evofsm.__main__ import application\n"
+        "from evofsm.cli.app import application\n"
         f"application()({words}, standalone_mode=False)\n"
         "print(sorted({'numpy', 'numba', 'polars', 'libsumo', 'rich'} & set(sys.modules)))"
     )
@@ -111,7 +111,7 @@ ELSEWISE = ("watch", "export", "monitor")
 
 
 def test_every_command_but_three_answers_programs():
-    from evofsm.__main__ import application
+    from evofsm.cli.app import application
 
     commands = typer.main.get_command(application()).commands
     lacking = {

@@ -10,7 +10,7 @@ pytest.importorskip("rich")
 
 from typer.testing import CliRunner
 
-from evofsm.__main__ import application
+from evofsm.cli.app import application
 from evofsm.driving.judge import LatentRisk
 from evofsm.fsm.actions import IntervalActions
 from evofsm.guard.api import Proposal

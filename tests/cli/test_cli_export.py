@@ -9,7 +9,7 @@ pytest.importorskip("mcap")
 
 from typer.testing import CliRunner
 
-from evofsm.__main__ import application
+from evofsm.cli.app import application
 from evofsm.fsm.machine import EvolvingFSM
 from evofsm.io import read_run
 

@@ -15,7 +15,7 @@ pytest.importorskip("rich")
 
 from typer.testing import CliRunner
 
-from evofsm.__main__ import application
+from evofsm.cli.app import application
 from evofsm.cli.monitor.decider import Decider, guard_of_monitor
 from evofsm.guard import Guard, Mode, audit
 from monitor_rows import JUNK, closing_in, line, traffic

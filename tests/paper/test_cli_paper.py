@@ -94,7 +94,7 @@ def test_without_the_extras_it_names_them_before_any_work(tmp_path):
         check=False,
     )
     assert run.returncode == 2
-    assert "pip install '.[cli,tables,plot]'" in run.stderr
+    assert "pip install '.[cli,tables]'" in run.stderr
     assert not Path(tmp_path / "evofsm-paper").exists()
 
 

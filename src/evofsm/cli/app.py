@@ -17,6 +17,7 @@ from evofsm.cli.export import export
 from evofsm.cli.inspect import inspect
 from evofsm.cli.learn import learn
 from evofsm.cli.monitor import monitor
+from evofsm.cli.paper import paper
 from evofsm.cli.show import message, warn
 from evofsm.cli.watch import watch
 
@@ -81,13 +82,10 @@ def _options(
     """Online recognition of latent risk with an evolving finite state machine."""
 
 
-def application(*others: Any) -> typer.Typer:
+def application() -> typer.Typer:
     """All commands, in the order in which the help names them."""
-    from evofsm.cli.commands.declared import callback
-
     about = _options.__doc__ or ""
-    commands = (learn, inspect, drive, watch, monitor, audit, export, check)
-    app = group(about, *commands, *map(callback, others))
+    app = group(about, paper, learn, inspect, drive, watch, monitor, audit, export, check)
     app.callback()(_options)
     return app
 

@@ -1,5 +1,4 @@
 from .claims import check_claims as check_claims
-from .command import Paper as Paper
 from .page import Figure as Figure
 from .page import Page as Page
 from .page import Table as Table
