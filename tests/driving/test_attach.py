@@ -216,17 +216,6 @@ def test_another_simulation_is_left_alone(road):
     assert second.collisions
 
 
-def test_cars_are_painted_by_how_they_stand(road):
-    sumo = road(*NO_GAP)
-    attach(sumo, ["ego"], color=True)
-    colors = []
-    for _ in range(200):
-        drive(sumo, 0.1)
-        colors.append(sumo.vehicle.getColor("ego")[:3])
-    assert colors[5] == (40, 160, 70)
-    assert (240, 160, 0) in colors
-
-
 # -- Watching --------------------------------------------------------------------------------------
 
 

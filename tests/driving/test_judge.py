@@ -32,19 +32,18 @@ SPEEDS = st.one_of(st.just(0.0), st.floats(0.0, 40.0))
 ACTIONS = st.floats(-5.0, 3.0)
 DECELS = st.floats(1.0, 9.0)
 LAGS = st.one_of(st.just(0.0), st.floats(0.0, 1.0))
-ONSETS = st.integers(0, 12)
 
 
-def critical(gap, speed, leader_speed, action, *, before=0.0, decel=4.0, lag=0.0, onset=0):
+def critical(gap, speed, leader_speed, action, *, before=0.0, decel=4.0, lag=0.0):
     answer = np.empty(1)
     observation = np.array([gap, speed, leader_speed])
     body = Follower(decel, lag, MARGIN)
-    critical_decelerations(observation, np.array([action]), before, body, onset, DT, answer)
+    critical_decelerations(observation, np.array([action]), before, body, DT, answer)
     return float(answer[0])
 
 
 @numba.njit
-def smallest_gap(gap, speed, leader_speed, action, before, decel, lag, onset, leader_decel):
+def smallest_gap(gap, speed, leader_speed, action, before, decel, lag, leader_decel):
     """Driven out in steps of 1 ms: the old command, the new one, and full braking."""
     step = 1e-3
     smallest, tick = gap, 0
@@ -58,9 +57,8 @@ def smallest_gap(gap, speed, leader_speed, action, before, decel, lag, onset, le
             command = -decel
             if speed <= 0.0:
                 return smallest
-        braking = -leader_decel if time >= onset * DT - 1e-9 else 0.0
         reached = max(0.0, speed + max(command, -decel) * step)
-        leader_reached = max(0.0, leader_speed + braking * step)
+        leader_reached = max(0.0, leader_speed - leader_decel * step)
         gap += 0.5 * (leader_speed + leader_reached - speed - reached) * step
         speed, leader_speed = reached, leader_reached
         smallest = min(smallest, gap)
@@ -72,20 +70,16 @@ def smallest_gap(gap, speed, leader_speed, action, before, decel, lag, onset, le
 
 @pytest.mark.slow
 @settings(max_examples=400)
-@given(GAPS, SPEEDS, SPEEDS, ACTIONS, ACTIONS, DECELS, LAGS, ONSETS)
+@given(GAPS, SPEEDS, SPEEDS, ACTIONS, ACTIONS, DECELS, LAGS)
 def test_the_critical_deceleration_agrees_with_driving_it_out(
-    gap, speed, leader_speed, action, before, decel, lag, onset
+    gap, speed, leader_speed, action, before, decel, lag
 ):
-    hardest = critical(
-        gap, speed, leader_speed, action, before=before, decel=decel, lag=lag, onset=onset
-    )
+    hardest = critical(gap, speed, leader_speed, action, before=before, decel=decel, lag=lag)
     stays = speed == 0.0 and max(action, before) <= 0.0
     kept = 0.0 if stays else MARGIN
 
     def left(leader_decel):
-        return smallest_gap(
-            gap, speed, leader_speed, action, before, decel, lag, onset, leader_decel
-        )
+        return smallest_gap(gap, speed, leader_speed, action, before, decel, lag, leader_decel)
 
     assert 0.0 <= hardest <= HARDEST
     if hardest > DECEL_TOLERANCE:
@@ -95,14 +89,12 @@ def test_the_critical_deceleration_agrees_with_driving_it_out(
 
 
 @pytest.mark.slow
-@given(GAPS, SPEEDS, SPEEDS, ACTIONS, ACTIONS, DECELS, LAGS, ONSETS, st.floats(0.0, 20.0))
+@given(GAPS, SPEEDS, SPEEDS, ACTIONS, ACTIONS, DECELS, LAGS, st.floats(0.0, 20.0))
 def test_the_critical_deceleration_is_monotonic(
-    gap, speed, leader_speed, action, before, decel, lag, onset, more
+    gap, speed, leader_speed, action, before, decel, lag, more
 ):
     def at(gap=gap, action=action, decel=decel):
-        return critical(
-            gap, speed, leader_speed, action, before=before, decel=decel, lag=lag, onset=onset
-        )
+        return critical(gap, speed, leader_speed, action, before=before, decel=decel, lag=lag)
 
     rounding = HARDEST / 2**9
     assert at(gap=gap + more) >= at() - rounding
@@ -213,7 +205,6 @@ def test_following_learns_nothing(taught, snapshot):
 def test_a_question_changes_nothing(taught, snapshot):
     before = snapshot(taught)
     taught.judge(situation(20.0, 20.0, 10.0), [1.0, 0.0])
-    taught.probability([20.0, 20.0, 20.0], 1.0, 8.0)
     taught.score(np.array([[20.0, 20.0, 20.0]]), DT)
     assert snapshot(taught) == before
 
@@ -239,11 +230,6 @@ def test_saved_and_loaded_it_judges_identically(taught, tmp_path, snapshot):
         ]
         for one, other in zip(*judged, strict=True):
             np.testing.assert_array_equal(one, other)
-        chances = [
-            risk.probability([gap, speed, leader_speed], 1.0, 5.0, [0.2, 0.3, 0.5])
-            for risk in (taught, loaded)
-        ]
-        assert chances[0] == chances[1]
 
 
 @pytest.mark.parametrize(
@@ -308,41 +294,6 @@ def test_limits_that_cannot_be_right_are_refused():
     for decel in (-2.5, math.nan):
         with pytest.raises(ValueError, match="decel"):
             LatentRisk.given(-2.5, decel, 4.5)
-
-
-@given(GAPS, SPEEDS, SPEEDS, ACTIONS, st.booleans())
-def test_the_probability_grows_with_the_horizon(gap, speed, leader_speed, action, braking):
-    risk = LatentRisk(lowest=-4.0)
-    risk.manoeuvres.remember(2.5, 3.0, 4.5)
-    for k in range(8):
-        risk.follow([60.0, 20.0, 20.0 - k * braking], 0.0)
-    chances = [
-        risk.probability([gap, speed, leader_speed], action, horizon)
-        for horizon in (0.25, 1.0, 4.0, 16.0)
-    ]
-    assert all(0.0 <= chance <= 1.0 for chance in chances)
-    assert (np.diff(chances) >= -1e-12).all()
-
-
-def test_what_no_one_can_avoid_is_certain_even_if_the_leader_does_not_brake():
-    risk = LatentRisk(lowest=-4.0)
-    assert risk.probability([5.0, 30.0, 0.0], -4.0, 5.0) == 1.0
-    assert risk.probability([50.0, 0.0, 0.0], -4.0, 5.0) == 0.0
-
-
-@pytest.mark.parametrize("horizon", [0.0, -1.0, math.nan, math.inf])
-def test_a_horizon_that_cannot_be_right_is_refused(horizon):
-    with pytest.raises(ValueError, match="horizon"):
-        LatentRisk(lowest=-4.0).probability([5.0, 3.0, 3.0], 0.0, horizon)
-
-
-def test_leaders_brake_more_often_where_they_were_seen_to():
-    risk = LatentRisk(lowest=-4.0)
-    for k in range(400):
-        at = k % 20
-        belief = [0.0, 1.0] if 10 <= at < 16 else [1.0, 0.0]
-        risk.learn([60.0, 20.0, 20.0 - max(0, at - 12)], 0.0, belief)
-    assert risk.onset_rate([0.0, 1.0]) > risk.onset_rate() > risk.onset_rate([1.0, 0.0])
 
 
 # -- In files ----------------------------------------------------------------------------------
@@ -438,7 +389,6 @@ def learnt(risk):
         risk.manoeuvres.gentle,
         [sizes.tolist() for sizes in noise],
         risk.perception.noise,
-        risk.onset_rate(),
     )
 
 
@@ -473,21 +423,6 @@ def test_merged_they_know_what_one_car_would_that_saw_all():
     np.testing.assert_allclose(first.manoeuvres.table, one.manoeuvres.table)
     assert first.judge(HERE, [0.0]).risk == pytest.approx(one.judge(HERE, [0.0]).risk)
     assert learnt(cars[1]) == before
-
-
-def test_onsets_add_up_by_state_only_where_states_are_the_same():
-    def car(seed, belief):
-        return follow(LatentRisk(-8.0, DT), 4.0, 3.0, seed=seed, belief=belief)
-
-    mine, yours = car(1, (0.0, 1.0)), car(2, (0.5, 0.5))
-    alone = mine.onset_rate((0.0, 1.0)), mine.seconds_seen((1.0, 0.0))
-    mine.merge([yours])
-    assert (mine.onset_rate((0.0, 1.0)), mine.seconds_seen((1.0, 0.0))) == alone
-    again = car(1, (0.0, 1.0))
-    again.merge([yours], same_states=True)
-    seconds = 2 * 20 * DT
-    assert again.seconds_seen((1.0, 0.0)) == pytest.approx(0.5 * seconds)
-    assert again.seconds_seen((0.0, 1.0)) == pytest.approx(1.5 * seconds)
 
 
 def test_own_brakes_are_ones_own_unless_told_otherwise():

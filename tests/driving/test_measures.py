@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
-from hypothesis.extra.numpy import arrays
 
 from evofsm.driving.measures import (
     DecelerationToAvoidCollision,
@@ -72,13 +71,6 @@ def test_every_row_gets_a_score_and_observations_stay(measure, episode):
 
 @pytest.mark.slow
 @EVERY_MEASURE
-@given(arrays(float, (4, 3), elements=st.floats(-1e100, 1e100)))
-def test_no_score_is_missing_however_wild_the_numbers(measure, episode):
-    assert not np.isnan(measure.score(episode, DT)).any()
-
-
-@pytest.mark.slow
-@EVERY_MEASURE
 @given(EPISODES, SPEEDS, SPEEDS, st.floats(-10.0, 0.0))
 def test_nothing_is_more_dangerous_than_to_have_met(measure, episode, speed, leader, gap):
     met = measure.score(np.vstack([episode, [[gap, speed, leader]]]), DT)
@@ -88,29 +80,19 @@ def test_nothing_is_more_dangerous_than_to_have_met(measure, episode, speed, lea
 
 @pytest.mark.slow
 @EVERY_MEASURE
-@given(EPISODES, st.floats(0.0, 100.0))
-def test_a_smaller_gap_is_not_safer(measure, episode, nearer):
-    closer = episode.copy()
-    closer[-1, 0] -= nearer
-    assert at_least(last_score(measure, closer), last_score(measure, episode))
+@given(EPISODES, st.sampled_from([(0, -1.0), (1, 1.0), (2, -1.0)]), st.floats(0.0, 50.0))
+def test_closer_faster_or_behind_a_slower_leader_is_not_safer(measure, episode, how, much):
+    column, sign = how
+    worse = episode.copy()
+    worse[-1, column] += sign * much
+    if column != 2 or worse[-1, 2] >= 0.0:
+        assert at_least(last_score(measure, worse), last_score(measure, episode))
 
 
-@pytest.mark.slow
 @EVERY_MEASURE
-@given(EPISODES, st.floats(0.0, 20.0))
-def test_a_faster_follower_is_not_safer(measure, episode, faster):
-    hasty = episode.copy()
-    hasty[-1, 1] += faster
-    assert at_least(last_score(measure, hasty), last_score(measure, episode))
-
-
-@pytest.mark.slow
-@EVERY_MEASURE
-@given(EPISODES, st.floats(0.0, 20.0))
-def test_a_faster_leader_is_not_more_dangerous(measure, episode, faster):
-    away = episode.copy()
-    away[-1, 2] += faster
-    assert at_least(last_score(measure, episode), last_score(measure, away))
+def test_far_behind_none_and_close_behind_a_standing_leader_all_call_for_braking(measure):
+    assert measure.score(np.array([[200, 20, 25]]), DT) <= 0.0
+    assert measure.score(np.array([[3, 20, 0]]), DT) > 0.0
 
 
 @pytest.mark.slow
@@ -123,22 +105,6 @@ def test_later_rows_change_nothing(measure, episode, data):
     )
 
 
-@EVERY_MEASURE
-def test_far_behind_a_faster_leader_nothing_calls_for_braking(measure):
-    assert measure.score(np.array([[200.0, 20.0, 25.0]]), DT) <= 0.0
-
-
-@EVERY_MEASURE
-def test_close_behind_a_standing_leader_everything_calls_for_braking(measure):
-    assert measure.score(np.array([[3.0, 20.0, 0.0]]), DT) > 0.0
-
-
-@EVERY_MEASURE
-def test_whole_numbers_are_taken(measure):
-    whole = np.array([[30, 20, 10], [29, 21, 10]])
-    np.testing.assert_array_equal(measure.score(whole, DT), measure.score(whole * 1.0, DT))
-
-
 @pytest.mark.parametrize("measure", MEASURES, ids=repr)
 @pytest.mark.parametrize("wrong", [-1.0, 0.0, float("nan"), float("inf"), "1"])
 def test_wrong_arguments_are_named(measure, wrong):
@@ -147,13 +113,6 @@ def test_wrong_arguments_are_named(measure, wrong):
             continue
         with pytest.raises(ValueError, match=f"{type(measure).__name__} {field.name} is"):
             replace(measure, **{field.name: wrong})
-
-
-def test_times_of_no_reaction_are_allowed():
-    assert Picud(reaction=0.0).reaction == 0.0
-    assert PerformanceModel(0.0, 6.0).reaction == 0.0
-    assert ResponsibilitySensitiveSafety(0.0, 0.0, 6.0, 6.0).response == 0.0
-    assert FuzzySafety(reaction=0.0, margin=0.0).margin == 0.0
 
 
 def test_fuzzy_arguments_that_do_not_fit_are_named():
@@ -171,6 +130,8 @@ def test_measures_that_need_the_time_step_refuse_a_wrong_one(measure):
 
 def test_at_equal_speed_some_are_blind_and_others_see():
     blind = {TimeToCollision, ModifiedTimeToCollision, DecelerationToAvoidCollision}
+    assert is_dead_end(AT_EQUAL_SPEED, 4.0, 9.0)
+    assert time_to_collision(AT_EQUAL_SPEED) == np.inf
     for measure in MEASURES:
         sees = measure.score(AT_EQUAL_SPEED, DT)[0] > 0.0
         assert sees == (type(measure) not in blind | {PerformanceModel})
@@ -250,15 +211,6 @@ def test_constants_of_the_regulation():
     assert PerformanceModel.careful_human() == PerformanceModel(0.75, 0.774 * 9.81)
 
 
-@given(st.floats(0.1, 100.0), st.floats(0.0, 30.0), st.floats(0.01, 30.0))
-def test_performance_models_brake_below_the_ttc_of_the_regulation(gap, leader, closing):
-    ttc = gap / closing
-    critical = closing / 12.0 + 0.35
-    assume(abs(ttc - critical) > 1e-6)
-    score = PerformanceModel.regulation().score(np.array([[gap, leader + closing, leader]]), DT)
-    assert (score[0] > 0.0) == (ttc < critical)
-
-
 def test_performance_models_score_in_metres_and_see_no_danger_in_opening_gaps():
     rows = np.array([[17.0, 30.0, 18.0], [17.0, 18.0, 30.0]])
     assert distance_to_avoid(rows, 0.5, 6.0).tolist() == [18.0, 0.0]
@@ -316,15 +268,3 @@ def test_the_oracle_agrees_with_driving_it_out(gap, speed, leader_speed, decel, 
     dead_end = is_dead_end(np.array([gap, speed, leader_speed]), decel, leader_decel)
     if abs(smallest) > 1e-4:
         assert dead_end == (smallest < 0.0)
-
-
-def test_close_at_equal_speed_is_a_dead_end_that_ttc_does_not_see():
-    observation = np.array([10.0, 24.0, 24.0])
-    assert is_dead_end(observation, 4.0, 9.0)
-    assert time_to_collision(observation) == np.inf
-
-
-def test_measures_take_whole_numbers_and_cars_that_have_met():
-    assert time_to_collision(np.array([10, 25, 20])) == 2.0
-    assert time_to_collision(np.array([-0.5, 25.0, 20.0])) == 0.0
-    assert is_dead_end(np.array([0, 10, 10]), 4, 9)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from evofsm import EvolvingFSM
-from evofsm.driving import IDM, AdaptiveCruise, AlwaysBrake, EnvelopeReviser, LatentRisk, Unrevised
+from evofsm.driving import IDM, AlwaysBrake, EnvelopeReviser, LatentRisk, Unrevised
 from evofsm.driving.measures import (
     DecelerationToAvoidCollision,
     FuzzySafety,
@@ -47,7 +47,6 @@ OURS = [
     Unrevised(ACTIONS),
     AlwaysBrake(ACTIONS),
     CALM,
-    AdaptiveCruise(30.0, 2.0, 1.1, lowest=-3.5, highest=2.0),
 ]
 
 

@@ -28,7 +28,6 @@ from evofsm.cli.journal import Journal
 from evofsm.driving import (
     DECISION_COLUMNS,
     IDM,
-    AdaptiveCruise,
     Draw,
     EnvelopeReviser,
     Episode,
@@ -55,10 +54,10 @@ from evofsm.guard import TOLERANCE, Controller, DecisionLogger, Explain, Guard, 
 _log = logging.getLogger(__name__)
 
 #: Controllers by name; ``family`` is the family's own.
-CONTROLLERS = ("family", "aggressive", "normal", "acc", "sumo")
+CONTROLLERS = ("family", "aggressive", "normal", "sumo")
 #: Revisers by name: none, ours, and the classic measures.
 REVISERS = ("least-risk", "none", "rss", "aeb", *FIXED_MEASURES)
-#: The columns of ``decisions.parquet`` after ``episode``; `driving/record.py` says which they are.
+#: The columns of ``decisions.parquet`` after ``episode``; `driving/naming.py` says which they are.
 DECISION_TABLE = tuple(name for name, column in DECISION_COLUMNS.items() if column.in_table)
 #: The guard in a folder of results.
 GUARD = "guard.evofsm"
@@ -179,8 +178,6 @@ def make_controller(setup: Setup, draw: Draw, world: World) -> Controller:
             return IDM(2.25, 28.0, 0.8, 0.3, 2.0, lowest=low, highest=high)
         case "normal":
             return IDM(1.25, 25.0, 2.0, 1.5, 2.0, lowest=low, highest=high)
-        case "acc":
-            return AdaptiveCruise(25.0, 2.0, 1.1, lowest=low, highest=high)
         case "sumo":
             if not isinstance(world, SumoWorld):
                 raise ValueError("the controller 'sumo' is SUMO's own; it needs --world sumo")

@@ -95,8 +95,7 @@ WorldOption = Annotated[World, typer.Option(help="SUMO itself, or the same motio
 ControllerOption = Annotated[
     str,
     typer.Option(
-        help="Who proposes: the family's own (family), aggressive, normal, acc, or sumo (SUMO's "
-        "IDM)."
+        help="Who proposes: the family's own (family), aggressive, normal, or sumo (SUMO's IDM)."
     ),
 ]
 ReviserOption = Annotated[

@@ -15,7 +15,6 @@ from .cars import load_learnt as load_learnt
 from .cars import name_judge as name_judge
 from .cars import save_learnt as save_learnt
 from .drivers import IDM as IDM
-from .drivers import AdaptiveCruise as AdaptiveCruise
 from .drivers import ChangingIDM as ChangingIDM
 from .env import CarFollowing as CarFollowing
 from .episodes import Outcome as Outcome
@@ -46,13 +45,13 @@ from .leaders import REAL_DRIVES as REAL_DRIVES
 from .leaders import BrakeWatch as BrakeWatch
 from .leaders import LeaderBrakes as LeaderBrakes
 from .leaders import brakes_needed as brakes_needed
+from .naming import DECISION_COLUMNS as DECISION_COLUMNS
 from .naming import LABELS as LABELS
 from .naming import UNITS as UNITS
 from .naming import VARIABLES as VARIABLES
 from .naming import WORDS as WORDS
 from .naming import name_state as name_state
 from .naming import name_states as name_states
-from .record import DECISION_COLUMNS as DECISION_COLUMNS
 from .revisers import GENTLE_BRAKE as GENTLE_BRAKE
 from .revisers import AlwaysBrake as AlwaysBrake
 from .revisers import EnvelopeReviser as EnvelopeReviser

@@ -18,39 +18,14 @@ from evofsm.guard import TOLERANCE, Guard
 # What is done with the chosen cars.
 _MODES = ("act", "shadow", "watch")
 _TYPE = "type:"
-_GREEN, _AMBER, _RED = (40, 160, 70, 255), (240, 160, 0, 255), (215, 40, 40, 255)
-# Needed decelerations from which on a car that is watched is amber, or red [m/s²].
-_CAREFUL, _HARD = 1.0, 3.35
 # Two that touched within this time before still do [s].
 _SAME_COLLISION = 5.0
 
 
 def choose(vehicles: str | float | Iterable[str], seed: int = 0) -> Callable[[Any, str], bool]:
-    """A test of whether a vehicle is one of those that are meant.
+    """A test of whether a vehicle is one of those that are meant, as `attach` takes them.
 
-    Parameters
-    ----------
-    vehicles : str, float or iterable of str
-        ``"all"``, ``"type:NAME"``, a share in (0, 1], also as ``"10%"``, or their ids.
-    seed : int
-        Other vehicles make up the share for another one.
-
-    Returns
-    -------
-    callable
-        From libsumo or traci and an id to whether it is meant. Of a share, the id alone decides:
-        the same vehicles are meant in every run.
-
-    Raises
-    ------
-    ValueError
-        If it is none of these.
-
-    Examples
-    --------
-    >>> chosen = choose(0.5)
-    >>> [chosen(None, car) for car in ("a", "b", "c", "d")]
-    [False, True, True, False]
+    Of a share, id and seed alone decide: the same vehicles are meant in every run.
     """
     if isinstance(vehicles, str):
         return _named(vehicles, seed)
@@ -126,12 +101,6 @@ class Watching:
         """It has left the simulation."""
         self.remove(car)
 
-    def urgency(self) -> dict[str, int]:
-        """0 to 2 of each car."""
-        needed = dict(zip(self.ids, self.drac.tolist(), strict=True))
-        drac = {car: needed.get(car, 0.0) for car in self._cars}
-        return {car: (each > _CAREFUL) + (each > _HARD) for car, each in drac.items()}
-
     def step(self) -> int:
         """Look at every car; returns how many there are."""
         ids, rows, pair_of = [], [], self._seeing.pair
@@ -188,7 +157,6 @@ class Attachment:
         *,
         tolerance: float,
         learn: bool,
-        color: bool,
         report: Callable[[GuardedStep], None] | None,
     ) -> None:
         self._sumo, self._chosen, self.mode = sumo, chosen, mode
@@ -208,7 +176,6 @@ class Attachment:
                 learn=learn,
                 report=report,
             )
-        self._colors: dict[str, tuple[int, ...]] | None = {} if color else None
         self._now = -math.inf
         self._known: set[str] = set()
         self._met: dict[tuple[str, str], float] = {}
@@ -260,8 +227,6 @@ class Attachment:
             self.guarding.step(now)
         if self.watching is not None:
             self.watching.step()
-        if self._colors is not None:
-            self._paint()
         self.seconds += clock.perf_counter() - begin
         return True
 
@@ -284,15 +249,6 @@ class Attachment:
                 self.collisions.append(Collision(now, *pair, each.type))
             self._met[pair] = now
 
-    def _paint(self) -> None:
-        """Green, amber where it is held back or close, red where it may be lost."""
-        assert self._colors is not None
-        for car, urgency in self._cars.urgency().items():
-            color = (_GREEN, _AMBER, _RED)[urgency]
-            if self._colors.get(car) is not color:
-                self._colors[car] = color
-                self._sumo.vehicle.setColor(car, color)
-
 
 def attach(
     sumo: Any,
@@ -302,7 +258,6 @@ def attach(
     mode: str = "act",
     tolerance: float = TOLERANCE,
     learn: bool = True,
-    color: bool = False,
     seed: int = 0,
     report: Callable[[GuardedStep], None] | None = None,
 ) -> Attachment:
@@ -329,9 +284,6 @@ def attach(
         Highest risk that is accepted; a ``guard`` has its own.
     learn : bool
         Whether the guards learn how hard leaders brake, all of them from what each sees.
-    color : bool
-        Whether cars are painted: green; amber where one is held back, red where its risk is not
-        tolerable. Those that are only watched by the deceleration that they need.
     seed : int
         Of the share.
     report : callable, optional
@@ -383,7 +335,6 @@ def attach(
         guard,
         tolerance=tolerance,
         learn=learn,
-        color=color,
         report=report,
     )
     attachment.listen()

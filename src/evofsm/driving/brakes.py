@@ -35,13 +35,7 @@ _HARDEST, _JUMP = 15.0, 5.0
 
 
 def hardest_seen(dt: float) -> float:
-    """Braking beyond which a change of one's own speed is no braking, but a sensor's jump [m/s²].
-
-    Examples
-    --------
-    >>> hardest_seen(0.25)
-    35.0
-    """
+    """Braking beyond which a change of one's speed is a sensor's jump [m/s²]."""
     return _HARDEST + _JUMP / dt
 
 
@@ -81,14 +75,8 @@ class Latest:
 class OwnBrakes:
     """What full braking really brings, and how late commands take effect.
 
-    Parameters
-    ----------
-    lowest : float
-        The hardest braking that can be commanded [m/s²], negative.
-    assumed : float
-        Share of it that is believed in until braking was seen.
-    dt : float
-        Time between decisions [s].
+    ``lowest`` is the hardest braking that can be commanded [m/s²], negative, ``assumed`` the share
+    of it that is believed in until braking was seen, and ``dt`` the time between decisions [s].
 
     Examples
     --------
@@ -180,20 +168,11 @@ class OwnBrakes:
         *,
         watched: bool = False,
     ) -> None:
-        """Take in a speed, and what is commanded after it.
+        """Take in a speed as observed [m/s], and what is commanded after it [m/s²].
 
-        Parameters
-        ----------
-        speed : float
-            As it was observed [m/s].
-        command : float
-            [m/s²].
-        estimate : float, optional
-            The speed as it most likely is [m/s], if it was observed with noise. Commands answer
-            to noise, so that the lag must not be told from it.
-        watched : bool
-            Whether someone else drives, whose proposal may be no command to the brakes but what
-            the car does anyway. Then ordinary braking does not show that they weakened.
+        ``estimate`` is the speed as it most likely is: commands answer to noise, so that the lag
+        must not be told from it. ``watched`` says that someone else drives, whose proposal may be
+        no command to the brakes; then ordinary braking does not show that they weakened.
         """
         asked = max(command, self.lowest)
         # Nothing is learnt from standing still, nor from a sensor's jump.

@@ -1,8 +1,7 @@
-"""Latent risk of states: what is said of a state as a whole, and risk read through the belief.
+"""Latent risk of states: which of them are dead ends, and what they are worth to steer by.
 
-A situation may be judged where it is, or by the states it is recognised as: then the risk of an
-action is that at the centres of the states, weighed by the belief. The first is sharper; the
-second says what a machine's states are worth to steer by, and which of them are dead ends.
+A situation may be judged where it is, which is sharper, or by the states it is recognised as: then
+the risk of an action is that at their centres, weighed by the belief.
 """
 
 from __future__ import annotations
@@ -16,7 +15,8 @@ from numpy.typing import ArrayLike, NDArray
 from evofsm.driving.judge import LatentRisk
 from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.model import FSMModel
-from evofsm.guard import Action, Judgement, Situation, Trial
+from evofsm.fsm.proportions import wilson_bounds
+from evofsm.guard import Judgement, Situation
 
 # States of a smaller belief are left out.
 _LEAST_BELIEF = 1e-3
@@ -28,36 +28,19 @@ class RiskByState:
     Parameters
     ----------
     risk : LatentRisk
-        What was learnt of leaders and brakes.
+        What was learnt of leaders and brakes; it answers all but how dangerous actions are.
     machine : EvolvingFSM
         Whose states they are.
     caution : float
         Where states disagree, so many standard deviations are added to their mean risk.
     """
 
+    labels, fallback = LatentRisk.labels, LatentRisk.fallback
+
     def __init__(self, risk: LatentRisk, machine: EvolvingFSM, caution: float = 1.0) -> None:
-        self.risk = risk
-        self.machine = machine
-        self.caution = caution
-
-    labels = LatentRisk.labels
-    fallback = LatentRisk.fallback
-
-    def why(self, judged: Judgement) -> str:
-        """Why the first action that was judged is dangerous, in a few words."""
-        return self.risk.why(judged)
-
-    def trial(self) -> Trial | None:
-        """What the risk has to try first."""
-        return self.risk.trial()
-
-    def effective(self, situation: Situation, actions: NDArray[np.float64]) -> NDArray[np.float64]:
-        """What actions come to here."""
-        return self.risk.effective(situation, actions)
-
-    def refuse_unfit(self, low: Action, high: Action) -> None:
-        """Raise a ValueError if the risk counts on harder braking than there is."""
-        self.risk.refuse_unfit(low, high)
+        self.risk, self.machine, self.caution = risk, machine, caution
+        self.why, self.trial = risk.why, risk.trial
+        self.effective, self.refuse_unfit = risk.effective, risk.refuse_unfit
 
     def described(self) -> dict[str, Any]:
         """What it takes to make it again beside the same machine and risk."""
@@ -86,7 +69,11 @@ class RiskByState:
         risk = weights @ risks
         disagreement = np.sqrt(weights @ (risks - risk) ** 2)
         cautious = np.minimum(risk + self.caution * disagreement, 1.0)
-        return self.risk.judgement(situation, cautious, weights @ critical)
+        evidence = float(len(self.risk.manoeuvres))
+        bounds = [wilson_bounds(each, evidence + 1.0) for each in cautious.tolist()]
+        low, high = np.transpose(bounds)
+        seen = self.risk.seen(situation)
+        return Judgement(cautious, low, high, weights @ critical, evidence, seen)
 
 
 class StateRisk(NamedTuple):

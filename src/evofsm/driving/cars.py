@@ -126,13 +126,7 @@ def guard_for_family(family: Family, **settings: Any) -> Guard:
 
 
 def learnt_by(guard: Guard) -> tuple[EvolvingFSM, LatentRisk]:
-    """The machine and the latent risk of a guard for cars.
-
-    Raises
-    ------
-    TypeError
-        If it has others.
-    """
+    """The machine and the latent risk of a guard for cars; a TypeError if it has others."""
     machine, judge = learners_of(guard)
     if not isinstance(judge, LatentRisk):
         raise TypeError("the guard's judge is no LatentRisk")
@@ -140,26 +134,14 @@ def learnt_by(guard: Guard) -> tuple[EvolvingFSM, LatentRisk]:
 
 
 def learners_of(guard: Guard) -> tuple[EvolvingFSM, LearningJudge]:
-    """The machine and the judge of a guard, whichever judge it has.
-
-    Raises
-    ------
-    TypeError
-        If it lacks one of them.
-    """
+    """The machine and the judge of a guard, whichever it has; a TypeError if it lacks one."""
     if guard.machine is None or guard.judge is None:
         raise TypeError("the guard has no machine, or its judge does not learn")
     return guard.machine, guard.judge
 
 
 def name_judge(judge: LearningJudge) -> str:
-    """Which of the judges for cars it is.
-
-    Raises
-    ------
-    TypeError
-        If it is another one.
-    """
+    """Which of the judges for cars it is; a TypeError if none."""
     if isinstance(judge, LatentRisk):
         return "kinematic"
     if isinstance(judge, LearntRisk):
@@ -182,18 +164,6 @@ def load_learnt(folder: Path) -> tuple[EvolvingFSM, LatentRisk | LearntRisk]:
 
 
 def load_judge(file: Place) -> LatentRisk | LearntRisk:
-    """One of the judges for cars, whichever was saved.
-
-    Parameters
-    ----------
-    file : path-like, or file open for reading bytes
-
-    Raises
-    ------
-    OSError
-        If there is no such file, or it may not be read.
-    ValueError
-        If the file holds something else or is damaged.
-    """
+    """One of the judges for cars, whichever was saved."""
     kind = read_header(file).kind
     return LearntRisk.load(file) if kind == "learntrisk" else LatentRisk.load(file)

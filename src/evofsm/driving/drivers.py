@@ -1,4 +1,4 @@
-"""Who drives the follower: laws of car following, within explicit bounds.
+"""Who drives the follower: the Intelligent Driver Model, within explicit bounds.
 
 SUMO's own IDM brakes as hard as its ``emergencyDecel`` allows, and then never collides. What a
 vehicle can really do is part of the question here, so the bounds are arguments.
@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import astuple, dataclass, fields
+from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import TypeAlias
 
@@ -49,24 +49,7 @@ def _idm(
     return float(min(max(acceleration, phases[now, 7]), phases[now, 8]))
 
 
-def _acc(
-    settings: NDArray[np.float64], time: float, gap: float, speed: float, leader_speed: float
-) -> float:
-    """The lower of speed control and gap control, within the bounds."""
-    desired_speed = settings[0, 0]
-    min_gap = settings[0, 1]
-    time_headway = settings[0, 2]
-    gap_gain = settings[0, 3]
-    approach_gain = settings[0, 4]
-    cruise_gain = settings[0, 5]
-    cruise = cruise_gain * (desired_speed - speed)
-    excess = gap - min_gap - time_headway * speed
-    follow = gap_gain * excess + approach_gain * (leader_speed - speed)
-    return float(min(max(min(cruise, follow), settings[0, 6]), settings[0, 7]))
-
-
 idm_kernel: Kernel = compiled(_idm, [DRIVER_KERNEL])
-acc_kernel: Kernel = compiled(_acc, [DRIVER_KERNEL])
 
 
 @dataclass(frozen=True)
@@ -115,12 +98,16 @@ class IDM:
     kernel = staticmethod(idm_kernel)
 
     def __post_init__(self) -> None:
-        _check(
-            self,
-            "IDM",
-            positive=("accel", "desired_speed", "decel", "exponent"),
-            not_negative=("min_gap", "time_headway"),
-        )
+        for name in ("accel", "desired_speed", "decel", "exponent"):
+            if not 0.0 < getattr(self, name) < math.inf:
+                value = getattr(self, name)
+                raise ValueError(f"IDM {name} is {value}; it must be positive and finite")
+        for name in ("min_gap", "time_headway"):
+            if not 0.0 <= getattr(self, name) < math.inf:
+                value = getattr(self, name)
+                raise ValueError(f"IDM {name} is {value}; it must be finite, 0 or more")
+        if not self.lowest < self.highest:
+            raise ValueError(f"IDM bounds are [{self.lowest}, {self.highest}]; lowest comes first")
 
     @cached_property
     def parameters(self) -> NDArray[np.float64]:
@@ -177,109 +164,9 @@ class ChangingIDM:
         return Proposal(self.kernel(self.parameters, time, *observation))
 
 
-@dataclass(frozen=True)
-class AdaptiveCruise:
-    """A car under adaptive cruise control: it keeps a time gap, or its set speed.
-
-    With a leader ``a = gap_gain (gap - min_gap - time_headway v) + approach_gain (v_leader - v)``,
-    on a free road ``a = cruise_gain (desired_speed - v)``; the lower one holds. The law is linear:
-    it does not know how hard a leader may brake, and the bounds are all that limits it.
-
-    Parameters
-    ----------
-    desired_speed : float
-        Set speed [m/s].
-    min_gap : float
-        Gap at standstill [m].
-    time_headway : float
-        Time gap that is kept [s].
-    gap_gain : float
-        Of the gap's deviation [1/s²].
-    approach_gain : float
-        Of the difference of speeds [1/s].
-    cruise_gain : float
-        Of the set speed's deviation [1/s].
-    lowest, highest : float
-        Bounds of the acceleration that comes out [m/s²].
-
-    Raises
-    ------
-    ValueError
-        If a parameter is impossible.
-
-    Notes
-    -----
-    The gap control is that of production cars (Milanés and Shladover 2014,
-    doi:10.1016/j.trc.2014.09.001), the speed control that of Xiao, Wang and van Arem (2017,
-    doi:10.3141/2623-01), and so are the preset gains. They switch between both by the range of the
-    sensor; that the lower one holds needs no memory, and does not jump.
-
-    Examples
-    --------
-    >>> cruise = AdaptiveCruise(30.0, 2.0, 1.1, lowest=-3.5, highest=2.0)
-    >>> cruise.propose(np.array([np.inf, 28.0, 0.0])).action  # a free road
-    0.8
-    >>> round(cruise.propose(np.array([20.0, 20.0, 18.0])).action, 3)  # too close, and closing
-    -1.06
-    >>> cruise.propose(np.array([5.0, 20.0, 0.0])).action
-    -3.5
-    """
-
-    desired_speed: float
-    min_gap: float
-    time_headway: float
-    gap_gain: float = 0.23
-    approach_gain: float = 0.07
-    cruise_gain: float = 0.4
-    lowest: float = -math.inf
-    highest: float = math.inf
-
-    kernel = staticmethod(acc_kernel)
-
-    def __post_init__(self) -> None:
-        _check(
-            self,
-            "ACC",
-            positive=("desired_speed", "gap_gain", "cruise_gain"),
-            not_negative=("min_gap", "time_headway", "approach_gain"),
-        )
-
-    @cached_property
-    def parameters(self) -> NDArray[np.float64]:
-        """(1, 8) ndarray: the arguments in order."""
-        return np.array([astuple(self)])
-
-    def propose(self, observation: NDArray[np.float64], time: float = 0.0) -> Proposal:
-        """Acceleration [m/s²] for ``[gap, v_follower, v_leader]``; the time does not matter."""
-        return Proposal(self.kernel(self.parameters, time, *observation))
-
-
 # As astuple does, which copies each of them: made for every draw, that is what takes long.
 _NAMES = tuple(one.name for one in fields(IDM))
 
 
 def _numbers(driver: IDM) -> tuple[float, ...]:
     return tuple(getattr(driver, name) for name in _NAMES)
-
-
-def _check(
-    driver: IDM | AdaptiveCruise,
-    law: str,
-    *,
-    positive: tuple[str, ...],
-    not_negative: tuple[str, ...],
-) -> None:
-    for name in positive:
-        if not 0.0 < getattr(driver, name) < math.inf:
-            raise ValueError(
-                f"{law} {name} is {getattr(driver, name)}; it must be positive and finite"
-            )
-    for name in not_negative:
-        if not 0.0 <= getattr(driver, name) < math.inf:
-            raise ValueError(
-                f"{law} {name} is {getattr(driver, name)}; it must be finite, 0 or more"
-            )
-    if not driver.lowest < driver.highest:
-        raise ValueError(
-            f"{law} bounds are [{driver.lowest}, {driver.highest}]; lowest comes first"
-        )

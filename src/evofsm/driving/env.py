@@ -64,8 +64,6 @@ class CarFollowing(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
         Which scenarios to pick from, unless `reset` is told.
     collision_cost : float
         Taken from the reward of the step that ends in a collision [m].
-    render_mode : {"ansi"}, optional
-        `render` then says in one line where the cars are.
 
     Examples
     --------
@@ -78,8 +76,6 @@ class CarFollowing(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
     (0.25, False, False)
     """
 
-    metadata: dict[str, Any] = {"render_modes": ["ansi"]}  # noqa: RUF012 (as its base class has it)
-
     def __init__(
         self,
         family: str | PathLike[str] | Family = "emergency",
@@ -88,18 +84,13 @@ class CarFollowing(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
         seed: int = 0,
         split: str = "train",
         collision_cost: float = 1000.0,
-        render_mode: str | None = None,
     ) -> None:
-        if render_mode not in (None, *self.metadata["render_modes"]):
-            raise ValueError(f"there is no render_mode {render_mode!r}; there is 'ansi'")
         if not 0.0 <= collision_cost < math.inf:
             raise ValueError(f"collision_cost is {collision_cost}; it must be finite, 0 or more")
         self.family = family if isinstance(family, Family) else load_family(family)
         self.seed = seed
         self.split = split
         self.collision_cost = collision_cost
-        self.render_mode = render_mode
-        self.metadata = {**self.metadata, "render_fps": 1.0 / self.family.interval}
         self.draw: Draw | None = None  #: what is driven: its scenario, and its own controller
         self.observation_space = Box(np.array(LOW), np.array(HIGH), dtype=np.float64)
         actions = self.family.actions
@@ -112,25 +103,7 @@ class CarFollowing(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[NDArray[np.float64], dict[str, Any]]:
-        """Begin a scenario, drawn by the seed or chosen exactly.
-
-        Parameters
-        ----------
-        seed : int, optional
-            Of the draws from now on.
-        options : dict, optional
-            ``split`` and ``index`` of the scenario.
-
-        Returns
-        -------
-        (ndarray, dict)
-            The first observation, and info.
-
-        Raises
-        ------
-        ValueError
-            If there is no such split, index or option.
-        """
+        """Begin a scenario, drawn by ``seed`` or with ``split`` and ``index`` of ``options``."""
         super().reset(seed=seed)
         asked = dict(options or {})
         split = asked.pop("split", self.split)
@@ -149,15 +122,7 @@ class CarFollowing(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
     def step(
         self, action: ArrayLike
     ) -> tuple[NDArray[np.float64], float, bool, bool, dict[str, Any]]:
-        """Drive for one interval with ``action`` commanded.
-
-        Raises
-        ------
-        RuntimeError
-            If the episode is over, or none was begun.
-        ValueError
-            If the action is no finite number.
-        """
+        """Drive for one interval with ``action`` commanded, which must be a finite number."""
         on = self._on
         if on is None or on.road.over:
             raise RuntimeError("step before reset: no episode is under way")
@@ -171,17 +136,6 @@ class CarFollowing(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
         info = self._info(on.road.episode(first=row)) | {"realised": came["realised"]}
         reward = info["distance"] - (self.collision_cost if terminated else 0.0)
         return np.clip(seen, LOW, HIGH), reward, terminated, truncated, info
-
-    def render(self) -> str | None:
-        """Where the cars are, in one line, with ``render_mode="ansi"``."""
-        if self.render_mode is None or self._on is None:
-            return None
-        road = self._on.road
-        gap, speed, leader_speed = road.episode(first=road.row).observations[-1]
-        return (
-            f"{road.time:.2f} s: at {speed:.1f} m/s, {gap:.1f} m behind a leader at "
-            f"{leader_speed:.1f} m/s"
-        )
 
     def close(self) -> None:
         """Leave the road and the world."""

@@ -58,11 +58,6 @@ def drive(
         From an observation to an acceleration [m/s²]; without one, the draw's own drives. Where it
         raises or proposes no number, the guard falls back.
 
-    Returns
-    -------
-    Episode
-        With its ``decisions``.
-
     Raises
     ------
     ValueError
@@ -115,6 +110,9 @@ def shadow_drive(
 ) -> Episode:
     """Let a guard in shadow mode decide on each row of a recorded episode, and learn from it.
 
+    Its decisions have what was done as the proposal, and what the guard would have done as
+    ``advised``.
+
     Parameters
     ----------
     guard : Guard
@@ -129,16 +127,10 @@ def shadow_drive(
     failed : bool
         Whether the episode ended in failure; a last gap of 0 or less is one anyway.
 
-    Returns
-    -------
-    Episode
-        With a decision for each row but the last, in which what was done stands as the proposal,
-        and what the guard would have done as ``advised``.
-
     Raises
     ------
     ValueError
-        If the guard would act, there are fewer than two rows, or the shapes do not fit.
+        If the guard would act, or there are fewer than two rows.
 
     Examples
     --------
@@ -290,14 +282,8 @@ def try_out(
 ) -> list[Outcome]:
     """What comes of draws under a frozen copy of a guard, against the controller alone.
 
-    Parameters
-    ----------
-    guard : Guard
-        Its copy has no machine: the same is decided, and nothing is recognised.
-    family : Family
-    draws : sequence of Draw
-    alone : sequence of Reference, optional
-        Of these draws; without them the controller is driven alone first.
+    The copy has no machine: the same is decided, and nothing is recognised. Without the references
+    ``alone`` of these draws the controller is driven alone first.
 
     Examples
     --------

@@ -51,20 +51,8 @@ class Draw(NamedTuple):
 class Numbers:
     """The numbers of one draw, each by the place that it is for.
 
-    Parameters
-    ----------
-    seed, index : int
-        Of the draw, from 0.
-    split : {"train", "test"}
-    chance : callable, optional
-        Decides instead of the seed: 0 is the lower end of a range, 0.5 its middle.
-    drawn : mapping, optional
-        Where each number is put by its place: of several its index, from 0.
-
-    Raises
-    ------
-    ValueError
-        If seed, index or split are none.
+    They are those of a draw's ``seed``, ``index`` and ``split``; or those that a ``chance`` of each
+    place makes, from 0 up to 1, where they are put into ``drawn``.
 
     Examples
     --------
@@ -72,8 +60,6 @@ class Numbers:
     >>> gap = numbers.between("scenario.initial_gap", 2.0, 30.0)
     >>> 2.0 <= gap <= 30.0, gap == numbers.between("scenario.initial_gap", 2.0, 30.0)
     (True, True)
-    >>> Numbers(0, 0, chance={"gap": 0.25, "brake.one_of": 0.9}.__getitem__).between("gap", 2, 30)
-    9.0
     """
 
     def __init__(
@@ -228,11 +214,6 @@ class Family:
     def with_switches(self, names: Iterable[str]) -> Family:
         """The family with some of `SWITCHES` on; what it draws is otherwise the same.
 
-        Raises
-        ------
-        ValueError
-            If there is no such switch.
-
         Examples
         --------
         >>> from evofsm.driving import load_family
@@ -247,21 +228,8 @@ class Family:
     def draw(self, seed: int, index: int, split: str = "train") -> Draw:
         """One scenario: always the same for the same arguments.
 
-        Parameters
-        ----------
-        seed, index : int
-            From 0; each pair is another draw.
-        split : {"train", "test"}
-            Draws of one never are draws of the other.
-
-        Returns
-        -------
-        Draw
-
-        Raises
-        ------
-        ValueError
-            If seed, index or split are none, or the family makes no scenario of these numbers.
+        Each pair of ``seed`` and ``index``, from 0, is another draw; draws of the splits
+        ``"train"`` and ``"test"`` never are the same.
 
         Examples
         --------
@@ -277,25 +245,10 @@ class Family:
     def draw_by(self, chance: Chance, drawn: MutableMapping[str, float] | None = None) -> Draw:
         """The scenario that given chances make, for whoever searches among all there are.
 
-        Parameters
-        ----------
-        chance : callable
-            Says for each place that is drawn for, such as ``scenario.initial_gap``, a number from 0
-            up to 1: 0 is the lower end of a range, 0.5 its middle. Independent and evenly
-            distributed ones make draws as `draw` does; which of the variants it is, is drawn for
-            ``variant``.
-        drawn : mapping, optional
-            Where each number that was drawn is put by its place: of a range the number itself, of
-            several its index, from 0.
-
-        Returns
-        -------
-        Draw
-
-        Raises
-        ------
-        ValueError
-            If a chance is out of its range, or the family makes no scenario of these numbers.
+        ``chance`` says for each place that is drawn for, such as ``scenario.initial_gap`` or
+        ``variant``, a number from 0 up to 1: 0 is the lower end of a range, 0.5 its middle. Evenly
+        distributed ones make draws as `draw` does. What was drawn is put into ``drawn`` by its
+        place: of a range the number itself, of several its index, from 0.
 
         Examples
         --------

@@ -58,13 +58,7 @@ class _Facts(NamedTuple):
 
 
 class Seeing:
-    """Reads the cars around one of them.
-
-    Parameters
-    ----------
-    sumo : module or connection
-        libsumo or traci.
-    """
+    """Reads the cars around one of them, by libsumo or traci."""
 
     def __init__(self, sumo: Any) -> None:
         self._vehicle = sumo.vehicle
@@ -203,8 +197,6 @@ class Guarding:
     decisions : int
     revised : int
         Steps in which a car drove slower than its driver wanted; in shadow, would have.
-    latest : dict from str to GuardedStep
-        What was said last of each car that is there.
     """
 
     def __init__(
@@ -230,7 +222,6 @@ class Guarding:
         self._every = _steps(self.interval, seeing.dt)
         self._steps = 0
         self.decisions = self.revised = 0
-        self.latest: dict[str, GuardedStep] = {}
 
     def __len__(self) -> int:
         return len(self._cars)
@@ -255,18 +246,6 @@ class Guarding:
     def leave(self, car: str) -> None:
         """It has left the simulation."""
         self._cars.pop(car, None)
-        self.latest.pop(car, None)
-
-    def urgency(self) -> dict[str, int]:
-        """0 to 2 of each car: free, held back, or at a risk that is not tolerable."""
-        return {car: self._urgency(self.latest.get(car)) for car in self._cars}
-
-    def _urgency(self, step: GuardedStep | None) -> int:
-        if step is None:
-            return 0
-        if step.revision.risk_executed > self._tolerance:
-            return 2
-        return int(step.deed < step.wish - _SAME)
 
     def step(self, time: float) -> int:
         """Say what came of the step that is over, and decide on the next; returns how often."""
@@ -361,10 +340,8 @@ class Guarding:
             self.revised += speed < wanted - _SAME
         else:
             self.revised += bool(revision.advised < wish - _SAME)
-        step = GuardedStep(one.time, one.id, wish, deed, revision, *one.about)
-        self.latest[one.id] = step
         if self._report is not None:
-            self._report(step)
+            self._report(GuardedStep(one.time, one.id, wish, deed, revision, *one.about))
 
     def _watch(self, speeds: dict[str, float]) -> None:
         """Learn how hard leaders brake, each by itself, whoever follows it."""

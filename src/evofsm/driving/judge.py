@@ -2,12 +2,11 @@
 
 A failure is rare and its causes are long past when it comes, so counting failures says too little
 and too late. What leads to it can be learnt from every ordinary minute: how hard leaders brake
-(`leaders`), how often they begin to (by state, here), and how well one brakes oneself (`brakes`).
-An action is then *rehearsed* (`rehearsal`): it is taken, full braking follows, and the leader
-brakes. The hardest braking of the leader that still ends well is the critical deceleration, and the
-latent risk is the probability that the leader brakes harder than that. A situation is a dead end
-where, if the leader braked hard now, even braking in full at once would be too late; while the
-leader does not, it can still be left.
+(`leaders`) and how well one brakes oneself (`brakes`). An action is then *rehearsed*
+(`rehearsal`): it is taken, full braking follows, and the leader brakes. The hardest braking of the
+leader that still ends well is the critical deceleration, and the latent risk is the probability
+that the leader brakes harder than that. A situation is a dead end where, if the leader braked hard
+now, even braking in full at once would be too late; while it does not, that can still be left.
 """
 
 from __future__ import annotations
@@ -42,8 +41,6 @@ from evofsm.store import (
     Place,
 )
 
-# Pseudo-evidence for the pooled rate of manoeuvres, against that of a state [s].
-_POOLED = 20.0
 # Slower than this a car stands, though a sensor may show that it moves [m/s].
 _STANDS = 0.1
 # Where a situation is not sure, it may be worse by so many standard deviations.
@@ -60,7 +57,7 @@ _PRODUCT, _NOISE = Numbers(least=-1e300, most=1e300), Numbers(least=0.0, most=1e
 _RISK = Kind(
     "risk",
     {
-        **dict.fromkeys(("onsets", "exposure", "seconds"), _TIME.of("n")),
+        "seconds": _TIME.of("n"),
         "brakes": Numbers(("samples",)),
         "stretches": FLAG.of("samples"),
         "decels": Numbers(("decels",), SMALLEST, HARDEST),
@@ -154,7 +151,7 @@ class LatentRisk:
         self._watch = BrakeWatch(dt)
         self._own_watch = BrakeWatch(dt)  # of the car itself, where someone else drives it
         self._watched = False  # the latest decision
-        self._by_state = np.zeros((3, 0))  # onsets of braking, seconds without, all seconds
+        self._seconds = np.zeros(0)  # for which each state was seen
         self._commands = (0.0, 0.0)  # the latest two
 
     @classmethod
@@ -169,16 +166,8 @@ class LatentRisk:
     ) -> Self:
         """Given the limits instead of learning them: the best that could be learnt.
 
-        Parameters
-        ----------
-        lowest : float
-            The hardest braking that can be commanded [m/s²], negative.
-        decel, leader_decel : float
-            Hardest braking of the follower and of leaders [m/s²], positive.
-        dt : float
-            Time between decisions [s].
-        leaders : LeaderBrakes, optional
-            What leaders' brakes are like, so that not each is taken to be the hardest.
+        ``decel`` and ``leader_decel`` are the hardest braking of the follower and of leaders
+        [m/s²], positive; with a table of ``leaders``, not each is taken to be the hardest.
         """
         risk = cls(lowest, dt, leader_decel=leader_decel, leaders=leaders)
         risk.brakes.trust(positive("decel", decel))
@@ -194,18 +183,17 @@ class LatentRisk:
         Parameters
         ----------
         observation : (3,) array_like
-            Gap [m], speed of the follower and of the leader [m/s]; NaN where it was not seen.
-            Then nothing is learnt, and what is under way is not gone on with.
+            Gap [m], speed of the follower and of the leader [m/s]. Where one is NaN nothing is
+            learnt, and what is under way is not gone on with.
         acceleration : float
             Commanded [m/s²].
         belief : (n,) array_like
-            Distribution over states, to learn where leaders begin to brake.
+            Distribution over states, to count for how long each was seen.
 
         Raises
         ------
         TypeError, ValueError
-            If one of them does not hold real, finite numbers, or has another shape, or ``belief``
-            is no distribution. What was learnt is then as it was.
+            If one of them is anything else. What was learnt is then as it was.
         """
         self._learn(observation, acceleration, belief, watched=False)
 
@@ -216,15 +204,6 @@ class LatentRisk:
 
         The ``acceleration`` may then be no command but what the car does anyway. Hard braking
         shows what its brakes can do; ordinary braking does not show what they cannot.
-
-        Examples
-        --------
-        >>> risk = LatentRisk(lowest=-8.0)
-        >>> before = risk.brakes.decel
-        >>> for speed in (20.0, 20.0, 18.5, 17.0, 15.5, 14.0, 14.0, 14.0, 14.0):
-        ...     risk.watch([40.0, speed, speed], -6.0)
-        >>> before, risk.brakes.decel
-        (4.8, 6.0)
         """
         self._learn(observation, acceleration, belief, watched=True)
 
@@ -237,12 +216,9 @@ class LatentRisk:
         if not is_whole(seen):
             self.follow(observation, acceleration)
             return
-        was_braking = self._watch.braking
-        self._count(states, was_braking)
+        self._count(states)
         estimate = self.perception.see(seen, self._expected, sure=self.brakes.known)
         self._remember(self._follow(seen, command))
-        if self._watch.braking and not was_braking:
-            self._by_state[0, : len(states)] += states
         self.brakes.see(seen[1], command, estimate.mean[1], watched=watched)
         if watched:
             if not self._watched:
@@ -298,66 +274,34 @@ class LatentRisk:
         if own is not None:
             self.brakes.show(own)
 
-    def _count(self, belief: NDArray[np.float64], braking: bool) -> None:
-        counts, missing = self._by_state, len(belief) - self._by_state.shape[1]
-        if missing > 0:
-            counts = np.concatenate([counts, np.zeros((len(counts), missing))], axis=1)
-        if not _count(counts, belief, self.dt, braking):
+    def _count(self, belief: NDArray[np.float64]) -> None:
+        missing = max(len(belief) - len(self._seconds), 0)
+        seconds = np.pad(self._seconds, (0, missing)) if missing else self._seconds
+        if not _count(seconds, belief, self.dt):
             refuse_unless_distribution("belief", belief)
-        self._by_state = counts
+        self._seconds = seconds
 
     # -- Sharing --------------------------------------------------------------------------------
 
-    def merge(
-        self, others: Iterable[LatentRisk], *, same_states: bool = False, brakes: bool = False
-    ) -> None:
+    def merge(self, others: Iterable[LatentRisk], *, brakes: bool = False) -> None:
         """Take in what others saw of their leaders, as if it had been seen here.
 
-        They must have learnt apart: what two of them began with in common counts twice, a table of
-        `leaders` too, which only this one may begin with. They stay as they are.
-
-        Parameters
-        ----------
-        others : iterable of LatentRisk
-            Leaders' manoeuvres and the noise of the sensors add up; where there are more than are
-            remembered, the latest of each stay. Where leaders begin to brake adds up if no states
-            are told apart, or if they are the same.
-        same_states : bool
-            Whether all of them learnt by the states of one machine.
-        brakes : bool
-            Whether all of them are cars with the same brakes, so that those add up as well.
+        Leaders' manoeuvres and the noise of the sensors add up, and with ``brakes`` what was learnt
+        of brakes that are the same; of more than are remembered the latest of each stay. They must
+        have learnt apart: what two of them began with in common counts twice.
 
         Raises
         ------
         TypeError, ValueError
             If one is no `LatentRisk`, is this one, or was made for another time between decisions,
             another ``hard`` or, for the brakes, another ``lowest``. Nothing is then changed.
-
-        Examples
-        --------
-        >>> mine, yours = LatentRisk(lowest=-2.5), LatentRisk(lowest=-4.0)
-        >>> mine.manoeuvres.remember(3.0, 4.0)
-        >>> yours.manoeuvres.remember(3.5)
-        >>> mine.merge([yours])
-        >>> sorted(mine.manoeuvres.decels)
-        [3.0, 3.5, 4.0]
         """
         given = list(others)
         alike = ("dt", "hard", "lowest") if brakes else ("dt", "hard")
         for other in given:
             self._refuse_unlike(other, alike)
-        every = [*given, self]
         self.manoeuvres.merge([other.manoeuvres for other in given])
         self.perception.merge([other.perception for other in given])
-        if same_states or max(one._by_state.shape[1] for one in every) <= 1:
-            states = max(one._by_state.shape[1] for one in every)
-            self._by_state = sum(
-                (
-                    np.pad(one._by_state, ((0, 0), (0, states - one._by_state.shape[1])))
-                    for one in every
-                ),
-                start=np.zeros((3, states)),
-            )
         if brakes:
             self.brakes.merge([other.brakes for other in given])
 
@@ -391,8 +335,10 @@ class LatentRisk:
         """
         here = self._cautious(situation.observation)
         actions = _series("accelerations", accelerations)
-        if not is_whole(here):
-            return self._blind(situation, _finite("accelerations", actions))
+        if not is_whole(here):  # where one is cannot be told: nothing can be survived for sure
+            sure = np.ones(len(_finite("accelerations", actions)))
+            evidence = float(len(self.manoeuvres))
+            return Judgement(sure, 0.0 * sure, sure, 0.0 * sure, evidence, self.seen(situation))
         judged = np.empty((4, len(actions)))
         table, evidence = self.manoeuvres.table, float(len(self.manoeuvres))
         if not _judge(
@@ -400,7 +346,7 @@ class LatentRisk:
         ):
             refuse_unusable("accelerations", actions)
         risk, low, high, critical = judged
-        return Judgement(risk, low, high, critical, evidence, self._seen(situation))
+        return Judgement(risk, low, high, critical, evidence, self.seen(situation))
 
     def why(self, judged: Judgement) -> str:
         """Why the first action that was judged is dangerous, in a few words."""
@@ -454,27 +400,12 @@ class LatentRisk:
         doubt = here.deviation((1.0, -speed / decel, leader_speed / decel))
         return gap - _CAUTION * doubt, speed, leader_speed
 
-    def _blind(self, situation: Situation, actions: NDArray[np.float64]) -> Judgement:
-        """Where one is was not seen, nor can it be told: nothing can be survived for sure."""
-        sure, none = np.ones(len(actions)), np.zeros(len(actions))
-        evidence = float(len(self.manoeuvres))
-        return Judgement(sure, none, sure, none, evidence, self._seen(situation))
-
-    def judgement(
-        self, situation: Situation, risk: NDArray[np.float64], critical: NDArray[np.float64]
-    ) -> Judgement:
-        """With the interval that as many manoeuvres as were seen allow for."""
-        evidence = float(len(self.manoeuvres))
-        low, high = np.transpose([wilson_bounds(each, evidence + 1.0) for each in risk.tolist()])
-        return Judgement(risk, low, high, critical, evidence, self._seen(situation))
-
-    def _seen(self, situation: Situation) -> float:
+    def seen(self, situation: Situation) -> float:
+        """For how long states like this one were seen [s]; NaN where there is none."""
         return math.nan if situation.state is None else self.seconds_seen(situation.belief)
 
-    def critical(
-        self, observation: ArrayLike, accelerations: ArrayLike, onset: float = 0.0
-    ) -> NDArray[np.float64]:
-        """Hardest braking of the leader, ``onset`` [s] from now, that is survived.
+    def critical(self, observation: ArrayLike, accelerations: ArrayLike) -> NDArray[np.float64]:
+        """Hardest braking of the leader, from now on, that is survived.
 
         Returns
         -------
@@ -482,64 +413,19 @@ class LatentRisk:
             [m/s²]; 0 where even a leader who keeps its speed is hit, `rehearsal.HARDEST` where
             none is.
         """
-        return self._critical(observation, accelerations, onset, self.margin)
+        actions = _finite("accelerations", accelerations)
+        return self._critical(_three_finite(observation), actions, self.margin)
 
     def _critical(
-        self,
-        observation: ArrayLike,
-        accelerations: ArrayLike,
-        onset: float = 0.0,
-        margin: float = 0.0,
+        self, observation: Three, actions: NDArray[np.float64], margin: float
     ) -> NDArray[np.float64]:
-        actions = _finite("accelerations", accelerations)
-        critical = np.empty(len(actions))
-        critical_decelerations(
-            _three_finite(observation),
-            actions,
-            self._commands[1],
-            self.body._replace(margin=margin),
-            round(onset / self.dt),
-            self.dt,
-            critical,
-        )
+        critical, body = np.empty(len(actions)), self.body._replace(margin=margin)
+        critical_decelerations(observation, actions, self._commands[1], body, self.dt, critical)
         return critical
-
-    def probability(
-        self,
-        observation: ArrayLike,
-        acceleration: float,
-        horizon: float,
-        belief: ArrayLike | None = None,
-    ) -> float:
-        """Probability of failure within ``horizon`` [s]: action now, then caution.
-
-        Unlike the latent risk this does not suppose that the leader brakes: it weighs by how
-        often leaders begin to, in states like this one (``belief``) or anywhere (None).
-        """
-        positive("horizon", horizon)
-        at_once = self.critical(observation, [acceleration])
-        if self._watch.braking or at_once[0] == 0.0:  # or it fails whatever the leader does
-            return float(self.manoeuvres.any_harder(at_once)[0])
-        rate = self.onset_rate(belief)
-        delays = np.arange(0.0, horizon, self.dt)
-        begins = np.exp(-rate * delays) * -math.expm1(-rate * self.dt)
-        critical = [self.critical(observation, [acceleration], delay)[0] for delay in delays]
-        return float(begins @ self.manoeuvres.any_harder(critical))
-
-    def onset_rate(self, belief: ArrayLike | None = None) -> float:
-        """How often leaders begin to brake [1/s], in states like this one or anywhere."""
-        onsets, exposure, _ = self._by_state
-        pooled = (onsets.sum() + 1.0) / (exposure.sum() + _POOLED)
-        if belief is None:
-            return float(pooled)
-        here = np.asarray(belief)[: len(onsets)]
-        n = len(here)
-        onsets, seconds = here @ onsets[:n], here @ exposure[:n]
-        return float((onsets + _POOLED * pooled) / (seconds + _POOLED))
 
     def seconds_seen(self, belief: ArrayLike) -> float:
         """How long states like this one were seen so far [s]: near 0 for what is new."""
-        return _weighed(self._by_state[2], np.asarray(belief, dtype=np.float64))
+        return _weighed(self._seconds, np.asarray(belief, dtype=np.float64))
 
     @property
     def body(self) -> Body:
@@ -552,30 +438,23 @@ class LatentRisk:
         """How surely each row is a dead end if the leader brakes now, as a `RiskMeasure` [m/s²].
 
         By how much the hardest braking of a leader that is survived by braking in full now falls
-        short of the one that leaders exceed with a probability of ``tolerance``. A dead end is a
-        collision, however small the gap that is left, so no margin is kept. Rows are judged one by
-        one, so ``dt`` does not matter.
+        short of the one that leaders exceed with a probability of ``tolerance``. No margin is kept:
+        a dead end is a collision, however small the gap that is left.
         """
         full = np.array([self.lowest])
-        critical = [self._critical(row, full, margin=0.0)[0] for row in np.asarray(observations)]
+        rows = map(_three_finite, np.asarray(observations, dtype=np.float64))
+        critical = [self._critical(row, full, margin=0.0)[0] for row in rows]
         return self.manoeuvres.exceeded_by(tolerance) - np.array(critical)
 
     # -- Keeping it -----------------------------------------------------------------------------
 
     def save(self, path: Place, provenance: Mapping[str, Any] | None = None) -> None:
-        """Write what was learnt to a file (arrays and a JSON header, nothing that can run).
-
-        Parameters
-        ----------
-        path : path-like, or file open for writing bytes
-        provenance : mapping, optional
-            What it learnt from, for people; kept in the file.
+        """Write what was learnt, and what it learnt from for people, to a file (`evofsm.store`).
 
         Raises
         ------
         OSError
-            If the folder does not exist, or the file cannot be written. A file that was there
-            before is then as it was.
+            If the file cannot be written; one that was there before is then as it was.
         """
         settings = {**self._settings, "own_brakes": self.brakes.assumed}
         learnt = self._learnt()
@@ -592,17 +471,6 @@ class LatentRisk:
             If there is no such file, or it may not be read.
         ValueError
             If the file holds something else, or is damaged.
-
-        Examples
-        --------
-        >>> import tempfile
-        >>> from pathlib import Path
-        >>> risk = LatentRisk(lowest=-2.5)
-        >>> risk.manoeuvres.remember(4.0)
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     risk.save(Path(folder) / "risk.evofsm")
-        ...     len(LatentRisk.load(Path(folder) / "risk.evofsm").manoeuvres)
-        1
         """
         settings, arrays = store.read(path, _RISK)
         with store.explained(path):
@@ -613,7 +481,7 @@ class LatentRisk:
             risk.brakes.remember(np.column_stack([arrays["brakes"], arrays["stretches"]]))
             risk.perception.restore(arrays)
             risk.brakes.set_lagged(*arrays["lagged"].tolist())
-            risk._by_state = np.array([arrays[name] for name in ("onsets", "exposure", "seconds")])
+            risk._seconds = np.array(arrays["seconds"])
             for latest in ("brought", "shortfalls"):
                 for value, begins in arrays[f"doubts_{latest}"].reshape(-1, 2).tolist():
                     getattr(risk.brakes, latest).add(value, bool(begins))
@@ -634,7 +502,7 @@ class LatentRisk:
             "lagged": np.array(self.brakes.lagged),
             "doubts_brought": self.brakes.brought.rows.reshape(-1),
             "doubts_shortfalls": self.brakes.shortfalls.rows.reshape(-1),
-            **dict(zip(("onsets", "exposure", "seconds"), self._by_state, strict=True)),
+            "seconds": self._seconds,
         }
 
 
@@ -698,7 +566,7 @@ def _judge(
         if not np.isfinite(acceleration):
             return False
     body = Body(decel, lag, margin)
-    critical_decelerations(observation, accelerations, before, body, 0, dt, judged[3])
+    critical_decelerations(observation, accelerations, before, body, dt, judged[3])
     for k in range(len(accelerations)):
         judged[0, k] = _interpolated(judged[3, k], table)
         judged[1, k], judged[2, k] = wilson_bounds(judged[0, k], evidence + 1.0)
@@ -724,9 +592,7 @@ def _interpolated(x: float, table: NDArray[np.float64]) -> float:
 
 
 @compiled
-def _count(
-    by_state: NDArray[np.float64], belief: NDArray[np.float64], dt: float, braking: bool
-) -> bool:
+def _count(seconds: NDArray[np.float64], belief: NDArray[np.float64], dt: float) -> bool:
     """Add the time of a decision to the states; nothing, and False, if ``belief`` is none."""
     total = 0.0
     for share in belief:
@@ -736,16 +602,14 @@ def _count(
     if not abs(total - 1.0) < 1e-6:
         return False
     for k in range(len(belief)):
-        by_state[2, k] += dt * belief[k]
-        if not braking:
-            by_state[1, k] += dt * belief[k]
+        seconds[k] += dt * belief[k]
     return True
 
 
 @compiled
-def _weighed(by_state: NDArray[np.float64], belief: NDArray[np.float64]) -> float:
+def _weighed(seconds: NDArray[np.float64], belief: NDArray[np.float64]) -> float:
     """Mean over states; of those that were never counted it is 0."""
     total = 0.0
-    for k in range(min(len(by_state), len(belief))):
-        total += by_state[k] * belief[k]
+    for k in range(min(len(seconds), len(belief))):
+        total += seconds[k] * belief[k]
     return total

@@ -114,17 +114,10 @@ REAL_DRIVES = LeaderBrakes(
 
 
 class Manoeuvres:
-    """The decelerations of the latest braking manoeuvres, and how likely harder ones are.
+    """The decelerations of the latest ``memory`` manoeuvres, and how likely harder ones are.
 
-    Parameters
-    ----------
-    assumed : float
-        The deceleration of the one that is only assumed [m/s²].
-    hard : float
-        Softer ones are counted, no more [m/s²]: however many were seen, they say nothing of how
-        hard the next hard one will be.
-    memory : int
-        How many are remembered; older ones are forgotten, so that a change shows.
+    The deceleration of one is only ``assumed`` [m/s²]. Those below ``hard`` [m/s²] are counted, no
+    more: however many were seen, they say nothing of how hard the next hard one will be.
 
     Examples
     --------
@@ -156,13 +149,7 @@ class Manoeuvres:
             self._tabulate()
 
     def begin_with(self, leaders: LeaderBrakes) -> None:
-        """Take in a table of others' manoeuvres as if they had been seen.
-
-        Raises
-        ------
-        ValueError
-            If some that are hard here were not counted there.
-        """
+        """Take in a table of others' manoeuvres as if they had been seen."""
         if leaders.hard > self.hard:
             raise ValueError(
                 f"leaders counts from {leaders.hard:g} m/s² on, but hard is {self.hard:g}; a "
@@ -184,11 +171,6 @@ class Manoeuvres:
         grid, harder = self.table
         return np.asarray(np.interp(np.asarray(decel, dtype=np.float64), grid, harder))
 
-    def any_harder(self, decel: ArrayLike) -> NDArray[np.float64]:
-        """Probability that the next manoeuvre, hard or gentle, is harder than these [m/s²]."""
-        share = (len(self.decels) + 1) / (len(self.decels) + 1 + self.gentle)
-        return np.where(np.asarray(decel) < self.hard, 1.0, share * self.harder(decel))
-
     def exceeded_by(self, share: float) -> float:
         """What a share of hard manoeuvres exceeds [m/s²]: the inverse of `harder`."""
         grid, harder = self.table
@@ -209,27 +191,16 @@ class Manoeuvres:
 
 
 def latest_of_each(series: Iterable[Iterable[float]]) -> list[float]:
-    """Values of several series, so that the latest of each come last.
-
-    Examples
-    --------
-    >>> latest_of_each([[1.0, 2.0, 3.0], [30.0]])
-    [1.0, 2.0, 30.0, 3.0]
-    """
+    """Values of several series, so that the latest of each come last."""
     columns = zip_longest(*(reversed(list(values)) for values in series))
     return [value for column in columns for value in column if value is not None][::-1]
 
 
 class BrakeWatch:
-    """Watches a leader's speed, and tells a manoeuvre when it has ended.
+    """Watches a leader's speed every ``dt`` [s], and tells a manoeuvre when it has ended.
 
     The deceleration of a manoeuvre is that of its hardest second, which neither its blurred ends
     nor noise on the speeds change much.
-
-    Parameters
-    ----------
-    dt : float
-        Time between observations [s].
 
     Examples
     --------

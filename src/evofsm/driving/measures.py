@@ -1,8 +1,10 @@
 """Classic measures of danger, and which situations are dead ends in truth.
 
-Every function takes observations (..., 3), the gap [m], the speed of the follower and that of the
-leader [m/s]. Every class scores them with a threshold: above 0 it calls for braking, and scores of
-different rows can be compared. Most return infinity where the cars have met.
+Every function takes ``observations``, a (..., 3) ndarray of the gap [m], the speed of the follower
+and that of the leader [m/s]; where accelerations matter, a (..., T, 3) one in the order of time.
+Every class scores them: above 0 it calls for braking, and most scores are infinite where the cars
+have met. An argument of a class that is not finite and positive raises a ValueError, except where 0
+is allowed.
 """
 
 from __future__ import annotations
@@ -71,18 +73,9 @@ class _ShortTime(_Measure):
 
 
 def time_to_collision(observations: Floats) -> Floats:
-    """Time until the cars meet if both kept their speed.
+    """Gap over closing speed [s]: until the cars meet if both kept their speed (Hayward 1972).
 
-    Parameters
-    ----------
-    observations : (..., 3) ndarray
-        Gap [m], speed of the follower and of the leader [m/s].
-
-    Returns
-    -------
-    (...) ndarray
-        Gap over closing speed [s]; infinite where the follower is not the faster one, 0 where
-        the cars have met.
+    Infinite where the follower is not the faster one, 0 where the cars have met.
 
     Examples
     --------
@@ -95,18 +88,9 @@ def time_to_collision(observations: Floats) -> Floats:
 
 @dataclass(frozen=True)
 class TimeToCollision(_ShortTime):
-    """Danger where the time to collision (Hayward 1972) is short; it is blind at equal speeds.
+    """Danger where the time to collision is below a ``threshold`` [s]; blind at equal speeds.
 
-    Parameters
-    ----------
-    threshold : float
-        Time to collision below which it calls for braking [s]; that of the Swedish conflict
-        technique (Hydén 1987).
-
-    Raises
-    ------
-    ValueError
-        If the threshold is not positive and finite.
+    That of 1.5 s is of the Swedish conflict technique (Hydén 1987).
 
     Examples
     --------
@@ -122,29 +106,12 @@ class TimeToCollision(_ShortTime):
 
 
 def modified_time_to_collision(observations: Floats, dt: float) -> Floats:
-    """Time until the cars meet if both kept their acceleration (Ozbay et al. 2008).
+    """Time until the cars meet if both kept their acceleration [s] (Ozbay et al. 2008).
 
     It is the first t > 0 at which Δa·t²/2 + Δv·t = gap, where Δv and Δa are the speed and the
-    acceleration of the follower minus the leader's. As published, it lets cars roll backwards
-    where they would in truth have come to a standstill.
-
-    Parameters
-    ----------
-    observations : (..., T, 3) ndarray
-        Gap [m], speed of the follower and of the leader [m/s], in the order of time.
-    dt : float
-        Time between two rows [s]. Accelerations are those since the row before, and 0 in the
-        first row.
-
-    Returns
-    -------
-    (..., T) ndarray
-        [s]; infinite where the cars would never meet, 0 where they have met.
-
-    Raises
-    ------
-    ValueError
-        If ``dt`` is not positive and finite.
+    acceleration of the follower minus the leader's; infinite where there is none, 0 where the cars
+    have met. Accelerations are those since the row before, ``dt`` [s] ago, and 0 in the first row.
+    As published, it lets cars roll backwards where they would in truth have come to a standstill.
 
     Examples
     --------
@@ -163,18 +130,9 @@ def modified_time_to_collision(observations: Floats, dt: float) -> Floats:
 
 @dataclass(frozen=True)
 class ModifiedTimeToCollision(_ShortTime):
-    """Danger where the modified time to collision is short: it sees the leader brake.
+    """Danger where the modified time to collision is below a ``threshold`` [s].
 
-    Parameters
-    ----------
-    threshold : float
-        Below which it calls for braking [s]; by default that of `TimeToCollision`, so that the two
-        differ in nothing but the accelerations.
-
-    Raises
-    ------
-    ValueError
-        If the threshold is not positive and finite.
+    By default it is that of `TimeToCollision`: the two differ in nothing but the accelerations.
 
     Examples
     --------
@@ -191,17 +149,9 @@ class ModifiedTimeToCollision(_ShortTime):
 
 
 def time_headway(observations: Floats) -> Floats:
-    """Time until the follower reaches the place at which the leader's rear bumper is.
+    """Gap over speed of the follower [s]: until it is where the leader's rear bumper is.
 
-    Parameters
-    ----------
-    observations : (..., 3) ndarray
-        Gap [m], speed of the follower and of the leader [m/s].
-
-    Returns
-    -------
-    (...) ndarray
-        Gap over speed of the follower [s]; infinite where it stands, 0 where the cars have met.
+    Infinite where it stands, 0 where the cars have met.
 
     Examples
     --------
@@ -214,17 +164,9 @@ def time_headway(observations: Floats) -> Floats:
 
 @dataclass(frozen=True)
 class TimeHeadway(_ShortTime):
-    """Danger where the follower drives close behind (Vogel 2003).
+    """Danger where the time headway is below a ``threshold`` [s] (Vogel 2003).
 
-    Parameters
-    ----------
-    threshold : float
-        Time headway below which it calls for braking [s]; below 1 s Sweden fines.
-
-    Raises
-    ------
-    ValueError
-        If the threshold is not positive and finite.
+    Below 1 s Sweden fines.
 
     Examples
     --------
@@ -243,18 +185,10 @@ class TimeHeadway(_ShortTime):
 
 
 def deceleration_to_avoid_collision(observations: Floats) -> Floats:
-    """Braking with which the follower just avoids a leader that keeps its speed.
+    """Braking with which a leader that keeps its speed is just avoided [m/s²].
 
-    Parameters
-    ----------
-    observations : (..., 3) ndarray
-        Gap [m], speed of the follower and of the leader [m/s].
-
-    Returns
-    -------
-    (...) ndarray
-        Square of the closing speed over twice the gap [m/s²]; 0 where the follower is not the
-        faster one, infinite where the cars have met.
+    The square of the closing speed over twice the gap; 0 where the follower is not the faster one,
+    infinite where the cars have met.
 
     Examples
     --------
@@ -271,17 +205,9 @@ def deceleration_to_avoid_collision(observations: Floats) -> Floats:
 
 @dataclass(frozen=True)
 class DecelerationToAvoidCollision(_Measure):
-    """DRAC (Cooper and Ferguson 1976): danger where hard braking is needed; blind at equal speeds.
+    """DRAC (Cooper and Ferguson 1976): danger where it is above a ``threshold`` [m/s²].
 
-    Parameters
-    ----------
-    threshold : float
-        Needed deceleration above which it calls for braking [m/s²], after Archer (2005).
-
-    Raises
-    ------
-    ValueError
-        If the threshold is not positive and finite.
+    That of 3.35 m/s² is of Archer (2005). It is blind at equal speeds.
 
     Examples
     --------
@@ -297,21 +223,10 @@ class DecelerationToAvoidCollision(_Measure):
 
 
 def picud(observations: Floats, decel: float, reaction: float) -> Floats:
-    """Gap that is left when both cars have braked to standstill.
+    """Gap that is left when both cars have braked to standstill [m]; below 0 they collide.
 
-    Parameters
-    ----------
-    observations : (..., 3) ndarray
-        Gap [m], speed of the follower and of the leader [m/s].
-    decel : float
-        Braking of both cars [m/s²], positive.
-    reaction : float
-        Time after which the follower brakes too [s].
-
-    Returns
-    -------
-    (...) ndarray
-        gap + v_leader² / (2·decel) − v·reaction − v² / (2·decel) [m]; below 0 they collide.
+    gap + v_leader² / (2·decel) − v·reaction − v² / (2·decel), where both brake by ``decel`` [m/s²],
+    the follower after a ``reaction`` [s].
 
     Examples
     --------
@@ -327,17 +242,7 @@ def picud(observations: Floats, decel: float, reaction: float) -> Floats:
 class Picud(_Measure):
     """PICUD (Uno et al. 2002): danger where urgent braking of both would end in a collision.
 
-    Parameters
-    ----------
-    decel : float
-        Braking of both cars [m/s²], positive.
-    reaction : float
-        Time after which the follower brakes too [s]; 0 is allowed.
-
-    Raises
-    ------
-    ValueError
-        If ``decel`` is not positive and finite, or ``reaction`` is negative or not finite.
+    Both brake by ``decel`` [m/s²], the follower after a ``reaction`` [s], which may be 0.
 
     Examples
     --------
@@ -362,24 +267,11 @@ class Picud(_Measure):
 def safe_distance(
     observations: Floats, response: float, accel: float, decel: float, leader_decel: float
 ) -> Floats:
-    """Gap from which the follower can still stop behind a leader that brakes in full.
+    """Gap from which the follower can still stop behind a leader that brakes in full [m].
 
-    Parameters
-    ----------
-    observations : (..., 3) ndarray
-        Gap [m], which does not matter here, speed of the follower and of the leader [m/s].
-    response : float
-        Time before the follower brakes [s].
-    accel : float
-        Acceleration of the follower until then [m/s²].
-    decel, leader_decel : float
-        Braking that the follower is sure to reach, and the hardest of the leader [m/s²], positive.
-
-    Returns
-    -------
-    (...) ndarray
-        v·ρ + a·ρ²/2 + (v + ρ·a)² / (2·decel) − v_leader² / (2·leader_decel) [m], or 0 if that is
-        negative, where v is the follower's speed, ρ the response and a ``accel``.
+    v·ρ + a·ρ²/2 + (v + ρ·a)² / (2·decel) − v_leader² / (2·leader_decel), or 0 if that is negative,
+    where v is the follower's speed, ρ the ``response`` [s], a ``accel`` [m/s²], ``decel`` the
+    braking that it is sure to reach and ``leader_decel`` the hardest of the leader [m/s²].
 
     Examples
     --------
@@ -397,21 +289,7 @@ def safe_distance(
 class ResponsibilitySensitiveSafety(_Measure):
     """RSS (Shalev-Shwartz et al. 2017, arXiv:1708.06374), its longitudinal part.
 
-    Danger where the gap is shorter than the safe distance.
-
-    Parameters
-    ----------
-    response : float
-        Time before the follower brakes [s]; 0 is allowed.
-    accel : float
-        Acceleration of the follower until then [m/s²]; 0 is allowed.
-    decel, leader_decel : float
-        Braking that the follower is sure to reach, and the hardest of the leader [m/s²], positive.
-
-    Raises
-    ------
-    ValueError
-        If an argument is negative or not finite, or a deceleration is 0.
+    Danger where the gap is shorter than the safe distance. ``response`` and ``accel`` may be 0.
 
     Examples
     --------
@@ -451,22 +329,10 @@ class ResponsibilitySensitiveSafety(_Measure):
 
 
 def distance_to_avoid(observations: Floats, reaction: float, decel: float) -> Floats:
-    """Gap from which the follower can still avoid a leader that keeps its speed.
+    """Gap from which the follower can still avoid a leader that keeps its speed [m].
 
-    Parameters
-    ----------
-    observations : (..., 3) ndarray
-        Gap [m], which does not matter here, speed of the follower and of the leader [m/s].
-    reaction : float
-        Time before the follower brakes [s].
-    decel : float
-        Its braking then [m/s²], positive.
-
-    Returns
-    -------
-    (...) ndarray
-        closing² / (2·decel) + closing·reaction [m], the regulation's time to collision times the
-        closing speed; 0 where the follower is not the faster one.
+    closing² / (2·decel) + closing·reaction, the time to collision of the regulation times the
+    closing speed; 0 where the follower is not the faster one.
 
     Examples
     --------
@@ -482,21 +348,9 @@ def distance_to_avoid(observations: Floats, reaction: float, decel: float) -> Fl
 class PerformanceModel(_Measure):
     """Danger where a driver of UN Regulation No. 157 could not avoid the collision any more.
 
-    The regulation (5.2.5.2 and Annex 4, Appendix 3) compares times to collision; here they are
-    multiplied by the closing speed, so that the score is a distance and defined at any speeds. Its
-    sign stays the same.
-
-    Parameters
-    ----------
-    reaction : float
-        Time before the follower brakes [s]; 0 is allowed.
-    decel : float
-        Its braking then [m/s²], positive.
-
-    Raises
-    ------
-    ValueError
-        If ``decel`` is not positive and finite, or ``reaction`` is negative or not finite.
+    It brakes by ``decel`` [m/s²] after a ``reaction`` [s], which may be 0. The regulation (5.2.5.2
+    and Annex 4, Appendix 3) compares times to collision; here they are multiplied by the closing
+    speed, so that the score is a distance and defined at any speeds. Its sign stays the same.
 
     Examples
     --------
@@ -543,20 +397,9 @@ def proactive_fuzzy(
 ) -> Floats:
     """PFS, how unsafe the gap is should the leader brake in full (Mattas et al. 2020).
 
-    With the distance s(b) = v·reaction + v² / (2·b) − v_leader² / (2·leader_decel), it is 1 for
-    gap − margin below s(decel), 0 above s(comfortable_decel) + margin, and linear in between.
-
-    Parameters
-    ----------
-    observations : (..., 3) ndarray
-        Gap [m], speed of the follower and of the leader [m/s].
-    reaction, comfortable_decel, decel, leader_decel, margin
-        As in `FuzzySafety`.
-
-    Returns
-    -------
-    (...) ndarray
-        From 0, safe, to 1, unsafe; 1 where the cars have met.
+    With the distance s(b) = v·reaction + v² / (2·b) − v_leader² / (2·leader_decel), it is 1,
+    unsafe, for gap − margin below s(decel) and where the cars have met, 0 above
+    s(comfortable_decel) + margin, and linear in between. The parameters are those of `FuzzySafety`.
 
     Examples
     --------
@@ -576,31 +419,11 @@ def critical_fuzzy(
 ) -> Floats:
     """CFS, how unsafe the gap is while the follower closes in on a leader that keeps its speed.
 
-    Until it reacts, the follower keeps its acceleration, or brakes by ``comfortable_decel`` where
-    it brakes harder than that. If it is then still the faster one, CFS is 1 for gaps from which
-    ``decel`` would not do, 0 for gaps from which ``comfortable_decel`` does, and linear in
-    between. If not, it is 1 for gaps from which the present braking does not do, and 0 else.
-
-    Parameters
-    ----------
-    observations : (..., T, 3) ndarray
-        Gap [m], speed of the follower and of the leader [m/s], in the order of time.
-    dt : float
-        Time between two rows [s]. The acceleration is the one since the row before, and 0 in the
-        first row.
-    reaction, comfortable_decel, decel
-        As in `FuzzySafety`.
-
-    Returns
-    -------
-    (..., T) ndarray
-        From 0, safe, to 1, unsafe; 0 where the follower is not the faster one, 1 where the cars
-        have met.
-
-    Raises
-    ------
-    ValueError
-        If ``dt`` is not positive and finite.
+    Until it reacts, the follower keeps its acceleration (since the row before, ``dt`` [s] ago), or
+    brakes by ``comfortable_decel`` where it brakes harder than that. If it is then still the faster
+    one, CFS is 1, unsafe, for gaps from which ``decel`` would not do, 0 for gaps from which
+    ``comfortable_decel`` does, and linear in between. If not, it is 1 for gaps from which the
+    present braking does not do, and 0 else; 1 where the cars have met.
 
     Examples
     --------
@@ -652,11 +475,6 @@ class FuzzySafety(_Measure):
     threshold : float
         Degree of danger above which it calls for braking, from 0 to below 1; the model itself
         brakes from 0 on, the harder the more dangerous it is.
-
-    Raises
-    ------
-    ValueError
-        If an argument is out of range or not finite.
 
     Examples
     --------
@@ -714,8 +532,6 @@ def is_dead_end(observations: Floats, decel: float, leader_decel: float) -> NDAr
 
     Parameters
     ----------
-    observations : (..., 3) ndarray
-        Gap [m], speed of the follower and of the leader [m/s].
     decel, leader_decel : float
         Hardest braking of the follower and of the leader [m/s²], positive.
 

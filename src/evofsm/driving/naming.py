@@ -1,15 +1,18 @@
-"""What is observed of car following, and how a place of it is told in words."""
+"""What is observed and recorded of car following, and how a place of it is put into words."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import groupby
+from operator import attrgetter
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from evofsm.driving.measures import time_headway, time_to_collision
 from evofsm.fsm.naming import Labels, Words
 from evofsm.fsm.validation import real_array
+from evofsm.guard.record import RECORD, Column
 
 #: What is observed of car following, and its units.
 VARIABLES, UNITS = ("gap", "v_follower", "v_leader"), ("m", "m/s", "m/s")
@@ -26,25 +29,14 @@ _MOST_DECIMALS = 3
 
 
 def name_state(center: ArrayLike, decimals: int = 0) -> str:
-    """Say where a state lies.
+    """Where a state lies, in words: its gap, its speed, and how fast the gap closes or opens.
 
     Parameters
     ----------
     center : (3,) array_like
-        Gap [m], speed of the follower and of the leader [m/s].
+        Gap [m], speed of the follower and of the leader [m/s]; a ValueError if it is not three.
     decimals : int
         Of the numbers.
-
-    Returns
-    -------
-    str
-        The gap, close up to 15 m and far beyond 40 m; the follower's speed, slow up to 8 m/s and
-        fast beyond 20 m/s; and how fast the gap closes or opens, where that is 0.5 m/s or more.
-
-    Raises
-    ------
-    ValueError
-        If it has not three variables.
 
     Examples
     --------
@@ -66,10 +58,9 @@ def name_state(center: ArrayLike, decimals: int = 0) -> str:
 
 
 def name_states(centers: ArrayLike, states: Sequence[int] | None = None) -> list[str]:
-    """Say where states lie; no two of them get the same name.
+    """Where states lie, in words; no two of them get the same name.
 
-    Those that would be called alike get decimals, as many as tell them apart; states that lie in
-    one place are told apart by their numbers.
+    Those that would be called alike get decimals; states that lie in one place get their numbers.
 
     Parameters
     ----------
@@ -77,10 +68,6 @@ def name_states(centers: ArrayLike, states: Sequence[int] | None = None) -> list
         Gap [m], speed of the follower and of the leader [m/s].
     states : sequence of int, optional
         Their indices, from 0; without them 0 to n - 1.
-
-    Returns
-    -------
-    list of str
 
     Examples
     --------
@@ -127,7 +114,47 @@ def _change(closing: float, decimals: int) -> str:
     return f"{'closing' if closing > 0.0 else 'opening'} at {abs(closing):.{decimals}f} m/s"
 
 
-#: How places and actions of car following are told: an entry point of ``evofsm.words``.
+#: How places and actions of car following are worded: an entry point of ``evofsm.words``.
 WORDS = Words(name_state, "m/s²")
 #: Of car following.
 LABELS = Labels(names=VARIABLES, units=UNITS)
+
+#: By name, in the order of ``decisions.parquet``, which has those that are `Column.in_table`: what
+#: was observed, the numbers of every decision, what came of it, and texts.
+DECISION_COLUMNS: Mapping[str, Column] = {
+    "time": RECORD["time"],
+    "gap": Column(
+        float,
+        "from bumper to bumper, as observed [m]; left out where missing",
+        lambda one: float(one.situation.observation[0]),
+    ),
+    "v_follower": Column(
+        float,
+        "speed of the follower [m/s]; left out where missing",
+        lambda one: float(one.situation.observation[1]),
+    ),
+    "v_leader": Column(
+        float,
+        "speed of the leader [m/s]; left out where missing",
+        lambda one: float(one.situation.observation[2]),
+    ),
+    "time_to_collision": Column(
+        float,
+        "[s]; left out where the gap does not close",
+        lambda one: float(time_to_collision(one.situation.observation)),
+        in_table=False,
+    ),
+    "time_headway": Column(
+        float,
+        "[s]; left out where the follower stands",
+        lambda one: float(time_headway(one.situation.observation)),
+        in_table=False,
+    ),
+    **{name: column for name, column in RECORD.items() if column.kind is not str},
+    "realised": Column(
+        float,
+        "what the body did until the next decision [m/s²]; left out where there is none",
+        attrgetter("realised"),
+    ),
+    **RECORD,
+}

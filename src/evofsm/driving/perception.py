@@ -9,7 +9,9 @@ what kinematics leave unexplained; as long as that is nothing, the estimate is t
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from bisect import bisect_left, insort
+from collections import deque
+from collections.abc import Iterable, Mapping, Sequence
 from math import isnan, nan, sqrt
 from typing import NamedTuple, TypeAlias
 
@@ -18,7 +20,7 @@ from numpy.typing import NDArray
 
 from evofsm.driving.leaders import latest_of_each
 from evofsm.driving.rehearsal import Three
-from evofsm.fsm.kernels import compiled, kernel
+from evofsm.fsm.kernels import compiled
 
 # Gap [m], speed of the follower and of the leader [m/s], or what is said of each of them.
 Matrix: TypeAlias = tuple[Three, Three, Three]
@@ -38,6 +40,7 @@ _STANDING = 1.0
 _ANOTHER_LEADER = 6.0
 # Median of the absolute value of a standard normal variable.
 _MEDIAN = 0.6745
+_SIX = sqrt(6.0)
 _NOTHING = (0.0, 0.0, 0.0)
 _EXACT = (_NOTHING, _NOTHING, _NOTHING)
 _NAMES = ("noise_gap", "noise_speed", "noise_leader")
@@ -55,12 +58,7 @@ class Estimate(NamedTuple):
 
 
 class Perception:
-    """Estimates gap and speeds, and learns how noisy they are observed.
-
-    Parameters
-    ----------
-    dt : float
-        Time between observations [s].
+    """Estimates gap and speeds every ``dt`` [s], and learns how noisy they are observed.
 
     Examples
     --------
@@ -75,11 +73,8 @@ class Perception:
         self.dt = dt
         #: Standard deviations of observed gap [m], own and leader's speed [m/s].
         self.noise = _NOTHING
-        # Of the latest residuals that kinematics do not explain, of gap and both speeds: their
-        # absolute values in rings, and sorted; from the medians, so that a few odd ones do
-        # not matter.
-        self._sizes, self._sorted = np.empty((3, _MEMORY)), np.empty((3, _MEMORY))
-        self._added = np.zeros(3, np.int64)
+        # Of what gap and both speeds did that kinematics do not explain.
+        self._sizes = _Sizes(), _Sizes(), _Sizes()
         self.clear()
 
     def clear(self) -> None:
@@ -92,28 +87,17 @@ class Perception:
     def see(
         self, now: Three, realised: float, *, sure: bool = True, learn: bool = True
     ) -> Estimate:
-        """Take in an observation, and learn the noise from it if told to.
+        """Take in gap and speeds, and learn their noise; NaN, where not seen, is estimated.
 
-        Parameters
-        ----------
-        now : tuple of three floats
-            Gap [m], speed of the follower and of the leader [m/s]; NaN where it was not seen,
-            which is then estimated from what was seen before, and teaches nothing of the noise.
-        realised : float
-            Acceleration of the follower since the observation before, as expected [m/s²].
-        sure : bool
-            Whether that is known well.
-        learn : bool
+        ``realised`` is the follower's acceleration since the observation before, as expected
+        [m/s²], and ``sure`` whether that is known well.
         """
         estimate = self.estimate(now, realised, sure=sure)
         if not is_whole(now):
             self._seen, self._changes = None, (nan, nan)
         else:
             if learn and self._seen is not None:
-                rings, before = (self._sizes, self._sorted, self._added), self._seen
-                self.noise, self._changes = _take_in(
-                    *rings, before, now, realised, self._changes, self.dt
-                )
+                self._learn(self._seen, now, realised)
             self._seen = now
         self._asked = None
         if is_whole(estimate.mean):
@@ -132,26 +116,35 @@ class Perception:
             self._asked, self._answer = (now, realised, sure), Estimate(*filtered)
         return self._answer
 
+    def _learn(self, before: Three, now: Three, realised: float) -> None:
+        """Take in what kinematics do not explain; of who may stand nothing."""
+        dt, (was, last) = self.dt, self._changes
+        closing = now[1] + before[1] - now[2] - before[2]
+        self._changes = own, leader = now[1] - before[1] - realised * dt, now[2] - before[2]
+        self._sizes[0].add(now[0] - before[0] + 0.5 * dt * closing)
+        if min(now[1], before[1]) > _STANDING:
+            self._sizes[1].add(own - was)
+        if min(now[2], before[2]) > _STANDING:
+            self._sizes[2].add(leader - last)
+        self.noise = _noise(self._sizes, dt)
+
     def learnt(self) -> dict[str, NDArray[np.float64]]:
         """The residuals by name, the oldest first, for a file."""
         return {
-            name: np.roll(ring, -added)[-added:] if added > _MEMORY else ring[:added].copy()
-            for name, ring, added in zip(_NAMES, self._sizes, self._added.tolist(), strict=True)
+            name: np.array(each.latest, dtype=np.float64)
+            for name, each in zip(_NAMES, self._sizes, strict=True)
         }
 
     def merge(self, others: Sequence[Perception]) -> None:
         """Take in what others' sensors left unexplained; of too many the latest of each."""
         every = [one.learnt() for one in (*others, self)]
-        self.restore({name: np.array(latest_of_each([e[name] for e in every])) for name in _NAMES})
+        self.restore({name: latest_of_each([e[name] for e in every]) for name in _NAMES})
 
-    def restore(self, arrays: Mapping[str, NDArray[np.float64]]) -> None:
+    def restore(self, latest: Mapping[str, Iterable[float]]) -> None:
         """Take over what `learnt` returned."""
-        for k, name in enumerate(_NAMES):
-            latest = np.abs(arrays[name][-_MEMORY:])
-            count = self._added[k] = len(latest)
-            self._sizes[k, :count], self._sorted[k, :count] = latest, np.sort(latest)
-        self.noise = _noise(_deviations(self._sorted, self._added), self.dt)
-        self._asked = None
+        gap, own, leader = (_Sizes(np.asarray(latest[name]).tolist()) for name in _NAMES)
+        self._sizes = gap, own, leader
+        self.noise, self._asked = _noise(self._sizes, self.dt), None
 
 
 def is_whole(observation: Three) -> bool:
@@ -174,7 +167,7 @@ def _diagonal(deviations: Three) -> Matrix:
 def _filtered(
     before: Three,
     covariance: Matrix,
-    observation: Three,
+    now: Three,
     noise: Three,
     realised: float,
     doubt: float,
@@ -184,29 +177,6 @@ def _filtered(
 
     ``doubt`` is the standard deviation of the acceleration that was ``realised`` [m/s²].
     """
-    mean, spread = _predicted(before, covariance, realised, doubt, dt)
-    variances = _diagonal(noise)
-    whole = not np.isnan(observation[0] + observation[1] + observation[2])
-    for i in (0, 2):
-        off, expected = observation[i] - mean[i], spread[i, i] + variances[i][i]
-        if whole and off * off > _ANOTHER_LEADER * _ANOTHER_LEADER * expected:
-            return observation, variances
-    for i in range(3):
-        if np.isnan(observation[i]):
-            continue
-        _correct(mean, spread, i, observation[i], variances[i][i])
-    return (mean[0], max(mean[1], 0.0), max(mean[2], 0.0)), (
-        (spread[0, 0], spread[0, 1], spread[0, 2]),
-        (spread[1, 0], spread[1, 1], spread[1, 2]),
-        (spread[2, 0], spread[2, 1], spread[2, 2]),
-    )
-
-
-@compiled
-def _predicted(
-    before: Three, covariance: Matrix, realised: float, doubt: float, dt: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Where one should be now, and how sure that is."""
     gap, own, leader = before
     reached = max(own + realised * dt, 0.0)
     mean = np.array([gap + (leader - 0.5 * (own + reached)) * dt, reached, leader])
@@ -218,26 +188,30 @@ def _predicted(
     v, u, half = (doubt * dt) ** 2, (_LEADER * dt) ** 2, 0.5 * dt
     gg += half * half * (v + u) + _UNEVEN**2
     to_v, to_u = to_v - half * v, to_u + half * u
-    return mean, np.array([[gg, to_v, to_u], [to_v, vv + v, vu], [to_u, vu, uu + u]])
+    spread = np.array([[gg, to_v, to_u], [to_v, vv + v, vu], [to_u, vu, uu + u]])
 
-
-@compiled
-def _correct(
-    mean: NDArray[np.float64],
-    covariance: NDArray[np.float64],
-    i: int,
-    value: float,
-    variance: float,
-) -> None:
-    """Take in one observed component: a scalar Kalman update, in place."""
-    row = covariance[i].copy()
-    total = row[i] + variance
-    off = (value - mean[i]) / total
-    for j in range(3):
-        mean[j] += row[j] * off
-        gain = row[j] / total
-        for k in range(3):
-            covariance[j, k] -= gain * row[k]
+    variances = _diagonal(noise)
+    whole = not np.isnan(now[0] + now[1] + now[2])
+    for i in (0, 2):
+        off, expected = now[i] - mean[i], spread[i, i] + variances[i][i]
+        if whole and off * off > _ANOTHER_LEADER * _ANOTHER_LEADER * expected:
+            return now, variances
+    for i in range(3):
+        if np.isnan(now[i]):
+            continue
+        row = spread[i].copy()
+        total = row[i] + variances[i][i]
+        off = (now[i] - mean[i]) / total
+        for j in range(3):
+            mean[j] += row[j] * off
+            gain = row[j] / total
+            for k in range(3):
+                spread[j, k] -= gain * row[k]
+    return (mean[0], max(mean[1], 0.0), max(mean[2], 0.0)), (
+        (spread[0, 0], spread[0, 1], spread[0, 2]),
+        (spread[1, 0], spread[1, 1], spread[1, 2]),
+        (spread[2, 0], spread[2, 1], spread[2, 2]),
+    )
 
 
 @compiled
@@ -252,106 +226,40 @@ def _deviation(covariance: Matrix, weights: Three) -> float:
 # -- The noise ----------------------------------------------------------------------------------
 
 
-@compiled
-def _take_in(
-    sizes: NDArray[np.float64],
-    ordered: NDArray[np.float64],
-    added: NDArray[np.int64],
-    before: Three,
-    now: Three,
-    realised: float,
-    changes: tuple[float, float],
-    dt: float,
-) -> tuple[Three, tuple[float, float]]:
-    residuals, changes = _unexplained(before, now, realised, changes, dt)
-    _add(sizes, ordered, added, residuals)
-    return _noise(_deviations(ordered, added), dt), changes
+class _Sizes:
+    """Absolute values of the latest residuals, and their standard deviation.
 
-
-@compiled
-def _unexplained(
-    before: Three, now: Three, realised: float, changes: tuple[float, float], dt: float
-) -> tuple[Three, tuple[float, float]]:
-    """What the gap and both speeds did that kinematics do not explain; NaN where that is not said.
-
-    And by how much both speeds changed, beyond what was expected; ``changes`` is that of the
-    interval before.
+    It is told from the median, so that a few odd ones do not matter.
     """
-    (gap_before, own_before, leader_before), (gap, own, leader) = before, now
-    closing = own + own_before - leader - leader_before
-    own_change, leader_change = own - own_before - realised * dt, leader - leader_before
-    own_moves = min(own, own_before) > _STANDING
-    leader_moves = min(leader, leader_before) > _STANDING
-    residuals = (
-        gap - gap_before + 0.5 * dt * closing,
-        own_change - changes[0] if own_moves else nan,
-        leader_change - changes[1] if leader_moves else nan,
-    )
-    return residuals, (own_change, leader_change)
+
+    def __init__(self, sizes: Iterable[float] = ()) -> None:
+        self.latest = deque(map(abs, sizes), maxlen=_MEMORY)
+        self._sorted = sorted(self.latest)
+
+    def add(self, residual: float) -> None:
+        """Take in one more, if it is a number; the oldest goes where there is no room."""
+        if isnan(residual):
+            return
+        if len(self.latest) == _MEMORY:
+            del self._sorted[bisect_left(self._sorted, self.latest[0])]
+        self.latest.append(abs(residual))
+        insort(self._sorted, abs(residual))
+
+    def deviation(self) -> float:
+        """0 while there are few."""
+        n = len(self._sorted)
+        return self._sorted[n // 2] / _MEDIAN if n >= _FEWEST else 0.0
 
 
-@compiled
-def _noise(deviations: Three, dt: float) -> Three:
+def _noise(sizes: Iterable[_Sizes], dt: float) -> Three:
     """Standard deviation of the noise on gap and both speeds, from that of their residuals."""
     # The second difference of a noisy speed has 6 times its variance; that of a gap against
     # the trapezoid of four noisy speeds twice its own, and some of theirs.
-    own, leader = deviations[1] / sqrt(6.0), deviations[2] / sqrt(6.0)
-    of_speeds = 0.5 * dt**2 * (own**2 + leader**2)
-    gap = sqrt(max(deviations[0] ** 2 - of_speeds, 0.0) / 2.0)
+    gap, own, leader = [each.deviation() for each in sizes]
+    own, leader = own / _SIX, leader / _SIX
+    gap = sqrt(max(gap**2 - 0.5 * dt**2 * (own**2 + leader**2), 0.0) / 2.0)
     return (
         gap if gap >= _FINEST[0] else 0.0,
         own if own >= _FINEST[1] else 0.0,
         leader if leader >= _FINEST[2] else 0.0,
-    )
-
-
-@compiled
-def _add(
-    sizes: NDArray[np.float64],
-    ordered: NDArray[np.float64],
-    added: NDArray[np.int64],
-    residuals: Three,
-) -> None:
-    """Put each residual's size in place of the oldest of its row; ``ordered`` stays sorted."""
-    for k in range(3):
-        if np.isnan(residuals[k]):
-            continue
-        size, place, row = abs(residuals[k]), added[k] % _MEMORY, ordered[k]
-        i = added[k]
-        if added[k] >= _MEMORY:  # the oldest leaves, and what is larger than it closes up
-            i = _place_in(row, sizes[k, place])
-            while i + 1 < _MEMORY and row[i + 1] < size:
-                row[i] = row[i + 1]
-                i += 1
-        while i > 0 and row[i - 1] > size:
-            row[i] = row[i - 1]
-            i -= 1
-        row[i] = sizes[k, place] = size
-        added[k] += 1
-
-
-@kernel
-def _place_in(ordered: NDArray[np.float64], size: float) -> int:
-    """Where a number stands, or the first of those equal to it."""
-    low, high = 0, len(ordered)
-    while low < high:
-        middle = (low + high) // 2
-        if ordered[middle] < size:
-            low = middle + 1
-        else:
-            high = middle
-    return low
-
-
-@kernel
-def _deviation_of(ordered: NDArray[np.float64], count: int) -> float:
-    return float(ordered[count // 2]) / _MEDIAN if count >= _FEWEST else 0.0
-
-
-@compiled
-def _deviations(ordered: NDArray[np.float64], added: NDArray[np.int64]) -> Three:
-    return (
-        _deviation_of(ordered[0], min(added[0], _MEMORY)),
-        _deviation_of(ordered[1], min(added[1], _MEMORY)),
-        _deviation_of(ordered[2], min(added[2], _MEMORY)),
     )

@@ -1,14 +1,10 @@
 """Rehearse what would happen: this action now, caution from then on, against a braking leader.
 
 The follower does what is asked of it for one decision interval and then brakes in full; the leader
-begins to brake, now or a little later, and keeps braking until it stands. The *critical
-deceleration* is the hardest braking of the leader that ends without a collision. Only kinematics
-is taken as known; how hard the follower itself can brake, how late it responds and how hard leaders
-brake is for others to learn.
-
+brakes from now on until it stands. The *critical deceleration* is the hardest braking of the leader
+that ends without a collision. Only kinematics is taken as known; the rest is for others to learn.
 Asking for the fixed cautious policy, and not for the best of many uncertain answers, keeps luck
-out of the estimate. The authors of the paper test an action in the same spirit, by predicting the
-states it leads to before it is taken (Han, Filev, Ozguner, arXiv:2006.08092).
+out of the estimate.
 """
 
 from __future__ import annotations
@@ -45,26 +41,24 @@ def critical_decelerations(
     accelerations: NDArray[np.float64],
     before: float,
     body: Body,
-    onset: int,
     dt: float,
     critical: NDArray[np.float64],
 ) -> None:
     """Write the critical deceleration under each acceleration that could be commanded now.
 
-    ``before`` is the acceleration commanded last, ``onset`` after how many decision intervals
-    of ``dt`` the leader begins to brake.
+    ``before`` is the acceleration commanded last.
     """
     for k in range(len(accelerations)):
         low, high = 0.0, HARDEST
-        if survives(observation, accelerations[k], before, body, high, onset, dt):
+        if survives(observation, accelerations[k], before, body, high, dt):
             critical[k] = HARDEST
             continue
-        if not survives(observation, accelerations[k], before, body, low, onset, dt):
+        if not survives(observation, accelerations[k], before, body, low, dt):
             critical[k] = 0.0
             continue
         for _ in range(_HALVINGS):
             middle = 0.5 * (low + high)
-            if survives(observation, accelerations[k], before, body, middle, onset, dt):
+            if survives(observation, accelerations[k], before, body, middle, dt):
                 low = middle
             else:
                 high = middle
@@ -78,7 +72,6 @@ def survives(
     before: float,
     body: Body,
     leader_decel: float,
-    onset: int,
     dt: float,
 ) -> bool:
     """Whether no collision comes of ``acceleration`` now and full braking after it."""
@@ -90,18 +83,14 @@ def survives(
     last = max(before, caution)
     if speed <= 0.0 and max(asked, last) <= 0.0:
         return bool(observation[0] > 0.0)  # who stands, and stays, may be closer than the margin
-    interval = 0
     while gap > 0.0:
         realised = body.lag * last + (1.0 - body.lag) * asked
         if speed <= 0.0 and realised <= 0.0 and asked == caution:
             return True
-        leader = -leader_decel if interval >= onset else 0.0
         distance, speed = _drive_on(speed, realised, dt)
-        leader_distance, leader_speed = _drive_on(leader_speed, leader, dt)
+        leader_distance, leader_speed = _drive_on(leader_speed, -leader_decel, dt)
         gap += leader_distance - distance
-        if (
-            asked == caution and last == caution and interval >= onset
-        ):  # both brake until they stand
+        if asked == caution and last == caution:  # both brake until they stand
             if leader_decel > body.decel:  # then the gap is smallest at the end, if it shrinks
                 leader_distance = 0.5 * leader_speed * leader_speed / leader_decel
                 left = gap + leader_distance - 0.5 * speed * speed / body.decel
@@ -109,7 +98,6 @@ def survives(
             if speed <= leader_speed:  # a faster leader who brakes less is never met
                 return bool(gap > 0.0)
         last, asked = asked, caution
-        interval += 1
     return False
 
 

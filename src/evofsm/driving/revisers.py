@@ -33,8 +33,7 @@ GENTLE_BRAKE = Fallback(-1.0, "braking gently")
 class EnvelopeReviser:
     """Brakes in full wherever a measure of danger calls for it, and else keeps the proposal.
 
-    So a classic measure becomes a reviser: time to collision an emergency brake, a safe distance
-    the proper response of RSS.
+    So time to collision becomes an emergency brake, a safe distance the proper response of RSS.
 
     Parameters
     ----------
@@ -96,24 +95,11 @@ class EnvelopeReviser:
 
 
 def _own_measure(name: str) -> Any:
-    """A class of ours by its name."""
     return getattr(measures, name, None)
 
 
 class Unrevised:
-    """Executes every proposal that can be executed: no reviser at all.
-
-    Parameters
-    ----------
-    actions : IntervalActions
-
-    Examples
-    --------
-    >>> actions = IntervalActions(low=-2.5, high=2.5, width=0.3)
-    >>> here = Situation(np.array([5.0, 20.0, 10.0]), np.ones(1), 0, 0.0, 0.0)
-    >>> Unrevised(actions).revise(here, Proposal(1.0)).executed
-    1.0
-    """
+    """Executes every proposal that can be executed: no reviser at all."""
 
     fallback = GENTLE_BRAKE
 

@@ -16,16 +16,9 @@ MOST_STEPS = 2_000_000
 
 @dataclass(frozen=True)
 class CutIn:
-    """Another car moves in between: from then on it is the leader.
+    """Another car moves in at a ``time`` [s]: from then on it is the leader.
 
-    Parameters
-    ----------
-    time : float
-        When [s].
-    gap : float
-        Bumper to bumper from the follower to it [m].
-    speed : float
-        Its speed [m/s].
+    ``gap`` is from bumper to bumper from the follower to it [m], ``speed`` its speed [m/s].
     """
 
     time: float
@@ -80,16 +73,10 @@ class Leader:
 
 @dataclass(frozen=True)
 class Body:
-    """What the follower's body makes of a command: limits, a jerk limit, a delay.
+    """What the follower's body makes of a command.
 
-    Parameters
-    ----------
-    lowest, highest : float
-        Bounds of the realised acceleration [m/s²].
-    delay : float
-        Time from a command to its effect [s].
-    jerk : float
-        Fastest change of the realised acceleration [m/s³].
+    ``lowest`` and ``highest`` bound the realised acceleration [m/s²], ``delay`` is the time from a
+    command to its effect [s], ``jerk`` the fastest change of the realised acceleration [m/s³].
     """
 
     lowest: float = -math.inf
@@ -107,18 +94,10 @@ class Body:
 
 @dataclass(frozen=True)
 class Sensors:
-    """How well the follower sees: noise and delay.
+    """How well the follower sees.
 
-    Parameters
-    ----------
-    gap_noise : float
-        Standard deviation of the gap [m].
-    speed_noise : float
-        Standard deviation of both speeds [m/s].
-    delay : float
-        Age of what is seen [s].
-    seed : int
-        Of the noise.
+    Standard deviations of the noise on the gap [m] and on both speeds [m/s], the age of what is
+    seen (``delay``, [s]) and the seed of the noise.
     """
 
     gap_noise: float = 0.0
@@ -137,14 +116,7 @@ class Sensors:
 
 @dataclass(frozen=True)
 class Behind:
-    """A third car, behind the follower.
-
-    Parameters
-    ----------
-    driver : IDM
-    gap : float
-        Bumper to bumper from it to the follower at the start [m].
-    """
+    """A third car, at first ``gap`` [m] behind the follower, from bumper to bumper."""
 
     driver: IDM
     gap: float
@@ -213,13 +185,7 @@ class Scenario:
         return round(seconds / self.dt)
 
     def steps_between(self, interval: float) -> int:
-        """How many steps lie between two decisions.
-
-        Raises
-        ------
-        ValueError
-            If the time between decisions is no whole number of them.
-        """
+        """How many steps lie between two decisions; a ValueError where they are no multiple."""
         steps = self.steps(interval)
         if steps < 1 or not math.isclose(steps * self.dt, interval):
             raise ValueError(

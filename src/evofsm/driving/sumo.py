@@ -121,47 +121,14 @@ class SumoWorld:
             return drive_alone(road, controller)
 
     def add_kind(self, attributes: Mapping[str, str]) -> str:
-        """A kind of car that SUMO can drive, known on every road opened from now on.
-
-        Parameters
-        ----------
-        attributes : mapping of str to str
-            Of SUMO's ``vType``, without ``id`` and ``length``.
-
-        Returns
-        -------
-        str
-            Its id.
-        """
+        """The id of a kind of car with such a ``vType``, on every road opened from now on."""
         given = " ".join(f"{name}={quoteattr(value)}" for name, value in attributes.items())
         return self._kinds.setdefault(given, f"car{len(self._kinds)}")
 
     def wish(
         self, kind: str, observation: NDArray[np.float64], time: float, leader_decel: float
     ) -> float:
-        """What SUMO itself would do with the follower, were it a car of this kind.
-
-        Parameters
-        ----------
-        kind : str
-            An id that `add_kind` gave.
-        observation : (3,) ndarray
-            Gap [m], v_follower [m/s], v_leader [m/s].
-        time : float
-            Now, on the road that was opened last [s].
-        leader_decel : float
-            How hard the follower takes the leader to be able to brake [m/s²].
-
-        Returns
-        -------
-        float
-            Acceleration over one step [m/s²].
-
-        Raises
-        ------
-        RuntimeError
-            If no road of this world is at that time.
-        """
+        """What SUMO itself would do with the follower, were it a car of this kind [m/s²]."""
         road = self._road
         if road is None or not road.is_open or road.time != time:
             at = f"a road at {road.time:g} s" if road is not None and road.is_open else "no road"
@@ -208,15 +175,10 @@ class SumoWorld:
             self._sumo.start(
                 [
                     "sumo",
-                    *("--net-file", str(net)),
-                    *("--route-files", str(routes)),
-                    *("--step-length", repr(dt)),
-                    *("--step-method.ballistic", "true"),
-                    *("--collision.action", "warn"),
-                    *("--collision.mingap-factor", "0"),
-                    *("--time-to-teleport", "-1"),
-                    *("--no-step-log", "true"),
-                    *("--no-warnings", "true"),
+                    *("--net-file", str(net), "--route-files", str(routes)),
+                    *("--step-length", repr(dt), "--step-method.ballistic", "true"),
+                    *("--collision.action", "warn", "--collision.mingap-factor", "0"),
+                    *("--time-to-teleport", "-1", "--no-step-log", "true", "--no-warnings", "true"),
                     *self._options,
                 ]
             )
@@ -377,9 +339,9 @@ _MAY_BE_ZERO = {"tau", "minGap"}
 class SumoDriver:
     """A follower with the car-following model of SUMO, for use in one `SumoWorld`.
 
-    It proposes what SUMO would do in its next step: the wish of the model, within the ``accel``
-    and ``emergencyDecel`` of the car and up to its speed limit. On its own it drives as SUMO does,
-    to the last digit; under a reviser, what is executed is carried out exactly.
+    It proposes what SUMO would do in its next step, so that it can be revised: the wish of the
+    model, within the ``accel`` and ``emergencyDecel`` of the car and up to its speed limit. On its
+    own it drives as SUMO does, to the last digit.
 
     Parameters
     ----------
@@ -405,14 +367,8 @@ class SumoDriver:
     Notes
     -----
     The acceleration is that of one step of the simulation: ``(wished speed - speed) / dt``. Whoever
-    decides more rarely holds it for longer than SUMO would. As SUMO wishes for no speed below 0,
-    it never brakes harder than to a standstill within the step; and where the step is longer than
-    ``stepping`` (0.25 s), SUMO's IDM takes several smaller ones in it.
-
-    The models are those whose wish, read before the step, is what SUMO then does. It is not for
-    EIDM, PWagner2009, SmartSK and Daniel1, which draw at random or remember being asked; nor for
-    Wiedemann on a free road; W99 has an acceleration of its own. Dawdling (``sigma``) is no wish:
-    SUMO adds it later.
+    decides more rarely holds it for longer than SUMO would. The models are those whose wish, read
+    before the step, is what SUMO then does; others draw at random or remember being asked.
 
     Examples
     --------
@@ -446,13 +402,7 @@ class SumoDriver:
         self._kind = world.add_kind(fixed | given)
 
     def propose(self, observation: NDArray[np.float64], time: float = 0.0) -> Proposal:
-        """What SUMO would do in its next step [m/s²], seeing ``[gap, v_follower, v_leader]``.
-
-        Raises
-        ------
-        RuntimeError
-            If this is not asked on the open road of the driver's own world, at its present time.
-        """
+        """What SUMO would do in its next step [m/s²], seeing ``[gap, v_follower, v_leader]``."""
         return Proposal(self.world.wish(self._kind, observation, time, self.leader_decel))
 
 

@@ -382,19 +382,8 @@ class KinematicWorld:
     def run(self, scenario: Scenario, controller: Drives, interval: float | None = None) -> Episode:
         """Drive the scenario with ``controller`` in the follower.
 
-        Parameters
-        ----------
-        scenario : Scenario
-        controller : Controller or callable
-            From an observation to an acceleration [m/s²].
-        interval : float, optional
-            Time between two decisions [s], a multiple of the scenario's step; asked at every step
-            if not given.
-
-        Raises
-        ------
-        ValueError
-            If the controller proposes no finite number, or the interval is no such multiple.
+        It is asked every ``interval`` [s], a multiple of the scenario's step, or at every step. A
+        proposal that is no finite number raises a ValueError.
         """
         road = _Road(scenario)
         steps = 1 if interval is None else scenario.steps_between(interval)

@@ -1,0 +1,183 @@
+"""Guards for cars: two judges, what comes of episodes, and what was recorded."""
+
+import numpy as np
+import pytest
+
+pytest.importorskip("scipy")
+
+from evofsm.driving.cars import (
+    TOLD,
+    guard_for_cars,
+    guard_for_family,
+    learners_of,
+    learnt_by,
+    load_learnt,
+    name_judge,
+    save_learnt,
+)
+from evofsm.driving.drivers import IDM
+from evofsm.driving.episodes import (
+    Trial,
+    drive,
+    lead_time,
+    outcome_of,
+    reference_of,
+    shadow_drive,
+    summarise,
+    teach,
+    try_out,
+    unrevised_guard,
+)
+from evofsm.driving.families import load_family
+from evofsm.driving.family import held_out, training
+from evofsm.driving.judge import LatentRisk
+from evofsm.driving.scenarios import Leader, Scenario
+from evofsm.driving.world import KinematicWorld
+from evofsm.guard.guard import Guard
+from evofsm.guard.learnt.judge import LearntRisk
+from evofsm.guard.reviser import Mode
+
+pytestmark = pytest.mark.usefixtures("compiled")
+
+EMERGENCY = load_family("emergency")
+
+
+def taught(episodes, **settings):
+    guard = guard_for_family(EMERGENCY, judge="learnt", **settings)
+    drives = teach(guard, training(EMERGENCY, 0, 0, episodes))
+    return guard, sum(one.collided for one in drives)
+
+
+def decided(guard):
+    """All that a frozen copy executes in a few held-out draws."""
+    frozen = guard.copy()
+    frozen.freeze()
+    drives = teach(frozen, held_out(EMERGENCY, 0, 2))
+    return np.concatenate([one.executed for one in drives]).tolist()
+
+
+def test_a_judge_is_made_by_its_name():
+    kinds = {"kinematic": LatentRisk, "learnt": LearntRisk}
+    assert set(kinds) == set(TOLD)
+    for name, kind in kinds.items():
+        _, judge = learners_of(guard_for_family(EMERGENCY, judge=name))
+        assert isinstance(judge, kind)
+        assert name_judge(judge) == name
+    with pytest.raises(ValueError, match="no judge 'wise'; there are kinematic, learnt"):
+        guard_for_family(EMERGENCY, judge="wise")
+    with pytest.raises(TypeError, match="no LatentRisk"):
+        learnt_by(guard_for_family(EMERGENCY, judge="learnt"))
+
+
+@pytest.mark.slow
+def test_told_nothing_but_failures_it_learns_to_prevent_them():
+    guard, collisions = taught(15)
+    assert 1 <= collisions <= 6  # it can know of none before the first
+    outcomes = try_out(guard, EMERGENCY, held_out(EMERGENCY, 0, 10))
+    assert not any(one.collided for one in outcomes)
+    assert np.mean([one.mobility for one in outcomes]) > 0.6
+
+
+@pytest.mark.slow
+def test_neither_states_nor_names_decide():
+    """A machine with other states, and a judge that was not told what variables are called."""
+    guard, _ = taught(6)
+    other, _ = taught(6, rule=None)
+    any_system = Guard(EMERGENCY.actions.low, EMERGENCY.actions.high, interval=EMERGENCY.interval)
+    teach(any_system, training(EMERGENCY, 0, 0, 6))
+    assert guard.machine.n_states > other.machine.n_states
+    assert decided(guard) == decided(other) == decided(any_system)
+
+
+def test_what_was_learnt_is_kept_with_the_machine_that_is_asked(tmp_path):
+    guard, _ = taught(4)
+    save_learnt(guard, tmp_path)
+    machine, judge = load_learnt(tmp_path)
+    assert isinstance(judge, LearntRisk)
+    assert judge.dynamics.n_episodes == 4
+    assert machine.n_states == guard.machine.n_states
+    assert decided(guard_for_family(EMERGENCY, judge=judge)) == decided(guard)
+
+
+# -- What came of episodes ------------------------------------------------------------------------
+
+
+def test_outcomes_compare_with_the_controller_alone():
+    draws = held_out(EMERGENCY, 0, 3)
+    alone = [reference_of(EMERGENCY, draw) for draw in draws]
+    same = [drive(unrevised_guard(EMERGENCY), draw) for draw in draws]
+    found = [outcome_of(*pair, EMERGENCY.interval) for pair in zip(same, alone, strict=True)]
+    assert [one.mobility for one in found] == [1.0, 1.0, 1.0]
+    assert [one.changed for one in found] == [0, 0, 0]
+    row = summarise("emergency", "unrevised", "", found, EMERGENCY.interval)
+    assert row.collisions == sum(one.collided for one in same) == 3
+    assert (row.collision_rate, row.mobility, row.mean_change) == (1.0, 1.0, 0.0)
+    assert row.collision_low == pytest.approx(0.025 ** (1.0 / 3.0))  # Clopper and Pearson
+    seconds = sum(len(one.decisions) for one in same) * EMERGENCY.interval
+    assert row.hours == pytest.approx(seconds / 3600.0)
+
+
+def test_a_trial_gives_the_same_rows_in_any_order_and_keeps_what_it_is_of():
+    guard = guard_for_family(EMERGENCY, mode=Mode.SHADOW)
+    guard.freeze()
+    trial = Trial(EMERGENCY, guard)
+    rows = [trial(number) for number in (2, 0, 1)]
+    assert rows[1:] == [trial(0), trial(1)]
+    assert [row["episode"] for row in rows] == [2, 0, 1]
+    assert all(row["collided"] and row["lead_time"] > 1.0 for row in rows)
+    assert lead_time(drive(unrevised_guard(EMERGENCY), EMERGENCY.draw(0, 0))) is None
+
+
+def test_nobody_drives_a_scenario_without_a_controller():
+    scenario = EMERGENCY.draw(0, 0).scenario
+    with pytest.raises(ValueError, match="nobody drives"):
+        drive(unrevised_guard(EMERGENCY), scenario)
+    with pytest.raises(ValueError, match="no whole number of the scenario's steps"):
+        drive(guard_for_cars(-2.5, 2.5, interval=0.123), EMERGENCY.draw(0, 0))
+
+
+# -- What was recorded ----------------------------------------------------------------------------
+
+HASTY = IDM(2.25, 28.0, 0.8, 0.3, 2.0, lowest=-4.0, highest=2.5)
+LEADER = Leader(IDM(1.2, 25.0, 1.0, 1.0, 2.5), brake_decel=9.0, brake_time=9.0)
+
+
+def recorded():
+    """A drive that ended in a collision, a row every quarter of a second."""
+    episode = KinematicWorld().run(Scenario(LEADER, 8.0, duration=20.0), HASTY)
+    assert episode.collided
+    rows = [*range(0, len(episode.time) - 1, 25), len(episode.time) - 1]
+    return episode.time[rows], episode.observations[rows], episode.accelerations[rows]
+
+
+def test_it_decides_on_each_row_and_changes_none():
+    time, seen, did = recorded()
+    guard = guard_for_cars(low=-8.0, high=4.0, mode=Mode.SHADOW)
+    driven = shadow_drive(guard, time, seen, did)
+    assert len(driven.decisions) == len(time) - 1
+    assert (driven.executed == driven.proposed).all()
+    assert driven.collided
+    assert not driven.rear_ended
+    assert (driven.observations == seen).all()
+    assert guard.machine.endings.sum() == 1.0
+    advised = np.array([one.revision.advised for one in driven.decisions])
+    assert advised[-1] < -2.0
+
+
+def test_a_failure_may_be_told():
+    time, seen, did = (rows[:4] for rows in recorded())
+    for failed in (False, True):
+        guard = guard_for_cars(low=-8.0, high=4.0, mode=Mode.SHADOW)
+        shadow_drive(guard, time, seen, did, failed=failed)
+        assert guard.machine.endings.sum() == failed
+
+
+def test_who_would_act_and_what_is_too_short_is_refused():
+    time, seen, did = recorded()
+    with pytest.raises(ValueError, match="mode is act"):
+        shadow_drive(guard_for_cars(low=-8.0, high=4.0), time, seen, did)
+    guard = guard_for_cars(low=-8.0, high=4.0, mode=Mode.SHADOW)
+    with pytest.raises(ValueError, match="with T of 2 or more"):
+        shadow_drive(guard, time[:1], seen[:1], did[:1])
+    with pytest.raises(ValueError, match="have the shapes"):
+        shadow_drive(guard, time, seen[:, :2], did)
