@@ -23,8 +23,8 @@ from evofsm.driving import (
     KinematicWorld,
     drive,
     guard_for_family,
+    learners_of,
     load_family,
-    load_learnt,
     name_judge,
     teach,
     training,
@@ -38,6 +38,9 @@ from studies.breaks.splitting import Chance
 #: How likely the toy fails.
 KNOWN = 1e-5
 _NORMAL = NormalDist()
+
+# Where evofsm drive --out puts what was learnt.
+_GUARD = "guard.evofsm"
 
 
 class Subject(Protocol):
@@ -134,7 +137,7 @@ def load(name: str, switches: tuple[str, ...] = ()) -> Family:
 def check_learnt(folder: str | None, judge: str) -> None:
     """Raise where a folder holds what another judge learnt."""
     if folder is not None and judge != NOBODY:
-        held = name_judge(load_learnt(Path(folder))[1])
+        held = name_judge(learners_of(Guard.load(Path(folder) / _GUARD))[1])
         if held != judge:
             raise ValueError(f"{folder} holds the judge {held!r}, not {judge!r}: --judge {held}")
 
@@ -143,9 +146,10 @@ def check_learnt(folder: str | None, judge: str) -> None:
 def _guard(cars: Cars) -> Guard:
     """Taught, then frozen; the same in every process."""
     family = load(cars.family, cars.switches)
-    machine, judge = load_learnt(Path(cars.learnt)) if cars.learnt else (None, None)
-    guard = guard_for_family(family, machine=machine, judge=judge or cars.judge, seed=cars.seed)
-    if judge is None:
+    if cars.learnt:
+        guard = Guard.load(Path(cars.learnt) / _GUARD)
+    else:
+        guard = guard_for_family(family, judge=cars.judge, seed=cars.seed)
         teach(guard, training(family, cars.seed, 0, cars.train))
     guard.freeze()
     frozen = guard.copy(states=False)

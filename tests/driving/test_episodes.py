@@ -11,9 +11,7 @@ from evofsm.driving.cars import (
     guard_for_family,
     learners_of,
     learnt_by,
-    load_learnt,
     name_judge,
-    save_learnt,
 )
 from evofsm.driving.drivers import IDM
 from evofsm.driving.episodes import (
@@ -87,16 +85,6 @@ def test_neither_states_nor_names_decide():
     teach(any_system, training(EMERGENCY, 0, 0, 6))
     assert guard.machine.n_states > other.machine.n_states
     assert decided(guard) == decided(other) == decided(any_system)
-
-
-def test_what_was_learnt_is_kept_with_the_machine_that_is_asked(tmp_path):
-    guard, _ = taught(4)
-    save_learnt(guard, tmp_path)
-    machine, judge = load_learnt(tmp_path)
-    assert isinstance(judge, LearntRisk)
-    assert judge.dynamics.n_episodes == 4
-    assert machine.n_states == guard.machine.n_states
-    assert decided(guard_for_family(EMERGENCY, judge=judge)) == decided(guard)
 
 
 # -- What came of episodes ------------------------------------------------------------------------

@@ -10,10 +10,7 @@ from .cars import guard_for_cars as guard_for_cars
 from .cars import guard_for_family as guard_for_family
 from .cars import learners_of as learners_of
 from .cars import learnt_by as learnt_by
-from .cars import load_judge as load_judge
-from .cars import load_learnt as load_learnt
 from .cars import name_judge as name_judge
-from .cars import save_learnt as save_learnt
 from .drivers import IDM as IDM
 from .drivers import ChangingIDM as ChangingIDM
 from .env import CarFollowing as CarFollowing

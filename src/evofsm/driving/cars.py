@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import astuple
-from pathlib import Path
 from typing import Any, Literal
 
 from evofsm.driving.family import Family
@@ -22,7 +20,6 @@ from evofsm.guard import (
     LearntRisk,
     Mode,
 )
-from evofsm.store import Place, read_header
 
 #: What each judge is told, by its name.
 TOLD: dict[str, str] = {
@@ -35,7 +32,6 @@ SAFETY_RULE = Novelty(radius=1.0, scales=(4.0, 2.0, 2.0))
 
 # What a machine's explanations call soon [s].
 _SOON = 5.0
-_MACHINE, _RISK = "machine.evofsm", "risk.evofsm"
 
 
 def guard_for_cars(
@@ -147,23 +143,3 @@ def name_judge(judge: LearningJudge) -> str:
     if isinstance(judge, LearntRisk):
         return "learnt"
     raise TypeError(f"a {type(judge).__name__} is none of the judges for cars: {', '.join(TOLD)}")
-
-
-def save_learnt(guard: Guard, folder: Path, provenance: Mapping[str, Any] | None = None) -> None:
-    """Write what a guard learnt, machine and judge in a file each, and what it learnt from."""
-    folder.mkdir(parents=True, exist_ok=True)
-    machine, judge = learners_of(guard)
-    machine.save(folder / _MACHINE, provenance)
-    judge.save(folder / _RISK, provenance)
-
-
-def load_learnt(folder: Path) -> tuple[EvolvingFSM, LatentRisk | LearntRisk]:
-    """The machine and the judge that `save_learnt` wrote."""
-    machine = EvolvingFSM.load(folder / _MACHINE)
-    return machine, load_judge(folder / _RISK)
-
-
-def load_judge(file: Place) -> LatentRisk | LearntRisk:
-    """One of the judges for cars, whichever was saved."""
-    kind = read_header(file).kind
-    return LearntRisk.load(file) if kind == "learntrisk" else LatentRisk.load(file)
