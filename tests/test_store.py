@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from evofsm import __version__, store
-from evofsm.store import COUNT, FLAG, SHARE, SIZE, Kind, Numbers
+from evofsm.store import COUNT, SHARE, SIZE, Kind, Numbers
 
 DRAWS = Kind(
     "draws",
@@ -275,14 +275,6 @@ def test_a_boolean_that_is_neither_true_nor_false_is_refused(forge, tmp_path):
         store.read(tmp_path / "file", DRAWS)
 
 
-def test_a_range_holds_its_ends_and_no_fraction_where_it_is_of_integers():
-    for number in (0.0, 1.0, [0.0, 1.0]):
-        FLAG.of(*np.shape(number)).refuse_others("flag", number)
-    for number in (-5e-324, 1.0000001, np.nan, 0.5):
-        with pytest.raises(ValueError, match="flag"):
-            FLAG.refuse_others("flag", number)
-
-
 # -- On the disk -----------------------------------------------------------------------------------
 
 
@@ -320,15 +312,6 @@ def test_a_file_and_its_name_are_on_the_disk_when_writing_returns(tmp_path, monk
     monkeypatch.setattr(os, "fsync", fsync)
     write(tmp_path / "file")
     assert flushed == [False, True]
-
-
-def test_what_cannot_be_read_again_takes_no_place(tmp_path, monkeypatch):
-    write(tmp_path / "file")
-    before, packed = (tmp_path / "file").read_bytes(), store._packed
-    monkeypatch.setattr(store, "_packed", lambda *given: [*packed(*given)[:-1], b"last"])
-    with pytest.raises(OSError, match=f"{tmp_path / 'file'} was left as it was"):
-        write(tmp_path / "file")
-    assert [one.read_bytes() for one in tmp_path.iterdir()] == [before]
 
 
 def test_an_interrupt_anywhere_in_a_write_is_an_interrupt_and_leaves_a_whole_file(tmp_path):

@@ -1,7 +1,6 @@
 import math
 from itertools import pairwise
 
-import numpy as np
 import pytest
 
 from evofsm.fsm.actions import IntervalActions
@@ -25,13 +24,6 @@ def test_every_inner_edge_falls_on_the_closed_side_and_its_neighbours_on_their_o
         assert actions.encode(edge) == k + above
         assert actions.encode(math.nextafter(edge, -math.inf)) == k
         assert actions.encode(math.nextafter(edge, math.inf)) == k + 1
-
-
-@pytest.mark.parametrize("closed", ["left", "right"])
-def test_both_ends_of_the_range_belong_to_the_end_intervals(closed):
-    actions = IntervalActions(**PAPER, closed=closed)
-    assert actions.encode(-2.5) == 0
-    assert actions.encode(2.5) == 16
 
 
 def test_the_papers_section_2_1_2_has_intervals_closed_on_the_right():
@@ -60,13 +52,6 @@ def test_the_range_is_covered_by_as_many_intervals_as_arithmetic_on_paper_says(
     assert (actions.edges[0], actions.edges[-1]) == (low, high)
 
 
-@pytest.mark.parametrize("scale", [1e-3, 1.0, 1e6])
-def test_edges_rise_in_small_and_large_units(scale):
-    edges = IntervalActions(-2.5 * scale, 2.5 * scale, 0.3 * scale).edges
-    np.testing.assert_allclose(edges, np.array(PAPER_EDGES) * scale, rtol=1e-8, atol=1e-9 * scale)
-    assert (np.diff(edges) > 0).all()
-
-
 @pytest.mark.parametrize("closed", ["left", "right"])
 def test_intervals_meet_and_their_centers_are_encoded_as_themselves(closed):
     actions = IntervalActions(**PAPER, closed=closed)
@@ -88,15 +73,6 @@ def test_labels_show_which_edges_belong_to_the_interval(closed, labels):
     assert [actions.label(i) for i in (0, 8, 16)] == labels
 
 
-def test_a_number_gives_an_int_and_an_array_gives_an_array_of_its_shape():
-    actions = IntervalActions(**PAPER)
-    assert type(actions.encode(0.0)) is int
-    assert type(actions.encode(np.float64(0.0))) is int
-    encoded = actions.encode([[-2.5, 0.0], [1.0, 2.5]])
-    assert encoded.dtype == np.int64
-    assert encoded.tolist() == [[0, 8], [11, 16]]
-
-
 def test_values_beyond_the_range_are_refused_by_default():
     actions = IntervalActions(**PAPER)
     for value in (2.6, -math.inf, [0.0, math.nextafter(2.5, 3)]):
@@ -112,11 +88,6 @@ def test_values_beyond_the_range_fall_into_the_end_intervals_when_clipped(closed
     ]
 
 
-def test_beyond_tells_which_values_would_be_clipped():
-    actions = IntervalActions(**PAPER, outside="clip")
-    assert actions.beyond([-2.6, -2.5, 0.0, 2.5, 2.6]).tolist() == [True, False, False, False, True]
-
-
 @pytest.mark.parametrize("outside", ["error", "clip"])
 def test_nan_is_refused_even_when_clipped(outside):
     actions = IntervalActions(**PAPER, outside=outside)
@@ -129,23 +100,8 @@ def test_nan_is_refused_even_when_clipped(outside):
 def test_an_interval_that_does_not_exist_is_refused(i):
     actions = IntervalActions(**PAPER)
     for method in (actions.interval, actions.center, actions.label):
-        with pytest.raises(ValueError, match=f"interval {i} does not exist; there are 0 to 16"):
+        with pytest.raises(ValueError, match=f"interval is {i}; there are intervals 0 to 16"):
             method(i)
-
-
-@pytest.mark.parametrize("i", [1.5, 1.0, "1", None])
-def test_an_index_that_is_no_integer_is_named(i):
-    actions = IntervalActions(**PAPER)
-    for method in (actions.interval, actions.center, actions.label):
-        with pytest.raises(TypeError, match=f"interval {i!r} does not exist; .*integer"):
-            method(i)
-
-
-def test_an_index_may_be_any_integer():
-    actions = IntervalActions(**PAPER)
-    for i in (np.int64(16), np.array(16)):
-        assert actions.interval(i) == (2.3, 2.5)
-        assert actions.label(i) == "[2.3, 2.5]"
 
 
 @pytest.mark.parametrize(
@@ -161,13 +117,8 @@ def test_an_index_may_be_any_integer():
 )
 def test_an_action_that_is_no_number_is_named(value, words):
     actions = IntervalActions(**PAPER)
-    for method in (actions.encode, actions.beyond):
-        with pytest.raises(TypeError, match=f"{words}; it must be a real number"):
-            method(value)
-
-
-def test_no_actions_have_no_intervals():
-    assert IntervalActions(**PAPER).encode([]).shape == (0,)
+    with pytest.raises(TypeError, match=f"{words}; it must be a real number"):
+        actions.encode(value)
 
 
 @pytest.mark.parametrize(

@@ -1,8 +1,5 @@
 """Direct forecasts: what they learn, that they agree with themselves, and what they refuse."""
 
-import copy
-import pickle
-
 import numpy as np
 import pytest
 
@@ -60,16 +57,6 @@ def test_the_action_helps(taught, machine, walk):
     assert with_action < 0.9 * without
 
 
-def test_where_beliefs_never_move_the_forecast_hardly_differs_from_persistence(machine, walk):
-    Z, actions = walk
-    forecasts = Forecasts(n_actions=2, steps=[1])
-    standing = np.repeat(Z[:40], 50, axis=0)
-    starts = np.arange(0, 2000, 50)
-    forecasts.learn(machine.model(), standing, np.resize(actions, 2000), starts)
-    beliefs = machine.model().recognise(Z[:40])
-    assert jensen_shannon(forecasts.predict(beliefs, 0, 1), beliefs).mean() < 1e-3
-
-
 @pytest.mark.parametrize("action", [None, 0, 1])
 def test_rows_of_matrices_are_distributions(taught, action):
     for steps in taught.steps:
@@ -77,17 +64,6 @@ def test_rows_of_matrices_are_distributions(taught, action):
         assert matrix.shape == (taught.n_states, taught.n_states)
         assert (matrix > 0.0).all()
         np.testing.assert_allclose(matrix.sum(axis=1), 1.0, atol=1e-9)
-
-
-def test_episodes_apart_and_together_teach_the_same(machine, walk):
-    Z, actions = walk
-    apart, together = (Forecasts(n_actions=2, steps=[1, 5]) for _ in range(2))
-    model = machine.model()
-    for begin in (0, 100, 300):
-        apart.learn(model, Z[begin : begin + 100], actions[begin : begin + 100])
-    rows = np.r_[0:200, 300:400]
-    together.learn(model, Z[rows], actions[rows], episode_starts=[100, 200])
-    np.testing.assert_array_equal(apart.matrix(0, 5), together.matrix(0, 5))
 
 
 def test_asking_changes_nothing_and_many_rows_are_answered_as_one_by_one(taught, machine, walk):
@@ -121,21 +97,6 @@ def test_states_created_later_are_taken_in(walk):
         counts.append(forecasts.n_states)
     assert counts[0] < counts[-1] == machine.n_states
     np.testing.assert_allclose(forecasts.matrix(0, 1).sum(axis=1), 1.0, atol=1e-9)
-
-
-def test_a_state_that_nothing_was_learnt_of_stays(taught):
-    newer = np.zeros(taught.n_states + 2)
-    newer[-1] = 1.0
-    np.testing.assert_array_equal(taught.predict(newer, 0, 1), newer)
-
-
-def test_a_copy_goes_its_own_way(taught, machine, walk):
-    Z, actions = walk
-    twin, other = copy.deepcopy(taught), pickle.loads(pickle.dumps(taught))
-    for one in (twin, other):
-        one.learn(machine.model(), Z[1500:], actions[1500:])
-    np.testing.assert_array_equal(twin.matrix(1, 5), other.matrix(1, 5))
-    assert not np.array_equal(twin.matrix(1, 5), taught.matrix(1, 5))
 
 
 @pytest.mark.parametrize(

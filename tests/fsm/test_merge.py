@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 from evofsm.driving.families import load_family
 from evofsm.driving.world import KinematicWorld
 from evofsm.fsm.arrays import by_name
-from evofsm.fsm.limit import WhenFull
 from evofsm.fsm.machine import EvolvingFSM, opened
 from evofsm.fsm.merging import merge
 from evofsm.fsm.rules import Edges, FailureSplit, Novelty, Paper
@@ -117,16 +116,6 @@ def test_what_has_observed_nothing_contributes_nothing(rule, seed):
     assert merge([nothing, nothing]).n_states == 0
 
 
-def test_the_parts_stay_as_they_are_and_the_merged_machine_is_its_own(snapshot):
-    parts = [taught(RULES[0], seed) for seed in range(3)]
-    before = [snapshot(part) for part in parts]
-    for machine in (merge(parts), merge(parts[:1])):
-        assert machine.state is None
-        machine.learn_one([0.0, 0.0], 0)
-        machine.learn_one([0.1, 0.0], 0)
-    assert [snapshot(part) for part in parts] == before
-
-
 def test_mean_scatter_and_potentials_are_those_of_all_the_data():
     random = np.random.default_rng(1)
     shards = [random.normal(size=(rows, 2)) * 3.0 + 1e4 for rows in (1, 2, 40, 100)]
@@ -193,28 +182,6 @@ def test_shards_of_a_stream_become_the_machine_of_the_whole_stream():
     assert error(merged.transition_matrices) < 0.6 * min(alone)
 
 
-def test_rows_count_by_decisions_and_a_row_of_no_decision_is_uniform():
-    there = np.array([[0.0, 0.0], [9.0, 0.0]])
-    stays = among(there, 0, rows=400, q=1, chain=np.array([np.eye(2)]))
-    goes = among(there, 1, rows=100, q=1, chain=np.array([[[0.0, 1.0], [1.0, 0.0]]]))
-    merged = merge([stays, goes])
-    weight = [
-        one.decisions[0, np.flatnonzero(one.centers[:, 0] == 9.0)[0]] for one in (stays, goes)
-    ]
-    row = merged.transition_matrices[0, np.flatnonzero(merged.centers[:, 0] == 9.0)[0]]
-    at = np.flatnonzero(merged.centers[:, 0] == 9.0)[0]
-    assert row[at] == pytest.approx(weight[0] / sum(weight), abs=0.01)
-    never = EvolvingFSM(3, rule=Novelty(1.0))
-    never.learn_many([[0.0], [0.0], [5.0]], [0, 0, -1])
-    other = EvolvingFSM(3, rule=Novelty(1.0))
-    other.learn_many([[0.0], [0.0], [9.0], [9.0]], [1, 1, -1, -1])
-    both = merge([never, other])
-    assert both.n_states == 3
-    assert by_name(opened(both)[0])["place"].tolist() == [0, 1, -1]
-    lonely = np.flatnonzero(both.decisions[0] == 0.0)
-    assert (both.transition_matrices[0, lonely] == 1.0 / 3.0).all()
-
-
 def test_the_prior_of_many_sparse_rows_enters_once():
     """A thousand vehicles that saw one transition each know it as well as one that saw all."""
     one = EvolvingFSM(1, rule=Novelty(1.0, spread=0.05))
@@ -251,15 +218,6 @@ def test_states_that_a_failure_split_stay_apart():
     merged = merge(parts)
     assert merged.centers.round(1).ravel().tolist() == [0.0, 1.5]
     assert merged.endings.tolist() == [0.0, 2.0]
-
-
-@pytest.mark.parametrize("when_full", list(WhenFull))
-def test_no_more_states_than_allowed(when_full):
-    options = {"max_states": 5, "when_full": when_full}
-    merged = merge([taught(RULES[0], seed, rows=200, **options) for seed in range(4)])
-    assert merged.n_states == 5
-    merged.learn_many(np.random.default_rng(0).normal(size=(300, 2)) * 20.0, [0] * 300)
-    assert merged.n_states == 5
 
 
 @pytest.mark.parametrize("rule", RULES)

@@ -20,13 +20,6 @@ def test_any_two_categories_lie_the_given_distance_apart():
         assert math.dist(a, b) == pytest.approx(10.0, rel=1e-15)
 
 
-def test_entries_follow_the_order_of_the_variables_and_are_named():
-    encoder = ObservationEncoder("gap", LIGHT, "speed")
-    encoded = encoder.encode({"speed": 2.0, "light": "amber", "gap": 5.0})
-    assert encoder.names == ("gap", "light=red", "light=amber", "light=green", "speed")
-    np.testing.assert_allclose(encoded, [5.0, 0.0, 10.0 / math.sqrt(2.0), 0.0, 2.0])
-
-
 def test_no_state_lies_between_two_categories():
     encoder = ObservationEncoder("gap", LIGHT)
     machine = EvolvingFSM(n_actions=1, radius=9.9)

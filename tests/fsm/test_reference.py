@@ -1,7 +1,5 @@
 """The compiled machine against its twin in plain NumPy, which is the paper on one screen."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -53,26 +51,3 @@ def test_the_machine_is_its_twin(stream):
         (machine.origin_frequency, twin.frequencies),
     ):
         np.testing.assert_allclose(ours, theirs, rtol=1e-9, atol=1e-10)
-
-
-def test_it_follows_the_golden_vectors_too():
-    """A literal transcription of the paper's sums made these; see golden/README.md."""
-    with np.load(Path(__file__).parents[1] / "golden" / "random_walk.npz") as archive:
-        golden = dict(archive)
-    q, distance_weight, radius, learning_rate, prior_frequency, spread = golden["params"]
-    twin = NumpyFSM(
-        int(q),
-        radius=radius,
-        distance_weight=distance_weight,
-        learning_rate=learning_rate,
-        prior_frequency=prior_frequency,
-        spread=spread,
-    )
-    found = [np.nan] * len(golden["observations"])
-    for row, z in enumerate(golden["observations"]):
-        if row in golden["episode_starts"]:
-            twin.start_episode()
-        found[row] = twin.observe(z)[2]
-        if golden["actions"][row] >= 0:
-            twin.act(golden["actions"][row])
-    np.testing.assert_allclose(found, golden["jsd"], rtol=0.0, atol=1e-7)

@@ -4,14 +4,12 @@ import math
 import pickle
 import sys
 from importlib import import_module
-from inspect import signature
 
 import numpy as np
 import pytest
-from river import checks, datasets, preprocessing, stream
+from river import checks, datasets, stream
 from river.checks import common
 
-from evofsm.fsm.limit import WhenFull
 from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.observations import Missing
 from evofsm.fsm.river import RiverClusterer
@@ -47,18 +45,6 @@ def test_rivers_checks_pass():
 @pytest.mark.parametrize("check", _ON_DATA, ids=lambda check: check.__name__)
 def test_rivers_checks_on_data_pass_as_well(check):
     check(RiverClusterer(), list(datasets.Phishing().take(150)))
-
-
-def test_settings_have_the_names_and_defaults_of_the_machine():
-    of_machine = dict(signature(EvolvingFSM).parameters)
-    of_clusterer = dict(signature(RiverClusterer).parameters)
-    del of_machine["n_actions"], of_machine["failure_horizon"]
-    del of_clusterer["features"]
-    assert {name: each.default for name, each in of_clusterer.items()} == {
-        name: each.default for name, each in of_machine.items()
-    }
-    told = RiverClusterer(radius=0.7, max_states=4, when_full=WhenFull.RETIRE).machine
-    assert (told.radius, told.max_states, told.when_full) == (0.7, 4, WhenFull.RETIRE)
 
 
 @pytest.mark.parametrize("settings", [{"radius": 0.5}, {"rule": Novelty(1.5)}])
@@ -119,13 +105,6 @@ def test_features_that_are_named_wait_for_a_whole_observation_and_others_are_lef
     assert clusterer.machine.centers.tolist() == [[3.0, 2.0]]
 
 
-def test_nothing_at_all_is_no_first_observation():
-    clusterer = RiverClusterer()
-    clusterer.learn_one({})
-    clusterer.learn_one({"a": 1.0})
-    assert clusterer.machine.centers.tolist() == [[1.0]]
-
-
 @pytest.mark.parametrize(
     ("x", "error", "words"),
     [
@@ -144,14 +123,6 @@ def test_what_is_no_number_is_named(x, error, words):
 def test_features_are_different_names(features):
     with pytest.raises(ValueError, match="must be different names, at least one"):
         RiverClusterer(features=features)
-
-
-def test_it_ends_a_pipeline():
-    pipeline = preprocessing.StandardScaler() | RiverClusterer()
-    for x in as_features(walk()):
-        pipeline.learn_one(x)
-    assert pipeline["RiverClusterer"].machine.n_states > 1
-    assert pipeline.predict_one(x) in range(pipeline["RiverClusterer"].machine.n_states)
 
 
 @pytest.mark.parametrize("library", ["river", "sklearn"])

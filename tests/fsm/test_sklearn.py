@@ -1,17 +1,10 @@
 """What scikit-learn expects of a clusterer holds, and the clusters are the machine's states."""
 
-from inspect import signature
-
 import numpy as np
 import polars
 import pytest
-from sklearn.base import clone
-from sklearn.exceptions import NotFittedError
-from sklearn.pipeline import make_pipeline
-from sklearn.preprocessing import StandardScaler
 from sklearn.utils.estimator_checks import parametrize_with_checks
 
-from evofsm.fsm.limit import WhenFull
 from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.rules import Edges, Novelty
 from evofsm.fsm.sklearn import EvolvingClusterer
@@ -40,19 +33,6 @@ def test_scikit_learns_checks_pass(estimator, check):
     check(estimator)
 
 
-def test_settings_have_the_names_and_defaults_of_the_machine():
-    of_machine = dict(signature(EvolvingFSM).parameters)
-    of_clusterer = dict(signature(EvolvingClusterer).parameters)
-    del of_machine["n_actions"], of_machine["failure_horizon"]
-    assert of_clusterer.keys() == of_machine.keys()
-    for name, setting in of_clusterer.items():
-        assert setting.default in (None, of_machine[name].default)
-    told = EvolvingClusterer(radius=0.7, max_states=4, when_full=WhenFull.RETIRE).fit([[0.0]])
-    machine = told.machine_
-    assert (machine.radius, machine.max_states, machine.when_full) == (0.7, 4, WhenFull.RETIRE)
-    assert EvolvingClusterer().fit([[0.0]]).machine_.when_full == of_machine["when_full"].default
-
-
 @pytest.mark.parametrize("settings", [{"radius": 0.5}, {"rule": Novelty(1.5)}])
 def test_labels_are_the_states_that_the_machine_recognised(settings):
     Z = walk()
@@ -76,26 +56,6 @@ def test_batches_learn_what_the_whole_does_and_fit_starts_anew():
     assert np.array_equal(parts.fit(Z).cluster_centers_, whole.cluster_centers_)
 
 
-def test_asking_changes_nothing():
-    clusterer = EvolvingClusterer().fit(walk())
-    twin = clusterer.machine_.copy()
-    clusterer.predict(walk(5)), clusterer.predict_proba(walk(5))
-    assert clusterer.machine_.observe(walk(1)[0]).surprise == twin.observe(walk(1)[0]).surprise
-
-
-def test_nothing_can_be_asked_before_anything_was_learnt():
-    with pytest.raises(NotFittedError):
-        EvolvingClusterer().predict(walk(5))
-    assert not hasattr(EvolvingClusterer(), "cluster_centers_")
-
-
-def test_a_clone_has_the_settings_and_nothing_else():
-    clusterer = EvolvingClusterer(spread=1.0, rule=Novelty(2.0)).fit(walk())
-    twin = clone(clusterer)
-    assert twin.get_params() == clusterer.get_params()
-    assert not hasattr(twin, "machine_")
-
-
 def test_settings_that_cannot_be_are_refused_when_it_learns():
     clusterer = EvolvingClusterer().set_params(radius=-1.0)
     with pytest.raises(ValueError, match=r"radius is -1\.0; it must be a positive"):
@@ -108,9 +68,3 @@ def test_names_of_columns_are_kept_and_held_to():
     assert clusterer.feature_names_in_.tolist() == ["gap", "speed", "leader"]
     with pytest.raises(ValueError, match="feature names should match"):
         clusterer.predict(frame.rename({"gap": "distance"}))
-
-
-def test_it_ends_a_pipeline():
-    pipeline = make_pipeline(StandardScaler(), EvolvingClusterer(rule=Novelty(1.0)))
-    labels = pipeline.fit_predict(walk())
-    assert set(labels) == set(range(pipeline[-1].machine_.n_states))

@@ -62,10 +62,6 @@ def test_further_steps_follow_the_policy(machine, policy, action, horizon, expec
     np.testing.assert_allclose(machine.predict(action, horizon, policy), expected, rtol=1e-14)
 
 
-def test_the_paper_policy_is_the_default(machine):
-    np.testing.assert_array_equal(machine.predict(0, 3), machine.predict(0, 3, "marginal"))
-
-
 def test_before_any_observation_the_forecast_is_empty():
     assert EvolvingFSM(2).predict(0).shape == (0,)
     assert EvolvingFSM(2).predict(1, 3).shape == (0,)
@@ -75,20 +71,6 @@ def test_at_the_start_of_an_episode_the_forecast_comes_from_the_uniform_belief(m
     machine.start_episode()
     assert machine.belief.tolist() == [0.5, 0.5]
     np.testing.assert_allclose(machine.predict(0), [2 / 3, 1 / 3], rtol=1e-15)
-
-
-def test_a_forecast_changes_nothing(machine, snapshot):
-    machine.act(1)
-    before = snapshot(machine)
-    machine.predict(0, 5, "observed")
-    assert snapshot(machine) == before
-
-
-def test_the_step_reports_the_forecast_made_one_step_before(machine):
-    forecast = machine.predict(1)
-    machine.act(1)
-    step = machine.observe([0.0])
-    np.testing.assert_allclose(step.predicted, forecast, rtol=1e-15)
 
 
 @numba.njit

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import operator
 from bisect import bisect_left, bisect_right
 from dataclasses import dataclass
 from functools import cached_property
@@ -12,8 +11,7 @@ from typing import Literal, SupportsIndex, overload
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-Closed = Literal["left", "right"]
-Outside = Literal["error", "clip"]
+from evofsm.fsm.validation import Floats, check_index
 
 # Digits to which an edge is rounded, so that -2.5 + 3 * 0.3 is the edge -1.6.
 _DIGITS = 9
@@ -40,17 +38,15 @@ class IntervalActions:
     Raises
     ------
     ValueError
-        If a number is not finite, ``low`` is not below ``high``, ``width`` is not positive or so
-        small that edges coincide or there are more than 100,000, or ``closed`` or ``outside`` is
-        none of its words.
+        If a setting is none of these, or there are more than 100,000 intervals.
 
     Examples
     --------
     >>> actions = IntervalActions(low=-2.5, high=2.5, width=0.3)
     >>> actions.n_actions
     17
-    >>> actions.encode(-2.2), actions.interval(1), actions.center(0)
-    (1, (-2.2, -1.9), -2.35)
+    >>> actions.encode(-2.2), actions.interval(1), actions.center(0), actions.label(16)
+    (1, (-2.2, -1.9), -2.35, '[2.3, 2.5]')
     >>> actions.encode([-2.5, 0.0, 2.5])
     array([ 0,  8, 16])
     """
@@ -58,8 +54,8 @@ class IntervalActions:
     low: float
     high: float
     width: float
-    closed: Closed = "left"
-    outside: Outside = "error"
+    closed: Literal["left", "right"] = "left"
+    outside: Literal["error", "clip"] = "error"
 
     def __post_init__(self) -> None:
         for name in ("low", "high", "width"):
@@ -72,10 +68,9 @@ class IntervalActions:
             raise ValueError(f"width is {self.width}; it must be positive")
         if not (self.high - self.low) / self.width <= _MOST:
             raise ValueError(f"width is {self.width}: more than {_MOST:,} intervals; make it wider")
-        if self.closed not in ("left", "right"):
-            raise ValueError(f"closed is {self.closed!r}; it must be 'left' or 'right'")
-        if self.outside not in ("error", "clip"):
-            raise ValueError(f"outside is {self.outside!r}; it must be 'error' or 'clip'")
+        for name, words in (("closed", ("left", "right")), ("outside", ("error", "clip"))):
+            if getattr(self, name) not in words:
+                raise ValueError(f"{name} is {getattr(self, name)!r}; it must be one of {words}")
         if not (np.diff(self.edges) > 0.0).all():
             raise ValueError(
                 f"width is {self.width}, but edges are rounded to {_DIGITS} decimals and then "
@@ -88,7 +83,7 @@ class IntervalActions:
         return len(self.edges) - 1
 
     @cached_property
-    def edges(self) -> NDArray[np.float64]:
+    def edges(self) -> Floats:
         """(n_actions + 1,) ndarray: where intervals meet, ``low`` and ``high`` included."""
         count = math.ceil(round((self.high - self.low) / self.width, _DIGITS))
         inner = np.round(self.low + np.arange(1, count) * self.width, _DIGITS)
@@ -111,27 +106,19 @@ class IntervalActions:
         Parameters
         ----------
         a : float or array_like
-            Values of the action, in the unit of ``low`` and ``high``.
-
-        Raises
-        ------
-        TypeError, ValueError
-            If ``a`` does not hold real numbers, or a value is NaN, or beyond the range and
-            ``outside`` is ``"error"``.
-
-        Examples
-        --------
-        >>> actions = IntervalActions(low=-2.5, high=2.5, width=0.3)
-        >>> actions.encode([-2.2, 2.5])  # an edge opens the next interval, but for the last one
-        array([ 1, 16])
+            Values of the action, in the unit of ``low`` and ``high``. NaN is refused.
         """
         if type(a) is float and self.low <= a <= self.high:  # one number, as every decision asks
             side = bisect_right if self.closed == "left" else bisect_left
             return side(self._inner_edges, a)
-        values = _real_numbers(a)
+        values = np.asarray(a)
+        if values.dtype.kind not in "fiub":
+            what = f"is {a!r}" if values.ndim == 0 else f"has dtype {values.dtype}"
+            raise TypeError(f"action {what}; it must be a real number, or an array of them")
+        values = values.astype(np.float64, copy=False)
         if np.isnan(values).any():
             raise ValueError("action is NaN; it has no interval")
-        beyond = self.beyond(values)
+        beyond = (values < self.low) | (values > self.high)
         if self.outside == "error" and beyond.any():
             raise ValueError(
                 f"action {values[beyond].flat[0]} is outside [{self.low}, {self.high}]; "
@@ -142,16 +129,6 @@ class IntervalActions:
         index = np.searchsorted(inner, values, side="right" if self.closed == "left" else "left")
         return int(index) if values.ndim == 0 else index.astype(np.int64)
 
-    def beyond(self, a: ArrayLike) -> NDArray[np.bool_]:
-        """Which values lie outside ``[low, high]``; NaN does not.
-
-        Parameters
-        ----------
-        a : float or array_like
-        """
-        values = _real_numbers(a)
-        return np.asarray((values < self.low) | (values > self.high))
-
     def interval(self, i: SupportsIndex) -> tuple[float, float]:
         """Lower and upper edge of interval ``i``, in the unit of ``low`` and ``high``.
 
@@ -160,7 +137,7 @@ class IntervalActions:
         i : int
             Index of the interval, from 0.
         """
-        i = self._index(i)
+        i = check_index("interval", i, self.n_actions)
         return float(self.edges[i]), float(self.edges[i + 1])
 
     def center(self, i: SupportsIndex) -> float:
@@ -183,44 +160,14 @@ class IntervalActions:
         ----------
         i : int
             Index of the interval, from 0.
-
-        Examples
-        --------
-        >>> actions = IntervalActions(low=-2.5, high=2.5, width=0.3)
-        >>> actions.label(0), actions.label(16)
-        ('[-2.5, -2.2)', '[2.3, 2.5]')
-        >>> IntervalActions(low=-2.5, high=2.5, width=0.3, outside="clip").label(0)
-        '< -2.2'
         """
-        i = self._index(i)
         lower, upper = self.interval(i)
-        if self.outside == "clip" and self.n_actions > 1:  # the end intervals hold what is beyond
-            if i == 0:
-                return f"{'<' if self.closed == 'left' else '≤'} {upper:g}"
-            if i == self.n_actions - 1:
-                return f"{'≥' if self.closed == 'left' else '>'} {lower:g}"
-        opening = "[" if self.closed == "left" or i == 0 else "("
-        closing = "]" if self.closed == "right" or i == self.n_actions - 1 else ")"
-        return f"{opening}{lower:g}, {upper:g}{closing}"
-
-    def _index(self, i: SupportsIndex) -> int:
-        try:
-            index = operator.index(i)
-        except TypeError:
-            raise TypeError(
-                f"interval {i!r} does not exist; its index must be an integer "
-                "(encode turns a number into one)"
-            ) from None
-        if not 0 <= index < self.n_actions:
-            raise ValueError(
-                f"interval {index} does not exist; there are 0 to {self.n_actions - 1}"
-            )
-        return index
-
-
-def _real_numbers(a: ArrayLike) -> NDArray[np.float64]:
-    values = np.asarray(a)
-    if values.dtype.kind not in "fiub":
-        what = f"is {a!r}" if values.ndim == 0 else f"has dtype {values.dtype}"
-        raise TypeError(f"action {what}; it must be a real number, or an array of them")
-    return values.astype(np.float64, copy=False)
+        is_left, is_first = self.closed == "left", lower == self.low
+        is_last = upper == self.high
+        if self.outside == "clip" and self.n_actions > 1:  # end intervals hold what is beyond
+            if is_first:
+                return f"{'<' if is_left else '≤'} {upper:g}"
+            if is_last:
+                return f"{'≥' if is_left else '>'} {lower:g}"
+        opening, closing = "[" if is_left or is_first else "(", ")" if is_left else "]"
+        return f"{opening}{lower:g}, {upper:g}{']' if is_last else closing}"

@@ -14,8 +14,8 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.fsm.kernels import kernel, lanes
-from evofsm.fsm.validation import refuse_more_failures, refuse_unless_distribution
+from evofsm.fsm.kernels import lanes
+from evofsm.fsm.validation import Floats, refuse_more_failures, refuse_unless_distribution
 from evofsm.store import (
     COUNT,
     FLAG,
@@ -28,7 +28,6 @@ from evofsm.store import (
     Numbers,
 )
 
-Floats: TypeAlias = NDArray[np.float64]
 Records: TypeAlias = NDArray[Any]
 
 #: The action where there is none, and the place of an action without a matrix.
@@ -54,6 +53,8 @@ NOW = np.dtype(
 #: Counts of each state, which add up where two states become one; and their rows.
 SUMS: tuple[str, ...] = ("visits", "endings", "episodes", "failed_soon", "onsets")
 VISITS, ENDINGS, EPISODES, FAILED_SOON, ONSETS = range(len(SUMS))
+#: Counts of each state by action.
+OF_ACTIONS = ("decisions", "failures", "tried", "failed_after")
 #: Of a state: the number of its creation (from 0) and of the observation that created it (from 1),
 #: whether two were joined in it, and the clock at the latest visit.
 STATE = np.dtype([(name, np.float64) for name in ("id", "created", "joined", "latest_visit")])
@@ -138,17 +139,6 @@ def resized(learnt: Learnt, capacity: int, places: int) -> Learnt:
         common = tuple(slice(min(pair)) for pair in zip(old.shape, new.shape, strict=True))
         new[common] = old[common]
     return copy
-
-
-@kernel
-def room_for(learnt: Learnt, settings: Settings) -> tuple[int, int]:
-    """Numbers of states and of matrices with which the next step cannot lack room."""
-    now, capacity, places = learnt.now[0], len(learnt.belief), len(learnt.matrices)
-    if now.action != NO_ACTION and learnt.actions[now.action].place == NOT_OPEN:
-        places = max(places, now.n_places + 1)
-    if now.n_states == capacity and capacity < settings.max_states:
-        capacity = lanes(capacity + max(capacity // 2, 1))
-    return capacity, places
 
 
 # -- By name --------------------------------------------------------------------------------------
@@ -247,7 +237,7 @@ _SETTINGS: dict[str, Any] = {
     **_optional(_OPTIONAL),
     "rule": _RULE,
 }
-OF_MODEL = {
+OF_MODEL: dict[str, Numbers] = {
     "centers": _OBSERVED.of("n", "m"),
     "potentials": SHARE.of("n"),
     "uses": COUNT.of("q"),

@@ -17,8 +17,9 @@ from typing import Any
 
 import numpy as np
 
-from evofsm.fsm.arrays import ENDINGS, VISITS, Floats, Learnt, Records, Settings
+from evofsm.fsm.arrays import ENDINGS, VISITS, Learnt, Records, Settings
 from evofsm.fsm.kernels import exponential, inner_kernel, kernel, lanes, rare_kernel, total
+from evofsm.fsm.validation import Floats
 
 # What may happen to the states: bits of an `Event`.
 UNCHANGED: int = 0
@@ -185,7 +186,7 @@ def splits(learnt: Learnt, settings: Settings, nearest: int) -> bool:
 # -- Recognise ------------------------------------------------------------------------------------
 
 
-@kernel
+@inner_kernel
 def width_of(settings: Settings, variance: float) -> float:
     """Width of recognition, where observations so far have this total variance.
 

@@ -7,10 +7,10 @@ from collections.abc import Sequence
 from typing import Any, overload
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from evofsm.fsm.kernels import inner_kernel, kernel, lanes, logarithm, total
-from evofsm.fsm.validation import refuse_unless_distribution
+from evofsm.fsm.validation import Floats, refuse_unless_distribution
 
 # Stands in for 0 in a divisor or a logarithm whose result is multiplied by 0.
 _TINY = 1e-300
@@ -22,9 +22,7 @@ _OPEN = -1.0
 
 
 @inner_kernel
-def jensen_shannon_kernel(
-    p: NDArray[np.float64], q: NDArray[np.float64], n: int, terms: NDArray[np.float64]
-) -> float:
+def jensen_shannon_kernel(p: Floats, q: Floats, n: int, terms: Floats) -> float:
     """Divergence in bits of the first ``n`` entries (whole lines) of two distributions.
 
     A state's ``p ln(p/m) + q ln(q/m)``, where m is the mean of p and q, is ``(p + q) / 2`` times
@@ -58,9 +56,7 @@ def _series(x: float) -> float:
 
 
 @inner_kernel
-def _use_logarithms(
-    p: NDArray[np.float64], q: NDArray[np.float64], n: int, terms: NDArray[np.float64]
-) -> None:
+def _use_logarithms(p: Floats, q: Floats, n: int, terms: Floats) -> None:
     """Fill in the terms that were left open."""
     for i in range(n):
         both = p[i] + q[i]
@@ -83,11 +79,6 @@ def jensen_shannon(p: ArrayLike, q: ArrayLike) -> Any:
     ----------
     p, q : (..., n) array_like
         Distributions over the same n states; leading axes are broadcast, and those of the result.
-
-    Raises
-    ------
-    ValueError
-        If the last axes differ in length, or a row is no distribution.
 
     Examples
     --------
@@ -117,10 +108,10 @@ def jensen_shannon(p: ArrayLike, q: ArrayLike) -> Any:
 
 @kernel
 def _jensen_shannon_rows(
-    p: NDArray[np.float64],
-    q: NDArray[np.float64],
-    terms: NDArray[np.float64],
-    result: NDArray[np.float64],
+    p: Floats,
+    q: Floats,
+    terms: Floats,
+    result: Floats,
 ) -> None:
     for row in range(len(result)):
         result[row] = jensen_shannon_kernel(p[row], q[row], p.shape[1], terms)

@@ -2,17 +2,13 @@
 
 Nothing is estimated here: all of it was counted, once for each episode that came to a state, or
 took an action there. So an explanation is true of what was seen, whatever comes next; that one
-action ended better than another does not say that it was the reason.
-
-Where nobody ever told of failures, none can be counted, and that is said instead of a share.
+action ended better than another does not say that it was the reason. Where nobody ever told of
+failures, none can be counted, and that is said instead of a share.
 
 Beliefs are normalised: one that lies far from every state still belongs to the nearest of them. So
-an observation that is farther from the nearest centre than a state reaches is *never seen*, and
-nothing that was counted is told of it. How far a state reaches is the rule's
-(`rules.reach`): the radius beyond which `Novelty` would make a new state; with the
-paper's rule, which makes none of what is rare, the distance at which the similarity has fallen to
-2 %, twice the root of the width of recognition. With that rule the states may have passed over
-something rare that was seen, hence "as far as the states tell".
+an observation that is farther from the nearest centre than a state reaches (`rules.reach`) is
+*never seen*, and nothing that was counted is told of it. With the paper's rule the states may have
+passed over something rare that was seen, hence "as far as the states tell".
 """
 
 from __future__ import annotations
@@ -21,11 +17,10 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from evofsm.fsm.naming import Labels
 from evofsm.fsm.proportions import bounds_text, wilson_bounds
-from evofsm.fsm.validation import state_name
+from evofsm.fsm.validation import Floats, state_name
 
 # A belief above this is not worth a word.
 _SURE = 0.995
@@ -49,10 +44,8 @@ class Tally(NamedTuple):
 
     Examples
     --------
-    >>> print(Tally(3, 12))
-    3 of 12 (10 to 49 %)
-    >>> print(Tally(0, 40), "|", Tally(7, 7), "|", Tally(7, 7, is_exact=False))
-    0 of 40 (at most 7 %) | 7 of 7 (at least 72 %) | 7 of 7
+    >>> print(Tally(3, 12), "|", Tally(0, 40), "|", Tally(7, 7), "|", Tally(7, 7, is_exact=False))
+    3 of 12 (10 to 49 %) | 0 of 40 (at most 7 %) | 7 of 7 (at least 72 %) | 7 of 7
     >>> Tally(0, 40, is_told=False).share
     nan
     """
@@ -103,15 +96,15 @@ class Explanation(NamedTuple):
     """
 
     text: str  #: the sentence
-    state: int | None  #: index of the most probable state; None where there is none
-    belief: float  #: that it is this one
-    visits: int  #: observations in which it was the most probable
-    here: Tally  #: of the episodes that came to it
-    reached_from: int | None  #: index of the state that most changes to it came from
-    action: Tally | None  #: of those that took the action there; None where none was asked for
+    state: int | None = None  #: index of the most probable state; None where there is none
+    belief: float = 0.0  #: that it is this one
+    visits: int = 0  #: observations in which it was the most probable
+    here: Tally = Tally(0, 0)  #: of the episodes that came to it
+    reached_from: int | None = None  #: index of the state that most changes to it came from
+    action: Tally | None = None  #: of those that took the action there; None where none was given
     #: index of the action after which a smaller share failed and whose interval ends lowest
-    better: int | None
-    after_better: Tally | None  #: of those that took it
+    better: int | None = None
+    after_better: Tally | None = None  #: of those that took it
     #: whether no state reaches as far: then `state` is the nearest, and nothing is told of it
     never_seen: bool = False
 
@@ -120,33 +113,26 @@ class Explanation(NamedTuple):
 
 
 def explain(
-    known: Any,
-    belief: NDArray[np.float64],
-    action: int | None,
-    labels: Labels,
-    nearest: Nearest | None = None,
+    known: Any, belief: Floats, action: int | None, labels: Labels, nearest: Nearest | None = None
 ) -> Explanation:
     """What experience says of a situation that is recognised as ``belief`` (n,).
 
     Where the observation is known, ``nearest`` says how far it is from what was learnt.
     """
     if not len(belief):
-        return nothing_known("Nothing was learnt yet.")
+        return Explanation("Nothing was learnt yet.")
     if nearest is not None and nearest.is_beyond:
         return _never_seen(known, belief, nearest, labels)
     state = int(belief.argmax())
     is_exact, is_told = not known.joined[state], known.failures_told
     here = Tally(int(known.failed_soon[state]), int(known.episodes[state]), is_exact, is_told)
     visits = int(known.visits[state])
-    after = [
-        Tally(int(failed), int(tried), is_exact, is_told)
-        for failed, tried in zip(known.failed_after[:, state], known.tried[:, state], strict=True)
-    ]
+    outcomes = zip(known.failed_after[:, state], known.tried[:, state], strict=True)
+    after = [Tally(int(failed), int(tried), is_exact, is_told) for failed, tried in outcomes]
     asked = None if action is None else after[action]
     better = _best(after, here if asked is None or not asked.episodes else asked)
     after_better = None if better is None else after[better]
-    arrivals = known.changes[:, state]
-    arrivals = np.where(np.arange(len(arrivals)) == state, 0.0, arrivals)
+    arrivals = np.where(np.arange(len(belief)) == state, 0.0, known.changes[:, state])
     came_from = int(arrivals.argmax()) if arrivals.any() else None
 
     horizon = known.settings.get("failure_horizon")
@@ -157,29 +143,16 @@ def explain(
         "" if better is None else f"Better after {labels.action(better)}: {after_better}",
         _of_onsets(known, state, labels),
         "" if is_exact else "States were joined here, so an episode may count twice",
-        _of_origin(arrivals, came_from),
+        "" if came_from is None else _of_origin(arrivals, came_from),
     ]
+    text = " ".join(f"{sentence}." for sentence in sentences if sentence)
+    sure = float(belief[state])
     return Explanation(
-        " ".join(f"{sentence}." for sentence in sentences if sentence),
-        state,
-        float(belief[state]),
-        visits,
-        here,
-        came_from,
-        asked,
-        better,
-        after_better,
+        text, state, sure, visits, here, came_from, asked, better, after_better, False
     )
 
 
-def nothing_known(text: str) -> Explanation:
-    """An explanation that there is nothing to explain."""
-    return Explanation(text, None, 0.0, 0, Tally(0, 0), None, None, None, None)
-
-
-def _never_seen(
-    known: Any, belief: NDArray[np.float64], nearest: Nearest, labels: Labels
-) -> Explanation:
+def _never_seen(known: Any, belief: Floats, nearest: Nearest, labels: Labels) -> Explanation:
     state, none = nearest.state, Tally(0, 0, is_told=known.failures_told)
     place = labels.place(known.centers[state])
     place = place if place.startswith("(") else f"({place})"
@@ -187,7 +160,7 @@ def _never_seen(
         f"Never seen, as far as the states tell: {nearest.distance:.3g} from the nearest, "
         f"{state_name(state)} {place}, where a state reaches {nearest.reach:.3g}."
     )
-    return Explanation(text, state, float(belief[state]), 0, none, None, None, None, None, True)
+    return Explanation(text, state, float(belief[state]), 0, none, never_seen=True)
 
 
 def _best(after: Sequence[Tally], than: Tally) -> int | None:
@@ -203,15 +176,13 @@ def _best(after: Sequence[Tally], than: Tally) -> int | None:
 # -- In words -------------------------------------------------------------------------------------
 
 
-def _of_place(known: Any, belief: NDArray[np.float64], state: int, labels: Labels) -> str:
+def _of_place(known: Any, belief: Floats, state: int, labels: Labels) -> str:
     place = f"{state_name(state)}: {labels.place(known.centers[state])}"
     if belief[state] > _SURE or len(belief) == 1:
         return place
     second = int(np.argsort(-belief, kind="stable")[1])
-    return (
-        f"{place} (belief {100.0 * belief[state]:.0f} %, next {state_name(second)} "
-        f"{100.0 * belief[second]:.0f} %)"
-    )
+    sure, next_ = 100.0 * belief[state], 100.0 * belief[second]
+    return f"{place} (belief {sure:.0f} %, next {state_name(second)} {next_:.0f} %)"
 
 
 def _of_episodes(here: Tally, visits: int, soon: str, asked: Tally | None, action: str) -> str:
@@ -242,9 +213,7 @@ def _of_onsets(known: Any, state: int, labels: Labels) -> str:
     return f"A disturbance began here {times} in {while_there}"
 
 
-def _of_origin(arrivals: NDArray[np.float64], came_from: int | None) -> str:
-    if came_from is None:
-        return ""
+def _of_origin(arrivals: Floats, came_from: int) -> str:
     most, all_ = arrivals[came_from], arrivals.sum()
     return f"Most often reached from {state_name(came_from)}: {most:,.0f} of {all_:,.0f} times"
 

@@ -3,11 +3,8 @@
 A machine's matrices say what the next step brings (the paper's Section 2.3). Raised to a power they
 answer for later ones as well, but poorly: each step smears a belief once more, and what a Markov
 chain of states forgets, such as whether one has been braking, stays forgotten. Here every horizon
-has matrices of its own, which go from the belief then straight to the belief h steps later.
-
-How a transition is counted is the other half. The paper counts from every state that was believed
-in to every state that was reached, in proportion to both; the count is as wide as two beliefs and
-forecasts are wider still. Here a transition is counted by how likely it is, given both ends::
+has matrices of its own, which go from the belief then straight to the belief h steps later, and a
+transition is counted by how likely it is, given both ends::
 
     xi_ij = tau_i P_ij gamma_j / (tau P)_j
 
@@ -25,17 +22,10 @@ from typing import Any, SupportsIndex
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from evofsm.fsm.arrays import NO_ACTION, Floats
+from evofsm.fsm import validation as valid
+from evofsm.fsm.arrays import NO_ACTION
 from evofsm.fsm.model import FSMModel
-from evofsm.fsm.validation import (
-    check_action,
-    check_actions,
-    check_rows,
-    positive,
-    real_rows,
-    refuse_unless_distribution,
-    whole,
-)
+from evofsm.fsm.validation import Floats, positive, whole
 
 # What is believed less than this takes no part in learning.
 _LEAST_BELIEF = 1e-3
@@ -50,7 +40,7 @@ class Forecasts:
 
     They share the machine's states, and look at observations through a snapshot of it: hand over
     each episode when it is over, and the machine has learnt it. States that the machine gives up
-    (``max_states``) are not followed.
+    (``max_states``) are not followed. Counts never forget.
 
     Parameters
     ----------
@@ -64,11 +54,6 @@ class Forecasts:
     moved : float
         Share of transitions that are presumed to leave a state before any was seen, in (0, 1). For
         each horizon it is learnt from there on.
-
-    Notes
-    -----
-    Counts never forget, and every row of every matrix is a distribution. Memory is about
-    ``8 * len(steps) * (1 + actions used) * n**2`` byte for n states.
 
     Examples
     --------
@@ -106,12 +91,6 @@ class Forecasts:
         self._moving = [np.array([1.0 - self.moved, self.moved]) for _ in self.steps]
         self._counts: list[dict[int, Floats]] = [{NO_ACTION: np.zeros((0, 0))} for _ in self.steps]
 
-    @property
-    def nbytes(self) -> int:
-        """Memory that holds what was learnt [byte]."""
-        counts = sum(array.nbytes for of_horizon in self._counts for array in of_horizon.values())
-        return self._elsewhere.nbytes + counts
-
     def learn(
         self,
         model: FSMModel,
@@ -119,9 +98,7 @@ class Forecasts:
         I: ArrayLike,
         episode_starts: Sequence[int] | NDArray[np.integer] = (),
     ) -> None:
-        """Learn an episode, or many, from each row to those that come after it.
-
-        Nothing is learnt from the rows of one call to those of the next.
+        """Learn an episode, or many, from each row to those that come after it in this call.
 
         Parameters
         ----------
@@ -133,16 +110,10 @@ class Forecasts:
             The action taken after each row; -1 where none is known.
         episode_starts : (E,) array_like of int
             Rows at which an episode begins; the first one does anyway.
-
-        Raises
-        ------
-        TypeError, ValueError
-            If observations or actions are not what the machine could have learnt, or the model has
-            fewer states than those before (of another machine?). Nothing is learnt then.
         """
-        beliefs = np.atleast_2d(model.recognise(real_rows("observations", Z)))
-        actions = check_actions(I, len(beliefs), self.n_actions)
-        starts = check_rows("episode_starts", episode_starts, len(beliefs))
+        beliefs = np.atleast_2d(model.recognise(valid.real_rows("observations", Z)))
+        actions = valid.check_actions(I, len(beliefs), self.n_actions)
+        starts = valid.check_rows("episode_starts", episode_starts, len(beliefs))
         self.n_states = self._check_states(model.n_states)
         near = model.recognise(model.centers)
         self._elsewhere = (1.0 - _ANYWHERE) * near + _ANYWHERE / self.n_states
@@ -155,7 +126,7 @@ class Forecasts:
                     given = beliefs[before], states[before], beliefs[row], states[row]
                     self._learn(horizon, int(actions[before]), *given)
 
-    def predict(self, belief: ArrayLike, i: ArrayLike | None, steps: int) -> NDArray[np.float64]:
+    def predict(self, belief: ArrayLike, i: ArrayLike | None, steps: int) -> Floats:
         """(n,) forecast of the state, or (T, n) of many; nothing is changed by asking.
 
         States created since nothing was learnt of stay as they are.
@@ -169,25 +140,20 @@ class Forecasts:
             Without it, or where it is -1, all actions together answer.
         steps : int
             One of the horizons.
-
-        Raises
-        ------
-        TypeError, ValueError
-            If the belief is no distribution, has fewer states than were learnt, or there is no such
-            action or horizon.
         """
-        rows = real_rows("belief", np.atleast_2d(belief))
-        refuse_unless_distribution("belief", rows)
+        rows = valid.real_rows("belief", np.atleast_2d(belief))
+        valid.refuse_unless_distribution("belief", rows)
         self._check_states(rows.shape[1])
-        given = np.broadcast_to(np.asarray(NO_ACTION if i is None else i), len(rows))
-        actions, horizon = check_actions(given, len(rows), self.n_actions), self._horizon(steps)
+        horizon, given = self._horizon(steps), np.asarray(NO_ACTION if i is None else i)
+        given = np.broadcast_to(given, len(rows))
+        actions = valid.check_actions(given, len(rows), self.n_actions)
         predicted, n = rows.copy(), self.n_states
         for action in np.unique(actions).tolist():
             of_it = actions == action
             predicted[of_it, :n] = rows[of_it, :n] @ self._matrix(horizon, action)
         return predicted if np.ndim(belief) == 2 else predicted[0]
 
-    def matrix(self, i: SupportsIndex | None, steps: int) -> NDArray[np.float64]:
+    def matrix(self, i: SupportsIndex | None, steps: int) -> Floats:
         """(n, n) transition probabilities over a horizon, from state (row) to state (column).
 
         Parameters
@@ -197,14 +163,11 @@ class Forecasts:
         steps : int
             One of the horizons.
         """
-        action = NO_ACTION if i is None else check_action(i, self.n_actions)
+        action = NO_ACTION if i is None else valid.check_action(i, self.n_actions)
         return self._matrix(self._horizon(steps), action)
 
     def __repr__(self) -> str:
-        return (
-            f"{type(self).__name__}(n_actions={self.n_actions}, steps={self.steps}, "
-            f"evidence={self.evidence}, moved={self.moved})"
-        )
+        return f"{type(self).__name__}(n_actions={self.n_actions}, steps={self.steps})"
 
     def _matrix(self, horizon: int, action: int, i: Any = None, j: Any = None) -> Floats:
         """Transition probabilities under an action, presumed to lead where all lead together.
@@ -227,10 +190,8 @@ class Forecasts:
     ) -> None:
         """Count one transition from states i to states j, by how likely each pair is."""
         moving, counts = self._moving[horizon], self._counts[horizon]
-        likely = {
-            one: origin[i, None] * self._matrix(horizon, one, i, j)
-            for one in {NO_ACTION: 0, action: 0}
-        }
+        both = {NO_ACTION: 0, action: 0}
+        likely = {one: origin[i, None] * self._matrix(horizon, one, i, j) for one in both}
         share = moving[1] / moving.sum()
         stayed = (1.0 - share) * origin[j]
         moved = share * (origin[i] @ self._elsewhere[np.ix_(i, j)])

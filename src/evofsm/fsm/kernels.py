@@ -16,15 +16,12 @@ from functools import partial
 from hashlib import sha256
 from pathlib import Path
 from threading import Timer
-from time import monotonic
 from typing import Any, ClassVar, TypeVar, cast
 
 import numba
 import numpy as np
-from llvmlite import ir
-from numba import types
 from numba.core import event
-from numba.extending import intrinsic, register_jitable
+from numba.extending import register_jitable
 from numpy.typing import NDArray
 
 Function = TypeVar("Function", bound=Callable[..., object])
@@ -97,26 +94,6 @@ _BIAS, _MANTISSA = 1023, 52
 _TO_ROOT = 0x3FF0_0000_0000_0000 - 0x3FE6_A09E_667F_3BCD
 
 
-@intrinsic
-def _bits_of_float(_context: Any, _number: Any) -> Any:
-    def generate(_: Any, builder: Any, __: Any, arguments: Any) -> Any:
-        return builder.bitcast(arguments[0], ir.IntType(64))
-
-    return types.int64(types.float64), generate
-
-
-@intrinsic
-def _float_of_bits(_context: Any, _bits: Any) -> Any:
-    def generate(_: Any, builder: Any, __: Any, arguments: Any) -> Any:
-        return builder.bitcast(arguments[0], ir.DoubleType())
-
-    return types.float64(types.int64), generate
-
-
-# As kernels see them.
-_bits_of, _float_of = cast(Any, _bits_of_float), cast(Any, _float_of_bits)
-
-
 @inner_kernel
 def exponential(x: float) -> float:
     """``exp(x)`` to two units in the last place, for x from -700 to 700.
@@ -133,7 +110,8 @@ def exponential(x: float) -> float:
     third = 1 / 40320 + r * (1 / 362880) + r2 * (1 / 3628800 + r * (1 / 39916800))
     fourth = 1 / 479001600 + r * (1 / 6227020800)
     series = first + r4 * (second + r4 * (third + r4 * fourth))
-    return float(series * _float_of((_bits_of(rounded) + _BIAS) << _MANTISSA))
+    power = (np.float64(rounded).view(np.int64) + _BIAS) << _MANTISSA
+    return float(series * np.int64(power).view(np.float64))
 
 
 @inner_kernel
@@ -143,9 +121,9 @@ def logarithm(x: float) -> float:
     ``x = 2^k m`` with m between the roots of 1/2 and 2; ``ln m = 2 atanh(s)`` with
     ``s = (m - 1) / (m + 1)``: eleven terms of the series.
     """
-    bits = _bits_of(x)
+    bits = np.float64(x).view(np.int64)
     k = ((bits + _TO_ROOT) >> _MANTISSA) - _BIAS
-    m = _float_of(bits - (k << _MANTISSA))
+    m = np.int64(bits - (k << _MANTISSA)).view(np.float64)
     s = (m - 1.0) / (m + 1.0)
     z = s * s
     z2 = z * z
@@ -153,7 +131,7 @@ def logarithm(x: float) -> float:
     first = 1 / 3 + z * (1 / 5) + z2 * (1 / 7 + z * (1 / 9))
     second = 1 / 11 + z * (1 / 13) + z2 * (1 / 15 + z * (1 / 17))
     series = first + z4 * (second + z4 * (1 / 19 + z * (1 / 21)))
-    exponent = _float_of(_INTEGER_BITS + k) - _INTEGER
+    exponent = np.int64(_INTEGER_BITS + k).view(np.float64) - _INTEGER
     return float(exponent * _LN_2_HIGH + (2.0 * s * z * series + (exponent * _LN_2_LOW + 2.0 * s)))
 
 
@@ -175,32 +153,30 @@ _log = logging.getLogger("evofsm")
 
 
 class _Announcement(event.Listener):
-    """Says once that kernels are compiled, where all that takes longer than a second."""
+    """Says once that kernels are compiled, where that takes longer than a second."""
 
     _PATIENCE: ClassVar = 1.0  # [s]
 
     def __init__(self) -> None:
-        self._depth = 0
-        self._spent = self._begun = 0.0
-        self._timer = Timer(0.0, self._say)
+        self._depth, self._timer = 0, Timer(0.0, self._say)
+        self._said = False
 
     def on_start(self, event: object) -> None:
-        if self._depth == 0 and self._spent < self._PATIENCE:
-            self._begun = monotonic()
-            self._timer = Timer(self._PATIENCE - self._spent, self._say)
+        self._depth += 1
+        if self._depth == 1:
+            self._timer = Timer(self._PATIENCE, self._say)
             self._timer.daemon = True
             self._timer.start()
-        self._depth += 1
 
     def on_end(self, event: object) -> None:
         self._depth -= 1
-        if self._depth == 0 and self._spent < self._PATIENCE:
+        if self._depth == 0:
             self._timer.cancel()
-            self._spent += monotonic() - self._begun
 
     def _say(self) -> None:
-        self._spent = self._PATIENCE
-        _log.warning("compiling kernels, once; this takes some seconds ...")
+        if not self._said:
+            _log.warning("compiling kernels, once; this takes some seconds ...")
+        self._said = True
 
 
 _announced: list[_Announcement] = []

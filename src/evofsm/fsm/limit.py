@@ -8,9 +8,10 @@ from __future__ import annotations
 from enum import IntEnum
 from typing import Any
 
-from evofsm.fsm.arrays import ENDINGS, EPISODES, VISITS, Floats, Learnt, Settings
+from evofsm.fsm.arrays import ENDINGS, EPISODES, VISITS, Learnt, Settings
 from evofsm.fsm.kernels import inner_kernel, rare_kernel
 from evofsm.fsm.transitions import merge_states, retire_state
+from evofsm.fsm.validation import Floats
 
 # What may happen besides what `evofsm.fsm.clusters` knows.
 MERGED: int = 4
@@ -32,14 +33,10 @@ class WhenFull(IntEnum):
     Examples
     --------
     >>> from evofsm import EvolvingFSM, Novelty
-    >>> Z, I = [[0.0], [4.0], [9.0]], [0, 0, 0]
-    >>> machine = EvolvingFSM(n_actions=1, rule=Novelty(radius=1.0), max_states=2)
-    >>> machine.learn_many(Z, I).event, machine.centers.ravel()
+    >>> for when_full in WhenFull:
+    ...     machine = EvolvingFSM(1, rule=Novelty(radius=1.0), max_states=2, when_full=when_full)
+    ...     machine.learn_many([[0.0], [4.0], [9.0]], [0, 0, 0]).event, machine.centers.ravel()
     (array([2, 2, 6], dtype=int8), array([2., 9.]))
-    >>> machine = EvolvingFSM(
-    ...     n_actions=1, rule=Novelty(radius=1.0), max_states=2, when_full=WhenFull.RETIRE
-    ... )
-    >>> machine.learn_many(Z, I).event, machine.centers.ravel()
     (array([ 2,  2, 10], dtype=int8), array([9., 4.]))
     """
 

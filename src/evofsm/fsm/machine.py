@@ -14,7 +14,6 @@ from __future__ import annotations
 import copy
 import os
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import fields
 from functools import wraps
 from threading import RLock
 from typing import TYPE_CHECKING, Any, Self, SupportsIndex, TypeVar, cast
@@ -25,76 +24,29 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from evofsm import store
+from evofsm.fsm import arrays, rules
+from evofsm.fsm import step as stepping
+from evofsm.fsm import validation as valid
 from evofsm.fsm.actions import IntervalActions
-from evofsm.fsm.arrays import (
-    MACHINE,
-    NO_ACTION,
-    NOT_OPEN,
-    ONSETS,
-    SUMS,
-    Floats,
-    Learnt,
-    Settings,
-    blank,
-    by_name,
-    from_names,
-    resized,
-    room_for,
-)
+from evofsm.fsm.arrays import MACHINE, NO_ACTION, NOT_OPEN, OF_ACTIONS, OF_MODEL, Learnt, Settings
 from evofsm.fsm.clusters import PAPER, width_of
 from evofsm.fsm.divergence import jensen_shannon
-from evofsm.fsm.explanation import Explanation, Nearest, explain, nothing_known
+from evofsm.fsm.explanation import Explanation, Nearest, explain
 from evofsm.fsm.kernels import LINE, announce_compiling
 from evofsm.fsm.limit import WhenFull
-from evofsm.fsm.model import (
-    Counts,
-    FSMModel,
-    Policy,
-    believed,
-    check_forecast,
-)
+from evofsm.fsm.model import Counts, FSMModel, Policy, believed, check_forecast
 from evofsm.fsm.naming import Labels
 from evofsm.fsm.notebook import machine_html
 from evofsm.fsm.observations import Missing
-from evofsm.fsm.rules import (
-    Novelty,
-    Paper,
-    StateRule,
-    check_rule,
-    describe_rule,
-    reach,
-    restore_rule,
-    weights_of,
-)
-from evofsm.fsm.step import (
-    EVENTS,
-    PREDICTED,
-    Event,
-    Limit,
-    Step,
-    Trace,
-    believe,
-    blank_trace,
-    fail,
-    learn_rows,
-    widen,
-)
-from evofsm.fsm.validation import (
-    check_action,
-    check_actions,
-    check_rows,
-    is_within,
-    positive,
-    real_array,
-    real_rows,
-    refuse_unusable,
-    whole,
-)
+from evofsm.fsm.rules import StateRule
+from evofsm.fsm.step import EVENTS, PREDICTED, Event, Limit, Step, Trace, blank_trace
+from evofsm.fsm.transitions import room_for
+from evofsm.fsm.validation import Floats, positive, whole
 from evofsm.store import LARGEST_OBSERVATION, Place
 
 Method = TypeVar("Method", bound=Callable[..., Any])
 
-# What a machine does not have to be told, with what holds if it is not.
+# What a machine does not have to be given, with what holds if it is not.
 _OPTIONS = {
     "max_states": None,
     "when_full": WhenFull.MERGE,
@@ -103,30 +55,23 @@ _OPTIONS = {
 }
 _SETTINGS = ("n_actions", "radius", "distance_weight", "learning_rate", "prior_frequency", "spread")
 _FLOATS = [name for name in Settings._fields if name not in ("retires", "rule", "weights")]
-_OF_ACTIONS = ("decisions", "failures", "tried", "failed_after")
 # Arrays of a snapshot that a machine answers with.
-_ASKED = {entry.name for entry in fields(Counts)} | {
-    "potentials",
-    "transition_matrices",
-    "origin_frequency",
-    "uses",
-}
-
-
-def _told(name: str, doc: str) -> Any:
-    """A setting, which cannot be changed any more."""
-    return property(lambda self: getattr(self._settings, name), doc=doc)
-
-
-if TYPE_CHECKING:
-    _Arrays = Counts
-else:
-    _Arrays = object
+_ASKED = {*arrays.OF_MODEL, "joint_frequency", "marginal_matrix"} - {"centers"}
 _FLOAT64 = np.dtype(np.float64)
 # Compiled code of a step, without and with a limit to the states.
 _ENTRIES: dict[bool, Callable[..., int]] = {}
 # Every machine there is, for a process that is forked.
 _MACHINES: WeakSet[EvolvingFSM] = WeakSet()
+
+if TYPE_CHECKING:
+    _Arrays = Counts
+else:
+    _Arrays = object
+
+
+def _setting(name: str, doc: str) -> Any:
+    """A setting, which cannot be changed any more."""
+    return property(lambda self: getattr(self._settings, name), doc=doc)
 
 
 def _alone(method: Method) -> Method:
@@ -178,23 +123,19 @@ class EvolvingFSM(_Arrays):
     max_states : int, optional
         Number of states at which another one is only created where one is given up.
     when_full : WhenFull
-        Which one is given up: ``MERGE`` joins the two that are closest, ``RETIRE`` forgets the
-        least useful.
+        Which one: ``MERGE`` joins the two that are closest, ``RETIRE`` forgets the least useful.
     belief_tolerance : float
         How far a belief may be from the exact one, summed over all states, in [0, 1). States that
         are less likely take no part in the step: with hundreds of states this saves most of the
-        time, 1e-6 for example. A jump to a state that got none teaches nothing about it until it is
-        recognised.
+        time, 1e-6 for example.
     failure_horizon : int, optional
         A failure within this many observations of a visit is counted in `failed_soon`; without it,
         every failure later in the same episode.
 
     Raises
     ------
-    TypeError
-        If ``rule`` is no rule (or the class of one).
-    ValueError
-        If a setting is out of its range, or ``radius`` or ``spread`` contradicts the rule's.
+    TypeError, ValueError
+        If a setting is out of its range or contradicts the rule's, or ``rule`` is no rule.
 
     Notes
     -----
@@ -208,18 +149,20 @@ class EvolvingFSM(_Arrays):
     Examples
     --------
     >>> machine = EvolvingFSM(n_actions=2, radius=0.5)
-    >>> for z in ([0.0], [0.1], [2.0], [1.0], [1.1]):
-    ...     step = machine.learn_one(z, 0)
-    >>> machine.n_states
-    2
-    >>> machine.predict(0).round(3)
-    array([0.48, 0.52])
+    >>> trace = machine.learn_many([[0.0], [0.1], [2.0], [1.0]], [0, 0, 0, 0])
+    >>> step = machine.observe([1.1])
+    >>> step.state, step.predicted.round(2), step.belief.round(2), round(step.surprise, 2)
+    (1, array([0.6, 0.4]), array([0.32, 0.68]), 0.06)
+    >>> machine.predict(0).round(3), machine.predict(1).round(3)  # 1 was never tried
+    (array([0.48, 0.52]), array([0.5, 0.5]))
     """
 
     potentials: Floats
     transition_matrices: Floats
     origin_frequency: Floats
     uses: Floats
+    joint_frequency: Floats
+    marginal_matrix: Floats
 
     def __init__(
         self,
@@ -235,19 +178,21 @@ class EvolvingFSM(_Arrays):
         belief_tolerance: float = 0.0,
         failure_horizon: int | None = None,
     ) -> None:
-        self._rule = Paper() if rule is None else check_rule(rule)
-        told = Settings(
+        self._rule = rules.Paper() if rule is None else rules.check_rule(rule)
+        if belief_tolerance and positive("belief_tolerance", belief_tolerance) >= 1.0:
+            raise ValueError(f"belief_tolerance is {belief_tolerance}; it must lie below 1")
+        if positive("learning_rate", learning_rate) >= 1.0:
+            raise ValueError(f"learning_rate is {learning_rate}; it must lie below 1")
+        given = Settings(
             radius=0.3 if radius is None else positive("radius", radius),
             distance_weight=positive("distance_weight", distance_weight),
-            learning_rate=positive("learning_rate", learning_rate),
+            learning_rate=learning_rate,
             prior_frequency=positive("prior_frequency", prior_frequency),
             spread=3.0 if spread is None else positive("spread", spread),
-            belief_tolerance=_tolerance(belief_tolerance),
-            max_states=np.inf if max_states is None else whole("max_states", max_states),
+            belief_tolerance=belief_tolerance,
+            max_states=_or_infinity("max_states", max_states),
             retires=WhenFull(when_full) is WhenFull.RETIRE,
-            failure_horizon=(
-                np.inf if failure_horizon is None else whole("failure_horizon", failure_horizon)
-            ),
+            failure_horizon=_or_infinity("failure_horizon", failure_horizon),
             rule=PAPER,
             memory=np.inf,
             failure_share=0.0,
@@ -255,13 +200,11 @@ class EvolvingFSM(_Arrays):
             weights=np.empty(0),
         )._replace(**cast(Any, self._rule.table))
         for name, value in (("radius", radius), ("spread", spread)):
-            if value not in (None, getattr(told, name)):
+            if value not in (None, getattr(given, name)):
                 raise ValueError(f"{name} is {value}, but the rule has its own: {self._rule}")
-        if told.learning_rate >= 1.0:
-            raise ValueError(f"learning_rate is {learning_rate}; it must lie below 1")
-        floats: dict[str, Any] = {name: float(getattr(told, name)) for name in _FLOATS}
-        self._settings = told._replace(**floats)
-        self._learnt = blank(0, whole("n_actions", n_actions), 0, 0)
+        floats: dict[str, Any] = {name: float(getattr(given, name)) for name in _FLOATS}
+        self._settings = given._replace(**floats)
+        self._learnt = arrays.blank(0, whole("n_actions", n_actions), 0, 0)
         self._share()
         MACHINE.refuse_others(self._content)
 
@@ -271,11 +214,6 @@ class EvolvingFSM(_Arrays):
 
         Observations are ``[gap [m], v_follower [m/s], v_leader [m/s]]``; the 17 actions are those
         of ``IntervalActions(-2.5, 2.5, 0.3)`` [m/s²].
-
-        Examples
-        --------
-        >>> EvolvingFSM.paper().n_actions
-        17
         """
         return cls(n_actions=17)
 
@@ -304,23 +242,12 @@ class EvolvingFSM(_Arrays):
 
         Raises
         ------
-        TypeError
-            If ``z`` does not hold real numbers.
-        ValueError
-            If ``z`` has another length than before, an entry is NaN, infinite or beyond 1e100, or
-            there is nothing yet by which to recognise what is incomplete. The machine is then as it
-            was.
-
-        Examples
-        --------
-        >>> machine = EvolvingFSM(n_actions=2, radius=0.5)
-        >>> trace = machine.learn_many([[0.0], [0.1], [2.0], [1.0]], [0, 0, 0, 0])
-        >>> step = machine.observe([1.1])
-        >>> step.state, step.predicted.round(2), step.belief.round(2), round(step.surprise, 2)
-        (1, array([0.6, 0.4]), array([0.32, 0.68]), 0.06)
+        TypeError, ValueError
+            If ``z`` holds no real numbers, has another length than before, an entry is NaN,
+            infinite or beyond 1e100. The machine is then as it was.
         """
         if missing is not Missing.REJECT:
-            given = real_array("observation", z, ndim=1)
+            given = valid.real_array("observation", z, ndim=1)
             if (absent := np.isnan(given)).any():
                 return self._observe_partly(given, absent, missing, failed)
         return self._step(z, NO_ACTION, failed)
@@ -336,13 +263,8 @@ class EvolvingFSM(_Arrays):
         ----------
         i : int
             Index of the action, from 0; `IntervalActions.encode` gives it for a number.
-
-        Raises
-        ------
-        TypeError, ValueError
-            If there is no such action, or nothing was observed yet in this episode.
         """
-        i = check_action(i, self.n_actions)
+        i = valid.check_action(i, self.n_actions)
         now = self._learnt.now
         if not now["chained"][0]:
             raise ValueError("act before observe: this episode has no observation to act on yet")
@@ -358,19 +280,8 @@ class EvolvingFSM(_Arrays):
             Observation, as `observe` takes it.
         i : int
             Index of the action commanded after it, as `act` takes it.
-
-        Raises
-        ------
-        TypeError, ValueError
-            As `observe` and `act`. The machine is then as it was.
-
-        Examples
-        --------
-        >>> machine = EvolvingFSM(n_actions=2, radius=0.5)
-        >>> [machine.learn_one([z], 0).state for z in (0.0, 0.1, 2.0, 1.0)]
-        [0, 0, 0, 1]
         """
-        return self._step(z, check_action(i, self.n_actions), None)
+        return self._step(z, valid.check_action(i, self.n_actions), None)
 
     @_alone
     def learn_many(
@@ -403,31 +314,27 @@ class EvolvingFSM(_Arrays):
         ------
         TypeError, ValueError
             As `observe` and `act`, before any row is learnt; the message names the row.
-
-        Examples
-        --------
-        >>> machine = EvolvingFSM(n_actions=2, radius=0.5)
-        >>> machine.learn_many([[0.0], [0.1], [2.0], [1.0]], [0, 0, 0, 0]).n_states
-        array([1, 1, 1, 2])
         """
-        observations = self._checked_rows(Z)
+        observations = valid.real_rows("observations", Z)
         rows = len(observations)
-        actions = check_actions(I, rows, self.n_actions)
-        starts = check_rows("episode_starts", episode_starts, rows)
-        ends = check_rows("failures", () if failures is None else failures, rows)
+        if self.n_states and rows:
+            self._refuse_other_length(observations.shape[1])
+        valid.refuse_unusable("observations", observations)
+        observations = np.require(observations, requirements=("C", "W"))
+        actions = valid.check_actions(I, rows, self.n_actions)
+        starts = valid.check_rows("episode_starts", episode_starts, rows)
+        ends = valid.check_rows("failures", () if failures is None else failures, rows)
         if rows:
             self._fit(observations.shape[1])
         trace, row = blank_trace(rows), 0
         beliefs = np.zeros((rows if belief else 0, self._capacity))
         while row < rows:
-            scratch = np.empty((3, self._capacity))
-            given = observations, actions, starts, ends, failures is not None, scratch
-            row = learn_rows(
-                self._learnt, self._settings, self.max_states, *given, row, trace, beliefs
-            )
+            given = self._learnt, self._settings, self.max_states, observations, actions, starts
+            told, scratch = failures is not None, np.empty((3, self._capacity))
+            row = stepping.learn_rows(*given, ends, told, scratch, row, trace, beliefs)
             if row < rows:
                 self._make_room()
-                beliefs = widen(beliefs, self._capacity)
+                beliefs = np.pad(beliefs, [(0, 0), (0, self._capacity - beliefs.shape[1])])
         return trace._replace(belief=beliefs[:, : self.n_states]) if belief else trace
 
     @_alone
@@ -441,16 +348,11 @@ class EvolvingFSM(_Arrays):
 
         The action commanded after the latest observation led there; where none was, the failure is
         counted for the state alone. The next observation begins a new episode.
-
-        Raises
-        ------
-        ValueError
-            If nothing was observed yet in this episode.
         """
         if not self._learnt.now["chained"][0]:
             raise ValueError("fail before observe: this episode has no observation to fail after")
         self._make_room()
-        fail(self._learnt, self._settings, self.max_states, np.empty((3, self._capacity)))
+        stepping.fail(self._learnt, self._settings, self.max_states, np.empty((3, self._capacity)))
 
     @_alone
     def onset(self) -> None:
@@ -460,23 +362,20 @@ class EvolvingFSM(_Arrays):
         counted where the episode has no earlier observation, or its state was given up.
         """
         if (before := self._learnt.now["before"][0]) >= 0:
-            self._learnt.sums[ONSETS, before] += 1.0
+            self._learnt.sums[arrays.ONSETS, before] += 1.0
 
     def tell_of_failures(self) -> None:
         """Say that failures are told: an episode that ends without one is known to have had none.
 
-        The same is said by `observe` with ``failed=False`` and by `learn_many` with
-        ``failures=[]``. Where nobody says so, and no failure was ever told, `explain` does not take
-        the silence for safety.
+        So do `observe` with ``failed=False`` and `learn_many` with ``failures=[]``. Where nobody
+        says so, and no failure was ever told, `explain` does not take the silence for safety.
         """
         self._learnt.now["failures_told"] = 1
 
     # -- Asking ---------------------------------------------------------------------------------
 
     @_alone
-    def predict(
-        self, i: SupportsIndex, horizon: int = 1, policy: Policy = "marginal"
-    ) -> NDArray[np.float64]:
+    def predict(self, i: SupportsIndex, horizon: int = 1, policy: Policy = "marginal") -> Floats:
         """(n,) forecast of the state ``horizon`` steps ahead; nothing is changed by asking.
 
         The forecast equations of the paper's Section 2.3.2: ``belief @ P[i] @ P*^(horizon - 1)``.
@@ -491,22 +390,8 @@ class EvolvingFSM(_Arrays):
         policy : {"marginal", "hold", "observed"}
             Actions after the first step: each alike, as in the paper's k-step equation; ``i``
             again; or each as often as it was used so far.
-
-        Raises
-        ------
-        TypeError, ValueError
-            If there is no such action or policy, or ``horizon`` is no integer of at least 1.
-
-        Examples
-        --------
-        >>> machine = EvolvingFSM(n_actions=2, radius=0.5)
-        >>> trace = machine.learn_many([[0.0], [0.1], [2.0], [1.0]], [0, 0, 0, 0])
-        >>> machine.predict(0).round(3), machine.predict(1).round(3)  # 1 was never tried
-        (array([0.602, 0.398]), array([0.5, 0.5]))
-        >>> machine.predict(0, horizon=10, policy="hold").round(3)
-        array([0.686, 0.314])
         """
-        action, n = check_action(i, self.n_actions), self.n_states
+        action, n = valid.check_action(i, self.n_actions), self.n_states
         if check_forecast(horizon, policy) > 1:
             return self.model().propagate(self.belief, action, horizon, policy)
         place = self._learnt.actions["place"][action]
@@ -526,26 +411,10 @@ class EvolvingFSM(_Arrays):
             Index of an action, from 0: what came of taking it there.
         labels : Labels, optional
             What the numbers mean, for words.
-
-        Raises
-        ------
-        TypeError, ValueError
-            If there is no such action.
-
-        Examples
-        --------
-        >>> from evofsm import Labels
-        >>> machine = EvolvingFSM(n_actions=2, radius=0.5)
-        >>> trace = machine.learn_many([[0.0], [0.1], [2.0], [1.0]], [0, 1, 0, 0], [0, 2], [3])
-        >>> step = machine.observe([0.9])
-        >>> print(machine.explain(0, Labels(names=("gap",), units=("m",))))
-        #2: gap 0.9 m (belief 63 %, next #1 37 %). 1 episode came here (2 observations);
-        1 of 1 (at least 26 %) failed later on; none of them is known to have tried a(1) here.
-        Most often reached from #1: 1 of 1 times.
         """
-        index = None if action is None else check_action(action, self.n_actions)
+        index = None if action is None else valid.check_action(action, self.n_actions)
         if self.state is None:
-            return nothing_known("Nothing was observed yet in this episode.")
+            return Explanation("Nothing was observed yet in this episode.")
         labels = Labels() if labels is None else labels
         return explain(self.model(), self.belief, index, labels, self._nearest(self.state))
 
@@ -553,11 +422,6 @@ class EvolvingFSM(_Arrays):
     nearest = _of_snapshot(FSMModel.nearest)
     propagate = _of_snapshot(FSMModel.propagate)
     averaged_matrix = _of_snapshot(FSMModel.averaged_matrix)
-    stationary_distribution = _of_snapshot(FSMModel.stationary_distribution)
-    committor_forward = _of_snapshot(FSMModel.committor_forward)
-    mfpt = _of_snapshot(FSMModel.mfpt)
-    joint_frequency = property(_of_snapshot(cast(Any, FSMModel.joint_frequency).fget))
-    marginal_matrix = property(_of_snapshot(cast(Any, FSMModel.marginal_matrix).fget))
 
     @_alone
     def model(
@@ -578,35 +442,25 @@ class EvolvingFSM(_Arrays):
             Names and units of the m variables.
         dt : float, optional
             Time between two observations [s].
-
-        Raises
-        ------
-        ValueError
-            If ``actions``, ``names`` or ``units`` are of another number than the machine's, or
-            ``dt`` is not positive and finite.
         """
-        arrays = by_name(self._learnt)
-        now, n = self._learnt.now[0], self.n_states
+        found, now = arrays.by_name(self._learnt), self._learnt.now[0]
+        q, n = self.n_actions, self.n_states
         if now["chained"]:  # what belongs to an episode that is going on is not shown yet
-            arrays["episodes"] -= arrays["latest_visit"] >= now["began"]
-            arrays["tried"] -= arrays["latest_try"] >= now["began"]
-        used = np.flatnonzero(arrays["place"] != NOT_OPEN)
+            found["episodes"] -= found["latest_visit"] >= now["began"]
+            found["tried"] -= found["latest_try"] >= now["began"]
+        used = np.flatnonzero(found["place"] != NOT_OPEN)
         of_actions = {
-            "transition_matrices": np.full((self.n_actions, n, n), 1.0 / max(n, 1)),
-            "origin_frequency": np.full((self.n_actions, n), n * self.prior_frequency),
-            **{name: np.zeros((self.n_actions, n)) for name in _OF_ACTIONS},
+            "transition_matrices": np.full((q, n, n), 1.0 / max(n, 1)),
+            "origin_frequency": np.full((q, n), n * self.prior_frequency),
+            **{name: np.zeros((q, n)) for name in OF_ACTIONS},
         }
+        found["transition_matrices"] = found["matrices"]
         for name, array in of_actions.items():
-            stored = arrays["matrices" if name == "transition_matrices" else name]
-            array[used] = stored[arrays["place"][used]]
-        of_states = {
-            name: arrays[name]
-            for name in ("potentials", "uses", "changes", "created", "joined", *SUMS)
-        }
+            array[used] = found[name][found["place"][used]]
+        parts = {name: found[name] for name in OF_MODEL} | of_actions
+        parts["centers"] = found["centers"].T
         return FSMModel(
-            **of_states,
-            **of_actions,
-            centers=arrays["centers"].T,
+            **parts,
             width=self.width,
             rule=self._rule,
             failures_told=self.failures_told,
@@ -623,7 +477,7 @@ class EvolvingFSM(_Arrays):
             raise AttributeError(f"{type(self).__name__} has no attribute {name!r}")
         return getattr(self.model(), name).copy()
 
-    # -- What it was told -----------------------------------------------------------------------
+    # -- What it was given ----------------------------------------------------------------------
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -636,12 +490,12 @@ class EvolvingFSM(_Arrays):
         """Number q of actions."""
         return len(self._learnt.actions)
 
-    radius = _told("radius", "The paper's epsilon, or the rule's own.")
-    distance_weight = _told("distance_weight", "The paper's rho.")
-    learning_rate = _told("learning_rate", "The paper's phi.")
-    prior_frequency = _told("prior_frequency", "The paper's epsilon-bar.")
-    spread = _told("spread", "Width of recognition, in total variances or the rule's measure.")
-    belief_tolerance = _told("belief_tolerance", "How far a belief may be from the exact one.")
+    radius = _setting("radius", "The paper's epsilon, or the rule's own.")
+    distance_weight = _setting("distance_weight", "The paper's rho.")
+    learning_rate = _setting("learning_rate", "The paper's phi.")
+    prior_frequency = _setting("prior_frequency", "The paper's epsilon-bar.")
+    spread = _setting("spread", "Width of recognition, in total variances or the rule's measure.")
+    belief_tolerance = _setting("belief_tolerance", "How far a belief may be from the exact one.")
 
     @property
     def rule(self) -> StateRule:
@@ -651,8 +505,7 @@ class EvolvingFSM(_Arrays):
     @property
     def max_states(self) -> int | None:
         """Number of states from which on one is given up for another; None for no limit."""
-        most = self._settings.max_states
-        return None if most == np.inf else int(most)
+        return _or_none(self._settings.max_states)
 
     @property
     def when_full(self) -> WhenFull:
@@ -662,8 +515,7 @@ class EvolvingFSM(_Arrays):
     @property
     def failure_horizon(self) -> int | None:
         """Observations after which a failure no longer counts as soon; None for no limit."""
-        most = self._settings.failure_horizon
-        return None if most == np.inf else int(most)
+        return _or_none(self._settings.failure_horizon)
 
     # -- What it knows --------------------------------------------------------------------------
 
@@ -694,7 +546,7 @@ class EvolvingFSM(_Arrays):
 
     @property
     @_alone
-    def centers(self) -> NDArray[np.float64]:
+    def centers(self) -> Floats:
         """(n, m) ndarray: the observation at the centre of each state."""
         return self._learnt.centers[:, : self.n_states].T.copy()
 
@@ -708,13 +560,13 @@ class EvolvingFSM(_Arrays):
     def width(self) -> float:
         """Width of recognition, a squared distance; 0 before the first observation."""
         now = self._learnt.now[0]
-        if not now["n_observations"]:
-            return 0.0
-        return float(width_of(self._settings, now["scatter"] / now["n_observations"]))
+        seen = now["n_observations"]
+        width = cast(Any, width_of).py_func
+        return float(width(self._settings, now["scatter"] / seen)) if seen else 0.0
 
     @property
     @_alone
-    def belief(self) -> NDArray[np.float64]:
+    def belief(self) -> Floats:
         """(n,) ndarray: the present distribution over states, uniform as an episode starts."""
         n = self.n_states
         if self._learnt.now["chained"][0]:
@@ -741,17 +593,12 @@ class EvolvingFSM(_Arrays):
         Parameters
         ----------
         path : str, path-like or binary file
-            Name of the file, used as it is; a file of that name is replaced.
+            Name of the file, used as it is; a file of that name is replaced, or left as it was
+            where this one cannot be written.
         provenance : mapping, optional
             What it learnt from, for JSON; `evofsm inspect` shows it.
-
-        Raises
-        ------
-        OSError
-            If the folder does not exist, or the file cannot be written. What was there is then as
-            it was.
         """
-        store.write(path, MACHINE, self._content, by_name(self._learnt), provenance)
+        store.write(path, MACHINE, self._content, arrays.by_name(self._learnt), provenance)
 
     @classmethod
     def load(cls, path: Place) -> Self:
@@ -763,50 +610,44 @@ class EvolvingFSM(_Arrays):
 
         Raises
         ------
-        OSError
-            If there is no such file, or it may not be read.
-        ValueError
-            If the file holds something else, is damaged, or of a newer version.
+        OSError, ValueError
+            If it may not be read, holds something else, is damaged, or of a newer version.
         """
-        content, arrays = store.read(path, MACHINE)
+        content, learnt = store.read(path, MACHINE)
         with store.explained(path):
-            machine = cls(**{**content, "rule": restore_rule(content["rule"])})
-            return machine._with_arrays(arrays)
+            machine = cls(**{**content, "rule": rules.restore_rule(content["rule"])})
+            return machine._with_arrays(learnt)
 
-    def _with_arrays(self, arrays: Mapping[str, NDArray[Any]]) -> Self:
+    def _with_arrays(self, learnt: Mapping[str, NDArray[Any]]) -> Self:
         """A machine of the same settings that has learnt these arrays, by their names in a file."""
         machine = self.copy()
-        if m := len(arrays["first"]):
+        if m := len(learnt["first"]):
             machine._settings = self._with_weights(m)
-            machine._learnt = from_names(arrays, m, self.n_actions)
+            machine._learnt = arrays.from_names(learnt, m, self.n_actions)
         else:
-            machine._learnt.now["failures_told"] = arrays["failures_told"]
+            machine._learnt.now["failures_told"] = learnt["failures_told"]
         return machine
 
     @property
     def _content(self) -> dict[str, Any]:
         """The settings, for JSON."""
-        return {**self.settings, "rule": describe_rule(self._rule)}
+        return {**self.settings, "rule": rules.describe_rule(self._rule)}
 
     # A copy, or what another process gets, has a lock and arrays of its own.
     @_alone
     def __getstate__(self) -> dict[str, Any]:
-        return {
-            "rule": self._rule,
-            "settings": self._settings,
-            "learnt": [array.copy() for array in self._learnt],
-        }
+        learnt = [array.copy() for array in self._learnt]
+        return {"rule": self._rule, "settings": self._settings, "learnt": learnt}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self._rule, self._settings = state["rule"], state["settings"]
         # A file that is mapped for reading cannot be written to.
-        self._learnt = Learnt(
-            *(np.require(one, requirements=("C", "W")) for one in state["learnt"])
-        )
+        own = (np.require(one, requirements=("C", "W")) for one in state["learnt"])
+        self._learnt = Learnt(*own)
         self._share()
 
     def __repr__(self) -> str:
-        shown = self.settings | ({} if self._rule == Paper() else {"rule": self._rule})
+        shown = self.settings | ({} if self._rule == rules.Paper() else {"rule": self._rule})
         settings = ", ".join(f"{name}={value}" for name, value in shown.items())
         return f"{type(self).__name__}({settings})"
 
@@ -845,11 +686,7 @@ class EvolvingFSM(_Arrays):
         return Step(trace.state.item(), belief, event, predicted, surprise)
 
     def _observe_partly(
-        self,
-        z: NDArray[np.float64],
-        absent: NDArray[np.bool_],
-        missing: Missing,
-        failed: bool | None,
+        self, z: Floats, absent: NDArray[np.bool_], missing: Missing, failed: bool | None
     ) -> Step:
         """Recognise what some variables are missing of; only the belief changes."""
         now, n = self._learnt.now[0], self.n_states
@@ -860,7 +697,7 @@ class EvolvingFSM(_Arrays):
             raise ValueError(f"variables {gone} are missing, and nothing to hold since the start")
         self._refuse_other_length(len(z))
         filled = np.where(absent, self._learnt.variables["latest"], z)
-        refuse_unusable("observation", filled)
+        valid.refuse_unusable("observation", filled)
         action = int(now["action"])
         predicted = self.predict(action) if now["chained"] and action >= 0 else np.empty(0)
         if missing is Missing.PARTIAL and absent.all():
@@ -872,37 +709,31 @@ class EvolvingFSM(_Arrays):
             belief = believed(centers, counted, filled[None], self.width)[0]
         surprise = jensen_shannon(predicted, belief) if len(predicted) else np.nan
         # In a copy, which takes the place of what there was as a whole.
-        learnt = resized(self._learnt, *room_for(self._learnt, self._settings))
-        believe(learnt, belief)
+        learnt = arrays.resized(self._learnt, *room_for(self._learnt, self._settings))
+        stepping.believe(learnt, belief)
         if failed:
-            fail(learnt, self._settings, self.max_states, np.empty((3, len(learnt.belief))))
+            scratch = np.empty((3, len(learnt.belief)))
+            stepping.fail(learnt, self._settings, self.max_states, scratch)
         if failed is not None:
             learnt.now["failures_told"] = 1
         self._learnt = learnt
         return Step(int(belief.argmax()), belief, Event.NONE, predicted, surprise, gone)
 
-    def _checked(self, z: ArrayLike) -> NDArray[np.float64]:
+    def _checked(self, z: ArrayLike) -> Floats:
         """An observation as a vector of its own, of as many variables as the first one had."""
         if (
             type(z) is np.ndarray
             and z.dtype is _FLOAT64
             and z.shape == self._learnt.variables.shape
-            and is_within(z, LARGEST_OBSERVATION)
+            and valid.is_within(z, LARGEST_OBSERVATION)
         ):
             return z.copy()
-        vector = real_array("observation", z, ndim=1)
+        vector = valid.real_array("observation", z, ndim=1)
         if self.n_states:
             self._refuse_other_length(len(vector))
-        refuse_unusable("observation", vector)
+        valid.refuse_unusable("observation", vector)
         self._fit(len(vector))
         return vector
-
-    def _checked_rows(self, Z: ArrayLike) -> NDArray[np.float64]:
-        observations = real_rows("observations", Z)
-        if self.n_states and len(observations):
-            self._refuse_other_length(observations.shape[1])
-        refuse_unusable("observations", observations)
-        return np.require(observations, requirements=("C", "W"))
 
     def _refuse_other_length(self, m: int) -> None:
         if m != self.n_variables:
@@ -915,18 +746,18 @@ class EvolvingFSM(_Arrays):
         """Settle the number of variables with the first observation."""
         if self.n_states == 0:
             self._settings = self._with_weights(m)
-            learnt = blank(m, self.n_actions, LINE, 0)
+            learnt = arrays.blank(m, self.n_actions, LINE, 0)
             learnt.now["failures_told"] = self._learnt.now["failures_told"]
             self._learnt = learnt
 
     def _with_weights(self, m: int) -> Settings:
-        return self._settings._replace(weights=weights_of(self._rule, m))
+        return self._settings._replace(weights=rules.weights_of(self._rule, m))
 
     def _make_room(self) -> None:
         """Make room for what the next step may need."""
-        learnt, room = self._learnt, room_for(self._learnt, self._settings)
-        if room != (len(learnt.belief), len(learnt.matrices)):
-            self._learnt = resized(learnt, *room)
+        room = room_for(self._learnt, self._settings)
+        if room != (self._capacity, len(self._learnt.matrices)):
+            self._learnt = arrays.resized(self._learnt, *room)
 
     def _nearest(self, state: int) -> Nearest | None:
         """How far the latest observation is from its state, if it was seen whole."""
@@ -934,7 +765,7 @@ class EvolvingFSM(_Arrays):
         if learnt.states["latest_visit"][state] != learnt.now["clock"][0]:
             return None
         distance = float(np.sqrt(learnt.squared_distances[state]))
-        return Nearest(state, distance, reach(self._rule, self.width))
+        return Nearest(state, distance, rules.reach(self._rule, self.width))
 
 
 def _row_kernel(learnt: Learnt, settings: Settings, limit: Limit, *given: Any) -> int:
@@ -942,12 +773,12 @@ def _row_kernel(learnt: Learnt, settings: Settings, limit: Limit, *given: Any) -
     entry = _ENTRIES.get(limit is None)
     if entry is None:
         types = tuple(numba.typeof(one) for one in (learnt, settings, limit, *given))
-        entry = _ENTRIES[limit is None] = cast(Any, learn_rows).compile(types)
+        entry = _ENTRIES[limit is None] = cast(Any, stepping.learn_rows).compile(types)
     return cast(int, entry(learnt, settings, limit, *given))
 
 
 def opened(machine: EvolvingFSM) -> tuple[Learnt, Settings]:
-    """What a machine has learnt and was told, itself."""
+    """What a machine has learnt and was given, itself."""
     return machine._learnt, machine._settings
 
 
@@ -961,7 +792,7 @@ def warm() -> None:
     >>> warm()
     """
     announce_compiling()
-    machine = EvolvingFSM(1, max_states=2, rule=Novelty())
+    machine = EvolvingFSM(1, max_states=2, rule=rules.Novelty())
     machine.learn_many([[0.0], [9.0], [20.0]], [0, 0, 0])
     machine.observe([np.nan], missing=Missing.PARTIAL, failed=True)
 
@@ -976,9 +807,9 @@ if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_unlock_all)
 
 
-def _tolerance(tolerance: float) -> float:
-    if tolerance == 0.0:
-        return 0.0
-    if positive("belief_tolerance", tolerance) >= 1.0:
-        raise ValueError(f"belief_tolerance is {tolerance}; it must lie below 1")
-    return float(tolerance)
+def _or_infinity(name: str, most: SupportsIndex | None) -> float:
+    return np.inf if most is None else whole(name, most)
+
+
+def _or_none(most: float) -> int | None:
+    return None if most == np.inf else int(most)

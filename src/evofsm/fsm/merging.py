@@ -14,18 +14,19 @@ order they are given, the answer is the same bit for bit.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, NamedTuple, TypeAlias
+from collections.abc import Iterable, Sequence
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.fsm.arrays import NO_ACTION, NOT_OPEN, SUMS, Settings, by_name
+from evofsm.fsm.arrays import NO_ACTION, NOT_OPEN, OF_ACTIONS, SUMS, Settings, by_name
 from evofsm.fsm.machine import EvolvingFSM, opened
-from evofsm.fsm.validation import positive
+from evofsm.fsm.model import FSMModel
+from evofsm.fsm.validation import Floats, positive
 
-# All that a part has learnt, by name, without spare room.
-_Part: TypeAlias = Mapping[str, NDArray[Any]]
+# What a part has learnt, by name, and its snapshot.
+_Part: TypeAlias = tuple[dict[str, NDArray[Any]], FSMModel]
 # A row with a smaller share of evidence than this is all prior, and rounding.
 _LEAST_EVIDENCE = 1e-9
 # Frequencies that differ by less than this part of themselves are of the same prior.
@@ -36,8 +37,7 @@ def merge(machines: Sequence[EvolvingFSM], *, radius: float | None = None) -> Ev
     """Merge machines that learnt apart into one that can go on learning.
 
     The parts stay as they are. The merged machine stands between two episodes; its states are
-    numbered by the most visits that a part paid them. Those that have observed nothing
-    contribute nothing, and of a single other one the answer is a copy.
+    numbered by the most visits that a part paid them.
 
     Parameters
     ----------
@@ -48,36 +48,25 @@ def merge(machines: Sequence[EvolvingFSM], *, radius: float | None = None) -> Ev
         How far from a centre others are still of the same state, in the scales of the rule;
         without it the rule's own radius.
 
-    Returns
-    -------
-    EvolvingFSM
-        A new machine with the settings of the parts.
-
     Raises
     ------
-    TypeError
-        If ``machines`` holds something else.
-    ValueError
-        If ``machines`` is empty, two of them have different settings or numbers of variables, or
-        ``radius`` is not positive and finite.
+    TypeError, ValueError
+        If there is none, something else is among them, or two have different settings or numbers
+        of variables.
 
     Notes
     -----
     *States.* By visits, strongest first, a centre joins the nearest state within ``radius``, else
-    it creates one: what the rule `Novelty` would have made of the centres. A merged centre is the
-    strongest of its group, and not the mean. So it remains an observation that was made, no
-    centre of that rule moves, and all remain farther apart than ``radius``, which the width of
-    recognition is made for. Two states of one part may join the same third one, but not where
-    they are closer than the rule's radius, for then it told them apart on purpose
-    (`FailureSplit`). Where ``max_states`` exist, the others join the nearest. `Paper` and `Edges`
-    take centres for the same only within a small radius: give a larger one, or ``max_states``.
+    it creates one. So a merged centre remains an observation that was made, and all remain farther
+    apart than ``radius``. Two states of one part that are closer than the rule's radius stay two,
+    for it told them apart on purpose (`FailureSplit`). Where ``max_states`` exist, the others join
+    the nearest. `Paper` and `Edges` take centres for the same only within a small radius: give a
+    larger one, or ``max_states``.
 
-    *Rows* count by decisions, which are belief-weighted and never forget. Their weight F_o says how
-    recently a part was there; it becomes the mean of the parts', by decisions. *The prior* of new
-    states is taken out of each part's rows and put in once: an average would keep it, however many
-    parts agree. Mean and scatter are pooled exactly [1]_, and a centre's potential is what the
-    recursion would have made of it, had it seen the data of all other parts since. An episode that
-    came to two states of one part that are joined is counted twice.
+    *Rows* count by decisions, which never forget; their weight F_o becomes the mean of the parts',
+    by decisions. *The prior* of new states is taken out of each part's rows and put in once: an
+    average would keep it, however many parts agree. Mean and scatter are pooled exactly [1]_, and
+    a centre's potential is what the recursion would have made of the data of all other parts.
 
     References
     ----------
@@ -91,26 +80,35 @@ def merge(machines: Sequence[EvolvingFSM], *, radius: float | None = None) -> Ev
     >>> trace = parts[0].learn_many([[0.0], [0.1], [2.0], [0.0]], [0, 0, 0, 0])
     >>> trace = parts[1].learn_many([[0.5], [9.0], [9.1]], [0, 0, 0])
     >>> merged = merge(parts)
-    >>> merged.centers.ravel(), merged.model().visits
+    >>> merged.centers.ravel(), merged.visits
     (array([0., 9., 2.]), array([4., 2., 1.]))
     """
-    parts = _refuse_unlike(machines)
-    experienced = [part for part in parts if part.n_states]
-    if len(experienced) < 2:
-        alone = (experienced or parts)[0].copy()
-        alone.start_episode()
-        return alone
-    settings = opened(experienced[0])[1]
+    machines = _refuse_unlike(machines)
+    known = [part.copy() for part in machines if part.n_states] or [machines[0].copy()]
+    for part in known:
+        part.start_episode()
+    settings = opened(known[0])[1]
     within = settings.radius if radius is None else positive("radius", radius)
-    learnt = sorted((by_name(opened(part)[0]) for part in experienced), key=_content)
-    match = _match(learnt, settings, within)
+    if len(known) == 1:
+        return known[0]
+    parts = [(by_name(opened(part)[0]), part.model()) for part in known]
+    parts.sort(key=lambda part: b"".join(array.tobytes() for array in part[0].values()))
+    leaders, members = _match([model for _, model in parts], settings, within)
+    n, counted = len(leaders), sum(int(arrays["n_observations"][0]) for arrays, _ in parts)
     merged = {
-        **_blank(match),
-        **_counts(learnt, match),
-        **_densities(learnt, match, settings),
-        **_transitions(learnt, match, settings),
+        **{name: np.zeros(1, np.int64) for name in ("chained", "state", "clock", "began")},
+        **{name: np.array([n]) for name in ("n_states", "n_created")},
+        "n_observations": np.array([counted]),
+        "failures_told": np.min([arrays["failures_told"] for arrays, _ in parts], axis=0),
+        "action": np.array([NO_ACTION]),
+        "before": np.array([-1]),
+        "id": np.arange(n, dtype=np.float64),
+        "belief": np.full(n, 1.0 / n),
+        "latest_visit": np.zeros(n),
+        **_densities(parts, leaders, settings),
+        **_counts(parts, members, settings),
     }
-    return experienced[0]._with_arrays(merged)
+    return known[0]._with_arrays(merged)
 
 
 def _refuse_unlike(machines: Iterable[EvolvingFSM]) -> list[EvolvingFSM]:
@@ -121,7 +119,7 @@ def _refuse_unlike(machines: Iterable[EvolvingFSM]) -> list[EvolvingFSM]:
     for number, part in enumerate(parts):
         if not isinstance(part, EvolvingFSM):
             raise TypeError(f"machine {number} is {part!r}; it must be an EvolvingFSM")
-    sized = {part.centers.shape[1]: number for number, part in enumerate(parts) if part.n_states}
+    sized = {part.n_variables: number for number, part in enumerate(parts) if part.n_states}
     if len(sized) > 1:
         (m, one), (other_m, other), *_ = sized.items()
         raise ValueError(
@@ -145,224 +143,128 @@ def _refuse_unlike(machines: Iterable[EvolvingFSM]) -> list[EvolvingFSM]:
     return parts
 
 
-def _content(part: _Part) -> bytes:
-    """What puts parts in an order that does not depend on how they were given."""
-    return b"".join(array.tobytes() for array in part.values())
+def _match(
+    models: Sequence[FSMModel], settings: Settings, radius: float
+) -> tuple[list[tuple[int, int]], list[Floats]]:
+    """Which states of the parts are one.
 
-
-# -- Match ----------------------------------------------------------------------------------------
-
-
-class _Match(NamedTuple):
-    """Which states of the parts are one."""
-
-    n: int  #: number of merged states
-    groups: list[NDArray[np.int64]]  #: for each part: the merged state of each of its own
-    leader_part: NDArray[np.int64]  #: (n,) the part whose state leads
-    leader_state: NDArray[np.int64]  #: (n,) its index there
-
-
-def _match(learnt: Sequence[_Part], settings: Settings, radius: float) -> _Match:
-    weights = settings.weights
-    places = [part["centers"].T * weights for part in learnt]
-    sizes = np.array([len(place) for place in places])
-    rivals = _rivals(places, settings.radius)
-    points, visits = (
-        np.concatenate(places),
-        np.concatenate([part["visits"] for part in learnt]),
-    )
-    group = np.full(len(points), -1, np.int64)
+    Returns part and index of the state that leads each of n, and for each part (states, n) ones
+    where a state of its own belongs.
+    """
+    places = np.concatenate([model.centers * settings.weights for model in models])
+    names = [(part, i) for part, model in enumerate(models) for i in range(model.n_states)]
+    of_part = np.array([part for part, _ in names])
+    visits = np.concatenate([model.visits for model in models])
     leaders: list[int] = []
-    led = np.empty_like(points)
-    for i in np.lexsort((*points.T, -visits)).tolist():
-        squared_distances = ((led[: len(leaders)] - points[i]) ** 2).sum(axis=1)
+    group = np.full(len(places), -1)
+    for i in np.lexsort((*places.T, -visits)).tolist():
+        squared_distances = ((places[leaders] - places[i]) ** 2).sum(axis=1)
         is_full = len(leaders) >= settings.max_states
-        if not is_full:
-            squared_distances[[group[k] for k in rivals.get(i, ()) if group[k] >= 0]] = np.inf
-        if is_full or (leaders and squared_distances.min() <= radius * radius):
+        if not is_full:  # what its own part told apart stays apart
+            near = ((places - places[i]) ** 2).sum(axis=1) < settings.radius**2
+            apart = group[near & (of_part == of_part[i])]
+            squared_distances[apart[apart >= 0]] = np.inf
+        if is_full or (leaders and squared_distances.min() <= radius**2):
             group[i] = squared_distances.argmin()
         else:
             group[i] = len(leaders)
-            led[len(leaders)] = points[i]
             leaders.append(i)
-    begins = np.cumsum(sizes) - sizes
-    leader_part = np.repeat(np.arange(len(learnt)), sizes)[leaders]
-    leader_state = np.array(leaders) - begins[leader_part]
-    return _Match(len(leaders), np.split(group, begins[1:]), leader_part, leader_state)
-
-
-def _rivals(places: Sequence[NDArray[np.float64]], radius: float) -> dict[int, list[int]]:
-    """By number in the pool: states of the same part that are closer than the radius."""
-    found: dict[int, list[int]] = {}
-    begin = 0
-    for points in places:
-        squared_distances = ((points[:, None] - points) ** 2).sum(axis=-1)
-        for i, k in np.argwhere(squared_distances < radius * radius).tolist():
-            if i != k:
-                found.setdefault(begin + i, []).append(begin + k)
-        begin += len(points)
-    return found
-
-
-# -- Add up ---------------------------------------------------------------------------------------
-
-
-def _blank(match: _Match) -> dict[str, NDArray[Any]]:
-    """All that stands for one episode, or for one machine, as a new one has it."""
-    n = match.n
-    none = ("chained", "state", "clock", "began")
-    return {
-        **{name: np.zeros(1, np.int64) for name in none},
-        "n_states": np.array([n]),
-        "n_created": np.array([n]),
-        "action": np.array([NO_ACTION]),
-        "before": np.array([-1]),
-        "id": np.arange(n, dtype=np.float64),
-        "belief": np.full(n, 1.0 / n),
-        "latest_visit": np.zeros(n),
-    }
-
-
-def _counts(learnt: Sequence[_Part], match: _Match) -> dict[str, NDArray[Any]]:
-    """What was counted."""
-    n, is_open = match.n, _is_open(learnt)
-    places = np.cumsum(is_open) - 1
-    shapes: dict[str, tuple[int, ...]] = {
-        **dict.fromkeys(SUMS, (n,)),
-        "changes": (n, n),
-        **dict.fromkeys(("failures", "tried", "failed_after"), (int(is_open.sum()), n)),
-    }
-    merged = {name: np.zeros(shape) for name, shape in shapes.items()}
-    joined, created = np.zeros(n), np.ones(n)
-    for part, group in zip(learnt, match.groups, strict=True):
-        of_place = places[_actions_of(part)][:, None]
-        for name, sums in merged.items():
-            where: Any = group if sums.shape == (n,) and name in SUMS else (of_place, group)
-            where = (group[:, None], group) if name == "changes" else where
-            np.add.at(sums, where, part[name])
-        of_part = np.bincount(group, minlength=n) > 1
-        np.maximum.at(joined, group, np.maximum(part["joined"], of_part[group]))
-        earliest = np.full(n, np.inf)
-        np.minimum.at(earliest, group, part["created"])
-        created += np.where(np.isfinite(earliest), earliest - 1.0, 0.0)
-    told = min(int(part["failures_told"][0]) for part in learnt)
-    return {
-        **merged,
-        "joined": joined,
-        "created": created,
-        "latest_try": np.zeros(shapes["tried"]),
-        "failures_told": np.array([told]),
-    }
+    ones = np.eye(len(leaders))[group]
+    members = [ones[of_part == part] for part in range(len(models))]
+    return [names[i] for i in leaders], members
 
 
 def _densities(
-    learnt: Sequence[_Part], match: _Match, settings: Settings
+    parts: Sequence[_Part], leaders: Sequence[tuple[int, int]], settings: Settings
 ) -> dict[str, NDArray[Any]]:
     """Pool the data's mean, scatter and potentials.
 
     ``(t - 1) / potential`` is a sum over z_1 .. z_{t-1}, of ``1 + rho |z - centre|^2`` for each
-    observation since the centre was created; see `clusters.determine`. That
-    sum over another part's data is known from their mean and scatter.
+    observation since the centre was created; see `clusters.determine`. That sum over another
+    part's data is known from their mean and scatter.
     """
     rho, weights = settings.distance_weight, settings.weights
-    counts = np.array([part["n_observations"][0] for part in learnt], np.float64)
-    main = learnt[int(counts.argmax())]
-    means = np.array([part["first"] - main["first"] + part["mean"] for part in learnt])
+    counts = np.array([arrays["n_observations"][0] for arrays, _ in parts], np.float64)
+    main = parts[int(counts.argmax())][0]
+    means = np.array([one["first"] - main["first"] + one["mean"] for one, _ in parts])
     mean = counts @ means / counts.sum()
     between = counts @ (((means - mean) * weights) ** 2).sum(axis=1)
-
-    led = list(zip(match.leader_part.tolist(), match.leader_state.tolist(), strict=True))
-    centers = np.array([learnt[k]["centers"][:, i] for k, i in led])
-    sums = np.zeros(match.n)
-    for k, part in enumerate(learnt):
+    centers = np.array([parts[k][1].centers[i] for k, i in leaders])
+    sums = np.zeros(len(leaders))
+    for k, (arrays, _) in enumerate(parts):
         from_mean = (((centers - main["first"] - means[k]) * weights) ** 2).sum(axis=1)
-        total = counts[k] + rho * (counts[k] * from_mean + part["scatter"][0])
-        own = match.leader_part == k
-        i = match.leader_state[own]
-        total[own] = (
-            (counts[k] - 1.0) / part["potentials"][i] + 1.0 + rho * part["squared_distances"][i]
-        )
+        total = counts[k] + rho * (counts[k] * from_mean + arrays["scatter"][0])
+        for state, (part, i) in enumerate(leaders):
+            if part == k:
+                seen = (counts[k] - 1.0) / arrays["potentials"][i]
+                total[state] = seen + 1.0 + rho * arrays["squared_distances"][i]
         sums += total
     from_latest = (((centers - main["latest"]) * weights) ** 2).sum(axis=1)
     others = counts.sum() - 1.0  # the latest one counts in the next step
     return {
-        "n_observations": counts.sum(keepdims=True).astype(np.int64),
         "first": main["first"],
         "latest": main["latest"],
         "mean": mean,
-        "scatter": np.sum([part["scatter"] for part in learnt], axis=0) + between,
+        "scatter": np.sum([arrays["scatter"] for arrays, _ in parts], axis=0) + between,
         "centers": centers.T,
         "potentials": others / np.maximum(sums - 1.0 - rho * from_latest, others),
         "squared_distances": from_latest,
     }
 
 
-# -- Combine --------------------------------------------------------------------------------------
-
-
-def _transitions(
-    learnt: Sequence[_Part], match: _Match, settings: Settings
+def _counts(
+    parts: Sequence[_Part], members: Sequence[Floats], settings: Settings
 ) -> dict[str, NDArray[Any]]:
-    n, is_open = match.n, _is_open(learnt)
-    uses = np.sum([part["uses"] for part in learnt], axis=0)
-    places = np.where(is_open, np.cumsum(is_open) - 1, NOT_OPEN)
-    open_ = int(is_open.sum())
-    joint = np.zeros((open_, n, n))
-    decisions, frequencies = np.zeros((2, open_, n))
-    for part, group in zip(learnt, match.groups, strict=True):
+    """Add up what was counted, and combine rows by the decisions that they rest on."""
+    q, n = parts[0][1].n_actions, members[0].shape[1]
+    merged = {name: np.zeros(n) for name in (*SUMS, "joined")} | {"created": np.ones(n)}
+    merged |= {name: np.zeros((q, n)) for name in OF_ACTIONS}
+    changes, uses, joint = np.zeros((n, n)), np.zeros(q), np.zeros((q, n, n))
+    frequencies = np.zeros((q, n))
+    for (_, part), belongs in zip(parts, members, strict=True):
+        for name in (*SUMS, *OF_ACTIONS):
+            merged[name] += getattr(part, name) @ belongs
+        twice = (part.joined @ belongs > 0.0) | (belongs.sum(axis=0) > 1.0)
+        merged["joined"] = np.maximum(merged["joined"], twice)
+        earliest = np.where(belongs > 0.0, part.created[:, None], np.inf).min(axis=0)
+        merged["created"] += np.where(np.isfinite(earliest), earliest - 1.0, 0.0)
+        changes += belongs.T @ part.changes @ belongs
+        uses += part.uses
         shares, weight = _evidence(part, settings)
-        counts = part["decisions"]
-        place = places[_actions_of(part)]
-        np.add.at(joint, (place[:, None, None], group[:, None], group), counts[..., None] * shares)
-        np.add.at(decisions, (place[:, None], group), counts)
-        np.add.at(frequencies, (place[:, None], group), counts * weight)
-
-    known = joint.sum(axis=-1)
-    seen = known > 0.0
-    frequencies = np.divide(frequencies, decisions, out=np.zeros_like(known), where=seen)
-    prior = n * _aged_prior(settings, uses[is_open])[:, None]
-    together = frequencies + prior
-    of_prior = np.divide(prior, together, out=np.zeros_like(known), where=together > 0.0)
-    of_prior[~seen] = 1.0
-    rows = np.divide(joint, known[..., None], out=np.zeros_like(joint), where=seen[..., None])
+        joint += belongs.T @ (part.decisions[..., None] * shares) @ belongs
+        frequencies += (part.decisions * weight) @ belongs
+    known, decisions = joint.sum(axis=-1, keepdims=True), merged["decisions"]
+    rows = np.divide(joint, known, out=np.full_like(joint, 1.0 / n), where=known > 0.0)
+    evidence = np.where(known[..., 0] > 0.0, frequencies / np.maximum(decisions, 1e-300), 0.0)
+    together = evidence + n * _aged_prior(settings, uses)[:, None]
+    of_prior = np.where(together > 0.0, 1.0 - evidence / np.maximum(together, 1e-300), 0.0)
+    used = np.flatnonzero(np.any([one["place"] != NOT_OPEN for one, _ in parts], axis=0))
+    place = np.full(q, NOT_OPEN)
+    place[used] = np.arange(len(used))
     return {
-        "place": places,
-        "n_places": np.array([open_]),
+        **{name: array[used] if name in OF_ACTIONS else array for name, array in merged.items()},
+        "changes": changes,
         "uses": uses,
-        "matrices": rows + of_prior[..., None] * (1.0 / n - rows),
-        "origin_frequency": together,
-        "decisions": decisions,
+        "place": place,
+        "n_places": np.array([len(used)]),
+        "matrices": (rows + of_prior[..., None] * (1.0 / n - rows))[used],
+        "origin_frequency": together[used],
+        "latest_try": np.zeros((len(used), n)),
     }
 
 
-def _is_open(learnt: Sequence[_Part]) -> NDArray[np.bool_]:
-    """(q,) whether any part has a matrix of an action."""
-    opened: NDArray[np.bool_] = np.any([part["place"] != NOT_OPEN for part in learnt], axis=0)
-    return opened
-
-
-def _actions_of(part: _Part) -> NDArray[np.int64]:
-    """The action of each of a part's matrices, in their order."""
-    places = part["place"]
-    used = np.flatnonzero(places != NOT_OPEN)
-    return used[places[used].argsort()]
-
-
-def _evidence(part: _Part, settings: Settings) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Rows (s, n, n) of a part's matrices without the prior, and their frequencies (s, n)."""
-    matrices, frequency = part["matrices"].copy(), part["origin_frequency"]
-    joint = frequency[..., None] * matrices
-    joint -= _prior_left(joint, part["uses"][_actions_of(part)], settings)
+def _evidence(part: FSMModel, settings: Settings) -> tuple[Floats, Floats]:
+    """Rows (q, n, n) of a part's matrices without the prior, and their frequencies (q, n)."""
+    joint = part.joint_frequency
+    joint -= _prior_left(joint, part.uses, settings)
     weight = joint.sum(axis=-1)
-    is_known = weight > _LEAST_EVIDENCE * frequency
-    shares = np.divide(joint, weight[..., None], out=matrices, where=is_known[..., None])
-    return shares, weight
+    is_known = (weight > _LEAST_EVIDENCE * part.origin_frequency)[..., None]
+    matrices = part.transition_matrices.copy()
+    return np.divide(joint, weight[..., None], out=matrices, where=is_known), weight
 
 
-def _prior_left(
-    joint: NDArray[np.float64], uses: NDArray[np.float64], settings: Settings
-) -> NDArray[np.float64]:
-    """What the prior has left in joint frequencies (s, n, n); no more than they are.
+def _prior_left(joint: Floats, uses: Floats, settings: Settings) -> Floats:
+    """What the prior has left in joint frequencies (q, n, n); no more than they are.
 
     A state's creation gives the prior frequency to all transitions between it and those before,
     which then age alike. Where the least of those into it and the least of those out of it agree,
@@ -381,7 +283,6 @@ def _prior_left(
     return np.minimum(left[:, np.maximum.outer(states, states)], joint)
 
 
-def _aged_prior(settings: Settings, uses: NDArray[np.float64]) -> NDArray[np.float64]:
+def _aged_prior(settings: Settings, uses: Floats) -> Floats:
     """The prior frequency, after so many uses."""
-    aged: NDArray[np.float64] = settings.prior_frequency * (1.0 - settings.learning_rate) ** uses
-    return aged
+    return np.asarray(settings.prior_frequency * (1.0 - settings.learning_rate) ** uses)

@@ -2,46 +2,38 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields
 from typing import Any, Literal, Self, SupportsIndex, get_args
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from evofsm import store
-from evofsm.fsm import chains
 from evofsm.fsm.actions import IntervalActions
-from evofsm.fsm.arrays import MODEL, OF_MODEL, Floats
+from evofsm.fsm.arrays import MODEL, OF_MODEL
 from evofsm.fsm.clusters import recognise_rows
 from evofsm.fsm.explanation import Explanation, Nearest, explain
 from evofsm.fsm.kernels import lanes
 from evofsm.fsm.naming import Labels
 from evofsm.fsm.notebook import model_html
-from evofsm.fsm.rules import (
-    Paper,
-    StateRule,
-    describe_rule,
-    reach,
-    restore_rule,
-    weights_of,
-)
+from evofsm.fsm.rules import Paper, StateRule, describe_rule, reach, restore_rule, weights_of
 from evofsm.fsm.validation import (
+    Floats,
     check_action,
-    check_state,
+    check_index,
     positive,
     real_array,
     refuse_more_failures,
     refuse_unless_distribution,
     refuse_unusable,
+    state_name,
     whole,
 )
 from evofsm.store import Place
 
 #: Which actions are taken: each alike, the first one again, or each as often as it was used.
 Policy = Literal["marginal", "hold", "observed"]
-
-# -- What was learnt ------------------------------------------------------------------------------
 
 # In place of counts that are not given.
 _NONE: Any = None
@@ -64,31 +56,19 @@ class Counts:
     >>> trace = machine.learn_many([[0.0], [0.1], [2.0], [1.0]], [0, 1, 0, 0], [0, 2], [3])
     >>> machine.visits, machine.endings, machine.episodes, machine.failed_soon
     (array([3., 1.]), array([0., 1.]), array([2., 1.]), array([1., 1.]))
-    >>> machine.decisions, machine.failures
-    (array([[2., 0.],
-           [0., 0.]]), array([[1., 0.],
-           [0., 0.]]))
-    >>> machine.tried, machine.failed_after
-    (array([[2., 0.],
-           [0., 0.]]), array([[1., 0.],
-           [0., 0.]]))
+    >>> machine.decisions[0], machine.failures[0], machine.tried[0], machine.failed_after[0]
+    (array([2., 0.]), array([1., 0.]), array([2., 0.]), array([1., 0.]))
     """
 
     visits: Floats = _NONE  #: (n,) observations in which each state was the most probable
     created: Floats = _NONE  #: (n,) number of the observation that created each state, from 1
-    changes: Floats = (
-        _NONE  #: (n, n) steps from the most probable state (row) to the next one (column)
-    )
-    decisions: Floats = (
-        _NONE  #: (q, n) transitions that began in each state under each action, by belief
-    )
+    changes: Floats = _NONE  #: (n, n) steps from the most probable state to the next (column)
+    decisions: Floats = _NONE  #: (q, n) transitions that began in each state, by belief
     failures: Floats = _NONE  #: (q, n) those of `decisions` that led straight into failure
     endings: Floats = _NONE  #: (n,) failures whose last observation was recognised as each state
     episodes: Floats = _NONE  #: (n,) episodes that came to each state
     failed_soon: Floats = _NONE  #: (n,) those of `episodes` that failed soon after they were there
-    joined: Floats = (
-        _NONE  #: (n,) 1 where two states were joined, so that an episode may count twice
-    )
+    joined: Floats = _NONE  #: (n,) 1 where states were joined, so that an episode may count twice
     tried: Floats = _NONE  #: (q, n) episodes that took each action in each state
     failed_after: Floats = _NONE  #: (q, n) those of `tried` that failed soon after they did
     onsets: Floats = _NONE  #: (n,) times that something unexpected began there, as it was told
@@ -99,17 +79,15 @@ class FSMModel(Counts):
     """States and transitions as they stood when the snapshot was taken.
 
     n is the number of states, m of variables, q of actions. Centres are in the units of the
-    observations; distances and potentials as if all had the same unit, or are those of observations
-    divided by the rule's scales. Rows of a matrix are "from", columns "to". Parts are given by
-    name; arrays are read-only, and counts that are not given are 0.
+    observations; distances and potentials are those of observations divided by the rule's scales.
+    Rows of a matrix are "from", columns "to". Parts are given by name; arrays are read-only, and
+    counts that are not given are 0.
 
     Raises
     ------
     ValueError
-        If an array has not its shape, a number is out of its range, such as NaN or a count below 0,
-        a row of a transition matrix is no distribution, more decisions failed than were taken,
-        ``actions``, ``names`` or ``units`` are of another number than the arrays say, or ``dt`` is
-        not positive and finite.
+        If parts do not fit each other, a number is out of its range, such as NaN or a count below
+        0, a row of a transition matrix is no distribution, or more failed than were tried.
 
     Examples
     --------
@@ -121,6 +99,11 @@ class FSMModel(Counts):
     FSMModel(2 states of gap, 2 actions, 4 observations, Paper(memory=None))
     >>> model.n_states, model.visits, model.created
     (2, array([3., 1.]), array([1., 4.]))
+    >>> model.recognise([[0.0], [0.5]]).round(3)
+    array([[0.625, 0.375],
+           [0.5  , 0.5  ]])
+    >>> model.propagate([1.0, 0.0], 0, horizon=20, policy="hold").round(3)
+    array([0.686, 0.314])
     """
 
     centers: Floats  #: (n, m) the observation at the centre of each state
@@ -186,19 +169,19 @@ class FSMModel(Counts):
         return Labels(self.actions, self.names, self.units, self.dt)
 
     @property
-    def joint_frequency(self) -> NDArray[np.float64]:
+    def joint_frequency(self) -> Floats:
         """(q, n, n) ndarray: the paper's F, recency-weighted frequencies of transitions."""
         return np.asarray(self.origin_frequency[:, :, None] * self.transition_matrices)
 
     @property
-    def marginal_matrix(self) -> NDArray[np.float64]:
+    def marginal_matrix(self) -> Floats:
         """(n, n) ndarray: the paper's P*, transition probabilities if all actions are alike."""
         return self.averaged_matrix("marginal")
 
     # -- Where it is ----------------------------------------------------------------------------
 
-    def recognise(self, z: ArrayLike) -> NDArray[np.float64]:
-        """Distribution over states for one observation (m,), or for each of many (N, m).
+    def recognise(self, z: ArrayLike) -> Floats:
+        """Distribution over states for one observation, or for each of many.
 
         The paper's Section 2.2.2, with the width that the snapshot holds; the states stay as they
         are.
@@ -207,20 +190,6 @@ class FSMModel(Counts):
         ----------
         z : (m,) or (N, m) array_like
             One observation, or one per row, in the units of the machine's.
-
-        Raises
-        ------
-        TypeError, ValueError
-            If ``z`` does not hold real numbers up to 1e100 in size, or not m variables, or the
-            model has no states.
-
-        Examples
-        --------
-        >>> from evofsm import EvolvingFSM
-        >>> machine = EvolvingFSM(n_actions=2, radius=0.5)
-        >>> trace = machine.learn_many([[0.0], [0.1], [2.0], [1.0]], [0, 0, 0, 0])
-        >>> machine.model().recognise([[0.0], [0.5], [1.0]]).round(3)
-        array([[0.625, 0.375], [0.5  , 0.5  ], [0.375, 0.625]])
         """
         given, rows = self._observations(z)
         weights = weights_of(self.rule, self.n_variables)
@@ -230,20 +199,10 @@ class FSMModel(Counts):
     def nearest(self, z: ArrayLike) -> Nearest:
         """Which state an observation is nearest to, how far that is, and how far a state reaches.
 
-        Distances are those of observations divided by the rule's scales.
-
         Parameters
         ----------
         z : (m,) array_like
             Observation, as `recognise` takes it.
-
-        Examples
-        --------
-        >>> from evofsm import EvolvingFSM, Novelty
-        >>> machine = EvolvingFSM(n_actions=1, rule=Novelty(radius=1.0, scales=(2.0,)))
-        >>> trace = machine.learn_many([[0.0], [1.9], [4.0]], [0, 0, 0])
-        >>> machine.model().nearest([9.0])
-        Nearest(state=1, distance=2.5, reach=1.0)
         """
         _, rows = self._observations(z)
         if len(rows) != 1:
@@ -261,7 +220,7 @@ class FSMModel(Counts):
         action: SupportsIndex | None = None,
         horizon: int = 1,
         policy: Policy = "marginal",
-    ) -> NDArray[np.float64]:
+    ) -> Floats:
         """(n,) distribution over states ``horizon`` steps after ``belief``.
 
         The forecast equations of the paper's Section 2.3.2: ``belief @ P[action] @ P*^(horizon -
@@ -278,20 +237,6 @@ class FSMModel(Counts):
         policy : {"marginal", "hold", "observed"}
             Actions after the first step: each alike (the paper's k-step equation), the first one
             again, or each as often as it was used.
-
-        Raises
-        ------
-        TypeError, ValueError
-            If ``belief`` is no distribution over the n states, there is no such action or policy,
-            ``horizon`` is no integer of at least 1, or ``"hold"`` has no action.
-
-        Examples
-        --------
-        >>> from evofsm import EvolvingFSM
-        >>> machine = EvolvingFSM(n_actions=2, radius=0.5)
-        >>> trace = machine.learn_many([[0.0], [0.1], [2.0], [1.0]], [0, 0, 0, 0])
-        >>> machine.model().propagate([1.0, 0.0], 0, horizon=20, policy="hold").round(3)
-        array([0.686, 0.314])
         """
         there, steps = self._belief(belief), check_forecast(horizon, policy)
         if action is None and policy == "hold":
@@ -300,11 +245,10 @@ class FSMModel(Counts):
             there, steps = there @ self._matrix(action), steps - 1
         if steps:
             held = action if policy == "hold" else None
-            then = self.averaged_matrix(policy) if held is None else self._matrix(held)
-            there = there @ np.linalg.matrix_power(then, steps)
+            there = there @ np.linalg.matrix_power(self._matrix(held, policy), steps)
         return there
 
-    def averaged_matrix(self, policy: Policy = "observed") -> NDArray[np.float64]:
+    def averaged_matrix(self, policy: Policy = "observed") -> Floats:
         """(n, n) transition probabilities from state (row) to state (column), over all actions.
 
         Parameters
@@ -312,17 +256,6 @@ class FSMModel(Counts):
         policy : {"observed", "marginal"}
             Each action as often as it was used, or all alike (the paper's P*, Section 2.3.2). Where
             none was used yet, both are alike.
-
-        Examples
-        --------
-        >>> from evofsm import EvolvingFSM
-        >>> machine = EvolvingFSM(n_actions=2, radius=0.5)
-        >>> trace = machine.learn_many([[0.0], [0.1], [2.0], [1.0]], [0, 0, 0, 0])
-        >>> model = machine.model()
-        >>> model.averaged_matrix("observed")[0].round(3)  # action 0 was all it saw
-        array([0.771, 0.229])
-        >>> model.averaged_matrix("marginal")[0].round(3)
-        array([0.636, 0.364])
         """
         if policy not in ("marginal", "observed"):
             raise ValueError(f"policy is {policy!r}; an average is 'marginal' or 'observed'")
@@ -330,93 +263,6 @@ class FSMModel(Counts):
             shares = self.uses / self.uses.sum()
             return np.asarray(np.tensordot(shares, self.transition_matrices, axes=1))
         return np.asarray(self.transition_matrices.mean(axis=0))
-
-    def stationary_distribution(self, policy: Policy = "marginal") -> NDArray[np.float64]:
-        """(n,) share of time that the chain would spend in each state if it ran on for ever.
-
-        Parameters
-        ----------
-        policy : {"marginal", "observed"}
-            How actions are weighed, as in `averaged_matrix`, which leaves this distribution as it
-            is.
-
-        Raises
-        ------
-        ValueError
-            If the chain falls apart into sets of states that never meet, and so has more than one.
-        """
-        return chains.stationary(self.averaged_matrix(policy))
-
-    def committor_forward(
-        self,
-        failure: Sequence[int] | None = None,
-        before: Sequence[int] = (),
-        action: SupportsIndex | None = None,
-        policy: Policy = "observed",
-    ) -> NDArray[np.float64]:
-        """(n,) probability to fail before the episode ends, from each state: 1 is a dead end.
-
-        An observation in state i, of the ``visits[i]`` that there were, was the last of an episode
-        that failed (``endings[i]``), the last of one that did not, or was followed by another (the
-        sum of ``changes[i]``). With these shares f_i, s_i and c_i, the least solution of ::
-
-            q_i = f_i + c_i sum_j P_ij q_j,        q_i = 0 in the states ``before``
-
-        Parameters
-        ----------
-        failure : sequence of int, optional
-            States that count as failure in place of failures that were counted: q is 1 there, and
-            an episode that ended elsewhere did not fail.
-        before : sequence of int
-            States that are safe: whoever gets there first has not failed.
-        action : int, optional
-            Index of the action that is taken in every state, from 0.
-        policy : {"observed", "marginal"}
-            Without an action, how actions are weighed, as in `averaged_matrix`.
-
-        Examples
-        --------
-        >>> from evofsm import EvolvingFSM, Novelty
-        >>> machine = EvolvingFSM(n_actions=1, rule=Novelty(radius=1.0, spread=0.01))
-        >>> Z = [[0.0], [2.0], [4.0], [0.0], [2.0], [0.0]]  # it failed at 4, and ended at 0
-        >>> trace = machine.learn_many(Z, [0] * 6, episode_starts=[0, 3], failures=[2])
-        >>> machine.model().committor_forward().round(2)
-        array([0.5 , 0.75, 1.  ])
-        """
-        P = self.averaged_matrix(policy) if action is None else self._matrix(action)
-        # Incomplete observations are no visits, and may lead to more changes than there were.
-        followed = self.changes.sum(axis=1)
-        cases = np.maximum(self.visits, followed + self.endings)
-        cases = np.where(cases > 0.0, cases, 1.0)
-        fails = self.endings / cases
-        ends = np.maximum(self.visits - followed - self.endings, 0.0) / cases
-        if failure is not None:
-            fails, ends = self._marked(failure).astype(np.float64), fails + ends
-        safe = self._marked(before)
-        fails = np.where(safe, 0.0, fails)
-        goes_on = np.where(safe, 0.0, np.clip(1.0 - fails - ends, 0.0, 1.0))
-        return chains.committor(goes_on[:, None] * P, fails)
-
-    def mfpt(
-        self,
-        targets: Sequence[int],
-        action: SupportsIndex | None = None,
-        policy: Policy = "observed",
-    ) -> NDArray[np.float64]:
-        """(n,) mean first passage time: observations until one of the targets, from each state.
-
-        ``m_i = 1 + sum_j P_ij m_j``, and 0 in a target; the chain runs on without an end. Infinity
-        where it is not certain that a target is reached.
-
-        Parameters
-        ----------
-        targets : sequence of int
-            States, from 0.
-        action, policy
-            As `committor_forward` takes them.
-        """
-        P = self.averaged_matrix(policy) if action is None else self._matrix(action)
-        return chains.passage_times(P, self._marked(targets))
 
     # -- In words ---------------------------------------------------------------------------------
 
@@ -441,12 +287,6 @@ class FSMModel(Counts):
             What was observed, in place of a situation: it is recognised, unless it is farther from
             every state than a state reaches, and so was never seen.
 
-        Raises
-        ------
-        TypeError, ValueError
-            If there is no such state or action, a belief is no distribution over the states, or not
-            one of ``situation`` and ``observation`` is given.
-
         Examples
         --------
         >>> from evofsm import EvolvingFSM
@@ -469,10 +309,9 @@ class FSMModel(Counts):
             belief = np.ravel(self.recognise(observation))
             return explain(self, belief, index, self.labels, self.nearest(observation))
         if np.ndim(situation) == 0:  # type: ignore[arg-type] # it is given
-            belief = np.eye(self.n_states)[check_state(situation, self.n_states)]
-        else:
-            belief = self._belief(situation)
-        return explain(self, belief, index, self.labels)
+            state = check_index("state", situation, self.n_states, state_name)
+            return explain(self, np.eye(self.n_states)[state], index, self.labels)
+        return explain(self, self._belief(situation), index, self.labels)
 
     def __repr__(self) -> str:
         variables = ", ".join(self.names) or f"{self.n_variables} variables"
@@ -511,10 +350,12 @@ class FSMModel(Counts):
         """
         content, arrays = store.read(path, MODEL)
         with store.explained(path):
-            if content["actions"] is not None:
-                content["actions"] = _actions(content["actions"], len(arrays["uses"]))
-            for name in ("names", "units"):
-                content[name] = tuple(content[name])
+            if (actions := content["actions"]) is not None:
+                q = len(arrays["uses"])  # as many as there are matrices
+                if (actions["high"] - actions["low"]) > (q + 1) * actions["width"]:
+                    raise ValueError(f"actions has more than {q} intervals, for {q} matrices")
+                content["actions"] = IntervalActions(**actions)
+            content |= {name: tuple(content[name]) for name in ("names", "units")}
             content["rule"] = restore_rule(content["rule"])
             if lacking := {entry.name for entry in fields(cls)} - set(content) - set(arrays):
                 raise ValueError(f"it lacks {', '.join(sorted(lacking))}")
@@ -524,29 +365,20 @@ class FSMModel(Counts):
     @property
     def _content(self) -> dict[str, Any]:
         """All but the arrays, for JSON."""
-        return {
-            "width": self.width,
-            "actions": None if self.actions is None else asdict(self.actions),
-            "names": self.names,
-            "units": self.units,
-            "dt": self.dt,
-            "settings": dict(self.settings),
-            "rule": describe_rule(self.rule),
-            "failures_told": self.failures_told,
-        }
+        told = {name: getattr(self, name) for name in _TOLD}
+        actions = None if self.actions is None else asdict(self.actions)
+        rule, settings = describe_rule(self.rule), dict(self.settings)
+        return {**told, "actions": actions, "rule": rule, "settings": settings}
 
     # -- Inside ---------------------------------------------------------------------------------
 
-    def _matrix(self, action: SupportsIndex) -> NDArray[np.float64]:
+    def _matrix(self, action: SupportsIndex | None, policy: Policy = "observed") -> Floats:
+        """Of an action; without one, of all as a policy weighs them."""
+        if action is None:
+            return self.averaged_matrix(policy)
         return np.asarray(self.transition_matrices[check_action(action, self.n_actions)])
 
-    def _marked(self, states: Sequence[int]) -> NDArray[np.bool_]:
-        """Whether each state is one of these."""
-        marked = np.zeros(self.n_states, np.bool_)
-        marked[[check_state(state, self.n_states) for state in states]] = True
-        return marked
-
-    def _observations(self, z: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _observations(self, z: ArrayLike) -> tuple[Floats, Floats]:
         """One observation or many, as given and row by row; refused where it is none."""
         given = real_array("z", z, ndim=np.ndim(z))
         rows = np.atleast_2d(given)
@@ -557,7 +389,7 @@ class FSMModel(Counts):
             raise ValueError("this model has no states: its machine had observed nothing")
         return given, rows
 
-    def _belief(self, belief: Any) -> NDArray[np.float64]:
+    def _belief(self, belief: Any) -> Floats:
         """Refuse what is no distribution over the states."""
         given = np.asarray(belief, dtype=np.float64)
         if given.shape != (self.n_states,):
@@ -567,6 +399,10 @@ class FSMModel(Counts):
         if self.n_states:
             refuse_unless_distribution("belief", given)
         return given
+
+
+# Settings of a model that JSON has words for as they are.
+_TOLD = ("width", "names", "units", "dt", "failures_told")
 
 
 def believed(centers: Floats, weights: Floats, rows: Floats, width: float) -> Floats:
@@ -583,10 +419,3 @@ def check_forecast(horizon: SupportsIndex, policy: str) -> int:
     if policy not in get_args(Policy):
         raise ValueError(f"policy is {policy!r}; it must be one of {', '.join(get_args(Policy))}")
     return whole("horizon", horizon)
-
-
-def _actions(settings: Mapping[str, Any], q: int) -> IntervalActions:
-    """A set of actions from a file, of as many intervals as there are matrices."""
-    if (settings["high"] - settings["low"]) > (q + 1) * settings["width"]:
-        raise ValueError(f"actions has more than {q} intervals, for {q} matrices")
-    return IntervalActions(**settings)

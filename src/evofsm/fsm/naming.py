@@ -20,20 +20,16 @@ _UNPRINTABLE = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u20
 
 
 def visible(text: str) -> str:
-    r"""A text, from wherever it came, in which no character tells a terminal what to do.
-
-    Each such one is shown as JSON would write it.
-
-    Examples
-    --------
-    >>> visible("gap \x1b[2J")
-    'gap \\u001b[2J'
-    """
+    """A text in which no character tells a terminal what to do: as JSON writes those."""
     return _UNPRINTABLE.sub(lambda found: f"\\u{ord(found[0]):04x}", text)
 
 
 class Words(NamedTuple):
-    """How places and actions of one kind of system are told in words."""
+    """How places and actions of one kind of system are told in words.
+
+    A package declares them by an entry point of the group ``evofsm.words``, whose name is those of
+    the variables, with commas.
+    """
 
     place: Callable[[ArrayLike], str]  #: of a centre
     unit: str  #: of an action
@@ -41,11 +37,6 @@ class Words(NamedTuple):
 
 @cache
 def _words_of(names: tuple[str, ...]) -> Words | None:
-    """The words for variables of these names, if an installed package declares some.
-
-    It does so by an entry point of the group ``evofsm.words``: the names with commas, and where
-    the `Words` are.
-    """
     for point in entry_points(group="evofsm.words", name=",".join(names)):
         words: Words = point.load()
         return words
@@ -57,8 +48,11 @@ class Labels(NamedTuple):
 
     Examples
     --------
-    >>> Labels(names=("gap", "speed"), units=("m", "m/s")).place([9.21, 4.0])
-    'gap 9.21 m, speed 4 m/s'
+    >>> labels = Labels(names=("gap", "speed"), units=("m", "m/s"), dt=0.25)
+    >>> labels.place([9.21, 4.0]), labels.variable(0), labels.action(16), labels.duration(20)
+    ('gap 9.21 m, speed 4 m/s', 'gap [m]', 'a(17)', '5 s')
+    >>> Labels(IntervalActions(low=-2.5, high=2.5, width=0.3)).action(16), Labels().place([9.2, 4])
+    ('a(17) [2.3, 2.5]', '(9.2, 4)')
     """
 
     actions: IntervalActions | None = None  #: what the action indices mean
@@ -67,19 +61,12 @@ class Labels(NamedTuple):
     dt: float | None = None  #: time between two observations [s]
 
     def place(self, center: ArrayLike) -> str:
-        """Where a centre (m,) lies: in words where a package declares some, else by its numbers.
+        """Where a centre lies: in words where a package declares some, else by its numbers.
 
         Parameters
         ----------
         center : (m,) array_like
             In the units of the observations.
-
-        Examples
-        --------
-        >>> Labels(names=("angle", "rate"), units=("rad", "rad/s")).place([0.12, 3.0])
-        'angle 0.12 rad, rate 3 rad/s'
-        >>> Labels().place([9.2, 4.1])
-        '(9.2, 4.1)'
         """
         if words := _words_of(self.names):
             return words.place(center)
@@ -110,12 +97,6 @@ class Labels(NamedTuple):
         ----------
         index : int
             From 0.
-
-        Examples
-        --------
-        >>> actions = IntervalActions(low=-2.5, high=2.5, width=0.3)
-        >>> Labels(actions).action(16), Labels().action(16)
-        ('a(17) [2.3, 2.5]', 'a(17)')
         """
         name = action_name(index)
         if self.actions is None:
@@ -129,11 +110,6 @@ class Labels(NamedTuple):
         Parameters
         ----------
         observations : int
-
-        Examples
-        --------
-        >>> Labels(dt=0.25).duration(20), Labels().duration(20)
-        ('5 s', '20 observations')
         """
         if self.dt is None:
             return f"{observations:,} observation{'s' * (observations != 1)}"

@@ -8,20 +8,11 @@ from html import escape
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from evofsm.fsm.validation import state_name
+from evofsm.fsm.validation import Floats, state_name
 
 # More states than these have no row, and more variables no column.
 _MOST_STATES, _MOST_VARIABLES = 12, 6
-_EVENTS = {
-    "NONE": "the states stayed as they were",
-    "MOVED": "the nearest state moved here",
-    "CREATED": "a state was created here",
-    "MERGED": "two states were merged",
-    "RETIRED": "a state was given up",
-}
-_NOT_CREATED = "none was created: there are as many states as allowed, and the nearest is close"
 
 
 def machine_html(machine: Any) -> str:
@@ -30,57 +21,45 @@ def machine_html(machine: Any) -> str:
     now = "no episode has begun" if state is None else f"now in {state_name(state)}"
     columns = _columns(model)
     if state is not None:
-        columns["belief"] = [_percent(share) for share in machine.belief]
-    return _html(machine, [*_sizes(model), now], _settings(model), columns, model.visits, state)
+        columns["belief"] = _percent(machine.belief)
+    return _html(machine, [*_about(model), now], columns, model.visits, state)
 
 
 def model_html(model: Any) -> str:
     """A model: its states, and where each leads most often."""
-    about = _sizes(model)
-    if model.dt is not None:
-        about.append(f"an observation every {model.dt:g} s")
     columns = _columns(model)
     if model.uses.any() and model.n_states > 1:
         matrix = model.averaged_matrix("observed")
         stays = matrix.diagonal()
         elsewhere = matrix - np.diag(stays)
-        columns["stays"] = [_percent(share) for share in stays]
+        next_, shares = elsewhere.argmax(axis=1), _percent(elsewhere.max(axis=1))
+        columns["stays"] = _percent(stays)
         columns["likeliest other next"] = [
-            f"{state_name(int(row.argmax()))} ({_percent(row.max())})" for row in elsewhere
+            f"{state_name(int(i))} ({share})" for i, share in zip(next_, shares, strict=True)
         ]
-    return _html(model, about, _settings(model), columns, model.visits)
+    every = [] if model.dt is None else [f"an observation every {model.dt:g} s"]
+    return _html(model, [*_about(model), *every], columns, model.visits)
 
 
 def step_html(step: Any) -> str:
     """A step: what was recognised, what happened to the states, and whether it was foreseen."""
-    surprise = "nothing was forecast"
-    if math.isfinite(step.surprise):
-        surprise = f"surprise {step.surprise:.3f} bit"
-    names = (step.event.name or "NONE").split("|")
-    happened = _NOT_CREATED if names == ["MERGED"] else ", ".join(_EVENTS[one] for one in names)
-    details = ""
+    is_foreseen = math.isfinite(step.surprise)
+    surprise = f"surprise {step.surprise:.3f} bit" if is_foreseen else "nothing was forecast"
+    about = [state_name(step.state), f"event {step.event.name}", surprise]
     if step.missing:
-        which = ", ".join(map(str, step.missing))
-        details = f"not observed: variable {which}; so nothing was learnt"
-    columns = {"belief": [_percent(share) for share in step.belief]}
+        about.append(f"not observed: variable {', '.join(map(str, step.missing))}")
+    columns = {"belief": _percent(step.belief)}
     if len(step.predicted):
-        columns["forecast"] = [_percent(share) for share in step.predicted]
-    about = [state_name(step.state), happened, surprise]
-    return _html(step, about, details, columns, step.belief, step.state)
+        columns["forecast"] = _percent(step.predicted)
+    return _html(step, about, columns, step.belief, step.state)
 
 
-def _sizes(model: Any) -> list[str]:
+def _about(model: Any) -> list[str]:
     sizes = ((model.n_states, "state"), (model.n_actions, "action"))
-    return [f"{number:,} {thing}{'s' * (number != 1)}" for number, thing in sizes]
-
-
-def _settings(model: Any) -> str:
-    told = [
-        f"{name} {getattr(value, 'name', value)}"
-        for name, value in model.settings.items()
-        if name != "n_actions"
-    ]
-    return ", ".join([*told, f"rule {model.rule}"])
+    told = [f"{number:,} {thing}{'s' * (number != 1)}" for number, thing in sizes]
+    settings = {name: value for name, value in model.settings.items() if name != "n_actions"}
+    told += [f"{name} {getattr(value, 'name', value)}" for name, value in settings.items()]
+    return [*told, f"rule {model.rule}"]
 
 
 def _columns(model: Any) -> dict[str, list[str]]:
@@ -93,47 +72,38 @@ def _columns(model: Any) -> dict[str, list[str]]:
         head: [f"{number:.4g}".replace("-", "−") for number in values]
         for head, values in zip(heads, model.centers.T, strict=False)
     }
-    columns["visits"] = [f"{count:,.0f}" for count in model.visits]
-    for head, counts in (
-        ("episodes", model.episodes),
-        ("failed soon", model.failed_soon),
-        ("failures ended here", model.endings),
-    ):
-        if counts.any():
-            columns[head] = [f"{count:,.0f}" for count in counts]
+    for name in ("visits", "episodes", "failed_soon", "endings"):
+        if (counts := getattr(model, name)).any() or name == "visits":
+            columns[name.replace("_", " ")] = [f"{count:,.0f}" for count in counts]
     return columns
 
 
-def _percent(share: float) -> str:
-    return "< 0.1 %" if 0.0 < share < 0.0005 else f"{100.0 * share:.1f} %"
+def _percent(shares: Floats) -> list[str]:
+    return ["< 0.1 %" if 0.0 < one < 0.0005 else f"{100.0 * one:.1f} %" for one in shares.tolist()]
 
 
 def _html(
     thing: object,
     about: Sequence[str],
-    details: str,
     columns: Mapping[str, Sequence[str]],
-    weights: NDArray[np.float64],
+    weights: Floats,
     present: int | None = None,
 ) -> str:
     """A head, and a row for each of the states that weigh most, the present one among them."""
     heaviest = np.argsort(-weights, kind="stable").tolist()
     if present is not None:
-        heaviest.remove(present)
-        heaviest.insert(0, present)
+        heaviest = [present, *(i for i in heaviest if i != present)]
     rows = [
         [state_name(i), *(cells[i] for cells in columns.values())]
         for i in sorted(heaviest[:_MOST_STATES])
     ]
     if len(weights) > len(rows):
         rows.append([f"… and {len(weights) - len(rows)} more", *[""] * len(columns)])
-    head = f"<strong>{escape(type(thing).__name__)}</strong>: {escape(', '.join(about))}"
-    if details:
-        head += f"<br><span style='opacity:.75'>{escape(details)}</span>"
+    head = f"<div><strong>{type(thing).__name__}</strong>: {escape(', '.join(about))}</div>"
     if not rows:
-        return f"<div>{head}</div>"
+        return head
     heads = "".join(f"<th scope='col'>{escape(one)}</th>" for one in ("state", *columns))
     cells = "".join(
         f"<tr>{''.join(f'<td>{escape(cell)}</td>' for cell in row)}</tr>" for row in rows
     )
-    return f"<div>{head}</div><table><thead><tr>{heads}</tr></thead><tbody>{cells}</tbody></table>"
+    return f"{head}<table><thead><tr>{heads}</tr></thead><tbody>{cells}</tbody></table>"

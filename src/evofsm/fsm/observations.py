@@ -16,7 +16,8 @@ from enum import Enum
 from typing import SupportsFloat
 
 import numpy as np
-from numpy.typing import NDArray
+
+from evofsm.fsm.validation import Floats, positive
 
 
 class Missing(Enum):
@@ -49,16 +50,10 @@ class Category:
     name : str
         Name of the variable.
     values : sequence of str
-        All the categories it may take.
+        All the categories it may take, two or more.
     distance : float
         Distance between any two of them, in the unit of the other variables. Above a machine's
         ``radius``, by more than rounding, no state moves from one category to another.
-
-    Raises
-    ------
-    ValueError
-        If there are fewer than two different values, one is given twice, or ``distance`` is not
-        positive and finite.
 
     Examples
     --------
@@ -76,8 +71,7 @@ class Category:
         object.__setattr__(self, "values", tuple(self.values))
         if len(set(self.values)) < 2 or len(set(self.values)) < len(self.values):
             raise ValueError(f"{self.name}: needs two or more different values, not {self.values}")
-        if not (math.isfinite(self.distance) and self.distance > 0.0):
-            raise ValueError(f"{self.name}: distance is {self.distance}; it must be positive")
+        positive(f"{self.name}: distance", self.distance)
 
 
 class ObservationEncoder:
@@ -105,18 +99,17 @@ class ObservationEncoder:
     def __init__(self, *variables: str | Category) -> None:
         if not variables:
             raise ValueError("an observation needs at least one variable")
-        names: list[str] = []
-        for variable in variables:
-            if isinstance(variable, Category):
-                names += [f"{variable.name}={value}" for value in variable.values]
-            else:
-                names.append(variable)
-        if len(set(names)) < len(names):
-            raise ValueError(f"variables have the same name twice: {', '.join(names)}")
         self.variables = variables
-        self.names = tuple(names)
+        self.names: tuple[str, ...] = ()
+        for one in variables:
+            if isinstance(one, Category):
+                self.names += tuple(f"{one.name}={value}" for value in one.values)
+            else:
+                self.names += (one,)
+        if len(set(self.names)) < len(self.names):
+            raise ValueError(f"variables have the same name twice: {', '.join(self.names)}")
 
-    def encode(self, values: Mapping[str, float | str]) -> NDArray[np.float64]:
+    def encode(self, values: Mapping[str, float | str]) -> Floats:
         """(len(names),) vector for one observation: the paper's Section 2.1.1.
 
         Numbers are as they are; a present category is ``distance / sqrt(2)``, others are 0.
@@ -126,11 +119,6 @@ class ObservationEncoder:
         values : mapping
             A number for each continuous variable, in the unit you observe it in; a category for
             each discrete one. Others are left out.
-
-        Raises
-        ------
-        TypeError, ValueError
-            If a continuous variable is no number, a variable is missing, or a category unknown.
         """
         encoded: list[float] = []
         for variable in self.variables:

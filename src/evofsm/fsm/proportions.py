@@ -44,24 +44,13 @@ def poisson_bounds(count: int) -> tuple[float, float]:
     """90 % interval of the number of events to be expected where ``count`` were seen.
 
     Exact (Garwood 1936): the bounds are where as few, and as many, are seen in 5 % of cases.
-
-    Examples
-    --------
-    >>> [round(bound, 3) for bound in poisson_bounds(0) + poisson_bounds(3)]
-    [0.0, 2.996, 0.818, 7.754]
     """
-    low = gamma_quantile(0.05, count) if count else 0.0
-    return low, gamma_quantile(0.95, count + 1.0)
+    low = _gamma_quantile(0.05, count) if count else 0.0
+    return low, _gamma_quantile(0.95, count + 1.0)
 
 
-def gamma_quantile(share: float, shape: float) -> float:
-    """Below which a gamma variable of scale 1 lies with this probability, 0.05 or 0.95.
-
-    Examples
-    --------
-    >>> round(gamma_quantile(0.95, 1.0), 3), round(gamma_quantile(0.05, 3.0), 3)  # - log 0.05
-    (2.996, 0.818)
-    """
+def _gamma_quantile(share: float, shape: float) -> float:
+    """Below which a gamma variable of scale 1 lies with this probability, 0.05 or 0.95."""
     if shape > _LARGE:  # Wilson & Hilferty 1931
         width = _WIDTH if share > 0.5 else -_WIDTH
         return float(shape * (1.0 - 1.0 / (9.0 * shape) + width / (3.0 * math.sqrt(shape))) ** 3)
@@ -74,8 +63,6 @@ def gamma_quantile(share: float, shape: float) -> float:
 
 def _gamma_below(x: float, shape: float) -> float:
     """Probability that a gamma variable of scale 1 lies below x: the series of its density."""
-    if x <= 0.0:
-        return 0.0
     term = total = 1.0 / shape
     k = shape
     while term > 1e-15 * total:
@@ -90,29 +77,22 @@ def bounds_text(low: float, high: float) -> str:
 
     Whole percents; within one percent of 0 or of 1, with the first digit that shows them. A bound
     of 0 from below, or of 1 from above, says nothing and is left out.
-
-    Examples
-    --------
-    >>> bounds_text(0.0, 0.00309), bounds_text(0.276, 1.0), bounds_text(0.104, 0.487)
-    ('at most 0.4 %', 'at least 27 %', '10 to 49 %')
-    >>> bounds_text(0.0034, 0.9962), bounds_text(0.9969, 1.0), bounds_text(0.0, 1.0)
-    ('0.3 to 99.7 %', 'at least 99.6 %', '0 to 100 %')
     """
+    least = _percent(low, math.floor)
+    most = _percent(high, math.ceil)
     if low <= 0.0 and high < 1.0:
-        return f"at most {_rounded_up(high)} %"
-    if high >= 1.0 and low > 0.0:
-        return f"at least {_rounded_down(low)} %"
-    return f"{_rounded_down(low)} to {_rounded_up(high)} %"
+        return f"at most {most} %"
+    return f"at least {least} %" if high >= 1.0 and low > 0.0 else f"{least} to {most} %"
+
+
+def _percent(share: float, rounded: Callable[[float], int]) -> str:
+    apart = 100.0 * min(share, 1.0 - share)
+    decimals = max(-math.floor(math.log10(apart)), 0) if 1e-9 < apart < 1.0 else 0
+    return f"{min(max(outward(rounded, 100.0 * share, decimals), 0.0), 100.0):.{decimals}f}"
 
 
 def two_digits(value: float, rounded: Callable[[float], int]) -> float:
-    """A number from 0 on with two significant digits, rounded as `outward` rounds.
-
-    Examples
-    --------
-    >>> two_digits(0.000184, math.ceil), two_digits(0.000184, math.floor)
-    (0.00019, 0.00018)
-    """
+    """A number from 0 on with two significant digits, rounded as `outward` rounds."""
     if not 0.0 < value < math.inf:
         return value
     return outward(rounded, value, 1 - math.floor(math.log10(value)))
@@ -121,31 +101,10 @@ def two_digits(value: float, rounded: Callable[[float], int]) -> float:
 def outward(rounded: Callable[[float], int], value: float, decimals: int) -> float:
     """A number with so many decimals, rounded by ``math.floor`` or ``math.ceil``.
 
-    What is off such a number by rounding alone is that number.
-
-    Examples
-    --------
-    >>> outward(math.ceil, 0.71, 1), outward(math.floor, 0.71, 1), outward(math.ceil, 0.1 + 0.2, 1)
-    (0.8, 0.7, 0.3)
+    What is off such a number by rounding alone is that number: 0.1 + 0.2 is 0.3.
     """
     scale = 10.0**decimals
     return rounded(round(value * scale, 6)) / scale
-
-
-def _rounded_up(share: float) -> str:
-    decimals = _decimals(share)
-    return f"{min(outward(math.ceil, 100.0 * share, decimals), 100.0):.{decimals}f}"
-
-
-def _rounded_down(share: float) -> str:
-    decimals = _decimals(share)
-    return f"{max(outward(math.floor, 100.0 * share, decimals), 0.0):.{decimals}f}"
-
-
-def _decimals(share: float) -> int:
-    """How many show how far it is from 0 and from 1."""
-    apart = 100.0 * min(share, 1.0 - share)
-    return max(-math.floor(math.log10(apart)), 0) if 1e-9 < apart < 1.0 else 0
 
 
 # -- Failures -------------------------------------------------------------------------------------
@@ -211,6 +170,4 @@ def _two_digits(value: float, rounded: Callable[[float], int]) -> str:
 
 def _exposure(value: float) -> str:
     """Rounded down: less would not be claimed."""
-    if value < 10.0:
-        return f"{outward(math.floor, value, 2):g}"
-    return f"{math.floor(round(value, 6)):,}"
+    return f"{outward(math.floor, value, 2):g}" if value < 10.0 else f"{math.floor(value + 1e-6):,}"

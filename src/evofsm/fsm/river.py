@@ -7,13 +7,13 @@ from collections.abc import Hashable, Mapping, Sequence
 from typing import Any, SupportsFloat
 
 import numpy as np
-from numpy.typing import NDArray
 
 from evofsm.extras import needs
 from evofsm.fsm.limit import WhenFull
 from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.observations import Missing
 from evofsm.fsm.rules import StateRule
+from evofsm.fsm.validation import Floats
 
 with needs("River", "river", "a clusterer of River"):
     from river import base
@@ -35,22 +35,15 @@ class RiverClusterer(base.Clusterer):
     features : sequence of hashable, optional
         Names of the features that are observed. Without them, those of the first observation
         that holds any; name them where it may lack some.
-    radius, distance_weight, learning_rate, prior_frequency, spread : float, optional
+    radius, learning_rate, spread, rule, max_states, when_full : optional
         As `EvolvingFSM` takes them; ``radius`` in the unit of the features, which all count
         alike: scale them first.
-    rule, max_states, when_full, belief_tolerance : optional
-        As `EvolvingFSM` takes them.
 
     Attributes
     ----------
     machine : EvolvingFSM
         With one action: ``machine.predict(0)`` forecasts the next state, and
         ``machine.start_episode()`` says that the next observation does not follow from the last.
-
-    Raises
-    ------
-    TypeError, ValueError
-        As `EvolvingFSM`, and where ``features`` are empty or named twice.
 
     Examples
     --------
@@ -68,27 +61,17 @@ class RiverClusterer(base.Clusterer):
         self,
         features: Sequence[Hashable] | None = None,
         radius: float | None = None,
-        distance_weight: float = 0.85,
         learning_rate: float = 0.01,
-        prior_frequency: float = 1e-3,
         spread: float | None = None,
         rule: StateRule | None = None,
         max_states: int | None = None,
         when_full: WhenFull = WhenFull.MERGE,
-        belief_tolerance: float = 0.0,
     ) -> None:
         if features is not None and not 0 < len(set(features)) == len(features):
             raise ValueError(f"features are {features}; they must be different names, at least one")
         self.features = features
-        self.radius = radius
-        self.distance_weight = distance_weight
-        self.learning_rate = learning_rate
-        self.prior_frequency = prior_frequency
-        self.spread = spread
-        self.rule = rule
-        self.max_states = max_states
-        self.when_full = when_full
-        self.belief_tolerance = belief_tolerance
+        self.radius, self.learning_rate, self.spread = radius, learning_rate, spread
+        self.rule, self.max_states, self.when_full = rule, max_states, when_full
         settings = {name: value for name, value in self._get_params().items() if name != "features"}
         self.machine = EvolvingFSM(n_actions=1, **settings)
         self._observed = () if features is None else tuple(features)
@@ -98,11 +81,6 @@ class RiverClusterer(base.Clusterer):
 
         Until every feature was observed once, all at the same time, there is no state to recognise
         by the others: what is incomplete is passed over.
-
-        Raises
-        ------
-        TypeError, ValueError
-            If a feature is no number, is infinite, or beyond 1e100.
         """
         if not self._observed:  # sorted, so that the order of the first does not matter either
             self._observed = tuple(sorted(x, key=str))
@@ -124,7 +102,7 @@ class RiverClusterer(base.Clusterer):
         """Distribution over states: how much an observation belongs to each."""
         return dict(enumerate(self._recognise(x).tolist()))
 
-    def _recognise(self, x: Mapping[Hashable, Any]) -> NDArray[np.float64]:
+    def _recognise(self, x: Mapping[Hashable, Any]) -> Floats:
         """(n,) belief, as `learn_one` would have it, but for what that would teach."""
         if self.machine.n_states == 0:
             return np.empty(0)
@@ -133,7 +111,7 @@ class RiverClusterer(base.Clusterer):
             return self.machine.copy().observe(z, missing=Missing.PARTIAL).belief
         return self.machine.model().recognise(z)
 
-    def _vector(self, x: Mapping[Hashable, Any]) -> NDArray[np.float64]:
+    def _vector(self, x: Mapping[Hashable, Any]) -> Floats:
         """The features in their order, NaN for those that were not observed."""
         return np.array([_number(name, x.get(name)) for name in self._observed])
 

@@ -12,10 +12,9 @@ from dataclasses import dataclass, field, fields, is_dataclass
 from typing import Any, ClassVar, Protocol, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
 from evofsm.fsm.clusters import EDGES, NOVELTY, PAPER
-from evofsm.fsm.validation import positive, whole
+from evofsm.fsm.validation import Floats, positive, whole
 
 # Squares of observations over the scales, summed over a long run, must not overflow.
 _SCALES = 1e-20, 1e20
@@ -32,7 +31,6 @@ class StateRule(Protocol):
 
     Examples
     --------
-    >>> from evofsm import Novelty
     >>> Novelty(radius=0.5, scales=(4.0, 2.0, 2.0)).scales
     (4.0, 2.0, 2.0)
     """
@@ -44,10 +42,7 @@ class StateRule(Protocol):
 
     @property
     def table(self) -> Mapping[str, float]:
-        """What its kernel judges by: fields of `Settings`, in place of the machine's.
-
-        At least ``rule``, unless it is that of the paper's.
-        """
+        """What its kernel judges by: fields of `Settings`, in place of the machine's."""
         ...
 
 
@@ -63,8 +58,7 @@ class Paper:
     ----------
     memory : int, optional
         Number of observations, at least 2, after which older ones fade, so that densities and
-        variances are those of the recent past: for regimes that change. Without it, as in the
-        paper, all count alike, and the more were seen the less a new one changes.
+        variances are those of the recent past: for regimes that change. Without it all count alike.
 
     Examples
     --------
@@ -86,7 +80,7 @@ class Paper:
 
     @property
     def table(self) -> Mapping[str, float]:
-        """What the kernel judges by, in place of the machine's settings."""
+        """What the kernel judges by."""
         return {"rule": self._rule, "memory": self.memory or math.inf}
 
 
@@ -97,11 +91,6 @@ class Edges(Paper):
     The paper's condition takes only observations nearer the mean of everything seen than any
     centre, so a rare corner never gets a state. Here an observation also creates a state where its
     potential lies below every centre's and it is farther than ``radius`` from every centre.
-
-    Parameters
-    ----------
-    memory : int, optional
-        As `Paper` has it.
 
     Examples
     --------
@@ -118,21 +107,19 @@ class Edges(Paper):
 class Novelty:
     """Create a state where every centre is farther than a radius; no centre ever moves.
 
-    Distances are those of observations divided by ``scales``, so that a metre and a metre per
-    second may count differently; observations and centres themselves stay in their units. The width
-    of recognition is ``spread * radius**2``: beliefs stay local, however much was seen.
+    Beliefs stay local, however much was seen. ``radius`` and ``spread`` take the place of the
+    machine's.
 
     Parameters
     ----------
     radius : float
-        Distance, in scales, beyond which an observation creates a state. It takes the place of the
-        machine's.
+        Distance, in scales, beyond which an observation creates a state.
     scales : sequence of float
-        For each of the m variables, the difference that counts as 1, in the variable's unit, from
-        1e-20 to 1e20; empty: 1 for each.
+        For each of the m variables, the difference that counts as 1, in the variable's unit, so
+        that a metre and a metre per second may count differently; empty: 1 for each.
     spread : float
         Width of recognition in squared radii: the similarity to a centre is
-        ``exp(-distance^2 / (spread * radius^2))``. It takes the place of the machine's.
+        ``exp(-distance^2 / (spread * radius^2))``.
 
     Examples
     --------
@@ -157,7 +144,7 @@ class Novelty:
 
     @property
     def table(self) -> Mapping[str, float]:
-        """What the kernel judges by, in place of the machine's settings."""
+        """What the kernel judges by."""
         return {"rule": NOVELTY, "radius": self.radius, "spread": self.spread}
 
 
@@ -208,15 +195,18 @@ class FailureSplit:
 
     @property
     def table(self) -> Mapping[str, float]:
-        """What the kernel judges by, in place of the machine's settings."""
+        """What the kernel judges by."""
         of_failures = {"failure_share": self.share, "failure_distance": self.distance}
         return {**self.base.table, **of_failures}
 
 
-# -- Which rules there are ------------------------------------------------------------------------
-
 # By name in files.
-_RULES: dict[str, Any] = {}
+_RULES: dict[str, Any] = {
+    "paper": Paper,
+    "edges": Edges,
+    "novelty": Novelty,
+    "failure": FailureSplit,
+}
 
 
 def register_rule(name: str, rule: type) -> None:
@@ -231,8 +221,7 @@ def register_rule(name: str, rule: type) -> None:
 
     Examples
     --------
-    >>> from dataclasses import dataclass
-    >>> from evofsm import EvolvingFSM, Novelty
+    >>> from evofsm import EvolvingFSM
     >>> @dataclass(frozen=True)
     ... class Fine(Novelty):
     ...     radius: float = 0.1
@@ -249,12 +238,6 @@ def register_rule(name: str, rule: type) -> None:
     _RULES[name] = rule  # anew where its module, or a cell of a notebook, was run again
 
 
-register_rule("paper", Paper)
-register_rule("edges", Edges)
-register_rule("novelty", Novelty)
-register_rule("failure", FailureSplit)
-
-
 def check_rule(rule: StateRule) -> StateRule:
     """One of the rules, as an object."""
     if type(rule) not in _RULES.values():
@@ -263,7 +246,7 @@ def check_rule(rule: StateRule) -> StateRule:
     return rule
 
 
-def weights_of(rule: StateRule, m: int) -> NDArray[np.float64]:
+def weights_of(rule: StateRule, m: int) -> Floats:
     """(m,) 1 / scale of each variable."""
     scales = np.array(rule.scales or [1.0] * m)
     if len(scales) != m:
@@ -293,13 +276,10 @@ def describe_rule(rule: StateRule) -> dict[str, Any]:
 
 def restore_rule(description: Mapping[str, Any]) -> StateRule:
     """The rule that `describe_rule` put into words."""
-    if not isinstance(description, Mapping) or "name" not in description:
-        raise ValueError(f"rule is {description!r}; it must have the name of a state rule")
-    settings = dict(description)
-    name = settings.pop("name")
-    if name not in _RULES:
-        raise ValueError(f"there is no state rule {name!r}, only {', '.join(_RULES)}")
+    if not isinstance(description, Mapping) or description.get("name") not in _RULES:
+        raise ValueError(f"rule is {description!r}; it must be one of {', '.join(_RULES)}")
+    settings = {name: value for name, value in description.items() if name != "name"}
     if "base" in settings:
         settings["base"] = restore_rule(settings["base"])
-    rule: StateRule = _RULES[name](**settings)
+    rule: StateRule = _RULES[description["name"]](**settings)
     return rule

@@ -11,6 +11,7 @@ from evofsm.extras import needs
 from evofsm.fsm.limit import WhenFull
 from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.rules import StateRule
+from evofsm.fsm.validation import Floats
 
 with needs("scikit-learn", "sklearn", "a clusterer of scikit-learn"):
     from sklearn.base import BaseEstimator, ClusterMixin
@@ -25,11 +26,9 @@ class EvolvingClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc] # bo
 
     Parameters
     ----------
-    radius, distance_weight, learning_rate, prior_frequency, spread : float, optional
+    radius, learning_rate, spread, rule, max_states, when_full : optional
         As `EvolvingFSM` takes them; ``radius`` in the unit of the features, which all count
-        alike: scale them first.
-    rule, max_states, when_full, belief_tolerance : optional
-        As `EvolvingFSM` takes them. (scikit-learn allows no enumeration as a default: None is
+        alike: scale them first. (scikit-learn allows no enumeration as a default: None is
         ``WhenFull.MERGE``.)
 
     Attributes
@@ -58,24 +57,14 @@ class EvolvingClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc] # bo
     def __init__(
         self,
         radius: float | None = None,
-        distance_weight: float = 0.85,
         learning_rate: float = 0.01,
-        prior_frequency: float = 1e-3,
         spread: float | None = None,
         rule: StateRule | None = None,
         max_states: int | None = None,
         when_full: WhenFull | None = None,
-        belief_tolerance: float = 0.0,
     ) -> None:
-        self.radius = radius
-        self.distance_weight = distance_weight
-        self.learning_rate = learning_rate
-        self.prior_frequency = prior_frequency
-        self.spread = spread
-        self.rule = rule
-        self.max_states = max_states
-        self.when_full = when_full
-        self.belief_tolerance = belief_tolerance
+        self.radius, self.learning_rate, self.spread = radius, learning_rate, spread
+        self.rule, self.max_states, self.when_full = rule, max_states, when_full
 
     def fit(self, X: ArrayLike, y: object = None) -> Self:
         """Learn from the rows of X (N, m), in the order of time, whatever was learnt before."""
@@ -89,13 +78,13 @@ class EvolvingClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc] # bo
         """(N,) index of the most probable state of each row; nothing is changed by asking."""
         return np.asarray(self.predict_proba(X).argmax(axis=1))
 
-    def predict_proba(self, X: ArrayLike) -> NDArray[np.float64]:
+    def predict_proba(self, X: ArrayLike) -> Floats:
         """(N, n) distribution over states of each row: how much it belongs to each."""
         check_is_fitted(self)
         return self.machine_.model().recognise(self._checked(X, reset=False))
 
     @property
-    def cluster_centers_(self) -> NDArray[np.float64]:
+    def cluster_centers_(self) -> Floats:
         """(n, m) ndarray: centres of the states."""
         return self.machine_.centers
 
@@ -108,7 +97,7 @@ class EvolvingClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc] # bo
         self.labels_ = self.machine_.learn_many(rows, np.zeros(len(rows), np.int64)).state
         return self
 
-    def _checked(self, X: ArrayLike, reset: bool) -> NDArray[np.float64]:
+    def _checked(self, X: ArrayLike, reset: bool) -> Floats:
         # Kernels are made for arrays that may be written to; others would make them anew.
         wanted = {"dtype": np.float64, "order": "C", "force_writeable": True}
         return np.asarray(validate_data(self, X, reset=reset, **wanted))

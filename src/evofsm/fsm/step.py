@@ -8,38 +8,20 @@ the next observation begins another episode.
 
 from __future__ import annotations
 
-import math
 from enum import IntFlag
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.fsm.arrays import (
-    ENDINGS,
-    EPISODES,
-    FAILED_SOON,
-    NO_ACTION,
-    VISITS,
-    Floats,
-    Learnt,
-    Settings,
-    room_for,
-)
-from evofsm.fsm.clusters import (
-    CREATED,
-    MOVED,
-    UNCHANGED,
-    determine,
-    recognise,
-    splits,
-    width_of,
-)
+from evofsm.fsm.arrays import ENDINGS, EPISODES, FAILED_SOON, NO_ACTION, VISITS, Learnt, Settings
+from evofsm.fsm.clusters import CREATED, MOVED, UNCHANGED, determine, recognise, splits, width_of
 from evofsm.fsm.divergence import jensen_shannon_kernel
 from evofsm.fsm.kernels import inner_kernel, kernel, lanes, rare_kernel, spliced_kernel
 from evofsm.fsm.limit import MERGED, RETIRED, merge_closest, retire_least_useful
 from evofsm.fsm.notebook import step_html
-from evofsm.fsm.transitions import expand, forecast_and_identify, place_of
+from evofsm.fsm.transitions import expand, forecast_and_identify, place_of, room_for
+from evofsm.fsm.validation import Floats
 
 #: The most states, or None. Numba compiles a kernel for each of the two kinds of machine, and that
 #: without a limit in half of the time.
@@ -181,9 +163,7 @@ def _create(
     """
     now, n = learnt.now[0], learnt.now[0].n_states
     new, event = n, CREATED
-    if (
-        limit is None or n < limit
-    ):  # known as this is compiled: what gives up states is left out then
+    if limit is None or n < limit:  # None is known as this is compiled: the rest is left out then
         now.n_states += 1
     else:
         if settings.retires:
@@ -294,11 +274,8 @@ class Event(IntFlag):
     Examples
     --------
     >>> from evofsm import EvolvingFSM
-    >>> machine = EvolvingFSM(n_actions=1)
-    >>> machine.observe([0.0]).event is Event.CREATED
-    True
-    >>> Event(machine.learn_many([[0.0], [0.1]], [0, 0]).event[1])
-    <Event.NONE: 0>
+    >>> Event(EvolvingFSM(n_actions=1).learn_many([[0.0], [0.1]], [0, 0]).event[0])
+    <Event.CREATED: 2>
     """
 
     NONE = UNCHANGED
@@ -318,28 +295,21 @@ class Step(NamedTuple):
     Examples
     --------
     >>> from evofsm import EvolvingFSM
-    >>> machine = EvolvingFSM(n_actions=1)
-    >>> step = machine.learn_one([0.0], 0)
-    >>> step.state, step.event.name, len(step.predicted), step.surprise
-    (0, 'CREATED', 0, nan)
-    >>> machine.observe([0.1])
-    Step(state=0, belief=1 of 1 states, event=NONE, surprise=0)
-    >>> machine.belief
-    array([1.])
+    >>> EvolvingFSM(n_actions=1).learn_one([0.0], 0)
+    Step(state=0, belief=1 of 1 states, event=CREATED, surprise=nan)
     """
 
     state: int  #: index of the most probable state
-    belief: NDArray[np.float64]  #: (n,) distribution over states
+    belief: Floats  #: (n,) distribution over states
     event: Event  #: what happened to the states
-    predicted: NDArray[np.float64]  #: (n,) forecast made one step before; empty where none was
+    predicted: Floats  #: (n,) forecast made one step before; empty where none was
     surprise: float  #: divergence of `predicted` and `belief` [bit]; NaN where none was
     missing: tuple[int, ...] = ()  #: variables that were not observed, so that nothing was learnt
 
     def __repr__(self) -> str:
-        belief = float(self.belief[self.state]) if len(self.belief) else math.nan
         missing = f", missing={self.missing}" if self.missing else ""
         return (
-            f"{type(self).__name__}(state={self.state}, belief={belief:.3g} of "
+            f"Step(state={self.state}, belief={self.belief[self.state]:.3g} of "
             f"{len(self.belief)} states, event={self.event.name}, surprise={self.surprise:.3g}"
             f"{missing})"
         )
@@ -356,26 +326,18 @@ class Trace(NamedTuple):
     >>> from evofsm import EvolvingFSM
     >>> machine = EvolvingFSM(n_actions=2, radius=0.5)
     >>> trace = machine.learn_many([[0.0], [0.1], [2.0], [1.0]], [0, 0, 0, 0], belief=True)
-    >>> trace.state, trace.surprise.round(2)
-    (array([0, 0, 0, 1]), array([ nan, 0. , 0. , 0.31]))
-    >>> trace.belief.round(2)
-    array([[1.  , 0.  ], [1.  , 0.  ], [1.  , 0.  ], [0.37, 0.63]])
+    >>> trace.state, trace.surprise.round(2), trace.belief[-1].round(2)
+    (array([0, 0, 0, 1]), array([ nan, 0. , 0. , 0.31]), array([0.37, 0.63]))
     """
 
     state: NDArray[np.int64]  #: (T,) index of the most probable state
     n_states: NDArray[np.int64]  #: (T,) number of states after the row
     event: NDArray[np.int8]  #: (T,) values of `Event`
-    surprise: NDArray[np.float64]  #: (T,) [bit], NaN where nothing was predicted
-    belief: NDArray[np.float64] | None = None  #: (T, n), 0 for states not yet created
+    surprise: Floats  #: (T,) [bit], NaN where nothing was predicted
+    belief: Floats | None = None  #: (T, n), 0 for states not yet created
 
 
 def blank_trace(rows: int) -> Trace:
     """Room for what is made of so many observations."""
     integers = np.empty(rows, np.int64), np.empty(rows, np.int64), np.empty(rows, np.int8)
     return Trace(*integers, np.empty(rows))
-
-
-def widen(belief: NDArray[np.float64], n: int) -> NDArray[np.float64]:
-    """Beliefs (..., n) over n states, 0 for those created since."""
-    missing = n - belief.shape[-1]
-    return np.pad(belief, [(0, 0)] * (belief.ndim - 1) + [(0, missing)]) if missing else belief

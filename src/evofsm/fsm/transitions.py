@@ -12,13 +12,25 @@ other way round, with the same meaning of rows.)
 
 from __future__ import annotations
 
-from evofsm.fsm.arrays import NOT_OPEN, Floats, Learnt
-from evofsm.fsm.kernels import inner_kernel, lanes, rare_kernel
+from evofsm.fsm.arrays import NO_ACTION, NOT_OPEN, Learnt, Settings
+from evofsm.fsm.kernels import inner_kernel, kernel, lanes, rare_kernel
+from evofsm.fsm.validation import Floats
 
 # A weight below this is taken as 0: smaller numbers turn denormal and slow every step.
 _LOWEST_FREQUENCY = 1e-290
 # A row with less left of it than this is rounding: scaled up it would no longer sum to 1.
 _LEAST_KEPT = 1e-9
+
+
+@kernel
+def room_for(learnt: Learnt, settings: Settings) -> tuple[int, int]:
+    """Numbers of states and of matrices with which the next step cannot lack room."""
+    now, capacity, places = learnt.now[0], len(learnt.belief), len(learnt.matrices)
+    if now.action != NO_ACTION and learnt.actions[now.action].place == NOT_OPEN:
+        places = max(places, now.n_places + 1)
+    if now.n_states == capacity and capacity < settings.max_states:
+        capacity = lanes(capacity + max(capacity // 2, 1))
+    return capacity, places
 
 
 @inner_kernel

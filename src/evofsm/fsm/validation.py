@@ -3,41 +3,53 @@
 from __future__ import annotations
 
 import operator
-from collections.abc import Mapping
-from typing import Any, SupportsFloat, SupportsIndex
+from collections.abc import Callable, Mapping
+from typing import Any, SupportsFloat, SupportsIndex, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from evofsm.store import LARGEST_OBSERVATION
 
+Floats: TypeAlias = NDArray[np.float64]
+
 # Cases, and failures among them.
 _OUTCOMES = (("decisions", "failures"), ("episodes", "failed_soon"), ("tried", "failed_after"))
-
-
 # NumPy is quicker for longer vectors.
 _SHORT = 16
+_ENCODE = "IntervalActions.encode turns a number into one"
 
 
 # -- States and actions are counted from 0 in code and data, and from 1 in what people read -------
 
 
 def state_name(index: int) -> str:
-    """A state as people read it, counted from 1, by its index from 0.
-
-    >>> state_name(3)
-    '#4'
-    """
+    """A state as people read it: #4 for 3."""
     return f"#{index + 1}"
 
 
 def action_name(index: int) -> str:
-    """An action as people read it, counted from 1 as in the paper, by its index from 0.
-
-    >>> action_name(16)
-    'a(17)'
-    """
+    """An action as people read it, as in the paper: a(17) for 16."""
     return f"a({index + 1})"
+
+
+def check_index(what: str, i: Any, n: int, name: Callable[[int], str] = str) -> int:
+    """An index of one of ``n`` things, which texts call by their ``name``."""
+    try:
+        index = operator.index(i)
+    except TypeError:
+        hint = "from 0" if what == "state" else f"from 0 ({_ENCODE})"
+        raise TypeError(f"{what} is {i!r}; it must be an integer index, {hint}") from None
+    if not 0 <= index < n:
+        called = "" if name is str else f", which texts call {name(0)} to {name(n - 1)}"
+        there = f"{what}s 0 to {n - 1}{called}" if n else f"no {what}s yet"
+        raise ValueError(f"{what} is {index}; there are {there}")
+    return index
+
+
+def check_action(i: Any, n_actions: int) -> int:
+    """An index of one of the actions."""
+    return check_index("action", i, n_actions, action_name)
 
 
 # -- Settings and numbers -------------------------------------------------------------------------
@@ -65,11 +77,8 @@ def whole(name: str, value: SupportsIndex) -> int:
     return number
 
 
-def real_array(name: str, values: ArrayLike, ndim: int) -> NDArray[np.float64]:
-    """A new array of real numbers with ``ndim`` axes, the last one not empty.
-
-    What is masked is NaN there: no more than any other missing value may it be guessed.
-    """
+def real_array(name: str, values: ArrayLike, ndim: int) -> Floats:
+    """A new array of real numbers with ``ndim`` axes, the last one not empty."""
     array = _array(name, values)
     if array.dtype.kind not in "fiub":
         raise TypeError(
@@ -79,133 +88,74 @@ def real_array(name: str, values: ArrayLike, ndim: int) -> NDArray[np.float64]:
     if array.ndim != ndim or array.shape[-1] == 0:
         wanted = "(variables,)" if ndim == 1 else "(rows, variables)"
         raise ValueError(f"{name} has shape {array.shape}; it must be {wanted}, not empty")
-    numbers = array.astype(np.float64)
-    if (masked := _masked(values)) is not None:
-        numbers[masked] = np.nan
-    return numbers
+    return array.astype(np.float64)
 
 
-def real_rows(name: str, values: ArrayLike) -> NDArray[np.float64]:
+def real_rows(name: str, values: ArrayLike) -> Floats:
     """Rows of real numbers, without gaps in memory: those given where they are that already."""
-    if not isinstance(values, np.ndarray) or values.dtype != np.float64:
+    if type(values) is not np.ndarray or values.dtype != np.float64:
         return real_array(name, values, ndim=2)
-    if _is_masked(values):
-        return real_array(name, values, ndim=2)
-    if values.ndim != 2 or values.shape[1] == 0:
-        return real_array(name, values, ndim=2)
-    return np.ascontiguousarray(values)
+    is_fit = values.ndim == 2 and values.shape[1]
+    return np.ascontiguousarray(values) if is_fit else real_array(name, values, ndim=2)
 
 
-def _array(name: str, values: ArrayLike) -> NDArray[Any]:
+def _array(name: str, values: Any) -> NDArray[Any]:
+    """An array, NaN where a mask hides a number, which NumPy would take as it is."""
     try:
+        if isinstance(values, list | tuple) and any(map(np.ma.is_masked, values)):
+            values = np.ma.array(values)
+        if np.ma.is_masked(values):
+            values = values.astype(np.float64).filled(np.nan)
         return np.asarray(values)
     except ValueError:
         raise ValueError(f"{name}: rows have different lengths") from None
 
 
-def _whole_array(name: str, values: ArrayLike) -> NDArray[Any]:
-    masked = _masked(values)
-    if masked is not None and masked.any():
-        raise ValueError(f"{name} are masked in places; each one must be known")
-    return _array(name, values)
-
-
-def _is_masked(values: Any) -> bool:
-    return type(values) is not np.ndarray and isinstance(values, np.ma.MaskedArray)
-
-
-def _masked(values: ArrayLike) -> NDArray[np.bool_] | None:
-    """Which entries a mask hides, in an array or in the rows of a list; None without a mask.
-
-    NumPy itself takes the numbers under the mask, whatever they are.
-    """
-    rows = values if isinstance(values, list | tuple) else ()
-    if _is_masked(values) or any(_is_masked(row) for row in rows):
-        return np.ma.getmaskarray(np.ma.array(values))
-    return None
-
-
-def is_within(values: NDArray[np.float64], largest: float) -> bool:
+def is_within(values: Floats, largest: float) -> bool:
     """Whether this is a short vector of numbers of at most that size: the quick way to ask it."""
     if values.ndim != 1 or not 0 < len(values) <= _SHORT:
         return False
     return all([-largest <= value <= largest for value in values.tolist()])  # noqa: C419
 
 
-def refuse_unusable(name: str, values: NDArray[np.float64]) -> None:
+def refuse_unusable(name: str, values: Floats) -> None:
     """Raise for the first entry that is not finite, or too large."""
-    if (
-        not values.size
-        or is_within(values, LARGEST_OBSERVATION)
-        or -LARGEST_OBSERVATION <= values.min() <= values.max() <= LARGEST_OBSERVATION
-    ):
+    if not values.size or is_within(values, LARGEST_OBSERVATION):
+        return
+    if -LARGEST_OBSERVATION <= values.min() <= values.max() <= LARGEST_OBSERVATION:
         return  # false of NaN
-    usable = np.abs(values) <= LARGEST_OBSERVATION
-    if not usable.all():
-        place = tuple(int(k) for k in np.argwhere(~usable)[0])
-        where = f"row {place[0]}, variable {place[1]}" if len(place) > 1 else f"variable {place[0]}"
-        raise ValueError(
-            f"{name}, {where}: {values[place]} cannot be used; every entry must be finite "
-            f"and at most {LARGEST_OBSERVATION:g} in size (a missing sensor value?)"
-        )
+    place = tuple(int(k) for k in np.argwhere(~(np.abs(values) <= LARGEST_OBSERVATION))[0])
+    where = f"row {place[0]}, variable {place[1]}" if len(place) > 1 else f"variable {place[0]}"
+    raise ValueError(
+        f"{name}, {where}: {values[place]} cannot be used; every entry must be finite "
+        f"and at most {LARGEST_OBSERVATION:g} in size (a missing sensor value?)"
+    )
 
 
-def refuse_unless_distribution(name: str, rows: NDArray[np.float64]) -> None:
+def refuse_unless_distribution(name: str, rows: Floats) -> None:
     """Raise unless every row, along the last axis, has no entry below 0 and sums to 1."""
     if not ((rows >= 0.0).all() and (np.abs(rows.sum(axis=-1) - 1.0) < 1e-6).all()):
         raise ValueError(f"{name} is no distribution: entries must be 0 or more and sum to 1")
 
 
-def refuse_more_failures(arrays: Mapping[str, NDArray[np.float64]]) -> None:
+def refuse_more_failures(arrays: Mapping[str, Floats]) -> None:
     """Raise where there are more failures than cases, in what has the outcomes by name."""
     for cases, failures in _OUTCOMES:
         if (arrays[failures] > arrays[cases]).any():
             raise ValueError(f"{failures} cannot be more than {cases}")
 
 
-def check_action(i: SupportsIndex, n_actions: int) -> int:
-    """An index of one of the actions."""
-    try:
-        index = operator.index(i)
-    except TypeError:
-        raise TypeError(
-            f"action is {i!r}; it must be an integer index "
-            "(IntervalActions.encode turns a number into one)"
-        ) from None
-    if not 0 <= index < n_actions:
-        raise ValueError(
-            f"action is {index}; there are actions 0 to {n_actions - 1}, which texts call "
-            f"{action_name(0)} to {action_name(n_actions - 1)}"
-        )
-    return index
-
-
-def check_state(state: Any, n_states: int) -> int:
-    """An index of one of the states."""
-    try:
-        index = operator.index(state)
-    except TypeError:
-        raise TypeError(f"state is {state!r}; it must be an integer index, from 0") from None
-    if not 0 <= index < n_states:
-        raise ValueError(
-            f"state is {index}; there are {n_states} states, from 0, which texts call "
-            f"{state_name(0)}"
-        )
-    return index
-
-
 def check_actions(indices: ArrayLike, rows: int, n_actions: int) -> NDArray[np.int64]:
     """An index for each row, or -1 for none."""
-    actions = _whole_array("actions", indices)
+    actions = _array("actions", indices)
     if actions.shape != (rows,):
         raise ValueError(f"actions have shape {actions.shape}; {rows} observations need ({rows},)")
     if rows and actions.dtype.kind not in "iu":
         raise TypeError(
-            f"actions have dtype {actions.dtype}; they must be integer indices "
-            "(IntervalActions.encode turns numbers into them)"
+            f"actions have dtype {actions.dtype}; they must be integer indices, "
+            f"none of them masked ({_ENCODE})"
         )
-    wrong = np.flatnonzero((actions < -1) | (actions >= n_actions))
-    if len(wrong):
+    if len(wrong := np.flatnonzero((actions < -1) | (actions >= n_actions))):
         raise ValueError(
             f"action in row {wrong[0]} is {actions[wrong[0]]}; "
             f"there are actions 0 to {n_actions - 1}, and -1 for none"
@@ -215,11 +165,10 @@ def check_actions(indices: ArrayLike, rows: int, n_actions: int) -> NDArray[np.i
 
 def check_rows(name: str, numbers: ArrayLike, rows: int) -> NDArray[np.bool_]:
     """Mark the rows that are named."""
-    given = _whole_array(name, numbers)
+    given = _array(name, numbers)
     if given.size and given.dtype.kind not in "iu":
-        raise TypeError(f"{name} has dtype {given.dtype}; it must hold row numbers")
-    wrong = given[(given < 0) | (given >= rows)]
-    if wrong.size:
+        raise TypeError(f"{name} has dtype {given.dtype}; it must hold row numbers, none masked")
+    if (wrong := given[(given < 0) | (given >= rows)]).size:
         raise ValueError(f"{name} names row {wrong[0]}, but there are {rows} rows")
     marked = np.zeros(rows, np.bool_)
     marked[given.astype(np.int64)] = True

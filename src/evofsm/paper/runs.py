@@ -31,7 +31,6 @@ from evofsm.fsm.actions import IntervalActions
 from evofsm.fsm.divergence import jensen_shannon
 from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.model import FSMModel
-from evofsm.fsm.step import widen
 
 CASES = (1, 2, 3, 4)
 
@@ -208,6 +207,11 @@ def as_it_is(number: int, episode: Episode) -> NDArray[np.float64]:
     return episode.observations
 
 
+def _widen(belief: NDArray[np.float64], n: int) -> NDArray[np.float64]:
+    """Beliefs (..., n) over n states, 0 for those created since."""
+    return np.pad(belief, [(0, 0)] * (belief.ndim - 1) + [(0, n - belief.shape[-1])])
+
+
 def run_paper(
     world: World,
     name: str,
@@ -262,7 +266,7 @@ def run_paper(
         trace = machine.learn_many(seen, action, [0], ends, belief=beliefs)
         belief = np.empty((len(action), 0)) if trace.belief is None else trace.belief
         known = beliefs and n > 0
-        first = jensen_shannon(widen(foreseen, machine.n_states), belief[0]) if known else math.nan
+        first = jensen_shannon(_widen(foreseen, machine.n_states), belief[0]) if known else math.nan
         progress(len(runs) + len(extra_runs) + 1, total)
         found = action, trace.state, trace.n_states, belief, trace.surprise, float(first)
         return Run(name, case, round_, episode, *found)
@@ -279,7 +283,7 @@ def run_paper(
     progress(total, total)
     at_collisions = [run.state[-1] for run in runs if run.episode.collided]
     if beliefs:  # over all the states there are in the end
-        runs = [replace(run, belief=widen(run.belief, machine.n_states)) for run in runs]
+        runs = [replace(run, belief=_widen(run.belief, machine.n_states)) for run in runs]
     return PaperStudy(
         world=name,
         settings=settings,
