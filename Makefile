@@ -33,7 +33,7 @@ house: .venv/installed          ## draw the rooms from their imports; fails wher
 
 bench: .venv/installed          ## how fast it is, as ratios against named references; bench.json
 	@$(BIN)/python benchmarks/speed.py --json bench.json
-	@$(BIN)/python benchmarks/decision.py
+	@$(BIN)/python benchmarks/calls.py
 
 evidence: .venv/installed       ## all studies in short, on one page; DATA=folder adds real drives
 	@$(BIN)/python -m studies evidence --out results/evidence $(if $(DATA),--data $(DATA))

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.rules import Novelty, Paper, StateRule
-from streams import paper_stream
+from fsm_rows import paper_stream
 
 # 1e9 steps are 116 days of decisions every 10 ms, or eight years of decisions every 0.25 s.
 _STEPS, _HOSTILE_STEPS = 1_000_000_000, 1_000_000

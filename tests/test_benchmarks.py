@@ -5,14 +5,11 @@ import json
 import numpy as np
 import pytest
 
-import clusterers
+import fsm_rows
 import speed
-import tolerance
-from evofsm.fsm.machine import EvolvingFSM
-from single import pair
-from streams import LATTICE_RULE, LATTICES, PAPER_ROUND, lattice_stream, paper_stream
-from table import Row, duration, judged, shown, worsened
-from turns import compare
+from evofsm import EvolvingFSM
+from fsm_rows import LATTICE_RULE, LATTICES, PAPER_ROUND, lattice_stream, pair, paper_stream
+from timing import Row, compare, duration, judged, shown, worsened
 
 pytestmark = pytest.mark.slow
 
@@ -49,8 +46,8 @@ def test_a_lattice_has_as_many_states_as_it_says_and_its_walk_founds_no_other(n_
 
 
 def test_beliefs_on_the_lattice_are_as_sure_as_they_should_be():
-    machine = tolerance.walked(256, 17)
-    spread = tolerance.perplexity(machine, tolerance.walk(256, 17, 500))
+    machine = fsm_rows.walked(256, 17)
+    spread = fsm_rows.perplexity(machine, fsm_rows.walk(256, 17, 500))
     assert 4.0 < np.median(spread) < spread.max() <= 16.0
 
 
@@ -59,7 +56,7 @@ def test_perplexity_of_a_belief_in_two_alike_is_two():
     machine.learn_many([[0.0], [0.1], [2.0], [1.0]], [0, 0, 0, 0])
     halfway = machine.centers.mean()
     stream = lattice_stream(7, 1)._replace(observations=np.array([[halfway]]))
-    assert tolerance.perplexity(machine, stream._replace(actions=np.zeros(1, int))) == [2.0]
+    assert fsm_rows.perplexity(machine, stream._replace(actions=np.zeros(1, int))) == [2.0]
 
 
 def test_a_round_of_the_paper_ends_where_another_begins():
@@ -210,7 +207,7 @@ def test_real_rows_run_and_the_table_is_no_wider_than_100_columns(tmp_path, caps
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")  # whatever others warn of
-@pytest.mark.parametrize("row", [clusterers.stream_k_means, clusterers.db_stream])
+@pytest.mark.parametrize("row", [fsm_rows.stream_k_means, fsm_rows.db_stream])
 def test_others_cluster_the_same_stream(row):
     pytest.importorskip("river")
     pytest.importorskip("deeptime")
@@ -220,4 +217,4 @@ def test_others_cluster_the_same_stream(row):
 
 
 def test_the_table_of_states_has_a_line_for_each():
-    assert len(tolerance.cost_and_memory(1, True).splitlines()) == 1 + 2 * 2
+    assert len(fsm_rows.cost_and_memory(1, True).splitlines()) == 1 + 2 * 2
