@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from evofsm import store
-from evofsm.guard import Guard, Mode, SceneRisk, same_action
+from evofsm.guard import Guard, Mode, SceneRisk
+from evofsm.guard.actions import same_action
 from evofsm.guard.scene import _KIND, Contact, Foreseen, Memory
 
 LEFT, STAY, RIGHT = range(3)

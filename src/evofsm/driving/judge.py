@@ -28,7 +28,9 @@ from evofsm.driving.revisers import GENTLE_BRAKE
 from evofsm.fsm.kernels import compiled, inner_kernel
 from evofsm.fsm.proportions import wilson_bounds
 from evofsm.fsm.validation import positive, real_array, refuse_unless_distribution, refuse_unusable
-from evofsm.guard import TOLERANCE, Action, Judgement, Situation, Trial
+from evofsm.guard import TOLERANCE, Judgement, Situation
+from evofsm.guard.actions import Action
+from evofsm.guard.api import Trial
 from evofsm.store import (
     COUNT,
     FLAG,

@@ -14,17 +14,9 @@ from evofsm.driving import measures
 from evofsm.driving.naming import VARIABLES
 from evofsm.fsm.actions import IntervalActions
 from evofsm.fsm.validation import positive
-from evofsm.guard import (
-    Fallback,
-    Proposal,
-    Revision,
-    RiskMeasure,
-    Situation,
-    make_usable,
-    unjudged_revision,
-    unseen_text,
-)
+from evofsm.guard import Fallback, Proposal, Revision, RiskMeasure, Situation, make_usable
 from evofsm.guard.parts import part_class, part_name
+from evofsm.guard.reviser import unjudged_revision, unseen_text
 
 #: Without a usable proposal a car brakes gently [m/s²].
 GENTLE_BRAKE = Fallback(-1.0, "braking gently")

@@ -25,7 +25,8 @@ from evofsm.driving import VARIABLES, Episode
 from evofsm.extras import needs
 from evofsm.fsm.model import FSMModel
 from evofsm.fsm.validation import positive
-from evofsm.guard import Action, Decision, Guard, Proposal, Revision, Situation
+from evofsm.guard import Decision, Guard, Proposal, Revision, Situation
+from evofsm.guard.actions import Action
 from evofsm.io.runs import (
     FORMAT,
     MODEL,

@@ -8,7 +8,8 @@ from contextlib import suppress
 import numpy as np
 import pytest
 
-from evofsm.guard import Mode, same_action
+from evofsm.guard import Mode
+from evofsm.guard.actions import same_action
 from evofsm.guard.audit_log import AuditLog
 from evofsm.guard.learnt import library
 from evofsm.guard.learnt.dynamics import Dynamics
