@@ -51,7 +51,7 @@ from evofsm.driving import (
     try_out,
     unrevised_guard,
 )
-from evofsm.fsm import Edges, FailureSplit, Novelty, StateRule
+from evofsm.fsm import Edges, Novelty, StateRule
 from evofsm.guard import TOLERANCE, ActionReviser, Guard, Mode, Reviser, RiskMeasure
 from evofsm.paper import Figure, Page, Table
 from studies import lib
@@ -74,7 +74,6 @@ RULES: dict[str, StateRule | None] = {
     "paper": None,
     "edges": Edges(),
     "novelty": Novelty(radius=1.0, scales=(4.0, 2.0, 2.0)),
-    "failure-split": FailureSplit(base=Novelty(radius=2.0, scales=(4.0, 2.0, 2.0))),
 }
 #: Times of the leader's full brake in two runs that are not learnt from [s], as in the paper.
 UNSEEN_BRAKES = (11.0, 15.0)

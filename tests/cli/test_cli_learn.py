@@ -7,7 +7,7 @@ import pytest
 
 from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.model import FSMModel
-from evofsm.fsm.rules import Edges, FailureSplit, Novelty, Paper
+from evofsm.fsm.rules import Edges, Novelty, Paper
 
 pytest.importorskip("typer")
 pytest.importorskip("rich")
@@ -338,7 +338,6 @@ def test_units_and_missing_leaders_are_said_in_the_summary(evofsm, tmp_path):
             ["--rule", "novelty", "--radius", "2", "--spread", "0.5", "--scale", "gap=8"],
             Novelty(2.0, (8.0, 2.0, 2.0), 0.5),
         ),
-        (["--rule", "failure", "--failed", "hit"], FailureSplit(Novelty(1.0, (4.0, 2.0, 2.0)))),
     ],
 )
 def test_another_rule_is_told_by_its_name(evofsm, crashes, tmp_path, options, rule):
@@ -352,11 +351,10 @@ def test_another_rule_is_told_by_its_name(evofsm, crashes, tmp_path, options, ru
         (["--failed", "gap<"], "--failed is 'gap<'"),
         (["--failed", "crash"], "no column 'crash'"),
         (["--unit", "v=warp"], "--unit is 'v=warp'"),
-        (["--scale", "gap=4"], "--scale is for --rule novelty or failure, not paper"),
+        (["--scale", "gap=4"], "--scale is for --rule novelty, not paper"),
         (["--rule", "novelty", "--scale", "speed=4"], "--scale names 'speed'; observed are gap"),
         (["--rule", "novelty", "--scale", "gap=0"], "--scale is 'gap=0'; write COLUMN=NUMBER"),
         (["--rule", "novelty", "--observe", "gap,hit"], "difference that counts as 1 in 'hit'"),
-        (["--rule", "failure"], "--failed has to tell"),
         (["--max-states", "0"], "max_states is 0"),
     ],
 )

@@ -15,7 +15,7 @@ from evofsm.fsm.merging import merge
 from evofsm.fsm.model import FSMModel
 from evofsm.fsm.naming import Labels
 from evofsm.fsm.observations import Missing
-from evofsm.fsm.rules import FailureSplit, Novelty
+from evofsm.fsm.rules import Novelty
 
 COUNTS = ("episodes", "failed_soon", "tried", "failed_after")
 
@@ -73,17 +73,6 @@ def test_an_episode_that_begins_unseen_is_no_part_of_the_one_before():
     machine.fail()
     assert machine.episodes.tolist() == [1.0, 1.0]
     assert machine.failed_soon.tolist() == [0.0, 0.0]
-
-
-def test_what_was_not_seen_whole_splits_no_state():
-    rule = FailureSplit(Novelty(radius=2.0), distance=0.5)
-    machine = EvolvingFSM(1, rule=rule)
-    machine.learn_many([[0.0, 0.0], [9.0, 9.0], [9.0, 8.0]], [0, 0, 0])
-    machine.start_episode()
-    machine.observe([0.0, np.nan], missing=Missing.PARTIAL)
-    machine.fail()
-    assert machine.n_states == 2
-    assert machine.endings.tolist() == [1.0, 0.0]
 
 
 def test_where_states_were_joined_there_is_no_interval():
@@ -243,7 +232,6 @@ def test_failures_that_were_told_and_never_happened_are_counted_as_none(tell, tm
     ("rule", "seen", "never"),
     [
         (Novelty(radius=1.0, spread=9.0), 5.9, 6.1),  # its radius
-        (FailureSplit(Novelty(radius=2.0)), 6.9, 7.1),
         (None, 8.6, 8.7),  # twice the root of the width, which is 3 times the variance
     ],
 )

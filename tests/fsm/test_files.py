@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 from evofsm.fsm.actions import IntervalActions
-from evofsm.fsm.limit import WhenFull
 from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.model import FSMModel
-from evofsm.fsm.rules import FailureSplit, Novelty, Paper
+from evofsm.fsm.rules import Novelty, Paper
 
 
 def full_model(grown):
@@ -74,11 +73,11 @@ def test_numbers_of_every_size_are_kept_and_read_again(snapshot, tmp_path):
     sizes = (0.0, 5e-324, 1e-200, 1e-9, 1.0, 1e9, 1e100)
     machines = [
         EvolvingFSM(2, max_states=3, rule=Novelty(1.0, (1e-20, 1e20))),
-        EvolvingFSM(2, max_states=3, when_full=WhenFull.RETIRE, rule=Novelty(2.0)),
+        EvolvingFSM(2, max_states=3, rule=Novelty(2.0)),
         EvolvingFSM(2, radius=1e-9, distance_weight=1e50, prior_frequency=1e50),
         EvolvingFSM(2, radius=1e100, spread=1e100, prior_frequency=1e-300),
         EvolvingFSM(2, rule=Paper(memory=2), belief_tolerance=1e-3, learning_rate=0.999),
-        EvolvingFSM(2, rule=FailureSplit(Novelty(2.0), distance=1e-3), failure_horizon=2),
+        EvolvingFSM(2, rule=Novelty(2.0), failure_horizon=2),
     ]
     for machine in machines:
         for _ in range(2):
@@ -120,11 +119,7 @@ MACHINES = [
     ("rule", {"name": "novelty", "radius": -1.0}, "rule.radius of -1"),
     ("rule", {"name": "novelty", "scales": [1e308, 1.0]}, r"rule.scales of 1e\+308"),
     ("rule", {"name": "novelty", "scales": [1.0]}, "scales"),
-    (
-        "rule",
-        {"name": "failure", "base": {"name": "novelty", "spread": 1e308}},
-        r"rule.base.spread of 1e\+308",
-    ),
+    ("rule", {"name": "novelty", "spread": 1e308}, r"rule.spread of 1e\+308"),
 ]
 
 

@@ -17,10 +17,9 @@ from hypothesis.stateful import (
     run_state_machine_as_test,
 )
 
-from evofsm.fsm.limit import WhenFull
 from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.model import FSMModel
-from evofsm.fsm.rules import FailureSplit, Novelty, Paper
+from evofsm.fsm.rules import Novelty, Paper
 
 M, Q = 2, 3
 ROUNDING = 1e-9
@@ -49,7 +48,7 @@ BAD_OBSERVATIONS = st.sampled_from(
     ]
 )
 BAD_ACTIONS = st.sampled_from([Q, -1, 0.5, np.nan, "0", None, [0], 2**70])
-RULES = st.sampled_from([Paper(), Novelty(2.0), FailureSplit(Novelty(2.0), distance=0.5)])
+RULES = st.sampled_from([Paper(), Novelty(2.0)])
 QUESTIONS = (
     *("belief", "state", "n_states", "state_ids", "centers", "potentials", "transition_matrices"),
     *("marginal_matrix", "joint_frequency", "origin_frequency", "decisions", "failures"),
@@ -75,16 +74,14 @@ class Life(RuleBasedStateMachine):
     @initialize(
         state_rule=RULES,
         most=st.sampled_from([None, 1, 2, 4]),
-        when_full=st.sampled_from(WhenFull),
         tolerance=st.sampled_from([0.0, 1e-6]),
     )
-    def begin(self, state_rule, most, when_full, tolerance):
+    def begin(self, state_rule, most, tolerance):
         self.machine = EvolvingFSM(
             Q,
             rule=state_rule,
             learning_rate=0.3,
             max_states=most,
-            when_full=when_full,
             belief_tolerance=tolerance,
         )
         self.twin = self.machine.copy()

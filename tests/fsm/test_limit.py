@@ -5,9 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from evofsm.fsm.limit import WhenFull
 from evofsm.fsm.machine import EvolvingFSM
-from evofsm.fsm.rules import FailureSplit, Novelty, Paper
+from evofsm.fsm.rules import Novelty, Paper
 from evofsm.fsm.step import Event
 
 
@@ -23,14 +22,12 @@ def learn(machine, points, actions=None):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("when_full", WhenFull)
 @given(seed=st.integers(0, 1000), most=st.integers(1, 12))
-def test_there_are_never_more_states_and_every_array_stays_sound(when_full, seed, most):
+def test_there_are_never_more_states_and_every_array_stays_sound(seed, most):
     rng = np.random.default_rng(seed)
     Z, I = np.cumsum(rng.normal(size=(200, 2)), axis=0), rng.integers(-1, 3, 200)
     failures = np.flatnonzero(rng.random(200) < 0.05)
-    rule = FailureSplit(Novelty(radius=0.7), distance=0.1)
-    machine = EvolvingFSM(3, rule=rule, max_states=most, when_full=when_full)
+    machine = EvolvingFSM(3, rule=Novelty(radius=0.7), max_states=most)
     trace = machine.learn_many(Z, I, [50], failures, belief=True)
     assert trace.n_states.max() <= most
     assert (trace.state < trace.n_states).all()
@@ -42,13 +39,12 @@ def test_there_are_never_more_states_and_every_array_stays_sound(when_full, seed
     assert len(set(machine.state_ids)) == machine.n_states
     assert (model.visits >= 0).all()
     assert (model.changes >= 0).all()
-    if when_full is WhenFull.MERGE:  # which loses no evidence
-        assert model.visits.sum() == 200
-        assert machine.endings.sum() == len(failures)
+    assert model.visits.sum() == 200  # no evidence is lost
+    assert machine.endings.sum() == len(failures)
 
 
 def test_the_settings_are_saved(tmp_path):
-    settings = {"max_states": 5, "when_full": WhenFull.RETIRE, "belief_tolerance": 1e-6}
+    settings = {"max_states": 5, "belief_tolerance": 1e-6}
     machine = sharp(**settings)
     learn(machine, range(0, 40, 2))
     machine.save(tmp_path / "machine")
@@ -88,41 +84,11 @@ def test_a_newcomer_close_to_a_state_is_left_to_it():
     assert machine.centers.ravel().tolist() == [0.0, 9.0]
 
 
-def test_the_least_useful_state_is_retired_with_all_that_was_learnt_of_it():
-    machine = sharp(max_states=3, when_full=WhenFull.RETIRE)
-    learn(machine, [0, 0, 0, 3, 9, 9, 0, 9])
-    step = machine.observe([50.0])
-    assert step.event == Event.CREATED | Event.RETIRED
-    assert machine.centers.ravel().tolist() == [0.0, 50.0, 9.0]  # 3 was seen once of eight times
-    assert machine.model().visits.tolist() == [4, 1, 3]
-    assert machine.decisions[0, 1] == 0.0
-    assert machine.model().changes[1].tolist() == [0.0, 0.0, 0.0]
-    assert machine.state_ids.tolist() == [0, 3, 2]
-
-
-def test_a_state_in_which_failures_ended_is_retired_last():
-    machine = sharp(max_states=3, when_full=WhenFull.RETIRE)
-    learn(machine, [0, 0, 0])
-    machine.observe([3.0], failed=True)
-    learn(machine, [9, 9, 9, 9, 0])
-    machine.observe([50.0])
-    assert 3.0 in machine.centers
-    assert machine.endings.sum() == 1.0
-
-
-def test_the_present_state_is_not_retired():
-    machine = sharp(max_states=1, when_full=WhenFull.RETIRE)
-    trace = learn(machine, [0, 5, 0])
-    assert trace.event.tolist() == [Event.CREATED, Event.MERGED, Event.NONE]
-    assert machine.centers.ravel().tolist() == [0.0]
-
-
 @pytest.mark.parametrize(
     ("settings", "words"),
     [
         ({"max_states": 0}, "max_states is 0; it must be a positive integer"),
         ({"max_states": 2.5}, "max_states is 2.5"),
-        ({"when_full": "merge"}, "'merge' is not a valid WhenFull"),
         ({"belief_tolerance": 1.0}, "belief_tolerance is 1.0; it must lie below 1"),
         ({"belief_tolerance": -1e-6}, "belief_tolerance is -1e-06"),
         ({"belief_tolerance": np.nan}, "belief_tolerance is nan"),

@@ -6,7 +6,6 @@ import sys
 import numpy as np
 import pytest
 
-from evofsm.fsm.limit import WhenFull
 from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.rules import Novelty
 from evofsm.fsm.step import Event
@@ -350,7 +349,6 @@ def test_a_width_beyond_all_bounds_leaves_no_belief_to_states_that_are_not_there
 def test_threads_may_begin_at_once():
     program = """
 import threading, numpy as np
-from evofsm.fsm.limit import WhenFull
 from evofsm.fsm.machine import EvolvingFSM
 failed = []
 def work():
@@ -374,9 +372,8 @@ def test_what_was_told_of_failures_before_the_first_observation_holds():
     assert machine.failures_told
 
 
-@pytest.mark.parametrize("when_full", list(WhenFull))
-def test_an_onset_is_counted_in_the_state_before_the_latest_observations(when_full):
-    machine = EvolvingFSM(1, rule=Novelty(radius=1.0), max_states=3, when_full=when_full)
+def test_an_onset_is_counted_in_the_state_before_the_latest_observations():
+    machine = EvolvingFSM(1, rule=Novelty(radius=1.0), max_states=3)
     machine.observe([0.0])
     machine.onset()  # nothing came before
     assert machine.onsets.tolist() == [0.0]
@@ -388,5 +385,4 @@ def test_an_onset_is_counted_in_the_state_before_the_latest_observations(when_fu
     for z in ([9.0], [20.0]):  # the latest takes the place of another state
         machine.observe(z)
     machine.onset()
-    gone = when_full is WhenFull.RETIRE
-    assert machine.onsets.sum() == (1.0 if gone else 3.0)
+    assert machine.onsets.sum() == 3.0

@@ -13,13 +13,12 @@ from evofsm.driving.world import KinematicWorld
 from evofsm.fsm.arrays import by_name
 from evofsm.fsm.machine import EvolvingFSM, opened
 from evofsm.fsm.merging import merge
-from evofsm.fsm.rules import Edges, FailureSplit, Novelty, Paper
+from evofsm.fsm.rules import Edges, Novelty, Paper
 
 RULES = [
     Novelty(1.0, (2.0, 1.0)),
     Paper(),
     Edges(),
-    FailureSplit(Novelty(1.0, (2.0, 1.0)), distance=0.2),
 ]
 CENTRES = np.array([[0.0, 0.0], [8.0, 0.0], [0.0, 4.0], [8.0, 4.0], [16.0, 0.0], [16.0, 4.0]])
 
@@ -205,19 +204,6 @@ def test_the_strongest_centre_leads_and_centres_stay_apart():
     leads = strongest.centers[strongest.model().visits.argmax()]
     assert merged.centers[0].tolist() == leads.tolist()
     assert merge(parts, radius=4.0).n_states < merged.n_states < merge(parts, radius=0.2).n_states
-
-
-def test_states_that_a_failure_split_stay_apart():
-    rule = FailureSplit(Novelty(2.0), distance=0.5)
-    parts = []
-    for offset in (0.0, 0.1):
-        part = EvolvingFSM(1, rule=rule)
-        part.learn_many(np.array([[0.0], [1.5], [0.0], [0.2]]) + offset, [0] * 4)
-        assert part.observe([1.5 + offset], failed=True).event.name == "CREATED"
-        parts.append(part)
-    merged = merge(parts)
-    assert merged.centers.round(1).ravel().tolist() == [0.0, 1.5]
-    assert merged.endings.tolist() == [0.0, 2.0]
 
 
 @pytest.mark.parametrize("rule", RULES)

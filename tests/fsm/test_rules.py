@@ -13,7 +13,6 @@ from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.model import FSMModel
 from evofsm.fsm.rules import (
     Edges,
-    FailureSplit,
     Novelty,
     Paper,
     describe_rule,
@@ -26,8 +25,7 @@ RULES = {
     "paper": Paper(),
     "edges": Edges(),
     "novelty": Novelty(radius=1.5, scales=(2.0, 0.5), spread=0.7),
-    "failure": FailureSplit(Novelty(radius=3.0), share=0.8, distance=0.3),
-    "failure on edges, forgetting": FailureSplit(Edges(memory=30), distance=0.1),
+    "edges, forgetting": Edges(memory=30),
 }
 
 
@@ -76,7 +74,7 @@ def assert_same_trace(trace, steps):
     assert trace.surprise.tobytes() == np.array([s.surprise for s in steps]).tobytes()
 
 
-bases = st.one_of(
+rules = st.one_of(
     st.just(Paper()),
     st.just(Edges()),
     st.builds(
@@ -85,12 +83,6 @@ bases = st.one_of(
         scales=st.sampled_from([(), (1.0, 1.0), (0.5, 3.0)]),
         spread=st.sampled_from([0.1, 1.0]),
     ),
-)
-rules = bases | st.builds(
-    FailureSplit,
-    base=bases,
-    share=st.sampled_from([0.1, 0.5, 1.0]),
-    distance=st.sampled_from([0.01, 0.5]),
 )
 
 
@@ -147,9 +139,8 @@ def test_a_rule_is_plain_json_in_a_file(rule):
 
 
 def test_the_names_and_settings_in_a_file_are_these():
-    rule = FailureSplit(Novelty(2.0, (1.0, 4.0)), share=0.25, distance=0.5)
-    base = {"name": "novelty", "radius": 2.0, "scales": (1.0, 4.0), "spread": 1.0}
-    assert describe_rule(rule) == {"name": "failure", "base": base, "share": 0.25, "distance": 0.5}
+    novelty = {"name": "novelty", "radius": 2.0, "scales": (1.0, 4.0), "spread": 1.0}
+    assert describe_rule(Novelty(2.0, (1.0, 4.0))) == novelty
     assert describe_rule(Paper()) == {"name": "paper"}
     assert describe_rule(Edges()) == {"name": "edges"}
 
@@ -166,9 +157,6 @@ def test_a_rule_is_registered_once_under_its_name():
         register_rule("novelty", Edges)
     with pytest.raises(TypeError, match="is no state rule"):
         register_rule("something", int)
-
-
-# -- Paper -----------------------------------------------------------------------------------------
 
 
 # -- Edges -----------------------------------------------------------------------------------------
@@ -275,81 +263,6 @@ def test_as_many_scales_as_variables(snapshot):
 def test_settings_that_cannot_be_right(settings, words):
     with pytest.raises(ValueError, match=words):
         Novelty(**settings)
-
-
-# -- FailureSplit ----------------------------------------------------------------------------------
-
-
-def machine_with(**settings):
-    """One state at 0, which holds everything up to 10, in which there were four stays."""
-    machine = EvolvingFSM(n_actions=2, rule=FailureSplit(Novelty(radius=10.0), **settings))
-    machine.learn_many([[0.0], [1.0]] * 4, [0] * 8, [0, 2, 4, 6])
-    assert machine.n_states == 1
-    return machine
-
-
-def fail_at(machine, z):
-    machine.start_episode()
-    return machine.observe([z], failed=True).event
-
-
-def test_a_failure_in_a_mostly_safe_state_founds_one():
-    machine = machine_with(distance=0.5)
-    assert fail_at(machine, 4.0) == Event.CREATED
-    assert machine.centers.tolist() == [[0.0], [4.0]]
-    assert machine.endings.tolist() == [0.0, 1.0]
-
-
-def test_a_safe_observation_at_the_same_place_founds_none():
-    machine = machine_with(distance=0.5)
-    assert machine.observe([4.0]).event == Event.NONE
-
-
-def test_a_state_is_split_only_while_fewer_stays_than_the_share_ended_in_failure():
-    machine = machine_with(distance=0.5, share=0.4)
-    for _ in range(4):
-        assert fail_at(machine, 0.1) == Event.NONE
-    assert fail_at(machine.copy(), 4.0) == Event.NONE  # 4 failures in 8 stays
-    for _ in range(2):
-        machine.start_episode()
-        machine.observe([0.0])
-    assert fail_at(machine.copy(), 4.0) == Event.NONE  # in 10 stays: exactly the share
-    machine.start_episode()
-    machine.observe([0.0])
-    assert fail_at(machine.copy(), 4.0) == Event.CREATED  # in 11
-
-
-def test_a_failure_without_a_further_observation_splits_at_the_latest():
-    machine = machine_with(distance=0.5)
-    machine.start_episode()
-    machine.observe([4.0])
-    machine.act(1)
-    machine.fail()
-    assert machine.centers.tolist() == [[0.0], [4.0]]
-    assert machine.endings.tolist() == [0.0, 1.0]
-    assert machine.model().created.tolist() == [1.0, 9.0]
-    belief = np.exp(np.array([-16.0, 0.0]) / 100.0)
-    np.testing.assert_allclose(machine.failures[1], belief / belief.sum())
-    np.testing.assert_allclose(machine.transition_matrices.sum(axis=2), 1.0)
-
-
-def test_distance_is_measured_in_the_scales_of_the_base():
-    rule = FailureSplit(Novelty(radius=10.0, scales=(4.0,)), distance=1.0)
-    machine = EvolvingFSM(n_actions=1, rule=rule)
-    machine.observe([0.0])
-    assert [fail_at(machine.copy(), z) for z in (4.0, 4.1)] == [Event.NONE, Event.CREATED]
-    assert rule.scales == (4.0,)
-
-
-def test_the_settings_are_looked_at():
-    with pytest.raises(ValueError, match=r"share is 1.5; it must be at most 1"):
-        FailureSplit(share=1.5)
-    with pytest.raises(ValueError, match=r"distance is 0.0; it must be a positive"):
-        FailureSplit(distance=0.0)
-    for base in (FailureSplit(), Novelty, "novelty", None):
-        with pytest.raises(TypeError, match=r"base is .*; it must be another rule, as an object"):
-            FailureSplit(base)
-    assert FailureSplit(Paper()).base == Paper()
 
 
 # -- Forgetting ------------------------------------------------------------------------------------
@@ -468,11 +381,3 @@ def test_exactly_a_radius_away_is_not_farther():
             machine = EvolvingFSM(1, rule=rule)
             machine.learn_many([[a], [b]], [0, 0])
             assert machine.n_states == 1
-
-
-def test_a_failure_exactly_at_the_distance_creates_no_state():
-    rule = FailureSplit(Novelty(radius=1.0), distance=0.3)
-    for k in range(-40, 200):
-        machine = EvolvingFSM(1, rule=rule)
-        machine.learn_many([[k / 10], [(k + 3) / 10]], [0, 0], failures=[1])
-        assert machine.n_states == 1

@@ -1,12 +1,9 @@
 """Transition matrices and forecasts, worked out by hand on two states and two actions."""
 
-import numba
 import numpy as np
 import pytest
 
-from evofsm.fsm.arrays import blank
 from evofsm.fsm.machine import EvolvingFSM
-from evofsm.fsm.transitions import retire_state
 
 # Learnt by `machine`, and by hand with phi = 1/2 and prior frequency 1/4 from
 # F = [[1/4, 1/4], [1/4, 1/4]]: action 0 led once from state 1 to 0, action 1 once from 0 to 0 and
@@ -71,23 +68,3 @@ def test_at_the_start_of_an_episode_the_forecast_comes_from_the_uniform_belief(m
     machine.start_episode()
     assert machine.belief.tolist() == [0.5, 0.5]
     np.testing.assert_allclose(machine.predict(0), [2 / 3, 1 / 3], rtol=1e-15)
-
-
-@numba.njit
-def retire(learnt, given, n, prior):
-    retire_state(learnt, given, n, prior)
-
-
-def test_a_row_that_led_almost_surely_to_a_state_that_is_retired_still_sums_to_1():
-    random, n, given = np.random.default_rng(0), 8, 3
-    for other in np.tile(10.0 ** np.arange(-13, -6, 0.25), 20):
-        row = random.random(n)
-        row[given] = 0.0
-        row *= other / row.sum()
-        row[given] = 1.0 - row.sum()
-        learnt = blank(1, 1, n, 1)
-        learnt.now["n_places"] = 1
-        learnt.matrices[0], learnt.origin_frequency[0] = row, 1.0
-        retire(learnt, given, n, 1e-3)
-        sums = np.delete(learnt.matrices[0], given, axis=0).sum(axis=1)
-        np.testing.assert_allclose(sums, 1.0, atol=1e-6, rtol=0)  # else no file of it would load

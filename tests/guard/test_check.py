@@ -20,7 +20,7 @@ from evofsm.driving.measures import (
     TimeToCollision,
 )
 from evofsm.fsm.actions import IntervalActions
-from evofsm.fsm.rules import Edges, FailureSplit, Novelty, Paper
+from evofsm.fsm.rules import Edges, Novelty, Paper
 from evofsm.guard import ActionReviser, Mode, Proposal
 from evofsm.guard.check import check_contract, check_results, kind_of
 
@@ -31,7 +31,6 @@ OURS = [
     Paper,
     Edges(),
     Novelty(radius=1.5, scales=(2.0, 0.5), spread=0.7),
-    FailureSplit(Novelty(radius=3.0), share=0.8),
     TimeToCollision,
     ModifiedTimeToCollision(),
     DecelerationToAvoidCollision(),

@@ -32,7 +32,6 @@ class RuleName(StrEnum):
     PAPER = "paper"
     EDGES = "edges"
     NOVELTY = "novelty"
-    FAILURE = "failure"
 
 
 class NoLeader(StrEnum):
@@ -126,8 +125,8 @@ def learn(
     rule: Annotated[
         RuleName,
         typer.Option(
-            help="How states are made: as in the paper; with states at edges too; one wherever "
-            "nothing like it was seen (novelty, recommended for logs); or that and at failures."
+            help="How states are made: as in the paper; with states at edges too; or one wherever "
+            "nothing like it was seen (novelty, recommended for logs)."
         ),
     ] = RuleName.PAPER,
     radius: Annotated[
@@ -193,7 +192,7 @@ def learn(
 
     _check_out(out)
     actions, encoder = _actions(action_range), _encoder(observe)
-    machine = _machine(actions.n_actions, rule, radius, spread, scale, max_states, failed, encoder)
+    machine = _machine(actions.n_actions, rule, radius, spread, scale, max_states, encoder)
     columns = LogColumns(
         observe=encoder,
         action=action,
@@ -297,22 +296,17 @@ def _machine(
     spread: float | None,
     scale: list[str] | None,
     max_states: int | None,
-    failed: str | None,
     encoder: ObservationEncoder,
 ) -> EvolvingFSM:
     from evofsm.fsm.machine import EvolvingFSM
-    from evofsm.fsm.rules import Edges, FailureSplit, Novelty
+    from evofsm.fsm.rules import Edges, Novelty
 
-    has_novelty = rule in (RuleName.NOVELTY, RuleName.FAILURE)
-    if rule is RuleName.FAILURE and failed is None:
-        raise ValueError("--rule failure makes states at failures; --failed has to tell of them")
-    if scale and not has_novelty:
-        raise ValueError(f"--scale is for --rule novelty or failure, not {rule.value}")
-    if has_novelty:
+    if scale and rule is not RuleName.NOVELTY:
+        raise ValueError(f"--scale is for --rule novelty, not {rule.value}")
+    if rule is RuleName.NOVELTY:
         one = 1.0 if radius is None else radius
         novelty = Novelty(one, _scales(scale, encoder, rule), 1.0 if spread is None else spread)
-        used = FailureSplit(novelty) if rule is RuleName.FAILURE else novelty
-        return EvolvingFSM(n_actions, rule=used, max_states=max_states)
+        return EvolvingFSM(n_actions, rule=novelty, max_states=max_states)
     return EvolvingFSM(
         n_actions,
         radius=0.3 if radius is None else radius,

@@ -97,12 +97,9 @@ class Settings(NamedTuple):
     spread: float
     belief_tolerance: float
     max_states: float  #: infinity for no limit
-    retires: bool  #: whether the least useful state is given up, and not two of them joined
     failure_horizon: float  #: observations; infinity for all of an episode
     rule: int  #: which rule judges an observation, see `evofsm.fsm.rules`
     memory: float  #: number of observations after which older ones fade; infinity: never
-    failure_share: float  #: a failure creates a state where fewer stays ended so; 0: none does
-    failure_distance: float  #: and only farther than this from the nearest centre
     weights: Floats  #: (m,) 1 / scale of each variable
 
 
@@ -217,16 +214,14 @@ def _optional(settings: Mapping[str, Any]) -> dict[str, Any]:
 
 _RULE: dict[str, Any] = {
     "memory": FROM_1._replace(least=2.0),
-    **dict.fromkeys(("radius", "spread", "distance"), SIZE),
+    **dict.fromkeys(("radius", "spread"), SIZE),
     "scales": Numbers(("scales",), 1e-20, 1e20),
-    "share": Numbers(least=SMALLEST, most=1.0),
 }
-_RULE = _optional(_RULE) | {"base": _optional(_RULE)}
+_RULE = _optional(_RULE)
 _BELOW_1, _WEIGHT = math.nextafter(1.0, 0.0), Numbers(least=SMALLEST, most=1e50)
 _OPTIONAL: dict[str, Any] = {
     "belief_tolerance": Numbers(least=0.0, most=_BELOW_1),
     **dict.fromkeys(("max_states", "failure_horizon"), FROM_1),
-    "when_full": FLAG,
 }
 #: Of a machine, with those of its rule.
 _SETTINGS: dict[str, Any] = {

@@ -17,8 +17,8 @@ from typing import Any
 
 import numpy as np
 
-from evofsm.fsm.arrays import ENDINGS, VISITS, Learnt, Records, Settings
-from evofsm.fsm.kernels import exponential, inner_kernel, kernel, lanes, rare_kernel, total
+from evofsm.fsm.arrays import Learnt, Records, Settings
+from evofsm.fsm.kernels import exponential, inner_kernel, kernel, lanes, total
 from evofsm.fsm.validation import Floats
 
 # What may happen to the states: bits of an `Event`.
@@ -169,18 +169,6 @@ def _absorb(now: Any, variables: Records, weights: Floats, z: Floats, memory: fl
         added *= share * n_observations
     now.n_observations += 1
     now.scatter += added
-
-
-@rare_kernel
-def splits(learnt: Learnt, settings: Settings, nearest: int) -> bool:
-    """Whether a failure at the latest observation creates a state, amid its nearest one.
-
-    Of all visits of that, those that did not come from the state itself began a stay.
-    """
-    if not exceeds(learnt.squared_distances[nearest], settings.failure_distance**2):
-        return False
-    stays = learnt.sums[VISITS, nearest] - learnt.changes[nearest, nearest]
-    return bool(learnt.sums[ENDINGS, nearest] < settings.failure_share * stays)
 
 
 # -- Recognise ------------------------------------------------------------------------------------

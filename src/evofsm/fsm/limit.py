@@ -1,47 +1,20 @@
-"""The state limit: where a state is created and there are as many as allowed, one is given up.
+"""The state limit: where a state is created and there are as many as allowed, two are merged.
 
-Its index goes to the new state, so that no other index changes; `state_ids` tell the two apart.
+The index that becomes free goes to the new state, so that no other index changes; `state_ids` tell
+the two apart.
 """
 
 from __future__ import annotations
 
-from enum import IntEnum
 from typing import Any
 
-from evofsm.fsm.arrays import ENDINGS, EPISODES, VISITS, Learnt, Settings
-from evofsm.fsm.kernels import inner_kernel, rare_kernel
-from evofsm.fsm.transitions import merge_states, retire_state
+from evofsm.fsm.arrays import EPISODES, VISITS, Learnt, Settings
+from evofsm.fsm.kernels import rare_kernel
+from evofsm.fsm.transitions import merge_states
 from evofsm.fsm.validation import Floats
 
 # What may happen besides what `evofsm.fsm.clusters` knows.
 MERGED: int = 4
-RETIRED: int = 8
-
-
-class WhenFull(IntEnum):
-    """Which state is given up where ``max_states`` exist and another one is created.
-
-    ``MERGE`` joins the two whose centres are closest, the newcomer among them: evidence is added
-    up, and the centre lies between theirs, by visits. If the newcomer is one of the two, it is
-    left out, and the other one stays where it is.
-
-    ``RETIRE`` gives up the least useful one, with all that was learnt of it: the one visited for
-    the smallest share of the time since it was created (the utility of Angelov and Filev's
-    simpl_eTS, 2005). The present state is kept, and so are those in which failures ended while
-    there are others.
-
-    Examples
-    --------
-    >>> from evofsm import EvolvingFSM, Novelty
-    >>> for when_full in WhenFull:
-    ...     machine = EvolvingFSM(1, rule=Novelty(radius=1.0), max_states=2, when_full=when_full)
-    ...     machine.learn_many([[0.0], [4.0], [9.0]], [0, 0, 0]).event, machine.centers.ravel()
-    (array([2, 2, 6], dtype=int8), array([2., 9.]))
-    (array([ 2,  2, 10], dtype=int8), array([9., 4.]))
-    """
-
-    MERGE = 0
-    RETIRE = 1
 
 
 @rare_kernel
@@ -69,6 +42,7 @@ def merge_closest(learnt: Learnt, settings: Settings, nearest: int) -> Any:
 
 @rare_kernel
 def _merge(learnt: Learnt, weights: Floats, kept: int, given: int, n: int) -> None:
+    """Add what was learnt of a state to another, whose centre moves between theirs, by visits."""
     now, sums, one, other = learnt.now[0], learnt.sums, learnt.states[kept], learnt.states[given]
     share = sums[VISITS, given] / max(sums[VISITS, kept] + sums[VISITS, given], 1.0)
     for k in range(len(weights)):
@@ -99,39 +73,15 @@ def _merge(learnt: Learnt, weights: Floats, kept: int, given: int, n: int) -> No
     now.before = kept if now.before == given else now.before
     _forget(learnt, given, n)
     # The latest observation, from centres of which one has moved.
-    latest = learnt.variables
     for i in range(n):
         squared_distance = 0.0
         for k in range(len(weights)):
-            offset = (latest[k].latest - learnt.centers[k, i]) * weights[k]
+            offset = (learnt.variables[k].latest - learnt.centers[k, i]) * weights[k]
             squared_distance += offset * offset
         learnt.squared_distances[i] = squared_distance
 
 
 @rare_kernel
-def retire_least_useful(learnt: Learnt, settings: Settings) -> Any:
-    """Give up one of n states; returns its index."""
-    now, n = learnt.now[0], learnt.now[0].n_states
-    given, least, failed = n, 0.0, True
-    for i in range(n):
-        age = now.n_observations - learnt.states[i].created + 1.0
-        utility, ended = learnt.sums[VISITS, i] / age, learnt.sums[ENDINGS, i] > 0.0
-        if i != now.state and (
-            given == n or (failed and not ended) or (failed == ended and utility < least)
-        ):
-            given, least, failed = i, utility, ended
-    if given < n:
-        retire_state(learnt, given, n, settings.prior_frequency)
-        kept = 1.0 - learnt.belief[given]
-        learnt.belief[given] = 0.0
-        for i in range(n):
-            learnt.belief[i] /= kept
-        now.before = -1 if now.before == given else now.before
-        _forget(learnt, given, n)
-    return given
-
-
-@inner_kernel
 def _forget(learnt: Learnt, given: int, n: int) -> None:
     """Make an index as good as new."""
     learnt.states[given].joined = learnt.states[given].latest_visit = 0.0

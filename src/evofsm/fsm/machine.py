@@ -33,7 +33,6 @@ from evofsm.fsm.clusters import PAPER, width_of
 from evofsm.fsm.divergence import jensen_shannon
 from evofsm.fsm.explanation import Explanation, Nearest, explain
 from evofsm.fsm.kernels import LINE, announce_compiling
-from evofsm.fsm.limit import WhenFull
 from evofsm.fsm.model import Counts, FSMModel, Policy, believed, check_forecast
 from evofsm.fsm.naming import Labels
 from evofsm.fsm.notebook import machine_html
@@ -49,12 +48,11 @@ Method = TypeVar("Method", bound=Callable[..., Any])
 # What a machine does not have to be given, with what holds if it is not.
 _OPTIONS = {
     "max_states": None,
-    "when_full": WhenFull.MERGE,
     "belief_tolerance": 0.0,
     "failure_horizon": None,
 }
 _SETTINGS = ("n_actions", "radius", "distance_weight", "learning_rate", "prior_frequency", "spread")
-_FLOATS = [name for name in Settings._fields if name not in ("retires", "rule", "weights")]
+_FLOATS = [name for name in Settings._fields if name not in ("rule", "weights")]
 # Arrays of a snapshot that a machine answers with.
 _ASKED = {*arrays.OF_MODEL, "joint_frequency", "marginal_matrix"} - {"centers"}
 _FLOAT64 = np.dtype(np.float64)
@@ -119,11 +117,10 @@ class EvolvingFSM(_Arrays):
         Width of recognition: the similarity to a centre is ``exp(-distance^2 / (spread * total
         variance of all observations))``. 3 for `Paper` and `Edges`; other rules have their own.
     rule : StateRule, optional
-        How states are determined: `Paper` (without it), `Edges`, `Novelty`, `FailureSplit`.
+        How states are determined: `Paper` (without it), `Edges`, `Novelty`.
     max_states : int, optional
-        Number of states at which another one is only created where one is given up.
-    when_full : WhenFull
-        Which one: ``MERGE`` joins the two that are closest, ``RETIRE`` forgets the least useful.
+        Number of states at which another one is only created where the two that are closest, the
+        newcomer among them, are merged: evidence adds up, and the centre lies between theirs.
     belief_tolerance : float
         How far a belief may be from the exact one, summed over all states, in [0, 1). States that
         are less likely take no part in the step: with hundreds of states this saves most of the
@@ -174,7 +171,6 @@ class EvolvingFSM(_Arrays):
         spread: float | None = None,
         rule: StateRule | None = None,
         max_states: int | None = None,
-        when_full: WhenFull = WhenFull.MERGE,
         belief_tolerance: float = 0.0,
         failure_horizon: int | None = None,
     ) -> None:
@@ -191,12 +187,9 @@ class EvolvingFSM(_Arrays):
             spread=3.0 if spread is None else positive("spread", spread),
             belief_tolerance=belief_tolerance,
             max_states=_or_infinity("max_states", max_states),
-            retires=WhenFull(when_full) is WhenFull.RETIRE,
             failure_horizon=_or_infinity("failure_horizon", failure_horizon),
             rule=PAPER,
             memory=np.inf,
-            failure_share=0.0,
-            failure_distance=0.0,
             weights=np.empty(0),
         )._replace(**cast(Any, self._rule.table))
         for name, value in (("radius", radius), ("spread", spread)):
@@ -352,14 +345,14 @@ class EvolvingFSM(_Arrays):
         if not self._learnt.now["chained"][0]:
             raise ValueError("fail before observe: this episode has no observation to fail after")
         self._make_room()
-        stepping.fail(self._learnt, self._settings, self.max_states, np.empty((3, self._capacity)))
+        stepping.fail(self._learnt, self._settings)
 
     @_alone
     def onset(self) -> None:
         """Count that something unexpected began in the state before the latest observation's.
 
         Whoever has a model of how the system moves says so, as `evofsm.Guard` does. Nothing is
-        counted where the episode has no earlier observation, or its state was given up.
+        counted where the episode has no earlier observation.
         """
         if (before := self._learnt.now["before"][0]) >= 0:
             self._learnt.sums[arrays.ONSETS, before] += 1.0
@@ -504,13 +497,8 @@ class EvolvingFSM(_Arrays):
 
     @property
     def max_states(self) -> int | None:
-        """Number of states from which on one is given up for another; None for no limit."""
+        """Number of states from which on two are merged for another; None for no limit."""
         return _or_none(self._settings.max_states)
-
-    @property
-    def when_full(self) -> WhenFull:
-        """Which state is given up."""
-        return WhenFull(int(self._settings.retires))
 
     @property
     def failure_horizon(self) -> int | None:
@@ -539,7 +527,7 @@ class EvolvingFSM(_Arrays):
     def state_ids(self) -> NDArray[np.int64]:
         """(n,) ndarray: identities of the states, the number of each one's creation from 0.
 
-        They equal the indices, unless states were given up (``max_states``): an index that became
+        They equal the indices, unless states were merged (``max_states``): an index that became
         free goes to a new state, with a new identity.
         """
         return self._learnt.states["id"][: self.n_states].astype(np.int64)
@@ -712,8 +700,7 @@ class EvolvingFSM(_Arrays):
         learnt = arrays.resized(self._learnt, *room_for(self._learnt, self._settings))
         stepping.believe(learnt, belief)
         if failed:
-            scratch = np.empty((3, len(learnt.belief)))
-            stepping.fail(learnt, self._settings, self.max_states, scratch)
+            stepping.fail(learnt, self._settings)
         if failed is not None:
             learnt.now["failures_told"] = 1
         self._learnt = learnt

@@ -58,10 +58,9 @@ def merge(machines: Sequence[EvolvingFSM], *, radius: float | None = None) -> Ev
     -----
     *States.* By visits, strongest first, a centre joins the nearest state within ``radius``, else
     it creates one. So a merged centre remains an observation that was made, and all remain farther
-    apart than ``radius``. Two states of one part that are closer than the rule's radius stay two,
-    for it told them apart on purpose (`FailureSplit`). Where ``max_states`` exist, the others join
-    the nearest. `Paper` and `Edges` take centres for the same only within a small radius: give a
-    larger one, or ``max_states``.
+    apart than ``radius``. Where ``max_states`` exist, the others join the nearest.
+    `Paper` and `Edges` take centres for the same only within a small radius: give a larger one, or
+    ``max_states``.
 
     *Rows* count by decisions, which never forget; their weight F_o becomes the mean of the parts',
     by decisions. *The prior* of new states is taken out of each part's rows and put in once: an
@@ -160,10 +159,6 @@ def _match(
     for i in np.lexsort((*places.T, -visits)).tolist():
         squared_distances = ((places[leaders] - places[i]) ** 2).sum(axis=1)
         is_full = len(leaders) >= settings.max_states
-        if not is_full:  # what its own part told apart stays apart
-            near = ((places - places[i]) ** 2).sum(axis=1) < settings.radius**2
-            apart = group[near & (of_part == of_part[i])]
-            squared_distances[apart[apart >= 0]] = np.inf
         if is_full or (leaders and squared_distances.min() <= radius**2):
             group[i] = squared_distances.argmin()
         else:

@@ -58,7 +58,7 @@ def _about(model: Any) -> list[str]:
     sizes = ((model.n_states, "state"), (model.n_actions, "action"))
     told = [f"{number:,} {thing}{'s' * (number != 1)}" for number, thing in sizes]
     settings = {name: value for name, value in model.settings.items() if name != "n_actions"}
-    told += [f"{name} {getattr(value, 'name', value)}" for name, value in settings.items()]
+    told += [f"{name} {value}" for name, value in settings.items()]
     return [*told, f"rule {model.rule}"]
 
 

@@ -9,7 +9,6 @@ from typing import Any, SupportsFloat
 import numpy as np
 
 from evofsm.extras import needs
-from evofsm.fsm.limit import WhenFull
 from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.observations import Missing
 from evofsm.fsm.rules import StateRule
@@ -35,7 +34,7 @@ class RiverClusterer(base.Clusterer):
     features : sequence of hashable, optional
         Names of the features that are observed. Without them, those of the first observation
         that holds any; name them where it may lack some.
-    radius, learning_rate, spread, rule, max_states, when_full : optional
+    radius, learning_rate, spread, rule, max_states : optional
         As `EvolvingFSM` takes them; ``radius`` in the unit of the features, which all count
         alike: scale them first.
 
@@ -65,13 +64,12 @@ class RiverClusterer(base.Clusterer):
         spread: float | None = None,
         rule: StateRule | None = None,
         max_states: int | None = None,
-        when_full: WhenFull = WhenFull.MERGE,
     ) -> None:
         if features is not None and not 0 < len(set(features)) == len(features):
             raise ValueError(f"features are {features}; they must be different names, at least one")
         self.features = features
         self.radius, self.learning_rate, self.spread = radius, learning_rate, spread
-        self.rule, self.max_states, self.when_full = rule, max_states, when_full
+        self.rule, self.max_states = rule, max_states
         settings = {name: value for name, value in self._get_params().items() if name != "features"}
         self.machine = EvolvingFSM(n_actions=1, **settings)
         self._observed = () if features is None else tuple(features)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from typing import Any, ClassVar, Protocol, cast
 
 import numpy as np
@@ -148,65 +148,8 @@ class Novelty:
         return {"rule": NOVELTY, "radius": self.radius, "spread": self.spread}
 
 
-@dataclass(frozen=True)
-class FailureSplit:
-    """Create states as another rule does, and at failures in states that were mostly safe.
-
-    A state that holds both safe situations and failures says little about either. Where an episode
-    ends in failure, let s be the most probable state at its last observation. If, of the stays in s
-    that began before the failure, fewer than ``share`` ended in a failure, and the observation is
-    farther than ``distance`` from the centre of s, it creates a state. A *stay* is a run of
-    observations of one episode that are all recognised as s.
-
-    Parameters
-    ----------
-    base : StateRule
-        The rule that creates and moves all other states, and says how wide they are recognised.
-    share : float
-        Share of stays that end in failure from which on a state is no longer safe, in (0, 1].
-    distance : float
-        Least distance from the centre, in the scales of ``base``.
-
-    Examples
-    --------
-    >>> from evofsm import EvolvingFSM
-    >>> machine = EvolvingFSM(n_actions=1, rule=FailureSplit(Novelty(radius=2.0), distance=0.5))
-    >>> trace = machine.learn_many([[0.0], [1.5], [0.0]], [0, 0, 0])
-    >>> machine.observe([1.5], failed=True).event.name
-    'CREATED'
-    """
-
-    base: StateRule = field(default_factory=Novelty)
-    share: float = 0.5
-    distance: float = 0.25
-
-    def __post_init__(self) -> None:
-        if isinstance(self.base, type | FailureSplit) or not hasattr(self.base, "table"):
-            raise TypeError(f"base is {self.base!r}; it must be another rule, as an object")
-        object.__setattr__(self, "share", positive("share", self.share))
-        object.__setattr__(self, "distance", positive("distance", self.distance))
-        if self.share > 1.0:
-            raise ValueError(f"share is {self.share}; it must be at most 1")
-
-    @property
-    def scales(self) -> Sequence[float]:
-        """Those of ``base``."""
-        return self.base.scales
-
-    @property
-    def table(self) -> Mapping[str, float]:
-        """What the kernel judges by."""
-        of_failures = {"failure_share": self.share, "failure_distance": self.distance}
-        return {**self.base.table, **of_failures}
-
-
 # By name in files.
-_RULES: dict[str, Any] = {
-    "paper": Paper,
-    "edges": Edges,
-    "novelty": Novelty,
-    "failure": FailureSplit,
-}
+_RULES: dict[str, Any] = {"paper": Paper, "edges": Edges, "novelty": Novelty}
 
 
 def register_rule(name: str, rule: type) -> None:
@@ -260,7 +203,6 @@ def reach(rule: StateRule, width: float) -> float:
     The radius of `Novelty`, beyond which it makes a new one. Other rules make no state of what is
     rare: twice the root of the width of recognition, where the similarity is 1/e⁴, or 2 %.
     """
-    rule = rule.base if isinstance(rule, FailureSplit) else rule
     return rule.radius if isinstance(rule, Novelty) else _WIDTHS * math.sqrt(width)
 
 
@@ -268,10 +210,7 @@ def describe_rule(rule: StateRule) -> dict[str, Any]:
     """A rule in plain JSON: its name and its settings, but for those that are None."""
     name, kind = next(item for item in _RULES.items() if item[1] is type(rule))
     given = {entry.name: getattr(rule, entry.name) for entry in fields(kind)}
-    settings = {name: value for name, value in given.items() if value is not None}
-    if "base" in settings:
-        settings["base"] = describe_rule(settings["base"])
-    return {"name": name, **settings}
+    return {"name": name} | {key: value for key, value in given.items() if value is not None}
 
 
 def restore_rule(description: Mapping[str, Any]) -> StateRule:
@@ -279,7 +218,5 @@ def restore_rule(description: Mapping[str, Any]) -> StateRule:
     if not isinstance(description, Mapping) or description.get("name") not in _RULES:
         raise ValueError(f"rule is {description!r}; it must be one of {', '.join(_RULES)}")
     settings = {name: value for name, value in description.items() if name != "name"}
-    if "base" in settings:
-        settings["base"] = restore_rule(settings["base"])
     rule: StateRule = _RULES[description["name"]](**settings)
     return rule

@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from evofsm.extras import needs
-from evofsm.fsm.limit import WhenFull
 from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.rules import StateRule
 from evofsm.fsm.validation import Floats
@@ -26,10 +25,9 @@ class EvolvingClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc] # bo
 
     Parameters
     ----------
-    radius, learning_rate, spread, rule, max_states, when_full : optional
+    radius, learning_rate, spread, rule, max_states : optional
         As `EvolvingFSM` takes them; ``radius`` in the unit of the features, which all count
-        alike: scale them first. (scikit-learn allows no enumeration as a default: None is
-        ``WhenFull.MERGE``.)
+        alike: scale them first.
 
     Attributes
     ----------
@@ -61,10 +59,9 @@ class EvolvingClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc] # bo
         spread: float | None = None,
         rule: StateRule | None = None,
         max_states: int | None = None,
-        when_full: WhenFull | None = None,
     ) -> None:
         self.radius, self.learning_rate, self.spread = radius, learning_rate, spread
-        self.rule, self.max_states, self.when_full = rule, max_states, when_full
+        self.rule, self.max_states = rule, max_states
 
     def fit(self, X: ArrayLike, y: object = None) -> Self:
         """Learn from the rows of X (N, m), in the order of time, whatever was learnt before."""

@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evofsm.fsm.arrays import ENDINGS, EPISODES, FAILED_SOON, NO_ACTION, VISITS, Learnt, Settings
-from evofsm.fsm.clusters import CREATED, MOVED, UNCHANGED, determine, recognise, splits, width_of
+from evofsm.fsm.clusters import CREATED, MOVED, UNCHANGED, determine, recognise, width_of
 from evofsm.fsm.divergence import jensen_shannon_kernel
 from evofsm.fsm.kernels import inner_kernel, kernel, lanes, rare_kernel, spliced_kernel
-from evofsm.fsm.limit import MERGED, RETIRED, merge_closest, retire_least_useful
+from evofsm.fsm.limit import MERGED, merge_closest
 from evofsm.fsm.notebook import step_html
 from evofsm.fsm.transitions import expand, forecast_and_identify, place_of, room_for
 from evofsm.fsm.validation import Floats
@@ -46,14 +46,17 @@ def step(
     event, nearest, potential = determine(learnt, settings, z)
     if event == CREATED:
         event, nearest = _create(learnt, settings, limit, nearest, potential)
-    elif event == UNCHANGED and failed and splits(learnt, settings, nearest):
-        event, nearest = _create(
-            learnt, settings, limit, nearest, _potential_of_latest(learnt, settings)
-        )
     n = now.n_states
 
     # Section 2.2.2: which state is this?
-    _recognise(learnt, settings, nearest, recognised)
+    recognise(
+        learnt.squared_distances,
+        lanes(n),
+        nearest,
+        width_of(settings, now.scatter / now.n_observations),
+        settings.belief_tolerance,
+        recognised,
+    )
 
     # Section 2.3: was it foreseen, and what does it teach about the action taken before it?
     surprise = np.nan
@@ -122,21 +125,9 @@ def learn_rows(
 
 
 @kernel
-def fail(learnt: Learnt, settings: Settings, limit: Limit, scratch: Floats) -> None:
-    """End the episode in failure, to which the pending action led from the latest observation.
-
-    There must be room for what this may create.
-    """
-    now, nearest = learnt.now[0], learnt.now[0].state
-    is_whole = learnt.states[nearest].latest_visit == now.clock
-    if is_whole and splits(learnt, settings, nearest):
-        potential = _potential_of_latest(learnt, settings)
-        nearest = _create(learnt, settings, limit, nearest, potential)[1]
-        now.state = nearest
-        _recognise(learnt, settings, nearest, scratch[RECOGNISED])
-        _count_visit(learnt, nearest)
-        for i in range(now.n_states):
-            learnt.belief[i] = scratch[RECOGNISED, i]
+def fail(learnt: Learnt, settings: Settings) -> None:
+    """End the episode in failure, to which the pending action led; there is room for its matrix."""
+    now = learnt.now[0]
     if now.action != NO_ACTION:
         place = place_of(learnt, now.action, settings.prior_frequency)
         _count_decision(learnt, place, now.n_states, True)
@@ -159,17 +150,14 @@ def _create(
 ) -> tuple[int, int]:
     """Create a state on the latest observation; returns what happened and the nearest state.
 
-    Where there are as many states as allowed, one of them, or the newcomer, is given up.
+    Where there are as many states as allowed, two of them, or the newcomer and one, are merged.
     """
     now, n = learnt.now[0], learnt.now[0].n_states
     new, event = n, CREATED
     if limit is None or n < limit:  # None is known as this is compiled: the rest is left out then
         now.n_states += 1
     else:
-        if settings.retires:
-            new, event = retire_least_useful(learnt, settings), CREATED | RETIRED
-        else:
-            new, event = merge_closest(learnt, settings, nearest), CREATED | MERGED
+        new, event = merge_closest(learnt, settings, nearest), CREATED | MERGED
         if new == n:
             return MERGED, nearest
     for j in range(len(learnt.variables)):
@@ -181,33 +169,6 @@ def _create(
     learnt.states[new].created = now.n_observations
     now.n_created += 1
     return event, new
-
-
-@rare_kernel
-def _potential_of_latest(learnt: Learnt, settings: Settings) -> float:
-    """The density at the latest observation, which is absorbed already and counts in it."""
-    variance = learnt.now[0].scatter / learnt.now[0].n_observations
-    squared_distance = 0.0
-    for j in range(len(learnt.variables)):
-        variable = learnt.variables[j]
-        offset = (variable.latest - variable.first - variable.mean) * settings.weights[j]
-        squared_distance += offset * offset
-    return float(1.0 / (1.0 + squared_distance + variance))
-
-
-@inner_kernel
-def _recognise(learnt: Learnt, settings: Settings, nearest: int, recognised: Floats) -> None:
-    """Recognise the latest observation."""
-    now = learnt.now[0]
-    width = width_of(settings, now.scatter / now.n_observations)
-    recognise(
-        learnt.squared_distances,
-        lanes(now.n_states),
-        nearest,
-        width,
-        settings.belief_tolerance,
-        recognised,
-    )
 
 
 # -- Counts ---------------------------------------------------------------------------------------
@@ -267,9 +228,9 @@ class Event(IntFlag):
     """What an observation did to the states (the paper's Section 2.2.1).
 
     ``NONE`` left them as they were, ``MOVED`` put the nearest one on the observation, and
-    ``CREATED`` put a new one there. Where there were ``max_states`` before, two were ``MERGED`` or
-    one was ``RETIRED`` to make room, and the new one has the index that became free; ``MERGED``
-    alone says that none was created, for the nearest one was close enough.
+    ``CREATED`` put a new one there. Where there were ``max_states`` before, two were ``MERGED`` to
+    make room, and the new one has the index that became free; ``MERGED`` alone says that none was
+    created, for the nearest one was close enough.
 
     Examples
     --------
@@ -282,11 +243,10 @@ class Event(IntFlag):
     MOVED = MOVED
     CREATED = CREATED
     MERGED = MERGED
-    RETIRED = RETIRED
 
 
 #: By value: looking one up is quicker than making one.
-EVENTS = tuple(Event(value) for value in range(16))
+EVENTS = tuple(Event(value) for value in range(8))
 
 
 class Step(NamedTuple):

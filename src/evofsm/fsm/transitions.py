@@ -18,8 +18,6 @@ from evofsm.fsm.validation import Floats
 
 # A weight below this is taken as 0: smaller numbers turn denormal and slow every step.
 _LOWEST_FREQUENCY = 1e-290
-# A row with less left of it than this is rounding: scaled up it would no longer sum to 1.
-_LEAST_KEPT = 1e-9
 
 
 @kernel
@@ -88,7 +86,7 @@ def forget_row(learnt: Learnt, place: int, i: int, n: int, prior_frequency: floa
 def expand(learnt: Learnt, new: int, n: int, prior_frequency: float) -> None:
     """Add a state to all matrices, ``n`` with it: its row and column of F are the prior frequency.
 
-    Its index ``new`` is the last, or that of a state given up, whose column is 0.
+    Its index ``new`` is the last, or that of a state merged into another, whose column is 0.
     """
     for place in range(learnt.now[0].n_places):
         matrix, origin_frequency = learnt.matrices[place], learnt.origin_frequency[place]
@@ -115,19 +113,3 @@ def merge_states(learnt: Learnt, kept: int, given: int, n: int) -> None:
         for i in range(n):
             matrix[i, kept] += matrix[i, given]
             matrix[i, given] = 0.0
-
-
-@rare_kernel
-def retire_state(learnt: Learnt, given: int, n: int, prior_frequency: float) -> None:
-    """Take the frequencies of transitions from and to a state away."""
-    for place in range(learnt.now[0].n_places):
-        matrix, frequency = learnt.matrices[place], learnt.origin_frequency[place]
-        frequency[given] = 0.0
-        for i in range(n):
-            if 1.0 - matrix[i, given] <= _LEAST_KEPT:  # nothing else is known of where it leads
-                forget_row(learnt, place, i, n, prior_frequency)
-            kept = 1.0 - matrix[i, given]
-            matrix[i, given] = 0.0
-            frequency[i] *= kept
-            for j in range(n):
-                matrix[i, j] /= kept
