@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from functools import partial
 from importlib.util import find_spec
@@ -27,24 +28,23 @@ from matplotlib.figure import Figure as Drawn
 from typer import Option
 
 from evofsm.driving import (
-    TOLD,
-    WORLDS,
     Draw,
     EnvelopeReviser,
+    Episode,
     Family,
+    KinematicWorld,
+    LatentRisk,
     Outcome,
-    Reference,
     RiskByState,
+    SumoWorld,
     drive,
     guard_for_family,
     held_out,
     learners_of,
-    learnt_by,
     load_family,
     measures,
-    open_world,
-    references_of,
-    score,
+    outcome_of,
+    reference_of,
     summarise,
     teach,
     training,
@@ -215,13 +215,13 @@ class Course(NamedTuple):
 
     family: Family
     draws: Sequence[Draw]
-    alone: Sequence[Reference]
+    alone: Sequence[Any]
 
     @classmethod
     def of(cls, family: Family, draws: Iterable[Draw]) -> Self:
         """These draws, once the controller has driven them alone."""
         every = list(draws)
-        return cls(family, every, references_of(family, every))
+        return cls(family, every, [reference_of(family, draw) for draw in every])
 
     def first(self, n: int) -> Self:
         """The first so many of them."""
@@ -233,7 +233,13 @@ class Course(NamedTuple):
             drive(Guard.of(reviser, interval=self.family.interval, learn=False), draw)
             for draw, reviser in zip(self.draws, revisers, strict=False)
         )
-        return score(self.family, self.alone, drives)
+        return self.scored(drives)
+
+    def scored(self, drives: Iterable[Episode]) -> list[Outcome]:
+        """Outcomes of the driven draws, against the controller alone."""
+        interval = self.family.interval
+        pairs = zip(self.alone, drives, strict=True)
+        return [outcome_of(driven, alone, interval) for alone, driven in pairs]
 
     def by(self, guard: Guard) -> list[Outcome]:
         """What comes of the draws by what a guard has learnt so far."""
@@ -363,7 +369,8 @@ def _test_learner(study: ClosedLoop, policy: str, seed: int) -> Found:
 def _test_rule(study: ClosedLoop, rule: str, seed: int) -> Found:
     """Steer by the states alone: what a rule's states are worth."""
     family = study.drawn_from
-    machine, risk = learnt_by(guard_for_family(family, rule=RULES[rule]))
+    risk = LatentRisk(family.low, family.interval)
+    machine, _ = learners_of(guard_for_family(family, rule=RULES[rule], judge=risk))
     by_state = RiskByState(risk, machine)
     reviser = ActionReviser(by_state, family.actions, tolerance=study.tolerance)
     guard = Guard.of(reviser, interval=family.interval, machine=machine, judge=risk)
@@ -374,7 +381,7 @@ def _test_rule(study: ClosedLoop, rule: str, seed: int) -> Found:
     row = tests.row(
         rule,
         Group.LEARNT,
-        score(family, tests.alone, teach(guard, tests.draws)),
+        tests.scored(teach(guard, tests.draws)),
         learning_seed=seed,
         train_episodes=episodes,
         train_collisions=sum(one.collided for one in taught),
@@ -391,10 +398,11 @@ def _separate(study: ClosedLoop) -> Found:
     The truth is a dead end: both cars brake as hard as they can from now on, and still collide.
     """
     family, test = study.drawn_from, study.side_test
-    watching = guard_for_family(family, tolerance=0.01, mode=Mode.SHADOW)
+    risk = LatentRisk(family.low, family.interval)
+    watching = guard_for_family(family, tolerance=0.01, mode=Mode.SHADOW, judge=risk)
     teach(watching, training(family, study.seed, 0, study.side_train))
     compared: dict[tuple[str, str], RiskMeasure] = {
-        (OURS, Group.LEARNT): learnt_by(watching)[1],
+        (OURS, Group.LEARNT): risk,
         ("rss-matched", Group.MATCHED): _true_limits(family),
         **{(name, Group.FIXED): measure for name, measure in measures.FIXED_MEASURES.items()},
     }
@@ -423,9 +431,9 @@ def _drive_both_worlds(study: ClosedLoop) -> Found:
     guard = guard_for_family(family, tolerance=study.tolerance)
     teach(guard, training(family, study.seed, 0, study.side_train))
     found = []
-    for name in WORLDS:
+    for name, opened in (("sumo", SumoWorld()), ("kinematic", nullcontext(KinematicWorld()))):
         tested, draws = _frozen(guard), held_out(family, study.seed, study.world_test)
-        with open_world(name) as world:
+        with opened as world:
             drives = [drive(tested, draw, world) for draw in draws]
         speeds = [one.observations[:, 1].mean() for one in drives]
         found.append(
@@ -559,7 +567,11 @@ _IS_RIVAL = ~_LEARNT & (pl.col("group") != Group.BOUND) & ~pl.col("policy").is_i
 def _told(policy: str) -> pl.Expr:
     """What a policy that learnt was told."""
     machine = pl.col(policy) == MACHINE
-    return pl.when(machine).then(pl.lit(TOLD["learnt"])).otherwise(pl.lit(TOLD["kinematic"]))
+    return (
+        pl.when(machine)
+        .then(pl.lit("nothing but failures"))
+        .otherwise(pl.lit("how cars follow each other"))
+    )
 
 
 def lines_of(rows: pl.DataFrame) -> pl.DataFrame:

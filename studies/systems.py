@@ -25,7 +25,6 @@ from evofsm.driving import (
     Draw,
     Family,
     KinematicWorld,
-    Reference,
     load_family,
     outcome_of,
     reference_of,
@@ -584,7 +583,7 @@ def _family(name: str) -> Family:
 
 
 @lru_cache(maxsize=4096)
-def _alone(name: str, start: Start) -> Reference:
+def _alone(name: str, start: Start) -> Any:
     """How far the driver comes by itself; the same draws are driven by every judge."""
     return reference_of(_family(name), _draw(_family(name), start))
 

@@ -10,7 +10,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from evofsm.driving import DECISION_COLUMNS
+from evofsm.driving.naming import DECISION_COLUMNS
 from evofsm.guard.record import Column
 
 pytestmark = pytest.mark.slow

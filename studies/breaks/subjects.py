@@ -13,19 +13,13 @@ from typing import Protocol
 import numpy as np
 
 from evofsm.driving import (
-    GAP,
-    LEADER_ACCELERATION,
-    LEADER_SPEED,
-    SPEED,
     Draw,
     Episode,
     Family,
     KinematicWorld,
     drive,
     guard_for_family,
-    learners_of,
     load_family,
-    name_judge,
     teach,
     training,
     unrevised_guard,
@@ -41,6 +35,7 @@ _NORMAL = NormalDist()
 
 # Where evofsm drive --out puts what was learnt.
 _GUARD = "guard.evofsm"
+_JUDGES = {"LatentRisk": "kinematic", "LearntRisk": "learnt"}
 
 
 class Subject(Protocol):
@@ -118,11 +113,11 @@ def needed_braking(episode: Episode) -> float:
     """
     if episode.collided:
         return math.inf
-    record = episode.record
-    gap, speed, ahead = record[:, GAP], record[:, SPEED], record[:, LEADER_SPEED]
+    gap, speed, ahead = episode.observations.T
+    accelerations = episode.leader_accelerations
     closing = np.maximum(speed - ahead, 0.0)
-    slows = record[:, LEADER_ACCELERATION] < 0.0
-    stops = ahead[slows] ** 2 / (-2.0 * record[slows, LEADER_ACCELERATION])
+    slows = accelerations < 0.0
+    stops = ahead[slows] ** 2 / (-2.0 * accelerations[slows])
     to_stop = speed[slows] ** 2 / (2.0 * (gap[slows] + stops))
     return float(max((closing**2 / (2.0 * gap)).max(), to_stop.max(initial=0.0)))
 
@@ -137,7 +132,7 @@ def load(name: str, switches: tuple[str, ...] = ()) -> Family:
 def check_learnt(folder: str | None, judge: str) -> None:
     """Raise where a folder holds what another judge learnt."""
     if folder is not None and judge != NOBODY:
-        held = name_judge(learners_of(Guard.load(Path(folder) / _GUARD))[1])
+        held = _JUDGES[type(Guard.load(Path(folder) / _GUARD).judge).__name__]
         if held != judge:
             raise ValueError(f"{folder} holds the judge {held!r}, not {judge!r}: --judge {held}")
 

@@ -7,11 +7,10 @@ from pathlib import Path
 
 import polars
 
-from evofsm.driving import VARIABLES
 from studies.datasets.columns import name_of
 from studies.datasets.episodes import Episode, cut
 
-_NUMBERS = ("time", *VARIABLES, "a_follower")
+_NUMBERS = ("time", "gap", "v_follower", "v_leader", "a_follower")
 _LABELS = ("pair", "segment")
 
 

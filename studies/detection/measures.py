@@ -22,7 +22,7 @@ from evofsm.driving import (
     Unrevised,
     drive,
     guard_for_family,
-    learnt_by,
+    learners_of,
     measures,
 )
 from evofsm.fsm import EvolvingFSM
@@ -145,7 +145,8 @@ class Watcher:
 
     def __init__(self, family: Family, *, states: bool = True) -> None:
         # What is learnt of leaders and brakes, and the machine beside it.
-        machine, self.risk = learnt_by(guard_for_family(family))
+        self.risk = LatentRisk(family.low, family.interval)
+        machine, _ = learners_of(guard_for_family(family, judge=self.risk))
         self.default = Chain(machine, family)
         self.paper = Chain(EvolvingFSM(family.actions.n_actions), family)
         self.states = states

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.driving import Draw, Family, KinematicWorld, Sensors, measures, training
+from evofsm.driving import Draw, Family, KinematicWorld, measures, training
 from evofsm.guard import make_usable
 
 #: A collision within so long counts as coming [s].
@@ -185,5 +185,5 @@ def _without_unused_seed(draw: Draw) -> Draw:
     sensors = draw.scenario.sensors
     if sensors.gap_noise > 0.0 or sensors.speed_noise > 0.0:
         return draw
-    without = replace(draw.scenario, sensors=Sensors(delay=sensors.delay))
+    without = replace(draw.scenario, sensors=replace(sensors, seed=0))
     return draw._replace(scenario=without)

@@ -12,7 +12,7 @@ import numpy as np
 import polars
 from numpy.typing import NDArray
 
-from evofsm.driving import VARIABLES, Draw, Family, KinematicWorld, held_out, load_family, training
+from evofsm.driving import Draw, Family, KinematicWorld, held_out, load_family, training
 from evofsm.fsm import IntervalActions
 from evofsm.fsm.arrays import NO_ACTION
 from evofsm.io import episodes_of, read_traces
@@ -23,6 +23,7 @@ FAMILIES = ("emergency", "stop_and_go", "cut_in", "rare")
 LOG_ACTIONS = IntervalActions(low=-2.5, high=2.5, width=0.3, outside="clip")
 
 
+_VARIABLES = ("gap", "v_follower", "v_leader")
 _ACTION = "a_follower"
 
 
@@ -122,7 +123,7 @@ def log_sources(folder: Path) -> list[LogSource]:
     sources = [LogSource(name, tuple(files)) for name, files in found.items() if len(files) > 1]
     if not sources:
         raise ValueError(
-            f"{folder} has no two logs of one origin, with columns time, {', '.join(VARIABLES)} "
+            f"{folder} has no two logs of one origin, with columns time, {', '.join(_VARIABLES)} "
             f"and {_ACTION} (files of one origin are named alike up to the first _)"
         )
     return sources
@@ -130,7 +131,7 @@ def log_sources(folder: Path) -> list[LogSource]:
 
 def _is_log(path: str) -> bool:
     scan = polars.scan_parquet if path.endswith(".parquet") else polars.scan_csv
-    return {"time", _ACTION, *VARIABLES} <= set(scan(path).collect_schema())
+    return {"time", _ACTION, *_VARIABLES} <= set(scan(path).collect_schema())
 
 
 def split_logs(source: LogSource, seed: int, part: int, parts: int) -> tuple[list[str], list[str]]:

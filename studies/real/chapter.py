@@ -8,7 +8,6 @@ from functools import partial
 from typing import Any
 
 from evofsm.cli import NONE, Column, Table, count, listed, number, percent, within
-from evofsm.driving import name_states
 from studies.old.against import ahead
 from studies.old.asked import Asked, failures, tables_of_asked
 from studies.old.chapter import Chapter
@@ -298,10 +297,15 @@ def _states(study: RealStudy) -> Iterator[Table]:
             f"The states after which {TITLES[SHOWN_QUESTION.target]} most often came within "
             f"{SHOWN_QUESTION.horizon:g} s",
             columns,
-            zip(name_states([one.center for one in found]), found, strict=True),
+            ((_place(one.center), one) for one in found),
             f"Of evofsm-states, as {taught_by} taught it: states in which {_LEAST_SECONDS:g} s or "
             "more were spent.",
         )
+
+
+def _place(center: tuple[float, ...]) -> str:
+    gap, speed, ahead = center
+    return f"{gap:.1f} m, {speed:.1f} m/s behind {ahead:.1f} m/s"
 
 
 def _plan(study: RealStudy) -> Iterator[Setting]:

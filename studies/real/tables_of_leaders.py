@@ -7,10 +7,12 @@ from collections.abc import Callable, Iterator
 from itertools import zip_longest
 
 from evofsm.cli import Column, Table, count, decimals
-from evofsm.driving import REAL_DRIVES, LeaderBrakes, brakes_needed
+from evofsm.driving import REAL_DRIVES, LeaderBrakes
 from evofsm.guard import TOLERANCE
 from studies.real.leaders import TOLD, Alarms, Braked, LeaderStudy, Limits
 
+# So many are to be seen until an assumed one weighs no more than the tolerance.
+_NEEDED = math.ceil(1.0 / TOLERANCE - 1e-9) - 1
 # The reviser's own.
 _BRAKES: tuple[Column[Braked], ...] = (
     Column("drives", "source"),
@@ -22,7 +24,7 @@ _BRAKES: tuple[Column[Braked], ...] = (
     Column("hardest", lambda one: one.hardest if one.seen else None, decimals(1), "m/s²"),
     Column("hard an hour", lambda one: one.seen / one.brakes.hours, decimals(1)),
     Column(
-        f"hours to {brakes_needed(TOLERANCE)}",
+        f"hours to {_NEEDED}",
         lambda one: one.brakes.hours_until(TOLERANCE),
         decimals(1),
     ),
@@ -36,7 +38,7 @@ def leader_tables(study: LeaderStudy, limits: Limits) -> tuple[Table, ...]:
         "Hard brakes of leaders, 2.5 m/s² and more",
         _BRAKES,
         study.braked,
-        f"With {brakes_needed(TOLERANCE)} remembered, a leader who is only assumed weighs no more "
+        f"With {_NEEDED} remembered, a leader who is only assumed weighs no more "
         f"than {TOLERANCE:.0%}. Waves: hard brakes less than 10 s apart in a run count once. "
         f"{_unseen(every)}",
     )

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.driving import Episode, Road, Scenario, World
+from evofsm.driving import Episode, KinematicWorld, Scenario
 from evofsm.guard import Controller
 from evofsm.paper import CASES, PaperStudy, Settings, check_claims, run_paper
 
@@ -161,12 +161,12 @@ class Remembering:
     the same.
     """
 
-    def __init__(self, world: World) -> None:
+    def __init__(self, world: KinematicWorld) -> None:
         self._world = world
         # The drivers are frozen, and so can be looked up, which `Controller` does not promise.
         self._run: Callable[..., Any] = lru_cache(_EPISODES)(world.run)
 
-    def open(self, scenario: Scenario) -> AbstractContextManager[Road]:
+    def open(self, scenario: Scenario) -> AbstractContextManager[Any]:
         """As the world itself."""
         return self._world.open(scenario)
 
@@ -176,7 +176,7 @@ class Remembering:
         return episode
 
 
-def study_of(setting: Setting, world: World, rounds: int = ROUNDS) -> PaperStudy:
+def study_of(setting: Setting, world: Any, rounds: int = ROUNDS) -> PaperStudy:
     """The paper's runs and what follows them, with another setting."""
     return run_paper(
         world,
@@ -191,7 +191,7 @@ def study_of(setting: Setting, world: World, rounds: int = ROUNDS) -> PaperStudy
 
 def evaluate(
     setting: Setting,
-    world: World,
+    world: Any,
     design: str = "",
     varied: tuple[str, ...] = (),
     rounds: int = ROUNDS,
@@ -201,7 +201,7 @@ def evaluate(
     Parameters
     ----------
     setting : Setting
-    world : World
+    world
         Where to drive; a `Remembering` one drives each case only once.
     design : str
         Why it is tried.

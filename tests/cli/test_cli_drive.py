@@ -22,7 +22,8 @@ from evofsm.cli.driving import (
     drive_in_turn,
     make_guard,
 )
-from evofsm.driving import KinematicWorld, load_family, open_world
+from evofsm.driving import KinematicWorld, load_family
+from evofsm.driving.sumo import open_world
 from evofsm.guard import Guard, Mode
 
 EMERGENCY = load_family("emergency")
@@ -124,7 +125,7 @@ def test_the_table_of_decisions_has_its_columns_in_their_order():
     [
         (("nowhere",), "nowhere"),
         (("emergency", "--reviser", "magic"), "magic"),
-        (("emergency", "--controller", "sumo"), "sumo"),
+        (("emergency", "--controller", "nobody"), "nobody"),
         (("emergency", "--mode", "shadow", "--reviser", "rss"), "rss"),
         (("emergency", "--with", "rain"), "rain"),
         (("emergency", "--frozen", "nothing-here"), "nothing-here"),

@@ -8,9 +8,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from evofsm.driving import LatentRisk, Role, attach, guard_for_cars, guard_for_traffic
+from evofsm.driving import LatentRisk, attach, guard_for_cars, guard_for_traffic
 from evofsm.driving.attached import choose
 from evofsm.driving.measures import deceleration_to_avoid_collision, time_to_collision
+from evofsm.driving.traffic import Role
 
 libsumo = pytest.importorskip("libsumo")
 

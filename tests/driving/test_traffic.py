@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from evofsm.driving import LatentRisk, Object, Role, Scene, TrafficRisk, guard_for_traffic
+from evofsm.driving import LatentRisk, Object, Scene, TrafficRisk, guard_for_traffic
+from evofsm.driving.traffic import Role
 from evofsm.guard import Situation
 
 LOW, HIGH, DECEL, INTERVAL = -9.0, 2.5, 4.5, 0.1

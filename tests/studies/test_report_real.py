@@ -106,8 +106,8 @@ def test_states_that_were_hardly_visited_are_not_listed(written):
     (table,) = (one for one in chapter.tables if one.title.startswith("The states after which"))
     names = [line[0] for line in table.rows]
     assert names == [
-        "close (9.0 m), slow (4.0 m/s), closing at 1.0 m/s",
-        "close (9.1 m), slow (4.0 m/s), closing at 1.0 m/s",
+        "9.0 m, 4.0 m/s behind 3.0 m/s",
+        "9.1 m, 4.0 m/s behind 3.0 m/s",
     ]
 
 

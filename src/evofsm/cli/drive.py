@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
     from evofsm.cli.driving import Driving, Results, Setup
     from evofsm.cli.sumocfg import Attached
-    from evofsm.driving import StateRisk
+    from evofsm.driving.by_state import StateRisk
     from evofsm.guard import Guard
     from evofsm.io.foxglove import FoxgloveSink, RunWriter
 
@@ -223,7 +223,8 @@ def _drive_in_turn(
     foxglove: int | None,
 ) -> Driving:
     from evofsm.cli.driving import drive_in_turn
-    from evofsm.driving import learners_of, open_world
+    from evofsm.driving import learners_of
+    from evofsm.driving.sumo import open_world
     from evofsm.guard import AuditLog
 
     setup = results.setup
@@ -298,7 +299,7 @@ def _live(port: int | None) -> Iterator[FoxgloveSink | None]:
 
 def _summary(driving: Driving, setup: Setup) -> Iterator[tuple[str, str]]:
     """Collisions and their price, and what was learnt."""
-    from evofsm.driving import TOLD
+    from evofsm.driving.cars import TOLD
 
     row = driving.row
     kind = "training" if setup.learn else "held-out"

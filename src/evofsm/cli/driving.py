@@ -26,7 +26,6 @@ from typing import Any, NamedTuple
 from evofsm import store
 from evofsm.cli.journal import Journal
 from evofsm.driving import (
-    DECISION_COLUMNS,
     IDM,
     Draw,
     EnvelopeReviser,
@@ -34,27 +33,25 @@ from evofsm.driving import (
     Family,
     LatentRisk,
     Outcome,
-    Row,
-    StateRisk,
-    SumoDriver,
-    SumoWorld,
-    Trial,
     Unrevised,
-    World,
     assess_states,
     guard_for_family,
     learners_of,
-    name_judge,
     summarise,
 )
+from evofsm.driving.by_state import StateRisk
+from evofsm.driving.cars import name_judge
+from evofsm.driving.episodes import Row, Trial
 from evofsm.driving.measures import FIXED_MEASURES
+from evofsm.driving.naming import DECISION_COLUMNS
+from evofsm.driving.world import World
 from evofsm.extras import needs
 from evofsm.guard import TOLERANCE, Controller, DecisionLogger, Explain, Guard, Mode, Reviser
 
 _log = logging.getLogger(__name__)
 
 #: Controllers by name; ``family`` is the family's own.
-CONTROLLERS = ("family", "aggressive", "normal", "sumo")
+CONTROLLERS = ("family", "aggressive", "normal")
 #: Revisers by name: none, ours, and the classic measures.
 REVISERS = ("least-risk", "none", "rss", "aeb", *FIXED_MEASURES)
 #: The columns of ``decisions.parquet`` after ``episode``; `driving/naming.py` says which they are.
@@ -168,7 +165,7 @@ def make_guard(setup: Setup, before: Guard | None = None) -> Guard:
     return Guard.of(reviser, interval=family.interval, learn=setup.learn, **learners)
 
 
-def make_controller(setup: Setup, draw: Draw, world: World) -> Controller:
+def make_controller(setup: Setup, draw: Draw) -> Controller:
     """A controller by its name, within the family's range of actions."""
     low, high = setup.family.actions.low, setup.family.actions.high
     match setup.controller:
@@ -178,10 +175,6 @@ def make_controller(setup: Setup, draw: Draw, world: World) -> Controller:
             return IDM(2.25, 28.0, 0.8, 0.3, 2.0, lowest=low, highest=high)
         case "normal":
             return IDM(1.25, 25.0, 2.0, 1.5, 2.0, lowest=low, highest=high)
-        case "sumo":
-            if not isinstance(world, SumoWorld):
-                raise ValueError("the controller 'sumo' is SUMO's own; it needs --world sumo")
-            return SumoDriver(world)
     raise ValueError(
         f"there is no controller {setup.controller!r}; there are {', '.join(CONTROLLERS)}"
     )

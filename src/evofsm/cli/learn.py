@@ -185,7 +185,7 @@ def learn(
     to the same result. The file stays at the end: run again, the command prints it at once.
     """
     from evofsm.cli.learning import Checkpoint, learn_traces
-    from evofsm.driving import UNITS, VARIABLES
+    from evofsm.driving.naming import UNITS, VARIABLES
     from evofsm.fsm.validation import positive
     from evofsm.io import LogColumns, Topics, VehicleLengths, read_traces
     from evofsm.io.logs import Noted, parse_units
@@ -318,7 +318,8 @@ def _machine(
 
 def _scales(scale: list[str] | None, encoder: ObservationEncoder, rule: RuleName) -> list[float]:
     """The difference that counts as 1, for each number that is observed."""
-    from evofsm.driving import SAFETY_RULE, VARIABLES
+    from evofsm.driving import SAFETY_RULE
+    from evofsm.driving.naming import VARIABLES
     from evofsm.fsm.validation import positive
 
     given = {}

@@ -57,7 +57,7 @@ class CarFollowing(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
     family : str, path or Family
         Name of a family of scenarios, a file with one, or one that `load_family` has made.
     world : str
-        One of `evofsm.driving.WORLDS`.
+        "kinematic" or "sumo".
     seed : int
         Of the family's draws. The seed of `reset` picks among them.
     split : str

@@ -300,41 +300,20 @@ def try_out(
 
 @dataclass(frozen=True)
 class Trial:
-    """Episodes of a family by their number: a function for any ``map``, of threads to clusters.
-
-    Parameters
-    ----------
-    family : Family
-    guard : Guard
-        Where it is frozen, no episode depends on another one.
-    world : World or str
-        Of a name each process opens a world of its own.
-    seed : int
-    split : {"test", "train"}
-    controller : callable, optional
-        From a draw and the world to who drives; without it the draw's own.
-
-    Examples
-    --------
-    >>> from evofsm.driving import load_family
-    >>> family = load_family("emergency")
-    >>> rows = list(map(Trial(family, unrevised_guard(family)), range(2)))
-    >>> [(row["episode"], row["collided"]) for row in rows]
-    [(0, True), (1, True)]
-    """
+    """Episodes of a family by their number: a function for any ``map``, of threads to clusters."""
 
     family: Family
-    guard: Guard
-    world: World | str = "kinematic"
-    seed: int = 0
-    split: str = "test"
-    controller: Callable[[Draw, World], Drives] | None = None
+    guard: Guard  #: frozen, no episode depends on another one
+    world: World | str  #: of a name each process opens a world of its own
+    seed: int
+    split: str
+    controller: Callable[[Draw], Drives]
 
     def drive(self, number: int) -> tuple[Episode, dict[str, Any]]:
         """An episode, and its row: number, variant, `Outcome`, and `lead_time`."""
         world = _opened(self.world) if isinstance(self.world, str) else self.world
         draw = self.family.draw(self.seed, number, split=self.split)
-        controller = draw.controller if self.controller is None else self.controller(draw, world)
+        controller = self.controller(draw)
         alone = reference_of(self.family, draw, world, controller)
         driven = drive(self.guard, draw, world, controller)
         outcome = outcome_of(driven, alone, self.family.interval)

@@ -1,4 +1,4 @@
-"""The same cars in SUMO, through libsumo, under exact external control; and SUMO as a driver.
+"""The same cars in SUMO, through libsumo, under exact external control.
 
 SUMO moves the cars and says where they are; both accelerations come from outside. What it takes
 to have them carried out to the letter: speed mode 0 (SUMO checks nothing), a speed set for every
@@ -9,15 +9,11 @@ from __future__ import annotations
 
 import math
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
 from importlib import import_module
 from pathlib import Path
 from typing import Any, Self
-from xml.sax.saxutils import quoteattr
-
-import numpy as np
-from numpy.typing import NDArray
 
 from evofsm.driving.scenarios import Scenario
 from evofsm.driving.world import (
@@ -38,7 +34,6 @@ from evofsm.driving.world import (
     drive_alone,
 )
 from evofsm.extras import needs
-from evofsm.guard import Proposal
 
 #: The worlds there are.
 WORLDS = ("sumo", "kinematic")
@@ -62,16 +57,12 @@ _NET = f"""<net version="1.20">
 </net>
 """
 
-_ROUTES = """<routes>
-    {kinds}
+_ROUTES = f"""<routes>
+    <vType id="car" length="{_VEHICLE_LENGTH}" minGap="0" maxSpeed="{_FASTEST}" accel="100"
+           decel="100" emergencyDecel="100" speedFactor="1" speedDev="0" sigma="0"/>
     <route id="along" edges="road"/>
 </routes>
 """
-
-_CAR = (
-    f'minGap="0" maxSpeed="{_FASTEST}" accel="100" decel="100" emergencyDecel="100" '
-    'speedFactor="1" speedDev="0" sigma="0"'
-)
 
 
 class SumoWorld:
@@ -100,48 +91,21 @@ class SumoWorld:
         self._folder: tempfile.TemporaryDirectory[str] | None = None  # while a simulation is open
         self._dt = 0.0
         self._runs = 0
-        self._road: _Road | None = None  # the latest
-        self._kinds = {_CAR: "car"}  # attributes of each kind of car, and its id
-        self._known: set[str] = set()  # the kinds that the simulation has
 
     def open(self, scenario: Scenario) -> AbstractContextManager[Road]:
         """Put the cars on a road, for use in a ``with`` statement."""
         _refuse_what_sumo_cannot_drive(scenario)
         goes_on = self._folder is not None and self._sumo.isLoaded()
-        if not goes_on or self._dt != scenario.dt or len(self._known) < len(self._kinds):
+        if not goes_on or self._dt != scenario.dt:
             self.close()
             self._start(scenario.dt)
         self._runs += 1
-        self._road = _Road(self._sumo, self._runs, scenario)
-        return self._road
+        return _Road(self._sumo, self._runs, scenario)
 
     def run(self, scenario: Scenario, controller: Drives) -> Episode:
         """Drive the scenario with ``controller`` in the follower, asked at every step."""
         with self.open(scenario) as road:
             return drive_alone(road, controller)
-
-    def add_kind(self, attributes: Mapping[str, str]) -> str:
-        """The id of a kind of car with such a ``vType``, on every road opened from now on."""
-        given = " ".join(f"{name}={quoteattr(value)}" for name, value in attributes.items())
-        return self._kinds.setdefault(given, f"car{len(self._kinds)}")
-
-    def wish(
-        self, kind: str, observation: NDArray[np.float64], time: float, leader_decel: float
-    ) -> float:
-        """What SUMO itself would do with the follower, were it a car of this kind [m/s²]."""
-        road = self._road
-        if road is None or not road.is_open or road.time != time:
-            at = f"a road at {road.time:g} s" if road is not None and road.is_open else "no road"
-            raise RuntimeError(
-                f"a SUMO-driven car was asked at {time:g} s, but its SumoWorld has {at} open: "
-                "it drives only in the world that it was made with, and is told the road's time"
-            )
-        if kind not in self._known:
-            raise RuntimeError(
-                "this SUMO-driven car was made after the road was opened, and SUMO does not know "
-                "its kind yet: make it first, then open the road"
-            )
-        return road.wish(kind, observation, leader_decel)
 
     def close(self) -> None:
         """End the simulation."""
@@ -166,11 +130,7 @@ class SumoWorld:
         folder = tempfile.TemporaryDirectory(prefix="evofsm-sumo-")
         net, routes = Path(folder.name) / "road.net.xml", Path(folder.name) / "road.rou.xml"
         net.write_text(_NET)
-        kinds = "\n    ".join(
-            f'<vType id="{kind}" length="{_VEHICLE_LENGTH}" {attributes}/>'
-            for attributes, kind in self._kinds.items()
-        )
-        routes.write_text(_ROUTES.format(kinds=kinds))
+        routes.write_text(_ROUTES)
         try:
             self._sumo.start(
                 [
@@ -185,7 +145,7 @@ class SumoWorld:
         except BaseException:
             folder.cleanup()
             raise
-        self._folder, self._dt, self._known = folder, dt, set(self._kinds.values())
+        self._folder, self._dt = folder, dt
 
 
 def open_world(name: str) -> AbstractContextManager[World]:
@@ -225,7 +185,6 @@ class _Road(Road):
     def __init__(self, sumo: Any, run: int, scenario: Scenario) -> None:
         super().__init__(scenario)
         self._sumo = sumo
-        self.is_open = True
         self._cars = [f"{role}{run}" for role in ("follower", "leader", "behind")]
         start, record = _start(scenario), self._record[0]
         starts = [start, start + scenario.initial_gap + _VEHICLE_LENGTH, _FIRST]
@@ -257,26 +216,6 @@ class _Road(Road):
                 self._cut_in(*self._plan.cut_in[1:].tolist())
             self._observe()
 
-    def wish(self, kind: str, observation: NDArray[np.float64], leader_decel: float) -> float:
-        """As `SumoWorld.wish`: SUMO's car-following model, within the bounds that SUMO puts to it.
-
-        Asked of the follower itself, which this makes a car of that kind; it obeys as before.
-        """
-        vehicle, dt = self._sumo.vehicle, self.scenario.dt
-        follower, leader = self._cars[:2]
-        if vehicle.getTypeID(follower) != kind:
-            vehicle.setType(follower, kind)
-        gap, speed, leader_speed = observation.tolist()
-        # SUMO's models take the gap without minGap; those that need all of it add it again.
-        wanted = vehicle.getFollowSpeed(
-            *(follower, speed, gap - vehicle.getMinGap(follower)),
-            *(leader_speed, leader_decel, leader),
-        )
-        fastest = min(vehicle.getAllowedSpeed(follower), speed + vehicle.getAccel(follower) * dt)
-        fastest = max(fastest, speed - vehicle.getDecel(follower) * dt)  # if above the limit
-        slowest = speed - vehicle.getEmergencyDecel(follower) * dt
-        return float((max(min(wanted, fastest), slowest) - speed) / dt)
-
     def _move(self, accelerations: list[float]) -> None:
         vehicle = self._sumo.vehicle
         for car, acceleration in zip(self._cars, accelerations, strict=False):
@@ -305,117 +244,7 @@ class _Road(Road):
         return self
 
     def __exit__(self, *error: object) -> None:
-        self.is_open = False
         for car in self._cars:
             if car in self._sumo.vehicle.getIDList():
                 self._sumo.vehicle.remove(car)
         self._sumo.simulationStep()
-
-
-# -- SUMO as a driver ---------------------------------------------------------------------------
-
-#: What every model takes: attributes of SUMO's ``vType``.
-COMMON = ("accel", "decel", "emergencyDecel", "tau", "minGap", "maxSpeed", "speedFactor")
-#: The models there are, and what each takes besides.
-MODELS: dict[str, tuple[str, ...]] = {
-    "IDM": ("delta", "stepping"),
-    "Krauss": (),
-    "KraussOrig1": (),
-    "ACC": (
-        *("speedControlGain", "gapControlGainSpeed", "gapControlGainSpace"),
-        *("gapClosingControlGainSpeed", "gapClosingControlGainSpace"),
-        *("collisionAvoidanceGainSpeed", "collisionAvoidanceGainSpace"),
-    ),
-    "CACC": (
-        *("speedControlGainCACC", "gapControlGainGap", "gapControlGainGapDot"),
-        *("gapClosingControlGainGap", "gapClosingControlGainGapDot"),
-        *("collisionAvoidanceGainGap", "collisionAvoidanceGainGapDot"),
-    ),
-}
-_MAY_BE_ANYTHING = {name for names in MODELS.values() for name in names} - {"stepping"}
-_MAY_BE_ZERO = {"tau", "minGap"}
-
-
-class SumoDriver:
-    """A follower with the car-following model of SUMO, for use in one `SumoWorld`.
-
-    It proposes what SUMO would do in its next step, so that it can be revised: the wish of the
-    model, within the ``accel`` and ``emergencyDecel`` of the car and up to its speed limit. On its
-    own it drives as SUMO does, to the last digit.
-
-    Parameters
-    ----------
-    world : SumoWorld
-        Where it drives. Make the driver before the road is opened.
-    model : str
-        One of `MODELS`.
-    leader_decel : float
-        How hard it takes the leader to be able to brake [m/s²]; SUMO's preset for a passenger car.
-        Krauss' models rely on it, IDM does not.
-    **attributes : float
-        Of SUMO's ``vType``, such as ``accel``, ``decel``, ``tau``, ``minGap``, ``maxSpeed`` (the
-        desired speed on a free road: the road itself allows 100 m/s), ``emergencyDecel``, each in
-        SUMO's unit, which is SI. What is not given is SUMO's preset.
-
-    Raises
-    ------
-    TypeError
-        If ``world`` is another one than SUMO.
-    ValueError
-        If there is no such model or attribute, or a value is impossible.
-
-    Notes
-    -----
-    The acceleration is that of one step of the simulation: ``(wished speed - speed) / dt``. Whoever
-    decides more rarely holds it for longer than SUMO would. The models are those whose wish, read
-    before the step, is what SUMO then does; others draw at random or remember being asked.
-
-    Examples
-    --------
-    >>> from evofsm.driving import IDM, Leader, Scenario
-    >>> leader = Leader(IDM(1.2, 25.0, 1.0, 1.0, 2.5), brake_decel=5.0, brake_time=8.0)
-    >>> with SumoWorld() as world:
-    ...     driver = SumoDriver(world, "Krauss", accel=2.0, decel=4.0, tau=1.0, minGap=2.0)
-    ...     episode = world.run(Scenario(leader, initial_gap=10.0, duration=20.0), driver)
-    >>> episode.collided, float(round(episode.accelerations[0], 6))
-    (False, 2.0)
-    """
-
-    def __init__(
-        self,
-        world: SumoWorld,
-        model: str = "IDM",
-        *,
-        leader_decel: float = 4.5,
-        **attributes: float,
-    ) -> None:
-        if not isinstance(world, SumoWorld):
-            raise TypeError(f"world is {world!r}; a SUMO-driven car drives in a SumoWorld only")
-        _refuse_impossible(model, leader_decel, attributes)
-        self.world = world
-        self.model = model
-        self.leader_decel = leader_decel
-        self.attributes = dict(attributes)
-        given = {name: repr(float(value)) for name, value in attributes.items()}
-        # What SUMO would draw at random is fixed.
-        fixed = {"carFollowModel": model, "speedFactor": "1", "speedDev": "0", "sigma": "0"}
-        self._kind = world.add_kind(fixed | given)
-
-    def propose(self, observation: NDArray[np.float64], time: float = 0.0) -> Proposal:
-        """What SUMO would do in its next step [m/s²], seeing ``[gap, v_follower, v_leader]``."""
-        return Proposal(self.world.wish(self._kind, observation, time, self.leader_decel))
-
-
-def _refuse_impossible(model: str, leader_decel: float, attributes: dict[str, float]) -> None:
-    if model not in MODELS:
-        raise ValueError(f"there is no model {model!r} here; there are {', '.join(MODELS)}")
-    known = (*COMMON, *MODELS[model])
-    for name, value in {"leader_decel": leader_decel, **attributes}.items():
-        if name not in ("leader_decel", *known):
-            raise ValueError(f"{model} takes no attribute {name!r}; it takes {', '.join(known)}")
-        if not math.isfinite(value):
-            raise ValueError(f"{name} is {value}; it must be finite")
-        if name in _MAY_BE_ZERO and value < 0.0:
-            raise ValueError(f"{name} is {value}; it must be 0 or more")
-        if name not in _MAY_BE_ZERO | _MAY_BE_ANYTHING and value <= 0.0:
-            raise ValueError(f"{name} is {value}; it must be positive")

@@ -21,7 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evofsm import __version__, store
-from evofsm.driving import VARIABLES, Episode
+from evofsm.driving import Episode
+from evofsm.driving.naming import VARIABLES
 from evofsm.extras import needs
 from evofsm.fsm.model import FSMModel
 from evofsm.fsm.validation import positive

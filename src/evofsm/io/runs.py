@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.driving import DECISION_COLUMNS, VARIABLES
+from evofsm.driving.naming import DECISION_COLUMNS, VARIABLES
 from evofsm.extras import needs
 from evofsm.fsm.model import FSMModel
 from evofsm.guard.record import RECORD, Column

@@ -21,7 +21,7 @@ from xml.parsers import expat
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.driving import VARIABLES
+from evofsm.driving.naming import VARIABLES
 from evofsm.extras import needs
 from evofsm.fsm.validation import positive
 from evofsm.io.tables import OnRead, Piece, Source, Table, Wanted, explained

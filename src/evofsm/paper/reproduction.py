@@ -11,8 +11,9 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from evofsm.driving import UNITS, VARIABLES, open_world
 from evofsm.driving.measures import time_to_collision
+from evofsm.driving.naming import UNITS, VARIABLES
+from evofsm.driving.sumo import open_world
 from evofsm.fsm.divergence import jensen_shannon
 from evofsm.paper.claims import LARGEST_DIVERGENCE, Claim, check_claims
 from evofsm.paper.figures import figures

@@ -16,17 +16,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.driving import (
-    IDM,
-    UNITS,
-    VARIABLES,
-    ChangingIDM,
-    Episode,
-    Leader,
-    Scenario,
-    World,
-)
+from evofsm.driving import IDM, ChangingIDM, Episode, Leader, Scenario
 from evofsm.driving.measures import is_dead_end
+from evofsm.driving.naming import UNITS, VARIABLES
+from evofsm.driving.world import World
 from evofsm.fsm.actions import IntervalActions
 from evofsm.fsm.divergence import jensen_shannon
 from evofsm.fsm.machine import EvolvingFSM

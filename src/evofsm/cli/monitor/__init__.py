@@ -239,7 +239,7 @@ def _rows_of(run: Path) -> Iterator[bytes]:
     import json
     import math
 
-    from evofsm.driving import VARIABLES
+    from evofsm.driving.naming import VARIABLES
     from evofsm.io import read_run
 
     names = {"time": "time", **dict(zip(VARIABLES, VARIABLES, strict=True)), "proposed": "proposal"}

@@ -14,7 +14,8 @@ import msgspec
 import numpy as np
 from msgspec import UNSET, Meta, UnsetType
 
-from evofsm.driving import VARIABLES, Object, Scene, TrafficRisk
+from evofsm.driving import Object, Scene, TrafficRisk
+from evofsm.driving.naming import VARIABLES
 from evofsm.fsm.naming import visible
 from evofsm.guard import ActionReviser, BoxActions, Choices, Guard
 from evofsm.store import LARGEST_OBSERVATION

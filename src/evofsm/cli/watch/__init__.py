@@ -186,7 +186,7 @@ def _driven(
 ) -> Opening:
     """A session in a world of its own."""
     from evofsm.cli.watch.session import Session, cases_of
-    from evofsm.driving import open_world
+    from evofsm.driving.sumo import open_world
 
     if case > len(cases_of(family)):
         raise ValueError(f"--case is {case}; {family.name} has 1 to {len(cases_of(family))}")

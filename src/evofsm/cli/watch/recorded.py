@@ -24,8 +24,10 @@ from evofsm.cli.watch.shown import (
     graph_of,
     most_believed,
 )
-from evofsm.driving import VARIABLES, guard_for_cars, shadow_drive
+from evofsm.driving import guard_for_cars
+from evofsm.driving.episodes import shadow_drive
 from evofsm.driving.measures import time_headway, time_to_collision
+from evofsm.driving.naming import VARIABLES
 from evofsm.guard import TOLERANCE, Mode
 from evofsm.guard.record import RECORD
 from evofsm.io.foxglove import recording

@@ -25,7 +25,7 @@ import msgspec
 from evofsm.cli.watch.player import SPEEDS, Clock, Player
 from evofsm.cli.watch.shown import Frame, Graph, Start, Transition
 from evofsm.cli.watch.words import tell
-from evofsm.driving import name_state, name_states
+from evofsm.driving.naming import name_state, name_states
 from evofsm.extras import needs
 
 with needs("websockets", "watch", "the live page"):

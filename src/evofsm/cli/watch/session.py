@@ -23,24 +23,19 @@ from evofsm.cli.watch.shown import (
     most_believed,
 )
 from evofsm.driving import (
-    GAP,
-    GAP_BEHIND,
-    LEADER_ACCELERATION,
-    LEADER_SPEED,
-    SPEED,
     Draw,
     Family,
     LatentRisk,
     SumoWorld,
-    World,
     drive,
     guard_for_family,
     learners_of,
-    name_judge,
     teach,
     unrevised_guard,
 )
+from evofsm.driving.cars import name_judge
 from evofsm.driving.measures import time_headway, time_to_collision
+from evofsm.driving.world import GAP, GAP_BEHIND, LEADER_ACCELERATION, LEADER_SPEED, SPEED, World
 from evofsm.fsm.rules import Novelty
 from evofsm.guard import Decision, Explain, Guard, Judgement, Mode
 from evofsm.guard.record import RECORD

@@ -108,7 +108,7 @@ class Start(NamedTuple):
     ttc_threshold: float  #: time to collision below which it is said to warn [s]
     headway_threshold: float  #: the same of time headway [s]
     learnt: int  #: episodes learnt from before
-    judge: str = "kinematic"  #: by what it was told, a name of `evofsm.driving.TOLD`
+    judge: str = "kinematic"  #: by what it was told, a name of `evofsm.driving.cars.TOLD`
 
 
 class Frame(NamedTuple):
