@@ -484,7 +484,7 @@ class Tasks(Study):
     tasks: Annotated[
         str, Option(help="Tasks with commas; all, or none where --task is given, if not named.")
     ] = ""
-    task: Annotated[str, Option(help="A task of your own, module:Class; see docs/tasks.md.")] = ""
+    task: Annotated[str, Option(help="A task of your own, module:Class; see docs/judges.md.")] = ""
     judge: Annotated[str, Option(help="A judge of your own on every task, module:Class.")] = ""
     controllers: Annotated[
         str, Option(help="Controllers with commas; all, or first: the first one of each task.")

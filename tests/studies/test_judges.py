@@ -12,7 +12,7 @@ from studies.judges import PARTS, Judges, Tasks, make_judge, run, summary, told_
 from studies.rivals import Rival
 from studies.systems import CartPole, Start, make_system
 
-PAGE = Path(__file__).parents[2] / "docs" / "tasks.md"
+PAGE = Path(__file__).parents[2] / "docs" / "judges.md"
 
 
 class Timid(Rival):
