@@ -25,7 +25,7 @@ _BRAKES: tuple[Column[Braked], ...] = (
     Column("hard an hour", lambda one: one.seen / one.brakes.hours, decimals(1)),
     Column(
         f"hours to {_NEEDED}",
-        lambda one: one.brakes.hours_until(TOLERANCE),
+        lambda one: _NEEDED * one.brakes.hours / one.seen if one.seen else math.inf,
         decimals(1),
     ),
 )
@@ -62,9 +62,10 @@ def leader_tables(study: LeaderStudy, limits: Limits) -> tuple[Table, ...]:
 
 
 def _unseen(brakes: LeaderBrakes) -> str:
-    share = math.ceil(1000.0 * brakes.at_most_harder) / 10.0
+    seen = sum(brakes.counts)
+    share = math.ceil(1000.0 * (1.0 - 0.05 ** (1.0 / seen) if seen else 1.0)) / 10.0
     return (
-        f"That none of {sum(brakes.counts)} was harder than the hardest says that at most "
+        f"That none of {seen} was harder than the hardest says that at most "
         f"{share:.1f} % are (95 %), if each is drawn by itself; brakes of one wave are not."
     )
 

@@ -14,7 +14,6 @@ from evofsm.driving.leaders import (
     BrakeWatch,
     LeaderBrakes,
     Manoeuvres,
-    brakes_needed,
 )
 from evofsm.driving.perception import Perception
 from evofsm.driving.rehearsal import HARDEST
@@ -277,7 +276,7 @@ def test_a_leaders_braking_is_measured_well_in_spite_of_noise(decel):
 
 def test_by_assumption_alone_49_are_needed_for_two_percent():
     table, risk = LatentRisk(-8.0).manoeuvres, 1.0
-    for seen in range(1, brakes_needed(0.02) + 1):
+    for seen in range(1, 50):
         assert risk > 0.02
         table.remember(3.0)
         risk = float(table.harder(9.0))
@@ -289,8 +288,6 @@ def test_the_shipped_table_says_no_more_than_was_seen():
     seen, hardest = sum(REAL_DRIVES.counts), max(REAL_DRIVES.decels)
     assert 6.1 <= hardest < 6.1 + 0.25
     assert len(REAL_DRIVES.decels) == seen == 92
-    assert REAL_DRIVES.at_most_harder > 0.03
-    assert 8.0 < REAL_DRIVES.hours_until(0.02) < 9.0
     assert float(LatentRisk(-8.0, leaders=REAL_DRIVES).manoeuvres.harder(9.9)) > 0.0
 
 
@@ -304,7 +301,6 @@ def test_a_table_counts_each_as_at_least_as_hard_as_it_was():
 def test_none_seen_is_a_table_too():
     none = LeaderBrakes.counted([], gentle=3, hours=2.0, source="made up")
     assert none.decels == ()
-    assert (none.hours_until(0.02), none.at_most_harder) == (float("inf"), 1.0)
     assert LatentRisk(-8.0, leaders=none).manoeuvres.gentle == 3
 
 

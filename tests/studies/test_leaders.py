@@ -50,7 +50,6 @@ def test_brakes_are_counted_by_source_and_waves_once(study):
     assert [one.waves for one in found.values()] == [1, 1, 2]
     assert found["all"].hardest == pytest.approx(4.2, abs=0.05)
     assert found["all"].brakes.hours == pytest.approx(4 * SECONDS / 3600.0)
-    assert found["all"].brakes.hours_until(0.02) == pytest.approx(49 / 3 * 4 * SECONDS / 3600.0)
 
 
 def test_what_is_told_makes_fewer_alarms_and_the_first_runs_can_be_asked_alone(folder, study):

@@ -27,60 +27,43 @@ def choose(vehicles: str | float | Iterable[str], seed: int = 0) -> Callable[[An
 
     Of a share, id and seed alone decide: the same vehicles are meant in every run.
     """
-    if isinstance(vehicles, str):
-        return _named(vehicles, seed)
-    if isinstance(vehicles, (int, float)):
-        return _share(float(vehicles), seed)
+    if vehicles == "all":
+        return lambda sumo, car: True
+    if isinstance(vehicles, str) and vehicles.startswith(_TYPE):
+        kind = vehicles.removeprefix(_TYPE)
+        return lambda sumo, car: sumo.vehicle.getTypeID(car) == kind
+    if isinstance(vehicles, (str, int, float)):
+        limit = _share(vehicles) * 2.0**32
+        return lambda _, car: zlib.crc32(f"{seed}:{car}".encode()) < limit
     ids = frozenset(vehicles)
     return lambda _, car: car in ids
 
 
-def _named(vehicles: str, seed: int) -> Callable[[Any, str], bool]:
-    if vehicles == "all":
-        return lambda sumo, car: True
-    if vehicles.startswith(_TYPE):
-        kind = vehicles.removeprefix(_TYPE)
-        return lambda sumo, car: sumo.vehicle.getTypeID(car) == kind
-    if vehicles.endswith("%"):
-        try:
-            return _share(float(vehicles[:-1]) / 100.0, seed)
-        except ValueError:
-            pass
-    raise ValueError(
-        f"vehicles is {vehicles!r}; it is 'all', 'type:NAME', a share such as 0.1 or '10%', or a "
-        "list of ids"
-    )
-
-
-def _share(share: float, seed: int) -> Callable[[Any, str], bool]:
-    if not 0.0 < share <= 1.0 or math.isnan(share):
-        raise ValueError(f"vehicles is {share}; a share lies above 0, up to 1")
-    limit = share * 2.0**32
-    return lambda _, car: zlib.crc32(f"{seed}:{car}".encode()) < limit
+def _share(vehicles: str | float) -> float:
+    text = str(vehicles)
+    try:
+        share = float(text.removesuffix("%")) / (100.0 if text.endswith("%") else 1.0)
+    except ValueError:
+        share = math.nan
+    if not 0.0 < share <= 1.0:
+        raise ValueError(
+            f"vehicles is {vehicles!r}; it is 'all', 'type:NAME', a share above 0 up to 1, such as "
+            "0.1 or '10%', or a list of ids"
+        )
+    return share
 
 
 class Watching:
-    """Measures each car against whoever is ahead of it.
-
-    Attributes
-    ----------
-    ids : list of str
-        Cars with somebody ahead, now.
-    observations : (len(ids), 3) ndarray
-        Gap [m], speed of the car and of the one ahead [m/s], of each.
-    ttc, drac : (len(ids),) ndarray
-        Time to collision [s] and deceleration to avoid it [m/s²], of each.
-    lowest_ttc, highest_drac : dict from str to float
-        Of each car that ever closed in, so far.
-    """
+    """Measures each car against whoever is ahead of it."""
 
     def __init__(self, seeing: Seeing) -> None:
         self._seeing = seeing
         self._cars: dict[str, None] = {}
-        self.ids: list[str] = []
-        self.observations = np.empty((0, 3))
-        self.ttc = self.drac = np.empty(0)
-        self.lowest_ttc: dict[str, float] = {}
+        self.ids: list[str] = []  #: of cars with somebody ahead, now
+        self.observations = np.empty((0, 3))  #: of each gap [m], its speed and the other's [m/s]
+        self.ttc = np.empty(0)  #: time to collision of each [s]
+        self.drac = np.empty(0)  #: deceleration to avoid it, of each [m/s²]
+        self.lowest_ttc: dict[str, float] = {}  #: of each car that ever closed in
         self.highest_drac: dict[str, float] = {}
 
     def __len__(self) -> int:
@@ -129,61 +112,28 @@ class Collision(NamedTuple):
 
 
 class Attachment:
-    """What `attach` returns: which cars it is, and what came of them.
-
-    Attributes
-    ----------
-    mode : str
-    guarding : Guarding or None
-        None where cars are only watched.
-    watching : Watching or None
-        None where they are guarded.
-    collisions : list of Collision
-        Of the whole simulation, other cars included.
-    ever : set of str
-        Vehicles that were guarded, or watched, at any time.
-    looked : int
-        Cars that were looked at, summed over the steps.
-    seconds : float
-        Time that the attachment took [s].
-    """
+    """What `attach` returns: which cars it is, and what came of them."""
 
     def __init__(
         self,
         sumo: Any,
         chosen: Callable[[Any, str], bool],
         mode: str,
-        guard: Guard | None,
-        *,
-        tolerance: float,
-        learn: bool,
-        report: Callable[[GuardedStep], None] | None,
+        seeing: Seeing,
+        cars: Guarding | Watching,
     ) -> None:
         self._sumo, self._chosen, self.mode = sumo, chosen, mode
-        seeing = self._seeing = Seeing(sumo)
-        self.guarding: Guarding | None = None
-        self.watching: Watching | None = None
-        if mode == "watch":
-            self._cars: Guarding | Watching = Watching(seeing)
-            self.watching = self._cars
-        else:
-            self._cars = self.guarding = Guarding(
-                sumo,
-                seeing,
-                guard,
-                acts=mode == "act",
-                tolerance=tolerance,
-                learn=learn,
-                report=report,
-            )
+        self._seeing, self._cars = seeing, cars
+        self.guarding = cars if isinstance(cars, Guarding) else None
+        self.watching = cars if isinstance(cars, Watching) else None
         self._now = -math.inf
         self._known: set[str] = set()
         self._met: dict[tuple[str, str], float] = {}
         self._listener: int | None = None
-        self.collisions: list[Collision] = []
-        self.ever: set[str] = set()
-        self.looked = 0
-        self.seconds = 0.0
+        self.collisions: list[Collision] = []  #: of the whole simulation, other cars included
+        self.ever: set[str] = set()  #: vehicles that were guarded, or watched, at any time
+        self.looked = 0  #: cars that were looked at, summed over the steps
+        self.seconds = 0.0  #: that the attachment took
 
     @property
     def cars(self) -> list[str]:
@@ -328,14 +278,11 @@ def attach(
         raise ValueError(f"there is no mode {mode!r}; there are {', '.join(_MODES)}")
     if mode == "watch" and guard is not None:
         raise ValueError("mode 'watch' asks no guard; use mode 'shadow'")
-    attachment = Attachment(
-        sumo,
-        choose(vehicles, seed),
-        mode,
-        guard,
-        tolerance=tolerance,
-        learn=learn,
-        report=report,
-    )
+    chosen, seeing = choose(vehicles, seed), Seeing(sumo)
+    cars: Guarding | Watching = Watching(seeing)
+    if mode != "watch":
+        given: dict[str, Any] = {"tolerance": tolerance, "learn": learn, "report": report}
+        cars = Guarding(sumo, seeing, guard, acts=mode == "act", **given)
+    attachment = Attachment(sumo, chosen, mode, seeing, cars)
     attachment.listen()
     return attachment

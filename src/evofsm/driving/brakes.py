@@ -63,33 +63,13 @@ class Latest:
         self._count = 0
 
     def mean_and_bound(self, errors: float, latest: int | None = None) -> tuple[float, float]:
-        """Mean, and so many standard errors below it; of all, or of the ``latest``.
-
-        A decision's acceleration is a difference of two speeds, and what noise does to one it
-        undoes in the next: the mean of a run has the noise of its two ends only.
-        """
+        """Mean, and so many standard errors below it; of all, or of the ``latest``."""
         first = 0 if latest is None else self._count - latest
         return _mean_and_bound(self._rows, first, self._count, errors)
 
 
 class OwnBrakes:
-    """What full braking really brings, and how late commands take effect.
-
-    ``lowest`` is the hardest braking that can be commanded [m/s²], negative, ``assumed`` the share
-    of it that is believed in until braking was seen, and ``dt`` the time between decisions [s].
-
-    Examples
-    --------
-    >>> brakes = OwnBrakes(lowest=-4.0, assumed=0.5, dt=0.25)
-    >>> brakes.decel
-    2.0
-    >>> speed = 20.0
-    >>> for _ in range(10):
-    ...     brakes.see(speed, -4.0)
-    ...     speed -= 0.25 * 3.0  # they are weaker than commanded
-    >>> brakes.decel, brakes.lag
-    (3.0, 0.0)
-    """
+    """What full braking really brings, and how late commands take effect."""
 
     def __init__(self, lowest: float, assumed: float, dt: float) -> None:
         self.lowest, self.assumed, self.dt = lowest, assumed, dt

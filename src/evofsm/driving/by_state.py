@@ -95,12 +95,6 @@ class StateRisk(NamedTuple):
 def assess_states(known: EvolvingFSM | FSMModel, risk: LatentRisk) -> list[StateRisk]:
     """Latent risk at the centre of every state, in the order of creation.
 
-    Parameters
-    ----------
-    known : EvolvingFSM or FSMModel
-        A machine, or the model of one, that observes gap [m], v_follower [m/s] and v_leader [m/s].
-    risk : LatentRisk
-
     Examples
     --------
     >>> machine = EvolvingFSM(n_actions=1, radius=0.5)

@@ -78,11 +78,6 @@ def guard_for_cars(
     **settings
         As in `Guard.of`: ``failed``, ``seed``, ``learn``, ``audit``, ``explaining``, ``missing``.
 
-    Raises
-    ------
-    ValueError
-        If there is no judge of that name.
-
     Examples
     --------
     >>> guard = guard_for_cars(low=-4.0, high=2.5)

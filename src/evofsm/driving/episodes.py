@@ -112,34 +112,6 @@ def shadow_drive(
 
     Its decisions have what was done as the proposal, and what the guard would have done as
     ``advised``.
-
-    Parameters
-    ----------
-    guard : Guard
-        For cars (`guard_for_cars`), in `Mode.SHADOW` or `Mode.OFF`: what was recorded cannot be
-        changed any more.
-    times : (T,) array_like
-        Rising, as far apart as the guard's interval [s].
-    observations : (T, 3) array_like
-        Gap [m], speed of the follower and of the leader [m/s].
-    accelerations : (T,) array_like
-        What the follower did after each row [m/s²]; that of the last row is not read.
-    failed : bool
-        Whether the episode ended in failure; a last gap of 0 or less is one anyway.
-
-    Raises
-    ------
-    ValueError
-        If the guard would act, or there are fewer than two rows.
-
-    Examples
-    --------
-    >>> from evofsm.driving import guard_for_cars
-    >>> guard = guard_for_cars(low=-8.0, high=3.0, interval=0.1, mode=Mode.SHADOW)
-    >>> rows = [[40.0, 20.0, 20.0], [39.9, 20.0, 19.0], [39.7, 20.0, 18.0]]
-    >>> episode = shadow_drive(guard, [0.0, 0.1, 0.2], rows, [0.0, 0.0, 0.0])
-    >>> len(episode.decisions), episode.executed.tolist()
-    (2, [0.0, 0.0])
     """
     mode = getattr(guard.reviser, "mode", Mode.ACT)
     if mode not in (Mode.SHADOW, Mode.OFF):
@@ -264,19 +236,6 @@ def lead_time(episode: Episode, tolerance: float = TOLERANCE) -> float | None:
     return 0.0 if math.isnan(alarm) else float(episode.time[-1] - alarm)
 
 
-def references_of(family: Family, draws: Iterable[Draw]) -> list[Reference]:
-    """How far the controller comes by itself in each draw."""
-    return [reference_of(family, draw) for draw in draws]
-
-
-def score(family: Family, alone: Iterable[Reference], episodes: Iterable[Episode]) -> list[Outcome]:
-    """Outcomes of driven draws, against the controller alone."""
-    return [
-        outcome_of(driven, base, family.interval)
-        for base, driven in zip(alone, episodes, strict=True)
-    ]
-
-
 def try_out(
     guard: Guard, family: Family, draws: Sequence[Draw], alone: Sequence[Reference] | None = None
 ) -> list[Outcome]:
@@ -295,7 +254,11 @@ def try_out(
     """
     frozen = guard.copy(states=False)
     frozen.freeze()
-    return score(family, alone or references_of(family, draws), teach(frozen, draws))
+    alone = alone or [reference_of(family, draw) for draw in draws]
+    return [
+        outcome_of(driven, base, family.interval)
+        for base, driven in zip(alone, teach(frozen, draws), strict=True)
+    ]
 
 
 @dataclass(frozen=True)
@@ -339,15 +302,15 @@ def _opened(name: str) -> World:
 # -- What came of many ----------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Row:
     """A line of the table: one policy on the held-out draws of a family."""
 
     family: str
     policy: str
     group: str
-    learning_seed: int | None
-    train_episodes: int
+    learning_seed: int | None = None
+    train_episodes: int = 0
     episodes: int
     collisions: int  #: with the leader; not `rear_ends`
     collision_rate: float
@@ -382,27 +345,27 @@ def summarise(
     group: str,
     outcomes: Sequence[Outcome],
     interval: float,
-    *,
-    learning_seed: int | None = None,
-    train_episodes: int = 0,
-    episodes_until_safe: int | None = None,
-    train_collisions: int = 0,
+    **learning: Any,
 ) -> Row:
-    """One line for the outcomes of a policy, deciding every ``interval`` [s]."""
+    """One line for the outcomes of a policy, deciding every ``interval`` [s].
+
+    How it learnt is told by fields of `Row`: ``train_episodes`` and others.
+    """
     with needs("scipy", "study", "the interval of a share"):
         from scipy.stats import binomtest
     n = len(outcomes)
     collisions = sum(o.collided for o in outcomes)
     exact = binomtest(collisions, n).proportion_ci(0.95, method="exact")
     mobility = np.array([o.mobility for o in outcomes])
-    low, high = _bootstrap(mobility)
+    # By resampling; the same numbers give the same interval.
+    rng = np.random.default_rng(0)
+    means = [rng.choice(mobility, n).mean() for _ in range(1000)]
+    low, high = np.quantile(means, [0.025, 0.975]).tolist()
     decisions = sum(o.decisions for o in outcomes)
     return Row(
         family=family,
         policy=policy,
         group=group,
-        learning_seed=learning_seed,
-        train_episodes=train_episodes,
         episodes=n,
         collisions=collisions,
         collision_rate=collisions / n,
@@ -416,16 +379,6 @@ def summarise(
         mean_change=sum(o.change for o in outcomes) / decisions,
         jerk=float(np.sqrt(sum(o.jerk for o in outcomes) / decisions)),
         mean_speed=float(np.mean([o.speed for o in outcomes])),
-        episodes_until_safe=episodes_until_safe,
-        train_collisions=train_collisions,
         hours=decisions * interval / 3600.0,
         kilometres=sum(o.speed * o.decisions for o in outcomes) * interval / 1000.0,
     )
-
-
-def _bootstrap(values: NDArray[np.float64], rounds: int = 1000) -> tuple[float, float]:
-    """95 % interval of a mean, by resampling; the same numbers give the same interval."""
-    rng = np.random.default_rng(0)
-    means = [rng.choice(values, len(values)).mean() for _ in range(rounds)]
-    low, high = np.quantile(means, [0.025, 0.975])
-    return float(low), float(high)

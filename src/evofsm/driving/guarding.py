@@ -92,10 +92,8 @@ class Seeing:
     def pair(self, car: str) -> tuple[float, float, float] | None:
         """Gap from bumper to bumper [m], its speed and that of whoever is ahead [m/s]."""
         speed = self._vehicle.getSpeed(car)
-        found = self._vehicle.getLeader(car, _far(speed))
-        if not found or not found[0]:
-            return None
-        return found[1] + self.body(car).min_gap, speed, self._vehicle.getSpeed(found[0])
+        found = self.ahead(car, speed)
+        return None if found is None else (found.gap, speed, found.speed)
 
     def ahead(self, car: str, speed: float) -> Neighbour | None:
         """Whoever is ahead on its route, if near enough to matter."""
@@ -188,16 +186,7 @@ class _Car:
 
 
 class Guarding:
-    """Guards each car, by a guard of its own; what leaders do all of them share.
-
-    Attributes
-    ----------
-    leaders : Manoeuvres
-        How hard leaders were seen to brake.
-    decisions : int
-    revised : int
-        Steps in which a car drove slower than its driver wanted; in shadow, would have.
-    """
+    """Guards each car, by a guard of its own; what leaders do all of them share."""
 
     def __init__(
         self,
@@ -215,13 +204,14 @@ class Guarding:
         self._judges: dict[tuple[float, float, float], TrafficRisk] = {}
         self._cars: dict[str, _Car] = {}
         self._watches: dict[str, BrakeWatch] = {}
-        self.leaders = _leaders_of(guard)
+        self.leaders = _leaders_of(guard)  #: how hard they were seen to brake
         if guard is not None:
             self._tolerance = guard.reviser.tolerance  # type: ignore[attr-defined]
         self.interval = seeing.dt if guard is None or guard.interval is None else guard.interval
         self._every = _steps(self.interval, seeing.dt)
-        self._steps = 0
-        self.decisions = self.revised = 0
+        self._steps = self.decisions = 0
+        #: Steps in which a car drove slower than its driver wanted; in shadow, would have.
+        self.revised = 0
 
     def __len__(self) -> int:
         return len(self._cars)

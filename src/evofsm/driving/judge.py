@@ -180,22 +180,11 @@ class LatentRisk:
     def learn(
         self, observation: ArrayLike, acceleration: float, belief: ArrayLike = (1.0,)
     ) -> None:
-        """Take in an observation and the acceleration commanded after it.
+        """Take in an observation and the acceleration commanded after it [m/s²].
 
-        Parameters
-        ----------
-        observation : (3,) array_like
-            Gap [m], speed of the follower and of the leader [m/s]. Where one is NaN nothing is
-            learnt, and what is under way is not gone on with.
-        acceleration : float
-            Commanded [m/s²].
-        belief : (n,) array_like
-            Distribution over states, to count for how long each was seen.
-
-        Raises
-        ------
-        TypeError, ValueError
-            If one of them is anything else. What was learnt is then as it was.
+        Where one of gap [m] and both speeds [m/s] is NaN nothing is learnt, and what is under way
+        is not gone on with; a TypeError or ValueError leaves what was learnt as it was. The
+        ``belief`` over states counts for how long each was seen.
         """
         self._learn(observation, acceleration, belief, watched=False)
 
@@ -204,8 +193,7 @@ class LatentRisk:
     ) -> None:
         """Learn as `learn` does, where someone else drives, as in shadow mode.
 
-        The ``acceleration`` may then be no command but what the car does anyway. Hard braking
-        shows what its brakes can do; ordinary braking does not show what they cannot.
+        Hard braking shows what the brakes can do; ordinary braking not what they cannot.
         """
         self._learn(observation, acceleration, belief, watched=True)
 
@@ -291,12 +279,6 @@ class LatentRisk:
         Leaders' manoeuvres and the noise of the sensors add up, and with ``brakes`` what was learnt
         of brakes that are the same; of more than are remembered the latest of each stay. They must
         have learnt apart: what two of them began with in common counts twice.
-
-        Raises
-        ------
-        TypeError, ValueError
-            If one is no `LatentRisk`, is this one, or was made for another time between decisions,
-            another ``hard`` or, for the brakes, another ``lowest``. Nothing is then changed.
         """
         given = list(others)
         alike = ("dt", "hard", "lowest") if brakes else ("dt", "hard")
@@ -320,29 +302,18 @@ class LatentRisk:
     # -- Judging --------------------------------------------------------------------------------
 
     def judge(self, situation: Situation, accelerations: ArrayLike) -> Judgement:
-        """Latent risk of each acceleration that could be commanded now.
+        """Latent risk of each acceleration that could be commanded now [m/s²].
 
         What was not seen (NaN) is estimated from what was seen before; the less sure that is, the
         higher the risk. Where nothing was seen before either, every risk is 1.
-
-        Parameters
-        ----------
-        situation : Situation
-        accelerations : (k,) array_like
-            To be judged [m/s²].
-
-        Returns
-        -------
-        Judgement
         """
         here = self._cautious(situation.observation)
         actions = _series("accelerations", accelerations)
+        table, evidence = self.manoeuvres.table, float(len(self.manoeuvres))
         if not is_whole(here):  # where one is cannot be told: nothing can be survived for sure
             sure = np.ones(len(_finite("accelerations", actions)))
-            evidence = float(len(self.manoeuvres))
             return Judgement(sure, 0.0 * sure, sure, 0.0 * sure, evidence, self.seen(situation))
         judged = np.empty((4, len(actions)))
-        table, evidence = self.manoeuvres.table, float(len(self.manoeuvres))
         if not _judge(
             here, actions, self._commands[1], *self.body, self.dt, table, evidence, judged
         ):
@@ -407,13 +378,9 @@ class LatentRisk:
         return math.nan if situation.state is None else self.seconds_seen(situation.belief)
 
     def critical(self, observation: ArrayLike, accelerations: ArrayLike) -> NDArray[np.float64]:
-        """Hardest braking of the leader, from now on, that is survived.
+        """(k,) ndarray: hardest braking of the leader, from now on, that is survived [m/s²].
 
-        Returns
-        -------
-        (k,) ndarray
-            [m/s²]; 0 where even a leader who keeps its speed is hit, `rehearsal.HARDEST` where
-            none is.
+        0 where even a leader who keeps its speed is hit, `rehearsal.HARDEST` where none is.
         """
         actions = _finite("accelerations", accelerations)
         return self._critical(_three_finite(observation), actions, self.margin)
@@ -451,13 +418,7 @@ class LatentRisk:
     # -- Keeping it -----------------------------------------------------------------------------
 
     def save(self, path: Place, provenance: Mapping[str, Any] | None = None) -> None:
-        """Write what was learnt, and what it learnt from for people, to a file (`evofsm.store`).
-
-        Raises
-        ------
-        OSError
-            If the file cannot be written; one that was there before is then as it was.
-        """
+        """Write what was learnt, and what it learnt from for people, to a file (`evofsm.store`)."""
         settings = {**self._settings, "own_brakes": self.brakes.assumed}
         learnt = self._learnt()
         _refuse_other_brakes(self.dt, learnt)
@@ -465,15 +426,7 @@ class LatentRisk:
 
     @classmethod
     def load(cls, path: Place) -> Self:
-        """Read what was learnt, between two episodes.
-
-        Raises
-        ------
-        OSError
-            If there is no such file, or it may not be read.
-        ValueError
-            If the file holds something else, or is damaged.
-        """
+        """Read what was learnt, between two episodes."""
         settings, arrays = store.read(path, _RISK)
         with store.explained(path):
             _refuse_other_brakes(settings["dt"], arrays)

@@ -11,7 +11,6 @@ table of them (`LeaderBrakes`).
 
 from __future__ import annotations
 
-import math
 from collections import deque
 from collections.abc import Iterable, Sequence
 from itertools import zip_longest
@@ -47,11 +46,8 @@ class LeaderBrakes(NamedTuple):
 
     Examples
     --------
-    >>> brakes = LeaderBrakes.counted([2.6, 3.1, 2.7], gentle=20, hours=0.5, source="our own cars")
-    >>> brakes.counts, brakes.decels
-    ((2, 0, 1), (2.75, 2.75, 3.25))
-    >>> brakes.hours_until(tolerance=0.02)
-    8.166666666666666
+    >>> LeaderBrakes.counted([2.6, 3.1, 2.7], gentle=20, hours=0.5, source="our own cars").decels
+    (2.75, 2.75, 3.25)
     """
 
     hard: float  #: from which deceleration on they count as hard [m/s²]
@@ -75,31 +71,6 @@ class LeaderBrakes(NamedTuple):
         ends = self.hard + _WIDTH * np.arange(1, len(self.counts) + 1)
         return tuple(np.repeat(ends, self.counts).tolist())
 
-    def hours_until(self, tolerance: float) -> float:
-        """Hours of driving until so many are seen that a tolerance can be met without a table."""
-        seen = sum(self.counts)
-        return brakes_needed(tolerance) * self.hours / seen if seen else math.inf
-
-    @property
-    def at_most_harder(self) -> float:
-        """Share of hard brakes that may be harder than all that were seen (95 %, one-sided).
-
-        If each were drawn by itself; those of one platoon are not, so the share may be larger.
-        """
-        seen = sum(self.counts)
-        return 1.0 - 0.05 ** (1.0 / seen) if seen else 1.0
-
-
-def brakes_needed(tolerance: float) -> int:
-    """Hard brakes to be seen until the assumed one weighs no more than the tolerance.
-
-    Examples
-    --------
-    >>> brakes_needed(0.02)
-    49
-    """
-    return max(math.ceil(1.0 / tolerance - 1e-9) - 1, 0)
-
 
 #: Public drives: 46 waves of braking, the hardest 6.1 m/s². Hardly anyone brakes hard in them, and
 #: no one in an emergency: how hard leaders brake then, they do not tell.
@@ -114,20 +85,7 @@ REAL_DRIVES = LeaderBrakes(
 
 
 class Manoeuvres:
-    """The decelerations of the latest ``memory`` manoeuvres, and how likely harder ones are.
-
-    The deceleration of one is only ``assumed`` [m/s²]. Those below ``hard`` [m/s²] are counted, no
-    more: however many were seen, they say nothing of how hard the next hard one will be.
-
-    Examples
-    --------
-    >>> manoeuvres = Manoeuvres(assumed=10.0)
-    >>> manoeuvres.harder([4.0, 12.0])  # nothing seen: only the assumed one counts
-    array([1., 0.])
-    >>> manoeuvres.remember(3.0, 3.5, 4.0)
-    >>> manoeuvres.harder([2.0, 3.5, 6.0, 12.0]).round(2)
-    array([1.  , 0.62, 0.25, 0.  ])
-    """
+    """The decelerations of the latest ``memory`` manoeuvres, and how likely harder ones are."""
 
     def __init__(self, assumed: float, hard: float = 2.5, memory: int = 500) -> None:
         self.assumed = positive("assumed", assumed)
@@ -197,19 +155,7 @@ def latest_of_each(series: Iterable[Iterable[float]]) -> list[float]:
 
 
 class BrakeWatch:
-    """Watches a leader's speed every ``dt`` [s], and tells a manoeuvre when it has ended.
-
-    The deceleration of a manoeuvre is that of its hardest second, which neither its blurred ends
-    nor noise on the speeds change much.
-
-    Examples
-    --------
-    >>> watch = BrakeWatch(dt=0.25)
-    >>> for speed in (20.0, 20.0, 19.0, 18.0, 17.0, 16.0, 16.0):
-    ...     decel = watch.see(50.0, speed, speed)
-    >>> watch.braking, watch.see(50.0, 16.0, 16.0)
-    (True, 4.0)
-    """
+    """Watches a leader's speed every ``dt`` [s], and tells a manoeuvre when it has ended."""
 
     def __init__(self, dt: float) -> None:
         self.dt = positive("dt", dt)

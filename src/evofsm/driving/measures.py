@@ -112,13 +112,6 @@ def modified_time_to_collision(observations: Floats, dt: float) -> Floats:
     acceleration of the follower minus the leader's; infinite where there is none, 0 where the cars
     have met. Accelerations are those since the row before, ``dt`` [s] ago, and 0 in the first row.
     As published, it lets cars roll backwards where they would in truth have come to a standstill.
-
-    Examples
-    --------
-    The leader begins to brake by 4 m/s² in front of a follower as fast as itself.
-
-    >>> modified_time_to_collision(np.array([[10.0, 20.0, 20.0], [8.0, 20.0, 18.0]]), dt=0.5)
-    array([       inf, 1.56155281])
     """
     gap, speed, leader_speed = _columns(observations)
     closing = speed - leader_speed
@@ -152,11 +145,6 @@ def time_headway(observations: Floats) -> Floats:
     """Gap over speed of the follower [s]: until it is where the leader's rear bumper is.
 
     Infinite where it stands, 0 where the cars have met.
-
-    Examples
-    --------
-    >>> time_headway(np.array([[30.0, 20.0, 25.0], [5.0, 0.0, 0.0]]))
-    array([1.5, inf])
     """
     gap, speed, _ = _columns(observations)
     return _time_to_cover(gap, speed)
@@ -189,11 +177,6 @@ def deceleration_to_avoid_collision(observations: Floats) -> Floats:
 
     The square of the closing speed over twice the gap; 0 where the follower is not the faster one,
     infinite where the cars have met.
-
-    Examples
-    --------
-    >>> deceleration_to_avoid_collision(np.array([[10.0, 30.0, 20.0], [10.0, 20.0, 20.0]]))
-    array([5., 0.])
     """
     gap, speed, leader_speed = _columns(observations)
     closing = np.maximum(speed - leader_speed, 0.0)
@@ -227,11 +210,6 @@ def picud(observations: Floats, decel: float, reaction: float) -> Floats:
 
     gap + v_leader² / (2·decel) − v·reaction − v² / (2·decel), where both brake by ``decel`` [m/s²],
     the follower after a ``reaction`` [s].
-
-    Examples
-    --------
-    >>> picud(np.array([[30.0, 20.0, 20.0], [30.0, 20.0, 10.0]]), decel=3.0, reaction=1.0)
-    array([ 10., -40.])
     """
     gap, speed, leader_speed = _columns(observations)
     braked = (leader_speed**2 - speed**2) / (2.0 * decel)
@@ -272,11 +250,6 @@ def safe_distance(
     v·ρ + a·ρ²/2 + (v + ρ·a)² / (2·decel) − v_leader² / (2·leader_decel), or 0 if that is negative,
     where v is the follower's speed, ρ the ``response`` [s], a ``accel`` [m/s²], ``decel`` the
     braking that it is sure to reach and ``leader_decel`` the hardest of the leader [m/s²].
-
-    Examples
-    --------
-    >>> safe_distance(np.array([50.0, 20.0, 20.0]), 0.5, 2.0, 5.0, 8.0)
-    array(29.35)
     """
     _, speed, leader_speed = _columns(observations)
     fastest = speed + response * accel
@@ -333,11 +306,6 @@ def distance_to_avoid(observations: Floats, reaction: float, decel: float) -> Fl
 
     closing² / (2·decel) + closing·reaction, the time to collision of the regulation times the
     closing speed; 0 where the follower is not the faster one.
-
-    Examples
-    --------
-    >>> distance_to_avoid(np.array([[50.0, 30.0, 18.0], [50.0, 18.0, 30.0]]), 0.5, 6.0)
-    array([18.,  0.])
     """
     _, speed, leader_speed = _columns(observations)
     closing = np.maximum(speed - leader_speed, 0.0)
@@ -400,12 +368,6 @@ def proactive_fuzzy(
     With the distance s(b) = v·reaction + v² / (2·b) − v_leader² / (2·leader_decel), it is 1,
     unsafe, for gap − margin below s(decel) and where the cars have met, 0 above
     s(comfortable_decel) + margin, and linear in between. The parameters are those of `FuzzySafety`.
-
-    Examples
-    --------
-    >>> observations = np.array([[50.0, 20.0, 20.0], [32.0, 20.0, 20.0], [20.0, 20.0, 20.0]])
-    >>> proactive_fuzzy(observations, 1.0, 4.0, 5.0, 5.0, margin=2.0).round(2)
-    array([0.  , 0.17, 1.  ])
     """
     gap, speed, leader_speed = _columns(observations)
     shared = speed * reaction - leader_speed**2 / (2.0 * leader_decel)
@@ -424,12 +386,6 @@ def critical_fuzzy(
     one, CFS is 1, unsafe, for gaps from which ``decel`` would not do, 0 for gaps from which
     ``comfortable_decel`` does, and linear in between. If not, it is 1 for gaps from which the
     present braking does not do, and 0 else; 1 where the cars have met.
-
-    Examples
-    --------
-    >>> observations = np.array([[30.0, 20.0, 10.0], [21.0, 20.0, 10.0], [5.0, 20.0, 10.0]])
-    >>> critical_fuzzy(observations, 0.5, 1.0, comfortable_decel=4.0, decel=5.0)
-    array([0. , 0.6, 1. ])
     """
     gap, speed, leader_speed = _columns(observations)
     closing = speed - leader_speed
@@ -529,15 +485,6 @@ def is_dead_end(observations: Floats, decel: float, leader_decel: float) -> NDAr
     """Whether the cars collide if both brake in full from now until standstill.
 
     Only a simulation knows both limits. It scores what was learnt; nothing learns from it.
-
-    Parameters
-    ----------
-    decel, leader_decel : float
-        Hardest braking of the follower and of the leader [m/s²], positive.
-
-    Returns
-    -------
-    (...) ndarray of bool
 
     Examples
     --------

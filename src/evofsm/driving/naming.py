@@ -31,13 +31,6 @@ _MOST_DECIMALS = 3
 def name_state(center: ArrayLike, decimals: int = 0) -> str:
     """Where a state lies, in words: its gap, its speed, and how fast the gap closes or opens.
 
-    Parameters
-    ----------
-    center : (3,) array_like
-        Gap [m], speed of the follower and of the leader [m/s]; a ValueError if it is not three.
-    decimals : int
-        Of the numbers.
-
     Examples
     --------
     >>> name_state([9.2, 4.1, 3.0])
@@ -61,21 +54,6 @@ def name_states(centers: ArrayLike, states: Sequence[int] | None = None) -> list
     """Where states lie, in words; no two of them get the same name.
 
     Those that would be called alike get decimals; states that lie in one place get their numbers.
-
-    Parameters
-    ----------
-    centers : (n, 3) array_like
-        Gap [m], speed of the follower and of the leader [m/s].
-    states : sequence of int, optional
-        Their indices, from 0; without them 0 to n - 1.
-
-    Examples
-    --------
-    >>> for name in name_states([[9.2, 4.1, 3.0], [9.4, 4.1, 3.0], [60.0, 25.0, 25.1]]):
-    ...     print(name)
-    close (9.2 m), slow (4.1 m/s), closing at 1.1 m/s
-    close (9.4 m), slow (4.1 m/s), closing at 1.1 m/s
-    far (60 m), fast (25 m/s), at equal speeds
     """
     if np.size(centers) == 0:
         return []

@@ -58,16 +58,7 @@ class Estimate(NamedTuple):
 
 
 class Perception:
-    """Estimates gap and speeds every ``dt`` [s], and learns how noisy they are observed.
-
-    Examples
-    --------
-    >>> perception = Perception(dt=0.25)
-    >>> for step in range(3):
-    ...     estimate = perception.see((30.0 - 2.5 * step, 20.0, 10.0), 0.0)
-    >>> estimate.mean, perception.noise  # nothing is left unexplained
-    ((25.0, 20.0, 10.0), (0.0, 0.0, 0.0))
-    """
+    """Estimates gap and speeds every ``dt`` [s], and learns how noisy they are observed."""
 
     def __init__(self, dt: float) -> None:
         self.dt = dt

@@ -73,11 +73,6 @@ class SumoWorld:
     options : sequence of str
         Further options of SUMO, such as ``("--fcd-output", "trace.xml")``.
 
-    Raises
-    ------
-    ModuleNotFoundError
-        If libsumo is not installed.
-
     Notes
     -----
     libsumo holds one simulation per process; a second one would silently end the first, and is

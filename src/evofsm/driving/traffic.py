@@ -44,14 +44,7 @@ _COASTING, _ONE = np.zeros(1), np.ones(1)
 
 
 class Object(NamedTuple):
-    """Something on the road, along which x is counted.
-
-    Examples
-    --------
-    >>> lorry = Object("lorry", x=40.0, y=0.0, vx=20.0, length=12.0)
-    >>> lorry.x - 0.5 * lorry.length  # its rear bumper
-    34.0
-    """
+    """Something on the road, along which x is counted."""
 
     id: str
     x: float  #: of its centre, along the road [m]
@@ -121,19 +114,7 @@ class Scene:
         return pairs_of(self.rows(len(self.objects) - 1))
 
     def rows(self, most: int) -> NDArray[np.float64]:
-        """The scene as an observation, for a guard.
-
-        Parameters
-        ----------
-        most : int
-            Number of objects that there is room for; of more the closest along the road stay.
-
-        Returns
-        -------
-        ((most + 1) * 7,) ndarray
-            A row for each of `objects`, oneself first: 1, x, y, vx, vy, length, width; zeros
-            where there is none.
-        """
+        """((most + 1) * 7,) ndarray: `COLUMNS` of oneself and the closest others; zeros else."""
         rows = np.zeros((most + 1, len(COLUMNS)))
         for row, each in zip(rows, self.objects, strict=False):
             row[:] = 1.0, *each[1:7]
@@ -258,19 +239,7 @@ class TrafficRisk:
         return cls(ahead, low, high, behind_decel=behind_decel, reaction=reaction)
 
     def judge(self, situation: Situation, actions: ArrayLike) -> Judgement:
-        """Risk of each acceleration: the highest of all pairs.
-
-        Parameters
-        ----------
-        situation : Situation
-        actions : (k,) array_like
-            [m/s²]
-
-        Returns
-        -------
-        Judgement
-            Its ``critical`` is the hardest braking of whoever is ahead that is survived.
-        """
+        """Risk of each acceleration [m/s²]: the highest of all pairs."""
         given = np.ascontiguousarray(actions, np.float64)
         return self._judge(pairs_of(situation.observation), given)[0]
 
@@ -418,11 +387,6 @@ def guard_for_traffic(
     mode : Mode
     **settings
         As in `TrafficRisk.given`: ``leader_decel``, ``behind_decel``, ``reaction``.
-
-    Returns
-    -------
-    Guard
-        It recognises no states, and learns nothing.
 
     Examples
     --------
