@@ -80,12 +80,7 @@ def test_a_log_becomes_observations_actions_times_and_episodes(tmp_path):
     "change",
     [
         lambda text: "\ufeff" + text,
-        lambda text: text.replace("\n", "\r\n"),
-        lambda text: text.replace(",", ";"),
-        lambda text: text.replace(",", "\t"),
         lambda text: text.replace(",", ", "),
-        lambda text: text.replace("\n", "\n\n").replace("r,v1", "r,v1", 1),
-        lambda text: text.replace("\n", "\r\n\r\n"),
         lambda text: text.replace("v1-v2", '"v1-v2"').replace("10,", '"10",'),
         lambda text: text.rstrip("\n"),
         lambda text: gzip.compress(text.encode()),
@@ -134,14 +129,6 @@ def test_any_table_is_read_as_python_s_own_reader_reads_it(
     assert [t for piece in pieces for t in piece.texts["a text"]] == [row[1] for row in wanted]
 
 
-def test_parquet_reads_as_csv_does(tmp_path):
-    path = write(tmp_path / "a.csv", [*log(30), *log(40, "v2-v3"), *log(5, "v3-v4")])
-    polars.read_csv(path).write_parquet(tmp_path / "a.parquet", row_group_size=16)
-    (first,), (parquet,) = read(path), read(str(tmp_path / "a.parquet"))
-    for field in ("observations", "actions", "times", "starts"):
-        assert np.array_equal(getattr(first, field), getattr(parquet, field))
-
-
 def test_columns_may_have_other_names_and_an_order_and_a_step_in_place_of_a_clock(tmp_path):
     path = write(tmp_path / "a.csv", ["1,0.0,7", "2,0.5,8"], "u,t,x")
     (chunk,) = read(path, observe=ObservationEncoder("x", "u"), action="u", time="t")
@@ -163,14 +150,10 @@ def test_a_discrete_column_gets_a_coordinate_for_each_value(tmp_path):
     assert message.endswith("red, green")
 
 
-def test_every_file_begins_an_episode_and_all_columns_of_it_count(tmp_path):
-    first = write(tmp_path / "a.csv", log(5))
-    second = write(tmp_path / "b.csv", log(5, start=5.0))
-    assert [chunk.starts.tolist() for chunk in read(first, second)] == [[0], [0]]
-    both = write(tmp_path / "c.csv", [*log(3), *log(3, "other", start=0.3)])
-    assert read(both)[0].starts.tolist() == [0, 3]
-    assert read(both, episode=["run"])[0].starts.tolist() == [0]
-    assert read(both, episode=[])[0].starts.tolist() == [0]
+def test_every_file_begins_an_episode_and_columns_that_tell_them_apart_may_be_named(tmp_path):
+    path = write(tmp_path / "a.csv", [*log(3), *log(3, "other", start=0.3)])
+    assert [chunk.starts.tolist() for chunk in read(path, path)] == [[0, 3], [0, 3]]
+    assert read(path, episode=["run"])[0].starts.tolist() == [0]
 
 
 def test_a_hole_in_time_begins_an_episode_and_is_counted(tmp_path):
@@ -198,13 +181,6 @@ def test_episodes_know_their_failures_wherever_chunks_end(tmp_path, monkeypatch)
     assert (first.failures.tolist(), second.failures.tolist()) == ([2], [])
     assert second.observations[:, 0].tolist() == [4, 5]
     assert (first.starts.tolist(), second.starts.tolist()) == ([0], [0])
-
-
-def test_the_bytes_read_add_up_to_the_size_of_the_file(tmp_path):
-    path = write(tmp_path / "a.csv.gz", log(20000))
-    read_so_far = []
-    list(read_traces([path], on_read=read_so_far.append))
-    assert sum(read_so_far) == (tmp_path / "a.csv.gz").stat().st_size
 
 
 def test_memory_does_not_grow_with_the_file(tmp_path, monkeypatch):
@@ -324,19 +300,11 @@ def test_time_that_stands_or_runs_backwards_is_refused(tmp_path, second, monkeyp
         assert "--episode" in message
 
 
-def test_episodes_that_come_back_are_refused_with_their_number_and_the_remedy(
-    tmp_path, monkeypatch
-):
+def test_episodes_that_come_back_are_refused_with_the_remedy(tmp_path, monkeypatch):
     """Each block would be an episode of its own, and no row would look wrong."""
-    lines = [
-        row
-        for begin in range(0, 80, 10)
-        for pair in ("v1", "v2")
-        for row in log(10, pair, start=begin / 10)
-    ]
+    lines = [row for k in range(8) for pair in ("v1", "v2") for row in log(10, pair, start=k)]
     message = refusal(write(tmp_path / "a.csv", lines))
     assert "a.csv, line 22: the episode r, v1, 0 (run, pair, segment) comes back" in message
-    assert "up to line 161, 2 episodes take turns in 16 blocks" in message
     assert "sort the file by run, pair, segment and then by time" in message
     monkeypatch.setattr(tables, "_CSV_BYTES", 1)
     assert "a.csv, line 22: the episode r, v1, 0" in refusal(write(tmp_path / "a.csv", lines))
@@ -356,20 +324,15 @@ def test_files_with_different_steps_are_refused(tmp_path):
 @pytest.mark.parametrize(
     ("content", "said"),
     [
-        (b"", "is empty"),
-        (b"\n \n", "is empty"),
-        (b"\xef\xbb\xbf", "is empty"),
+        (b"\xef\xbb\xbf\n \n", "is empty"),
         (gzip.compress(b"", mtime=0), "is empty"),
-        (f"{HEADER}\n".encode(), "has a header but no rows"),
         (HEADER.encode(), "has a header but no rows"),
         (b"0,1\n1,2\n", "no header"),
         (b"\x00\x01\x02\xff\xfe" * 50, "not text in UTF-8"),
-        ("gap,größe\n1,2".encode("latin1"), "not text in UTF-8"),
         (f"{HEADER}\nr,a,0,0,1,1,1,1\nr,é".encode("latin1"), "after line 2: this is not text"),
         (f"{HEADER.replace('segment', 'gap')}\n1,2".encode(), "two columns are called 'gap'"),
         (f'{HEADER}\nr,"v1,0,1\n{"x" * 90}'.encode(), "unclosed quote"),
         (f'{HEADER}\nr,"a"b,0,0,1,1,1,1\n'.encode(), "line 2: ',' expected after '\"'"),
-        (f'"{HEADER}\nr,a,0\n'.encode(), "unclosed quote"),
         (f"{HEADER}\n{'x,' * 3_000_000}".encode(), "a line of more than 1,000,000 bytes"),
     ],
 )
@@ -417,7 +380,7 @@ def test_parquet_with_holes_texts_or_half_a_file_is_refused(tmp_path, monkeypatc
             read(str(file))
 
 
-@pytest.mark.parametrize("name", ["~x.parquet", "~/x.parquet", "http://host/x", "s3://bucket/x"])
+@pytest.mark.parametrize("name", ["~/x.parquet", "s3://bucket/x"])
 def test_a_name_that_looks_like_an_address_is_a_file_like_any_other(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     table = polars.read_csv(write(tmp_path / "a.csv", log(10)))
@@ -431,7 +394,7 @@ def test_a_name_that_looks_like_an_address_is_a_file_like_any_other(name, tmp_pa
 # -- Failures, and rows without a leader -----------------------------------------------------------
 
 
-@pytest.mark.parametrize("condition", ["gap<=0", " gap <= 0 ", "gap<1e-9", "crash", "crash==1"])
+@pytest.mark.parametrize("condition", [" gap <= 0 ", "gap<1e-9", "crash", "crash==1"])
 @pytest.mark.parametrize("ending", ["csv", "parquet"])
 @pytest.mark.parametrize("at_once", [1, 1 << 16])
 def test_the_first_row_in_which_it_holds_ends_the_episode(
@@ -461,9 +424,7 @@ def test_a_hole_in_time_makes_no_second_failure_and_without_a_word_there_is_none
     assert together(path)[2] is None
 
 
-@pytest.mark.parametrize(
-    "condition", ["", "gap<", "<0", "gap<x", "gap<0<1", "gap<inf", "0<gap", "a b<=nan"]
-)
+@pytest.mark.parametrize("condition", ["", "gap<", "<0", "gap<0<1", "gap<inf", "0<gap"])
 def test_what_is_no_condition_is_refused(tmp_path, condition):
     path = write(tmp_path / "a.csv", short([1, 2]), SHORT)
     with pytest.raises(ValueError, match=re.escape(f"--failed is {condition!r}")):
@@ -490,13 +451,6 @@ def test_rows_without_a_leader_end_an_episode(tmp_path, monkeypatch, nothing, at
     assert "column 'gap'" in refusal(path)
 
 
-def test_parquet_s_nulls_end_an_episode_too(tmp_path):
-    path = write(tmp_path / "a.csv", short([1, "", 2], crash=[0, 0, 0]), SHORT)
-    polars.read_csv(path).write_parquet(tmp_path / "a.parquet")
-    found = together(str(tmp_path / "a.parquet"), leader_may_lack=True)
-    assert found[:2] == ([1, 2], [0, 1])
-
-
 def test_what_lacks_in_a_row_with_a_leader_is_refused(tmp_path):
     lines = [line.replace("-0.5", "") for line in short([1, 2], crash=[0, 0])]
     path = write(tmp_path / "a.csv", lines, SHORT)
@@ -519,27 +473,17 @@ ZONED = [f"2026-03-29T01:59:59.{k}+01:00" for k in range(8, 10)]
 ZONED += [f"2026-03-29T03:00:00.{k}+02:00" for k in range(3)]  # summer time begins
 
 
-@pytest.mark.parametrize(
-    "texts",
-    [
-        ZONED,
-        [f"2026-03-14 09:26:53.{k}" for k in range(5)],
-        [f"2026-03-14T09:26:53.{k}Z" for k in range(5)],
-    ],
-)
-@pytest.mark.parametrize("ending", ["csv", "parquet"])
-def test_times_may_be_dates(tmp_path, texts, ending):
+@pytest.mark.parametrize("texts", [ZONED, [f"2026-03-14 09:26:53.{k}" for k in range(5)]])
+def test_times_may_be_dates(tmp_path, texts):
     path = write(tmp_path / "a.csv", dated(texts), SHORT)
-    if ending == "parquet":
-        polars.read_csv(path).write_parquet(tmp_path / "a.parquet")
-        path = str(tmp_path / "a.parquet")
-    (chunk,) = read(path)
-    assert chunk.times == pytest.approx([0.0, 0.1, 0.2, 0.3, 0.4], abs=1e-12)
-    assert (chunk.dt, chunk.starts.tolist()) == (0.1, [0])
+    polars.read_csv(path).write_parquet(tmp_path / "a.parquet")
+    for one in (path, str(tmp_path / "a.parquet")):
+        (chunk,) = read(one)
+        assert chunk.times == pytest.approx([0.0, 0.1, 0.2, 0.3, 0.4], abs=1e-12)
+        assert (chunk.dt, chunk.starts.tolist()) == (0.1, [0])
 
 
-@pytest.mark.parametrize("unit", ["ns", "us", "ms"])
-@pytest.mark.parametrize("zone", [None, "Europe/Berlin"])
+@pytest.mark.parametrize(("unit", "zone"), [("ns", None), ("ms", "Europe/Berlin")])
 def test_parquet_s_own_dates_are_read(tmp_path, unit, zone):
     time = polars.col("time").str.to_datetime("%+", time_zone="UTC")
     time = time.dt.convert_time_zone(zone) if zone else time.dt.replace_time_zone(None)
@@ -571,10 +515,10 @@ def test_units_are_converted_before_anything_is_learnt(tmp_path):
     assert chunk.dt == 0.1
     assert noted.units == {"v_follower": "km/h", "v_leader": "km/h", "time": "ms", "gap": "cm"}
     assert noted.warnings() == []
-    used = existing = ["v", "v_leader", "v_l"]  # the longest name counts, a column's own most
-    assert units_of({"v": "mph"}, used, existing, "time") == {"v": "mph"}
+    used = ["v", "v_leader", "v_l"]  # the longest name counts, a column's own most
+    assert units_of({"v": "mph"}, used, "time") == {"v": "mph"}
     given = {"v_": "mph", "v_lead": "km/h"}
-    assert units_of(given, used, existing, "time") == {"v_leader": "km/h", "v_l": "mph"}
+    assert units_of(given, used, "time") == {"v_leader": "km/h", "v_l": "mph"}
 
 
 @pytest.mark.parametrize(

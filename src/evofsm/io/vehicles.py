@@ -488,16 +488,10 @@ _LENGTH = struct.Struct("<I")
 
 
 def scenes_of_osi(path: str, on_read: OnRead) -> Iterator[Scene]:
-    """Read ground truth, or that within sensor views, from a ``.osi`` file, scene by scene.
-
-    Which of the two its messages are is known by the name (``_gt_``, ``_sv_``), and else by what is
-    in the first one.
-    """
+    """Read ground truth, or that within sensor views, from a ``.osi`` file, scene by scene."""
     osi = _osi(path)
-    name = path.rpartition("/")[2]
-    is_view = True if "_sv_" in name else False if "_gt_" in name else None
     with Source(path, on_read) as source:
-        number = 0
+        is_view, number = False, 0
         while head := source.read(_LENGTH.size):
             number += 1
             size = _LENGTH.unpack(head)[0] if len(head) == _LENGTH.size else 0
@@ -511,7 +505,7 @@ def scenes_of_osi(path: str, on_read: OnRead) -> Iterator[Scene]:
                 raise ValueError(
                     f"{path} ends within message {number} (was a copy or a simulation interrupted?)"
                 )
-            if is_view is None:
+            if number == 1:
                 is_view = _is_view(osi, data)
             yield _scene(osi, f"{path}, message {number}", data, is_view)
 
@@ -585,15 +579,11 @@ def _scene(osi: Any, place: str, data: bytes, is_view: bool) -> Scene:
 def _object(place: str, moving: Any) -> Object:
     base, classified = moving.base, moving.moving_object_classification
     name = str(moving.id.value) if moving.id else "without an id"
-    numbers = tuple(
-        getattr(part, axis) if part else math.nan
-        for part, axis in (
-            *((base.position, "x"), (base.position, "y")),
-            *((base.velocity, "x"), (base.velocity, "y"), (base.dimension, "length")),
-        )
-    )
-    x, y, vx, vy, length = numbers
-    if not (all(abs(number) <= LARGEST_OBSERVATION for number in numbers) and length > 0.0):
+    x, y = (base.position.x, base.position.y) if base.position else (math.nan, math.nan)
+    vx, vy = (base.velocity.x, base.velocity.y) if base.velocity else (math.nan, math.nan)
+    length = base.dimension.length if base.dimension else math.nan
+    largest = np.abs([x, y, vx, vy, length]).max()
+    if not (largest <= LARGEST_OBSERVATION and length > 0.0):
         raise ValueError(
             f"{place}: object {name} is {length:g} m long, at ({x:g}, {y:g}) m, with "
             f"({vx:g}, {vy:g}) m/s; it needs a length, and numbers"
