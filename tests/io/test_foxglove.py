@@ -17,8 +17,8 @@ pytest.importorskip("mcap")
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
-from evofsm.driving import DECISION_COLUMNS, IDM, Leader, Scenario, drive, guard_for_cars
-from evofsm.driving.naming import VARIABLES
+from evofsm.driving import IDM, Leader, Scenario, drive, guard_for_cars
+from evofsm.driving.naming import DECISION_COLUMNS, VARIABLES
 from evofsm.driving.world import Episode
 from evofsm.guard import Guard
 from evofsm.guard.api import Intake
