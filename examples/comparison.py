@@ -10,7 +10,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm import wilson_bounds
+from evofsm.fsm import wilson_bounds
 from evofsm.guard import RevisedActions
 
 

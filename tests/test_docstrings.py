@@ -27,12 +27,13 @@ def sections(thing):
 def missing(thing):
     """Sections that the docstring of a class, function or method lacks, or leaves empty.
 
-    What it returns stands in its first line, with the shape; a method may leave its example to its
-    class.
+    What it returns stands in its first line, with the shape. A method may leave its example to its
+    class, and tell there of the one thing that it is given.
     """
     is_method = not inspect.isclass(thing) and "." in thing.__qualname__
     lacks = set() if is_method else {"Examples"}
-    if not inspect.isclass(thing) and set(inspect.signature(thing).parameters) - {"self"}:
+    given = () if inspect.isclass(thing) else set(inspect.signature(thing).parameters) - {"self"}
+    if len(given) > is_method:
         lacks.add("Parameters")
     lacks -= set(sections(thing))
     if not (is_method or doctest.DocTestParser().get_examples(thing.__doc__ or "")):
@@ -69,14 +70,16 @@ class Bad:
     There is none.
     """
 
-    def bare(self, x) -> int: ...
+    def bare(self, x, y) -> int: ...
 
-    def described(self, x) -> None:
+    def of_one(self, x) -> int: ...
+
+    def described(self, x, y) -> None:
         """Line.
 
         Parameters
         ----------
-        x : int
+        x, y : int
         """
 
 
@@ -88,6 +91,7 @@ def bare(x) -> int: ...
     [
         (Bad, {"Examples"}),
         (Bad.bare, {"Parameters"}),
+        (Bad.of_one, set()),
         (Bad.described, set()),
         (bare, {"Parameters", "Examples"}),
     ],

@@ -18,7 +18,6 @@ from .fsm import jensen_shannon as jensen_shannon
 from .fsm import merge as merge
 from .fsm import register_rule as register_rule
 from .fsm import warm as warm
-from .fsm import wilson_bounds as wilson_bounds
 from .guard import Guard as Guard
 from .store import read_header as read_header
 

@@ -17,21 +17,11 @@ def test_the_papers_experiment_has_17_actions():
     assert actions.edges.tolist() == PAPER_EDGES
 
 
-@pytest.mark.parametrize(("closed", "above"), [("left", 1), ("right", 0)])
-def test_every_inner_edge_falls_on_the_closed_side_and_its_neighbours_on_their_own(closed, above):
-    actions = IntervalActions(**PAPER, closed=closed)
+def test_an_inner_edge_belongs_to_the_interval_that_it_begins():
+    actions = IntervalActions(**PAPER)
     for k, edge in enumerate(PAPER_EDGES[1:-1]):
-        assert actions.encode(edge) == k + above
+        assert actions.encode(edge) == actions.encode([edge])[0] == k + 1
         assert actions.encode(math.nextafter(edge, -math.inf)) == k
-        assert actions.encode(math.nextafter(edge, math.inf)) == k + 1
-
-
-def test_the_papers_section_2_1_2_has_intervals_closed_on_the_right():
-    actions = IntervalActions(low=-1.0, high=1.0, width=0.5, closed="right")
-    assert actions.n_actions == 4
-    assert actions.encode([-0.99, -0.5, -0.49, 0.0, 0.01, 0.5, 0.51, 1.0]).tolist() == [
-        *(0, 0, 1, 1, 2, 2, 3, 3)
-    ]
 
 
 @pytest.mark.parametrize(
@@ -52,25 +42,12 @@ def test_the_range_is_covered_by_as_many_intervals_as_arithmetic_on_paper_says(
     assert (actions.edges[0], actions.edges[-1]) == (low, high)
 
 
-@pytest.mark.parametrize("closed", ["left", "right"])
-def test_intervals_meet_and_their_centers_are_encoded_as_themselves(closed):
-    actions = IntervalActions(**PAPER, closed=closed)
+def test_intervals_meet_and_their_centers_are_encoded_as_themselves():
+    actions = IntervalActions(**PAPER)
     intervals = [actions.interval(i) for i in range(17)]
     assert all(a[1] == b[0] for a, b in pairwise(intervals))
     assert [actions.center(i) for i in (0, 8, 16)] == [-2.35, 0.05, 2.4]
     assert [actions.encode(actions.center(i)) for i in range(17)] == list(range(17))
-
-
-@pytest.mark.parametrize(
-    ("closed", "labels"),
-    [
-        ("left", ["[-2.5, -2.2)", "[-0.1, 0.2)", "[2.3, 2.5]"]),
-        ("right", ["[-2.5, -2.2]", "(-0.1, 0.2]", "(2.3, 2.5]"]),
-    ],
-)
-def test_labels_show_which_edges_belong_to_the_interval(closed, labels):
-    actions = IntervalActions(**PAPER, closed=closed)
-    assert [actions.label(i) for i in (0, 8, 16)] == labels
 
 
 def test_values_beyond_the_range_are_refused_by_default():
@@ -80,9 +57,8 @@ def test_values_beyond_the_range_are_refused_by_default():
             actions.encode(value)
 
 
-@pytest.mark.parametrize("closed", ["left", "right"])
-def test_values_beyond_the_range_fall_into_the_end_intervals_when_clipped(closed):
-    actions = IntervalActions(**PAPER, closed=closed, outside="clip")
+def test_values_beyond_the_range_fall_into_the_end_intervals_when_clipped():
+    actions = IntervalActions(**PAPER, outside="clip")
     assert actions.encode([-math.inf, -9.0, -2.6, 2.6, 9.0, math.inf]).tolist() == [
         *(0, 0, 0, 16, 16, 16)
     ]
@@ -131,7 +107,6 @@ def test_an_action_that_is_no_number_is_named(value, words):
         ({"width": -0.3}, "width is -0.3"),
         ({"low": 2.5}, "low must be below high"),
         ({"low": 3.0}, "low must be below high"),
-        ({"closed": "both"}, "closed is 'both'"),
         ({"outside": "ignore"}, "outside is 'ignore'"),
     ],
 )
@@ -143,7 +118,7 @@ def test_settings_that_make_no_sense_are_refused(change, words):
 def test_encoders_with_equal_settings_are_equal_and_cannot_be_changed():
     actions = IntervalActions(**PAPER)
     assert actions == IntervalActions(**PAPER)
-    assert actions != IntervalActions(**PAPER, closed="right")
+    assert actions != IntervalActions(**PAPER, outside="clip")
     with pytest.raises(ValueError, match="read-only"):
         actions.edges[0] = 0.0
 
@@ -153,8 +128,7 @@ def test_intervals_too_narrow_for_their_edges_to_be_told_apart_are_refused():
         IntervalActions(0.0, 1e-10, 1e-11)
 
 
-def test_end_intervals_that_hold_what_is_beyond_say_so():
-    clipping = IntervalActions(-2.5, 2.5, 0.3, outside="clip")
-    assert [clipping.label(i) for i in (0, 1, 16)] == ["< -2.2", "[-2.2, -1.9)", "≥ 2.3"]
-    right = IntervalActions(-1.0, 1.0, 0.5, closed="right", outside="clip")
-    assert [right.label(i) for i in (0, 3)] == ["≤ -0.5", "> 0.5"]
+def test_labels_show_which_edges_belong_to_the_interval():
+    for outside, ends in (("error", ("[-2.5, -2.2)", "[2.3, 2.5]")), ("clip", ("< -2.2", "≥ 2.3"))):
+        actions = IntervalActions(**PAPER, outside=outside)
+        assert [actions.label(i) for i in (0, 8, 16)] == [ends[0], "[-0.1, 0.2)", ends[1]]

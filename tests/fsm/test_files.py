@@ -13,7 +13,7 @@ from evofsm.fsm.rules import Novelty, Paper
 
 def full_model(grown):
     return grown.model(
-        actions=IntervalActions(-0.5, 1.0, 0.5, closed="right", outside="clip"),
+        actions=IntervalActions(-0.5, 1.0, 0.5, outside="clip"),
         names=("gap", "speed"),
         units=("m", "m/s"),
         dt=0.01,

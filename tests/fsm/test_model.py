@@ -183,9 +183,6 @@ def test_a_machine_is_asked_as_its_model_is(grown):
     model = grown.model()
     for ask in (
         lambda known: known.recognise([[0.2, 1.0], [2.0, 0.0]]),
-        lambda known: known.propagate(np.eye(known.n_states)[0], 1, 3, "observed"),
-        lambda known: known.nearest([1.0, 0.0]),
-        lambda known: known.averaged_matrix(),
         lambda known: known.joint_frequency,
         lambda known: (known.width, known.failures_told, known.settings),
     ):

@@ -96,17 +96,11 @@ def test_many_states_are_the_most_visited_and_a_row_for_all_others(crowd):
     assert len(page.rows) == 14
 
 
-def test_a_model_shows_names_units_and_what_follows(machine):
+def test_a_model_shows_names_and_units(machine):
     model = machine.model(names=["gap", "speed"], units=["m", ""], dt=0.25)
     page = Reader(model_html(model))
-    matrix = model.averaged_matrix("observed")
     assert "an observation every 0.25 s" in page.text
     assert page.rows[0][1:3] == ["gap [m]", "speed"]
-    assert column(page.rows, "stays") == [f"{100 * matrix[i, i]:.1f} %" for i in range(2)]
-    assert column(page.rows, "likeliest other next") == [
-        f"#2 ({100 * matrix[0, 1]:.1f} %)",
-        f"#1 ({100 * matrix[1, 0]:.1f} %)",
-    ]
 
 
 def test_what_users_name_is_escaped(machine):

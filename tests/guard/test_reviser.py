@@ -61,8 +61,7 @@ def sets(draw):
     low = draw(st.floats(-6.0, -0.2))
     high = low + draw(st.floats(0.5, 8.0))
     width = draw(st.floats(0.05, 2.0))
-    closed = draw(st.sampled_from(["left", "right"]))
-    return IntervalActions(low=low, high=high, width=width, closed=closed)
+    return IntervalActions(low=low, high=high, width=width)
 
 
 # -- What is executed ---------------------------------------------------------------------------

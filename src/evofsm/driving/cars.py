@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import astuple
-from typing import Any, Literal
+from typing import Any
 
 from evofsm.driving.family import Family
 from evofsm.driving.judge import LatentRisk
@@ -40,7 +40,6 @@ def guard_for_cars(
     interval: float = 0.25,
     *,
     width: float = 0.3,
-    closed: Literal["left", "right"] = "left",
     tolerance: float = TOLERANCE,
     mode: Mode = Mode.ACT,
     rule: StateRule | None = SAFETY_RULE,
@@ -62,8 +61,6 @@ def guard_for_cars(
         Time between two decisions [s].
     width : float
         Of an interval of accelerations, for the machine [m/s²].
-    closed : {"left", "right"}
-        Which edge belongs to an interval.
     tolerance : float
         Highest risk that is accepted, in (0, 1).
     mode : Mode
@@ -87,7 +84,7 @@ def guard_for_cars(
     >>> guard.decide([9.0, 20.0, 20.0], proposal=0.5).reason
     'nothing was learnt yet'
     """
-    actions = IntervalActions(low, high, width, closed, outside="clip")
+    actions = IntervalActions(low, high, width, outside="clip")
     if isinstance(judge, str):
         judge = _judge(judge, actions, interval, settings.get("seed", 0))
     machine = machine or EvolvingFSM(
@@ -112,8 +109,8 @@ def _judge(name: str, actions: IntervalActions, interval: float, seed: int) -> L
 
 def guard_for_family(family: Family, **settings: Any) -> Guard:
     """The same for a family's set of actions and interval; settings as in `guard_for_cars`."""
-    low, high, width, closed, _ = astuple(family.actions)
-    return guard_for_cars(low, high, family.interval, width=width, closed=closed, **settings)
+    low, high, width, _ = astuple(family.actions)
+    return guard_for_cars(low, high, family.interval, width=width, **settings)
 
 
 def learnt_by(guard: Guard) -> tuple[EvolvingFSM, LatentRisk]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from bisect import bisect_left, bisect_right
+from bisect import bisect_right
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal, SupportsIndex, overload
@@ -21,7 +21,7 @@ _MOST = 100_000
 
 @dataclass(frozen=True)
 class IntervalActions:
-    """Intervals of equal width over ``[low, high]``; the last one ends at ``high``.
+    """Intervals ``[a, b)`` of equal width over ``[low, high]``; the last one ends at ``high``.
 
     Parameters
     ----------
@@ -29,16 +29,8 @@ class IntervalActions:
         Range of the action, for an acceleration in [m/s²].
     width : float
         Width of an interval, in the same unit; the last one may be narrower.
-    closed : {"left", "right"}
-        Which edge belongs to an interval: ``[a, b)`` as in the paper's experiment, or ``(a, b]``
-        as in its Section 2.1.2. The outermost edge on the open side is included as well.
     outside : {"error", "clip"}
         Whether a value beyond the range is refused or put into the end interval.
-
-    Raises
-    ------
-    ValueError
-        If a setting is none of these, or there are more than 100,000 intervals.
 
     Examples
     --------
@@ -54,7 +46,6 @@ class IntervalActions:
     low: float
     high: float
     width: float
-    closed: Literal["left", "right"] = "left"
     outside: Literal["error", "clip"] = "error"
 
     def __post_init__(self) -> None:
@@ -68,9 +59,8 @@ class IntervalActions:
             raise ValueError(f"width is {self.width}; it must be positive")
         if not (self.high - self.low) / self.width <= _MOST:
             raise ValueError(f"width is {self.width}: more than {_MOST:,} intervals; make it wider")
-        for name, words in (("closed", ("left", "right")), ("outside", ("error", "clip"))):
-            if getattr(self, name) not in words:
-                raise ValueError(f"{name} is {getattr(self, name)!r}; it must be one of {words}")
+        if self.outside not in ("error", "clip"):
+            raise ValueError(f"outside is {self.outside!r}; it must be 'error' or 'clip'")
         if not (np.diff(self.edges) > 0.0).all():
             raise ValueError(
                 f"width is {self.width}, but edges are rounded to {_DIGITS} decimals and then "
@@ -101,16 +91,9 @@ class IntervalActions:
     @overload
     def encode(self, a: ArrayLike) -> NDArray[np.int64]: ...
     def encode(self, a: ArrayLike) -> int | NDArray[np.int64]:
-        """Index, from 0, of the interval in which each value lies: the paper's Section 2.1.2.
-
-        Parameters
-        ----------
-        a : float or array_like
-            Values of the action, in the unit of ``low`` and ``high``. NaN is refused.
-        """
+        """Index, from 0, of the interval in which each value lies: the paper's Section 2.1.2."""
         if type(a) is float and self.low <= a <= self.high:  # one number, as every decision asks
-            side = bisect_right if self.closed == "left" else bisect_left
-            return side(self._inner_edges, a)
+            return bisect_right(self._inner_edges, a)
         values = np.asarray(a)
         if values.dtype.kind not in "fiub":
             what = f"is {a!r}" if values.ndim == 0 else f"has dtype {values.dtype}"
@@ -124,50 +107,26 @@ class IntervalActions:
                 f"action {values[beyond].flat[0]} is outside [{self.low}, {self.high}]; "
                 'widen the range, or use outside="clip" to put it into the end interval'
             )
-        # An inner edge belongs to the interval on its closed side; the outer ones need no search.
-        inner = self.edges[1:-1]
-        index = np.searchsorted(inner, values, side="right" if self.closed == "left" else "left")
+        index = np.searchsorted(self.edges[1:-1], values, side="right")
         return int(index) if values.ndim == 0 else index.astype(np.int64)
 
     def interval(self, i: SupportsIndex) -> tuple[float, float]:
-        """Lower and upper edge of interval ``i``, in the unit of ``low`` and ``high``.
-
-        Parameters
-        ----------
-        i : int
-            Index of the interval, from 0.
-        """
+        """Lower and upper edge of interval ``i`` (from 0)."""
         i = check_index("interval", i, self.n_actions)
         return float(self.edges[i]), float(self.edges[i + 1])
 
     def center(self, i: SupportsIndex) -> float:
-        """Middle of interval ``i``, the action that stands for all in it.
-
-        Parameters
-        ----------
-        i : int
-            Index of the interval, from 0.
-        """
+        """Middle of interval ``i`` (from 0), the action that stands for all in it."""
         lower, upper = self.interval(i)
         return round((lower + upper) / 2.0, _DIGITS)
 
     def label(self, i: SupportsIndex) -> str:
-        """Interval ``i`` as people write it, a bracket at each edge that belongs to it.
-
-        Where values beyond the range are put into the end intervals, these have one edge only.
-
-        Parameters
-        ----------
-        i : int
-            Index of the interval, from 0.
-        """
+        """Interval ``i`` (from 0) as people write it; of clipped ends the inner edge alone."""
         lower, upper = self.interval(i)
-        is_left, is_first = self.closed == "left", lower == self.low
-        is_last = upper == self.high
+        is_first, is_last = lower == self.low, upper == self.high
         if self.outside == "clip" and self.n_actions > 1:  # end intervals hold what is beyond
             if is_first:
-                return f"{'<' if is_left else '≤'} {upper:g}"
+                return f"< {upper:g}"
             if is_last:
-                return f"{'≥' if is_left else '>'} {lower:g}"
-        opening, closing = "[" if is_left or is_first else "(", ")" if is_left else "]"
-        return f"{opening}{lower:g}, {upper:g}{']' if is_last else closing}"
+                return f"≥ {lower:g}"
+        return f"[{lower:g}, {upper:g}{']' if is_last else ')'}"

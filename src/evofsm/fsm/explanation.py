@@ -1,14 +1,11 @@
 """What a machine's experience says of a situation, in a sentence with its numbers.
 
-Nothing is estimated here: all of it was counted, once for each episode that came to a state, or
-took an action there. So an explanation is true of what was seen, whatever comes next; that one
-action ended better than another does not say that it was the reason. Where nobody ever told of
-failures, none can be counted, and that is said instead of a share.
+All of it was counted, once for each episode that came to a state, or took an action there; that
+one action ended better than another does not say that it was the reason.
 
-Beliefs are normalised: one that lies far from every state still belongs to the nearest of them. So
-an observation that is farther from the nearest centre than a state reaches (`rules.reach`) is
-*never seen*, and nothing that was counted is told of it. With the paper's rule the states may have
-passed over something rare that was seen, hence "as far as the states tell".
+A belief belongs to the nearest state, however far that is. So an observation that is farther from
+its centre than a state reaches (`rules.reach`) is *never seen*, and no count is told of it. With
+the paper's rule states may have passed over something rare, hence "as far as the states tell".
 """
 
 from __future__ import annotations
@@ -32,11 +29,6 @@ class Nearest(NamedTuple):
     state: int  #: its index
     distance: float  #: from its centre
     reach: float  #: how far from a centre an observation still belongs to the state
-
-    @property
-    def is_beyond(self) -> bool:
-        """Whether no state reaches as far as the observation."""
-        return self.distance > self.reach
 
 
 class Tally(NamedTuple):
@@ -80,20 +72,7 @@ class Tally(NamedTuple):
 
 
 class Explanation(NamedTuple):
-    """What is known of a situation; as text, its sentence.
-
-    Examples
-    --------
-    >>> from evofsm import EvolvingFSM
-    >>> machine = EvolvingFSM(n_actions=2, radius=0.5)
-    >>> trace = machine.learn_many([[0.0], [0.1], [2.0], [1.0]], [0, 1, 0, 0], [0, 2], [3])
-    >>> found = machine.model(names=["gap"], units=["m"]).explain(0, action=0)
-    >>> found.here.share, round(found.action.interval[0], 2)
-    (0.5, 0.12)
-    >>> print(found)
-    #1: gap 0 m. 2 episodes came here (3 observations); 1 of 2 (12 to 88 %) failed later on, and
-    1 of 2 (12 to 88 %) after a(1).
-    """
+    """What is known of a situation; as text, its sentence."""
 
     text: str  #: the sentence
     state: int | None = None  #: index of the most probable state; None where there is none
@@ -115,13 +94,10 @@ class Explanation(NamedTuple):
 def explain(
     known: Any, belief: Floats, action: int | None, labels: Labels, nearest: Nearest | None = None
 ) -> Explanation:
-    """What experience says of a situation that is recognised as ``belief`` (n,).
-
-    Where the observation is known, ``nearest`` says how far it is from what was learnt.
-    """
+    """What a model ``known`` says of a ``belief`` (n,) and, if known, of its observation."""
     if not len(belief):
         return Explanation("Nothing was learnt yet.")
-    if nearest is not None and nearest.is_beyond:
+    if nearest is not None and nearest.distance > nearest.reach:
         return _never_seen(known, belief, nearest, labels)
     state = int(belief.argmax())
     is_exact, is_told = not known.joined[state], known.failures_told
@@ -146,10 +122,8 @@ def explain(
         "" if came_from is None else _of_origin(arrivals, came_from),
     ]
     text = " ".join(f"{sentence}." for sentence in sentences if sentence)
-    sure = float(belief[state])
-    return Explanation(
-        text, state, sure, visits, here, came_from, asked, better, after_better, False
-    )
+    counted = visits, here, came_from, asked, better, after_better
+    return Explanation(text, state, float(belief[state]), *counted)
 
 
 def _never_seen(known: Any, belief: Floats, nearest: Nearest, labels: Labels) -> Explanation:

@@ -46,13 +46,9 @@ from evofsm.store import LARGEST_OBSERVATION, Place
 Method = TypeVar("Method", bound=Callable[..., Any])
 
 # What a machine does not have to be given, with what holds if it is not.
-_OPTIONS = {
-    "max_states": None,
-    "belief_tolerance": 0.0,
-    "failure_horizon": None,
-}
+_LIMITS = {"max_states": None, "failure_horizon": None}
+_OPTIONS = {**_LIMITS, "belief_tolerance": 0.0}
 _SETTINGS = ("n_actions", "radius", "distance_weight", "learning_rate", "prior_frequency", "spread")
-_FLOATS = [name for name in Settings._fields if name not in ("rule", "weights")]
 # Arrays of a snapshot that a machine answers with.
 _ASKED = {*arrays.OF_MODEL, "joint_frequency", "marginal_matrix"} - {"centers"}
 _FLOAT64 = np.dtype(np.float64)
@@ -67,11 +63,6 @@ else:
     _Arrays = object
 
 
-def _setting(name: str, doc: str) -> Any:
-    """A setting, which cannot be changed any more."""
-    return property(lambda self: getattr(self._settings, name), doc=doc)
-
-
 def _alone(method: Method) -> Method:
     """A method during which no other thread changes the machine."""
 
@@ -83,30 +74,19 @@ def _alone(method: Method) -> Method:
     return cast(Method, locked)
 
 
-def _of_snapshot(question: Method) -> Method:
-    """The same question, answered by the machine's snapshot of now."""
-
-    @wraps(question)
-    def ask(self: EvolvingFSM, *args: Any, **kwargs: Any) -> Any:
-        return question(self.model(), *args, **kwargs)
-
-    return cast(Method, ask)
-
-
 class EvolvingFSM(_Arrays):
     """A finite state machine that grows its states and transitions from what it observes.
 
-    It has the arrays of a snapshot, `FSMModel`, under their names: `visits`, `transition_matrices`
-    ...
+    It has the arrays of a snapshot, `FSMModel`, under their names, as `visits`.
 
     Parameters
     ----------
     n_actions : int
         Number q of discrete actions; each has a transition matrix of its own.
     radius : float, optional
-        The paper's epsilon, in the unit of the observations: an observation that is denser than
-        every centre moves the nearest one if that is closer than this, else it creates a state. 0.3
-        for `Paper` and `Edges`; other rules have their own.
+        The paper's epsilon: an observation that is denser than every centre moves the nearest one
+        if that is closer than this, else it creates a state. 0.3 for `Paper` and `Edges`; other
+        rules have their own.
     distance_weight : float
         The paper's rho, how fast distance to new data lowers a centre's potential.
     learning_rate : float
@@ -122,9 +102,8 @@ class EvolvingFSM(_Arrays):
         Number of states at which another one is only created where the two that are closest, the
         newcomer among them, are merged: evidence adds up, and the centre lies between theirs.
     belief_tolerance : float
-        How far a belief may be from the exact one, summed over all states, in [0, 1). States that
-        are less likely take no part in the step: with hundreds of states this saves most of the
-        time, 1e-6 for example.
+        How far a belief may be from the exact one, summed over all states, in [0, 1): 1e-6 saves
+        most of the time with hundreds of states.
     failure_horizon : int, optional
         A failure within this many observations of a visit is counted in `failed_soon`; without it,
         every failure later in the same episode.
@@ -139,9 +118,8 @@ class EvolvingFSM(_Arrays):
     Rows of a transition matrix are "from", columns "to": a forecast is ``belief @ P``. States and
     actions are counted from 0 here, and from 1 (``#3``) in what people read.
 
-    Threads may share a machine: each method is whole. But its episode is one stream, so give each
-    source of observations a machine of its own. An interrupt (Ctrl-C) leaves a machine as it was
-    before the observation or as it is after; `learn_many` has then learnt its first rows.
+    Threads may share a machine, but its episode is one stream. An interrupt (Ctrl-C) leaves it as
+    it was before an observation or as it is after; `learn_many` has then learnt its first rows.
 
     Examples
     --------
@@ -154,6 +132,14 @@ class EvolvingFSM(_Arrays):
     (array([0.48, 0.52]), array([0.5, 0.5]))
     """
 
+    radius: float
+    distance_weight: float
+    learning_rate: float
+    prior_frequency: float
+    spread: float
+    max_states: int | None
+    belief_tolerance: float
+    failure_horizon: int | None
     potentials: Floats
     transition_matrices: Floats
     origin_frequency: Floats
@@ -175,28 +161,27 @@ class EvolvingFSM(_Arrays):
         failure_horizon: int | None = None,
     ) -> None:
         self._rule = rules.Paper() if rule is None else rules.check_rule(rule)
-        if belief_tolerance and positive("belief_tolerance", belief_tolerance) >= 1.0:
-            raise ValueError(f"belief_tolerance is {belief_tolerance}; it must lie below 1")
-        if positive("learning_rate", learning_rate) >= 1.0:
-            raise ValueError(f"learning_rate is {learning_rate}; it must lie below 1")
         given = Settings(
             radius=0.3 if radius is None else positive("radius", radius),
             distance_weight=positive("distance_weight", distance_weight),
-            learning_rate=learning_rate,
+            learning_rate=_below_1("learning_rate", learning_rate),
             prior_frequency=positive("prior_frequency", prior_frequency),
             spread=3.0 if spread is None else positive("spread", spread),
-            belief_tolerance=belief_tolerance,
+            belief_tolerance=_below_1("belief_tolerance", belief_tolerance)
+            if belief_tolerance
+            else 0.0,
             max_states=_or_infinity("max_states", max_states),
             failure_horizon=_or_infinity("failure_horizon", failure_horizon),
             rule=PAPER,
             memory=np.inf,
             weights=np.empty(0),
-        )._replace(**cast(Any, self._rule.table))
+        )
+        table = {name: float(value) for name, value in self._rule.table.items() if name != "rule"}
+        given = given._replace(rule=int(self._rule.table["rule"]), **cast(Any, table))
         for name, value in (("radius", radius), ("spread", spread)):
             if value not in (None, getattr(given, name)):
                 raise ValueError(f"{name} is {value}, but the rule has its own: {self._rule}")
-        floats: dict[str, Any] = {name: float(getattr(given, name)) for name in _FLOATS}
-        self._settings = given._replace(**floats)
+        self._settings = given
         self._learnt = arrays.blank(0, whole("n_actions", n_actions), 0, 0)
         self._share()
         MACHINE.refuse_others(self._content)
@@ -236,8 +221,8 @@ class EvolvingFSM(_Arrays):
         Raises
         ------
         TypeError, ValueError
-            If ``z`` holds no real numbers, has another length than before, an entry is NaN,
-            infinite or beyond 1e100. The machine is then as it was.
+            If ``z`` holds no real numbers of at most 1e100, or has another length than before. The
+            machine is then as it was.
         """
         if missing is not Missing.REJECT:
             given = valid.real_array("observation", z, ndim=1)
@@ -255,7 +240,7 @@ class EvolvingFSM(_Arrays):
         Parameters
         ----------
         i : int
-            Index of the action, from 0; `IntervalActions.encode` gives it for a number.
+            Index of the action, from 0.
         """
         i = valid.check_action(i, self.n_actions)
         now = self._learnt.now
@@ -288,6 +273,8 @@ class EvolvingFSM(_Arrays):
     ) -> Trace:
         """Learn from many observations at once, bit for bit as `observe` and `act` would.
 
+        An error is raised before any row is learnt, and names the row.
+
         Parameters
         ----------
         Z : (T, m) array_like
@@ -302,11 +289,6 @@ class EvolvingFSM(_Arrays):
             tells that there was none; without it nothing is said of failures.
         belief : bool
             Whether the trace holds the belief of every row as well.
-
-        Raises
-        ------
-        TypeError, ValueError
-            As `observe` and `act`, before any row is learnt; the message names the row.
         """
         observations = valid.real_rows("observations", Z)
         rows = len(observations)
@@ -322,7 +304,7 @@ class EvolvingFSM(_Arrays):
         trace, row = blank_trace(rows), 0
         beliefs = np.zeros((rows if belief else 0, self._capacity))
         while row < rows:
-            given = self._learnt, self._settings, self.max_states, observations, actions, starts
+            given = self._learnt, self._settings, self._limit, observations, actions, starts
             told, scratch = failures is not None, np.empty((3, self._capacity))
             row = stepping.learn_rows(*given, ends, told, scratch, row, trace, beliefs)
             if row < rows:
@@ -339,8 +321,8 @@ class EvolvingFSM(_Arrays):
     def fail(self) -> None:
         """End the episode in failure, without a further observation.
 
-        The action commanded after the latest observation led there; where none was, the failure is
-        counted for the state alone. The next observation begins a new episode.
+        The action commanded after the latest observation led there, if there was one. The next
+        observation begins a new episode.
         """
         if not self._learnt.now["chained"][0]:
             raise ValueError("fail before observe: this episode has no observation to fail after")
@@ -360,8 +342,7 @@ class EvolvingFSM(_Arrays):
     def tell_of_failures(self) -> None:
         """Say that failures are told: an episode that ends without one is known to have had none.
 
-        So do `observe` with ``failed=False`` and `learn_many` with ``failures=[]``. Where nobody
-        says so, and no failure was ever told, `explain` does not take the silence for safety.
+        So does ``failed=False``. Without it `explain` does not take silence for safety.
         """
         self._learnt.now["failures_told"] = 1
 
@@ -401,9 +382,9 @@ class EvolvingFSM(_Arrays):
         Parameters
         ----------
         action : int, optional
-            Index of an action, from 0: what came of taking it there.
+            What came of taking it there.
         labels : Labels, optional
-            What the numbers mean, for words.
+            What the numbers mean.
         """
         index = None if action is None else valid.check_action(action, self.n_actions)
         if self.state is None:
@@ -411,10 +392,9 @@ class EvolvingFSM(_Arrays):
         labels = Labels() if labels is None else labels
         return explain(self.model(), self.belief, index, labels, self._nearest(self.state))
 
-    recognise = _of_snapshot(FSMModel.recognise)
-    nearest = _of_snapshot(FSMModel.nearest)
-    propagate = _of_snapshot(FSMModel.propagate)
-    averaged_matrix = _of_snapshot(FSMModel.averaged_matrix)
+    def recognise(self, z: ArrayLike) -> Floats:
+        """(n,) belief of an observation, or (N, n) of many, as `FSMModel.recognise` tells it."""
+        return self.model().recognise(z)
 
     @_alone
     def model(
@@ -429,12 +409,8 @@ class EvolvingFSM(_Arrays):
 
         Parameters
         ----------
-        actions : IntervalActions, optional
-            What the action indices mean.
-        names, units : sequence of str, optional
-            Names and units of the m variables.
-        dt : float, optional
-            Time between two observations [s].
+        actions, names, units, dt : optional
+            What its numbers mean, as `Labels` takes them.
         """
         found, now = arrays.by_name(self._learnt), self._learnt.now[0]
         q, n = self.n_actions, self.n_states
@@ -465,10 +441,15 @@ class EvolvingFSM(_Arrays):
         )
 
     def __getattr__(self, name: str) -> Any:
-        """Arrays of the snapshot of now."""
-        if name not in _ASKED:
-            raise AttributeError(f"{type(self).__name__} has no attribute {name!r}")
-        return getattr(self.model(), name).copy()
+        """A setting, or an array of the snapshot of now."""
+        if name in _LIMITS:
+            most = getattr(self._settings, name)
+            return None if most == np.inf else int(most)
+        if name in Settings._fields:
+            return getattr(self._settings, name)
+        if name in _ASKED:
+            return getattr(self.model(), name).copy()
+        raise AttributeError(f"{type(self).__name__} has no attribute {name!r}")
 
     # -- What it was given ----------------------------------------------------------------------
 
@@ -483,27 +464,10 @@ class EvolvingFSM(_Arrays):
         """Number q of actions."""
         return len(self._learnt.actions)
 
-    radius = _setting("radius", "The paper's epsilon, or the rule's own.")
-    distance_weight = _setting("distance_weight", "The paper's rho.")
-    learning_rate = _setting("learning_rate", "The paper's phi.")
-    prior_frequency = _setting("prior_frequency", "The paper's epsilon-bar.")
-    spread = _setting("spread", "Width of recognition, in total variances or the rule's measure.")
-    belief_tolerance = _setting("belief_tolerance", "How far a belief may be from the exact one.")
-
     @property
     def rule(self) -> StateRule:
         """How states are determined."""
         return self._rule
-
-    @property
-    def max_states(self) -> int | None:
-        """Number of states from which on two are merged for another; None for no limit."""
-        return _or_none(self._settings.max_states)
-
-    @property
-    def failure_horizon(self) -> int | None:
-        """Observations after which a failure no longer counts as soon; None for no limit."""
-        return _or_none(self._settings.failure_horizon)
 
     # -- What it knows --------------------------------------------------------------------------
 
@@ -576,13 +540,12 @@ class EvolvingFSM(_Arrays):
 
     @_alone
     def save(self, path: Place, provenance: Mapping[str, Any] | None = None) -> None:
-        """Write it to a file (arrays and a JSON header, nothing that can run).
+        """Write it to a file: arrays and a JSON header.
 
         Parameters
         ----------
         path : str, path-like or binary file
-            Name of the file, used as it is; a file of that name is replaced, or left as it was
-            where this one cannot be written.
+            A file of that name is replaced, or left as it was where this cannot be written.
         provenance : mapping, optional
             What it learnt from, for JSON; `evofsm inspect` shows it.
         """
@@ -592,14 +555,8 @@ class EvolvingFSM(_Arrays):
     def load(cls, path: Place) -> Self:
         """Read it from a file; it goes on bit for bit as if it had never been stopped.
 
-        Parameters
-        ----------
-        path : str, path-like or binary file
-
-        Raises
-        ------
-        OSError, ValueError
-            If it may not be read, holds something else, is damaged, or of a newer version.
+        Raises an OSError if it may not be read, and a ValueError if it holds something else, is
+        damaged, or of a newer version.
         """
         content, learnt = store.read(path, MACHINE)
         with store.explained(path):
@@ -647,7 +604,7 @@ class EvolvingFSM(_Arrays):
 
     def _share(self) -> None:
         """Be ready for threads. They wait for whoever steps, grows, or takes a copy."""
-        self._lock = RLock()
+        self._lock, self._limit = RLock(), self.max_states
         # Room for a single row.
         flags = np.zeros((2, 1), np.bool_)
         self._one = np.empty(1, np.int64), *flags, blank_trace(1), np.empty((0, 0))
@@ -663,7 +620,7 @@ class EvolvingFSM(_Arrays):
         actions, starts, failures, trace, none = self._one
         actions[0], failures[0] = action, bool(failed)
         scratch = np.empty((3, len(self._learnt.belief)))
-        given = self._settings, self.max_states, row, actions, starts, failures, failed is not None
+        given = self._settings, self._limit, row, actions, starts, failures, failed is not None
         while not _row_kernel(self._learnt, *given, scratch, 0, trace, none):
             self._make_room()
             scratch = np.empty((3, len(self._learnt.belief)))
@@ -794,9 +751,11 @@ if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_unlock_all)
 
 
+def _below_1(name: str, value: float) -> float:
+    if positive(name, value) >= 1.0:
+        raise ValueError(f"{name} is {value}; it must lie below 1")
+    return float(value)
+
+
 def _or_infinity(name: str, most: SupportsIndex | None) -> float:
-    return np.inf if most is None else whole(name, most)
-
-
-def _or_none(most: float) -> int | None:
-    return None if most == np.inf else int(most)
+    return np.inf if most is None else float(whole(name, most))

@@ -43,11 +43,10 @@ _NONE: Any = None
 class Counts:
     """What was counted; machines and models have it under these names.
 
-    n is the number of states, q of actions. Counts never forget: a rare failure must not fade, and
-    they are the evidence that there is. An episode is counted once for each state it came to, and
-    each action it took there, for observations of one episode are no independent evidence; the one
-    that is going on is not shown yet. It failed *soon* after it was in a state if no more than
-    ``failure_horizon`` observations lay between; where that is not set, if it failed at all.
+    n is the number of states, q of actions. Counts never forget. An episode is counted once for
+    each state it came to, and each action it took there, for its observations are no independent
+    evidence; the one that is going on is not shown yet. It failed *soon* after it was in a state if
+    no more than ``failure_horizon`` observations lay between; without that, if it failed at all.
 
     Examples
     --------
@@ -78,16 +77,10 @@ class Counts:
 class FSMModel(Counts):
     """States and transitions as they stood when the snapshot was taken.
 
-    n is the number of states, m of variables, q of actions. Centres are in the units of the
-    observations; distances and potentials are those of observations divided by the rule's scales.
-    Rows of a matrix are "from", columns "to". Parts are given by name; arrays are read-only, and
-    counts that are not given are 0.
-
-    Raises
-    ------
-    ValueError
-        If parts do not fit each other, a number is out of its range, such as NaN or a count below
-        0, a row of a transition matrix is no distribution, or more failed than were tried.
+    n is the number of states, m of variables, q of actions. Distances and potentials are those of
+    observations divided by the rule's scales. Rows of a matrix are "from", columns "to". Arrays are
+    read-only, and counts that are not given are 0. Parts that do not fit each other, or hold what
+    cannot be, are refused.
 
     Examples
     --------
@@ -170,40 +163,23 @@ class FSMModel(Counts):
 
     @property
     def joint_frequency(self) -> Floats:
-        """(q, n, n) ndarray: the paper's F, recency-weighted frequencies of transitions."""
+        """(q, n, n) the paper's F, recency-weighted frequencies of transitions."""
         return np.asarray(self.origin_frequency[:, :, None] * self.transition_matrices)
 
     @property
     def marginal_matrix(self) -> Floats:
-        """(n, n) ndarray: the paper's P*, transition probabilities if all actions are alike."""
+        """(n, n) the paper's P*, transition probabilities if all actions are alike."""
         return self.averaged_matrix("marginal")
 
-    # -- Where it is ----------------------------------------------------------------------------
-
     def recognise(self, z: ArrayLike) -> Floats:
-        """Distribution over states for one observation, or for each of many.
-
-        The paper's Section 2.2.2, with the width that the snapshot holds; the states stay as they
-        are.
-
-        Parameters
-        ----------
-        z : (m,) or (N, m) array_like
-            One observation, or one per row, in the units of the machine's.
-        """
+        """(n,) belief of an observation (m,), or (N, n) of many: the paper's Section 2.2.2."""
         given, rows = self._observations(z)
         weights = weights_of(self.rule, self.n_variables)
         belief = believed(self.centers.T, weights, rows, self.width)
         return belief if given.ndim == 2 else belief[0]
 
     def nearest(self, z: ArrayLike) -> Nearest:
-        """Which state an observation is nearest to, how far that is, and how far a state reaches.
-
-        Parameters
-        ----------
-        z : (m,) array_like
-            Observation, as `recognise` takes it.
-        """
+        """Which state an observation (m,) is nearest to, and how far a state reaches."""
         _, rows = self._observations(z)
         if len(rows) != 1:
             raise ValueError(f"z holds {len(rows)} observations; one is asked for")
@@ -212,8 +188,6 @@ class FSMModel(Counts):
         state = int(distances.argmin())
         return Nearest(state, float(distances[state]), reach(self.rule, self.width))
 
-    # -- What comes next --------------------------------------------------------------------------
-
     def propagate(
         self,
         belief: ArrayLike,
@@ -221,10 +195,7 @@ class FSMModel(Counts):
         horizon: int = 1,
         policy: Policy = "marginal",
     ) -> Floats:
-        """(n,) distribution over states ``horizon`` steps after ``belief``.
-
-        The forecast equations of the paper's Section 2.3.2: ``belief @ P[action] @ P*^(horizon -
-        1)``.
+        """(n,) distribution over states some steps later: the paper's Section 2.3.2.
 
         Parameters
         ----------
@@ -232,11 +203,8 @@ class FSMModel(Counts):
             Present distribution over states.
         action : int, optional
             Index of the first step's action, from 0; without it ``policy`` rules that step too.
-        horizon : int
-            Number of steps, at least 1.
-        policy : {"marginal", "hold", "observed"}
-            Actions after the first step: each alike (the paper's k-step equation), the first one
-            again, or each as often as it was used.
+        horizon, policy
+            As `EvolvingFSM.predict` takes them.
         """
         there, steps = self._belief(belief), check_forecast(horizon, policy)
         if action is None and policy == "hold":
@@ -251,11 +219,8 @@ class FSMModel(Counts):
     def averaged_matrix(self, policy: Policy = "observed") -> Floats:
         """(n, n) transition probabilities from state (row) to state (column), over all actions.
 
-        Parameters
-        ----------
-        policy : {"observed", "marginal"}
-            Each action as often as it was used, or all alike (the paper's P*, Section 2.3.2). Where
-            none was used yet, both are alike.
+        Each action counts as often as it was used ("observed"), or all alike ("marginal", the
+        paper's P* of Section 2.3.2).
         """
         if policy not in ("marginal", "observed"):
             raise ValueError(f"policy is {policy!r}; an average is 'marginal' or 'observed'")
@@ -263,8 +228,6 @@ class FSMModel(Counts):
             shares = self.uses / self.uses.sum()
             return np.asarray(np.tensordot(shares, self.transition_matrices, axes=1))
         return np.asarray(self.transition_matrices.mean(axis=0))
-
-    # -- In words ---------------------------------------------------------------------------------
 
     def explain(
         self,
@@ -275,8 +238,6 @@ class FSMModel(Counts):
     ) -> Explanation:
         """What experience says of a situation: where it lies, and what came of being there.
 
-        All of it was counted, once for each episode; see `evofsm.fsm.explanation`.
-
         Parameters
         ----------
         situation : int or (n,) array_like, optional
@@ -284,8 +245,7 @@ class FSMModel(Counts):
         action : int, optional
             Index of an action, from 0: what came of taking it there.
         observation : (m,) array_like, optional
-            What was observed, in place of a situation: it is recognised, unless it is farther from
-            every state than a state reaches, and so was never seen.
+            What was observed, in place of a situation.
 
         Examples
         --------
@@ -330,24 +290,19 @@ class FSMModel(Counts):
     # -- Files ------------------------------------------------------------------------------------
 
     def save(self, path: Place, provenance: Mapping[str, Any] | None = None) -> None:
-        """Write it to a file, as `EvolvingFSM.save` does.
+        """Write it to a file.
 
         Parameters
         ----------
-        path : str, path-like or binary file
-        provenance : mapping, optional
+        path, provenance
+            As `EvolvingFSM.save` takes them.
         """
         arrays = {name: getattr(self, name) for name in OF_MODEL}
         store.write(path, MODEL, self._content, arrays, provenance)
 
     @classmethod
     def load(cls, path: Place) -> Self:
-        """Read it from a file, as `EvolvingFSM.load` does.
-
-        Parameters
-        ----------
-        path : str, path-like or binary file
-        """
+        """Read it from a file, as `EvolvingFSM.load` does."""
         content, arrays = store.read(path, MODEL)
         with store.explained(path):
             if (actions := content["actions"]) is not None:
@@ -365,10 +320,12 @@ class FSMModel(Counts):
     @property
     def _content(self) -> dict[str, Any]:
         """All but the arrays, for JSON."""
-        told = {name: getattr(self, name) for name in _TOLD}
-        actions = None if self.actions is None else asdict(self.actions)
-        rule, settings = describe_rule(self.rule), dict(self.settings)
-        return {**told, "actions": actions, "rule": rule, "settings": settings}
+        told = ("width", "names", "units", "dt", "failures_told")
+        return {name: getattr(self, name) for name in told} | {
+            "actions": None if self.actions is None else asdict(self.actions),
+            "rule": describe_rule(self.rule),
+            "settings": dict(self.settings),
+        }
 
     # -- Inside ---------------------------------------------------------------------------------
 
@@ -399,10 +356,6 @@ class FSMModel(Counts):
         if self.n_states:
             refuse_unless_distribution("belief", given)
         return given
-
-
-# Settings of a model that JSON has words for as they are.
-_TOLD = ("width", "names", "units", "dt", "failures_told")
 
 
 def believed(centers: Floats, weights: Floats, rows: Floats, width: float) -> Floats:

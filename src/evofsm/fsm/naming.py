@@ -44,7 +44,7 @@ def _words_of(names: tuple[str, ...]) -> Words | None:
 
 
 class Labels(NamedTuple):
-    """What the numbers of a machine mean: for words and pictures, it learns without.
+    """What the numbers of a machine mean, for words and pictures.
 
     Examples
     --------
@@ -61,13 +61,7 @@ class Labels(NamedTuple):
     dt: float | None = None  #: time between two observations [s]
 
     def place(self, center: ArrayLike) -> str:
-        """Where a centre lies: in words where a package declares some, else by its numbers.
-
-        Parameters
-        ----------
-        center : (m,) array_like
-            In the units of the observations.
-        """
+        """Where a centre (m,) lies: in words where a package declares some, else by its numbers."""
         if words := _words_of(self.names):
             return words.place(center)
         values = [f"{value:.3g}" for value in np.asarray(center, np.float64).tolist()]
@@ -78,26 +72,14 @@ class Labels(NamedTuple):
         return ", ".join(" ".join(part for part in one if part) for one in named)
 
     def variable(self, index: int) -> str:
-        """Name and unit of a variable, as far as they are known.
-
-        Parameters
-        ----------
-        index : int
-            From 0.
-        """
+        """Name and unit of a variable (from 0), as far as they are known."""
         if not self.names:
             return f"variable {index}"
         unit = self.units[index] if self.units else ""
         return f"{self.names[index]} [{unit}]" if unit else self.names[index]
 
     def action(self, index: int) -> str:
-        """An action with its interval, where that is known.
-
-        Parameters
-        ----------
-        index : int
-            From 0.
-        """
+        """An action (from 0) with its interval, where that is known."""
         name = action_name(index)
         if self.actions is None:
             return name
@@ -105,12 +87,7 @@ class Labels(NamedTuple):
         return f"{name} {self.actions.label(index)}{f' {words.unit}' if words else ''}"
 
     def duration(self, observations: int) -> str:
-        """How long so many observations last: in seconds where that is known, else their number.
-
-        Parameters
-        ----------
-        observations : int
-        """
+        """How long so many observations last: in seconds where that is known, else their number."""
         if self.dt is None:
             return f"{observations:,} observation{'s' * (observations != 1)}"
         return f"{observations * self.dt:.4g} s"

@@ -11,34 +11,22 @@ import numpy as np
 
 from evofsm.fsm.validation import Floats, state_name
 
-# More states than these have no row, and more variables no column.
-_MOST_STATES, _MOST_VARIABLES = 12, 6
+# More states than these have no row.
+_MOST_STATES = 12
 
 
 def machine_html(machine: Any) -> str:
     """A machine: its settings, its states, and where it is."""
     state, model = machine.state, machine.model()
     now = "no episode has begun" if state is None else f"now in {state_name(state)}"
-    columns = _columns(model)
-    if state is not None:
-        columns["belief"] = _percent(machine.belief)
-    return _html(machine, [*_about(model), now], columns, model.visits, state)
+    belief = {} if state is None else {"belief": _percent(machine.belief)}
+    return _html(machine, [*_about(model), now], _columns(model) | belief, model.visits, state)
 
 
 def model_html(model: Any) -> str:
-    """A model: its states, and where each leads most often."""
-    columns = _columns(model)
-    if model.uses.any() and model.n_states > 1:
-        matrix = model.averaged_matrix("observed")
-        stays = matrix.diagonal()
-        elsewhere = matrix - np.diag(stays)
-        next_, shares = elsewhere.argmax(axis=1), _percent(elsewhere.max(axis=1))
-        columns["stays"] = _percent(stays)
-        columns["likeliest other next"] = [
-            f"{state_name(int(i))} ({share})" for i, share in zip(next_, shares, strict=True)
-        ]
+    """A model: its settings and its states."""
     every = [] if model.dt is None else [f"an observation every {model.dt:g} s"]
-    return _html(model, [*_about(model), *every], columns, model.visits)
+    return _html(model, [*_about(model), *every], _columns(model), model.visits)
 
 
 def step_html(step: Any) -> str:
@@ -58,19 +46,14 @@ def _about(model: Any) -> list[str]:
     sizes = ((model.n_states, "state"), (model.n_actions, "action"))
     told = [f"{number:,} {thing}{'s' * (number != 1)}" for number, thing in sizes]
     settings = {name: value for name, value in model.settings.items() if name != "n_actions"}
-    told += [f"{name} {value}" for name, value in settings.items()]
-    return [*told, f"rule {model.rule}"]
+    return [*told, *(f"{name} {value}" for name, value in settings.items()), f"rule {model.rule}"]
 
 
 def _columns(model: Any) -> dict[str, list[str]]:
     """Where the states lie, and how often each was seen."""
-    m = model.n_variables
-    heads = [model.labels.variable(j) for j in range(min(m, _MOST_VARIABLES))]
-    if m > _MOST_VARIABLES:
-        heads[-1] += f" (and {m - _MOST_VARIABLES} more)"
     columns = {
-        head: [f"{number:.4g}".replace("-", "−") for number in values]
-        for head, values in zip(heads, model.centers.T, strict=False)
+        model.labels.variable(j): [f"{number:.4g}".replace("-", "−") for number in values]
+        for j, values in enumerate(model.centers.T)
     }
     for name in ("visits", "episodes", "failed_soon", "endings"):
         if (counts := getattr(model, name)).any() or name == "visits":
@@ -91,8 +74,7 @@ def _html(
 ) -> str:
     """A head, and a row for each of the states that weigh most, the present one among them."""
     heaviest = np.argsort(-weights, kind="stable").tolist()
-    if present is not None:
-        heaviest = [present, *(i for i in heaviest if i != present)]
+    heaviest.sort(key=lambda i: i != present)
     rows = [
         [state_name(i), *(cells[i] for cells in columns.values())]
         for i in sorted(heaviest[:_MOST_STATES])
@@ -102,8 +84,8 @@ def _html(
     head = f"<div><strong>{type(thing).__name__}</strong>: {escape(', '.join(about))}</div>"
     if not rows:
         return head
-    heads = "".join(f"<th scope='col'>{escape(one)}</th>" for one in ("state", *columns))
-    cells = "".join(
-        f"<tr>{''.join(f'<td>{escape(cell)}</td>' for cell in row)}</tr>" for row in rows
-    )
-    return f"{head}<table><thead><tr>{heads}</tr></thead><tbody>{cells}</tbody></table>"
+    table = [
+        f"<tr>{''.join(f'<{tag}>{escape(cell)}</{tag}>' for cell in row)}</tr>"
+        for tag, row in (("th", ["state", *columns]), *(("td", row) for row in rows))
+    ]
+    return f"{head}<table>{''.join(table)}</table>"

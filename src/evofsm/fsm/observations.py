@@ -1,9 +1,7 @@
 """Put continuous and discrete variables into one observation: the paper's Section 2.1.1.
 
-States are found by Euclidean distance, so a discrete variable needs numbers in which no category
-is nearer to one than to another: one coordinate per category, which is the variable's
-``distance / sqrt(2)`` for the present category and 0 for the others. Any two categories then lie
-``distance`` apart.
+States are found by Euclidean distance, so a discrete variable has a coordinate for each category,
+``distance / sqrt(2)`` for the present one and 0 for the others: any two lie ``distance`` apart.
 """
 
 from __future__ import annotations
@@ -48,12 +46,11 @@ class Category:
     Parameters
     ----------
     name : str
-        Name of the variable.
     values : sequence of str
         All the categories it may take, two or more.
     distance : float
-        Distance between any two of them, in the unit of the other variables. Above a machine's
-        ``radius``, by more than rounding, no state moves from one category to another.
+        Between any two of them, in the unit of the other variables. Above a machine's ``radius`` no
+        state moves from one category to another.
 
     Examples
     --------
@@ -82,11 +79,6 @@ class ObservationEncoder:
     *variables : str or Category
         A name for each continuous variable, a `Category` for each discrete one, in order.
 
-    Attributes
-    ----------
-    names : tuple of str
-        Name of each entry of the vector; ``light=red`` for a category.
-
     Examples
     --------
     >>> encoder = ObservationEncoder("gap", Category("light", ("red", "green")))
@@ -100,6 +92,7 @@ class ObservationEncoder:
         if not variables:
             raise ValueError("an observation needs at least one variable")
         self.variables = variables
+        #: Of each entry of the vector; ``light=red`` for a category.
         self.names: tuple[str, ...] = ()
         for one in variables:
             if isinstance(one, Category):
@@ -110,16 +103,7 @@ class ObservationEncoder:
             raise ValueError(f"variables have the same name twice: {', '.join(self.names)}")
 
     def encode(self, values: Mapping[str, float | str]) -> Floats:
-        """(len(names),) vector for one observation: the paper's Section 2.1.1.
-
-        Numbers are as they are; a present category is ``distance / sqrt(2)``, others are 0.
-
-        Parameters
-        ----------
-        values : mapping
-            A number for each continuous variable, in the unit you observe it in; a category for
-            each discrete one. Others are left out.
-        """
+        """(len(names),) vector of a number or category for each variable; others are left out."""
         encoded: list[float] = []
         for variable in self.variables:
             name = variable.name if isinstance(variable, Category) else variable

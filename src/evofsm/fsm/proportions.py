@@ -11,28 +11,14 @@ from evofsm.fsm.kernels import compiled
 
 # Two-sided 90 %.
 _WIDTH = 1.645
-# From this shape on a gamma distribution is taken to be a power of a normal one.
-_LARGE = 50.0
+# From so many events on their distribution is taken to be a power of a normal one.
+_LARGE = 50
 _HALVINGS = 60
 
 
 @compiled
 def wilson_bounds(share: float, count: float) -> tuple[float, float]:
-    """90 % interval, lower and upper, of a share that was counted (Wilson 1927).
-
-    Parameters
-    ----------
-    share : float
-        Of the cases, in [0, 1].
-    count : float
-        Number of cases, above 0.
-
-    Examples
-    --------
-    >>> low, high = wilson_bounds(0.25, 12.0)
-    >>> round(low, 2), round(high, 2)
-    (0.1, 0.49)
-    """
+    """90 % interval, lower and upper, of a share of ``count`` cases (Wilson 1927)."""
     spread = _WIDTH * _WIDTH / count
     centre = (share + 0.5 * spread) / (1.0 + spread)
     reach = math.sqrt(spread * (share * (1.0 - share) + 0.25 * spread)) / (1.0 + spread)
@@ -43,40 +29,28 @@ def wilson_bounds(share: float, count: float) -> tuple[float, float]:
 def poisson_bounds(count: int) -> tuple[float, float]:
     """90 % interval of the number of events to be expected where ``count`` were seen.
 
-    Exact (Garwood 1936): the bounds are where as few, and as many, are seen in 5 % of cases.
+    The bounds are where as few, and as many, are seen in 5 % of cases (Garwood 1936).
     """
-    low = _gamma_quantile(0.05, count) if count else 0.0
-    return low, _gamma_quantile(0.95, count + 1.0)
+    return _mean(count - 1, 0.95) if count else 0.0, _mean(count, 0.05)
 
 
-def _gamma_quantile(share: float, shape: float) -> float:
-    """Below which a gamma variable of scale 1 lies with this probability, 0.05 or 0.95."""
-    if shape > _LARGE:  # Wilson & Hilferty 1931
-        width = _WIDTH if share > 0.5 else -_WIDTH
+def _mean(most: int, share: float) -> float:
+    """Of a Poisson variable that is at most so many with this probability, 0.05 or 0.95."""
+    if most >= _LARGE:  # Wilson & Hilferty 1931, of a gamma variable
+        width, shape = _WIDTH if share < 0.5 else -_WIDTH, most + 1.0
         return float(shape * (1.0 - 1.0 / (9.0 * shape) + width / (3.0 * math.sqrt(shape))) ** 3)
-    low, high = 0.0, shape + 10.0 * math.sqrt(shape) + 10.0
+    low, high = 0.0, 2.0 * most + 20.0
     for _ in range(_HALVINGS):
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if _gamma_below(middle, shape) < share else (low, middle)
+        mean = 0.5 * (low + high)
+        terms = (mean**k / math.factorial(k) for k in range(most + 1))
+        low, high = (mean, high) if math.exp(-mean) * sum(terms) > share else (low, mean)
     return high
 
 
-def _gamma_below(x: float, shape: float) -> float:
-    """Probability that a gamma variable of scale 1 lies below x: the series of its density."""
-    term = total = 1.0 / shape
-    k = shape
-    while term > 1e-15 * total:
-        k += 1.0
-        term *= x / k
-        total += term
-    return total * math.exp(shape * math.log(x) - x - math.lgamma(shape))
-
-
 def bounds_text(low: float, high: float) -> str:
-    """Bounds of a share in percent, rounded outward, so that what is said of it holds.
+    """Bounds of a share in percent, rounded outward, but for those that say nothing.
 
-    Whole percents; within one percent of 0 or of 1, with the first digit that shows them. A bound
-    of 0 from below, or of 1 from above, says nothing and is left out.
+    Within one percent of 0 or of 1 they have the first digit that shows them.
     """
     least = _percent(low, math.floor)
     most = _percent(high, math.ceil)
@@ -111,11 +85,10 @@ def outward(rounded: Callable[[float], int], value: float, decimals: int) -> flo
 
 
 class FailureRecord(NamedTuple):
-    """How often it failed, in the words of a safety review, with what that rests on.
+    """How often it failed, with what that rests on.
 
-    The intervals are Garwood's (1936), exact if failures come at a constant rate and independently
-    of each other (of more than 50 failures they are right to four digits). Each end by itself holds
-    with 95 %. They speak of the conditions in which it was run, and of nothing else.
+    The intervals are Garwood's (1936), of failures that come at a constant rate, independently of
+    each other. Each end by itself holds with 95 %, in the conditions in which it was run.
 
     Examples
     --------
@@ -134,13 +107,15 @@ class FailureRecord(NamedTuple):
 
     def __str__(self) -> str:
         ran = [] if self.episodes is None else [_counted(self.episodes, "episode")]
-        rates = [(self.hours, "h", 1.0, "per hour")]
-        if self.kilometres is not None:
-            rates.append((self.kilometres, "km", 1000.0, "per 1,000 km"))
-        ran += [f"{_exposure(done)} {unit}" for done, unit, *_ in rates]
-        said = [
-            _rate(self.failures, done / per, words) for done, _, per, words in rates if done > 0.0
-        ]
+        said = []
+        for done, unit, per, words in (
+            (self.hours, "h", 1.0, "per hour"),
+            (self.kilometres, "km", 1000.0, "per 1,000 km"),
+        ):
+            if done is not None:
+                ran.append(f"{_exposure(done)} {unit}")
+            if done:
+                said.append(_rate(self.failures, done / per, words))
         text = f"{_counted(self.failures, 'failure')} in {', '.join(ran)}"
         if not said:
             return f"{text}: nothing is known"

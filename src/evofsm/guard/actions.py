@@ -341,10 +341,7 @@ def nearest_bounds(actions: ActionSet) -> tuple[NDArray[np.float64], NDArray[np.
         every = np.arange(actions.n_actions, dtype=np.float64)
         return np.append(0.0, every), np.append(actions.high, every)
     lowest, highest = actions.edges[:-1].copy(), actions.edges[1:].copy()
-    if actions.closed == "left":
-        highest[:-1] = np.nextafter(highest[:-1], -math.inf)
-    else:
-        lowest[1:] = np.nextafter(lowest[1:], math.inf)
+    highest[:-1] = np.nextafter(highest[:-1], -math.inf)
     low, high = actions.low, actions.high
     return np.array([low, *lowest, low, high]), np.array([high, *highest, low, high])
 
