@@ -77,6 +77,9 @@ class Study(ABC):
     def page(self, found: Frames) -> Page:
         """The tables and figures that show what `run` returned."""
 
+    def write(self, found: Frames, folder: Path) -> None:  # noqa: B027
+        """Write further files of one's own beside the rows."""
+
     @property
     def facts(self) -> dict[str, str]:
         """All its settings, for the page."""
@@ -105,6 +108,7 @@ def command(study: type[Study]) -> Callable[..., None]:
             for name, frame in found.items():
                 file = study.name if name == "rows" else f"{study.name}-{name}"
                 frame.write_parquet(folder.absolute() / f"{file}.parquet")
+            asked.write(found, folder.absolute())
             page = asked.page(found)
             path = write_page(folder / "index.html", [page])
             print_page(page)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 from studies.alarms.plan import Plan as Alarms
-from studies.breaks.plan import Plan as Breaks
 from studies.detection.plan import Plan as Detection
 from studies.foresight.plan import Plan as Foresight
 from studies.old.study import Study
@@ -17,7 +16,6 @@ from studies.sensitivity.plan import Plan as Sensitivity
 STUDIES: dict[str, type[Study[Any]]] = {
     study.id: study
     for study in (
-        Breaks,
         Detection,
         Alarms,
         Prediction,
