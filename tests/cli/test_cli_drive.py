@@ -125,7 +125,6 @@ def test_the_table_of_decisions_has_its_columns_in_their_order():
     [
         (("nowhere",), "nowhere"),
         (("emergency", "--reviser", "magic"), "magic"),
-        (("emergency", "--controller", "nobody"), "nobody"),
         (("emergency", "--mode", "shadow", "--reviser", "rss"), "rss"),
         (("emergency", "--with", "rain"), "rain"),
         (("emergency", "--frozen", "nothing-here"), "nothing-here"),

@@ -6,9 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
-
-from evofsm.cli.options import Json, imported
+from evofsm.cli.options import Json, argument, imported, option
 from evofsm.cli.show import facts, print_json, show
 
 if TYPE_CHECKING:
@@ -23,23 +21,13 @@ _FIELDS, _LETTERS = 5, 40
 
 
 def audit(
-    file: Annotated[Path, typer.Argument(help="An audit log.")],
+    file: Annotated[Path, argument("An audit log.")],
     head: Annotated[
-        str | None,
-        typer.Option(
-            help="NUMBER:HASH of the last record at some time, kept elsewhere: shows an end that "
-            "was cut off, and a log that was written anew."
-        ),
+        str | None, option("NUMBER:HASH of its last record at some time, kept elsewhere.")
     ] = None,
-    replay: Annotated[
-        bool, typer.Option(help="Whether to drive again, and compare every decision.")
-    ] = True,
+    replay: Annotated[bool, option("Whether to drive again, and compare every decision.")] = True,
     failed: Annotated[
-        str | None,
-        typer.Option(
-            help="MODULE:FUNCTION that told the guard where it fails, if one did: no log holds "
-            "code."
-        ),
+        str | None, option("MODULE:FUNCTION that told the guard where it fails, if one did.")
     ] = None,
     as_json: Json = False,
 ) -> int:

@@ -5,23 +5,13 @@ from __future__ import annotations
 import sys
 from typing import Annotated, Any
 
-import typer
-
-from evofsm.cli.options import Json, imported
+from evofsm.cli.options import Json, argument, imported, option
 from evofsm.cli.show import print_json, say, show
 
 
 def check(
-    name: Annotated[
-        str,
-        typer.Argument(help="module:Class, module:instance, or module:function that makes one."),
-    ],
-    make: Annotated[
-        str | None,
-        typer.Option(
-            help="How to make it, in Python with the module's names: 'MyRule(radius=2.0)'."
-        ),
-    ] = None,
+    name: Annotated[str, argument("module:Class, module:instance, or a function that makes one.")],
+    make: Annotated[str | None, option("How to make it, as in: 'MyRule(radius=2.0)'.")] = None,
     as_json: Json = False,
 ) -> int:
     """Check a class of your own against the contract of its kind.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import AbstractContextManager, closing, contextmanager, nullcontext
 from dataclasses import replace
 from hashlib import sha256
@@ -11,24 +11,21 @@ from pathlib import Path
 from statistics import median
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
-
 from evofsm.cli.options import (
-    ControllerOption,
+    ByJudge,
+    InWorld,
     Json,
     Judge,
-    JudgeOption,
     ModeName,
-    ReviserOption,
-    SeedOption,
-    SwitchesOption,
-    ToleranceOption,
+    Seed,
+    Switches,
+    Tolerance,
     World,
-    WorldOption,
+    argument,
     family_of,
+    option,
     require,
     require_world,
-    split_names,
 )
 from evofsm.cli.show import facts, print_json, progress, say, show, table, warn
 
@@ -36,8 +33,6 @@ if TYPE_CHECKING:
     from rich.console import RenderableType
 
     from evofsm.cli.driving import Driving, Results, Setup
-    from evofsm.cli.sumocfg import Attached
-    from evofsm.driving.by_state import StateRisk
     from evofsm.guard import Guard
     from evofsm.io.foxglove import FoxgloveSink, RunWriter
 
@@ -48,76 +43,44 @@ _MOST = 8
 def drive(
     family: Annotated[
         str,
-        typer.Argument(
-            help="Family of scenarios: emergency, paper, shift, ..., a Python file with one of "
-            "your own, or a SUMO configuration (.sumocfg)."
+        argument(
+            "Family of scenarios: emergency, paper, shift, ..., a Python file with one of your "
+            "own, or a SUMO configuration (.sumocfg)."
         ),
     ],
-    episodes: Annotated[int, typer.Option(min=1, max=2**32, help="How many are driven.")] = 100,
-    world: WorldOption = World.KINEMATIC,
-    controller: ControllerOption = "family",
-    reviser: ReviserOption = "least-risk",
-    judge: JudgeOption = Judge.KINEMATIC,
-    mode: Annotated[
-        ModeName, typer.Option(help="How far least-risk goes: off, shadow, advise, act.")
-    ] = ModeName.ACT,
-    tolerance: ToleranceOption = 0.02,
-    switches: SwitchesOption = "",
-    seed: SeedOption = 0,
+    episodes: Annotated[int, option("How many are driven.", min=1, max=2**32)] = 100,
+    world: InWorld = World.KINEMATIC,
+    reviser: Annotated[
+        str, option("Who revises: least-risk (ours), none, rss, aeb, or another measure.")
+    ] = "least-risk",
+    judge: ByJudge = Judge.KINEMATIC,
+    mode: Annotated[ModeName, option("How far least-risk goes.")] = ModeName.ACT,
+    tolerance: Tolerance = 0.02,
+    switches: Switches = "",
+    seed: Seed = 0,
     learn: Annotated[
-        Path | None, typer.Option(help="Go on learning from this folder of an earlier --out.")
+        Path | None, option("Go on learning from this folder of an earlier --out.")
     ] = None,
     frozen: Annotated[
-        Path | None,
-        typer.Option(help="Drive held-out draws with what this folder holds; learn nothing."),
+        Path | None, option("Drive held-out draws with what this folder holds; learn nothing.")
     ] = None,
     workers: Annotated[
-        int | None,
-        typer.Option(
-            min=1,
-            help="Drive held-out draws in so many processes, and learn nothing; with --cluster, "
-            "wait for so many workers.",
-        ),
+        int | None, option("Drive held-out draws in so many processes; learn nothing.", min=1)
     ] = None,
     cluster: Annotated[
-        str | None,
-        typer.Option(
-            help="The same by the workers of Dask's scheduler, such as tcp://10.0.0.1:8786."
-        ),
+        str | None, option("The same by Dask's workers; its scheduler: tcp://10.0.0.1:8786.")
     ] = None,
     out: Annotated[
-        Path | None,
-        typer.Option(
-            help="Folder for what was learnt, every episode and every decision; what it holds is "
-            "not driven again."
-        ),
+        Path | None, option("Folder of what was learnt and driven; nothing is driven again.")
     ] = None,
-    audit: Annotated[
-        Path | None,
-        typer.Option(
-            help="Append to this log what the reviser changed or warned of, to be verified and "
-            "replayed by evofsm audit."
-        ),
-    ] = None,
+    audit: Annotated[Path | None, option("Append to this log, for evofsm audit.")] = None,
     vehicles: Annotated[
-        str,
-        typer.Option(
-            help="Of a SUMO configuration the guarded cars: all, a share, type:NAME, or ids with "
-            "commas."
-        ),
+        str, option("Of a SUMO configuration: all, a share, type:NAME, or ids with commas.")
     ] = "10%",
-    mcap: Annotated[
-        Path | None,
-        typer.Option(help="Write every episode to this log, for Foxglove and evofsm watch."),
-    ] = None,
+    mcap: Annotated[Path | None, option("Log every episode for Foxglove and watch.")] = None,
     foxglove: Annotated[
         int | None,
-        typer.Option(
-            min=0,
-            max=65535,
-            help="Serve every decision at this port (8765 is usual) to Foxglove or Lichtblick on "
-            "this computer, in real time; it begins when somebody looks on.",
-        ),
+        option("Serve decisions to Foxglove at this port (8765 is usual).", min=0, max=65535),
     ] = None,
     as_json: Json = False,
 ) -> int | None:
@@ -139,7 +102,13 @@ def drive(
     given |= {"out": out, "audit": audit, "mcap": mcap, "foxglove": foxglove}
     given = {name: value for name, value in given.items() if value is not None}
     if family.endswith(".sumocfg"):
-        _drive_configuration(Path(family), vehicles, mode, tolerance, given, as_json=as_json)
+        if given:
+            what = "is for families of scenarios, not for a configuration"
+            raise ValueError(f"--{next(iter(given))} {what}")
+        require(libsumo="sumo")
+        from evofsm.cli.sumocfg import run_configuration
+
+        run_configuration(Path(family), vehicles, mode.value, tolerance, as_json=as_json)
         return None
     _refuse_pairs(given)
     require_world(world, **({"polars": "tables"} if out is not None and not at_once else {}))
@@ -151,7 +120,6 @@ def drive(
 
     setup = Setup(
         family_of(family, switches),
-        controller,
         reviser,
         judge.value,
         Mode(mode.value),
@@ -196,20 +164,19 @@ def drive(
 
 def _refuse_pairs(given: dict[str, Any]) -> None:
     """Raise where two options exclude each other."""
+    many = ("workers", "cluster")
     why = {
-        ("learn", "frozen"): "",
-        ("learn", "workers"): ": whoever learns drives episodes one after the other",
-        ("learn", "cluster"): ": whoever learns drives episodes one after the other",
-        ("foxglove", "audit"): ": a guard has one decision logger",
-        **{
-            (watching, many): ": workers send no decisions"
-            for watching in ("audit", "mcap", "foxglove")
-            for many in ("workers", "cluster")
-        },
+        "whoever learns drives episodes one after the other": [("learn", one) for one in many],
+        "workers send no decisions": [
+            (one, other) for one in ("audit", "mcap", "foxglove") for other in many
+        ],
+        "a guard has one decision logger": [("foxglove", "audit")],
+        "whoever is frozen learns nothing": [("learn", "frozen")],
     }
-    for (one, other), reason in why.items():
-        if one in given and other in given:
-            raise ValueError(f"--{one} and --{other} exclude each other{reason}")
+    for reason, pairs in why.items():
+        for one, other in pairs:
+            if one in given and other in given:
+                raise ValueError(f"--{one} and --{other} exclude each other: {reason}")
 
 
 # -- Driving --------------------------------------------------------------------------------------
@@ -304,7 +271,6 @@ def _summary(driving: Driving, setup: Setup) -> Iterator[tuple[str, str]]:
     row = driving.row
     kind = "training" if setup.learn else "held-out"
     yield "family", f"{row.family}, {row.episodes:,} {kind} episodes"
-    yield "controller", setup.controller
     yield "reviser", f"{setup.reviser}, {setup.mode.value}"
     yield "judge", f"{setup.judge}, given {TOLD[setup.judge]}"
     interval = f"(95 %: {row.collision_low:.1%} to {row.collision_high:.1%})"
@@ -347,108 +313,27 @@ def _states(driving: Driving) -> Iterator[RenderableType]:
     from evofsm.driving import LatentRisk, learners_of
 
     machine, judge = learners_of(driving.guard)
-    is_kinematic = isinstance(judge, LatentRisk)
-    count = len(driving.states)
-    found = [one for one in driving.states if (one.is_dead_end if is_kinematic else one.failures)]
+    knows = isinstance(judge, LatentRisk)
+    found = [one for one in driving.states if (one.is_dead_end if knows else one.failures)]
+    what = "Dead ends" if knows else "States in which a collision ended"
     if not found:
-        yield (
-            f"No dead ends among the {count} states."
-            if is_kinematic
-            else f"No episode ended in failure in any of the {count} states."
-        )
+        yield f"{what}: none of {len(driving.states)} states."
         return
-    found.sort(key=lambda one: -(one.seconds if is_kinematic else one.failures))
-    place = ("state", "gap [m]", "follower [m/s]", "leader [m/s]")
-
-    def cells(one: StateRisk, *others: str) -> Sequence[str]:
-        center = machine.centers[one.state].tolist()
-        return (f"#{one.state + 1}", *(f"{value:.1f}" for value in center), *others)
-
-    if is_kinematic:
-        title = f"Dead ends: {len(found)} of {count} states; seen longest"
-        header: tuple[str, ...] = (
-            "survives [m/s²]",
-            "risk if braking",
-            "escape margin",
-            "seen [s]",
-            "ended here",
-        )
-        rows = [
-            cells(
-                one,
-                *(f"{one.critical:.1f}", f"{one.risk:.0%}", f"{one.margin:.0%}"),
-                *(f"{one.seconds:.1f}", f"{one.failures:g}"),
-            )
-            for one in found[:_MOST]
-        ]
-        note = (
+    found.sort(key=lambda one: -(one.seconds if knows else one.failures))
+    header = ["state", "gap [m]", "follower [m/s]", "leader [m/s]", "seen [s]", "ended here"]
+    rows = []
+    for one in found[:_MOST]:
+        center = [f"{value:.1f}" for value in machine.centers[one.state].tolist()]
+        rows.append([f"#{one.state + 1}", *center, f"{one.seconds:.1f}", f"{one.failures:g}"])
+        if knows:
+            rows[-1] += [f"{one.critical:.1f}", f"{one.risk:.0%}", f"{one.margin:.0%}"]
+    if knows:
+        header += ["survives [m/s²]", "risk if braking", "escape margin"]
+    yield table(f"{what}: {len(found)} of {len(driving.states)}; foremost", header, rows)
+    yield "\nEnded here: collisions."
+    if knows:
+        yield (
             "Dead end: if the leader braked hard now, braking in full would most likely be too "
-            "late. Survives: the hardest braking of a leader that braking in full now still "
-            "survives; escape margin: how much lower the risk then is than if speed is kept; ended "
-            "here: collisions."
+            "late. Survives: the hardest braking of a leader that braking in full now survives; "
+            "escape margin: how much lower the risk then is than if speed is kept."
         )
-    else:
-        title = f"Collisions ended in {len(found)} of {count} states"
-        header = ("seen [s]", "began here", "ended here")
-        rows = [
-            cells(one, f"{one.seconds:.1f}", f"{machine.onsets[one.state]:g}", f"{one.failures:g}")
-            for one in found[:_MOST]
-        ]
-        note = (
-            "Began here: disturbances, that is, what was not expected and went on for a while; "
-            "ended here: collisions."
-        )
-    yield table(title, (*place, *header), rows)
-    yield f"\n{note}"
-
-
-# -- A SUMO configuration -------------------------------------------------------------------------
-
-
-def _drive_configuration(
-    file: Path,
-    vehicles: str,
-    mode: ModeName,
-    tolerance: float,
-    given: dict[str, Any],
-    *,
-    as_json: bool,
-) -> None:
-    """Run it to its end, and print what came of it."""
-    require(libsumo="sumo")
-    from evofsm.cli.sumocfg import drive_configuration
-
-    if given:
-        what = "is for families of scenarios, not for a configuration"
-        raise ValueError(f"--{next(iter(given))} {what}")
-    if mode not in (ModeName.ACT, ModeName.SHADOW):
-        raise ValueError(f"--mode is {mode.value!r}; for a configuration it is act or shadow")
-    by_ids = not (vehicles == "all" or vehicles.startswith("type:") or vehicles.endswith("%"))
-    with progress("Driving") as move:
-
-        def moved(time: float, collisions: int) -> None:
-            if time == int(time):
-                move(text=f"Driving ({time:,.0f} s, {collisions} collisions)")
-
-        chosen = split_names(vehicles) if by_ids else vehicles
-        came = drive_configuration(file, chosen, mode.value, tolerance, moved)
-    if as_json:
-        print_json(came)
-    else:
-        show(facts("What came of the simulation", list(_attached(came))))
-
-
-def _attached(came: Attached) -> Iterator[tuple[str, str]]:
-    """Collisions, speed, and what guarding did."""
-    what = "held back" if came.mode == "act" else "would have held back"
-    yield "simulation", f"{came.configuration}, {came.seconds:,.0f} s"
-    yield "guarded", f"{came.guarded:,} cars ({came.vehicles}), {came.mode}"
-    if not came.guarded:
-        yield "note", f"no car was {came.vehicles}: is it the name of a type or car?"
-    of_guarded = f"{came.of_guarded:,} by guarded cars, {came.into_guarded:,} by others into them"
-    yield "collisions", f"{came.collisions:,}: {of_guarded}"
-    yield "mean speed", f"{came.speed:.2f} m/s of guarded cars"
-    share = came.revised / max(1, came.decisions)
-    yield "guards", f"{what} {share:.1%} of {came.decisions:,} decisions"
-    if came.guarded:
-        yield "overhead", f"{came.microseconds:.0f} µs a decision"

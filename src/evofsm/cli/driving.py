@@ -26,8 +26,6 @@ from typing import Any, NamedTuple
 from evofsm import store
 from evofsm.cli.journal import Journal
 from evofsm.driving import (
-    IDM,
-    Draw,
     EnvelopeReviser,
     Episode,
     Family,
@@ -46,12 +44,10 @@ from evofsm.driving.measures import FIXED_MEASURES
 from evofsm.driving.naming import DECISION_COLUMNS
 from evofsm.driving.world import World
 from evofsm.extras import needs
-from evofsm.guard import TOLERANCE, Controller, DecisionLogger, Explain, Guard, Mode, Reviser
+from evofsm.guard import TOLERANCE, DecisionLogger, Explain, Guard, Mode, Reviser
 
 _log = logging.getLogger(__name__)
 
-#: Controllers by name; ``family`` is the family's own.
-CONTROLLERS = ("family", "aggressive", "normal")
 #: Revisers by name: none, ours, and the classic measures.
 REVISERS = ("least-risk", "none", "rss", "aeb", *FIXED_MEASURES)
 #: The columns of ``decisions.parquet`` after ``episode``; `driving/naming.py` says which they are.
@@ -78,7 +74,6 @@ class Setup:
     """What is asked for."""
 
     family: Family
-    controller: str = "family"
     reviser: str = "least-risk"
     judge: str = "kinematic"
     mode: Mode = Mode.ACT
@@ -102,24 +97,13 @@ class Setup:
             "switches": list(self.family.switches),
             "file": self.family.source and Path(self.family.source).read_text("utf-8"),
         }
-        names = (
-            "controller",
-            "reviser",
-            "judge",
-            "tolerance",
-            "seed",
-            "world",
-            "learn",
-            "learnt",
-            "digest",
-        )
+        names = ("reviser", "judge", "tolerance", "seed", "world", "learn", "learnt", "digest")
         own = {name: getattr(self, name) for name in names}
         return {"family": of_family, **own, "mode": self.mode.value}
 
     def trial(self, guard: Guard, world: World | str) -> Trial:
         """Its episodes, by their number: training draws while it learns, held-out ones else."""
-        split, controller = "train" if self.learn else "test", partial(make_controller, self)
-        return Trial(self.family, guard, world, self.seed, split, controller)
+        return Trial(self.family, guard, world, self.seed, "train" if self.learn else "test")
 
 
 class Driving(NamedTuple):
@@ -132,13 +116,7 @@ class Driving(NamedTuple):
 
 
 def make_guard(setup: Setup, before: Guard | None = None) -> Guard:
-    """A guard whose reviser and judge have the setup's names, with what was learnt before.
-
-    Raises
-    ------
-    ValueError
-        If there is no such reviser or judge, or what was learnt is of another judge.
-    """
+    """A guard whose reviser and judge have the setup's names, with what was learnt before."""
     family, name = setup.family, _ALIASES.get(setup.reviser, setup.reviser)
     if name not in ("least-risk", "none", *FIXED_MEASURES):
         raise ValueError(f"there is no reviser {name!r}; there are {', '.join(REVISERS)}")
@@ -165,39 +143,13 @@ def make_guard(setup: Setup, before: Guard | None = None) -> Guard:
     return Guard.of(reviser, interval=family.interval, learn=setup.learn, **learners)
 
 
-def make_controller(setup: Setup, draw: Draw) -> Controller:
-    """A controller by its name, within the family's range of actions."""
-    low, high = setup.family.actions.low, setup.family.actions.high
-    match setup.controller:
-        case "family":
-            return draw.controller
-        case "aggressive":
-            return IDM(2.25, 28.0, 0.8, 0.3, 2.0, lowest=low, highest=high)
-        case "normal":
-            return IDM(1.25, 25.0, 2.0, 1.5, 2.0, lowest=low, highest=high)
-    raise ValueError(
-        f"there is no controller {setup.controller!r}; there are {', '.join(CONTROLLERS)}"
-    )
 
 
 # -- What has been driven so far ------------------------------------------------------------------
 
 
 class Results:
-    """Rows of episodes, in a folder if there is one. Close it after use.
-
-    Parameters
-    ----------
-    setup : Setup
-    guard : Guard
-        Of `make_guard`, with what was learnt before.
-    folder : Path, optional
-
-    Raises
-    ------
-    ValueError
-        If the folder has episodes of other settings, or another process drives into it.
-    """
+    """Rows of episodes, in a folder if there is one. Close it after use."""
 
     def __init__(self, setup: Setup, guard: Guard, folder: Path | None = None) -> None:
         self.setup = setup
@@ -210,6 +162,8 @@ class Results:
         if folder is None:
             return
         folder.mkdir(parents=True, exist_ok=True)
+        for name in (GUARD, _EPISODES, _SUMMARY, _DECISIONS):
+            store.sweep(folder / name)
         self._journal = Journal(folder / _JOURNAL, setup.settings)
         try:
             self._journal.go_on(setup.settings, "run it with those, or name another folder")
@@ -302,14 +256,9 @@ def _write_decisions(path: Path, rows: Sequence[Outcomes]) -> None:
 
 
 def _decided(driven: Episode) -> dict[str, list[Any]]:
-    """The columns of an episode's decisions; None where a number is not known."""
-    columns = {}
-    for name in DECISION_TABLE:
-        values = [DECISION_COLUMNS[name].read(one) for one in driven.decisions]
-        is_unknown = [isinstance(value, float) and math.isnan(value) for value in values]
-        pairs = zip(values, is_unknown, strict=True)
-        columns[name] = [None if unknown else value for value, unknown in pairs]
-    return columns
+    """The columns of an episode's decisions."""
+    columns = {name: DECISION_COLUMNS[name].read for name in DECISION_TABLE}
+    return {name: [read(one) for one in driven.decisions] for name, read in columns.items()}
 
 
 def _assessed(guard: Guard) -> list[StateRisk]:
@@ -335,26 +284,7 @@ def drive_in_turn(
     audit: DecisionLogger | None = None,
     record: Callable[[Episode], None] | None = None,
 ) -> Driving:
-    """Drive those episodes that the results lack, one after the other.
-
-    Parameters
-    ----------
-    results : Results
-    episodes : int
-        How many there shall be.
-    world : World
-    show : callable
-        Given how many are done, and how many ended in a collision.
-    audit : DecisionLogger, optional
-        Writes down what is decided; also in episodes that are driven again after a stop.
-    record : callable, optional
-        Given each episode that is driven here; every decision is then explained.
-
-    Raises
-    ------
-    ValueError
-        If a guard that learns has driven more than so many.
-    """
+    """Drive those episodes that the results lack, one after the other."""
     setup, guard, done = results.setup, results.guard, len(results.rows)
     if setup.learn and done > episodes:
         raise ValueError(f"{results.folder} has driven {done} episodes, more than {episodes}")
@@ -386,24 +316,6 @@ def drive_at_once(
     """Drive those held-out episodes that the results lack, by many workers.
 
     What comes of it does not depend on who drives, nor on what happens to them.
-
-    Parameters
-    ----------
-    results : Results
-        Of a setup that does not learn.
-    episodes, show
-        As in `drive_in_turn`.
-    workers : int
-        Processes of this computer; of a cluster, how many to wait for.
-    cluster : str, optional
-        Address of Dask's scheduler, such as ``"tcp://10.0.0.1:8786"``.
-
-    Raises
-    ------
-    ChildProcessError
-        If workers die over the same episodes again and again.
-    ConnectionError
-        If no scheduler answers, or there are too few workers.
     """
     guard = results.guard.copy(states=False)  # what is decided does not depend on them
     guard.freeze()

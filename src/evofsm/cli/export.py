@@ -7,10 +7,8 @@ from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
-
 from evofsm.cli.inspect import load_model
-from evofsm.cli.options import Saved
+from evofsm.cli.options import Saved, option
 
 if TYPE_CHECKING:
     from evofsm.fsm.model import FSMModel
@@ -28,23 +26,14 @@ class Format(StrEnum):
 
 def export(
     file: Saved,
-    to: Annotated[
-        Format,
-        typer.Option(help="Graph for Graphviz (dot), or process for PRISM and Storm."),
-    ],
-    out: Annotated[Path | None, typer.Option(help="File to write; else it is printed.")] = None,
+    to: Annotated[Format, option("Graph for Graphviz (dot), or process for PRISM and Storm.")],
+    out: Annotated[Path | None, option("File to write; else it is printed.")] = None,
     least: Annotated[
         float | None,
-        typer.Option(
-            min=0.0, max=1.0, help="Leave out what is less probable; in a graph 0.001, else 0."
-        ),
+        option("Leave out what is less probable. [default: dot 0.001]", min=0.0, max=1.0),
     ] = None,
     evidence: Annotated[
-        float | None,
-        typer.Option(
-            min=0.0,
-            help="Leave out edges, for prism actions, that were seen less often; 1 if not given.",
-        ),
+        float | None, option("Leave out what was seen less often. [default: 1]", min=0.0)
     ] = None,
 ) -> None:
     """Write what was learnt, or driven, in the formats of other tools."""
@@ -69,21 +58,16 @@ def export(
 
 def _refuse_learnt(out: Path | None) -> None:
     """Raise where a graph would take the place of what cannot be had again."""
-    if out is not None and out.is_file() and _is_learnt(out):
-        raise ValueError(f"--out {out}: what was learnt or driven is kept there; it was left alone")
-
-
-def _is_learnt(file: Path) -> bool:
     from evofsm.store import read_header
 
-    with file.open("rb") as start:
-        if start.read(len(_MCAP)) == _MCAP:
-            return True
-    try:
-        read_header(file)
-    except ValueError:
-        return False
-    return True
+    if out is None or not out.is_file():
+        return
+    if not out.read_bytes().startswith(_MCAP):
+        try:
+            read_header(out)
+        except ValueError:
+            return
+    raise ValueError(f"--out {out}: what was learnt or driven is kept there; it was left alone")
 
 
 def _learnt(file: Path) -> tuple[FSMModel, list[int] | None]:

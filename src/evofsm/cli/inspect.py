@@ -8,9 +8,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
-import typer
-
-from evofsm.cli.options import Json, Saved, require
+from evofsm.cli.options import Json, Saved, option, require
 from evofsm.cli.show import facts, print_json, say, show, table
 
 if TYPE_CHECKING:
@@ -37,17 +35,11 @@ _UNTOLD = (
 def inspect(
     file: Saved,
     at: Annotated[
-        str | None,
-        typer.Option(
-            help="Explain an observation, its values with commas between them: which state it is, "
-            "how often that was seen, and what came of it."
-        ),
+        str | None, option("Explain an observation: its values, with commas between them.")
     ] = None,
-    state: Annotated[
-        str | None, typer.Option(help="Explain a state by its number, from 1; or all.")
-    ] = None,
+    state: Annotated[str | None, option("Explain a state by its number, from 1; or all.")] = None,
     action: Annotated[
-        int | None, typer.Option(help="With --at or --state: what came of this action, from 1.")
+        int | None, option("With --at or --state: what came of this action, from 1.")
     ] = None,
     as_json: Json = False,
 ) -> None:

@@ -33,32 +33,9 @@ Record = Mapping[str, Any]
 
 
 class Journal:
-    """Records in a file that no other process writes. Close it, or use it in a ``with`` statement.
+    """Records in a file that no other process writes. Close it, or use it in ``with``.
 
-    Parameters
-    ----------
-    path : Path
-        Is made if it is not there.
-    settings : mapping
-        For JSON: what determines the records.
-    otherwise : str
-        What to do where the file is taken, for errors.
-
-    Raises
-    ------
-    ValueError
-        If it is no journal, is damaged elsewhere than at its end, or another process writes it.
-
-    Examples
-    --------
-    >>> from tempfile import TemporaryDirectory
-    >>> with TemporaryDirectory() as folder:
-    ...     path = Path(folder) / "journal.jsonl"
-    ...     with Journal(path, {"seed": 0}) as journal:
-    ...         journal.append({"episode": 7, "collided": False})
-    ...     with Journal(path, {"seed": 0}) as journal:
-    ...         journal.records
-    [{'episode': 7, 'collided': False}]
+    A file that is no journal, or is damaged elsewhere than at its end, is refused.
     """
 
     def __init__(
@@ -87,13 +64,7 @@ class Journal:
         self.begin_anew(settings)
 
     def append(self, *records: Record, sync: bool = True) -> None:
-        """Add records; when this returns they survive the process, with ``sync`` a power cut too.
-
-        Raises
-        ------
-        OSError
-            If they cannot be written. What was there before is kept.
-        """
+        """Add records, which then survive the process, with ``sync`` a power cut too."""
         self._write(b"".join(map(_line, records)), sync=sync)
 
     def begin_anew(self, settings: Record) -> None:
@@ -183,13 +154,7 @@ def _record(line: bytes) -> dict[str, Any] | None:
 
 
 def differences(before: Record, now: Record) -> str:
-    """In which settings two pieces of work differ, in words; empty where in none.
-
-    Examples
-    --------
-    >>> differences({"seed": 0, "family": {"name": "paper"}}, {"seed": 1, "family": {"name": "r"}})
-    'seed was 0 and is now 1, family.name was "paper" and is now "r"'
-    """
+    """In which settings two pieces of work differ, in words; empty where in none."""
     flat_before, flat_now = _flat(before), _flat(now)
     found = [
         f"{name} was {_shown(flat_before.get(name))} and is now {_shown(flat_now.get(name))}"

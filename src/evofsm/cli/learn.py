@@ -9,10 +9,8 @@ from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
-
 from evofsm.cli.inspect import model_document, tables_of
-from evofsm.cli.options import Json, split_names
+from evofsm.cli.options import Json, argument, option, split_names
 from evofsm.cli.show import facts, print_json, progress, say, show, table, warn
 
 if TYPE_CHECKING:
@@ -54,116 +52,78 @@ _UNCERTAIN = 0.5
 def learn(
     files: Annotated[
         list[str],
-        typer.Argument(
-            help="Logs or tables of objects (CSV, Parquet), FCD output of SUMO (XML, CSV, "
-            "Parquet), traces of ASAM OSI (.osi, MCAP), bags of ROS 2 (folder, MCAP, db3)."
+        argument(
+            "Logs or tables of objects (CSV, Parquet), FCD output of SUMO (XML, CSV, Parquet), "
+            "traces of ASAM OSI (.osi, MCAP), bags of ROS 2 (folder, MCAP, db3)."
         ),
     ],
     observe: Annotated[
-        str,
-        typer.Option(
-            help="Columns to observe. A discrete one is written with its values: light=red/green."
-        ),
+        str, option("Columns to observe. A discrete one has its values: light=red/green.")
     ] = "gap,v_follower,v_leader",
     action: Annotated[
-        str, typer.Option(help="Column of the action taken from a row to the next.")
+        str, option("Column of the action taken from a row to the next.")
     ] = "a_follower",
     action_range: Annotated[
-        str,
-        typer.Option(
-            help="Intervals of the action, LOW:HIGH:WIDTH. What lies beyond goes into the end "
-            "intervals and is counted."
-        ),
+        str, option("Its intervals, LOW:HIGH:WIDTH; what lies beyond goes into the end ones.")
     ] = "-2.5:2.5:0.3",
-    time: Annotated[str, typer.Option(help="Column of the time, in seconds.")] = "time",
+    time: Annotated[str, option("Column of the time, in seconds.")] = "time",
     episode: Annotated[
         str | None,
-        typer.Option(
-            help="An episode begins where one of these columns changes, and in each file; none of "
-            "them: ''. [default: those of run,pair,segment that exist]"
+        option(
+            "An episode begins where one of these columns changes, and in each file; none of them: "
+            "''. [default: those of run,pair,segment that exist]"
         ),
     ] = None,
-    dt: Annotated[
-        float | None,
-        typer.Option(help="Seconds from a row to the next, for a log without a clock."),
-    ] = None,
+    dt: Annotated[float | None, option("From a row to the next [s], without a clock.")] = None,
     failed: Annotated[
         str | None,
-        typer.Option(
-            help="What tells of failures: a column of truth values, or a comparison such as "
-            "'gap<=0'. The row with which it becomes true ends the episode in failure; rows in "
-            "which it stays so are left out. Compared after --unit."
+        option(
+            "What tells of failures: a column of truth values, or a comparison such as 'gap<=0'. "
+            "The row with which it becomes true ends the episode in failure."
         ),
     ] = None,
     unit: Annotated[
         list[str] | None,
-        typer.Option(
-            help="Unit of a column, or of all read that begin so: v=km/h, time=ms. May be "
-            "repeated. Learnt are s, m, m/s, m/s²."
-        ),
+        option("Of a column, or of all that begin so: v=km/h, time=ms. May be repeated."),
     ] = None,
     topics: Annotated[
-        Path | None,
-        typer.Option(
-            help="File in TOML that says which field of which topic of a bag is which variable."
-        ),
+        Path | None, option("TOML: which field of which topic of a bag is which variable.")
     ] = None,
     no_leader: Annotated[
-        NoLeader,
-        typer.Option(
-            help="A row in which an observed number is missing, as where there is no leader: "
-            "refuse the log, or end the episode there and leave the row out."
-        ),
+        NoLeader, option("Where a number is missing: refuse the log, or end the episode.")
     ] = NoLeader.REFUSE,
     vehicle_length: Annotated[
         list[str] | None,
-        typer.Option(
-            help="FCD: length of vehicles in metres, or of a type: truck=12. May be repeated. "
-            "[default: 5.0]"
-        ),
+        option("FCD: of vehicles [m], or of a type: truck=12. May be repeated. [default: 5.0]"),
     ] = None,
     rule: Annotated[
         RuleName,
-        typer.Option(
-            help="How states are made: as in the paper; with states at edges too; or one wherever "
+        option(
+            "How states are made: as in the paper; with states at edges too; or one wherever "
             "nothing like it was seen (novelty, recommended for logs)."
         ),
     ] = RuleName.PAPER,
     radius: Annotated[
         float | None,
-        typer.Option(
-            help="The paper's ε, which parts states; of novelty, in --scale. [default: 0.3; of "
-            "novelty and failure 1.0]"
-        ),
+        option("How far states lie apart. [default: 0.3; of novelty 1.0, in --scale]"),
     ] = None,
     scale: Annotated[
         list[str] | None,
-        typer.Option(
-            help="Novelty and failure: the difference that counts as 1, by the column, such as "
-            "gap=4. May be repeated. [default: gap=4, v_follower=2, v_leader=2]"
+        option(
+            "Novelty: the difference that counts as 1, by the column, such as gap=4. "
+            "May be repeated. [default: gap=4, v_follower=2, v_leader=2]"
         ),
     ] = None,
     spread: Annotated[
         float | None,
-        typer.Option(
-            help="Width of recognition; smaller is sharper. [default: 3.0; of novelty and failure "
-            "1.0]"
-        ),
+        option("Width of recognition. [default: 3.0; of novelty 1.0]"),
     ] = None,
     max_states: Annotated[
-        int | None,
-        typer.Option(
-            help="Where there are so many states, two are merged for each new one. [default: no "
-            "limit]"
-        ),
+        int | None, option("At so many, two are merged for each new one. [default: no limit]")
     ] = None,
-    out: Annotated[Path | None, typer.Option(help="File to save the model to.")] = None,
+    out: Annotated[Path | None, option("File to save the model to.")] = None,
     checkpoint: Annotated[
-        Path | None,
-        typer.Option(
-            help="Save what was learnt so far in this file every minute; where it exists, go on "
-            "from it."
-        ),
+        Path | None, option("Save what was learnt every minute; where it exists, go on from it.")
     ] = None,
     as_json: Json = False,
 ) -> None:

@@ -97,17 +97,7 @@ class Learning:
 
 
 class Checkpoint:
-    """A machine in a file, with how far it has come, to be gone on from.
-
-    Parameters
-    ----------
-    path : Path
-        Made where there is none.
-    settings : mapping
-        For JSON: what determines the result.
-    every : float
-        Time between two checkpoints [s].
-    """
+    """A machine in a file, with how far it has come, to be gone on from."""
 
     def __init__(self, path: Path, settings: Mapping[str, Any], every: float = _EVERY) -> None:
         self.path, self.settings, self.every = path, dict(settings), every
@@ -116,15 +106,7 @@ class Checkpoint:
         self._latest = time.monotonic()
 
     def begin(self, machine: EvolvingFSM) -> tuple[EvolvingFSM, Progress]:
-        """What was learnt, and how far it has come.
-
-        Raises
-        ------
-        OSError
-            If the file cannot be read, or could not be written.
-        ValueError
-            If it is of other work, no checkpoint, or damaged.
-        """
+        """What was learnt, and how far it has come."""
         if not self.path.exists():
             self.save(machine, Progress(), first=True)
             return machine, Progress()
@@ -165,32 +147,7 @@ def learn_traces(
     units: Sequence[str] = (),
     checkpoint: Checkpoint | None = None,
 ) -> Learning:
-    """Learn all chunks in their order, each row once.
-
-    Parameters
-    ----------
-    chunks : iterable of Chunk
-        As `evofsm.io.read_traces` gives them.
-    machine : EvolvingFSM
-        Is copied, and the copy is taught; needs as many actions as ``actions`` has intervals.
-    actions : IntervalActions
-        Turns actions into indices; made with ``outside="clip"`` it takes any action.
-    names, units : sequence of str, optional
-        Of the variables, for the model.
-    checkpoint : Checkpoint, optional
-        Where its file exists, what was learnt before is gone on with, and so many rows, which must
-        be the same, are passed over. The result is the same, bit for bit.
-
-    Returns
-    -------
-    Learning
-
-    Raises
-    ------
-    ValueError
-        If no row follows another in any episode, so that there is no transition to learn, or the
-        checkpoint is of other work.
-    """
+    """Learn all chunks in their order, each row once."""
     if actions.n_actions != machine.n_actions:
         raise ValueError(
             f"the machine has {machine.n_actions} actions, but there are {actions.n_actions} "

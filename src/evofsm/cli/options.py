@@ -40,16 +40,35 @@ class ModeName(StrEnum):
     ACT = "act"
 
 
+def option(about: str, *names: str, **limits: Any) -> Any:
+    """An option by its help; with names in place of the parameter's, and bounds of a number."""
+    return typer.Option(*names, help=about, **limits)
+
+
+def argument(about: str, **further: Any) -> Any:
+    """An argument by its help."""
+    return typer.Argument(help=about, **further)
+
+
 Json = Annotated[
-    bool, typer.Option("--json", help="Print one JSON document; states and actions count from 0.")
+    bool, option("Print one JSON document; states and actions count from 0.", "--json")
 ]
 Saved = Annotated[
     Path,
-    typer.Argument(
-        help="A machine, a model or a guard that was saved, a folder of evofsm drive --out, or a "
-        "log of evofsm drive --mcap."
+    argument(
+        "A machine, a model or a guard that was saved, a folder of drive --out, or a log of drive "
+        "--mcap."
     ),
 ]
+Seed = Annotated[int, option("Seed of all random draws.", min=0)]
+InWorld = Annotated[World, option("SUMO itself, or the same motion in closed form.")]
+ByJudge = Annotated[
+    Judge, option("Given how cars follow each other, or nothing but which episodes failed.")
+]
+Tolerance = Annotated[
+    float, option("Share of hard brakes (learnt: of disturbances) that need not be survived.")
+]
+Switches = Annotated[str, option("noise, delay, actuator, jerk, third_car; with commas.", "--with")]
 
 
 def require(**extras: str) -> None:
@@ -57,6 +76,11 @@ def require(**extras: str) -> None:
     if lacking := [package for package in extras if find_spec(package) is None]:
         command = install(*dict.fromkeys(["cli", *(extras[package] for package in lacking)]))
         raise ModuleNotFoundError(f"this needs {' and '.join(lacking)}: {command}")
+
+
+def require_world(world: World, **extras: str) -> None:
+    """The same for a drive: SciPy is for SUMO's distributions and exact intervals."""
+    require(scipy="study", **({"libsumo": "sumo"} if world is World.SUMO else {}), **extras)
 
 
 def imported(name: str) -> Any:
@@ -86,48 +110,6 @@ def imported(name: str) -> Any:
 def split_names(text: str) -> list[str]:
     """Names that were given with commas between them."""
     return [name.strip() for name in text.split(",") if name.strip()]
-
-
-# -- Of drives ------------------------------------------------------------------------------------
-
-#: Driving in either world needs SciPy, for SUMO's distributions and exact intervals.
-WorldOption = Annotated[World, typer.Option(help="SUMO itself, or the same motion in closed form.")]
-ControllerOption = Annotated[
-    str,
-    typer.Option(
-        help="Who proposes: the family's own (family), aggressive, normal, or sumo (SUMO's IDM)."
-    ),
-]
-ReviserOption = Annotated[
-    str,
-    typer.Option(
-        help="Who revises: least-risk (what was learnt), none, rss, aeb, or another measure."
-    ),
-]
-JudgeOption = Annotated[
-    Judge,
-    typer.Option(
-        help="Who judges for least-risk: kinematic (given how cars follow each other) or learnt "
-        "(given nothing but which episodes failed)."
-    ),
-]
-ToleranceOption = Annotated[
-    float,
-    typer.Option(
-        help="Share of leaders' hard brakes that need not be survived; for a learnt judge, of the "
-        "disturbances that it remembers."
-    ),
-]
-SwitchesOption = Annotated[
-    str,
-    typer.Option("--with", help="noise, delay, actuator, jerk, third_car; with commas."),
-]
-SeedOption = Annotated[int, typer.Option(min=0, help="Seed of all random draws.")]
-
-
-def require_world(world: World, **extras: str) -> None:
-    """Refuse before the long work what a drive lacks."""
-    require(scipy="study", **({"libsumo": "sumo"} if world is World.SUMO else {}), **extras)
 
 
 def family_of(name: str, switches: str) -> Family:

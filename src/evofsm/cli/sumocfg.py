@@ -2,119 +2,79 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+from evofsm.cli.options import split_names
+from evofsm.cli.show import facts, print_json, progress, show
 from evofsm.driving import attach
 from evofsm.extras import needs
 
 
-@dataclass(frozen=True)
-class Attached:
-    """What came of a simulation with guards in it."""
-
-    configuration: str
-    vehicles: str
-    mode: str
-    seconds: float  #: of the simulation
-    guarded: int  #: cars that had a guard
-    collisions: int  #: of all cars
-    of_guarded: int  #: in which a guarded car ran into another one
-    into_guarded: int  #: in which another one ran into a guarded car
-    speed: float  #: mean of the guarded cars [m/s]
-    decisions: int
-    revised: int  #: in which a car drove slower than its driver wanted; in shadow, would have
-    microseconds: float  #: for a decision, all that guarding takes
-
-    def document(self) -> dict[str, Any]:
-        """For programs."""
-        return asdict(self)
+def run_configuration(
+    file: Path, vehicles: str, mode: str, tolerance: float, *, as_json: bool
+) -> None:
+    """Run it to its end, or until all cars have arrived, and print what came of it."""
+    if mode not in ("act", "shadow"):
+        raise ValueError(f"--mode is {mode!r}; for a configuration it is act or shadow")
+    with progress("Driving") as move:
+        came = drive_configuration(file, vehicles, mode, tolerance, move)
+    if as_json:
+        print_json(came)
+    else:
+        show(facts("What came of the simulation", _facts(came)))
 
 
 def drive_configuration(
     file: Path,
-    vehicles: str | Iterable[str],
+    vehicles: str,
     mode: str,
     tolerance: float,
-    show: Callable[[float, int], None] = lambda time, collisions: None,
-) -> Attached:
-    """Run a configuration to its end, or until all cars have arrived.
-
-    Parameters
-    ----------
-    file : path
-    vehicles, mode, tolerance
-        As in `evofsm.driving.attach`.
-    show : callable
-        Told the time [s] and the number of collisions after each step.
-
-    Raises
-    ------
-    OSError
-        If there is no such file.
-    ValueError
-        If SUMO refuses it.
-    """
-    sumo = _started(file)
-    try:
-        guards = attach(sumo, vehicles, mode=mode, tolerance=tolerance)
-        end, distance, drives = sumo.simulation.getEndTime(), 0.0, 0
-        while _goes_on(sumo, end):
-            sumo.simulationStep()
-            cars = guards.cars
-            distance += sum(map(sumo.vehicle.getSpeed, cars))
-            drives += len(cars)
-            show(sumo.simulation.getTime(), len(guards.collisions))
+    move: Callable[..., None] = lambda **_: None,
+) -> dict[str, Any]:
+    """What came of it: cars, collisions, speed, and what guarding did."""
+    by_ids = not (vehicles == "all" or vehicles.startswith("type:") or vehicles.endswith("%"))
+    with _running(file) as (sumo, steps):
+        chosen = split_names(vehicles) if by_ids else vehicles
+        guards = attach(sumo, chosen, mode=mode, tolerance=tolerance)
+        distance, drives = 0.0, 0
+        for seconds in steps:
+            distance += sum(map(sumo.vehicle.getSpeed, guards.cars))
+            drives += len(guards.cars)
+            if seconds == int(seconds):
+                move(text=f"Driving ({seconds:,.0f} s, {len(guards.collisions)} collisions)")
         seconds = float(sumo.simulation.getTime())
-    finally:
-        sumo.close()
     met, guarded, guarding = guards.collisions, guards.ever, guards.guarding
     assert guarding is not None
-    return Attached(
-        str(file),
-        vehicles if isinstance(vehicles, str) else ",".join(vehicles),
-        mode,
-        seconds,
-        len(guarded),
-        len(met),
-        sum(each.collider in guarded for each in met),
-        sum(each.victim in guarded and each.collider not in guarded for each in met),
-        distance / drives if drives else 0.0,
-        guarding.decisions,
-        guarding.revised,
-        1e6 * guards.seconds / max(1, guarding.decisions),
-    )
+    return {
+        "configuration": str(file),
+        "vehicles": vehicles,
+        "mode": mode,
+        "seconds": seconds,
+        "guarded": len(guarded),
+        "collisions": len(met),  # of all cars
+        "of_guarded": sum(one.collider in guarded for one in met),  # which ran into another one
+        "into_guarded": sum(one.victim in guarded and one.collider not in guarded for one in met),
+        "speed": distance / drives if drives else 0.0,  # mean of the guarded cars [m/s]
+        "decisions": guarding.decisions,
+        "revised": guarding.revised,
+        "microseconds": 1e6 * guards.seconds / max(1, guarding.decisions),  # for a decision, in all
+    }
 
 
 def trace_configuration(file: Path, out: Path, *, seconds: float) -> None:
-    """Run a configuration as it is, and write where its cars were as an FCD file.
-
-    Parameters
-    ----------
-    file : path
-    out : path
-        Of the FCD file; it ends in ``.xml``.
-    seconds : float
-        Of the simulation that are enough [s].
-
-    Raises
-    ------
-    OSError, ValueError
-        As in `drive_configuration`.
-    """
-    sumo = _started(file, "--fcd-output", str(out))
-    try:
-        end, begin = sumo.simulation.getEndTime(), sumo.simulation.getTime()
-        while _goes_on(sumo, end) and sumo.simulation.getTime() < begin + seconds:
-            sumo.simulationStep()
-    finally:
-        sumo.close()
+    """Run a configuration as it is, and write where its cars were as an FCD file."""
+    with _running(file, "--fcd-output", str(out)) as (sumo, steps):
+        end = sumo.simulation.getTime() + seconds
+        next((now for now in steps if now >= end), None)
 
 
-def _started(file: Path, *options: str) -> Any:
+@contextmanager
+def _running(file: Path, *options: str) -> Iterator[tuple[Any, Iterator[float]]]:
+    """SUMO, and the times after each of its steps [s]."""
     if not file.is_file():
         raise FileNotFoundError(2, "no such file", str(file))
     with needs("libsumo", "sumo", "a SUMO configuration"):
@@ -123,10 +83,32 @@ def _started(file: Path, *options: str) -> Any:
         sumo.start(["sumo", "-c", str(file), "--no-step-log", "true", *options])
     except sumo.TraCIException as error:
         raise ValueError(f"{file}: SUMO refuses it: {str(error).strip()}") from error
-    return sumo
+
+    def steps() -> Iterator[float]:
+        end = sumo.simulation.getEndTime()
+        while not 0.0 <= end <= sumo.simulation.getTime():
+            if sumo.simulation.getMinExpectedNumber() <= 0:
+                return
+            sumo.simulationStep()
+            yield sumo.simulation.getTime()
+
+    try:
+        yield sumo, steps()
+    finally:
+        sumo.close()
 
 
-def _goes_on(sumo: Any, end: float) -> bool:
-    if 0.0 <= end <= sumo.simulation.getTime():
-        return False
-    return bool(sumo.simulation.getMinExpectedNumber() > 0)
+def _facts(came: dict[str, Any]) -> Iterator[tuple[str, str]]:
+    acts = came["mode"] == "act"
+    yield "simulation", f"{came['configuration']}, {came['seconds']:,.0f} s"
+    yield "guarded", f"{came['guarded']:,} cars ({came['vehicles']}), {came['mode']}"
+    if not came["guarded"]:
+        yield "note", f"no car was {came['vehicles']}: is it the name of a type or car?"
+    by, into = f"{came['of_guarded']:,} by guarded cars", f"{came['into_guarded']:,} by others"
+    yield "collisions", f"{came['collisions']:,}: {by}, {into} into them"
+    yield "mean speed", f"{came['speed']:.2f} m/s of guarded cars"
+    share = came["revised"] / max(1, came["decisions"])
+    what = "held back" if acts else "would have held back"
+    yield "guards", f"{what} {share:.1%} of {came['decisions']:,} decisions"
+    if came["guarded"]:
+        yield "overhead", f"{came['microseconds']:.0f} µs a decision"

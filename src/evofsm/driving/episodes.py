@@ -7,7 +7,7 @@ road. A `Trial` is the same as a function of an episode's number, for any ``map`
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cache
 from typing import Any, NamedTuple
@@ -270,15 +270,13 @@ class Trial:
     world: World | str  #: of a name each process opens a world of its own
     seed: int
     split: str
-    controller: Callable[[Draw], Drives]
 
     def drive(self, number: int) -> tuple[Episode, dict[str, Any]]:
         """An episode, and its row: number, variant, `Outcome`, and `lead_time`."""
         world = _opened(self.world) if isinstance(self.world, str) else self.world
         draw = self.family.draw(self.seed, number, split=self.split)
-        controller = self.controller(draw)
-        alone = reference_of(self.family, draw, world, controller)
-        driven = drive(self.guard, draw, world, controller)
+        alone = reference_of(self.family, draw, world)
+        driven = drive(self.guard, draw, world)
         outcome = outcome_of(driven, alone, self.family.interval)
         tolerance = getattr(self.guard.reviser, "tolerance", TOLERANCE)
         return driven, {

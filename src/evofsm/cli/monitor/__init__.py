@@ -8,9 +8,7 @@ from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
-
-from evofsm.cli.options import ModeName, require
+from evofsm.cli.options import ModeName, argument, option, require
 from evofsm.cli.show import warn
 
 if TYPE_CHECKING:
@@ -21,71 +19,39 @@ if TYPE_CHECKING:
 def monitor(
     file: Annotated[
         Path | None,
-        typer.Argument(
-            help="JSON lines, or a run that drive --mcap recorded. [default: standard input]"
-        ),
+        argument("JSON lines, or a run that drive --mcap recorded. [default: standard input]"),
     ] = None,
-    guard: Annotated[
-        Path | None,
-        typer.Option(help="A saved guard. Without one, that of a car whose brakes are given."),
-    ] = None,
-    interval: Annotated[
-        float, typer.Option(help="Time between two rows [s]; a saved guard has its own.")
-    ] = 0.1,
+    guard: Annotated[Path | None, option("A saved guard. [default: see --brakes]")] = None,
+    interval: Annotated[float, option("Time between two rows [s], without --guard.")] = 0.1,
     brakes: Annotated[
-        float,
-        typer.Option(
-            min=0.5, max=20.0, help="Hardest braking of the own car [m/s²], without --guard."
-        ),
+        float, option("Hardest braking of the own car [m/s²], without --guard.", min=0.5, max=20.0)
     ] = 6.0,
     traffic: Annotated[
-        bool,
-        typer.Option(
-            "--traffic",
-            help="Judge all objects of scenes, who is behind included; nothing of it is learnt.",
-        ),
+        bool, option("Judge all objects of scenes, who is behind included.", "--traffic")
     ] = False,
     mode: Annotated[
-        ModeName,
-        typer.Option(
-            help="How far it goes: shadow (it executes what is proposed), advise, or act."
-        ),
+        ModeName, option("How far it goes: shadow (what is proposed is executed) to act.")
     ] = ModeName.SHADOW,
-    proposal: Annotated[
-        float | None, typer.Option(help="Taken for that of rows without one.")
-    ] = None,
-    learn: Annotated[bool, typer.Option("--learn", help="Learn from what comes.")] = False,
+    proposal: Annotated[float | None, option("Taken for that of rows without one.")] = None,
+    learn: Annotated[bool, option("Learn from what comes.", "--learn")] = False,
     state: Annotated[
-        Path | None,
-        typer.Option(
-            help="Save all of it in this file, and go on from there; may be that of --guard."
-        ),
+        Path | None, option("Save all in this file, and go on from it; may be that of --guard.")
     ] = None,
-    audit: Annotated[Path | None, typer.Option(help="Write an audit log to this file.")] = None,
+    audit: Annotated[Path | None, option("Write an audit log to this file.")] = None,
     episode: Annotated[
-        int,
-        typer.Option(
-            min=1, help="An episode ends after so many rows: between two it learns and is saved."
-        ),
+        int, option("Rows of an episode at most: it learns and saves after each.", min=1)
     ] = 6000,
-    socket: Annotated[Path | None, typer.Option(help="Listen to a UNIX socket.")] = None,
+    socket: Annotated[Path | None, option("Listen to a UNIX socket.")] = None,
     udp: Annotated[
-        int | None,
-        typer.Option(
-            min=0, max=65535, help="Listen to this port on 127.0.0.1; 0 for any that is free."
-        ),
+        int | None, option("Listen to this port on 127.0.0.1; 0 for any.", min=0, max=65535)
     ] = None,
     zenoh: Annotated[
-        str | None,
-        typer.Option(help="Rows are put under KEY/row, decisions under KEY/decision."),
+        str | None, option("Rows under KEY/row, decisions under KEY/decision.")
     ] = None,
     heartbeat: Annotated[
-        float | None,
-        typer.Option(help="Say so many seconds after the last message that it is there."),
+        float | None, option("Say that it is there where so long nothing came [s].")
     ] = None,
-    warm: Annotated[
-        bool, typer.Option("--warm", help="Compile before the first row comes.")
-    ] = False,
+    warm: Annotated[bool, option("Compile before the first row comes.", "--warm")] = False,
 ) -> int | None:
     """Decide beside a stack of your own: rows in, decisions out, a JSON line each.
 

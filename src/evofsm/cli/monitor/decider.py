@@ -36,32 +36,7 @@ Answer = dict[str, Any]
 
 
 class Decider:
-    """Answers messages by a guard's decisions.
-
-    Parameters
-    ----------
-    guard : Guard
-        Between two episodes. Its mode says whether what it decides is executed.
-    proposal : float, optional
-        Taken where a row has none; without it such a row is refused.
-    episode : int
-        Rows after which an episode ends, as soon as no alarm is on: the guard learns, and can be
-        saved, between two of them only. At twice as many it ends anyway.
-    keep : callable, optional
-        Called with each message that was acted on, before it is answered.
-
-    Examples
-    --------
-    >>> from evofsm.driving import guard_for_cars
-    >>> from evofsm.guard import Mode
-    >>> decider = Decider(guard_for_cars(low=-6.0, high=2.5, mode=Mode.SHADOW))
-    >>> row = b'{"time": 0, "gap": 9, "v_follower": 20, "v_leader": 20, "proposal": 1}'
-    >>> answer = decider.answer(row)
-    >>> answer["kind"], answer["n"], answer["alarm"], answer["executed"], answer["advised"]
-    ('decision', 1, True, 1.0, -6.0)
-    >>> decider.answer(b"nonsense")["error"]
-    'is no JSON: JSON is malformed: invalid character (byte 4)'
-    """
+    """Answers messages by a guard's decisions."""
 
     def __init__(
         self,
@@ -137,13 +112,7 @@ class Decider:
     # -- What it does ---------------------------------------------------------------------------
 
     def act(self, told: Message) -> Answer:
-        """Take in what was accepted, and answer it.
-
-        Raises
-        ------
-        Exception
-            If the guard cannot take an end.
-        """
+        """Take in what was accepted, and answer it."""
         if isinstance(told, End):
             if self.rows or (told.failed and not isinstance(self._before, End)):
                 self.end(told.failed, _numbers(told.observation))
@@ -321,19 +290,6 @@ def guard_of_monitor(interval: float, brakes: float) -> Guard:
     """A guard of car following that is given how hard its car brakes, in shadow mode.
 
     How hard leaders brake it begins with from public drives (`evofsm.driving.REAL_DRIVES`).
-
-    Parameters
-    ----------
-    interval : float
-        Time between two rows [s].
-    brakes : float
-        Hardest braking of the own car [m/s²].
-
-    Examples
-    --------
-    >>> guard = guard_of_monitor(interval=0.1, brakes=6.0)
-    >>> guard.decide([60.0, 20.0, 20.0], proposal=0.0).reason
-    'never seen before; risk is within the tolerance'
     """
     judge = _ahead(interval, brakes)
     return guard_for_cars(-brakes, _HIGHEST, interval, judge=judge, mode=Mode.SHADOW)

@@ -52,17 +52,7 @@ _RULES = {
 
 
 class MessageError(ValueError):
-    """A line that is no message.
-
-    Parameters
-    ----------
-    about : str
-        The key, such as ``objects[3].vx``; ``line`` where it is about all of it.
-    what : str
-        What is wrong with it.
-    time : float, optional
-        Of the message, where that could be read [s].
-    """
+    """A line that is no message."""
 
     def __init__(self, about: str, what: str, time: float | None = None) -> None:
         super().__init__(what)
@@ -106,27 +96,7 @@ class _Vehicle(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
 
 
 class Form:
-    """Reads lines, for one guard.
-
-    Parameters
-    ----------
-    guard : Guard
-    proposal : float, optional
-        Taken where a row has none; without it such a row is refused.
-
-    Examples
-    --------
-    >>> from evofsm.driving import guard_for_cars
-    >>> form = Form(guard_for_cars(low=-6.0, high=2.5))
-    >>> line = b'{"time": 1.5, "gap": 30, "v_follower": 20, "v_leader": null, "proposal": 0.5}'
-    >>> form.read(line)
-    Row(time=1.5, observation=(30.0, 20.0, None), proposal=0.5, ahead=None, objects=())
-    >>> form.read(b'{"end": true, "failed": true}')
-    End(failed=True, observation=None)
-    >>> form.read(b'{"schema": 2}')
-    Traceback (most recent call last):
-    evofsm.cli.monitor.messages.MessageError: is 2; this monitor knows version 1 alone
-    """
+    """Reads lines, for one guard."""
 
     def __init__(self, guard: Guard, proposal: float | None = None) -> None:
         reviser = guard.reviser
@@ -153,13 +123,7 @@ class Form:
         self._decoders = {kind: msgspec.json.Decoder(kind) for kind in (self._row, self._scene)}
 
     def read(self, line: bytes) -> Message:
-        """The message on a line.
-
-        Raises
-        ------
-        MessageError
-            If it is none; the error names the key.
-        """
+        """The message on a line."""
         if len(line) > LONGEST:
             raise MessageError("line", f"is longer than {LONGEST} bytes")
         kind = self._row

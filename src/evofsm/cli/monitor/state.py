@@ -31,21 +31,7 @@ _NEW = -1
 
 
 class State:
-    """Keeps a monitor in files. Close it after use.
-
-    Parameters
-    ----------
-    path : Path
-        Of the guard. The journal has the same name, with ``.journal``.
-    settings : mapping
-        Texts, numbers and truth values that decisions depend on beside the guard; those of other
-        settings are not gone on with.
-
-    Raises
-    ------
-    ValueError
-        If another process has the files, by whatever path.
-    """
+    """Keeps a monitor in files. Close it after use."""
 
     def __init__(self, path: Path, settings: Mapping[str, Any]) -> None:
         self.path = path.resolve()
@@ -61,13 +47,7 @@ class State:
         self._count = 0  # messages in the journal
 
     def guard(self, fresh: Callable[[], Guard]) -> Guard:
-        """The guard as it was saved; a fresh one where there is none.
-
-        Raises
-        ------
-        ValueError
-            If it was saved with other settings, or one of the two files is damaged or missing.
-        """
+        """The guard as it was saved; a fresh one where there is none."""
         journal = self._journal
         if not self.path.exists():
             if journal.records:
@@ -95,13 +75,7 @@ class State:
         return Guard.load(self.path)
 
     def begin(self, decider: Decider) -> int:
-        """Go on where it was, and keep it from now on; returns the number of rows taken in again.
-
-        Raises
-        ------
-        OSError
-            If the files cannot be written.
-        """
+        """Go on where it was; returns the number of messages that were taken in again."""
         decider.keep = lambda told: self._keep(told, decider)
         if self._memory is not None:
             decider.remember(self._memory)

@@ -44,14 +44,7 @@ class StoppedError(Exception):
 
 
 class Lines:
-    r"""Cuts what comes in into lines; one that is too long is cut off, and so refused.
-
-    Examples
-    --------
-    >>> lines = Lines()
-    >>> lines.feed(b"one\r\ntw"), lines.feed(b"o\nthree"), lines.feed(b"")
-    ([b'one'], [b'two'], [b'three'])
-    """
+    r"""Cuts what comes in into lines; one that is too long is cut off, and so refused."""
 
     def __init__(self) -> None:
         self._begun = b""
@@ -64,14 +57,7 @@ class Lines:
 
 
 class Server:
-    """A decider as transports see it: lines in, lines out, a sign of life where nothing comes.
-
-    Parameters
-    ----------
-    decider : Decider
-    heartbeat : float, optional
-        Time without a message after which it says that it is there [s].
-    """
+    """A decider as transports see it: lines in, lines out, a sign of life where nothing comes."""
 
     def __init__(self, decider: Decider, heartbeat: float | None = None) -> None:
         self.decider = decider
@@ -163,13 +149,7 @@ def _line(answer: Answer) -> bytes:
 
 
 def serve_stream(server: Server, source: BinaryIO, sink: BinaryIO) -> None:
-    """Read lines to the end of a pipe or a file.
-
-    Raises
-    ------
-    BrokenPipeError
-        If nobody reads the answers any more.
-    """
+    """Read lines to the end of a pipe or a file."""
     lines = Lines()
     for stream in (source, sink):
         with suppress(OSError, ValueError):  # ours wait, however whoever started it left them
@@ -223,20 +203,7 @@ class _Peer:
 
 
 class SocketTransport:
-    """Answers whoever connects to a UNIX socket; several peers speak of the same car.
-
-    Parameters
-    ----------
-    path : Path
-        Of the socket, for this user only. One that nobody listens to any more is replaced.
-
-    Raises
-    ------
-    OSError
-        If there can be none, or something else is there.
-    ValueError
-        If another process listens there.
-    """
+    """Answers whoever connects to a UNIX socket; several peers speak of the same car."""
 
     def __init__(self, path: Path) -> None:
         if not hasattr(socket, "AF_UNIX"):
@@ -337,13 +304,7 @@ def _make_way(path: Path) -> None:
 
 
 class UdpTransport:
-    """Answers datagrams from this computer, a line or some of them in each, to their senders.
-
-    Parameters
-    ----------
-    port : int
-        0 for any that is free.
-    """
+    """Answers datagrams from this computer, a line or some of them in each, to their senders."""
 
     def __init__(self, port: int) -> None:
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -383,17 +344,6 @@ class ZenohTransport:
 
     The session is configured by the file that the variable ``ZENOH_CONFIG`` names, where it is
     set; else it finds peers and routers of its network by itself.
-
-    Parameters
-    ----------
-    key : str
-
-    Raises
-    ------
-    ModuleNotFoundError
-        If Zenoh is not installed.
-    ValueError
-        If the key is none, or no session can be opened.
     """
 
     def __init__(self, key: str) -> None:

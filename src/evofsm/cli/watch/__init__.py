@@ -9,17 +9,17 @@ from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
-
 from evofsm.cli.options import (
+    ByJudge,
+    InWorld,
     Judge,
-    JudgeOption,
-    SeedOption,
-    SwitchesOption,
-    ToleranceOption,
+    Seed,
+    Switches,
+    Tolerance,
     World,
-    WorldOption,
+    argument,
     family_of,
+    option,
     require,
     require_world,
 )
@@ -40,42 +40,27 @@ Opening = Callable[[], "AbstractContextManager[Watched]"]
 def watch(
     what: Annotated[
         str,
-        typer.Argument(
+        argument(
+            "Family of scenarios: paper, emergency, ..., or a Python file with one of your own; a "
+            "run that drive --mcap recorded; a log, as evofsm learn reads them, or what a SUMO "
+            "configuration drives (.sumocfg), watched in shadow mode.",
             metavar="FAMILY|FILE",
-            help="Family of scenarios: paper, emergency, ..., or a Python file with one of your "
-            "own; a run that drive --mcap recorded; a log, as evofsm learn reads them, or what a "
-            "SUMO configuration drives (.sumocfg), watched in shadow mode.",
         ),
     ] = "paper",
-    case: Annotated[
-        int, typer.Option(min=1, help="Which of the family's cases, or of its draws.")
-    ] = 1,
-    world: WorldOption = World.KINEMATIC,
-    off: Annotated[bool, typer.Option("--off", help="Begin with the reviser off.")] = False,
-    judge: JudgeOption = Judge.KINEMATIC,
-    tolerance: ToleranceOption = 0.02,
-    switches: SwitchesOption = "",
-    seed: SeedOption = 0,
-    learn_first: Annotated[
-        int, typer.Option(min=0, help="Episodes to learn from before it is watched.")
-    ] = 60,
-    learn: Annotated[
-        Path | None, typer.Option(help="Begin with what this folder of drive --out holds.")
-    ] = None,
-    topics: Annotated[
-        Path | None,
-        typer.Option(help="Of a bag of ROS 2: which field of which topic is which variable."),
-    ] = None,
-    speed: Annotated[float, typer.Option(help="At first, as a multiple of real time.")] = 1.0,
-    paused: Annotated[
-        bool, typer.Option("--paused", help="Show the first frame, and wait.")
-    ] = False,
-    port: Annotated[
-        int, typer.Option(min=0, max=65535, help="Of the page; 0 for any that is free.")
-    ] = 0,
-    no_browser: Annotated[
-        bool, typer.Option("--no-browser", help="Print the address; open nothing.")
-    ] = False,
+    case: Annotated[int, option("Which of its cases, draws or episodes.", min=1)] = 1,
+    world: InWorld = World.KINEMATIC,
+    off: Annotated[bool, option("Begin with the reviser off.", "--off")] = False,
+    judge: ByJudge = Judge.KINEMATIC,
+    tolerance: Tolerance = 0.02,
+    switches: Switches = "",
+    seed: Seed = 0,
+    learn_first: Annotated[int, option("Episodes to learn from before.", min=0)] = 60,
+    learn: Annotated[Path | None, option("Begin with what a folder of drive --out holds.")] = None,
+    topics: Annotated[Path | None, option("Of a bag: which field is which variable.")] = None,
+    speed: Annotated[float, option("At first, as a multiple of real time.")] = 1.0,
+    paused: Annotated[bool, option("Show the first frame, and wait.", "--paused")] = False,
+    port: Annotated[int, option("Of the page; 0 for any that is free.", min=0, max=65535)] = 0,
+    no_browser: Annotated[bool, option("Print the address alone.", "--no-browser")] = False,
 ) -> None:
     """Watch a run in the browser while it is driven, and act on it; or one that was recorded.
 

@@ -81,19 +81,6 @@ class Player:
 
     What it is told is carried out before the next decision; telling never waits. What cannot be
     opened raises its error where the player is entered.
-
-    Parameters
-    ----------
-    watched : callable
-        Opens what is watched, for use in a ``with`` statement, in the player's own thread: SUMO
-        and its roads stay in one thread.
-    audience : Audience
-    paused : bool
-        Whether it waits at first.
-    speed : float
-        Multiple of real time; infinite for as fast as it goes.
-    awaits : bool
-        Whether it plays nothing before `attend`, as long as no one looks on.
     """
 
     def __init__(
@@ -137,13 +124,7 @@ class Player:
         self._tell("step", lambda watched: self._set(paused=True, steps=1))
 
     def speed(self, speed: float) -> None:
-        """Play so many times as fast as real time.
-
-        Raises
-        ------
-        ValueError
-            If the speed is not positive.
-        """
+        """Play so many times as fast as real time."""
         _checked(speed)
         self._tell("speed", lambda watched: self._set(speed=speed))
 

@@ -52,35 +52,6 @@ class Recording:
 
     What a log does not hold stays unknown: how hard a leader's braking could be survived, and so
     which states are dead ends; those in which a collision ended are marked instead.
-
-    Parameters
-    ----------
-    path : str or path-like
-        Of a log that `evofsm.io.recording` wrote.
-
-    Raises
-    ------
-    OSError
-        If there is no such file.
-    ValueError
-        If it holds no run, or no episode with a decision.
-
-    Examples
-    --------
-    >>> import tempfile
-    >>> from evofsm.driving import drive, load_family, unrevised_guard
-    >>> from evofsm.io import recording
-    >>> family = load_family("paper")
-    >>> driven = drive(unrevised_guard(family), family.draw(0, 0))
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     with recording(Path(folder) / "run.mcap", {"family": "paper"}) as log:
-    ...         log.add(driven)
-    ...     shown = Recording(Path(folder) / "run.mcap")
-    >>> frame = shown.step()
-    >>> while not frame.over:
-    ...     frame = shown.step()
-    >>> frame.collided, frame.time
-    (True, 31.4)
     """
 
     def __init__(self, path: str | PathLike[str]) -> None:
@@ -94,13 +65,7 @@ class Recording:
         self.start = self.restart(0)
 
     def restart(self, case: int | None = None) -> Start:
-        """Show an episode from its start, or another one.
-
-        Raises
-        ------
-        ValueError
-            If there is no such episode.
-        """
+        """Show an episode from its start, or another one."""
         case = self.start.case if case is None else case
         if not 0 <= case < len(self._episodes):
             raise ValueError(f"episode is {case + 1}; there are 1 to {len(self._episodes)}")
@@ -112,13 +77,7 @@ class Recording:
         return self.start
 
     def step(self) -> Frame:
-        """The next frame.
-
-        Raises
-        ------
-        RuntimeError
-            If the episode is over.
-        """
+        """The next frame."""
         number, decisions = self._number, len(self._episode.columns["time"])
         if number > decisions:
             raise RuntimeError("the episode is over; restart it")
@@ -263,11 +222,6 @@ def record_log(
 
     Returns whether rows after the first `MOST_ROWS` were left out; ``show`` is told how many
     were decided on.
-
-    Raises
-    ------
-    ValueError
-        If the log cannot be read, or no episode has ten rows.
     """
     reading = read_traces([path], topics=topics)
     taken, more = 0, False

@@ -91,12 +91,6 @@ class LivePage:
     """Serves a run to browsers on this computer; the audience of a `Player`.
 
     ``port`` may be 0, for any that is free; ``live`` says whether the run can be acted on.
-
-    Examples
-    --------
-    >>> with LivePage() as page:
-    ...     page.address.startswith("http://127.0.0.1:")
-    True
     """
 
     def __init__(self, port: int = 0, *, live: bool = True) -> None:
@@ -293,21 +287,7 @@ class Command(msgspec.Struct, forbid_unknown_fields=True):
 
     @classmethod
     def parse(cls, text: str) -> Command:
-        """A command from a page.
-
-        Raises
-        ------
-        ValueError
-            If it is none.
-
-        Examples
-        --------
-        >>> Command.parse('{"do": "pause", "value": true}')
-        Command(do='pause', value=True)
-        >>> Command.parse("hello")
-        Traceback (most recent call last):
-        ValueError: not a command
-        """
+        """A command from a page."""
         try:
             return msgspec.json.decode(text, type=cls)
         except (msgspec.MsgspecError, ValueError, RecursionError):

@@ -75,33 +75,7 @@ def cases_of(family: Family) -> tuple[str, ...]:
 
 
 class Session:
-    """One run after another, each driven decision by decision.
-
-    Parameters
-    ----------
-    family : Family
-    guard : Guard
-        Of `watched_guard`; it goes on learning.
-    world : World
-    case : int
-        Which one of the family's cases, or of its draws, from 0.
-    seed : int
-        Of the draws.
-    on : bool
-        Whether the reviser may act.
-    learnt : int
-        Episodes that the guard has learnt from before.
-
-    Examples
-    --------
-    >>> from evofsm.driving import KinematicWorld, load_family
-    >>> family = load_family("paper")
-    >>> with Session(family, watched_guard(family), KinematicWorld(), on=False) as session:
-    ...     while not (frame := session.step()).over:
-    ...         pass
-    >>> frame.collided, frame.time
-    (True, 31.4)
-    """
+    """One run after another, each driven decision by decision."""
 
     def __init__(
         self,
@@ -133,13 +107,7 @@ class Session:
         self._reviser.mode = Mode.ACT if on else Mode.SHADOW  # type: ignore[attr-defined]
 
     def restart(self, case: int | None = None) -> Start:
-        """Begin a run anew, or another one; one that is under way is broken off.
-
-        Raises
-        ------
-        ValueError
-            If there is no such case.
-        """
+        """Begin a run anew, or another one; one that is under way is broken off."""
         case, cases = self.case if case is None else case, cases_of(self.family)
         if not 0 <= case < len(cases):
             raise ValueError(f"case is {case + 1}; {self.family.name} has 1 to {len(cases)}")
@@ -161,13 +129,7 @@ class Session:
         return self.start
 
     def step(self) -> Frame:
-        """One decision, and what came of the one before.
-
-        Raises
-        ------
-        RuntimeError
-            If the run is over.
-        """
+        """One decision, and what came of the one before."""
         if self._over:
             raise RuntimeError("the run is over; restart it")
         ends = self._road.over or self._stood >= _STANDING

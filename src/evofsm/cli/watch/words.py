@@ -27,14 +27,7 @@ class Told(NamedTuple):
 
 
 def tell(frame: Frame, start: Start) -> Told:
-    """What has happened up to a frame.
-
-    Parameters
-    ----------
-    frame : Frame
-    start : Start
-        Of its run.
-    """
+    """What has happened up to a frame."""
     story, danger = frame.story, frame.story.danger
     status = _status(frame, start)
     told = Told(
