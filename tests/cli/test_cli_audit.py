@@ -1,6 +1,4 @@
 import json
-import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -107,20 +105,6 @@ def test_what_cannot_be_read_ends_with_two(log, tmp_path):
         result = evofsm(*wrong)
         assert result.exit_code == 2
         assert says in result.stderr
-
-
-@pytest.mark.slow
-def test_drive_writes_a_log(tmp_path):
-    pytest.importorskip("scipy")
-    path = tmp_path / "log.jsonl"
-    command = [sys.executable, "-m", "evofsm", "drive", "emergency", "--episodes", "2"]
-    run = subprocess.run(
-        [*command, "--audit", str(path), "--json"], capture_output=True, text=True, check=False
-    )
-    assert run.returncode == 0, run.stderr
-    result = evofsm("audit", path, "--json")
-    assert result.exit_code == 0, result.output
-    assert json.loads(result.stdout)["contents"]["episodes"] == 2
 
 
 def is_too_close(z):

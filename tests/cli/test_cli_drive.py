@@ -2,7 +2,6 @@
 
 import json
 import os
-import shutil
 import signal
 import subprocess
 import sys
@@ -24,7 +23,7 @@ from evofsm.cli.driving import (
 )
 from evofsm.driving import KinematicWorld, load_family
 from evofsm.driving.sumo import open_world
-from evofsm.guard import Guard, Mode
+from evofsm.guard import Guard
 
 EMERGENCY = load_family("emergency")
 EPISODES = 400
@@ -101,15 +100,6 @@ def test_a_judge_that_is_given_nothing_but_failures_is_driven_saved_and_gone_on_
     assert "held-out episodes" in frozen.stdout, frozen.stderr
     wrong = evofsm("drive", "emergency", "--episodes", 3, "--frozen", out)
     failure(wrong, "of the judge 'learnt', not of 'kinematic'")
-
-
-def test_left_to_itself_the_driver_collides_and_in_shadow_there_was_an_alarm():
-    alone = in_turn(reviser="none", learn=False)
-    assert alone.row.collision_rate > 0.5
-    shadow = in_turn(mode=Mode.SHADOW, learn=False)
-    assert shadow.row.intervention_rate == 0.0
-    assert len(shadow.lead_times) == shadow.row.collisions
-    assert min(shadow.lead_times) > 1.0
 
 
 def test_the_table_of_decisions_has_its_columns_in_their_order():
@@ -360,14 +350,6 @@ def test_episodes_that_kill_every_worker_are_named(monkeypatch):
 
     with pytest.raises(ChildProcessError, match="5 times a worker died over episodes 3 to 4"):
         list(_in_processes(fatal, [[3, 4]], 1))
-
-
-@pytest.mark.slow
-def test_more_episodes_are_added_to_those_that_are_there(tmp_path, undisturbed):
-    shutil.copytree(undisturbed, tmp_path, dirs_exist_ok=True)
-    before = lines(tmp_path / "episodes.jsonl")
-    at_once(tmp_path, EPISODES + 3, reviser="none")
-    assert lines(tmp_path / "episodes.jsonl") == before + 3
 
 
 # -- In Foxglove ----------------------------------------------------------------------------------

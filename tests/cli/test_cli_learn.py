@@ -5,7 +5,6 @@ import math
 
 import pytest
 
-from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.model import FSMModel
 from evofsm.fsm.rules import Edges, Novelty, Paper
 
@@ -69,12 +68,6 @@ def test_learn_prints_what_was_read_and_learnt(evofsm, log):
     assert result.stderr == ""
 
 
-def test_piped_output_is_plain_text_of_80_columns(evofsm, log):
-    for line in evofsm("learn", log).stdout.splitlines():
-        assert len(line) <= 80
-        assert "\x1b" not in line
-
-
 def test_learn_saves_a_model_that_inspect_prints(evofsm, log, tmp_path):
     path = tmp_path / "model.evofsm"
     learnt = evofsm("learn", log, "--out", path)
@@ -111,13 +104,6 @@ def test_options_reach_the_machine_and_the_log(evofsm, tmp_path):
     assert learnt.centers[:, 1].max() == pytest.approx(1 / math.sqrt(2))
 
 
-def test_an_action_range_may_begin_with_a_minus_either_way(evofsm, log):
-    first = evofsm("learn", log, "--action-range", "-1:1:0.5", "--json")
-    second = evofsm("learn", log, "--action-range=-1:1:0.5", "--json")
-    assert first.stdout == second.stdout
-    assert len(json.loads(first.stdout)["model"]["actions"]) == 4
-
-
 def test_json_is_one_document_with_counts_from_zero(evofsm, log, tmp_path):
     path = tmp_path / "model.evofsm"
     learnt = json.loads(evofsm("learn", log, "--json", "--out", path).stdout)
@@ -152,24 +138,6 @@ def test_fcd_says_which_lengths_it_assumed(evofsm, tmp_path):
 
 
 # -- Inspect --------------------------------------------------------------------------------------
-
-
-def test_inspect_reads_machines_too(evofsm, tmp_path):
-    machine = EvolvingFSM(n_actions=2, radius=0.5)
-    machine.learn_many([[0.0], [0.1], [2.0], [1.0], [1.1]], [0, 1, 0, 0, 0])
-    machine.save(tmp_path / "machine")
-    text = " ".join(evofsm("inspect", tmp_path / "machine").stdout.split())
-    assert "a machine that can go on learning" in text
-    assert "radius 0.5" in text
-    assert "observations 5, the step is not known" in text
-    assert "variable 1" in text
-
-
-def test_inspect_of_a_machine_that_saw_nothing_prints_that(evofsm, tmp_path):
-    EvolvingFSM.paper().save(tmp_path / "machine")
-    result = evofsm("inspect", tmp_path / "machine")
-    assert result.exit_code == 0
-    assert "observations  0" in result.stdout
 
 
 # -- What goes wrong ------------------------------------------------------------------------------
@@ -247,12 +215,6 @@ def test_numbers_stay_whole_in_a_narrow_terminal(evofsm, log, monkeypatch):
     assert first_state() == wide
 
 
-def test_an_out_that_is_a_folder_is_refused_before_the_work(evofsm, log, tmp_path):
-    result = evofsm("learn", log, "--out", tmp_path)
-    assert result.exit_code == 2
-    assert "is a folder" in result.stderr
-
-
 @pytest.fixture
 def crashes(tmp_path):
     """Four drives, of which two end in a collision that lasts for some rows."""
@@ -294,18 +256,6 @@ def test_a_log_that_tells_nothing_of_failures_is_said_to(evofsm, crashes, tmp_pa
     text = " ".join(evofsm("inspect", safe, "--state", "all").stdout.split())
     assert "tells nothing of failures" not in text
     assert "0 of 3 (at most 48 %) failed later on" in text
-
-
-def test_failures_survive_a_stop_and_another_condition_is_other_work(evofsm, crashes, tmp_path):
-    whole, kept = tmp_path / "whole", tmp_path / "kept"
-    command = ("learn", crashes, crashes, "--failed", "hit")
-    assert evofsm(*command, "--out", whole).exit_code == 0
-    assert evofsm(*command, "--checkpoint", kept).exit_code == 0
-    again = evofsm(*command, "--checkpoint", kept, "--out", tmp_path / "again")
-    assert "4 episodes ended with hit; 36 rows" in " ".join(again.stdout.split())
-    assert (tmp_path / "again").read_bytes() == whole.read_bytes()
-    other = evofsm("learn", crashes, crashes, "--failed", "gap<=0", "--checkpoint", kept)
-    assert 'failed was "hit" and is now "gap<=0"' in failure(other)
 
 
 def test_units_and_missing_leaders_are_said_in_the_summary(evofsm, tmp_path):

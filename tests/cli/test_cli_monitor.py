@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 
 from evofsm.cli.app import application
 from evofsm.cli.monitor.decider import Decider, guard_of_monitor
-from evofsm.guard import Guard, Mode, audit
+from evofsm.guard import audit
 from monitor_rows import JUNK, closing_in, line, traffic
 
 EXAMPLES = Path(__file__).parents[2] / "examples" / "monitor"
@@ -71,30 +71,6 @@ def test_rows_from_a_file_and_from_standard_input_are_answered_alike(tmp_path):
         assert result.exit_code == 0, result.stderr
         assert told(result) == by_hand
     assert "compiled" in result.stderr
-
-
-def test_learning_says_that_it_is_not_kept():
-    result = evofsm("--learn", lines=ROWS)
-    assert "--state FILE saves it" in result.stderr
-    assert told(result) == expected()
-
-
-def test_a_saved_guard_in_another_mode(tmp_path):
-    guard = guard_of_monitor(0.1, 6.0)
-    guard.reviser.mode = Mode.ACT
-    guard.save(tmp_path / "guard.evofsm")
-    rows = [line(row) for row in closing_in(80)]
-    shadow = told(evofsm("--guard", tmp_path / "guard.evofsm", lines=rows))
-    assert {one["executed"] for one in shadow} == {0.5}
-    act = told(evofsm("--guard", tmp_path / "guard.evofsm", "--mode", "act", lines=rows))
-    assert act[-1]["executed"] < 0.0
-    assert act[-1]["mode"] == "act"
-
-
-def test_a_proposal_taken_for_granted():
-    rows = [line({k: v for k, v in row.items() if k != "proposal"}) for row in closing_in(3)]
-    assert {one["about"] for one in told(evofsm(lines=rows))} == {"proposal"}
-    assert {one["proposed"] for one in told(evofsm("--proposal", 0, lines=rows))} == {0.0}
 
 
 def test_a_state_goes_on_over_runs_and_may_be_the_guards_own_file(tmp_path):
@@ -225,19 +201,3 @@ def test_the_client_in_c_gets_its_alarm(listening, tmp_path):
     assert time.monotonic() - begun < PATIENCE
     nowhere = subprocess.run([client, "nowhere"], capture_output=True, text=True)
     assert nowhere.returncode == 2
-
-
-@posix
-@pytest.mark.slow
-def test_the_client_in_shell_gets_its_alarm():
-    command = ["sh", EXAMPLES / "client.sh"]
-    here = os.environ | {"EVOFSM": f"{shlex.quote(sys.executable)} -m evofsm"}
-    done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE, env=here)
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.startswith("alarm at ")
-
-
-def test_what_is_kept_can_be_loaded_as_a_guard(tmp_path):
-    state = tmp_path / "state.evofsm"
-    assert evofsm("--learn", "--state", state, lines=ROWS).exit_code == 0
-    assert Guard.load(state).learn

@@ -1,15 +1,12 @@
-import json
 import signal
 import subprocess
 import sys
-from urllib.parse import urlsplit
 from urllib.request import urlopen
 
 import pytest
 
 pytest.importorskip("websockets")
 
-from websockets.sync.client import connect
 
 pytestmark = pytest.mark.usefixtures("compiled")
 
@@ -32,26 +29,6 @@ def test_it_prints_an_address_that_answers_and_ends_with_control_c():
     assert process.returncode == 0
     assert rest == "\nThe page is closed.\n"
     assert errors == ""
-
-
-@pytest.mark.slow
-def test_paused_shows_the_first_frame():
-    with watch("paper", "--learn-first", "0", "--no-browser", "--paused") as process:
-        process.stdout.readline()
-        address = urlsplit(process.stdout.readline().strip())
-        socket = f"ws://{address.netloc}{address.path}socket"
-        with connect(socket, origin=f"http://{address.netloc}", proxy=None) as client:
-            shown = []
-            while "frame" not in {part["kind"] for part in shown}:
-                message = json.loads(client.recv(timeout=60))
-                shown += message.get("parts", [message])
-        process.send_signal(signal.SIGINT)
-        process.communicate(timeout=60)
-    assert process.returncode == 0
-    (frame,) = [part for part in shown if part["kind"] == "frame"]
-    (*_, clock) = [part for part in shown if part["kind"] == "clock"]
-    assert frame["number"] == 0
-    assert clock["paused"]
 
 
 @pytest.mark.parametrize(

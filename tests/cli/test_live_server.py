@@ -16,7 +16,7 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
 from evofsm.cli.watch.player import Player
-from evofsm.cli.watch.server import LivePage, encode, frame_message
+from evofsm.cli.watch.server import LivePage
 from evofsm.cli.watch.session import Session, watched_guard
 from evofsm.driving import KinematicWorld, load_family
 
@@ -172,15 +172,6 @@ def test_pages_act_on_the_run(page):
         assert told(client, "start")["case"] == 3
 
 
-def test_numbers_that_are_none_are_sent_as_null():
-    with session() as opened:
-        frame = opened.step()
-    assert math.isinf(frame.time_to_collision)
-    message = json.loads(encode(frame_message(frame, opened.start)))
-    assert message["time_to_collision"] is None
-    assert message["told"]["status"] == "safe"
-
-
 def test_a_run_waits_for_the_first_who_looks_on():
     with (
         LivePage() as page,
@@ -264,17 +255,6 @@ def test_junk_on_the_wire_is_survived(page):
     with looking_on(page) as client:
         page.player.step()
         assert told(client, "frame")["number"] == 0
-
-
-def test_a_client_that_vanishes_is_forgotten(page):
-    with looking_on(page) as client:
-        told(client, "start")
-        assert page.clients == 1
-        client.socket.shutdown(socket.SHUT_RDWR)  # without a word
-        until(lambda: page.clients == 0)
-    with looking_on(page) as another:
-        page.player.step()
-        assert told(another, "frame")
 
 
 class Counted:

@@ -58,13 +58,6 @@ def test_guards_act_where_they_are_told_to(evofsm, configuration):
     assert found["act"]["speed"] > 0.9 * found["shadow"]["speed"]
 
 
-def test_what_came_of_it_is_said(evofsm, configuration):
-    result = evofsm("drive", configuration, "--vehicles", "ego,lead")
-    assert result.exit_code == 0
-    assert "2 cars (ego,lead), act" in result.output
-    assert "0 by guarded cars" in result.output
-
-
 @pytest.mark.parametrize(
     ("options", "said"),
     [
@@ -101,8 +94,3 @@ def test_what_a_configuration_drives_is_watched_in_shadow_mode(configuration, tm
     frames = [recorded.step() for _ in range(20)]
     assert frames[-1].time > frames[0].time
     assert _is_log(str(configuration))
-
-
-def test_a_configuration_that_is_not_there_is_named(tmp_path):
-    with pytest.raises(FileNotFoundError, match="no such file"):
-        trace_configuration(tmp_path / "none.sumocfg", tmp_path / "my.xml", seconds=1.0)

@@ -3,11 +3,9 @@
 import math
 import threading
 from contextlib import contextmanager
-from itertools import pairwise
 
 import pytest
 
-from evofsm.cli.watch import recorded as module
 from evofsm.cli.watch.player import Player
 from evofsm.cli.watch.recorded import Recording, record_log
 from evofsm.cli.watch.session import Session, learn_first, watched_guard
@@ -51,20 +49,6 @@ def test_the_reviser_prevents_the_collision_that_happens_without_it():
     assert alone.time == alone.story.collision == revised.story.alone
 
 
-def test_switched_on_in_time_it_still_prevents_it_and_switched_off_it_says_what_it_would_do():
-    session = opened()
-    session.revising = False
-    frames = [session.step() for _ in range(20)]  # 5 s: danger, but no dead end yet
-    session.revising = True
-    frames += drive(session)
-    assert not frames[-1].collided
-    off = frames[:20]
-    assert all(frame.executed == frame.proposed for frame in off)
-    assert any(frame.advised < frame.executed - 0.5 for frame in off)
-    assert any(frame.executed < frame.proposed - 0.5 for frame in frames[20:-1])
-    assert frames[-1].story.danger.since < 5.0 <= frames[-1].story.danger.stepped_in
-
-
 def test_danger_shows_long_before_time_to_collision_notices_and_is_told_from_when_it_began():
     session = opened(on=False)
     frames = drive(session)
@@ -93,14 +77,6 @@ def test_the_same_run_is_shown_the_same_and_restarting_begins_anew():
     assert frames[0].story.danger is None
     with pytest.raises(ValueError, match="case is 5; paper has 1 to 4"):
         session.restart(4)
-
-
-def test_positions_follow_from_speeds():
-    frames = drive(opened())
-    for before, now in pairwise(frames):
-        mean = 0.5 * (before.v_follower + now.v_follower)
-        moved = now.x_follower - before.x_follower
-        assert moved == pytest.approx(mean * (now.time - before.time), abs=0.02)
 
 
 def test_states_grow_from_empty_and_keep_their_numbers():
@@ -165,12 +141,6 @@ def test_a_recording_shows_what_was_decided(recorded):
         shown.restart(2)
 
 
-def test_no_recording_is_made_of_something_else(tmp_path):
-    (tmp_path / "no.mcap").write_bytes(b"junk")
-    with pytest.raises(ValueError, match=r"no\.mcap"):
-        Recording(tmp_path / "no.mcap")
-
-
 # -- A log of others ------------------------------------------------------------------------------
 
 
@@ -198,18 +168,6 @@ def test_a_guard_decides_on_each_row_of_a_log_and_changes_nothing(tmp_path):
     assert shown.start.about == "recorded in objects.csv"
     assert not shown.revising
     assert shown.step().v_follower == pytest.approx(20.0)
-
-
-def test_a_log_too_long_is_cut_and_one_too_short_refused(tmp_path, monkeypatch):
-    path = objects(tmp_path / "objects.csv")
-    monkeypatch.setattr(module, "MOST_ROWS", 50)
-    assert record_log(path, tmp_path / "run.mcap")
-    (episode,) = read_run(tmp_path / "run.mcap").episodes
-    assert len(episode.columns["time"]) == 49
-    short = objects(tmp_path / "short.csv", rows=4)
-    with pytest.raises(ValueError, match="nobody follows anybody for 10 rows"):
-        record_log(short, tmp_path / "other.mcap")
-    assert not (tmp_path / "other.mcap").exists()
 
 
 # -- The clock ------------------------------------------------------------------------------------
@@ -326,16 +284,6 @@ def test_what_cannot_be_opened_raises_and_a_run_that_breaks_off_says_why():
     with Player(short_road, told, speed=math.inf):
         told.wait(lambda told: told.of("failed"))
     assert told.of("failed") == ["ZeroDivisionError: division by zero"]
-
-
-def test_it_ends_at_once_when_closed():
-    with played(Told(), speed=0.01):
-        pass
-
-
-def test_no_speed_of_nothing():
-    with pytest.raises(ValueError, match="speed is 0"):
-        played(Told(), speed=0.0)
 
 
 # -- A judge that was told nothing but which episodes failed --------------------------------------

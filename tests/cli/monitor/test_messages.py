@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 
 from evofsm import Guard
-from evofsm.cli.monitor.messages import LONGEST, End, Form, MessageError, Row
+from evofsm.cli.monitor.messages import End, Form, MessageError, Row
 from evofsm.driving import guard_for_cars
 from monitor_rows import JUNK
 
@@ -85,12 +85,6 @@ def test_the_time_of_what_is_refused_is_told_where_it_can_be_read():
         with pytest.raises(MessageError) as error:
             FORM.read(wrong)
         assert error.value.time == time
-
-
-def test_a_proposal_may_be_taken_for_granted():
-    form = Form(guard_for_cars(-6.0, 2.5), proposal=0.0)
-    assert form.read(line(proposal=...)).proposal == 0.0
-    assert form.read(line(proposal=1.0)).proposal == 1.0
 
 
 def test_an_end():
@@ -171,14 +165,6 @@ def test_what_is_wrong_with_a_scene_is_named():
     assert refused(FORM, b'{"time": 0, "ego": {}, "objects": {}, "proposal": 0}')[0] == "ego.vx"
     assert refused(FORM, scene(3)) == ("objects[0]", "is 3; it must be a JSON object")
     assert refused(Form(Guard(low=-1.0, high=1.0, interval=0.1)), scene(TRUCK))[0] == "objects"
-
-
-def test_fifty_objects_fit_on_a_line():
-    objects = [
-        TRUCK | {"id": f"vehicle {k:03}", "s": 123.456789 + k, "vy": 0.123456789, "width": 2.55}
-        for k in range(50)
-    ]
-    assert len(scene(*objects)) < LONGEST / 4
 
 
 SOME = st.recursive(

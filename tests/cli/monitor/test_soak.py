@@ -2,7 +2,6 @@
 
 import pytest
 
-import monitor
 import monitor_soak
 
 pytestmark = pytest.mark.slow
@@ -20,10 +19,3 @@ def test_a_wrong_decision_would_be_found(monkeypatch):
     monkeypatch.setattr(monitor_soak, "answered", lambda answer: ())
     found = monitor_soak.soak(0.005)
     assert found.wrong == found.rows
-
-
-def test_the_time_of_an_answer_is_measured():
-    with monitor.CARRIERS["pipe"](0.01) as ask:
-        took = monitor.latencies(ask, seconds=1.0, objects=50, rate=100.0)
-    assert len(took) == 100
-    assert min(took) > 0.0

@@ -102,28 +102,6 @@ def test_a_row_that_was_taken_in_but_not_answered_is_answered_when_it_is_sent_ag
     state.close()
 
 
-def test_it_remembers_the_latest_answer_over_a_save(tmp_path):
-    rows = [line(row) for row in traffic(701)]
-    decider, state = opened(tmp_path / "state.evofsm")
-    answers = [decider.answer(row) for row in rows[:700]]
-    assert decider.rows == 0  # the episode has just ended, and the guard was saved
-    abandoned(state)
-    decider, state = opened(tmp_path / "state.evofsm")
-    assert decider.answer(rows[699]) == answers[699]
-    assert decider.answer(rows[700])["n"] == 701
-    state.close()
-
-
-def test_what_is_kept_is_a_guard_that_has_learnt_and_one_journal(tmp_path):
-    path = tmp_path / "state.evofsm"
-    decider, state = opened(path)
-    for row in traffic(1500):
-        decider.answer(line(row))
-    state.close()
-    assert 1 < Guard.load(path).machine.n_states <= decider.guard.machine.n_states
-    assert len([*tmp_path.iterdir()]) == 2
-
-
 def test_a_saved_guard_is_gone_on_from_and_keeps_where_it_came_from(tmp_path):
     path = tmp_path / "guard.evofsm"
     made().save(path, {"drive": "Monday"})
