@@ -1,6 +1,5 @@
 """Guards for cars: two judges, what comes of episodes, and what was recorded."""
 
-
 import numpy as np
 import pytest
 

@@ -143,8 +143,6 @@ def make_guard(setup: Setup, before: Guard | None = None) -> Guard:
     return Guard.of(reviser, interval=family.interval, learn=setup.learn, **learners)
 
 
-
-
 # -- What has been driven so far ------------------------------------------------------------------
 
 
