@@ -19,6 +19,7 @@ STUDIES = {
     "falsification": "falsification:Falsification",
     "judges": "judges:Judges",
     "tasks": "judges:Tasks",
+    "sensitivity": "sensitivity:Sensitivity",
 }
 _ABOUT = (
     "Each study asks one question and shows the numbers that its answer rests on, and which rows "

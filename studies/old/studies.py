@@ -10,7 +10,6 @@ from studies.foresight.plan import Plan as Foresight
 from studies.old.study import Study
 from studies.prediction.plan import Plan as Prediction
 from studies.real.plan import Plan as Real
-from studies.sensitivity.plan import Plan as Sensitivity
 
 #: By id.
 STUDIES: dict[str, type[Study[Any]]] = {
@@ -20,7 +19,6 @@ STUDIES: dict[str, type[Study[Any]]] = {
         Alarms,
         Prediction,
         Foresight,
-        Sensitivity,
         Real,
     )
 }
