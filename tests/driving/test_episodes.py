@@ -10,7 +10,6 @@ from evofsm.driving.cars import (
     guard_for_cars,
     guard_for_family,
     learners_of,
-    learnt_by,
     name_judge,
 )
 from evofsm.driving.drivers import IDM
@@ -63,8 +62,6 @@ def test_a_judge_is_made_by_its_name():
         assert name_judge(judge) == name
     with pytest.raises(ValueError, match="no judge 'wise'; there are kinematic, learnt"):
         guard_for_family(EMERGENCY, judge="wise")
-    with pytest.raises(TypeError, match="no LatentRisk"):
-        learnt_by(guard_for_family(EMERGENCY, judge="learnt"))
 
 
 @pytest.mark.slow

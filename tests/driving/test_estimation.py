@@ -304,19 +304,6 @@ def test_none_seen_is_a_table_too():
     assert LatentRisk(-8.0, leaders=none).manoeuvres.gentle == 3
 
 
-def test_of_more_than_are_remembered_the_latest_of_each_stay():
-    cars = [LatentRisk(-8.0) for _ in range(3)]
-    for k, car in enumerate(cars):
-        car.manoeuvres.remember(*(3.0 + k + 0.001 * np.arange(400)))
-    cars[0].merge(cars[1:])
-    kept = np.array(cars[0].manoeuvres.decels)
-    assert len(kept) == 500
-    for k in range(3):
-        mine = kept[(kept >= 3.0 + k) & (kept < 4.0 + k)]
-        assert 166 <= len(mine) <= 167
-        assert mine.max() == pytest.approx(3.399 + k)
-
-
 # -- Where one is -----------------------------------------------------------------------------
 
 

@@ -411,50 +411,6 @@ def test_a_table_that_lacks_what_is_hard_here_is_refused():
     assert len(higher) + higher.gentle == sum(REAL_DRIVES.counts) + REAL_DRIVES.gentle
 
 
-def test_merged_they_know_what_one_car_would_that_saw_all():
-    cars = [follow(LatentRisk(-8.0, DT), *drive, seed=k) for k, drive in enumerate(DRIVES)]
-    one = LatentRisk(-8.0, DT)
-    for k, drive in enumerate(DRIVES):
-        follow(one, *drive, seed=k)
-    before = learnt(cars[1])
-    first, *others = cars
-    first.merge(others)
-    assert learnt(first) == learnt(one)
-    np.testing.assert_allclose(first.manoeuvres.table, one.manoeuvres.table)
-    assert first.judge(HERE, [0.0]).risk == pytest.approx(one.judge(HERE, [0.0]).risk)
-    assert learnt(cars[1]) == before
-
-
-def test_own_brakes_are_ones_own_unless_told_otherwise():
-    mine, yours = LatentRisk(-8.0), LatentRisk(-8.0)
-    yours.brakes.trust(6.5)
-    mine.merge([yours])
-    assert not mine.brakes.known
-    mine.merge([yours], brakes=True)
-    assert mine.brakes.known
-    assert mine.brakes.decel == pytest.approx(6.5)
-
-
-@pytest.mark.parametrize(
-    ("other", "how", "says"),
-    [
-        (LatentRisk(-8.0, dt=0.1), {}, "dt is 0.25 here and 0.1 there"),
-        (LatentRisk(-8.0, hard=3.0), {}, "hard is 2.5 here and 3 there"),
-        (LatentRisk(-4.0), {"brakes": True}, "lowest is -8 here and -4 there"),
-        ("a file", {}, "only a LatentRisk can be merged, not str"),
-    ],
-)
-def test_what_cannot_be_merged_is_refused_and_nothing_is_changed(other, how, says):
-    risk, fine = LatentRisk(-8.0), LatentRisk(-8.0)
-    fine.manoeuvres.remember(4.0)
-    with pytest.raises((TypeError, ValueError), match=says):
-        risk.merge([fine, other], **how)
-    assert len(risk.manoeuvres) == 0
-    with pytest.raises(ValueError, match="itself"):
-        risk.merge([fine, risk])
-    assert len(risk.manoeuvres) == 0
-
-
 # -- In traffic -------------------------------------------------------------------------------
 
 

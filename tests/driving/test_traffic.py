@@ -54,8 +54,8 @@ def test_rows_hold_the_closest_and_zeros_where_there_is_none():
 # -- The judge ---------------------------------------------------------------------------------
 
 
-def judge():
-    return TrafficRisk.given(LOW, HIGH, DECEL, INTERVAL)
+def judge(low=LOW):
+    return TrafficRisk(LatentRisk.given(-DECEL, DECEL, 9.0, INTERVAL), low, HIGH)
 
 
 def scene(*others):
@@ -175,8 +175,8 @@ def test_what_was_taught_of_leaders_is_used():
 @pytest.mark.parametrize(
     ("make", "why"),
     [
-        (lambda: TrafficRisk.given(0.0, 1.0, DECEL, INTERVAL), "around 0"),
-        (lambda: TrafficRisk.given(-np.inf, 1.0, DECEL, INTERVAL), "around 0"),
+        (lambda: judge(0.0), "around 0"),
+        (lambda: judge(-np.inf), "around 0"),
         (lambda: guard_for_traffic(-5.0, HIGH, DECEL, INTERVAL, judge=judge()), "looks at"),
         (lambda: decide([1.0, 2.0]), "no rows of 7"),
     ],

@@ -13,7 +13,7 @@ from studies.real.plan import Plan
 from studies.real.study import WARNED_OF, Drives, RealStudy, Row
 from studies.real.targets import TARGETS
 
-from evofsm.driving.naming import name_state, name_states
+from evofsm.driving.naming import name_state
 
 
 def row(target, horizon, measure, area, enough):
@@ -170,15 +170,6 @@ def _said(study, folder):
 )
 def test_a_name_says_where_a_state_lies(center, name):
     assert name_state(center) == name
-
-
-def test_no_two_states_have_the_same_name():
-    rng = np.random.default_rng(0)
-    centers = np.round(rng.uniform(0.0, 3.0, size=(200, 3)), 1)
-    centers = np.concatenate([centers, centers[:3]])  # three lie where others do
-    names = name_states(centers)
-    assert len(set(names)) == len(names) == 203
-    assert name_states(centers[[0, 0]], states=[4, 9])[1].endswith("#10")
 
 
 def test_a_centre_of_other_variables_has_no_name():

@@ -80,9 +80,7 @@ class Watching:
         """Watch it no longer; what was measured stays."""
         self._cars.pop(car, None)
 
-    def leave(self, car: str) -> None:
-        """It has left the simulation."""
-        self.remove(car)
+    leave = remove
 
     def step(self) -> int:
         """Look at every car; returns how many there are."""
@@ -239,10 +237,6 @@ def attach(
     report : callable, optional
         Called with each `GuardedStep`: what a car's driver wanted, what it did, and why.
 
-    Returns
-    -------
-    Attachment
-
     Raises
     ------
     ValueError
@@ -253,15 +247,10 @@ def attach(
 
     Notes
     -----
-    What a driver wants is what its car does, unless it is held back: then it is what SUMO's
-    ``getFollowSpeed`` said before the step. (``getAcceleration`` is the deed, and so is
-    ``getSpeedWithoutTraCI`` of a car whose speed was set.) Where a guard acts, the speed mode has
-    "safe speed" and the limit of acceleration on and that of braking off. It is put back as it was,
-    with ``setSpeed(-1)``, as soon as the guard allows all that the car can do. Where you set a
-    car's speed yourself, ask a `Guard` before you do instead.
-
-    A simulation in which time does not go on, as after ``close`` and another ``start``, is
-    another one: attach anew.
+    Where a guard acts, the speed mode has "safe speed" and the limit of acceleration on and that of
+    braking off. It is put back as it was, with ``setSpeed(-1)``, as soon as the guard allows all
+    that the car can do. Where you set a car's speed yourself, ask a `Guard` before you do instead.
+    In another simulation, as after ``close`` and ``start``, attach anew.
 
     Examples
     --------

@@ -106,16 +106,6 @@ class OwnBrakes:
         self.decel = max(counted_on, -_WEAKEST * self.lowest)
         self._likely = mean if self.known else self.decel
 
-    def merge(self, others: Iterable[OwnBrakes]) -> None:
-        """Take in what full braking brought others, of the same brakes; one's own is the latest."""
-        own, (products, squares) = self.full.rows, self.lagged
-        self.full.clear()
-        for other in others:
-            self.remember(other.full.rows)
-            products, squares = products + other.lagged[0], squares + other.lagged[1]
-        self.remember(own)
-        self.set_lagged(products, squares)
-
     def show(self, decel: float) -> None:
         """Take in that the car braked so hard [m/s²], whatever was commanded.
 

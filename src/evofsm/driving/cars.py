@@ -113,14 +113,6 @@ def guard_for_family(family: Family, **settings: Any) -> Guard:
     return guard_for_cars(low, high, family.interval, width=width, **settings)
 
 
-def learnt_by(guard: Guard) -> tuple[EvolvingFSM, LatentRisk]:
-    """The machine and the latent risk of a guard for cars; a TypeError if it has others."""
-    machine, judge = learners_of(guard)
-    if not isinstance(judge, LatentRisk):
-        raise TypeError("the guard's judge is no LatentRisk")
-    return machine, judge
-
-
 def learners_of(guard: Guard) -> tuple[EvolvingFSM, LearningJudge]:
     """The machine and the judge of a guard, whichever it has; a TypeError if it lacks one."""
     if guard.machine is None or guard.judge is None:

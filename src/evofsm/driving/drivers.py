@@ -28,6 +28,15 @@ DRIVER_KERNEL = types.float64(
 )
 
 
+def refuse_others(one: object, whose: str, positive: str, not_negative: str = "") -> None:
+    """Raise where a field is not positive and finite, or of others not 0 or more and finite."""
+    for name in (*positive.split(), *not_negative.split()):
+        value, may_be_zero = getattr(one, name), name in not_negative.split()
+        if not 0.0 <= value < math.inf or (value == 0.0 and not may_be_zero):
+            must = "finite, 0 or more" if may_be_zero else "positive and finite"
+            raise ValueError(f"{whose} {name} is {value}; it must be {must}")
+
+
 def _idm(
     phases: NDArray[np.float64], time: float, gap: float, speed: float, leader_speed: float
 ) -> float:
@@ -73,11 +82,6 @@ class IDM:
     lowest, highest : float
         Bounds of the acceleration that comes out [m/s²].
 
-    Raises
-    ------
-    ValueError
-        If a parameter is impossible.
-
     Examples
     --------
     >>> IDM(1.25, 25.0, 2.0, 1.5, 2.0).propose(np.array([np.inf, 0.0, 0.0])).action
@@ -98,14 +102,7 @@ class IDM:
     kernel = staticmethod(idm_kernel)
 
     def __post_init__(self) -> None:
-        for name in ("accel", "desired_speed", "decel", "exponent"):
-            if not 0.0 < getattr(self, name) < math.inf:
-                value = getattr(self, name)
-                raise ValueError(f"IDM {name} is {value}; it must be positive and finite")
-        for name in ("min_gap", "time_headway"):
-            if not 0.0 <= getattr(self, name) < math.inf:
-                value = getattr(self, name)
-                raise ValueError(f"IDM {name} is {value}; it must be finite, 0 or more")
+        refuse_others(self, "IDM", "accel desired_speed decel exponent", "min_gap time_headway")
         if not self.lowest < self.highest:
             raise ValueError(f"IDM bounds are [{self.lowest}, {self.highest}]; lowest comes first")
 
@@ -128,11 +125,6 @@ class ChangingIDM:
     first : IDM
     changes : tuple of (float, IDM)
         When [s], and how it drives from then on, in the order of time.
-
-    Raises
-    ------
-    ValueError
-        If the times are negative or not in order.
 
     Examples
     --------

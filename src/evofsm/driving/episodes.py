@@ -227,13 +227,12 @@ def lead_time(episode: Episode, tolerance: float = TOLERANCE) -> float | None:
     """
     if not episode.collided or math.isnan(episode.decisions[0].revision.risk_proposed):
         return None
-    alarm = math.nan
-    for decision in episode.decisions:
-        if decision.revision.risk_proposed > tolerance:
-            alarm = decision.situation.time if math.isnan(alarm) else alarm
-        else:
-            alarm = math.nan
-    return 0.0 if math.isnan(alarm) else float(episode.time[-1] - alarm)
+    began = episode.time[-1]
+    for decision in reversed(episode.decisions):
+        if not decision.revision.risk_proposed > tolerance:
+            break
+        began = decision.situation.time
+    return float(episode.time[-1] - began)
 
 
 def try_out(

@@ -321,10 +321,6 @@ def load_family(name: str | PathLike[str]) -> Family:
         One of `FAMILIES`, or a file of Python, which is run and defines a `Family` that is called
         ``family``; with some of `SWITCHES` behind a ``+`` each.
 
-    Returns
-    -------
-    Family
-
     Raises
     ------
     ValueError

@@ -8,7 +8,6 @@ number draw the same ones everywhere else. All numbers are SI units.
 
 from __future__ import annotations
 
-import math
 import operator
 import runpy
 from collections.abc import Callable, Iterable, Iterator, Mapping, MutableMapping, Sequence
@@ -20,7 +19,7 @@ from zlib import crc32
 
 import numpy as np
 
-from evofsm.driving.drivers import IDM, ChangingIDM
+from evofsm.driving.drivers import IDM, ChangingIDM, refuse_others
 from evofsm.driving.naming import UNITS, VARIABLES
 from evofsm.driving.scenarios import Behind, Scenario
 from evofsm.fsm.actions import IntervalActions
@@ -123,9 +122,8 @@ class Family:
 
     Parameters
     ----------
-    name : str
-    about : str
-        What happens, in a sentence.
+    name, about : str
+        ``about`` says what happens, in a sentence.
     make : callable
         From `Numbers` to a `Scenario` and the follower's driver. The seed of the sensors' noise is
         drawn besides.
@@ -139,22 +137,14 @@ class Family:
     width : float
         Of an interval of actions [m/s²].
     variants : tuple of str
-        Names of the variants; ``numbers.variant`` is the index of the one that is drawn.
-    in_turn : bool
-        Whether variants come in turn: draw i is variant i % cases.
+        Their names; ``numbers.variant`` is the index of the one that is drawn, or, where they come
+        ``in_turn``, that of the draw modulo their number.
     shifted : Family, optional
         The family after its shift.
     switches : tuple of str
         Those of `SWITCHES` that are on.
     fixed : bool
         Whether nothing is drawn, the sensors' noise neither.
-    source : str
-        The file that it is from.
-
-    Raises
-    ------
-    ValueError
-        If a number is impossible, there is no such switch, or the family makes no scenario.
 
     Examples
     --------
@@ -188,9 +178,7 @@ class Family:
     source: str = ""
 
     def __post_init__(self) -> None:
-        for name in ("decel", "leader_decel", "interval"):
-            if not 0.0 < getattr(self, name) < math.inf:
-                raise ValueError(f"{name} is {getattr(self, name)}; it must be positive and finite")
+        refuse_others(self, "family's", "decel leader_decel interval")
         for name in self.switches:
             if name not in SWITCHES:
                 raise ValueError(f"there is no switch {name!r}; there are {', '.join(SWITCHES)}")
@@ -212,15 +200,7 @@ class Family:
         return max(1, len(self.variants)) if self.in_turn else 1
 
     def with_switches(self, names: Iterable[str]) -> Family:
-        """The family with some of `SWITCHES` on; what it draws is otherwise the same.
-
-        Examples
-        --------
-        >>> from evofsm.driving import load_family
-        >>> family = load_family("emergency").with_switches(["actuator", "jerk"])
-        >>> family.draw(seed=0, index=0).scenario.body
-        Body(lowest=-2.5, highest=2.5, delay=0.2, jerk=15.0)
-        """
+        """The family with some of `SWITCHES` on; what it draws is otherwise the same."""
         on = (names,) if isinstance(names, str) else tuple(names)
         after = None if self.shifted is None else self.shifted.with_switches(on)
         return replace(self, switches=(*self.switches, *on), shifted=after)
@@ -230,14 +210,6 @@ class Family:
 
         Each pair of ``seed`` and ``index``, from 0, is another draw; draws of the splits
         ``"train"`` and ``"test"`` never are the same.
-
-        Examples
-        --------
-        >>> from evofsm.driving import load_family
-        >>> family = load_family("cut_in")
-        >>> train, test = (family.draw(seed=1, index=0, split=s) for s in ("train", "test"))
-        >>> train == family.draw(seed=1, index=0), train == test
-        (True, False)
         """
         numbers = Numbers(seed, index, split)
         return self._draw(numbers, index % self.cases if self.cases > 1 else None)

@@ -22,14 +22,12 @@ from numpy.typing import NDArray
 from evofsm.driving.judge import LatentRisk
 from evofsm.driving.leaders import BrakeWatch, Manoeuvres
 from evofsm.driving.naming import VARIABLES
-from evofsm.driving.traffic import COLUMNS, Role, TrafficRisk, guard_for_traffic
+from evofsm.driving.traffic import COLUMNS, LEADER_DECEL, Role, TrafficRisk, guard_for_traffic
 from evofsm.guard import ActionReviser, Guard, Mode, Revision
 
 # How far one looks at least [m]; further by what it takes to stop.
 _NEAR, _GENTLE = 30.0, 3.0
 _WIDTH = 1.8
-# Leaders are assumed to brake so hard until they were seen to: SUMO's emergencyDecel [m/s²].
-_LEADER_DECEL = 9.0
 # A speed that is lower by no more is what the driver wanted [m/s].
 _SAME = 1e-6
 # SUMO's speed mode where a guard acts: no faster than safe, nor than the car can accelerate (bits 0
@@ -374,8 +372,9 @@ class Guarding:
         """One for all cars that can do the same: it remembers nothing of any."""
         judge = self._judges.get((low, high, decel))
         if judge is None:
-            judge = TrafficRisk.given(low, high, decel, self.interval, leader_decel=_LEADER_DECEL)
-            judge.ahead.manoeuvres = self.leaders
+            ahead = LatentRisk.given(-decel, decel, LEADER_DECEL, self.interval)
+            ahead.manoeuvres = self.leaders
+            judge = TrafficRisk(ahead, low, high)
             self._judges[low, high, decel] = judge
         return judge
 
@@ -383,7 +382,7 @@ class Guarding:
 def _leaders_of(guard: Guard | None) -> Manoeuvres:
     """What a guard knows of leaders; what is assumed without one."""
     if guard is None:
-        return Manoeuvres(_LEADER_DECEL)
+        return Manoeuvres(LEADER_DECEL)
     if not isinstance(guard.reviser, ActionReviser):
         raise TypeError(f"the guard has a {type(guard.reviser).__name__}; it needs a judge")
     judge = guard.reviser.risk
@@ -396,7 +395,7 @@ def _leaders_of(guard: Guard | None) -> Manoeuvres:
         )
     if isinstance(judge, LatentRisk):
         return copy.deepcopy(judge.manoeuvres)
-    return Manoeuvres(_LEADER_DECEL)
+    return Manoeuvres(LEADER_DECEL)
 
 
 def _steps(interval: float, dt: float) -> int:

@@ -12,7 +12,7 @@ now, even braking in full at once would be too late; while it does not, that can
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import Any, Self
 
 import numpy as np
@@ -270,34 +270,6 @@ class LatentRisk:
         if not _count(seconds, belief, self.dt):
             refuse_unless_distribution("belief", belief)
         self._seconds = seconds
-
-    # -- Sharing --------------------------------------------------------------------------------
-
-    def merge(self, others: Iterable[LatentRisk], *, brakes: bool = False) -> None:
-        """Take in what others saw of their leaders, as if it had been seen here.
-
-        Leaders' manoeuvres and the noise of the sensors add up, and with ``brakes`` what was learnt
-        of brakes that are the same; of more than are remembered the latest of each stay. They must
-        have learnt apart: what two of them began with in common counts twice.
-        """
-        given = list(others)
-        alike = ("dt", "hard", "lowest") if brakes else ("dt", "hard")
-        for other in given:
-            self._refuse_unlike(other, alike)
-        self.manoeuvres.merge([other.manoeuvres for other in given])
-        self.perception.merge([other.perception for other in given])
-        if brakes:
-            self.brakes.merge([other.brakes for other in given])
-
-    def _refuse_unlike(self, other: object, alike: Iterable[str]) -> None:
-        if not isinstance(other, LatentRisk):
-            raise TypeError(f"only a LatentRisk can be merged, not {type(other).__name__}")
-        if other is self:
-            raise ValueError("a risk cannot be merged with itself: what it saw would count twice")
-        for name in alike:
-            mine, its = getattr(self, name), getattr(other, name)
-            if mine != its:
-                raise ValueError(f"{name} is {mine:g} here and {its:g} there; it must be the same")
 
     # -- Judging --------------------------------------------------------------------------------
 

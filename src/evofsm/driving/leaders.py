@@ -12,8 +12,7 @@ table of them (`LeaderBrakes`).
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable, Sequence
-from itertools import zip_longest
+from collections.abc import Sequence
 from typing import NamedTuple, Self
 
 import numpy as np
@@ -116,14 +115,6 @@ class Manoeuvres:
         self.remember(*leaders.decels)
         self.gentle += leaders.gentle
 
-    def merge(self, others: Sequence[Manoeuvres]) -> None:
-        """Take in what others saw, who call the same hard; of too many the latest of each."""
-        self.gentle += sum(other.gentle for other in others)
-        every = latest_of_each([*(other.decels for other in others), self.decels])
-        self.decels.clear()
-        self.decels.extend(every)
-        self._tabulate()
-
     def harder(self, decel: ArrayLike) -> NDArray[np.float64]:
         """Probability that the next hard manoeuvre is harder than these decelerations [m/s²]."""
         grid, harder = self.table
@@ -146,12 +137,6 @@ class Manoeuvres:
         harder[grid >= HARDEST] = 0.0
         #: Decelerations [m/s²], and the chance that the next hard manoeuvre is harder.
         self.table: NDArray[np.float64] = np.array([grid, harder / (len(self.decels) + 1)])
-
-
-def latest_of_each(series: Iterable[Iterable[float]]) -> list[float]:
-    """Values of several series, so that the latest of each come last."""
-    columns = zip_longest(*(reversed(list(values)) for values in series))
-    return [value for column in columns for value in column if value is not None][::-1]
 
 
 class BrakeWatch:

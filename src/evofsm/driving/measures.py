@@ -418,19 +418,10 @@ class FuzzySafety(_Measure):
     It brakes gently before it must brake hard (Mattas et al. 2020, Accident Analysis & Prevention
     148; 2022, the same 174).
 
-    Parameters
-    ----------
-    reaction : float
-        Time before the follower reacts [s]; 0 is allowed.
-    comfortable_decel, decel, leader_decel : float
-        Comfortable and hardest braking of the follower, braking of the leader [m/s²], positive;
-        ``decel`` is not the weaker one.
-    margin : float
-        Gap to be left at standstill, and once more before the follower must brake [m]; 0 is
-        allowed.
-    threshold : float
-        Degree of danger above which it calls for braking, from 0 to below 1; the model itself
-        brakes from 0 on, the harder the more dangerous it is.
+    After a ``reaction`` [s] the follower brakes, comfortably or, not weaker, by ``decel`` [m/s²].
+    The ``margin`` [m] is to be left at standstill, and once more before it must brake. Above the
+    ``threshold`` the degree of danger, from 0 to 1, calls for braking; the model itself brakes from
+    0 on, the harder the more dangerous it is. These three may be 0.
 
     Examples
     --------

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from itertools import groupby
 from operator import attrgetter
 
-import numpy as np
 from numpy.typing import ArrayLike
 
 from evofsm.driving.measures import time_headway, time_to_collision
@@ -24,8 +22,6 @@ _SPEEDS = ((0.5, "standing"), (8.0, "slow"), (20.0, "at medium speed"))
 _FAST = "fast"
 # Speeds that differ by less are called equal [m/s].
 _EQUAL = 0.5
-# With so many decimals at most two states are told apart by their numbers.
-_MOST_DECIMALS = 3
 
 
 def name_state(center: ArrayLike, decimals: int = 0) -> str:
@@ -48,33 +44,6 @@ def name_state(center: ArrayLike, decimals: int = 0) -> str:
         _change(speed - leader, decimals),
     ]
     return ", ".join(parts)
-
-
-def name_states(centers: ArrayLike, states: Sequence[int] | None = None) -> list[str]:
-    """Where states lie, in words; no two of them get the same name.
-
-    Those that would be called alike get decimals; states that lie in one place get their numbers.
-    """
-    if np.size(centers) == 0:
-        return []
-    rows = real_array("centers", centers, 2)
-    names = [name_state(row) for row in rows]
-    for decimals in range(1, _MOST_DECIMALS + 1):
-        for alike in _alike(names):
-            for place in alike:
-                names[place] = name_state(rows[place], decimals)
-    for alike in _alike(names):
-        for place in alike:
-            number = place if states is None else states[place]
-            names[place] = f"{names[place]}, #{number + 1}"
-    return names
-
-
-def _alike(names: Sequence[str]) -> list[list[int]]:
-    """Places of names that occur more than once."""
-    order = sorted(range(len(names)), key=lambda place: names[place])
-    groups = [list(places) for _, places in groupby(order, key=lambda place: names[place])]
-    return [places for places in groups if len(places) > 1]
 
 
 def _word(value: float, bands: Sequence[tuple[float, str]], beyond: str) -> str:

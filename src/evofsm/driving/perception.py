@@ -11,14 +11,13 @@ from __future__ import annotations
 
 from bisect import bisect_left, insort
 from collections import deque
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from math import isnan, nan, sqrt
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.driving.leaders import latest_of_each
 from evofsm.driving.rehearsal import Three
 from evofsm.fsm.kernels import compiled
 
@@ -125,11 +124,6 @@ class Perception:
             name: np.array(each.latest, dtype=np.float64)
             for name, each in zip(_NAMES, self._sizes, strict=True)
         }
-
-    def merge(self, others: Sequence[Perception]) -> None:
-        """Take in what others' sensors left unexplained; of too many the latest of each."""
-        every = [one.learnt() for one in (*others, self)]
-        self.restore({name: latest_of_each([e[name] for e in every]) for name in _NAMES})
 
     def restore(self, latest: Mapping[str, Iterable[float]]) -> None:
         """Take over what `learnt` returned."""

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.driving.drivers import IDM
+from evofsm.driving.drivers import IDM, refuse_others
 
 #: No scenario has more, so that no file can ask for more memory than there is.
 MOST_STEPS = 2_000_000
@@ -26,8 +26,7 @@ class CutIn:
     speed: float
 
     def __post_init__(self) -> None:
-        _require_positive("cut-in's", gap=self.gap)
-        _require_not_negative("cut-in's", time=self.time, speed=self.speed)
+        refuse_others(self, "cut-in's", "gap", "time speed")
 
 
 @dataclass(frozen=True)
@@ -61,11 +60,10 @@ class Leader:
     cut_in: CutIn | None = None
 
     def __post_init__(self) -> None:
-        _require_positive("leader's", brake_decel=self.brake_decel)
+        refuse_others(self, "leader's", "brake_decel", "initial_speed")
         for name in ("brake_speed", "brake_time"):
             if not getattr(self, name) >= 0.0:
                 raise ValueError(f"leader's {name} is {getattr(self, name)}; it must be 0 or more")
-        _require_not_negative("leader's", initial_speed=self.initial_speed)
         times = [time for time, _ in self.waves]
         if times != sorted(times) or not np.isfinite(np.ravel(self.waves)).all():
             raise ValueError(f"leader's waves are {self.waves}; they must be finite, in order")
@@ -87,7 +85,7 @@ class Body:
     def __post_init__(self) -> None:
         if not self.lowest < self.highest:
             raise ValueError(f"body's bounds are [{self.lowest}, {self.highest}]; lowest is first")
-        _require_not_negative("body's", delay=self.delay)
+        refuse_others(self, "body's", "", "delay")
         if not self.jerk > 0.0:
             raise ValueError(f"body's jerk is {self.jerk}; it must be positive")
 
@@ -106,12 +104,7 @@ class Sensors:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        _require_not_negative(
-            "sensors'",
-            gap_noise=self.gap_noise,
-            speed_noise=self.speed_noise,
-            delay=self.delay,
-        )
+        refuse_others(self, "sensors'", "", "gap_noise speed_noise delay")
 
 
 @dataclass(frozen=True)
@@ -122,7 +115,7 @@ class Behind:
     gap: float
 
     def __post_init__(self) -> None:
-        _require_positive("the car behind's", gap=self.gap)
+        refuse_others(self, "the car behind's", "gap")
 
 
 @dataclass(frozen=True)
@@ -155,10 +148,7 @@ class Scenario:
     behind: Behind | None = None
 
     def __post_init__(self) -> None:
-        _require_positive(
-            "scenario's", initial_gap=self.initial_gap, duration=self.duration, dt=self.dt
-        )
-        _require_not_negative("scenario's", initial_speed=self.initial_speed)
+        refuse_others(self, "scenario's", "initial_gap duration dt", "initial_speed")
         if self.duration < 2 * self.dt:
             raise ValueError(
                 f"scenario's duration is {self.duration} and its dt {self.dt}; "
@@ -193,15 +183,3 @@ class Scenario:
                 f"steps of {self.dt} s"
             )
         return steps
-
-
-def _require_positive(whose: str, **values: float) -> None:
-    for name, value in values.items():
-        if not 0.0 < value < math.inf:
-            raise ValueError(f"{whose} {name} is {value}; it must be positive and finite")
-
-
-def _require_not_negative(whose: str, **values: float) -> None:
-    for name, value in values.items():
-        if not 0.0 <= value < math.inf:
-            raise ValueError(f"{whose} {name} is {value}; it must be finite, 0 or more")

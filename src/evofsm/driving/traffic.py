@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from enum import Enum
-from typing import Any, NamedTuple, Self
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -34,6 +34,8 @@ COLUMNS = ("present", "x", "y", "vx", "vy", "length", "width")
 _AHEAD = 2.0
 # Between two accelerations that are looked at [m/s²]; width of an interval of them [m/s²].
 _STEP, _WIDTH = 0.25, 0.3
+# So hard leaders brake at most, unless told or seen otherwise: SUMO's emergencyDecel [m/s²].
+LEADER_DECEL = 9.0
 # Once it revises, a proposal is kept again below this share of the tolerance.
 _RELEASE = 0.9
 _KEPT = "risk is within the tolerance"
@@ -222,22 +224,6 @@ class TrafficRisk:
         #: The worst pair of the first action that was judged last; None where there is none.
         self.worst: Pair | None = None
 
-    @classmethod
-    def given(
-        cls,
-        low: float,
-        high: float,
-        decel: float,
-        interval: float,
-        *,
-        leader_decel: float = 9.0,
-        behind_decel: float = 4.5,
-        reaction: float = 1.0,
-    ) -> Self:
-        """Given the limits: braking that is counted on, and the hardest of leaders [m/s²]."""
-        ahead = LatentRisk.given(-decel, decel, leader_decel, interval)
-        return cls(ahead, low, high, behind_decel=behind_decel, reaction=reaction)
-
     def judge(self, situation: Situation, actions: ArrayLike) -> Judgement:
         """Risk of each acceleration [m/s²]: the highest of all pairs."""
         given = np.ascontiguousarray(actions, np.float64)
@@ -368,7 +354,6 @@ def guard_for_traffic(
     judge: TrafficRisk | None = None,
     tolerance: float = TOLERANCE,
     mode: Mode = Mode.ACT,
-    **settings: Any,
 ) -> Guard:
     """A guard for a car among others; it observes `Scene.rows` and decides on the acceleration.
 
@@ -381,12 +366,10 @@ def guard_for_traffic(
     interval : float
         Time between two decisions [s].
     judge : TrafficRisk, optional
-        Without one it is given these limits.
+        Without one it is given these limits, and leaders who brake by 9 m/s² at most.
     tolerance : float
         Highest risk that is accepted, in (0, 1).
     mode : Mode
-    **settings
-        As in `TrafficRisk.given`: ``leader_decel``, ``behind_decel``, ``reaction``.
 
     Examples
     --------
@@ -396,7 +379,7 @@ def guard_for_traffic(
     >>> guard.decide(alone.rows(most=4), proposal=1.0).executed
     1.0
     """
-    judge = judge or TrafficRisk.given(low, high, decel, interval, **settings)
+    judge = judge or TrafficRisk(LatentRisk.given(-decel, decel, LEADER_DECEL, interval), low, high)
     actions = IntervalActions(low, high, _WIDTH, outside="clip")
     reviser = ActionReviser(judge, actions, tolerance=tolerance, mode=mode)
     return Guard.of(reviser, interval=interval, learn=False)

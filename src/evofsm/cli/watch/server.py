@@ -25,7 +25,7 @@ import msgspec
 from evofsm.cli.watch.player import SPEEDS, Clock, Player
 from evofsm.cli.watch.shown import Frame, Graph, Start, Transition
 from evofsm.cli.watch.words import tell
-from evofsm.driving.naming import name_state, name_states
+from evofsm.driving.naming import name_state
 from evofsm.extras import needs
 
 with needs("websockets", "watch", "the live page"):
@@ -153,9 +153,7 @@ class LivePage:
 
     def grew(self, graph: Graph) -> None:
         """States, or ways between them, have changed."""
-        names = name_states([state.center for state in graph.states])
-        pairs = zip(graph.states, names, strict=True)
-        states = [{**state._asdict(), "name": name} for state, name in pairs]
+        states = [{**one._asdict(), "name": name_state(one.center, 1)} for one in graph.states]
         self._hand_over("graph", {**graph._asdict(), "states": states})
 
     def ticked(self, clock: Clock) -> None:
