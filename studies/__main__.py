@@ -77,7 +77,7 @@ def main() -> None:
     )
     asked = sys.argv[1] if len(sys.argv) > 1 else ""
     if asked not in STUDIES and asked != "evidence":
-        from evofsm.cli import commands
+        from studies.old.shim import commands
 
         return commands.main(application)
     for name in [asked] if asked in STUDIES else STUDIES:
@@ -88,9 +88,9 @@ def main() -> None:
 
 def application() -> typer.Typer:
     """Commands of studies that do not stand on `lib` yet."""
-    from evofsm.cli import commands
     from studies.old.bench import command_of
     from studies.old.leaders import Leaders
+    from studies.old.shim import commands
     from studies.old.studies import STUDIES as OLD
 
     about = "Studies: ours against the baselines, on held-out scenarios."

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import ClassVar, Literal, Self
 
-from evofsm.cli import option, split_names
+from studies.old.shim import option, split_names
 
 Errors = Literal["false alarms", "misses"]
 

@@ -6,7 +6,6 @@ from collections.abc import Iterator
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from evofsm.cli import Column, Table, count, listed, percent, percents, seeds_text
 from studies.alarms.amounts import Amounts, Errors
 from studies.alarms.study import ADAPTIVE, DELAY, FIXED, Found, Row
 from studies.alarms.windows import LENGTH
@@ -15,6 +14,7 @@ from studies.old.asked import Asked, failures, tables_of_asked
 from studies.old.chapter import Chapter, Source
 from studies.old.drawing import Sketch
 from studies.old.html import Setting
+from studies.old.shim import Column, Table, count, listed, percent, percents, seeds_text
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

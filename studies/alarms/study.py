@@ -17,12 +17,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.fleet import in_order
 from evofsm.guard import ConformalAlarm
 from studies.alarms.amounts import Amounts, Errors
 from studies.alarms.windows import Windows, stages
 from studies.old.frame import Frame, Progress, silent
 from studies.old.scores import bootstrap, share_of
+from studies.old.shim import in_order
 
 #: Kinds of alarms: a threshold that adapts, and one that is chosen once.
 ADAPTIVE, FIXED = "adaptive", "fixed"

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import ClassVar, Self
 
-from evofsm.cli import option, split_names
 from studies.old.own_measure import ABOUT
+from studies.old.shim import option, split_names
 
 #: What is judged if nothing else is asked for; see `studies.detection.worlds.world`.
 FAMILIES = (

@@ -10,7 +10,16 @@ from typing import Any
 
 import numpy as np
 
-from evofsm.cli import (
+from studies.detection.figures import sketches
+from studies.detection.measures import Ours
+from studies.detection.rows import Row
+from studies.detection.study import ASSUMED, IN_GRID, Detection
+from studies.detection.watch import HORIZON, WHAT, Target
+from studies.old.against import ahead
+from studies.old.asked import Asked, at_least, failures, tables_of_asked
+from studies.old.chapter import Chapter
+from studies.old.html import Setting
+from studies.old.shim import (
     Column,
     Table,
     bare_percent,
@@ -21,15 +30,6 @@ from evofsm.cli import (
     seeds_text,
     span,
 )
-from studies.detection.figures import sketches
-from studies.detection.measures import Ours
-from studies.detection.rows import Row
-from studies.detection.study import ASSUMED, IN_GRID, Detection
-from studies.detection.watch import HORIZON, WHAT, Target
-from studies.old.against import ahead
-from studies.old.asked import Asked, at_least, failures, tables_of_asked
-from studies.old.chapter import Chapter
-from studies.old.html import Setting
 from studies.policies import Group
 
 # Measures that stand in the columns of tables over families.

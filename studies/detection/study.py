@@ -14,7 +14,6 @@ from itertools import islice, product
 from typing import Any, NamedTuple
 
 from evofsm.driving import measures
-from evofsm.fleet import in_order
 from studies.detection.amounts import Amounts
 from studies.detection.measures import (
     Detector,
@@ -38,6 +37,7 @@ from studies.detection.watch import (
 from studies.detection.worlds import World, grid_world, world
 from studies.old.frame import Frame, Progress, silent
 from studies.old.scores import auroc
+from studies.old.shim import in_order
 from studies.policies import Group
 
 #: Limits that are told to the safe distance of the grid that is wrong almost everywhere [m/s²].

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import ClassVar, Self
 
-from evofsm.cli import option
+from studies.old.shim import option
 
 #: Steps within which a failure counts.
 HORIZONS = (10, 25, 50)

@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterator
 from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
 
-from evofsm.cli import Column, Table, count, decimals, listed, number, percent, seeds_text
 from studies.foresight.amounts import HORIZONS, Amounts
 from studies.foresight.measures import FALSE, RECALL
 from studies.foresight.rivals import NEIGHBOURS
@@ -17,6 +16,7 @@ from studies.old.against import ahead
 from studies.old.chapter import Chapter, Source
 from studies.old.drawing import Sketch
 from studies.old.html import Setting
+from studies.old.shim import Column, Table, count, decimals, listed, number, percent, seeds_text
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -15,8 +15,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.cli import split_names
-from evofsm.fleet import in_order
 from studies.foresight.amounts import HORIZONS, Amounts
 from studies.foresight.data import Cases, cases, gather
 from studies.foresight.measures import Scored, ece, measured, scored
@@ -24,6 +22,7 @@ from studies.foresight.ours import Learnt
 from studies.foresight.rivals import Logistic, Neighbours, Taylor
 from studies.old.frame import Frame, Progress, silent
 from studies.old.scores import auroc
+from studies.old.shim import in_order, split_names
 from studies.systems import Start, make_system
 
 #: Who foresees: ours first, and of ours the one that all others are held against.

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
-from evofsm.cli import Column, Table
+from studies.old.shim import Column, Table
 
 
 class Asked(NamedTuple):

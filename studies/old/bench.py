@@ -7,7 +7,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from evofsm.cli import PAGE, Command, command_line, counter, option, print_json, progress
+from studies.old.shim import PAGE, Command, command_line, counter, option, print_json, progress
 from studies.old.study import Study
 
 _FOLDER = "Folder for the page, its figures and the data."
@@ -35,8 +35,8 @@ class RunStudy(Command):
         if self.as_json:
             print_json(found.frame.as_dicts())
             return
-        from evofsm.cli import console, to_json
         from studies.old.chapter import write_chapters
+        from studies.old.shim import console, to_json
 
         self.out.mkdir(parents=True, exist_ok=True)
         with progress() as bars:

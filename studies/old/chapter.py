@@ -11,10 +11,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from evofsm.cli import Column, Table
 from studies.old.drawing import Drawing, Sketch, draw_all
 from studies.old.frame import Progress, silent
 from studies.old.html import Setting, versions, write_html
+from studies.old.shim import Column, Table
 
 
 class Source(NamedTuple):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from evofsm.cli import REQUIRED, Command, counter, option, print_json, progress
+from studies.old.shim import REQUIRED, Command, counter, option, print_json, progress
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,7 +28,7 @@ class Leaders(Command):
 
     def run(self) -> None:
         """Count, and print the tables."""
-        from evofsm.cli import console, print_table, spelled_out
+        from studies.old.shim import console, print_table, spelled_out
         from studies.real.leaders import Limits, run_leaders
 
         limits = Limits(self.lowest, self.decel)

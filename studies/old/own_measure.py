@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 from typing import TYPE_CHECKING
 
-from evofsm.cli import imported
+from studies.old.shim import imported
 
 if TYPE_CHECKING:
     from evofsm.guard import RiskMeasure

@@ -2,7 +2,7 @@
 
 Every study is a frozen dataclass that derives from `Study`, and stands once in
 `studies.old.studies.STUDIES`; ``python -m studies`` and the docs read it there.
-Its fields say how much is done; those made by `evofsm.cli.option` are the options of its command.
+Its fields say how much is done; those made by `shim.option` are the options of its command.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, Protocol, Self, TypeVar
 
-from evofsm.cli import is_required
 from studies.old.frame import Frame, Progress, silent
+from studies.old.shim import is_required
 
 if TYPE_CHECKING:
     from rich.console import Console

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from rich.console import Console
 from rich.padding import Padding
 
-from evofsm.cli import print_table
 from studies.old.chapter import Chapter
+from studies.old.shim import print_table
 
 
 def print_chapter(out: Console, chapter: Chapter) -> None:

@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from evofsm.cli import NONE, Column, Table, decimals, interval, listed, number
 from studies.old import plot
 from studies.old.against import ahead
 from studies.old.asked import Asked, failures, tables_of_asked
 from studies.old.chapter import Chapter
 from studies.old.drawing import Sketch
 from studies.old.html import Setting
+from studies.old.shim import NONE, Column, Table, decimals, interval, listed, number
 from studies.prediction.forecasters import Method, Variant
 from studies.prediction.scoring import Row
 from studies.prediction.sources import Pace

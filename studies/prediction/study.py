@@ -14,8 +14,8 @@ from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple
 
-from evofsm.fleet import in_order
 from studies.old.frame import Frame, Progress, silent
+from studies.old.shim import in_order
 from studies.prediction.amounts import Amounts
 from studies.prediction.forecasters import (
     REFERENCES,

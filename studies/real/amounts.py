@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import ClassVar, Self
 
-from evofsm.cli import option
+from studies.old.shim import option
 
 
 @dataclass(frozen=True)

@@ -7,11 +7,11 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from typing import Any
 
-from evofsm.cli import NONE, Column, Table, count, listed, number, percent, within
 from studies.old.against import ahead
 from studies.old.asked import Asked, failures, tables_of_asked
 from studies.old.chapter import Chapter
 from studies.old.html import Setting
+from studies.old.shim import NONE, Column, Table, count, listed, number, percent, within
 from studies.real.cases import HORIZONS, INTERVAL
 from studies.real.figures import sketches
 from studies.real.measures import LOWEST, MEASURES, OURS, StateShare

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.cli import percent
 from studies.old import plot
 from studies.old.drawing import Sketch
+from studies.old.shim import percent
 from studies.real.cases import HORIZONS
 from studies.real.measures import MEASURES, Group
 from studies.real.moments import ALARM_SHARE, Kind, Moment

@@ -13,13 +13,13 @@ from pathlib import Path
 from typing import NamedTuple, TypeVar
 
 from evofsm.driving import REAL_DRIVES, LatentRisk, LeaderBrakes
-from evofsm.fleet import in_order
 from evofsm.fsm import IntervalActions
 from evofsm.guard import ActionReviser, Guard, Mode, is_spoken
 from studies.datasets.checksums import find_checksums
 from studies.datasets.episodes import Episode
 from studies.datasets.layouts import Layout, read_episodes
 from studies.old.frame import Progress, silent
+from studies.old.shim import in_order
 from studies.real.cases import runs_in
 
 #: What is taken to be known in shadow mode, in the order in which it is reported.

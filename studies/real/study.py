@@ -14,11 +14,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.fleet import in_order
 from studies.datasets.checksums import find_checksums
 from studies.datasets.layouts import Layout, read_episodes
 from studies.old.frame import Frame, Progress, silent
 from studies.old.scores import Ranked, interval, resampled
+from studies.old.shim import in_order
 from studies.real.amounts import Amounts
 from studies.real.cases import INTERVAL, QUESTIONS, Case, Question, case_of, runs_in
 from studies.real.measures import (

@@ -6,9 +6,9 @@ import math
 from collections.abc import Callable, Iterator
 from itertools import zip_longest
 
-from evofsm.cli import Column, Table, count, decimals
 from evofsm.driving import REAL_DRIVES, LeaderBrakes
 from evofsm.guard import TOLERANCE
+from studies.old.shim import Column, Table, count, decimals
 from studies.real.leaders import TOLD, Alarms, Braked, LeaderStudy, Limits
 
 # So many are to be seen until an assumed one weighs no more than the tolerance.

@@ -32,7 +32,7 @@ from inspect import Parameter, Signature
 from types import MappingProxyType, NoneType
 from typing import Annotated, Any, NamedTuple, TypeVar, get_args, get_origin, get_type_hints
 
-from evofsm.cli.commands.common import require
+from studies.old.shim.common import require
 
 T = TypeVar("T")
 _KEY = "evofsm"

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from operator import attrgetter
 from typing import Any, Generic, TypeVar
 
-from evofsm.cli.text.numbers import NONE
+from studies.old.shim.numbers import NONE
 
 R = TypeVar("R")
 
@@ -30,7 +30,7 @@ class Column(Generic[R]):
 
     Examples
     --------
-    >>> from evofsm.cli import percent
+    >>> from studies.old.shim import percent
     >>> Column("collisions", lambda rate: rate, percent).cell(0.25)
     '25.0 %'
     """
@@ -93,7 +93,7 @@ class Table:
 
         Examples
         --------
-        >>> from evofsm.cli import decimals
+        >>> from studies.old.shim import decimals
         >>> columns = Column("who", lambda row: row[0]), Column("lead", lambda r: r[1], decimals(1))
         >>> Table.of("Leads", columns, [("ours", 3.0), ("ttc", None)]).rows
         (('ours', '3.0'), ('ttc', '–'))

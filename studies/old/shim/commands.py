@@ -1,4 +1,4 @@
-"""The commands of before, until all are plain functions."""
+"""The command line of studies that do not stand on `lib` yet."""
 
 from __future__ import annotations
 
@@ -7,13 +7,12 @@ from collections.abc import Callable
 import typer
 
 from evofsm.cli.app import group as group_of
-from evofsm.cli.commands.declared import Command, callback
+from evofsm.cli.app import run
+from studies.old.shim.declared import Command, callback
 
 
 def main(application: Callable[[], typer.Typer]) -> None:
     """Run the command line that ``application`` makes."""
-    from evofsm.cli.app import run
-
     run(application)
 
 

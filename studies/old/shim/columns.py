@@ -16,8 +16,8 @@ from rich.console import Console
 from rich.padding import Padding
 from rich.text import Text
 
-from evofsm.cli.text.table import Table
 from evofsm.fsm.naming import visible
+from studies.old.shim.table import Table
 
 # Narrower than this, words do not stand beside one another.
 _WORDS_WIDTH = 66

@@ -1,1 +1,0 @@
-"""What the programs print: tables, numbers and documents, for people and for other programs."""

@@ -1,7 +1,0 @@
-"""Many at once: machines of a whole fleet as arrays, and campaigns over many processes."""
-
-from __future__ import annotations
-
-import lazy_loader
-
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

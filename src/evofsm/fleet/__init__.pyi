@@ -1,1 +1,0 @@
-from .executors import in_order as in_order
