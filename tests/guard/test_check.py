@@ -39,7 +39,7 @@ OURS = [
     ResponsibilitySensitiveSafety.r157(),
     PerformanceModel.regulation(),
     FuzzySafety(),
-    LatentRisk,
+    LatentRisk(lowest=-2.5),
     ActionReviser(LatentRisk(lowest=-2.5), ACTIONS),
     ActionReviser(LatentRisk(lowest=-2.5), ACTIONS, mode=Mode.SHADOW),
     EnvelopeReviser(ModifiedTimeToCollision(), ACTIONS),
@@ -271,7 +271,7 @@ def test_what_breaks_a_contract_is_found_by_the_check_for_it(name, part):
 
 
 def test_every_check_has_something_that_breaks_it():
-    parts = (Paper, Unrevised(ACTIONS), CALM, LatentRisk, TimeToCollision)
+    parts = (Paper, Unrevised(ACTIONS), CALM, LatentRisk(lowest=-2.5), TimeToCollision)
     assert {one.check for part in parts for one in check_results(part)} == BROKEN.keys()
 
 

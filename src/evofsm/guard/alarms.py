@@ -7,18 +7,15 @@ scores. Then ::
 
     alpha_{t+1} = alpha_t + step (rate - err_t),      alpha_1 = rate
 
-so that an error raises the threshold, and every other update lowers it a little.
-
-**What is guaranteed.** Where alpha_t <= 0 the threshold is infinite and nothing is an error; where
-alpha_t >= 1 it is minus infinity and everything is. So alpha_t never leaves
-[-step (1 - rate), 1 + step rate]. The sum of both sides over T updates is
-alpha_{T+1} - rate = step (T rate - sum err), hence ::
+so that an error raises the threshold, and every other update lowers it a little. Where alpha_t <= 0
+the threshold is infinite and nothing is an error; where alpha_t >= 1 everything is. So alpha_t
+never leaves [-step (1 - rate), 1 + step rate], and the sum over T updates is bounded::
 
     -((1 - rate) / step + rate)  <=  sum err - T rate  <=  rate / step + 1 - rate
 
 for *any* sequence of scores and outcomes: no distribution is assumed, nothing has to stay the same
 or be independent. With ``rate=0.01`` and ``step=0.005`` there are never more than 2.99 errors above
-1 % of the updates. What is not guaranteed stands in `ConformalAlarm`.
+1 % of the updates.
 """
 
 from __future__ import annotations
@@ -26,36 +23,19 @@ from __future__ import annotations
 import math
 from bisect import bisect_left, insort
 from collections import deque
-from collections.abc import Mapping
-from typing import Any, Literal, Self, get_args
+from typing import Literal, get_args
 
-import numpy as np
-
-from evofsm import store
 from evofsm.fsm.validation import positive, whole
-from evofsm.store import COUNT, FROM_1, SIZE, SMALLEST, Kind, Numbers, Place
 
 #: Kinds of errors, of which one has its rate held.
 Errors = Literal["false alarms", "misses"]
 
 # A rank this close to an integer differs from it by rounding alone.
 _ROUNDING = 1e-9
-_SETTINGS = ("rate", "of", "step", "memory")
-_KIND = Kind(
-    "conformalalarm",
-    {"scores": Numbers(("n",), -math.inf, math.inf)},
-    {
-        "rate": Numbers(least=SMALLEST, most=1.0),
-        "step": SIZE,
-        "memory": FROM_1,
-        "counted": COUNT,
-        "errors": COUNT,
-    },
-)
 
 
 class ConformalAlarm:
-    """An alarm above a threshold that adapts, so that its error rate is as stated.
+    """An alarm above a threshold that adapts, so that its error rate is as stated; pickle keeps it.
 
     Parameters
     ----------
@@ -83,16 +63,14 @@ class ConformalAlarm:
     The guarantee (`held`) is about the error rate over all updates that count, and nothing else:
     not about a single alarm, nor about the other kind of errors. A rate of false alarms is held by
     silence if need be, a rate of misses by an alarm that is always on; until about ``1 / rate``
-    updates were counted it is so. Decisions a quarter of a second apart are much alike: the bound
-    holds for them too, but one long false alarm is then many errors.
-
-    Where the outcome is known only later, update then, with ``alarmed`` as the alarm was at the
-    time. A delay of d updates allows for d more errors on either side.
+    updates were counted it is so. Where the outcome is known only later, update then, with
+    ``alarmed`` as the alarm was at the time: a delay of d updates allows for d more errors.
 
     Examples
     --------
     A score whose scale doubles half way; 5 % of the safe updates may be in alarm:
 
+    >>> import numpy as np
     >>> alarm = ConformalAlarm(rate=0.05, step=0.02)
     >>> rng = np.random.default_rng(0)
     >>> for t in range(4000):
@@ -208,36 +186,6 @@ class ConformalAlarm:
     def _errs(self, value: float) -> bool:
         quantile = self._quantile
         return value > quantile or quantile == -math.inf
-
-    def save(self, path: Place, provenance: Mapping[str, Any] | None = None) -> None:
-        """Write it to a file, with ``provenance`` for people; it goes on where it was."""
-        settings = {name: getattr(self, name) for name in (*_SETTINGS, "counted", "errors")}
-        store.write(
-            path, _KIND, settings, {"scores": np.array(self._latest, np.float64)}, provenance
-        )
-
-    @classmethod
-    def load(cls, path: Place) -> Self:
-        """Read what `save` wrote.
-
-        Raises
-        ------
-        OSError
-            If there is no such file, or it may not be read.
-        ValueError
-            If the file holds something else or is damaged.
-        """
-        settings, arrays = store.read(path, _KIND)
-        with store.explained(path):
-            alarm = cls(**{name: settings[name] for name in _SETTINGS})
-            alarm.counted, alarm.errors = int(settings["counted"]), int(settings["errors"])
-            scores = arrays["scores"].tolist()
-            if len(scores) != min(alarm.counted, alarm.memory):
-                raise ValueError(f"it has {len(scores)} scores of {alarm.counted} updates")
-            if alarm.errors > alarm.counted:
-                raise ValueError(f"it has {alarm.errors} errors of {alarm.counted} updates")
-        alarm._latest, alarm._ordered = deque(scores), sorted(scores)
-        return alarm
 
     def __repr__(self) -> str:
         return (

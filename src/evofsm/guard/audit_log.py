@@ -243,14 +243,10 @@ class Chain:
             why = "its hash is not that of what it says"
         elif here.previous == self.head.digest:
             why = f"it says that it is record {here.number}"
-        elif here.number > at:
-            return Finding(at, f"record {at} is missing: it was removed, or moved elsewhere")
-        elif here.number < at:
-            return Finding(
-                here.number,
-                f"line {at} holds a record {here.number} once more: it was repeated, or one of the "
-                "two was inserted",
-            )
+        elif here.number != at:
+            first = min(at, here.number)
+            why = "records were removed, moved, repeated or inserted"
+            return Finding(first, f"record {first} is not there once: {why}")
         elif at > 1 and (after is None or after.previous == here.digest):
             # The next record says that this one is as it was; of the last one nothing does.
             at, why = at - 1, f"record {at} is chained to another hash than it has"

@@ -109,16 +109,16 @@ def _maker(part: Any) -> Make:
     if not inspect.isclass(part):
         is_function = _by_methods(part) is None and callable(part)
         return part if is_function else lambda: copy.deepcopy(part)
-    given = {"lowest": -2.5, "dt": _DT} if hasattr(part, "judge") else {}
     by_name = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
     parameters = inspect.signature(part).parameters.values()
     needed = [one.name for one in parameters if one.default is one.empty and one.kind in by_name]
-    if not given.keys() >= set(needed):
+    if needed:
         raise TypeError(
             f"{part.__name__} needs arguments ({', '.join(needed)}); give an instance, or a "
             "function that makes one (--make on the command line)"
         )
-    return lambda: part(**{name: given[name] for name in needed})
+    make: Make = part
+    return make
 
 
 def _result(clause: Clause, make: Make) -> Result:

@@ -1,8 +1,4 @@
-"""A guard as a wrapper: any Gymnasium environment, or many at once, run under it.
-
-A policy, trained or in training, keeps its environment. Its actions are revised before they are
-executed, and the guard learns from what follows.
-"""
+"""A guard as a wrapper: any Gymnasium environment, or many at once, run under it."""
 
 from __future__ import annotations
 
@@ -137,12 +133,11 @@ class RevisedVectorActions(VectorWrapper[Any, Any, Any, Any, Any]):
     """Many environments at once under one guard, as `RevisedActions` does it for one.
 
     All profit from what each meets: the guard learns every environment's episode **as a whole when
-    it ends**, those that end in the same step in the order of the environments. So no transition
-    is taken for one of another environment, or across a reset. Within an episode a twin of the
-    guard (`Guard.copy`) decides, made as the episode begins: it knows the episodes that had ended
-    by then and learns from its own, but not from those that run alongside. With one environment
-    it comes to the same as `RevisedActions`, bit for bit. What you change about the guard, its
-    mode for example, counts in each environment from its next episode on.
+    it ends**, those that end in the same step in the order of the environments. Within an episode
+    a twin of the guard (`Guard.copy`) decides, made as the episode begins: it knows the episodes
+    that had ended by then and learns from its own, but not from those that run alongside. What you
+    change about the guard, its mode for example, counts in each environment from its next episode
+    on. With one environment it comes to the same as `RevisedActions`, bit for bit.
 
     Parameters
     ----------
@@ -165,11 +160,8 @@ class RevisedVectorActions(VectorWrapper[Any, Any, Any, Any, Any]):
     ``infos`` has the names of a single environment, as arrays over the environments, each with a
     mask as Gymnasium has it: ``_reviser/reason`` and so on are False where nothing was decided, in
     a step that only resets (``AutoresetMode.NEXT_STEP``) or after an episode that was not reset
-    (``DISABLED``). With ``SAME_STEP`` they describe the step that ended the episode. `revisions`
-    has the latest decisions.
-
-    All that begin together know equally little: with nothing learnt yet, each of them may fail
-    where one environment after another would have failed once.
+    (``DISABLED``). All that begin together know equally little: each of them may fail where one
+    environment after another would have failed once.
 
     Examples
     --------

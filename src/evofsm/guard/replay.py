@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from evofsm.fsm.observations import Missing
 from evofsm.guard.actions import Action
-from evofsm.guard.api import Proposal, Situation
+from evofsm.guard.api import Proposal
 from evofsm.guard.audit_log import (
     FIELDS,
     LOG_VERSION,
@@ -201,19 +201,21 @@ class _Player:
         return None
 
     def _play(self, content: Mapping[str, Any]) -> None:
-        kind = content["kind"]
+        kind, before = content["kind"], content.get("before", ())
         if kind == "start":
             self._start(content)
-        if self._guard is None or kind == "start":
             return
-        for row in content.get("before", ()):
+        if self._guard is None:
+            return
+        if not self._is_under_way and (before or kind in ("decision", "end")):
+            raise ValueError("it belongs to no episode")
+        for row in before:
             self._silent(self._guard, *row)
-        if kind == "begin":
+        if kind in ("begin", "settings"):
             self._set(self._guard, content["settings"])
+        if kind == "begin":
             self._guard.begin()
             self._is_under_way = True
-        elif kind == "settings":
-            self._set(self._guard, content["settings"])
         elif kind == "decision":
             self._decision(self._guard, content)
         elif kind == "end":
@@ -239,10 +241,8 @@ class _Player:
 
     @staticmethod
     def _set(guard: Guard, settings: Mapping[str, Any]) -> None:
-        guard.explaining, guard.missing = (
-            Explain(settings["explaining"]),
-            Missing(settings["missing"]),
-        )
+        guard.explaining = Explain(settings["explaining"])
+        guard.missing = Missing(settings["missing"])
         guard.interval = settings["interval"]
         if guard.learn != settings["learn"]:
             guard.learn = settings["learn"]
@@ -260,40 +260,37 @@ class _Player:
     ) -> None:
         """What was executed as it was proposed, or nothing was proposed to."""
         if action is None:
-            self._recognise(guard, time, observation)
+            guard.recognise(_floats(observation), _number(time))
             return
-        proposal = _proposal(action, candidates)
-        situation = self._recognise(guard, time, observation)
-        revision = guard.revise(situation, proposal)
-        if is_spoken(guard.reviser, revision):
-            told = decision_of(situation, proposal, revision)
+        when, told, speaks = self._again(guard, time, observation, action, candidates)
+        if speaks:
             raise _DiffersError(
-                f"the decision at {situation.time:g} s was recorded as nothing to speak of, but "
-                f"{revision.reason}",
+                f"{when} was recorded as nothing to speak of, but {told['reason']}",
                 (Field("executed", canonical(told["proposed"]), canonical(told["executed"])),),
             )
         self.decisions += 1
 
     def _decision(self, guard: Guard, content: Mapping[str, Any]) -> None:
-        proposal = _proposal(content["proposed"], content["candidates"])
-        situation = self._recognise(guard, content["time"], content["observation"])
-        revision = guard.revise(situation, proposal)
-        again = decision_of(situation, proposal, revision)
-        when = f"the decision at {situation.time:g} s"
-        if fields := _differing({name: content[name] for name in again}, again):
+        given = (content[name] for name in ("time", "observation", "proposed", "candidates"))
+        when, told, speaks = self._again(guard, *given)
+        if fields := _differing({name: content[name] for name in told}, told):
             raise _DiffersError(f"{when} comes out otherwise", fields)
-        if not is_spoken(guard.reviser, revision):
+        if not speaks:
             raise _DiffersError(f"{when} changed nothing")
         self.decisions += 1
 
-    def _recognise(self, guard: Guard, time: Any, observation: Sequence[Any]) -> Situation:
-        if not self._is_under_way:
-            raise ValueError("it belongs to no episode")
-        return guard.recognise(_floats(observation), _number(time))
+    @staticmethod
+    def _again(
+        guard: Guard, time: Any, observation: Any, action: Any, candidates: Any
+    ) -> tuple[str, dict[str, Any], bool]:
+        """Which decision it is, what is told of it, and whether it is one to speak of."""
+        proposal = Proposal(_action(action), tuple(_action(candidate) for candidate in candidates))
+        situation = guard.recognise(_floats(observation), _number(time))
+        revision = guard.revise(situation, proposal)
+        told = decision_of(situation, proposal, revision)
+        return f"the decision at {situation.time:g} s", told, is_spoken(guard.reviser, revision)
 
     def _end(self, guard: Guard, content: Mapping[str, Any]) -> None:
-        if not self._is_under_way:
-            raise ValueError("it belongs to no episode")
         last, failed = content["observation"], content["failed"]
         if not isinstance(failed, bool):
             raise ValueError(f"failed is {failed!r}")
@@ -314,10 +311,6 @@ def _number(value: Any) -> float:
 
 def _floats(values: Sequence[Any]) -> NDArray[np.float64]:
     return np.array([_number(value) for value in values])
-
-
-def _proposal(action: Any, candidates: Sequence[Any]) -> Proposal:
-    return Proposal(_action(action), tuple(_action(candidate) for candidate in candidates))
 
 
 def _action(action: Any) -> Action:
