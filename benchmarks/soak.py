@@ -30,7 +30,6 @@ _ROWS = 1_000_000
 MOST_OFF = 1e-9
 _RULES: dict[str, tuple[StateRule, int | None]] = {
     "paper": (Paper(), None),
-    "paper, memory of 100,000": (Paper(memory=100_000), 64),
     "novelty": (Novelty(radius=2.0, scales=(6.0, 3.0, 3.0)), None),
 }
 

@@ -76,7 +76,7 @@ def test_numbers_of_every_size_are_kept_and_read_again(snapshot, tmp_path):
         EvolvingFSM(2, max_states=3, rule=Novelty(2.0)),
         EvolvingFSM(2, radius=1e-9, distance_weight=1e50, prior_frequency=1e50),
         EvolvingFSM(2, radius=1e100, spread=1e100, prior_frequency=1e-300),
-        EvolvingFSM(2, rule=Paper(memory=2), belief_tolerance=1e-3, learning_rate=0.999),
+        EvolvingFSM(2, rule=Paper(), belief_tolerance=1e-3, learning_rate=0.999),
         EvolvingFSM(2, rule=Novelty(2.0), failure_horizon=2),
     ]
     for machine in machines:

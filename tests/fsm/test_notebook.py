@@ -65,7 +65,7 @@ def crowd():
 def test_a_machine_shows_its_states_and_where_it_is(machine):
     page = Reader(machine_html(machine))
     assert page.text.startswith("EvolvingFSM: 2 states, 2 actions, radius 0.5")
-    assert "rule Paper(memory=None), now in #2" in page.text
+    assert "rule Paper(), now in #2" in page.text
     assert column(page.rows, "state") == ["#1", "#2"]
     assert column(page.rows, "variable 0") == ["0", "1"]
     assert column(page.rows, "variable 1") == ["−7.5", "−7.5"]

@@ -25,7 +25,6 @@ RULES = {
     "paper": Paper(),
     "edges": Edges(),
     "novelty": Novelty(radius=1.5, scales=(2.0, 0.5), spread=0.7),
-    "edges, forgetting": Edges(memory=30),
 }
 
 
@@ -263,50 +262,6 @@ def test_as_many_scales_as_variables(snapshot):
 def test_settings_that_cannot_be_right(settings, words):
     with pytest.raises(ValueError, match=words):
         Novelty(**settings)
-
-
-# -- Forgetting ------------------------------------------------------------------------------------
-
-
-def two_regimes(rows=4000, seed=0):
-    rng = np.random.default_rng(seed)
-    before = rng.normal([0.0, 0.0], 1.0, (rows, 2))
-    after = rng.normal([30.0, -20.0], 1.0, (rows, 2))
-    return np.concatenate([before, after]), rng.integers(0, 2, 2 * rows)
-
-
-def variance(machine):
-    return machine.width / machine.spread
-
-
-@pytest.mark.parametrize("rule", [Paper, Edges])
-def test_up_to_its_memory_nothing_is_forgotten(rule, snapshot):
-    Z, I = two_regimes(300)
-    machines = EvolvingFSM(2, rule=rule()), EvolvingFSM(2, rule=rule(memory=600))
-    for machine in machines:
-        machine.learn_many(Z, I)
-    np.testing.assert_array_equal(machines[0].centers, machines[1].centers)
-    np.testing.assert_array_equal(machines[0].transition_matrices, machines[1].transition_matrices)
-    np.testing.assert_array_equal(machines[0].potentials, machines[1].potentials)
-
-
-def test_mean_and_variance_are_weighted_exponentially():
-    Z, I = two_regimes(100)
-    machine = EvolvingFSM(2, rule=Paper(memory=50))
-    machine.learn_many(Z, I)
-    share = 1.0 / 50.0
-    mean, var = Z[:50].mean(axis=0), Z[:50].var(axis=0).sum()
-    for z in Z[50:]:
-        off = z - mean
-        mean = mean + share * off
-        var = (1.0 - share) * (var + share * off @ off)
-    assert variance(machine) == pytest.approx(var, rel=1e-12)
-
-
-@pytest.mark.parametrize("memory", [0, 1, -3, 2.5, "long"])
-def test_a_memory_that_is_none_is_refused(memory):
-    with pytest.raises(ValueError, match="memory"):
-        Paper(memory=memory)
 
 
 # -- Ties ----------------------------------------------------------------------------------------

@@ -99,7 +99,6 @@ class Settings(NamedTuple):
     max_states: float  #: infinity for no limit
     failure_horizon: float  #: observations; infinity for all of an episode
     rule: int  #: which rule judges an observation, see `evofsm.fsm.rules`
-    memory: float  #: number of observations after which older ones fade; infinity: never
     weights: Floats  #: (m,) 1 / scale of each variable
 
 
@@ -213,7 +212,6 @@ def _optional(settings: Mapping[str, Any]) -> dict[str, Any]:
 
 
 _RULE: dict[str, Any] = {
-    "memory": FROM_1._replace(least=2.0),
     **dict.fromkeys(("radius", "spread"), SIZE),
     "scales": Numbers(("scales",), 1e-20, 1e20),
 }

@@ -1,9 +1,8 @@
 """Determine and recognise states: the paper's Sections 2.2.1 and 2.2.2.
 
 The density of observations at a place is its *potential*, a Cauchy kernel summed over the whole
-past, by two recursions: one for the present observation, one for the centres. The paper keeps
-running sums of z and z'z (its a_t, b_t, c_t). Those lose all digits where observations lie far from
-zero, so here are the same quantities in the form of mean and variance, the mean relative to the
+past. The paper keeps running sums of z and z'z (its a_t, b_t, c_t), which lose all digits where
+observations lie far from zero. So here is the same by mean and variance, the mean relative to the
 first observation::
 
     potential of z_t = 1 / (1 + |z_t - mean|^2 + variance),   both over z_1 .. z_{t-1}
@@ -61,7 +60,7 @@ def determine(learnt: Learnt, settings: Settings, z: Floats) -> tuple[int, int, 
                 learnt.centers[j, nearest] = z[j]
             learnt.potentials[nearest] = potential
             learnt.squared_distances[nearest] = 0.0
-    _absorb(now, learnt.variables, weights, z, settings.memory)
+    _absorb(now, learnt.variables, weights, z)
     return event, nearest, potential
 
 
@@ -134,7 +133,7 @@ def _update_potentials(learnt: Learnt, settings: Settings, n: int) -> float:
     It needs the distances to z_{t-1}, which are still at hand from the step before.
     """
     potentials, squared_distances = learnt.potentials, learnt.squared_distances
-    t = min(float(learnt.now[0].n_observations), settings.memory) + 1.0
+    t = learnt.now[0].n_observations + 1.0
     for i in range(lanes(n)):
         potential = potentials[i]
         far = 1.0 + settings.distance_weight * squared_distances[i]
@@ -146,14 +145,9 @@ def _update_potentials(learnt: Learnt, settings: Settings, n: int) -> float:
 
 
 @inner_kernel
-def _absorb(now: Any, variables: Records, weights: Floats, z: Floats, memory: float) -> None:
-    """Add the observation to the running mean and scatter (Welford 1962).
-
-    Beyond ``memory`` observations both are exponentially weighted (West 1979): each new one takes
-    the place of a share of all before it.
-    """
-    n_observations = now.n_observations + 1.0
-    share = 1.0 / min(n_observations, memory)
+def _absorb(now: Any, variables: Records, weights: Floats, z: Floats) -> None:
+    """Add the observation to the running mean and scatter (Welford 1962)."""
+    share = 1.0 / (now.n_observations + 1.0)
     added = 0.0
     for j in range(len(z)):
         variable = variables[j]
@@ -163,10 +157,6 @@ def _absorb(now: Any, variables: Records, weights: Floats, z: Floats, memory: fl
         mean = variable.mean + before * share
         variable.mean = mean
         added += (before * weights[j]) * ((offset - mean) * weights[j])
-    if n_observations > memory:  # the scatter is always the variance times their number
-        grown = n_observations / (n_observations - 1.0)
-        now.scatter *= (1.0 - share) * grown
-        added *= share * n_observations
     now.n_observations += 1
     now.scatter += added
 

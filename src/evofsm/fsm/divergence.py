@@ -87,8 +87,7 @@ def jensen_shannon(p: ArrayLike, q: ArrayLike) -> Any:
     >>> jensen_shannon([[0.5, 0.5], [1.0, 0.0]], [0.5, 0.5]).round(3)
     array([0.   , 0.311])
     """
-    p = np.asarray(p, dtype=np.float64)
-    q = np.asarray(q, dtype=np.float64)
+    p, q = np.asarray(p, dtype=np.float64), np.asarray(q, dtype=np.float64)
     if p.ndim == 0 or q.ndim == 0 or p.shape[-1] != q.shape[-1]:
         raise ValueError(
             f"p has shape {p.shape} and q has shape {q.shape}: "
@@ -107,11 +106,6 @@ def jensen_shannon(p: ArrayLike, q: ArrayLike) -> Any:
 
 
 @kernel
-def _jensen_shannon_rows(
-    p: Floats,
-    q: Floats,
-    terms: Floats,
-    result: Floats,
-) -> None:
+def _jensen_shannon_rows(p: Floats, q: Floats, terms: Floats, result: Floats) -> None:
     for row in range(len(result)):
         result[row] = jensen_shannon_kernel(p[row], q[row], p.shape[1], terms)

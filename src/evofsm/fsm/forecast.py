@@ -1,23 +1,21 @@
 """Forecasts of the state some steps ahead, each horizon learnt by itself.
 
-A machine's matrices say what the next step brings (the paper's Section 2.3). Raised to a power they
-answer for later ones as well, but poorly: each step smears a belief once more, and what a Markov
-chain of states forgets, such as whether one has been braking, stays forgotten. Here every horizon
-has matrices of its own, which go from the belief then straight to the belief h steps later, and a
+Powers of a machine's matrices (the paper's Section 2.3) forecast later steps poorly: each one
+smears a belief once more, and forgets what a chain of states forgets. Here every horizon has
+matrices of its own, which go from the belief then straight to the belief h steps later, and a
 transition is counted by how likely it is, given both ends::
 
     xi_ij = tau_i P_ij gamma_j / (tau P)_j
 
 This is the E-step of Baum and Welch (1970), taken online (Cappe & Moulines, J. R. Stat. Soc. B 71,
 2009). It climbs the expected log score ``sum_j gamma_j log (tau P)_j``, which is concave in P, and
-persistence is one of the P that it climbs over: where nothing better can be learnt, the forecast
-stays as good as "it stays as it is".
+persistence is one P of those: where nothing better can be learnt, the forecast stays as good.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, SupportsIndex
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -38,9 +36,8 @@ _TINY = 1e-300
 class Forecasts:
     """Forecasts of the state a number of steps ahead, learnt alongside a machine.
 
-    They share the machine's states, and look at observations through a snapshot of it: hand over
-    each episode when it is over, and the machine has learnt it. States that the machine gives up
-    (``max_states``) are not followed. Counts never forget.
+    They look at observations through a snapshot of the machine: hand over each episode when it is
+    over, and the machine has learnt it. Counts never forget.
 
     Parameters
     ----------
@@ -78,8 +75,7 @@ class Forecasts:
         self.steps = tuple(whole("a horizon", h) for h in steps)
         if not self.steps or len(set(self.steps)) < len(self.steps):
             raise ValueError(f"steps are {tuple(steps)}; there must be one or more, each once")
-        self.evidence = positive("evidence", evidence)
-        self.moved = positive("moved", moved)
+        self.evidence, self.moved = positive("evidence", evidence), positive("moved", moved)
         if self.moved >= 1.0:
             raise ValueError(f"moved is {moved}; it must lie below 1")
         #: Number of states of the latest snapshot that was learnt through.
@@ -89,7 +85,7 @@ class Forecasts:
         # For each horizon, evidence that beliefs stay, and that they move; and (n, n) counts, by
         # action, with those of all actions together at NO_ACTION.
         self._moving = [np.array([1.0 - self.moved, self.moved]) for _ in self.steps]
-        self._counts: list[dict[int, Floats]] = [{NO_ACTION: np.zeros((0, 0))} for _ in self.steps]
+        self._counts: list[dict[int, Floats]] = [{} for _ in self.steps]
 
     def learn(
         self,
@@ -104,12 +100,8 @@ class Forecasts:
         ----------
         model : FSMModel
             Snapshot of the machine that has learnt these rows, ``machine.model()``.
-        Z : (T, m) array_like
-            Observations, evenly spaced in time, as the machine's.
-        I : (T,) array_like of int
-            The action taken after each row; -1 where none is known.
-        episode_starts : (E,) array_like of int
-            Rows at which an episode begins; the first one does anyway.
+        Z, I, episode_starts
+            As `EvolvingFSM.learn_many` takes them; the first row begins an episode anyway.
         """
         beliefs = np.atleast_2d(model.recognise(valid.real_rows("observations", Z)))
         actions = valid.check_actions(I, len(beliefs), self.n_actions)
@@ -136,46 +128,32 @@ class Forecasts:
         belief : (n,) or (T, n) array_like
             Present distribution over states, or many.
         i : int, or (T,) array_like of int, optional
-            Action that is taken now; what comes after it is not told, and goes as it usually went.
-            Without it, or where it is -1, all actions together answer.
+            Action that is taken now. Without it, or where it is -1, all actions together answer.
         steps : int
             One of the horizons.
         """
         rows = valid.real_rows("belief", np.atleast_2d(belief))
         valid.refuse_unless_distribution("belief", rows)
         self._check_states(rows.shape[1])
-        horizon, given = self._horizon(steps), np.asarray(NO_ACTION if i is None else i)
-        given = np.broadcast_to(given, len(rows))
+        if steps not in self.steps:
+            known = ", ".join(map(str, self.steps))
+            raise ValueError(f"there is no horizon of {steps} steps; there are {known}")
+        given = np.broadcast_to(np.asarray(NO_ACTION if i is None else i), len(rows))
         actions = valid.check_actions(given, len(rows), self.n_actions)
-        predicted, n = rows.copy(), self.n_states
+        predicted, n = rows.copy(), np.arange(self.n_states)
         for action in np.unique(actions).tolist():
-            of_it = actions == action
-            predicted[of_it, :n] = rows[of_it, :n] @ self._matrix(horizon, action)
+            of_it = np.ix_(actions == action, n)
+            predicted[of_it] = rows[of_it] @ self._matrix(self.steps.index(steps), action, n, n)
         return predicted if np.ndim(belief) == 2 else predicted[0]
-
-    def matrix(self, i: SupportsIndex | None, steps: int) -> Floats:
-        """(n, n) transition probabilities over a horizon, from state (row) to state (column).
-
-        Parameters
-        ----------
-        i : int, optional
-            Action taken at first; None for all together.
-        steps : int
-            One of the horizons.
-        """
-        action = NO_ACTION if i is None else valid.check_action(i, self.n_actions)
-        return self._matrix(self._horizon(steps), action)
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}(n_actions={self.n_actions}, steps={self.steps})"
 
-    def _matrix(self, horizon: int, action: int, i: Any = None, j: Any = None) -> Floats:
-        """Transition probabilities under an action, presumed to lead where all lead together.
+    def _matrix(self, horizon: int, action: int, i: Any, j: Any) -> Floats:
+        """Transition probabilities from states i to states j under an action.
 
-        Of all states, or from some of them, i, to some of them, j.
+        It is presumed to lead where all lead together.
         """
-        n = np.arange(self.n_states)
-        i, j = (n, n) if i is None else (i, j)
         block, stays = np.ix_(i, j), i[:, None] == j
         share = self._moving[horizon][1] / self._moving[horizon].sum()
         presumed = share * self._elsewhere[block] + (1.0 - share) * stays
@@ -200,13 +178,6 @@ class Forecasts:
         for one, pairs in likely.items():
             counts[one][np.ix_(i, j)] += pairs * (reached[j] / np.maximum(pairs.sum(axis=0), _TINY))
 
-    def _horizon(self, steps: int) -> int:
-        """Index of a horizon."""
-        if steps not in self.steps:
-            known = ", ".join(map(str, self.steps))
-            raise ValueError(f"there is no horizon of {steps} steps; there are {known}")
-        return self.steps.index(steps)
-
     def _check_states(self, n: int) -> int:
         """A number of states that can be of the same machine, later on."""
         if n < self.n_states:
@@ -220,6 +191,4 @@ class Forecasts:
         counts, n = self._counts[horizon], self.n_states
         for action in {NO_ACTION, *np.unique(actions).tolist()} | set(counts):
             old = counts.get(action, np.zeros((0, 0)))
-            if len(old) < n:
-                counts[action] = np.zeros((n, n))
-                counts[action][: len(old), : len(old)] = old
+            counts[action] = np.pad(old, (0, n - len(old)))

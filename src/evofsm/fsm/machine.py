@@ -173,7 +173,6 @@ class EvolvingFSM(_Arrays):
             max_states=_or_infinity("max_states", max_states),
             failure_horizon=_or_infinity("failure_horizon", failure_horizon),
             rule=PAPER,
-            memory=np.inf,
             weights=np.empty(0),
         )
         table = {name: float(value) for name, value in self._rule.table.items() if name != "rule"}

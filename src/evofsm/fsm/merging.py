@@ -1,15 +1,14 @@
 """Merge machines that learnt apart into one: what a fleet knows, or the shards of a log.
 
-Three steps. *Match*: the centres of all parts, strongest first, each join the nearest state within
-a radius or create one. *Add up*: what was counted, and what potentials are made of, are sums over
-observations. *Combine*: rows of matrices by the decisions that they rest on, after taking out of
-each what is left in it of its prior::
+*Match*: the centres of all parts, strongest first, each join the nearest state within a radius or
+create one. *Add up*: counts, and what potentials are made of, are sums over observations.
+*Combine*: rows of matrices by the decisions that they rest on, without what is left of the prior::
 
     F_k = evidence_k + what its prior left       for each row of each part k (`transitions`)
     row = sum_k decisions_k * evidence_k / |evidence_k|        then the prior again, once
 
-Every step is symmetric in the parts, which are put in an order of their own first: in whatever
-order they are given, the answer is the same bit for bit.
+The parts are put in an order of their own first: in whatever order they are given, the answer is
+the same bit for bit.
 """
 
 from __future__ import annotations
@@ -36,36 +35,27 @@ _SAME = 0.01
 def merge(machines: Sequence[EvolvingFSM], *, radius: float | None = None) -> EvolvingFSM:
     """Merge machines that learnt apart into one that can go on learning.
 
-    The parts stay as they are. The merged machine stands between two episodes; its states are
-    numbered by the most visits that a part paid them.
+    The merged machine stands between two episodes; its states are numbered by the most visits that
+    a part paid them.
 
     Parameters
     ----------
     machines : sequence of EvolvingFSM
-        The parts, with the same settings. They must have learnt apart: what two of them have in
-        common, because both began as a copy of a machine that knew something, counts twice.
+        The parts, with the same settings. What two of them have in common, because both began as a
+        copy of a machine that knew something, counts twice.
     radius : float, optional
         How far from a centre others are still of the same state, in the scales of the rule;
         without it the rule's own radius.
 
-    Raises
-    ------
-    TypeError, ValueError
-        If there is none, something else is among them, or two have different settings or numbers
-        of variables.
-
     Notes
     -----
-    *States.* By visits, strongest first, a centre joins the nearest state within ``radius``, else
-    it creates one. So a merged centre remains an observation that was made, and all remain farther
-    apart than ``radius``. Where ``max_states`` exist, the others join the nearest.
-    `Paper` and `Edges` take centres for the same only within a small radius: give a larger one, or
-    ``max_states``.
+    A merged centre is an observation that was made, and all are farther apart than ``radius``.
+    Where ``max_states`` exist, the others join the nearest. `Paper` and `Edges` take centres for
+    the same only within a small radius: give a larger one, or ``max_states``.
 
-    *Rows* count by decisions, which never forget; their weight F_o becomes the mean of the parts',
-    by decisions. *The prior* of new states is taken out of each part's rows and put in once: an
-    average would keep it, however many parts agree. Mean and scatter are pooled exactly [1]_, and
-    a centre's potential is what the recursion would have made of the data of all other parts.
+    The weight F_o of a row becomes the mean of the parts', by decisions. Mean and scatter are
+    pooled exactly [1]_, and a centre's potential is what the recursion would have made of the data
+    of all other parts.
 
     References
     ----------
@@ -134,11 +124,6 @@ def _refuse_unlike(machines: Iterable[EvolvingFSM]) -> list[EvolvingFSM]:
                     f"{name} of machine {number} is {given!r}, but {expected!r} of machine 0; "
                     "machines to merge must have the same settings"
                 )
-    if np.isfinite(opened(parts[0])[1].memory):
-        raise ValueError(
-            f"machines with {parts[0].rule} cannot be merged: what each still remembers depends on "
-            "when it saw it"
-        )
     return parts
 
 
@@ -263,8 +248,7 @@ def _prior_left(joint: Floats, uses: Floats, settings: Settings) -> Floats:
 
     A state's creation gives the prior frequency to all transitions between it and those before,
     which then age alike. Where the least of those into it and the least of those out of it agree,
-    this is what is left; else it is as much as all uses would leave, which is less. (Where an
-    index was given to a newer state, less is found than there is.)
+    this is what is left; else it is as much as all uses would leave, which is less.
     """
     states = np.arange(joint.shape[-1])
     between = np.where(states[:, None] == states, np.inf, joint)

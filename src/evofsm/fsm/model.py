@@ -89,7 +89,7 @@ class FSMModel(Counts):
     >>> trace = machine.learn_many([[0.0], [0.1], [2.0], [1.0]], [0, 0, 0, 0])
     >>> model = machine.model(names=["gap"], units=["m"])
     >>> model
-    FSMModel(2 states of gap, 2 actions, 4 observations, Paper(memory=None))
+    FSMModel(2 states of gap, 2 actions, 4 observations, Paper())
     >>> model.n_states, model.visits, model.created
     (2, array([3., 1.]), array([1., 4.]))
     >>> model.recognise([[0.0], [0.5]]).round(3)

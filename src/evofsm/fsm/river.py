@@ -24,25 +24,20 @@ _ACTION = 0
 class RiverClusterer(base.Clusterer):
     """The states of an `EvolvingFSM` as the clusters of a River clusterer.
 
-    It observes features of fixed names, whatever their order. One that is absent, None or NaN was
-    *not observed*, which is not to say that it is 0: such an observation is recognised by the
-    features that are there, creates and moves no state, and teaches no transition. A feature that
-    is not among those observed is left out.
+    A feature that is absent, None or NaN was *not observed*: such an observation is recognised by
+    the features that are there, creates and moves no state, and teaches no transition.
 
     Parameters
     ----------
     features : sequence of hashable, optional
-        Names of the features that are observed. Without them, those of the first observation
-        that holds any; name them where it may lack some.
+        Names of the features that are observed; without them, those of the first observation.
     radius, learning_rate, spread, rule, max_states : optional
-        As `EvolvingFSM` takes them; ``radius`` in the unit of the features, which all count
-        alike: scale them first.
+        As `EvolvingFSM` takes them. All features count alike: scale them first.
 
     Attributes
     ----------
     machine : EvolvingFSM
-        With one action: ``machine.predict(0)`` forecasts the next state, and
-        ``machine.start_episode()`` says that the next observation does not follow from the last.
+        With one action: ``machine.predict(0)`` forecasts the next state.
 
     Examples
     --------

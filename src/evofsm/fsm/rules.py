@@ -1,7 +1,6 @@
 """State rules: when an observation creates or moves a state, and how wide a state is recognised.
 
-A rule is a frozen dataclass of settings. Its ``table`` has the numbers by which the kernel judges
-an observation (`evofsm.fsm.clusters.determine`).
+Its ``table`` has the numbers by which `evofsm.fsm.clusters.determine` judges an observation.
 """
 
 from __future__ import annotations
@@ -14,7 +13,7 @@ from typing import Any, ClassVar, Protocol, cast
 import numpy as np
 
 from evofsm.fsm.clusters import EDGES, NOVELTY, PAPER
-from evofsm.fsm.validation import Floats, positive, whole
+from evofsm.fsm.validation import Floats, positive
 
 # Squares of observations over the scales, summed over a long run, must not overflow.
 _SCALES = 1e-20, 1e20
@@ -25,9 +24,8 @@ _WIDTHS = 2.0
 class StateRule(Protocol):
     """When an observation creates or moves a state, and how wide a state is recognised.
 
-    A rule is a frozen dataclass of settings, made known with `register_rule`: a small table of
-    numbers for the kernel that judges an observation, which is that of a rule there is or, in the
-    package, one of its own. All distances are those of observations divided by the rule's scales.
+    A rule is a frozen dataclass of settings, made known with `register_rule`. All distances are
+    those of observations divided by the rule's scales.
 
     Examples
     --------
@@ -42,7 +40,7 @@ class StateRule(Protocol):
 
     @property
     def table(self) -> Mapping[str, float]:
-        """What its kernel judges by: fields of `Settings`, in place of the machine's."""
+        """What the kernel judges by: fields of `Settings`, in place of the machine's."""
         ...
 
 
@@ -52,13 +50,7 @@ class Paper:
 
     An observation that is denser than every centre moves the nearest one if that is closer than the
     machine's ``radius``, else it creates a state. The width of recognition is ``spread`` times the
-    total variance of all observations: the more data vary, the wider states are recognised.
-
-    Parameters
-    ----------
-    memory : int, optional
-        Number of observations, at least 2, after which older ones fade, so that densities and
-        variances are those of the recent past: for regimes that change. Without it all count alike.
+    total variance of all observations.
 
     Examples
     --------
@@ -68,20 +60,13 @@ class Paper:
     array([1, 1, 1, 2])
     """
 
-    memory: int | None = None
     scales: ClassVar[Sequence[float]] = ()
     _rule: ClassVar[int] = PAPER
-
-    def __post_init__(self) -> None:
-        if self.memory is not None:
-            object.__setattr__(self, "memory", whole("memory", self.memory))
-            if self.memory == 1:
-                raise ValueError("memory is 1; of one observation nothing can be said to vary")
 
     @property
     def table(self) -> Mapping[str, float]:
         """What the kernel judges by."""
-        return {"rule": self._rule, "memory": self.memory or math.inf}
+        return {"rule": self._rule}
 
 
 @dataclass(frozen=True)
@@ -115,8 +100,7 @@ class Novelty:
     radius : float
         Distance, in scales, beyond which an observation creates a state.
     scales : sequence of float
-        For each of the m variables, the difference that counts as 1, in the variable's unit, so
-        that a metre and a metre per second may count differently; empty: 1 for each.
+        For each of the m variables, the difference that counts as 1; empty: 1 for each.
     spread : float
         Width of recognition in squared radii: the similarity to a centre is
         ``exp(-distance^2 / (spread * radius^2))``.
@@ -207,10 +191,9 @@ def reach(rule: StateRule, width: float) -> float:
 
 
 def describe_rule(rule: StateRule) -> dict[str, Any]:
-    """A rule in plain JSON: its name and its settings, but for those that are None."""
+    """A rule in plain JSON: its name and its settings."""
     name, kind = next(item for item in _RULES.items() if item[1] is type(rule))
-    given = {entry.name: getattr(rule, entry.name) for entry in fields(kind)}
-    return {"name": name} | {key: value for key, value in given.items() if value is not None}
+    return {"name": name} | {entry.name: getattr(rule, entry.name) for entry in fields(kind)}
 
 
 def restore_rule(description: Mapping[str, Any]) -> StateRule:

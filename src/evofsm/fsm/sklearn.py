@@ -20,20 +20,17 @@ with needs("scikit-learn", "sklearn", "a clusterer of scikit-learn"):
 class EvolvingClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc] # both are untyped
     """The states of an `EvolvingFSM` as the clusters of a scikit-learn clusterer.
 
-    Rows are observations in the order of time. Their order matters: states are created and moved
-    as the rows come, and how one follows another is learnt as well.
+    Rows are observations in the order of time, which matters.
 
     Parameters
     ----------
     radius, learning_rate, spread, rule, max_states : optional
-        As `EvolvingFSM` takes them; ``radius`` in the unit of the features, which all count
-        alike: scale them first.
+        As `EvolvingFSM` takes them. All features count alike: scale them first.
 
     Attributes
     ----------
     machine_ : EvolvingFSM
-        With one action: ``machine_.predict(0)`` forecasts the next state, and
-        ``machine_.start_episode()`` says that the next row does not follow from the last.
+        With one action: ``machine_.predict(0)`` forecasts the next state.
     labels_ : (N,) ndarray of int
         State that each row of the latest batch was recognised as when it was learnt; `predict`
         goes by the states of now.
