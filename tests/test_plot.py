@@ -6,7 +6,7 @@ import matplotlib
 import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.colors import same_color, to_rgba
+from matplotlib.colors import same_color
 from matplotlib.figure import Figure
 
 from evofsm import EvolvingFSM, IntervalActions, Novelty, plot
@@ -48,28 +48,13 @@ def saved():
     return driven(Mode.ACT)
 
 
-@pytest.fixture(scope="module")
-def lost():
-    return driven(Mode.SHADOW)
-
-
 def test_they_answer_with_the_axes_they_were_given_and_leave_the_style(machine, model, saved):
     before = dict(matplotlib.rcParams)
-    for draw in (*OF_A_MODEL, lambda model, ax: plot.belief([machine.belief], ax)):
+    given = [*((draw, model) for draw in OF_A_MODEL), (plot.belief, [machine.belief])]
+    for draw, what in (*given, (plot.risk, saved), (plot.accelerations, saved)):
         ax = new()
-        assert draw(model, ax) is ax
-    for draw in (plot.risk, plot.accelerations):
-        ax = new()
-        assert draw(saved, ax) is ax
+        assert draw(what, ax) is ax
     assert dict(matplotlib.rcParams) == before
-
-
-def test_without_axes_they_make_some_of_pyplot(model):
-    from matplotlib import pyplot
-
-    ax = plot.graph(model)
-    assert ax.figure.number in pyplot.get_fignums()
-    pyplot.close(ax.figure)
 
 
 def test_type_has_the_size_and_colour_of_the_users_style(model):
@@ -126,11 +111,10 @@ def test_transitions_are_those_of_the_action_or_of_all(model, action):
     ax = plot.transitions(model, new(), action=action, dead_ends=[2])
     matrix = model.averaged_matrix() if action is None else model.transition_matrices[action]
     assert np.array_equal(ax.images[0].get_array(), matrix)
-    assert texts(ax) == [f"{100 * value:.0f}" for value in matrix.ravel()]
+    assert texts(ax) == [f"{100 * value:.0f} %" for value in matrix.ravel()]
     assert ax.get_title().startswith("all actions" if action is None else f"a({action + 1})  ")
-    ticks = ax.get_xticklabels()
-    assert [tick.get_text() for tick in ticks] == ["1", "2", "3"]
-    assert [tick.get_fontweight() == "bold" for tick in ticks] == [False, False, True]
+    bold = [tick.get_fontweight() == "bold" for tick in ax.get_xticklabels()]
+    assert bold == [False, False, True]
     assert ax.get_xlabel() == "to state (bold: dead end)"
 
 
@@ -146,12 +130,10 @@ def test_what_a_model_does_not_have_is_named(model):
         plot.transitions(model, new(), action=2)
 
 
-@pytest.mark.parametrize("n", [1, 30])
-def test_one_state_and_many_can_be_drawn(n):
+def test_many_states_can_be_drawn():
     machine = EvolvingFSM(n_actions=1, rule=Novelty(radius=0.5))
-    Z = np.column_stack([np.arange(n), np.arange(n) ** 2])
-    trace = machine.learn_many(Z, np.zeros(n, np.int64), belief=True)
-    assert machine.n_states == n
+    Z = np.column_stack([np.arange(30), np.arange(30) ** 2])
+    trace = machine.learn_many(Z, np.zeros(30, np.int64), belief=True)
     axes = [draw(machine.model(), new(), dead_ends=[0]) for draw in OF_A_MODEL]
     for ax in (*axes, plot.belief(trace, new())):
         FigureCanvasAgg(ax.figure).draw()
@@ -198,12 +180,11 @@ def test_accelerations_are_what_was_proposed_and_executed(saved):
     assert saved.changed.any()
     assert np.array_equal(drawn["proposed"].get_ydata()[:-1], saved.proposed)
     assert np.array_equal(drawn["executed"].get_ydata()[:-1], saved.executed)
-    tint = to_rgba(plot.COLORS["dead end"], 0.25)
-    assert same_color(ax.collections[0].get_facecolor()[0], tint)
 
 
 @pytest.mark.parametrize("draw", [plot.risk, plot.accelerations])
-def test_a_collision_is_marked_where_there_was_one(draw, saved, lost):
+def test_a_collision_is_marked_where_there_was_one(draw, saved):
+    lost = driven(Mode.SHADOW)
     assert (saved.collided, lost.collided) == (False, True)
     assert lines(draw(lost, new()))["collision"].get_xdata()[0] == lost.time[-1]
     assert "collision" not in lines(draw(saved, new()))

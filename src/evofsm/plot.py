@@ -1,8 +1,7 @@
 """Plots of a model, of beliefs and of a drive, on axes that are given or new, which they return.
 
-They draw in whatever style holds, and set none. Data on the axes count states and actions from 0,
-as the code does, and labels from 1. A dead end differs by its shape or in words, so that nothing
-rests on colour. The same colours stand in ``io/graphs.py`` and ``cli/watch/live/page.css``.
+They set no style. Data on the axes count states and actions from 0, labels from 1. Nothing rests on
+colour alone. The same colours stand in ``io/graphs.py`` and ``cli/watch/live/page.css``.
 """
 
 from __future__ import annotations
@@ -34,6 +33,7 @@ __all__ = ["COLORS", "accelerations", "belief", "graph", "risk", "states", "tran
 
 Look = dict[str, Any]  # how something is drawn, as matplotlib is told
 States = Collection[int]  # indices
+Point = tuple[float, float]
 
 #: Okabe and Ito's colours, which colour-blind readers can tell apart.
 COLORS = {
@@ -55,8 +55,8 @@ def states(
 ) -> Axes:
     """Centres of the states in the plane of two variables.
 
-    A state is recognised by the distance in all variables, so that no plane alone decides. Where
-    discs would overlap they are moved apart. What is on the axes before sets their limits as well.
+    Where discs would overlap they are moved apart. What is on the axes before sets their limits as
+    well.
 
     Parameters
     ----------
@@ -141,8 +141,8 @@ def transitions(
     >>> machine = EvolvingFSM(n_actions=2, radius=0.5)
     >>> trace = machine.learn_many([[0.0], [0.1], [2.0], [1.0]], [0, 0, 0, 0])
     >>> ax = plot.transitions(machine.model(), Figure().subplots(), action=0)
-    >>> [text.get_text() for text in ax.texts]  # in %
-    ['77', '23', '50', '50']
+    >>> [text.get_text() for text in ax.texts]
+    ['77 %', '23 %', '50 %', '50 %']
     """
     _refuse_unknown(model.n_states, dead_ends)
     if action is not None and not 0 <= action < model.n_actions:
@@ -154,21 +154,18 @@ def transitions(
     ax.grid(False)
     ax.spines[:].set_visible(False)
     for i, j in np.ndindex(matrix.shape) if len(matrix) <= _VALUES else ():
-        look: Look = {"ha": "center", "va": "center_baseline", "fontsize": points(7.0)}
         color = "white" if scale(matrix[i, j]) > 0.68 else COLORS["ink"]
-        ax.text(j, i, f"{100 * matrix[i, j]:.0f}", color=color, **look)
+        look: Look = {"ha": "center", "va": "center_baseline", "fontsize": points(7.0)}
+        ax.text(j, i, f"{100 * matrix[i, j]:.0f} %", color=color, **look)
     title = "all actions, as used"
     if action is not None:
-        name = f"a({action + 1})"
-        if model.actions is not None:
-            name += f"  {model.actions.label(action)}".replace("-", "−") + " m/s²"
-        title = f"{name}\n{model.uses[action]:,.0f} transitions"
+        interval = "" if model.actions is None else f"  {model.actions.label(action)}"
+        title = f"a({action + 1}){interval}\n{model.uses[action]:,.0f} transitions"
     ax.set_title(title)
     for axis, way in ((ax.xaxis, "to"), (ax.yaxis, "from")):
         label_states(axis, model.n_states, dead_ends)
         axis.set_label_text(f"{way} state" + (" (bold: dead end)" if dead_ends else ""))
-    written = ", written in %" if model.n_states <= _VALUES else ""
-    ax.figure.colorbar(image, ax=ax, label=f"probability of the next state{written}")
+    ax.figure.colorbar(image, ax=ax, label="probability of the next state")
     return ax
 
 
@@ -204,9 +201,8 @@ def belief(
     >>> from evofsm import EvolvingFSM, plot
     >>> machine = EvolvingFSM(n_actions=1, radius=0.5)
     >>> trace = machine.learn_many([[0.0], [0.1], [2.0], [1.0]], [0] * 4, belief=True)
-    >>> ax = plot.belief(trace, Figure().subplots(), time=[0.0, 0.1, 0.2, 0.3])
-    >>> ax.get_xlabel(), ax.lines[0].get_ydata()  # from 0: #2 at last
-    ('time [s]', array([0, 0, 0, 1]))
+    >>> plot.belief(trace, Figure().subplots()).lines[0].get_ydata()  # from 0: #2 at last
+    array([0, 0, 0, 1])
     """
     held = belief.belief if isinstance(belief, Trace) else belief
     if held is None:
@@ -225,8 +221,8 @@ def belief(
     ax.grid(False)
     if n <= _DISCS:  # among more it would hide the belief
         look = {"where": "mid", "color": COLORS["ink"], "label": "most probable state"}
-        (line,) = ax.step(when, rows.argmax(axis=1), **look)
-        line.set_path_effects([withStroke(linewidth=3.0, foreground="white")])
+        look["path_effects"] = [withStroke(linewidth=3.0, foreground="white")]
+        ax.step(when, rows.argmax(axis=1), **look)
         _explain(ax)
     label_states(ax.yaxis, n, dead_ends, called="dead end")
     ax.set(ylabel="state", xlabel="observation" if time is None else "time [s]")
@@ -258,8 +254,7 @@ def risk(drive: Episode, ax: Axes | None = None, *, tolerance: float | None = No
         label = f"tolerance, {tolerance:g}"
         ax.axhline(tolerance, color=ink(), linestyle=":", linewidth=1.0, label=label)
     ax.set(ylim=(-0.03, 1.03), ylabel="latent risk")
-    _finish(ax, drive, 0.0)
-    return ax
+    return _finished(ax, drive, 0.0)
 
 
 def accelerations(drive: Episode, ax: Axes | None = None) -> Axes:
@@ -289,8 +284,7 @@ def accelerations(drive: Episode, ax: Axes | None = None) -> Axes:
     both = drive.proposed, drive.executed
     _draw_decisions(ax, drive, both, both, "dead end", "revised")
     ax.set_ylabel("acceleration [m/s²]")
-    _finish(ax, drive, float(drive.executed[-1]))
-    return ax
+    return _finished(ax, drive, float(drive.executed[-1]))
 
 
 def _draw_decisions(
@@ -310,19 +304,20 @@ def _draw_decisions(
     ax.step(when, executed, where="post", color=COLORS["follower"], label="executed")
 
 
-def _finish(ax: Axes, drive: Episode, y: float) -> None:
-    """Mark a collision at height ``y``, and explain."""
+def _finished(ax: Axes, drive: Episode, y: float) -> Axes:
+    """With a collision marked at height ``y``, and explained."""
     if drive.collided:
         draw_collision(ax, float(drive.time[-1]), y)
         ax.lines[-1].set_label("collision")
     ax.set_xlabel("time [s]")
     _explain(ax)
+    return ax
 
 
 def _explain(ax: Axes) -> None:
     """Put the legend above, where it hides nothing."""
     look: Look = {"loc": "lower left", "bbox_to_anchor": (0.0, 1.0), "borderaxespad": 0.2}
-    ax.legend(columnspacing=1.2, fontsize=points(7.5), frameon=False, ncols=3, **look)
+    ax.legend(fontsize=points(7.5), frameon=False, ncols=3, **look)
 
 
 def _given_or_new(ax: Axes | None) -> Axes:
@@ -357,13 +352,7 @@ def ink(share: float = 1.0) -> str:
 
 
 def write(
-    axes: Axes,
-    text: str,
-    xy: tuple[float, float],
-    offset: tuple[float, float] = (0.0, 0.0),
-    *,
-    size: float = 7.0,
-    **look: Any,
+    axes: Axes, text: str, xy: Point, offset: Point = (0.0, 0.0), *, size: float = 7.0, **look: Any
 ) -> Annotation:
     """Write beside a place, ``offset`` points from it."""
     given = {"textcoords": "offset points", "annotation_clip": False, "va": "center", **look}
@@ -377,8 +366,8 @@ def mark(axes: Axes, x: float, y: float, **look: Any) -> None:
 
 def draw_collision(axes: Axes, x: float, y: float) -> None:
     """Mark where a run ended in a collision."""
-    white: Look = {"markeredgecolor": "white", "markeredgewidth": 0.7}
-    mark(axes, x, y, color=COLORS["ink"], marker="X", markersize=8, zorder=7, **white)
+    look: Look = {"marker": "X", "markersize": 8, "markeredgecolor": "white"}
+    mark(axes, x, y, color=COLORS["ink"], markeredgewidth=0.7, zorder=7, **look)
 
 
 def draw_state(
@@ -445,17 +434,12 @@ def draw_chain(
     for state, ((x, y), note) in enumerate(zip(places, notes, strict=True)):
         dead_end = state in dead_ends
         draw_state(axes, x, y, state, 13.0, dead_end=dead_end, numbered=numbered)
-        said = note if numbered or dead_end else f"{state + 1}"
-        write(
-            axes,
-            f"dead end\n{said}" if dead_end else said,
-            (x, y),
-            (11.0 * x, 11.0 * y),
-            size=7.0 if numbered or dead_end else 5.5,
-            ha="center" if abs(x) < 0.2 else "left" if x > 0.0 else "right",
-            va="center" if abs(y) < 0.5 else "bottom" if y > 0.0 else "top",
-            color=COLORS["dead end"] if dead_end else ink(),
-        )
+        if numbered or dead_end:  # among many there is room for dead ends alone
+            ha = "center" if abs(x) < 0.2 else "left" if x > 0.0 else "right"
+            va = "center" if abs(y) < 0.5 else "bottom" if y > 0.0 else "top"
+            color = COLORS["dead end"] if dead_end else ink()
+            said = f"dead end\n{note}" if dead_end else note
+            write(axes, said, (x, y), (11.0 * x, 11.0 * y), ha=ha, va=va, color=color)
     axes.set(xlim=(-1.75, 1.75), ylim=(-1.35, 1.35), aspect="equal")
     axes.set_axis_off()
     between = weights * (1.0 - np.eye(n))
@@ -470,9 +454,9 @@ def draw_chain(
         look: Look = {"connectionstyle": f"arc3,rad={bend}", "arrowstyle": "-|>"}
         look |= {"mutation_scale": 6.5, "shrinkA": 7.5, "shrinkB": 8.5}
         look |= {"linewidth": max(widest * between[i, j] / heaviest, 0.4)}
-        color = ink(0.19) if pale else COLORS["dead end"] if j in dead_ends else ink(0.69)
+        look["color"] = ink(0.19) if pale else COLORS["dead end"] if j in dead_ends else ink(0.69)
         zorder = 1.5 if pale else 2.0
-        axes.add_patch(FancyArrowPatch(places[i], places[j], color=color, zorder=zorder, **look))
+        axes.add_patch(FancyArrowPatch(places[i], places[j], zorder=zorder, **look))
         if counted and numbered:
             middle = 0.5 * (places[i] + places[j]) + 0.5 * bend * np.array([way[1], -way[0]])
             box: Look = {"boxstyle": "round,pad=0.12", "facecolor": ink(0.0), "edgecolor": "none"}

@@ -221,7 +221,6 @@ def test_in_a_file_it_is_kept_as_it_is_also_between_two_fits(more):
 @pytest.mark.parametrize(
     ("name", "change", "what"),
     [
-        ("counts", lambda array: array + 1.0, "not as many"),
         ("links", lambda array: np.full_like(array, len(array)), "not as many"),
         ("links", lambda array: np.zeros_like(array), "another moment"),
         ("actions", lambda array: np.full_like(array, 7.0), "an action is none"),
@@ -263,11 +262,9 @@ def test_the_shape_of_what_is_too_close_is_learnt():
     ("make", "why"),
     [
         (lambda: SceneRisk(1.0, 3, columns=4, place=(0, 1)), "place"),
-        (lambda: SceneRisk(1.0, 3, columns=3), "place"),
         (lambda: SceneRisk(0.0, 3), "dt"),
         (lambda: Rain().guard().decide(np.ones(7), STAY), "7 numbers are no rows of 4"),
         (lambda: Guard(n_actions=4, interval=1.0, judge=SceneRisk(1.0, 3)), "3 choices"),
-        (lambda: Guard(low=-1, high=1, interval=1.0, judge=SceneRisk(1.0, 3)), "3 choices"),
     ],
 )
 def test_what_it_cannot_work_with_is_refused(make, why):
