@@ -23,7 +23,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -118,7 +118,7 @@ def _drive(path: Path) -> bytes:
     setup = Setup(load_family("emergency"))
     with closing(Results(setup, make_guard(setup), path)) as results:
         driving = drive_in_turn(results, 4, KinematicWorld())
-    told = json.dumps([driving.row.as_dict(), driving.lead_times])
+    told = json.dumps([asdict(driving.row), driving.lead_times])
     files = [(path / name).read_bytes() for name in ("episodes.csv", "summary.json")]
     return b"".join(files) + _saved(driving.guard.machine) + told.encode()
 

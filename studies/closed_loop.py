@@ -16,7 +16,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from importlib.util import find_spec
 from itertools import repeat
@@ -386,7 +386,7 @@ def _test_rule(study: ClosedLoop, rule: str, seed: int) -> Found:
         train_episodes=episodes,
         train_collisions=sum(one.collided for one in taught),
     )
-    return {"rules": [row.as_dict() | {"states": machine.n_states}]}
+    return {"rules": [asdict(row) | {"states": machine.n_states}]}
 
 
 # -- Below the table; each learns with one seed ---------------------------------------------------

@@ -101,17 +101,6 @@ def test_a_guarded_car_does_not_collide(road, options, ballistic):
         assert stands or one.deed <= one.revision.executed + 1e-6
 
 
-def test_the_wish_of_a_car_that_is_held_back_is_that_of_its_own_model(road):
-    sumo = road(*NO_GAP)
-    told = []
-    attach(sumo, ["ego"], report=told.append)
-    drive(sumo, 14.0)
-    held = [one for one in told if one.deed < one.wish - 1e-6]
-    assert held
-    assert all(one.revision.executed == pytest.approx(one.deed, abs=1e-6) for one in held)
-    assert max(one.wish for one in told) <= sumo.vehicle.getAccel("ego") + 1e-9
-
-
 def test_a_car_is_taken_over_only_where_it_has_to_be_and_handed_back(road):
     sumo = road(*NO_GAP)
     guards = attach(sumo, ["ego"])
@@ -192,17 +181,6 @@ def test_a_guard_that_knows_gentler_cars_does_not_hold_back_on_a_free_road(road)
     drive(sumo, 5.0, brakes_at=np.inf)
     assert sumo.vehicle.getSpeedMode("lead") == 31
     assert guards.guarding.revised == 0
-
-
-def test_two_runs_are_the_same(road):
-    runs = []
-    for _ in range(2):
-        sumo = road(*NO_GAP)
-        told = []
-        attach(sumo, "all", report=told.append)
-        drive(sumo, 20.0)
-        runs.append([(one.car, one.wish, one.deed, one.revision.reason) for one in told])
-    assert runs[0] == runs[1]
 
 
 def test_another_simulation_is_left_alone(road):

@@ -35,14 +35,6 @@ def test_a_changing_driver_is_the_first_before_and_the_other_from_the_change_on(
     assert driver.propose(situation, 15.0).action == NORMAL.propose(situation).action
 
 
-@pytest.mark.parametrize("driver", [NORMAL, HASTY, ChangingIDM(NORMAL, ((10.0, HASTY),))])
-def test_the_kernel_and_the_controller_agree(driver):
-    for time in (0.0, 10.0):
-        for observation in ([5.0, 3.0, 2.0], [50.0, 25.0, 20.0]):
-            proposed = driver.propose(np.array(observation), time).action
-            assert proposed == driver.kernel(driver.parameters, time, *observation)
-
-
 @pytest.mark.parametrize(
     ("change", "word"),
     [

@@ -138,13 +138,6 @@ def test_being_rear_ended_terminates_and_costs_but_is_no_failure():
         assert reward == info["distance"] - env.collision_cost
 
 
-def test_what_lies_beyond_the_range_is_commanded_at_its_edge():
-    wild, full = CarFollowing(), CarFollowing()
-    answers = [env.reset(options={"index": 1}) for env in (wild, full)]
-    answers = [env.step([a]) for env, a in ((wild, 99.0), (full, 2.5))]
-    assert np.array_equal(answers[0][0], answers[1][0])
-
-
 @pytest.mark.parametrize("action", [[np.nan], [np.inf], [1.0, 2.0]])
 def test_an_action_that_is_no_number_is_refused(action):
     env = CarFollowing()

@@ -117,7 +117,7 @@ def test_nobody_drives_a_scenario_without_a_controller():
     scenario = EMERGENCY.draw(0, 0).scenario
     with pytest.raises(ValueError, match="nobody drives"):
         drive(unrevised_guard(EMERGENCY), scenario)
-    with pytest.raises(ValueError, match="no whole number of the scenario's steps"):
+    with pytest.raises(ValueError, match="no multiple of the simulation's step"):
         drive(guard_for_cars(-2.5, 2.5, interval=0.123), EMERGENCY.draw(0, 0))
 
 

@@ -97,37 +97,12 @@ def test_noise_on_the_speed_never_makes_brakes_look_good(seed, noise):
         assert counted_on[-1] > 0.7 * 2.5
 
 
-def test_nothing_is_learnt_from_noise_at_a_standstill():
-    rng = np.random.default_rng(0)
-    brakes = OwnBrakes(lowest=-2.5, assumed=0.6, dt=DT)
-    drive(brakes, 2.5, rounds=3)
-    for speed in np.maximum(rng.normal(0.0, 0.3, 2000), 0.0):
-        brakes.see(speed, -2.5)
-    assert brakes.decel > 2.3
-
-
 @pytest.mark.parametrize(("late", "lag"), [(0, 0.0), (1, 1.0)])
 def test_it_learns_how_late_commands_take_effect(late, lag):
     brakes = OwnBrakes(lowest=-2.5, assumed=0.6, dt=DT)
     drive(brakes, 2.5, rounds=6, late=late)
     assert brakes.lag == pytest.approx(lag, abs=0.05)
     assert brakes.decel == pytest.approx(2.5)
-
-
-@pytest.mark.parametrize("seed", range(8))
-def test_noise_makes_brakes_seem_neither_better_nor_much_weaker(seed):
-    rng = np.random.default_rng(seed)
-    brakes = OwnBrakes(lowest=-4.0, assumed=0.6, dt=DT)
-    for _ in range(40):
-        brakes.clear()
-        speed = 25.0
-        for k in range(30):
-            command = -4.0 if k > 8 else 0.0
-            brakes.see(speed + rng.normal(0.0, NOISE[1]), command)
-            assert brakes.decel <= 1.1 * 3.0
-            speed = max(speed + DT * max(command, -3.0), 0.0)
-    assert brakes.known
-    assert brakes.decel >= 0.85 * 3.0
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -146,19 +121,6 @@ def test_what_brakes_bring_is_what_all_samples_in_full_precision_say(seed):
             error = np.sqrt(np.var(values, ddof=1) * stretches) / len(values)
             few = 1.0 + 1.2 / (len(values) - 1)
             assert bound == pytest.approx(mean - few * 2.0 * error, abs=1e-9)
-
-
-def test_what_was_saved_doubts_the_brakes_as_before(tmp_path):
-    risk = LatentRisk(lowest=-4.0)
-    drive(risk.brakes, 4.0)
-    for k in range(3):  # weaker than they were, but not yet for sure
-        risk.learn([80.0, 20.0 - 0.5 * k, 20.0], -4.0)
-    risk.save(tmp_path / "risk")
-    again = LatentRisk.load(tmp_path / "risk")
-    for name in ("brought", "shortfalls"):
-        before, after = (getattr(one.brakes, name).rows for one in (risk, again))
-        assert len(before) > 0
-        np.testing.assert_array_equal(before, after)
 
 
 # -- How hard leaders brake -------------------------------------------------------------------
@@ -398,24 +360,6 @@ def test_an_episode_begins_afresh_but_knows_its_sensors():
     assert risk.perception.estimate(tuple(elsewhere), 0.0).mean == tuple(elsewhere)
 
 
-def test_following_without_learning_leaves_the_noise_as_it_is():
-    risk, _ = taught()
-    noise = risk.perception.noise
-    rows, done = traffic(100, seed=9)
-    for row, did in zip(rows, done, strict=True):
-        risk.follow(row, did)
-    assert risk.perception.noise == noise
-
-
-def test_rows_that_are_scored_are_taken_as_they_are():
-    risk, row = taught()
-    scores = risk.score(np.array([row, row - [5.0, 0.0, 0.0]]))
-    risk.start_episode()
-    risk.learn(row, 0.0)
-    assert risk.score(np.array([row]))[0] == pytest.approx(scores[0], abs=0.5)
-    assert scores[1] > scores[0]
-
-
 def test_a_situation_that_is_not_sure_is_judged_with_more_distance():
     risk, _ = taught()
     risk.start_episode()
@@ -425,14 +369,6 @@ def test_a_situation_that_is_not_sure_is_judged_with_more_distance():
     np.testing.assert_array_equal(
         sharp.judge(situation(row), ACTIONS).critical, sharp.critical(row, ACTIONS)
     )
-
-
-def test_what_was_learnt_of_noise_is_kept_in_the_file(tmp_path):
-    risk, _ = taught()
-    risk.save(tmp_path / "risk.evofsm")
-    again = LatentRisk.load(tmp_path / "risk.evofsm")
-    assert again.perception.noise == risk.perception.noise
-    np.testing.assert_array_equal(again.brakes.full.rows, risk.brakes.full.rows)
 
 
 @pytest.mark.parametrize("decimals", [1, 9])

@@ -1,5 +1,6 @@
 """Families of scenarios: what each states, how they are drawn, and files of one's own."""
 
+import hashlib
 import math
 import pickle
 import subprocess
@@ -8,10 +9,8 @@ from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
-from hypothesis import given
 from hypothesis import strategies as st
 
-from evofsm.driving.drivers import IDM
 from evofsm.driving.episodes import drive, unrevised_guard
 from evofsm.driving.families import FAMILIES, fixed_family, load_family
 from evofsm.driving.family import SWITCHES
@@ -25,6 +24,20 @@ BEFORE_AND_AFTER = [
 ]
 #: In these nothing is drawn at random.
 FIXED = ("paper", "r157")
+
+#: Digests of what is drawn, as it was when the numbers of the docs were measured.
+DRAWN = {
+    "paper": "580a0d8a25eb",
+    "emergency": "89a3ba97fb6a",
+    "stop_and_go": "79c43b869921",
+    "cut_in": "3a20360498d0",
+    "ncap": "3045a5306f57",
+    "r157": "24ed00aabba7",
+    "shift": "3dd455625764",
+    "shift_leader": "a702bb3c19fe",
+    "weak_brakes": "afc1ca0c95ce",
+    "rare": "ad799a00ca9d",
+}
 
 MINE = """
 from evofsm.driving import IDM, Body, Family, Leader, Scenario
@@ -103,52 +116,20 @@ def test_a_draw_is_always_the_same_and_training_and_test_never_meet(name):
     assert len(set(draws())) == 240
 
 
-def test_draws_stay_what_they_were():
+@pytest.mark.parametrize(("name", "digest"), DRAWN.items())
+def test_draws_stay_what_they_were(name, digest):
     """Numbers of the README and of the docs hang on them."""
-    gap = LOADED["emergency"].draw(0, 0, "test").scenario.initial_gap
-    cut_in = LOADED["cut_in"].draw(7, 3).scenario.leader.cut_in
-    waves = LOADED["stop_and_go"].draw(1, 2).scenario.leader.waves
-    assert gap == pytest.approx(21.710242493986346)
-    assert (cut_in.time, cut_in.gap) == pytest.approx((4.609853135459575, 8.356477535042133))
-    assert cut_in.speed == pytest.approx(5.3215488739111345)
-    assert waves[2] == pytest.approx((13.309115424828892, -1.7750361455080146))
+    before = load_family(name)
+    families = (before, before.with_switches(SWITCHES), before.shifted or before)
+    keys = [(s, i, of) for s in (0, 7) for i in range(8) for of in ("train", "test")]
+    drawn = repr([family.draw(*key) for family in families for key in keys])
+    assert hashlib.sha256(drawn.encode()).hexdigest()[:12] == digest
 
 
 def test_the_noise_is_another_one_in_every_draw():
     family = load_family("paper+noise")
     keys = [(s, i, of) for s in (0, 1) for i in range(20) for of in ("train", "test")]
     assert len({family.draw(*key).scenario.sensors.seed for key in keys}) == 80
-
-
-@given(seed=SEEDS, index=SEEDS)
-def test_emergency_keeps_to_its_ranges(seed, index):
-    scenario, controller, variant = LOADED["emergency"].draw(seed, index)
-    assert variant == "emergency"
-    assert 2.0 <= scenario.initial_gap <= 30.0
-    assert 5.0 <= scenario.leader.brake_time <= 30.0
-    assert 2.5 <= scenario.leader.brake_decel <= 4.5
-    assert scenario.leader.driver == IDM(1.2, 25.0, 1.0, 1.0, 2.5)
-    assert (scenario.duration, scenario.dt, scenario.initial_speed) == (35.0, 0.01, 0.0)
-    assert controller == IDM(2.25, 28.0, 0.8, 0.3, 2.0, lowest=-2.5, highest=2.5)
-
-
-@given(seed=SEEDS)
-def test_cut_ins_traffic_and_lapses_keep_to_what_they_state(seed):
-    scenario = LOADED["cut_in"].draw(seed, 0).scenario
-    car, speed = scenario.leader.cut_in, scenario.initial_speed
-    assert 20 / 3.6 - 1e-4 <= speed <= 60 / 3.6 + 1e-4
-    assert 0.0 <= car.speed <= speed <= car.speed + 50 / 3.6
-    assert scenario.leader.brake_time > car.time
-    leader = LOADED["stop_and_go"].draw(seed, 0).scenario.leader
-    times, accelerations = np.transpose(leader.waves)
-    speeds = np.cumsum(np.diff(times) * accelerations[:-1])
-    assert -1e-9 < speeds.min() <= speeds.max() < 20.0 + 1e-9
-    assert times[-1] + 8.0 >= 35.0
-    phases = LOADED["rare"].draw(seed, 0).controller.parameters
-    assert (np.diff(phases[:, 0]) > 0.0).all()
-    assert len(phases) in (1, 3, 5)
-    assert (phases[::2, 4] == 1.5).all()  # careful
-    assert (phases[1::2, 4] == 0.3).all()  # careless
 
 
 @pytest.mark.parametrize(
@@ -214,21 +195,6 @@ def test_r157_is_what_the_regulation_states():
         assert scenario.leader.initial_speed == scenario.initial_speed
         assert scenario.initial_gap == pytest.approx(scenario.initial_speed * headway)
         assert (scenario.leader.brake_decel, scenario.leader.brake_time) == (6.0, 0.0)
-
-
-@given(seed=SEEDS)
-def test_a_shift_changes_what_it_states_and_nothing_else(seed):
-    family = LOADED["shift"]
-    before, after = family.draw(seed, 0), family.shifted.draw(seed, 0)
-    body = replace(before.scenario.body, lowest=-2.5)
-    assert after == before._replace(scenario=replace(before.scenario, body=body))
-    assert (family.decel, family.shifted.decel) == (4.5, 2.5)
-    family = LOADED["shift_leader"]
-    before, after = family.draw(seed, 0), family.shifted.draw(seed, 0)
-    leader = replace(before.scenario.leader, brake_decel=after.scenario.leader.brake_decel)
-    assert after == before._replace(scenario=replace(before.scenario, leader=leader))
-    assert before.scenario.leader.brake_decel <= 6.0 <= leader.brake_decel <= 9.0
-    assert (family.leader_decel, family.shifted.leader_decel) == (6.0, 9.0)
 
 
 def test_switches_switch_on_what_they_say_before_and_after_a_shift():

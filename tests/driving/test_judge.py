@@ -9,7 +9,6 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from evofsm.driving import IDM, Body, Family, Leader, Scenario, guard_for_family, teach
 from evofsm.driving.by_state import RiskByState, assess_states
 from evofsm.driving.judge import LatentRisk
 from evofsm.driving.leaders import REAL_DRIVES
@@ -86,20 +85,6 @@ def test_the_critical_deceleration_agrees_with_driving_it_out(
         assert left(hardest - DECEL_TOLERANCE) > kept - GAP_TOLERANCE
     if hardest < HARDEST:
         assert left(hardest + DECEL_TOLERANCE) < kept + GAP_TOLERANCE
-
-
-@pytest.mark.slow
-@given(GAPS, SPEEDS, SPEEDS, ACTIONS, ACTIONS, DECELS, LAGS, st.floats(0.0, 20.0))
-def test_the_critical_deceleration_is_monotonic(
-    gap, speed, leader_speed, action, before, decel, lag, more
-):
-    def at(gap=gap, action=action, decel=decel):
-        return critical(gap, speed, leader_speed, action, before=before, decel=decel, lag=lag)
-
-    rounding = HARDEST / 2**9
-    assert at(gap=gap + more) >= at() - rounding
-    assert at(decel=decel + more) >= at() - rounding
-    assert at(action=action + more) <= at() + rounding
 
 
 @given(st.floats(1.0, 120.0), SPEEDS, SPEEDS, DECELS, st.floats(0.5, 14.0))
@@ -209,15 +194,6 @@ def test_a_question_changes_nothing(taught, snapshot):
     assert snapshot(taught) == before
 
 
-def test_a_copy_goes_its_own_way(taught, snapshot):
-    before, other = snapshot(taught), copy.deepcopy(taught)
-    for k in range(30):
-        other.learn([60.0, 20.0, max(0.0, 20.0 - k)], -4.0, [0.0, 1.0])
-    other.start_episode()
-    other.brakes.trust(1.0)
-    assert snapshot(taught) == before
-
-
 def test_saved_and_loaded_it_judges_identically(taught, tmp_path, snapshot):
     taught.save(tmp_path / "risk")
     loaded = LatentRisk.load(tmp_path / "risk")
@@ -290,12 +266,6 @@ def test_settings_that_cannot_be_right_are_refused(settings_):
         LatentRisk(**settings_)
 
 
-def test_limits_that_cannot_be_right_are_refused():
-    for decel in (-2.5, math.nan):
-        with pytest.raises(ValueError, match="decel"):
-            LatentRisk.given(-2.5, decel, 4.5)
-
-
 # -- In files ----------------------------------------------------------------------------------
 
 
@@ -363,33 +333,6 @@ def test_states_are_judged_at_their_centres_weighed_by_the_belief():
 
 # Survived only up to some 9 m/s² of the leader.
 HERE = Situation(np.array([10.0, 20.0, 20.0]), np.ones(1), 0, np.nan, 0.0)
-DRIVES = [(3.0, 1.5), (4.0, 5.0, 2.0), (6.0,)]
-
-
-def follow(risk, *decels, seed=0, speed=25.0, belief=(1.0,)):
-    """Drives behind leaders who brake so hard, one after another, seen with noise."""
-    rng = np.random.default_rng(seed)
-    for decel in decels:
-        gap = 40.0
-        leader = np.concatenate([np.full(8, speed), speed - decel * DT * np.arange(1, 9)])
-        leader = np.concatenate([leader, np.full(4, leader[-1])])
-        for v in leader:
-            seen = np.array([gap, speed, v]) + rng.normal(0.0, 0.1, 3)
-            risk.learn(seen, 0.0, belief)
-            gap += DT * (v - speed)
-        risk.start_episode()
-    return risk
-
-
-def learnt(risk):
-    """What others may be told of, in no order."""
-    noise = [np.sort(sizes) for sizes in risk.perception.learnt().values()]
-    return (
-        sorted(risk.manoeuvres.decels),
-        risk.manoeuvres.gentle,
-        [sizes.tolist() for sizes in noise],
-        risk.perception.noise,
-    )
 
 
 def test_with_a_table_of_real_drives_a_tolerance_can_be_met_at_once():
@@ -412,44 +355,3 @@ def test_a_table_that_lacks_what_is_hard_here_is_refused():
 
 
 # -- In traffic -------------------------------------------------------------------------------
-
-
-def waves(numbers):
-    """Of a leader who goes between a slow and a fast speed and brakes gently."""
-    rng = np.random.default_rng(numbers.below("waves", 2**32))
-    time, speed, found = 0.0, 0.0, []
-    while time < 60.0:
-        rates = {1: rng.uniform(0.8, 1.5), -1: rng.uniform(1.2, 2.4)}
-        for wanted, hold in ((rng.uniform(15, 22), 3.5), (rng.uniform(5, 12), 2.5)):
-            sign = 1 if wanted > speed else -1
-            found.append((time, sign * rates[sign]))
-            time += abs(wanted - speed) / rates[sign]
-            found.append((time, 0.0))
-            time, speed = time + hold, wanted
-    return tuple(found)
-
-
-def make(numbers, stops):
-    leader = Leader(
-        IDM(1.2, 25.0, 1.0, 1.0, 2.5),
-        brake_time=numbers.between("leader.brake_time", 20.0, 50.0) if stops else math.inf,
-        brake_decel=numbers.between("leader.brake_decel", 7.0, 8.0),
-        waves=waves(numbers),
-    )
-    gap = numbers.between("scenario.initial_gap", 2.0, 20.0)
-    hasty = IDM(2.25, 28.0, 0.8, 0.3, 2.0, lowest=-6.0, highest=2.5)
-    return Scenario(leader, gap, duration=60.0, body=Body(-6.0, 2.5)), hasty
-
-
-@pytest.mark.slow
-def test_gentle_traffic_does_not_make_it_bold():
-    gentle, stop = (
-        Family("waves", "", lambda n, s=stops: make(n, s), -6.0, 2.5, decel=6.0, leader_decel=8.0)
-        for stops in (False, True)
-    )
-    guard = guard_for_family(gentle)
-    teach(guard, (gentle.draw(0, index) for index in range(30)))
-    assert guard.judge.manoeuvres.gentle > 60
-    guard.freeze()
-    drives = teach(guard, (stop.draw(0, index, split="test") for index in range(40)))
-    assert not any(drive.collided for drive in drives)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, closing, contextmanager, nullcontext
-from dataclasses import replace
+from dataclasses import asdict, replace
 from hashlib import sha256
 from pathlib import Path
 from statistics import median
@@ -151,7 +151,7 @@ def drive(
             return 130
     if as_json:
         states = [{**one._asdict(), "is_dead_end": one.is_dead_end} for one in driving.states]
-        summary = {**driving.row.as_dict(), "lead_times": driving.lead_times, "states": states}
+        summary = {**asdict(driving.row), "lead_times": driving.lead_times, "states": states}
         print_json(summary)
         return None
     show(facts("What came of driving", _summary(driving, setup)), "", *_states(driving))

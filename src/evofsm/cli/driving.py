@@ -16,7 +16,7 @@ import signal
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import BrokenExecutor, ProcessPoolExecutor, as_completed
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
@@ -211,7 +211,7 @@ class Results:
         row = summarise(setup.family.name, setup.reviser, "", outcomes, setup.family.interval)
         leads = tuple(row["lead_time"] for row in rows if row["lead_time"] is not None)
         if self.folder is not None:
-            self._write(self.folder, rows, {**row.as_dict(), "lead_times": leads})
+            self._write(self.folder, rows, {**asdict(row), "lead_times": leads})
         return Driving(row, leads, _assessed(self.guard), self.guard)
 
     def _write(self, folder: Path, rows: Sequence[Outcomes], summary: dict[str, Any]) -> None:

@@ -25,14 +25,8 @@ _LEAST_BELIEF = 1e-3
 class RiskByState:
     """Judges actions by the states that a situation is recognised as.
 
-    Parameters
-    ----------
-    risk : LatentRisk
-        What was learnt of leaders and brakes; it answers all but how dangerous actions are.
-    machine : EvolvingFSM
-        Whose states they are.
-    caution : float
-        Where states disagree, so many standard deviations are added to their mean risk.
+    The ``risk`` answers all but how dangerous actions are. Where states disagree, ``caution``
+    standard deviations are added to their mean risk.
     """
 
     labels, fallback = LatentRisk.labels, LatentRisk.fallback

@@ -65,23 +65,6 @@ idm_kernel: Kernel = compiled(_idm, [DRIVER_KERNEL])
 class IDM:
     """A car follower by the Intelligent Driver Model (Treiber, Hennecke, Helbing 2000).
 
-    Parameters
-    ----------
-    accel : float
-        Desired maximum acceleration [m/s²].
-    desired_speed : float
-        Speed on a free road [m/s].
-    min_gap : float
-        Gap at standstill [m].
-    time_headway : float
-        Desired time headway [s].
-    decel : float
-        Comfortable deceleration [m/s²], positive.
-    exponent : float
-        How acceleration falls off towards the desired speed.
-    lowest, highest : float
-        Bounds of the acceleration that comes out [m/s²].
-
     Examples
     --------
     >>> IDM(1.25, 25.0, 2.0, 1.5, 2.0).propose(np.array([np.inf, 0.0, 0.0])).action
@@ -90,13 +73,13 @@ class IDM:
     -4.0
     """
 
-    accel: float
-    desired_speed: float
-    min_gap: float
-    time_headway: float
-    decel: float
-    exponent: float = 4.0
-    lowest: float = -math.inf
+    accel: float  #: desired maximum acceleration [m/s²]
+    desired_speed: float  #: on a free road [m/s]
+    min_gap: float  #: at standstill [m]
+    time_headway: float  #: desired [s]
+    decel: float  #: comfortable deceleration [m/s²], positive
+    exponent: float = 4.0  #: how acceleration falls off towards the desired speed
+    lowest: float = -math.inf  #: bounds of the acceleration that comes out [m/s²]
     highest: float = math.inf
 
     kernel = staticmethod(idm_kernel)
@@ -120,12 +103,6 @@ class IDM:
 class ChangingIDM:
     """One driver who drives by one IDM and, from given times on, by others.
 
-    Parameters
-    ----------
-    first : IDM
-    changes : tuple of (float, IDM)
-        When [s], and how it drives from then on, in the order of time.
-
     Examples
     --------
     >>> calm, hasty = IDM(1.0, 25.0, 2.0, 1.5, 2.0), IDM(2.0, 28.0, 1.0, 0.5, 2.0)
@@ -136,7 +113,7 @@ class ChangingIDM:
     """
 
     first: IDM
-    changes: tuple[tuple[float, IDM], ...]
+    changes: tuple[tuple[float, IDM], ...]  #: when [s], and how from then on, in order of time
 
     kernel = staticmethod(idm_kernel)
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any, NamedTuple
 
@@ -185,11 +185,9 @@ def unrevised_guard(family: Family) -> Guard:
     return Guard.of(Unrevised(family.actions), interval=family.interval, learn=False)
 
 
-def reference_of(
-    family: Family, draw: Draw, world: World | None = None, controller: Drives | None = None
-) -> Reference:
+def reference_of(family: Family, draw: Draw, world: World | None = None) -> Reference:
     """How far the controller comes by itself in a draw, up to the leader's full brake."""
-    alone = drive(unrevised_guard(family), draw, world, controller)
+    alone = drive(unrevised_guard(family), draw, world)
     brake = -draw.scenario.leader.brake_decel
     braking = np.flatnonzero(alone.record[:, LEADER_ACCELERATION] == brake)
     until = int(braking[0]) if len(braking) else len(alone.time) - 1
@@ -330,10 +328,6 @@ class Row:
     def failures(self) -> FailureRecord:
         """How often it collides, per hour and per 1,000 km, and what that rests on."""
         return FailureRecord(self.collisions, self.hours, self.kilometres, self.episodes)
-
-    def as_dict(self) -> dict[str, Any]:
-        """For JSON."""
-        return asdict(self)
 
 
 def summarise(

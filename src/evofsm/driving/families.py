@@ -355,16 +355,8 @@ def fixed_family(family: Family, cases: Mapping[str, Draw], about: str) -> str:
     """Draws of a family as a family of their own, in which nothing is left to chance.
 
     The text is Python, to be written to a file that ends in ``.py``. `load_family` reads it, and
-    draw k is case k, counted from 0, with exactly its numbers.
-
-    Parameters
-    ----------
-    family : Family
-        That they are of; with its switches, and after its shift if they are.
-    cases : mapping of str to Draw
-        By name; a ValueError if there are none.
-    about : str
-        What they have in common, in a sentence.
+    draw k is case k, counted from 0, with exactly its numbers; ``about`` says in a sentence what
+    they have in common.
 
     Examples
     --------

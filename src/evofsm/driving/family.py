@@ -120,32 +120,6 @@ Make = Callable[[Numbers], tuple[Scenario, IDM | ChangingIDM]]
 class Family:
     """Scenarios that are drawn by seed.
 
-    Parameters
-    ----------
-    name, about : str
-        ``about`` says what happens, in a sentence.
-    make : callable
-        From `Numbers` to a `Scenario` and the follower's driver. The seed of the sensors' noise is
-        drawn besides.
-    low, high : float
-        Range of the actions [m/s²].
-    decel, leader_decel : float
-        The true hardest braking of the follower and of any leader [m/s²], positive: for those who
-        may know it.
-    interval : float
-        Time between decisions [s].
-    width : float
-        Of an interval of actions [m/s²].
-    variants : tuple of str
-        Their names; ``numbers.variant`` is the index of the one that is drawn, or, where they come
-        ``in_turn``, that of the draw modulo their number.
-    shifted : Family, optional
-        The family after its shift.
-    switches : tuple of str
-        Those of `SWITCHES` that are on.
-    fixed : bool
-        Whether nothing is drawn, the sensors' noise neither.
-
     Examples
     --------
     >>> from evofsm.driving import Leader, load_family
@@ -162,20 +136,22 @@ class Family:
     """
 
     name: str
-    about: str
-    make: Make
-    low: float
+    about: str  #: what happens, in a sentence
+    make: Make  #: the seed of the sensors' noise is drawn besides
+    low: float  #: range of the actions [m/s²]
     high: float
+    #: The true hardest braking of the follower, and of any leader [m/s²], positive: for those who
+    #: may know it.
     decel: float
     leader_decel: float
-    interval: float = 0.25
-    width: float = 0.3
-    variants: tuple[str, ...] = ()
-    in_turn: bool = False
-    shifted: Family | None = None
-    switches: tuple[str, ...] = ()
-    fixed: bool = False
-    source: str = ""
+    interval: float = 0.25  #: time between decisions [s]
+    width: float = 0.3  #: of an interval of actions [m/s²]
+    variants: tuple[str, ...] = ()  #: ``numbers.variant`` is the index of the one that is drawn ...
+    in_turn: bool = False  #: ... or that of the draw, modulo their number
+    shifted: Family | None = None  #: the family after its shift
+    switches: tuple[str, ...] = ()  #: those of `SWITCHES` that are on
+    fixed: bool = False  #: whether nothing is drawn, the sensors' noise neither
+    source: str = ""  #: the file that it is from
 
     def __post_init__(self) -> None:
         refuse_others(self, "family's", "decel leader_decel interval")

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from evofsm.driving.judge import LatentRisk
 from evofsm.driving.leaders import BrakeWatch, Manoeuvres
 from evofsm.driving.naming import VARIABLES
+from evofsm.driving.scenarios import steps_between
 from evofsm.driving.traffic import COLUMNS, LEADER_DECEL, Role, TrafficRisk, guard_for_traffic
 from evofsm.guard import ActionReviser, Guard, Mode, Revision
 
@@ -206,7 +207,7 @@ class Guarding:
         if guard is not None:
             self._tolerance = guard.reviser.tolerance  # type: ignore[attr-defined]
         self.interval = seeing.dt if guard is None or guard.interval is None else guard.interval
-        self._every = _steps(self.interval, seeing.dt)
+        self._every = steps_between(self.interval, seeing.dt)
         self._steps = self.decisions = 0
         #: Steps in which a car drove slower than its driver wanted; in shadow, would have.
         self.revised = 0
@@ -396,14 +397,3 @@ def _leaders_of(guard: Guard | None) -> Manoeuvres:
     if isinstance(judge, LatentRisk):
         return copy.deepcopy(judge.manoeuvres)
     return Manoeuvres(LEADER_DECEL)
-
-
-def _steps(interval: float, dt: float) -> int:
-    """Decision interval in steps of the simulation."""
-    steps = round(interval / dt)
-    if steps < 1 or abs(steps * dt - interval) > 1e-9 * steps:
-        raise ValueError(
-            f"the guard decides every {interval:g} s, which is no multiple of the simulation's "
-            f"step of {dt:g} s"
-        )
-    return steps

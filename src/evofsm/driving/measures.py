@@ -126,12 +126,6 @@ class ModifiedTimeToCollision(_ShortTime):
     """Danger where the modified time to collision is below a ``threshold`` [s].
 
     By default it is that of `TimeToCollision`: the two differ in nothing but the accelerations.
-
-    Examples
-    --------
-    >>> episode = np.array([[10.0, 20.0, 20.0], [8.0, 20.0, 18.0], [5.0, 20.0, 16.0]])
-    >>> ModifiedTimeToCollision().score(episode, dt=0.5) > 0.0
-    array([False, False,  True])
     """
 
     threshold: float = 1.5
@@ -155,11 +149,6 @@ class TimeHeadway(_ShortTime):
     """Danger where the time headway is below a ``threshold`` [s] (Vogel 2003).
 
     Below 1 s Sweden fines.
-
-    Examples
-    --------
-    >>> TimeHeadway().score(np.array([[30.0, 20.0, 25.0], [10.0, 20.0, 25.0]]), dt=0.1)
-    array([-0.33333333,  1.        ])
     """
 
     threshold: float = 1.0
@@ -191,11 +180,6 @@ class DecelerationToAvoidCollision(_Measure):
     """DRAC (Cooper and Ferguson 1976): danger where it is above a ``threshold`` [m/s²].
 
     That of 3.35 m/s² is of Archer (2005). It is blind at equal speeds.
-
-    Examples
-    --------
-    >>> DecelerationToAvoidCollision().score(np.array([[10.0, 30.0, 20.0]]), dt=0.1)
-    array([1.65])
     """
 
     threshold: float = 3.35
@@ -221,11 +205,6 @@ class Picud(_Measure):
     """PICUD (Uno et al. 2002): danger where urgent braking of both would end in a collision.
 
     Both brake by ``decel`` [m/s²], the follower after a ``reaction`` [s], which may be 0.
-
-    Examples
-    --------
-    >>> Picud().score(np.array([[30.0, 20.0, 20.0], [15.0, 20.0, 20.0]]), dt=0.1)
-    array([-10.,   5.])
     """
 
     decel: float = 3.3

@@ -27,13 +27,6 @@ class EnvelopeReviser:
 
     So time to collision becomes an emergency brake, a safe distance the proper response of RSS.
 
-    Parameters
-    ----------
-    measure : RiskMeasure
-    actions : IntervalActions
-    dt : float
-        Time between decisions [s].
-
     Examples
     --------
     >>> from evofsm.driving.measures import TimeToCollision

@@ -31,33 +31,16 @@ class CutIn:
 
 @dataclass(frozen=True)
 class Leader:
-    """A leader on a free road who, once, may brake in full until standstill.
+    """A leader on a free road who, once, may brake in full until standstill."""
 
-    Parameters
-    ----------
-    driver : IDM
-        How it drives before.
-    brake_decel : float
-        Deceleration of the full brake [m/s²], positive.
-    brake_speed : float
-        It brakes on reaching this speed [m/s] ...
-    brake_time : float
-        ... or at this time [s], whichever comes first.
-    initial_speed : float
-        Speed at the start [m/s].
-    waves : tuple of (float, float)
-        From a time [s] on it accelerates so [m/s²] instead of by ``driver``; in order of time.
-    cut_in : CutIn, optional
-        Another car that takes its place.
-    """
-
-    driver: IDM
-    brake_decel: float
-    brake_speed: float = math.inf
-    brake_time: float = math.inf
-    initial_speed: float = 0.0
+    driver: IDM  #: how it drives before
+    brake_decel: float  #: deceleration of the full brake [m/s²], positive
+    brake_speed: float = math.inf  #: it brakes on reaching this speed [m/s] ...
+    brake_time: float = math.inf  #: ... or at this time [s], whichever comes first
+    initial_speed: float = 0.0  #: [m/s]
+    #: From a time [s] on it accelerates so [m/s²] instead of by ``driver``; in order of time.
     waves: tuple[tuple[float, float], ...] = ()
-    cut_in: CutIn | None = None
+    cut_in: CutIn | None = None  #: another car that takes its place
 
     def __post_init__(self) -> None:
         refuse_others(self, "leader's", "brake_decel", "initial_speed")
@@ -120,29 +103,13 @@ class Behind:
 
 @dataclass(frozen=True)
 class Scenario:
-    """Cars on a straight road, from a given start until two collide or time is up.
-
-    Parameters
-    ----------
-    leader : Leader
-    initial_gap : float
-        From bumper to bumper [m].
-    duration : float
-        Time that is driven at most [s].
-    dt : float
-        Time of a step [s].
-    initial_speed : float
-        Of the follower, and of the car behind it [m/s].
-    body : Body
-    sensors : Sensors
-    behind : Behind, optional
-    """
+    """Cars on a straight road, from a given start until two collide or time is up."""
 
     leader: Leader
-    initial_gap: float
-    duration: float = 35.0
-    dt: float = 0.01
-    initial_speed: float = 0.0
+    initial_gap: float  #: from bumper to bumper [m]
+    duration: float = 35.0  #: time that is driven at most [s]
+    dt: float = 0.01  #: time of a step [s]
+    initial_speed: float = 0.0  #: of the follower, and of the car behind it [m/s]
     body: Body = field(default_factory=Body)
     sensors: Sensors = field(default_factory=Sensors)
     behind: Behind | None = None
@@ -176,10 +143,15 @@ class Scenario:
 
     def steps_between(self, interval: float) -> int:
         """How many steps lie between two decisions; a ValueError where they are no multiple."""
-        steps = self.steps(interval)
-        if steps < 1 or not math.isclose(steps * self.dt, interval):
-            raise ValueError(
-                f"interval is {interval} s, which is no whole number of the scenario's "
-                f"steps of {self.dt} s"
-            )
-        return steps
+        return steps_between(interval, self.dt)
+
+
+def steps_between(interval: float, dt: float) -> int:
+    """How many steps lie between two decisions; a ValueError where they are no multiple."""
+    steps = round(interval / dt)
+    if steps < 1 or not math.isclose(steps * dt, interval):
+        raise ValueError(
+            f"the interval between decisions is {interval:g} s, which is no multiple of the "
+            f"simulation's step of {dt:g} s"
+        )
+    return steps

@@ -85,11 +85,6 @@ class Pair(NamedTuple):
 class Scene:
     """Oneself and the objects around.
 
-    Parameters
-    ----------
-    own : Object
-    others : sequence of Object
-
     Examples
     --------
     >>> own = Object("me", x=0.0, y=0.0, vx=25.0)
