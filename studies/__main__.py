@@ -19,6 +19,7 @@ STUDIES = {
     "falsification": "falsification:Falsification",
     "judges": "judges:Judges",
     "tasks": "judges:Tasks",
+    "forecasts": "forecasts:ForecastStudy",
     "sensitivity": "sensitivity:Sensitivity",
 }
 _ABOUT = (

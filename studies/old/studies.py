@@ -6,9 +6,7 @@ from typing import Any
 
 from studies.alarms.plan import Plan as Alarms
 from studies.detection.plan import Plan as Detection
-from studies.foresight.plan import Plan as Foresight
 from studies.old.study import Study
-from studies.prediction.plan import Plan as Prediction
 from studies.real.plan import Plan as Real
 
 #: By id.
@@ -17,8 +15,6 @@ STUDIES: dict[str, type[Study[Any]]] = {
     for study in (
         Detection,
         Alarms,
-        Prediction,
-        Foresight,
         Real,
     )
 }

@@ -18,6 +18,7 @@ from evofsm.guard.learnt.replay import (
     MOVING,
     ONSET,
     Disturbances,
+    Ends,
     Floats,
     Ints,
     Model,
@@ -27,6 +28,7 @@ from evofsm.guard.learnt.replay import (
     learn_transition,
     n_features,
     n_products,
+    replay,
     residuals,
 )
 from evofsm.store import COUNT, SHARE, Numbers
@@ -544,6 +546,16 @@ class Dynamics:
                 for k, one in enumerate(self.sequences, 1):
                     self._find_jump(found, k, j, one.observations)
         return found
+
+    def fails_after(self, situation: Floats, plan: Floats, disturbances: Disturbances) -> Floats:
+        """(K,) steps after which a plan (T, a) fails amid each disturbance, infinite if it lasts.
+
+        The situation is an observation, its change, and the action before (2m + a).
+        """
+        count = disturbances.residuals.shape[2]
+        ends, policy = Ends.of(count), np.zeros((plan.shape[1], 1 + self.n_variables))
+        replay(self.model, situation[None], plan, policy, disturbances, 1.0, 0.0, count, ends)
+        return np.where(ends.value >= 0.0, np.inf, ends.value + len(plan) + 2.0)
 
     def _find_jump(self, found: Disturbances, k: int, j: int, z: Floats) -> None:
         """What a variable of a sequence jumps to: after on before, of jumps in that direction."""

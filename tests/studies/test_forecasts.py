@@ -1,0 +1,223 @@
+"""Fair references, honest splits, and scores by hand."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import polars as pl
+import pytest
+from studies.forecasts import (
+    BLEND,
+    DECISIONS,
+    LOGS,
+    OURS,
+    PAPER,
+    REFERENCES,
+    REPLAY,
+    STAYS,
+    Cases,
+    Episode,
+    ForecastStudy,
+    Logistic,
+    Neighbours,
+    Run,
+    Said,
+    Source,
+    Taylor,
+    add_up,
+    batch,
+    cases,
+    compare,
+    drive,
+    foresee,
+    gather,
+    logs_in,
+    measured,
+    read_part,
+    score,
+    skill,
+    stays,
+    teach,
+)
+from studies.systems import Start
+
+from evofsm.fsm import Novelty
+
+
+@pytest.fixture(scope="module")
+def logs(tmp_path_factory):
+    """Followers behind leaders whose speed sways, three of one origin and a lonely one."""
+    folder = tmp_path_factory.mktemp("logs")
+    for k, name in enumerate(("track_0", "track_1", "track_2", "lonely")):
+        rng, t = np.random.default_rng(k), np.round(np.arange(400) * 0.1, 9)
+        leader = 10.0 + 3.0 * np.sin(0.3 * t + rng.uniform(0, 6))
+        follower = 10.0 + 3.0 * np.sin(0.3 * (t - 2.0) + rng.uniform(0, 0.2))
+        gap = 15.0 + np.cumsum(leader - follower) * 0.1
+        columns = {"time": t, "gap": gap, "v_follower": follower, "v_leader": leader}
+        frame = pl.DataFrame(columns | {"a_follower": np.gradient(follower, 0.1)})
+        frame.write_csv(folder / f"{name}.csv")
+    (folder / "MANIFEST.csv").write_text("file,rows\ntrack_0.csv,400\n")
+    return folder
+
+
+def test_each_run_is_held_out_once_and_never_learnt_from_then(logs):
+    (source,) = logs_in(logs)
+    assert source.name == "track"
+    held = []
+    for part in range(2):
+        found = read_part(source, 0, part, 2)
+        seen = [[one.observations.tobytes() for one in some] for some in (found.train, found.test)]
+        assert not set(seen[0]) & set(seen[1])
+        assert len(seen[0]) + len(seen[1]) == 3
+        held += seen[1]
+    assert len(set(held)) == 3
+    assert found.train[0].observations.shape == (400, 3)
+    assert found.train[0].actions.max() <= 16
+
+
+def test_a_folder_without_logs_is_refused(tmp_path):
+    with pytest.raises(ValueError, match="no two logs of one origin"):
+        logs_in(tmp_path)
+
+
+def test_training_and_test_drives_differ_and_all_seeds_are_judged_by_the_same_ones():
+    one, other = (drive("cut_in", DECISIONS, 0, seed, 1, 2) for seed in (0, 1))
+    first = one.train[0].observations[:5]
+    assert not np.array_equal(first, one.test[0].observations[:5])
+    assert not np.array_equal(first, other.train[0].observations[:5])
+    np.testing.assert_array_equal(one.test[1].observations, other.test[1].observations)
+
+
+@pytest.mark.slow
+def test_ours_beats_persistence_and_the_paper_does_not():
+    sums = compare(drive("stop_and_go", DECISIONS, 0, 0, 10, 4), 0)
+    rows = pl.DataFrame(list(add_up(pl.DataFrame(sums), 50, 0)))
+    assert len(rows) == len(REFERENCES) * len(DECISIONS.horizons)
+    assert rows["forecasts"].n_unique() == len(DECISIONS.horizons)
+    later = rows.filter(pl.col("horizon").is_in([1.0, 2.0]))
+    assert later.filter(method=OURS).select(pl.min_horizontal("low", "log_low")).min().item() > 0.1
+    assert later.filter(method=PAPER)["high"].max() < 0.0
+    still = rows.filter(method=STAYS)
+    assert (still["skill"] == 0.0).all()
+    assert (still["log_skill"] == 0.0).all()
+
+
+def test_scores_by_hand():
+    beliefs = np.array([[1.0, 0.0], [0.5, 0.5], [0.0, 1.0]])
+    episodes = [(beliefs[:1], np.zeros(1, np.int64)), (beliefs, np.zeros(3, np.int64))]
+    perfect = {"ahead": lambda b, a: beliefs[1:], "stays": stays}
+    ahead, still = score(perfect, episodes, 1, 1)  # the first is too short to be asked
+    assert ahead["divergence"] == pytest.approx(0.0, abs=1e-12)
+    assert ahead["excess"] == pytest.approx(0.0, abs=1e-5)
+    assert ahead["log_score"] == pytest.approx(1.0, abs=1e-5)
+    # Half of what came had a forecast of 0, which counts as 1e-6 / 2; then half a bit more.
+    assert still["excess"] == pytest.approx(-0.5 * np.log2(5e-7), abs=1e-4)
+    assert (still["forecasts"], still["episode"]) == (2, 1)
+
+
+def test_what_an_episode_got_in_several_rounds_is_added_up():
+    of_round = {0: {STAYS: 4.0, OURS: 1.0}, 1: {STAYS: 4.0, OURS: 3.0}}
+    rows = [
+        {"source": "s", "horizon": 1.0, "round": k, "part": 0, "method": name, "episode": 0}
+        | dict.fromkeys(("divergence", "excess", "log_score"), value)
+        | {"forecasts": 2}
+        for k, values in of_round.items()
+        for name, value in {**values, "batch": 8.0}.items()
+    ]
+    ours = next(one for one in add_up(pl.DataFrame(rows), 3, 0) if one["method"] == OURS)
+    assert (ours["skill"], ours["worst"], ours["over_batch"]) == (0.5, 0.25, 0.75)
+    assert (ours["episodes"], ours["forecasts"], ours["jsd"]) == (1, 4, 1.0)
+    assert math.isnan(skill(np.array([1.0]), np.array([0.0])))
+
+
+def test_the_batch_counts_transitions_at_the_lag():
+    path = np.array([[0.0], [9.0], [0.0], [9.0], [0.0], [9.0]])
+    episode = Episode(path, np.zeros(6, np.int64))
+    taught = teach(Source("line", LOGS, 1, [episode], [episode]), Novelty(radius=1.0))
+    states, none = np.eye(2), np.zeros(2, np.int64)
+    np.testing.assert_allclose(batch(taught, 1)(states, none), [[0.0, 1.0], [1.0, 0.0]])
+    np.testing.assert_allclose(batch(taught, 2)(states, none), states)
+
+
+# -- Failures of tasks ----------------------------------------------------------------------------
+
+
+def run(steps, *, failed):
+    """A point that moves by 1 in each step."""
+    actions = np.zeros((steps, 1))
+    return Run(np.arange(float(steps + 1))[:, None], actions, tuple(actions[:, 0]), failed)
+
+
+def test_steps_are_counted_back_from_the_end():
+    some = cases([run(12, failed=True), run(9, failed=False)], every=5)
+    np.testing.assert_array_equal(some.z[:, 0], [6.0, 11.0, 3.0, 8.0])
+    np.testing.assert_array_equal(some.left, [6.0, 1.0, math.inf, math.inf])
+    np.testing.assert_array_equal(some.known(5), [True, True, True, False])
+    np.testing.assert_array_equal(some.episode, [0, 0, 1, 1])
+    np.testing.assert_array_equal(some.change, 1.0)
+
+
+def test_the_same_start_gives_the_same_episode_and_controllers_are_mixed():
+    starts = [Start.held_out(0, k) for k in range(12)]
+    one, other = gather("acc", starts), gather("acc", starts)
+    for a, b in zip(one, other, strict=True):
+        np.testing.assert_array_equal(a.observations, b.observations)
+        np.testing.assert_array_equal(a.actions, b.actions)
+        assert np.abs(a.actions).max() <= 1.0
+    assert {run.failed for run in one} == {True, False}
+
+
+def test_logistic_regression_and_neighbours_learn_a_curved_boundary():
+    def disc(seed):
+        z = np.random.default_rng(seed).normal(size=(800, 2))
+        zeros, left = np.zeros((800, 2)), np.where((z**2).sum(axis=1) < 1.0, 1.0, math.inf)
+        return Cases(z, zeros, zeros, zeros, zeros, left, left, np.arange(800))
+
+    train, test = disc(0), disc(1)
+    truth = train.left <= 5
+    for says in (Logistic(train, truth), Neighbours(train, truth)):
+        probability = says(test)
+        assert (probability.min() >= 0.0) & (probability.max() <= 1.0)
+        assert ((probability > 0.5) == (test.left <= 5)).mean() > 0.9
+
+
+def test_extrapolation_is_exact_where_motion_is_uniform_or_its_pace_grows():
+    z = np.array([[0.0], [0.0]])
+    change, earlier = np.array([[1.0], [2.0]]), np.array([[1.0], [1.0]])
+    zeros, left = np.zeros((2, 1)), np.full(2, math.inf)
+    some = Cases(z, change, earlier, zeros, zeros, left, left, np.zeros(2, np.intp))
+    sides = np.array([[0.0, 1.0, 9.5, 1.0]])
+    np.testing.assert_array_equal(Taylor(sides, 1)(some), [-10.0, -5.0])
+    np.testing.assert_array_equal(Taylor(sides, 2)(some), [-10.0, -3.0])  # 3, 7, 12
+    assert np.isinf(Taylor(-sides, 1)(some)).all()
+
+
+def test_the_brier_score_is_that_of_all_learning_seeds_together():
+    truth, episode = np.array([True, False, False]), np.array([0, 0, 2])
+    wrong = Said(np.array([0.0, 0.0, 0.0]), truth, episode)
+    halved = Said(np.array([0.5, 0.5, 0.5]), truth, episode)
+    found = measured([wrong, halved], 3, 200, 0)
+    assert found["brier"] == pytest.approx((1.0 / 3.0 + 0.25) / 2.0)
+    assert found["brier_low"] < found["brier"] < found["brier_high"]
+
+
+@pytest.mark.slow
+def test_replays_foresee_a_task_better_than_its_share_of_failures():
+    found = foresee("acc", (0, 0), train=20, calibration=10, test=15, every=5)
+    said = found[25, REPLAY]
+    base = said.truth.mean() * (1.0 - said.truth.mean())
+    assert np.mean((said.probability - said.truth) ** 2) < 0.5 * base
+
+
+@pytest.mark.slow
+def test_a_page_says_where_others_are_better_and_workers_change_nothing(logs, monkeypatch):
+    monkeypatch.setattr("studies.forecasts.FAMILIES", ("cut_in",))
+    tiny = ForecastStudy(tasks="acc", seeds=1, train=3, test=2, fine_train=1, fine_test=1, parts=2)
+    tiny = replace(tiny, data=logs, task_train=6, task_test=6, calibration=6, rounds=10)
+    one, two = tiny.run(workers=1), tiny.run(workers=2)
+    assert all(one[name].equals(two[name]) for name in one)
+    rows = one["rows"].with_columns(skill=pl.when(method=BLEND).then(0.9).otherwise("skill"))
+    page = tiny.page(one | {"rows": rows})
+    better = next(table for table in page.lost if "References" in table.title).frame
+    assert set(better.filter(source="track")["method"]) >= {BLEND}
+    assert all(table.cells or table.frame.is_empty() for table in [*page.tables, *page.lost])
