@@ -711,7 +711,8 @@ def measured(every: Sequence[Said], episodes: int, rounds: int, seed: int) -> di
         errors += np.bincount(one.episode, (one.probability - one.truth) ** 2, episodes)
 
     def brier(chosen: Indices) -> float:
-        return float(errors[chosen].sum() / (cases_of[chosen].sum() * len(every)))
+        asked = cases_of[chosen].sum() * len(every)
+        return float(errors[chosen].sum() / asked) if asked else math.nan
 
     low, high = lib.bootstrap(brier, episodes, rounds, seed)
     return {"brier": brier(np.arange(episodes)), "brier_low": low, "brier_high": high}
