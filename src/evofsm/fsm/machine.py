@@ -108,11 +108,6 @@ class EvolvingFSM(_Arrays):
         A failure within this many observations of a visit is counted in `failed_soon`; without it,
         every failure later in the same episode.
 
-    Raises
-    ------
-    TypeError, ValueError
-        If a setting is out of its range or contradicts the rule's, or ``rule`` is no rule.
-
     Notes
     -----
     Rows of a transition matrix are "from", columns "to": a forecast is ``belief @ P``. States and
@@ -187,10 +182,9 @@ class EvolvingFSM(_Arrays):
 
     @classmethod
     def paper(cls) -> Self:
-        """The machine of the paper's Section 3, with the settings that it leaves open recovered.
+        """The machine of the paper's Section 3: ``[gap [m], v_follower [m/s], v_leader [m/s]]``.
 
-        Observations are ``[gap [m], v_follower [m/s], v_leader [m/s]]``; the 17 actions are those
-        of ``IntervalActions(-2.5, 2.5, 0.3)`` [m/s²].
+        Its 17 actions are those of ``IntervalActions(-2.5, 2.5, 0.3)`` [m/s²].
         """
         return cls(n_actions=17)
 
@@ -209,13 +203,11 @@ class EvolvingFSM(_Arrays):
         z : (m,) array_like
             Observation, in units of your own; the first one fixes m.
         failed : bool, optional
-            Whether the episode ended in failure with this observation. It is learnt like any other;
-            then the failure is counted, and the next observation begins an episode. Without it
-            nothing is said of failures: see `failures_told`.
+            Whether the episode ended in failure with this observation, so that the next one begins
+            an episode. Without it nothing is said of failures: see `failures_told`.
         missing : Missing
-            What to do where entries are NaN or masked: that they were not observed. Such an
-            observation is recognised and no more: no state moves, no transition to it is learnt,
-            and `Step.missing` tells the variables.
+            What to do where entries are NaN or masked: that they were not observed. No state moves,
+            and no transition is learnt; `Step.missing` tells the variables.
 
         Raises
         ------
@@ -231,15 +223,10 @@ class EvolvingFSM(_Arrays):
 
     @_alone
     def act(self, i: SupportsIndex) -> None:
-        """Say which action was commanded after the latest observation.
+        """Say which action (from 0) was commanded after the latest observation.
 
-        It labels exactly one transition, the one to the next observation; a second call replaces
-        the first. Without it the next observation teaches no transition.
-
-        Parameters
-        ----------
-        i : int
-            Index of the action, from 0.
+        It labels exactly one transition, the one to the next observation, which teaches none
+        without it; a second call replaces the first.
         """
         i = valid.check_action(i, self.n_actions)
         now = self._learnt.now
@@ -249,14 +236,12 @@ class EvolvingFSM(_Arrays):
 
     @_alone
     def learn_one(self, z: ArrayLike, i: SupportsIndex) -> Step:
-        """Observe ``z``, then act with ``i``; the action shows in the next step.
+        """Observe, then act; the action shows in the next step.
 
         Parameters
         ----------
-        z : (m,) array_like
-            Observation, as `observe` takes it.
-        i : int
-            Index of the action commanded after it, as `act` takes it.
+        z, i
+            As `observe` and `act` take them.
         """
         return self._step(z, valid.check_action(i, self.n_actions), None)
 
@@ -283,8 +268,7 @@ class EvolvingFSM(_Arrays):
         episode_starts : (E,) array_like of int
             Rows at which an episode begins. Without row 0 the present episode goes on.
         failures : (K,) array_like of int, optional
-            Rows with which an episode ended in failure, as ``observe(z, failed=True)`` tells it.
-            The action in such a row is not used, and the next row begins an episode. An empty one
+            Rows with which an episode ended in failure; their actions are not used. An empty one
             tells that there was none; without it nothing is said of failures.
         belief : bool
             Whether the trace holds the belief of every row as well.
@@ -318,11 +302,7 @@ class EvolvingFSM(_Arrays):
 
     @_alone
     def fail(self) -> None:
-        """End the episode in failure, without a further observation.
-
-        The action commanded after the latest observation led there, if there was one. The next
-        observation begins a new episode.
-        """
+        """End the episode in failure, to which the action after the latest observation led."""
         if not self._learnt.now["chained"][0]:
             raise ValueError("fail before observe: this episode has no observation to fail after")
         self._make_room()
@@ -332,8 +312,7 @@ class EvolvingFSM(_Arrays):
     def onset(self) -> None:
         """Count that something unexpected began in the state before the latest observation's.
 
-        Whoever has a model of how the system moves says so, as `evofsm.Guard` does. Nothing is
-        counted where the episode has no earlier observation.
+        Whoever has a model of how the system moves says so, as `evofsm.Guard` does.
         """
         if (before := self._learnt.now["before"][0]) >= 0:
             self._learnt.sums[arrays.ONSETS, before] += 1.0
@@ -349,9 +328,8 @@ class EvolvingFSM(_Arrays):
 
     @_alone
     def predict(self, i: SupportsIndex, horizon: int = 1, policy: Policy = "marginal") -> Floats:
-        """(n,) forecast of the state ``horizon`` steps ahead; nothing is changed by asking.
+        """(n,) forecast of the state, ``belief @ P[i] @ P*^(horizon - 1)``: Section 2.3.2.
 
-        The forecast equations of the paper's Section 2.3.2: ``belief @ P[i] @ P*^(horizon - 1)``.
         At the start of an episode the belief is uniform; before any observation it is empty.
 
         Parameters
@@ -359,10 +337,10 @@ class EvolvingFSM(_Arrays):
         i : int
             Index of the action taken now, from 0.
         horizon : int
-            Number of steps, each as long as the time between two observations; at least 1.
+            Number of steps, at least 1.
         policy : {"marginal", "hold", "observed"}
-            Actions after the first step: each alike, as in the paper's k-step equation; ``i``
-            again; or each as often as it was used so far.
+            Actions after the first step: each alike, as in the paper; ``i`` again; or each as often
+            as it was used.
         """
         action, n = valid.check_action(i, self.n_actions), self.n_states
         if check_forecast(horizon, policy) > 1:
@@ -488,17 +466,16 @@ class EvolvingFSM(_Arrays):
     @property
     @_alone
     def state_ids(self) -> NDArray[np.int64]:
-        """(n,) ndarray: identities of the states, the number of each one's creation from 0.
+        """(n,) number of each state's creation, from 0.
 
-        They equal the indices, unless states were merged (``max_states``): an index that became
-        free goes to a new state, with a new identity.
+        An index that became free (``max_states``) goes to a new state, with a new number.
         """
         return self._learnt.states["id"][: self.n_states].astype(np.int64)
 
     @property
     @_alone
     def centers(self) -> Floats:
-        """(n, m) ndarray: the observation at the centre of each state."""
+        """(n, m) the observation at the centre of each state."""
         return self._learnt.centers[:, : self.n_states].T.copy()
 
     @property
@@ -518,7 +495,7 @@ class EvolvingFSM(_Arrays):
     @property
     @_alone
     def belief(self) -> Floats:
-        """(n,) ndarray: the present distribution over states, uniform as an episode starts."""
+        """(n,) the present distribution over states, uniform as an episode starts."""
         n = self.n_states
         if self._learnt.now["chained"][0]:
             return self._learnt.belief[:n].copy()
@@ -546,7 +523,7 @@ class EvolvingFSM(_Arrays):
         path : str, path-like or binary file
             A file of that name is replaced, or left as it was where this cannot be written.
         provenance : mapping, optional
-            What it learnt from, for JSON; `evofsm inspect` shows it.
+            What it learnt from, for JSON.
         """
         store.write(path, MACHINE, self._content, arrays.by_name(self._learnt), provenance)
 
@@ -566,7 +543,7 @@ class EvolvingFSM(_Arrays):
         """A machine of the same settings that has learnt these arrays, by their names in a file."""
         machine = self.copy()
         if m := len(learnt["first"]):
-            machine._settings = self._with_weights(m)
+            machine._fit(m)
             machine._learnt = arrays.from_names(learnt, m, self.n_actions)
         else:
             machine._learnt.now["failures_told"] = learnt["failures_told"]
@@ -575,7 +552,7 @@ class EvolvingFSM(_Arrays):
     @property
     def _content(self) -> dict[str, Any]:
         """The settings, for JSON."""
-        return {**self.settings, "rule": rules.describe_rule(self._rule)}
+        return self.settings | {"rule": rules.describe_rule(self._rule)}
 
     # A copy, or what another process gets, has a lock and arrays of its own.
     @_alone
@@ -688,13 +665,10 @@ class EvolvingFSM(_Arrays):
     def _fit(self, m: int) -> None:
         """Settle the number of variables with the first observation."""
         if self.n_states == 0:
-            self._settings = self._with_weights(m)
+            self._settings = self._settings._replace(weights=rules.weights_of(self._rule, m))
             learnt = arrays.blank(m, self.n_actions, LINE, 0)
             learnt.now["failures_told"] = self._learnt.now["failures_told"]
             self._learnt = learnt
-
-    def _with_weights(self, m: int) -> Settings:
-        return self._settings._replace(weights=rules.weights_of(self._rule, m))
 
     def _make_room(self) -> None:
         """Make room for what the next step may need."""

@@ -130,10 +130,9 @@ def _refuse_unlike(machines: Iterable[EvolvingFSM]) -> list[EvolvingFSM]:
 def _match(
     models: Sequence[FSMModel], settings: Settings, radius: float
 ) -> tuple[list[tuple[int, int]], list[Floats]]:
-    """Which states of the parts are one.
+    """Which states of the parts are one: part and index of the state that leads each of n.
 
-    Returns part and index of the state that leads each of n, and for each part (states, n) ones
-    where a state of its own belongs.
+    With them come, for each part, (states, n) ones where a state of its own belongs.
     """
     places = np.concatenate([model.centers * settings.weights for model in models])
     names = [(part, i) for part, model in enumerate(models) for i in range(model.n_states)]

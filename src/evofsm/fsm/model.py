@@ -90,8 +90,6 @@ class FSMModel(Counts):
     >>> model = machine.model(names=["gap"], units=["m"])
     >>> model
     FSMModel(2 states of gap, 2 actions, 4 observations, Paper())
-    >>> model.n_states, model.visits, model.created
-    (2, array([3., 1.]), array([1., 4.]))
     >>> model.recognise([[0.0], [0.5]]).round(3)
     array([[0.625, 0.375],
            [0.5  , 0.5  ]])
@@ -102,8 +100,7 @@ class FSMModel(Counts):
     centers: Floats  #: (n, m) the observation at the centre of each state
     potentials: Floats  #: (n,) density of all observations at each centre
     width: float  #: of recognition: a squared distance, as the rule makes it of the spread
-    #: (q, n, n) for each action, probabilities from state (row) to state (column); 1 / n where it
-    #: was never used
+    #: (q, n, n) probabilities from state (row) to state (column); 1 / n for an action never used
     transition_matrices: Floats
     origin_frequency: Floats  #: (q, n) the paper's F_o, recency-weighted frequency of each row
     uses: Floats  #: (q,) transitions learnt with each action
@@ -241,9 +238,9 @@ class FSMModel(Counts):
         Parameters
         ----------
         situation : int or (n,) array_like, optional
-            A state, or a distribution over states, of which the most probable one is explained.
+            A state, or a distribution over states.
         action : int, optional
-            Index of an action, from 0: what came of taking it there.
+            What came of taking it there.
         observation : (m,) array_like, optional
             What was observed, in place of a situation.
 

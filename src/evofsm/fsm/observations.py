@@ -22,8 +22,7 @@ class Missing(Enum):
     """What is done where some variables were not observed; they hold NaN.
 
     ``REJECT`` is an error, ``HOLD`` takes the value of the observation before, and ``PARTIAL``
-    recognises from the variables that are there. Whichever it is, an incomplete observation moves
-    no state and teaches no transition to it.
+    recognises from the variables that are there.
 
     Examples
     --------
@@ -43,14 +42,7 @@ class Missing(Enum):
 class Category:
     """A discrete variable and how far apart its categories count.
 
-    Parameters
-    ----------
-    name : str
-    values : sequence of str
-        All the categories it may take, two or more.
-    distance : float
-        Between any two of them, in the unit of the other variables. Above a machine's ``radius`` no
-        state moves from one category to another.
+    Above a machine's ``radius`` no state moves from one category to another.
 
     Examples
     --------
@@ -61,8 +53,8 @@ class Category:
     """
 
     name: str
-    values: Sequence[str]
-    distance: float = 1.0
+    values: Sequence[str]  #: all the categories it may take, two or more
+    distance: float = 1.0  #: between any two of them, in the unit of the other variables
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "values", tuple(self.values))

@@ -73,9 +73,8 @@ class Paper:
 class Edges(Paper):
     """The paper's rule, and a state at each edge of the data.
 
-    The paper's condition takes only observations nearer the mean of everything seen than any
-    centre, so a rare corner never gets a state. Here an observation also creates a state where its
-    potential lies below every centre's and it is farther than ``radius`` from every centre.
+    The paper's condition never gives a rare corner a state. Here an observation also creates one
+    where its potential lies below every centre's and it is farther than ``radius`` from each.
 
     Examples
     --------
@@ -184,8 +183,8 @@ def weights_of(rule: StateRule, m: int) -> Floats:
 def reach(rule: StateRule, width: float) -> float:
     """Distance from a centre, in scales, beyond which an observation is like no state.
 
-    The radius of `Novelty`, beyond which it makes a new one. Other rules make no state of what is
-    rare: twice the root of the width of recognition, where the similarity is 1/e⁴, or 2 %.
+    The radius of `Novelty`; of other rules twice the root of the width of recognition, where the
+    similarity is 1/e⁴, or 2 %.
     """
     return rule.radius if isinstance(rule, Novelty) else _WIDTHS * math.sqrt(width)
 

@@ -1,9 +1,8 @@
 """One observation through the machine: the paper's Section 2 on one screen.
 
-An observation may create a state and is recognised as a distribution over states (`clusters`), and,
-where an action was taken after the observation before it, teaches that action's transition matrix
-(`transitions`). An episode may end in failure, which is no state of the machine: it is counted, and
-the next observation begins another episode.
+An observation may create a state and is recognised as a distribution over states (`clusters`), and
+teaches the transition matrix of the action taken before it (`transitions`). Failure, in which an
+episode may end, is no state of the machine: it is counted.
 """
 
 from __future__ import annotations
@@ -104,8 +103,7 @@ def learn_rows(
 ) -> int:
     """Step through the rows from ``row`` on; returns where it stopped for want of room.
 
-    Failures are ``told`` where there may be some in these rows; ``beliefs`` is (T, capacity), or
-    empty where nobody wants them.
+    ``beliefs`` is (T, capacity), or empty where nobody wants them.
     """
     now, room = learnt.now[0], (len(learnt.belief), len(learnt.matrices))
     while row < len(observations) and room_for(learnt, settings) == room:
@@ -228,9 +226,8 @@ class Event(IntFlag):
     """What an observation did to the states (the paper's Section 2.2.1).
 
     ``NONE`` left them as they were, ``MOVED`` put the nearest one on the observation, and
-    ``CREATED`` put a new one there. Where there were ``max_states`` before, two were ``MERGED`` to
-    make room, and the new one has the index that became free; ``MERGED`` alone says that none was
-    created, for the nearest one was close enough.
+    ``CREATED`` put a new one there. With ``max_states`` two were ``MERGED`` first; ``MERGED`` alone
+    says that the observation was left to the nearest one.
 
     Examples
     --------
