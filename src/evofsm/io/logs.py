@@ -7,7 +7,7 @@ import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from evofsm.driving.naming import VARIABLES
 from evofsm.fsm.observations import Category, ObservationEncoder
 from evofsm.io import vehicles
-from evofsm.io.rosbag import BagTable, Topics
 from evofsm.io.tables import (
     UNITS,
     CsvTable,
@@ -28,6 +27,9 @@ from evofsm.io.tables import (
     silent,
 )
 from evofsm.io.vehicles import ACTION, PairTable, VehicleLengths
+
+if TYPE_CHECKING:
+    from evofsm.io.rosbag import Topics
 
 #: Columns that tell episodes apart where nothing else was said and they exist.
 USUAL_EPISODE = ("run", "pair", "segment")
@@ -369,6 +371,8 @@ def _open(
                 f"{path} is a bag of ROS 2; --topics names a file that says which field of which "
                 "topic is which variable (docs/how-to/logs-of-others.md has one)"
             )
+        from evofsm.io.rosbag import BagTable
+
         return BagTable(path, topics, on_read)
     if kind == "run":
         raise ValueError(

@@ -13,20 +13,21 @@ import re
 import tomllib
 from array import array
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
-from typing import Any, NamedTuple, Self
+from typing import Annotated, Any, Literal, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from evofsm.extras import needs
-from evofsm.fsm.validation import positive
 from evofsm.io.tables import UNITS, OnRead, Piece, RefusedError, Table, Wanted, readable
 from evofsm.io.vehicles import ACTION
 
-_SHORTEST = 1e-6  # [s]
+with needs("msgspec", "ros", "a bag of ROS 2"):
+    import msgspec
+    from msgspec import Meta
+
 _NANOSECONDS = 1_000_000_000
 _STEP = re.compile(r"([A-Za-z_]\w*)((?:\[\d+\])*)")
 
@@ -39,13 +40,13 @@ class Field(NamedTuple):
     steps: tuple[str | int, ...]  #: names of fields, and places in arrays, from 0
 
     @classmethod
-    def parse(cls, text: Any) -> Self:
+    def parse(cls, text: str) -> Self:
         """A topic, and behind its first dot the way to the number: ``/scan.ranges[3]``."""
-        topic, _, way = str(text).partition(".")
+        topic, _, way = text.partition(".")
         found = [_STEP.fullmatch(name) for name in way.split(".")]
         steps: list[str | int] = []
         for step in found:
-            if not (step and topic and isinstance(text, str)):
+            if not (step and topic):
                 raise ValueError(
                     f"{text!r} is no field; write /topic.field, /topic.field.field or "
                     "/topic.field[0].field"
@@ -71,34 +72,27 @@ class Field(NamedTuple):
             ) from None
 
 
-class Variable(NamedTuple):
-    """Where a variable comes from: a field, less another one, times a factor, plus an offset."""
+class Variable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Where a variable comes from: a field, less another one, in a unit, plus an offset."""
 
-    field: Field
-    minus: Field | None
-    factor: float
-    offset: float  #: in units of the SI
+    field: str
+    minus: str | None = None
+    unit: str | None = None
+    offset: Annotated[float, Meta(ge=-1e9, le=1e9)] = 0.0  #: in units of the SI
 
-    @classmethod
-    def of(cls, name: str, given: Any) -> Self:
-        """From what a file says of it."""
-        given = given if isinstance(given, Mapping) else {"field": given}
-        _refuse_unknown(f"variable {name}", given, "field", "minus", "unit", "offset")
-        unit, offset, minus = given.get("unit"), given.get("offset", 0.0), given.get("minus")
-        if unit is not None and unit not in UNITS:
-            raise ValueError(f"variable {name}: unit is {unit!r}; known are {', '.join(UNITS)}")
-        if not math.isfinite(offset):
-            raise ValueError(f"variable {name}: offset is {offset}; it must be finite")
-        try:
-            field = Field.parse(given.get("field"))
-            less = None if minus is None else Field.parse(minus)
-        except ValueError as error:
-            raise ValueError(f"variable {name}: {error}") from None
-        return cls(field, less, 1.0 if unit is None else UNITS[unit][1], float(offset))
+    def __post_init__(self) -> None:
+        for text in self.fields:
+            Field.parse(text)
+        if self.unit is not None and self.unit not in UNITS:
+            raise ValueError(f"unit is {self.unit!r}; known are {', '.join(UNITS)}")
+
+    @property
+    def fields(self) -> list[str]:
+        """Those that it is made of."""
+        return [self.field] if self.minus is None else [self.field, self.minus]
 
 
-@dataclass(frozen=True)
-class Topics:
+class Topics(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """What the topics of bags mean.
 
     Parameters
@@ -113,10 +107,10 @@ class Topics:
         When a message is: as it was recorded, or as its header says.
     """
 
-    variables: Mapping[str, Variable]
-    interval: float = 0.1
-    oldest: float = 0.5
-    stamp: str = "received"
+    variables: Annotated[dict[str, Variable], Meta(min_length=1)]
+    interval: Annotated[float, Meta(ge=1e-6, le=1e6)] = 0.1
+    oldest: Annotated[float, Meta(gt=0.0, le=1e6)] = 0.5
+    stamp: Literal["received", "header"] = "received"
 
     @classmethod
     def load(cls, path: str | PathLike[str]) -> Self:
@@ -131,7 +125,7 @@ class Topics:
         """
         try:
             return cls.of(tomllib.loads(Path(path).read_text(encoding="utf-8")))
-        except (ValueError, TypeError) as error:  # that of TOML is a ValueError
+        except ValueError as error:  # that of TOML is one
             raise ValueError(f"{path}: {error}") from error
 
     @classmethod
@@ -142,31 +136,22 @@ class Topics:
 
         Examples
         --------
-        >>> topics = Topics.of({"variables": {"v": {"field": "/odom.speed", "unit": "kn"}}})
-        >>> topics.variables["v"].factor
-        0.5144444444444445
+        >>> topics = Topics.of({"variables": {"v": "/odom.speed"}})
+        >>> topics.variables["v"].field, topics.interval
+        ('/odom.speed', 0.1)
         """
-        _refuse_unknown("it", given, "interval", "oldest", "stamp", "variables")
-        stamp = given.get("stamp", "received")
-        if stamp not in ("received", "header"):
-            raise ValueError(f"stamp is {stamp!r}; it must be received or header")
-        variables = given.get("variables")
-        if not (isinstance(variables, Mapping) and variables):
-            raise ValueError("it names no variables; write [variables.gap] and field = ...")
-        interval = float(given.get("interval", cls.interval))
-        if not _SHORTEST <= interval < math.inf:
-            raise ValueError(f"interval is {interval}; it must be at least {_SHORTEST:g} s")
-        return cls(
-            {name: Variable.of(name, one) for name, one in variables.items()},
-            interval,
-            positive("oldest", float(given.get("oldest", cls.oldest))),
-            stamp,
-        )
-
-
-def _refuse_unknown(what: str, given: Mapping[str, Any], *known: str) -> None:
-    if unknown := sorted(set(given) - set(known)):
-        raise ValueError(f"{what} says {unknown[0]!r}; known are {', '.join(known)}")
+        named, where = given.get("variables"), ""
+        try:
+            if isinstance(named, Mapping):
+                each: dict[str, Variable] = {}
+                for name, one in named.items():
+                    where = f"variable {name}: "
+                    told = {"field": one} if isinstance(one, str) else one
+                    each[name] = msgspec.convert(told, Variable)
+                given, where = {**given, "variables": each}, ""
+            return msgspec.convert(given, cls)
+        except msgspec.ValidationError as error:
+            raise ValueError(f"{where}{error}") from None
 
 
 class BagTable(Table):
@@ -205,7 +190,7 @@ class BagTable(Table):
         yield piece
 
     def _held(
-        self, messages: Mapping[str, tuple[NDArray[np.int64], Mapping[Field, NDArray[np.float64]]]]
+        self, messages: Mapping[str, tuple[NDArray[np.int64], Mapping[str, NDArray[np.float64]]]]
     ) -> dict[str, NDArray[np.float64]]:
         """Of each tick in which all are known, the latest values before it."""
         topics = self._topics
@@ -221,7 +206,7 @@ class BagTable(Table):
             ]
         )
         at = stamps[0] + interval * ticks[ticks * interval <= stamps[-1] - stamps[0]]
-        values: dict[Field, NDArray[np.float64]] = {}
+        values: dict[str, NDArray[np.float64]] = {}
         known = np.ones(len(at), np.bool_)
         for of_topic, fields in messages.values():
             latest = np.searchsorted(of_topic, at, side="right") - 1
@@ -230,24 +215,24 @@ class BagTable(Table):
         numbers = {"time": (at - stamps[0])[known] / _NANOSECONDS}
         for name, one in topics.variables.items():
             value = values[one.field] - (values[one.minus] if one.minus else 0.0)
-            numbers[name] = (one.factor * value + one.offset)[known]
+            factor = 1.0 if one.unit is None else UNITS[one.unit][1]
+            numbers[name] = (factor * value + one.offset)[known]
         if self._derives:
             action = np.diff(numbers["v_follower"], append=np.nan) / topics.interval
             follows = np.diff(at[known], append=0) == interval
             numbers[ACTION] = np.where(follows, action, np.nan)
         return numbers
 
-    def _messages(
-        self,
-    ) -> dict[str, tuple[NDArray[np.int64], dict[Field, NDArray[np.float64]]]]:
+    def _messages(self) -> dict[str, tuple[NDArray[np.int64], dict[str, NDArray[np.float64]]]]:
         """Of each topic that is wanted, when its messages were, and what stands in their fields."""
         with needs("rosbags", "ros", f"{self.path}: a bag of ROS 2"):
             from rosbags.highlevel import AnyReader
             from rosbags.typesys import Stores, get_typestore
-        fields = {f for v in self._topics.variables.values() for f in (v.field, v.minus) if f}
+        texts = {text for one in self._topics.variables.values() for text in one.fields}
+        fields = [Field.parse(text) for text in texts]
         of_topic = {one.topic: [f for f in fields if f.topic == one.topic] for one in fields}
         stamps = {topic: array("q") for topic in of_topic}
-        values = {field: array("d") for field in fields}
+        values = {text: array("d") for text in texts}
         usual = get_typestore(Stores.LATEST)
         with AnyReader([Path(self.path)], default_typestore=usual) as reader:
             there = sorted({one.topic for one in reader.connections})
@@ -267,12 +252,12 @@ class BagTable(Table):
                     stamp = at.sec * _NANOSECONDS + at.nanosec
                 stamps[connection.topic].append(stamp)
                 for field in of_topic[connection.topic]:
-                    values[field].append(field.read(message))
+                    values[field.text].append(field.read(message))
         found = {}
         for topic, of_one in stamps.items():
             if not len(of_one):
                 raise RefusedError(f"its topic {topic!r} has no messages")
             order = np.argsort(np.array(of_one), kind="stable")
-            fields_of = {field: np.array(values[field])[order] for field in of_topic[topic]}
-            found[topic] = np.array(of_one)[order], fields_of
+            of_fields = {one.text: np.array(values[one.text])[order] for one in of_topic[topic]}
+            found[topic] = np.array(of_one)[order], of_fields
         return found
