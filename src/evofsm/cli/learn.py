@@ -379,7 +379,7 @@ def _save(
 def _document(learning: Learning, provenance: Mapping[str, Any]) -> dict[str, Any]:
     """All that is printed, for JSON; states and actions from 0."""
     read = learning.read
-    names = ("rows", "episodes", "seconds", "clipped_below", "clipped_above", "jumps", "cuts")
+    names = ("rows", "episodes", "seconds", "clipped_below", "clipped_above", "jumps")
     known = read.failures if learning.model.failures_told else None
     return {
         **{name: getattr(read, name) for name in names},
@@ -398,8 +398,6 @@ def _read(learning: Learning, action: str) -> Iterator[tuple[str, str]]:
     yield "transitions", f"{learning.transitions:,}"
     if read.jumps:
         yield "time jumps", f"{read.jumps:,}; each begins an episode"
-    if read.cuts:
-        yield "pairs cut", f"{read.cuts:,} long ones go on in an episode of their own"
     assert actions is not None
     text = f"{actions.n_actions} intervals of {action} from {actions.low:g} to {actions.high:g}"
     if clipped := read.clipped_below + read.clipped_above:

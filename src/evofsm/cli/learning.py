@@ -71,7 +71,6 @@ class Progress(msgspec.Struct):
     clipped_below: int = 0  #: actions below the range, put into its first interval
     clipped_above: int = 0  #: actions above the range, put into its last interval
     jumps: int = 0  #: episodes that began because of a hole in time
-    cuts: int = 0  #: episodes cut because too many pairs were on the road at once
     failures: int = 0  #: episodes that ended in failure
     dt: float | None = None  #: usual time between two rows [s]
     last_time: float | None = None
@@ -223,7 +222,6 @@ def _learn(machine: EvolvingFSM, actions: IntervalActions, chunk: Chunk, read: P
     read.rows += len(steps)
     read.episodes += len(chunk.starts)
     read.jumps += chunk.jumps
-    read.cuts += chunk.cuts
     read.failures += 0 if chunk.failures is None else len(chunk.failures)
     read.clipped_below += int((chunk.actions < actions.low).sum())
     read.clipped_above += int((chunk.actions > actions.high).sum())

@@ -61,7 +61,6 @@ class Chunk(NamedTuple):
     starts: NDArray[np.int64]  #: (E,) rows at which an episode begins
     dt: float  #: usual time from a row to the next [s]; NaN while no two rows belong together
     jumps: int = 0  #: episodes that begin because of a hole in time
-    cuts: int = 0  #: episodes that end because too many pairs were on the road to wait for
     #: (K,) rows with which an episode ended in failure; None where nothing tells of failures
     failures: NDArray[np.int64] | None = None
 
@@ -327,7 +326,7 @@ def episodes_of(chunks: Iterable[Chunk]) -> Iterator[Chunk]:
     Yields
     ------
     Chunk
-        Its ``jumps`` and ``cuts`` are not told apart by episode.
+        Its ``jumps`` are not told apart by episode.
 
     Examples
     --------
@@ -519,7 +518,6 @@ class _Reader:
                 starts=np.flatnonzero(starts[rows]),
                 dt=clock.dt,
                 jumps=int(holes[rows].sum()),
-                cuts=piece.cuts,
                 failures=None if self._failed is None else np.flatnonzero(fails[rows]),
             )
 

@@ -183,7 +183,7 @@ class BagTable(Table):
                 f"{self.path}: at no time are all variables known, none older than "
                 f"{self._topics.oldest:g} s (oldest in the file of --topics)"
             )
-        piece = Piece.of_numbers(self.path, 0, numbers, np.zeros(1, np.int64))
+        piece = Piece.of_numbers(self.path, 0, numbers, [0])
         for name in wanted.numbers:
             if name in self._topics.variables and name not in wanted.gaps:
                 piece.refuse_unusable(name)

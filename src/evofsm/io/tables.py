@@ -197,17 +197,11 @@ class Piece:
     find: Find
     texts: dict[str, polars.Series] = field(default_factory=dict)
     #: Rows that begin an episode, of a table that knows; None where columns tell episodes apart.
-    starts: NDArray[np.int64] | None = None
-    cuts: int = 0  #: episodes in it that were cut because too many pairs were on the road at once
+    starts: Sequence[int] | None = None
 
     @classmethod
     def of_numbers(
-        cls,
-        path: str,
-        before: int,
-        numbers: dict[str, NDArray[np.float64]],
-        starts: NDArray[np.int64],
-        cuts: int = 0,
+        cls, path: str, before: int, numbers: dict[str, NDArray[np.float64]], starts: Sequence[int]
     ) -> Self:
         """Rows of numbers alone, after so many others."""
 
@@ -215,8 +209,7 @@ class Piece:
             text = "" if name is None else str(numbers[name][row])
             return f"{path}, row {before + row + 1}", text
 
-        rows = len(next(iter(numbers.values())))
-        return cls(rows, numbers, find, starts=starts, cuts=cuts)
+        return cls(len(next(iter(numbers.values()))), numbers, find, starts=starts)
 
     def at(self, row: int) -> str:
         """Where a row stands, for a message."""

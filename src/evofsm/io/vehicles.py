@@ -74,22 +74,20 @@ class PairTable(Table):
 
     def pieces(self, wanted: Wanted) -> Iterator[Piece]:
         """All columns, whichever are wanted."""
-        before = count = cuts = 0
-        waiting: list[NDArray[np.float64]] = []
-        for rows, was_cut in chain(self._episodes(), [(None, False)]):
+        before, starts, waiting = 0, [0], list[NDArray[np.float64]]()
+        for rows in chain(self._episodes(), [None]):
             if rows is not None:
                 waiting.append(rows)
-                count, cuts = count + len(rows), cuts + was_cut
-            if waiting and (rows is None or count >= _ROWS_AT_ONCE):
-                starts = np.cumsum([0, *map(len, waiting[:-1])])
+                starts.append(starts[-1] + len(rows))
+            if waiting and (rows is None or starts[-1] >= _ROWS_AT_ONCE):
                 numbers = dict(zip(COLUMNS, np.concatenate(waiting).T, strict=True))
-                yield Piece.of_numbers(self.path, before, numbers, starts, cuts)
-                before, count, cuts, waiting = before + count, 0, 0, []
+                yield Piece.of_numbers(self.path, before, numbers, starts[:-1])
+                before, starts, waiting = before + starts[-1], [0], []
         if before == 0:
             raise ValueError(f"{self.path}: no vehicle ever follows another one on the same lane")
 
-    def _episodes(self) -> Iterator[tuple[NDArray[np.float64], bool]]:
-        """Rows of a pair for as long as it stays one, and whether it went on after it was cut."""
+    def _episodes(self) -> Iterator[NDArray[np.float64]]:
+        """Rows of a pair for as long as it stays one, or until too many wait."""
         open_pairs: dict[tuple[str, str, str], array[float]] = {}
         waiting, before = 0, -math.inf
         for moment in self._moments:
@@ -107,14 +105,12 @@ class PairTable(Table):
             waiting += len(moment.pairs)
             for rows in open_pairs.values():
                 waiting -= len(rows) // 4
-                yield _with_actions(rows), False
+                yield _with_actions(rows)
             open_pairs = present
             if waiting > _MOST_WAITING:
-                for rows in open_pairs.values():
-                    yield _with_actions(rows), True
+                yield from map(_with_actions, open_pairs.values())
                 open_pairs, waiting = {}, 0
-        for rows in open_pairs.values():
-            yield _with_actions(rows), False
+        yield from map(_with_actions, open_pairs.values())
 
 
 def _with_actions(rows: array[float]) -> NDArray[np.float64]:
