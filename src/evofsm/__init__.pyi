@@ -17,8 +17,8 @@ from .fsm import Trace as Trace
 from .fsm import jensen_shannon as jensen_shannon
 from .fsm import merge as merge
 from .fsm import register_rule as register_rule
-from .fsm import warm as warm
 from .guard import Guard as Guard
+from .guard import warm as warm
 from .store import read_header as read_header
 
 __version__: str

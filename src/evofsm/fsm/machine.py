@@ -32,7 +32,7 @@ from evofsm.fsm.arrays import MACHINE, NO_ACTION, NOT_OPEN, OF_ACTIONS, OF_MODEL
 from evofsm.fsm.clusters import PAPER, width_of
 from evofsm.fsm.divergence import jensen_shannon
 from evofsm.fsm.explanation import Explanation, Nearest, explain
-from evofsm.fsm.kernels import LINE, announce_compiling
+from evofsm.fsm.kernels import LINE
 from evofsm.fsm.model import Counts, FSMModel, Policy, believed, check_forecast
 from evofsm.fsm.naming import Labels
 from evofsm.fsm.notebook import machine_html
@@ -697,21 +697,6 @@ def _row_kernel(learnt: Learnt, settings: Settings, limit: Limit, *given: Any) -
 def opened(machine: EvolvingFSM) -> tuple[Learnt, Settings]:
     """What a machine has learnt and was given, itself."""
     return machine._learnt, machine._settings
-
-
-def warm() -> None:
-    """Compile what machines need now, and not on first use; say so where it takes long.
-
-    Compiled code is kept on disk, so that this is quick from the second time on.
-
-    Examples
-    --------
-    >>> warm()
-    """
-    announce_compiling()
-    machine = EvolvingFSM(1, max_states=2, rule=rules.Novelty())
-    machine.learn_many([[0.0], [9.0], [20.0]], [0, 0, 0])
-    machine.observe([np.nan], missing=Missing.PARTIAL, failed=True)
 
 
 def _unlock_all() -> None:
