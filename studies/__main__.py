@@ -16,6 +16,7 @@ from studies import lib
 #: Where each study is, in the order in which the evidence tells them.
 STUDIES = {
     "closed-loop": "closed_loop:ClosedLoop",
+    "detection": "detection:Detection",
     "falsification": "falsification:Falsification",
     "judges": "judges:Judges",
     "tasks": "judges:Tasks",

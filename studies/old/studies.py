@@ -4,17 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from studies.alarms.plan import Plan as Alarms
-from studies.detection.plan import Plan as Detection
 from studies.old.study import Study
 from studies.real.plan import Plan as Real
 
 #: By id.
-STUDIES: dict[str, type[Study[Any]]] = {
-    study.id: study
-    for study in (
-        Detection,
-        Alarms,
-        Real,
-    )
-}
+STUDIES: dict[str, type[Study[Any]]] = {study.id: study for study in (Real,)}

@@ -1,42 +1,19 @@
-"""Who sees danger: scores, alarms, what is watched, and the study as a whole."""
+"""Who sees danger: what is watched, alarms as events, rates that are held, and the study."""
 
-from __future__ import annotations
-
-import json
+import math
 from dataclasses import replace
 
 import numpy as np
+import polars as pl
 import pytest
-from studies.detection.alarms import (
-    choose_threshold,
-    count_alarms,
-    is_measurable,
-    lead_times,
-)
-from studies.detection.measures import Detector, Ours, Watcher, classic, fixed, tuned
-from studies.detection.plan import Plan
-from studies.detection.rows import Row, Scored, judge
-from studies.detection.study import run_detection
-from studies.detection.watch import (
-    Cases,
-    Exposure,
-    Target,
-    Watched,
-    calibration_draws,
-    expose,
-    held_out_draws,
-    watch,
-)
-from studies.detection.worlds import GRID, grid_world, world
-from studies.old.frame import Frame
-from studies.old.scores import Ranked, auprc, auroc, bootstrap, brier, isotonic
-from studies.policies import Group
+from studies import detection, lib
+from studies.detection import COUNTS, OURS, PAPER, STATES, Danger, Detection, Exposure, Watched
 
-from evofsm.driving import measures
-from evofsm.driving.episodes import drive, unrevised_guard
-from evofsm.driving.families import load_family
+from evofsm.driving import drive, load_family, unrevised_guard
+from evofsm.guard import ConformalAlarm
+from evofsm.paper import write_page
 
-TINY = Plan(
+TINY = Detection(
     train=6,
     since=3,
     seeds=2,
@@ -44,146 +21,75 @@ TINY = Plan(
     long_hours=0.05,
     rounds=5,
     seed_hours=0.02,
-    grid=(2.0, 4.0),
+    grid=(2.0,),
     grid_leader=(6.0,),
     grid_train=4,
     grid_hours=0.02,
+    alarm_seeds=1,
+    alarm_train=4,
+    alarm_calibration=12,
+    alarm_test=12,
+    alarm_rounds=20,
 )
 
 
-# -- Scores ---------------------------------------------------------------------------------------
-
-
-def test_areas_are_those_of_their_definitions() -> None:
-    rng = np.random.default_rng(0)
-    score, truth = rng.integers(6, size=60).astype(float), rng.random(60) < 0.4
-    above = score[truth][:, None] - score[~truth]
-    assert auroc(score, truth) == pytest.approx(((above > 0) + 0.5 * (above == 0)).mean())
-    thresholds = np.unique(score)[::-1]
-    recall = np.array([truth[score >= t].sum() for t in thresholds]) / truth.sum()
-    precision = np.array([truth[score >= t].mean() for t in thresholds])
-    assert auprc(score, truth) == pytest.approx(np.diff(recall, prepend=0.0) @ precision)
-
-
-def test_an_episode_counts_as_often_as_it_was_drawn() -> None:
-    rng = np.random.default_rng(1)
-    score, truth, episode = rng.random(30), rng.random(30) < 0.5, np.repeat(np.arange(3), 10)
-    twice = np.concatenate([np.flatnonzero(episode == k) for k in (0, 0, 2)])
-    by_weight = Ranked(score, truth, episode).areas([2, 0, 1])
-    assert by_weight == pytest.approx(Ranked(score[twice], truth[twice]).areas())
-
-
-def test_infinite_scores_have_a_rank_and_nan_has_none() -> None:
-    truth = [False, True, False, True]
-    assert auroc([-np.inf, np.inf, 0.0, np.inf], truth) == 1.0
-    with pytest.raises(ValueError, match="NaN"):
-        auroc([0.0, np.nan, 0.0, 1.0], truth)
-    with pytest.raises(ValueError, match="equally long"):
-        auroc([0.0], truth)
-
-
-def test_areas_need_both_kinds() -> None:
-    assert np.isnan(auroc([1.0, 2.0], [True, True]))
-    assert auprc([1.0, 2.0], [True, True]) == 1.0
-    assert np.isnan(auprc([1.0, 2.0], [False, False]))
-
-
-def test_isotonic_probabilities_never_fall_and_fit_better_than_the_base_rate() -> None:
-    rng = np.random.default_rng(2)
-    score = np.append(rng.normal(size=400), [np.inf, -np.inf])
-    truth = rng.random(402) < 1.0 / (1.0 + np.exp(-2.0 * score))
-    calibrate = isotonic(score, truth)
-    probability = calibrate(np.append(np.sort(score), np.inf))
-    assert (np.diff(probability) >= 0.0).all()
-    assert 0.0 <= probability[0] <= probability[-1] <= 1.0
-    assert brier(calibrate(score), truth) < truth.var()
-
-
-def test_a_bootstrap_leaves_out_what_has_no_number() -> None:
-    values = np.arange(20.0)
-    low, high = bootstrap(lambda chosen: float(values[chosen].mean()), 20)
-    assert 5.0 < low < values.mean() < high < 14.0
-    assert np.isnan(bootstrap(lambda chosen: float("nan"), 20, rounds=3)).all()
-
-
-# -- Alarms ---------------------------------------------------------------------------------------
-
-
-def cases(truth: list[bool]) -> Cases:
+def cases(truth):
     """One episode, a decision every 0.25 s."""
     n = len(truth)
-    return Cases(
-        np.arange(n), np.array(truth), np.zeros(n, int), np.array([0, n]), n * 0.25 / 3600.0
-    )
+    hours = n * 0.25 / 3600.0
+    return detection.Cases(np.arange(n), np.array(truth), np.zeros(n, int), np.array([0, n]), hours)
 
 
-def raised(n: int, *rows: int) -> np.ndarray:
+def raised(n, *rows):
     score = np.zeros(n)
     score[list(rows)] = 1.0
     return score
 
 
-def test_alarms_no_more_than_a_second_apart_are_one() -> None:
-    safe = cases([False] * 40)
-    assert count_alarms(raised(40, 5, 9), safe, 0.5, 0.25).false == 1
-    assert count_alarms(raised(40, 5, 10), safe, 0.5, 0.25).false == 2
-
-
-def test_an_alarm_holds_for_a_second() -> None:
-    alarms = count_alarms(raised(40, 5), cases([False] * 40), 0.5, 0.25)
-    assert alarms.false_decisions == 4
-
-
-def test_an_alarm_comes_true_if_the_target_follows_while_it_is_on() -> None:
-    late = cases([False] * 12 + [True] * 8)
-    assert count_alarms(raised(20, 10), late, 0.5, 0.25)[:2] == (0, 1)
-    assert count_alarms(raised(20, 2), late, 0.5, 0.25)[:2] == (1, 0)
-
-
-def test_an_alarm_that_is_always_on_is_false_where_the_target_is_far() -> None:
-    always = np.ones(60)
-    near, far = cases([False] * 20 + [True] * 40), cases([False] * 21 + [True] * 39)
-    assert count_alarms(always, near, 0.5, 0.25).false == 0
-    assert count_alarms(always, far, 0.5, 0.25).false == 1
-
-
-def test_the_threshold_keeps_the_rate_on_what_it_was_chosen_on() -> None:
-    rng = np.random.default_rng(3)
-    n = 4 * 3600 * 4
-    some = cases((rng.random(n) < 0.02).tolist())
-    score = rng.normal(size=n) + some.truth
-    thresholds = [choose_threshold(score, some, rate, 0.25) for rate in (2.0, 10.0, 50.0)]
-    assert thresholds == sorted(thresholds, reverse=True)
-    for rate, threshold in zip((2.0, 10.0, 50.0), thresholds, strict=True):
-        assert count_alarms(score, some, threshold, 0.25).false <= rate * some.hours
-    assert choose_threshold(score, cases([True] * n), 1.0, 0.25) == -np.inf
-
-
-def test_a_rate_needs_three_expected_events() -> None:
-    assert is_measurable(1.0, 3.0)
-    assert not is_measurable(0.1, 29.9)
-
-
-def exposure(*collided: bool, n: int = 40) -> Exposure:
+def exposure(*collided, n=40):
     """Episodes in which nothing moves, each as long."""
     still = np.tile([10.0, 0.0, 0.0], (n, 1))
     watched = (Watched(still, still, np.zeros(n), n * 0.25, one) for one in collided)
     return Exposure(load_family("emergency"), tuple(watched))
 
 
-def test_lead_time_is_that_of_the_alarm_that_stays_on() -> None:
+def test_alarms_hold_for_a_second_and_come_true_if_the_danger_follows_soon():
+    safe, late = cases([False] * 40), cases([False] * 12 + [True] * 8)
+    near, far = cases([False] * 20 + [True] * 40), cases([False] * 21 + [True] * 39)
+    for score, some, false in (
+        (raised(40, 5, 9), safe, 1),  # no further apart they are one
+        (raised(40, 5, 10), safe, 2),
+        (raised(20, 10), late, 0),
+        (raised(20, 2), late, 1),
+        (np.ones(60), near, 0),
+        (np.ones(60), far, 1),
+    ):
+        assert detection.count_alarms(score, some, 0.5, 0.25)[0] == false
+    assert detection.count_alarms(raised(40, 5), safe, 0.5, 0.25) == (1, 4)
+
+
+def test_the_threshold_keeps_the_rate_on_what_it_was_chosen_on():
+    rng = np.random.default_rng(3)
+    n = 4 * 3600 * 4
+    some = cases((rng.random(n) < 0.02).tolist())
+    score = rng.normal(size=n) + some.truth
+    thresholds = [detection.choose_threshold(score, some, rate, 0.25) for rate in (2.0, 10.0, 50.0)]
+    assert thresholds == sorted(thresholds, reverse=True)
+    for rate, threshold in zip((2.0, 10.0, 50.0), thresholds, strict=True):
+        assert detection.count_alarms(score, some, threshold, 0.25)[0] <= rate * some.hours
+    assert detection.choose_threshold(score, cases([True] * n), 1.0, 0.25) == -math.inf
+
+
+def test_lead_time_is_that_of_the_alarm_that_stays_on():
     three = exposure(True, False, True)
     score = np.concatenate([raised(40, 3, *range(30, 40)), np.ones(40), raised(40, 10)])
-    assert lead_times(score, three, 0.5).tolist() == [2.5, 0.0]
+    assert detection.lead_times(score, three, 0.5).tolist() == [2.5, 0.0]
 
 
-# -- What is watched ------------------------------------------------------------------------------
-
-
-def test_watching_is_driving_unrevised() -> None:
-    family = load_family("rare").with_switches(["noise"])
+def test_watching_is_driving_unrevised():
+    family = load_family("rare+noise")
     draw = family.draw(1, 2, split="test")
-    one, driven = watch(family, draw), drive(unrevised_guard(family), draw)
+    one, driven = detection.watch(family, draw), drive(unrevised_guard(family), draw)
     seen = [decision.situation.observation for decision in driven.decisions]
     assert np.array_equal(one.seen, seen)
     assert np.array_equal(one.commands, driven.executed)
@@ -191,195 +97,166 @@ def test_watching_is_driving_unrevised() -> None:
     assert (one.end, one.collided) == (driven.time[-1], driven.collided)
 
 
-def test_runs_that_are_always_the_same_add_no_hours() -> None:
+def test_runs_that_are_always_the_same_add_no_hours():
     family = load_family("r157")
-    assert len(expose(family, held_out_draws(family, 0), hours=1.0).watched) == 7
-    few_kinds = load_family("ncap")  # of which some draws are the same by chance
-    assert len(expose(few_kinds, held_out_draws(few_kinds, 0), hours=0.2).watched) > 30
+    assert (
+        len(detection.expose(family, detection.held_out_draws(family, 0), hours=1.0).watched) == 7
+    )
 
 
-def test_hours_are_those_of_every_target() -> None:
-    family = load_family("rare")
-    some = expose(family, held_out_draws(family, 0), hours=0.1)
-    assert 0.1 <= some.cases(Target.COLLISION).hours < some.cases(Target.DEAD_END).hours < 0.13
+def test_draws_for_thresholds_are_nobody_elses():
+    here = detection.world("emergency")
+    others = [draw for seed in range(3) for _, draw in here.training(0, seed, 6)]
+    assert next(detection.calibration_draws(here.family, 0)) not in others
+    assert next(detection.held_out_draws(here.family, 0)) not in others
 
 
-def test_draws_for_thresholds_are_nobody_elses() -> None:
-    here = world("emergency", TINY)
-    calibration = next(calibration_draws(here.family, 0))
-    others = [draw for seed in range(3) for _, draw in here.training(TINY, seed)]
-    assert calibration not in others
-    assert calibration != next(held_out_draws(here.family, 0))
-
-
-def test_what_would_have_come_after_the_end_is_left_out() -> None:
+def test_what_would_have_come_after_the_end_is_left_out():
     safe, crash = exposure(False), exposure(True)
-    assert len(safe.cases(Target.COLLISION).truth) == 21  # the last five seconds are not known
-    truth = crash.cases(Target.COLLISION).truth
+    assert len(safe.cases(Danger.COLLISION).truth) == 21  # the last five seconds are not known
+    truth = crash.cases(Danger.COLLISION).truth
     assert truth.tolist() == [False] * 20 + [True] * 20
 
 
-def test_worlds_by_name() -> None:
-    shift, at_once = world("shift", TINY), world("shift-at-once", TINY)
-    assert (shift.watched.decel, shift.family.decel, shift.since) == (4.5, 2.5, TINY.since)
-    assert at_once.since == 0
-    assert at_once.settled.decel == 4.5
-    families = [family.decel for family, _ in shift.training(TINY, 0)]
-    assert families == [4.5] * TINY.train + [2.5] * TINY.since
-    noisy = world("emergency+noise", TINY).family.draw(0, 0).scenario.sensors
-    assert noisy.gap_noise > 0.0
-    paper = world("paper", TINY).family
-    assert paper.name == "paper"
+def test_worlds_by_name():
+    shift, at_once = detection.world("shift", since=3), detection.world("shift-at-once")
+    assert (shift.watched.decel, shift.family.decel, shift.settled.decel) == (4.5, 2.5, 2.5)
+    assert (at_once.since, at_once.settled.decel) == (0, 4.5)
+    assert [family.decel for family, _ in shift.training(0, 0, 6)] == [4.5] * 6 + [2.5] * 3
+    assert detection.world("emergency+noise").family.draw(0, 0).scenario.sensors.gap_noise > 0.0
+    paper = detection.world("paper").family
     assert paper.draw(0, 0).scenario.initial_gap != paper.draw(0, 4).scenario.initial_gap
     with pytest.raises(ValueError, match="no shift"):
-        world("rare-at-once", TINY)
+        detection.world("rare-at-once")
 
 
-def test_worlds_of_the_grid_have_the_brakes_asked_for() -> None:
-    family = grid_world(3.0, 7.5, Plan()).family
-    assert (family.decel, family.leader_decel) == (3.0, 7.5)
-    scenario = family.draw(0, 0).scenario
-    assert scenario.body.lowest == -3.0
-    assert 2.5 <= scenario.leader.brake_decel <= 7.5
-
-
-# -- Measures -------------------------------------------------------------------------------------
-
-
-@pytest.fixture(scope="module", params=["emergency", "emergency+noise"])
-def watcher(request: pytest.FixtureRequest) -> tuple[Watcher, Exposure]:
-    """One that has watched, and what it is judged on."""
-    here = world(request.param, TINY)
-    return (
-        Watcher(here.watched).watch(here.training(TINY, 0)),
-        expose(here.family, held_out_draws(here.family, 0), 0.02),
-    )
-
-
-def test_scores_know_nothing_of_what_comes_later(watcher: tuple[Watcher, Exposure]) -> None:
-    mine, some = watcher
-    half = Exposure(
-        some.family,
-        tuple(
+@pytest.mark.parametrize("name", ["emergency", "emergency+noise"])
+def test_scores_know_nothing_of_what_comes_later_and_ours_tells_dead_ends(name):
+    here = detection.world(name)
+    watcher = detection.Watcher(here.watched).watch(here.training(0, 0, 6))
+    some = detection.expose(here.family, detection.held_out_draws(here.family, 0), 0.02)
+    half = some._replace(
+        watched=tuple(
             one._replace(seen=one.seen[:20], true=one.true[:20], commands=one.commands[:20])
             for one in some.watched
-        ),
+        )
     )
-    first = np.append(0, np.cumsum([len(one.commands) for one in some.watched]))[:-1]
-    rows = (first[:, None] + np.arange(20)).ravel()
-    for detector in [*mine.detectors(), *fixed(some.family)]:
-        np.testing.assert_allclose(
-            detector.score(half), detector.score(some)[rows], atol=1e-12, err_msg=detector.name
-        )
+    rows = (some.first[:-1, None] + np.arange(20)).ravel()
+    scores = watcher.scores()
+    assert set(scores) == {OURS, STATES, COUNTS, PAPER}
+    for measure, score in (scores | detection.classics(some.family)).items():
+        np.testing.assert_allclose(score(half), score(some)[rows], atol=1e-12, err_msg=measure)
+    truth = some.cases(Danger.DEAD_END).truth
+    assert lib.Ranked(scores[OURS](some), truth).areas().auroc > 0.98
 
 
-def test_ours_tells_dead_ends_and_states_are_coarser(watcher: tuple[Watcher, Exposure]) -> None:
-    mine, some = watcher
-    truth = some.cases(Target.DEAD_END).truth
-    areas = {one.name: auroc(one.score(some), truth) for one in mine.detectors()}
-    assert areas[Ours.DEFAULT] > 0.98
-    assert areas[Ours.DEFAULT] > areas[Ours.PAPER_ACTIONS]
+def test_failures_are_counted_in_states_within_the_horizon():
+    here = detection.world("emergency")
+    watcher = detection.Watcher(here.watched).watch(here.training(0, 0, 1))
+    (cases_, failures) = watcher.default._counts.sum(axis=1)
+    one = detection.watch(*next(here.training(0, 0, 1)))
+    assert one.collided
+    assert (cases_, failures) == pytest.approx((len(one.commands), 20))
+    assert np.all((watcher.default.probability > 0.0) & (watcher.default.probability < 1.0))
 
 
-def test_without_noise_the_score_is_that_of_what_is_seen() -> None:
-    here = world("emergency", TINY)
-    mine = Watcher(here.watched, states=False).watch(here.training(TINY, 0))
-    some = expose(here.family, held_out_draws(here.family, 0), 0.01)
-    seen = np.concatenate([one.seen for one in some.watched])
-    assert np.array_equal(mine.latent_risk(some), mine.risk.score(seen))
-    assert [one.name for one in mine.detectors()] == [Ours.DEFAULT]
+def test_windows_before_a_collision_are_dangerous_and_open_ends_are_left_out():
+    some = exposure(True, False, False)
+    crash, safe, short = some.watched
+    cut = [
+        one._replace(commands=np.zeros(n), end=0.25 * n)
+        for one, n in ((crash, 50), (safe, 60), (short, 10))
+    ]
+    found = detection.windows(some._replace(watched=tuple(cut)), np.arange(120.0))
+    np.testing.assert_array_equal(found.episode, [0, 0, 0, 1, 1])
+    np.testing.assert_array_equal(found.score, [19.0, 39.0, 49.0, 69.0, 89.0])
+    # 20 decisions are 5 s: of the first 7.5 s are left, of the second 2.5 s
+    np.testing.assert_array_equal(found.happened, [False, True, True, False, False])
+    assert len(detection.windows(some._replace(watched=tuple(cut[2:])), np.zeros(10)).score) == 0
 
 
-def test_tuning_takes_what_tells_best_in_training() -> None:
-    family = load_family("weak_brakes")
-    some = Exposure(family, tuple(watch(family, family.draw(0, index)) for index in range(12)))
-    truth = some.cases(Target.DEAD_END).truth
-    unmatched = measures.ResponsibilitySensitiveSafety.r157()
-    best = auroc(tuned(some, Target.DEAD_END).score(some), truth)
-    assert best >= auroc(classic("", Group.FIXED, unmatched).score(some), truth) - 0.01
+def test_a_fixed_threshold_holds_the_rate_of_what_it_was_chosen_on():
+    rng = np.random.default_rng(0)
+    score, happened = rng.normal(size=1000), rng.random(1000) < 0.5
+    made = detection.Windows(score, happened, np.arange(1000))
+    above = score > detection.fixed_threshold(made, 0.1, "false alarms")
+    assert above[~happened].mean() == pytest.approx(0.1, abs=0.01)
+    missed = score < detection.fixed_threshold(made, 0.1, "misses")
+    assert missed[happened].mean() == pytest.approx(0.1, abs=0.01)
+    few = detection.Windows(score[:5], np.zeros(5, np.bool_), np.arange(5))
+    assert detection.fixed_threshold(few, 0.1, "false alarms") == math.inf
+    assert (
+        detection.fixed_threshold(few, 0.1, "misses") == -math.inf
+    )  # no event to choose it on: always on
 
 
-# -- Rows -----------------------------------------------------------------------------------------
+def test_an_alarm_is_told_a_window_later():
+    alarm = ConformalAlarm(0.5, step=0.1)
+    made = detection.Windows(np.array([1.0, 2.0, 3.0]), np.zeros(3, np.bool_), np.zeros(3, np.intp))
+    assert [alarm.counted for _ in detection.said_by(alarm, made)] == [0, 1, 2]
+    assert alarm.counted == 3
 
 
-def oracle(target: Target) -> Detector:
-    """Knows the truth of everything but what is never known."""
-
-    def score(some: Exposure) -> np.ndarray:
-        known = some.cases(target)
-        scores = np.zeros(sum(len(one.commands) for one in some.watched))
-        scores[known.rows] = np.where(known.truth, 1.0, -1.0)
-        return scores
-
-    return Detector("oracle", Group.BOUND, score)
-
-
-def judged(target: Target, some: Exposure, other: Exposure) -> Row:
-    seer = oracle(target)
-    now, before = (Scored(one, seer.score(one)) for one in (some, other))
-    return judge("emergency", seer, target, now, before, rounds=3).row
+def test_errors_are_those_of_the_kind_that_is_held():
+    seen = detection.Windows(
+        np.zeros(4), np.array([True, True, False, False]), np.array([0, 0, 1, 1])
+    )
+    alarmed = np.array([True, False, True, True])
+    false, missed = (detection.errors_of(alarmed, seen, of) for of in ("false alarms", "misses"))
+    assert false == {"errors": [0, 2], "windows": [0, 2], "other": 1, "could": 2}
+    assert missed == {"errors": [1, 0], "windows": [2, 0], "other": 2, "could": 2}
+    key = {"world": "a", "changed": False, "score": "s", "stated": 0.1, "most": 3.0}
+    said = [key | {"alarm": "adaptive", "of": "misses"} | missed] * 2
+    (row,) = detection.rates(pl.DataFrame(said), rounds=50, seed=0).to_dicts()
+    assert (row["errors"], row["windows"], row["realised"], row["other"]) == (2, 4, 0.5, 1.0)
+    assert row["most"] == 0.1 + 6.0 / 4
+    assert not row["holds"]
 
 
-def test_who_knows_the_truth_is_perfect() -> None:
-    family = load_family("emergency")
-    some = expose(family, held_out_draws(family, 0), 0.1)
-    row = judged(Target.DEAD_END, some, expose(family, calibration_draws(family, 0), 0.1))
-    assert (row.auroc, row.auroc_low, row.auprc) == (1.0, 1.0, 1.0)
-    assert (row.brier, row.missed, row.called) == (0.0, 0.0, 0.0)
-    assert row.lead_median_1 is None  # of one false alarm per hour nothing is known after this
-    assert row.false_alarms_1 is None
+@pytest.fixture(scope="module")
+def found():
+    return replace(TINY, family="r157,cut_in").run(workers=1)
 
 
-def test_with_hours_enough_lead_times_are_told() -> None:
-    long = exposure(*720 * (True, False))
-    row = judged(Target.COLLISION, long, long)
-    assert row.hours > 3.0
-    assert (row.false_alarms_1, row.warned_1, row.false_time_1) == (0.0, 1.0, 0.0)
-    assert row.lead_median_1 == row.lead_p10_1 == 5.0
-    assert row.lead_median_01 is None
+def test_every_measure_is_judged_in_every_world(found):
+    rows = found["rows"]
+    assert set(rows["family"]) == {"r157", "cut_in"}
+    assert set(rows["danger"]) == {str(one) for one in Danger}
+    names = {OURS, STATES, COUNTS, PAPER, "rss-tuned", *detection.classics(load_family("r157"))}
+    assert set(rows["measure"]) == names
+    assert set(rows.filter(family="r157")["episodes"]) == {7}
+    assert rows["lead"].null_count() == len(rows)  # so few hours cannot tell one alarm per hour
+    assert rows.filter(measure=OURS, danger=Danger.DEAD_END)["auroc"].min() > 0.9
+    assert len(found["seeds"]) == 2 * 4
+    assert set(found["grid"]["measure"]) == {OURS, "rss-r157", "rss-matched"}
+    alarms = found["alarms"]
+    assert set(alarms["world"]) == {"cut_in"}
+    assert len(alarms) == 3 * 2 * 2
+    bound = alarms.filter(alarm="adaptive", of="false alarms")
+    assert (bound["errors"] <= bound["most"] * bound["windows"] + 1e-9).all()
 
 
-# -- The study ------------------------------------------------------------------------------------
+def test_the_page_says_where_ours_loses_and_is_sound(found, tmp_path, read_page):
+    lead = pl.when(measure="ttc").then(9.0).otherwise(1.0)
+    page = TINY.page({**found, "rows": found["rows"].with_columns(lead=lead, false_time=0.1)})
+    read_page(write_page(tmp_path / "index.html", [page])).is_sound()
+    assert "ttc" in set(page.losses[0].frame["measure"])
 
 
-@pytest.mark.slow
-def test_the_study_does_not_depend_on_the_number_of_workers() -> None:
-    plan = replace(TINY, grid=(2.0,), family="r157,ncap")
-    seen: list[tuple[int, int]] = []
-    alone = run_detection(plan, lambda done, total: seen.append((done, total)), workers=1)
-    shared = run_detection(plan, workers=2)
-    assert repr(alone) == repr(shared)
-    assert seen[-1] == (5, 5)
-    assert {row.family for row in alone.rows} == set(plan.families)
-    assert {row.target for row in alone.rows} == set(Target)
-    assert all(row.family == GRID for row in alone.grid)
-    row = alone.row("ncap", Ours.DEFAULT, Target.DEAD_END)
-    assert row is not None
-    assert len(row.auroc_seeds) == plan.seeds - 1
-    assert alone.row("ncap", "nobody", Target.DEAD_END) is None
+def test_targets_are_judged_as_far_as_their_worlds_were():
+    areas = {("rare", OURS): 0.99, ("rare", STATES): 0.6, ("rare", PAPER): 0.5}
+    areas |= {("shift", OURS): 0.9, ("shift", "rss-r157"): 0.95}
+    rows = [(*who, "dead end", None, area) for who, area in areas.items()]
+    frame = pl.DataFrame(rows, ["family", "measure", "danger", "lead", "auroc"], orient="row")
+    met = {one.target: one.met for one in detection._targets({"rows": frame})}
+    assert met == {
+        "AUROC on rare": True,
+        "AUROC on shift: at least rss-r157's": False,
+        "AUROC on rare, evofsm: evofsm-paper's + 0.2": True,
+        "AUROC on rare, evofsm-states: evofsm-paper's + 0.2": False,
+    }
 
 
-def test_rows_are_plain_numbers() -> None:
-    study = replace(TINY, seeds=1, family="r157", with_grid=False).run(workers=1)
-    assert study.grid == []
-    for row in study.rows:
-        assert isinstance(row, Row)
-        (document,) = Frame([row]).as_dicts()
-        json.dumps(document)
-        assert {"family", "measure", "target", "auroc", "auprc", "brier", "episodes"} < set(
-            document
-        )
-        assert document["episodes"] == 7
-        assert document["lead_median_1"] is None  # seven fixed runs are no hours
-
-
-def test_a_wrong_family_is_told_before_anything_is_driven() -> None:
+def test_a_wrong_family_is_told_before_anything_is_driven():
     with pytest.raises(ValueError, match="nowhere"):
-        run_detection(replace(TINY, family="emergency,nowhere"))
-
-
-def test_a_short_plan_still_measures_one_alarm_an_hour() -> None:
-    plan = Plan(seed=3).shortened()
-    assert is_measurable(1.0, plan.hours_of("paper"))
-    assert plan.seed == 3
-    assert plan.train < Plan().train
+        replace(TINY, family="emergency,nowhere").run()

@@ -9,7 +9,6 @@ import numpy as np
 import polars as pl
 import pytest
 from studies.falsification import (
-    KNOWN,
     Cars,
     Falsification,
     Toy,
@@ -18,16 +17,10 @@ from studies.falsification import (
     plain,
     row_of,
     split,
-    to_chance,
 )
 
-from evofsm.driving import (
-    FAMILIES,
-    drive,
-    guard_for_family,
-    load_family,
-    unrevised_guard,
-)
+from evofsm.driving import FAMILIES, drive, guard_for_family, load_family, unrevised_guard
+from evofsm.paper import write_page
 
 FOUND = Path(__file__).with_name("found-seldom-none.py")
 
@@ -39,19 +32,6 @@ def above(least):
         return math.inf if chance("x") >= least else chance("x")
 
     return score
-
-
-# -- Splitting ------------------------------------------------------------------------------------
-
-
-@pytest.mark.slow
-def test_a_probability_of_1e_5_comes_out_within_chance():
-    runs = [split(Toy().score, (1, k), cases=100, moves=10) for k in range(16)]
-    values = np.array([run.probability for run in runs])
-    error = values.std(ddof=1) / math.sqrt(len(values))
-    assert abs(values.mean() - KNOWN) < 3.3 * error  # 99.5 % of Student's t with 15 degrees
-    assert error < 0.25 * KNOWN
-    assert sum(run.tried for run in runs) < 200_000  # where plain sampling would see two
 
 
 def test_splitting_and_plain_sampling_say_the_same_where_both_see():
@@ -96,12 +76,6 @@ def test_where_nothing_fails_it_says_how_far_it_came():
     assert 0.99 < never.best < 1.0
 
 
-def test_chances_are_below_1_whatever_the_number():
-    assert 0.0 <= to_chance(-40.0) < to_chance(0.0) == 0.5 < to_chance(40.0) < 1.0
-
-
-# -- The study ------------------------------------------------------------------------------------
-
 STUDY = Falsification(
     family="toy,seldom,emergency", judge="none", runs=3, cases=20, moves=2, least=1e-3, plain=200
 )
@@ -125,13 +99,6 @@ def test_every_row_rests_on_splitting_and_on_plain_samples(found):
     assert targets["met"].to_list() == [True]
 
 
-@pytest.mark.slow
-def test_numbers_do_not_depend_on_the_processes():
-    study = replace(STUDY, family="toy,seldom", plain=50)
-    alone, together = study.run(workers=1), study.run(workers=2)
-    assert alone["rows"].equals(together["rows"])
-
-
 def test_cases_are_written_as_a_family_that_fails_as_often(found, tmp_path):
     STUDY.write(found, tmp_path)
     family = load_family(tmp_path / "found-emergency-none.py")
@@ -149,19 +116,9 @@ def test_cases_are_written_as_a_family_that_fails_as_often(found, tmp_path):
     assert 0.0 < far[-1] <= far[0] <= 1.0
 
 
-def test_the_page_has_its_figure_and_all_numbers_of_what_was_found(found, tmp_path):
-    from evofsm.paper import write_page
-
-    page = STUDY.page(found)
-    write_page(tmp_path / "index.html", [page])
-    assert len(list(tmp_path.rglob("*.svg"))) == 1
-    table = next(part for part in page.parts if "emergency" in part.title)
-    assert len(table.cells) == 3
-    assert "scenario.initial_gap [m]" in table.header
-    assert not any("sensors.seed" in name for name in table.header)
-
-
-def test_failures_under_a_guard_and_runs_that_disagree_are_among_the_losses(found):
+def test_failures_under_a_guard_and_runs_that_disagree_are_among_the_losses(
+    found, tmp_path, read_page
+):
     runs = [split(above(least), [0], 20, 2, 1e-2) for least in (0.9, 2.0, 2.0)]
     rows = [
         row_of("seldom", "kinematic", runs, 1000, 0),
@@ -169,12 +126,18 @@ def test_failures_under_a_guard_and_runs_that_disagree_are_among_the_losses(foun
         row_of("seldom", "none", runs[:1] * 2, 1000, 900),
     ]
     assert [row["blind"] for row in rows] == [2, 2, 0]
-    page = STUDY.page({"rows": pl.concat([found["rows"], pl.DataFrame(rows)], how="diagonal")})
+    rows = pl.concat([found["rows"], pl.DataFrame(rows)], how="diagonal")
+    page = STUDY.page({**found, "rows": rows})
     fails, doubtful = (table.frame.select("family", "judge").rows() for table in page.losses)
     assert fails == [("seldom", "kinematic"), ("rare", "kinematic")]
     assert ("seldom", "kinematic") in doubtful  # its runs do not agree
     assert doubtful[-1] == ("seldom", "none")  # 0.1 against 0.9
     assert page.holds is False
+    table = next(part for part in page.parts if "emergency" in part.title)
+    assert len(table.cells) == 3
+    assert "scenario.initial_gap [m]" in table.header
+    assert not any("sensors.seed" in name for name in table.header)
+    read_page(write_page(tmp_path / "index.html", [page])).is_sound()
 
 
 @pytest.mark.parametrize("name", FAMILIES)

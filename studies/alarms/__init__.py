@@ -1,1 +1,0 @@
-"""Alarms that state a rate of errors, adaptive and fixed, before and after a change."""

@@ -1,1 +1,0 @@
-"""Detection: who sees danger, how early, and at how many false alarms."""
