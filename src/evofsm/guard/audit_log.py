@@ -4,16 +4,13 @@ A record is a JSON object on a line of its own, and its number is that of the li
 
     {"clock":...,"kind":"begin",...,"number":2,"previous":"9c1e...","hash":"51b0..."}
 
-``hash`` is the SHA-256 of the line up to the comma before it, in hexadecimal, and ``previous`` that
-of the record before (zeros for the first): a hash chain as in Haber and Stornetta (J. Cryptology
-3, 1991). Whoever changes, removes, moves or inserts a record breaks the chain there, unless
-everything after it is written anew, or cut off. That is shown by the *head*, the number and hash of
-the last record, where someone has kept it elsewhere.
+``hash`` is the SHA-256 of the line up to the comma before it, and ``previous`` that of the record
+before (zeros for the first): a hash chain as in Haber and Stornetta (J. Cryptology 3, 1991).
+Whoever changes, removes, moves or inserts a record breaks the chain there, unless everything after
+it is written anew, or cut off: that is shown by a *head* that was kept elsewhere.
 
-``FIELDS`` has the names in each kind of record, docs/audit.md what they are. An action is a number,
-or a list of them where the set of actions is a box. ``before`` holds what happened since the last
-record, where the proposal was executed as it was: ``[time, observation, proposal]``, with the
-candidates after that if there were any, and without a proposal where none was made.
+docs/audit.md says what is in a record. A row of ``before`` is ``[time, observation, proposal]``,
+with the candidates after that if there were any, and without a proposal where none was made.
 """
 
 from __future__ import annotations
@@ -50,12 +47,9 @@ from evofsm.guard.reviser import is_spoken
 _log = logging.getLogger(__name__)
 
 LOG_VERSION = 1
-# So many states of a belief are written, the most probable first.
-_STATES = 3
-# Decisions of which nothing is to be said that are held back at most: what a kill may lose.
-_MOST_QUIET = 240
-# A longer line is no record: it holds a machine at most.
-_LONGEST = 1 << 29
+# Most probable states of a belief that are written; decisions that are held back at most, which a
+# kill loses; and bytes of a line, which holds a machine at most.
+_STATES, _MOST_QUIET, _LONGEST = 3, 240, 1 << 29
 _SEAL, _END = b',"hash":"', b'"}\n'
 # How a log begins: so a half-written one is told from other people's files.
 _ABOUT = "evofsm audit log"
@@ -285,8 +279,8 @@ def _against(kept: Head, head: Head) -> Finding:
 class AuditLog:
     """Logs what a guard decides, so that nobody can change it unnoticed: ``Guard(..., audit=log)``.
 
-    Where the disk fails while driving, someone has to go on driving: the log is broken off there,
-    which is logged, and raised as the episode ends.
+    Where the disk fails while driving, the log is broken off there, which is logged, and raised as
+    the episode ends.
 
     Parameters
     ----------
@@ -307,10 +301,9 @@ class AuditLog:
 
     Notes
     -----
-    Between the episodes of a log anything may teach machine or judge: they are written anew then.
-    During one nothing else may. An interrupt (Ctrl-C) while something is written breaks the
-    episode off in the log, which goes on with the next one. Where a process forks, the log stays
-    with the parent: a child that has something to write fails as if the disk did.
+    Between the episodes of a log anything may teach machine or judge, during one nothing else may.
+    An interrupt (Ctrl-C) while something is written breaks the episode off in the log. Where a
+    process forks, the log stays with the parent.
 
     Examples
     --------

@@ -41,11 +41,10 @@ class RevisedActions(gymnasium.Wrapper[Any, Any, Any, Any]):
     """Executes a guard's revision of each action, and forwards all else as it is.
 
     The guard learns while the environment runs. ``info`` holds ``reviser/proposed_action`` and
-    ``reviser/executed_action``, both as the environment takes them, ``reviser/reason``,
+    ``reviser/executed_action``, as the environment takes them, ``reviser/reason``,
     ``reviser/risk``, the probability of failure under the executed action,
-    ``reviser/risk_proposed``, that under the proposed one (both NaN where nothing was judged), and
-    ``reviser/penalty``, the size of the change. All else about the latest decision is in
-    `revision`.
+    ``reviser/risk_proposed``, that under the proposed one (NaN where nothing was judged), and
+    ``reviser/penalty``, the size of the change.
 
     Parameters
     ----------
@@ -84,9 +83,9 @@ class RevisedActions(gymnasium.Wrapper[Any, Any, Any, Any]):
     >>> guard = guard_for_family(env.family)
     >>> env = RevisedActions(env, guard, failed=lambda info: info["failed"])
     >>> observation, info = env.reset(seed=1)
-    >>> full_throttle, over = env.action_space.high, False
-    >>> while not over:
-    ...     observation, reward, terminated, truncated, info = env.step(full_throttle)
+    >>> over = False
+    >>> while not over:  # at full throttle
+    ...     _, _, terminated, truncated, info = env.step(env.action_space.high)
     ...     over = terminated or truncated
     >>> info["failed"]
     False
@@ -171,8 +170,7 @@ class RevisedVectorActions(VectorWrapper[Any, Any, Any, Any, Any]):
     >>> guard = guard_for_cars(low=-2.5, high=2.5, interval=0.25)
     >>> envs = RevisedVectorActions(envs, guard, failed=lambda info: info["failed"])
     >>> observations, infos = envs.reset(seed=1)
-    >>> for _ in range(300):
-    ...     observations, _, ended, _, infos = envs.step(envs.action_space.high)
+    >>> *_, infos = envs.step(envs.action_space.high)
     >>> infos["reviser/executed_action"].shape, infos["_reviser/executed_action"].tolist()
     ((2, 1), [True, True])
     >>> envs.close()

@@ -37,7 +37,7 @@ _Ints = NDArray[np.int64]
 
 # Steps that are looked ahead.
 _STEPS = 5
-# Objects of all moments that are remembered, at most; the oldest episodes are forgotten.
+# Objects that are remembered, at most; the oldest episodes are forgotten.
 _MOST = 40_000
 # Analogs of an object, and of oneself.
 _ANALOGS, _OWN_ANALOGS = 20, 3
@@ -115,9 +115,9 @@ class SceneRisk:
 
     Notes
     -----
-    Before the first failure all is kept. Failures that no object explains (a border, time) are
-    not learnt. How objects answer to one's own action is not forecast: they go on as such objects
-    went on before. The 90 % interval is that of a share of so many analogs (Wilson 1927).
+    Before the first failure all is kept. Failures that no object explains (a border, time) are not
+    learnt, nor how objects answer to one's own action. The 90 % interval is that of a share of so
+    many analogs (Wilson 1927).
 
     Examples
     --------
@@ -181,9 +181,8 @@ class SceneRisk:
     ) -> Search:
         """The action within the tolerance that is closest to ``wanted`` in what it brings oneself.
 
-        Where none is, one of those that are as little risky as any, and of these one after which
-        it lasts as long as after any, both up to the tolerance; ``wanted``, if it is among them.
-        ``revising`` is not used.
+        Where none is, one of the least risky, and of these one after which it lasts longest, both
+        up to the tolerance; ``wanted``, if it is among them.
         """
         found = self._foreseen(situation)
         if isinstance(found, str):
@@ -216,14 +215,7 @@ class SceneRisk:
         return self._judged(found.risks.min(1)[given.astype(int)])
 
     def why(self, judged: Judgement) -> str:
-        """Why the first action that was judged is dangerous, in a few words.
-
-        Examples
-        --------
-        >>> judge = SceneRisk(1.0, 5)
-        >>> judge.why(Judgement(np.array([0.25]), *np.zeros((3, 1)), evidence=3.0))
-        'whatever follows, an object is met within 5 s: 25 %'
-        """
+        """Why the first action that was judged is dangerous, in a few words."""
         ahead, risk = _STEPS * self.dt, 100.0 * judged.risk[0]
         return f"whatever follows, an object is met within {ahead:g} s: {risk:.2g} %"
 
@@ -749,8 +741,7 @@ def _terms(before: _Floats, after: _Floats, p: int) -> _Floats:
 def _first_motion(terms: int, p: int) -> _Floats:
     """The prior of how places change: by what oneself moves, all places move back.
 
-    Without it one's own moves, if they are rare, are never learnt: the right links are then far
-    from where objects are expected.
+    Without it one's own moves are never learnt where they are rare.
     """
     motion = np.zeros((terms, p))
     motion[:p] = -np.eye(p)

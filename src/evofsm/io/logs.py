@@ -16,6 +16,7 @@ from evofsm.driving.naming import VARIABLES
 from evofsm.fsm.observations import Category, ObservationEncoder
 from evofsm.io import vehicles
 from evofsm.io.tables import (
+    TIMES,
     UNITS,
     CsvTable,
     OnRead,
@@ -152,7 +153,7 @@ def units_of(units: Mapping[str, str], used: Sequence[str], time: str) -> dict[s
             )
         found |= dict.fromkeys(fit, units[name])
     for name, unit in found.items():
-        if (UNITS[unit][0] == "time") != (name == time):
+        if (unit in TIMES) != (name == time):
             raise ValueError(
                 f"--unit gives column {name!r} the unit {unit}; the column of the time needs a "
                 "unit of time, and no other one may have it"
@@ -555,7 +556,7 @@ class _Reader:
         gaps = [name for name in compared if name not in learnt]
         gaps += learnt if columns.leader_may_lack else []
         wanted = Wanted(numbers, [*self._episode, *categories, *told], gaps, date)
-        return wanted, {name: UNITS[unit][1] for name, unit in given.items()}
+        return wanted, {name: UNITS[unit] for name, unit in given.items()}
 
     def _times(self, piece: Piece, date: str | None) -> NDArray[np.float64]:
         if not self._clock.ticks:

@@ -215,7 +215,7 @@ class BagTable(Table):
         numbers = {"time": (at - stamps[0])[known] / _NANOSECONDS}
         for name, one in topics.variables.items():
             value = values[one.field] - (values[one.minus] if one.minus else 0.0)
-            factor = 1.0 if one.unit is None else UNITS[one.unit][1]
+            factor = 1.0 if one.unit is None else UNITS[one.unit]
             numbers[name] = (factor * value + one.offset)[known]
         if self._derives:
             action = np.diff(numbers["v_follower"], append=np.nan) / topics.interval

@@ -40,16 +40,13 @@ _SQLITE, _MCAP = b"SQLite format 3\0", b"\x89MCAP0\r\n"
 # Where an MCAP file has its profile: behind the mark, an opcode and two lengths.
 _PROFILE = len(_MCAP) + 1 + 8 + 4
 
-#: What is measured in a unit, and the factor that gives s, m, m/s or m/s².
-UNITS: Mapping[str, tuple[str, float]] = {
-    **{"s": ("time", 1.0), "ms": ("time", 1e-3), "us": ("time", 1e-6), "ns": ("time", 1e-9)},
-    **{"min": ("time", 60.0), "h": ("time", 3600.0)},
-    **{"m": ("length", 1.0), "mm": ("length", 1e-3), "cm": ("length", 0.01)},
-    **{"km": ("length", 1000.0), "ft": ("length", 0.3048)},
-    **{"m/s": ("speed", 1.0), "cm/s": ("speed", 0.01), "km/h": ("speed", 1.0 / 3.6)},
-    **{"mph": ("speed", 0.44704), "kn": ("speed", 1852.0 / 3600.0), "ft/s": ("speed", 0.3048)},
-    **{"m/s2": ("acceleration", 1.0), "cm/s2": ("acceleration", 0.01)},
-    **{"ft/s2": ("acceleration", 0.3048), "g": ("acceleration", 9.80665)},
+#: Factors that turn units of time into s, and all units into s, m, m/s or m/s².
+TIMES = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0}
+UNITS: Mapping[str, float] = {
+    **TIMES,
+    **{"m": 1.0, "mm": 1e-3, "cm": 0.01, "km": 1000.0, "ft": 0.3048},
+    **{"m/s": 1.0, "cm/s": 0.01, "km/h": 1.0 / 3.6, "mph": 0.44704, "kn": 1852.0 / 3600.0},
+    **{"ft/s": 0.3048, "m/s2": 1.0, "cm/s2": 0.01, "ft/s2": 0.3048, "g": 9.80665},
 }
 # What stands in a field where there is no number.
 _NOTHING = ("", "na", "n/a", "null", "none")
