@@ -20,6 +20,7 @@ KEYS = ("reviser/penalty", "reviser/risk", "reviser/risk_proposed")
 
 
 def make(guard=None):
+    """The environment, under a guard if there is one, scaled for the network."""
     env = gymnasium.make("evofsm.driving.env:evofsm/CarFollowing-v0")
     if guard is not None:  # innermost: it has to see metres and m/s²
         env = RevisedActions(env, guard, failed=lambda info: info["failed"], penalty=1.0)
@@ -42,11 +43,12 @@ class GuardBoard(BaseCallback):
     def _on_rollout_end(self):
         told = np.array(self.told)
         self.logger.record("reviser/changed", np.mean(told[:, 0] > 0.0))
-        for key, mean in zip(KEYS, np.nanmean(told, axis=0)):
+        for key, mean in zip(KEYS, np.nanmean(told, axis=0), strict=True):
             self.logger.record(key, mean)
 
 
-def test(agent, env, episodes=20):
+def judged(agent, env, episodes=20):
+    """Held-out episodes: how many collide, and how far it gets."""
     failed, way = 0, 0.0
     for index in range(episodes):
         seen, info = env.reset(options={"split": "test", "index": index})
@@ -71,5 +73,5 @@ print(
     f"while training: {guard.machine.endings.sum():.0f} of {len(env.get_episode_rewards())} collide"
 )
 guard.freeze()
-print("under the guard:", test(agent, env))
-print("the policy alone:", test(agent, make()))
+print("under the guard:", judged(agent, env))
+print("the policy alone:", judged(agent, make()))
