@@ -22,7 +22,11 @@ STUDIES = {
     "tasks": "judges:Tasks",
     "forecasts": "forecasts:ForecastStudy",
     "sensitivity": "sensitivity:Sensitivity",
+    "real": "real:Real",
+    "leaders": "real:Leaders",
 }
+#: Those that need real drives.
+REAL = ("real", "leaders")
 _ABOUT = (
     "Each study asks one question and shows the numbers that its answer rests on, and which rows "
     "go against us. These are the short forms, too small for conclusions: the command of each "
@@ -40,7 +44,7 @@ def study(name: str) -> type[lib.Study]:
 def evidence(
     data: Annotated[
         Path | None,
-        typer.Option(help="Folder of real drives for `real`, which is left out without it."),
+        typer.Option(help="Folder of real drives, without which what needs them is left out."),
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of every study.")] = 0,
     workers: Annotated[
@@ -52,13 +56,13 @@ def evidence(
 ) -> None:
     """All studies in their short form, on one page: what holds, and where it loses."""
     with lib.refused():
-        kinds = [study(name) for name in STUDIES if name != "real" or data is not None]
+        kinds = [study(name) for name in STUDIES if name not in REAL or data is not None]
         for kind in kinds:
             lib.require(kind.needed)
         pages = []
         for kind in kinds:
             begun = time.monotonic()
-            given = {"data": data} if kind.name == "real" else {}
+            given = {"data": data} if kind.name in REAL else {}
             asked = kind(seed=seed, **given).shortened()
             pages.append(asked.page(asked.run(workers)))
             print(f"{kind.name}: {time.monotonic() - begun:.0f} s", file=sys.stderr)
@@ -78,25 +82,10 @@ def main() -> None:
         pretty_exceptions_enable=False,
     )
     asked = sys.argv[1] if len(sys.argv) > 1 else ""
-    if asked not in STUDIES and asked != "evidence":
-        from studies.old.shim import commands
-
-        return commands.main(application)
     for name in [asked] if asked in STUDIES else STUDIES:
         app.command(name)(lib.command(study(name)))
     app.command()(evidence)
     app()
-
-
-def application() -> typer.Typer:
-    """Commands of studies that do not stand on `lib` yet."""
-    from studies.old.bench import command_of
-    from studies.old.leaders import Leaders
-    from studies.old.shim import commands
-    from studies.old.studies import STUDIES as OLD
-
-    about = "Studies: ours against the baselines, on held-out scenarios."
-    return commands.group("studies", about, *map(command_of, OLD.values()), Leaders)
 
 
 if __name__ == "__main__":

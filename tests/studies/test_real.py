@@ -1,36 +1,42 @@
-"""Real data: what is asked, what is learnt, and how it is judged, on small made-up drives."""
+"""Real drives: what is asked, what is learnt, and how it is judged, on small made-up ones."""
 
-import json
-import shutil
+import hashlib
 
 import numpy as np
+import polars as pl
 import pytest
-from studies.counts import OutcomeCounts
-from studies.datasets.episodes import Episode
-from studies.old.scores import auroc
-from studies.real.cases import HORIZONS, Question, case_of, recent_acceleration
-from studies.real.measures import MEASURES, ComingByState, approach, learn_logistic
-from studies.real.moments import Kind, alarm_threshold, lead_before, leads, telling_moments
-from studies.real.plan import Plan
-from studies.real.study import fold_of_runs, read_folder, run_real
-from studies.real.targets import TARGETS, coming, onsets
+from studies.drives import Episode, checksums_in, read_runs, runs_in
+from studies.real import (
+    HORIZONS,
+    TARGETS,
+    TOLD,
+    ComingByState,
+    Leaders,
+    Question,
+    Real,
+    approach,
+    case_of,
+    coming,
+    fold_of_runs,
+    foretellable,
+    shadow,
+)
+from typer.testing import CliRunner
 
-from evofsm.fsm.machine import EvolvingFSM
-from evofsm.fsm.rules import Novelty
+from evofsm.fsm import EvolvingFSM, Novelty
 
-TINY = Plan(folds=2, rounds=20)
 TTC_3, BRAKING = Question("ttc-3", 2.0), Question("braking-3", 2.0)
 
 
 # -- Made-up drives -------------------------------------------------------------------------------
 
 
-def drive(seed, seconds=60.0):
+def drive(seed):
     """A follower who reacts late to a leader who brakes now and then: (T, 5) rows of a log."""
     rng = np.random.default_rng(seed)
-    braking = rng.uniform(5.0, seconds - 8.0, size=2)
+    braking = rng.uniform(5.0, 52.0, size=2)
     gap, v, lead, accel, rows = 18.0, 15.0, 15.0, 0.0, []
-    for k in range(round(10 * seconds)):
+    for k in range(600):
         time = k / 10.0
         hard = any(start <= time < start + 2.5 for start in braking)
         push = -5.0 if hard else 0.8 * (15.0 - lead)
@@ -43,39 +49,107 @@ def drive(seed, seconds=60.0):
     return np.array(rows)
 
 
-def write_runs(folder, runs=range(4)):
+def write_run(folder, name, pairs):
+    """A run of pairs, (T, 5) rows each."""
     folder.mkdir(exist_ok=True)
+    columns = ("time", "gap", "v_follower", "v_leader", "a_follower")
+    frames = [
+        pl.DataFrame(np.round(rows, 3), schema=columns).with_columns(
+            pair=pl.lit(f"v{pair}-v{pair + 1}"), segment=pl.lit("0")
+        )
+        for pair, rows in enumerate(pairs)
+    ]
+    pl.concat(frames).write_csv(folder / f"{name}.csv")
+
+
+def write_runs(folder, runs):
     for run in runs:
-        lines = ["run,pair,segment,time,gap,v_follower,v_leader,a_follower"]
-        for pair in range(2):
-            rows = drive(10 * run + pair)
-            lines += [
-                ",".join([f"made_{run}", f"v{pair}-v{pair + 1}", "0", *(f"{x:.3f}" for x in row)])
-                for row in rows
-            ]
-        (folder / f"made_{run}.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
+        write_run(folder, f"made_{run}", [drive(10 * run + pair) for pair in range(2)])
     return folder
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    return write_runs(tmp_path_factory.mktemp("data"))
+    return write_runs(tmp_path_factory.mktemp("data"), range(4))
+
+
+@pytest.fixture(scope="module")
+def others(tmp_path_factory):
+    return write_runs(tmp_path_factory.mktemp("others"), range(4, 6))
 
 
 @pytest.fixture(scope="module")
 def cases(folder):
-    return read_folder(folder, TINY)[0]
+    return [case_of(one) for one in read_runs(runs_in(folder))]
 
 
 @pytest.fixture(scope="module")
-def study(cases):
-    return run_real(cases, TINY, workers=1)
+def rows(folder):
+    return Real(data=folder, folds=2, rounds=20).run(workers=1)["rows"]
 
 
 def episode(observations, accelerations=None, dt=0.1):
-    rows = np.asarray(observations, dtype=np.float64)
-    given = np.zeros(len(rows)) if accelerations is None else np.asarray(accelerations)
-    return Episode("run", "v1-v2", dt * np.arange(len(rows)), rows, given, dt)
+    seen = np.asarray(observations, dtype=np.float64)
+    given = np.zeros(len(seen)) if accelerations is None else np.asarray(accelerations)
+    return Episode("run", "v1-v2", dt * np.arange(len(seen)), seen, given, dt)
+
+
+# -- Files ----------------------------------------------------------------------------------------
+
+
+def test_a_pair_is_parted_where_a_value_is_missing_no_gap_is_left_or_time_has_a_hole(tmp_path):
+    rows = drive(0)[:200]
+    rows[50, 2], rows[100, 1] = np.nan, 0.0
+    rows[150:, 0] += 5.0
+    rows[:, 1] = np.maximum(rows[:, 1], 0.0)
+    write_run(tmp_path, "parted", [rows, drive(1)[:10]])  # the second is too short
+    found = list(read_runs([tmp_path / "parted.csv"]))
+    assert [len(one.times) for one in found] == [50, 49, 49, 50]
+    assert {(one.run, one.pair, one.dt) for one in found} == {("parted", "v0-v1", 0.1)}
+    np.testing.assert_allclose(found[1].observations, rows[51:100, 1:4], atol=1e-3)
+    np.testing.assert_allclose(found[1].accelerations, rows[51:100, 4], atol=1e-3)
+
+
+@pytest.mark.parametrize("listed", ["MANIFEST.csv", "SHA256SUMS"])
+def test_a_file_that_is_not_what_the_list_says_is_refused(tmp_path, listed):
+    write_run(tmp_path, "run", [drive(0)[:50]])
+    path = tmp_path / "run.csv"
+    checksum = hashlib.sha256(path.read_bytes()).hexdigest()
+    said = f"file,sha256\ndev/run.csv,{checksum}\n" if listed[0] == "M" else f"{checksum} *run.csv"
+    (tmp_path / listed).write_text(said)
+    assert checksums_in(tmp_path) == {"run.csv": checksum}
+    assert len(list(read_runs([path]))) == 1
+    path.write_text(path.read_text() + "\n")
+    with pytest.raises(ValueError, match=r"run.csv: its SHA-256 is .* or a download"):
+        list(read_runs([path]))
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "said"),
+    [
+        ("a.csv", "when,distance\n0,1\n", "a.csv has no column 'time'; it has when, distance"),
+        ("a.csv", "pair,segment,time,gap,v_follower,v_leader,a_follower\n", "nobody in it follows"),
+        ("a.csv", "pair,segment,time,gap,v_follower,v_leader,a_follower\nv,0,x,1,1,1,1\n", "a.csv"),
+        ("a.csv.gz", "no gzip", "a.csv.gz"),
+        ("SHA256SUMS", "abc a.csv", "'abc' is no SHA-256"),
+        ("MANIFEST.csv", "name\na\n", "needs the columns file and sha256"),
+    ],
+)
+def test_what_is_no_run_and_no_list_is_refused_by_name(tmp_path, name, text, said):
+    (tmp_path / name).write_text(text)
+    with pytest.raises(ValueError, match=said):
+        list(read_runs([tmp_path / (name if name[0] == "a" else "a.csv")]))
+
+
+def test_lists_are_no_runs_and_a_folder_without_runs_is_refused(folder, tmp_path):
+    (folder / "SEGMENTS.csv").write_text("a,b\n1,2\n")
+    assert [path.name for path in runs_in(folder)] == [f"made_{k}.csv" for k in range(4)]
+    with pytest.raises(ValueError, match="holds no runs"):
+        runs_in(tmp_path)
+    with pytest.raises(NotADirectoryError, match="no such folder"):
+        runs_in(tmp_path / "none")
+    with pytest.raises(ValueError, match="holds 4 runs"):
+        Real(data=folder, folds=5).run(workers=1)
 
 
 # -- What is asked --------------------------------------------------------------------------------
@@ -83,8 +157,7 @@ def episode(observations, accelerations=None, dt=0.1):
 
 def test_a_short_time_to_collision_counts_only_while_driving():
     fast, slow = [10.0, 12.0, 7.0], [4.0, 4.0, 2.0]  # both 2 s before contact
-    happens = TARGETS[0].happens(episode([fast, slow, fast]))
-    assert happens.tolist() == [True, False, True]
+    assert TARGETS["ttc-3"](episode([fast, slow, fast])).tolist() == [True, False, True]
 
 
 def test_what_is_under_way_or_not_known_is_no_case():
@@ -93,16 +166,8 @@ def test_what_is_under_way_or_not_known_is_no_case():
     assert came.tolist() == [False, True, True, True, False, False, False]
     # While it happens nothing is asked; the last two rows do not see two steps ahead.
     assert known.tolist() == [True, True, True, False, False, False, False]
-
-
-def test_an_event_before_the_end_is_known_even_if_the_end_is_near():
-    came, known = coming(np.array([False, False, True]), 5)
-    assert came.tolist() == [True, True, False]
-    assert known.tolist() == [True, True, False]
-
-
-def test_an_event_that_an_episode_begins_with_has_no_beginning():
-    assert onsets(np.array([True, True, False, True])).tolist() == [3]
+    came, known = coming(np.array([False, False, True]), 5)  # known, though the end is near
+    assert (came & known).tolist() == [True, True, False]
 
 
 def test_events_between_two_decisions_are_not_overlooked():
@@ -112,21 +177,17 @@ def test_events_between_two_decisions_are_not_overlooked():
     came, known = case.answers[BRAKING]
     assert case.times[came & known] == pytest.approx(np.arange(12, 31, 2) / 10.0)
     assert case.begins["braking-3"] == pytest.approx([3.1])
-
-
-def test_rows_that_do_not_fall_on_decisions_are_refused():
+    assert foretellable([case], BRAKING) == (1, 1)
     with pytest.raises(ValueError, match=r"run, v1-v2: a row every 0\.15 s"):
         case_of(episode([[20.0, 10.0, 10.0]] * 40, dt=0.15))
 
 
 def test_nothing_that_is_observed_looks_ahead():
-    full = case_of(episode(drive(3)[:, 1:4]))
-    part = case_of(episode(drive(3)[:300, 1:4]))
+    full, part = (case_of(episode(drive(3)[:rows, 1:4])) for rows in (600, 300))
     np.testing.assert_array_equal(approach(full)[:150], approach(part))
-    assert recent_acceleration(np.array([3.0, 2.0])).tolist() == [0.0, 0.0]
 
 
-# -- Runs and folds -------------------------------------------------------------------------------
+# -- What is learnt, and how it is judged ---------------------------------------------------------
 
 
 def test_every_run_is_in_one_fold_and_sources_are_dealt_evenly():
@@ -138,268 +199,135 @@ def test_every_run_is_in_one_fold_and_sources_are_dealt_evenly():
     assert folds != fold_of_runs(runs, 5, seed=4)
 
 
-def test_lists_beside_the_runs_are_no_runs_and_are_counted_if_they_verify(folder, tmp_path):
-    copied = shutil.copytree(folder, tmp_path / "copied")
-    (copied / "SEGMENTS.csv").write_text("a,b\n1,2\n")
-    cases, verified = read_folder(copied, TINY)
-    assert {case.run for case in cases} == {f"made_{k}" for k in range(4)}
-    assert verified == 0
-
-
-def test_a_short_look_takes_a_few_runs(folder):
-    cases, _ = read_folder(folder, Plan(folds=2, most_runs=2))
-    assert len({case.run for case in cases}) == 2
-
-
-def test_a_folder_with_too_few_runs_or_none_is_refused(folder, tmp_path):
-    with pytest.raises(ValueError, match="holds 4 runs"):
-        read_folder(folder, Plan(folds=5))
-    with pytest.raises(NotADirectoryError, match="no such folder"):
-        read_folder(tmp_path / "none", TINY)
-
-
-# -- What is learnt -------------------------------------------------------------------------------
-
-
-def test_what_followed_is_counted_as_outcome_counts_would():
-    accelerations = np.zeros(80)
-    accelerations[60:] = -4.0
-    rows = np.column_stack([np.linspace(30.0, 10.0, 80), np.full(80, 10.0), np.full(80, 8.0)])
-    case = case_of(episode(rows, accelerations))
-    machine = EvolvingFSM(n_actions=1, rule=Novelty(radius=5.0))
-    machine.learn_many(case.observations, np.full(len(case.times), -1), [0])
-    model = machine.model()
-    counts = ComingByState(model)
-    counts.learn(case.observations, case)
-    online = OutcomeCounts(n_actions=1, horizon=2.0, dt=0.2)
-    beliefs = model.recognise(case.observations)
-    for belief in beliefs[:30]:  # row 30 is where the braking begins
-        online.learn(belief, 0)
-    online.end_episode(failed=True)
-    answer = case.answers[BRAKING]
-    assert (answer.known.sum(), (answer.came & answer.known).sum()) == (30, 10)
-    anywhere = (10 + 0.5) / (30 + 1.0)
-    for belief, here in zip(beliefs, counts.score(case.observations)[BRAKING], strict=True):
-        # There the share after the action leans once more on that of the state, which is ours.
-        found = online.outcome(belief, 0)
-        failures = here * (found.evidence + 2.0) - 2.0 * anywhere
-        expected = (failures + 2.0 * here) / (found.evidence + 2.0)
-        assert found.probability == pytest.approx(expected)
-
-
-def test_the_most_dangerous_state_comes_first(cases):
+def test_what_followed_is_counted_by_state(cases):
     machine = EvolvingFSM(n_actions=1, rule=Novelty(radius=2.0, scales=(4.0, 2.0, 2.0)))
-    for case in cases:
-        machine.learn_many(case.observations, np.full(len(case.times), -1), [0])
+    case = cases[0]
+    machine.learn_many(case.observations, np.full(len(case.times), -1), [0])
     counts = ComingByState(machine.model())
-    for case in cases:
-        counts.learn(case.observations, case)
-    shares = counts.shares(BRAKING)
-    assert [one.share for one in shares] == sorted((one.share for one in shares), reverse=True)
-    assert sum(one.seconds for one in shares) == pytest.approx(
-        0.2 * sum(case.answers[BRAKING].known.sum() for case in cases)
-    )
+    counts.learn(case.observations, case)
+    came, known = case.answers[BRAKING]
+    at = list(case.answers).index(BRAKING)
+    assert counts.cases[at].sum() == pytest.approx(known.sum())
+    assert counts.came[at].sum() == pytest.approx((came & known).sum())
+    score = counts.score(case.observations)[BRAKING]
+    assert score[came & known].mean() > 2.0 * score[~came & known].mean()
 
 
-# -- Moments --------------------------------------------------------------------------------------
-
-
-def test_a_lead_counts_from_the_first_alarm_that_stays_on():
-    times = np.arange(6.0)
-    assert lead_before(np.array([1, 0, 0, 1, 1, 0], bool), times, 5.0) == 2.0
-    assert lead_before(np.array([1, 1, 1, 1, 0, 0], bool), times, 5.0) == 0.0
-
-
-def test_the_threshold_is_exceeded_in_one_percent_of_quiet_time(cases):
-    scores = [np.random.default_rng(k).random(len(case.times)) for k, case in enumerate(cases)]
-    threshold = alarm_threshold(scores, cases, "braking-3", 2.0)
-    quiet = np.concatenate(
-        [
-            score[answer.known & ~answer.came]
-            for score, case in zip(scores, cases, strict=True)
-            for answer in [case.answers[BRAKING]]
-        ]
-    )
-    assert (quiet > threshold).mean() == pytest.approx(0.01, abs=2.0 / len(quiet))
-
-
-def test_moments_show_where_ours_was_earlier_and_where_it_was_wrong(cases):
-    def warns(lead):
-        """A score that rises so long before every event."""
-        scores = []
-        for case in cases:
-            score = np.zeros(len(case.times))
-            for event in case.begins["braking-3"]:
-                score[(case.times >= event - lead) & (case.times < event + 1.0)] = 1.0
-            scores.append(score)
-        return scores
-
-    ours, other = warns(1.8), warns(0.6)
-    first = cases[0].begins["braking-3"][0]
-    ours[0][(cases[0].times >= first - 1.8) & (cases[0].times < first)] = 0.0  # one is missed
-    moments = telling_moments(cases, "braking-3", 2.0, ours, other)
-    kinds = [one.kind for one in moments]
-    assert kinds.count(Kind.EARLIER) == 3
-    assert kinds.count(Kind.LATER) == 1
-    assert len({one.run for one in moments if one.kind is Kind.EARLIER}) == 3
-    assert all(one.lead > one.other_lead for one in moments if one.kind is Kind.EARLIER)
-    (later,) = (one for one in moments if one.kind is Kind.LATER)
-    assert (later.run, later.time, later.lead) == (cases[0].run, pytest.approx(first), 0.0)
-    np.testing.assert_allclose(leads(other, 0.5, cases, "braking-3"), 0.5, atol=0.21)
-
-
-# -- The whole study ------------------------------------------------------------------------------
-
-
-def test_every_question_is_put_to_every_measure(study):
-    asked = {(row.target, row.horizon, row.measure) for row in study.rows}
-    assert len(asked) == len(study.rows) == len(TARGETS) * len(HORIZONS) * len(MEASURES)
-
-
-def test_rows_hold_what_they_say(study, cases):
-    row = next(r for r in study.rows if (r.target, r.horizon) == TTC_3 and r.measure == "ttc")
+def test_every_question_is_put_to_every_measure_and_rows_hold_what_they_say(rows, cases):
+    assert len(rows) == len(TARGETS) * len(HORIZONS) * rows["measure"].n_unique()
+    row = rows.row(by_predicate=(pl.col("measure") == "ttc") & _asks(TTC_3), named=True)
     known = [case.answers[TTC_3].known for case in cases]
-    assert row.decisions == sum(k.sum() for k in known)
-    assert row.runs == 4
-    assert row.over_ttc == 0.0
-    assert row.low <= row.auroc <= row.high
-    score = np.concatenate(
-        [
-            ((case.observations[:, 1] - case.observations[:, 2]) / case.observations[:, 0])[k]
-            for case, k in zip(cases, known, strict=True)
-        ]
+    assert row["decisions"] == sum(k.sum() for k in known)
+    assert (row["runs"], row["over_ttc"]) == (4, 0.0)
+    assert row["auroc_low"] <= row["auroc"] <= row["auroc_high"]
+    ours = rows.row(
+        by_predicate=(pl.col("measure") == "evofsm-approach") & _asks(BRAKING), named=True
     )
-    came = np.concatenate([c.answers[TTC_3].came[k] for c, k in zip(cases, known, strict=True)])
-    assert row.prevalence == pytest.approx(came.mean())
-    # Where the gap opens all of them are alike to time to collision.
-    assert row.auroc == pytest.approx(auroc(np.maximum(score, 0.0), came))
+    assert ours["events"] > 5
+    assert ours["auroc"] > 0.8
+    assert ours["auprc"] > 5.0 * ours["prevalence"]
 
 
-def test_states_learn_what_foretells_braking(study):
-    found = {row.measure: row for row in study.of(*BRAKING)}
-    assert found["evofsm-approach"].events > 5
-    assert found["evofsm-approach"].auroc > 0.8
-    assert found["evofsm-approach"].auprc > 5.0 * found["evofsm-approach"].prevalence
+def _asks(question):
+    return (pl.col("target") == question.target) & (pl.col("horizon") == question.horizon)
 
 
-def test_what_a_run_shows_does_not_teach_how_it_is_judged(cases, study):
-    """The runs of one fold are turned to noise: scores of the other fold's runs change, own not."""
-    folds = fold_of_runs(sorted({case.run for case in cases}), 2, TINY.seed)
-    changed = [
-        case._replace(answers={q: a._replace(came=~a.came) for q, a in case.answers.items()})
-        if folds[case.run] == 0
-        else case
-        for case in cases
-    ]
-    again = run_real(changed, TINY, workers=1)
-    # Of fold 0 the first machine was taught by fold 1 alone, which is as it was.
-    assert again.shares == study.shares
+def test_what_is_judged_teaches_nothing_and_a_recording_in_both_folders_is_refused(
+    folder, others, monkeypatch
+):
+    asked = Real(data=folder, train=others, rounds=2)
+
+    def turned(by_other):
+        """Whatever came in the other folder, or in the judged one, did not, and the other way."""
+
+        def cases_in(self, path, *, dealt=False):
+            found = [case_of(one) for one in read_runs(runs_in(path))]
+            if (path == others) != by_other:
+                return found
+            answers = [{q: a._replace(came=~a.came) for q, a in c.answers.items()} for c in found]
+            return [c._replace(answers=a) for c, a in zip(found, answers, strict=True)]
+
+        monkeypatch.setattr(Real, "cases_in", cases_in)
+        return areas(asked.run(workers=1)["rows"])
+
+    def areas(rows):
+        return dict(rows.filter(_asks(BRAKING)).select("measure", "auroc").iter_rows())
+
+    plain, judged, taught = areas(asked.run(workers=1)["rows"]), turned(False), turned(True)
+    for measure in ("logistic", "evofsm-approach", "evofsm-states"):
+        assert judged[measure] == pytest.approx(1.0 - plain[measure])
+    assert taught["ttc"] == plain["ttc"]
+    assert (plain["evofsm-approach"] > 0.8, taught["evofsm-approach"] < 0.2) == (True, True)
+    monkeypatch.undo()
+    (others / "copied.csv").write_bytes((folder / "made_1.csv").read_bytes())
+    with pytest.raises(ValueError, match=r"made_1, v0-v1 is judged and learnt from \(as copied"):
+        asked.run(workers=1)
 
 
 @pytest.mark.slow
-def test_the_same_seed_gives_the_same_numbers_with_any_number_of_workers(cases, study):
-    assert repr(run_real(cases, TINY, workers=2).rows) == repr(study.rows)
+def test_any_number_of_workers_gives_the_same_rows_and_the_page_says_what_is_better(folder, rows):
+    asked = Real(data=folder, folds=2, rounds=20)
+    assert asked.run(workers=2)["rows"].equals(rows)
+    better = rows.with_columns(auroc=pl.when(measure="ttc").then(1.0).otherwise("auroc"))
+    page = asked.page({"rows": better.with_columns(enough=pl.lit(value=True))})
+    assert set(page.losses[0].frame.filter(measure="ttc")["horizon"]) == set(HORIZONS)
+    assert all(table.cells for table in [*page.tables, *page.losses])
+    few = asked.page({"rows": rows.with_columns(enough=pl.lit(value=False))})
+    assert (few.holds, few.answer) == (None, "Too few events in these runs to compare anything")
 
 
-# -- Learnt on one folder, judged on another ------------------------------------------------------
-
-
-def turned(cases):
-    """The same drives, in which whatever came did not, and the other way round."""
-    return [
-        case._replace(answers={q: a._replace(came=~a.came) for q, a in case.answers.items()})
-        for case in cases
-    ]
-
-
-def area(study, measure, question=BRAKING):
-    return next(row.auroc for row in study.of(*question) if row.measure == measure)
+# -- Leaders --------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
-def others(tmp_path_factory):
-    """Runs of another folder."""
-    folder = write_runs(tmp_path_factory.mktemp("others"), range(4, 6))
-    return read_folder(folder, TINY, dealt=False)[0]
+def braking(tmp_path_factory):
+    """Leaders who brake [s, m/s²], a pair for each brake; drivers keep the leader's speed."""
+    folder = tmp_path_factory.mktemp("drives")
+    times = np.arange(0.0, 12.0, 0.1)
+    for name, brakes in {"a_1": [(3.0, 4.2)], "a_2": [], "b_1": [(3.0, 3.1), (6.0, 2.9)]}.items():
+        pairs = []
+        for begins, decel in brakes or [(99.0, 1.0)]:
+            v = 25.0 - decel * np.clip(times - begins, 0.0, 2.0)
+            did = np.append(np.diff(v) / 0.1, 0.0)
+            pairs.append(np.column_stack([times, np.full(len(v), 12.0), v, v, did]))
+        write_run(folder, name, pairs)
+    return folder
 
 
-@pytest.fixture(scope="module")
-def apart(cases, others):
-    return run_real(cases, TINY, workers=1, training=others)
+@pytest.mark.slow
+def test_hard_brakes_are_counted_by_source_and_waves_once_and_knowledge_quiets_alarms(braking):
+    asked = Leaders(data=braking)
+    found = asked.run(workers=1)
+    rows, alarms = found["rows"], found["alarms"]
+    assert rows["source"].to_list() == ["a", "b", "all"]
+    assert rows["hard"].to_list() == [1, 2, 3]
+    assert rows["waves"].to_list() == [1, 1, 2]
+    assert rows["hardest"][-1] == pytest.approx(4.2, abs=0.05)
+    assert rows["hours"][-1] == pytest.approx(4 * 12.0 / 3600.0)
+    every = alarms.filter(source="all")
+    assert every["decisions"].to_list() == [480] * len(TOLD)
+    nothing, own, table, _ = every["alarms"]
+    assert nothing > own > table
+    assert table <= 0.05 * 480
+    first = Leaders(data=braking, first=1).run(workers=1)
+    assert first["rows"].equals(rows)
+    assert set(first["alarms"]["runs"]) == {1}
+    one = shadow(braking / "a_1.csv", -8.0, None, None)
+    assert one["alarms"] == alarms.filter(source="a", told="nothing")["alarms"].item() // 2
+    page = asked.page(found)
+    assert all(table.cells for table in page.tables)
+    assert "none of 3 was harder than the hardest says that at most 63.2 %" in page.tables[1].note
 
 
-def test_all_of_one_folder_is_judged_by_all_that_the_other_taught(cases, others, apart):
-    assert apart.runs == tuple(f"made_{k}" for k in range(4))
-    assert apart.episodes == len(cases)
-    assert apart.taught_by.runs == 2
-    assert apart.taught_by.hours == pytest.approx(
-        0.2 / 3600.0 * sum(len(case.times) for case in others)
-    )
-    scores = [one[BRAKING] for one in learn_logistic(others, cases).scores["logistic"]]
-    answers = [case.answers[BRAKING] for case in cases]
-    score = np.concatenate([s[a.known] for s, a in zip(scores, answers, strict=True)])
-    came = np.concatenate([a.came[a.known] for a in answers])
-    assert area(apart, "logistic") == pytest.approx(auroc(score, came))
+def test_the_commands_need_a_folder_and_name_the_one_that_is_wrong(tmp_path):
+    import typer
+    from studies import lib
 
-
-def test_what_is_judged_teaches_nothing(cases, others, apart):
-    again = run_real(turned(cases), TINY, workers=1, training=others)
-    assert again.shares == apart.shares
-    assert again.states == apart.states
-    # What ranked moments well ranks them as badly once the truth is turned: it learnt none of it.
-    for measure in ("logistic", "evofsm-approach", "evofsm-states"):
-        assert area(again, measure) == pytest.approx(1.0 - area(apart, measure))
-
-
-def test_what_teaches_is_the_other_folder(cases, others, apart):
-    again = run_real(cases, TINY, workers=1, training=turned(others))
-    assert area(again, "ttc") == area(apart, "ttc")
-    assert area(apart, "evofsm-approach") > 0.8
-    assert area(again, "evofsm-approach") < 0.2
-
-
-def test_a_recording_that_is_in_both_folders_is_refused_by_any_name(cases, others):
-    renamed = cases[3]._replace(run="other_name")
-    with pytest.raises(ValueError, match=r"made_1, v1-v2 is judged and learnt from \(as other"):
-        run_real(cases, TINY, workers=1, training=[*others, renamed])
-
-
-def test_one_run_is_enough_to_be_judged_or_to_teach(tmp_path):
-    one = write_runs(tmp_path / "one", [0])
-    assert {case.run for case in read_folder(one, TINY, dealt=False)[0]} == {"made_0"}
-    (tmp_path / "empty").mkdir()
-    with pytest.raises(ValueError, match=r"empty holds no runs \(\*\.csv"):
-        read_folder(tmp_path / "empty", TINY, dealt=False)
-
-
-# -- The command ----------------------------------------------------------------------------------
-
-
-def bench_real(*arguments):
-    pytest.importorskip("typer")
-    from studies.__main__ import application
-    from typer.testing import CliRunner
-
-    return CliRunner().invoke(application(), ["real", *map(str, arguments)])
-
-
-def test_the_command_learns_on_one_folder_and_judges_on_the_other(tmp_path):
-    teaching, judged = write_runs(tmp_path / "a", [4]), write_runs(tmp_path / "b", [0])
-    found = bench_real("--train", teaching, "--data", judged, "--workers", 1, "--json")
-    assert found.exit_code == 0, found.stderr
-    assert {row["runs"] for row in json.loads(found.stdout)} == {1}
-
-
-def test_the_command_names_the_folder_that_is_wrong(tmp_path):
-    runs = write_runs(tmp_path / "runs", [0])
-    missing, strange = tmp_path / "missing", tmp_path / "strange"
-    strange.mkdir()
-    (strange / "x.csv").write_text("when,distance\n0,1\n", encoding="utf-8")
-    for folder, said in (
-        (missing, "missing: there is no such folder"),
-        (strange, "x.csv has no column 'time'; it has when, distance"),
-        (runs, "made_0, v0-v1 is judged and learnt from"),
-    ):
-        found = bench_real("--train", folder, "--data", runs, "--json")
-        assert found.exit_code == 2
-        assert said in found.stderr.replace("\n", " ")
+    app = typer.Typer()
+    app.command()(lib.command(Real))
+    wanting = CliRunner().invoke(app, [])
+    assert wanting.exit_code == 2
+    assert "--data" in wanting.stderr
+    wrong = CliRunner().invoke(app, ["--data", str(tmp_path / "missing")])
+    assert wrong.exit_code == 2
+    assert "missing: there is no such folder" in wrong.stderr.replace("\n", " ")

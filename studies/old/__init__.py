@@ -1,1 +1,0 @@
-"""What studies stand on that are not rewritten on `studies.lib` yet: it leaves with them."""
