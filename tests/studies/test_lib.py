@@ -18,7 +18,7 @@ import typer
 from hypothesis import given
 from hypothesis import strategies as st
 from studies import lib
-from studies.__main__ import STUDIES, study
+from studies.__main__ import REAL, STUDIES, study
 from typer.testing import CliRunner
 
 from evofsm.paper import Page, Table
@@ -85,7 +85,7 @@ def test_what_a_user_can_mend_is_one_line_and_status_2():
 def test_every_study_asks_a_question_has_a_short_form_and_stands_in_the_evidence(name):
     kind = study(name)
     assert kind.name == name
-    given = {"data": "drives"} if name == "real" else {}
+    given = {"data": "drives"} if name in REAL else {}
     short = kind(seed=3, **given).shortened()
     assert short.shortened() == short
     assert short.seed == 3
