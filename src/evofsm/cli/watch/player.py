@@ -7,7 +7,7 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager
-from typing import NamedTuple, Protocol, Self
+from typing import Any, NamedTuple, Protocol, Self
 
 from evofsm.cli.watch.shown import Frame, Graph, Start
 
@@ -23,24 +23,17 @@ _LATE = 0.1
 class Watched(Protocol):
     """Anything that can be watched: a session, or a run that was recorded."""
 
+    start: Start  #: what is known as the run begins
     revising: bool  #: whether the reviser may act
 
-    @property
-    def start(self) -> Start:
-        """What is known as the run begins."""
-        ...
-
-    def restart(self, case: int | None = None) -> Start:
+    def restart(self, case: int | None = None) -> object:
         """Begin anew, or another case."""
-        ...
 
     def step(self) -> Frame:
         """The next frame."""
-        ...
 
     def graph(self) -> Graph:
         """The states at the latest frame."""
-        ...
 
 
 class Clock(NamedTuple):
@@ -52,41 +45,19 @@ class Clock(NamedTuple):
     over: bool
 
 
-class Audience(Protocol):
-    """Whoever is told what happens; it must not wait."""
-
-    def began(self, start: Start, clock: Clock) -> None:
-        """A run begins."""
-        ...
-
-    def saw(self, frame: Frame) -> None:
-        """The next frame."""
-        ...
-
-    def grew(self, graph: Graph) -> None:
-        """States, or ways between them, have changed."""
-        ...
-
-    def ticked(self, clock: Clock) -> None:
-        """It is played otherwise."""
-        ...
-
-    def failed(self, text: str) -> None:
-        """It broke off with an error."""
-        ...
-
-
 class Player:
     """Plays what is watched at a pace, and does as it is told while it plays.
 
     What it is told is carried out before the next decision; telling never waits. What cannot be
-    opened raises its error where the player is entered.
+    opened raises its error where the player is entered. ``audience``, which must not wait, is told
+    what happens: "start" with a `Start`, "frame" with a `Frame`, "graph" with a `Graph`, "clock"
+    with a `Clock`, and "failed" with why it broke off.
     """
 
     def __init__(
         self,
         watched: Callable[[], AbstractContextManager[Watched]],
-        audience: Audience,
+        audience: Callable[[str, Any], object],
         *,
         paused: bool = False,
         speed: float = 1.0,
@@ -96,7 +67,7 @@ class Player:
         self._audience = audience
         self._awaits = awaits
         self._paused = paused
-        self._speed = _checked(speed)
+        self._speed = speed
         self._over = False
         self._steps: float = 0  # to be taken although paused
         self._due = 0.0  # when the next frame is [s]
@@ -125,7 +96,6 @@ class Player:
 
     def speed(self, speed: float) -> None:
         """Play so many times as fast as real time."""
-        _checked(speed)
         self._tell("speed", lambda watched: self._set(speed=speed))
 
     def revise(self, on: bool) -> None:
@@ -181,12 +151,13 @@ class Player:
                 self._refused = error
                 self._opened.set()
             # Whoever looks on must learn why nothing moves any more.
-            self._audience.failed(f"{type(error).__name__}: {error}")
+            self._audience("failed", f"{type(error).__name__}: {error}")
 
     def _begin(self, watched: Watched) -> None:
         self._over, self._due = False, time.monotonic()
-        self._audience.began(watched.start, self._clock(watched))
-        self._audience.grew(watched.graph())
+        self._audience("start", watched.start)
+        self._audience("clock", self._clock(watched))
+        self._audience("graph", watched.graph())
 
     def _is_due(self, watched: Watched) -> bool:
         """Wait for the next frame, and do meanwhile what was told; False once closed."""
@@ -201,7 +172,7 @@ class Player:
                 break
             for order in orders.values():
                 order(watched)
-            self._audience.ticked(self._clock(watched))
+            self._audience("clock", self._clock(watched))
         self._steps = 0
         # What came late is not made up for.
         self._due = max(self._due, time.monotonic() - _LATE) + watched.start.interval / self._speed
@@ -216,20 +187,14 @@ class Player:
         return self._due - time.monotonic()
 
     def _show(self, watched: Watched, frame: Frame) -> None:
-        self._audience.saw(frame)
+        self._audience("frame", frame)
         self._since += 1
         if frame.event == "created" or frame.over or self._since >= _GRAPH_EVERY:
-            self._audience.grew(watched.graph())
+            self._audience("graph", watched.graph())
             self._since = 0
         if frame.over:
             self._over = True
-            self._audience.ticked(self._clock(watched))
+            self._audience("clock", self._clock(watched))
 
     def _clock(self, watched: Watched) -> Clock:
         return Clock(self._paused, self._speed, watched.revising, self._over)
-
-
-def _checked(speed: float) -> float:
-    if not speed > 0.0:
-        raise ValueError(f"speed is {speed}; it must be positive")
-    return speed

@@ -12,10 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evofsm.cli.watch.shown import (
-    CAR_LENGTH,
-    HEADWAY,
     RECORDED,
-    TTC,
     Chronicle,
     Frame,
     Graph,
@@ -73,7 +70,7 @@ class Recording:
         self._cars = _cars(self._episode)
         self._number = 0
         self._chronicle = Chronicle(self._tolerance)
-        self.start = self._start(case)
+        self.start = self._begun(case)
         return self.start
 
     def step(self) -> Frame:
@@ -94,7 +91,7 @@ class Recording:
     def graph(self) -> Graph:
         """The states as they were after the last episode."""
         model = self._run.model
-        return Graph(self._number, (), ()) if model is None else graph_of(model, None, self._number)
+        return Graph(self._number) if model is None else graph_of(model, None, self._number)
 
     def __enter__(self) -> Self:
         return self
@@ -102,7 +99,7 @@ class Recording:
     def __exit__(self, *error: object) -> None:
         """Nothing is open."""
 
-    def _start(self, case: int) -> Start:
+    def _begun(self, case: int) -> Start:
         about, columns = self._run.about, self._episode.columns
         times = np.append(columns["time"], self._episode.end_time)
         commands = np.concatenate([columns["proposed"], columns["executed"], [0.0]])
@@ -111,26 +108,18 @@ class Recording:
             about=f"recorded in {self._name}",
             cases=tuple(f"episode {k + 1}" for k in range(len(self._episodes[:_MOST_EPISODES]))),
             case=case,
-            world=about.get("world", ""),
-            controller=about.get("controller", ""),
-            reviser=about.get("reviser", ""),
             tolerance=self._tolerance,
             interval=float(np.median(np.diff(times))),
-            duration=self._episode.end_time,
             actions=(float(np.nanmin(commands)), float(np.nanmax(commands))),
-            car_length=CAR_LENGTH,
-            ttc_threshold=TTC.threshold,
-            headway_threshold=HEADWAY.threshold,
             learnt=0,
             judge=about.get("judge", "kinematic"),
         )
 
     def _moved(self, number: int) -> Frame:
         """Where the cars are; the rest is as in a frame in which nothing is decided."""
-        columns, cars = self._episode.columns, self._cars
+        cars = self._cars
         observed = cars["observed"][number]
         gap, speed, leader_speed = observed.tolist()
-        last = min(number, len(columns["time"]) - 1)
         return Frame(
             number=number,
             time=float(cars["time"][number]),
@@ -140,13 +129,10 @@ class Recording:
             a_follower=float(cars["a_follower"][number]),
             a_leader=float(cars["a_leader"][number]),
             x_follower=float(cars["x_follower"][number]),
-            gap_behind=math.inf,
             observation=(gap, speed, leader_speed),
-            n_states=int(columns["n_states"][last]),
             time_to_collision=float(time_to_collision(observed)),
             time_headway=float(time_headway(observed)),
             revising=self.revising,
-            story=self._chronicle.story,
         )
 
 
@@ -159,13 +145,12 @@ def _decided(columns: Any, number: int) -> dict[str, Any]:
     proposed = float(columns["risk_proposed"][number])
     # The log has the interval of what was executed only.
     is_kept = proposed == executed.risk
-    unknown = Judged(proposed, math.nan, math.nan)
     return {
         **{name: RECORD[name].kind(columns[name][number]) for name in RECORDED},
         "belief": most_believed(columns["belief"][number]),
         "state": None if state == _NONE else state,
         "event": "moved" if state != before else "",
-        "proposed_risk": executed if is_kept else unknown,
+        "proposed_risk": executed if is_kept else Judged(proposed),
         "executed_risk": executed,
     }
 

@@ -17,19 +17,18 @@ import threading
 from collections import deque
 from http import HTTPStatus
 from importlib.resources import files
-from types import TracebackType
-from typing import Annotated, Any, Self
+from typing import Any, Self
 
 import msgspec
 
-from evofsm.cli.watch.player import SPEEDS, Clock, Player
-from evofsm.cli.watch.shown import Frame, Graph, Start, Transition
+from evofsm.cli.watch.player import SPEEDS, Player
+from evofsm.cli.watch.shown import Frame, Graph, Start
 from evofsm.cli.watch.words import tell
 from evofsm.driving.naming import name_state
 from evofsm.extras import needs
 
 with needs("websockets", "watch", "the live page"):
-    from websockets.asyncio.server import Server, ServerConnection, serve
+    from websockets.asyncio.server import ServerConnection, serve
     from websockets.datastructures import Headers
     from websockets.exceptions import ConnectionClosed
     from websockets.http11 import Request, Response
@@ -55,33 +54,38 @@ _log = logging.getLogger(__name__)
 _log.addHandler(logging.NullHandler())  # junk on the socket is nobody's traceback
 
 
-def frame_message(frame: Frame, start: Start) -> dict[str, Any]:
-    """A frame, with the story so far in words."""
-    story, danger = frame.story, frame.story.danger
-    dead_end = None if danger is None else danger.dead_end  # since when no braking helps [s]
-    return {
-        **frame._asdict(),
-        "here": name_state(frame.observation),
-        "danger": danger._asdict() if danger and story.in_danger else None,
-        "story": {**story._asdict(), "danger": None, "dead_end": dead_end},
-        "told": tell(frame, start)._asdict(),
-    }
+def message(kind: str, what: Any, start: Start | None = None, *, live: bool = True) -> str:
+    """What a `Player` tells, as a page reads it: JSON, null for what is no finite number.
 
-
-def encode(message: Any) -> str:
-    """As JSON, numbers with five decimals; what is no finite number becomes null.
-
-    >>> encode({"kind": "clock", "speed": float("inf")})
-    '{"kind":"clock","speed":null}'
+    >>> message("failed", "no road")
+    '{"kind":"failed","text":"no road"}'
     """
-    return msgspec.json.encode(_rounded(message)).decode()
+    told: dict[str, Any] = what._asdict() if hasattr(what, "_asdict") else {"text": what}
+    if isinstance(what, Start):
+        told |= {"live": live, "speeds": SPEEDS}
+    elif isinstance(what, Graph):
+        told["states"] = [
+            {**one._asdict(), "name": name_state(one.center, 1)} for one in what.states
+        ]
+    elif isinstance(what, Frame):
+        assert start is not None
+        story, danger = what.story, what.story.danger
+        told["proposed_risk"] = what.proposed_risk._asdict()
+        told["executed_risk"] = what.executed_risk._asdict()
+        told["here"] = name_state(what.observation)
+        told["danger"] = None
+        dead_end = None if danger is None else danger.dead_end  # since when no braking helps [s]
+        if danger is not None and story.in_danger:
+            told["danger"] = {"since": danger.began.time, "last": danger.last, "dead_end": dead_end}
+        told["story"] = {**story._asdict(), "danger": None, "dead_end": dead_end}
+        told["told"] = tell(what, start)._asdict()
+    return msgspec.json.encode(_rounded({"kind": kind, **told})).decode()
 
 
 def _rounded(value: Any) -> Any:
+    """With five decimals."""
     if isinstance(value, float):
         return round(value, 5)
-    if hasattr(value, "_asdict") and not isinstance(value, Transition):
-        value = value._asdict()
     if isinstance(value, dict):
         return {name: _rounded(part) for name, part in value.items()}
     return [_rounded(part) for part in value] if isinstance(value, list | tuple) else value
@@ -97,8 +101,8 @@ class LivePage:
         self.token = secrets.token_urlsafe(24)
         self.player: Player | None = None  #: does what pages ask for
         self._live = live
-        self._port = port
-        self._shown = _Shown(live)
+        self.port = port  #: where it listens
+        self._shown = _Shown()
         self._clients: set[_Client] = set()
         self._start: Start | None = None
         self._ready = threading.Event()
@@ -107,19 +111,9 @@ class LivePage:
         self._files = {name: (files(__package__) / "live" / name).read_bytes() for name in _WELCOME}
 
     @property
-    def port(self) -> int:
-        """Where it listens."""
-        return self._port
-
-    @property
     def address(self) -> str:
         """To be opened in a browser; who has it may steer the run."""
-        return f"http://{_HOST}:{self._port}/{self.token}/"
-
-    @property
-    def clients(self) -> int:
-        """How many look on."""
-        return len(self._clients)
+        return f"http://{_HOST}:{self.port}/{self.token}/"
 
     def __enter__(self) -> Self:
         self._thread.start()
@@ -129,43 +123,16 @@ class LivePage:
             raise self._error
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self._loop.call_soon_threadsafe(self._stop.set)
         self._thread.join()
 
-    # -- What the player tells; never waits -------------------------------------------------------
-
-    def began(self, start: Start, clock: Clock) -> None:
-        """A run begins."""
-        self._start = start
-        self._hand_over("start", {**start._asdict(), "live": self._live, "speeds": SPEEDS})
-        self.ticked(clock)
-
-    def saw(self, frame: Frame) -> None:
-        """The next frame."""
-        assert self._start is not None
-        self._hand_over("frame", frame_message(frame, self._start))
-
-    def grew(self, graph: Graph) -> None:
-        """States, or ways between them, have changed."""
-        states = [{**one._asdict(), "name": name_state(one.center, 1)} for one in graph.states]
-        self._hand_over("graph", {**graph._asdict(), "states": states})
-
-    def ticked(self, clock: Clock) -> None:
-        """It is played otherwise."""
-        self._hand_over("clock", clock._asdict())
-
-    def failed(self, text: str) -> None:
-        """It broke off with an error."""
-        self._hand_over("failed", {"text": text})
-
-    def _hand_over(self, kind: str, message: dict[str, Any]) -> None:
-        self._loop.call_soon_threadsafe(self._publish, kind, encode({"kind": kind, **message}))
+    def __call__(self, kind: str, what: Any) -> None:
+        """What the player tells; it never waits."""
+        if isinstance(what, Start):
+            self._start = what
+        text = message(kind, what, self._start, live=self._live)
+        self._loop.call_soon_threadsafe(self._publish, kind, text)
 
     # -- In the server's own thread ---------------------------------------------------------------
 
@@ -183,7 +150,7 @@ class LivePage:
             server = await serve(
                 self._attend,
                 _HOST,
-                self._port,
+                self.port,
                 process_request=self._answer,
                 compression=None,
                 max_size=_LONGEST_COMMAND,
@@ -198,7 +165,8 @@ class LivePage:
             self._ready.set()
             return
         async with server:
-            self._port = _port_of(server)
+            (listening,) = server.sockets
+            self.port = int(listening.getsockname()[1])
             self._ready.set()
             await self._stop.wait()
 
@@ -217,13 +185,11 @@ class LivePage:
         name = name or "page.html"
         if name not in self._files:
             return _refusal(HTTPStatus.NOT_FOUND, "There is no such file.")
-        return _response(HTTPStatus.OK, self._files[name], _WELCOME[name], self._sources())
+        sources = " ".join(f"ws://{host}" for host in self._hosts())
+        return _response(HTTPStatus.OK, self._files[name], _WELCOME[name], sources)
 
     def _hosts(self) -> list[str]:
-        return [f"{name}:{self._port}" for name in (_HOST, "localhost")]
-
-    def _sources(self) -> str:
-        return " ".join(f"ws://{host}" for host in self._hosts())
+        return [f"{name}:{self.port}" for name in (_HOST, "localhost")]
 
     async def _attend(self, connection: ServerConnection) -> None:
         if len(self._clients) >= _MOST_CLIENTS:
@@ -252,12 +218,12 @@ class LivePage:
                 await connection.close(_NOT_TEXT, "commands are text")
                 return
             try:
-                self._obey(Command.parse(text))
-            except ValueError as error:
-                await connection.close(_NOT_UNDERSTOOD, str(error))
+                self._obey(msgspec.json.decode(text, type=_Command))
+            except (msgspec.MsgspecError, ValueError, RecursionError):
+                await connection.close(_NOT_UNDERSTOOD, "no such command")
                 return
 
-    def _obey(self, command: Command) -> None:
+    def _obey(self, command: _Command) -> None:
         if self.player is None or self._start is None:
             return
         match (command.do, command.value):
@@ -274,50 +240,35 @@ class LivePage:
             case ("case", float(case)) if case in range(len(self._start.cases)):
                 self.player.restart(int(case))
             case _:
-                raise ValueError(f"no such command: {command.do}")
+                raise ValueError(command.do)
 
 
-class Command(msgspec.Struct, forbid_unknown_fields=True):
+class _Command(msgspec.Struct, forbid_unknown_fields=True):
     """What a page asks for."""
 
-    do: Annotated[str, msgspec.Meta(max_length=20, pattern="^[a-z]+$")]
+    do: str
     value: bool | float | None = None
-
-    @classmethod
-    def parse(cls, text: str) -> Command:
-        """A command from a page."""
-        try:
-            return msgspec.json.decode(text, type=cls)
-        except (msgspec.MsgspecError, ValueError, RecursionError):
-            raise ValueError("not a command") from None
 
 
 class _Shown:
     """What was shown of the present run, for who comes later."""
 
-    def __init__(self, live: bool) -> None:
+    def __init__(self) -> None:
         self._latest: dict[str, str] = {}
-        self._frames: deque[str] = deque(maxlen=_MOST_FRAMES)
+        self.frames: deque[str] = deque(maxlen=_MOST_FRAMES)
 
     def add(self, kind: str, text: str) -> None:
         if kind == "start":
-            self._frames.clear()
+            self.frames.clear()
             self._latest.clear()
         if kind == "frame":
-            self._frames.append(text)
+            self.frames.append(text)
         else:
             self._latest[kind] = text
 
     def whole(self) -> str:
-        """All of it in one message."""
-        return f'{{"kind":"whole","parts":[{",".join([*self._parts()])}]}}'
-
-    def _parts(self) -> list[str]:
-        latest = [self._latest[kind] for kind in _ORDER if kind in self._latest]
-        return [*latest, *self._frames]
-
-
-_ORDER = ("start", "clock", "graph", "failed")
+        """All of it in one message, the start first."""
+        return f'{{"kind":"whole","parts":[{",".join([*self._latest.values(), *self.frames])}]}}'
 
 
 class _Client:
@@ -354,11 +305,6 @@ class _Client:
                     await self._connection.send(self._waiting.popleft())
         except ConnectionClosed:
             pass
-
-
-def _port_of(server: Server) -> int:
-    (listening,) = server.sockets
-    return int(listening.getsockname()[1])
 
 
 def _refusal(status: HTTPStatus, text: str) -> Response:

@@ -10,10 +10,7 @@ from typing import Any, Self
 import numpy as np
 
 from evofsm.cli.watch.shown import (
-    CAR_LENGTH,
-    HEADWAY,
     RECORDED,
-    TTC,
     Chronicle,
     Frame,
     Graph,
@@ -23,10 +20,8 @@ from evofsm.cli.watch.shown import (
     most_believed,
 )
 from evofsm.driving import (
-    Draw,
     Family,
     LatentRisk,
-    SumoWorld,
     drive,
     guard_for_family,
     learners_of,
@@ -125,7 +120,7 @@ class Session:
         self._state: int | None = None
         self._held = np.full(3, np.nan)
         self._over = False
-        self.start = self._start(draw)
+        self.start = self._begun()
         return self.start
 
     def step(self) -> Frame:
@@ -152,23 +147,16 @@ class Session:
     def __exit__(self, *error: object) -> None:
         self._closing.close()
 
-    def _start(self, draw: Draw) -> Start:
+    def _begun(self) -> Start:
         family = self.family
         return Start(
             family=family.name,
             about=family.about,
             cases=cases_of(family),
             case=self.case,
-            world="sumo" if isinstance(self.world, SumoWorld) else "kinematic",
-            controller="family",
-            reviser="least-risk",
             tolerance=self._tolerance,
             interval=family.interval,
-            duration=draw.scenario.duration,
             actions=(family.actions.low, family.actions.high),
-            car_length=CAR_LENGTH,
-            ttc_threshold=TTC.threshold,
-            headway_threshold=HEADWAY.threshold,
             learnt=self.learnt,
             judge=name_judge(self.judge),
         )
@@ -232,11 +220,9 @@ class Session:
             x_follower=self._position,
             gap_behind=float(now[GAP_BEHIND]),
             observation=tuple(seen.tolist()),
-            n_states=self.machine.n_states,
             time_to_collision=float(time_to_collision(seen)),
             time_headway=float(time_headway(seen)),
             revising=self.revising,
-            story=self._chronicle.story,
             **leaders,
         )
 

@@ -14,10 +14,8 @@ from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.model import FSMModel
 from evofsm.guard import LearningJudge
 
-#: What is drawn of a car; worlds need no length [m].
-CAR_LENGTH = 5.0
-#: The classic measures that are shown beside, with their thresholds.
-TTC, HEADWAY = TimeToCollision(), TimeHeadway()
+# The classic measures that are shown beside, with their thresholds.
+_TTC, _HEADWAY = TimeToCollision(), TimeHeadway()
 
 # So many states of a belief are shown, and none that is less probable.
 _MOST_BELIEVED, _LEAST_BELIEF = 12, 0.002
@@ -35,29 +33,15 @@ _SAME, _LEADER_BRAKES = 0.05, -2.5
 class Danger(NamedTuple):
     """A stretch of time in which the driver's wishes were not tolerable."""
 
-    since: float  #: [s]
-    gap: float  #: then [m]
-    speed: float  #: the follower's, then [m/s]
-    closing: float  #: the follower's speed less the leader's, then [m/s]
-    risk: float  #: of what the driver then wanted
-    #: hardest braking of the leader that was then survived [m/s²]; NaN, as the next two, where the
-    #: judge knows no leaders
-    critical: float
-    brakes_to: float  #: how hard leaders were then known to brake [m/s²]
-    decel: float  #: how hard the follower was then known to brake in full [m/s²]
-    proposed: float  #: what the driver then wanted [m/s²]
-    advised: float  #: what the reviser then found better [m/s²]
-    why: str = ""  #: what a judge then said that knows no leaders
-    stepped_in: float = math.nan  #: when the reviser first changed something in it [s]
-    wished: float = math.nan  #: what the driver wanted then [m/s²]
-    instead: float = math.nan  #: and what was executed [m/s²]
-    revised: int = 0  #: decisions in it that the reviser changed
+    began: Frame
+    last: float  #: time of the latest decision that was not tolerable [s]
+    stepped_in: Frame | None = None  #: in which the reviser first changed something
+    revised: int = 0  #: decisions that the reviser changed
     change: float = 0.0  #: by how much, all of them together [m/s²]
-    off: float = math.nan  #: time of the latest decision in it with the reviser off [s]
-    decisions: int = 0  #: decisions in it
-    hardest: float = math.inf  #: lowest acceleration that the reviser put through in it [m/s²]
+    off: float = math.nan  #: time of the latest decision with the reviser off [s]
+    decisions: int = 0
+    hardest: float = math.inf  #: lowest acceleration that the reviser put through [m/s²]
     dead_end: float = math.nan  #: since when full braking was too late as well [s]
-    last: float = math.nan  #: time of the latest decision that was not tolerable [s]
 
 
 class Story(NamedTuple):
@@ -70,24 +54,18 @@ class Story(NamedTuple):
     time_to_collision: float = math.nan  #: when it first fell below its threshold [s]
     time_headway: float = math.nan  #: the same of time headway [s]
     leader_brakes: float = math.nan  #: when the leader first braked hard [s]
-    leader_decel: float = math.nan  #: how hard it has braked since, at most [m/s²]
+    leader_decel: float = 0.0  #: how hard it has braked since, at most [m/s²]
     revised: int = 0  #: decisions that the reviser changed, in danger or not
     alone: float = math.nan  #: when the driver left alone collides [s]; infinite if it does not
     collision: float = math.nan  #: [s]
-    impact: float = math.nan  #: speed at which the cars met [m/s]
-    ended: float = math.nan  #: [s]
 
 
 class Judged(NamedTuple):
     """Risk of an action, with its 90 % interval."""
 
-    risk: float
-    low: float
-    high: float
-
-
-#: Where nothing is judged.
-UNJUDGED = Judged(math.nan, math.nan, math.nan)
+    risk: float = math.nan
+    low: float = math.nan
+    high: float = math.nan
 
 
 class Start(NamedTuple):
@@ -97,18 +75,14 @@ class Start(NamedTuple):
     about: str  #: what happens in the family, in a sentence
     cases: tuple[str, ...]  #: that can be chosen
     case: int  #: the one that is driven
-    world: str
-    controller: str
-    reviser: str
     tolerance: float  #: highest risk that is accepted
     interval: float  #: time between decisions [s]
-    duration: float  #: time that is driven at most [s]
     actions: tuple[float, float]  #: lowest and highest acceleration [m/s²]
-    car_length: float  #: [m]
-    ttc_threshold: float  #: time to collision below which it is said to warn [s]
-    headway_threshold: float  #: the same of time headway [s]
     learnt: int  #: episodes learnt from before
-    judge: str = "kinematic"  #: by what it was told, a name of `evofsm.driving.cars.TOLD`
+    judge: str  #: by what it was told, a name of `evofsm.driving.cars.TOLD`
+    car_length: float = 5.0  #: as it is drawn; worlds need none [m]
+    ttc_threshold: float = _TTC.threshold  #: time to collision below which it warns [s]
+    headway_threshold: float = _HEADWAY.threshold  #: the same of time headway [s]
 
 
 class Frame(NamedTuple):
@@ -125,13 +99,12 @@ class Frame(NamedTuple):
     a_follower: float  #: what the body did until now [m/s²]; NaN at first
     a_leader: float  #: [m/s²]; NaN at first
     x_follower: float  #: front bumper, from where it started [m]
-    gap_behind: float  #: to the car behind [m]; infinite where there is none
     observation: tuple[float, ...]  #: gap, v_follower, v_leader, as they were seen
-    n_states: int
     time_to_collision: float  #: [s]; infinite where the gap does not close
     time_headway: float  #: [s]
     revising: bool  #: whether the reviser may act
-    story: Story  #: what has happened so far
+    gap_behind: float = math.inf  #: to the car behind [m]; infinite where there is none
+    story: Story = Story()  #: what has happened so far
     decel: float = math.nan  #: of the follower if it brakes in full, as far as is known [m/s²]
     #: all but a tolerated share of leaders' hard brakes are softer [m/s²]
     brakes_to: float = math.nan
@@ -139,9 +112,8 @@ class Frame(NamedTuple):
     belief: tuple[tuple[int, float], ...] = ()
     state: int | None = None  #: the most probable one
     event: str = ""  #: ``created``, ``moved``, or nothing
-    surprise: float = math.nan  #: [bit]
-    proposed_risk: Judged = UNJUDGED  #: of what the driver wants
-    executed_risk: Judged = UNJUDGED  #: of what is executed
+    proposed_risk: Judged = Judged()  #: of what the driver wants
+    executed_risk: Judged = Judged()  #: of what is executed
     #: of full braking at once, or of the best that a learnt judge knows: high in a dead end
     braking_risk: float = math.nan
     #: hardest braking of the leader that is survived if the driver has its way [m/s²]
@@ -156,9 +128,14 @@ class Frame(NamedTuple):
     rear_ended: bool = False  #: by the car behind
     over: bool = False  #: whether the run ended here
 
+    @property
+    def is_revised(self) -> bool:
+        """Whether the reviser changed what the driver wanted."""
+        return abs(self.executed - self.proposed) > _SAME
+
 
 #: What a frame takes over from the record of a decision (`evofsm.guard.RECORD`), as it is.
-RECORDED = ("state", "surprise", "proposed", "executed", "advised", "reason", "explanation")
+RECORDED = ("state", "proposed", "executed", "advised", "reason", "explanation")
 
 
 class StateShown(NamedTuple):
@@ -167,25 +144,16 @@ class StateShown(NamedTuple):
     state: int
     center: tuple[float, ...]  #: gap [m], v_follower [m/s], v_leader [m/s]
     visits: float
-    risk: float  #: latent risk if one brakes in full at once; NaN where it is not known
     is_dead_end: bool  #: or where that is not known, whether a collision ended in it
-    failures: float  #: collisions that ended in it
-
-
-class Transition(NamedTuple):
-    """From a state to another."""
-
-    origin: int
-    target: int
-    share: float  #: of all changes out of the origin
 
 
 class Graph(NamedTuple):
     """The states found so far, and how one follows another."""
 
     number: int  #: of the frame from which on it holds
-    states: tuple[StateShown, ...]
-    transitions: tuple[Transition, ...]
+    states: tuple[StateShown, ...] = ()
+    #: origin, target, and the share of all changes out of the origin
+    transitions: tuple[tuple[int, int, float], ...] = ()
 
 
 def graph_of(
@@ -195,28 +163,16 @@ def graph_of(
 
     Only a `LatentRisk` says which are dead ends; else those are marked in which a collision ended.
     """
-    places, visits, ways = known.centers.tolist(), known.visits.tolist(), tuple(_usual_ways(known))
+    marked = [ended > 0.0 for ended in known.endings.tolist()]
     if isinstance(judge, LatentRisk):
-        found = [(one.risk, one.is_dead_end, one.failures) for one in assess_states(known, judge)]
-    else:
-        found = [(math.nan, ended > 0.0, ended) for ended in known.endings.tolist()]
-    states = enumerate(zip(places, visits, found, strict=True))
-    shown = (StateShown(k, tuple(place), seen, *how) for k, (place, seen, how) in states)
-    return Graph(number, tuple(shown), ways)
-
-
-def _usual_ways(known: EvolvingFSM | FSMModel) -> list[Transition]:
-    """How one state follows another, of each state the most usual ways."""
+        marked = [one.is_dead_end for one in assess_states(known, judge)]
+    places = map(tuple, known.centers.tolist())
+    states = map(StateShown, range(known.n_states), places, known.visits.tolist(), marked)
     changes = known.changes * ~np.eye(known.n_states, dtype=bool)
-    ways = []
-    for origin, row in enumerate(changes):
-        if not row.any():
-            continue
-        shares = row / row.sum()
-        for target in np.argsort(-shares, kind="stable")[:_MOST_WAYS].tolist():
-            if shares[target] >= _LEAST_SHARE:
-                ways.append(Transition(origin, target, float(shares[target])))
-    return ways
+    shares = changes / np.maximum(changes.sum(axis=1, keepdims=True), 1.0)
+    usual = np.argsort(-shares, axis=1, kind="stable")[:, :_MOST_WAYS]
+    ways = ((i, j, float(shares[i, j])) for i, row in enumerate(usual.tolist()) for j in row)
+    return Graph(number, tuple(states), tuple(way for way in ways if way[2] >= _LEAST_SHARE))
 
 
 def most_believed(belief: NDArray[np.float64]) -> tuple[tuple[int, float], ...]:
@@ -240,36 +196,24 @@ class Chronicle:
 
     def tell(self, frame: Frame) -> Story:
         """The story with one more frame."""
-        story = self._warnings(frame, self._leader(frame, self.story))
+        story, moves = self.story, frame.v_follower > 0.0  # who stands hits nobody
+        brakes = frame.a_leader <= _LEADER_BRAKES
+
+        def first(at: float, holds: bool) -> float:
+            return frame.time if math.isnan(at) and holds else at
+
+        warns, near = frame.time_to_collision < _TTC.threshold, _HEADWAY.threshold
         story = story._replace(
-            revised=story.revised + _is_revised(frame),
             judged=story.judged or not math.isnan(frame.proposed_risk.risk),
+            time_to_collision=first(story.time_to_collision, moves and warns),
+            time_headway=first(story.time_headway, moves and frame.time_headway < near),
+            leader_brakes=first(story.leader_brakes, brakes),
+            leader_decel=max(story.leader_decel, -frame.a_leader if brakes else 0.0),
+            revised=story.revised + frame.is_revised,
+            collision=first(story.collision, frame.collided),
         )
-        if frame.over:
-            story = story._replace(ended=frame.time)
-            if frame.collided:
-                impact = frame.v_follower - frame.v_leader
-                story = story._replace(collision=frame.time, impact=impact)
-        else:
-            story = self._danger(frame, story)
-        self.story = story
-        return story
-
-    def _leader(self, frame: Frame, story: Story) -> Story:
-        if not frame.a_leader <= _LEADER_BRAKES:
-            return story
-        if math.isnan(story.leader_brakes):
-            story = story._replace(leader_brakes=frame.time, leader_decel=0.0)
-        return story._replace(leader_decel=max(story.leader_decel, -frame.a_leader))
-
-    def _warnings(self, frame: Frame, story: Story) -> Story:
-        if frame.v_follower == 0.0:  # who stands hits nobody
-            return story
-        if math.isnan(story.time_to_collision) and frame.time_to_collision < TTC.threshold:
-            story = story._replace(time_to_collision=frame.time)
-        if math.isnan(story.time_headway) and frame.time_headway < HEADWAY.threshold:
-            story = story._replace(time_headway=frame.time)
-        return story
+        self.story = story if frame.over else self._danger(frame, story)
+        return self.story
 
     def _danger(self, frame: Frame, story: Story) -> Story:
         is_tolerable = not frame.proposed_risk.risk > self.tolerance
@@ -277,7 +221,7 @@ class Chronicle:
         if danger is None:
             if is_tolerable:
                 return story
-            danger = _began(frame)
+            danger = Danger(frame, frame.time)
             first = frame.time if math.isnan(story.first) else story.first
             story = story._replace(in_danger=True, first=first)
         elif is_tolerable and frame.time - danger.last >= _CALM:
@@ -285,44 +229,20 @@ class Chronicle:
         return story._replace(danger=_went_on(danger, frame, is_tolerable))
 
 
-def _began(frame: Frame) -> Danger:
-    gap, speed, leader_speed = frame.observation
-    return Danger(
-        since=frame.time,
-        gap=gap,
-        speed=speed,
-        closing=speed - leader_speed,
-        risk=frame.proposed_risk.risk,
-        critical=frame.critical,
-        brakes_to=frame.brakes_to,
-        decel=frame.decel,
-        proposed=frame.proposed,
-        advised=frame.advised,
-        why=frame.why,
-    )
-
-
-def _is_revised(frame: Frame) -> bool:
-    return abs(frame.executed - frame.proposed) > _SAME
-
-
 def _went_on(danger: Danger, frame: Frame, is_tolerable: bool) -> Danger:
-    revised = _is_revised(frame)
-    if revised and danger.revised == 0:
+    if frame.is_revised:
         danger = danger._replace(
-            stepped_in=frame.time, wished=frame.proposed, instead=frame.executed
+            stepped_in=danger.stepped_in or frame,
+            revised=danger.revised + 1,
+            change=danger.change + abs(frame.executed - frame.proposed),
+            hardest=min(danger.hardest, frame.executed),
         )
-    dead_end = danger.dead_end
-    if not frame.braking_risk > _DEAD_END:  # or it is not known
-        dead_end = math.nan
-    elif math.isnan(dead_end):
-        dead_end = frame.time
+    dead_end = math.nan  # where it is over, or not known
+    if frame.braking_risk > _DEAD_END:
+        dead_end = frame.time if math.isnan(danger.dead_end) else danger.dead_end
     return danger._replace(
-        decisions=danger.decisions + 1,
-        revised=danger.revised + revised,
-        change=danger.change + (abs(frame.executed - frame.proposed) if revised else 0.0),
-        off=danger.off if frame.revising else frame.time,
-        hardest=min(danger.hardest, frame.executed) if revised else danger.hardest,
-        dead_end=dead_end,
         last=danger.last if is_tolerable else frame.time,
+        off=danger.off if frame.revising else frame.time,
+        decisions=danger.decisions + 1,
+        dead_end=dead_end,
     )

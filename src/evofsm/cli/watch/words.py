@@ -10,39 +10,6 @@ from evofsm.cli.watch.shown import Danger, Frame, Start, Story
 
 # Changes of speed that are smaller are "at the same speed" [m/s], and softer accelerations none.
 _EQUAL, _HARDLY = 0.5, 0.3
-
-
-class Told(NamedTuple):
-    """A story as it is read."""
-
-    #: ``unjudged``, ``safe``, ``averted``, ``danger``, ``dead end``, ``collision`` or ``ended``
-    status: str
-    headline: str
-    when: str
-    why: str
-    done: str
-    others: str  #: what time to collision and time headway would have said
-    outcome: str
-    alone: str  #: what the driver would have come to by itself
-
-
-def tell(frame: Frame, start: Start) -> Told:
-    """What has happened up to a frame."""
-    story, danger = frame.story, frame.story.danger
-    status = _status(frame, start)
-    told = Told(
-        status,
-        _headline(status, start),
-        "No danger so far." if danger is None else _when(story, danger, start),
-        _no_danger(frame, start) if danger is None else _why(danger),
-        _quiet(story, start) if danger is None else _done(danger, frame),
-        _others(story, start),
-        _outcome(story, frame),
-        _alone(story, frame),
-    )
-    return Told(*(_UNIT.sub("\u00a0", text) for text in told))
-
-
 # A number and its unit stay on one line.
 _UNIT = re.compile(r"(?<=\d) (?=(?:s|m|m/s|m/s²)\b)")
 _HEADLINES = {
@@ -56,32 +23,58 @@ _HEADLINES = {
 }
 
 
-def _knows_leaders(start: Start) -> bool:
-    """Whether the judge was told how cars follow each other."""
-    return start.judge != "learnt"
+class Told(NamedTuple):
+    """A story as it is read."""
+
+    status: str  #: a key of the headlines above
+    headline: str
+    when: str
+    why: str
+    done: str
+    others: str  #: what time to collision and time headway would have said
+    outcome: str
+    alone: str  #: what the driver would have come to by itself
 
 
-def _headline(status: str, start: Start) -> str:
-    if status == "dead end" and not _knows_leaders(start):
-        return "Dead end, as far as it has learnt"
-    return _HEADLINES[status]
+def tell(frame: Frame, start: Start) -> Told:
+    """What has happened up to a frame."""
+    story, danger = frame.story, frame.story.danger
+    knows_leaders = start.judge != "learnt"
+    status = _status(frame, start.tolerance, is_judged=story.judged or knows_leaders)
+    headline = _HEADLINES[status]
+    if status == "dead end" and not knows_leaders:
+        headline = "Dead end, as far as it has learnt"
+    if danger is None:
+        when = "No danger so far."
+        why, done = _no_danger(frame, knows_leaders), _quiet(story, knows_leaders)
+    else:
+        when = _when(story, danger, knows_leaders)
+        why, done = _why(danger.began), _done(danger, frame)
+    others = (
+        f"Time to collision (below {start.ttc_threshold:g} s) "
+        f"{_noticed(story.time_to_collision, story.first)}; "
+        f"time headway (below {start.headway_threshold:g} s) "
+        f"{_noticed(story.time_headway, story.first)}."
+    )
+    told = status, headline, when, why, done, others, _outcome(frame), _alone(frame)
+    return Told(*(_UNIT.sub("\u00a0", text) for text in told))
 
 
-def _quiet(story: Story, start: Start) -> str:
-    """What was done where the judge saw no danger; classic measures may have."""
-    if story.revised == 0 and not (story.judged or _knows_leaders(start)):
-        return "Nothing: every wish of the driver was carried out."
-    if story.revised == 0:
-        return "Nothing had to be done: every wish of the driver was carried out."
-    plural = "decision" if story.revised == 1 else "decisions"
-    changed = f"The reviser changed {story.revised} {plural}"
-    if not _knows_leaders(start):
-        return f"{changed}, to survive all that it remembers by a margin."
-    return f"{changed}, though latent risk saw no danger."
+def _status(frame: Frame, tolerance: float, *, is_judged: bool) -> str:
+    story = frame.story
+    if frame.collided or frame.rear_ended:
+        return "collision"
+    if frame.over:
+        return "ended"
+    if not story.in_danger or story.danger is None:
+        return "safe" if is_judged else "unjudged"
+    if not math.isnan(story.danger.dead_end):
+        return "dead end"
+    return "averted" if frame.revising and frame.executed_risk.risk <= tolerance else "danger"
 
 
-def _no_danger(frame: Frame, start: Start) -> str:
-    if not _knows_leaders(start) and not frame.story.judged:
+def _no_danger(frame: Frame, knows_leaders: bool) -> str:
+    if not (knows_leaders or frame.story.judged):
         return "Nothing was judged, for no failure was known yet."
     if math.isnan(frame.brakes_to):  # which recordings do not hold
         return "No wish of the driver was judged to be too risky."
@@ -91,91 +84,75 @@ def _no_danger(frame: Frame, start: Start) -> str:
     )
 
 
-def _seconds(time: float) -> str:
-    return f"{_tenths(time):.1f} s"
+def _quiet(story: Story, knows_leaders: bool) -> str:
+    """What was done where the judge saw no danger; classic measures may have."""
+    if story.revised == 0:
+        had = "Nothing had to be done" if story.judged or knows_leaders else "Nothing"
+        return f"{had}: every wish of the driver was carried out."
+    changed = f"The reviser changed {story.revised} decision{'s' * (story.revised != 1)}"
+    if not knows_leaders:
+        return f"{changed}, to survive all that it remembers by a margin."
+    return f"{changed}, though latent risk saw no danger."
 
 
-def _tenths(time: float) -> float:
-    """A time, rounded as the page does it: 14.25 s becomes 14.3 s."""
-    return math.nan if math.isnan(time) else math.floor(10.0 * time + 0.5) / 10.0
-
-
-def _status(frame: Frame, start: Start) -> str:
-    story = frame.story
-    if frame.collided or frame.rear_ended:
-        return "collision"
-    if frame.over:
-        return "ended"
-    if not story.in_danger or story.danger is None:
-        return "safe" if story.judged or _knows_leaders(start) else "unjudged"
-    if not math.isnan(story.danger.dead_end):
-        return "dead end"
-    is_held_off = frame.executed_risk.risk <= start.tolerance
-    return "averted" if frame.revising and is_held_off else "danger"
-
-
-def _when(story: Story, danger: Danger, start: Start) -> str:
-    text = f"Danger began at {_seconds(danger.since)}"
-    if danger.since > story.first:
+def _when(story: Story, danger: Danger, knows_leaders: bool) -> str:
+    since = danger.began.time
+    text = f"Danger began at {_seconds(since)}"
+    if since > story.first:
         text += f" (and before, at {_seconds(story.first)})"
     if not story.in_danger:
         return f"{text}; it was over at {_seconds(danger.last)}."
-    if not math.isnan(danger.dead_end) and not _knows_leaders(start):
-        return (
-            f"{text}, in what the driver wanted. From {_seconds(danger.dead_end)} on it was a dead "
-            "end: nothing that it knows to do would most likely have been enough."
-        )
-    if not math.isnan(danger.dead_end):
-        return (
-            f"{text}, in what the driver wanted. From {_seconds(danger.dead_end)} on it was a dead "
-            "end: if the leader braked hard, even braking in full at once would come too late."
-        )
-    return f"{text}."
+    if math.isnan(danger.dead_end):
+        return f"{text}."
+    what = "nothing that it knows to do would most likely have been enough"
+    if knows_leaders:
+        what = "if the leader braked hard, even braking in full at once would come too late"
+    end = f"From {_seconds(danger.dead_end)} on it was a dead end: {what}."
+    return f"{text}, in what the driver wanted. {end}"
 
 
-def _why(danger: Danger) -> str:
+def _why(began: Frame) -> str:
     """Where the cars were, and what could not be survived there."""
-    where = f"{danger.gap:.1f} m behind the leader at {danger.speed:.0f} m/s"
-    if danger.closing > _EQUAL:
-        where += f", {danger.closing:.1f} m/s faster than it"
-    elif danger.closing < -_EQUAL:
-        where += f", {-danger.closing:.1f} m/s slower than it"
-    else:
-        where += ", as fast as it"
-    wanted = f"{where[0].upper()}{where[1:]}, the driver wanted to {_wish(danger.proposed)}"
-    if danger.why:
-        return f"{wanted}: a risk of {danger.risk:.0%}. After that {danger.why}."
-    if math.isnan(danger.critical):  # which recordings do not hold
-        return f"{wanted}: a risk of {danger.risk:.0%}."
+    gap, speed, leader_speed = began.observation
+    closing = speed - leader_speed
+    pace = f"{abs(closing):.1f} m/s {'faster' if closing > 0.0 else 'slower'} than it"
+    if abs(closing) <= _EQUAL:
+        pace = "as fast as it"
+    wish = _wish(began.proposed)
+    wanted = (
+        f"{gap:.1f} m behind the leader at {speed:.0f} m/s, {pace}, the driver wanted to {wish}"
+    )
+    risk = began.proposed_risk.risk
+    if began.why:
+        return f"{wanted}: a risk of {risk:.0%}. After that {began.why}."
+    if math.isnan(began.critical):  # which recordings do not hold
+        return f"{wanted}: a risk of {risk:.0%}."
     return (
-        f"{wanted}. After that, not even braking in full (by {danger.decel:.1f} m/s²) would avoid "
-        f"a collision if the leader braked harder than {danger.critical:.1f} m/s² – and leaders "
-        f"must be expected to brake by up to {danger.brakes_to:.1f} m/s²."
+        f"{wanted}. After that, not even braking in full (by {began.decel:.1f} m/s²) would avoid "
+        f"a collision if the leader braked harder than {began.critical:.1f} m/s² – and leaders "
+        f"must be expected to brake by up to {began.brakes_to:.1f} m/s²."
     )
 
 
 def _done(danger: Danger, frame: Frame) -> str:
-    share = f"{danger.revised} of {danger.decisions} decisions in danger"
-    if danger.revised == 0:
+    first, share = danger.stepped_in, f"{danger.revised} of {danger.decisions} decisions in danger"
+    if first is None:
         if frame.revising:
             return "The reviser has changed nothing yet."
-        instead = _instead(danger.advised, danger.proposed)
+        instead = _instead(danger.began.advised, danger.began.proposed)
         return f"Nothing: the reviser is off. It would have begun at once, {instead}."
     if not frame.revising:
         return f"The reviser changed {share}, but now it is off."
-    hardest = ""
+    hardest, elsewhere = "", ""
     if danger.hardest < -_HARDLY:
         hardest = f"; at its hardest it braked by {-danger.hardest:.1f} m/s²"
-    instead = _instead(danger.instead, danger.wished)
-    when = _seconds(danger.stepped_in)
-    if danger.off < danger.stepped_in:
-        when += ", as it was switched on"
-    mean = danger.change / danger.revised
-    others = frame.story.revised - danger.revised
-    elsewhere = f" It changed {others} more outside of this danger." if others else ""
+    if others := frame.story.revised - danger.revised:
+        elsewhere = f" It changed {others} more outside of this danger."
+    when = _seconds(first.time) + ", as it was switched on" * (danger.off < first.time)
     return (
-        f"The reviser stepped in at {when}, at first {instead}. It changed {share}, by "
-        f"{mean:.1f} m/s² on average{hardest}.{elsewhere}"
+        f"The reviser stepped in at {when}, at first {_instead(first.executed, first.proposed)}. "
+        f"It changed {share}, by {danger.change / danger.revised:.1f} m/s² on average{hardest}."
+        f"{elsewhere}"
     )
 
 
@@ -194,17 +171,8 @@ def _instead(better: float, wished: float) -> str:
     return f"to {_wish(better)} instead of {wishing}"
 
 
-def _others(story: Story, start: Start) -> str:
-    """When the classic measures noticed, against the first danger."""
-    collision = _noticed(story.time_to_collision, story.first)
-    headway = _noticed(story.time_headway, story.first)
-    return (
-        f"Time to collision (below {start.ttc_threshold:g} s) {collision}; "
-        f"time headway (below {start.headway_threshold:g} s) {headway}."
-    )
-
-
 def _noticed(at: float, danger: float) -> str:
+    """When a classic measure noticed, against the first danger."""
     if math.isnan(at):
         return "has not noticed anything"
     late = _tenths(at) - _tenths(danger)
@@ -214,28 +182,35 @@ def _noticed(at: float, danger: float) -> str:
     return f"did at {_seconds(at)}, {_seconds(abs(late))} {side}"
 
 
-def _outcome(story: Story, frame: Frame) -> str:
-    parts = []
+def _outcome(frame: Frame) -> str:
+    story, parts = frame.story, []
     if not math.isnan(story.leader_brakes):
         when = _seconds(story.leader_brakes)
         parts.append(f"The leader braked from {when} on, by up to {story.leader_decel:.1f} m/s².")
-    if not math.isnan(story.collision):
-        parts.append(f"Collision at {_seconds(story.collision)}, {story.impact:.1f} m/s too fast.")
+    if frame.collided:
+        impact = frame.v_follower - frame.v_leader
+        parts.append(f"Collision at {_seconds(frame.time)}, {impact:.1f} m/s too fast.")
     elif frame.rear_ended:
         parts.append(f"The car behind ran into the follower at {_seconds(frame.time)}.")
-    elif not math.isnan(story.ended):
-        parts.append(f"No collision: {_rest(frame)}.")
+    elif frame.over and frame.v_follower == 0.0:
+        parts.append(f"No collision: stopped {frame.gap:.1f} m behind the leader.")
+    elif frame.over:
+        parts.append(f"No collision: {frame.gap:.1f} m behind the leader at the end.")
     return " ".join(parts)
 
 
-def _alone(story: Story, frame: Frame) -> str:
-    if not math.isfinite(story.alone) or frame.collided or frame.time == 0.0:
+def _alone(frame: Frame) -> str:
+    alone = frame.story.alone
+    if not math.isfinite(alone) or frame.collided or frame.time == 0.0:
         return ""
-    verb = "would have hit" if frame.time >= story.alone else "would hit"
-    return f"This driver {verb} the leader at {_seconds(story.alone)}."
+    verb = "would have hit" if frame.time >= alone else "would hit"
+    return f"This driver {verb} the leader at {_seconds(alone)}."
 
 
-def _rest(frame: Frame) -> str:
-    if frame.v_follower == 0.0:
-        return f"stopped {frame.gap:.1f} m behind the leader"
-    return f"{frame.gap:.1f} m behind the leader at the end"
+def _seconds(time: float) -> str:
+    return f"{_tenths(time):.1f} s"
+
+
+def _tenths(time: float) -> float:
+    """A time, rounded as the page does it: 14.25 s becomes 14.3 s."""
+    return math.nan if math.isnan(time) else math.floor(10.0 * time + 0.5) / 10.0
