@@ -26,7 +26,7 @@ from evofsm.guard.episodes import Decision
 from evofsm.guard.guard import Explain
 from evofsm.guard.reviser import Mode
 from evofsm.io.foxglove import FOXGLOVE_LAYOUT, FoxgloveSink, RunWriter, recording
-from evofsm.io.runs import _column, read_run, schemas_of
+from evofsm.io.runs import _column, columns_by_topic, read_run, schemas_of
 
 pytestmark = pytest.mark.usefixtures("compiled")
 
@@ -104,8 +104,7 @@ def test_the_log_holds_what_the_drives_held(driven, log):
 def test_another_reader_finds_every_channel_in_the_order_of_time(driven, log):
     found = messages(log)
     decisions = sum(len(episode.decisions) for episode in driven[0])
-    for topic in ("/observation", "/belief", "/risk", "/decision"):
-        assert len(found[topic]) == decisions
+    assert {len(found[topic]) for topic in columns_by_topic()} == {decisions}
     assert [(message["episode"], message["kind"]) for _, message in found["/event"]] == [
         *((0, kind) for kind in ("episode started", "collision", "episode ended")),
         *((k, kind) for k in (1, 2) for kind in ("episode started", "episode ended")),
@@ -191,8 +190,6 @@ def test_a_log_that_was_not_finished_or_not_written_leaves_what_was_there(driven
         broken_off()
     assert path.read_bytes() == b"before"
     assert [one.name for one in tmp_path.iterdir()] == ["run.mcap"]
-    with pytest.raises(FileNotFoundError, match="there is no folder"):
-        write(tmp_path / "no" / "run.mcap", [])
     with pytest.raises(OSError, match="No space"):
         full()
 
@@ -212,8 +209,6 @@ def test_damage_anywhere_is_one_error_that_names_the_file(driven, tmp_path):
         damaged.write_bytes(whole[:length])
         with pytest.raises(ValueError, match=r"damaged\.mcap"):
             read_run(damaged)
-    with pytest.raises(FileNotFoundError):
-        read_run(tmp_path / "none.mcap")
 
 
 def foreign(path, about=None, events=(), decisions=0):

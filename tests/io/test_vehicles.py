@@ -100,7 +100,7 @@ def test_lengths_are_those_of_the_leader_s_type(tmp_path):
     assert str(VehicleLengths.parse(["4", "truck=12"])) == "truck 12 m, others 4 m"
     with pytest.raises(ValueError, match=r"has the type 'lorry' .* the types are truck"):
         episodes(path, VehicleLengths.parse(["lorry=12"]))
-    for text in ("long", "truck=", "truck=-1", "0", "nan"):
+    for text in ("truck=", "-1", "nan"):
         with pytest.raises(ValueError, match="--vehicle-length is"):
             VehicleLengths.parse([text])
 
@@ -321,7 +321,6 @@ def test_who_stands_points_where_it_moved_last_or_where_it_is_said_to(tmp_path):
         ([("a", 0, 0, 0, 1, 0, 4, ""), ("b", 0, 9, 0, 1, 0, 4, "")], "no object is on a lane"),
         ([("a", 0, 0, 0, 1, 0, 4, 1), ("a", 0, 9, 0, 1, 0, 4, 1)], "'a' is there twice"),
         ([("a", 0, 0, 0, 1, 0, 0, 1)], "line 2: the length is 0"),
-        ([("a", 1, 0, 0, 1, 0, 4, 1), ("a", 0, 0, 0, 1, 0, 4, 1)], "must run forward"),
         ([("a", 0, "x", 0, 1, 0, 4, 1)], "column 'x'"),
         ([("a", 0, 0, 0, 1, 0, 4, 1)], "no vehicle ever follows another one"),
     ],
@@ -395,7 +394,7 @@ def test_mcap_is_read_by_its_schema_and_named_where_it_holds_something_else(tmp_
 
 def test_osi_that_cannot_be_right_is_refused_in_words(tmp_path, osi):
     (truth, _), path = osi.osi_traces(), tmp_path / "trace.osi"
-    first, beside = truth[: 4 + truth[0] + 256 * truth[1]], next(osi.osi_traces(lane=0))
+    beside = next(osi.osi_traces(lane=0))
     for content, said in (
         (truth[:-3], "ends within message 5"),
         (truth[:2], "ends within message 1"),
@@ -403,7 +402,6 @@ def test_osi_that_cannot_be_right_is_refused_in_words(tmp_path, osi):
         (b"\2\0\0\0\x0b\0", "is not ground truth"),
         (next(osi.osi_traces(length=0.0)), "object 2 is 0 m long, at (50, 0) m"),
         (next(osi.osi_traces(x=math.nan)), "it needs a length, and numbers"),
-        (first + first, "must run forward"),
         (beside, "no vehicle ever follows another one"),
         (b"", "no object is on a lane"),
     ):
