@@ -258,6 +258,13 @@ def test_the_shape_of_what_is_too_close_is_learnt():
     assert coming[0] < 0.05 < 0.3 < coming[1] == coming[2]
 
 
+def test_risk_is_of_those_who_failed_there_or_farther_and_survived_there_or_closer():
+    survived, failed = np.array([[0.5], [2.0]]), np.array([[1.0]])
+    contact = Contact.learn((survived, survived), [(failed, failed)], np.ones(1))
+    assert contact.closeness.tolist() == [0.0, 0.5, 1.0, 2.0]
+    assert contact.risk == pytest.approx([1.0, 2 / 3, 2 / 3, 1 / 3])  # with one that might fail
+
+
 @pytest.mark.parametrize(
     ("make", "why"),
     [

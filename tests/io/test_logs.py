@@ -158,9 +158,9 @@ def test_every_file_begins_an_episode_and_columns_that_tell_them_apart_may_be_na
 
 
 def test_a_hole_in_time_begins_an_episode_and_is_counted(tmp_path):
-    path = write(tmp_path / "a.csv", [*log(5), *log(5, start=0.5), *log(5, start=1.2)])
-    (chunk,) = read(path)
-    assert (chunk.starts.tolist(), chunk.jumps) == ([0, 10], 1)
+    parts = log(5), log(5, start=0.5), log(5, start=1.2), log(5, start=1.65)  # early, after 0.05 s
+    (chunk,) = read(write(tmp_path / "a.csv", [row for part in parts for row in part]))
+    assert (chunk.starts.tolist(), chunk.jumps) == ([0, 10, 15], 2)
 
 
 def test_chunks_go_on_where_the_one_before_ended(tmp_path, monkeypatch):

@@ -132,6 +132,10 @@ def test_so_many_waiting_rows_are_handed_on_before_the_pairs_part(tmp_path, monk
     assert len(chunk.times) == 250
     assert chunk.starts.tolist() == [0, 101, 202]
     assert np.isnan(chunk.actions).sum() == 3
+    beside = [("c", "f_0", 50.0, 1.0), ("d", "f_0", 20.0, 2.0)]
+    apart = {k / 10: [*beside, *(PAIR if k % 10 else [])] for k in range(80)}
+    (chunk,) = read_traces([write(tmp_path / "b.xml", xml(apart))])
+    assert len(chunk.starts) == 1 + 8  # what has ended does not wait
     monkeypatch.setattr(vehicles, "_ROWS_AT_ONCE", 100)
     assert [len(chunk.times) for chunk in read_traces([path])] == [101, 101, 48]
 

@@ -287,12 +287,11 @@ class Lane:
         self._shared = shared
         self._guard: Guard | None = None  # that decides, within an episode of the guard
         self._seen: _Seen = None
-        self._steps = 0
-        self._past: list[tuple[NDArray[np.float64], float, Proposal, Action]] = []
+        self._past: list[tuple[NDArray[np.float64], Proposal, Action]] = []
 
     def begin(self, observation: Any) -> None:
         """An episode of the environment begins."""
-        self.is_open, self._seen, self._steps = True, self.terms.look(observation), 0
+        self.is_open, self._seen = True, self.terms.look(observation)
 
     def decide(self, action: Any) -> Decided:
         """What to execute; the action itself where there is nothing to judge, or to decide."""
@@ -307,11 +306,9 @@ class Lane:
         if self._guard is None:
             self._guard = terms.guard.copy() if self._shared else terms.guard
             self._guard.begin()
-        interval = terms.guard.interval
-        time = math.nan if interval is None else self._steps * interval
-        self.revision = self._guard.decide(self._seen, proposal, time)
+        self.revision = self._guard.decide(self._seen, proposal)
         if self._shared:
-            self._past.append((self._seen, time, proposal, self.revision.executed))
+            self._past.append((self._seen, proposal, self.revision.executed))
         return terms.decided(action, self.revision)
 
     def follow(
@@ -319,7 +316,7 @@ class Lane:
     ) -> None:
         """What followed in the environment."""
         failed = self.terms.failed(info, terminated)
-        self._seen, self._steps = self.terms.look(observation), self._steps + 1
+        self._seen = self.terms.look(observation)
         if failed or terminated or truncated or self._seen is None:
             self.end(failed=failed)
         if terminated or truncated:
@@ -334,7 +331,8 @@ class Lane:
             return
         if self._shared:
             guard.begin()
-            for seen, time, proposal, executed in past:
+            for step, (seen, proposal, executed) in enumerate(past):
+                time = math.nan if guard.interval is None else step * guard.interval
                 guard.take_in(guard.recognise(seen, time), proposal, executed)
         guard.end(failed, self._seen)
 
