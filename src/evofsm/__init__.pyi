@@ -2,7 +2,6 @@ from .fsm import Category as Category
 from .fsm import Edges as Edges
 from .fsm import Event as Event
 from .fsm import EvolvingFSM as EvolvingFSM
-from .fsm import FailureRecord as FailureRecord
 from .fsm import Forecasts as Forecasts
 from .fsm import FSMModel as FSMModel
 from .fsm import IntervalActions as IntervalActions
@@ -12,8 +11,6 @@ from .fsm import Novelty as Novelty
 from .fsm import ObservationEncoder as ObservationEncoder
 from .fsm import Paper as Paper
 from .fsm import StateRule as StateRule
-from .fsm import Step as Step
-from .fsm import Trace as Trace
 from .fsm import jensen_shannon as jensen_shannon
 from .fsm import merge as merge
 from .fsm import register_rule as register_rule

@@ -109,8 +109,6 @@ def test_states_created_later_are_taken_in(walk):
         ({"steps": []}, "one or more"),
         ({"steps": [2, 2]}, "each once"),
         ({"steps": [0]}, "a positive integer"),
-        ({"evidence": 0.0}, "evidence"),
-        ({"moved": 1.0}, "below 1"),
     ],
 )
 def test_settings_that_cannot_be_are_refused(settings, message):

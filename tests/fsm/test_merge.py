@@ -249,7 +249,7 @@ def test_observations_of_other_sizes_and_impossible_radii_are_refused():
     parts = [EvolvingFSM(2), EvolvingFSM(2), EvolvingFSM(2)]
     parts[1].observe([0.0])
     parts[2].observe([0.0, 1.0])
-    with pytest.raises(ValueError, match="machine 1 has 1 variables, and machine 2 has 2"):
+    with pytest.raises(ValueError, match="n_variables of machine 2 is 2, but 1 of machine 1"):
         merge(parts)
     parts[0].observe([1.0])
     with pytest.raises(ValueError, match="radius is -1"):

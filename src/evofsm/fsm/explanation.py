@@ -17,7 +17,7 @@ import numpy as np
 
 from evofsm.fsm.naming import Labels
 from evofsm.fsm.proportions import bounds_text, wilson_bounds
-from evofsm.fsm.validation import Floats, state_name
+from evofsm.fsm.validation import Floats, counted, state_name
 
 # A belief above this is not worth a word.
 _SURE = 0.995
@@ -32,15 +32,7 @@ class Nearest(NamedTuple):
 
 
 class Tally(NamedTuple):
-    """How many episodes failed, of how many.
-
-    Examples
-    --------
-    >>> print(Tally(3, 12), "|", Tally(0, 40), "|", Tally(7, 7), "|", Tally(7, 7, is_exact=False))
-    3 of 12 (10 to 49 %) | 0 of 40 (at most 7 %) | 7 of 7 (at least 72 %) | 7 of 7
-    >>> Tally(0, 40, is_told=False).share
-    nan
-    """
+    """How many episodes failed, of how many."""
 
     failed: int
     episodes: int
@@ -147,9 +139,6 @@ def _best(after: Sequence[Tally], than: Tally) -> int | None:
     return min(better)[1] if better else None
 
 
-# -- In words -------------------------------------------------------------------------------------
-
-
 def _of_place(known: Any, belief: Floats, state: int, labels: Labels) -> str:
     place = f"{state_name(state)}: {labels.place(known.centers[state])}"
     if belief[state] > _SURE or len(belief) == 1:
@@ -162,10 +151,10 @@ def _of_place(known: Any, belief: Floats, state: int, labels: Labels) -> str:
 def _of_episodes(here: Tally, visits: int, soon: str, asked: Tally | None, action: str) -> str:
     if visits <= 1 and not here.episodes:
         return "Never seen but in one observation"
-    observations = f" ({_count(visits, 'observation')})" if visits else ""
+    observations = f" ({counted(visits, 'observation')})" if visits else ""
     if not here.episodes:
         return f"No earlier episode that was counted came here{observations}"
-    came = f"{_count(here.episodes, 'episode')} came here{observations}"
+    came = f"{counted(here.episodes, 'episode')} came here{observations}"
     if not here.is_told:
         took = "" if asked is None else f", {asked.episodes:,} of which took {action}"
         return f"{came}{took}; how many failed is not known, for no failure was ever told"
@@ -190,7 +179,3 @@ def _of_onsets(known: Any, state: int, labels: Labels) -> str:
 def _of_origin(arrivals: Floats, came_from: int) -> str:
     most, all_ = arrivals[came_from], arrivals.sum()
     return f"Most often reached from {state_name(came_from)}: {most:,.0f} of {all_:,.0f} times"
-
-
-def _count(number: int, noun: str) -> str:
-    return f"{number:,} {noun}{'s' * (number != 1)}"

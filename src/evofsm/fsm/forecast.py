@@ -23,8 +23,13 @@ from numpy.typing import ArrayLike, NDArray
 from evofsm.fsm import validation as valid
 from evofsm.fsm.arrays import NO_ACTION
 from evofsm.fsm.model import FSMModel
-from evofsm.fsm.validation import Floats, positive, whole
+from evofsm.fsm.validation import Floats, whole
 
+# So many transitions count as much as what is presumed: that an action leads where all lead
+# together, and that a state stays, or goes to those near it.
+_EVIDENCE = 0.3
+# Share of transitions that are presumed to leave a state before any was seen.
+_MOVED = 0.003
 # What is believed less than this takes no part in learning.
 _LEAST_BELIEF = 1e-3
 # Share of where a state's transitions may lead that is spread over all states, however far.
@@ -45,12 +50,6 @@ class Forecasts:
         Number of actions, as the machine's.
     steps : sequence of int
         Horizons, in steps of the machine, each once.
-    evidence : float
-        How many transitions count as much as what is presumed: that an action leads where all
-        actions lead together, and that a state stays, or goes to those near it.
-    moved : float
-        Share of transitions that are presumed to leave a state before any was seen, in (0, 1). For
-        each horizon it is learnt from there on.
 
     Examples
     --------
@@ -64,27 +63,18 @@ class Forecasts:
     (3, 1)
     """
 
-    def __init__(
-        self,
-        n_actions: int,
-        steps: Sequence[int] = (2, 4, 8, 20),
-        evidence: float = 0.3,
-        moved: float = 0.003,
-    ) -> None:
+    def __init__(self, n_actions: int, steps: Sequence[int] = (2, 4, 8, 20)) -> None:
         self.n_actions = whole("n_actions", n_actions)
         self.steps = tuple(whole("a horizon", h) for h in steps)
         if not self.steps or len(set(self.steps)) < len(self.steps):
             raise ValueError(f"steps are {tuple(steps)}; there must be one or more, each once")
-        self.evidence, self.moved = positive("evidence", evidence), positive("moved", moved)
-        if self.moved >= 1.0:
-            raise ValueError(f"moved is {moved}; it must lie below 1")
         #: Number of states of the latest snapshot that was learnt through.
         self.n_states = 0
         # (n, n) where a state's transitions are presumed to lead that leave it: to those near it.
         self._elsewhere: Floats = np.zeros((0, 0))
         # For each horizon, evidence that beliefs stay, and that they move; and (n, n) counts, by
         # action, with those of all actions together at NO_ACTION.
-        self._moving = [np.array([1.0 - self.moved, self.moved]) for _ in self.steps]
+        self._moving = [np.array([1.0 - _MOVED, _MOVED]) for _ in self.steps]
         self._counts: list[dict[int, Floats]] = [{} for _ in self.steps]
 
     def learn(
@@ -159,8 +149,8 @@ class Forecasts:
         presumed = share * self._elsewhere[block] + (1.0 - share) * stays
         for counts in (self._counts[horizon].get(one) for one in {NO_ACTION: 0, action: 0}):
             if counts is not None:
-                weight = 1.0 / (counts[i].sum(axis=1, keepdims=True) + self.evidence)
-                presumed = (counts[block] + self.evidence * presumed) * weight
+                weight = 1.0 / (counts[i].sum(axis=1, keepdims=True) + _EVIDENCE)
+                presumed = (counts[block] + _EVIDENCE * presumed) * weight
         return np.asarray(presumed)
 
     def _learn(

@@ -1,7 +1,6 @@
 """How kernels are compiled and cached, and the functions of mathematics that compile to vectors.
 
-A kernel is a plain function under a decorator of this file. Constants that it uses stand in its own
-file, or in another one of kernels: so a cache that is out of date is seen.
+Constants that a kernel uses stand in a file of kernels: so a cache that is out of date is seen.
 """
 
 from __future__ import annotations
@@ -72,10 +71,9 @@ LINE = 8
 
 @register_jitable
 def lanes(n: int) -> int:
-    """``n`` rounded up to whole cache lines, as the room for states is.
+    """``n`` rounded up to whole cache lines: a loop of so many turns is all vector instructions.
 
-    A loop of so many turns is all vector instructions, without a rest that is worked off one by
-    one. What it does to states that are not there does no harm: nothing is believed of them.
+    What it does to states that are not there does no harm: nothing is believed of them.
     """
     return (n + LINE - 1) // LINE * LINE
 
@@ -158,8 +156,7 @@ class _Announcement(event.Listener):
     _PATIENCE: ClassVar = 1.0  # [s]
 
     def __init__(self) -> None:
-        self._depth, self._timer = 0, Timer(0.0, self._say)
-        self._said = False
+        self._depth, self._timer, self._said = 0, Timer(0.0, self._say), False
 
     def on_start(self, event: object) -> None:
         self._depth += 1

@@ -1,7 +1,7 @@
 """The evolving finite state machine (e-FSM): it grows from what it observes.
 
 What happens to an observation stands in `evofsm.fsm.step`, in the order of the paper; what can be
-asked of what was learnt, in `evofsm.fsm.model`. This is what people hold in their hands.
+asked of what was learnt, in `evofsm.fsm.model`.
 
 References
 ----------
@@ -57,11 +57,6 @@ _ENTRIES: dict[bool, Callable[..., int]] = {}
 # Every machine there is, for a process that is forked.
 _MACHINES: WeakSet[EvolvingFSM] = WeakSet()
 
-if TYPE_CHECKING:
-    _Arrays = Counts
-else:
-    _Arrays = object
-
 
 def _alone(method: Method) -> Method:
     """A method during which no other thread changes the machine."""
@@ -74,7 +69,7 @@ def _alone(method: Method) -> Method:
     return cast(Method, locked)
 
 
-class EvolvingFSM(_Arrays):
+class EvolvingFSM(Counts if TYPE_CHECKING else object):  # type: ignore[misc] # by __getattr__
     """A finite state machine that grows its states and transitions from what it observes.
 
     It has the arrays of a snapshot, `FSMModel`, under their names, as `visits`.
@@ -110,9 +105,7 @@ class EvolvingFSM(_Arrays):
 
     Notes
     -----
-    Rows of a transition matrix are "from", columns "to": a forecast is ``belief @ P``. States and
-    actions are counted from 0 here, and from 1 (``#3``) in what people read.
-
+    States and actions are counted from 0 here, and from 1 (``#3``) in what people read.
     Threads may share a machine, but its episode is one stream. An interrupt (Ctrl-C) leaves it as
     it was before an observation or as it is after; `learn_many` has then learnt its first rows.
 
@@ -430,8 +423,6 @@ class EvolvingFSM(_Arrays):
             return getattr(self.model(), name).copy()
         raise AttributeError(f"{type(self).__name__} has no attribute {name!r}")
 
-    # -- What it was given ----------------------------------------------------------------------
-
     @property
     def settings(self) -> dict[str, Any]:
         """Its settings by name, but for the rule; those that were left as they are, left out."""
@@ -447,8 +438,6 @@ class EvolvingFSM(_Arrays):
     def rule(self) -> StateRule:
         """How states are determined."""
         return self._rule
-
-    # -- What it knows --------------------------------------------------------------------------
 
     @property
     def nbytes(self) -> int:
@@ -553,7 +542,6 @@ class EvolvingFSM(_Arrays):
 
     @property
     def _content(self) -> dict[str, Any]:
-        """The settings, for JSON."""
         return self.settings | {"rule": rules.describe_rule(self._rule)}
 
     # A copy, or what another process gets, has a lock and arrays of its own.

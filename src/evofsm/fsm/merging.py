@@ -101,28 +101,23 @@ def merge(machines: Sequence[EvolvingFSM], *, radius: float | None = None) -> Ev
 
 
 def _refuse_unlike(machines: Iterable[EvolvingFSM]) -> list[EvolvingFSM]:
-    """The parts, if they can be merged."""
+    """The parts, if they can be merged. A part that has seen nothing has no number of variables."""
     parts = list(machines)
     if not parts:
         raise ValueError("machines is empty; there must be at least one to merge")
     for number, part in enumerate(parts):
         if not isinstance(part, EvolvingFSM):
             raise TypeError(f"machine {number} is {part!r}; it must be an EvolvingFSM")
-    sized = {part.n_variables: number for number, part in enumerate(parts) if part.n_states}
-    if len(sized) > 1:
-        (m, one), (other_m, other), *_ = sized.items()
-        raise ValueError(
-            f"machine {one} has {m} variables, and machine {other} has {other_m}; "
-            "machines to merge must have observed the same"
-        )
-    settings = [part.settings | {"rule": part.rule} for part in parts]
-    for number, own in enumerate(settings):
-        for name in sorted(own.keys() | settings[0].keys()):
-            given, expected = getattr(parts[number], name), getattr(parts[0], name)
+    known: dict[str, tuple[int, Any]] = {}
+    for number, part in enumerate(parts):
+        names = ["n_actions", *Settings._fields[:-1], *["n_variables"][: part.n_states]]
+        for name in names:
+            given = getattr(part, name)
+            first, expected = known.setdefault(name, (number, given))
             if given != expected:
                 raise ValueError(
-                    f"{name} of machine {number} is {given!r}, but {expected!r} of machine 0; "
-                    "machines to merge must have the same settings"
+                    f"{name} of machine {number} is {given!r}, but {expected!r} of machine "
+                    f"{first}; machines to merge must have the same settings and variables"
                 )
     return parts
 

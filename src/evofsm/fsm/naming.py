@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from evofsm.fsm.actions import IntervalActions
-from evofsm.fsm.validation import action_name
+from evofsm.fsm.validation import action_name, counted
 
 # What a terminal obeys, or cannot print: control characters but for tab and newline, ends of lines
 # and directions of Unicode, halves of characters.
@@ -89,5 +89,5 @@ class Labels(NamedTuple):
     def duration(self, observations: int) -> str:
         """How long so many observations last: in seconds where that is known, else their number."""
         if self.dt is None:
-            return f"{observations:,} observation{'s' * (observations != 1)}"
+            return counted(observations, "observation")
         return f"{observations * self.dt:.4g} s"

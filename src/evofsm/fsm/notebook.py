@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from evofsm.fsm.validation import Floats, state_name
+from evofsm.fsm.validation import Floats, counted, state_name
 
 # More states than these have no row.
 _MOST_STATES = 12
@@ -43,8 +43,7 @@ def step_html(step: Any) -> str:
 
 
 def _about(model: Any) -> list[str]:
-    sizes = ((model.n_states, "state"), (model.n_actions, "action"))
-    told = [f"{number:,} {thing}{'s' * (number != 1)}" for number, thing in sizes]
+    told = [counted(model.n_states, "state"), counted(model.n_actions, "action")]
     settings = {name: value for name, value in model.settings.items() if name != "n_actions"}
     return [*told, *(f"{name} {value}" for name, value in settings.items()), f"rule {model.rule}"]
 

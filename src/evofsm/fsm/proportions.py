@@ -8,6 +8,7 @@ from functools import cache
 from typing import NamedTuple
 
 from evofsm.fsm.kernels import compiled
+from evofsm.fsm.validation import counted
 
 # Two-sided 90 %.
 _WIDTH = 1.645
@@ -65,13 +66,6 @@ def _percent(share: float, rounded: Callable[[float], int]) -> str:
     return f"{min(max(outward(rounded, 100.0 * share, decimals), 0.0), 100.0):.{decimals}f}"
 
 
-def two_digits(value: float, rounded: Callable[[float], int]) -> float:
-    """A number from 0 on with two significant digits, rounded as `outward` rounds."""
-    if not 0.0 < value < math.inf:
-        return value
-    return outward(rounded, value, 1 - math.floor(math.log10(value)))
-
-
 def outward(rounded: Callable[[float], int], value: float, decimals: int) -> float:
     """A number with so many decimals, rounded by ``math.floor`` or ``math.ceil``.
 
@@ -79,9 +73,6 @@ def outward(rounded: Callable[[float], int], value: float, decimals: int) -> flo
     """
     scale = 10.0**decimals
     return rounded(round(value * scale, 6)) / scale
-
-
-# -- Failures -------------------------------------------------------------------------------------
 
 
 class FailureRecord(NamedTuple):
@@ -106,7 +97,7 @@ class FailureRecord(NamedTuple):
     episodes: int | None = None
 
     def __str__(self) -> str:
-        ran = [] if self.episodes is None else [_counted(self.episodes, "episode")]
+        ran = [] if self.episodes is None else [counted(self.episodes, "episode")]
         said = []
         for done, unit, per, words in (
             (self.hours, "h", 1.0, "per hour"),
@@ -116,16 +107,12 @@ class FailureRecord(NamedTuple):
                 ran.append(f"{_exposure(done)} {unit}")
             if done:
                 said.append(_rate(self.failures, done / per, words))
-        text = f"{_counted(self.failures, 'failure')} in {', '.join(ran)}"
+        text = f"{counted(self.failures, 'failure')} in {', '.join(ran)}"
         if not said:
             return f"{text}: nothing is known"
         if self.failures == 0:
             return f"{text}: at most {', '.join(said)}, 95 %"
         return f"{text}: {', '.join(said)}, 90 %"
-
-
-def _counted(number: int, what: str) -> str:
-    return f"{number:,} {what}{'s' * (number != 1)}"
 
 
 def _rate(failures: int, exposure: float, words: str) -> str:
@@ -138,11 +125,9 @@ def _rate(failures: int, exposure: float, words: str) -> str:
 
 
 def _two_digits(value: float, rounded: Callable[[float], int]) -> str:
-    """Of a number above 0."""
-    places = max(1 - math.floor(math.log10(value)), 0)
-    return f"{two_digits(value, rounded):,.{places}f}"
+    decimals = 1 - math.floor(math.log10(value))
+    return f"{outward(rounded, value, decimals):,.{max(decimals, 0)}f}"
 
 
 def _exposure(value: float) -> str:
-    """Rounded down: less would not be claimed."""
     return f"{outward(math.floor, value, 2):g}" if value < 10.0 else f"{math.floor(value + 1e-6):,}"

@@ -70,11 +70,7 @@ class RiverClusterer(base.Clusterer):
         self._observed = () if features is None else tuple(features)
 
     def learn_one(self, x: Mapping[Hashable, Any]) -> None:
-        """Observe, as the machine's ``learn_one`` does.
-
-        Until every feature was observed once, all at the same time, there is no state to recognise
-        by the others: what is incomplete is passed over.
-        """
+        """Observe; until all features were observed at once, what is incomplete is passed over."""
         if not self._observed:  # sorted, so that the order of the first does not matter either
             self._observed = tuple(sorted(x, key=str))
         if not self._observed:

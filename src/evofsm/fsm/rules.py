@@ -141,7 +141,6 @@ def register_rule(name: str, rule: type) -> None:
     Parameters
     ----------
     name : str
-        Its name in files.
     rule : type
         A frozen dataclass as `StateRule`, whose settings JSON has words for.
 

@@ -22,8 +22,7 @@ from evofsm.fsm.notebook import step_html
 from evofsm.fsm.transitions import expand, forecast_and_identify, place_of, room_for
 from evofsm.fsm.validation import Floats
 
-#: The most states, or None. Numba compiles a kernel for each of the two kinds of machine, and that
-#: without a limit in half of the time.
+#: The most states, or None: without a limit a kernel is compiled in half of the time.
 Limit: TypeAlias = int | None
 
 #: Rows of the room in which a step works, (3, capacity).
@@ -148,7 +147,7 @@ def _create(
 ) -> tuple[int, int]:
     """Create a state on the latest observation; returns what happened and the nearest state.
 
-    Where there are as many states as allowed, two of them, or the newcomer and one, are merged.
+    Where there are as many states as allowed, two, or the newcomer and one, are merged.
     """
     now, n = learnt.now[0], learnt.now[0].n_states
     new, event = n, CREATED
@@ -247,14 +246,7 @@ EVENTS = tuple(Event(value) for value in range(8))
 
 
 class Step(NamedTuple):
-    """What the machine made of one observation; n states exist after it.
-
-    Examples
-    --------
-    >>> from evofsm import EvolvingFSM
-    >>> EvolvingFSM(n_actions=1).learn_one([0.0], 0)
-    Step(state=0, belief=1 of 1 states, event=CREATED, surprise=nan)
-    """
+    """What the machine made of one observation; n states exist after it."""
 
     state: int  #: index of the most probable state
     belief: Floats  #: (n,) distribution over states
@@ -276,16 +268,7 @@ class Step(NamedTuple):
 
 
 class Trace(NamedTuple):
-    """What the machine made of T observations, a row each; n states exist after the last.
-
-    Examples
-    --------
-    >>> from evofsm import EvolvingFSM
-    >>> machine = EvolvingFSM(n_actions=2, radius=0.5)
-    >>> trace = machine.learn_many([[0.0], [0.1], [2.0], [1.0]], [0, 0, 0, 0], belief=True)
-    >>> trace.state, trace.surprise.round(2), trace.belief[-1].round(2)
-    (array([0, 0, 0, 1]), array([ nan, 0. , 0. , 0.31]), array([0.37, 0.63]))
-    """
+    """What the machine made of T observations, a row each; n states exist after the last."""
 
     state: NDArray[np.int64]  #: (T,) index of the most probable state
     n_states: NDArray[np.int64]  #: (T,) number of states after the row

@@ -33,6 +33,11 @@ def action_name(index: int) -> str:
     return f"a({index + 1})"
 
 
+def counted(number: int, noun: str) -> str:
+    """Such as "1 episode" and "1,200 episodes"."""
+    return f"{number:,} {noun}{'s' * (number != 1)}"
+
+
 def check_index(what: str, i: Any, n: int, name: Callable[[int], str] = str) -> int:
     """An index of one of ``n`` things, which texts call by their ``name``."""
     try:
