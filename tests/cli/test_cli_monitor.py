@@ -118,22 +118,6 @@ def test_what_cannot_be_is_said_in_a_line(arguments, said, tmp_path, monkeypatch
     assert result.stderr.count("\n") == 1
 
 
-def test_a_recorded_run_is_watched(tmp_path):
-    pytest.importorskip("mcap")
-    from evofsm.driving import drive, guard_for_family, load_family
-    from evofsm.io import recording
-
-    family = load_family("emergency")
-    driven = drive(guard_for_family(family), family.draw(seed=0, index=0))
-    with recording(tmp_path / "run.mcap") as log:
-        log.add(driven)
-    result = evofsm(tmp_path / "run.mcap", "--interval", family.interval)
-    *decisions, end = told(result)
-    assert len(decisions) == len(driven.decisions)
-    assert {one["kind"] for one in decisions} == {"decision"}
-    assert (end["kind"], end["failed"]) == ("end", driven.collided)
-
-
 # -- As a process ---------------------------------------------------------------------------------
 
 

@@ -35,7 +35,6 @@ def test_it_prints_an_address_that_answers_and_ends_with_control_c():
     ("arguments", "error"),
     [
         (["paper", "--case", "5"], "--case is 5; paper has 1 to 4"),
-        (["paper", "--speed", "3"], "--speed is 3; it must be one of 0.25, 0.5, 1, 2, 4, 8"),
         (["paper", "--learn", "nowhere"], "nowhere/guard.evofsm: no such file or directory"),
         (["missing.mcap"], "missing.mcap: no such file or directory"),
     ],

@@ -24,8 +24,6 @@ if TYPE_CHECKING:
 _MODELS = ("guard.evofsm", "model.evofsm")
 # So many files that something was learnt from are named.
 _MOST_FILES = 3
-# An action taken less often in a state than this says nothing about where it leads.
-_LEAST_EVIDENCE = 10.0
 _UNTOLD = (
     "What was learnt tells nothing of failures: none was ever told. From a log, evofsm learn "
     "--failed COLUMN or --failed 'gap<=0' tells of them."
@@ -117,37 +115,22 @@ class Passage(NamedTuple):
     times: int  #: steps in which the recognised state went from the one to the other
     share: float  #: of the steps from the state of origin
     learnt: float  #: probability per step that the matrices give, actions as often as used
-    action: int | None  #: under which that is highest, of those taken there often enough
-    under_action: float  #: probability per step under that action
-    taken: float  #: about how often that action was taken in the state of origin
 
 
 def passages(model: FSMModel, most: int = 12) -> list[Passage]:
-    """The transitions between states that were recognised most often.
-
-    How often an action was taken in a state is estimated from its use as a whole and the share
-    of the state in its recent use.
-    """
+    """The transitions between states that were recognised most often."""
     import numpy as np
 
     counts = model.changes - np.diag(np.diag(model.changes))
     steps = model.changes.sum(axis=1)
     learnt = model.averaged_matrix("observed")
-    recent = model.origin_frequency.sum(axis=1, keepdims=True)
-    taken = model.uses[:, None] * model.origin_frequency / np.where(recent > 0.0, recent, 1.0)
-    found = []
-    for place in np.argsort(-counts, axis=None, kind="stable")[:most]:
-        i, j = divmod(int(place), model.n_states)
-        if counts[i, j] == 0.0:
-            break
-        tried = np.flatnonzero(taken[:, i] >= _LEAST_EVIDENCE)
-        best, under, often = None, np.nan, np.nan
-        if len(tried):
-            best = int(tried[model.transition_matrices[tried, i, j].argmax()])
-            under, often = float(model.transition_matrices[best, i, j]), float(taken[best, i])
-        times, share = int(counts[i, j]), float(counts[i, j] / steps[i])
-        found.append(Passage(i, j, times, share, float(learnt[i, j]), best, under, often))
-    return found
+    most_first = np.argsort(-counts, axis=None, kind="stable")[:most].tolist()
+    places = (divmod(place, model.n_states) for place in most_first)
+    return [
+        Passage(i, j, int(counts[i, j]), float(counts[i, j] / steps[i]), float(learnt[i, j]))
+        for i, j in places
+        if counts[i, j] > 0.0
+    ]
 
 
 def model_document(model: FSMModel) -> dict[str, Any]:
@@ -201,23 +184,14 @@ def tables_of(model: FSMModel) -> Iterator[RenderableType]:
         yield "The recognised state never changed."
         return
     rows = [
-        (f"#{one.origin + 1} → #{one.target + 1}", f"{one.times:,}")
-        + (f"{one.share:.4f}", f"{one.learnt:.3f}")
-        + (
-            ("", "", "")
-            if one.action is None
-            else (_action(model, one.action), f"{one.under_action:.3f}", f"{one.taken:,.0f}×")
-        )
-        for one in found
+        (f"#{i + 1} → #{j + 1}", f"{times:,}", f"{share:.4f}", f"{learnt:.3f}")
+        for i, j, times, share, learnt in found
     ]
-    header = ("from → to", "times", "share", "learnt", "most under", "there", "tried")
     title = f"Transitions that matter: the {len(found)} most frequent"
-    yield table(title, header, rows, left=(0, 4))
+    yield table(title, ("from → to", "times", "share", "learnt"), rows)
     yield (
         "\nTimes and share: of the steps from that state, as recognised. Learnt: probability per "
-        "step that the matrices give; most under which action, how probable there, and about how "
-        "often that action was taken in the state. Where learnt is far above the share, beliefs "
-        "are wide."
+        "step that the matrices give. Where it is far above the share, beliefs are wide."
     )
 
 

@@ -40,11 +40,6 @@ class NoLeader(StrEnum):
 
 
 _MOST_ACTIONS = 1000
-_SECOND_STEPS = {
-    "marginal": "all alike, as in the paper",
-    "hold": "the same, held",
-    "observed": "as often as they were used",
-}
 # With less of the belief, the most probable state is hardly told apart from the others.
 _UNCERTAIN = 0.5
 
@@ -386,7 +381,7 @@ def _document(learning: Learning, provenance: Mapping[str, Any]) -> dict[str, An
         "transitions": learning.transitions,
         "failures": known,
         "certainty": learning.certainty,
-        "skills": [{**vars(skill), "skill": skill.skill} for skill in learning.skills],
+        "skills": learning.skills,
         "model": {**model_document(learning.model), "provenance": provenance},
     }
 
@@ -434,19 +429,19 @@ def _skills(skills: Sequence[Skill]) -> Iterator[RenderableType]:
     rows = [
         (
             f"{one.seconds:g} s",
-            "-" if one.policy is None else _SECOND_STEPS[one.policy],
             f"{one.divergence:.2g}",
             f"{one.persistence:.2g}",
             _skill_text(one.skill),
         )
         for one in skills
     ]
-    header = ("ahead", "actions after the first", "forecast [bit]", "persistence [bit]", "skill")
-    yield table("Forecasts compared with persistence", header, rows, left=(0, 1))
+    header = ("ahead", "forecast [bit]", "persistence [bit]", "skill")
+    yield table("Forecasts compared with persistence", header, rows)
     yield (
-        "\nMean Jensen-Shannon divergence from the belief that came, of rows that were not learnt "
-        "yet. Persistence: the belief stays as it is. Skill: 1 is perfect, 0 as good as "
-        "persistence, below 0 worse."
+        "\nThe first step under its own action, others under all alike, as in the paper; mean "
+        "Jensen-Shannon divergence from the belief that came, of rows that were not learnt yet. "
+        "Persistence: the belief stays as it is. Skill: 1 is perfect, 0 as good as persistence, "
+        "below 0 worse."
     )
     if len(skills) == 1:
         yield "The step is too long for a separate forecast of 1 s ahead."

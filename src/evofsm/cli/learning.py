@@ -14,7 +14,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
@@ -25,14 +25,13 @@ from evofsm.cli.journal import differences
 from evofsm.fsm.actions import IntervalActions
 from evofsm.fsm.divergence import jensen_shannon
 from evofsm.fsm.machine import EvolvingFSM
-from evofsm.fsm.model import FSMModel, Policy
+from evofsm.fsm.model import FSMModel
 from evofsm.io import Chunk
 
 _log = logging.getLogger(__name__)
 
 #: How far ahead the longer forecast looks [s].
 HORIZON = 1.0
-POLICIES: tuple[Policy, ...] = get_args(Policy)
 
 # Blocks grow from so many rows to so many; of each so many are scored at most.
 _FIRST_BLOCK, _LARGEST_BLOCK, _SCORED = 64, 8192, 512
@@ -40,24 +39,14 @@ _FIRST_BLOCK, _LARGEST_BLOCK, _SCORED = 64, 8192, 512
 _EVERY = 60.0
 
 
-@dataclass(frozen=True)
-class Skill:
+class Skill(NamedTuple):
     """How well one kind of forecast did against persistence."""
 
-    steps: int  #: looked ahead
     seconds: float  #: looked ahead [s]
-    policy: Policy | None  #: actions after the first step; None where there is only one step
     forecasts: int  #: number scored
     divergence: float  #: mean, from the belief that came [bit]
     persistence: float  #: the same mean for the belief that stays as it is [bit]
-
-    @property
-    def skill(self) -> float:
-        """1 for a perfect forecast, 0 for one as good as persistence, negative for a worse one.
-
-        NaN where nothing was forecast or the belief never moved.
-        """
-        return 1.0 - self.divergence / self.persistence if self.persistence > 0.0 else np.nan
+    skill: float  #: 1 perfect, 0 as good as persistence, negative worse; NaN: nothing ever moved
 
 
 class Progress(msgspec.Struct):
@@ -77,9 +66,9 @@ class Progress(msgspec.Struct):
     finished: bool = False
     scored: int = 0  #: rows of which forecasts were scored
     certainty: float = 0.0  #: sum over them of the share that the most probable state has
-    #: number, divergence of persistence, then of each kind of forecast: one step, and `HORIZON`
+    #: number, divergence of persistence, and of forecasts: one step, and `HORIZON`
     one_step: list[float] = msgspec.field(default_factory=lambda: [0.0] * 3)
-    ahead: list[float] = msgspec.field(default_factory=lambda: [0.0] * (2 + len(POLICIES)))
+    ahead: list[float] = msgspec.field(default_factory=lambda: [0.0] * 3)
 
 
 @dataclass(frozen=True)
@@ -91,7 +80,7 @@ class Learning:
     read: Progress
     transitions: int
     certainty: float  #: mean share of the belief that the most probable state has
-    skills: tuple[Skill, ...]  #: of one step, then of `HORIZON` under each policy
+    skills: tuple[Skill, ...]  #: of one step, then of `HORIZON`
     notes: Mapping[str, Any] = field(default_factory=dict)  #: of whoever read the rows
 
 
@@ -231,63 +220,33 @@ def _learn(machine: EvolvingFSM, actions: IntervalActions, chunk: Chunk, read: P
 
 
 def _score(model: FSMModel, block: Chunk, taken: NDArray[np.int64], read: Progress) -> None:
-    """Add the divergences of forecasts that a model makes of rows."""
+    """Add the divergences of forecasts that a model makes of rows.
+
+    The first step is made under its own action, the others under all alike, as in the paper.
+    """
+    matrices, marginal = model.transition_matrices, model.averaged_matrix("marginal")
     beliefs = np.atleast_2d(model.recognise(block.observations))
     read.scored += len(beliefs)
     read.certainty += float(beliefs.max(axis=1).sum())
     episode = np.zeros(len(beliefs), np.int64)
     episode[block.starts] = 1
     episode = episode.cumsum()
-    then = _pairs(episode, taken, 1)
-    one = _advanced(model, beliefs[then], taken[then])
-    _add(read.one_step, beliefs[then + 1], beliefs[then], [one])
-    if (steps := _steps_ahead(read.dt)) and len(then := _pairs(episode, taken, steps)[::steps]):
-        first = _advanced(model, beliefs[then], taken[then])
-        forecasts = [_held(model, first, taken[then], policy, steps - 1) for policy in POLICIES]
-        _add(read.ahead, beliefs[then + steps], beliefs[then], forecasts)
+    steps = _steps_ahead(read.dt)
+    for sums, n in ((read.one_step, 1), (read.ahead, steps)):
+        if not n or not len(then := _pairs(episode, taken, n)[::n]):
+            continue
+        pairs = zip(beliefs[then], taken[then], strict=True)
+        forecast = np.array([belief @ matrices[action] for belief, action in pairs])
+        for _ in range(n - 1):
+            forecast = forecast @ marginal
+        came, before = beliefs[then + n], beliefs[then]
+        found = [float(jensen_shannon(one, came).sum()) for one in (before, forecast)]
+        sums[:] = [a + b for a, b in zip(sums, [float(len(then)), *found], strict=True)]
 
 
 def _pairs(episode: NDArray[np.int64], taken: NDArray[np.int64], steps: int) -> NDArray[np.int64]:
     """Rows with an action that so many others of their episode follow."""
     return np.flatnonzero((episode[:-steps] == episode[steps:]) & (taken[:-steps] >= 0))
-
-
-def _advanced(
-    model: FSMModel, beliefs: NDArray[np.float64], taken: NDArray[np.int64], steps: int = 1
-) -> NDArray[np.float64]:
-    """Beliefs after some steps, each under its own action."""
-    after = beliefs.copy()
-    for action in np.unique(taken):
-        for _ in range(steps):
-            after[taken == action] @= model.transition_matrices[action]
-    return after
-
-
-def _held(
-    model: FSMModel,
-    beliefs: NDArray[np.float64],
-    taken: NDArray[np.int64],
-    policy: Policy,
-    steps: int,
-) -> NDArray[np.float64]:
-    """Beliefs after more steps, as `FSMModel.propagate` has them."""
-    if policy == "hold":
-        return _advanced(model, beliefs, taken, steps)
-    matrix = model.averaged_matrix(policy)
-    for _ in range(steps):
-        beliefs = beliefs @ matrix
-    return beliefs
-
-
-def _add(
-    sums: list[float],
-    came: NDArray[np.float64],
-    before: NDArray[np.float64],
-    forecasts: list[NDArray[np.float64]],
-) -> None:
-    if len(came):
-        found = [float(jensen_shannon(one, came).sum()) for one in (before, *forecasts)]
-        sums[:] = [a + b for a, b in zip(sums, [float(len(came)), *found], strict=True)]
 
 
 def _steps_ahead(dt: float | None) -> int:
@@ -299,11 +258,9 @@ def _steps_ahead(dt: float | None) -> int:
 def _skills(read: Progress) -> Iterator[Skill]:
     """The means, for each kind of forecast."""
     dt = np.nan if read.dt is None else read.dt
-    kinds: list[tuple[int, Policy | None, list[float], float]] = [
-        (1, None, read.one_step, read.one_step[2])
-    ]
-    if steps := _steps_ahead(read.dt):
-        kinds += [(steps, one, read.ahead, read.ahead[2 + k]) for k, one in enumerate(POLICIES)]
-    for steps, policy, (count, persistence, *_), total in kinds:
-        rows = count or np.nan
-        yield Skill(steps, steps * dt, policy, int(count), total / rows, persistence / rows)
+    for sums, steps in ((read.one_step, 1), (read.ahead, _steps_ahead(read.dt))):
+        if steps:
+            count, persistence, forecast = sums
+            skill = 1.0 - forecast / persistence if persistence > 0.0 else np.nan
+            rows = count or np.nan
+            yield Skill(steps * dt, int(count), forecast / rows, persistence / rows, skill)

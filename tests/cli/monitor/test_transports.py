@@ -52,7 +52,7 @@ def served(transport, server):
     thread.start()
 
     def stop(knock):
-        server.stop()
+        server.stopped = True
         knock()
         thread.join(PATIENCE)
         assert not thread.is_alive()

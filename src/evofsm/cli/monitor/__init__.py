@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
 from contextlib import ExitStack, closing
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 from evofsm.cli.options import ModeName, argument, option, require
 from evofsm.cli.show import warn
@@ -17,10 +16,7 @@ if TYPE_CHECKING:
 
 
 def monitor(
-    file: Annotated[
-        Path | None,
-        argument("JSON lines, or a run that drive --mcap recorded. [default: standard input]"),
-    ] = None,
+    file: Annotated[Path | None, argument("JSON lines. [default: standard input]")] = None,
     guard: Annotated[Path | None, option("A saved guard. [default: see --brakes]")] = None,
     interval: Annotated[float, option("Time between two rows [s], without --guard.")] = 0.1,
     brakes: Annotated[
@@ -32,7 +28,6 @@ def monitor(
     mode: Annotated[
         ModeName, option("How far it goes: shadow (what is proposed is executed) to act.")
     ] = ModeName.SHADOW,
-    proposal: Annotated[float | None, option("Taken for that of rows without one.")] = None,
     learn: Annotated[bool, option("Learn from what comes.", "--learn")] = False,
     state: Annotated[
         Path | None, option("Save all in this file, and go on from it; may be that of --guard.")
@@ -70,7 +65,6 @@ def monitor(
             "--traffic learns nothing: it goes with none of --guard, --state and --learn"
         )
     require(**({} if zenoh is None else {"zenoh": "zenoh"}))
-    require(**({"mcap": "mcap"} if file is not None and file.suffix == ".mcap" else {}))
     from evofsm.cli.monitor.decider import Decider, guard_of_monitor, guard_of_traffic
     from evofsm.cli.monitor.state import State
     from evofsm.cli.monitor.transports import Server, silence_output
@@ -87,14 +81,14 @@ def monitor(
         if state is not None:
             given = None if guard is None or guard.resolve() == state.resolve() else _digest(guard)
             made = {"interval": interval, "brakes": brakes} if guard is None else {}
-            told = {"mode": mode.value, "proposal": proposal, "learn": learn, "episode": episode}
+            told = {"mode": mode.value, "learn": learn, "episode": episode}
             saved = State(state, {"guard": given, **made, **told})
             stack.callback(saved.close)
         elif learn:
             warn("nothing of what is learnt is saved; --state FILE saves it")
         used = fresh() if saved is None else saved.guard(fresh)
         _prepare(used, mode, audit, stack, learn=learn)
-        decider = Decider(used, proposal=proposal, episode=episode)
+        decider = Decider(used, episode=episode)
         if warm:
             _compile(used, scenes=decider.form.scenes)
         if saved is not None:
@@ -146,40 +140,29 @@ def _serve(
     udp: int | None,
     zenoh: str | None,
 ) -> None:
-    from evofsm.cli.monitor.transports import (
-        SocketTransport,
-        UdpTransport,
-        ZenohTransport,
-        serve_stream,
-    )
+    from evofsm.cli.monitor import transports
 
     if socket is not None:
-        by_socket = stack.enter_context(closing(SocketTransport(socket)))
+        by_socket = stack.enter_context(closing(transports.SocketTransport(socket)))
         warn(f"listens to {socket}")
         by_socket.serve(server)
     elif udp is not None:
-        by_udp = stack.enter_context(closing(UdpTransport(udp)))
+        by_udp = stack.enter_context(closing(transports.UdpTransport(udp)))
         warn(f"listens to UDP port {by_udp.port}")
         by_udp.serve(server)
     elif zenoh is not None:
-        by_zenoh = stack.enter_context(closing(ZenohTransport(zenoh)))
+        by_zenoh = stack.enter_context(closing(transports.ZenohTransport(zenoh)))
         warn(f"listens to {zenoh}/row")
         by_zenoh.serve(server)
-    elif file is not None and file.suffix == ".mcap":
-        for line in _rows_of(file):
-            with server.waiting():
-                pass
-            sys.stdout.buffer.write(server.answer([line]))
-        sys.stdout.buffer.flush()
     elif file is not None:
         with open(file, "rb") as source:
-            serve_stream(server, source, sys.stdout.buffer)
+            transports.serve_stream(server, source, sys.stdout.buffer)
     elif sys.stdin is None:
         raise ValueError("standard input is closed; give FILE, --socket, --udp or --zenoh")
     elif server.heartbeat is not None and sys.platform == "win32":
         raise ValueError("on Windows --heartbeat needs --udp or --zenoh")
     else:
-        serve_stream(server, sys.stdin.buffer, sys.stdout.buffer)
+        transports.serve_stream(server, sys.stdin.buffer, sys.stdout.buffer)
 
 
 def _compile(guard: Guard, *, scenes: bool) -> None:
@@ -198,21 +181,3 @@ def _compile(guard: Guard, *, scenes: bool) -> None:
         twin.decide(seen + 0.1 * k, None)
     twin.end(observation=seen)
     warn("compiled")
-
-
-def _rows_of(run: Path) -> Iterator[bytes]:
-    """The rows of a recorded run, and the ends of its episodes, as messages."""
-    import json
-    import math
-
-    from evofsm.driving.naming import VARIABLES
-    from evofsm.io import read_run
-
-    names = {"time": "time", **dict(zip(VARIABLES, VARIABLES, strict=True)), "proposed": "proposal"}
-    for episode in read_run(run).episodes:
-        columns = [episode.columns[name].tolist() for name in names]
-        for values in zip(*columns, strict=True):
-            known: Any = (None if math.isnan(value) else value for value in values)
-            yield json.dumps(dict(zip(names.values(), known, strict=True))).encode()
-        last = dict(zip(VARIABLES, episode.end.tolist(), strict=True))
-        yield json.dumps({"end": True, "failed": bool(episode.collided), **last}).encode()

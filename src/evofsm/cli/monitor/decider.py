@@ -42,7 +42,6 @@ class Decider:
         self,
         guard: Guard,
         *,
-        proposal: float | None = None,
         episode: int = EPISODE,
         keep: Callable[[Message], None] = lambda message: None,
     ) -> None:
@@ -50,7 +49,7 @@ class Decider:
             raise ValueError(f"episode is {episode}; it must have a row at least")
         self.guard = guard
         self.episode = episode
-        self.form = Form(guard, proposal)
+        self.form = Form(guard)
         self.keep = keep
         self.n = 0  #: decisions so far
         self.refused = 0  #: messages that were refused, since the process began

@@ -98,7 +98,7 @@ class _Vehicle(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
 class Form:
     """Reads lines, for one guard."""
 
-    def __init__(self, guard: Guard, proposal: float | None = None) -> None:
+    def __init__(self, guard: Guard) -> None:
         reviser = guard.reviser
         #: Names of what is observed; empty where they have none, and come as a list.
         self.variables: tuple[str, ...] = guard.variables
@@ -111,7 +111,7 @@ class Form:
         several: Any = Annotated[list[_Seen], length]
         seen = [(name, _Seen) for name in self.variables] or [("observation", several)]
         self._names = [name for name, _ in seen]
-        action = ("proposal", _action(guard), *(() if proposal is None else (proposal,)))
+        action = ("proposal", _action(guard))
         version = ("schema", Literal[1], SCHEMA)
         self._row = _struct("Row", ("time", _Number), action, *seen, version)
         placed = ("ego", _Vehicle), ("objects", list[_Vehicle])
@@ -325,10 +325,7 @@ def _rule(text: str, place: str) -> str:
 def _missing(about: str) -> str:
     """What to do about a key that is missing."""
     if about == "proposal":
-        return (
-            ": what the controller wants to do, or null if nothing; with --proposal NUMBER that is "
-            "taken for it"
-        )
+        return ": what the controller wants to do, or null if nothing"
     if about in ("time", "ego", "objects", "end") or "." in about:
         return "; every message of its kind has it"
     return "; a variable that was not seen is null"

@@ -63,7 +63,7 @@ class Server:
         self.decider = decider
         self.heartbeat = heartbeat
         self._heard = self._said = time.monotonic()
-        self._stop = self._waits = False
+        self.stopped = self._waits = False
 
     def answer(self, lines: Iterable[bytes]) -> bytes:
         """What is answered to lines, each with an end."""
@@ -71,8 +71,10 @@ class Server:
         self._heard = self._said = time.monotonic()
         return answers
 
-    def answer_packet(self, data: bytes) -> bytes:
-        """What is answered to some lines that came at once."""
+    def answer_packet(self, data: bytes | None) -> bytes:
+        """What is answered to some lines that came at once, or where none came in time."""
+        if data is None:
+            return self.beat()
         lines = data.removesuffix(b"\n").split(b"\n")
         if len(lines) > _MOST_LINES:
             return self.refuse(f"is one of {len(lines)} at once; at most {_MOST_LINES} may be")
@@ -124,18 +126,14 @@ class Server:
         """In this it may be stopped, by a `StoppedError`."""
         self._waits = True
         try:
-            if self._stop:
+            if self.stopped:
                 raise StoppedError
             yield
         finally:
             self._waits = False
 
-    def stop(self) -> None:
-        """Stop it as it next waits."""
-        self._stop = True
-
     def _asked(self, number: int, frame: FrameType | None) -> None:
-        self._stop = True
+        self.stopped = True
         if self._waits:
             raise StoppedError
 
@@ -218,9 +216,8 @@ class SocketTransport:
             self._socket.setblocking(False)
         except OSError as error:
             self._socket.close()
-            if error.filename is not None:
-                raise
-            raise OSError(error.errno, error.strerror or str(error), os.fspath(path)) from error
+            where = error.filename or os.fspath(path)
+            raise OSError(error.errno, error.strerror or str(error), where) from error
         except ValueError:
             self._socket.close()
             raise
@@ -324,10 +321,8 @@ class UdpTransport:
             data = None
             with suppress(OSError), server.waiting():  # nothing in time; or the sender is gone
                 data, self._sender = self._socket.recvfrom(_CHUNK)
-            answers = server.beat() if data is None else server.answer_packet(data)
-            if self._sender is None:
-                continue
-            for answer in answers.splitlines(keepends=True):
+            answers = server.answer_packet(data)
+            for answer in answers.splitlines(keepends=True) if self._sender else ():
                 with suppress(OSError):
                     self._socket.sendto(answer, self._sender)
 
@@ -372,7 +367,7 @@ class ZenohTransport:
             data = None
             with suppress(queue.Empty), server.waiting():
                 data = self._came.get(timeout=server.patience)
-            answers = server.beat() if data is None else server.answer_packet(data)
+            answers = server.answer_packet(data)
             dropped, self._dropped = self._dropped, 0
             if dropped:
                 answers += server.refuse(f"{dropped} messages came too fast, and were left out")

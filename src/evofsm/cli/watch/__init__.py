@@ -57,7 +57,6 @@ def watch(
     learn_first: Annotated[int, option("Episodes to learn from before.", min=0)] = 60,
     learn: Annotated[Path | None, option("Begin with what a folder of drive --out holds.")] = None,
     topics: Annotated[Path | None, option("Of a bag: which field is which variable.")] = None,
-    speed: Annotated[float, option("At first, as a multiple of real time.")] = 1.0,
     paused: Annotated[bool, option("Show the first frame, and wait.", "--paused")] = False,
     port: Annotated[int, option("Of the page; 0 for any that is free.", min=0, max=65535)] = 0,
     no_browser: Annotated[bool, option("Print the address alone.", "--no-browser")] = False,
@@ -75,12 +74,9 @@ def watch(
         require(scipy="study", mcap="mcap")
     else:
         require_world(world)
-    from evofsm.cli.watch.player import SPEEDS, Player
+    from evofsm.cli.watch.player import Player
     from evofsm.cli.watch.server import LivePage
 
-    if speed not in SPEEDS:
-        speeds = ", ".join(f"{one:g}" for one in SPEEDS)
-        raise ValueError(f"--speed is {speed:g}; it must be one of {speeds}")
     if is_recorded:
         opened = _recorded(what, case, topics, judge, tolerance, is_log=is_log)
     else:
@@ -90,7 +86,7 @@ def watch(
     with (
         LivePage(port, live=not is_recorded) as page,
         # Whoever comes to a run that waits finds its first frame.
-        Player(opened, page, paused=paused, speed=speed, awaits=not paused) as player,
+        Player(opened, page, paused=paused, awaits=not paused) as player,
     ):
         page.player = player
         if paused:
