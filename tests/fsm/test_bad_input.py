@@ -12,19 +12,14 @@ RAGGED = [[1.0, 2.0], [3.0]]
 # What is wrong with one observation of two variables: the exception and the words that tell.
 OBSERVATIONS = {
     "NaN": ([0.0, NAN], ValueError, "observation, variable 1: nan .*finite"),
-    "infinity": ([INF, 0.0], ValueError, "observation, variable 0: inf .*finite"),
-    "minus infinity": ([0.0, -INF], ValueError, "observation, variable 1: -inf .*finite"),
     "too large": ([0.0, 1e200], ValueError, r"observation, variable 1: 1e\+200 .*at most 1e\+100"),
     "texts": (["a", "b"], TypeError, "observation has dtype <U1.*text"),
-    "complex": ([1j, 0.0], TypeError, "observation has dtype complex128.*complex"),
     "nothing": (None, TypeError, "observation has dtype object.*None"),
     "a None": ([None, 1.0], TypeError, "observation has dtype object.*None"),
-    "an object": ([object(), 1.0], TypeError, "observation has dtype object"),
     "ragged": (RAGGED, ValueError, "observation: rows have different lengths"),
     "two axes": ([[0.0, 1.0]], ValueError, r"observation has shape \(1, 2\).*\(variables,\)"),
     "a number": (1.0, ValueError, r"observation has shape \(\).*\(variables,\)"),
     "an empty list": ([], ValueError, r"observation has shape \(0,\).*not empty"),
-    "an empty array": (np.empty(0), ValueError, r"observation has shape \(0,\).*not empty"),
 }
 # The same, where a machine already knows that there are two.
 LENGTHS = {
@@ -44,23 +39,16 @@ ACTIONS = {
 ROWS = np.array([[0.0, 1.0], [2.0, 3.0], [1.0, 2.0]])
 BATCHES = {
     "NaN": ([[0.0, 1.0], [2.0, NAN]], [0, 0], [], ValueError, "row 1, variable 1: nan .*finite"),
-    "infinity": ([[0.0, 1.0], [INF, 0.0]], [0, 0], [], ValueError, "row 1, variable 0: inf"),
     "too large": ([[0.0, 1.0], [1e200, 0.0]], [0, 0], [], ValueError, r"row 1.*1e\+200.*1e\+100"),
     "texts": ([["a", "b"]], [0], [], TypeError, "observations has dtype <U1.*text"),
-    "complex": ([[1j, 0.0]], [0], [], TypeError, "observations has dtype complex128"),
     "a None": ([[None, 0.0]], [0], [], TypeError, "observations has dtype object.*None"),
     "ragged rows": (RAGGED, [0, 0], [], ValueError, "observations: rows have different lengths"),
     "one axis": ([0.0, 1.0], [0, 0], [], ValueError, r"observations has shape \(2,\).*\(rows, var"),
-    "three axes": ([ROWS], [0, 0, 0], [], ValueError, r"observations has shape \(1, 3, 2\)"),
     "no variables": (np.empty((3, 0)), [0, 0, 0], [], ValueError, r"shape \(3, 0\).*not empty"),
     "too few actions": (ROWS, [0, 0], [], ValueError, r"actions .*\(2,\); 3 observations"),
     "too many actions": (ROWS, [0] * 4, [], ValueError, r"actions .*\(4,\); 3 observations"),
-    "two axes of actions": (ROWS, [[0, 0, 0]], [], ValueError, r"actions .*\(1, 3\)"),
-    "one action": (ROWS, 0, [], ValueError, r"actions .*\(\); 3 observations"),
     "ragged actions": (ROWS, [[0], [0, 1], 2], [], (TypeError, ValueError), "actions"),
     "numbers as actions": (ROWS, [0.0, 1.0, 2.0], [], TypeError, "actions .*float64.*integer"),
-    "texts as actions": (ROWS, ["0", "1", "2"], [], TypeError, "actions .*<U1.*integer"),
-    "a None action": (ROWS, [0, None, 1], [], TypeError, "actions .*object.*integer"),
     "action too high": (ROWS, [0, 1, 3], [], ValueError, "row 2 is 3; .*0 to 2, and -1 for none"),
     "action too low": (ROWS, [0, -2, 1], [], ValueError, "row 1 is -2; .*0 to 2, and -1 for none"),
     "start beyond": (ROWS, [0, 0, 0], [0, 3], ValueError, "episode_starts names row 3.* 3 rows"),
@@ -117,7 +105,7 @@ def test_an_observation_that_cannot_be_right(machine, refuses, z, error, words):
     refuses(machine, lambda m: m.learn_one(z, 1), error, words)
 
 
-@pytest.mark.parametrize("name", ["NaN", "infinity", "minus infinity", "too large"])
+@pytest.mark.parametrize("name", ["NaN", "too large"])
 def test_an_array_is_looked_at_as_closely_as_a_list(machine, refuses, name):
     z, error, words = OBSERVATIONS[name]
     refuses(machine, lambda m: m.observe(np.array(z)), error, words)
@@ -135,10 +123,6 @@ def test_an_action_that_cannot_be_right(machine, refuses, i, error, words):
     refuses(machine, lambda m: m.act(i), error, words)
     refuses(machine, lambda m: m.learn_one([0.0, 1.0], i), error, words)
     refuses(machine, lambda m: m.predict(i), error, words)
-
-
-def test_an_action_before_any_observation(refuses):
-    refuses(EvolvingFSM(3), lambda m: m.act(0), ValueError, "act before observe")
 
 
 def test_an_action_before_the_first_observation_of_an_episode(grown, refuses):

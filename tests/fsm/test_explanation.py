@@ -97,22 +97,6 @@ def test_where_states_were_joined_there_is_no_interval():
     assert not merge([one, other.copy()], radius=0.1).joined.any()
 
 
-def test_counts_survive_a_file(tmp_path):
-    machine = EvolvingFSM(3, rule=Novelty(radius=1.0), failure_horizon=4)
-    Z, I, starts, failures = drives(3)
-    machine.learn_many(Z[:37], I[:37], starts[starts < 37], failures[failures < 37])
-    machine.save(tmp_path / "machine")
-    machine.model(names=["place"]).save(tmp_path / "model")
-    again, model = EvolvingFSM.load(tmp_path / "machine"), FSMModel.load(tmp_path / "model")
-    assert model.explain(0, 1) == machine.model(names=["place"]).explain(0, 1)
-    for one in (machine, again):
-        one.learn_many(Z[37:], I[37:])
-        one.fail()
-    assert again.failure_horizon == 4
-    for name in COUNTS:
-        np.testing.assert_array_equal(getattr(again, name), getattr(machine, name))
-
-
 # -- What is said ----------------------------------------------------------------------------------
 
 

@@ -102,12 +102,6 @@ def test_any_real_array_is_read_and_none_is_written(dtype, order, snapshot):
 # -- Actions and episodes ----------------------------------------------------------------------
 
 
-def test_an_action_labels_the_next_transition_and_no_other(grown):
-    grown.act(1)
-    assert not np.isnan(grown.observe([0.3, 0.1]).surprise)
-    assert np.isnan(grown.observe([0.2, 0.1]).surprise)
-
-
 def test_an_observation_without_an_action_before_it_teaches_no_transition(grown):
     grown.start_episode()
     grown.observe([3.0, 1.0])
@@ -129,14 +123,6 @@ def test_a_new_episode_clears_the_belief_and_nothing_else(grown):
         np.testing.assert_array_equal(getattr(grown, name), before[name])
 
 
-def test_states_are_determined_from_all_episodes_alike(stream):
-    Z, I, starts = stream
-    apart = new_machine().learn_many(Z, I, starts)
-    together = new_machine().learn_many(Z, I)
-    np.testing.assert_array_equal(apart.state, together.state)
-    np.testing.assert_array_equal(apart.event, together.event)
-
-
 def test_learn_one_observes_and_then_acts(snapshot):
     one, two = new_machine(), new_machine()
     for z, i in (([0.0], 1), ([1.0], 2), ([0.4], 0)):
@@ -151,35 +137,12 @@ def test_learn_one_observes_and_then_acts(snapshot):
 # -- What a machine shows ----------------------------------------------------------------------
 
 
-def test_a_new_machine_knows_no_state():
-    machine = new_machine()
-    assert machine.n_states == 0
-    assert machine.state is None
-    assert machine.belief.shape == machine.state_ids.shape == (0,)
-    assert machine.transition_matrices.shape == (3, 0, 0)
-
-
-def test_the_first_observation_founds_the_first_state():
-    machine = new_machine()
-    step = machine.observe([3.0, -1.0])
-    assert (step.state, step.event, step.belief.tolist()) == (0, Event.CREATED, [1.0])
-    assert machine.centers.tolist() == [[3.0, -1.0]]
-    assert machine.potentials.tolist() == [1.0]
-    assert machine.transition_matrices.tolist() == [[[1.0]]] * 3
-    assert machine.origin_frequency.tolist() == [[1e-3]] * 3
-
-
 def test_a_denser_observation_moves_the_nearest_state_if_closer_than_the_radius():
     Z = [[0.0], [0.1], [2.0], [1.0]]
     for radius, event in ((1.5, Event.MOVED), (0.5, Event.CREATED)):
         machine = EvolvingFSM(n_actions=1, radius=radius)
         assert machine.learn_many(Z, [0] * 4).event.tolist() == [Event.CREATED, 0, 0, event]
         assert machine.centers[-1].tolist() == [1.0]
-
-
-def test_a_state_at_exactly_the_radius_is_not_near_enough_to_move():
-    machine = EvolvingFSM(n_actions=1, radius=1.0)
-    assert machine.learn_many([[0.0], [0.1], [2.0], [1.0]], [0] * 4).event[-1] == Event.CREATED
 
 
 def test_a_step_keeps_its_arrays_when_the_machine_goes_on(grown):
@@ -214,13 +177,6 @@ def test_a_constructor_argument_is_an_attribute_of_the_same_name():
     machine = EvolvingFSM(**settings)
     assert {name: getattr(machine, name) for name in settings} == settings
     assert repr(eval(repr(machine))) == repr(machine)
-
-
-def test_the_state_is_the_nearest_also_where_beliefs_tie():
-    machine = EvolvingFSM(n_actions=1, radius=0.5, spread=1e6)
-    machine.learn_many([[0.0], [0.1], [2.0], [1.0]], [0, 0, 0, 0])
-    step = machine.observe([0.5 + 1e-12])
-    assert machine.state == step.state
 
 
 def test_changes_count_the_steps_of_the_recognised_state_within_episodes(grown):
@@ -304,18 +260,6 @@ def test_counts_never_forget_where_frequencies_do():
     assert machine.origin_frequency[0, 1] == 0.0
     assert machine.decisions[0].tolist() == [4999.0, 1.0]
     assert machine.failures[0].tolist() == [0.0, 1.0]
-
-
-def test_decisions_sum_to_the_transitions_learnt_and_the_failures_after_them(stream):
-    machine = new_machine()
-    trace = machine.learn_many(*stream, failures=[10, 77])
-    machine.observe([0.0, 0.0])
-    machine.act(2)
-    uses = machine.model().uses
-    assert uses.sum() == (~np.isnan(trace.surprise)).sum() + (stream[1][-1] >= 0)
-    np.testing.assert_allclose(machine.decisions.sum(axis=1), uses, rtol=1e-12)
-    machine.fail()
-    np.testing.assert_allclose(machine.decisions.sum(axis=1), [*uses[:2], uses[2] + 1], rtol=1e-12)
 
 
 GIVEN = {

@@ -102,19 +102,6 @@ def test_parts_that_do_not_fit_each_other_are_refused(change, words):
 # -- Recognition -------------------------------------------------------------------------------
 
 
-def test_the_snapshot_recognises_the_latest_observation_as_the_machine_did(grown):
-    z = [0.7, 0.1]
-    belief = grown.observe(z).belief
-    np.testing.assert_allclose(grown.model().recognise(z), belief, rtol=1e-13)
-
-
-def test_recognition_follows_the_similarity_equation(grown):
-    model = grown.model()
-    z = np.array([0.7, 0.1])
-    similarity = np.exp(-((model.centers - z) ** 2).sum(axis=1) / model.width)
-    np.testing.assert_allclose(model.recognise(z), similarity / similarity.sum(), rtol=1e-12)
-
-
 def test_many_rows_are_recognised_each_as_alone(grown):
     model = grown.model()
     Z = np.random.default_rng(0).normal(size=(20, 2)) * 4.0
@@ -166,6 +153,8 @@ def test_without_an_action_the_policy_rules_from_the_first_step_on():
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
+        ({"belief": [2.0, -1.0]}, "no distribution"),
+        ({"belief": [np.nan, 1.0]}, "no distribution"),
         ({"belief": [1.0]}, r"belief has shape \(1,\); the model has 2 states"),
         ({"action": 2}, "action is 2; there are actions 0 to 1"),
         ({"action": -1}, "action is -1"),
@@ -179,28 +168,10 @@ def test_a_forecast_that_makes_no_sense_is_refused(arguments, words):
         chain(SWITCH, STAY).propagate(**{"belief": [1.0, 0.0], "action": 0, **arguments})
 
 
-def test_a_machine_is_asked_as_its_model_is(grown):
-    model = grown.model()
-    for ask in (
-        lambda known: known.recognise([[0.2, 1.0], [2.0, 0.0]]),
-        lambda known: known.joint_frequency,
-        lambda known: (known.width, known.failures_told, known.settings),
-    ):
-        np.testing.assert_equal(ask(grown), ask(model))
-
-
 @pytest.mark.parametrize("policy", ["hold", "nonsense"])
 def test_an_average_over_actions_takes_only_policies_that_average(grown, policy):
     with pytest.raises(ValueError, match="an average is 'marginal' or 'observed'"):
         grown.model().averaged_matrix(policy)
-
-
-@pytest.mark.parametrize("belief", [[2.0, -1.0], [0.5, 0.2], [np.nan, 1.0]])
-def test_what_is_no_distribution_is_not_propagated(belief):
-    machine = EvolvingFSM(n_actions=1, radius=0.5)
-    machine.learn_many([[0.0], [0.1], [2.0], [1.0]], [0, 0, 0, 0])
-    with pytest.raises(ValueError, match="no distribution"):
-        machine.model().propagate(belief)
 
 
 def test_models_and_steps_are_shown_in_a_line():

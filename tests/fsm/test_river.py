@@ -64,14 +64,6 @@ def test_it_learns_what_the_machine_learns(settings):
     assert np.allclose(of_last, trace.belief[-1], atol=1e-12)
 
 
-def test_the_order_of_features_matters_never_not_even_in_the_first_observation():
-    straight, turned = RiverClusterer(), RiverClusterer()
-    for x in as_features(walk()):
-        straight.learn_one(x)
-        turned.learn_one(dict(reversed(x.items())))
-    assert pickle.dumps(straight.machine) == pickle.dumps(turned.machine)
-
-
 @pytest.mark.parametrize("absent", [{}, {"b": None}, {"b": math.nan}])
 def test_what_is_absent_was_not_observed(absent):
     Z = walk()
