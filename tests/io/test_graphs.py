@@ -37,9 +37,12 @@ def model():
 # -- Graphs ---------------------------------------------------------------------------------------
 
 
+def read_back(model, **how):
+    return pytest.importorskip("pygraphviz").AGraph(string=to_dot(model, **how))
+
+
 def test_graphviz_draws_every_state_and_every_edge_that_was_asked_for(model):
-    pygraphviz = pytest.importorskip("pygraphviz")
-    graph = pygraphviz.AGraph(string=to_dot(model, least=0.0, evidence=1.0))
+    graph = read_back(model, least=0.0, evidence=1.0)
     drawn = (model.averaged_matrix("observed") > 0.0) & (model.changes >= 1.0)
     edges = {(int(a[1:]) - 1, int(b[1:]) - 1) for a, b in graph.edges()}
     assert edges == set(map(tuple, np.argwhere(drawn).tolist()))
@@ -50,19 +53,17 @@ def test_graphviz_draws_every_state_and_every_edge_that_was_asked_for(model):
 
 
 def test_a_dead_end_is_marked_by_its_shape_and_in_words(model):
-    pygraphviz = pytest.importorskip("pygraphviz")
-    graph = pygraphviz.AGraph(string=to_dot(model))
+    graph = read_back(model)
     marked = {n for n in graph.nodes() if n.attr["shape"] == "hexagon"}
     assert marked == {f"s{i + 1}" for i in np.flatnonzero(model.endings)}
     assert all("of all" in graph.get_node(name).attr["label"] for name in marked)
-    told = pygraphviz.AGraph(string=to_dot(model, dead_ends=[1]))
+    told = read_back(model, dead_ends=[1])
     assert [n for n in told.nodes() if "dead end" in n.attr["label"]] == ["s2"]
     assert [n for n in told.nodes() if n.attr["shape"] == "hexagon"] == ["s2"]
 
 
 def test_what_was_never_seen_is_dashed(model):
-    pygraphviz = pytest.importorskip("pygraphviz")
-    graph = pygraphviz.AGraph(string=to_dot(model, least=0.0, evidence=0.0))
+    graph = read_back(model, least=0.0, evidence=0.0)
     assert len(graph.edges()) == model.n_states**2
     for edge in graph.edges():
         seen = model.changes[int(edge[0][1:]) - 1, int(edge[1][1:]) - 1]

@@ -199,35 +199,29 @@ def test_what_is_wrong_in_a_table_is_named(tmp_path, text, message):
 NET = """<net version="1.20">
   <location netOffset="0,0" convBoundary="0,0,2000,0" origBoundary="0,0,2000,0" projParameter="!"/>
   <edge id="e" from="a" to="b" priority="1">
-    <lane id="e_0" index="0" speed="30" length="2000" shape="0,-4.8 2000,-4.8"/>
-    <lane id="e_1" index="1" speed="30" length="2000" shape="0,-1.6 2000,-1.6"/>
+    <lane id="e_0" index="0" speed="30" length="2000" shape="0,-1.6 2000,-1.6"/>
   </edge>
-  <junction id="a" type="dead_end" x="0" y="0" incLanes="" intLanes="" shape="0,0 0,-6.4"/>
-  <junction id="b" type="dead_end" x="2000" y="0" incLanes="e_0 e_1" intLanes="" shape="0,0 0,1"/>
+  <junction id="a" type="dead_end" x="0" y="0" incLanes="" intLanes="" shape="0,0 0,-3.2"/>
+  <junction id="b" type="dead_end" x="2000" y="0" incLanes="e_0" intLanes="" shape="0,0 0,1"/>
 </net>"""
 ROUTES = """<routes>
   <vType id="car" length="5" sigma="0.5"/>
   <vType id="truck" length="12" maxSpeed="20"/>
   <route id="r" edges="e"/>
-  <vehicle id="a" type="car" route="r" depart="1" departLane="0"/>
-  <vehicle id="b" type="truck" route="r" depart="3" departLane="0"/>
-  <vehicle id="c" type="car" route="r" depart="6" departLane="0"/>
-  <vehicle id="d" type="car" route="r" depart="7" departLane="1"/>
+  <vehicle id="a" type="car" route="r" depart="1"/>
+  <vehicle id="b" type="truck" route="r" depart="3"/>
+  <vehicle id="c" type="car" route="r" depart="6"/>
 </routes>"""
 DRIVE = """
-import json, sys
-import libsumo
+import json, sys, libsumo
 libsumo.start(["sumo", "-n", "net.xml", "-r", "routes.xml", "--step-length", "0.1",
                "--no-step-log", "--fcd-output", sys.argv[1], *sys.argv[2:]])
-seen = []
+seen, car = [], libsumo.vehicle
 while libsumo.simulation.getTime() < 20:
     libsumo.simulationStep()
-    if {"b", "c"} <= set(libsumo.vehicle.getIDList()):
-        lanes = [libsumo.vehicle.getLaneID(name) for name in "bc"]
-        if lanes == ["e_0", "e_0"]:
-            place = libsumo.vehicle.getLanePosition
-            gap = place("b") - libsumo.vehicle.getLength("b") - place("c")
-            seen.append([gap, libsumo.vehicle.getSpeed("c"), libsumo.vehicle.getSpeed("b")])
+    if {"b", "c"} <= set(car.getIDList()):
+        gap = car.getLanePosition("b") - car.getLength("b") - car.getLanePosition("c")
+        seen.append([gap, car.getSpeed("c"), car.getSpeed("b")])
 libsumo.close()
 json.dump(seen, open("truth.json", "w"))
 """
@@ -255,9 +249,9 @@ def test_pairs_are_those_that_sumo_drove(sumo):
     with open(path.replace("truth.xml", "truth.json")) as file:
         truth = np.array(json.load(file))
     found = episodes(path, VehicleLengths.parse(["truck=12"]))
-    mine = np.vstack([rows for rows, _, _ in found if abs(rows[0, 0] - truth[0, 0]) < 1e-5])
-    assert len(mine) > 30
-    assert mine == pytest.approx(truth[: len(mine)], abs=2e-6)
+    (mine,) = [rows for rows, _, _ in found if abs(rows[0, 0] - truth[0, 0]) < 1e-5]
+    assert len(mine) == len(truth) > 30
+    assert mine == pytest.approx(truth, abs=2e-6)
 
 
 @pytest.mark.slow
@@ -265,7 +259,7 @@ def test_pairs_are_those_that_sumo_drove(sumo):
 def test_all_of_sumo_s_formats_tell_the_same(sumo, ending):
     reference = episodes(sumo("same.xml", "--precision", "6"))
     other = episodes(sumo(f"same.{ending}", "--precision", "6"))
-    assert len(reference) == len(other) > 2
+    assert len(reference) == len(other) == 2
     for mine, theirs in zip(reference, other, strict=True):
         for a, b in zip(mine, theirs, strict=True):
             assert a == pytest.approx(b, abs=2e-5, nan_ok=True)
