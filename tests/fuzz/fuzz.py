@@ -1,7 +1,7 @@
 """Fuzz the readers of files: `python tests/fuzz/fuzz.py [TARGET ...] --seconds 60`.
 
 A target takes bytes as a file's content. Whatever they are, a reader answers with sound numbers or
-with a `ValueError` that names the file; anything else is a finding, and is kept in ``--found``.
+with a `ValueError` that names the file; anything else is a finding, kept as ``/tmp/found-TARGET``.
 """
 
 import argparse
@@ -9,10 +9,8 @@ import io
 import math
 import os
 import random
-import sys
 import tempfile
 import time
-import traceback
 import warnings
 from pathlib import Path
 
@@ -114,27 +112,16 @@ def _mcap():
 
 
 def search(name, seconds, found):
-    """Change the seeds at random; answers executions and findings."""
-    draw = random.Random(0)
-    known = seeds(name)
-    ends, done, kinds = time.monotonic() + seconds, 0, set()
+    """Change the seeds at random until one finds something, which is kept; answers executions."""
+    draw, known, done = random.Random(0), seeds(name), 0
+    ends, kept = time.monotonic() + seconds, Path(found) / f"found-{name}"
     while time.monotonic() < ends:
-        data = mutated(draw, known)
-        try:
-            tried(name, data)
-        except BaseException as error:
-            if isinstance(error, KeyboardInterrupt):
-                raise
-            place = traceback.extract_tb(error.__traceback__)[-1]
-            if (kind := (type(error), place.filename, place.lineno)) not in kinds:
-                kinds.add(kind)
-                kept = Path(found) / f"{name}-{len(kinds)}"
-                kept.write_bytes(data)
-                print(f"{kept}: {error!r}"[:500], file=sys.stderr)
+        kept.write_bytes(data := mutated(draw, known))
+        tried(name, data)
         done += 1
-    for path in (_FILE, _FILE.with_suffix(".osi")):
+    for path in (kept, _FILE, _FILE.with_suffix(".osi")):
         path.unlink(missing_ok=True)
-    return done, len(kinds)
+    return done
 
 
 def mutated(draw, known):
@@ -157,14 +144,10 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("targets", nargs="*", default=list(TARGETS), help=", ".join(TARGETS))
     parser.add_argument("--seconds", type=int, default=60, help="for each target")
-    parser.add_argument("--found", default=tempfile.gettempdir(), help="folder for findings")
     asked = parser.parse_args()
-    total = 0
     for name in asked.targets:
-        done, findings = search(name, asked.seconds, asked.found)
-        print(f"{name}: {done:,} executions in {asked.seconds} s, {findings} findings")
-        total += findings
-    sys.exit(total > 0)
+        done = search(name, asked.seconds, tempfile.gettempdir())
+        print(f"{name}: {done:,} executions in {asked.seconds} s find nothing")
 
 
 if __name__ == "__main__":
