@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from evofsm.driving.judge import LatentRisk
 from evofsm.fsm.machine import EvolvingFSM
@@ -66,8 +66,7 @@ class RiskByState:
         evidence = float(len(self.risk.manoeuvres))
         bounds = [wilson_bounds(each, evidence + 1.0) for each in cautious.tolist()]
         low, high = np.transpose(bounds)
-        seen = self.risk.seen(situation)
-        return Judgement(cautious, low, high, weights @ critical, evidence, seen)
+        return Judgement(cautious, low, high, weights @ critical, evidence, situation.seen)
 
 
 class StateRisk(NamedTuple):
@@ -98,18 +97,17 @@ def assess_states(known: EvolvingFSM | FSMModel, risk: LatentRisk) -> list[State
     [False]
     """
     actions = np.array([risk.lowest, 0.0])
-    assessed, endings = [], known.endings
+    assessed, seconds, endings = [], known.visits * risk.dt, known.endings
     for state, center in enumerate(known.centers):
         critical = risk.critical(center, actions)
         braking, keeping = risk.manoeuvres.harder(critical)
-        alone: NDArray[np.float64] = np.eye(known.n_states)[state]
         assessed.append(
             StateRisk(
                 state,
                 float(braking),
                 float(keeping - braking),
                 float(critical[0]),
-                risk.seconds_seen(alone),
+                float(seconds[state]),
                 float(endings[state]),
             )
         )

@@ -27,7 +27,7 @@ from evofsm.driving.rehearsal import HARDEST, Body, Three, critical_deceleration
 from evofsm.driving.revisers import GENTLE_BRAKE
 from evofsm.fsm.kernels import compiled, inner_kernel
 from evofsm.fsm.proportions import wilson_bounds
-from evofsm.fsm.validation import positive, real_array, refuse_unless_distribution, refuse_unusable
+from evofsm.fsm.validation import positive, real_array, refuse_unusable
 from evofsm.guard import TOLERANCE, Judgement, Situation
 from evofsm.guard.actions import Action
 from evofsm.guard.api import Trial
@@ -35,7 +35,6 @@ from evofsm.store import (
     COUNT,
     FLAG,
     LARGEST_OBSERVATION,
-    MOST_COUNTED,
     SIZE,
     SMALLEST,
     Kind,
@@ -53,13 +52,11 @@ _CAUTION = 2.5
 # No car is asked to brake harder [m/s²]; decisions are no closer nor farther apart [s].
 
 _ASKED, _SHORTEST, _LONGEST = 100.0, 1e-6, 1e6
-_TIME = Numbers(least=0.0, most=_LONGEST * MOST_COUNTED)
 _ACCELERATION = Numbers(least=SMALLEST, most=_ASKED)
 _PRODUCT, _NOISE = Numbers(least=-1e300, most=1e300), Numbers(least=0.0, most=1e300)
 _RISK = Kind(
     "risk",
     {
-        "seconds": _TIME.of("n"),
         "brakes": Numbers(("samples",)),
         "stretches": FLAG.of("samples"),
         "decels": Numbers(("decels",), SMALLEST, HARDEST),
@@ -153,7 +150,6 @@ class LatentRisk:
         self._watch = BrakeWatch(dt)
         self._own_watch = BrakeWatch(dt)  # of the car itself, where someone else drives it
         self._watched = False  # the latest decision
-        self._seconds = np.zeros(0)  # for which each state was seen
         self._commands = (0.0, 0.0)  # the latest two
 
     @classmethod
@@ -183,10 +179,10 @@ class LatentRisk:
         """Take in an observation and the acceleration commanded after it [m/s²].
 
         Where one of gap [m] and both speeds [m/s] is NaN nothing is learnt, and what is under way
-        is not gone on with; a TypeError or ValueError leaves what was learnt as it was. The
-        ``belief`` over states counts for how long each was seen.
+        is not gone on with; a TypeError or ValueError leaves what was learnt as it was. It learns
+        alike in all states, whatever the ``belief``.
         """
-        self._learn(observation, acceleration, belief, watched=False)
+        self._learn(observation, acceleration, watched=False)
 
     def watch(
         self, observation: ArrayLike, acceleration: float, belief: ArrayLike = (1.0,)
@@ -195,18 +191,14 @@ class LatentRisk:
 
         Hard braking shows what the brakes can do; ordinary braking not what they cannot.
         """
-        self._learn(observation, acceleration, belief, watched=True)
+        self._learn(observation, acceleration, watched=True)
 
-    def _learn(
-        self, observation: ArrayLike, acceleration: float, belief: ArrayLike, *, watched: bool
-    ) -> None:
+    def _learn(self, observation: ArrayLike, acceleration: float, *, watched: bool) -> None:
         seen = _three_finite(observation, whole=False)
         command = _one_finite("acceleration", acceleration)
-        states = _series("belief", belief)
         if not is_whole(seen):
             self.follow(observation, acceleration)
             return
-        self._count(states)
         estimate = self.perception.see(seen, self._expected, sure=self.brakes.known)
         self._remember(self._follow(seen, command))
         self.brakes.see(seen[1], command, estimate.mean[1], watched=watched)
@@ -264,13 +256,6 @@ class LatentRisk:
         if own is not None:
             self.brakes.show(own)
 
-    def _count(self, belief: NDArray[np.float64]) -> None:
-        missing = max(len(belief) - len(self._seconds), 0)
-        seconds = np.pad(self._seconds, (0, missing)) if missing else self._seconds
-        if not _count(seconds, belief, self.dt):
-            refuse_unless_distribution("belief", belief)
-        self._seconds = seconds
-
     # -- Judging --------------------------------------------------------------------------------
 
     def judge(self, situation: Situation, accelerations: ArrayLike) -> Judgement:
@@ -284,14 +269,14 @@ class LatentRisk:
         table, evidence = self.manoeuvres.table, float(len(self.manoeuvres))
         if not is_whole(here):  # where one is cannot be told: nothing can be survived for sure
             sure = np.ones(len(_finite("accelerations", actions)))
-            return Judgement(sure, 0.0 * sure, sure, 0.0 * sure, evidence, self.seen(situation))
+            return Judgement(sure, 0.0 * sure, sure, 0.0 * sure, evidence, situation.seen)
         judged = np.empty((4, len(actions)))
         if not _judge(
             here, actions, self._commands[1], *self.body, self.dt, table, evidence, judged
         ):
             refuse_unusable("accelerations", actions)
         risk, low, high, critical = judged
-        return Judgement(risk, low, high, critical, evidence, self.seen(situation))
+        return Judgement(risk, low, high, critical, evidence, situation.seen)
 
     def why(self, judged: Judgement) -> str:
         """Why the first action that was judged is dangerous, in a few words."""
@@ -332,7 +317,6 @@ class LatentRisk:
         return {
             "brakes": self.brakes.decel,
             "manoeuvres": len(self.manoeuvres) + self.manoeuvres.gentle,
-            "seconds": self.seconds_seen(np.ones(max(1, n_states))),
         }
 
     def _cautious(self, observation: ArrayLike) -> Three:
@@ -344,10 +328,6 @@ class LatentRisk:
         decel = self.brakes.decel
         doubt = here.deviation((1.0, -speed / decel, leader_speed / decel))
         return gap - _CAUTION * doubt, speed, leader_speed
-
-    def seen(self, situation: Situation) -> float:
-        """For how long states like this one were seen [s]; NaN where there is none."""
-        return math.nan if situation.state is None else self.seconds_seen(situation.belief)
 
     def critical(self, observation: ArrayLike, accelerations: ArrayLike) -> NDArray[np.float64]:
         """(k,) ndarray: hardest braking of the leader, from now on, that is survived [m/s²].
@@ -363,10 +343,6 @@ class LatentRisk:
         critical, body = np.empty(len(actions)), self.body._replace(margin=margin)
         critical_decelerations(observation, actions, self._commands[1], body, self.dt, critical)
         return critical
-
-    def seconds_seen(self, belief: ArrayLike) -> float:
-        """How long states like this one were seen so far [s]: near 0 for what is new."""
-        return _weighed(self._seconds, np.asarray(belief, dtype=np.float64))
 
     @property
     def body(self) -> Body:
@@ -408,7 +384,6 @@ class LatentRisk:
             risk.brakes.remember(np.column_stack([arrays["brakes"], arrays["stretches"]]))
             risk.perception.restore(arrays)
             risk.brakes.set_lagged(*arrays["lagged"].tolist())
-            risk._seconds = np.array(arrays["seconds"])
             for latest in ("brought", "shortfalls"):
                 for value, begins in arrays[f"doubts_{latest}"].reshape(-1, 2).tolist():
                     getattr(risk.brakes, latest).add(value, bool(begins))
@@ -429,7 +404,6 @@ class LatentRisk:
             "lagged": np.array(self.brakes.lagged),
             "doubts_brought": self.brakes.brought.rows.reshape(-1),
             "doubts_shortfalls": self.brakes.shortfalls.rows.reshape(-1),
-            "seconds": self._seconds,
         }
 
 
@@ -516,27 +490,3 @@ def _interpolated(x: float, table: NDArray[np.float64]) -> float:
             high = middle
     slope = (table[1, high] - table[1, low]) / (table[0, high] - table[0, low])
     return float(slope * (x - table[0, low]) + table[1, low])
-
-
-@compiled
-def _count(seconds: NDArray[np.float64], belief: NDArray[np.float64], dt: float) -> bool:
-    """Add the time of a decision to the states; nothing, and False, if ``belief`` is none."""
-    total = 0.0
-    for share in belief:
-        if not share >= 0.0:
-            return False
-        total += share
-    if not abs(total - 1.0) < 1e-6:
-        return False
-    for k in range(len(belief)):
-        seconds[k] += dt * belief[k]
-    return True
-
-
-@compiled
-def _weighed(seconds: NDArray[np.float64], belief: NDArray[np.float64]) -> float:
-    """Mean over states; of those that were never counted it is 0."""
-    total = 0.0
-    for k in range(min(len(seconds), len(belief))):
-        total += seconds[k] * belief[k]
-    return total
