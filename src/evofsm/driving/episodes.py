@@ -372,4 +372,5 @@ def summarise(
         mean_speed=float(np.mean([o.speed for o in outcomes])),
         hours=decisions * interval / 3600.0,
         kilometres=sum(o.speed * o.decisions for o in outcomes) * interval / 1000.0,
+        **learning,
     )
