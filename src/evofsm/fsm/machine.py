@@ -28,7 +28,16 @@ from evofsm.fsm import arrays, rules
 from evofsm.fsm import step as stepping
 from evofsm.fsm import validation as valid
 from evofsm.fsm.actions import IntervalActions
-from evofsm.fsm.arrays import MACHINE, NO_ACTION, NOT_OPEN, OF_ACTIONS, OF_MODEL, Learnt, Settings
+from evofsm.fsm.arrays import (
+    MACHINE,
+    NO_ACTION,
+    NOT_OPEN,
+    OF_ACTIONS,
+    OF_MODEL,
+    SUMS,
+    Learnt,
+    Settings,
+)
 from evofsm.fsm.clusters import PAPER, width_of
 from evofsm.fsm.divergence import jensen_shannon
 from evofsm.fsm.explanation import Explanation, Nearest, explain
@@ -50,7 +59,7 @@ _LIMITS = {"max_states": None, "failure_horizon": None}
 _OPTIONS = {**_LIMITS, "belief_tolerance": 0.0}
 _SETTINGS = ("n_actions", "radius", "distance_weight", "learning_rate", "prior_frequency", "spread")
 # Arrays of a snapshot that a machine answers with.
-_ASKED = {*arrays.OF_MODEL, "joint_frequency", "marginal_matrix"} - {"centers"}
+_ASKED = {*arrays.OF_MODEL, "joint_frequency", "marginal_matrix"} - {"centers", "visits"}
 _FLOAT64 = np.dtype(np.float64)
 # Compiled code of a step, without and with a limit to the states.
 _ENTRIES: dict[bool, Callable[..., int]] = {}
@@ -473,6 +482,12 @@ class EvolvingFSM(Counts if TYPE_CHECKING else object):  # type: ignore[misc] # 
     def failures_told(self) -> bool:
         """Whether anybody told of failures: of one, or that there was none."""
         return bool(self._learnt.now["failures_told"][0])
+
+    @property
+    @_alone
+    def visits(self) -> Floats:
+        """(n,) ndarray: observations in which each state was the most probable."""
+        return self._learnt.sums[SUMS.index("visits"), : self.n_states].copy()
 
     @property
     @_alone

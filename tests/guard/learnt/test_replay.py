@@ -1,14 +1,17 @@
 """Replays, and which action passes by them."""
 
+from typing import Any, NamedTuple
+
 import numpy as np
 import pytest
 
 from evofsm.guard.learnt.library import Backups, harm
 from evofsm.guard.learnt.replay import (
+    KEPT,
+    NOTHING_PASSES,
     Disturbances,
     Ends,
     Model,
-    acts,
     features,
     limited,
     n_features,
@@ -60,6 +63,12 @@ def random_model(draw, m, a, choices):
         inverse=1.0 + draw.random(m),
         choices=a if choices else 0,
     )
+
+
+def acts(model, policy, z):
+    """What a policy does at an observation."""
+    action = policy[:, 0] + policy[:, 1:] @ ((z - model.mean) * model.inverse)
+    return np.eye(len(action))[action.argmax()] if model.choices else np.clip(action, -1.0, 1.0)
 
 
 def plainly(model, situation, plan, policy, disturbances, k, scale, enough):
@@ -142,14 +151,28 @@ def test_a_harder_disturbance_still_has_a_sequel():
 # -- Which action passes ------------------------------------------------------------------------
 
 
+class Found(NamedTuple):
+    """What a search found."""
+
+    action: Any
+    backup: int
+    safety_margin: float
+    alike: bool
+
+
 def search_for(model, proposal, policies, margin=0.0, place=0.0, disturbances=None, allowed=0):
     """What is found there, if nothing disturbs."""
     policies, a = np.array(policies), len(proposal)
     disturbances = Disturbances.none(1, STEPS, 1) if disturbances is None else disturbances
     here = np.concatenate([[place, 0.0], np.zeros(a)])
     ranks = np.arange(len(policies))
-    world = here, policies, ranks, disturbances, 1.0, np.array(proposal), margin, allowed
-    return search(model, *world)
+    world = here[None], policies, ranks, disturbances, 1.0, np.array([proposal]), margin, allowed
+    action = np.empty((1, a))
+    how, backup, left = search(model, *world, action)
+    if how == NOTHING_PASSES:
+        return Found(None, backup, -np.inf, left < 0.02)
+    assert (how == KEPT) == (action[0] == proposal).all()
+    return Found(action[0], backup, left, False)
 
 
 @pytest.mark.parametrize("margin", [0.0, 0.25, 8.0])

@@ -23,7 +23,6 @@ from evofsm.guard.learnt.replay import (
     Ints,
     Model,
     Sums,
-    features,
     lags,
     learn_transition,
     n_features,
@@ -182,7 +181,6 @@ class Dynamics:
         self.n_under_way = 0  #: observations of this episode that are not studied yet
         self.has_acted = False  #: whether it is known what was done after the latest of them
         self._z, self._u = np.empty((0, self.n_variables)), np.empty((0, self.size))
-        self._row = np.empty((0, 0))  # features of the latest transition
         self._surprised = False  # whether something in it was not expected
 
     def _begin(self, z: Floats) -> None:
@@ -227,7 +225,7 @@ class Dynamics:
         if self.failed is not None and not self.thresholds and sums.counts[1] >= 1.0:
             self.thresholds = probe(self.failed, z, np.where(sums.unit > 0.0, sums.unit, 1e-9))
             self.rebuild()
-        if n:
+        if n > 1:
             self._learn(n - 1)
         seen = float(sums.counts[0])
         every = _OFTEN if self.ready and seen < _FIRST_ONES else _SELDOM
@@ -254,7 +252,7 @@ class Dynamics:
     def _ends(self, action: Floats) -> Floats:
         """(a, 2) which numbers of an action are near an end of their range."""
         lowest = -1.0 if self.choices else -0.6
-        return np.column_stack([action < lowest, action > 0.6])
+        return np.array([action < lowest, action > 0.6]).T
 
     def end(self, *, failed: bool) -> None:
         """The episode is over, or what comes does not follow from what was.
@@ -268,15 +266,10 @@ class Dynamics:
     # -- The model ------------------------------------------------------------------------------
 
     def _learn(self, i: int) -> None:
-        """Take in the transition i -> i + 1, and learn the one before it."""
-        z, u, before = self._z[i : i + 1], self._u[i : i + 1], slice(max(i - 1, 0), max(i, 1))
-        row = features(self.model, z, z - self._z[before], self._u[before], u)
-        rows, self._row = np.vstack([self._row, row]) if i else row, row
-        if not i:
-            return
+        """Learn the transition to observation i, now that the one after it is known."""
         sums, z, jumped = self.sums, self._z, np.zeros(self.n_variables)
         n = int(sums.counts[1])
-        args = sums, self.model, self.close, z, rows, i - 1, jumped
+        args = sums, self.model, self.close, z, self._u, i - 1, jumped
         self._surprised = bool(learn_transition(*args))
         if n < EARLY:
             sums.early[n] = np.abs(z[i] - z[i - 1])

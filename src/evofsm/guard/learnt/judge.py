@@ -25,7 +25,7 @@ from evofsm.guard.api import Fallback, Judgement, Search, Situation, Trial
 from evofsm.guard.learnt import library, words
 from evofsm.guard.learnt.dynamics import ARRAYS, DYNAMICS_PARTS, Dynamics
 from evofsm.guard.learnt.library import Backups, Violations
-from evofsm.guard.learnt.replay import Disturbances, Floats, Ints, acts, search
+from evofsm.guard.learnt.replay import KEPT, NOTHING_PASSES, Disturbances, Floats, Ints, search
 from evofsm.guard.learnt.words import Remembered
 from evofsm.store import COUNT, FLAG, FROM_1, SHARE, SIZE, Kind, Numbers, Place
 
@@ -51,8 +51,8 @@ _CAUTION, _AGAIN = 4.0, 0.44
 # which so much is left an episode later, and after one in which a dead end was none.
 _HORIZON, _SHORTEST, _FARTHEST, _AHEAD = 64, 32, 144, 1.5
 _LATEST, _REFUTED = 0.98, 0.8
-# An action that was used less often is tried.
-_TRIES = 8
+# Backups closer than this are alike; an action that was used less often is tried.
+_ALIKE, _TRIES = 0.02, 8
 # From so many situations on backups evolve, and disturbances are looked for.
 _ENOUGH = 3
 
@@ -295,19 +295,20 @@ class LearntRisk:
         model, proposal, scale = dynamics.model, dynamics.encode(wanted), self.disturbance_scale
         remembered, ranks = self.remembered, self._ranks[:_ASKED]
         allowed = self._allowed(tolerance, remembered)
-        asked = model, here, backups.policies, ranks, disturbances, scale
-        found = search(*asked, proposal, self.margin, allowed)
-        if found.backup != ranks[0]:  # what passed now is asked first the next time
-            self._ranks = np.append(found.backup, self._ranks[self._ranks != found.backup])
-        passes, action, tried = found.action is not None, found.action, None
-        self._holds, self._refused = passes, action is not proposal
-        if action is None:
-            action = acts(model, backups.policies[found.backup], here[: dynamics.n_variables])
+        asked = model, here[None], backups.policies, ranks, disturbances, scale
+        found, tried = np.empty((1, dynamics.size)), None
+        how, which, left = search(*asked, proposal[None], self.margin, allowed, found)
+        action = found[0]
+        if which != ranks[0]:  # what passed now is asked first the next time
+            self._ranks = np.append(which, self._ranks[self._ranks != which])
+        passes, self._refused = how != NOTHING_PASSES, how != KEPT
+        self._holds = passes
+        if not passes:
             if self._certified:
-                self._holds = search(*asked, action, 0.0, allowed).action is not None
-            tried = self._untried(action) if self.learning and found.alike else None
+                again = search(*asked, found, 0.0, allowed, np.empty_like(found))
+                self._holds = again[0] != NOTHING_PASSES
+            tried = self._untried(action) if self.learning and left < _ALIKE else None
             action = action if tried is None else tried
-        left = found.safety_margin
         judged, self._dead_end, fails_after = self._judged(
             situation,
             here,
@@ -315,7 +316,7 @@ class LearntRisk:
             left if passes and not allowed else None,
         )
         self._fails_after = max(self._fails_after, fails_after)
-        backup = self._backup_text(found.backup)
+        backup = self._backup_text(which)
         if not self._refused:
             return Search(one, judged, 0, words.kept(backup, remembered, left, allowed))
         why = words.refused(self._unsurvived, remembered, self.margin, scale, allowed)
@@ -721,7 +722,7 @@ class LearntRisk:
         """All that may change while it learns: sums and notes change in place."""
         sums = self.dynamics.sums if self.dynamics.n_variables else ()
         own = {**self.__dict__, "_notes": list(self._notes)}
-        return own, dict(self.dynamics.__dict__), list(map(np.copy, sums))
+        return own, dict(self.dynamics.__dict__), [array.copy() for array in sums]
 
     def _put_back(self, own: dict[str, Any], dynamics: dict[str, Any], sums: list[Floats]) -> None:
         self.__dict__ = own

@@ -290,11 +290,11 @@ class Backups:
             return np.asarray(ends.worth.reshape(-1, each).mean(1))
 
         values = np.array([worth(policy) for policy in policies])
-        for mutation in self._mutations(random) if len(linear) else ():
+        for _ in range(_MUTANTS if len(linear) else 0):
             parent = linear[values[linear].mean(1).round(_ROUNDED).argmax()]
             if random.random() >= _OF_BEST:
                 parent = ranks[int(random.integers(len(policies)))]
-            child = policies[parent] + mutation
+            child = policies[parent] + self._mutation(random)
             reached = worth(child)
             tried = np.repeat(values[None], 1 + len(linear), 0)  # as they are, and with the child
             tried[1 + np.arange(len(linear)), linear] = reached
@@ -312,13 +312,13 @@ class Backups:
             most = np.maximum(most, values[q])
         return replaced(self, policies=policies, scores=scores)
 
-    def _mutations(self, random: np.random.Generator) -> Floats:
-        """(n, a, 1 + m) what mutants differ by."""
-        shape = (_MUTANTS, *self.policies.shape[1:])
-        size = 10.0 ** random.uniform(*_SIZES, _MUTANTS)[:, None, None]
+    def _mutation(self, random: np.random.Generator) -> Floats:
+        """(a, 1 + m) what a mutant differs by."""
+        shape = self.policies.shape[1:]
+        size = 10.0 ** random.uniform(*_SIZES)
         drawn = (random.random(shape) < _CHANGED) * size * random.standard_normal(shape)
         put: Floats = np.empty_like(drawn)
-        put[:, self.actions[:, None], np.append(0, 1 + self.variables)] = drawn
+        put[np.ix_(self.actions, np.append(0, 1 + self.variables))] = drawn
         put *= np.append(1.0, self.flips) * self.turns[:, None]
         return put
 

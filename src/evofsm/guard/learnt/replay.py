@@ -21,7 +21,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-kernel = numba.njit(cache=True, error_model="numpy")
+kernel = numba.njit(cache=True, error_model="numpy", no_cfunc_wrapper=True)
 inner_kernel = numba.njit(inline="always", error_model="numpy")
 
 Floats = NDArray[np.float64]
@@ -38,8 +38,8 @@ _RESERVE = 0.01
 _DISTANCE, _FAR = 0.05, 0.05
 # Halvings between a proposal and an action that passes.
 _HALVINGS = 4
-# Of two backups that last as long up to so much the first is taken; closer than so much are alike.
-_EQUAL, _ALIKE = 1e-9, 0.02
+# Of two backups that last as long up to so much the first is taken.
+_EQUAL = 1e-9
 # A change so many times those around it, and the ordinary one, is a jump; so many more of the first
 # ones, of which it is not known what is ordinary.
 JUMP, _FIRST_JUMP, _FIRST = 8.0, 32.0, 8.0
@@ -286,40 +286,46 @@ def _is_beyond(expected: float, seen: float, low: float, high: float, close: flo
 
 @kernel
 def learn_transition(
-    sums: Sums, model: Model, close: Floats, z: Floats, rows: Floats, i: int, jumped: Floats
+    sums: Sums, model: Model, close: Floats, z: Floats, u: Floats, i: int, jumped: Floats
 ) -> bool:
-    """Learn the transition i -> i + 1, amid observations (T, m), in ``sums``.
+    """Learn the transition i -> i + 1 of observations z (T, m) and actions u (T, a), in ``sums``.
 
-    ``rows`` (2, p) are the features of that transition and the next, ``close`` (m,) says how far
-    from where it saturates a variable may be seen that is there. ``jumped`` (m,) gets 1 where a
-    variable jumped. Returns whether something of the next transition was not expected.
+    ``close`` (m,) says how far from where it saturates a variable may be seen that is there.
+    ``jumped`` (m,) gets 1 where a variable jumped. Returns whether something of the next transition
+    was not expected.
     """
-    (p, m), n, first = model.weights.shape, sums.counts[1], i == 0
-    move, known, jump = np.zeros((2, m)), sums.scale[0] > 0.0, False
-    moved, surprised = False, False
-    for r in range(2 if known else 0):
-        for k in range(p):
-            for j in range(m):
-                move[r, j] += rows[r, k] * model.weights[k, j]
+    (p, m), a, n, first = model.weights.shape, u.shape[1], sums.counts[1], i == 0
+    at, change, move = np.empty((m, 2)), np.empty((m, 2)), np.empty((m, 2))
+    action, latest, found = np.empty((a, 2)), np.empty((a, 2)), np.empty((p, 2))
+    for t in range(i, i + 2):
+        for j in range(m):
+            at[j, t - i], change[j, t - i] = z[t, j], z[t, j] - z[max(t - 1, 0), j]
+        for k in range(a):
+            action[k, t - i], latest[k, t - i] = u[t, k], u[max(t - 1, 0), k]
+    fill_features(
+        at, change, latest, action, model.origin, model.reach, 1.0, model.choices == 0, found
+    )
+    expect(model.weights, found, move)
+    known, jump, moved, surprised = sums.scale[0] > 0.0, False, False, False
     for j in range(m):
-        if first:
-            move[0, j] = 0.0
+        if first or not known:
+            move[j, 0] = 0.0
         now, after = z[i + 1, j] - z[i, j], z[i + 2, j] - z[i + 1, j]
-        before = 0.0 if first else z[i, j] - z[i - 1, j]
+        before = change[j, 0]
         sums.variance[j] += (now * now - sums.variance[j]) / (n + 1.0)
         around = max(abs(before), abs(after), sums.unit[j])
         stands_out = abs(now) > (JUMP if n > _FIRST else _FIRST_JUMP) * around
-        if n > 0.0 and stands_out and abs(now - move[0, j]) > 0.5 * abs(now):
+        if n > 0.0 and stands_out and abs(now - move[j, 0]) > 0.5 * abs(now):
             jumped[j], jump = 1.0, True
     weight, worst = 1.0, 0.0
     for j in range(m):
-        x, y = z[i + 2, j], z[i + 1, j] + move[1, j]
+        x, y = z[i + 2, j], z[i + 1, j] + move[j, 1]
         moved |= x != z[i + 1, j]
         beyond = _is_beyond(y, x, model.lowest[j], model.highest[j], close[j])
         surprised |= known and not beyond and abs(x - y) > ONSET * sums.scale[j]
     for j in range(m):
         x, now = z[i + 1, j], z[i + 1, j] - z[i, j]
-        y, low, high = z[i, j] + move[0, j], model.lowest[j], model.highest[j]
+        y, low, high = z[i, j] + move[j, 0], model.lowest[j], model.highest[j]
         if jumped[j] == 0.0:
             sums.least[j], sums.most[j] = min(sums.least[j], now), max(sums.most[j], now)
         if n >= EARLY:
@@ -342,14 +348,13 @@ def learn_transition(
         return surprised and moved
     weight *= min(1.0, _OUTLIER / max(worst, 1e-12)) ** 2
     for j in range(m):  # lags, as far as they have a sequel by now
-        before = z[i, j] - z[i - 1, j]
         reach = 1.5 * max(abs(sums.least[j]), abs(sums.most[j]))
-        rows[0, 1 + m + j] = before if abs(before) <= reach else 0.0
+        found[1 + m + j, 0] = change[j, 0] if abs(change[j, 0]) <= reach else 0.0
     for k in range(p):
-        f = weight * rows[0, k]
+        f = weight * found[k, 0]
         if f != 0.0:
             for r in range(p):
-                sums.squares[k, r] += f * rows[0, r]
+                sums.squares[k, r] += f * found[r, 0]
             for j in range(m):
                 sums.products[k, j] += f * (z[i + 1, j] - z[i, j])
     return surprised and moved
@@ -358,18 +363,10 @@ def learn_transition(
 # -- Replays --------------------------------------------------------------------------------------
 
 
-def acts(model: Model, policy: Floats, z: Floats) -> Floats:
-    """(a,) what a policy (a, 1 + m) does at an observation (m,): see `_follow_policy`."""
-    action = policy[:, 0] + policy[:, 1:] @ ((z - model.mean) * model.inverse)
-    if not model.choices:
-        return np.minimum(1.0, np.maximum(-1.0, action))
-    return np.asarray(np.eye(len(action))[action.argmax()])
-
-
 @inner_kernel
 def _follow_policy(model: Model, policy: Floats, z: Floats, end: float, action: Floats) -> None:
     """Actions (a, n) of a linear policy (a, 1 + m): saturated at ``end``, or the largest of few."""
-    (a, n), m, choices = action.shape, len(z), model.choices
+    (a, n), m, choices = action.shape, policy.shape[1] - 1, model.choices
     for i in range(a):
         for l in range(n):
             action[i, l] = policy[i, 0]
@@ -522,16 +519,19 @@ def replay(
 
 # -- What decides ---------------------------------------------------------------------------------
 
-
-class Found(NamedTuple):
-    """What a search found."""
-
-    action: Floats | None  #: (a,) the closest to the proposal that passes; None where none does
-    backup: int  #: after which it passes; where none does, the one that lasts longest
-    safety_margin: float  #: least distance to failure that is then left [ordinary changes]
-    alike: bool  #: whether no action passes, and all backups last as long
+#: What a search finds: the proposal passes, another action passes, or none does.
+KEPT, CHANGED, NOTHING_PASSES = 0, 1, 2
 
 
+@inner_kernel
+def _between(one: Floats, other: Floats, share: float, action: Floats) -> None:
+    """An action (1, a) so much of the way from one to another; at the end of it the other."""
+    for i in range(action.shape[1]):
+        between = one[0, i] + share * (other[0, i] - one[0, i])
+        action[0, i] = other[0, i] if share == 1.0 else between
+
+
+@kernel
 def search(
     model: Model,
     situation: Floats,
@@ -542,52 +542,58 @@ def search(
     proposal: Floats,
     margin: float,
     allowed: int,
-) -> Found:
-    """The closest action to a proposal (a,) after which a backup survives by the margin.
+    action: Floats,
+) -> tuple[int, int, float]:
+    """Find the ``action`` closest to a proposal after which a backup survives by the margin.
 
     The proposal itself if one does; else what the first of ``ranks`` does that survives, and from
     there as near to the proposal as halvings come. All disturbances have to be survived but
-    ``allowed``, and that none begins.
+    ``allowed``, and that none begins. Where no action passes it is that of the backup that lasts
+    longest. ``situation`` is (1, 2m + a), proposal and action are (1, a).
+
+    Returns what was found, after which backup it passes, and the least distance to failure that is
+    then left; where nothing passes, how far apart backups are, near 0 if all last as long.
     """
-    z, count = situation[: len(model.origin)], disturbances.residuals.shape[2]
-    situations, ends = situation[None], Ends.of(count)
-
-    def left(action: Floats, q: int) -> float:
-        """Least distance to failure; negative infinity if it is not survived."""
-        plan, policy = action[None], policies[q]
-        lost, least = replay(
-            model, situations, plan, policy, disturbances, scale, margin, allowed, ends
+    a, count = proposal.shape[1], disturbances.residuals.shape[2]
+    ends, own, nothing = Ends(np.empty(count), np.empty(count)), np.empty((1, a)), np.empty((0, a))
+    halvings, middle = _HALVINGS if model.choices == 0 else 0, np.empty((1, a))
+    _between(proposal, proposal, 1.0, action)
+    for q in ranks:
+        lost, left = replay(
+            model, situation, proposal, policies[q], disturbances, scale, margin, allowed, ends
         )
-        return least if lost <= allowed else -np.inf
-
+        if lost <= allowed and left >= margin:
+            return KEPT, q, left
     for q in ranks:
-        least = left(proposal, q)
-        if least >= margin:
-            return Found(proposal, q, least, False)
-    for q in ranks:
-        own = acts(model, policies[q], z)
-        if model.choices and (own == proposal).all():
+        _follow_policy(model, policies[q], situation.T, 1.0, own.T)
+        refused, share, distance, passes = 0.0, 1.0, 0.0, False
+        for i in range(a):
+            distance += abs(own[0, i] - proposal[0, i])
+        if model.choices > 0 and distance == 0.0:
             continue  # it was refused
-        least = left(own, q)
-        if least < margin:
-            continue
-        best, share, refused = own, 1.0, 0.0
-        for _ in range(_HALVINGS if not model.choices else 0):
-            half = 0.5 * (refused + share)
-            middle = proposal + half * (own - proposal)
-            closer = left(middle, q)
-            if closer >= margin:
-                share, least, best = half, closer, middle
+        for halving in range(1 + halvings):  # the backup's own action, then closer ones
+            half = 0.5 * (refused + share) if halving else 1.0
+            _between(proposal, own, half, middle)
+            lost, closer = replay(
+                model, situation, middle, policies[q], disturbances, scale, margin, allowed, ends
+            )
+            if lost <= allowed and closer >= margin:
+                share, left, passes = half, closer, True
+                _between(middle, middle, 1.0, action)
+            elif not passes:
+                break
             else:
                 refused = half
-        return Found(best, q, least, False)
-    worths, nothing = [], np.empty((0, len(proposal)))
+        if passes:
+            return CHANGED, q, left
+    which, longest, shortest = ranks[0], -np.inf, np.inf
     for q in ranks:
-        replay(model, situations, nothing, policies[q], disturbances, scale, 0.0, count, ends)
-        worths.append(float(ends.worth.mean()))
-    which, longest = 0, worths[0]
-    for k, lasts in enumerate(worths):
+        replay(model, situation, nothing, policies[q], disturbances, scale, 0.0, count, ends)
+        lasts = 0.0
+        for l in range(count):
+            lasts += ends.worth[l] / count
+        shortest = min(shortest, lasts)
         if lasts > longest + _EQUAL:
-            which, longest = k, lasts
-    apart = (longest - min(worths)) / (abs(longest) + 1e-12)
-    return Found(None, int(ranks[which]), -np.inf, apart < _ALIKE)
+            which, longest = q, lasts
+    _follow_policy(model, policies[which], situation.T, 1.0, action.T)
+    return NOTHING_PASSES, which, (longest - shortest) / (abs(longest) + 1e-12)
