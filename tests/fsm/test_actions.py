@@ -115,14 +115,6 @@ def test_settings_that_make_no_sense_are_refused(change, words):
         IntervalActions(**{**PAPER, **change})
 
 
-def test_encoders_with_equal_settings_are_equal_and_cannot_be_changed():
-    actions = IntervalActions(**PAPER)
-    assert actions == IntervalActions(**PAPER)
-    assert actions != IntervalActions(**PAPER, outside="clip")
-    with pytest.raises(ValueError, match="read-only"):
-        actions.edges[0] = 0.0
-
-
 def test_intervals_too_narrow_for_their_edges_to_be_told_apart_are_refused():
     with pytest.raises(ValueError, match="larger unit"):
         IntervalActions(0.0, 1e-10, 1e-11)

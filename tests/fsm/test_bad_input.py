@@ -217,13 +217,6 @@ def test_a_masked_entry_is_treated_as_nan_is(grown, z, missing):
     assert step.belief.tobytes() == expected.belief.tobytes()
 
 
-def test_a_mask_that_hides_nothing_changes_nothing(machine, snapshot):
-    twin, Z = machine.copy(), np.array([[0.5, 7.0], [1.0, 2.0]])
-    machine.learn_many(np.ma.array(Z), np.ma.array([0, 1]))
-    twin.learn_many(Z, [0, 1])
-    assert snapshot(machine) == snapshot(twin)
-
-
 def test_a_masked_action_or_row_number_is_refused(machine, refuses):
     hidden = np.ma.array([0, 1], mask=[False, True])
     refuses(machine, lambda m: m.learn_many(ROWS[:2], hidden), TypeError, "actions .*masked")

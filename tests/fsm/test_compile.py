@@ -59,28 +59,6 @@ def test_editing_a_kernel_takes_effect_in_the_kernels_that_call_it(package):
     assert run(package) == (6.0, 0)
 
 
-@pytest.fixture
-def cached(tmp_path):
-    """A package with a file of kernels, another one, and the cache of a kernel."""
-    (tmp_path / "room" / "__pycache__").mkdir(parents=True)
-    (tmp_path / "kernel.py").write_text("@kernel\ndef one(): ...\n")
-    (tmp_path / "page.py").write_text("draws nothing that a kernel compiles\n")
-    kernels._drop_stale_caches(tmp_path)
-    cache = tmp_path / "room" / "__pycache__" / "kernel.kernel-3.py311.nbi"
-    cache.touch()
-    return cache
-
-
-@pytest.mark.parametrize(("edited", "kept"), [("kernel.py", False), ("page.py", True)])
-def test_caches_go_where_what_kernels_are_made_of_was_edited(cached, tmp_path, edited, kept):
-    kernels._drop_stale_caches(tmp_path)
-    assert cached.exists()
-    with open(tmp_path / edited, "a") as file:
-        file.write("\n# another line\n")
-    kernels._drop_stale_caches(tmp_path)
-    assert cached.exists() is kept
-
-
 WARMED = """
 import numpy as np
 from numba.core import event

@@ -1,4 +1,3 @@
-import io
 import re
 from dataclasses import fields
 
@@ -158,9 +157,3 @@ def test_a_model_that_no_learning_could_have_left_is_refused(
     forge(path, {name: value})
     with pytest.raises(ValueError, match=f"{re.escape(str(path))}.*{words}"):
         FSMModel.load(path)
-
-
-def test_an_open_file_will_do_in_place_of_a_name(grown, snapshot):
-    file = io.BytesIO()
-    grown.save(file)
-    assert snapshot(EvolvingFSM.load(file)) == snapshot(grown)

@@ -55,12 +55,6 @@ def test_held_out_rows_are_foreseen_better_than_by_persistence(taught, machine, 
     assert ours < 0.8 * persistence
 
 
-def test_the_action_helps(taught, machine, walk):
-    with_action, _ = divergences(taught, machine, walk, 5)
-    without, _ = divergences(taught, machine, walk, 5, by_action=False)
-    assert with_action < 0.9 * without
-
-
 @pytest.mark.parametrize("action", [None, 0, 1])
 def test_rows_of_matrices_are_distributions(taught, action):
     for steps in taught.steps:
@@ -80,13 +74,6 @@ def test_asking_changes_nothing_and_many_rows_are_answered_as_one_by_one(taught,
     np.testing.assert_allclose(many, single, rtol=1e-12)
     np.testing.assert_array_equal(beliefs, given)
     np.testing.assert_array_equal(before, matrix(taught, 1, 5))
-
-
-def test_an_action_never_seen_goes_where_all_go(machine, walk):
-    Z, actions = walk
-    forecasts = Forecasts(n_actions=3, steps=[5])
-    forecasts.learn(machine.model(), Z[:500], actions[:500])
-    np.testing.assert_array_equal(matrix(forecasts, 2, 5), matrix(forecasts, None, 5))
 
 
 def test_states_created_later_are_taken_in(walk):

@@ -38,12 +38,12 @@ def test_every_row_is_the_golden_one(name, golden, outcome):
 
 
 def test_surprise_is_the_golden_one_and_missing_in_the_same_rows(golden, outcome):
-    np.testing.assert_allclose(outcome[1].surprise, golden["jsd"], rtol=0, atol=1e-7)
+    np.testing.assert_allclose(outcome[1].surprise, golden["jsd"], rtol=0, atol=1e-9)
     assert np.flatnonzero(np.isnan(outcome[1].surprise)).tolist() == list(golden["episode_starts"])
 
 
 def test_beliefs_are_the_golden_ones(golden, outcome):
-    np.testing.assert_allclose(outcome[1].belief[::25], golden["belief"], rtol=0, atol=1e-7)
+    np.testing.assert_allclose(outcome[1].belief[::25], golden["belief"], rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -51,7 +51,7 @@ def test_beliefs_are_the_golden_ones(golden, outcome):
     ["centers", "potentials", "transition_matrices", "joint_frequency", "origin_frequency"],
 )
 def test_what_is_learnt_in_the_end_is_the_golden_one(name, golden, outcome):
-    np.testing.assert_allclose(getattr(outcome[0], name), golden[name], rtol=0, atol=1e-7)
+    np.testing.assert_allclose(getattr(outcome[0], name), golden[name], rtol=0, atol=1e-9)
 
 
 def test_observations_a_million_away_from_zero_give_the_same_states(golden, outcome):

@@ -43,17 +43,6 @@ def test_there_are_never_more_states_and_every_array_stays_sound(seed, most):
     assert machine.endings.sum() == len(failures)
 
 
-def test_the_settings_are_saved(tmp_path):
-    settings = {"max_states": 5, "belief_tolerance": 1e-6}
-    machine = sharp(**settings)
-    learn(machine, range(0, 40, 2))
-    machine.save(tmp_path / "machine")
-    loaded = EvolvingFSM.load(tmp_path / "machine")
-    assert {name: getattr(loaded, name) for name in settings} == settings
-    assert loaded.state_ids.tolist() == machine.state_ids.tolist()
-    assert repr(loaded) == repr(machine)
-
-
 def test_merged_states_have_the_evidence_of_both():
     machine = sharp(max_states=3)
     learn(machine, [0, 0, 0, 3, 3, 9, 0, 9, 3], [0, 0, 1, 0, 0, 0, 0, 0, -1])

@@ -29,25 +29,13 @@ def new_machine():
 
 
 def learn_in_a_loop(machine, Z, I, starts=()):
-    """What `learn_many` does, with `observe` and `act`; answers the steps."""
-    steps = []
+    """What `learn_many` does, with `observe` and `act`."""
     for row, (z, i) in enumerate(zip(Z, I, strict=True)):
         if row in starts:
             machine.start_episode()
-        steps.append(machine.observe(z))
+        machine.observe(z)
         if i >= 0:
             machine.act(i)
-    return steps
-
-
-def assert_same_trace(trace, steps, n_states):
-    assert trace.state.tolist() == [s.state for s in steps]
-    assert trace.n_states.tolist() == [len(s.belief) for s in steps]
-    assert trace.event.tolist() == [s.event for s in steps]
-    assert trace.surprise.tobytes() == np.array([s.surprise for s in steps]).tobytes()
-    if trace.belief is not None:
-        padded = [np.pad(s.belief, (0, n_states - len(s.belief))) for s in steps]
-        assert trace.belief.tobytes() == np.array(padded).tobytes()
 
 
 @pytest.fixture(scope="module")
@@ -62,10 +50,9 @@ def stream(spiral):
 
 def test_a_batch_learns_bit_for_bit_what_the_loop_learns(stream, snapshot):
     loop, batch = new_machine(), new_machine()
-    steps = learn_in_a_loop(loop, *stream)
-    trace = batch.learn_many(*stream, belief=True)
+    learn_in_a_loop(loop, *stream)
+    batch.learn_many(*stream)
     assert loop.n_states > 32
-    assert_same_trace(trace, steps, loop.n_states)
     assert snapshot(batch) == snapshot(loop)
 
 
@@ -84,19 +71,6 @@ def test_a_batch_of_no_rows_changes_nothing(grown, snapshot):
     trace = grown.learn_many(np.empty((0, 2)), [], belief=True)
     assert [len(column) for column in trace] == [0, 0, 0, 0, 0]
     assert snapshot(grown) == before
-
-
-@pytest.mark.parametrize("order", ["C", "F"])
-@pytest.mark.parametrize("dtype", [np.float64, np.float32, np.int16])
-def test_any_real_array_is_read_and_none_is_written(dtype, order, snapshot):
-    Z = np.array([[0, 4], [9, 1], [4, 3], [5, 2]], dtype=dtype, order=order)
-    Z.setflags(write=False)
-    I = np.array([0, 1, 2, 0], dtype=np.uint8)
-    I.setflags(write=False)
-    machine, expected = new_machine(), new_machine()
-    machine.learn_many(Z, I)
-    learn_in_a_loop(expected, [list(map(float, z)) for z in Z], I.tolist())
-    assert snapshot(machine) == snapshot(expected)
 
 
 # -- Actions and episodes ----------------------------------------------------------------------

@@ -7,7 +7,6 @@ import sys
 import threading
 from collections import Counter
 
-import numpy as np
 import pytest
 
 import one_machine
@@ -78,11 +77,3 @@ def test_a_forked_process_is_not_kept_waiting_by_a_thread_that_it_lacks(grown):
     over.set()
     thread.join()
     assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
-
-
-def test_learning_by_missing_and_failing_counts_as_ever(grown):
-    twin = grown.copy()
-    grown.observe([0.1, np.nan], missing=one_machine.Missing.PARTIAL, failed=True)
-    twin.observe([0.1, np.nan], missing=one_machine.Missing.PARTIAL)
-    twin.fail()
-    assert one_machine.saved(grown) == one_machine.saved(twin)

@@ -111,12 +111,6 @@ def test_what_is_no_number_is_named(x, error, words):
     assert clusterer.machine.n_states == 0
 
 
-@pytest.mark.parametrize("features", [(), ("a", "a")])
-def test_features_are_different_names(features):
-    with pytest.raises(ValueError, match="must be different names, at least one"):
-        RiverClusterer(features=features)
-
-
 @pytest.mark.parametrize("library", ["river", "sklearn"])
 def test_a_missing_library_is_named(library, monkeypatch):
     for name in (library, f"{library}.base"):

@@ -1,6 +1,5 @@
 """State rules: what each makes of observations, and what holds for all of them."""
 
-import json
 from fractions import Fraction
 from random import Random
 
@@ -17,7 +16,6 @@ from evofsm.fsm.rules import (
     Paper,
     describe_rule,
     register_rule,
-    restore_rule,
 )
 from evofsm.fsm.step import Event
 
@@ -125,16 +123,6 @@ def test_a_model_keeps_the_rule_and_recognises_by_it(rule, walk, tmp_path):
     for name in ("decisions", "failures", "endings"):
         assert getattr(model, name).any()
     assert repr(EvolvingFSM(**model.settings, rule=model.rule)) == repr(machine)
-
-
-def test_a_machine_shows_its_rule_and_can_be_made_again_from_that(rule):
-    machine = EvolvingFSM(3, rule=rule)
-    assert repr(eval(repr(machine))) == repr(machine)
-    assert (f", rule={rule}" in repr(machine)) == (rule != Paper())
-
-
-def test_a_rule_is_plain_json_in_a_file(rule):
-    assert restore_rule(json.loads(json.dumps(describe_rule(rule)))) == rule
 
 
 def test_the_names_and_settings_in_a_file_are_these():
