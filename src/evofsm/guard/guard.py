@@ -127,7 +127,7 @@ class DecisionLogger(Protocol):
     """Anything that records what a guard does in an episode, such as an audit log."""
 
     def begin(self, guard: Guard) -> None:
-        """An episode begins."""
+        """Begin an episode; one that is under way is broken off, and nothing follows from it."""
         ...
 
     def seen(self, observation: NDArray[np.float64], time: float) -> None:
@@ -488,21 +488,8 @@ class Guard:
 
         Parameters
         ----------
-        observation : (m,) array_like
-            NaN where a variable was not observed.
-        time : float
-            Of the observation, in this episode [s].
-
-        Returns
-        -------
-        Situation
-
-        Examples
-        --------
-        >>> from evofsm.driving import guard_for_cars
-        >>> guard = guard_for_cars(low=-2.5, high=2.5)
-        >>> guard.recognise([9.0, 20.0, 20.0], time=0.0).state
-        0
+        observation, time
+            As in `decide`.
         """
         z = self._checked(observation)
         if not self._under_way:
@@ -573,22 +560,8 @@ class Guard:
 
         Parameters
         ----------
-        situation : Situation
-            What `recognise` returned.
-        proposal : Proposal
-            What the controller wants.
-
-        Returns
-        -------
-        Revision
-
-        Examples
-        --------
-        >>> from evofsm.driving import guard_for_cars
-        >>> guard = guard_for_cars(low=-2.5, high=2.5)
-        >>> here = guard.recognise([9.0, 20.0, 20.0], time=0.0)
-        >>> guard.revise(here, Proposal(1.0)).executed
-        -2.5
+        situation, proposal
+            What `recognise` returned, and what the controller wants.
         """
         revision = self.reviser.revise(situation, proposal)
         if self.explaining is not None or self.audit is not None:
@@ -604,31 +577,14 @@ class Guard:
         """Instead of `revise`, where it was decided elsewhere: learn from what was executed.
 
         The reviser is asked all the same, as a judge may learn from that too; what it says is
-        not executed.
+        not executed. Refused with an audit log, which could not be replayed then.
 
         Parameters
         ----------
-        situation : Situation
-            What `recognise` returned.
-        proposal : Proposal
-            What the controller wanted.
+        situation, proposal
+            As in `revise`.
         executed : float or (d,) array_like
             An action of the set.
-
-        Raises
-        ------
-        ValueError
-            If there is an audit log, which could not be replayed then.
-
-        Examples
-        --------
-        >>> from evofsm.driving import guard_for_cars
-        >>> guard = guard_for_cars(low=-2.5, high=2.5)
-        >>> for k in range(2):
-        ...     here = guard.recognise([9.0 - k, 20.0, 20.0], time=0.25 * k)
-        ...     guard.take_in(here, Proposal(1.0), executed=-1.0)
-        >>> guard.machine.model().uses.sum()
-        np.float64(1.0)
         """
         if self.audit is not None:
             raise ValueError("with an audit log a guard decides itself: call revise")
