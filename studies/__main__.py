@@ -10,7 +10,7 @@ from typing import Annotated
 
 import typer
 
-from evofsm.paper import print_summary, write_page
+from evofsm.paper import print_page, write_page
 from studies import lib
 
 #: Where each study is, in the order in which the evidence tells them.
@@ -68,7 +68,7 @@ def evidence(
             print(f"{kind.name}: {time.monotonic() - begun:.0f} s", file=sys.stderr)
         title = "Does it see danger earlier, and does that help?"
         page = write_page(out / "index.html", pages, title, _ABOUT)
-        print_summary(pages)
+        print_page(*pages)
         print(f"\nPage with all tables and figures: {page}")
 
 

@@ -97,7 +97,7 @@ def test_the_terminal_says_the_same_and_cuts_no_number(width, monkeypatch, capsy
 
     wide = pl.DataFrame({"name": ["[bold]row"], **{f"column {k}": [12345.25] for k in range(20)}})
     page = replace(PAGE, parts=[Table("Wide", wide)], targets=TARGETS.with_columns(met=False))
-    print_page(page, Console(width=width, markup=False, highlight=False))
+    print_page(page, out=Console(width=width, markup=False, highlight=False))
     said = capsys.readouterr().out
     assert said.count("12345.2") == 20
     assert "[bold]row" in said

@@ -25,7 +25,8 @@ def paper(
     Ends with 0 if all claims hold, with 1 if any does not.
     """
     require_world(world, polars="tables", matplotlib="plot", jinja2="plot")
-    from evofsm.paper import print_page, reproduce
+    from evofsm.paper import print_page
+    from evofsm.paper.reproduction import reproduce
 
     with progress(f"Driving and learning ({world})") as done:
         found = reproduce(world.value, rounds, settings, done)

@@ -3,11 +3,6 @@ from .page import Figure as Figure
 from .page import Page as Page
 from .page import Table as Table
 from .page import print_page as print_page
-from .page import print_summary as print_summary
 from .page import write_page as write_page
-from .reproduction import Reproduction as Reproduction
-from .reproduction import reproduce as reproduce
-from .runs import CASES as CASES
-from .runs import PaperStudy as PaperStudy
 from .runs import Settings as Settings
 from .runs import run_paper as run_paper

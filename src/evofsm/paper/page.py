@@ -280,9 +280,13 @@ def _versions(more: Sequence[str]) -> dict[str, str]:
 # -- The terminal ---------------------------------------------------------------------------------
 
 
-def print_page(page: Page, out: Console | None = None) -> None:
-    """Print what a page says: its targets, tables, and where it loses."""
+def print_page(*pages: Page, out: Console | None = None) -> None:
+    """Print what a page says: its targets, tables, and where it loses; many in a line each."""
     out = out or _console()
+    if len(pages) != 1:
+        print_table(_summary(pages), out)
+        return
+    (page,) = pages
     out.print(page.title, style="bold")
     out.print(page.answer, style="bold red" if page.holds is False else "")
     for table in page.tables:
@@ -292,11 +296,6 @@ def print_page(page: Page, out: Console | None = None) -> None:
         print_table(table, out)
     if not page.losses:
         out.print("In no row of these tables.")
-
-
-def print_summary(pages: Sequence[Page]) -> None:
-    """Print what each page asks and what came out, in a line each."""
-    print_table(_summary(pages), _console())
 
 
 def print_table(table: Table, out: Console) -> None:

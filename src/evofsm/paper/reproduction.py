@@ -218,20 +218,21 @@ def _table_of_losses(study: PaperStudy) -> Table:
 
 def _table_of_states(study: PaperStudy) -> Table:
     """Where the states lie, and for how much of their time an oracle sees a dead end."""
-    state = np.concatenate([run.state for run in study.runs])
+    recognised = np.concatenate([run.state for run in study.runs])
+    created = zip(study.creations, study.model.centers.tolist(), strict=True)
     hopeless = np.concatenate([study.in_dead_end(run) for run in study.runs])
     ends = [run.state[-1] for run in study.runs if run.episode.collided]
     rows = [
         {
-            "state": one.state + 1,
-            **dict(zip(VARIABLES, study.model.centers[one.state].tolist(), strict=True)),
-            "run": one.run + 1,
-            "time": one.time,
-            "share": float((state == one.state).mean()),
-            "dead end": _mean(hopeless[state == one.state]),
-            "collisions": ends.count(one.state),
+            "state": state + 1,
+            **dict(zip(VARIABLES, center, strict=True)),
+            "run": run + 1,
+            "time": time,
+            "share": float((recognised == state).mean()),
+            "dead end": _mean(hopeless[recognised == state]),
+            "collisions": ends.count(state),
         }
-        for one in study.foundings
+        for state, ((run, time), center) in enumerate(created)
     ]
     centers = zip(VARIABLES, UNITS, strict=True)
     return Table(

@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib.resources import files
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -147,14 +147,6 @@ class Run:
     first_surprise: float  #: of the first row, against the uniform belief and marginal matrix [bit]
 
 
-class Founding(NamedTuple):
-    """When a state was created."""
-
-    state: int
-    run: int  #: index of the run
-    time: float  #: in that run [s]
-
-
 @dataclass(frozen=True, eq=False)
 class PaperStudy:
     """The runs in the order in which they were learnt, and what follows from them."""
@@ -168,16 +160,14 @@ class PaperStudy:
     dead_end: int  #: index of the state that stands at most collisions; -1 without collisions
 
     @property
-    def foundings(self) -> list[Founding]:
-        """When each state was created, in the order of time."""
-        first_rows = np.cumsum([0, *(len(run.state) for run in self.runs)])
-        foundings = []
-        for state, number in enumerate(self.model.created):
-            row = int(number) - 1
-            run = int(np.searchsorted(first_rows, row, side="right")) - 1
-            time = float(self.runs[run].episode.time[row - first_rows[run]])
-            foundings.append(Founding(state, run, time))
-        return foundings
+    def creations(self) -> list[tuple[int, float]]:
+        """In which run each state was created, and when in it [s]."""
+        ends = np.cumsum([len(run.state) for run in self.runs])
+        rows = np.asarray(self.model.created).astype(int) - 1
+        numbers = np.searchsorted(ends, rows, side="right")
+        found = zip(numbers.tolist(), rows.tolist(), strict=True)
+        times = [(run, self.runs[run].episode.time, row - ends[run]) for run, row in found]
+        return [(run, float(time[row])) for run, time, row in times]  # rows from the run's end
 
     @property
     def dead_ends(self) -> tuple[int, ...]:
