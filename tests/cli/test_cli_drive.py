@@ -102,14 +102,6 @@ def test_a_judge_that_is_given_nothing_but_failures_is_driven_saved_and_gone_on_
     failure(wrong, "of the judge 'learnt', not of 'kinematic'")
 
 
-def test_the_table_of_decisions_has_its_columns_in_their_order():
-    assert DECISION_TABLE == (
-        *("time", "gap", "v_follower", "v_leader", "intake", "state", "n_states"),
-        *("surprise", "proposed", "executed", "advised", "risk_proposed", "risk_executed"),
-        *("risk_low", "risk_high", "evidence", "seen", "realised", "reason"),
-    )
-
-
 @pytest.mark.parametrize(
     ("words", "says"),
     [

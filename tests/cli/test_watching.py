@@ -91,14 +91,6 @@ def test_states_grow_from_empty_and_keep_their_numbers():
     assert origins <= set(range(len(graph.states)))
 
 
-def test_a_finished_run_does_not_go_on_and_counts_as_learnt_from():
-    session = opened()
-    drive(session)
-    with pytest.raises(RuntimeError, match="over"):
-        session.step()
-    assert session.restart().learnt == 1
-
-
 # -- A recording ----------------------------------------------------------------------------------
 
 
@@ -221,26 +213,6 @@ def test_it_waits_steps_and_goes_on():
         player.pause(False)
         told.wait(lambda told: told.of("clock")[-1].over)
     assert told.of("frame")[-1].over
-
-
-def test_restarted_over_and_over_every_run_is_whole():
-    told = Told()
-    with played(told, speed=math.inf) as player:
-        told.wait(lambda told: ends(told) == 1)
-        player.restart(2)
-        told.wait(lambda told: ends(told) == 2)
-    numbers = [frame.number for frame in told.of("frame")]
-    assert numbers.count(0) == 2
-    assert told.of("start")[-1].case == 2
-
-
-def test_the_reviser_is_switched_while_it_plays():
-    told = Told()
-    with played(told, paused=True) as player:
-        player.revise(False)
-        player.step()
-        told.wait(lambda told: told.of("frame"))
-    assert not told.of("frame")[0].revising
 
 
 def test_speed_is_kept():

@@ -27,17 +27,12 @@ from evofsm.cli.options import (
     require,
     require_world,
 )
-from evofsm.cli.show import facts, print_json, progress, say, show, table, warn
+from evofsm.cli.show import facts, print_json, progress, say, show, warn
 
 if TYPE_CHECKING:
-    from rich.console import RenderableType
-
     from evofsm.cli.driving import Driving, Results, Setup
     from evofsm.guard import Guard
     from evofsm.io.foxglove import FoxgloveSink, RunWriter
-
-# More states than these are not listed.
-_MOST = 8
 
 
 def drive(
@@ -150,11 +145,9 @@ def drive(
             warn(f"stopped after {how_far}; the same command goes on from there")
             return 130
     if as_json:
-        states = [{**one._asdict(), "is_dead_end": one.is_dead_end} for one in driving.states]
-        summary = {**asdict(driving.row), "lead_times": driving.lead_times, "states": states}
-        print_json(summary)
+        print_json({**asdict(driving.row), "lead_times": driving.lead_times})
         return None
-    show(facts("What came of driving", _summary(driving, setup)), "", *_states(driving))
+    show(facts("What came of driving", _summary(driving, setup)))
     if out is not None:
         say(f"What was learnt, and every episode: {out}")
     if mcap is not None:
@@ -291,7 +284,7 @@ def _summary(driving: Driving, setup: Setup) -> Iterator[tuple[str, str]]:
 
 
 def _learnt(guard: Guard) -> str:
-    from evofsm.driving import LatentRisk, learners_of
+    from evofsm.driving import LatentRisk, assess_states, learners_of
     from evofsm.guard import LearntRisk
 
     machine, judge = learners_of(guard)
@@ -300,40 +293,10 @@ def _learnt(guard: Guard) -> str:
         return f"{states}; {judge.told_by_experience}"
     if not isinstance(judge, LatentRisk):
         return states
+    ends = sum(one.is_dead_end for one in assess_states(machine, judge))
     brakes = judge.brakes
     own = f"{brakes.decel:.1f} m/s²" if brakes.known else "not known yet"
     return (
-        f"{states}; {len(judge.manoeuvres)} manoeuvres of leaders, "
+        f"{states}, {ends} of them dead ends; {len(judge.manoeuvres)} manoeuvres of leaders, "
         f"1 % brake harder than {judge.manoeuvres.exceeded_by(0.01):.1f} m/s²; own brakes: {own}"
     )
-
-
-def _states(driving: Driving) -> Iterator[RenderableType]:
-    """The dead ends, or where no judge says which these are, the states in which it failed."""
-    from evofsm.driving import LatentRisk, learners_of
-
-    machine, judge = learners_of(driving.guard)
-    knows = isinstance(judge, LatentRisk)
-    found = [one for one in driving.states if (one.is_dead_end if knows else one.failures)]
-    what = "Dead ends" if knows else "States in which a collision ended"
-    if not found:
-        yield f"{what}: none of {len(driving.states)} states."
-        return
-    found.sort(key=lambda one: -(one.seconds if knows else one.failures))
-    header = ["state", "gap [m]", "follower [m/s]", "leader [m/s]", "seen [s]", "ended here"]
-    rows = []
-    for one in found[:_MOST]:
-        center = [f"{value:.1f}" for value in machine.centers[one.state].tolist()]
-        rows.append([f"#{one.state + 1}", *center, f"{one.seconds:.1f}", f"{one.failures:g}"])
-        if knows:
-            rows[-1] += [f"{one.critical:.1f}", f"{one.risk:.0%}", f"{one.margin:.0%}"]
-    if knows:
-        header += ["survives [m/s²]", "risk if braking", "escape margin"]
-    yield table(f"{what}: {len(found)} of {len(driving.states)}; foremost", header, rows)
-    yield "\nEnded here: collisions."
-    if knows:
-        yield (
-            "Dead end: if the leader braked hard now, braking in full would most likely be too "
-            "late. Survives: the hardest braking of a leader that braking in full now survives; "
-            "escape margin: how much lower the risk then is than if speed is kept."
-        )

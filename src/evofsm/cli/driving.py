@@ -29,15 +29,12 @@ from evofsm.driving import (
     EnvelopeReviser,
     Episode,
     Family,
-    LatentRisk,
     Outcome,
     Unrevised,
-    assess_states,
     guard_for_family,
     learners_of,
     summarise,
 )
-from evofsm.driving.by_state import StateRisk
 from evofsm.driving.cars import name_judge
 from evofsm.driving.episodes import Row, Trial
 from evofsm.driving.measures import FIXED_MEASURES
@@ -111,7 +108,6 @@ class Driving(NamedTuple):
 
     row: Row
     lead_times: tuple[float, ...]  #: from the last alarm that stayed on to the collision [s]
-    states: list[StateRisk]
     guard: Guard  #: with what it learnt
 
 
@@ -212,7 +208,7 @@ class Results:
         leads = tuple(row["lead_time"] for row in rows if row["lead_time"] is not None)
         if self.folder is not None:
             self._write(self.folder, rows, {**asdict(row), "lead_times": leads})
-        return Driving(row, leads, _assessed(self.guard), self.guard)
+        return Driving(row, leads, self.guard)
 
     def _write(self, folder: Path, rows: Sequence[Outcomes], summary: dict[str, Any]) -> None:
         self.save_guard(now=True)
@@ -257,18 +253,6 @@ def _decided(driven: Episode) -> dict[str, list[Any]]:
     """The columns of an episode's decisions."""
     columns = {name: DECISION_COLUMNS[name].read for name in DECISION_TABLE}
     return {name: [read(one) for one in driven.decisions] for name, read in columns.items()}
-
-
-def _assessed(guard: Guard) -> list[StateRisk]:
-    """The states; how dangerous each is by itself is known to a judge of leaders alone."""
-    machine, judge = learners_of(guard)
-    if isinstance(judge, LatentRisk):
-        return assess_states(machine, judge)
-    nan, seconds = math.nan, machine.visits * judge.dt
-    return [
-        StateRisk(state, nan, nan, nan, float(seen), float(failures))
-        for state, (seen, failures) in enumerate(zip(seconds, machine.endings, strict=True))
-    ]
 
 
 # -- In turn --------------------------------------------------------------------------------------

@@ -41,25 +41,6 @@ def test_in_act_what_is_executed_is_the_guards():
     assert answers[-1]["mode"] == "act"
 
 
-def test_what_is_refused_changes_nothing():
-    decider, plain = Decider(made()), Decider(made())
-    for k, row in enumerate(rows(60)):
-        for junk in (b"junk", line(row | {"gap": "x"}), line(row | {"schema": 9})):
-            answer = decider.answer(junk)
-            assert (answer["kind"], answer["n"], answer["schema"]) == ("error", k, 1)
-        assert decider.answer(line(row)) == plain.answer(line(row))
-    assert decider.refused == 180
-
-
-def test_a_row_that_is_sent_again_gets_the_same_answer_and_counts_once():
-    decider = Decider(made())
-    first, second, third = (line(row) for row in rows(3))
-    decider.answer(first)
-    answer = decider.answer(second)
-    assert decider.answer(second) == answer
-    assert decider.answer(third)["n"] == 3
-
-
 def test_time_that_stands_or_goes_backward():
     decider = Decider(made())
     row = next(iter(rows(1))) | {"time": 50.0}

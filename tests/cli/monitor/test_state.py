@@ -172,13 +172,6 @@ def test_killed_as_the_guard_is_saved_it_goes_on(tmp_path, moment, monkeypatch):
     state.close()
 
 
-def test_other_settings_are_refused(tmp_path):
-    _, state = opened(tmp_path / "state.evofsm")
-    state.close()
-    with pytest.raises(ValueError, match="learn was true and is now false"):
-        opened(tmp_path / "state.evofsm", {"learn": False, "guard": None})
-
-
 def test_two_monitors_do_not_keep_themselves_in_one_place(tmp_path):
     _, state = opened(tmp_path / "state.evofsm")
     (tmp_path / "elsewhere").mkdir()

@@ -32,6 +32,8 @@ _HIGHEST = 2.5
 # The weight of one brake so hard is added to those of the table [m/s²].
 _HARDEST = 10.0
 
+_RISKS = ("risk_proposed", "risk_executed", "risk_low", "risk_high", "evidence")
+
 Answer = dict[str, Any]
 
 
@@ -139,36 +141,26 @@ class Decider:
         notes = self._notes(row)
         note = {"note": "; ".join(notes)} if notes else {}
         self.n += 1
-        if row.observation is None:
-            return self._kept(row, note)
+        who = {} if row.ahead is None else {"ahead": row.ahead}
+        if row.observation is None:  # nothing is ahead: whatever is wanted is done
+            said = dict.fromkeys(("proposed", "executed", "advised"), _plain(row.proposal))
+            said |= dict.fromkeys(_RISKS) | {"reason": "nothing is ahead in the lane"}
+            said |= {"alarm": False, "mode": self.mode.value}
+            return self._of("decision", time=row.time, ahead=None, **said, **note)
+        self.rows += 1
         try:
             revision = self._revision(row)
         except Exception as error:  # whatever a judge of somebody's own raises
             if not self._has_failed:  # once, as it may fail at each row
                 _log.exception("the guard failed at %s s", row.time)
             self._has_failed = True
-            self.rows += 1
             return self.error("guard", f"failed: {type(error).__name__}: {error}", row.time)
-        self.rows += 1
         low, high = revision.interval
-        return self._of(
-            "decision",
-            time=row.time,
-            **({} if row.ahead is None else {"ahead": row.ahead}),
-            **self._worst(row),
-            proposed=_plain(revision.proposed),
-            executed=_plain(revision.executed),
-            advised=_plain(revision.advised),
-            risk_proposed=_plain(revision.risk_proposed),
-            risk_executed=_plain(revision.risk_executed),
-            risk_low=_plain(low),
-            risk_high=_plain(high),
-            evidence=_plain(revision.evidence),
-            reason=revision.reason,
-            alarm=self._is_alarm(revision),
-            mode=self.mode.value,
-            **note,
-        )
+        known = {**revision._asdict(), "risk_low": low, "risk_high": high}
+        said = {name: _plain(known[name]) for name in ("proposed", "executed", "advised", *_RISKS)}
+        said |= {"reason": revision.reason, "alarm": self._is_alarm(revision)}
+        said |= {"mode": self.mode.value}
+        return self._of("decision", time=row.time, **who, **self._worst(row), **said, **note)
 
     def _worst(self, row: Row) -> Answer:
         """Who of a scene the proposal is most dangerous with."""
@@ -178,22 +170,6 @@ class Decider:
         if pair is None:
             return {"object": None, "role": None}
         return {"object": row.objects[pair.number - 1], "role": pair.role.value}
-
-    def _kept(self, row: Row, note: Answer) -> Answer:
-        """Nothing is ahead: whatever is wanted is done."""
-        wanted = dict.fromkeys(("proposed", "executed", "advised"), _plain(row.proposal))
-        risks = ("risk_proposed", "risk_executed", "risk_low", "risk_high", "evidence")
-        return self._of(
-            "decision",
-            time=row.time,
-            ahead=None,
-            **wanted,
-            **dict.fromkeys(risks),
-            reason="nothing is ahead in the lane",
-            alarm=False,
-            mode=self.mode.value,
-            **note,
-        )
 
     def _notes(self, row: Row) -> list[str]:
         """What is odd about when a row comes, and what it follows; may end the episode."""
