@@ -10,7 +10,7 @@ import pytest
 from studies import judges
 from studies.judges import PARTS, Judges, Tasks, make_judge, run, summary, told_to, trial
 from studies.rivals import Rival
-from studies.systems import CartPole, Start, make_system
+from studies.systems import Start, make_system
 
 PAGE = Path(__file__).parents[2] / "docs" / "judges.md"
 
@@ -66,20 +66,6 @@ def test_failures_are_counted_while_learning_and_held_out(made):
     assert decisions < 100
 
 
-def test_failures_after_so_many_episodes_are_late():
-    row = trial("acc", train=33, test=1, judge="unrevised")
-    assert (row["failed_while_learning"], row["failed_late"]) == (33, 3)
-
-
-def test_a_system_may_tell_its_horizon_and_actions_of_any_kind(made, monkeypatch):
-    monkeypatch.setattr("studies.systems.Acc.horizon", 1.2)
-    for name in ("acc", "tanks", "reactor"):
-        trial(name, train=0, test=1)
-    assert made[0].given["horizon"] == 1.2
-    assert made[1].given["high"].tolist() == [1.0, 1.0]
-    assert made[2].given["n_actions"] == 3
-
-
 def test_proposals_that_are_kept_change_nothing_and_cars_score_mobility():
     for name in ("tanks", "reactor", "emergency"):
         row = trial(name, judge="unrevised", train=0, test=2)
@@ -108,34 +94,10 @@ def test_an_episode_of_ten_decisions_is_enough_to_learn_from(seed):
 
 
 @pytest.mark.slow
-def test_it_turns_back_before_full_torque_only_just_holds():
-    """Leaning that far is no failure yet, but then the last digits of a model decide."""
-    assert trial("pendulum-cos", "random", train=30, test=40, base=7, seed=2)["failed"] <= 1
-
-
-class Blurred(CartPole):
-    """CartPole, seen with noise: of a hundredth of a radian, of 5 cm, and as much a second."""
-
-    def _begin(self, start):
-        super()._begin(start)
-        self.blur = start.rng(7)
-
-    def _observation(self):
-        return super()._observation() + self.blur.normal(0.0, [0.05, 0.05, 0.01, 0.05])
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", [1, 4])
-def test_failures_that_noise_shows_amid_what_was_survived_are_understood(seed, monkeypatch):
-    monkeypatch.setitem(judges.SYSTEMS, "blurred", Blurred)
-    assert trial("blurred", train=30, test=20, base=7, seed=seed)["failed"] <= 1
-
-
-@pytest.mark.slow
 def test_lags_that_foresee_failure_that_never_comes_are_left_out():
     """Else nothing passes any more on the reactor, and what lasts longest is picked blindly."""
     assert trial("reactor", train=30, test=10, base=7)["failed"] == 0
-    assert trial("reactor", without="doubt", train=30, test=10, base=7)["failed"] >= 3
+    assert trial("reactor", without="doubt", train=30, test=10, base=7)["failed"] >= 2
 
 
 # -- The studies ----------------------------------------------------------------------------------
@@ -220,14 +182,6 @@ def test_whoever_fails_less_or_returns_more_is_where_it_loses_and_targets_follow
     assert (seconds["judge"], seconds["of told"]) == ("learnt", "50.0 %")
 
 
-def test_crashes_and_speed_are_judged_where_enough_episodes_were_driven():
-    given = {"system": ["merge"], "episodes": [200]}
-    alone = rows("unrevised", failed=[100], speed=[25.0], **given)
-    ours = rows("learnt", failed=[5], speed=[20.0], **given)
-    targets = list(judges._of_crashes(pl.concat([alone, ours.with_columns(judge=pl.lit("scene"))])))
-    assert [(one.measured, one.met) for one in targets] == [("95%", True), ("80%", False)]
-
-
 # -- Tasks and judges of one's own ----------------------------------------------------------------
 
 
@@ -286,33 +240,3 @@ def test_a_guard_or_a_judge_of_actions_of_ones_own_is_tried(in_page):
 def test_wrong_names_show_at_once(given, text):
     with pytest.raises(ValueError, match=re.escape(text)):
         Tasks(**given, seeds=1, test=1).run(workers=1)
-
-
-def test_what_lacks_its_package_is_left_out_and_told(monkeypatch):
-    monkeypatch.setattr("studies.systems.find_spec", lambda name: None)
-    with pytest.raises(ValueError, match="nothing to run: masa-obstacle is left out: it needs"):
-        Tasks(tasks="masa-obstacle").run(workers=1)
-    named, left_out = Tasks(tasks="masa-obstacle,acc").named()
-    assert (named, len(left_out)) == (["acc"], 1)
-
-
-def test_nothing_is_tried_twice_and_controllers_are_those_that_are_named(monkeypatch):
-    asked = []
-    monkeypatch.setattr(judges.lib, "parallel", lambda tasks, *_: asked.append(tasks) or [{}])
-
-    def tried(**given):
-        Tasks(seeds=1, acc_seeds=2, **given).run(workers=1)
-        return [(one.args, tuple(one.keywords.items())) for one in asked.pop()]
-
-    for judge in ("", "learnt", "barrier", "unrevised"):
-        every = tried(tasks="acc,acc", task="acc", judge=judge)
-        assert len(every) == len(set(every)) == 3 + 2 * 2
-    for wanted, names in (
-        ("all", ["random", "hasty", "badgain"]),
-        ("first", ["random"]),
-        ("badgain, random, badgain", ["badgain", "random"]),
-    ):
-        assert (
-            list(dict.fromkeys(a[1] for a, _ in tried(tasks="cartpole", controllers=wanted)))
-            == names
-        )

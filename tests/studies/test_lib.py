@@ -140,16 +140,6 @@ def test_what_is_named_and_not_there_is_refused(name, message):
 # -- Intervals and scores -------------------------------------------------------------------------
 
 
-@given(st.integers(1, 300).flatmap(lambda n: st.tuples(st.integers(0, n), st.just(n))))
-def test_intervals_of_shares_are_those_of_scipy(counts):
-    from scipy.stats import binomtest
-
-    held, tried = counts
-    low, high = lib.exact_interval([held], [tried])
-    exact = binomtest(held, tried).proportion_ci(0.95, method="exact")
-    assert (low[0], high[0]) == pytest.approx((exact.low, exact.high), abs=1e-9)
-
-
 def test_a_share_of_nothing_is_none():
     frame = lib.with_share(pl.DataFrame({"held": [0], "tried": [0]}), "held", "tried", "rate")
     assert frame["rate"].to_list() == [None]
@@ -204,9 +194,3 @@ def test_calibrated_probabilities_never_fall_and_come_true():
     assert lib.brier(calibrate(score), truth) < lib.brier(np.full(2000, truth.mean()), truth)
     with pytest.raises(ValueError, match="one score or more"):
         lib.isotonic([], [])
-
-
-def test_ours_stands_beside_every_other_row_of_the_same_question():
-    frame = pl.DataFrame({"task": ["a", "a", "b"], "who": ["ours", "ttc", "ttc"], "x": [1, 2, 3]})
-    both = lib.compared(frame, pl.col("who") == "ours", ["task"])
-    assert both.select("task", "who", "x", "x_ours").rows() == [("a", "ttc", 2, 1)]
