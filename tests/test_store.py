@@ -79,13 +79,6 @@ def test_a_file_says_what_it_holds_who_wrote_it_and_what_it_learnt_from(tmp_path
     assert header == ("draws", 1, __version__, SETTINGS, provenance)
 
 
-@pytest.mark.parametrize("provenance", ["drive 7", ["drive 7"], 7])
-def test_a_provenance_that_is_no_mapping_is_named(provenance, tmp_path):
-    with pytest.raises(TypeError, match=r"provenance is .*; it must be a mapping"):
-        store.write(tmp_path / "file", DRAWS, SETTINGS, arrays(), provenance)
-    assert not list(tmp_path.iterdir())
-
-
 def test_the_libraries_of_safetensors_can_read_a_file(whole):
     length = int.from_bytes(whole[:8], "little")
     header, numbers = json.loads(whole[8 : 8 + length]), whole[8 + length :]
@@ -107,9 +100,7 @@ def test_the_libraries_of_safetensors_can_read_a_file(whole):
         ({}, {"ranks": np.arange(5) - 1}, "ranks of -1 cannot be right"),
         ({}, {"values": np.zeros((5, 2), object)}, "values is of object"),
         ({}, {"values": np.full((5, 2), np.nan)}, "values of nan"),
-        ({}, {"values": np.full((5, 2), np.inf)}, "values of inf"),
         ({"n_kinds": -2}, {}, "n_kinds of -2"),
-        ({"n_kinds": None}, {}, "lacks n_kinds"),
         ({"scale": [0.5]}, {}, "scale has shape"),
     ],
 )
@@ -150,13 +141,10 @@ def test_any_other_file_is_refused_by_name(content, tmp_path):
             attempt(tmp_path / "other")
 
 
-def test_a_file_of_another_kind_is_named(tmp_path):
+def test_another_kind_a_missing_file_and_a_missing_folder_are_named(tmp_path):
     write(tmp_path / "file")
     with pytest.raises(ValueError, match=f"{tmp_path / 'file'} holds a draws, not a machine"):
         store.read(tmp_path / "file", Kind("machine", {}))
-
-
-def test_a_missing_file_and_a_missing_folder_are_named(tmp_path):
     with pytest.raises(FileNotFoundError, match="missing"):
         store.read(tmp_path / "missing", DRAWS)
     with pytest.raises(FileNotFoundError, match=f"there is no folder {tmp_path / 'missing'}"):
@@ -183,48 +171,44 @@ def claim_much(told, entries, _):
         entry["data_offsets"] = [at + more * (at >= end) for at in entry["data_offsets"]]
 
 
+def chosen_2(told, entries, numbers):
+    numbers[entries["chosen"]["data_offsets"][0]] = 2
+
+
 HARMFUL = {
     "newer": (header_with(version=2), "version 2 is newer than this library's 1; a newer evofsm"),
     "no version": (header_with(version=None), "does not say what it holds"),
     "no kind": (header_with(kind=7), "does not say what it holds"),
-    "odd kind": (header_with(kind="../draws"), "does not say what it holds"),
     "settings of none": (header_with(settings=None), "does not say what it holds"),
-    "settings in a list": (header_with(settings=[]), "does not say what it holds"),
     "more in the header": (header_with(pickle="cos"), "pickle"),
     "null": (settings_with(n_kinds=None), "lacks n_kinds"),
     "an empty list": (settings_with(n_kinds=[]), r"n_kinds has shape \(0,\)"),
     "negative": (settings_with(n_kinds=-1), "n_kinds of -1 cannot be right"),
     "a fraction": (settings_with(n_kinds=2.5), "n_kinds holds a fraction"),
     "huge": (settings_with(n_kinds=10**400), "n_kinds is 1000"),
-    "more kinds": (settings_with(n_kinds=3), r"shares has shape \(2,\), not \(3,\)"),
-    "true": (settings_with(scale=True), "scale is True; it must be a number"),
     "text": (settings_with(scale="wide"), "scale is 'wide'; it must be a number"),
     "NaN": (settings_with(scale=float("nan")), "scale of nan"),
     "too few ends": (settings_with(ends=[1.0]), r"values has shape \(5, 2\), not \(5, 1\)"),
     "a rule of none": (settings_with(rule=[]), r"rule is \[\]; it must be a mapping"),
     "an odd rule": (settings_with(rule={"width": -1.0}), "rule.width of -1"),
     "a lost array": (lambda told, entries, _: entries.pop("note"), "claim .* bytes, but it has"),
-    "another type": (array_with("values", dtype="I64"), "values is of type I64, not F64"),
     "an unknown type": (array_with("values", dtype="F32"), "of F32 is no array that a file may"),
     "an object": (array_with("values", dtype="O"), "of O is no array that a file may hold"),
-    "too large": (
-        array_with("values", shape=[1 << 60, 2]),
-        "values does not stand where",
-    ),
-    "far too large": (array_with("values", shape=[1 << 60] * 9), "values does not stand where"),
-    "too small": (array_with("values", shape=[1, 2]), "values does not stand where"),
+    "too large": (array_with("values", shape=[1 << 60, 2]), "values does not stand where"),
     "negative sizes": (array_with("values", shape=[-5, -2]), r"claims to be of shape \[-5, -2\]"),
-    "no shape": (array_with("values", shape=None), "cannot be read"),
     "fractional sizes": (array_with("values", shape=[5.0, 2.0]), "claims to be of shape"),
     "turned": (array_with("values", shape=[2, 5]), "shape"),
     "overlapping": (array_with("ranks", data_offsets=[0, 40]), "ranks does not stand where"),
     "beyond the end": (array_with("note", data_offsets=[0, 1 << 60]), "note does not stand"),
-    "without end": (array_with("note", data_offsets=[]), "note does not stand"),
     "one more array": (
         lambda told, entries, _: entries.update(extra=entries["note"] | {"shape": [0]}),
         "extra does not stand where it should",
     ),
     "a path": (lambda told, entries, _: entries.update({"../x": entries.pop("note")}), "'../x'"),
+    "no number": ({"values": np.nan}, "values of nan"),
+    "below the least": ({"ranks": -1}, "ranks of -1"),
+    "above the most": ({"ranks": 1 << 40}, r"ranks of 1\.09951e\+12 .* must lie between 0"),
+    "a boolean of 2": (chosen_2, "neither true nor false"),
     "more than is there": (claim_much, "claim 17,592.* but it has"),
 }
 
@@ -245,36 +229,6 @@ def test_a_forged_file_is_refused_before_anything_is_allocated(change, words, fo
     assert peak < 1 << 23
 
 
-@pytest.mark.parametrize(
-    ("name", "value", "words"),
-    [
-        ("values", np.nan, "values of nan"),
-        ("ranks", -1, "ranks of -1"),
-        (
-            "ranks",
-            1 << 40,
-            r"ranks of 1\.09951e\+12 cannot be right: it must lie between 0",
-        ),
-        ("shares", 1.5, "shares of 1.5"),
-    ],
-)
-def test_numbers_that_are_out_of_their_range_are_refused(name, value, words, forge, tmp_path):
-    write(tmp_path / "file")
-    forge(tmp_path / "file", {name: value})
-    with pytest.raises(ValueError, match=words):
-        store.read(tmp_path / "file", DRAWS)
-
-
-def test_a_boolean_that_is_neither_true_nor_false_is_refused(forge, tmp_path):
-    def change(told, entries, numbers):
-        numbers[entries["chosen"]["data_offsets"][0]] = 2
-
-    write(tmp_path / "file")
-    forge(tmp_path / "file", change)
-    with pytest.raises(ValueError, match="neither true nor false"):
-        store.read(tmp_path / "file", DRAWS)
-
-
 # -- On the disk -----------------------------------------------------------------------------------
 
 
@@ -289,18 +243,16 @@ def full_disk():
     signal.signal(signal.SIGXFSZ, handler)
 
 
-@pytest.mark.parametrize("old", [None, b"what was there before"])
-def test_a_full_disk_leaves_the_folder_as_it_was_and_names_the_file(old, full_disk, tmp_path):
+def test_a_full_disk_leaves_the_folder_as_it_was_and_names_the_file(full_disk, tmp_path):
     path = tmp_path / "file"
-    if old is not None:
-        path.write_bytes(old)
+    path.write_bytes(b"what was there before")
     try:
         raise KeyboardInterrupt
     except KeyboardInterrupt:  # who saves on Ctrl-C is told of the disk
         with pytest.raises(OSError, match="File too large") as raised:
             write(path)
     assert raised.value.filename == str(path)
-    assert [one.read_bytes() for one in tmp_path.iterdir()] == ([] if old is None else [old])
+    assert [one.read_bytes() for one in tmp_path.iterdir()] == [b"what was there before"]
 
 
 def test_a_file_and_its_name_are_on_the_disk_when_writing_returns(tmp_path, monkeypatch):

@@ -59,14 +59,7 @@ _DAMAGE = (ValueError, LookupError, TypeError, ArithmeticError, RuntimeError, EO
 
 
 class Numbers(NamedTuple):
-    """What one array or setting of a file may hold.
-
-    Examples
-    --------
-    >>> Numbers(least=0.0, most=1.0).refuse_others("share", 1.5)
-    Traceback (most recent call last):
-    ValueError: share of 1.5 cannot be right: it must lie between 0 and 1
-    """
+    """What one array or setting of a file may hold."""
 
     #: Sizes of an array; a name stands for the same number throughout a file.
     shape: tuple[int | str, ...] = ()
@@ -154,8 +147,7 @@ def write(
 ) -> None:
     """Write a file as a whole or not at all; when this returns, it is on the disk.
 
-    Raises an OSError where it cannot be written (what was there before is then as it was), and a
-    ValueError or TypeError where no file of this kind may hold this.
+    A ValueError or TypeError says what no file of this kind may hold.
     """
     if not isinstance(provenance, Mapping | None):
         raise TypeError(f"provenance is {provenance!r}; it must be a mapping of names to values")
@@ -200,10 +192,7 @@ def _packed(kind: Kind, header: Header, arrays: Mapping[str, NDArray[Any]]) -> l
 def only_writer(file: BinaryIO, path: str | os.PathLike[str], otherwise: str) -> None:
     """Lock a file against other processes, where the system can; it is unlocked as it is closed.
 
-    Raises
-    ------
-    ValueError
-        If another process has locked it; says what to do ``otherwise``.
+    Where another one has locked it, a ValueError says what to do ``otherwise``.
     """
     with suppress(ModuleNotFoundError):  # Windows
         import fcntl
@@ -229,9 +218,8 @@ def let_others_write(file: BinaryIO) -> None:
 def replacing(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
     """A file, open for writing and reading, that takes its place once it is whole and on the disk.
 
-    Whoever else writes the same path has a file of its own until then: the last one to end stays. A
-    link is followed, and the mode of a file that was there is kept. Where it cannot be written, an
-    OSError names the file, and what was there before is as it was.
+    The last one to end stays. A link is followed, and the mode of a file that was there is kept.
+    Where it cannot be written, an OSError names the file, and what was there is as it was.
     """
     temporary = None
     try:
@@ -293,23 +281,16 @@ def sweep(path: str | os.PathLike[str]) -> None:
 
 
 def read_header(place: Place) -> Header:
-    """Read what a file says of itself; its numbers are neither read nor checked.
+    """Read the kind, versions, settings and provenance of a file; its numbers are not looked at.
 
     Parameters
     ----------
     place : path-like, or file open for reading bytes
 
-    Returns
-    -------
-    Header
-        Its kind, versions, settings and provenance.
-
     Raises
     ------
-    OSError
-        If there is no such file, or it may not be read.
-    ValueError
-        If it is no file of evofsm, or of a newer version.
+    OSError, ValueError
+        If it may not be read; if it is no file of evofsm, or of a newer version.
 
     Examples
     --------
@@ -322,14 +303,13 @@ def read_header(place: Place) -> Header:
     ('machine', {'drive': 'Monday'})
     """
     with _opened(place) as file, explained(place):
-        return _unpacked(file).header
+        return _unpacked(file)[0]
 
 
 def read(place: Place, kind: Kind) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
     """Read a file of a kind: its settings and its arrays, all that the kind declares checked.
 
-    Raises an OSError where it cannot be read, and a ValueError where it holds something else, is
-    damaged or of a newer version; the message says which.
+    A ValueError says whether it holds something else, is damaged or of a newer version.
     """
     with _opened(place) as file:
         with explained(place):
@@ -354,17 +334,8 @@ class _Entry(NamedTuple):
     data_offsets: list[int]  #: behind the header [bytes]
 
 
-class _Unpacked(NamedTuple):
-    """The header of a file, and as it was written."""
-
-    header: Header
-    entries: dict[str, _Entry]
-    encoded: bytes
-    sha256: str
-
-
-def _unpacked(file: BinaryIO) -> _Unpacked:
-    """Read the header of an open file, which is then at the first number."""
+def _unpacked(file: BinaryIO) -> tuple[Header, dict[str, _Entry], bytes, str]:
+    """Read the header of an open file, as it was written too, and its checksum."""
     size = file.seek(0, os.SEEK_END)
     file.seek(0)
     length = int.from_bytes(file.read(8), "little")
@@ -392,7 +363,7 @@ def _unpacked(file: BinaryIO) -> _Unpacked:
         begin = _end_of(name, entry, begin)
     if begin != size - 8 - length:
         raise ValueError(f"its arrays claim {begin:,} bytes, but it has {size - 8 - length:,}")
-    return _Unpacked(header, entries, encoded, sha256)
+    return header, entries, encoded, sha256
 
 
 def _end_of(name: str, entry: _Entry, begin: int) -> int:
