@@ -90,25 +90,18 @@ def check_results(part: object) -> list[Result]:
 
 def kind_of(part: object) -> str:
     """Of which kind a class, an instance, or a function that makes one is."""
-    kind = _by_methods(part)
-    if kind is None and callable(part) and not inspect.isclass(part):
-        kind = _by_methods(part())
-    if kind is None:
-        known = "; ".join(f"a {kind} has {', '.join(names)}" for kind, names in _METHODS.items())
-        raise TypeError(f"{part!r} has the methods of no kind: {known}")
-    return kind
-
-
-def _by_methods(part: object) -> str | None:
-    found = (k for k, names in _METHODS.items() if all(hasattr(part, name) for name in names))
-    return next(found, None)
+    made = _maker(part)()
+    for kind, names in _METHODS.items():
+        if all(hasattr(made, name) for name in names):
+            return kind
+    known = "; ".join(f"a {kind} has {', '.join(names)}" for kind, names in _METHODS.items())
+    raise TypeError(f"{part!r} has the methods of no kind: {known}")
 
 
 def _maker(part: Any) -> Make:
     """A function that makes the part anew: of a class instances, of an instance copies."""
     if not inspect.isclass(part):
-        is_function = _by_methods(part) is None and callable(part)
-        return part if is_function else lambda: copy.deepcopy(part)
+        return part if inspect.isroutine(part) else lambda: copy.deepcopy(part)
     by_name = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
     parameters = inspect.signature(part).parameters.values()
     needed = [one.name for one in parameters if one.default is one.empty and one.kind in by_name]
