@@ -1,4 +1,3 @@
-from .actions import ActionSet as ActionSet
 from .actions import BoxActions as BoxActions
 from .actions import Choices as Choices
 from .alarms import ConformalAlarm as ConformalAlarm

@@ -90,7 +90,7 @@ def check_results(part: object) -> list[Result]:
 
 def kind_of(part: object) -> str:
     """Of which kind a class, an instance, or a function that makes one is."""
-    made = _maker(part)()
+    made = part if inspect.isclass(part) else _maker(part)()
     for kind, names in _METHODS.items():
         if all(hasattr(made, name) for name in names):
             return kind
