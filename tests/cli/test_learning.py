@@ -6,7 +6,7 @@ import os
 import numpy as np
 import pytest
 
-from evofsm import EvolvingFSM, IntervalActions, jensen_shannon
+from evofsm import EvolvingFSM, IntervalActions, Novelty, jensen_shannon
 from evofsm.cli import learning as module
 from evofsm.cli.inspect import passages
 from evofsm.cli.learning import Checkpoint, learn_traces
@@ -130,6 +130,13 @@ def test_where_the_action_tells_what_comes_forecasts_beat_persistence():
     assert {(p.origin, p.target) for p in found} == {(0, 1), (1, 0)}
     happened = sum(places[k] != places[k + 1] for k in range(len(Z) - 1))
     assert sum(p.times for p in found) == pytest.approx(happened, abs=2)
+
+
+def test_a_transition_goes_from_where_one_was_to_where_one_came():
+    Z = np.tile([[0.0], [10.0], [30.0]], (40, 1))
+    fsm = EvolvingFSM(ACTIONS.n_actions, rule=Novelty(1.0, [2.0]))
+    learnt = learn_traces(chunks(Z, np.zeros(120), [0]), fsm, ACTIONS)
+    assert {(one.origin, one.target) for one in passages(learnt.model)} == {(0, 1), (1, 2), (2, 0)}
 
 
 def test_one_state_has_no_skill():

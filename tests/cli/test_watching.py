@@ -9,6 +9,7 @@ import pytest
 from evofsm.cli.watch.player import Player
 from evofsm.cli.watch.recorded import Recording, record_log
 from evofsm.cli.watch.session import Session, learn_first, watched_guard
+from evofsm.cli.watch.shown import Chronicle, Judged
 from evofsm.cli.watch.words import tell
 from evofsm.driving import KinematicWorld, guard_for_family, learners_of, load_family, teach
 from evofsm.guard import Mode
@@ -77,6 +78,18 @@ def test_the_same_run_is_shown_the_same_and_restarting_begins_anew():
     assert frames[0].story.danger is None
     with pytest.raises(ValueError, match="case is 5; paper has 1 to 4"):
         session.restart(4)
+
+
+def test_danger_is_over_two_seconds_after_the_last_wish_that_was_not_tolerable():
+    calm, chronicle = Session(PAPER, learnt(), KinematicWorld()).step(), Chronicle(0.02)
+    risks = {0.0: 0.5, 1.0: 0.01, 1.9: 0.01, 2.0: 0.01, 3.0: 0.03, 4.0: math.nan}
+    told = []
+    for time, risk in risks.items():
+        frame = calm._replace(time=time, proposed_risk=Judged(risk), proposed=2.0, executed=1.0)
+        told.append(chronicle.tell(frame))
+    assert [story.in_danger for story in told] == [True, True, True, False, True, True]
+    assert (told[-1].first, told[-1].danger.began.time, told[-1].danger.last) == (0.0, 3.0, 3.0)
+    assert (told[-1].revised, told[-1].danger.revised, told[-1].danger.change) == (6, 2, 2.0)
 
 
 def test_states_grow_from_empty_and_keep_their_numbers():
