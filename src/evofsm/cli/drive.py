@@ -15,12 +15,10 @@ from evofsm.cli.options import (
     ByJudge,
     InWorld,
     Json,
-    Judge,
     ModeName,
     Seed,
     Switches,
     Tolerance,
-    World,
     argument,
     family_of,
     option,
@@ -44,12 +42,12 @@ def drive(
         ),
     ],
     episodes: Annotated[int, option("How many are driven.", min=1, max=2**32)] = 100,
-    world: InWorld = World.KINEMATIC,
+    world: InWorld = "kinematic",
     reviser: Annotated[
         str, option("Who revises: least-risk (ours), none, rss, aeb, or another measure.")
     ] = "least-risk",
-    judge: ByJudge = Judge.KINEMATIC,
-    mode: Annotated[ModeName, option("How far least-risk goes.")] = ModeName.ACT,
+    judge: ByJudge = "kinematic",
+    mode: Annotated[ModeName, option("How far least-risk goes.")] = "act",
     tolerance: Tolerance = 0.02,
     switches: Switches = "",
     seed: Seed = 0,
@@ -103,7 +101,7 @@ def drive(
         require(libsumo="sumo")
         from evofsm.cli.sumocfg import run_configuration
 
-        run_configuration(Path(family), vehicles, mode.value, tolerance, as_json=as_json)
+        run_configuration(Path(family), vehicles, mode, tolerance, as_json=as_json)
         return None
     _refuse_pairs(given)
     require_world(world, **({"polars": "tables"} if out is not None and not at_once else {}))
@@ -116,11 +114,11 @@ def drive(
     setup = Setup(
         family_of(family, switches),
         reviser,
-        judge.value,
-        Mode(mode.value),
+        judge,
+        Mode(mode),
         tolerance,
         seed,
-        world.value,
+        world,
         learn=frozen is None and not at_once,
     )
     before = None

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import sys
-from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from evofsm.cli.inspect import load_model
 from evofsm.cli.options import Saved, option
@@ -17,16 +16,11 @@ if TYPE_CHECKING:
 _MCAP = b"\x89MCAP"
 
 
-class Format(StrEnum):
-    """What it is written as."""
-
-    DOT = "dot"
-    PRISM = "prism"
-
-
 def export(
     file: Saved,
-    to: Annotated[Format, option("Graph for Graphviz (dot), or process for PRISM and Storm.")],
+    to: Annotated[
+        Literal["dot", "prism"], option("Graph for Graphviz (dot), or process for PRISM and Storm.")
+    ],
     out: Annotated[Path | None, option("File to write; else it is printed.")] = None,
     least: Annotated[
         float | None,
@@ -45,7 +39,7 @@ def export(
     model, dead_ends = _learnt(file)
     bounds = {"least": least, "evidence": evidence}
     given = {name: bound for name, bound in bounds.items() if bound is not None}
-    if to is Format.PRISM:
+    if to == "prism":
         text = graphs.to_prism(model, **given)
     else:
         text = graphs.to_dot(model, **given, dead_ends=dead_ends)

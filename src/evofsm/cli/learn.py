@@ -5,9 +5,8 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Iterator, Mapping, Sequence
-from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from evofsm.cli.inspect import model_document, tables_of
 from evofsm.cli.options import Json, argument, option, split_names
@@ -24,20 +23,7 @@ if TYPE_CHECKING:
     from evofsm.io.logs import Noted
 
 
-class RuleName(StrEnum):
-    """How states are made."""
-
-    PAPER = "paper"
-    EDGES = "edges"
-    NOVELTY = "novelty"
-
-
-class NoLeader(StrEnum):
-    """What to do where there is no leader."""
-
-    REFUSE = "refuse"
-    END = "end"
-
+Rule = Literal["paper", "edges", "novelty"]
 
 _MOST_ACTIONS = 1000
 # With less of the belief, the most probable state is hardly told apart from the others.
@@ -85,19 +71,20 @@ def learn(
         Path | None, option("TOML: which field of which topic of a bag is which variable.")
     ] = None,
     no_leader: Annotated[
-        NoLeader, option("Where a number is missing: refuse the log, or end the episode.")
-    ] = NoLeader.REFUSE,
+        Literal["refuse", "end"],
+        option("Where a number is missing: refuse the log, or end the episode."),
+    ] = "refuse",
     vehicle_length: Annotated[
         list[str] | None,
         option("FCD: of vehicles [m], or of a type: truck=12. May be repeated. [default: 5.0]"),
     ] = None,
     rule: Annotated[
-        RuleName,
+        Rule,
         option(
             "How states are made: as in the paper; with states at edges too; or one wherever "
             "nothing like it was seen (novelty, recommended for logs)."
         ),
-    ] = RuleName.PAPER,
+    ] = "paper",
     radius: Annotated[
         float | None,
         option("How far states lie apart. [default: 0.3; of novelty 1.0, in --scale]"),
@@ -156,7 +143,7 @@ def learn(
         dt=None if dt is None else positive("--dt", dt),
         failed=failed,
         units=parse_units(unit or ()),
-        leader_may_lack=no_leader is NoLeader.END,
+        leader_may_lack=no_leader == "end",
     )
     lengths, noted = VehicleLengths.parse(vehicle_length or ()), Noted()
     known = [{"name": file, "bytes": _size(file)} for file in files]
@@ -246,7 +233,7 @@ def _encoder(text: str) -> ObservationEncoder:
 
 def _machine(
     n_actions: int,
-    rule: RuleName,
+    rule: Rule,
     radius: float | None,
     spread: float | None,
     scale: list[str] | None,
@@ -256,22 +243,22 @@ def _machine(
     from evofsm.fsm.machine import EvolvingFSM
     from evofsm.fsm.rules import Edges, Novelty
 
-    if scale and rule is not RuleName.NOVELTY:
-        raise ValueError(f"--scale is for --rule novelty, not {rule.value}")
-    if rule is RuleName.NOVELTY:
+    if scale and rule != "novelty":
+        raise ValueError(f"--scale is for --rule novelty, not {rule}")
+    if rule == "novelty":
         one = 1.0 if radius is None else radius
-        novelty = Novelty(one, _scales(scale, encoder, rule), 1.0 if spread is None else spread)
+        novelty = Novelty(one, _scales(scale, encoder), 1.0 if spread is None else spread)
         return EvolvingFSM(n_actions, rule=novelty, max_states=max_states)
     return EvolvingFSM(
         n_actions,
         radius=0.3 if radius is None else radius,
         spread=3.0 if spread is None else spread,
         max_states=max_states,
-        rule=Edges() if rule is RuleName.EDGES else None,
+        rule=Edges() if rule == "edges" else None,
     )
 
 
-def _scales(scale: list[str] | None, encoder: ObservationEncoder, rule: RuleName) -> list[float]:
+def _scales(scale: list[str] | None, encoder: ObservationEncoder) -> list[float]:
     """The difference that counts as 1, for each number that is observed."""
     from evofsm.driving import SAFETY_RULE
     from evofsm.driving.naming import VARIABLES
@@ -291,7 +278,7 @@ def _scales(scale: list[str] | None, encoder: ObservationEncoder, rule: RuleName
     given = dict(zip(VARIABLES, SAFETY_RULE.scales, strict=True)) | given
     if lacking := [column for column in single if column not in given]:
         raise ValueError(
-            f"--rule {rule.value} has to know the difference that counts as 1 in {lacking[0]!r}: "
+            f"--rule novelty has to know the difference that counts as 1 in {lacking[0]!r}: "
             f"--scale {lacking[0]}=2 (4 m of a gap and 2 m/s of a speed are usual)"
         )
     return [given.get(name, 1.0) for name in encoder.names]

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import importlib
 import sys
-from enum import StrEnum
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -17,27 +16,12 @@ if TYPE_CHECKING:
     from evofsm.driving import Family
 
 
-class World(StrEnum):
-    """Where to drive."""
-
-    SUMO = "sumo"
-    KINEMATIC = "kinematic"
-
-
-class Judge(StrEnum):
-    """What a judge was given."""
-
-    KINEMATIC = "kinematic"
-    LEARNT = "learnt"
-
-
-class ModeName(StrEnum):
-    """How far a guard goes, as `evofsm.guard.Mode`."""
-
-    OFF = "off"
-    SHADOW = "shadow"
-    ADVISE = "advise"
-    ACT = "act"
+#: Where to drive.
+World = Literal["sumo", "kinematic"]
+#: What a judge was given.
+Judge = Literal["kinematic", "learnt"]
+#: How far a guard goes, as `evofsm.guard.Mode`.
+ModeName = Literal["off", "shadow", "advise", "act"]
 
 
 def option(about: str, *names: str, **limits: Any) -> Any:
@@ -80,7 +64,7 @@ def require(**extras: str) -> None:
 
 def require_world(world: World, **extras: str) -> None:
     """The same for a drive: SciPy is for SUMO's distributions and exact intervals."""
-    require(scipy="study", **({"libsumo": "sumo"} if world is World.SUMO else {}), **extras)
+    require(scipy="study", **({"libsumo": "sumo"} if world == "sumo" else {}), **extras)
 
 
 def imported(name: str) -> Any:

@@ -7,12 +7,12 @@ import sys
 from pathlib import Path
 from typing import Annotated
 
-from evofsm.cli.options import InWorld, Json, World, option, require_world
+from evofsm.cli.options import InWorld, Json, option, require_world
 from evofsm.cli.show import print_json, progress
 
 
 def paper(
-    world: InWorld = World.SUMO,
+    world: InWorld = "sumo",
     rounds: Annotated[int, option("How often the four cases are driven.", min=1)] = 20,
     out: Annotated[Path, option("Folder for the page, figures, traces and the model.")] = Path(
         "evofsm-paper"
@@ -29,7 +29,7 @@ def paper(
     from evofsm.paper.reproduction import reproduce
 
     with progress(f"Driving and learning ({world})") as done:
-        found = reproduce(world.value, rounds, settings, done)
+        found = reproduce(world, rounds, settings, done)
     command = shlex.join(["evofsm", *sys.argv[1:]])
     page = found.write(out, command)
     if as_json:

@@ -27,7 +27,7 @@ def monitor(
     ] = False,
     mode: Annotated[
         ModeName, option("How far it goes: shadow (what is proposed is executed) to act.")
-    ] = ModeName.SHADOW,
+    ] = "shadow",
     learn: Annotated[bool, option("Learn from what comes.", "--learn")] = False,
     state: Annotated[
         Path | None, option("Save all in this file, and go on from it; may be that of --guard.")
@@ -81,7 +81,7 @@ def monitor(
         if state is not None:
             given = None if guard is None or guard.resolve() == state.resolve() else _digest(guard)
             made = {"interval": interval, "brakes": brakes} if guard is None else {}
-            told = {"mode": mode.value, "learn": learn, "episode": episode}
+            told = {"mode": mode, "learn": learn, "episode": episode}
             saved = State(state, {"guard": given, **made, **told})
             stack.callback(saved.close)
         elif learn:
@@ -123,8 +123,8 @@ def _prepare(
     from evofsm.guard import ActionReviser, AuditLog, Mode
 
     if isinstance(guard.reviser, ActionReviser):
-        guard.reviser.mode = Mode(mode.value)
-    elif mode is not ModeName.ACT:
+        guard.reviser.mode = Mode(mode)
+    elif mode != "act":
         name = type(guard.reviser).__name__
         raise ValueError(f"a {name} knows no --mode {mode}: what it says is executed")
     guard.learn = learn

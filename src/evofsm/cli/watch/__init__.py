@@ -48,9 +48,9 @@ def watch(
         ),
     ] = "paper",
     case: Annotated[int, option("Which of its cases, draws or episodes.", min=1)] = 1,
-    world: InWorld = World.KINEMATIC,
+    world: InWorld = "kinematic",
     off: Annotated[bool, option("Begin with the reviser off.", "--off")] = False,
-    judge: ByJudge = Judge.KINEMATIC,
+    judge: ByJudge = "kinematic",
     tolerance: Tolerance = 0.02,
     switches: Switches = "",
     seed: Seed = 0,
@@ -133,9 +133,7 @@ def _recorded(
                 log = str(Path(folder) / f"{Path(what).stem}.xml")
                 trace_configuration(Path(what), Path(log), seconds=_SECONDS)
             given = None if topics is None else Topics.load(topics)
-            if record_log(
-                log, run, topics=given, judge=judge.value, tolerance=tolerance, show=move
-            ):
+            if record_log(log, run, topics=given, judge=judge, tolerance=tolerance, show=move):
                 warn(f"watched are the first {MOST_ROWS:,} rows; there are more")
             recording = Recording(run)
     recording.restart(case - 1)
@@ -156,7 +154,7 @@ def _guard(
         machine, known = learners_of(Guard.load(learn / GUARD))
         guard = guard_for_family(family, machine=machine, judge=known, tolerance=tolerance)
         return guard, int(store.read_header(learn / GUARD).provenance.get("episodes", 0))
-    guard = watched_guard(family, judge=judge.value, tolerance=tolerance)
+    guard = watched_guard(family, judge=judge, tolerance=tolerance)
     with progress("Learning first", episodes) as move:
         learn_first(guard, family, episodes, seed, move)
     return guard, episodes
@@ -175,7 +173,7 @@ def _driven(
     @contextmanager
     def session() -> Iterator[Session]:
         with (
-            open_world(world.value) as place,
+            open_world(world) as place,
             Session(
                 family, guard, place, case=case - 1, seed=seed, on=not off, learnt=learnt
             ) as opened,
