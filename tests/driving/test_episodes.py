@@ -91,6 +91,10 @@ def test_outcomes_compare_with_the_controller_alone():
     draws = held_out(EMERGENCY, 0, 3)
     alone = [reference_of(EMERGENCY, draw) for draw in draws]
     same = [drive(unrevised_guard(EMERGENCY), draw) for draw in draws]
+    for one, base in zip(same, alone, strict=True):  # up to the leader's brake
+        until = one.time <= one.time[base.until]
+        way = np.trapezoid(one.observations[until, 1], one.time[until])
+        assert base.distance == pytest.approx(way, rel=0.01)
     found = [outcome_of(*pair, EMERGENCY.interval) for pair in zip(same, alone, strict=True)]
     assert [one.mobility for one in found] == [1.0, 1.0, 1.0]
     assert [one.changed for one in found] == [0, 0, 0]

@@ -198,11 +198,12 @@ def test_a_manoeuvre_under_way_counts_when_the_episode_ends():
 
 @pytest.mark.parametrize("dt", [0.1, 0.25])
 @pytest.mark.parametrize("speed", [0.0, 20.0])
-def test_noise_is_no_manoeuvre(dt, speed):
+@pytest.mark.parametrize(("deviation", "known"), [(0.2, 0.0), (0.5, 0.7)])
+def test_noise_is_no_manoeuvre(dt, speed, deviation, known):
     rng = np.random.default_rng(0)
     watch, told = BrakeWatch(dt), 0
-    for noise, own in rng.normal(0.0, 0.2, (round(3600 / dt), 2)):
-        seen = watch.see(30.0, max(0.0, speed + own), max(0.0, speed + noise))
+    for noise, own in rng.normal(0.0, deviation, (round(3600 / dt), 2)):
+        seen = watch.see(30.0, max(0.0, speed + own), max(0.0, speed + noise), known)
         told += seen is not None
     assert told <= 1  # in an hour
 

@@ -6,7 +6,7 @@ import math
 import numba
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
+from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 
 from evofsm.driving.by_state import RiskByState, assess_states
@@ -88,6 +88,7 @@ def test_the_critical_deceleration_agrees_with_driving_it_out(
 
 
 @given(st.floats(1.0, 120.0), SPEEDS, SPEEDS, DECELS, st.floats(0.5, 14.0))
+@example(5.0, 20.0, 25.0, 2.0, 10.0)  # a faster leader who brakes harder
 def test_braking_at_once_agrees_with_the_oracle_of_dead_ends(
     gap, speed, leader_speed, decel, leader_decel
 ):
@@ -315,6 +316,9 @@ def test_states_are_judged_at_their_centres_weighed_by_the_belief():
     cautious = RiskByState(risk, machine, caution=1.0)
     assert cautious.judge(situation(20.0, 10.0, 10.0, [0.5, 0.5]), [-4.0]).risk[0] == 1.0
     assert [state.is_dead_end for state in assess_states(machine.model(), risk)] == [False, True]
+    brink = EvolvingFSM(n_actions=1)
+    brink.observe([7.0, 10.0, 10.0])  # full braking saves, keeping the speed does not
+    assert [(state.risk, state.margin) for state in assess_states(brink, risk)] == [(0.0, 1.0)]
 
 
 # -- Sharing, and a table to begin with -------------------------------------------------------

@@ -21,6 +21,7 @@ from evofsm.driving.measures import (
     modified_time_to_collision,
     picud,
     proactive_fuzzy,
+    safe_distance,
     time_headway,
     time_to_collision,
 )
@@ -168,6 +169,12 @@ def test_picud_is_the_gap_at_standstill():
     # 30 m + 10²/6 m of the leader - 20 m of reaction - 20²/6 m of the follower.
     assert picud(np.array([30.0, 20.0, 10.0]), 3.0, 1.0) == pytest.approx(-40.0)
     assert Picud(3.0, 1.0).score(np.array([[30.0, 20.0, 10.0]]), DT) == pytest.approx(40.0)
+
+
+def test_the_safe_distance_of_rss_by_hand():
+    # 10 m and 0.25 m until it responds, 21²/10 m of braking, less 20²/16 m of the leader.
+    assert safe_distance(np.array([9.0, 20.0, 20.0]), 0.5, 2.0, 5.0, 8.0) == pytest.approx(29.35)
+    assert safe_distance(np.array([9.0, 5.0, 40.0]), 0.5, 2.0, 5.0, 8.0) == 0.0
 
 
 def test_constants_of_the_regulation():
