@@ -135,9 +135,9 @@ def test_extrapolation_is_exact_where_motion_is_uniform_or_its_pace_grows():
     change, earlier = np.array([[1.0], [2.0]]), np.array([[1.0], [1.0]])
     zeros, left = np.zeros((2, 1)), np.full(2, math.inf)
     some = Cases(z, change, earlier, zeros, zeros, left, left, np.zeros(2, np.intp))
-    sides = np.array([[0.0, 1.0, 9.5, 1.0]])
-    np.testing.assert_array_equal(Taylor(sides, 1)(some), [-10.0, -5.0])
-    np.testing.assert_array_equal(Taylor(sides, 2)(some), [-10.0, -3.0])  # 3, 7, 12
+    sides = np.array([[0.0, 1.0, 10.9, 1.0]])
+    np.testing.assert_array_equal(Taylor(sides, 1)(some), [-11.0, -6.0])
+    np.testing.assert_array_equal(Taylor(sides, 2)(some), [-11.0, -3.0])  # 3, 7, 12
     assert np.isinf(Taylor(-sides, 1)(some)).all()
 
 

@@ -35,4 +35,4 @@ from .reviser import Way as Way
 from .reviser import is_spoken as is_spoken
 from .reviser import make_usable as make_usable
 from .scene import SceneRisk as SceneRisk
-from .warm import warm as warm
+from .warming import warm as warm
