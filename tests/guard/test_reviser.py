@@ -332,13 +332,7 @@ def test_what_was_never_seen_is_said_to_be_so_and_what_is_known_is_not():
     assert unseen.interval[1] - unseen.interval[0] > 0.5
     reviser.start_episode()
     far = Situation(np.array([200.0, 10.0, 10.0]), np.array([0.0, 1.0]), 1, math.nan, 0.0)
-    first = reviser.revise(far, Proposal(0.0))
-    assert "never seen before" in first.reason
-    assert first.seen == 0.0
-    for _ in range(8):
-        risk.learn(far.observation, 0.0, far.belief)
-    again = reviser.revise(far, Proposal(0.0))
-    assert again.reason == "risk is within the tolerance"
-    assert again.seen == 2.0
-    nobody = reviser.revise(far._replace(state=None), Proposal(0.0))
-    assert math.isnan(nobody.seen)
+    for seen, remark in ((0.25, "never seen before; "), (0.5, ""), (math.nan, "")):
+        revision = reviser.revise(far._replace(seen=seen), Proposal(0.0))
+        assert revision.reason == f"{remark}risk is within the tolerance"
+        np.testing.assert_equal(revision.seen, seen)
