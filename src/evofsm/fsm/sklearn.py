@@ -34,8 +34,6 @@ class EvolvingClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc] # bo
     labels_ : (N,) ndarray of int
         State that each row of the latest batch was recognised as when it was learnt; `predict`
         goes by the states of now.
-    cluster_centers_ : (n, m) ndarray
-        Centres of the states.
 
     Examples
     --------

@@ -99,7 +99,7 @@ class Dynamics:
     as many. Parts of `DYNAMICS_PARTS` may be left out (``without``).
 
     Each variable's change is linear in the observation, its latest change, the action, the one
-    before, bends of the action and products of variables and actions (`replay.features`), learnt by
+    before, bends of the action and products of variables and actions (``replay.features``), learnt by
     sums (`regression`). Where a system fails is known only after it failed there once, or where it
     is given; nothing here says that something is safe.
 
