@@ -239,7 +239,7 @@ def test_the_site_loads_nothing_from_elsewhere(site):
 def test_formulas_are_there_without_a_script(site):
     folder, _ = site
     text = (folder / "equations" / "states.html").read_text()
-    assert len(re.findall(r'<math [^>]*display="block"', text)) == 5
+    assert len(re.findall(r'<math [^>]*display="block"', text)) == 3
     assert "\\frac" not in text
 
 
@@ -247,10 +247,10 @@ def test_formulas_are_there_without_a_script(site):
 def test_a_line_of_code_is_where_its_link_leads(site):
     folder, pages = site
     links = pages[folder / "equations" / "states.html"].links
-    found = {int(one.rpartition("L-")[2]) for one in links if "fsm/states/paper.html#" in one}
-    source = (ROOT / "src/evofsm/fsm/states/paper.py").read_text().splitlines()
+    found = {int(one.rpartition("L-")[2]) for one in links if "fsm/clusters.html#" in one}
+    source = (ROOT / "src/evofsm/fsm/clusters.py").read_text().splitlines()
     there = [source[line - 1].strip().partition("(")[0] for line in sorted(found)]
-    assert there == ["def judge", "return MOVED if exceeds"]
+    assert {"def _judge", "def exceeds", "return MOVED if exceeds"} <= set(there)
 
 
 @pytest.mark.slow
