@@ -99,9 +99,9 @@ class Dynamics:
     as many. Parts of `DYNAMICS_PARTS` may be left out (``without``).
 
     Each variable's change is linear in the observation, its latest change, the action, the one
-    before, bends of the action and products of variables and actions (``replay.features``), learnt by
-    sums (`regression`). Where a system fails is known only after it failed there once, or where it
-    is given; nothing here says that something is safe.
+    before, bends of the action and products of variables and actions, learnt by sums
+    (`regression`). Where a system fails is known only after it failed there once, or where it is
+    given; nothing here says that something is safe.
 
     What is in lists, and all arrays but those of ``sums``, never change in place.
 
