@@ -10,7 +10,6 @@ from .fsm import Missing as Missing
 from .fsm import Novelty as Novelty
 from .fsm import ObservationEncoder as ObservationEncoder
 from .fsm import Paper as Paper
-from .fsm import StateRule as StateRule
 from .fsm import jensen_shannon as jensen_shannon
 from .fsm import merge as merge
 from .fsm import register_rule as register_rule

@@ -1,8 +1,8 @@
 """All that a machine has learnt, as named arrays, and its settings, as numbers: what kernels see.
 
-What belongs together and is touched together stands in one array of records; `by_name` gives each
-field as an array of its own, as it stands in files. There is room for ``capacity`` states, of which
-the first n are in use, and for the matrices of the actions that were used.
+What is touched together stands in one array of records; `by_name` gives each field as an array of
+its own, as in files. There is room for ``capacity`` states, of which the first n are in use, and
+for the matrices of the actions that were used.
 """
 
 from __future__ import annotations

@@ -26,7 +26,7 @@ _SURE = 0.995
 class Nearest(NamedTuple):
     """The state that an observation is nearest to, in the scales of the rule."""
 
-    state: int  #: its index
+    state: int
     distance: float  #: from its centre
     reach: float  #: how far from a centre an observation still belongs to the state
 

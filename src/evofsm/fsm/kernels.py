@@ -25,9 +25,8 @@ from numpy.typing import NDArray
 
 Function = TypeVar("Function", bound=Callable[..., object])
 
-# Kernels own no memory, so that there is nothing to count references of. A product and a sum may be
-# one instruction, but sums are in the order in which they are written: a batch and single steps
-# agree bit for bit.
+# Kernels own no memory, so there are no references to count. A product and a sum may be one
+# instruction, but sums are in the order as written: a batch and single steps agree bit for bit.
 _OPTIONS = {"fastmath": {"contract"}, "_nrt": False, "no_cfunc_wrapper": True}
 
 

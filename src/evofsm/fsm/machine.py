@@ -88,9 +88,8 @@ class EvolvingFSM(Counts if TYPE_CHECKING else object):  # type: ignore[misc] # 
     n_actions : int
         Number q of discrete actions; each has a transition matrix of its own.
     radius : float, optional
-        The paper's epsilon: an observation that is denser than every centre moves the nearest one
-        if that is closer than this, else it creates a state. 0.3 for `Paper` and `Edges`; other
-        rules have their own.
+        The paper's epsilon: how close the nearest state must be to be moved. 0.3 for `Paper` and
+        `Edges`; other rules have their own.
     distance_weight : float
         The paper's rho, how fast distance to new data lowers a centre's potential.
     learning_rate : float
@@ -98,13 +97,12 @@ class EvolvingFSM(Counts if TYPE_CHECKING else object):  # type: ignore[misc] # 
     prior_frequency : float
         The paper's epsilon-bar, the frequency given to every transition of a new state.
     spread : float, optional
-        Width of recognition: the similarity to a centre is ``exp(-distance^2 / (spread * total
-        variance of all observations))``. 3 for `Paper` and `Edges`; other rules have their own.
+        Width of recognition, in total variances of all observations. 3 for `Paper` and `Edges`;
+        other rules have their own.
     rule : StateRule, optional
         How states are determined: `Paper` (without it), `Edges`, `Novelty`.
     max_states : int, optional
-        Number of states at which another one is only created where the two that are closest, the
-        newcomer among them, are merged: evidence adds up, and the centre lies between theirs.
+        Number of states at which, before another one, the two that are closest are merged.
     belief_tolerance : float
         How far a belief may be from the exact one, summed over all states, in [0, 1): 1e-6 saves
         most of the time with hundreds of states.
@@ -388,7 +386,7 @@ class EvolvingFSM(Counts if TYPE_CHECKING else object):  # type: ignore[misc] # 
 
         Parameters
         ----------
-        actions, names, units, dt : optional
+        actions, names, units, dt
             What its numbers mean, as `Labels` takes them.
         """
         found, now = arrays.by_name(self._learnt), self._learnt.now[0]

@@ -53,15 +53,6 @@ def merge(machines: Sequence[EvolvingFSM], *, radius: float | None = None) -> Ev
     Where ``max_states`` exist, the others join the nearest. `Paper` and `Edges` take centres for
     the same only within a small radius: give a larger one, or ``max_states``.
 
-    The weight F_o of a row becomes the mean of the parts', by decisions. Mean and scatter are
-    pooled exactly [1]_, and a centre's potential is what the recursion would have made of the data
-    of all other parts.
-
-    References
-    ----------
-    .. [1] T. F. Chan, G. H. Golub, R. J. LeVeque, "Updating formulae and a pairwise algorithm for
-       computing sample variances", Stanford STAN-CS-79-773 (1979).
-
     Examples
     --------
     >>> from evofsm import Novelty
@@ -151,7 +142,7 @@ def _match(
 def _densities(
     parts: Sequence[_Part], leaders: Sequence[tuple[int, int]], settings: Settings
 ) -> dict[str, NDArray[Any]]:
-    """Pool the data's mean, scatter and potentials.
+    """Pool the data's mean and scatter (Chan, Golub & LeVeque 1979), and potentials.
 
     ``(t - 1) / potential`` is a sum over z_1 .. z_{t-1}, of ``1 + rho |z - centre|^2`` for each
     observation since the centre was created; see `clusters.determine`. That sum over another

@@ -25,11 +25,7 @@ def visible(text: str) -> str:
 
 
 class Words(NamedTuple):
-    """How places and actions of one kind of system are told in words.
-
-    A package declares them by an entry point of the group ``evofsm.words``, whose name is those of
-    the variables, with commas.
-    """
+    """How one kind of system is told: an entry point ``evofsm.words``, named as its variables."""
 
     place: Callable[[ArrayLike], str]  #: of a centre
     unit: str  #: of an action

@@ -66,10 +66,7 @@ class Category:
 class ObservationEncoder:
     """Turns named variables, continuous and discrete, into the vector a machine observes.
 
-    Parameters
-    ----------
-    *variables : str or Category
-        A name for each continuous variable, a `Category` for each discrete one, in order.
+    It is given a name for each continuous variable, and a `Category` for each discrete one.
 
     Examples
     --------

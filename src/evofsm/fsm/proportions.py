@@ -80,15 +80,6 @@ class FailureRecord(NamedTuple):
 
     The intervals are Garwood's (1936), of failures that come at a constant rate, independently of
     each other. Each end by itself holds with 95 %, in the conditions in which it was run.
-
-    Examples
-    --------
-    >>> print(FailureRecord(0, hours=12.0))
-    0 failures in 12 h: at most 0.25 per hour, 95 %
-    >>> record = FailureRecord(3, hours=40.0, kilometres=2500.0, episodes=4000)
-    >>> print(record)  # doctest: +NORMALIZE_WHITESPACE
-    3 failures in 4,000 episodes, 40 h, 2,500 km: 0.075 per hour (0.020 to 0.20),
-    1.2 per 1,000 km (0.32 to 3.2), 90 %
     """
 
     failures: int

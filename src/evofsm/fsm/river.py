@@ -34,10 +34,7 @@ class RiverClusterer(base.Clusterer):
     radius, learning_rate, spread, rule, max_states : optional
         As `EvolvingFSM` takes them. All features count alike: scale them first.
 
-    Attributes
-    ----------
-    machine : EvolvingFSM
-        With one action: ``machine.predict(0)`` forecasts the next state.
+    Its ``machine`` has one action: ``machine.predict(0)`` forecasts the next state.
 
     Examples
     --------
@@ -47,8 +44,6 @@ class RiverClusterer(base.Clusterer):
     ...     clusterer.learn_one(x)
     >>> clusterer.predict_one({"gap": 0.2}), clusterer.predict_one({"gap": 1.8})
     (0, 1)
-    >>> {state: round(p, 2) for state, p in clusterer.predict_proba_one({"gap": 0.5}).items()}
-    {0: 0.5, 1: 0.5}
     """
 
     def __init__(

@@ -26,22 +26,15 @@ class StateRule(Protocol):
 
     A rule is a frozen dataclass of settings, made known with `register_rule`. All distances are
     those of observations divided by the rule's scales.
-
-    Examples
-    --------
-    >>> Novelty(radius=0.5, scales=(4.0, 2.0, 2.0)).scales
-    (4.0, 2.0, 2.0)
     """
 
     @property
     def scales(self) -> Sequence[float]:
         """Difference that counts as 1, for each of the m variables; empty: 1 for each."""
-        ...
 
     @property
     def table(self) -> Mapping[str, float]:
         """What the kernel judges by: fields of `Settings`, in place of the machine's."""
-        ...
 
 
 @dataclass(frozen=True)
