@@ -34,14 +34,6 @@ def test_all_claims_hold_and_the_page_is_named(reproduced):
     assert "\x1b" not in run.stdout, "colours in a pipe"
 
 
-def test_the_folder_holds_page_claims_traces_model_and_figures(reproduced):
-    _, folder = reproduced
-    names = {path.name for path in folder.iterdir()}
-    assert names == {"index.html", "claims.json", "traces.parquet", "model.evofsm", "figures"}
-    for path in (folder / "figures").iterdir():
-        assert path.stat().st_size > 10_000
-
-
 @pytest.mark.slow
 def test_a_claim_that_fails_is_shown_and_ends_with_1(tmp_path):
     settings = tmp_path / "coarse.toml"
@@ -74,28 +66,6 @@ def test_what_cannot_be_done_is_said_in_a_line_and_ends_with_2(tmp_path, argumen
     assert run.returncode == 2
     assert message in run.stderr
     assert "Traceback" not in run.stderr
-
-
-def test_without_the_extras_it_names_them_before_any_work(tmp_path):
-    hidden = tmp_path / "hidden"
-    hidden.mkdir()
-    (hidden / "sitecustomize.py").write_text(
-        "import importlib.util as util\n"
-        "found = util.find_spec\n"
-        "util.find_spec = lambda name, *rest: None if name == 'polars' else found(name, *rest)\n"
-    )
-    command = [sys.executable, "-m", "evofsm", "paper", "--world", "kinematic"]
-    run = subprocess.run(
-        command,
-        cwd=tmp_path,
-        env={"PYTHONPATH": str(hidden)},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert run.returncode == 2
-    assert "pip install '.[cli,tables]'" in run.stderr
-    assert not Path(tmp_path / "evofsm-paper").exists()
 
 
 def test_the_docs_show_what_the_command_measures(reproduced):

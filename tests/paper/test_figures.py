@@ -1,7 +1,5 @@
 """The paper's figures are drawn whatever the study holds, and show what it holds."""
 
-import subprocess
-import sys
 from importlib.resources import files
 from pathlib import Path
 
@@ -31,24 +29,6 @@ def study(tmp_path_factory):
 
 def texts(figure):
     return [text.get_text() for text in figure.findobj(matplotlib.text.Text)]
-
-
-@pytest.mark.slow
-def test_pyplot_stays_out_and_a_missing_matplotlib_is_named():
-    code = """
-import sys
-import evofsm.paper.figures
-assert "matplotlib.pyplot" not in sys.modules
-for name in [name for name in sys.modules if name.startswith(("matplotlib", "evofsm.p"))]:
-    del sys.modules[name]
-sys.modules["matplotlib"] = None
-try:
-    import evofsm.paper.figures
-except ModuleNotFoundError as error:
-    print(error)
-"""
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert "pip install '.[plot]'" in done.stdout
 
 
 def test_a_case_shows_what_it_was_its_moments_its_states_and_its_collision(study):

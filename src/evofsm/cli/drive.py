@@ -107,9 +107,8 @@ def drive(
     require_world(world, **({"polars": "tables"} if out is not None and not at_once else {}))
     require(**({} if mcap is None else {"mcap": "mcap"}))
     require(**({} if foxglove is None else {"foxglove": "foxglove"}))
-    from evofsm import store
-    from evofsm.cli.driving import GUARD, Results, Setup, make_guard
-    from evofsm.guard import Guard, Mode
+    from evofsm.cli.driving import GUARD, Results, Setup, load_guard, make_guard
+    from evofsm.guard import Mode
 
     setup = Setup(
         family_of(family, switches),
@@ -123,10 +122,9 @@ def drive(
     )
     before = None
     if (start := learn or frozen) is not None:
-        file = start / GUARD
-        before = Guard.load(file)
-        reached = int(store.read_header(file).provenance.get("episodes", 0))
-        setup = replace(setup, learnt=reached, digest=sha256(file.read_bytes()).hexdigest())
+        before, reached = load_guard(start)
+        digest = sha256((start / GUARD).read_bytes()).hexdigest()
+        setup = replace(setup, learnt=reached, digest=digest)
     with closing(Results(setup, make_guard(setup, before), out)) as results:
         if mcap is not None and results.rows:
             found = f"{out} has {len(results.rows):,} episodes already; name another folder"

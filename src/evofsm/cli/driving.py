@@ -111,6 +111,12 @@ class Driving(NamedTuple):
     guard: Guard  #: with what it learnt
 
 
+def load_guard(folder: Path) -> tuple[Guard, int]:
+    """What a folder of results holds, and from how many episodes it has learnt."""
+    reached = store.read_header(folder / GUARD).provenance.get("episodes", 0)
+    return Guard.load(folder / GUARD), int(reached)
+
+
 def make_guard(setup: Setup, before: Guard | None = None) -> Guard:
     """A guard whose reviser and judge have the setup's names, with what was learnt before."""
     family, name = setup.family, _ALIASES.get(setup.reviser, setup.reviser)
@@ -163,17 +169,17 @@ class Results:
             self._journal.go_on(setup.settings, "run it with those, or name another folder")
             self.rows = {int(row["episode"]): row for row in self._journal.records}
             if setup.learn and self.rows:
-                self._go_on(folder / GUARD)
+                self._go_on(folder)
         except BaseException:
             self._journal.close()
             raise
 
-    def _go_on(self, saved: Path) -> None:
+    def _go_on(self, folder: Path) -> None:
         """Take what was learnt, and leave out the rows of episodes that came after it."""
         learnt = 0
-        if saved.exists():
-            learnt = int(store.read_header(saved).provenance.get("episodes", 0))
-            self.guard = make_guard(self.setup, Guard.load(saved))
+        if (folder / GUARD).exists():
+            saved, learnt = load_guard(folder)
+            self.guard = make_guard(self.setup, saved)
         done = range(self.setup.first, learnt)
         self.rows = {number: row for number, row in self.rows.items() if number in done}
 

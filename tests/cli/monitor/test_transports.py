@@ -229,9 +229,3 @@ def test_zenoh_carries_the_same_and_refuses_a_key_that_is_none(alone, plain):
             found.append(answer)
     assert found == plain
     stop(lambda: None)
-
-
-def test_zenoh_that_is_not_there_says_what_brings_it(monkeypatch):
-    monkeypatch.setitem(sys.modules, "zenoh", None)
-    with pytest.raises(ModuleNotFoundError, match="zenoh"):
-        ZenohTransport("car")

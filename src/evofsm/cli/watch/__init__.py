@@ -144,16 +144,15 @@ def _guard(
     family: Family, judge: Judge, tolerance: float, seed: int, episodes: int, learn: Path | None
 ) -> tuple[Guard, int]:
     """One that has learnt something, and from how many episodes."""
-    from evofsm import store
-    from evofsm.cli.driving import GUARD
+    from evofsm.cli.driving import load_guard
     from evofsm.cli.watch.session import learn_first, watched_guard
     from evofsm.driving import guard_for_family, learners_of
-    from evofsm.guard import Guard
 
     if learn is not None:
-        machine, known = learners_of(Guard.load(learn / GUARD))
+        before, reached = load_guard(learn)
+        machine, known = learners_of(before)
         guard = guard_for_family(family, machine=machine, judge=known, tolerance=tolerance)
-        return guard, int(store.read_header(learn / GUARD).provenance.get("episodes", 0))
+        return guard, reached
     guard = watched_guard(family, judge=judge, tolerance=tolerance)
     with progress("Learning first", episodes) as move:
         learn_first(guard, family, episodes, seed, move)
