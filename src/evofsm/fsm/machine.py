@@ -424,8 +424,6 @@ class EvolvingFSM(Counts if TYPE_CHECKING else object):  # type: ignore[misc] # 
             return None if most == np.inf else int(most)
         if name in Settings._fields:
             return getattr(self._settings, name)
-        if name == "visits":  # asked at every decision: not by a snapshot of all
-            return self._learnt.sums[arrays.SUMS.index(name), : self.n_states].copy()
         if name in _ASKED:
             return getattr(self.model(), name).copy()
         raise AttributeError(f"{type(self).__name__} has no attribute {name!r}")

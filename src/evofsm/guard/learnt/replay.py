@@ -21,8 +21,15 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-kernel = numba.njit(cache=True, error_model="numpy", no_cfunc_wrapper=True)
+from evofsm.fsm.kernels import Function, compiled
+
 inner_kernel = numba.njit(inline="always", error_model="numpy")
+
+
+def kernel(function: Function) -> Function:
+    """A function that Python calls; it is cached where there is a place."""
+    return compiled(function, no_cfunc_wrapper=True)
+
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
