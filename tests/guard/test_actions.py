@@ -29,9 +29,6 @@ def boxes(draw):
     return BoxActions(tuple(low), tuple(a + b for a, b in zip(low, ranges, strict=True)))
 
 
-# -- A box --------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("dimensions", "levels"),
     [(1, (17,)), (2, (9, 9)), (3, (4,) * 3), (4, (3,) * 4), (5, (2,) * 5), (6, (2,) * 6)],
@@ -68,16 +65,6 @@ def test_every_cell_is_encoded_by_its_middle_and_beyond_lies_the_edge():
         BOX.encode([0.0, math.nan])
 
 
-def test_it_is_a_value_with_plain_fields():
-    same = BoxActions(np.array([-1, 0]), [1, 4], levels=[9, 9])
-    assert same == BOX
-    assert hash(same) == hash(BOX)
-    assert same.low == (-1.0, 0.0)
-    assert BoxActions((0.0,), (1.0,), levels=(3,)).n_actions == 3
-    with pytest.raises(ValueError, match="read-only"):
-        BOX.bounds[0, 0] = 5.0
-
-
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
@@ -106,9 +93,6 @@ def test_numbers_in_words_are_refused():
         BOX.encode([0.0])
 
 
-# -- What is done with the actions of any set ---------------------------------------------------
-
-
 def test_options_are_the_nearest_of_each_cell_and_the_corners():
     lowest, highest = nearest_bounds(BOX)
     nearest = np.minimum(np.maximum([0.3, 1.0], lowest), highest)
@@ -122,16 +106,11 @@ def test_options_are_the_nearest_of_each_cell_and_the_corners():
 def test_whatever_is_finite_is_put_into_a_box(box, data):
     action = np.array([data.draw(st.floats()) for _ in box.low])
     assert is_usable(box, action) == np.isfinite(action).all()
+    assert not is_usable(box, np.append(action, 0.0))
     if is_usable(box, action):
         inside = put_into(box, action)
         assert inside in box
         assert same_action(inside, action) == (action in box)
-
-
-def test_of_other_shapes_none_is_usable():
-    assert not is_usable(BOX, np.zeros(3))
-    assert not is_usable(BOX, 0.0)
-    assert [0.0] not in BOX
 
 
 def test_how_far_apart_actions_are():

@@ -64,9 +64,6 @@ def make_guard(reviser=None, interval=0.25, **others):
     return Guard.of(reviser or Unrevised(ACTIONS), interval=interval, **others)
 
 
-# -- What is recorded ---------------------------------------------------------------------------
-
-
 def test_decisions_are_those_of_the_record():
     risk = LatentRisk(lowest=-2.5)
     told = driven(reviser=ActionReviser(risk, ACTIONS), judge=risk)
@@ -97,9 +94,6 @@ def test_a_collision_ends_the_last_decision_early_and_is_learnt_as_a_failure():
     assert math.isfinite(told.decisions[-1].realised)
     assert told.decisions[-1].situation.time < told.time[-1]
     assert machine.model().endings.sum() == 1
-
-
-# -- Controllers that fail ----------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -136,9 +130,6 @@ def test_a_function_is_a_controller_and_cannot_change_what_was_observed():
     assert (told.executed == 0.5).all()
 
 
-# -- Who is told what ---------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("learn", [True, False])
 def test_machine_and_risk_are_told_what_was_executed(learn, monkeypatch):
     machine = EvolvingFSM(ACTIONS.n_actions, radius=1.0)
@@ -158,9 +149,6 @@ def test_machine_and_risk_are_told_what_was_executed(learn, monkeypatch):
     assert list(risk.told) == [(how, *one) for one in zip(seen, told.executed, strict=True)]
     assert acted == ([0] * len(told.decisions) if learn else [])
     assert (told.executed == -2.5).all()
-
-
-# -- Shadow mode during ordinary driving ----------------------------------------------------------
 
 
 def ordinary_driving(seed, minutes=2.0):
@@ -209,14 +197,8 @@ def test_ordinary_driving_raises_few_alarms_and_none_that_speaks_of_braking_not_
         assert least * len(said) <= len(alarms) <= most * len(said)
         assert not [revision.reason for revision in alarms if "in full" in revision.reason]
     assert unlearnt.brakes.decel == pytest.approx(0.6 * 8.0)  # no harder braking was shown
-
-
-@pytest.mark.parametrize("mode", [Mode.SHADOW, Mode.ADVISE, Mode.OFF])
-def test_brakes_that_were_told_stay_as_told_beside_a_driver(mode):
-    risk = LatentRisk.given(-8.0, decel=7.0, leader_decel=8.0, dt=0.1)
-    shadowed(risk, mode)
-    assert risk.brakes.known
-    assert risk.brakes.decel == pytest.approx(7.0)
+    assert told.brakes.known
+    assert told.brakes.decel == pytest.approx(7.0)
 
 
 def test_a_driver_who_brakes_hard_shows_what_the_brakes_can_do(tmp_path):
@@ -241,9 +223,6 @@ def test_a_driver_who_brakes_hard_shows_what_the_brakes_can_do(tmp_path):
     assert braked(7.0) == pytest.approx(6.0)  # its own braking is told from what it commands
 
 
-# -- Learning, and not learning -----------------------------------------------------------------
-
-
 def test_learning_goes_on_from_episode_to_episode_until_it_is_frozen(snapshot):
     risk, machine = LatentRisk(lowest=-2.5), EvolvingFSM(ACTIONS.n_actions, radius=1.0)
     guard = make_guard(ActionReviser(risk, ACTIONS), machine=machine)
@@ -263,31 +242,6 @@ def test_learning_goes_on_from_episode_to_episode_until_it_is_frozen(snapshot):
     drive(guard, scenario(14.0), controller=HASTY)
     assert snapshot(risk) != before[1]
     assert snapshot(machine) != before[0]
-
-
-def test_frozen_with_an_empty_machine_nothing_is_recognised():
-    machine = EvolvingFSM(ACTIONS.n_actions, radius=1.0)
-    told = driven(machine=machine, learn=False, on=scenario(1.0))
-    assert machine.n_states == 0
-    assert all(d.situation.state is None for d in told.decisions)
-
-
-def test_of_an_episode_that_was_broken_off_nothing_follows():
-    def broken_off():
-        risk = LatentRisk(lowest=-2.5)
-        guard = Guard.of(Unrevised(ACTIONS), judge=risk)
-        for k in range(12):
-            situation = guard.recognise(np.array([50.0, 30.0 - k, 30.0 - k]), 0.25 * k)
-            guard.revise(situation, Proposal(-2.5))
-        return risk
-
-    risk, before = broken_off(), broken_off()
-    guard = Guard.of(Unrevised(ACTIONS), judge=risk)
-    situation = guard.recognise(np.array([9.0, 5.0, 5.0]), 0.0)
-    guard.revise(situation, Proposal(0.0))
-    guard.end(failed=False)
-    assert risk.manoeuvres.decels == before.manoeuvres.decels
-    np.testing.assert_array_equal(risk.brakes.full.rows, before.brakes.full.rows)
 
 
 def test_an_interval_that_is_no_multiple_of_the_steps_is_refused():

@@ -45,9 +45,6 @@ def guard(learn=True, **options):
     return Guard.of(reviser, machine=machine(), learn=learn, interval=0.25, **options)
 
 
-# -- The machine --------------------------------------------------------------------------------
-
-
 def test_an_incomplete_observation_is_rejected_unless_asked_for(snapshot):
     taught = machine()
     before = snapshot(taught)
@@ -109,9 +106,6 @@ def test_a_first_observation_must_be_whole_and_none_is_held_from_another_episode
         taught.observe([NAN, 1.0, 1.0], missing=Missing.HOLD)
 
 
-# -- Driving on less ----------------------------------------------------------------------------
-
-
 def test_the_less_is_seen_the_more_careful_it_gets():
     watch, risks = guard(), []
     for k in range(24):
@@ -164,9 +158,6 @@ def test_the_reviser_keeps_its_promise_with_a_gap_sensor_that_fails_half_the_tim
     seen = [decision.situation.intake is Intake.WHOLE for decision in driven.decisions]
     assert 0.3 < np.mean(seen) < 0.7
     assert not driven.collided
-
-
-# -- Time ---------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("time", "flag"), [(1.0, Intake.REPEATED), (0.4, Intake.LATE)])

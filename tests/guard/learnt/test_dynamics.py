@@ -7,13 +7,11 @@ from evofsm.guard.learnt.dynamics import Dynamics
 from evofsm.guard.learnt.library import Violations
 from evofsm.guard.learnt.regression import (
     are_misleading,
-    misled_by_lags,
 )
 from evofsm.guard.learnt.replay import (
     features,
     lags,
     limited,
-    n_features,
     residuals,
 )
 
@@ -73,25 +71,6 @@ def content(dynamics):
 # -- What an action does ------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("given", "why"),
-    [
-        ({}, "either"),
-        ({"low": 0.0}, "either"),
-        ({"low": 0.0, "high": 1.0, "n_actions": 2}, "either"),
-        ({"low": 1.0, "high": 0.0}, "below high"),
-        ({"low": [0.0, 0.0], "high": [1.0]}, "below high"),
-        ({"low": np.nan, "high": 1.0}, "low"),
-        ({"n_actions": 0}, "n_actions"),
-        ({"n_actions": 2, "horizon": 0}, "horizon"),
-        ({"n_actions": 2, "remembered": 1.5}, "remembered"),
-    ],
-)
-def test_settings_that_cannot_be_are_refused(given, why):
-    with pytest.raises(ValueError, match=why):
-        Dynamics(**given)
-
-
 def test_it_learns_what_a_car_does_but_nothing_of_the_failing_transition():
     one, other = taught(), taught()
     assert ahead(one, [40.0, 15.0, 14.0], 1.0, 1)[0] == pytest.approx(
@@ -134,15 +113,6 @@ def test_a_long_rest_at_an_end_teaches_nothing_of_what_an_action_does():
         follow(dynamics, Z, U)
         np.testing.assert_allclose(dynamics.weights[[7, 8], 1], effect, atol=0.01)
     assert dynamics.model.lowest[1] == 0.0
-
-
-def test_what_hardly_ever_changes_is_learnt_at_its_ends_too():
-    draw, dynamics = np.random.default_rng(0), Dynamics(-1.0, 1.0)
-    for _ in range(4):
-        flag = (np.arange(101) // 25 % 2).astype(float)
-        place = np.cumsum(np.append(0.0, draw.uniform(-1.0, 1.0, 100)))
-        follow(dynamics, np.column_stack([place, flag]), np.diff(place))
-    assert dynamics.weights[5, 0] == pytest.approx(1.0, abs=0.01)
 
 
 # -- Jumps, and ends ----------------------------------------------------------------------------
@@ -325,35 +295,6 @@ def test_lags_that_are_doubted_enough_are_left_out_until_they_foresee_again():
     assert np.abs(dynamics.weights[where]).max() < 1e-6
     dynamics.refute(np.arange(5, 40), 10)
     assert np.abs(dynamics.weights[where]).max() > 0.5
-
-
-def misled(course, starts):
-    """How much more is missed by who takes a latest change to go on than by who does not."""
-    one, none, weights = np.ones(1), np.zeros(1), np.zeros((n_features(1, 1, box=True), 1))
-    dynamics = coasting()
-    calm = dynamics.model._replace(
-        weights=weights, origin=none, reach=9.0 * one, least=-9.0 * one, most=9.0 * one
-    )
-    goes_on = calm._replace(weights=np.where(np.arange(len(weights))[:, None] == 2, 1.0, 0.0))
-    Z, U = np.array(course, float)[:, None], np.zeros((len(course) - 1, 1))
-    return misled_by_lags([goes_on, calm], Z, U, np.array(starts), 10, one)
-
-
-def test_what_stopped_is_missed_by_who_takes_it_to_go_on():
-    moved_once = [0.0] + [3.0] * 30
-    assert misled(moved_once, [1]) == 1.0  # no more, however far it is off
-    assert misled(moved_once, [4, 9, 20]) == 0.0  # it rests: both foresee that
-    assert misled(np.arange(31), range(1, 21)) == -1.0  # what goes on is missed by the other
-    assert misled(np.arange(31), [0]) == 0.0  # before an episode nothing moved
-
-
-@pytest.mark.parametrize(("starts", "failed"), [([55, 58], False), ([], False), ([5, 20], True)])
-def test_of_too_few_steps_or_a_failure_nothing_speaks_for_lags(starts, failed):
-    dynamics = coasting()
-    dynamics.doubt_of_lags = 0.5
-    dynamics.latest = dynamics.latest._replace(failed=failed)
-    dynamics.refute(np.array(starts, int), 10)
-    assert dynamics.doubt_of_lags == 0.5
 
 
 def test_where_certificates_were_violated_ever_more_often_disturbances_are_worse():

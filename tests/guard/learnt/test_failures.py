@@ -10,38 +10,28 @@ from evofsm.guard.learnt.failures import explain_failures
 EXACT = np.zeros((2, 2))
 
 
-def box(failures, lowest=(0.0, 0.0), highest=(10.0, 10.0), blur=EXACT):
-    ends = np.array(lowest), np.array(highest)
-    return explain_failures(np.array(failures), *ends, np.ones(2), blur)
+AMID = [[-0.1, 13.0], [0.1, 4.0], [0.2, 5.0], [0.3, 6.0]]
+ABOVE_ALONE = np.array([[0.0, 0.2], [0.2, 0.2]])  # who stands, does not fail for it
 
 
-def test_an_end_that_all_failures_are_beyond_is_enough():
-    assert box([[-1.0, 11.0], [-2.0, 5.0]]) == [(0, -1.0, 0.0)]
-
-
-def test_of_two_that_explain_the_first_failures_alike_both_hold():
-    assert set(box([[-1.0, 11.0]])) == {(0, -1.0, 0.0), (1, 1.0, 10.0)}
-
-
-def test_a_failure_amid_what_was_survived_is_explained_by_no_end():
-    assert box([[5.0, 5.0]]) == box([[0.5, 5.0]]) == []
-
-
-def test_noise_blurs_the_ends_so_the_innermost_failure_says_where():
-    assert box([[0.6, 5.0], [0.2, 4.0]], blur=EXACT + 0.2) == [(0, -1.0, 0.6)]
-    assert box([[9.4, 5.0]], blur=EXACT + 0.2) == [(0, 1.0, 9.4)]
-    assert box([[2.0, 5.0]], blur=EXACT + 0.2) == []  # farther in than any noise
-
-
-def test_where_a_variable_saturates_nothing_is_blurred():
-    """Who stands, stands at the end of its range, and does not fail for it."""
-    only_above = np.array([[0.0, 0.2], [0.2, 0.2]])
-    assert box([[0.0, 5.0]], blur=only_above) == []
-
-
-def test_of_ends_that_explain_as_many_the_one_that_may_explain_most_is_taken():
-    failures = [[-0.1, 13.0], [0.1, 4.0], [0.2, 5.0], [0.3, 6.0]]
-    assert box(failures, blur=EXACT + 0.2) == [(0, -1.0, 0.3)]
+@pytest.mark.parametrize(
+    ("failures", "blur", "ends"),
+    [
+        ([[-1.0, 11.0], [-2.0, 5.0]], EXACT, {(0, -1.0, 0.0)}),  # that explains all of them
+        ([[-1.0, 11.0]], EXACT, {(0, -1.0, 0.0), (1, 1.0, 10.0)}),  # of one it may be either
+        ([[5.0, 5.0]], EXACT, set()),  # amid what was survived
+        ([[0.5, 5.0]], EXACT, set()),
+        ([[0.6, 5.0], [0.2, 4.0]], EXACT + 0.2, {(0, -1.0, 0.6)}),  # the innermost says where
+        ([[9.4, 5.0]], EXACT + 0.2, {(0, 1.0, 9.4)}),
+        ([[9.4, 5.0], [9.8, 4.0]], EXACT + 0.2, {(0, 1.0, 9.4)}),
+        ([[2.0, 5.0]], EXACT + 0.2, set()),  # farther in than any noise
+        ([[0.0, 5.0]], ABOVE_ALONE, set()),  # where a variable saturates nothing is blurred
+        (AMID, EXACT + 0.2, {(0, -1.0, 0.3)}),  # the one that may explain most
+    ],
+)
+def test_failures_are_explained_by_ends_of_what_was_survived(failures, blur, ends):
+    found = explain_failures(np.array(failures), np.zeros(2), np.full(2, 10.0), np.ones(2), blur)
+    assert set(found) == ends
 
 
 @pytest.mark.parametrize("blur", [0.0, 0.1])

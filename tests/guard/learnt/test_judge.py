@@ -23,15 +23,15 @@ def kept(said):
     return [same_action(one.executed, one.proposed) for one in said]
 
 
-# -- What it learns -----------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("seed", [0, *(pytest.param(k, marks=pytest.mark.slow) for k in (1, 2))])
 def test_after_a_failure_or_two_it_keeps_a_bad_controller_from_failing(point, seed):
     guard = point.guard(seed=seed)
     assert 1 <= sum(point.play(guard, 1000 * seed + k)[1] for k in range(6)) <= 2
     guard.freeze()
     held_out = [point.play(guard, 90_000 + k) for k in range(10)]
+    as_it_was = next(one for one in held_out[0][0] if same_action(one.executed, one.proposed))
+    assert 0.0 <= as_it_was.interval[0] <= as_it_was.risk_executed <= as_it_was.interval[1] <= 1.0
+    assert as_it_was.evidence > 0.0  # of what is remembered
     assert not any(failed for _, failed in held_out)
     assert 0.25 < np.mean([one for said, _ in held_out for one in kept(said)]) < 0.95
     alone = point.guard(mode=Mode.OFF)
@@ -54,14 +54,6 @@ def test_told_what_failure_is_it_keeps_from_the_first_one(point):
     assert not any(point.play(guard, 100 + k)[1] for k in range(5))
 
 
-def test_its_risk_lies_in_its_interval_and_rests_on_what_is_remembered(point):
-    guard = point.taught(4)
-    said, _ = point.play(guard, 9)
-    as_it_was = next(one for one in said if same_action(one.executed, one.proposed))
-    assert 0.0 <= as_it_was.interval[0] <= as_it_was.risk_executed <= as_it_was.interval[1] <= 1.0
-    assert as_it_was.evidence > 0.0  # of what is remembered
-
-
 def test_where_all_that_it_may_remember_are_lost_its_interval_has_no_end(points):
     judge = points["box"].taught(10).judge
     most = judge.dynamics.remembered
@@ -74,49 +66,70 @@ def test_where_all_that_it_may_remember_are_lost_its_interval_has_no_end(points)
         assert one.risk[0] == 1.0 if one.dead_end else one.risk[0] < one.risk[2]
 
 
-@pytest.mark.parametrize("steps", [30, 1100])
-def test_what_is_noted_of_a_decision_belongs_to_its_observation(points, monkeypatch, steps):
-    """Although the first observations lack something, and a long episode is studied in parts."""
-    guard, noted, refused = points["box"].taught(4), [], {}
-    add = library.noted
+def long_episode(guard, steps, seen=lambda t, z: z):
+    """Observations of an episode without a failure that may go on and on, and what was decided."""
+    rng, z, course, said = np.random.default_rng(3), np.zeros(2), [], []
+    for t in range(steps):
+        course.append(z)
+        said.append(guard.decide(seen(t, z), float(rng.uniform(-0.2, 1.0))))
+        speed = 0.9 * z[1] + 0.02 * said[-1].executed + 0.002 * rng.normal()
+        z = np.array([z[0] + speed, speed])
+    return [*course, z], said
 
-    def note(situations, episode, tight, *others):
-        noted.extend(zip(episode.observations[:-1], tight, strict=False))
+
+@pytest.fixture
+def noted(monkeypatch):
+    """Of each episode that is noted: its actions, observations and what was refused there."""
+    found, add = [], library.noted
+
+    def listen(situations, episode, tight, *others):
+        found.append((len(episode.actions), episode.observations[:-1].tolist(), list(tight)))
         return add(situations, episode, tight, *others)
 
-    monkeypatch.setattr(library, "noted", note)
-    rng = np.random.default_rng(3)
-    z = np.zeros(2)
-    for t in range(steps):
-        seen = z if t > 3 else np.array([z[0], np.nan])
-        said = guard.decide(seen, float(rng.uniform(-0.2, 1.0)))
-        refused[tuple(z)] = not same_action(said.executed, said.proposed)
-        speed = 0.9 * z[1] + 0.02 * said.executed + 0.002 * rng.normal()
-        z = np.array([z[0] + speed, speed])
-    guard.end(False, z)
-    assert len(noted) >= steps - 6
-    assert any(tight for _, tight in noted)
-    assert all(tight == refused[tuple(observed)] for observed, tight in noted)
+    monkeypatch.setattr(library, "noted", listen)
+    return found
+
+
+@pytest.mark.parametrize("steps", [30, 1100])
+def test_what_is_noted_of_a_decision_belongs_to_its_observation(points, noted, steps):
+    """Although the first observations lack something, and a long episode is studied in parts."""
+    guard = points["box"].taught(4)
+    del noted[:]
+    course, said = long_episode(guard, steps, lambda t, z: z if t > 3 else [z[0], np.nan])
+    guard.end(False, course[-1])
+    refused = {tuple(z): not kept_it for z, kept_it in zip(course[:-1], kept(said), strict=True)}
+    pairs = [pair for _, seen, tight in noted for pair in zip(seen, tight, strict=False)]
+    assert len(pairs) >= steps - 6
+    assert any(tight for _, tight in pairs)
+    assert all(tight == refused[tuple(z)] for z, tight in pairs)
 
 
 def test_an_episode_that_goes_on_and_on_is_studied_and_goes_on(points):
     """What is remembered of it is bounded, and what was learnt is used before its end."""
     point, guard = points["box"], points["box"].taught(2)
     before = guard.judge.n_studied
-    z, said = np.zeros(2), []
-    rng = np.random.default_rng(0)
-    for _ in range(1100):
-        said.append(guard.decide(z, float(rng.uniform(-0.2, 1.0))))
-        speed = 0.9 * z[1] + 0.02 * said[-1].executed + 0.002 * rng.normal()
-        z = np.array([z[0] + speed, speed])
-    assert z[0] < 1.0
+    course, said = long_episode(guard, 1100)
+    assert course[-1][0] < 1.0
     assert guard.judge.n_studied == guard.judge.dynamics.n_episodes == before + 1
     assert not all(kept(said[1030:]))
-    guard.end(False, z)
+    guard.end(False, course[-1])
     assert not point.play(guard, 7)[1]
 
 
-# -- Bit for bit --------------------------------------------------------------------------------
+def test_what_came_before_a_gap_in_time_is_learnt_from_as_at_an_end(points, noted):
+    """With all that the judge noted on the way, such as which proposals were refused."""
+    guards = [points["box"].taught(4) for _ in range(2)]
+    del noted[:]
+    for guard in guards:
+        for k in range(40):
+            guard.decide([0.024 * k, 0.08], 1.0, time=0.1 * k)
+    guards[0].decide([0.0, 0.0], 1.0, time=60.0)
+    guards[1].end(False)
+    before_a_gap, at_the_end = noted
+    assert before_a_gap == at_the_end
+    steps, _, tight = at_the_end
+    assert len(tight) == steps + 1 == 40
+    assert any(tight)
 
 
 def test_the_same_seed_learns_the_same_and_another_one_something_else(point, exactly, content):
@@ -125,18 +138,8 @@ def test_the_same_seed_learns_the_same_and_another_one_something_else(point, exa
     assert exactly(point.play(one, 50)[0]) == exactly(point.play(same, 50)[0])
 
 
-def test_frozen_it_repeats_its_decisions_and_learns_nothing(point, exactly, content):
-    guard = point.taught(3)
-    guard.freeze()
-    before = content(guard)
-    first = point.play(guard, 50)[0]
-    point.play(guard, 51)
-    assert exactly(point.play(guard, 50)[0]) == exactly(first)
-    assert content(guard) == before
-
-
 @pytest.mark.parametrize("how", [lambda guard: guard.copy(), copy.deepcopy, pickle.dumps])
-def test_a_copy_goes_on_the_same_and_by_itself(point, exactly, content, how):
+def test_a_copy_goes_on_the_same_by_itself_until_it_is_frozen(point, exactly, content, how):
     guard = point.taught(3)
     before = content(guard)
     twin = how(guard)
@@ -145,6 +148,10 @@ def test_a_copy_goes_on_the_same_and_by_itself(point, exactly, content, how):
     ahead = [exactly(point.play(twin, 60 + k)[0]) for k in range(2)]
     assert content(guard) == before
     assert [exactly(point.play(guard, 60 + k)[0]) for k in range(2)] == ahead
+    assert content(guard) == content(twin)
+    guard.freeze()
+    first, _, again = (exactly(point.play(guard, k)[0]) for k in (50, 51, 50))
+    assert first == again
     assert content(guard) == content(twin)
 
 
@@ -163,9 +170,6 @@ def test_a_log_is_replayed_learning_and_frozen(point, tmp_path):
     assert found.contents.spoke > 20
 
 
-# -- Looking on ---------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("mode", [Mode.SHADOW, Mode.ADVISE])
 def test_looking_on_it_changes_nothing_and_learns_no_margin(point, mode):
     guard = point.guard(mode=mode)
@@ -177,10 +181,7 @@ def test_looking_on_it_changes_nothing_and_learns_no_margin(point, mode):
     assert guard.judge.dynamics.n_episodes == 4
 
 
-# -- Observations as they come in life ----------------------------------------------------------
-
-
-def test_what_is_not_seen_now_and_then_does_not_keep_it_from_deciding(point, exactly):
+def test_what_is_not_seen_now_and_then_does_not_keep_it_from_deciding(point):
     def seen(k, z):
         return np.where([k % 7 == 3, *[False] * (len(z) - 1)], math.nan, z)
 
@@ -190,96 +191,52 @@ def test_what_is_not_seen_now_and_then_does_not_keep_it_from_deciding(point, exa
     assert not all(kept(said))
     assert all(np.isfinite(one.executed).all() for one in said)
     guard.freeze()
-    nothing = guard.decide(np.full(2 * point.places, math.nan), point.propose(guard_rng()))
+    nothing = guard.decide(
+        np.full(2 * point.places, math.nan), point.propose(np.random.default_rng(0))
+    )
     assert same_action(nothing.executed, nothing.proposed)
     assert math.isnan(nothing.risk_proposed)
     assert "was observed" in nothing.reason
-    guard.begin()
-    again = [exactly(point.play(guard, 31, seen=seen)[0]) for _ in range(2)]
-    assert again[0] == again[1]
-
-
-def guard_rng():
-    return np.random.default_rng(0)
 
 
 def test_after_a_gap_in_time_nothing_follows_from_what_was(points):
-    point = points["box"]
-    one, other = point.taught(3), point.taught(3)
-    for guard in (one, other):
-        guard.freeze()
-    one.decide([-0.5, 0.0], 1.0, time=0.0)
-    after = one.decide([0.5, 0.05], 1.0, time=9.0)
-    fresh = other.decide([0.5, 0.05], 1.0, time=0.0)
+    frozen, learning = points["box"].taught(3), points["box"].taught(3)
+    frozen.freeze()
+    fresh = frozen.decide([0.5, 0.05], 1.0, time=0.0)
+    frozen.begin()
+    frozen.decide([-0.5, 0.0], 1.0, time=0.0)
+    after = frozen.decide([0.5, 0.05], 1.0, time=9.0)
     assert (after.executed, after.risk_proposed) == (fresh.executed, fresh.risk_proposed)
-    learning = point.taught(3)
-    episodes = learning.judge.dynamics.n_episodes
     for k in range(20):
         learning.decide([0.01 * k, 0.01], 0.1, time=0.1 * k)
     learning.decide([0.9, 0.01], 0.1, time=60.0)
-    assert learning.judge.dynamics.n_episodes == learning.judge.n_studied == episodes + 1
-    assert learning.judge.dynamics.sums.most[0] < 0.3  # the leap was not learnt
+    dynamics = learning.judge.dynamics
+    assert dynamics.n_episodes == learning.judge.n_studied == 4
+    assert dynamics.sums.most[0] < 0.3  # the leap was not learnt
 
 
-def test_what_came_before_a_gap_in_time_is_learnt_from_as_at_an_end(points, monkeypatch):
-    """With all that the judge noted on the way, such as which proposals were refused."""
-    noted, add = [], library.noted
-
-    def listen(situations, episode, tight, horizon, random):
-        noted.append((len(episode.actions), list(tight)))
-        return add(situations, episode, tight, horizon, random)
-
-    guards = [points["box"].taught(4) for _ in range(2)]
-    monkeypatch.setattr(library, "noted", listen)
-    for guard in guards:
-        for k in range(40):
-            guard.decide([0.024 * k, 0.08], 1.0, time=0.1 * k)
-    guards[0].decide([0.0, 0.0], 1.0, time=60.0)
-    guards[1].end(False)
-    (steps, tight), ended = noted
-    assert (steps, tight) == ended
-    assert len(tight) == steps + 1 == 40
-    assert any(tight)
+@pytest.mark.parametrize(
+    ("told", "why"),
+    [
+        ({}, "either low and high, or n_actions"),
+        ({"low": 0.0, "high": 1.0, "n_actions": 2}, "either"),
+        ({"low": 1.0, "high": 0.0}, "below high"),
+        ({"low": [0.0, 0.0], "high": [1.0]}, "below high"),
+        ({"n_actions": 0}, "n_actions"),
+        ({"n_actions": 2, "without": ("luck",)}, "without names"),
+        ({"n_actions": 2, "dt": 0.0}, "dt"),
+        ({"n_actions": 2, "horizon": 0.0}, "horizon"),
+    ],
+)
+def test_settings_that_cannot_be_are_refused(told, why):
+    with pytest.raises(ValueError, match=why):
+        LearntRisk(**({"dt": 0.1} | told))
 
 
-def test_an_observation_that_comes_twice_is_taken_in_once(points, content):
-    point = points["box"]
-    once, twice = point.taught(3), point.taught(3)
-    for k in range(10):
-        z = [0.05 * k, 0.05]
-        for guard in (once, twice):
-            said = guard.decide(z, 1.0, time=0.1 * k)
-        assert twice.decide(z, 1.0, time=0.1 * k).executed == said.executed
-    for guard in (once, twice):
-        guard.end(False, [0.5, 0.0])
-    assert content(once)["judge"] == content(twice)["judge"]
-
-
-def test_a_refused_input_leaves_it_as_it_was(point, exactly, content):
-    guard, other = point.taught(3), point.taught(3)
-    m, proposal = 2 * point.places, point.propose(guard_rng())
-    for observation, wanted in (
-        (np.zeros(m + 1), proposal),
-        (np.full(m, math.inf), proposal),
-        (np.full(m, 1e200), proposal),
-        (np.zeros((1, m)), proposal),
-        (["a"] * m, proposal),
-        (np.zeros(m), "push"),
-    ):
-        with pytest.raises((TypeError, ValueError)):
-            guard.decide(observation, wanted)
-    assert content(guard) == content(other)
-    assert exactly(point.play(guard, 5)[0]) == exactly(point.play(other, 5)[0])
-    assert content(guard) == content(other)
-
-
-def test_by_itself_it_says_what_it_lacks():
-    with pytest.raises(ValueError, match="either low and high, or n_actions"):
-        LearntRisk(0.1)
-    with pytest.raises(ValueError, match="without names"):
-        LearntRisk(0.1, n_actions=2, without=("luck",))
-    with pytest.raises(ValueError, match="dt"):
-        LearntRisk(0.0, n_actions=2)
+def looking(points, time_to_failure, horizon, believed=144.0):
+    judge = points["box"].guard(horizon=None).judge
+    judge.time_to_failure, judge.horizon, judge.believed = time_to_failure, horizon, believed
+    return judge
 
 
 def look(judge, after, *, refuted=False, fails_after=0.0, failed=False):
@@ -290,34 +247,31 @@ def look(judge, after, *, refuted=False, fails_after=0.0, failed=False):
 
 
 @pytest.mark.parametrize(
-    ("told", "looks"),
+    ("told", "least", "most"),
     [
-        ({"refuted": True}, "less far"),  # it went on for the whole horizon
-        ({}, "as far"),
-        ({"refuted": True, "failed": True}, "as far"),  # they were dead ends
-        ({"fails_after": 90.0}, "farther"),  # what was refused would have failed as late
+        ({"refuted": True}, 0.0, 0.9),  # it went on for the whole horizon: it looks less far
+        ({}, 0.95, 1.05),
+        ({"refuted": True, "failed": True}, 0.95, 1.05),  # they were dead ends
+        ({"fails_after": 90.0}, 2.0, 9.0),  # what was refused would have failed as late
     ],
 )
-def test_the_horizon_follows_what_became_of_dead_ends(points, told, looks):
-    judge = points["box"].guard(horizon=None).judge
-    judge.time_to_failure, judge.horizon, judge.believed = 40.0, 60, 144.0
-    ratio = look(judge, 5, **told) / 40.0
-    expected = {"less far": ratio < 0.9, "as far": 0.95 < ratio < 1.05, "farther": ratio > 2.0}
-    assert expected[looks]
+def test_the_horizon_follows_what_became_of_dead_ends(points, told, least, most):
+    judge = looking(points, 40.0, 60)
+    assert least < look(judge, 5, **told) / 40.0 < most
     assert judge.horizon == int(min(max(1.5 * judge.time_to_failure, 32), 144))
 
 
 def test_what_was_refuted_is_believed_again_little_by_little(points):
     """Else a model that says that all fails late looks as far again an episode later."""
-    judge = points["box"].guard(horizon=None).judge
-    judge.time_to_failure, judge.horizon, judge.believed = 90.0, 135, 144.0
+    judge = looking(points, 90.0, 135)
     refuted = look(judge, 130, refuted=True)
     assert refuted < 90.0
     later = [look(judge, 130) for _ in range(40)]
     assert refuted < later[0] < 1.05 * refuted
     assert later == sorted(later)
     assert later[-1] == 130.0
-    judge.time_to_failure, judge.believed, judge._was_certified = 40.0, 30.0, True
+    judge = looking(points, 40.0, 60, believed=30.0)
+    judge._was_certified = True
     assert look(judge, 5, failed=True) > 50.0  # who failed although certified looks farther
 
 
@@ -372,44 +326,45 @@ def test_what_an_interrupt_breaks_off_is_not_learnt_at_all(points, content, monk
     assert content(guard)["judge"] == content(other)["judge"]
 
 
-def test_after_a_drift_the_margin_begins_anew(point, monkeypatch):
+def drift(judge, patch):
+    study = Dynamics._study
+
+    def drifting(dynamics, *, failed):
+        dynamics.drifts = [Drift(0, dynamics.n_episodes, dynamics.n_episodes)]
+        study(dynamics, failed=failed)
+
+    patch.setattr(Dynamics, "_study", drifting)
+
+
+def violate(judge, patch):
+    learn, judge.violations = LearntRisk.learn, Violations(share=0.0)
+
+    def violated(judge, *given):
+        learn(judge, *given)
+        judge._violated = True  # as by what was never seen before
+
+    patch.setattr(LearntRisk, "learn", violated)
+
+
+@pytest.mark.parametrize(
+    ("change", "episodes", "said"),
+    [
+        (drift, 1, "since episode 5 variable 1 moves otherwise"),
+        (violate, 3, "since episode 5 disturbances are worse"),
+    ],
+)
+def test_after_a_change_the_margin_begins_anew(point, monkeypatch, change, episodes, said):
     guard = point.taught(4)
-    judge, dynamics = guard.judge, guard.judge.dynamics
-    judge.margin = 0.1
-    study = type(dynamics)._study
-
-    def drifting(self, *, failed):
-        self.drifts = [Drift(0, self.n_episodes, self.n_episodes)]
-        study(self, failed=failed)
-
-    monkeypatch.setattr(type(dynamics), "_study", drifting)
-    point.play(guard, 50)
-    assert judge.margin > 2.0
-    assert "since episode 5 variable 1 moves otherwise" in judge.told_by_experience
+    guard.judge.margin = 0.1
+    change(guard.judge, monkeypatch)
+    for episode in range(40, 40 + episodes):
+        point.play(guard, episode)
+    assert said in guard.judge.told_by_experience
+    assert guard.judge.disturbance_scale == 1.44  # harder again
+    assert guard.judge.margin > 2.0
     monkeypatch.undo()
     point.play(guard, 51)
-    assert judge.margin < 3.0
-
-
-def test_where_certificates_are_violated_in_every_episode_disturbances_are_harder_again(
-    point, monkeypatch
-):
-    guard = point.taught(4)
-    judge = guard.judge
-    judge.violations, judge.margin = Violations(share=0.0), 0.1
-    learn = type(judge).learn
-
-    def violated(self, *given):
-        learn(self, *given)
-        self._violated = True  # as by what was never seen before
-
-    monkeypatch.setattr(type(judge), "learn", violated)
-    for episode in range(40, 43):
-        point.play(guard, episode)
-    assert judge.violations.worse == 4
-    assert "since episode 5 disturbances are worse" in judge.told_by_experience
-    assert judge.disturbance_scale == 1.44
-    assert judge.margin > 2.0
+    assert guard.judge.margin < 3.0
 
 
 def test_where_sensors_are_noisy_a_margin_stays(noisy):
