@@ -57,15 +57,6 @@ def test_a_loaded_model_has_every_field_of_the_saved_one(make, grown, tmp_path):
             assert type(value) is type(expected) or field.name == "width"
 
 
-def test_a_machines_file_is_no_models_and_the_reverse(grown, tmp_path):
-    grown.save(tmp_path / "file")
-    with pytest.raises(ValueError, match="holds a machine, not a model"):
-        FSMModel.load(tmp_path / "file")
-    grown.model().save(tmp_path / "file")
-    with pytest.raises(ValueError, match="holds a model, not a machine"):
-        EvolvingFSM.load(tmp_path / "file")
-
-
 def test_numbers_of_every_size_are_kept_and_read_again(snapshot, tmp_path):
     """What can be learnt can be kept: whatever the observations, the rule, and who is given up."""
     random = np.random.default_rng(0)

@@ -8,7 +8,6 @@ import pytest
 
 from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.rules import Novelty
-from evofsm.fsm.step import Event
 
 LEARNT = (
     "n_states",
@@ -76,17 +75,6 @@ def test_a_batch_of_no_rows_changes_nothing(grown, snapshot):
 # -- Actions and episodes ----------------------------------------------------------------------
 
 
-def test_an_observation_without_an_action_before_it_teaches_no_transition(grown):
-    grown.start_episode()
-    grown.observe([3.0, 1.0])
-    matrices, frequency = grown.transition_matrices, grown.origin_frequency
-    step = grown.observe([3.1, 1.0])
-    assert (step.event, step.predicted.shape) == (Event.NONE, (0,))
-    assert np.isnan(step.surprise)
-    assert grown.transition_matrices.tolist() == matrices.tolist()
-    assert grown.origin_frequency.tolist() == frequency.tolist()
-
-
 def test_a_new_episode_clears_the_belief_and_nothing_else(grown):
     n = grown.n_states
     before = {name: getattr(grown, name) for name in LEARNT}
@@ -97,26 +85,7 @@ def test_a_new_episode_clears_the_belief_and_nothing_else(grown):
         np.testing.assert_array_equal(getattr(grown, name), before[name])
 
 
-def test_learn_one_observes_and_then_acts(snapshot):
-    one, two = new_machine(), new_machine()
-    for z, i in (([0.0], 1), ([1.0], 2), ([0.4], 0)):
-        step = one.learn_one(z, i)
-        expected = two.observe(z)
-        two.act(i)
-        assert step.belief.tolist() == expected.belief.tolist()
-        np.testing.assert_array_equal(step.surprise, expected.surprise)
-    assert snapshot(one) == snapshot(two)
-
-
 # -- What a machine shows ----------------------------------------------------------------------
-
-
-def test_a_denser_observation_moves_the_nearest_state_if_closer_than_the_radius():
-    Z = [[0.0], [0.1], [2.0], [1.0]]
-    for radius, event in ((1.5, Event.MOVED), (0.5, Event.CREATED)):
-        machine = EvolvingFSM(n_actions=1, radius=radius)
-        assert machine.learn_many(Z, [0] * 4).event.tolist() == [Event.CREATED, 0, 0, event]
-        assert machine.centers[-1].tolist() == [1.0]
 
 
 def test_a_step_keeps_its_arrays_when_the_machine_goes_on(grown):
@@ -137,20 +106,6 @@ def test_a_copy_goes_its_own_way(grown, snapshot, duplicate):
     assert snapshot(grown) == before
     grown.learn_many([[5.0, 5.0], [0.0, 0.1]], [0, 1])
     assert snapshot(twin) == snapshot(grown)
-
-
-def test_a_constructor_argument_is_an_attribute_of_the_same_name():
-    settings = {
-        "n_actions": 4,
-        "radius": 0.5,
-        "distance_weight": 0.7,
-        "learning_rate": 0.2,
-        "prior_frequency": 0.1,
-        "spread": 2.0,
-    }
-    machine = EvolvingFSM(**settings)
-    assert {name: getattr(machine, name) for name in settings} == settings
-    assert repr(eval(repr(machine))) == repr(machine)
 
 
 def test_changes_count_the_steps_of_the_recognised_state_within_episodes(grown):

@@ -56,12 +56,6 @@ def test_batches_learn_what_the_whole_does_and_fit_starts_anew():
     assert np.array_equal(parts.fit(Z).cluster_centers_, whole.cluster_centers_)
 
 
-def test_settings_that_cannot_be_are_refused_when_it_learns():
-    clusterer = EvolvingClusterer().set_params(radius=-1.0)
-    with pytest.raises(ValueError, match=r"radius is -1\.0; it must be a positive"):
-        clusterer.fit(walk())
-
-
 def test_names_of_columns_are_kept_and_held_to():
     frame = polars.DataFrame(walk(), schema=["gap", "speed", "leader"])
     clusterer = EvolvingClusterer().fit(frame)
