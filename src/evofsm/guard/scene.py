@@ -57,8 +57,8 @@ _CONSTANT = 1e-6
 _EXACT = 1e-4
 # Objects that have to be seen twice before anything is learnt, times the numbers of oneself.
 _ROWS = 10
-# Shares of a step after which a distance is taken.
-_SHARES = np.arange(6) / 5
+# Points of a step at which a distance is taken, its two ends included.
+_POINTS = 6
 # Shapes of the box around an object that are tried: how much longer than wide, as powers of e.
 _SHAPES = np.linspace(-3.5, 3.5, 29)
 # Closest steps that were survived, of which each counts.
@@ -479,10 +479,24 @@ class Contact(NamedTuple):
 
 def _closest(start: _Floats, end: _Floats, sides: _Floats) -> _Floats:
     """How close it comes between two places: the least of ``max(abs(x) / sides)`` on the line."""
-    least, way = np.asarray(np.inf), end - start
-    for share in _SHARES:
-        least = np.minimum(least, (np.abs(start + share * way) / sides).max(axis=-1))
+    start, end = np.broadcast_arrays(start, end)
+    least = np.empty(start.shape[:-1])
+    first, last = (np.ascontiguousarray(of).reshape(-1, len(sides)) for of in (start, end))
+    _closest_on_lines(first, last, sides, least.reshape(-1))
     return least
+
+
+@compiled
+def _closest_on_lines(start: _Floats, end: _Floats, sides: _Floats, least: _Floats) -> None:
+    for k in range(len(least)):
+        least[k] = np.inf
+        for point in range(_POINTS):
+            share = point / (_POINTS - 1)
+            far = 0.0
+            for i in range(len(sides)):
+                at = start[k, i] + share * (end[k, i] - start[k, i])
+                far = max(far, abs(at) / sides[i])
+            least[k] = min(least[k], far)
 
 
 # -- What is remembered, and forecast from it ---------------------------------------------------

@@ -280,8 +280,8 @@ class Table:
 class CsvTable(Table):
     """A CSV file, gzipped or not, with a header; fields end at a comma, a semicolon or a tab.
 
-    polars reads blocks of plain lines; Python's own reader, which is slower, blocks with quotes or
-    anything odd, and what a message is to name.
+    polars reads blocks of plain lines; Python's own reader, which is slower, blocks with anything
+    odd, such as a line break within quotes, and what a message is to name.
     """
 
     def __init__(self, path: str, on_read: OnRead = silent) -> None:
@@ -294,6 +294,9 @@ class CsvTable(Table):
         text = self._decoded(header, 0).removeprefix("\ufeff").rstrip("\r")
         self._separator = max(",;\t", key=text.count)
         self.columns = [name.strip() for name in self._split(text, 1)]
+        # With nothing in it that has a meaning; polars is not to be left alone with others.
+        quoted = f'"[^"{self._separator}\\r\\n]*"(?=[{self._separator}\\r\\n])'
+        self._quoted = re.compile(quoted.encode())
         self._first_row = self._split(first.decode(errors="replace").rstrip("\r"), 2)
         if all(_is_number(name) for name in self.columns):
             raise ValueError(
@@ -345,7 +348,7 @@ class CsvTable(Table):
         """The columns, numbers as such; None where anything is odd."""
         import polars
 
-        if b'"' in block:
+        if b'"' in block and 2 * len(self._quoted.findall(block)) != block.count(b'"'):
             return None
         # As polars calls columns, for there may be two of one name.
         kinds: dict[str, Any] = {f"column_{k + 1}": polars.String for k in range(len(self.columns))}
