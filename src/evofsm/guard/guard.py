@@ -799,9 +799,12 @@ class Guard:
         0.25
         """
         kept, files = store.read(path, KIND)
-        if kept["failed"] and failed is None:
-            raise ValueError("this guard knew failures by a function; give it again: failed=")
         with store.explained(path):
+            for name in ("failed", "learn"):
+                if not isinstance(kept[name], bool):
+                    raise ValueError(f"{name} is {kept[name]!r}; it must be true or false")
+            if kept["failed"] and failed is None:
+                raise ValueError("this guard knew failures by a function; give it again: failed=")
             given = None if isinstance(judge, type) else judge
             parts = rebuild(kept, *_loaded(kept, files, judge), given)
             return cls.of(
