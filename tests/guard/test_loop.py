@@ -27,19 +27,17 @@ def scenario(duration=10.0, **others):
     return Scenario(LEADER, initial_gap=8.0, duration=duration, **others)
 
 
-class Script:
+def script(*lines):
     """Proposes what is written for a decision; the last for all that follow."""
+    left = list(lines)
 
-    def __init__(self, *lines):
-        self.lines = lines
-        self.seen = []
-
-    def propose(self, observation, time=0.0):
-        self.seen.append((observation, time))
-        line = self.lines[min(len(self.seen), len(self.lines)) - 1]
+    def propose(observation):
+        line = left.pop(0) if len(left) > 1 else left[0]
         if isinstance(line, Exception):
             raise line
-        return line if isinstance(line, Proposal) else Proposal(line)
+        return line
+
+    return propose
 
 
 class Listening(LatentRisk):
@@ -82,14 +80,14 @@ def test_decisions_are_those_of_the_record():
 def test_realised_is_what_the_body_did_whatever_the_sensors_show():
     weak = Body(lowest=-1.0, highest=1.0)
     blind = Sensors(gap_noise=1.0, speed_noise=0.5, delay=0.3)
-    told = driven(Script(2.0), on=scenario(2.0, body=weak, sensors=blind))
+    told = driven(script(2.0), on=scenario(2.0, body=weak, sensors=blind))
     assert [d.realised for d in told.decisions] == [pytest.approx(1.0)] * 8
     assert (told.executed == 2.0).all()
 
 
 def test_a_collision_ends_the_last_decision_early_and_is_learnt_as_a_failure():
     machine = EvolvingFSM(ACTIONS.n_actions, radius=1.0)
-    told = driven(Script(2.5), machine=machine)
+    told = driven(script(2.5), machine=machine)
     assert told.collided
     assert math.isfinite(told.decisions[-1].realised)
     assert told.decisions[-1].situation.time < told.time[-1]
@@ -109,9 +107,8 @@ def test_a_collision_ends_the_last_decision_early_and_is_learnt_as_a_failure():
 )
 def test_a_controller_that_fails_once_is_driven_on_without(line, caplog):
     risk = LatentRisk(lowest=-2.5)
-    script = Script(1.0, 1.0, line, 1.0)
     with caplog.at_level(logging.WARNING, logger="evofsm"):
-        told = driven(script, Unrevised(ACTIONS), judge=risk, on=scenario(3.0))
+        told = driven(script(1.0, 1.0, line, 1.0), Unrevised(ACTIONS), judge=risk, on=scenario(3.0))
     assert len(caplog.records) == 1
     assert "controller" in caplog.text
     assert "0.5 s" in caplog.text
@@ -143,7 +140,7 @@ def test_machine_and_risk_are_told_what_was_executed(learn, monkeypatch):
 
     monkeypatch.setattr(EvolvingFSM, "act", listen)
     risk = Listening(lowest=-2.5)
-    told = driven(Script(1.0), AlwaysBrake(ACTIONS), machine=machine, judge=risk, learn=learn)
+    told = driven(script(1.0), AlwaysBrake(ACTIONS), machine=machine, judge=risk, learn=learn)
     seen = [d.situation.observation.tolist() for d in told.decisions]
     how = "learn" if learn else "follow"
     assert list(risk.told) == [(how, *one) for one in zip(seen, told.executed, strict=True)]

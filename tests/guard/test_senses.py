@@ -45,14 +45,6 @@ def guard(learn=True, **options):
     return Guard.of(reviser, machine=machine(), learn=learn, interval=0.25, **options)
 
 
-def test_an_incomplete_observation_is_rejected_unless_asked_for(snapshot):
-    taught = machine()
-    before = snapshot(taught)
-    with pytest.raises(ValueError, match="observation"):
-        taught.observe([NAN, 15.0, 15.0])
-    assert snapshot(taught) == before
-
-
 @pytest.mark.parametrize("missing", [Missing.PARTIAL, Missing.HOLD])
 def test_an_incomplete_observation_teaches_nothing_but_that_it_failed(missing):
     taught = machine()
