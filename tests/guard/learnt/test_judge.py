@@ -253,6 +253,19 @@ def test_the_horizon_follows_what_became_of_dead_ends(points, told, least, most)
     assert judge.horizon == int(min(max(1.5 * judge.time_to_failure, 32), 144))
 
 
+def test_what_was_refuted_is_believed_again_little_by_little(points):
+    """Else a model that says that all fails late looks as far again an episode later."""
+    judge, lasts = points["box"].guard(horizon=None).judge, []
+    judge.time_to_failure, judge.horizon, judge.believed = 90.0, 135, 144.0
+    for episode in range(41):
+        judge._look_ahead(130, refuted=episode == 0, failed=False)
+        lasts.append(judge.time_to_failure)
+    assert lasts[0] < 90.0
+    assert lasts[0] < lasts[1] < 1.05 * lasts[0]
+    assert lasts == sorted(lasts)
+    assert lasts[-1] == 130.0
+
+
 def test_a_question_changes_nothing_of_what_is_learnt(point, content):
     asked, unasked = point.guard(horizon=None), point.guard(horizon=None)
 
