@@ -12,6 +12,7 @@ from evofsm.driving.judge import LatentRisk
 from evofsm.driving.measures import TimeToCollision
 from evofsm.driving.revisers import AlwaysBrake, EnvelopeReviser, Unrevised
 from evofsm.fsm.actions import IntervalActions
+from evofsm.guard.actions import nearest_bounds
 from evofsm.guard.api import Judgement, Proposal, Situation
 from evofsm.guard.reviser import ActionReviser, Mode, Way
 
@@ -38,8 +39,8 @@ class Told(LatentRisk):
 
 def nearest_values(actions, wanted):
     """For each interval the value in it that is nearest to what is wanted, and both limits."""
-    reviser = ActionReviser(Told(above(0.0), lowest=actions.low), actions)
-    return reviser._options(wanted, Proposal(wanted))[1:].tolist()
+    lowest, highest = nearest_bounds(actions)
+    return np.minimum(np.maximum(wanted, lowest), highest)[1:].tolist()
 
 
 def above(limit, low=0.0, high=1.0):

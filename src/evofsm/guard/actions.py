@@ -34,15 +34,6 @@ Action: TypeAlias = Any
 class Choices:
     """A set of actions that are told apart by their index alone: none is nearer than another.
 
-    Parameters
-    ----------
-    n_actions : int
-
-    Raises
-    ------
-    ValueError
-        If ``n_actions`` is no whole number of at least 1.
-
     Examples
     --------
     >>> actions = Choices(3)
@@ -136,7 +127,7 @@ class BoxActions:
 
     @cached_property
     def bounds(self) -> NDArray[np.float64]:
-        """(2, d) ndarray: the lowest and the highest value of each component."""
+        """(2, d) the lowest and the highest value of each component."""
         bounds = np.array([self.low, self.high])
         bounds.setflags(write=False)
         return bounds
@@ -174,35 +165,13 @@ class BoxActions:
         return values.shape == self.half.shape and bool(inside.all())
 
     def clip(self, action: ArrayLike) -> NDArray[np.float64]:
-        """The action of the set that is closest in every component.
-
-        Parameters
-        ----------
-        action : (..., d) array_like
-
-        Returns
-        -------
-        ndarray
-            Of the shape of ``action``; NaN stays.
-        """
+        """(..., d) ndarray: the actions of the set that are closest; NaN stays."""
         return np.asarray(np.clip(np.asarray(action, dtype=np.float64), *self.bounds))
 
     def encode(self, action: ArrayLike) -> int:
-        """Index of the cell in which an action lies; beyond the box, of the cell at its edge.
+        """Index of the cell in which an action (d,) lies; beyond the box, of the cell at its edge.
 
-        Parameters
-        ----------
-        action : (d,) array_like
-
-        Returns
-        -------
-        int
-            From 0; the last component counts fastest.
-
-        Raises
-        ------
-        TypeError, ValueError
-            If ``action`` has another length, or does not hold real numbers.
+        The last component counts fastest.
         """
         values = self.checked("action", action)
         if np.isnan(values).any():
@@ -235,13 +204,7 @@ def fixed(action: Action) -> Action:
 
 
 def same_action(one: Action, other: Action) -> bool:
-    """Whether two actions are the same; NaN is no action, and the same as none.
-
-    Examples
-    --------
-    >>> same_action(0.5, 0.5), same_action(np.array([0.5, 1.0]), np.array([0.5, 2.0]))
-    (True, False)
-    """
+    """Whether two actions are the same; NaN is no action, and the same as none."""
     same = one == other
     return bool(same.all()) if isinstance(same, np.ndarray) else bool(same)
 
@@ -273,24 +236,12 @@ def limits(actions: ActionSet) -> tuple[Action, Action]:
 
 
 def written(action: Action) -> Any:
-    """An action as JSON holds it: a number, or a list of them.
-
-    Examples
-    --------
-    >>> written(1), written(np.array([0.5, 1.0]))
-    (1.0, [0.5, 1.0])
-    """
+    """An action as JSON holds it: a number, or a list of them."""
     return float(action) if np.ndim(action) == 0 else np.asarray(action, np.float64).tolist()
 
 
 def action_text(action: Action) -> str:
-    """An action as people read it.
-
-    Examples
-    --------
-    >>> action_text(9.0), action_text(np.array([0.5, 1.0]))
-    ('9', '(0.5, 1)')
-    """
+    """An action as people read it."""
     if np.ndim(action) == 0:
         return f"{action:g}"
     return f"({', '.join(f'{each:g}' for each in action)})"
@@ -299,26 +250,14 @@ def action_text(action: Action) -> str:
 def distances(
     actions: ActionSet, options: NDArray[np.float64], action: Action
 ) -> NDArray[np.float64]:
-    """(k,) ndarray: how far each option is from an action, for comparing them.
-
-    In the unit of the action; in a box in half ranges of the components, the root of the sum of
-    their squares.
-    """
+    """(k,) how far options are from an action, in its unit; in a box, as vectors of half ranges."""
     if isinstance(actions, BoxActions):
         return np.asarray(np.sqrt((((options - action) / actions.half) ** 2).sum(axis=-1)))
     return np.asarray(np.abs(options - action))
 
 
 def change(actions: ActionSet, one: Action, other: Action) -> float:
-    """How far apart two actions are, in half ranges of the set; of `Choices` 1 if they differ.
-
-    Examples
-    --------
-    >>> change(IntervalActions(low=-2.0, high=2.0, width=0.5), 1.0, -1.0), change(Choices(5), 0, 4)
-    (1.0, 1.0)
-    >>> change(BoxActions((-1.0, 0.0), (1.0, 4.0)), [0.0, 2.0], [0.0, 4.0])
-    1.0
-    """
+    """How far apart two actions are, in half ranges of the set; of `Choices` 1 if they differ."""
     if same_action(one, other):
         return 0.0
     if isinstance(actions, Choices):

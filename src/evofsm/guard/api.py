@@ -87,12 +87,7 @@ class Controller(Protocol):
     """Anything that proposes actions."""
 
     def propose(self, observation: NDArray[np.float64], time: float = 0.0) -> Proposal:
-        """What it wants to do at ``time`` [s], seeing ``observation``.
-
-        The observation is ``[gap [m], v_follower [m/s], v_leader [m/s]]``, the gap from bumper
-        to bumper.
-        """
-        ...
+        """What it wants to do at ``time`` [s], seeing ``observation``, as `Guard.decide` has it."""
 
 
 class Reviser(Protocol):
@@ -100,11 +95,9 @@ class Reviser(Protocol):
 
     def start_episode(self) -> None:
         """Forget what was under way."""
-        ...
 
     def revise(self, situation: Situation, proposal: Proposal) -> Revision:
         """What to execute instead of the proposal; the proposal itself where it will do."""
-        ...
 
 
 class Judgement(NamedTuple):
@@ -152,29 +145,23 @@ class ActionJudge(Protocol):
     @property
     def fallback(self) -> Fallback:
         """What is done without a usable proposal."""
-        ...
 
     def judge(self, situation: Situation, actions: ArrayLike, /) -> Judgement:
         """How dangerous each action is."""
-        ...
 
     def why(self, judged: Judgement, /) -> str:
         """Why the first action that was judged is dangerous, in a few words."""
-        ...
 
     def trial(self) -> Trial | None:
         """What it has to try before its judgement can be relied on; None if nothing."""
-        ...
 
     def effective(
         self, situation: Situation, actions: NDArray[np.float64], /
     ) -> NDArray[np.float64]:
         """What actions come to here, where some of them would change nothing."""
-        ...
 
     def refuse_unfit(self, low: Action, high: Action, /) -> None:
         """Raise a ValueError if it counts on actions outside ``low`` to ``high``."""
-        ...
 
 
 class Search(NamedTuple):
@@ -193,12 +180,10 @@ class SearchingJudge(ActionJudge, Protocol):
     def search(
         self, situation: Situation, wanted: Action, /, *, tolerance: float, revising: bool
     ) -> Search:
-        """The action to execute instead of ``wanted``, the closest that is within the tolerance.
+        """The action closest to ``wanted``, one of the set, that is within the tolerance.
 
-        ``wanted`` lies in the set of actions. ``revising`` says that the proposal before, in this
-        episode, was not kept.
+        ``revising`` says that the proposal before, in this episode, was not kept.
         """
-        ...
 
 
 @runtime_checkable
@@ -213,39 +198,28 @@ class LearningJudge(ActionJudge, Protocol):
 
     def learn(self, observation: ArrayLike, action: Action, belief: ArrayLike, /) -> None:
         """Take in an observation, recognised as ``belief``, and the action executed after it."""
-        ...
 
     def watch(self, observation: ArrayLike, action: Action, belief: ArrayLike, /) -> None:
         """Learn where someone else acts."""
-        ...
 
     def follow(self, observation: ArrayLike, action: Action, /) -> None:
         """Keep up with what happens, without learning from it."""
-        ...
 
     def start_episode(self, *, learn: bool = True) -> None:
         """What comes is not a consequence of what was."""
-        ...
 
     def end(self, observation: NDArray[np.float64] | None, *, failed: bool) -> None:
-        """Learn how an episode ended, with the last observation if there is one.
-
-        After it nothing is under way, as after `start_episode`.
-        """
-        ...
+        """Learn how an episode ended, with the last observation if there is one."""
 
     def sums(self, n_states: int, /) -> dict[str, float]:
         """A few sums, by name, that whatever is learnt changes."""
-        ...
 
     def save(self, path: Place, provenance: Mapping[str, Any] | None = None) -> None:
         """Write what was learnt to a file."""
-        ...
 
     @classmethod
     def load(cls, path: Place) -> Self:
         """Read what was learnt, between two episodes."""
-        ...
 
 
 @runtime_checkable
@@ -258,11 +232,9 @@ class ObservingJudge(LearningJudge, Protocol):
         Whether something that was not expected began with the action before it: the guard's machine
         counts that.
         """
-        ...
 
     def act(self, action: Action, /) -> None:
         """Take in what was executed after the latest observation; another one replaces it."""
-        ...
 
 
 class Participants(NamedTuple):
@@ -278,18 +250,8 @@ class RiskMeasure(Protocol):
     """Anything that says how dangerous a situation is."""
 
     def score(self, observations: NDArray[np.float64], dt: float) -> NDArray[np.float64]:
-        """Danger of each row of an episode, from it and the rows before it only.
+        """(T,) danger of each row of an episode, from it and the rows before it only.
 
-        Parameters
-        ----------
-        observations : (T, 3) ndarray
-            Gap [m], speed of the follower and of the leader [m/s], in the order of time.
-        dt : float
-            Time between two rows [s].
-
-        Returns
-        -------
-        (T,) ndarray
-            In the measure's own unit; higher is more dangerous. Above 0 it calls for braking.
+        Rows are gap [m], speed of the follower and of the leader [m/s], ``dt`` [s] apart. Danger is
+        in the measure's own unit; above 0 it calls for braking.
         """
-        ...

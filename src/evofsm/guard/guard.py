@@ -68,27 +68,7 @@ class Explain(Enum):
 class InputMonitor:
     """Tells what is wrong with observations: late, twice, after a gap in time, or incomplete.
 
-    What is done about it is decided here, and told with the situation, so that a reviser knows when
-    it decides on less.
-
-    Parameters
-    ----------
-    missing : Missing
-        What to do where a variable was not observed (NaN).
-    interval : float, optional
-        Time between observations [s]; without it no gap in time is told.
-
-    Examples
-    --------
-    >>> monitor = InputMonitor(interval=0.25)
-    >>> monitor.take(np.array([30.0, 20.0, 20.0]), 0.0)
-    <Intake.WHOLE: 0>
-    >>> monitor.take(np.array([np.nan, 20.0, 20.0]), 0.25), monitor.held
-    (<Intake.PARTIAL: 1>, array([30., 20., 20.]))
-    >>> monitor.take(np.array([29.0, 20.0, 20.0]), 0.25), monitor.take(np.zeros(3), 0.1)
-    (<Intake.REPEATED: 8>, <Intake.LATE: 16>)
-    >>> monitor.take(np.array([25.0, 20.0, 20.0]), 2.0)
-    <Intake.GAP: 4>
+    Without an ``interval`` [s] no gap in time is told.
     """
 
     def __init__(self, missing: Missing = Missing.PARTIAL, interval: float | None = None) -> None:
@@ -99,13 +79,7 @@ class InputMonitor:
         self._time = math.nan
 
     def take(self, observation: NDArray[np.float64], time: float) -> Intake:
-        """What is wrong with an observation at ``time`` [s]; one out of order is not taken in.
-
-        Raises
-        ------
-        ValueError
-            If a variable is missing, and that is to be rejected.
-        """
+        """What is wrong with an observation at ``time`` [s]; one out of order is not taken in."""
         if time <= self._time:
             return Intake.REPEATED if time == self._time else Intake.LATE
         found, held = Intake.WHOLE, observation
@@ -128,19 +102,15 @@ class DecisionLogger(Protocol):
 
     def begin(self, guard: Guard) -> None:
         """Begin an episode; one that is under way is broken off, and nothing follows from it."""
-        ...
 
     def seen(self, observation: NDArray[np.float64], time: float) -> None:
         """An observation came in, at ``time`` [s]."""
-        ...
 
     def decided(self, situation: Situation, proposal: Proposal, revision: Revision) -> None:
         """A decision was made."""
-        ...
 
     def ended(self, observation: NDArray[np.float64] | None, *, failed: bool) -> None:
         """The episode ended."""
-        ...
 
 
 # What a judge has that learns.
@@ -240,13 +210,20 @@ class Guard:
     ) -> None:
         actions = _actions(low, high, n_actions, width)
         interval = positive("interval", interval)
-        soon = _steps(horizon, interval)
+        soon = None if horizon is None else max(1, round(positive("horizon", horizon) / interval))
         if judge is None:
             judge = LearntRisk(interval, low, high, n_actions=n_actions, horizon=horizon, seed=seed)
+        if machine is None:
+            machine = EvolvingFSM(
+                actions.n_actions,
+                max_states=_MOST_STATES,
+                belief_tolerance=BELIEF_TOLERANCE,
+                failure_horizon=soon,
+            )
         self._set_up(
             ActionReviser(judge, actions, tolerance=tolerance, mode=mode),
             interval=interval,
-            machine=machine or _machine(actions, soon),
+            machine=machine,
             failed=failed,
             seed=seed,
             audit=audit,
@@ -275,10 +252,6 @@ class Guard:
             Whether machine and judge learn.
         failed, seed, audit, explaining, missing
             As in `Guard`.
-
-        Returns
-        -------
-        Guard
 
         Examples
         --------
@@ -380,21 +353,8 @@ class Guard:
 
         The same episode is then decided the same again, bit for bit. An episode that is under way
         is broken off: nothing more is learnt from it.
-
-        Examples
-        --------
-        >>> from evofsm.driving import guard_for_cars
-        >>> guard = guard_for_cars(low=-2.5, high=2.5)
-        >>> guard.freeze()
-        >>> guard.decide([9.0, 20.0, 20.0], 1.0).executed, guard.machine.n_states
-        (-2.5, 0)
         """
         self.learn = False
-
-    @property
-    def held(self) -> NDArray[np.float64]:
-        """(m,) ndarray: the latest value of each variable; NaN of one that was never observed."""
-        return self._monitor.held.copy()
 
     @property
     def situation(self) -> Situation:
@@ -404,14 +364,7 @@ class Guard:
         return self._latest
 
     def begin(self) -> None:
-        """Begin an episode; one that is under way is broken off, and nothing follows from it.
-
-        Examples
-        --------
-        >>> from evofsm.driving import guard_for_cars
-        >>> guard = guard_for_cars(low=-2.5, high=2.5)
-        >>> guard.begin()
-        """
+        """Begin an episode; one that is under way is broken off, and nothing follows from it."""
         self._monitor = InputMonitor(self.missing, self.interval)
         self._latest = None
         self._decisions = 0
@@ -453,14 +406,6 @@ class Guard:
         ------
         TypeError, ValueError
             If observation or proposal are not real numbers, or an entry is infinite or too large.
-
-        Examples
-        --------
-        >>> from evofsm.driving import guard_for_cars
-        >>> guard = guard_for_cars(low=-2.5, high=2.5)
-        >>> revision = guard.decide([9.0, 20.0, 20.0], proposal=1.0)
-        >>> revision.executed, revision.risk_proposed
-        (-2.5, 1.0)
         """
         if isinstance(proposal, Proposal):
             others = tuple(self._proposed(candidate) for candidate in proposal.candidates)
@@ -481,10 +426,10 @@ class Guard:
         return float(action)  # type: ignore[arg-type]
 
     def recognise(self, observation: ArrayLike, time: float) -> Situation:
-        """The first half of `decide`: where the system is at ``time`` [s].
+        """The first half of `decide`: where the system is; machine and judge learn from it.
 
-        The machine learns the transition to it. An observation that is no newer than the one
-        before changes nothing: the situation is still that one.
+        An observation that is no newer than the one before changes nothing: the situation is still
+        that one.
 
         Parameters
         ----------
@@ -498,8 +443,11 @@ class Guard:
         if intake and intake & STALE and self._latest is not None:
             situation = self._latest._replace(intake=intake)
         else:
-            if intake and intake & Intake.GAP:
-                self._begin_anew()
+            if intake and intake & Intake.GAP:  # what comes does not follow from what was before
+                if self.machine is not None and self._learn:
+                    self.machine.start_episode()  # first, as a judge learns from what it made of it
+                if self.judge is not None:
+                    self.judge.start_episode(learn=self._learn)
             situation = self._latest = self._recognised(z, time, intake)
         if self.audit is not None:
             self.audit.seen(z, time)
@@ -520,16 +468,6 @@ class Guard:
             named = f" ({', '.join(self.variables)})" if self.variables else ""
             raise ValueError(f"observation has {len(z)} variables; it must have {known}{named}")
         return z
-
-    def _begin_anew(self) -> None:
-        """What comes after a gap in time does not follow from what was before it.
-
-        The machine first, as at an end: a judge learns from what the machine made of it.
-        """
-        if self.machine is not None and self._learn:
-            self.machine.start_episode()
-        if self.judge is not None:
-            self.judge.start_episode(learn=self._learn)
 
     def _recognised(self, z: NDArray[np.float64], time: float, intake: Intake) -> Situation:
         """Where it is; machine and judge learn the transition to it."""
@@ -576,8 +514,8 @@ class Guard:
     def take_in(self, situation: Situation, proposal: Proposal, executed: Action) -> None:
         """Instead of `revise`, where it was decided elsewhere: learn from what was executed.
 
-        The reviser is asked all the same, as a judge may learn from that too; what it says is
-        not executed. Refused with an audit log, which could not be replayed then.
+        The reviser is asked all the same, as a judge may learn from that too. Refused with an audit
+        log, which could not be replayed then.
 
         Parameters
         ----------
@@ -632,15 +570,6 @@ class Guard:
             observation.
         observation : (m,) array_like, optional
             The last one, on which nothing was decided any more.
-
-        Examples
-        --------
-        >>> from evofsm.driving import guard_for_cars
-        >>> guard = guard_for_cars(low=-2.5, high=2.5)
-        >>> revision = guard.decide([9.0, 20.0, 20.0], proposal=1.0)
-        >>> guard.end(failed=True, observation=[-0.1, 20.0, 12.0])
-        >>> guard.machine.endings
-        array([0., 1.])
         """
         z = None if observation is None else self._checked(observation)
         if not self._under_way:
@@ -687,33 +616,15 @@ class Guard:
         states : bool
             Whether it has the machine too. Without it the same is decided, unless the judge asks
             the states, and nothing is recognised.
-
-        Returns
-        -------
-        Guard
-
-        Examples
-        --------
-        >>> from evofsm.driving import guard_for_cars
-        >>> guard = guard_for_cars(low=-2.5, high=2.5)
-        >>> twin = guard.copy()
-        >>> revision = twin.decide([9.0, 20.0, 20.0], proposal=1.0)
-        >>> twin.machine.n_states, guard.machine.n_states
-        (1, 0)
         """
         machine = None if self.machine is None else self.machine.copy()
         reviser, judge = copy.deepcopy(
             (self.reviser, self.judge),
             {} if self.machine is None else {id(self.machine): machine},
         )
-        return type(self).of(
-            reviser, judge=judge, machine=machine if states else None, **self._settings
-        )
-
-    @property
-    def _settings(self) -> dict[str, Any]:
         names = ("actions", "interval", "learn", "failed", "seed", "explaining", "missing")
-        return {name: getattr(self, name) for name in names}
+        settings = {name: getattr(self, name) for name in names}
+        return type(self).of(reviser, judge=judge, machine=machine if states else None, **settings)
 
     def save(self, path: Place, provenance: Mapping[str, Any] | None = None) -> None:
         """Write all of it to one file: machine, judge and settings.
@@ -733,16 +644,6 @@ class Guard:
             If it cannot be written.
         ValueError
             If the reviser is of someone's own class, so that no file can say what it is.
-
-        Examples
-        --------
-        >>> from io import BytesIO
-        >>> from evofsm.driving import guard_for_cars
-        >>> guard, file = guard_for_cars(low=-2.5, high=2.5), BytesIO()
-        >>> guard.save(file, provenance={"drive": "Monday"})
-        >>> again = Guard.load(BytesIO(file.getvalue()))
-        >>> again.decide([9.0, 20.0, 20.0], 1.0).executed
-        -2.5
         """
         described = outline(self.participants)
         if described["reviser"] is None:
@@ -777,10 +678,6 @@ class Guard:
         failed : callable, optional
             As in `Guard`; needed where the guard had one.
         audit : DecisionLogger, optional
-
-        Returns
-        -------
-        Guard
 
         Raises
         ------
@@ -820,21 +717,6 @@ class Guard:
             )
 
 
-def _steps(horizon: float | None, interval: float) -> int | None:
-    """A time as a number of decisions."""
-    return None if horizon is None else max(1, round(positive("horizon", horizon) / interval))
-
-
-def _machine(actions: ActionSet, soon: int | None) -> EvolvingFSM:
-    """With recommended settings."""
-    return EvolvingFSM(
-        actions.n_actions,
-        max_states=_MOST_STATES,
-        belief_tolerance=BELIEF_TOLERANCE,
-        failure_horizon=soon,
-    )
-
-
 def _actions(
     low: ArrayLike | None, high: ArrayLike | None, n_actions: int | None, width: float | None
 ) -> ActionSet:
@@ -847,18 +729,13 @@ def _actions(
     if np.ndim(low) or np.ndim(high):
         if width is not None:
             raise ValueError("width is of an action that is one number; leave it out")
-        return BoxActions(*_as_long(low, high))
+        if not (np.ndim(low) and np.ndim(high)):  # a number is the end of each component
+            low, high = np.broadcast_arrays(low, high)
+        ends: Any = low, high
+        return BoxActions(*ends)
     least, most = np.asarray(low, np.float64).item(), np.asarray(high, np.float64).item()
     width = (most - least) / _INTERVALS if width is None and least < most else width
     return IntervalActions(least, most, width or 1.0, outside="clip")
-
-
-def _as_long(low: ArrayLike, high: ArrayLike) -> tuple[Any, Any]:
-    """Both limits; one that is a number is that of each component."""
-    if np.ndim(low) and np.ndim(high):
-        return low, high
-    either = np.broadcast(low, high).shape
-    return np.broadcast_to(low, either), np.broadcast_to(high, either)
 
 
 def _loaded(

@@ -1,8 +1,7 @@
 """The parts that a guard is made of, as plain data: no file and no log holds code.
 
-Judges, revisers and measures stand in it by name: that of their class, which an installed package
-declares as an entry point of the group ``evofsm.participants``. What machine and judge have learnt
-stands elsewhere, in arrays of their own.
+Judges, revisers and measures stand in it by the name of their class, which an installed package
+declares as an entry point of ``evofsm.participants``. What was learnt stands in arrays elsewhere.
 """
 
 from __future__ import annotations
@@ -89,7 +88,9 @@ def rebuild(
 
     ``judge`` is asked where the outline knows none, and none that learns was read.
     """
-    actions, reviser = _actions(told["actions"]), told["reviser"]
+    fields, reviser = told["actions"], told["reviser"]
+    kind = IntervalActions if "width" in fields else BoxActions if "levels" in fields else Choices
+    actions: ActionSet = kind(**fields)
     if reviser["class"] != "ActionReviser":
         again: Reviser = part_class(reviser["class"]).restored(reviser, actions)
         return Participants(actions, again, machine, risk)
@@ -102,13 +103,6 @@ def rebuild(
     again = ActionReviser(asked, actions)
     set_again(again, reviser["settings"])
     return Participants(actions, again, machine, risk)
-
-
-def _actions(told: Mapping[str, Any]) -> ActionSet:
-    """Of the class that has these fields."""
-    if "n_actions" in told:
-        return Choices(**told)
-    return BoxActions(**told) if "levels" in told else IntervalActions(**told)
 
 
 def settings_of(reviser: Reviser) -> dict[str, Any]:
@@ -130,7 +124,4 @@ def set_again(reviser: Reviser, settings: Mapping[str, Any]) -> None:
         return
     reviser.mode, reviser.way = Mode(settings["mode"]), Way(settings["way"])
     reviser.release, reviser.tolerance = float(settings["release"]), float(settings["tolerance"])
-    if settings["overridden"]:
-        reviser.take_over()
-    else:
-        reviser.hand_back()
+    reviser.overridden = bool(settings["overridden"])

@@ -1,8 +1,7 @@
 """The action reviser: it keeps what a controller proposes, or replaces it by something better.
 
-The module of the paper's Section 4.2, in both of its ways: to choose among the candidates that a
-controller offers, or to improve on its proposal with any action of the set. The authors' own sequel
-tests an action by predicting the states it leads to (Han, Filev, Ozguner, arXiv:2006.08092).
+The module of the paper's Section 4.2, in both of its ways (`Way`). The authors' own sequel tests an
+action by predicting the states it leads to (Han, Filev, Ozguner, arXiv:2006.08092).
 """
 
 from __future__ import annotations
@@ -89,19 +88,19 @@ def make_usable(proposal: Proposal, actions: ActionSet, fallback: Fallback = NOT
     >>> make_usable(Proposal(float("nan")), actions)
     Usable(action=0.0, remark='no usable proposal (nan): doing nothing')
     """
-    wanted, is_box = proposal.action, isinstance(actions, BoxActions)
-    if not is_box and actions.low <= wanted <= actions.high:  # the usual case, at once
+    wanted = proposal.action
+    if not isinstance(actions, BoxActions) and actions.low <= wanted <= actions.high:
         is_choice = isinstance(actions, Choices)
-        if not is_choice or wanted == int(wanted):
+        if not is_choice or wanted == int(wanted):  # the usual case, at once
             return Usable(float(wanted), "")
-    if not is_usable(actions, proposal.action):
-        nothing = f"no usable proposal ({action_text(proposal.action)}): {fallback.doing}"
+    if not is_usable(actions, wanted):
+        nothing = f"no usable proposal ({action_text(wanted)}): {fallback.doing}"
         return Usable(put_into(actions, fallback.action), nothing)
-    action = put_into(actions, proposal.action)
-    if same_action(action, proposal.action):
+    action = put_into(actions, wanted)
+    if same_action(action, wanted):
         return Usable(action, "")
     low, high = (action_text(limit) for limit in limits(actions))
-    return Usable(action, f"proposal {action_text(proposal.action)} is outside [{low}, {high}]")
+    return Usable(action, f"proposal {action_text(wanted)} is outside [{low}, {high}]")
 
 
 class ActionReviser:
@@ -113,20 +112,17 @@ class ActionReviser:
     has begun to revise, it keeps on until the proposal is safe by a margin, so that it does not
     chatter.
 
-    A judge that looks for an action itself (`api.SearchingJudge`) is asked for it where any
-    action of the set will do (`Way.IMPROVE`); how it goes about that is its own.
-
+    A judge that looks for an action itself (`api.SearchingJudge`) is asked for it (`Way.IMPROVE`).
     Where nothing of what it decides is executed (any mode but `Mode.ACT`, or the driver has taken
-    over), nothing is tried, and nothing is asked that would change nothing.
+    over), nothing is tried.
 
     Parameters
     ----------
     risk : ActionJudge
         Usually a `LatentRisk`.
     actions : IntervalActions, Choices or BoxActions
-        The set of actions. Nothing outside it is ever executed. Of `Choices` none is closer than
-        another: a proposal is kept, or replaced by the least risky one. In a box the closest is
-        that of the least change in half ranges, of each cell the point that is nearest.
+        Nothing outside it is ever executed. Of `Choices` none is closer than another: a proposal is
+        kept, or replaced by the least risky one. In a box change is counted in half ranges.
     tolerance : float
         Highest latent risk that is accepted, in (0, 1).
     release : float
@@ -167,7 +163,7 @@ class ActionReviser:
         self.release = release
         self.mode = mode
         self.way = way
-        self._overridden = False
+        self.overridden = False  #: whether the driver has taken over
         self._searches = isinstance(risk, SearchingJudge)
         self._lowest, self._highest = nearest_bounds(actions)
         self._low, self._high = limits(actions)
@@ -184,36 +180,20 @@ class ActionReviser:
         return self.risk.fallback
 
     @property
-    def overridden(self) -> bool:
-        """Whether the driver has taken over."""
-        return self._overridden
-
-    @property
     def acts(self) -> bool:
         """Whether what it decides is executed."""
-        return self.mode is Mode.ACT and not self._overridden
+        return self.mode is Mode.ACT and not self.overridden
 
     def take_over(self) -> None:
         """The driver overrides: proposals are executed until `hand_back`."""
-        self._overridden = True
+        self.overridden = True
 
     def hand_back(self) -> None:
         """The driver lets the reviser act again."""
-        self._overridden = False
+        self.overridden = False
 
     def revise(self, situation: Situation, proposal: Proposal) -> Revision:
-        """What to execute instead of the proposal; the proposal itself where it will do.
-
-        Parameters
-        ----------
-        situation : Situation
-        proposal : Proposal
-            One that is no number, or outside the set, is first made usable.
-
-        Returns
-        -------
-        Revision
-        """
+        """What to execute instead of the proposal, which is first made usable (`make_usable`)."""
         acts, names = self.acts, self.risk.labels.names
         wanted, remark = make_usable(proposal, self.actions, self.risk.fallback)
         if not acts:
@@ -224,7 +204,7 @@ class ActionReviser:
         executed = best if acts else 0
         is_number = options.ndim == 1
         if not acts and best != 0:
-            who = "driver has taken over" if self._overridden else self.mode.value
+            who = "driver has taken over" if self.overridden else self.mode.value
             reason = f"{who}: {reason}"
         unseen = unseen_text(situation, names) if situation.intake else ""
         # Of a situation that is new: whether it is dangerous is another question.
@@ -252,18 +232,15 @@ class ActionReviser:
             self._revising = found.best != 0
             within = np.minimum(np.maximum(found.options, self._low), self._high)
             return found._replace(options=within)
-        options = self._options(wanted, proposal)
-        if not acts and self.way is Way.IMPROVE:
-            options = self.risk.effective(situation, options)
+        if self.way is Way.IMPROVE:
+            options = np.minimum(np.maximum(wanted, self._lowest), self._highest)
+            if not acts:
+                options = self.risk.effective(situation, options)
+        else:
+            offered = (make_usable(Proposal(one), self.actions) for one in proposal.candidates)
+            options = np.array([wanted, *(one.action for one in offered if not one.remark)])
         judged = self.risk.judge(situation, options)
         return Search(options, judged, *self._decide(options, judged, acts))
-
-    def _options(self, wanted: Action, proposal: Proposal) -> NDArray[np.float64]:
-        """What could be executed, the proposal first."""
-        if self.way is Way.IMPROVE:
-            return np.minimum(np.maximum(wanted, self._lowest), self._highest)
-        offered = (make_usable(Proposal(one), self.actions) for one in proposal.candidates)
-        return np.array([wanted, *(one.action for one in offered if not one.remark)])
 
     def _decide(
         self, options: NDArray[np.float64], judged: Judgement, acts: bool
@@ -304,12 +281,8 @@ class ActionReviser:
 
 def unseen_text(situation: Situation, variables: Sequence[str]) -> str:
     """What is said of a situation that was not seen whole, or not in time."""
-    missing = [
-        name
-        for name, value in zip(variables, situation.observation, strict=False)
-        if math.isnan(value)
-    ]
-    if missing:
+    each = zip(variables, situation.observation, strict=False)
+    if missing := [name for name, value in each if math.isnan(value)]:
         return f"not seen: {', '.join(missing)}"
     return "nothing new was seen" if situation.intake & STALE else ""
 
