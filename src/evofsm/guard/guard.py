@@ -44,6 +44,7 @@ from evofsm.guard.api import (
 from evofsm.guard.learnt.judge import LearntRisk
 from evofsm.guard.parts import outline, part_class, rebuild
 from evofsm.guard.reviser import NOTHING, ActionReviser, Mode, is_spoken
+from evofsm.guard.warming import warm_judge, warm_machine
 from evofsm.store import Kind, Numbers, Place
 
 # Intervals that a range of actions is divided into for the machine, unless a width is given.
@@ -307,6 +308,9 @@ class Guard:
                     "the other way round"
                 )
             asked.dynamics.failed = failed
+            warm_judge()
+        if machine is not None:
+            warm_machine(limited=machine.max_states is not None)
         self._observing = judge if isinstance(judge, ObservingJudge) else None
         self.reviser = reviser
         self.machine = machine

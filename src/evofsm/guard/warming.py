@@ -1,32 +1,51 @@
-"""Compile before it is needed."""
+"""Compile before it is needed, what follows a first failure too: nobody expects to wait then."""
+
+from functools import cache
 
 import numpy as np
 
 from evofsm.fsm.kernels import announce_compiling
 from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.observations import Missing
-from evofsm.guard.guard import Guard
+from evofsm.guard.api import TOLERANCE, Situation
+from evofsm.guard.learnt.judge import LearntRisk
 
 
 def warm() -> None:
     """Compile now what machines and guards need; say so where it takes long.
 
-    Compiled code is kept on disk, so that this is quick from the second time on.
+    Compiled code is kept on disk, so that this is quick from the second time on. A guard that is
+    made compiles what it needs itself.
 
     Examples
     --------
     >>> from evofsm import warm
     >>> warm()
     """
+    for limited in (False, True):
+        warm_machine(limited=limited)
+    warm_judge()
+
+
+@cache
+def warm_machine(*, limited: bool) -> None:
+    """Compile what machines need, with a limit to the number of states or without."""
     announce_compiling()
-    for most in (None, 1):
-        machine = EvolvingFSM(1, max_states=most)
-        machine.learn_many([[0.0, 0.0], [9.0, 0.0]], [0, 0])
-        machine.observe([np.nan, 0.0], missing=Missing.PARTIAL, failed=True)
-    guard = Guard(low=-1.0, high=1.0, interval=0.1)
-    random = np.random.default_rng(0)
-    for _ in range(3):  # what follows a first failure is among it
-        walk = random.normal(size=(12, 2)).cumsum(axis=0)
-        for z in walk:
-            guard.decide(z, 0.5)
-        guard.end(failed=True, observation=walk[-1])
+    machine = EvolvingFSM(1, max_states=1 if limited else None)
+    machine.learn_many([[0.0, 0.0], [9.0, 0.0]], [0, 0])
+    machine.observe([np.nan, 0.0], missing=Missing.PARTIAL, failed=True)
+
+
+@cache
+def warm_judge() -> None:
+    """Compile what learnt judges need."""
+    announce_compiling()
+    judge, random = LearntRisk(1.0, -1.0, 1.0), np.random.default_rng(0)
+    for _ in range(3):
+        for z in random.normal(size=(12, 2)).cumsum(axis=0):
+            judge.observe(z)
+            here = Situation(z, np.ones(1), None, 0.0, 0.0)
+            judge.search(here, 0.5, tolerance=TOLERANCE, revising=False)
+            judge.act(0.5)
+            judge.learn(z, 0.5, here.belief)
+        judge.end(None, failed=True)

@@ -289,12 +289,17 @@ class Backups:
             replay(model, situations, nothing, policy, disturbances, scale, 0.0, count, ends)
             return np.asarray(ends.worth.reshape(-1, each).mean(1))
 
+        shape, columns = policies.shape[1:], np.append(0, 1 + self.variables)
+        own_order = np.ix_(np.argsort(self.actions), np.argsort(columns))
+        signs = np.append(1.0, self.flips) * self.turns[:, None]
         values = np.array([worth(policy) for policy in policies])
         for _ in range(_MUTANTS if len(linear) else 0):
             parent = linear[values[linear].mean(1).round(_ROUNDED).argmax()]
             if random.random() >= _OF_BEST:
                 parent = ranks[int(random.integers(len(policies)))]
-            child = policies[parent] + self._mutation(random)
+            size = 10.0 ** random.uniform(*_SIZES)
+            drawn = (random.random(shape) < _CHANGED) * size * random.standard_normal(shape)
+            child = policies[parent] + drawn[own_order] * signs
             reached = worth(child)
             tried = np.repeat(values[None], 1 + len(linear), 0)  # as they are, and with the child
             tried[1 + np.arange(len(linear)), linear] = reached
@@ -311,16 +316,6 @@ class Backups:
             scores[q] = adds.max()  # never more than that of the one before
             most = np.maximum(most, values[q])
         return replaced(self, policies=policies, scores=scores)
-
-    def _mutation(self, random: np.random.Generator) -> Floats:
-        """(a, 1 + m) what a mutant differs by."""
-        shape = self.policies.shape[1:]
-        size = 10.0 ** random.uniform(*_SIZES)
-        drawn = (random.random(shape) < _CHANGED) * size * random.standard_normal(shape)
-        put: Floats = np.empty_like(drawn)
-        put[np.ix_(self.actions, np.append(0, 1 + self.variables))] = drawn
-        put *= np.append(1.0, self.flips) * self.turns[:, None]
-        return put
 
 
 def _order(rows: Floats) -> Ints:

@@ -302,7 +302,7 @@ def learn_transition(
     was not expected.
     """
     (p, m), a, n, first = model.weights.shape, u.shape[1], sums.counts[1], i == 0
-    at, change, move = np.empty((m, 2)), np.empty((m, 2)), np.empty((m, 2))
+    at, change, move = np.empty((m, 2)), np.empty((m, 2)), np.zeros((m, 2))
     action, latest, found = np.empty((a, 2)), np.empty((a, 2)), np.empty((p, 2))
     for t in range(i, i + 2):
         for j in range(m):
@@ -312,7 +312,10 @@ def learn_transition(
     fill_features(
         at, change, latest, action, model.origin, model.reach, 1.0, model.choices == 0, found
     )
-    expect(model.weights, found, move)
+    for r in range(2):
+        for k in range(p):
+            for j in range(m):
+                move[j, r] += found[k, r] * model.weights[k, j]
     known, jump, moved, surprised = sums.scale[0] > 0.0, False, False, False
     for j in range(m):
         if first or not known:
