@@ -63,30 +63,38 @@ def test_chunks_of_any_size_learn_what_single_rows_do(trace, snapshot, size):
 
 @pytest.mark.parametrize(("dt", "steps"), [(0.1, 10), (0.3, 3), (2.0, 0)])
 def test_skill_is_what_its_definition_says(trace, monkeypatch, dt, steps):
-    """Of each block the forecasts of the machine before it, against the beliefs that it has."""
+    """One step as the machine forecast it then; a second as the machine before each block does."""
     monkeypatch.setattr(module, "_LARGEST_BLOCK", 64)
     Z, actions = trace
+    alone, indices = machine(), np.full(200, -1)
+    indices[~np.isnan(actions)] = ACTIONS.encode(actions[~np.isnan(actions)])
     one, ahead, certainty = [], [], []
-    for first in range(64, 200, 64):
-        before = [start for start in STARTS if start < first]
-        model = learn_traces(chunks(Z[:first], actions[:first], before), machine(), ACTIONS).model
+    for first in (0, 64, 128, 192):
         rows = range(first, min(first + 64, 200))
-        belief = {t: model.recognise(Z[t]) for t in rows}
-        certainty += [belief[t].max() for t in rows]
-
-        def scores(t, steps, model=model, belief=belief):
-            here, i = belief[t], ACTIONS.encode(actions[t])
-            made = here, model.propagate(here, i, steps, "marginal")
-            return [jensen_shannon(forecast, belief[t + steps]) for forecast in made]
+        starts = [start - first for start in STARTS if start in rows]
+        model = alone.model() if first else None
+        learnt = alone.learn_many(Z[rows], indices[rows], starts, belief=True)
+        if model is None:
+            continue
+        beliefs = dict(zip(rows, learnt.belief, strict=True))
 
         def goes_on(t, steps, rows=rows):
             within = t + steps in rows and not any(t < start <= t + steps for start in STARTS)
             return within and not math.isnan(actions[t])
 
-        one += [scores(t, 1) for t in rows if goes_on(t, 1)]
-        if steps:
-            longer = [t for t in rows if goes_on(t, steps)][::steps]
-            ahead += [scores(t, steps) for t in longer]
+        for t in rows:
+            if goes_on(t, 1):
+                stays = jensen_shannon(beliefs[t], beliefs[t + 1])
+                one.append([stays, learnt.surprise[t - first + 1]])
+                certainty.append(beliefs[t].max())
+            if steps and goes_on(t, steps):
+                forecast, n = beliefs[t].copy(), model.n_states
+                known = forecast[:n] @ model.transition_matrices[ACTIONS.encode(actions[t])]
+                for _ in range(steps - 1):
+                    known = known @ model.averaged_matrix("marginal")
+                forecast[:n] = known
+                came = beliefs[t + steps]
+                ahead.append([jensen_shannon(each, came) for each in (beliefs[t], forecast)])
     learnt = learn_traces(chunks(Z, actions, dt=dt), machine(), ACTIONS)
     first, *others = learnt.skills
     assert first.forecasts == len(one) > 100

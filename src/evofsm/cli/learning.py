@@ -1,9 +1,9 @@
 """Learn a machine from a stream of traces, and score its forecasts before it learns from them.
 
-Rows are learnt in blocks. The forecasts of a block are made by the machine as it was before, so
-the scores are of rows that it had not seen; of long blocks the first rows are scored. The rival is
-persistence: the belief stays as it is. A forecast's distance from the belief that came is measured
-by the Jensen-Shannon divergence.
+Rows are learnt in blocks, of which so many rows are scored. The forecast of one step is the one
+that the machine made as it learnt; those further ahead are made by the machine as it was before the
+block. The rival is persistence: the belief stays as it is. A forecast's distance from the belief
+that came is measured by the Jensen-Shannon divergence.
 """
 
 from __future__ import annotations
@@ -26,15 +26,18 @@ from evofsm.fsm.actions import IntervalActions
 from evofsm.fsm.divergence import jensen_shannon
 from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.model import FSMModel
+from evofsm.fsm.step import Trace
 from evofsm.io import Chunk
 
 _log = logging.getLogger(__name__)
+
+Beliefs = NDArray[np.float64]
 
 #: How far ahead the longer forecast looks [s].
 HORIZON = 1.0
 
 # Blocks grow from so many rows to so many; of each so many are scored at most.
-_FIRST_BLOCK, _LARGEST_BLOCK, _SCORED = 64, 8192, 512
+_FIRST_BLOCK, _LARGEST_BLOCK, _SCORED = 64, 8192, 256
 # A checkpoint is written so often [s].
 _EVERY = 60.0
 
@@ -198,9 +201,12 @@ def _learn(machine: EvolvingFSM, actions: IntervalActions, chunk: Chunk, read: P
     while first < len(indices):
         end = first + min(_FIRST_BLOCK << min(read.blocks, 20), _LARGEST_BLOCK)
         block, taken = chunk.rows(first, end), indices[first:end]
-        if machine.n_states:
-            _score(machine.model(), block.rows(0, _SCORED), taken[:_SCORED], read)
-        machine.learn_many(block.observations, taken, block.starts, block.failures)
+        before = machine.model() if machine.n_states else None
+        trace = machine.learn_many(
+            block.observations, taken, block.starts, block.failures, belief=True
+        )
+        if before is not None:
+            _score(before, trace, block, taken, read)
         first, read.blocks = end, read.blocks + 1
     last = np.nan if read.last_time is None else read.last_time
     steps = np.diff(chunk.times, prepend=last)
@@ -219,29 +225,42 @@ def _learn(machine: EvolvingFSM, actions: IntervalActions, chunk: Chunk, read: P
 # -- Scores ---------------------------------------------------------------------------------------
 
 
-def _score(model: FSMModel, block: Chunk, taken: NDArray[np.int64], read: Progress) -> None:
-    """Add the divergences of forecasts that a model makes of rows.
+def _score(
+    model: FSMModel, trace: Trace, block: Chunk, taken: NDArray[np.int64], read: Progress
+) -> None:
+    """Add the divergences of forecasts of rows: of one step as it was learnt, of more by a model.
 
     The first step is made under its own action, the others under all alike, as in the paper.
     """
-    matrices, marginal = model.transition_matrices, model.averaged_matrix("marginal")
-    beliefs = np.atleast_2d(model.recognise(block.observations))
-    read.scored += len(beliefs)
-    read.certainty += float(beliefs.max(axis=1).sum())
-    episode = np.zeros(len(beliefs), np.int64)
+    episode = np.zeros(len(taken), np.int64)
     episode[block.starts] = 1
     episode = episode.cumsum()
-    steps = _steps_ahead(read.dt)
-    for sums, n in ((read.one_step, 1), (read.ahead, steps)):
-        if not n or not len(then := _pairs(episode, taken, n)[::n]):
-            continue
-        pairs = zip(beliefs[then], taken[then], strict=True)
-        forecast = np.array([belief @ matrices[action] for belief, action in pairs])
-        for _ in range(n - 1):
-            forecast = forecast @ marginal
-        came, before = beliefs[then + n], beliefs[then]
-        found = [float(jensen_shannon(one, came).sum()) for one in (before, forecast)]
-        sums[:] = [a + b for a, b in zip(sums, [float(len(then)), *found], strict=True)]
+    then = _pairs(episode, taken, 1)
+    then = _some(then[np.isfinite(trace.surprise[then + 1])])
+    beliefs = trace.belief
+    assert beliefs is not None
+    _add(read.one_step, beliefs[then], beliefs[then + 1], trace.surprise[then + 1])
+    read.scored += len(then)
+    read.certainty += float(beliefs[then].max(axis=1).sum())
+    if steps := _steps_ahead(read.dt):
+        then, n = _some(_pairs(episode, taken, steps)), model.n_states
+        known = np.einsum("ti,tij->tj", beliefs[then, :n], model.transition_matrices[taken[then]])
+        marginal = model.averaged_matrix("marginal")
+        forecast = beliefs[then]  # of states created since nothing is known: they stay
+        forecast[:, :n] = known @ np.linalg.matrix_power(marginal, steps - 1)
+        came = beliefs[then + steps]
+        _add(read.ahead, beliefs[then], came, jensen_shannon(forecast, came))
+
+
+def _some(rows: NDArray[np.int64]) -> NDArray[np.int64]:
+    """So many of the rows as are scored, from all over the block."""
+    return rows[:: max(1, -(-len(rows) // _SCORED))]
+
+
+def _add(sums: list[float], now: Beliefs, came: Beliefs, divergence: Beliefs) -> None:
+    """The number of forecasts, the divergence of persistence and theirs."""
+    found = len(now), float(jensen_shannon(now, came).sum()), float(divergence.sum())
+    sums[:] = [one + more for one, more in zip(sums, found, strict=True)]
 
 
 def _pairs(episode: NDArray[np.int64], taken: NDArray[np.int64], steps: int) -> NDArray[np.int64]:
@@ -252,7 +271,7 @@ def _pairs(episode: NDArray[np.int64], taken: NDArray[np.int64], steps: int) -> 
 def _steps_ahead(dt: float | None) -> int:
     """Steps of the longer forecast; 0 where one step is about as long, or longer."""
     steps = 0 if dt is None else round(HORIZON / dt)
-    return steps if 1 < steps < _SCORED else 0
+    return steps if 1 < steps < _LARGEST_BLOCK // 2 else 0
 
 
 def _skills(read: Progress) -> Iterator[Skill]:
