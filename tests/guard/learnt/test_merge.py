@@ -46,7 +46,8 @@ def test_a_merged_judge_knows_what_both_have_learnt_and_goes_on(points):
     merged = merge_judges([guard.judge for guard in guards])
     assert merged.dynamics.n_episodes == 12
     assert len(merged.dynamics.failures) == sum(len(g.judge.dynamics.failures) for g in guards)
-    assert merged.exposure == pytest.approx(sum(guard.judge.exposure for guard in guards))
+    seconds = sum(guard.judge.remembered.seconds for guard in guards)
+    assert merged.remembered.seconds == pytest.approx(seconds)
     assert len(merged.dynamics.sequences) <= 10
     guard = point.guard(judge=merged)
     assert not any(point.play(guard, 50 + episode)[1] for episode in range(4))

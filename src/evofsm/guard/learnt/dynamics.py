@@ -91,8 +91,6 @@ class DisturbanceSequence(NamedTuple):
 class Dynamics:
     """Learns how a system moves under actions, what disturbs it for a while, and where it fails.
 
-    It is told nothing of the system but observations, actions and which episodes failed.
-
     Actions are in a range from ``low`` to ``high``, (d,) each, or ``n_actions`` told apart by their
     index. A disturbance sequence has at most ``horizon`` steps; so many are ``remembered`` where
     somebody chooses among them (`keep`), of those that nobody has chosen yet the newest, four times
@@ -104,21 +102,6 @@ class Dynamics:
     given; nothing here says that something is safe.
 
     What is in lists, and all arrays but those of ``sums``, never change in place.
-
-    Examples
-    --------
-    A cart that is pushed by the action, to the left, not at all or to the right:
-
-    >>> dynamics = Dynamics(n_actions=3)
-    >>> draw, speed = np.random.default_rng(0), 0.0
-    >>> for t in range(80):
-    ...     i = int(draw.integers(3))
-    ...     begins = dynamics.observe(np.array([speed]))
-    ...     dynamics.act(dynamics.encode(i))
-    ...     speed += 0.1 * (i - 1) - 0.1 * speed
-    >>> dynamics.end(failed=False)
-    >>> dynamics.n_episodes, dynamics.ready
-    (1, True)
     """
 
     sums: Sums
@@ -201,10 +184,7 @@ class Dynamics:
         self.forget_episode()
 
     def observe(self, z: Floats) -> bool:
-        """Take in an observation (m,), all finite, and learn the transition before the one to it.
-
-        Returns whether something that was not expected began with it, the first for a while.
-        """
+        """Take in an observation (m,), all finite; whether something unexpected began with it."""
         if not self.n_variables:
             self._begin(z)
         if self.n_under_way >= _LONGEST:
@@ -255,10 +235,7 @@ class Dynamics:
         return np.array([action < lowest, action > 0.6]).T
 
     def end(self, *, failed: bool) -> None:
-        """The episode is over, or what comes does not follow from what was.
-
-        ``failed`` says whether it ended in failure with the latest observation.
-        """
+        """The episode is over, ``failed`` or not, or what comes does not follow from what was."""
         if self.n_under_way > 2 or (failed and self.n_under_way):
             self._study(failed=failed)
         self.forget_episode()
@@ -332,10 +309,7 @@ class Dynamics:
         self.close = np.where(self.gains < 1.0, _CLOSE * np.sqrt(sums.noise), 1e-9 / inverse)
 
     def corrected(self, situation: Floats, action: Floats, seen: Floats) -> Floats:
-        """(m,) where one is, a step after a situation and an action, from what was expected.
-
-        That is ``seen`` itself as long as no sensor is known to be noisy.
-        """
+        """(m,) where one is, a step after a situation and an action; ``seen`` if none is noisy."""
         if not self.is_noisy:
             return seen
         return regression.corrected(self.model, self.gains, situation, action, seen, self.sums.unit)
@@ -343,8 +317,7 @@ class Dynamics:
     def refute(self, starts: Ints, steps: int) -> None:
         """Compare the model with what came where it had foreseen failure that never came.
 
-        ``starts`` (k,) are observations of the latest episode from which it went on for so many
-        steps.
+        From ``starts`` (k,) of the latest episode it went on for so many steps.
         """
         assert self.latest is not None
         z, u = self.latest.observations, self.latest.actions
@@ -420,11 +393,9 @@ class Dynamics:
     def _follow_drift(self, z: Floats, u: Floats) -> None:
         """Correct the model of what moves otherwise; what was unforeseen before stays so."""
         sums, before, close, young = self.sums, self.model, self.close, self._young
-        recent = regression.compared(
-            self.recent, before, sums, close, z, u, self.n_episodes, bool(young)
-        )
-        begun = recent.overthrown()
-        self.recent = recent
+        known = self.recent, before, sums, close
+        self.recent = recent = regression.compared(*known, z, u, self.n_episodes, bool(young))
+        begun = np.flatnonzero(recent.doubt > regression.DOUBT).tolist()
         self.drifts = self.drifts + [Drift(j, int(recent.since[j]), self.n_episodes) for j in begun]
         moved = sorted({*begun, *young})
         if not moved:
@@ -445,10 +416,7 @@ class Dynamics:
     def _as_it_was(
         self, one: DisturbanceSequence, before: Model, close: Floats, moved: list[int]
     ) -> DisturbanceSequence:
-        """A sequence with what was unforeseen in it by the model of then, if it is of then.
-
-        It is not if the new model foresees better what those variables did that moved otherwise.
-        """
+        """A sequence with what was unforeseen by the model of then, if that foresaw it better."""
         if len(one.unforeseen):
             return one
         seen, carried = (one.observations, one.actions), self._carried
@@ -464,17 +432,11 @@ class Dynamics:
         return [one.variable for one in self.drifts if n - one.noticed < regression.LEARNT]
 
     def _saturate(self, found: Floats, safe: Floats) -> None:
-        """Know ends by variables that rested there although they were expected to go on.
-
-        Whoever never leaves an end does not come to it by moving.
-        """
+        """Know ends by variables that rested there although they were expected to go on."""
         rests, far = safe[1:-1] == safe[2:], ONSET * self.sums.scale
-        held = np.column_stack(
-            [
-                (rests & (safe[2:] == self.lowest) & (found > far)).any(0),
-                (rests & (safe[2:] == self.highest) & (found < -far)).any(0),
-            ]
-        )
+        at_lowest = (rests & (safe[2:] == self.lowest) & (found > far)).any(0)
+        at_highest = (rests & (safe[2:] == self.highest) & (found < -far)).any(0)
+        held = np.column_stack([at_lowest, at_highest])
         held[(self.sums.moving <= MOVING) | (self.sums.scale[0] == 0.0)] = False
         if held.any():
             self.reached = np.where(held, np.maximum(self.reached, _REACHED), self.reached)
@@ -541,10 +503,7 @@ class Dynamics:
         return found
 
     def fails_after(self, situation: Floats, plan: Floats, disturbances: Disturbances) -> Floats:
-        """(K,) steps after which a plan (T, a) fails amid each disturbance, infinite if it lasts.
-
-        The situation is an observation, its change, and the action before (2m + a).
-        """
+        """(K,) steps after which a plan (T, a) fails amid each disturbance; infinite: it lasts."""
         count = disturbances.residuals.shape[2]
         ends, policy = Ends.of(count), np.zeros((plan.shape[1], 1 + self.n_variables))
         replay(self.model, situation[None], plan, policy, disturbances, 1.0, 0.0, count, ends)
@@ -616,10 +575,7 @@ class Dynamics:
     def restore(self, numbers: Mapping[str, Any], arrays: Mapping[str, Floats]) -> None:
         """Be what `numbers` and `arrays` were of, between two episodes.
 
-        Raises
-        ------
-        ValueError
-            If arrays contradict each other, or the actions: kernels trust their sizes.
+        A ValueError if they contradict each other, or the actions: kernels trust their sizes.
         """
         m, a, p = len(arrays["origin"]), self.size, len(arrays["sums_squares"])
         self.n_episodes, self.quiet = int(numbers["n_episodes"]), int(numbers["quiet"])

@@ -32,21 +32,6 @@ def explain_failures(
     ``lowest`` to ``highest`` (m,). ``unit`` (m,) is the ordinary change of each variable. A failure
     within five times ``blur`` (m, 2) of the lowest or the highest may have been beyond it, as noise
     blurs them; 0 where a variable saturates.
-
-    Examples
-    --------
-    >>> low, high = np.array([1.0, 0.0]), np.array([9.0, 5.0])
-    >>> failures, exact = np.array([[-0.5, 3.0], [-0.1, 4.0]]), np.zeros((2, 2))
-    >>> explain_failures(failures, low, high, np.ones(2), exact)
-    [(0, -1.0, 1.0)]
-
-    With noise, -0.6 was survived as well:
-
-    >>> low[0] = -0.6
-    >>> explain_failures(failures, low, high, np.ones(2), exact)
-    []
-    >>> explain_failures(failures, low, high, np.ones(2), exact + 0.2)
-    [(0, -1.0, -0.1)]
     """
     m = len(unit)
     if not len(failures):

@@ -12,7 +12,7 @@ import math
 import operator
 from collections.abc import Callable, Mapping, Sequence
 from functools import wraps
-from typing import Any, NamedTuple, ParamSpec, Self, TypeVar
+from typing import Any, ParamSpec, Self, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from evofsm import store
 from evofsm.fsm.naming import Labels
 from evofsm.fsm.proportions import poisson_bounds
-from evofsm.fsm.validation import action_name, positive, refuse_unusable
+from evofsm.fsm.validation import action_name, positive
 from evofsm.guard.api import Fallback, Judgement, Search, Situation, Trial
 from evofsm.guard.learnt import library, words
 from evofsm.guard.learnt.dynamics import ARRAYS, DYNAMICS_PARTS, Dynamics
@@ -57,31 +57,22 @@ _ALIKE, _TRIES = 0.02, 8
 _ENOUGH = 3
 
 
-class Outlook(NamedTuple):
-    """How it stands somewhere, if the best backup is followed from now on."""
-
-    dead_end: bool  #: no known backup survives it, even if nothing disturbs it
-    unsurvived: int  #: remembered disturbances that no backup survives
-    remembered: int  #: disturbances that were tried
-    safety_margin: float  #: distance to failure under the worst of them [ordinary changes]
-    #: probability, with its 90 % interval, that within the horizon one begins that is unsurvived
-    risk: tuple[float, float, float]
-    #: how often such begin [1/h], with its 90 % interval; its end is infinite where all that it
-    #: may remember are unsurvived, as it is not known what was forgotten
-    per_hour: tuple[float, float, float]
-
-
 def _atomic(learn: Callable[_P, _T]) -> Callable[_P, _T]:
     """All of it is learnt, or nothing: after an error or an interrupt the judge is as it was."""
 
     @wraps(learn)
     def wrapped(*given: _P.args, **named: _P.kwargs) -> _T:
         judge: Any = given[0]
-        before = judge._snapshot()
+        dynamics = judge.dynamics
+        own = {**judge.__dict__, "_notes": list(judge._notes)}  # notes and sums change in place
+        moves = dict(dynamics.__dict__)
+        sums = [array.copy() for array in (dynamics.sums if dynamics.n_variables else ())]
         try:
             return learn(*given, **named)
         except BaseException:
-            judge._put_back(*before)
+            judge.__dict__, dynamics.__dict__ = own, moves
+            for array, before in zip(moves["sums"] if sums else (), sums, strict=True):
+                array[:] = before
             raise
 
     return wrapped
@@ -241,15 +232,11 @@ class LearntRisk:
         return 1.0 + min(most, _CAUTION / max(1, self.n_scanned))
 
     @property
-    def exposure(self) -> float:
-        """Time in which all that is remembered was seen [s]."""
-        dynamics = self.dynamics
-        return float(dynamics.sums.counts[0]) * self.dt if dynamics.n_variables else 0.0
-
-    @property
     def remembered(self) -> Remembered:
         """Disturbances that it counts on, and the time in which they were seen."""
-        return Remembered(len(self.dynamics.sequences), self.exposure)
+        dynamics = self.dynamics
+        exposure = float(dynamics.sums.counts[0]) * self.dt if dynamics.n_variables else 0.0
+        return Remembered(len(dynamics.sequences), exposure)
 
     @property
     def told_by_experience(self) -> str:
@@ -270,19 +257,7 @@ class LearntRisk:
     ) -> Search:
         """The closest action to ``wanted`` that passes, or else that of the longest-lasting backup.
 
-        Parameters
-        ----------
-        situation : Situation
-        wanted : float or (d,) array
-        tolerance : float
-            Share of the disturbances that need not be survived, where so much was seen that the
-            upper bound of the risk is within it as well.
-        revising : bool
-            Not used: a band in which a proposal is refused longer was tried, and gained nothing.
-
-        Returns
-        -------
-        Search
+        ``revising`` changes nothing: a band in which a proposal is refused longer gained nothing.
         """
         dynamics, here, one = self.dynamics, self._here(situation.observation), np.array([wanted])
         disturbances, backups = self.disturbances, self.backups
@@ -328,89 +303,12 @@ class LearntRisk:
         return Search(np.array((one[0], executed)), judged, 1, f"{why}; {instead}")
 
     def judge(self, situation: Situation, actions: ArrayLike) -> Judgement:
-        """Risk of each action.
-
-        Parameters
-        ----------
-        situation : Situation
-        actions : (k,) or (k, d) array_like
-
-        Returns
-        -------
-        Judgement
-            NaN as long as nothing can be said.
-        """
+        """Risk of each action, (k,) or (k, d); NaN as long as nothing can be said."""
         given, here = np.asarray(actions, np.float64), self._here(situation.observation)
-        if here is None or not self._can_judge:
+        if here is None or self.disturbances is None or not self.dynamics.thresholds:
             return _unjudged(len(given))
         inner = np.array([self.dynamics.encode(one) for one in given])
         return self._judged(situation, here, inner)[0]
-
-    def assess(self, observation: ArrayLike, change: ArrayLike | None = None) -> Outlook:
-        """How it stands somewhere if the best backup is followed from now on.
-
-        Parameters
-        ----------
-        observation : (m,) array_like
-        change : (m,) array_like, optional
-            Since the observation before; without it nothing moved.
-
-        Returns
-        -------
-        Outlook
-
-        Raises
-        ------
-        ValueError
-            If no failure is known yet, or an array is of another length than observations, or
-            holds NaN or infinity.
-
-        Examples
-        --------
-        A point that coasts to a wall at 1, and may push back in time:
-
-        >>> from evofsm.guard import Guard
-        >>> guard = Guard(low=-1.0, high=1.0, interval=0.1)
-        >>> for episode in range(8):
-        ...     x, v = -1.0, 0.0
-        ...     for t in range(60):
-        ...         u = guard.decide([x, v], proposal=1.0).executed
-        ...         x, v = x + 0.1 * v, v + 0.1 * u
-        ...         if x >= 1.0:
-        ...             break
-        ...     guard.end(failed=x >= 1.0, observation=[x, v])
-        >>> guard.judge.assess([-1.0, 0.0]).dead_end, guard.judge.assess([0.7, 2.0]).dead_end
-        (False, True)
-        """
-        dynamics = self.dynamics
-        if not self._can_judge or self.backups is None:
-            raise ValueError("no failure is known yet: there is nothing to judge by")
-        z = np.asarray(observation, np.float64)
-        moved = np.zeros_like(z) if change is None else np.asarray(change, np.float64)
-        if not z.shape == moved.shape == (dynamics.n_variables,):
-            raise ValueError(
-                f"observation and change have shapes {z.shape} and {moved.shape}; both must be "
-                f"({dynamics.n_variables},)"
-            )
-        refuse_unusable("observation", z)
-        refuse_unusable("change", moved)
-        here = np.concatenate([z, moved, np.zeros(dynamics.size)])
-        unsurvived, left, _ = self._foresee(here, None, self.backups.ranks)
-        number, seconds = self.remembered
-        count = number if math.isinf(unsurvived) else int(unsurvived)
-        expected, low, high = (one / (seconds / 3600.0) for one in self._expected(count))
-        return Outlook(
-            dead_end=math.isinf(unsurvived),
-            unsurvived=count,
-            remembered=number,
-            safety_margin=left,
-            risk=self._risk(unsurvived, self._soon(seconds)),
-            per_hour=(expected, low, high),
-        )
-
-    @property
-    def _can_judge(self) -> bool:
-        return self.disturbances is not None and bool(self.dynamics.thresholds)
 
     def why(self, judged: Judgement) -> str:
         """Why the first action that was judged is dangerous, in a few words."""
@@ -460,31 +358,20 @@ class LearntRisk:
         """The horizon, as a share of the time in which all that is remembered was seen."""
         return self.horizon * self.dt / max(exposure, 1e-300)
 
-    def _expected(self, unsurvived: int) -> tuple[float, float, float]:
-        """Disturbances that are not survived, in the time observed, with their 90 % interval.
-
-        Where all that it may remember are not, those that it forgot may not be either, and it is
-        not known how many they were.
-        """
-        low, high = poisson_bounds(unsurvived)
-        return float(unsurvived), low, high if unsurvived < _REMEMBERED else math.inf
-
     def _risk(self, unsurvived: float, soon: float) -> tuple[float, float, float]:
         """Probability, with its 90 % interval, that within the horizon something begins of those.
 
-        Certain where nothing helps by the model, of which nobody knows how good it is.
+        Certain where nothing helps by the model, of which nobody knows how good it is. Where all
+        that it may remember are not survived, it is not known how many more were forgotten.
         """
         if math.isinf(unsurvived):
             return 1.0, 0.0, 1.0
-        expected, low, high = self._expected(int(unsurvived))
-        return -math.expm1(-expected * soon), -math.expm1(-low * soon), -math.expm1(-high * soon)
+        low, high = poisson_bounds(int(unsurvived))
+        high = high if unsurvived < _REMEMBERED else math.inf
+        return -math.expm1(-unsurvived * soon), -math.expm1(-low * soon), -math.expm1(-high * soon)
 
     def _allowed(self, tolerance: float, remembered: Remembered) -> int:
-        """How many of the disturbances need not be survived.
-
-        No larger share of them than the tolerance, and no more than keep the upper bound of the
-        risk within it.
-        """
+        """How many of the disturbances need not be survived, by share and bound of the risk."""
         soon, most, allowed = self._soon(remembered.seconds), tolerance * remembered.number, 0
         while allowed + 1 <= most and self._risk(allowed + 1, soon)[2] <= tolerance:
             allowed += 1
@@ -497,8 +384,7 @@ class LearntRisk:
             return None if has_gaps else np.append(z, np.zeros(m + self.dynamics.size))
         if has_gaps:
             z = np.where(np.isnan(z), at[:m] + at[m : 2 * m], z)
-        if self.dynamics.is_noisy:
-            z = self.dynamics.corrected(at, self._action, z)
+        z = self.dynamics.corrected(at, self._action, z)
         return np.concatenate([z, z - at[:m], self._action])
 
     def _untried(self, best: Floats) -> Floats | None:
@@ -534,8 +420,7 @@ class LearntRisk:
     def observe(self, observation: Floats) -> bool:
         """Learn the transition to an observation; whether something unexpected began with it.
 
-        One of which something was not seen ends what can be learnt from: what comes does not
-        follow from what was.
+        One of which something was not seen ends what can be learnt from.
         """
         dynamics = self.dynamics
         if dynamics.n_variables not in (0, len(observation)):
@@ -586,19 +471,16 @@ class LearntRisk:
     def start_episode(self, *, learn: bool = True) -> None:
         """What comes is not a consequence of what was; the episode before is learnt from."""
         if learn:
-            self._end(failed=False)
+            self.end(None, failed=False)
         else:
             self.dynamics.forget_episode()
             self._forget()
 
+    @_atomic
     def end(self, observation: Floats | None, *, failed: bool) -> None:
         """Learn from an episode; its last observation was taken in (`observe`)."""
         seen_whole = observation is None or not math.isnan(observation.dot(observation))
-        self._end(failed=failed and seen_whole)
-
-    @_atomic
-    def _end(self, *, failed: bool) -> None:
-        self.dynamics.end(failed=failed)
+        self.dynamics.end(failed=failed and seen_whole)
         if self.dynamics.n_episodes != self.n_studied:
             self._study()
         self._forget()
@@ -633,7 +515,9 @@ class LearntRisk:
                 choices=bool(dynamics.choices),
                 evolving="backups" not in self.without,
             )
-        best, refuted = self.backups.policies[self.backups.ranks], self._refuted
+        best = self.backups.policies[self.backups.ranks]
+        # From where it went on for the horizon although nothing seemed to help.
+        refuted = np.flatnonzero([dead_end for _, dead_end in self._notes[: -self.horizon]])
         tight = [refused for refused, _ in self._notes]
         situations = library.noted(self.situations, episode, tight, self.horizon, random)
         self.situations, knows = situations, bool(dynamics.thresholds)
@@ -681,11 +565,6 @@ class LearntRisk:
         if "margin" not in self.without:
             self.margin = max(self.margin, _MARGIN)
 
-    @property
-    def _refuted(self) -> Ints:
-        """From which observations it went on for the horizon although nothing seemed to help."""
-        return np.flatnonzero([dead_end for _, dead_end in self._notes[: -self.horizon]])
-
     def _look_ahead(self, after: int, *, refuted: bool, failed: bool) -> None:
         """As far as it takes to fail where nothing helps, and half as far again.
 
@@ -718,18 +597,6 @@ class LearntRisk:
         scale, model = self.disturbance_scale, self.dynamics.model
         return backups.evolved(model, self.situations, disturbances, scale, random)
 
-    def _snapshot(self) -> tuple[dict[str, Any], dict[str, Any], list[Floats]]:
-        """All that may change while it learns: sums and notes change in place."""
-        sums = self.dynamics.sums if self.dynamics.n_variables else ()
-        own = {**self.__dict__, "_notes": list(self._notes)}
-        return own, dict(self.dynamics.__dict__), [array.copy() for array in sums]
-
-    def _put_back(self, own: dict[str, Any], dynamics: dict[str, Any], sums: list[Floats]) -> None:
-        self.__dict__ = own
-        self.dynamics.__dict__ = dynamics
-        for array, before in zip(dynamics["sums"] if sums else (), sums, strict=True):
-            array[:] = before
-
     # -- In a file ------------------------------------------------------------------------------
 
     def sums(self, n_states: int) -> dict[str, float]:
@@ -743,27 +610,18 @@ class LearntRisk:
         }
 
     def save(self, path: Place, provenance: Mapping[str, Any] | None = None) -> None:
-        """Write what was learnt to a file.
-
-        Parameters
-        ----------
-        path : path-like, or file open for writing bytes
-        provenance : mapping, optional
-            What it learnt from, for people; kept in the file.
-
-        Raises
-        ------
-        OSError
-            If it cannot be written.
-        """
+        """Write what was learnt to a file, with what it learnt from, for people (`provenance`)."""
         dynamics, own, backups = self.dynamics, self.__dict__, self.backups
-        settings = {name: own[name] for name in ("dt", "seed", "given_horizon", *_NUMBERS)}
-        settings |= {"without": sorted(self.without), "violations": self.violations._asdict()}
-        settings |= {"names": list(self.labels.names), "units": list(self.labels.units)}
-        settings |= {"n_actions": dynamics.choices or None}
-        settings |= {"low": dynamics.low.tolist(), "high": dynamics.high.tolist()}
-        settings |= {"dynamics": dynamics.numbers()}
-        settings |= {"n_constant": 0 if backups is None else backups.n_constant}
+        settings = {
+            **{name: own[name] for name in ("dt", "seed", "given_horizon", *_NUMBERS)},
+            **{name: getattr(dynamics, name).tolist() for name in ("low", "high")},
+            **{name: list(getattr(self.labels, name)) for name in ("names", "units")},
+            "n_actions": dynamics.choices or None,
+            "without": sorted(self.without),
+            "violations": self.violations._asdict(),
+            "dynamics": dynamics.numbers(),
+            "n_constant": 0 if backups is None else backups.n_constant,
+        }
         arrays = {"situations": self.situations, **dynamics.arrays()}
         sizes = {"b": 0, "a": dynamics.size, "m": dynamics.n_variables}
         sizes["f"] = 1 + dynamics.n_variables
@@ -775,23 +633,7 @@ class LearntRisk:
 
     @classmethod
     def load(cls, path: Place) -> Self:
-        """Read what was learnt, between two episodes.
-
-        Parameters
-        ----------
-        path : path-like, or file open for reading bytes
-
-        Returns
-        -------
-        LearntRisk
-
-        Raises
-        ------
-        OSError
-            If there is no such file, or it may not be read.
-        ValueError
-            If the file holds something else or is damaged.
-        """
+        """Read what was learnt, between two episodes; a ValueError if the file is damaged."""
         settings, arrays = store.read(path, KIND)
         with store.explained(path):
             return cls._restored(settings, arrays)
@@ -825,10 +667,9 @@ class LearntRisk:
 
 
 # Numbers that it goes on with, and the arrays of backups: each action has features of its own.
-_NUMBERS = (
-    *("margin", "n_violated", "horizon", "time_to_failure", "believed", "n_studied"),
-    "n_scanned",
-)
+_TIMES = ("margin", "time_to_failure", "believed")
+_COUNTS = ("n_violated", "n_studied", "n_scanned")
+_NUMBERS = (*_TIMES, *_COUNTS, "horizon")
 _BACKUPS: dict[str, tuple[str, ...]] = {
     "policies": ("b", "a", "f"),
     "scores": ("b",),
@@ -851,8 +692,8 @@ KIND = Kind(
         "given_horizon": SIZE._replace(optional=True),
         "n_actions": FROM_1._replace(optional=True),
         **dict.fromkeys(("low", "high"), _ENDS),
-        **dict.fromkeys(("margin", "time_to_failure", "believed"), _TIME),
-        **dict.fromkeys(("seed", "n_violated", "n_studied", "n_scanned", "n_constant"), COUNT),
+        **dict.fromkeys(_TIMES, _TIME),
+        **dict.fromkeys(("seed", *_COUNTS, "n_constant"), COUNT),
         "horizon": FROM_1,
         "violations": {
             "share": SHARE,

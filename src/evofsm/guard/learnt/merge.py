@@ -30,25 +30,7 @@ def merge_judges(judges: Sequence[LearntRisk]) -> LearntRisk:
     Of sequences, failures, jumps and situations the newest of all are kept; backups are those of
     the judge that learnt from most episodes, which evolve on; the margin is the largest.
 
-    Parameters
-    ----------
-    judges : sequence of LearntRisk
-        Of the same actions and interval; at least one.
-
-    Returns
-    -------
-    LearntRisk
-
-    Raises
-    ------
-    ValueError
-        If there is none, or they are of different actions, intervals, or numbers of variables.
-
-    Examples
-    --------
-    >>> from evofsm.guard import LearntRisk
-    >>> merge_judges([LearntRisk(0.1, n_actions=2) for _ in range(3)])
-    LearntRisk(dt=0.1, seed=0)
+    A ValueError if there is none, or actions, intervals or numbers of variables differ.
     """
     if not judges:
         raise ValueError("judges is empty; there must be at least one to merge")

@@ -118,7 +118,7 @@ _FADES = 0.95
 _MATTERS, _HALVES = 0.5, 2.0
 # Doubt from which on a model is corrected; and the number of episodes before which it is still
 # being learnt.
-_DOUBT = 30.0
+DOUBT = 30.0
 LEARNT = 20
 # What corrections are held to 0 by: as many transitions, of products more; and how many there have
 # to be.
@@ -137,10 +137,6 @@ class Recent(NamedTuple):
     def none(cls, p: int, m: int, episode: int) -> Recent:
         """Before anything was seen, in this episode."""
         return cls(np.zeros((p, p)), np.zeros((p, m)), np.zeros(m), np.full(m, float(episode)))
-
-    def overthrown(self) -> list[int]:
-        """Variables that do not move any more as was learnt."""
-        return np.flatnonzero(self.doubt > _DOUBT).tolist()
 
 
 class Drift(NamedTuple):
@@ -161,10 +157,7 @@ def compared(
     episode: int,
     young: bool,
 ) -> Recent:
-    """Take in an episode: observations (T + 1, m), and actions (T, a).
-
-    Rows in which something rests at an end, or changes more than it ordinarily does, say nothing.
-    """
+    """Take in an episode; rows at an end, or that change more than ordinarily, say nothing."""
     found = features(model, z[1:-1], np.diff(z[:-1], axis=0), u[:-1], u[1:])
     move = found @ model.weights
     after, change = z[2:], np.diff(z[1:], axis=0)
@@ -187,11 +180,9 @@ def compared(
 
 
 def correction(recent: Recent, weights: Floats, sums: Sums, a: int) -> Floats:
-    """(p, m) what is to be added to the weights of the model.
+    """(p, m) what is to be added to the weights of the model, by ridge regression about 0.
 
-    By ridge regression, about 0, in units of each feature's own variance. Latest
-    changes and the action before, of ``a`` numbers, are not asked: they would foresee that what
-    disturbs goes on. Products are asked only if they have to be.
+    Lags are not asked: they would foresee that what disturbs goes on.
     """
     found, m, n = np.zeros_like(weights), weights.shape[1], max(1.0, float(sums.squares[0, 0]))
     if recent.squares[0, 0] < _ENOUGH_ROWS:
@@ -224,11 +215,7 @@ _MOST, _ENOUGH = 1.0, 1.0
 def misled_by_lags(
     models: Sequence[Model], z: Floats, u: Floats, starts: Ints, steps: int, unit: Floats
 ) -> float:
-    """How much more is missed with lags than without, the two ``models``, in [-1, 1].
-
-    Of an episode of observations (T + 1, m) and actions (T, a), from each of ``starts``, of which
-    the last is at most T - ``steps``.
-    """
+    """How much more is missed with lags than without, the two ``models``, in [-1, 1]."""
     some = starts[np.unique(np.linspace(0, len(starts) - 1, _STARTS).astype(int))]
     missed, less = (_missed_ahead(model, z, u, some, steps, unit) for model in models)
     return min(_MOST, max(-_MOST, missed - less))
@@ -278,22 +265,15 @@ def untried(m: int) -> Floats:
 
 
 def best_gains(missed: Floats) -> Floats:
-    """(m,) for each variable the largest gain that misses hardly more than the best one.
-
-    Examples
-    --------
-    >>> best_gains(np.array([[0.44, 0.41, 0.391, 0.388, 0.39, 0.41]]))
-    array([0.5])
-    """
+    """(m,) for each variable the largest gain that misses hardly more than the best one."""
     hardly_more = missed <= missed.min(1, keepdims=True) + _HARDLY
     return np.asarray(GAINS[hardly_more.argmax(1)])
 
 
 def tried(missed: Floats, model: Model, z: Floats, u: Floats, unit: Floats) -> Floats:
-    """(m, g) what gains miss, after an episode of observations (T + 1, m) and actions (T, a).
+    """(m, g) what gains miss after one more episode: the mean of ln(1 + square), in units.
 
-    Mean of ln(1 + square) of what a variable's next observation misses [ordinary changes] of what
-    was expected, the others being taken as they are seen; the last episodes count most.
+    Of what is expected of a variable, the others being taken as they are seen.
     """
     unit = np.maximum(unit, 1e-300)[:, None]
     calm, slope, curve, lag = _of_itself(model, z, u)
@@ -315,8 +295,7 @@ def tried(missed: Floats, model: Model, z: Floats, u: Floats, unit: Floats) -> F
 def _of_itself(model: Model, z: Floats, u: Floats) -> tuple[Floats, Floats, Floats, Floats]:
     """How each variable's expected change depends on that variable, the others being as seen.
 
-    The change of variable j at time t is calm + slope x + curve x^2 + lag dx, of its distance x to
-    the origin and its latest change dx: (T, m), (T, m), (m, 1) and (m, 1).
+    It is calm + slope x + curve x^2 + lag dx, of its distance x to the origin and latest change dx.
     """
     m = z.shape[1]
     change = np.diff(z[:-1], axis=0, prepend=z[:1])

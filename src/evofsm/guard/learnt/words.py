@@ -67,11 +67,7 @@ def kept(backup: str, remembered: Remembered, left: float, spared: int = 0) -> s
 def refused(
     unsurvived: int, remembered: Remembered, margin: float, scale: float, spared: int = 0
 ) -> str:
-    """Why an action is dangerous.
-
-    ``unsurvived`` disturbances; negative where none survives even without one, 0 where what is
-    lacking is the margin alone. Disturbances are taken to be ``scale`` times as hard as they were.
-    """
+    """Why an action is dangerous; ``unsurvived`` is -1 without a disturbance, 0 by the margin."""
     if unsurvived < 0:
         return "no backup prevents failure, even if nothing disturbs it"
     if unsurvived == 0:
@@ -103,11 +99,9 @@ def experience(
     worse: int = 0,
     noisy: Sequence[str] = (),
 ) -> str:
-    """What was learnt so far.
+    """What was learnt so far: variables that fail, whether below a threshold, and which.
 
-    Variables that fail, whether below a threshold, and which; those that do not move any more as
-    they did, and since which episode, from 1; since which episode disturbances are worse than those
-    of before, 0 since none; and variables whose sensors are noisy.
+    Since which episode, from 1, variables move otherwise and disturbances are worse (0: none are).
     """
     since = "".join(f"; since episode {first} {name} moves otherwise" for name, first in drifts)
     if worse:
