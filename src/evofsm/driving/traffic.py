@@ -19,9 +19,9 @@ from numpy.typing import ArrayLike, NDArray
 from evofsm.driving.judge import LatentRisk
 from evofsm.fsm.actions import IntervalActions
 from evofsm.fsm.naming import Labels
-from evofsm.fsm.validation import positive, real_array
+from evofsm.fsm.validation import real_array
 from evofsm.guard.actions import Action
-from evofsm.guard.api import TOLERANCE, Fallback, Judgement, Search, Situation, Trial
+from evofsm.guard.api import TOLERANCE, ActionJudge, Fallback, Judgement, Search, Situation
 from evofsm.guard.guard import Guard
 from evofsm.guard.reviser import ActionReviser, Mode
 
@@ -36,6 +36,8 @@ _AHEAD = 2.0
 _STEP, _WIDTH = 0.25, 0.3
 # So hard leaders brake at most, unless told or seen otherwise: SUMO's emergencyDecel [m/s²].
 LEADER_DECEL = 9.0
+# So hard those behind brake [m/s²], once they have kept their speed for so long [s].
+_BEHIND, _REACTION = 4.5, 1.0
 # Once it revises, a proposal is kept again below this share of the tolerance.
 _RELEASE = 0.9
 _KEPT = "risk is within the tolerance"
@@ -153,7 +155,7 @@ def _pair(own: list[float], other: list[float], index: int) -> Pair | None:
 # -- The judge ----------------------------------------------------------------------------------
 
 
-class TrafficRisk:
+class TrafficRisk(ActionJudge):
     """Judges accelerations among any number of objects, as the worst of the pairs with them.
 
     An observation is that of `Scene.rows`. It learns nothing itself; what leaders do can be taught
@@ -166,15 +168,11 @@ class TrafficRisk:
         than what is possible, so that one brakes early.
     low, high : float
         The hardest braking, negative, and the hardest acceleration [m/s²].
-    behind_decel : float
-        How hard those behind can brake [m/s²].
-    reaction : float
-        For so long those behind keep their speed before they brake in full [s].
 
     Raises
     ------
     ValueError
-        If low and high are no range around 0, or another number is not positive.
+        If low and high are no range around 0.
 
     Notes
     -----
@@ -197,22 +195,13 @@ class TrafficRisk:
 
     fallback = Fallback(0.0, "keeping the speed")
 
-    def __init__(
-        self,
-        ahead: LatentRisk,
-        low: float,
-        high: float,
-        *,
-        behind_decel: float = 4.5,
-        reaction: float = 1.0,
-    ) -> None:
+    def __init__(self, ahead: LatentRisk, low: float, high: float) -> None:
         if not -math.inf < low < 0.0 < high < math.inf:
             raise ValueError(f"low is {low} and high is {high}; they must lie around 0")
         self.ahead = ahead
         self.low, self.high = float(low), float(high)
-        decel = positive("behind_decel", behind_decel)
-        #: Judges the one that follows, of which oneself is the leader.
-        self.behind = LatentRisk.given(-decel, decel, decel, positive("reaction", reaction))
+        # Judges the one that follows, of which oneself is the leader.
+        self._behind = LatentRisk.given(-_BEHIND, _BEHIND, _BEHIND, _REACTION)
         self.labels = Labels(dt=ahead.dt)
         steps = max(2, round((self.high - self.low) / _STEP) + 1)
         self._grid = np.linspace(self.low, self.high, steps)
@@ -255,7 +244,7 @@ class TrafficRisk:
 
     def _survived(self, pair: Pair) -> float:
         """The hardest braking of oneself that who is behind survives [m/s²]."""
-        return float(self.behind.critical(pair.observation, _COASTING)[0])
+        return float(self._behind.critical(pair.observation, _COASTING)[0])
 
     def search(
         self, situation: Situation, wanted: Action, *, tolerance: float, revising: bool
@@ -286,14 +275,6 @@ class TrafficRisk:
         if pair.role is Role.BEHIND:
             return f"{who}, survives no braking harder than {self._survived(pair):.1f} m/s²"
         return f"{who}: {self.ahead.why(judged)}"
-
-    def trial(self) -> Trial | None:
-        """None: it tries nothing."""
-        return None
-
-    def effective(self, situation: Situation, actions: _Floats) -> _Floats:
-        """All actions as they are."""
-        return actions
 
     def refuse_unfit(self, low: Action, high: Action) -> None:
         """Raise a ValueError if it counts on harder braking than there is."""

@@ -60,11 +60,9 @@ class ConformalAlarm:
     share of failures. Only their order matters, so any unit and infinities will do. NaN counts as
     the most dangerous score.
 
-    The guarantee (`held`) is about the error rate over all updates that count, and nothing else:
-    not about a single alarm, nor about the other kind of errors. A rate of false alarms is held by
-    silence if need be, a rate of misses by an alarm that is always on; until about ``1 / rate``
-    updates were counted it is so. Where the outcome is known only later, update then, with
-    ``alarmed`` as the alarm was at the time: a delay of d updates allows for d more errors.
+    The guarantee (`held`) is about the error rate over all updates that count, not about the other
+    kind of errors: a rate of false alarms is held by silence if need be, a rate of misses by an
+    alarm that is always on. A delay of the outcome by d updates allows for d more errors.
 
     Examples
     --------
@@ -139,28 +137,21 @@ class ConformalAlarm:
 
     def alarms(self, score: float) -> bool:
         """Whether a score is in alarm now. Changes nothing."""
-        return self._errs(self._value(score)) == (self.of == "false alarms")
+        value, quantile = self._value(score), self._quantile
+        errs = value > quantile or quantile == -math.inf
+        return errs == (self.of == "false alarms")
 
     def update(self, score: float, happened: bool, *, alarmed: bool | None = None) -> None:
-        """Learn the outcome of a score.
+        """Learn whether the event came that a score is to warn of.
 
-        Parameters
-        ----------
-        score : float
-            NaN counts as the most dangerous one.
-        happened : bool
-            Whether the event came that the alarm is to warn of. Of false alarms only updates
-            without it count, of misses only updates with it.
-        alarmed : bool, optional
-            Whether it was in alarm at the time; without it, whether it is now.
+        Of false alarms only updates without it count, of misses only those with it. ``alarmed``
+        says whether it was in alarm at the time; without it, whether it is now counts.
         """
         value = self._value(score)
         if bool(happened) != (self.of == "misses"):
             return
-        if alarmed is None:
-            error = self._errs(value)
-        else:
-            error = bool(alarmed) == (self.of == "false alarms")
+        in_alarm = self.alarms(score) if alarmed is None else bool(alarmed)
+        error = in_alarm == (self.of == "false alarms")
         self.counted += 1
         self.errors += error
         self._latest.append(value)
@@ -182,10 +173,6 @@ class ConformalAlarm:
         if above < 1:
             return math.inf
         return -math.inf if above > n else self._ordered[n - above]
-
-    def _errs(self, value: float) -> bool:
-        quantile = self._quantile
-        return value > quantile or quantile == -math.inf
 
     def __repr__(self) -> str:
         return (

@@ -154,11 +154,13 @@ class ActionJudge(Protocol):
 
     def trial(self) -> Trial | None:
         """What it has to try before its judgement can be relied on; None if nothing."""
+        return None
 
     def effective(
         self, situation: Situation, actions: NDArray[np.float64], /
     ) -> NDArray[np.float64]:
         """What actions come to here, where some of them would change nothing."""
+        return actions
 
     def refuse_unfit(self, low: Action, high: Action, /) -> None:
         """Raise a ValueError if it counts on actions outside ``low`` to ``high``."""

@@ -1,16 +1,9 @@
 """The audit log of a guard: what it decided, so that nobody can change it unnoticed.
 
-A record is a JSON object on a line of its own, and its number is that of the line::
-
-    {"clock":...,"kind":"begin",...,"number":2,"previous":"9c1e...","hash":"51b0..."}
-
-``hash`` is the SHA-256 of the line up to the comma before it, and ``previous`` that of the record
-before (zeros for the first): a hash chain as in Haber and Stornetta (J. Cryptology 3, 1991).
-Whoever changes, removes, moves or inserts a record breaks the chain there, unless everything after
-it is written anew, or cut off: that is shown by a *head* that was kept elsewhere.
-
-docs/audit.md says what is in a record. A row of ``before`` is ``[time, observation, proposal]``,
-with the candidates after that if there were any, and without a proposal where none was made.
+docs/audit.md says what is in a record, a JSON object on a line of its own. ``hash``, its last, is
+the SHA-256 of the line up to the comma before it, and ``previous`` that of the record before (zeros
+for the first): a hash chain as in Haber and Stornetta (J. Cryptology 3, 1991). A row of ``before``
+is ``[time, observation]``, with the proposal and its candidates after that if there were any.
 """
 
 from __future__ import annotations
@@ -71,15 +64,7 @@ FIELDS: Mapping[str, set[str]] = {
 
 
 def canonical(content: Any) -> str:
-    """JSON that is the same for equal content: sorted keys, no spaces, floats to the last bit.
-
-    What JSON has no number for is written as ``"NaN"``, ``"Infinity"`` or ``"-Infinity"``.
-
-    Examples
-    --------
-    >>> canonical({"b": 0.1, "a": [float("nan"), -0.0]})
-    '{"a":["NaN",-0.0],"b":0.1}'
-    """
+    """JSON that is the same for equal content, with words for numbers that are not finite."""
     try:
         return _dumped(content)
     except ValueError:
@@ -91,7 +76,6 @@ def _dumped(content: Any) -> str:
 
 
 def _finite(content: Any) -> Any:
-    """With words for numbers that are not finite."""
     if isinstance(content, float) and not math.isfinite(content):
         return "NaN" if math.isnan(content) else "Infinity" if content > 0.0 else "-Infinity"
     if isinstance(content, Mapping):
@@ -203,15 +187,7 @@ class Chain:
         self._kept = kept
 
     def records(self) -> Iterator[Record]:
-        """The records; after the last one `finding` is known.
-
-        Raises
-        ------
-        OSError
-            If there is no such file, or it may not be read.
-        ValueError
-            If no line of it is a record.
-        """
+        """The records, after which `finding` is known; a ValueError if there is none."""
         known = self._kept in (None, NOTHING)
         reading = lines(self.path)
         for line in reading:
@@ -250,10 +226,7 @@ class Chain:
 
 
 def lines(path: Path) -> Iterator[bytes]:
-    """The lines of a log, the last perhaps without an end; of one that grows, those there are now.
-
-    Raises a ValueError if one is longer than any record.
-    """
+    """The lines of a log, the last perhaps without an end; of one that grows, those now there."""
     with open(path, "rb") as file:
         left = os.fstat(file.fileno()).st_size
         while line := file.readline(min(_LONGEST, left)):
@@ -349,13 +322,7 @@ class AuditLog:
         return self._head
 
     def close(self) -> None:
-        """Write what was held back, and let others have the file.
-
-        Raises
-        ------
-        OSError
-            If something could not be written, now or before.
-        """
+        """Write what was held back; an OSError if that failed, now or before."""
         if self._file.closed:
             return
         try:
@@ -436,13 +403,7 @@ class AuditLog:
         self._busy = False
 
     def ended(self, observation: NDArray[np.float64] | None, *, failed: bool) -> None:
-        """The episode ended.
-
-        Raises
-        ------
-        OSError
-            If something could not be written since it began.
-        """
+        """The episode ended; an OSError if something could not be written since it began."""
         if self._busy or self._guard is None:
             return
         self._busy = True

@@ -131,12 +131,10 @@ class RevisedActions(gymnasium.Wrapper[Any, Any, Any, Any]):
 class RevisedVectorActions(VectorWrapper[Any, Any, Any, Any, Any]):
     """Many environments at once under one guard, as `RevisedActions` does it for one.
 
-    All profit from what each meets: the guard learns every environment's episode **as a whole when
-    it ends**, those that end in the same step in the order of the environments. Within an episode
-    a twin of the guard (`Guard.copy`) decides, made as the episode begins: it knows the episodes
-    that had ended by then and learns from its own, but not from those that run alongside. What you
-    change about the guard, its mode for example, counts in each environment from its next episode
-    on. With one environment it comes to the same as `RevisedActions`, bit for bit.
+    The guard learns every environment's episode **as a whole when it ends**. Within an episode a
+    twin of the guard (`Guard.copy`) decides, made as the episode begins: it learns from its own,
+    but not from those that run alongside. What you change about the guard, its mode for example,
+    counts from the next episode on. With one environment it comes to the same as `RevisedActions`.
 
     Parameters
     ----------
@@ -159,8 +157,7 @@ class RevisedVectorActions(VectorWrapper[Any, Any, Any, Any, Any]):
     ``infos`` has the names of a single environment, as arrays over the environments, each with a
     mask as Gymnasium has it: ``_reviser/reason`` and so on are False where nothing was decided, in
     a step that only resets (``AutoresetMode.NEXT_STEP``) or after an episode that was not reset
-    (``DISABLED``). All that begin together know equally little: each of them may fail where one
-    environment after another would have failed once.
+    (``DISABLED``).
 
     Examples
     --------
@@ -273,10 +270,7 @@ class Decided(NamedTuple):
 
 
 class Lane:
-    """The episodes of one environment, or of one agent, under a guard.
-
-    Where the guard is shared, a twin decides, and the guard learns the episode when it ends.
-    """
+    """The episodes of one environment, or of one agent, under a guard or a twin of a shared one."""
 
     def __init__(self, terms: Terms, *, shared: bool) -> None:
         if shared and terms.guard.audit is not None:
@@ -297,9 +291,8 @@ class Lane:
         """What to execute; the action itself where there is nothing to judge, or to decide."""
         terms, proposal = self.terms, self.terms.proposal(action)
         if not self.is_open:
-            return terms.decided(action, terms.unjudged(proposal))._replace(
-                executed=action, cost=0.0
-            )
+            unjudged = terms.decided(action, terms.unjudged(proposal))
+            return unjudged._replace(executed=action, cost=0.0)
         if self._seen is None:
             self.revision = terms.unjudged(proposal)
             return terms.decided(action, self.revision)

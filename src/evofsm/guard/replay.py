@@ -137,7 +137,6 @@ fields=())
     contents = Contents(
         counts["start"], counts["begin"], spoke + counts["quiet rows"], spoke, counts["settings"]
     )
-    others = tuple(Field(name, *both) for name, both in player.other_makers.items())
     return Audit(
         head=chain.head,
         half_written=chain.half_written,
@@ -146,7 +145,7 @@ fields=())
         replayed=player.decisions if replay else None,
         difference=difference,
         not_replayed=tuple(player.not_replayed),
-        other_makers=others,
+        other_makers=tuple(player.other_makers.values()),
     )
 
 
@@ -184,7 +183,7 @@ class _Player:
     def __init__(self, failed: _Failed | None) -> None:
         self.decisions = 0
         self.not_replayed: list[str] = []
-        self.other_makers: dict[str, tuple[str, str]] = {}
+        self.other_makers: dict[str, Field] = {}
         self._failed = failed
         self._guard: Guard | None = None  # None while a session cannot be replayed
         self._is_under_way = False
@@ -225,7 +224,7 @@ class _Player:
         now = made_by()
         for name, then in content["made_by"].items():
             if then != now.get(name):
-                self.other_makers[name] = str(then), now.get(name, "")
+                self.other_makers[name] = Field(name, str(then), now.get(name, ""))
         self._guard, self._is_under_way = None, False
         told = content["told_failures"]
         if content["guard"] is None:
@@ -250,19 +249,12 @@ class _Player:
         if fields := _differing(settings, settings_now(guard)):
             raise _DiffersError("there are no such settings", fields)
 
-    def _silent(
-        self,
-        guard: Guard,
-        time: Any,
-        observation: Sequence[Any],
-        action: Any = None,
-        candidates: Sequence[Any] = (),
-    ) -> None:
+    def _silent(self, guard: Guard, time: Any, observation: Any, *proposed: Any) -> None:
         """What was executed as it was proposed, or nothing was proposed to."""
-        if action is None:
+        if not proposed:
             guard.recognise(_floats(observation), _number(time))
             return
-        when, told, speaks = self._again(guard, time, observation, action, candidates)
+        when, told, speaks = self._again(guard, time, observation, *proposed)
         if speaks:
             raise _DiffersError(
                 f"{when} was recorded as nothing to speak of, but {told['reason']}",
@@ -281,7 +273,7 @@ class _Player:
 
     @staticmethod
     def _again(
-        guard: Guard, time: Any, observation: Any, action: Any, candidates: Any
+        guard: Guard, time: Any, observation: Any, action: Any, candidates: Any = ()
     ) -> tuple[str, dict[str, Any], bool]:
         """Which decision it is, what is told of it, and whether it is one to speak of."""
         proposal = Proposal(_action(action), tuple(_action(candidate) for candidate in candidates))
@@ -301,7 +293,6 @@ class _Player:
 
 
 def _number(value: Any) -> float:
-    """A number as `canonical` writes it."""
     if value in ("NaN", "Infinity", "-Infinity"):
         return float(value)
     if isinstance(value, bool) or not isinstance(value, int | float):

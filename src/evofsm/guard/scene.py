@@ -29,7 +29,7 @@ from evofsm.fsm.naming import Labels
 from evofsm.fsm.proportions import wilson_bounds
 from evofsm.fsm.validation import positive, whole
 from evofsm.guard.actions import Action
-from evofsm.guard.api import Fallback, Judgement, Search, Situation, Trial
+from evofsm.guard.api import ActionJudge, Fallback, Judgement, Search, Situation
 from evofsm.store import COUNT, FLAG, FROM_1, MOST_COUNTED, SIZE, Kind, Numbers, Place
 
 _Floats = NDArray[np.float64]
@@ -87,7 +87,7 @@ _KIND = Kind(
 )
 
 
-class SceneRisk:
+class SceneRisk(ActionJudge):
     """Judges one of a few actions among any number of objects; given only which episodes failed.
 
     The risk of an action is the probability to meet an object within five decisions, if the best
@@ -158,14 +158,6 @@ class SceneRisk:
         self.memory = Memory(operator.index(n_actions), len(self.place), len(self._rest))
         self._seen, self._actions = [], []
 
-    def trial(self) -> Trial | None:
-        """None: it tries nothing."""
-        return None
-
-    def effective(self, situation: Situation, actions: _Floats) -> _Floats:
-        """All actions as they are."""
-        return actions
-
     def refuse_unfit(self, low: Action, high: Action) -> None:
         """Raise a ValueError if there are other actions than it was made for."""
         if (low, high) != (0.0, self.memory.n_actions - 1.0):
@@ -179,10 +171,9 @@ class SceneRisk:
     def search(
         self, situation: Situation, wanted: Action, *, tolerance: float, revising: bool
     ) -> Search:
-        """The action within the tolerance that is closest to ``wanted`` in what it brings oneself.
+        """The tolerable action that is closest in effect to ``wanted``.
 
-        Where none is, one of the least risky, and of these one after which it lasts longest, both
-        up to the tolerance; ``wanted``, if it is among them.
+        Else one of the least risky after which it lasts longest; ``wanted``, if it is among them.
         """
         found = self._foreseen(situation)
         if isinstance(found, str):
@@ -309,15 +300,7 @@ class SceneRisk:
 
     @classmethod
     def load(cls, path: Place) -> Self:
-        """Read what `save` wrote, as between two episodes.
-
-        Raises
-        ------
-        OSError
-            If there is no such file, or it may not be read.
-        ValueError
-            If the file holds something else or is damaged.
-        """
+        """Read what `save` wrote; a ValueError if it is something else or damaged."""
         settings, arrays = store.read(path, _KIND)
         with store.explained(path):
             counted = {name: int(settings.pop(name)) for name in ("failures", "fitted")}
@@ -443,36 +426,28 @@ class Contact(NamedTuple):
         failed: list[tuple[_Floats, _Floats]],
         spread: _Floats,
     ) -> Contact:
-        """From steps of objects that were survived, and of all objects at each failure.
+        """From steps, (s, p) places before and after, of objects survived and at each failure.
 
-        A step is the (s, p) places at its beginning and at its end. Whichever object came closest
-        in a failure is taken to be the one that was met. Of the shapes of the box, beginning with
-        the ``spread`` of places, that is taken by which the fewest survived steps came closer than
-        the failed ones.
+        The closest object in a failure was met. Of the shapes of a box of this ``spread``, that is
+        taken by which the fewest survived steps came closer than the failed ones.
         """
-        best: tuple[float, _Floats, _Floats, _Floats] | None = None
+        tried = []
         for power in _SHAPES if len(spread) == 2 else (0.0,):
             turned = np.exp(0.5 * power * np.array([1.0, -1.0])) if len(spread) == 2 else 1.0
             sides = spread * turned
             near = np.sort(_closest(*survived, sides))
             met = np.sort([_closest(*steps, sides).min() for steps in failed])
-            score = float(np.log1p(np.searchsorted(near, met)).sum())
-            if best is None or score < best[0]:
-                best = score, sides, near, met
-        assert best is not None
-        _, sides, near, met = best
+            tried.append((np.log1p(np.searchsorted(near, met)).sum(), sides, near, met))
+        _, sides, near, met = min(tried, key=operator.itemgetter(0))
         at = np.unique(np.concatenate([met, near[:_CLOSEST]]))
         failures = 1 + len(met) - np.searchsorted(met, at, "left")
         risk = failures / (failures + np.searchsorted(near, at, "right"))
         return cls(sides, np.append(0.0, at), np.append(1.0, risk), float(np.median(met)))
 
     def of(self, path: _Floats) -> _Floats:
-        """(..., n) probability of failure by each step of paths, (..., n + 1, p) places.
-
-        It is that of the closest step so far: what is not known of how close is too close is not
-        drawn anew in each step.
-        """
+        """(..., n) probability of failure by each step of paths, (..., n + 1, p) places."""
         come = _closest(path[..., :-1, :], path[..., 1:, :], self.sides)
+        # What is not known of how close is too close is not drawn anew in each step.
         so_far = np.minimum.accumulate(come, axis=-1)
         return np.asarray(np.interp(so_far, self.closeness, self.risk))
 
@@ -715,10 +690,9 @@ class Memory:
         return Foreseen(lost[:, :, -1], 1.0 - lost.mean(-1), after)
 
     def _own_courses(self, own: _Floats, p: int) -> tuple[_Floats, _Floats, _Floats]:
-        """How oneself moves relative places, for each action and each that follows for good.
+        """How r courses move relative places, by action and by that which follows for good.
 
-        (r, n², H, p) for each of r courses, of which each is what once happened after the same
-        actions; (r, n²) their shares; and the (n, p + q) state after each action in the first.
+        (r, n², H, p) moves, (r, n²) shares, and the (n, p + q) states a step later in the first.
         """
         n, r = self.n_actions, _OWN_ANALOGS
         first, then = np.repeat(np.arange(n), n), np.tile(np.arange(n), n)
@@ -753,10 +727,7 @@ def _terms(before: _Floats, after: _Floats, p: int) -> _Floats:
 
 
 def _first_motion(terms: int, p: int) -> _Floats:
-    """The prior of how places change: by what oneself moves, all places move back.
-
-    Without it one's own moves are never learnt where they are rare.
-    """
+    """The prior of how places change, without which rare moves of one's own are never learnt."""
     motion = np.zeros((terms, p))
     motion[:p] = -np.eye(p)
     return motion
