@@ -434,7 +434,7 @@ def test_a_judge_is_told_all_that_happens_and_the_machine_counts_what_began():
 
         def observe(self, observation):
             self.told += (("seen", observation.tolist()),)
-            return len(self.told) == 6  # something unexpected began with the action before
+            return len(self.told) in (6, 9, 11)  # something unexpected began then
 
         def act(self, action):
             self.told += (("did", action),)
@@ -448,17 +448,20 @@ def test_a_judge_is_told_all_that_happens_and_the_machine_counts_what_began():
 
     guard = continuous(judge=Observing(), failed=lambda z: abs(z[0]) > 0.8)
     step = (("seen", [0.1, 0.0]), ("did", 0.0), "learnt")
-    guard.decide([0.1, 0.0], 0.0)
-    guard.decide([0.1, 0.0], 0.0)
-    guard.decide([0.1, 0.0], 0.0, time=DT)  # the same observation once more
+    for _ in range(3):
+        guard.decide([0.1, 0.0], 0.0)
+    guard.decide([0.1, 0.0], 0.0, time=2 * DT)  # the same observation once more
     guard.end(observation=[0.9, 0.0])
-    assert guard.judge.told == (*step, *step, ("did", 0.0), ("seen", [0.9, 0.0]), ("failed", True))
+    once_more, last = ("did", 0.0), ("seen", [0.9, 0.0])
+    assert guard.judge.told == (*step, *step, *step, once_more, last, ("failed", True))
+    assert guard.machine.onsets.sum() == 0.0  # of what failed nothing is counted
     guard.judge.told = (None,) * 2
     guard.decide([0.1, 0.0], 0.0)
     guard.decide([0.1, 0.0], 0.0)
-    guard.end()
-    assert guard.judge.told == (None, None, *step, *step, ("ended", False))
-    assert guard.machine.onsets.tolist() == [1.0]
+    guard.end(observation=[0.2, 0.0])
+    ended = ("seen", [0.2, 0.0]), ("ended", True)
+    assert guard.judge.told == (None, None, *step, *step, *ended)
+    assert guard.machine.onsets.tolist() == [2.0]
     before = guard.judge.told
     guard.freeze()
     guard.decide([0.0, 0.0], 1.0)
