@@ -96,7 +96,9 @@ def watch(
             print(f"  {page.address}", flush=True)
             if not no_browser:
                 webbrowser.open(page.address)
-            threading.Event().wait()
+            never = threading.Event()
+            while not never.wait(0.5):  # a thread of polars may take the signal: look now and then
+                pass
     say("\nThe page is closed.")
 
 
