@@ -555,10 +555,11 @@ def sums_of(guard: Guard) -> dict[str, float]:
     sums: dict[str, float] = {}
     machine = guard.machine
     if machine is not None:
-        sums["states"] = machine.n_states
-        sums["failures"] = math.fsum(machine.endings.tolist())
-        sums["potential"] = math.fsum(machine.potentials.tolist())
-        sums["transitions"] = math.fsum(machine.decisions.ravel().tolist())
+        model = machine.model()  # each array of a machine by itself would be another snapshot
+        sums["states"] = model.n_states
+        sums["failures"] = math.fsum(model.endings.tolist())
+        sums["potential"] = math.fsum(model.potentials.tolist())
+        sums["transitions"] = math.fsum(model.decisions.ravel().tolist())
     if guard.judge is not None:
         sums |= guard.judge.sums(0 if machine is None else machine.n_states)
     return sums
