@@ -25,6 +25,7 @@ import polars as pl
 from matplotlib.figure import Figure as Drawn
 from typer import Option
 
+from evofsm.cli import imported
 from evofsm.driving import guard_for_family
 from evofsm.fsm import EvolvingFSM
 from evofsm.guard import Guard, LearntRisk, SceneRisk, run_episode
@@ -83,7 +84,7 @@ def make_judge(name: str, system: System, without: Sequence[str] = (), seed: int
     """
     told: dict[str, Any] = {**system.actions.settings, "interval": system.interval, "seed": seed}
     if ":" in name:
-        own = lib.imported(name)(system, seed)
+        own = imported(name)(system, seed)
         if all(hasattr(own, method) for method in ("begin", "decide", "end", "freeze")):
             return own  # a guard, too, which has a judge beside
         if hasattr(own, "judge"):

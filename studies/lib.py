@@ -9,7 +9,6 @@ itself is `evofsm.paper.Page`; `README.md` beside this file has an example.
 from __future__ import annotations
 
 import inspect
-import json
 import math
 import os
 import shlex
@@ -20,7 +19,6 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
 from dataclasses import MISSING, dataclass, fields
 from functools import partial
-from importlib import import_module
 from importlib.util import find_spec
 from multiprocessing import get_context
 from pathlib import Path
@@ -36,6 +34,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import isotonic_regression
 from scipy.stats import beta
 
+from evofsm.cli import print_json
 from evofsm.extras import install
 from evofsm.paper import Page, print_page, write_page
 
@@ -101,7 +100,7 @@ def command(study: type[Study]) -> Callable[..., None]:
             asked = study(**given).shortened() if short else study(**given)
             found = asked.run(workers)
             if as_json:
-                print(to_json({name: frame.to_dicts() for name, frame in found.items()}))
+                print_json({name: frame.to_dicts() for name, frame in found.items()})
                 return
             folder = out or Path(f"evofsm-{study.name}")
             folder.mkdir(parents=True, exist_ok=True)
@@ -189,49 +188,9 @@ def command_line() -> str:
     return shlex.join(["python", "-m", "studies", *sys.argv[1:]])
 
 
-def to_json(document: object) -> str:
-    """JSON that every parser reads: what is not a finite number becomes null."""
-
-    def plain(value: Any) -> Any:
-        if isinstance(value, dict):
-            return {name: plain(one) for name, one in value.items()}
-        if isinstance(value, list | tuple):
-            return [plain(one) for one in value]
-        return None if isinstance(value, float) and not math.isfinite(value) else value
-
-    return json.dumps(plain(document), indent=2, ensure_ascii=False, allow_nan=False)
-
-
 def names_in(text: str) -> list[str]:
     """Names that were given with commas between them."""
     return [name.strip() for name in text.split(",") if name.strip()]
-
-
-def imported(name: str) -> Any:
-    """What ``module:Name`` names; the module is looked for in the present folder too, and run.
-
-    Raises
-    ------
-    ValueError
-        If it is no such name, there is no such module, or nothing of that name in it.
-
-    Examples
-    --------
-    >>> imported("math:pi")
-    3.141592653589793
-    """
-    module_name, colon, thing = name.partition(":")
-    if not (module_name and colon and thing):
-        raise ValueError(f"{name!r} names nothing; write module:Name")
-    if "" not in sys.path:
-        sys.path.insert(0, "")
-    try:
-        module = import_module(module_name)
-    except ModuleNotFoundError as error:
-        raise ValueError(f"{module_name}: {error} (is it in this folder, or installed?)") from error
-    if not hasattr(module, thing):
-        raise ValueError(f"{module_name} has no {thing!r}")
-    return getattr(module, thing)
 
 
 # -- Work over processes --------------------------------------------------------------------------

@@ -20,6 +20,7 @@ from typing import Any, ClassVar, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from evofsm.cli import imported
 from evofsm.driving import (
     FAMILIES,
     Draw,
@@ -30,7 +31,7 @@ from evofsm.driving import (
     reference_of,
 )
 from evofsm.extras import install, needs
-from studies.lib import ALL, FIRST, imported, names_in
+from studies.lib import ALL, FIRST, names_in
 
 #: A float, or (d,) of them, or an index from 0.
 Action = Any

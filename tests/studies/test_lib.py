@@ -21,6 +21,7 @@ from studies import lib
 from studies.__main__ import REAL, STUDIES, study
 from typer.testing import CliRunner
 
+from evofsm.cli import imported
 from evofsm.paper import Page, Table
 
 ROOT = Path(__file__).parents[2]
@@ -134,7 +135,7 @@ def test_results_keep_the_order_of_the_tasks_whatever_the_number_of_workers():
 )
 def test_what_is_named_and_not_there_is_refused(name, message):
     with pytest.raises(ValueError, match=message):
-        lib.imported(name)
+        imported(name)
 
 
 # -- Intervals and scores -------------------------------------------------------------------------
