@@ -26,8 +26,6 @@ FAMILY = "emergency"
 _LEARNT, _SHORT = 40, 4
 # Episodes of a turn, on which nothing is learnt.
 _TURN, _FIRST_OF_TURN = 8, 1_000
-#: States of the machine beside the kinematic judge, at least.
-STATES = 200
 
 Stream = list[list[tuple[NDArray[np.float64], float]]]  # by episode: observations and proposals
 
@@ -61,7 +59,7 @@ def taught(short: bool) -> Taught:
 
 
 def many_states() -> Guard:
-    """A guard for cars whose machine creates many states: `STATES` after some episodes."""
+    """A guard for cars whose machine creates many states."""
     family = load_family(FAMILY)
     return guard_for_family(family, rule=Novelty(radius=1.0, scales=(2.0, 1.0, 1.0)))
 

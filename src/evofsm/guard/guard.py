@@ -102,7 +102,7 @@ class DecisionLogger(Protocol):
     """Anything that records what a guard does in an episode, such as an audit log."""
 
     def begin(self, guard: Guard) -> None:
-        """Begin an episode; one that is under way is broken off, and nothing follows from it."""
+        """An episode begins."""
 
     def seen(self, observation: NDArray[np.float64], time: float) -> None:
         """An observation came in, at ``time`` [s]."""
