@@ -168,7 +168,8 @@ for z, a in ((0.0, -1.0), (0.1, 0.0), (2.0, 0.2), (1.0, 0.9), (1.1, 1.0)):
 machine.save("machine")
 assert EvolvingFSM.load("machine").predict(0).tolist() == machine.predict(0).tolist()
 machine.model(actions=actions).save("model")
-FSMModel.load("model").stationary_distribution()
+forecast = FSMModel.load("model").propagate(machine.belief, 0)
+assert forecast.tolist() == machine.predict(0).tolist()
 print(machine.n_states, sys.modules["evofsm"].__file__)
 """
     n_states, origin = run(fresh / "python", "-I", "-c", program, cwd=tmp_path).split()
