@@ -565,7 +565,7 @@ def crowd():
             return ONE
 
         def reset(self, seed=None, options=None):
-            self.agents = self.possible_agents[:]
+            self.agents = list(self.scripts)
             each = {one: script.reset(seed=seed) for one, script in self.scripts.items()}
             return tuple({one: np.array(got[k]) for one, got in each.items()} for k in range(2))
 
@@ -586,11 +586,15 @@ def drive_agents(env, wanted):
     return steps
 
 
-def test_the_guard_learns_each_agents_episode_whole_and_info_says_what_was_done(crowd):
+@pytest.mark.parametrize("named", [2, 1, 0])  # agents that the environment knows beforehand
+def test_the_guard_learns_each_agents_episode_whole_and_info_says_what_was_done(crowd, named):
     from evofsm.guard import RevisedAgents
 
-    guard = guard_for(ONE, Spy(above_half))
-    env = RevisedAgents(crowd(2, 4), guard, penalty=2.0)
+    guard, agents = guard_for(ONE, Spy(above_half)), crowd(2, 4)
+    del agents.possible_agents[named:]
+    if not named:
+        del agents.possible_agents
+    env = RevisedAgents(agents, guard, penalty=2.0)
     first, *_, last = drive_agents(env, 2.5)
     size = first[4]["a0"]["reviser/penalty"]
     assert size > 0.5

@@ -9,13 +9,14 @@ from evofsm.io.logs import LogColumns, read_traces
 from evofsm.io.rosbag import Field, Topics
 
 rosbags = pytest.importorskip("rosbags")
-from rosbags.rosbag2 import StoragePlugin, Writer  # noqa: E402
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer  # noqa: E402
 from rosbags.typesys import Stores, get_typestore  # noqa: E402
 
 STORE = get_typestore(Stores.LATEST)
 EGO, OTHER = "/ego/odometry", "/other/odometry"
 SECOND = 1_000_000_000
 SQLITE, MCAP = StoragePlugin.SQLITE3, StoragePlugin.MCAP
+PLAIN, COMPRESSED = CompressionMode.NONE, CompressionMode.MESSAGE
 TOLD = {
     "interval": 0.1,
     "oldest": 0.5,
@@ -46,9 +47,11 @@ def odometry(x, v, at=0):
     )
 
 
-def write(path, messages, plugin=SQLITE):
+def write(path, messages, plugin=SQLITE, mode=PLAIN):
     """Messages are (time [s], topic, message)."""
-    with Writer(path, version=9, storage_plugin=plugin) as writer:
+    writer = Writer(path, version=9, storage_plugin=plugin)
+    writer.set_compression(mode, CompressionFormat.ZSTD)
+    with writer:
         topics = {}
         for time, topic, message in sorted(messages, key=lambda one: one[0]):
             kind = message.__msgtype__
@@ -72,9 +75,9 @@ def read(path, told=TOLD, **columns):
     return list(read_traces([path], LogColumns(**columns), topics=Topics.of(told)))
 
 
-@pytest.mark.parametrize("plugin", [SQLITE, MCAP])
-def test_rows_hold_the_latest_values_before_them(tmp_path, plugin):
-    path = write(tmp_path / "bag", drive(), plugin)
+@pytest.mark.parametrize(("plugin", "mode"), [(SQLITE, PLAIN), (SQLITE, COMPRESSED), (MCAP, PLAIN)])
+def test_rows_hold_the_latest_values_before_them(tmp_path, plugin, mode):
+    path = write(tmp_path / "bag", drive(), plugin, mode)
     (chunk,) = read(path)
     assert chunk.times[:3] == pytest.approx([0.1, 0.2, 0.3])  # at 0 s the follower is not known
     # At 0.1 s the follower was heard of at 0.06 s last, and the leader at 0.1 s.

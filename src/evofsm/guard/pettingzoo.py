@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 from evofsm.extras import needs
@@ -53,10 +54,10 @@ class RevisedAgents(BaseParallelWrapper[Any, Any, Any]):  # type: ignore[misc]
     ) -> None:
         super().__init__(env)
         self.guard = guard
-        agent = env.possible_agents[0]
-        spaces = env.observation_space(agent), env.action_space(agent)
-        terms = Terms(guard, *spaces, observe, failed, penalty)
-        self._lanes = {one: Lane(terms, shared=True) for one in env.possible_agents}
+        self._terms = partial(Terms, guard, observe=observe, failed=failed, penalty=penalty)
+        self._lanes: dict[Any, Lane] = {}
+        for agent in getattr(env, "possible_agents", ()):  # which an environment need not know
+            self._enter(agent)
 
     @property
     def revisions(self) -> dict[Any, Revision]:
@@ -76,7 +77,7 @@ class RevisedAgents(BaseParallelWrapper[Any, Any, Any]):  # type: ignore[misc]
 
     def step(self, actions: _Each) -> tuple[_Each, _Each, _Each, _Each, _Each]:
         """Execute the guard's revision of each agent's action."""
-        decided = {agent: self._lanes[agent].decide(action) for agent, action in actions.items()}
+        decided = {agent: self._enter(agent).decide(action) for agent, action in actions.items()}
         executed = {agent: one.executed for agent, one in decided.items()}
         observations, rewards, terminated, truncated, infos = self.env.step(executed)
         infos, rewards = dict(infos), dict(rewards)
@@ -93,5 +94,12 @@ class RevisedAgents(BaseParallelWrapper[Any, Any, Any]):  # type: ignore[misc]
     def _begin(self, observations: _Each) -> None:
         """Begin the episodes of agents that are new."""
         for agent, observation in observations.items():
-            if agent in self._lanes and not self._lanes[agent].is_open:
-                self._lanes[agent].begin(observation)
+            if not (lane := self._enter(agent)).is_open:
+                lane.begin(observation)
+
+    def _enter(self, agent: Any) -> Lane:
+        """The lane of an agent, which may be new."""
+        if agent not in self._lanes:
+            spaces = self.env.observation_space(agent), self.env.action_space(agent)
+            self._lanes[agent] = Lane(self._terms(*spaces), shared=True)
+        return self._lanes[agent]

@@ -29,6 +29,7 @@ with needs("msgspec", "ros", "a bag of ROS 2"):
     from msgspec import Meta
 
 _NANOSECONDS = 1_000_000_000
+_ZSTD = b"\x28\xb5\x2f\xfd"  # how what is compressed begins; no message in CDR does
 _STEP = re.compile(r"([A-Za-z_]\w*)((?:\[\d+\])*)")
 
 
@@ -226,6 +227,7 @@ class BagTable(Table):
     def _messages(self) -> dict[str, tuple[NDArray[np.int64], dict[str, NDArray[np.float64]]]]:
         """Of each topic that is wanted, when its messages were, and what stands in their fields."""
         with needs("rosbags", "ros", f"{self.path}: a bag of ROS 2"):
+            import zstandard  # of rosbags
             from rosbags.highlevel import AnyReader
             from rosbags.typesys import Stores, get_typestore
         texts = {text for one in self._topics.variables.values() for text in one.fields}
@@ -241,6 +243,8 @@ class BagTable(Table):
             connections = [one for one in reader.connections if one.topic in of_topic]
             for connection, stamp, data in reader.messages(connections=connections):
                 self._on_read(len(data))
+                if data.startswith(_ZSTD):  # as only the folder's metadata.yaml would say
+                    data = zstandard.decompress(data)
                 message = reader.deserialize(data, connection.msgtype)
                 if self._topics.stamp == "header":
                     if not hasattr(message, "header"):

@@ -37,6 +37,22 @@ _LONGEST_LINE = 1_000_000
 
 _BYTE_ORDER_MARK, _GZIP, _PARQUET = b"\xef\xbb\xbf", b"\x1f\x8b", b"PAR1"
 _SQLITE, _MCAP = b"SQLite format 3\0", b"\x89MCAP0\r\n"
+# How files begin that others hand around and we do not read: what they are, and the way out.
+_FOREIGN = {
+    b"\xfd7zXZ\0": "is compressed by xz; unpack it: xz --decompress --keep FILE",
+    b"\x5d\0\0": "is compressed by lzma; unpack it: xz --format=lzma --decompress --keep FILE",
+    b"BZh": "is compressed by bzip2; unpack it: bzip2 --decompress --keep FILE",
+    b"\x28\xb5\x2f\xfd": "is compressed by zstd; unpack it: zstd --decompress FILE",
+    b"PK\3\4": "is a zip archive, or an Excel workbook (.xlsx); unpack it, or save it as CSV",
+    b"\xd0\xcf\x11\xe0": "is an Excel workbook of the old kind (.xls); save it as CSV",
+    b"MATLAB ": "is a MAT-file of MATLAB; write it as CSV there: writetable",
+    b"\x89HDF": "is HDF5 (or a MAT-file of MATLAB 7.3); write its table as CSV or Parquet: pandas",
+    b"#ROSBAG ": "is a bag of ROS 1; convert it: rosbags-convert --src FILE --dst FOLDER",
+    b"LOGG": "is a CAN log of Vector (BLF); decode it to CSV: python-can, cantools",
+    b"MDF ": "is a measurement in ASAM MDF (MF4); write it as Parquet or CSV: asammdf",
+    b"ARROW1": "is an Arrow (Feather) file; write it as Parquet: pyarrow, polars or pandas",
+    b"\x93NUMPY": "is an array of NumPy; write it as CSV with names of columns: numpy.savetxt",
+}
 # Where an MCAP file has its profile: behind the mark, an opcode and two lengths.
 _PROFILE = len(_MCAP) + 1 + 8 + 4
 
@@ -64,7 +80,8 @@ def file_kind(path: str) -> Kind:
     """What the file holds, judged by how it begins.
 
     A trace of OSI begins with nothing of its own and is known by its name, ``.osi``. The folder of
-    a bag of ROS 2 is ``"bag"``, as its files are; ``"run"`` is a log that evofsm wrote.
+    a bag of ROS 2 is ``"bag"``, as its files are; ``"run"`` is a log that evofsm wrote. A
+    ValueError says what a file is that is of a foreign kind, and how it can be read.
     """
     if os.path.isfile(os.path.join(path, "metadata.yaml")):
         return "bag"
@@ -74,6 +91,8 @@ def file_kind(path: str) -> Kind:
         beginning = source.read(64).removeprefix(_BYTE_ORDER_MARK).lstrip()
     if not beginning:
         raise ValueError(f"{path} is empty")
+    if foreign := next((says for mark, says in _FOREIGN.items() if beginning.startswith(mark)), ""):
+        raise ValueError(f"{path} {foreign}")
     if beginning.startswith(_MCAP):
         profile = beginning[_PROFILE:]
         kinds: dict[bytes, Kind] = {b"ros2": "bag", b"evofsm": "run"}

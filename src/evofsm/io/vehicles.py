@@ -533,7 +533,8 @@ def scenes_of_mcap(path: str, on_read: OnRead) -> Iterator[Scene]:
         names = ", ".join(sorted(set(kinds.values()))) or "none"
         raise ValueError(
             f"{path}: no channel of it holds GroundTruth or SensorView of OSI; its schemas are "
-            f"{names} (a bag of ROS 2 says so at its beginning, and this one does not)"
+            f"{names} (if they are of ROS 2: the header names no profile, as after merging; "
+            "ros2 bag convert writes it anew)"
         )
 
 
