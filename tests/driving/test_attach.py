@@ -51,7 +51,8 @@ def road(tmp_path):
         (tmp_path / "cars.rou.xml").write_text(CARS.format(others=others, ssm=ssm))
         files = ["-n", str(tmp_path / "road.net.xml"), "-r", str(tmp_path / "cars.rou.xml")]
         quiet = ["--no-step-log", "--no-warnings", "--collision.action", "warn"]
-        libsumo.start(["sumo", *files, *quiet, "--step-length", "0.1", *options])
+        start.options = [*files, *quiet, *options, "--step-length", "0.1"]
+        libsumo.start(["sumo", *start.options])
         return libsumo
 
     yield start
@@ -183,7 +184,7 @@ def test_a_guard_that_knows_gentler_cars_does_not_hold_back_on_a_free_road(road)
     assert guards.guarding.revised == 0
 
 
-def test_another_simulation_is_left_alone(road):
+def test_who_attaches_anew_ends_what_was_attached_to_a_simulation_before(road):
     sumo = road(*NO_GAP)
     first = attach(sumo, ["ego"])
     drive(sumo, 5.0)
@@ -193,6 +194,41 @@ def test_another_simulation_is_left_alone(road):
     drive(sumo, 25.0)
     assert first.guarding.decisions == decisions
     assert second.collisions
+
+
+@pytest.mark.parametrize("begin", [None, 0.3, 14.0, 1000.0, "step", "state", "start"])
+def test_guards_go_on_wherever_time_moves_otherwise(road, tmp_path, begin):
+    sumo, told = road(*NO_GAP), []
+    guards = attach(sumo, ["ego"], report=told.append)
+    drive(sumo, 1.0)
+    sumo.simulation.saveState(str(tmp_path / "state.xml"))
+    drive(sumo, 13.0)
+    if begin == "state":
+        sumo.simulation.loadState(str(tmp_path / "state.xml"))
+    elif begin == "start":
+        road(*NO_GAP)
+    else:
+        options = [*road.options[:-1], "0.05" if begin == "step" else "0.1"]
+        if isinstance(begin, float):  # at 14 s time goes on as if it were the same simulation
+            cars = tmp_path / "cars.rou.xml"
+            cars.write_text(cars.read_text().replace('depart="0"', f'depart="{begin}"'))
+            options += ["--begin", str(begin)]
+        sumo.load(options)
+    before, now = guards.guarding.decisions, sumo.simulation.getTime()
+    drive(sumo, 40.0, brakes_at=now + 15.0)
+    assert guards.collisions == []
+    assert guards.guarding.decisions > before + 100
+    assert max(abs(one.deed) for one in told) < 9.1  # no step is taken for another
+
+
+def test_who_skips_steps_is_told_that_nobody_looked(road):
+    sumo, told = road(*NO_GAP), []
+    attach(sumo, ["ego"], report=told.append)
+    drive(sumo, 1.0)
+    with pytest.warns(RuntimeWarning, match="several steps at once"):
+        sumo.simulationStep(5.0)
+    drive(sumo, 2.0)
+    assert max(abs(one.deed) for one in told) < 9.1
 
 
 # -- Watching --------------------------------------------------------------------------------------

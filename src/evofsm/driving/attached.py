@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import time as clock
+import warnings
+import weakref
 import zlib
 from collections.abc import Callable, Iterable, Iterator
 from importlib import import_module
@@ -18,6 +21,14 @@ from evofsm.guard import TOLERANCE, Guard
 # What is done with the chosen cars.
 _MODES = ("act", "shadow", "watch")
 _TYPE = "type:"
+# Clocks of SUMO count thousandths; two times that differ by less are one [s].
+_TICK = 5e-4
+_SKIPPED = (
+    "SUMO went on by several steps at once (simulationStep with a time, or loadState), in which no "
+    "guard looked or acted and no collision was counted; cars begin anew. Go on step by step"
+)
+_NUMBERS = itertools.count()
+_ATTACHED: weakref.WeakSet[Attachment] = weakref.WeakSet()
 # Two that touched within this time before still do [s].
 _SAME_COLLISION = 5.0
 
@@ -124,7 +135,8 @@ class Attachment:
         self._seeing, self._cars = seeing, cars
         self.guarding = cars if isinstance(cars, Guarding) else None
         self.watching = cars if isinstance(cars, Watching) else None
-        self._now = -math.inf
+        self._now: float | None = None
+        self._key = f"evofsm.{next(_NUMBERS)}"  # of a parameter that no other simulation has
         self._known: set[str] = set()
         self._met: dict[tuple[str, str], float] = {}
         self._listener: int | None = None
@@ -145,28 +157,42 @@ class Attachment:
         def step(_: Any, __: float) -> bool:
             return self.step()
 
+        if getattr(self._sumo, "__name__", "") == "libsumo":
+            # It keeps listeners where a simulation is closed. Whoever attaches anew is not guarded
+            # twice, once by what was attached to the one before.
+            for other in [one for one in _ATTACHED if one._sumo is self._sumo and one._is_new()]:
+                other._listen_no_more()
         listener = type("Listener", (base,), {"step": step})()
         self._listener = self._sumo.addStepListener(listener)
+        self._sumo.simulation.setParameter("", self._key, "1")
+        _ATTACHED.add(self)
 
     def detach(self) -> None:
         """Hand every car back to SUMO, and listen no longer."""
+        self._listen_no_more()
+        for car in self.cars:
+            self._cars.remove(car)
+
+    def _listen_no_more(self) -> None:
         if self._listener is not None:
             self._sumo.removeStepListener(self._listener)
             self._listener = None
-        for car in self.cars:
-            self._cars.remove(car)
 
     def step(self) -> bool:
         """Take in a step of the simulation that is over, and decide on the next.
 
-        Returns False, and does nothing, in another simulation: SUMO keeps its listeners when one is
-        closed.
+        In another simulation, after ``load`` or ``close`` and ``start``, and wherever time moved by
+        anything but one step, all that is known of cars is forgotten, and they begin anew.
         """
         begin = clock.perf_counter()
-        now = float(self._sumo.simulation.getTime())
-        if now <= self._now:
-            self._listener = None
-            return False
+        now, before = float(self._sumo.simulation.getTime()), self._now
+        if self._is_new():
+            self._begin_anew()
+            self._sumo.simulation.setParameter("", self._key, "1")
+        elif before is not None and abs(now - before - self._seeing.dt) > _TICK:
+            if now - before > self._seeing.dt:
+                warnings.warn(_SKIPPED, RuntimeWarning, stacklevel=2)
+            self._begin_anew()
         self._now = now
         self._count_cars()
         self._count_collisions(now)
@@ -177,6 +203,20 @@ class Attachment:
             self.watching.step()
         self.seconds += clock.perf_counter() - begin
         return True
+
+    def _is_new(self) -> bool:
+        return bool(self._sumo.simulation.getParameter("", self._key) != "1")
+
+    def _begin_anew(self) -> None:
+        """Forget the cars, which are other ones, or are elsewhere; who is here is handed back."""
+        here = set(self._sumo.vehicle.getIDList())
+        for car in self.cars:
+            (self._cars.remove if car in here else self._cars.leave)(car)
+        self._known.clear()
+        self._met.clear()
+        self._seeing.look_up()
+        if self.guarding is not None:
+            self.guarding.begin_anew()
 
     def _count_cars(self) -> None:
         """Cars that are inserted, or come back from a teleport; and those that leave."""
@@ -250,7 +290,8 @@ def attach(
     Where a guard acts, the speed mode has "safe speed" and the limit of acceleration on and that of
     braking off. It is put back as it was, with ``setSpeed(-1)``, as soon as the guard allows all
     that the car can do. Where you set a car's speed yourself, ask a `Guard` before you do instead.
-    In another simulation, as after ``close`` and ``start``, attach anew.
+    After ``load``, or ``close`` and ``start``, an attachment goes on with the new cars, and what it
+    counts goes on; whoever attaches anew ends those of earlier simulations.
 
     Examples
     --------

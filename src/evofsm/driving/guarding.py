@@ -60,20 +60,26 @@ class Seeing:
     """Reads the cars around one of them, by libsumo or traci."""
 
     def __init__(self, sumo: Any) -> None:
-        self._vehicle = sumo.vehicle
-        factor = float(sumo.simulation.getOption("collision.mingap-factor"))
+        self._vehicle, self._simulation = sumo.vehicle, sumo.simulation
+        self._bodies: dict[str, _Facts] = {}
+        self.look_up()
+
+    def look_up(self) -> None:
+        """Look up what holds in this simulation; no car of another one is known."""
+        simulation = self._simulation
+        factor = float(simulation.getOption("collision.mingap-factor"))
         # Share of minGap that SUMO wants kept; below 0 each model has its own, at most all of it.
         self._factor = factor if factor >= 0.0 else 1.0
         #: Time of a step [s].
-        self.dt = float(sumo.simulation.getDeltaT())
-        ballistic = str(sumo.simulation.getOption("step-method.ballistic")).lower() in ("true", "1")
+        self.dt = float(simulation.getDeltaT())
+        ballistic = str(simulation.getOption("step-method.ballistic")).lower() in ("true", "1")
         # In SUMO's Euler step a car drives all of it at the speed of its end. Against what is
         # rehearsed, a slower follower is nearer by half a step's worth of the difference; and
         # whoever brakes to a standstill within a step gets further by up to an eighth of its
         # braking over the square of the step. What the Euler step adds to the gap is not counted:
         # with an actionStepLength in any type SUMO steps ballistically, and no option says so.
         self._euler = 0.0 if ballistic else self.dt
-        self._bodies: dict[str, _Facts] = {}
+        self._bodies.clear()
 
     def forget(self, car: str) -> None:
         """It has left."""
@@ -206,9 +212,8 @@ class Guarding:
         self.leaders = _leaders_of(guard)  #: how hard they were seen to brake
         if guard is not None:
             self._tolerance = guard.reviser.tolerance  # type: ignore[attr-defined]
-        self.interval = seeing.dt if guard is None or guard.interval is None else guard.interval
-        self._every = steps_between(self.interval, seeing.dt)
-        self._steps = self.decisions = 0
+        self.begin_anew()
+        self.decisions = 0
         #: Steps in which a car drove slower than its driver wanted; in shadow, would have.
         self.revised = 0
 
@@ -217,6 +222,15 @@ class Guarding:
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._cars)
+
+    def begin_anew(self) -> None:
+        """Another simulation, or another moment of it, begins."""
+        own = None if self._template is None else self._template.interval
+        self.interval = self._seeing.dt if own is None else own
+        self._every = steps_between(self.interval, self._seeing.dt)
+        self._steps = 0
+        self._watches.clear()
+        self._judges.clear()
 
     def add(self, car: str) -> None:
         """Guard it from now on."""
