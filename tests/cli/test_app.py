@@ -120,7 +120,7 @@ def test_what_programs_are_told_is_strict_json(evofsm):
     def refuse(constant):
         raise AssertionError(f"{constant} is no JSON")
 
-    told = evofsm("check", "evofsm.driving.measures:TimeHeadway", "--json").stdout
+    told = evofsm("check", "evofsm.fsm.rules:Paper", "--json").stdout
     assert all(one["passed"] for one in json.loads(told, parse_constant=refuse))
     told = evofsm("drive", "emergency", "--episodes", 2, "--json").stdout
     driven = json.loads(told, parse_constant=refuse)

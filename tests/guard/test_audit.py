@@ -29,12 +29,10 @@ from evofsm.driving import (
 from evofsm.guard import (
     ActionReviser,
     AuditLog,
-    Explain,
     Guard,
     Head,
     Mode,
     Proposal,
-    Way,
     audit,
     audit_log,
 )
@@ -264,10 +262,9 @@ def test_a_controller_that_fails_and_one_out_of_range_are_written(tmp_path):
     with AuditLog(path) as log:
         guard = Guard.of(Unrevised(ACTIONS), audit=log)
         for step, proposed in enumerate([1.0, math.nan, 99.0, math.inf]):
-            guard.decide([50.0, 9.0, 9.0], Proposal(proposed, (0.5, -math.inf)), step * 0.25)
+            guard.decide([50.0, 9.0, 9.0], proposed, step * 0.25)
     decisions = [record for record in contents(path) if record["kind"] == "decision"]
     assert [one["proposed"] for one in decisions] == ["NaN", 99.0, "Infinity"]
-    assert decisions[0]["candidates"] == [0.5, "-Infinity"]
     assert audit(path).is_good
     assert audit(path).replayed == 4
 
@@ -306,7 +303,7 @@ def test_episodes_of_learning_and_of_none_come_out_the_same(tmp_path):
     with AuditLog(path) as log:
         guard = cars(log)
         said = drive(guard) + drive(guard, brake=4)
-        guard.reviser.tolerance, guard.explaining = 0.3, Explain.NONE
+        guard.reviser.tolerance, guard.explaining = 0.3, True
         said += drive(guard, brake=12)
         guard.freeze()
         said += drive(guard)
@@ -322,7 +319,6 @@ REVISERS = {
     "measure": lambda judge, machine: EnvelopeReviser(measures.TimeToCollision(4.0), ACTIONS),
     "by state": lambda judge, machine: ActionReviser(RiskByState(judge, machine), ACTIONS),
     "shadow": lambda judge, machine: ActionReviser(judge, ACTIONS, mode=Mode.SHADOW),
-    "choose": lambda judge, machine: ActionReviser(judge, ACTIONS, way=Way.CHOOSE),
 }
 
 
@@ -359,20 +355,16 @@ def test_who_takes_over_is_written_and_replayed(tmp_path):
 
     def wanted(k):
         if k == 8:
-            guard.reviser.take_over()
+            guard.reviser.mode = Mode.SHADOW
         if k == 12:
-            guard.reviser.hand_back()
-            guard.reviser.tolerance = 0.1
+            guard.reviser.mode, guard.reviser.tolerance = Mode.ACT, 0.1
         return 2.5
 
     with AuditLog(path) as log:
         guard = cars(log)
         drive(guard, wanted=wanted)
     changes = [one["settings"]["reviser"] for one in contents(path) if one["kind"] == "settings"]
-    assert [(one["overridden"], one["tolerance"]) for one in changes] == [
-        (True, 0.02),
-        (False, 0.1),
-    ]
+    assert [(one["mode"], one["tolerance"]) for one in changes] == [("shadow", 0.02), ("act", 0.1)]
     assert audit(path).is_good
     assert audit(path).contents.settings == 2
 

@@ -11,7 +11,7 @@ from evofsm.driving.judge import LatentRisk
 from evofsm.fsm.actions import IntervalActions
 from evofsm.guard.actions import nearest_bounds
 from evofsm.guard.api import Judgement, Proposal, Situation
-from evofsm.guard.reviser import ActionReviser, Mode, Way
+from evofsm.guard.reviser import ActionReviser, Mode
 
 LOW, HIGH, TOLERANCE = -2.5, 2.5, 0.02
 ACTIONS = IntervalActions(low=LOW, high=HIGH, width=0.3)
@@ -105,26 +105,10 @@ def test_what_is_revised_is_said_with_numbers():
     assert "nothing can" in hopeless.reason
 
 
-@given(risks(), PROPOSALS, st.lists(st.floats(-9.0, 9.0) | st.just(math.nan), max_size=6))
-def test_to_choose_is_to_take_one_of_the_candidates_if_there_are_any(risk, wanted, candidates):
-    reviser = ActionReviser(Told(risk), ACTIONS, way=Way.CHOOSE)
-    executed = reviser.revise(HERE, Proposal(wanted, tuple(candidates))).executed
-    could = [wanted, *(a for a in candidates if LOW <= a <= HIGH)]
-    tolerable = [abs(a - wanted) for a in could if risk(a) <= TOLERANCE]
-    assert executed in could
-    if tolerable:
-        assert abs(executed - wanted) == min(tolerable)
-    else:
-        assert risk(executed) == min(risk(a) for a in could)
-
-
 def not_acting(judge):
     """Revisers whose decisions are not executed."""
     for mode in (Mode.SHADOW, Mode.ADVISE):
         yield ActionReviser(judge, ACTIONS, mode=mode)
-    driven = ActionReviser(judge, ACTIONS)
-    driven.take_over()
-    yield driven
 
 
 class Changing(Told):
@@ -166,9 +150,9 @@ def test_a_test_of_the_brakes_ends_where_the_driver_takes_over():
     reviser = ActionReviser(Changing(), ACTIONS)
     assert "in full" in reviser.revise(HERE, Proposal(1.0)).reason
     reviser.risk.danger = False
-    reviser.take_over()
+    reviser.mode = Mode.SHADOW
     assert reviser.revise(HERE, Proposal(1.0)).advised == 1.0
-    reviser.hand_back()
+    reviser.mode = Mode.ACT
     assert reviser.revise(HERE, Proposal(1.0)).executed == 1.0
 
 
@@ -184,9 +168,9 @@ def test_where_nothing_is_executed_no_braking_is_asked_of_a_car_that_stands(want
 def test_once_revising_it_goes_on_until_the_proposal_is_safe_by_a_margin():
     level = 0.0
     judge = Told(lambda a: level if a > -1.0 else 0.001)
-    reviser = ActionReviser(judge, ACTIONS, release=0.5)
+    reviser = ActionReviser(judge, ACTIONS)
     kept = []
-    for level in (0.9, 1.1, 0.9, 0.6, 1.1, 0.4, 0.9):  # the judge reads it
+    for level in (0.95, 1.1, 0.95, 0.91, 1.1, 0.89, 0.95):  # the judge reads it
         level *= TOLERANCE
         kept.append(reviser.revise(HERE, Proposal(1.0)).executed == 1.0)
     assert kept == [True, False, False, False, False, True, True]
@@ -195,8 +179,8 @@ def test_once_revising_it_goes_on_until_the_proposal_is_safe_by_a_margin():
 
 
 def test_where_no_margin_can_be_had_what_is_tolerable_will_do_and_it_does_not_change_its_mind():
-    levels = Told(lambda a: (2.0 if a > 0.0 else 0.9) * TOLERANCE)
-    reviser = ActionReviser(levels, ACTIONS, release=0.5)
+    levels = Told(lambda a: (2.0 if a > 0.0 else 0.95) * TOLERANCE)
+    reviser = ActionReviser(levels, ACTIONS)
     first, *others = (reviser.revise(HERE, Proposal(1.0)).executed for _ in range(6))
     assert LOW < first <= 0.0
     assert others == [first] * 5
@@ -221,12 +205,6 @@ def test_what_cannot_be_executed_is_made_usable_and_judged_as_such(wanted, execu
         np.testing.assert_equal(revision.proposed, wanted)
     revision = ActionReviser(Told(above(-2.0)), ACTIONS).revise(HERE, Proposal(wanted))
     assert revision.executed <= -2.0
-
-
-@pytest.mark.parametrize("release", [0.0, 1.5])
-def test_a_release_that_is_no_share_is_refused(release):
-    with pytest.raises(ValueError, match="release"):
-        ActionReviser(Told(above(0.0)), ACTIONS, release=release)
 
 
 @given(st.floats(0.1, 80.0), st.floats(0.0, 35.0), st.floats(0.0, 35.0), PROPOSALS)

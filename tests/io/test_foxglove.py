@@ -23,7 +23,6 @@ from evofsm.driving.world import Episode
 from evofsm.guard import Guard
 from evofsm.guard.api import Intake
 from evofsm.guard.episodes import Decision
-from evofsm.guard.guard import Explain
 from evofsm.guard.reviser import Mode
 from evofsm.io.foxglove import FOXGLOVE_LAYOUT, FoxgloveSink, RunWriter, recording
 from evofsm.io.runs import _column, columns_by_topic, read_run, schemas_of
@@ -38,7 +37,7 @@ ROWS = [[30.0 - 2.0 * k, 20.0, 12.0] for k in range(8)]
 @pytest.fixture(scope="module")
 def driven():
     """A model and three episodes: one watched only, two acted in."""
-    guard, episodes = guard_for_cars(-4.0, 2.5, explaining=Explain.ALL), []
+    guard, episodes = guard_for_cars(-4.0, 2.5, explaining=True), []
     for mode in (Mode.SHADOW, Mode.ACT, Mode.ACT):
         guard.reviser.mode = mode
         episodes.append(drive(guard, Scenario(LEADER, 8.0, duration=14.0), controller=HASTY))

@@ -16,9 +16,9 @@ def check(
 ) -> int:
     """Check a class of your own against the contract of its kind.
 
-    A state rule, a reviser, a controller, a judge or a risk measure; its methods tell which. The
-    module is imported, from the present folder too, so that its code is run: check code that you
-    trust. Ends with 1 if a check fails.
+    A state rule, a reviser, a controller or a judge; its methods tell which. The module is
+    imported, from the present folder too, so that its code is run: check code that you trust. Ends
+    with 1 if a check fails.
     """
     from rich.padding import Padding
 

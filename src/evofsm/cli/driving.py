@@ -41,7 +41,7 @@ from evofsm.driving.measures import FIXED_MEASURES
 from evofsm.driving.naming import DECISION_COLUMNS
 from evofsm.driving.world import World
 from evofsm.extras import needs
-from evofsm.guard import TOLERANCE, DecisionLogger, Explain, Guard, Mode, Reviser
+from evofsm.guard import TOLERANCE, DecisionLogger, Guard, Mode, Reviser
 
 _log = logging.getLogger(__name__)
 
@@ -276,7 +276,7 @@ def drive_in_turn(
     setup, guard, done = results.setup, results.guard, len(results.rows)
     if setup.learn and done > episodes:
         raise ValueError(f"{results.folder} has driven {done} episodes, more than {episodes}")
-    guard.audit, guard.explaining = audit, None if record is None else Explain.ALL
+    guard.audit, guard.explaining = audit, record is not None
     trial = setup.trial(guard, world)
     for number in range(setup.first, setup.first + episodes):
         if number in results.rows:

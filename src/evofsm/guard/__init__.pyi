@@ -22,7 +22,6 @@ from .check import check_contract as check_contract
 from .episodes import Decision as Decision
 from .episodes import run_episode as run_episode
 from .guard import DecisionLogger as DecisionLogger
-from .guard import Explain as Explain
 from .guard import Guard as Guard
 from .gym import RevisedActions as RevisedActions
 from .gym import RevisedVectorActions as RevisedVectorActions
@@ -31,7 +30,6 @@ from .pettingzoo import RevisedAgents as RevisedAgents
 from .replay import audit as audit
 from .reviser import ActionReviser as ActionReviser
 from .reviser import Mode as Mode
-from .reviser import Way as Way
 from .reviser import is_spoken as is_spoken
 from .reviser import make_usable as make_usable
 from .scene import SceneRisk as SceneRisk

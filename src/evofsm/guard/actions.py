@@ -19,12 +19,10 @@ from numpy.typing import ArrayLike, NDArray
 from evofsm.fsm.actions import IntervalActions
 from evofsm.fsm.validation import real_array, whole
 
-# Cells that a box is divided into for the machine, at most, unless levels are given: 9 x 9.
+# Cells that a box is divided into for the machine, at most: 9 x 9.
 _CELLS = 81
 # Levels of a box of one dimension, as many as an interval has.
 _LEVELS = 17
-# More cells would be a mistake: a machine counts all of them in each state.
-_MOST = 10_000
 
 #: One action: a float, or a (d,) array where the set is a `BoxActions`.
 Action: TypeAlias = Any
@@ -64,20 +62,19 @@ class Choices:
 class BoxActions:
     """A set of actions that are vectors; the machine tells them apart by the cells of a grid.
 
+    Each component is divided into as many levels as make 81 cells at most in all (17 where there
+    is one component, 9 by 9 where there are two); of more than six components the first six are
+    divided in two.
+
     Parameters
     ----------
     low, high : tuple of d floats
         Range of each component of the action, in its own unit.
-    levels : tuple of d ints, optional
-        Cells along each component. Without them there are as many along each as make 81 at most in
-        all (17 where there is one component, 9 by 9 where there are two), and of more than six
-        components the first six are divided in two.
 
     Raises
     ------
     TypeError, ValueError
-        If a number is not finite, ``low`` is not below ``high``, the lengths differ, or there are
-        more than 10,000 cells.
+        If a number is not finite, ``low`` is not below ``high``, or the lengths differ.
 
     Examples
     --------
@@ -90,7 +87,6 @@ class BoxActions:
 
     low: tuple[float, ...]
     high: tuple[float, ...]
-    levels: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
         for name in ("low", "high"):
@@ -109,18 +105,13 @@ class BoxActions:
             sum(high - low for high, low in zip(self.high, self.low, strict=True))
         ):
             raise ValueError("high - low is too large to compute with; use a larger unit")
-        levels = tuple(self.levels) or _levels(len(self.low))
-        if len(levels) != len(self.low):
-            raise ValueError(
-                f"levels has {len(levels)} entries, but an action has {len(self.low)} components"
-            )
-        object.__setattr__(self, "levels", tuple(whole("levels", each) for each in levels))
-        if self.n_actions > _MOST:
-            raise ValueError(
-                f"levels make {self.n_actions:,} cells, more than {_MOST:,}; give fewer"
-            )
 
-    @property
+    @cached_property
+    def levels(self) -> tuple[int, ...]:
+        """Cells along each component."""
+        return _levels(len(self.low))
+
+    @cached_property
     def n_actions(self) -> int:
         """Number of cells."""
         return math.prod(self.levels)

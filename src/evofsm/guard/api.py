@@ -29,12 +29,11 @@ class Proposal(NamedTuple):
     Examples
     --------
     >>> Proposal(1.2)
-    Proposal(action=1.2, candidates=())
+    Proposal(action=1.2)
     """
 
     #: of a car the acceleration [m/s²]; of `Choices` an index, of `BoxActions` a (d,) array
     action: Action
-    candidates: tuple[Action, ...] = ()  #: others it could do as well
 
 
 class Intake(IntFlag):
@@ -222,21 +221,6 @@ class LearningJudge(ActionJudge, Protocol):
     @classmethod
     def load(cls, path: Place) -> Self:
         """Read what was learnt, between two episodes."""
-
-
-@runtime_checkable
-class ObservingJudge(LearningJudge, Protocol):
-    """A learning judge that also learns from each observation before it is asked about it."""
-
-    def observe(self, observation: NDArray[np.float64], /) -> bool:
-        """Learn from an observation, the last of an episode included.
-
-        Whether something that was not expected began with the action before it: the guard's machine
-        counts that.
-        """
-
-    def act(self, action: Action, /) -> None:
-        """Take in what was executed after the latest observation; another one replaces it."""
 
 
 class Participants(NamedTuple):

@@ -3,7 +3,7 @@
 docs/audit.md says what is in a record, a JSON object on a line of its own. ``hash``, its last, is
 the SHA-256 of the line up to the comma before it, and ``previous`` that of the record before (zeros
 for the first): a hash chain as in Haber and Stornetta (J. Cryptology 3, 1991). A row of ``before``
-is ``[time, observation]``, with the proposal and its candidates after that if there were any.
+is ``[time, observation]``, with the proposal after that if there was one.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from evofsm import store
 from evofsm.guard.actions import written
 from evofsm.guard.api import Proposal, Revision, Situation
 from evofsm.guard.episodes import Decision
-from evofsm.guard.guard import Explain, Guard
+from evofsm.guard.guard import Guard
 from evofsm.guard.parts import can_be_made_again, settings_of
 from evofsm.guard.record import RECORD
 from evofsm.guard.reviser import is_spoken
@@ -53,7 +53,7 @@ _TOLD = tuple(name for name in RECORD if name not in ("time", "n_states", "risk_
 FIELDS: Mapping[str, set[str]] = {
     "start": {"about", "cut_off", "guard", "made_by", "reviser", "told_failures", "version"},
     "begin": {"settings"},
-    "decision": {"before", "belief", "candidates", "interval", "observation", "time", *_TOLD},
+    "decision": {"before", "belief", "interval", "observation", "time", *_TOLD},
     "quiet": {"before"},
     "settings": {"settings"},
     "end": {"before", "failed", "learnt", "observation"},
@@ -395,9 +395,7 @@ class AuditLog:
             before = self._take_before()
             self._write("decision", before=before, time=time, observation=observation, **decision)
         else:
-            candidates = _candidates(proposal)
-            row = [time, observation, written(proposal.action)]
-            self._before.append([*row, candidates] if candidates else row)
+            self._before.append([time, observation, written(proposal.action)])
             if len(self._before) >= _MOST_QUIET:
                 self._flush()
         self._busy = False
@@ -542,7 +540,7 @@ def _start(guard: Guard) -> dict[str, Any]:
 def settings_now(guard: Guard) -> dict[str, Any]:
     """What may be changed between episodes; and, of the reviser, while driving."""
     return {
-        "explaining": (guard.explaining or Explain.SPOKEN).value,
+        "explaining": guard.explaining,
         "interval": guard.interval,
         "learn": guard.learn,
         "missing": guard.missing.value,
@@ -572,7 +570,6 @@ def decision_of(situation: Situation, proposal: Proposal, revision: Revision) ->
     return {
         **{name: _plain(RECORD[name].kind, RECORD[name].read(decided)) for name in _TOLD},
         "belief": [[state, float(situation.belief[state])] for state in likely],
-        "candidates": _candidates(proposal),
         "interval": [float(bound) for bound in revision.interval],
     }
 
@@ -581,10 +578,6 @@ def _plain(kind: type, value: Any) -> Any:
     if isinstance(value, np.ndarray):
         return written(value)
     return None if value is None else kind(value)
-
-
-def _candidates(proposal: Proposal) -> list[Any]:
-    return [written(candidate) for candidate in proposal.candidates]
 
 
 def _floats(observation: NDArray[np.float64]) -> list[float]:

@@ -120,11 +120,11 @@ def _asked(
     try:
         wanted = propose(seen.copy(), time)
         proposal = wanted if isinstance(wanted, Proposal) else Proposal(wanted)
-        numbers = np.array([proposal.action, *proposal.candidates], dtype=np.float64)
+        numbers = np.asarray(proposal.action, dtype=np.float64)
     except Exception as error:
         _log.warning("controller failed at %g s: %r", time, error)
         return None
-    if np.isfinite(numbers[0]).all():
+    if np.isfinite(numbers).all():
         return proposal
     _log.warning("controller proposed %s at %g s", proposal.action, time)
     return None

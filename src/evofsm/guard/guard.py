@@ -9,7 +9,6 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Callable, Mapping
-from enum import Enum
 from io import BytesIO
 from typing import Any, Protocol, Self
 
@@ -34,7 +33,6 @@ from evofsm.guard.api import (
     Fallback,
     Intake,
     LearningJudge,
-    ObservingJudge,
     Participants,
     Proposal,
     Reviser,
@@ -56,14 +54,6 @@ _GAP = 1.5
 _LACKING = {Missing.PARTIAL: Intake.PARTIAL, Missing.HOLD: Intake.HELD}
 # Fourth powers of larger observations, summed over a long run, would lose all others.
 _LARGEST = 1e30
-
-
-class Explain(Enum):
-    """For which decisions a revision holds the machine's experience (`Revision.explanation`)."""
-
-    NONE = "none"
-    SPOKEN = "spoken"  #: those that change a proposal or warn
-    ALL = "all"
 
 
 class InputMonitor:
@@ -114,6 +104,8 @@ class DecisionLogger(Protocol):
         """The episode ended."""
 
 
+# Settings that stand in a file as they are.
+_PLAIN = ("explaining", "interval", "learn", "seed")
 # What a judge has that learns.
 _LEARNS = ("dt", "learn", "watch", "follow", "start_episode", "end", "sums", "save", "load")
 # The files of the machine and of the judge, as bytes.
@@ -161,9 +153,9 @@ class Guard:
         lie in the cells of a grid instead (`BoxActions`).
     audit : DecisionLogger, optional
         Records what is decided: an `AuditLog`, or `evofsm.io.FoxgloveSink`, which shows it.
-    explaining : Explain, optional
-        For which decisions the machine's experience is looked up; without it for none, and with
-        an audit log for those that speak.
+    explaining : bool
+        Whether `Revision.explanation` holds the machine's experience for every decision; with an
+        audit log it does for those that change a proposal or warn.
     missing : Missing
         What to do where a variable was not observed (NaN).
 
@@ -206,7 +198,7 @@ class Guard:
         machine: EvolvingFSM | None = None,
         width: float | None = None,
         audit: DecisionLogger | None = None,
-        explaining: Explain | None = None,
+        explaining: bool = False,
         missing: Missing = Missing.PARTIAL,
     ) -> None:
         actions = _actions(low, high, n_actions, width)
@@ -279,7 +271,7 @@ class Guard:
         failed: Callable[[NDArray[np.float64]], bool] | None = None,
         seed: int = 0,
         audit: DecisionLogger | None = None,
-        explaining: Explain | None = None,
+        explaining: bool = False,
         missing: Missing = Missing.PARTIAL,
     ) -> None:
         self.actions: ActionSet = actions or reviser.actions  # type: ignore[attr-defined]
@@ -311,7 +303,7 @@ class Guard:
             warm_judge()
         if machine is not None:
             warm_machine(limited=machine.max_states is not None)
-        self._observing = judge if isinstance(judge, ObservingJudge) else None
+        self._observing = judge if isinstance(judge, LearntRisk) else None
         self.reviser = reviser
         self.machine = machine
         #: Learns from what happens; None where nothing but the machine does.
@@ -411,17 +403,12 @@ class Guard:
         TypeError, ValueError
             If observation or proposal are not real numbers, or an entry is infinite or too large.
         """
-        if isinstance(proposal, Proposal):
-            others = tuple(self._proposed(candidate) for candidate in proposal.candidates)
-            proposal = Proposal(self._proposed(proposal.action), others)
-        elif proposal is None:
-            proposal = Proposal(no_action(self.actions))
-        else:
-            proposal = Proposal(self._proposed(proposal))
+        wanted = proposal.action if isinstance(proposal, Proposal) else proposal
+        wanted = no_action(self.actions) if wanted is None else self._proposed(wanted)
         if time is None:
             count = self._decisions if self._under_way else 0
             time = math.nan if self.interval is None else count * self.interval
-        return self.revise(self.recognise(observation, time), proposal)
+        return self.revise(self.recognise(observation, time), Proposal(wanted))
 
     def _proposed(self, action: ArrayLike) -> Action:
         """An action of the right type, whatever its values."""
@@ -506,7 +493,7 @@ class Guard:
             What `recognise` returned, and what the controller wants.
         """
         revision = self.reviser.revise(situation, proposal)
-        if self.explaining is not None or self.audit is not None:
+        if self.explaining or self.audit is not None:
             revision = self._explained(situation, revision)
         if self.audit is not None:
             self.audit.decided(situation, proposal, revision)
@@ -551,10 +538,9 @@ class Guard:
 
     def _explained(self, situation: Situation, revision: Revision) -> Revision:
         """With what the machine has seen come of what is executed, where that is asked for."""
-        explaining = self.explaining or (Explain.NONE if self.audit is None else Explain.SPOKEN)
-        if self.machine is None or situation.state is None or explaining is Explain.NONE:
+        if self.machine is None or situation.state is None:
             return revision
-        if explaining is Explain.SPOKEN and not is_spoken(self.reviser, revision):
+        if not (self.explaining or is_spoken(self.reviser, revision)):
             return revision
         action = self.actions.encode(revision.executed)
         if self._frozen is None:
@@ -654,10 +640,9 @@ class Guard:
             raise ValueError(f"a {type(self.reviser).__name__} is no reviser that a file can hold")
         kept = {
             **described,
-            "explaining": None if self.explaining is None else self.explaining.value,
             "missing": self.missing.value,
             "failed": self.failed is not None,
-            **{name: getattr(self, name) for name in ("interval", "learn", "seed")},
+            **{name: getattr(self, name) for name in _PLAIN},
         }
         files = {"machine": _bytes(self.machine), "judge": _bytes(self.judge)}
         store.write(path, KIND, kept, files, provenance)
@@ -701,7 +686,7 @@ class Guard:
         """
         kept, files = store.read(path, KIND)
         with store.explained(path):
-            for name in ("failed", "learn"):
+            for name in ("explaining", "failed", "learn"):
                 if not isinstance(kept[name], bool):
                     raise ValueError(f"{name} is {kept[name]!r}; it must be true or false")
             if kept["failed"] and failed is None:
@@ -715,9 +700,8 @@ class Guard:
                 judge=parts.risk,
                 failed=failed,
                 audit=audit,
-                explaining=None if kept["explaining"] is None else Explain(kept["explaining"]),
                 missing=Missing(kept["missing"]),
-                **{name: kept[name] for name in ("interval", "learn", "seed")},
+                **{name: kept[name] for name in _PLAIN},
             )
 
 

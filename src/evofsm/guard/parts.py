@@ -16,7 +16,7 @@ from evofsm.fsm.actions import IntervalActions
 from evofsm.fsm.machine import EvolvingFSM
 from evofsm.guard.actions import ActionSet, BoxActions, Choices
 from evofsm.guard.api import ActionJudge, LearningJudge, Participants, Reviser
-from evofsm.guard.reviser import ActionReviser, Mode, Way
+from evofsm.guard.reviser import ActionReviser, Mode
 
 
 @cache
@@ -89,7 +89,7 @@ def rebuild(
     ``judge`` is asked where the outline knows none, and none that learns was read.
     """
     fields, reviser = told["actions"], told["reviser"]
-    kind = IntervalActions if "width" in fields else BoxActions if "levels" in fields else Choices
+    kind = IntervalActions if "width" in fields else BoxActions if "low" in fields else Choices
     actions: ActionSet = kind(**fields)
     if reviser["class"] != "ActionReviser":
         again: Reviser = part_class(reviser["class"]).restored(reviser, actions)
@@ -109,19 +109,11 @@ def settings_of(reviser: Reviser) -> dict[str, Any]:
     """What may be changed about a reviser while driving."""
     if not isinstance(reviser, ActionReviser):
         return {}
-    return {
-        "mode": reviser.mode.value,
-        "overridden": reviser.overridden,
-        "release": reviser.release,
-        "tolerance": reviser.tolerance,
-        "way": reviser.way.value,
-    }
+    return {"mode": reviser.mode.value, "tolerance": reviser.tolerance}
 
 
 def set_again(reviser: Reviser, settings: Mapping[str, Any]) -> None:
     """Give a reviser the `settings_of` another time."""
     if not isinstance(reviser, ActionReviser):
         return
-    reviser.mode, reviser.way = Mode(settings["mode"]), Way(settings["way"])
-    reviser.release, reviser.tolerance = float(settings["release"]), float(settings["tolerance"])
-    reviser.overridden = bool(settings["overridden"])
+    reviser.mode, reviser.tolerance = Mode(settings["mode"]), float(settings["tolerance"])

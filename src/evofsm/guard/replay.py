@@ -13,6 +13,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from io import BytesIO
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -36,7 +37,7 @@ from evofsm.guard.audit_log import (
     settings_now,
     sums_of,
 )
-from evofsm.guard.guard import Explain, Guard
+from evofsm.guard.guard import Guard
 from evofsm.guard.parts import set_again
 from evofsm.guard.reviser import is_spoken
 
@@ -45,6 +46,10 @@ _NONSENSE = (ValueError, TypeError, LookupError, AttributeError, ArithmeticError
 _NO_FUNCTION = (
     "a function told the guard where it fails, and no log holds code; give it as failed "
     "(--failed MODULE:FUNCTION)"
+)
+# Where there is a decision logger, decisions that speak are explained.
+_DEAF: Any = SimpleNamespace(
+    **dict.fromkeys(("begin", "seen", "decided", "ended"), lambda *told, **others: None)
 )
 _Failed = Callable[[NDArray[np.float64]], bool]
 
@@ -236,11 +241,11 @@ class _Player:
             self.not_replayed.append(_NO_FUNCTION)
         else:
             file = BytesIO(base64.b64decode(content["guard"], validate=True))
-            self._guard = Guard.load(file, failed=self._failed if told else None)
+            self._guard = Guard.load(file, failed=self._failed if told else None, audit=_DEAF)
 
     @staticmethod
     def _set(guard: Guard, settings: Mapping[str, Any]) -> None:
-        guard.explaining = Explain(settings["explaining"])
+        guard.explaining = bool(settings["explaining"])
         guard.missing = Missing(settings["missing"])
         guard.interval = settings["interval"]
         if guard.learn != settings["learn"]:
@@ -263,7 +268,7 @@ class _Player:
         self.decisions += 1
 
     def _decision(self, guard: Guard, content: Mapping[str, Any]) -> None:
-        given = (content[name] for name in ("time", "observation", "proposed", "candidates"))
+        given = (content[name] for name in ("time", "observation", "proposed"))
         when, told, speaks = self._again(guard, *given)
         if fields := _differing({name: content[name] for name in told}, told):
             raise _DiffersError(f"{when} comes out otherwise", fields)
@@ -273,10 +278,10 @@ class _Player:
 
     @staticmethod
     def _again(
-        guard: Guard, time: Any, observation: Any, action: Any, candidates: Any = ()
+        guard: Guard, time: Any, observation: Any, action: Any
     ) -> tuple[str, dict[str, Any], bool]:
         """Which decision it is, what is told of it, and whether it is one to speak of."""
-        proposal = Proposal(_action(action), tuple(_action(candidate) for candidate in candidates))
+        proposal = Proposal(_action(action))
         situation = guard.recognise(_floats(observation), _number(time))
         revision = guard.revise(situation, proposal)
         told = decision_of(situation, proposal, revision)

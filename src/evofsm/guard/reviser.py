@@ -1,6 +1,6 @@
 """The action reviser: it keeps what a controller proposes, or replaces it by something better.
 
-The module of the paper's Section 4.2, in both of its ways (`Way`). The authors' own sequel tests an
+The module of the paper's Section 4.2, where it improves actions. The authors' own sequel tests an
 action by predicting the states it leads to (Han, Filev, Ozguner, arXiv:2006.08092).
 """
 
@@ -44,6 +44,8 @@ from evofsm.guard.api import (
 
 # Further decisions for which an action is held whose effect is not known yet.
 _TRIAL = 4
+# Share of the tolerance below which a proposal is kept again, once revising.
+_RELEASE = 0.9
 # States that were seen for a shorter time are new [s].
 _NEW = 0.5
 #: Done without a usable proposal where nobody says what is better.
@@ -57,13 +59,6 @@ class Mode(Enum):
     SHADOW = "shadow"  #: proposals are executed, what it would have done is recorded
     ADVISE = "advise"  #: as shadow, and the driver is told
     ACT = "act"  #: what it decides is executed
-
-
-class Way(Enum):
-    """Where another action may come from."""
-
-    CHOOSE = "choose"  #: the candidates that the controller returns
-    IMPROVE = "improve"  #: any action of the set
 
 
 class Usable(NamedTuple):
@@ -112,9 +107,8 @@ class ActionReviser:
     has begun to revise, it keeps on until the proposal is safe by a margin, so that it does not
     chatter.
 
-    A judge that looks for an action itself (`api.SearchingJudge`) is asked for it (`Way.IMPROVE`).
-    Where nothing of what it decides is executed (any mode but `Mode.ACT`, or the driver has taken
-    over), nothing is tried.
+    A judge that looks for an action itself (`api.SearchingJudge`) is asked for it. Where nothing of
+    what it decides is executed (any mode but `Mode.ACT`), nothing is tried.
 
     Parameters
     ----------
@@ -125,10 +119,8 @@ class ActionReviser:
         kept, or replaced by the least risky one. In a box change is counted in half ranges.
     tolerance : float
         Highest latent risk that is accepted, in (0, 1).
-    release : float
-        Share of the tolerance below which a proposal is kept again, once revising.
     mode : Mode
-    way : Way
+        May be changed at any time, as where a driver takes over.
 
     Examples
     --------
@@ -148,22 +140,15 @@ class ActionReviser:
         actions: ActionSet,
         *,
         tolerance: float = TOLERANCE,
-        release: float = 0.9,
         mode: Mode = Mode.ACT,
-        way: Way = Way.IMPROVE,
     ) -> None:
         if not 0.0 < tolerance < 1.0:
             raise ValueError(f"tolerance is {tolerance}; it is a probability, between 0 and 1")
-        if not 0.0 < release <= 1.0:
-            raise ValueError(f"release is {release}; it must lie in (0, 1]")
         risk.refuse_unfit(*limits(actions))
         self.risk = risk
         self.actions = actions
         self.tolerance = tolerance
-        self.release = release
         self.mode = mode
-        self.way = way
-        self.overridden = False  #: whether the driver has taken over
         self._searches = isinstance(risk, SearchingJudge)
         self._lowest, self._highest = nearest_bounds(actions)
         self._low, self._high = limits(actions)
@@ -182,15 +167,7 @@ class ActionReviser:
     @property
     def acts(self) -> bool:
         """Whether what it decides is executed."""
-        return self.mode is Mode.ACT and not self.overridden
-
-    def take_over(self) -> None:
-        """The driver overrides: proposals are executed until `hand_back`."""
-        self.overridden = True
-
-    def hand_back(self) -> None:
-        """The driver lets the reviser act again."""
-        self.overridden = False
+        return self.mode is Mode.ACT
 
     def revise(self, situation: Situation, proposal: Proposal) -> Revision:
         """What to execute instead of the proposal, which is first made usable (`make_usable`)."""
@@ -200,12 +177,11 @@ class ActionReviser:
             self._trial = 0
         if self.mode is Mode.OFF:
             return unjudged_revision(wanted, proposal, remark or "reviser is off")
-        options, judged, best, reason = self._search(situation, wanted, proposal, acts)
+        options, judged, best, reason = self._search(situation, wanted, acts)
         executed = best if acts else 0
         is_number = options.ndim == 1
         if not acts and best != 0:
-            who = "driver has taken over" if self.overridden else self.mode.value
-            reason = f"{who}: {reason}"
+            reason = f"{self.mode.value}: {reason}"
         unseen = unseen_text(situation, names) if situation.intake else ""
         # Of a situation that is new: whether it is dangerous is another question.
         new = "never seen before" if judged.seen < _NEW else ""
@@ -221,24 +197,18 @@ class ActionReviser:
             advised=float(options[best]) if is_number else fixed(options[best]),
         )
 
-    def _search(
-        self, situation: Situation, wanted: Action, proposal: Proposal, acts: bool
-    ) -> Search:
+    def _search(self, situation: Situation, wanted: Action, acts: bool) -> Search:
         """Which option should be executed: the judge's own, or the best of those it is given."""
-        if self.way is Way.IMPROVE and self._searches:
+        if self._searches:
             found: Search = self.risk.search(  # type: ignore[attr-defined]
                 situation, wanted, tolerance=self.tolerance, revising=self._revising
             )
             self._revising = found.best != 0
             within = np.minimum(np.maximum(found.options, self._low), self._high)
             return found._replace(options=within)
-        if self.way is Way.IMPROVE:
-            options = np.minimum(np.maximum(wanted, self._lowest), self._highest)
-            if not acts:
-                options = self.risk.effective(situation, options)
-        else:
-            offered = (make_usable(Proposal(one), self.actions) for one in proposal.candidates)
-            options = np.array([wanted, *(one.action for one in offered if not one.remark)])
+        options = np.minimum(np.maximum(wanted, self._lowest), self._highest)
+        if not acts:
+            options = self.risk.effective(situation, options)
         judged = self.risk.judge(situation, options)
         return Search(options, judged, *self._decide(options, judged, acts))
 
@@ -246,7 +216,7 @@ class ActionReviser:
         self, options: NDArray[np.float64], judged: Judgement, acts: bool
     ) -> tuple[int, str]:
         """Index of the best option, and why."""
-        limit = self.tolerance * (self.release if self._revising else 1.0)
+        limit = self.tolerance * (_RELEASE if self._revising else 1.0)
         trial = self.risk.trial()
         if self._trial > 0 and trial is not None:
             self._trial -= 1

@@ -32,7 +32,7 @@ from evofsm.driving.cars import name_judge
 from evofsm.driving.measures import time_headway, time_to_collision
 from evofsm.driving.world import GAP, GAP_BEHIND, LEADER_ACCELERATION, LEADER_SPEED, SPEED, World
 from evofsm.fsm.rules import Novelty
-from evofsm.guard import Decision, Explain, Guard, Judgement, Mode
+from evofsm.guard import Decision, Guard, Judgement, Mode
 from evofsm.guard.record import RECORD
 
 #: The state rule for looking on: coarse enough that each state can be told from the others.
@@ -87,7 +87,7 @@ class Session:
         self.machine, self.judge = learners_of(guard)
         self._guard, self._reviser, self._seed = guard, guard.reviser, seed
         self._tolerance = float(self._reviser.tolerance)  # type: ignore[attr-defined]
-        guard.explaining = Explain.ALL
+        guard.explaining = True
         self.revising = on
         self._closing = ExitStack()
         self.start = self.restart()
