@@ -42,10 +42,14 @@ def read_back(model, **how):
 
 
 def test_graphviz_draws_every_state_and_every_edge_that_was_asked_for(model):
-    graph = read_back(model, least=0.0, evidence=1.0)
     drawn = (model.averaged_matrix("observed") > 0.0) & (model.changes >= 1.0)
-    edges = {(int(a[1:]) - 1, int(b[1:]) - 1) for a, b in graph.edges()}
-    assert edges == set(map(tuple, np.argwhere(drawn).tolist()))
+    assert len(read_back(model, least=0.0, evidence=1.0).edges()) == drawn.sum()
+    graph = read_back(model, least=0.0, evidence=0.0)
+    assert len(graph.edges()) == model.n_states**2
+    for edge in graph.edges():
+        seen = model.changes[int(edge[0][1:]) - 1, int(edge[1][1:]) - 1]
+        assert (edge.attr["style"] == "dashed") == (seen == 0)
+        assert edge.attr["label"].endswith(f"({seen:,.0f})")
     picture = graph.draw(format="svg", prog="dot").decode()
     assert picture.count('class="node"') == model.n_states
     shown = ODD.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
@@ -62,21 +66,19 @@ def test_a_dead_end_is_marked_by_its_shape_and_in_words(model):
     assert [n for n in told.nodes() if n.attr["shape"] == "hexagon"] == ["s2"]
 
 
-def test_what_was_never_seen_is_dashed(model):
-    graph = read_back(model, least=0.0, evidence=0.0)
-    assert len(graph.edges()) == model.n_states**2
-    for edge in graph.edges():
-        seen = model.changes[int(edge[0][1:]) - 1, int(edge[1][1:]) - 1]
-        assert (edge.attr["style"] == "dashed") == (seen == 0)
-        assert edge.attr["label"].endswith(f"({seen:,.0f})")
-
-
-def test_what_cannot_be_drawn_is_refused(model):
+def test_what_cannot_be_drawn_or_is_no_process_is_refused(model):
     with pytest.raises(ValueError, match="least is 2"):
         to_dot(model, least=2)
     with pytest.raises(ValueError, match=r"\[99\].*states, from 0"):
         to_dot(model, dead_ends=[0, 99])
-    assert "s1" not in to_dot(EvolvingFSM(n_actions=1, radius=0.5).model())
+    empty = EvolvingFSM(n_actions=1, radius=0.5)
+    assert "s1" not in to_dot(empty.model())
+    with pytest.raises(ValueError, match="counted no decisions"):
+        to_prism(empty.model())
+    with pytest.raises(ValueError, match="evidence is 0"):
+        to_prism(model, evidence=0.0)
+    empty.learn_many([[0.0], [1.0]], [0, 0])
+    assert "NO DECISION FAILED" in to_prism(empty.model())
 
 
 # -- PRISM ----------------------------------------------------------------------------------------
@@ -162,21 +164,5 @@ def test_states_without_evidence_are_absorbing_and_say_so(model):
     assert labels["unknown"] == f"s={lost}"
     assert commands[lost, "unknown"][lost] == 1.0
     assert "labelled unknown: 1." in text
-
-
-def test_comments_say_the_evidence_what_actions_mean_and_that_nothing_failed(model):
-    text = to_prism(model)
     assert "//   a1: [-1.5, -0.5)" in text
-    assert re.search(r"\[a1\] s=\d+ -> // [\d.]+ decisions; a1 was used", text)
-    assert f"seen {model.changes.max():g}" in text
-    safe = EvolvingFSM(n_actions=1, radius=0.5)
-    safe.learn_many([[0.0], [1.0]], [0, 0])
-    assert "NO DECISION FAILED" in to_prism(safe.model())
     assert "NO DECISION FAILED" not in text
-
-
-def test_what_is_no_process_is_refused(model):
-    with pytest.raises(ValueError, match="counted no decisions"):
-        to_prism(EvolvingFSM(n_actions=1, radius=0.5).model())
-    with pytest.raises(ValueError, match="evidence is 0"):
-        to_prism(model, evidence=0.0)

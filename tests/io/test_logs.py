@@ -3,6 +3,7 @@
 import csv
 import gzip
 import io
+import itertools
 import re
 import sys
 import tracemalloc
@@ -13,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from evofsm.fsm.observations import Category, ObservationEncoder
-from evofsm.io import logs, tables
+from evofsm.io import tables
 from evofsm.io.logs import LogColumns, Noted, episodes_of, parse_units, read_traces
 from evofsm.io.tables import CsvTable, Wanted, file_kind
 
@@ -200,23 +201,6 @@ def test_memory_does_not_grow_with_the_file(tmp_path, monkeypatch):
     assert peak(100_000) < 1.1 * peak(20_000)
 
 
-def test_of_a_file_that_grows_what_was_there_at_first_is_read(tmp_path, caplog):
-    path = tmp_path / "a.csv"
-    write(path, log(100))
-    whole = path.read_bytes()
-    path.write_bytes(whole[:-4])  # its last line is being written
-    more = [whole[-4:], "\n".join([*log(50, start=10.0), ""]).encode()]
-
-    def grow(count):
-        with open(path, "ab") as file:
-            file.write(more.pop(0) if len(more) > 1 else more[0])
-
-    chunks = list(read_traces([str(path)], on_read=grow))
-    assert sum(len(chunk.times) for chunk in chunks) == 100
-    assert (chunks[-1].actions == -0.25).all()
-    assert "a.csv grew by" in caplog.text
-
-
 @pytest.mark.parametrize(
     ("name", "content", "kind"),
     [
@@ -290,15 +274,6 @@ def test_a_missing_column_names_those_there_are_and_the_option(tmp_path, columns
     assert f"no column {missing!r}; it has {HEADER.replace(',', ', ')} ({option}" in message
 
 
-@pytest.mark.parametrize("second", ["0.200", "-1"])
-def test_time_that_stands_or_runs_backwards_is_refused(tmp_path, second, monkeypatch):
-    for size in (1, 1 << 20):  # within a chunk, or between two
-        monkeypatch.setattr(tables, "_CSV_BYTES", size)
-        message = refusal(write(tmp_path / "a.csv", [*log(3), f"r,v1-v2,0,{second},1,1,1,1"]))
-        assert "line 5: time goes from 0.2 to" in message
-        assert "--episode" in message
-
-
 def test_episodes_that_come_back_are_refused_with_the_remedy(tmp_path, monkeypatch):
     """Each block would be an episode of its own, and no row would look wrong."""
     lines = [row for k in range(8) for pair in ("v1", "v2") for row in log(10, pair, start=k)]
@@ -307,13 +282,14 @@ def test_episodes_that_come_back_are_refused_with_the_remedy(tmp_path, monkeypat
     assert "sort the file by run, pair, segment and then by time" in message
     monkeypatch.setattr(tables, "_CSV_BYTES", 1)
     assert "a.csv, line 22: the episode r, v1, 0" in refusal(write(tmp_path / "a.csv", lines))
-    monkeypatch.setattr(logs, "_MOST_EPISODES", 2)  # of very many the first are kept in mind
-    lines = [row for pair in "abcdc" for row in log(3, pair)]
-    assert together(write(tmp_path / "a.csv", lines))[1] == [0, 3, 6, 9, 12]
-    assert "comes back" in refusal(write(tmp_path / "b.csv", [*lines, *log(3, "b")]))
 
 
-def test_files_with_different_steps_are_refused(tmp_path):
+def test_time_runs_forward_at_the_step_of_the_first_file(tmp_path, monkeypatch):
+    for size, second in itertools.product((1, 1 << 20), ("0.200", "-1")):  # between chunks, within
+        monkeypatch.setattr(tables, "_CSV_BYTES", size)
+        message = refusal(write(tmp_path / "a.csv", [*log(3), f"r,v1-v2,0,{second},1,1,1,1"]))
+        assert "line 5: time goes from 0.2 to" in message
+        assert "--episode" in message
     slow = write(tmp_path / "slow.csv", log(9, step=1.0))
     message = refusal(write(tmp_path / "fast.csv", log(9)), slow)
     assert "slow.csv has a row every 1 s" in message
@@ -398,7 +374,8 @@ def test_a_name_that_looks_like_an_address_is_a_file_like_any_other(name, tmp_pa
 def test_the_first_row_in_which_it_holds_ends_the_episode(
     tmp_path, monkeypatch, condition, ending, at_once
 ):
-    lines = [*short([3, 1, 0, -1, -1, 2, 0, 5]), *short([-1, 4], "q"), *short([5, 6], "r")]
+    hole = [f"s,{t},{gap},1,1,0,{hit}" for t, gap, hit in ((0, 1, 0), (0.1, 0, 1), (9, 0, 1))]
+    lines = [*short([3, 1, 0, -1, -1, 2, 0, 5]), *short([-1, 4], "q"), "r,0,5,1,1,0,0", *hole]
     path = write(tmp_path / "a.csv", lines, SHORT)
     if ending == "parquet":
         kind = polars.Boolean if condition == "crash" else polars.Int8
@@ -409,24 +386,11 @@ def test_the_first_row_in_which_it_holds_ends_the_episode(
     monkeypatch.setattr(tables, "_PARQUET_ROWS", at_once)
     noted = Noted()
     gaps, starts, failures = together(path, noted=noted, failed=condition)
-    assert gaps == [3, 1, 0, 2, 0, 5, -1, 4, 5, 6]
-    assert starts == [0, 3, 5, 6, 7, 8]
-    assert failures == [2, 4, 6]
-    assert noted.after_failure == 2
-
-
-def test_a_hole_in_time_makes_no_second_failure_and_without_a_word_there_is_none(tmp_path):
-    lines = [f"p,{t},{gap},1,1,0,0" for t, gap in ((0, 1), (1, 1), (2, 0), (9, 0), (10, 0))]
-    path = write(tmp_path / "a.csv", lines, SHORT)
-    assert together(path, failed="gap<=0") == ([1, 1, 0], [0], [2])
-    assert together(path)[2] is None
-
-
-@pytest.mark.parametrize("condition", ["", "gap<", "<0", "gap<0<1", "gap<inf", "0<gap"])
-def test_what_is_no_condition_is_refused(tmp_path, condition):
-    path = write(tmp_path / "a.csv", short([1, 2]), SHORT)
-    with pytest.raises(ValueError, match=re.escape(f"--failed is {condition!r}")):
-        read(path, failed=condition)
+    assert gaps == [3, 1, 0, 2, 0, 5, -1, 4, 5, 1, 0]
+    assert starts == [0, 3, 5, 6, 7, 8, 9]
+    assert failures == [2, 4, 6, 10]
+    assert noted.after_failure == 3
+    assert together(path)[2] is None  # nothing tells of failures
 
 
 def test_what_only_tells_of_failures_may_be_infinite_but_must_be_there(tmp_path):
@@ -447,15 +411,12 @@ def test_rows_without_a_leader_end_an_episode(tmp_path, monkeypatch, nothing, at
     assert together(path, noted=noted, leader_may_lack=True)[:2] == ([1, 2, 3], [0, 2])
     assert noted.leaderless == 3
     assert "column 'gap'" in refusal(path)
-
-
-def test_what_lacks_in_a_row_with_a_leader_is_refused(tmp_path):
-    lines = [line.replace("-0.5", "") for line in short([1, 2], crash=[0, 0])]
-    path = write(tmp_path / "a.csv", lines, SHORT)
-    assert "line 2, column 'a_follower'" in refusal(path, leader_may_lack=True)
-    path = write(tmp_path / "b.csv", short(["", ""], crash=[0, 0]), SHORT)
+    lines = [f"p,0,{nothing},10,11,1,1", "p,0.1,2,10,11,,0"]
+    path, noted = write(tmp_path / "b.csv", lines[:1], SHORT), Noted()
     assert "no row has a leader" in refusal(path, leader_may_lack=True)
-    path, noted = write(tmp_path / "c.csv", short([1, "", 2], crash=[0, 1, 0]), SHORT), Noted()
+    path = write(tmp_path / "c.csv", lines, SHORT)
+    assert "line 3, column 'a_follower'" in refusal(path, leader_may_lack=True)
+    path = write(tmp_path / "d.csv", [lines[0], lines[1].replace(",,", ",1,")], SHORT)
     read(path, noted=noted, leader_may_lack=True, failed="crash")
     assert "1 failures lie in rows without a leader" in " ".join(noted.warnings())
 
@@ -474,22 +435,14 @@ ZONED += [f"2026-03-29T03:00:00.{k}+02:00" for k in range(3)]  # summer time beg
 @pytest.mark.parametrize("texts", [ZONED, [f"2026-03-14 09:26:53.{k}" for k in range(5)]])
 def test_times_may_be_dates(tmp_path, texts):
     path = write(tmp_path / "a.csv", dated(texts), SHORT)
-    polars.read_csv(path).write_parquet(tmp_path / "a.parquet")
-    for one in (path, str(tmp_path / "a.parquet")):
+    frame, time = polars.read_csv(path), polars.col("time")
+    frame.write_parquet(tmp_path / "text.parquet")
+    zoned = time.str.to_datetime(time_zone="UTC" if texts is ZONED else None)
+    frame.with_columns(zoned.dt.cast_time_unit("ms")).write_parquet(tmp_path / "typed.parquet")
+    for one in (path, str(tmp_path / "text.parquet"), str(tmp_path / "typed.parquet")):
         (chunk,) = read(one)
         assert chunk.times == pytest.approx([0.0, 0.1, 0.2, 0.3, 0.4], abs=1e-12)
         assert (chunk.dt, chunk.starts.tolist()) == (0.1, [0])
-
-
-@pytest.mark.parametrize(("unit", "zone"), [("ns", None), ("ms", "Europe/Berlin")])
-def test_parquet_s_own_dates_are_read(tmp_path, unit, zone):
-    time = polars.col("time").str.to_datetime("%+", time_zone="UTC")
-    time = time.dt.convert_time_zone(zone) if zone else time.dt.replace_time_zone(None)
-    frame = polars.read_csv(write(tmp_path / "a.csv", dated(ZONED), SHORT))
-    frame = frame.with_columns(time.dt.cast_time_unit(unit))
-    frame.write_parquet(tmp_path / "a.parquet")
-    (chunk,) = read(str(tmp_path / "a.parquet"))
-    assert chunk.times == pytest.approx([0.0, 0.1, 0.2, 0.3, 0.4], abs=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -508,30 +461,25 @@ def test_dates_that_are_none_are_refused(tmp_path, texts, says):
 def test_units_are_converted_before_anything_is_learnt(tmp_path):
     lines = [f"p,{100 * k},{1000 * k},36,72,0,0" for k in range(4)]
     units = parse_units(["v=km/h", "v_l=m/s", "time=ms", "gap=cm"])  # the longest name counts
-    (chunk,) = read(write(tmp_path / "a.csv", lines, SHORT), units=units)
+    path, noted = write(tmp_path / "a.csv", lines, SHORT), Noted()
+    (chunk,) = read(path, units=units)
     assert chunk.observations[1] == pytest.approx([10.0, 10.0, 72.0])
     assert chunk.dt == 0.1
+    read(path, noted=noted)
+    speed, step = noted.warnings("time")
+    assert re.search("v_leader reaches 72 m/s.*--unit v_leader=km/h", speed)
+    assert re.search("a row every 100 s.*--unit time=ms", step)
 
 
 @pytest.mark.parametrize(
-    ("texts", "says"),
+    ("columns", "says"),
     [
-        (["v=knots"], "--unit is 'v=knots'; write NAME=UNIT with one of s, ms"),
-        (["v=km/h", "v=mph"], "names 'v' twice"),
-        (["speed=km/h"], "no column that is read is called so"),
-        (["time=km/h"], "needs a unit of time"),
+        *(({"failed": text}, f"--failed is {text!r}") for text in ("", "<0", "gap<0<1", "gap<inf")),
+        ({"units": {"speed": "km/h"}}, "no column that is read is called so"),
+        ({"units": {"time": "km/h"}}, "needs a unit of time"),
     ],
 )
-def test_units_that_cannot_be_are_refused(tmp_path, texts, says):
+def test_what_is_no_condition_and_no_unit_of_a_column_is_refused(tmp_path, columns, says):
     path = write(tmp_path / "a.csv", short([1, 2]), SHORT)
     with pytest.raises(ValueError, match=re.escape(says)):
-        read(path, units=parse_units(texts))
-
-
-def test_speeds_and_steps_beyond_belief_name_the_likely_cause(tmp_path):
-    lines = [f"p,{100 * k},9,120,50,0,0" for k in range(4)]
-    noted = Noted()
-    read(write(tmp_path / "a.csv", lines, SHORT), noted=noted)
-    speed, step = noted.warnings("time")
-    assert re.search("v_follower reaches 120 m/s.*--unit v_follower=km/h", speed)
-    assert re.search("a row every 100 s.*--unit time=ms", step)
+        read(path, **columns)

@@ -40,8 +40,6 @@ LONGEST_STEP = 1.5
 _FIRST_ROWS = 8192
 # Share by which the usual steps of two files may differ.
 _SAME_STEP = 0.05
-# Episodes of a file that are kept in mind, some 30 MB; of those after them nothing is known.
-_MOST_EPISODES = 1 << 18
 # Speeds [m/s] and usual steps [s] beyond these are most likely in another unit.
 _FASTEST, _LONGEST_USUAL = 60.0, 10.0
 _SPEED = re.compile(r"v([_0-9]|$)|.*(speed|velocity)", re.IGNORECASE)
@@ -119,11 +117,7 @@ class Noted:
 
 
 def parse_units(texts: Iterable[str]) -> dict[str, str]:
-    """Units by the column, or the beginning of columns, from what --unit was given.
-
-    >>> parse_units(["v=km/h", "time=ms"])
-    {'v': 'km/h', 'time': 'ms'}
-    """
+    """Units by the column, or the beginning of columns, from what --unit was given."""
     found: dict[str, str] = {}
     for text in texts:
         name, _, unit = (part.strip() for part in text.rpartition("="))
@@ -139,9 +133,6 @@ def units_of(units: Mapping[str, str], used: Sequence[str], time: str) -> dict[s
     """The unit of each column in use that was given one.
 
     A name that is no column's is the beginning of all that it fits; the longest one counts.
-
-    >>> units_of({"v": "km/h"}, ["gap", "v_follower", "time"], "time")
-    {'v_follower': 'km/h'}
     """
     found: dict[str, str] = {}
     for name in sorted(units, key=lambda name: (name in used, len(name))):
@@ -279,8 +270,7 @@ def read_traces(
     Raises
     ------
     ValueError
-        If a file is not what it should be; the message names file, line and likely cause. So
-        where an episode comes back after another one, of the first 262,144 episodes of a file.
+        If a file is not what it should be; the message names file, line and likely cause.
     ModuleNotFoundError
         If what reads such a file is not installed; the message has the command that does it.
 
@@ -400,9 +390,8 @@ def _columns_of_pairs(path: str, columns: LogColumns) -> LogColumns:
     """What is read of a recording of many vehicles; what else was asked for is refused."""
     asked = [f"--observe {name}" for name in columns.observe.names if name not in VARIABLES]
     asked += [f"--action {columns.action}"] if columns.action != ACTION else []
-    asked += ["--episode"] if columns.episode is not None else []
-    asked += ["--dt"] if columns.dt is not None else []
-    asked += ["--unit"] if columns.units else []
+    given = {"--episode": columns.episode, "--dt": columns.dt, "--unit": columns.units or None}
+    asked += [option for option, value in given.items() if value is not None]
     failed = None if columns.failed is None else Condition.parse(columns.failed)
     if failed is not None and not (failed.sign and failed.column in (*VARIABLES, ACTION)):
         asked += [f"--failed {columns.failed} (but with 'gap<=0')"]
@@ -593,8 +582,7 @@ class _Reader:
                     f"({names}) comes back after another one, and each block of its rows would be "
                     f"taken for an episode of its own; sort the file by {names} and then by time"
                 )
-            if len(self._known) < _MOST_EPISODES:
-                self._known.add(tuple(episode))
+            self._known.add(tuple(episode))
         return starts
 
     def _sift(

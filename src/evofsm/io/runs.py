@@ -36,9 +36,8 @@ MODEL = "model.evofsm"
 FORMAT = "1"
 # Where there is no state.
 _NONE = -1
-# No chunk is larger than this, unpacked, nor all of them together than so many times the file and
-# one chunk more [bytes]; and no episode's beliefs are more numbers than the last.
-_LARGEST_CHUNK, _DENSEST, _MOST_BELIEFS = 1 << 24, 1000, 1 << 27
+# No chunk is larger than this, unpacked [byte], and no episode's beliefs are more numbers.
+_LARGEST_CHUNK, _MOST_BELIEFS = 1 << 24, 1 << 27
 
 
 # -- Channels -------------------------------------------------------------------------------------
@@ -195,18 +194,15 @@ def _unpacked(path: str | os.PathLike[str], largest: int) -> Iterator[McapRecord
         from mcap.records import Chunk
         from mcap.stream_reader import StreamReader, breakup_chunk
     with open(path, "rb") as file:
-        size = file.seek(0, os.SEEK_END)
-        file.seek(0)
-        room = _DENSEST * size + largest
+        size = os.fstat(file.fileno()).st_size
         reader = StreamReader(file, emit_chunks=True, validate_crcs=True, record_size_limit=size)
         for record in reader.records:
             if not isinstance(record, Chunk):
                 yield record
                 continue
             data = _unpacked_chunk(record, largest)
-            room -= len(data)
-            if len(data) > largest or room < 0:
-                raise ValueError(f"it unpacks to more than was ever packed in {size:,} bytes")
+            if len(data) > largest:
+                raise ValueError(f"a chunk unpacks to more than the {largest:,} bytes it may have")
             yield from breakup_chunk(replace(record, compression="", data=data), validate_crc=True)
 
 
@@ -217,8 +213,7 @@ def _unpacked_chunk(chunk: Chunk, largest: int) -> bytes:
 
     if chunk.compression == "zstd":
         unpacker = ZstdDecompressor(max_window_size=largest)
-        with unpacker.stream_reader(chunk.data) as stream:
-            return bytes(stream.read(largest + 1))
+        return bytes(unpacker.stream_reader(chunk.data).read(largest + 1))
     if chunk.compression == "lz4":
         return bytes(LZ4FrameDecompressor().decompress(chunk.data, max_length=largest + 1))
     if chunk.compression:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import gzip
 import io
-import logging
 import os
 import re
 import zlib
@@ -69,8 +68,6 @@ _NOTHING = ("", "na", "n/a", "null", "none")
 _DATE = re.compile(r"\s*\d{4}-?\d\d-?\d\d[Tt ]")
 _ZONE = r"([zZ]|[+-]\d\d:?\d\d)$"
 
-_log = logging.getLogger(__name__)
-
 
 def silent(count: int) -> None:
     """Nobody wants to know how much was read."""
@@ -102,11 +99,7 @@ def file_kind(path: str) -> Kind:
 
 
 class Source:
-    """A file that is read once, unpacked if it is gzipped.
-
-    One that grows meanwhile is read up to where it was when it was opened, and to the end of that
-    line; a warning is logged.
-    """
+    """A file that is read once, unpacked if it is gzipped."""
 
     def __init__(self, path: str, on_read: OnRead = silent) -> None:
         if os.path.isdir(path):
@@ -117,7 +110,6 @@ class Source:
         self.lines = 0  # read so far of one that is gzipped
         self._on_read = on_read
         self._raw = io.BufferedReader(io.FileIO(path))
-        self._size = os.fstat(self._raw.fileno()).st_size
         self._packed = self._raw.peek(2).startswith(_GZIP)
         self._file = gzip.GzipFile(fileobj=self._raw) if self._packed else self._raw
 
@@ -138,38 +130,26 @@ class Source:
 
     def rows(self) -> bytes:
         """The next whole lines, some megabytes of them; no quoted field goes on behind them."""
-        block = self.read(_CSV_BYTES)
-        if not block:
-            if (growth := os.fstat(self._raw.fileno()).st_size - self._size) > 0:
-                late = "rows that came meanwhile are left out"
-                _log.warning("%s grew by %d bytes while it was read; %s", self.path, growth, late)
-            return block
-        is_open = b'"' in block and block.count(b'"') % 2 == 1
-        parts, room = [block], _LONGEST_LINE
-        while True:
-            is_whole = parts[-1].endswith(b"\n")
-            # A quote that is never closed is left to whoever parses them.
-            if is_whole and not (is_open and room > 0):
-                break
+        block = bytearray(self.read(_CSV_BYTES))
+        quotes, most = block.count(b'"'), len(block) + _LONGEST_LINE
+        # A quote that is never closed is left to whoever parses them.
+        while block and not (block.endswith(b"\n") and (quotes % 2 == 0 or len(block) > most)):
             line = self._take(_LONGEST_LINE, to_line_end=True)
             if not line:
-                parts += [] if is_whole else [b"\n"]
+                block += b"" if block.endswith(b"\n") else b"\n"
                 break
-            parts.append(line)
-            is_open ^= line.count(b'"') % 2 == 1
-            room -= len(line)
-            if room < 0 and not line.endswith(b"\n"):
+            block += line
+            quotes += line.count(b'"')
+            if len(block) > most and not line.endswith(b"\n"):
                 where = f"line {self.lines}" if self._packed else f"byte {self._raw.tell():,}"
                 raise ValueError(
                     f"{self.path}, about {where}: a line of more than {_LONGEST_LINE:,} bytes; "
                     "this is no table"
                 )
-        return b"".join(parts) if len(parts) > 1 else block
+        return bytes(block)
 
     def _take(self, most: int, to_line_end: bool = False) -> bytes:
         before = self._raw.tell()
-        if not (self._packed or to_line_end):
-            most = min(most, max(self._size - before, 0))
         try:
             data: bytes = self._file.readline(most) if to_line_end else self._file.read1(most)
         except (EOFError, zlib.error, gzip.BadGzipFile) as error:
