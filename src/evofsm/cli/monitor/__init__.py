@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import sys
-from contextlib import ExitStack, closing
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -11,7 +12,7 @@ from evofsm.cli.options import ModeName, argument, option, require
 from evofsm.cli.show import warn
 
 if TYPE_CHECKING:
-    from evofsm.cli.monitor.transports import Server
+    from evofsm.cli.monitor.transports import Transport
     from evofsm.guard import Guard
 
 
@@ -67,7 +68,7 @@ def monitor(
     require(**({} if zenoh is None else {"zenoh": "zenoh"}))
     from evofsm.cli.monitor.decider import Decider, guard_of_monitor, guard_of_traffic
     from evofsm.cli.monitor.state import State
-    from evofsm.cli.monitor.transports import Server, silence_output
+    from evofsm.cli.monitor.transports import Server
     from evofsm.fsm.validation import positive
     from evofsm.guard import Guard
 
@@ -95,12 +96,11 @@ def monitor(
             again = saved.begin(decider)
             if decider.n:
                 warn(f"goes on after decision {decider.n} ({again} rows taken in again)")
-        server = Server(decider, None if heartbeat is None else positive("--heartbeat", heartbeat))
+        each = math.inf if heartbeat is None else positive("--heartbeat", heartbeat)
+        server = Server(decider, each)
         try:
-            with server.stoppable():
-                _serve(server, stack, file, socket, udp, zenoh)
+            server.run(_transport(file, socket, udp, zenoh, stack))
         except BrokenPipeError:
-            silence_output()
             warn("nobody reads the decisions any more")
             return 1
         finally:
@@ -132,37 +132,27 @@ def _prepare(
         guard.audit = stack.enter_context(AuditLog(audit, sync="episode"))
 
 
-def _serve(
-    server: Server,
-    stack: ExitStack,
-    file: Path | None,
-    socket: Path | None,
-    udp: int | None,
-    zenoh: str | None,
-) -> None:
-    from evofsm.cli.monitor import transports
+def _transport(
+    file: Path | None, socket: Path | None, udp: int | None, zenoh: str | None, stack: ExitStack
+) -> Transport:
+    """Where rows come from; who listens says where."""
+    from evofsm.cli.monitor.transports import SocketTransport, Stream, UdpTransport, ZenohTransport
 
     if socket is not None:
-        by_socket = stack.enter_context(closing(transports.SocketTransport(socket)))
+        transport: Transport = SocketTransport(socket)
         warn(f"listens to {socket}")
-        by_socket.serve(server)
     elif udp is not None:
-        by_udp = stack.enter_context(closing(transports.UdpTransport(udp)))
+        transport = by_udp = UdpTransport(udp)
         warn(f"listens to UDP port {by_udp.port}")
-        by_udp.serve(server)
     elif zenoh is not None:
-        by_zenoh = stack.enter_context(closing(transports.ZenohTransport(zenoh)))
+        transport = ZenohTransport(zenoh)
         warn(f"listens to {zenoh}/row")
-        by_zenoh.serve(server)
-    elif file is not None:
-        with open(file, "rb") as source:
-            transports.serve_stream(server, source, sys.stdout.buffer)
-    elif sys.stdin is None:
+    elif file is None and sys.stdin is None:
         raise ValueError("standard input is closed; give FILE, --socket, --udp or --zenoh")
-    elif server.heartbeat is not None and sys.platform == "win32":
-        raise ValueError("on Windows --heartbeat needs --udp or --zenoh")
     else:
-        transports.serve_stream(server, sys.stdin.buffer, sys.stdout.buffer)
+        source = sys.stdin.buffer if file is None else stack.enter_context(file.open("rb"))
+        transport = Stream(source, sys.stdout.buffer)
+    return transport
 
 
 def _compile(guard: Guard, *, scenes: bool) -> None:

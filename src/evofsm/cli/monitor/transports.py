@@ -1,26 +1,22 @@
 """How messages come and go: pipes, files, a UNIX socket, UDP on this computer, Zenoh.
 
-Each transport hands lines to a `Server` and its answers back, until the input ends or the process
-is asked to stop. A peer that sends junk, vanishes or does not read is no reason to end.
+Each transport reads in threads of its own and has a `Server` answer, until the input ends or the
+process is asked to stop. A peer that sends junk, vanishes or does not read is no reason to end.
 """
 
 from __future__ import annotations
 
+import math
 import os
-import queue
-import select
-import selectors
 import signal
 import socket
 import stat
-import sys
 import threading
 import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from types import FrameType
-from typing import Any, BinaryIO, Self
+from typing import Any
 
 import msgspec
 
@@ -29,18 +25,12 @@ from evofsm.cli.monitor.messages import LONGEST
 from evofsm.extras import needs
 from evofsm.fsm.naming import visible
 
-# So much is read at once; a peer that leaves more unread is cut off [byte].
-_CHUNK, _UNREAD = 1 << 16, 1 << 20
-# So many lines may come in one datagram or sample.
-_MOST_LINES = 100
-# Messages of Zenoh that wait, at most.
-_WAITING = 1000
-# Longer than this it never waits at once: the system knows no longer times [s].
-_LONGEST_WAIT = 3600.0
-
-
-class StoppedError(Exception):
-    """The process was asked to end."""
+# So much is read at once [byte].
+_CHUNK = 1 << 16
+# So many lines may come in one datagram or sample, and so many peers may be connected.
+_MOST_LINES, _MOST_PEERS = 100, 100
+# A signal that another thread took is seen after so long [s].
+_LONGEST_WAIT = 0.5
 
 
 class Lines:
@@ -57,85 +47,79 @@ class Lines:
 
 
 class Server:
-    """A decider as transports see it: lines in, lines out, a sign of life where nothing comes."""
+    """A decider that threads share: lines in, lines out, a sign of life where nothing comes."""
 
-    def __init__(self, decider: Decider, heartbeat: float | None = None) -> None:
+    def __init__(self, decider: Decider, heartbeat: float = math.inf) -> None:
         self.decider = decider
-        self.heartbeat = heartbeat
+        self.heartbeat = heartbeat  #: where so long nothing came, it says that it is there [s]
         self._heard = self._said = time.monotonic()
-        self.stopped = self._waits = False
+        self._turn = threading.Lock()
+        self._over = threading.Event()
+        self._failure: Exception | None = None
 
     def answer(self, lines: Iterable[bytes]) -> bytes:
         """What is answered to lines, each with an end."""
-        answers = b"".join([_line(self.decider.answer(line)) for line in lines])
-        self._heard = self._said = time.monotonic()
+        with self._turn:
+            answers = b"".join([_line(self.decider.answer(line)) for line in lines])
+            self._heard = self._said = time.monotonic()
         return answers
 
-    def answer_packet(self, data: bytes | None) -> bytes:
-        """What is answered to some lines that came at once, or where none came in time."""
-        if data is None:
-            return self.beat()
+    def answer_packet(self, data: bytes) -> bytes:
+        """What is answered to some lines that came at once."""
         lines = data.removesuffix(b"\n").split(b"\n")
-        if len(lines) > _MOST_LINES:
-            return self.refuse(f"is one of {len(lines)} at once; at most {_MOST_LINES} may be")
-        return self.answer(lines)
+        if len(lines) <= _MOST_LINES:
+            return self.answer(lines)
+        with self._turn:
+            what = f"is one of {len(lines)} at once; at most {_MOST_LINES} may be"
+            return _line(self.decider.error("line", what))
 
-    def refuse(self, what: str) -> bytes:
-        """Say that something was wrong with lines that are not looked at."""
-        return _line(self.decider.error("line", what))
+    def run(self, transport: Transport) -> None:
+        """Serve until the input ends, or SIGTERM, SIGHUP or Ctrl-C comes; no decision is cut short.
 
-    @property
-    def patience(self) -> float | None:
-        """How long to wait for a message [s]; None for as long as it takes."""
-        if self.heartbeat is None:
-            return None
-        left = self._said + self.heartbeat - time.monotonic()
-        return min(max(0.0, left), _LONGEST_WAIT)
-
-    def beat(self) -> bytes:
-        """The sign of life that is due; empty where none is."""
-        now = time.monotonic()
-        if self.heartbeat is None or now - self._said < self.heartbeat:
-            return b""
-        self._said = now
-        return _line(self.decider.heartbeat(round(now - self._heard, 3)))
-
-    # -- Its end --------------------------------------------------------------------------------
-
-    @contextmanager
-    def stoppable(self) -> Iterator[Self]:
-        """Let SIGTERM and Ctrl-C end it while it waits, never while it decides.
-
-        What whoever started it let it ignore, as nohup does, it ignores.
+        This thread waits and gives signs of life; another one reads.
         """
-        names = ("SIGTERM", "SIGINT", "SIGHUP")
-        signals = [getattr(signal, name) for name in names if hasattr(signal, name)]
-        signals = [one for one in signals if signal.getsignal(one) is not signal.SIG_IGN]
-        if threading.current_thread() is not threading.main_thread():
-            signals = []
-        before = {one: signal.signal(one, self._asked) for one in signals}
+        threading.Thread(target=self._serve, args=(transport,), daemon=True).start()
         try:
-            with suppress(StoppedError):
-                yield self
+            with _stoppable():
+                while not self._over.wait(min(self._patience(), _LONGEST_WAIT)):
+                    if self._patience() == 0.0:
+                        transport.send(self._beat())
         finally:
-            for one, handler in before.items():
-                signal.signal(one, handler)
+            self._turn.acquire()  # for good: nothing is decided any more
+            transport.close()
+        if self._failure is not None:
+            raise self._failure
 
-    @contextmanager
-    def waiting(self) -> Iterator[None]:
-        """In this it may be stopped, by a `StoppedError`."""
-        self._waits = True
+    def _serve(self, transport: Transport) -> None:
         try:
-            if self.stopped:
-                raise StoppedError
+            transport.serve(self)
+        except Exception as error:
+            self._failure = error
+        self._over.set()
+
+    def _patience(self) -> float:
+        """Time until a sign of life is due [s]."""
+        return max(0.0, self._said + self.heartbeat - time.monotonic())
+
+    def _beat(self) -> bytes:
+        with self._turn:
+            self._said = time.monotonic()
+            return _line(self.decider.heartbeat(round(self._said - self._heard, 3)))
+
+
+@contextmanager
+def _stoppable() -> Iterator[None]:
+    """Let signals end it; what whoever started it let it ignore, as nohup does, it ignores."""
+    names = ("SIGTERM", "SIGINT", "SIGHUP")
+    signals = [getattr(signal, name) for name in names if hasattr(signal, name)]
+    signals = [one for one in signals if signal.getsignal(one) is not signal.SIG_IGN]
+    before = {one: signal.signal(one, signal.default_int_handler) for one in signals}
+    try:
+        with suppress(KeyboardInterrupt):
             yield
-        finally:
-            self._waits = False
-
-    def _asked(self, number: int, frame: FrameType | None) -> None:
-        self.stopped = True
-        if self._waits:
-            raise StoppedError
+    finally:
+        for one, handler in before.items():
+            signal.signal(one, handler)
 
 
 def _line(answer: Answer) -> bytes:
@@ -143,144 +127,101 @@ def _line(answer: Answer) -> bytes:
     return line if line.isascii() else visible(line.decode()[:-1]).encode() + b"\n"
 
 
-# -- Pipes and files ------------------------------------------------------------------------------
+class Stream:
+    """A pipe or a file, to its end."""
 
+    def __init__(self, source: Any, sink: Any) -> None:
+        # A buffer that a thread waits in would not let the process end.
+        self._source, self._sink = (getattr(one, "raw", one) for one in (source, sink))
+        self._writing = threading.Lock()
+        for one in (source, sink):
+            with suppress(OSError, ValueError):  # they wait, however whoever started it left them
+                os.set_blocking(one.fileno(), True)
 
-def serve_stream(server: Server, source: BinaryIO, sink: BinaryIO) -> None:
-    """Read lines to the end of a pipe or a file."""
-    lines = Lines()
-    for stream in (source, sink):
-        with suppress(OSError, ValueError):  # ours wait, however whoever started it left them
-            os.set_blocking(stream.fileno(), True)
-    while True:
-        with server.waiting():
-            data = _read(source, server.patience)
-        answers = server.beat() if data is None else server.answer(lines.feed(data))
-        if answers:
-            sink.write(answers)
-            sink.flush()
-        if data == b"":
-            return
+    def serve(self, server: Server) -> None:
+        """Answer line by line."""
+        lines, data = Lines(), b"\n"
+        while data:
+            data = self._source.read(_CHUNK)
+            self.send(server.answer(lines.feed(data)))
 
+    def send(self, line: bytes) -> None:
+        """Write it."""
+        with self._writing:
+            while line:
+                line = line[self._sink.write(line) :]
 
-def _read(source: BinaryIO, patience: float | None) -> bytes | None:
-    """What there is; empty at the end, None where nothing came in time."""
-    if patience is not None and not select.select([source], [], [], patience)[0]:
-        return None
-    return source.read1(_CHUNK)  # type: ignore[attr-defined,no-any-return]
-
-
-def silence_output() -> None:
-    """Nobody reads it any more: nothing is to fail as the process ends."""
-    with suppress(OSError, ValueError), open(os.devnull, "wb") as nothing:
-        os.dup2(nothing.fileno(), sys.stdout.fileno())
+    def close(self) -> None:
+        """Others opened them."""
 
 
 # -- A UNIX socket --------------------------------------------------------------------------------
 
 
-class _Peer:
-    """Whoever is connected, with what it has not read yet."""
-
-    def __init__(self, connection: socket.socket) -> None:
-        self.connection = connection
-        self.lines = Lines()
-        self.unread = b""
-
-    def send(self, data: bytes) -> bool:
-        """Send what goes; False where the peer is gone, or leaves too much unread."""
-        self.unread += data
-        try:
-            while self.unread:
-                self.unread = self.unread[self.connection.send(self.unread) :]
-        except (BlockingIOError, InterruptedError):
-            return len(self.unread) <= _UNREAD
-        except OSError:
-            return False
-        return True
-
-
 class SocketTransport:
-    """Answers whoever connects to a UNIX socket; several peers speak of the same car."""
+    """Answers whoever connects to a UNIX socket; several peers speak of the same car.
+
+    A peer that does not read waits for itself alone.
+    """
 
     def __init__(self, path: Path) -> None:
         if not hasattr(socket, "AF_UNIX"):
             raise ValueError("this system has no UNIX sockets; --udp PORT carries the same")
         self.path = path
+        self._peers: dict[socket.socket, threading.Lock] = {}
+        _make_way(path)
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         try:
-            _make_way(path)
             self._socket.bind(os.fspath(path))
             path.chmod(0o600)
             self._socket.listen()
-            self._socket.setblocking(False)
         except OSError as error:
             self._socket.close()
             where = error.filename or os.fspath(path)
             raise OSError(error.errno, error.strerror or str(error), where) from error
-        except ValueError:
-            self._socket.close()
-            raise
-        self._selector = selectors.DefaultSelector()
-        self._selector.register(self._socket, selectors.EVENT_READ)
 
     def serve(self, server: Server) -> None:
-        """Serve until it is stopped."""
-        while True:
-            with server.waiting():
-                ready = self._selector.select(server.patience)
-            for key, events in ready:
-                if key.data is None:
-                    self._accept()
-                else:
-                    self._attend(key.data, events, server)
-            if beat := server.beat():
-                for peer in self._peers():
-                    self._send(peer, beat)
+        """Serve each peer in a thread, until it is closed."""
+        while self._socket.fileno() >= 0:
+            try:
+                peer, _ = self._socket.accept()
+            except OSError:  # gone already, or no more files may be open
+                time.sleep(0.1)
+                continue
+            if len(self._peers) >= _MOST_PEERS:
+                peer.close()
+                continue
+            self._peers[peer] = threading.Lock()
+            threading.Thread(target=self._attend, args=(peer, server), daemon=True).start()
+
+    def send(self, line: bytes) -> None:
+        """Pass it to all that are not being answered; who does not read is let go."""
+        for peer, writing in list(self._peers.items()):
+            if not writing.acquire(blocking=False):
+                continue
+            with suppress(OSError):  # gone meanwhile
+                try:
+                    is_sent = peer.send(line, socket.MSG_DONTWAIT) == len(line)
+                except BlockingIOError:
+                    is_sent = False
+                if not is_sent:
+                    peer.shutdown(socket.SHUT_RDWR)
+            writing.release()
 
     def close(self) -> None:
-        """Let go of all peers, and remove the socket."""
-        for peer in self._peers():
-            self._let_go(peer)
-        self._selector.close()
+        """Remove the socket."""
         self._socket.close()
         self.path.unlink(missing_ok=True)
 
-    def _peers(self) -> list[_Peer]:
-        return [key.data for key in self._selector.get_map().values() if key.data is not None]
-
-    def _accept(self) -> None:
-        with suppress(OSError):  # gone already
-            connection, _ = self._socket.accept()
-            connection.setblocking(False)
-            self._selector.register(connection, selectors.EVENT_READ, _Peer(connection))
-
-    def _attend(self, peer: _Peer, events: int, server: Server) -> None:
-        answers = b""
-        if events & selectors.EVENT_READ:
-            try:
-                data = peer.connection.recv(_CHUNK)
-            except (BlockingIOError, InterruptedError):
-                return
-            except OSError:
-                data = b""
-            answers = server.answer(peer.lines.feed(data))
-            if not data:
-                peer.send(answers)
-                self._let_go(peer)
-                return
-        self._send(peer, answers)
-
-    def _send(self, peer: _Peer, data: bytes) -> None:
-        if not peer.send(data):
-            self._let_go(peer)
-            return
-        events = selectors.EVENT_READ | (selectors.EVENT_WRITE if peer.unread else 0)
-        self._selector.modify(peer.connection, events, peer)
-
-    def _let_go(self, peer: _Peer) -> None:
-        self._selector.unregister(peer.connection)
-        peer.connection.close()
+    def _attend(self, peer: socket.socket, server: Server) -> None:
+        lines, data = Lines(), b"\n"
+        with suppress(OSError), peer:
+            while data:
+                data = peer.recv(_CHUNK)
+                answers = server.answer(lines.feed(data))
+                with self._peers[peer]:
+                    peer.sendall(answers)
+        del self._peers[peer]
 
 
 def _make_way(path: Path) -> None:
@@ -315,16 +256,17 @@ class UdpTransport:
         self._sender: Any = None
 
     def serve(self, server: Server) -> None:
-        """Serve until it is stopped."""
-        while True:
-            self._socket.settimeout(server.patience or (None if server.heartbeat is None else 1e-3))
-            data = None
-            with suppress(OSError), server.waiting():  # nothing in time; or the sender is gone
+        """Answer each sender, until it is closed."""
+        while self._socket.fileno() >= 0:
+            with suppress(OSError):  # the sender is gone
                 data, self._sender = self._socket.recvfrom(_CHUNK)
-            answers = server.answer_packet(data)
-            for answer in answers.splitlines(keepends=True) if self._sender else ():
-                with suppress(OSError):
-                    self._socket.sendto(answer, self._sender)
+                self.send(server.answer_packet(data))
+
+    def send(self, line: bytes) -> None:
+        """Send each line to who sent the latest."""
+        for one in line.splitlines(keepends=True) if self._sender else ():
+            with suppress(OSError):
+                self._socket.sendto(one, self._sender)
 
     def close(self) -> None:
         """Let others have the port."""
@@ -344,8 +286,6 @@ class ZenohTransport:
     def __init__(self, key: str) -> None:
         with needs("eclipse-zenoh", "zenoh", "Zenoh"):
             import zenoh
-        self._came: queue.Queue[bytes] = queue.Queue(_WAITING)
-        self._dropped = 0
         try:
             file = os.environ.get("ZENOH_CONFIG")
             config = zenoh.Config.from_file(file) if file else zenoh.Config()
@@ -356,31 +296,24 @@ class ZenohTransport:
             self._publisher = self._session.declare_publisher(
                 f"{key}/decision", express=True, priority=zenoh.Priority.REAL_TIME
             )
-            self._subscriber = self._session.declare_subscriber(f"{key}/row", self._take)
+            self._rows = self._session.declare_subscriber(f"{key}/row")
         except zenoh.ZError as error:
             self.close()
             raise ValueError(f"--zenoh {key}: {error}") from None
 
     def serve(self, server: Server) -> None:
-        """Serve until it is stopped."""
-        while True:
-            data = None
-            with suppress(queue.Empty), server.waiting():
-                data = self._came.get(timeout=server.patience)
-            answers = server.answer_packet(data)
-            dropped, self._dropped = self._dropped, 0
-            if dropped:
-                answers += server.refuse(f"{dropped} messages came too fast, and were left out")
-            for answer in answers.splitlines():
-                self._publisher.put(answer)
+        """Answer what comes, until it is closed."""
+        for sample in self._rows:
+            self.send(server.answer_packet(sample.payload.to_bytes()))
+
+    def send(self, line: bytes) -> None:
+        """Publish each line."""
+        for one in line.splitlines():
+            self._publisher.put(one)
 
     def close(self) -> None:
         """Leave the network."""
         self._session.close()  # type: ignore[no-untyped-call]
 
-    def _take(self, sample: Any) -> None:
-        """In a thread of Zenoh's."""
-        try:
-            self._came.put_nowait(sample.payload.to_bytes())
-        except queue.Full:
-            self._dropped += 1
+
+Transport = Stream | SocketTransport | UdpTransport | ZenohTransport
