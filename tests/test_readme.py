@@ -11,16 +11,6 @@ ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
 
 
-@pytest.mark.parametrize("target", ["paper", "test", "bench"])
-def test_every_make_command_of_the_readme_exists(target):
-    assert f"make {target}" in README
-    assert re.search(rf"^{target}:", (ROOT / "Makefile").read_text(), re.MULTILINE)
-
-
-def test_ci_runs_the_test_command_of_the_readme():
-    assert "make test" in (ROOT / ".ci" / "run").read_text()
-
-
 # -- The closed loop -----------------------------------------------------------------------------
 
 RESULTS = json.loads((ROOT / "docs" / "results" / "emergency.json").read_text())

@@ -72,7 +72,6 @@ def test_a_column():
     assert column.read(decision) == 3.0
 
 
-@pytest.mark.slow
 def test_a_family(tmp_path):
     pytest.importorskip("typer")
     pytest.importorskip("scipy")
