@@ -184,7 +184,6 @@ def test_constant_brakes_are_measured_as_they_are(dt, decel, speed):
     watch = BrakeWatch(dt)
     told = watch_it(watch, np.concatenate([[speed] * 12, braking, [0.0] * 8]))
     assert told == [pytest.approx(decel)]
-    assert not watch.braking
 
 
 def test_a_manoeuvre_under_way_counts_when_the_episode_ends():

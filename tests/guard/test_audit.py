@@ -21,7 +21,6 @@ from evofsm.driving import (
     AlwaysBrake,
     EnvelopeReviser,
     LatentRisk,
-    RiskByState,
     Unrevised,
     guard_for_cars,
     measures,
@@ -317,7 +316,6 @@ def test_episodes_of_learning_and_of_none_come_out_the_same(tmp_path):
 REVISERS = {
     "always brakes": lambda judge, machine: AlwaysBrake(ACTIONS),
     "measure": lambda judge, machine: EnvelopeReviser(measures.TimeToCollision(4.0), ACTIONS),
-    "by state": lambda judge, machine: ActionReviser(RiskByState(judge, machine), ACTIONS),
     "shadow": lambda judge, machine: ActionReviser(judge, ACTIONS, mode=Mode.SHADOW),
 }
 

@@ -8,7 +8,7 @@ import time as clock
 import warnings
 import weakref
 import zlib
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from importlib import import_module
 from typing import Any, NamedTuple
 
@@ -69,7 +69,7 @@ class Watching:
 
     def __init__(self, seeing: Seeing) -> None:
         self._seeing = seeing
-        self._cars: dict[str, None] = {}
+        self.cars: dict[str, None] = {}  #: by id
         self.ids: list[str] = []  #: of cars with somebody ahead, now
         self.observations = np.empty((0, 3))  #: of each gap [m], its speed and the other's [m/s]
         self.ttc = np.empty(0)  #: time to collision of each [s]
@@ -77,38 +77,26 @@ class Watching:
         self.lowest_ttc: dict[str, float] = {}  #: of each car that ever closed in
         self.highest_drac: dict[str, float] = {}
 
-    def __len__(self) -> int:
-        return len(self._cars)
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._cars)
-
     def add(self, car: str) -> None:
         """Watch it from now on."""
-        self._cars[car] = None
+        self.cars[car] = None
 
     def remove(self, car: str) -> None:
         """Watch it no longer; what was measured stays."""
-        self._cars.pop(car, None)
+        del self.cars[car]
 
-    leave = remove
-
-    def step(self) -> int:
-        """Look at every car; returns how many there are."""
-        ids, rows, pair_of = [], [], self._seeing.pair
-        for car in self._cars:
-            pair = pair_of(car)
-            if pair is not None:
-                ids.append(car)
-                rows.append(pair)
-        self.ids, self.observations = ids, np.array(rows) if rows else np.empty((0, 3))
+    def step(self, time: float) -> None:
+        """Look at every car."""
+        pairs = {car: self._seeing.pair(car) for car in self.cars}
+        met = {car: pair for car, pair in pairs.items() if pair is not None}
+        self.ids = list(met)
+        self.observations = np.array(list(met.values())).reshape(-1, 3)
         self.ttc = time_to_collision(self.observations)
         self.drac = deceleration_to_avoid_collision(self.observations)
         for k in np.flatnonzero(np.isfinite(self.ttc)).tolist():
-            car, ttc, drac = ids[k], float(self.ttc[k]), float(self.drac[k])
+            car, ttc, drac = self.ids[k], float(self.ttc[k]), float(self.drac[k])
             self.lowest_ttc[car] = min(ttc, self.lowest_ttc.get(car, ttc))
             self.highest_drac[car] = max(drac, self.highest_drac.get(car, drac))
-        return len(self._cars)
 
 
 class Collision(NamedTuple):
@@ -127,12 +115,10 @@ class Attachment:
         self,
         sumo: Any,
         chosen: Callable[[Any, str], bool],
-        mode: str,
         seeing: Seeing,
         cars: Guarding | Watching,
     ) -> None:
-        self._sumo, self._chosen, self.mode = sumo, chosen, mode
-        self._seeing, self._cars = seeing, cars
+        self._sumo, self._chosen, self._seeing, self._cars = sumo, chosen, seeing, cars
         self.guarding = cars if isinstance(cars, Guarding) else None
         self.watching = cars if isinstance(cars, Watching) else None
         self._now: float | None = None
@@ -148,7 +134,7 @@ class Attachment:
     @property
     def cars(self) -> list[str]:
         """Vehicles that are guarded, or watched, now."""
-        return list(self._cars)
+        return list(self._cars.cars)
 
     def listen(self) -> None:
         """Have SUMO call `step` after each of its own."""
@@ -196,11 +182,8 @@ class Attachment:
         self._now = now
         self._count_cars()
         self._count_collisions(now)
-        self.looked += len(self._cars)
-        if self.guarding is not None:
-            self.guarding.step(now)
-        if self.watching is not None:
-            self.watching.step()
+        self.looked += len(self._cars.cars)
+        self._cars.step(now)
         self.seconds += clock.perf_counter() - begin
         return True
 
@@ -210,8 +193,9 @@ class Attachment:
     def _begin_anew(self) -> None:
         """Forget the cars, which are other ones, or are elsewhere; who is here is handed back."""
         here = set(self._sumo.vehicle.getIDList())
-        for car in self.cars:
-            (self._cars.remove if car in here else self._cars.leave)(car)
+        for car in here.intersection(self.cars):
+            self._cars.remove(car)
+        self._cars.cars.clear()
         self._known.clear()
         self._met.clear()
         self._seeing.look_up()
@@ -226,7 +210,7 @@ class Attachment:
                 self._cars.add(car)
                 self.ever.add(car)
         for car in self._known - here:
-            self._cars.leave(car)
+            self._cars.cars.pop(car, None)
             self._seeing.forget(car)
         self._known = here
 
@@ -311,8 +295,7 @@ def attach(
     chosen, seeing = choose(vehicles, seed), Seeing(sumo)
     cars: Guarding | Watching = Watching(seeing)
     if mode != "watch":
-        given: dict[str, Any] = {"tolerance": tolerance, "learn": learn, "report": report}
-        cars = Guarding(sumo, seeing, guard, acts=mode == "act", **given)
-    attachment = Attachment(sumo, chosen, mode, seeing, cars)
+        cars = Guarding(sumo, seeing, guard, mode == "act", tolerance, learn, report)
+    attachment = Attachment(sumo, chosen, seeing, cars)
     attachment.listen()
     return attachment

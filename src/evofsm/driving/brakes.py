@@ -56,7 +56,11 @@ class Latest:
 
     def add(self, value: float, begins: bool) -> None:
         """Take in one more; the oldest goes where there is no room."""
-        self._count = _add(self._rows, self._count, value, begins)
+        if self._count == len(self._rows):
+            self._rows[:-1] = self._rows[1:]
+            self._count -= 1
+        self._rows[self._count] = value, begins
+        self._count += 1
 
     def clear(self) -> None:
         """Forget them."""
@@ -65,7 +69,7 @@ class Latest:
     def mean_and_bound(self, errors: float, latest: int | None = None) -> tuple[float, float]:
         """Mean, and so many standard errors below it; of all, or of the ``latest``."""
         first = 0 if latest is None else self._count - latest
-        return _mean_and_bound(self._rows, first, self._count, errors)
+        return _mean_and_bound(self._rows[first : self._count], errors)
 
 
 class OwnBrakes:
@@ -106,13 +110,13 @@ class OwnBrakes:
         self.decel = max(counted_on, -_WEAKEST * self.lowest)
         self._likely = mean if self.known else self.decel
 
-    def show(self, decel: float) -> None:
-        """Take in that the car braked so hard [m/s²], whatever was commanded.
+    def show(self, decel: float | None) -> None:
+        """Take in that the car braked so hard [m/s²], whatever was commanded; None for not at all.
 
         So hard it can brake, which is believed in until full braking is known; that it can brake
         no harder is not shown by it.
         """
-        share = min(decel / -self.lowest, 1.0)
+        share = min((decel or 0.0) / -self.lowest, 1.0)
         if share > self.assumed and len(self.full) < _FEWEST:
             self.assumed = share
             self.decel = self._likely = max(share, _WEAKEST) * -self.lowest
@@ -131,12 +135,7 @@ class OwnBrakes:
         self._was_full = self._was_braking = False
 
     def see(
-        self,
-        speed: float,
-        command: float,
-        estimate: float | None = None,
-        *,
-        watched: bool = False,
+        self, speed: float, command: float, estimate: float | None = None, *, watched: bool = False
     ) -> None:
         """Take in a speed as observed [m/s], and what is commanded after it [m/s²].
 
@@ -171,23 +170,17 @@ class OwnBrakes:
         if is_full:
             self.remember([(-realised, not self._was_full)])
         self._was_full = is_full
-        if watched:
-            self._was_braking = False
-        else:
-            self._learn_shortfall(ruled, realised)
-
-    def _learn_shortfall(self, ruled: float, realised: float) -> None:
-        """Any braking shows whether the brakes are weaker than they were."""
-        is_braking = ruled < -_GENTLE and len(self.full) >= _FEWEST
+        # Any braking shows whether the brakes are weaker than they were.
+        is_braking = ruled < -_GENTLE and len(self.full) >= _FEWEST and not watched
         if is_braking:
             begins = not self._was_braking
             self.brought.add(-realised, begins)
             self.shortfalls.add(min(-ruled, self.decel) + realised, begins)
+            if self._is_sure_to_fall_short():  # begin anew
+                self.full.clear()
+                self.remember(self.brought.rows)
+                self.shortfalls.clear()
         self._was_braking = is_braking
-        if is_braking and self._is_sure_to_fall_short():  # begin anew
-            self.full.clear()
-            self.remember(self.brought.rows)
-            self.shortfalls.clear()
 
     def _is_sure_to_fall_short(self) -> bool:
         """Without noise the latest few tell; in noise it takes more."""
@@ -198,24 +191,11 @@ class OwnBrakes:
 
 
 @compiled
-def _add(rows: NDArray[np.float64], count: int, value: float, begins: bool) -> int:
-    """Add a row; returns how many there are."""
-    if count == len(rows):
-        count -= 1
-        for i in range(count):
-            rows[i, 0], rows[i, 1] = rows[i + 1, 0], rows[i + 1, 1]
-    rows[count, 0], rows[count, 1] = value, begins
-    return count + 1
-
-
-@compiled
-def _mean_and_bound(
-    rows: NDArray[np.float64], first: int, end: int, errors: float
-) -> tuple[float, float]:
-    values, count = rows[first:end, 0], end - first
+def _mean_and_bound(rows: NDArray[np.float64], errors: float) -> tuple[float, float]:
+    values, count = rows[:, 0], len(rows)
     mean = _sum(values) / count
     variance = _sum((values - mean) ** 2) / (count - 1)
-    runs = max(1.0, rows[first:end, 1].sum())
+    runs = max(1.0, rows[:, 1].sum())
     few = 1.0 + 1.2 / (count - 1)  # roughly what Student's t adds: few say little of their variance
     return mean, mean - few * errors * sqrt(variance * runs) / count
 

@@ -6,8 +6,7 @@ the risk of an action is that at their centres, weighed by the belief.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any, NamedTuple, Self
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -36,27 +35,12 @@ class RiskByState:
         self.why, self.trial = risk.why, risk.trial
         self.effective, self.refuse_unfit = risk.effective, risk.refuse_unfit
 
-    def described(self) -> dict[str, Any]:
-        """What it takes to make it again beside the same machine and risk."""
-        return {"caution": self.caution}
-
-    @classmethod
-    def restored(cls, described: Mapping[str, Any], machine: EvolvingFSM, risk: LatentRisk) -> Self:
-        """The one that was `described`."""
-        return cls(risk, machine, described["caution"])
-
     def judge(self, situation: Situation, accelerations: ArrayLike) -> Judgement:
         """Latent risk of each acceleration: of the states, weighed by the belief."""
-        states, known = len(situation.belief), self.machine.n_states
-        if states > max(known, 1):
-            raise ValueError(
-                f"belief is over {states} states, but the machine has {known} (is it another one?)"
-            )
         taking_part = np.flatnonzero(situation.belief >= _LEAST_BELIEF)
         if len(taking_part) == 0 or self.machine.n_states == 0:
             return self.risk.judge(situation, accelerations)
-        belief = situation.belief[taking_part]
-        centers = self.machine.centers[taking_part]
+        belief, centers = situation.belief[taking_part], self.machine.centers[taking_part]
         critical = np.stack([self.risk.critical(center, accelerations) for center in centers])
         weights = belief / belief.sum()
         risks = self.risk.manoeuvres.harder(critical)
@@ -97,18 +81,9 @@ def assess_states(known: EvolvingFSM | FSMModel, risk: LatentRisk) -> list[State
     [False]
     """
     actions = np.array([risk.lowest, 0.0])
-    assessed, seconds, endings = [], known.visits * risk.dt, known.endings
-    for state, center in enumerate(known.centers):
-        critical = risk.critical(center, actions)
-        braking, keeping = risk.manoeuvres.harder(critical)
-        assessed.append(
-            StateRisk(
-                state,
-                float(braking),
-                float(keeping - braking),
-                float(critical[0]),
-                float(seconds[state]),
-                float(endings[state]),
-            )
-        )
-    return assessed
+    critical = [risk.critical(center, actions) for center in known.centers]
+    braking, keeping = risk.manoeuvres.harder(np.reshape(critical, (-1, 2))).T
+    hardest = [survived[0] for survived in critical]
+    columns = braking, keeping - braking, hardest, known.visits * risk.dt, known.endings
+    rows = zip(*(np.asarray(column).tolist() for column in columns), strict=True)
+    return [StateRisk(state, *row) for state, row in enumerate(rows)]

@@ -7,7 +7,7 @@ seed 1.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import count
@@ -16,10 +16,18 @@ from pathlib import Path
 from typing import Any
 
 from evofsm.driving.drivers import IDM, ChangingIDM
-from evofsm.driving.family import Draw, Family, Numbers, read_family
+from evofsm.driving.family import Draw, Family, Make, Numbers, read_family
 from evofsm.driving.scenarios import Body, CutIn, Leader, Scenario
 
+MakeFamily = Callable[..., Family]
+_CASES = ("case 1", "case 2", "case 3", "case 4")
+
 _LEADER = IDM(1.2, 25.0, 1.0, 1.0, 2.5)
+
+
+def _told_by(function: Callable[..., Any]) -> tuple[str, str]:
+    """Name of a family, and what happens in it: the first line that a function says of itself."""
+    return function.__name__.removeprefix("_"), (function.__doc__ or "").partition("\n")[0]
 
 
 def _aggressive(lowest: float, desired_speed: float = 28.0) -> IDM:
@@ -31,32 +39,18 @@ def _normal(lowest: float) -> IDM:
 
 
 def _paper(numbers: Numbers) -> tuple[Scenario, IDM | ChangingIDM]:
-    leader = Leader(_LEADER, brake_decel=9.0, brake_speed=24.2)
-    hasty, calm = _aggressive(-4.0), _normal(-4.0)
-    drivers = (
-        hasty,
-        calm,
-        ChangingIDM(hasty, ((15.0, calm),)),
-        ChangingIDM(calm, ((10.0, hasty),)),
-    )
-    return Scenario(leader, initial_gap=5.0, duration=60.0), drivers[numbers.variant]
+    """The paper's four cases in turn: a leader brakes in full on reaching its top speed.
 
-
-def paper() -> Family:
-    """Section 3 of Han, Filev, Ozguner (arXiv:1908.10823), run on to 60 s, in which not all stand.
-
-    The settings are those of `evofsm paper`, but for the set of actions, which begins at -2.5 m/s²
+    Section 3 of Han, Filev, Ozguner (arXiv:1908.10823), run on to 60 s, in which not all stand. The
+    settings are those of `evofsm paper`, but for the set of actions, which begins at -2.5 m/s²
     in the study: there no one could command what its drivers brake by. Unrevised, cases 1 and 4
     collide; 28 % of the time is a dead end.
     """
-    return Family(
-        "paper",
-        "The paper's four cases in turn: a leader brakes in full on reaching its top speed.",
-        _paper,
-        *(-4.0, 2.5, 4.0, 9.0),
-        variants=("case 1", "case 2", "case 3", "case 4"),
-        in_turn=True,
-    )
+    leader = Leader(_LEADER, brake_decel=9.0, brake_speed=24.2)
+    hasty, calm = _aggressive(-4.0), _normal(-4.0)
+    changing = ChangingIDM(hasty, ((15.0, calm),)), ChangingIDM(calm, ((10.0, hasty),))
+    drivers = hasty, calm, *changing
+    return Scenario(leader, initial_gap=5.0, duration=60.0), drivers[numbers.variant]
 
 
 def _emergency(
@@ -74,18 +68,20 @@ def _emergency(
 def emergency(
     low: float = -2.5, decel: float = 2.5, leader_decel: float = 4.5, softest: float = 2.5
 ) -> Family:
-    """From rest; the leader drives off and brakes in full, some time.
+    """From rest; the leader brakes to a standstill at a random time, brakes are weak.
 
     ``low`` is the hardest braking that can be commanded [m/s²], ``decel`` what the follower's
     brakes bring at most; a leader's full brake lies between ``softest`` and ``leader_decel``.
     Unrevised, 97 % collide, 78 % of the time is a dead end.
     """
-    return Family(
-        "emergency",
-        "From rest; the leader brakes to a standstill at a random time, brakes are weak.",
-        partial(_emergency, low, decel, softest, leader_decel),
-        *(low, 2.5, decel, leader_decel),
-    )
+    return _emergency_as(emergency, low, decel, leader_decel, softest)
+
+
+def _emergency_as(
+    told: Callable[..., Any], low: float, decel: float, leader_decel: float, softest: float = 2.5
+) -> Family:
+    make = partial(_emergency, low, decel, softest, leader_decel)
+    return Family(*_told_by(told), make, low, 2.5, decel, leader_decel)
 
 
 def _waves(numbers: Numbers, duration: float) -> tuple[tuple[float, float], ...]:
@@ -112,6 +108,10 @@ def _waves(numbers: Numbers, duration: float) -> tuple[tuple[float, float], ...]
 
 
 def _stop_and_go(numbers: Numbers) -> tuple[Scenario, IDM]:
+    """The leader goes in waves between slow and fast, and in some episodes stops hard.
+
+    Unrevised, 61 % collide, 67 % of the time is a dead end.
+    """
     stops = numbers.one_of("leader.brake_time", (False, True))
     leader = Leader(
         _LEADER,  # only its waves are driven
@@ -123,13 +123,13 @@ def _stop_and_go(numbers: Numbers) -> tuple[Scenario, IDM]:
     return Scenario(leader, gap, body=Body(-2.5, 2.5)), _aggressive(-2.5)
 
 
-def stop_and_go() -> Family:
-    """Dense traffic. Unrevised, 61 % collide, 67 % of the time is a dead end."""
-    about = "The leader goes in waves between slow and fast, and in some episodes stops hard."
-    return Family("stop_and_go", about, _stop_and_go, -2.5, 2.5, 2.5, 4.5)
-
-
 def _cut_in(numbers: Numbers) -> tuple[Scenario, IDM]:
+    """A slower car cuts in at a short gap, and may brake afterwards.
+
+    Speeds are those of UN Regulation No. 157's first version, up to 60 km/h. Unrevised, 7 %
+    collide, 3 % of the time is a dead end; 25 % are one at the cut-in, should that car brake by
+    6 m/s² at once. Braking in full from the cut-in on avoids all but 0.25 %.
+    """
     time = numbers.between("values.time", 2.0, 8.0)
     slower = numbers.between("values.slower", 0.0, 13.8889)  # at most to a standstill
     # A time to collision [s], and some.
@@ -137,13 +137,12 @@ def _cut_in(numbers: Numbers) -> tuple[Scenario, IDM]:
     gap = times * slower + numbers.between("leader.cut_in.gap.plus", 3.0, 8.0)
     speed = numbers.between("values.speed", 5.5556, 16.6667)  # 20 to 60 km/h
     brakes = numbers.one_of("leader.brake_time", (False, True))
+    plus = numbers.between("leader.brake_time.plus", 0.5, 4.0) if brakes else math.inf
     leader = Leader(
         _LEADER,
         initial_speed=speed,
         waves=((0.0, 0.0),),  # until then it keeps its speed
-        brake_time=time + numbers.between("leader.brake_time.plus", 0.5, 4.0)
-        if brakes
-        else math.inf,
+        brake_time=time + plus,
         brake_decel=numbers.between("leader.brake_decel", 3.0, 6.0),
         cut_in=CutIn(time, gap, max(0.0, speed - slower)),
     )
@@ -152,17 +151,14 @@ def _cut_in(numbers: Numbers) -> tuple[Scenario, IDM]:
     return scenario, _aggressive(-4.0, speed)
 
 
-def cut_in() -> Family:
-    """At the speeds of UN Regulation No. 157's first version: up to 60 km/h.
-
-    Unrevised, 7 % collide, 3 % of the time is a dead end; 25 % are one at the cut-in, should that
-    car brake by 6 m/s² at once. Braking in full from the cut-in on avoids all but 0.25 %.
-    """
-    about = "A slower car cuts in at a short gap, and may brake afterwards."
-    return Family("cut_in", about, _cut_in, -4.0, 2.5, 4.0, 6.0)
-
-
 def _ncap(numbers: Numbers) -> tuple[Scenario, IDM]:
+    """Euro NCAP's rear tests: a stationary, a slower and a braking car ahead.
+
+    They are those of the AEB Car-to-Car protocol. The range of actions is what the paper's drivers
+    brake by: by 2.5 m/s², 4 in 10 starts were dead ends; by 6, nobody would collide. Unrevised, 9 %
+    collide, all in CCRb at 12 m and 6 m/s²; 2 % of the time is a dead end, no start is, and braking
+    in full from the start avoids all.
+    """
     # They keep their speeds, but for the leader of CCRb.
     keeps = partial(Leader, _LEADER, waves=((0.0, 0.0),))
     if numbers.variant == 0:  # 10 to 80 km/h towards a standing car, 4 s before the impact
@@ -181,18 +177,6 @@ def _ncap(numbers: Numbers) -> tuple[Scenario, IDM]:
     return scenario, _aggressive(-4.0, speed)
 
 
-def ncap() -> Family:
-    """Euro NCAP's car-to-car rear tests (AEB Car-to-Car protocol).
-
-    The range of actions is what the paper's drivers brake by: by 2.5 m/s², 4 in 10 starts were dead
-    ends; by 6, nobody would collide. Unrevised, 9 % collide, all in CCRb at 12 m and 6 m/s²; 2 % of
-    the time is a dead end, no start is, and braking in full from the start avoids all.
-    """
-    about = "Euro NCAP's rear tests: a stationary, a slower and a braking car ahead."
-    variants = ("CCRs", "CCRm", "CCRb")
-    return Family("ncap", about, _ncap, -4.0, 2.5, 4.0, 6.0, variants=variants)
-
-
 # Speeds of both cars [m/s], and the time headways [s] that the regulation allows at them.
 _R157 = {
     "7.2 km/h": (2.0000, 1.0),
@@ -206,6 +190,12 @@ _R157 = {
 
 
 def _r157(numbers: Numbers) -> tuple[Scenario, IDM]:
+    """A leader at the shortest headway that UN R157 allows brakes by 6 m/s².
+
+    By paragraph 5.2.3.3. Nothing is drawn: training and test are the same seven runs, but for what
+    switches add. Unrevised, 60 km/h collides and the others do not; 3 % of the time is a dead end,
+    no start is.
+    """
     speed, headway = list(_R157.values())[numbers.variant]
     leader = Leader(_LEADER, initial_speed=speed, brake_time=0.0, brake_decel=6.0)
     body, gap = Body(-4.0, 2.5), headway * speed
@@ -213,99 +203,73 @@ def _r157(numbers: Numbers) -> tuple[Scenario, IDM]:
     return scenario, _aggressive(-4.0, speed)
 
 
-def r157() -> Family:
-    """UN Regulation No. 157, paragraph 5.2.3.3: the shortest time headways that it allows.
-
-    Nothing is drawn: training and test are the same seven runs, but for what switches add.
-    Unrevised, 60 km/h collides and the others do not; 3 % of the time is a dead end, no start is.
-    """
-    about = "A leader at the shortest headway that UN R157 allows brakes by 6 m/s²."
-    return Family("r157", about, _r157, -4.0, 2.5, 4.0, 6.0, variants=tuple(_R157), in_turn=True)
-
-
 def shift() -> Family:
-    """`emergency` with better brakes, which then weaken; commands stay the same, nobody is told.
+    """The leader brakes to a standstill at a random time; the follower's brakes weaken unsaid.
 
-    Unrevised, 27 % collide before the shift and 99 % after it; 25 % and 80 % of the time is a dead
-    end. Did leaders brake by 4.5 m/s² at most, no one would collide before.
+    `emergency` with better brakes, and the same commands after the shift. Unrevised, 27 % collide
+    before the shift and 99 % after it; 25 % and 80 % of the time is a dead end. Did leaders brake
+    by 4.5 m/s² at most, no one would collide before.
     """
-    about = (
-        "The leader brakes to a standstill at a random time; the follower's brakes weaken unsaid."
-    )
-    before, after = (
-        replace(emergency(-4.5, decel, 6.0), name="shift", about=about) for decel in (4.5, 2.5)
-    )
+    before, after = (_emergency_as(shift, -4.5, decel, 6.0) for decel in (4.5, 2.5))
     return replace(before, shifted=after)
 
 
 def shift_leader() -> Family:
-    """As `shift`, but other leaders come, with better brakes.
+    """The leader brakes to a standstill at a random time; from the shift on it brakes harder.
 
     Unrevised, 27 % collide before the shift and 99 % after it; 25 % and 60 % of the time is a dead
     end.
     """
-    about = (
-        "The leader brakes to a standstill at a random time; from the shift on it brakes harder."
-    )
-    before, after = (
-        replace(emergency(-4.5, 4.5, *hard), name="shift_leader", about=about)
-        for hard in ((6.0, 2.5), (9.0, 6.0))
-    )
+    hardest = (6.0, 2.5), (9.0, 6.0)
+    before, after = (_emergency_as(shift_leader, -4.5, 4.5, *leader) for leader in hardest)
     return replace(before, shifted=after)
 
 
 def weak_brakes() -> Family:
-    """`emergency` with brakes that bring less than is commanded, behind leaders that brake hard.
+    """The follower's brakes bring 3 m/s² whatever is commanded, the leader's up to 9.
 
-    Unrevised, 91 % collide, 74 % of the time is a dead end.
+    Else as `emergency`. Unrevised, 91 % collide, 74 % of the time is a dead end.
     """
-    about = "The follower's brakes bring 3 m/s² whatever is commanded, the leader's up to 9."
-    return replace(emergency(-4.5, 3.0, 9.0), name="weak_brakes", about=about)
-
-
-def _with_lapses(
-    careful: IDM, careless: IDM, lapses: Iterable[tuple[float, float]]
-) -> IDM | ChangingIDM:
-    """A driver who drives like another from the begin to the end of each lapse [s]."""
-    apart: list[tuple[float, float]] = []
-    for start, end in sorted(lapses):
-        if apart and start <= apart[-1][1]:
-            apart[-1] = (apart[-1][0], max(end, apart[-1][1]))
-        else:
-            apart.append((start, end))
-    changes = tuple(
-        change for start, end in apart for change in ((start, careless), (end, careful))
-    )
-    return ChangingIDM(careful, changes) if changes else careful
+    return _emergency_as(weak_brakes, -4.5, 3.0, 9.0)
 
 
 def _rare(numbers: Numbers) -> tuple[Scenario, IDM | ChangingIDM]:
-    scenario, careless = _emergency(-4.0, 4.0, 2.5, 6.0, numbers)
-    lapses = []
-    for k in range(numbers.one_of("follower.lapses.count", (0, 1, 2))):
-        start = numbers.between(f"follower.lapses.{k}.start", 8.0, 30.0)
-        lapses.append((start, start + numbers.between(f"follower.lapses.{k}.duration", 2.0, 5.0)))
-    return scenario, _with_lapses(_normal(-4.0), careless, lapses)
-
-
-def rare() -> Family:
-    """A careful driver who lapses now and then, tuned so that dead ends are rare.
+    """A careful driver, now and then careless for some seconds, behind leaders that may brake.
 
     Unrevised, 9 % collide, 1.5 % of the time is a dead end; without lapses none.
     """
-    about = (
-        "A careful driver, now and then careless for some seconds, behind leaders that may brake."
-    )
-    return Family("rare", about, _rare, -4.0, 2.5, 4.0, 6.0)
+    scenario, careless = _emergency(-4.0, 4.0, 2.5, 6.0, numbers)
+    careful, lapses = _normal(-4.0), []
+    for k in range(numbers.one_of("follower.lapses.count", (0, 1, 2))):
+        start = numbers.between(f"follower.lapses.{k}.start", 8.0, 30.0)
+        lapses.append((start, start + numbers.between(f"follower.lapses.{k}.duration", 2.0, 5.0)))
+    changes: list[tuple[float, IDM]] = []
+    for start, end in sorted(lapses):
+        if changes and start <= changes[-1][0]:  # it goes on with the one before
+            end = max(end, changes.pop()[0])
+        else:
+            changes.append((start, careless))
+        changes.append((end, careful))
+    return scenario, ChangingIDM(careful, tuple(changes)) if changes else careful
+
+
+def _family(make: Make, decel: float, leader_decel: float, **how: Any) -> MakeFamily:
+    """A family of which brakes bring what can be commanded."""
+    return partial(Family, *_told_by(make), make, -decel, 2.5, decel, leader_decel, **how)
 
 
 #: The families that come with the package, by name.
-FAMILIES: Mapping[str, Callable[..., Family]] = {
-    made.__name__: made
-    for made in (
-        *(paper, emergency, stop_and_go, cut_in, ncap, r157),
-        *(shift, shift_leader, weak_brakes, rare),
-    )
+FAMILIES: Mapping[str, MakeFamily] = {
+    "paper": _family(_paper, 4.0, 9.0, variants=_CASES, in_turn=True),
+    "emergency": emergency,
+    "stop_and_go": _family(_stop_and_go, 2.5, 4.5),
+    "cut_in": _family(_cut_in, 4.0, 6.0),
+    "ncap": _family(_ncap, 4.0, 6.0, variants=("CCRs", "CCRm", "CCRb")),
+    "r157": _family(_r157, 4.0, 6.0, variants=tuple(_R157), in_turn=True),
+    "shift": shift,
+    "shift_leader": shift_leader,
+    "weak_brakes": weak_brakes,
+    "rare": _family(_rare, 4.0, 6.0),
 }
 
 

@@ -12,7 +12,7 @@ collision before the bumpers touch (``--collision.mingap-factor``), the gap ends
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -145,12 +145,10 @@ class Seeing:
         rows = np.zeros((3, len(COLUMNS)))  # oneself, ahead and behind
         length = self.body(car).length
         rows[0] = 1.0, -0.5 * length, 0.0, speed, 0.0, length, _WIDTH
-        if ahead is not None:
-            its = self.body(ahead.id).length
-            rows[1] = 1.0, ahead.room + 0.5 * its, 0.0, ahead.speed, 0.0, its, _WIDTH
-        if behind is not None:
-            its = self.body(behind.id).length
-            rows[2] = 1.0, -length - behind.room - 0.5 * its, 0.0, behind.speed, 0.0, its, _WIDTH
+        for row, one, from_, way in ((rows[1], ahead, 0.0, 1.0), (rows[2], behind, -length, -1.0)):
+            if one is not None:
+                its = self.body(one.id).length
+                row[:] = 1.0, from_ + way * (one.room + 0.5 * its), 0.0, one.speed, 0.0, its, _WIDTH
         return rows.ravel()
 
 
@@ -198,7 +196,6 @@ class Guarding:
         sumo: Any,
         seeing: Seeing,
         guard: Guard | None,
-        *,
         acts: bool,
         tolerance: float,
         learn: bool,
@@ -207,7 +204,7 @@ class Guarding:
         self._vehicle, self._seeing, self._acts, self._report = sumo.vehicle, seeing, acts, report
         self._template, self._tolerance, self._learn = guard, tolerance, learn
         self._judges: dict[tuple[float, float, float], TrafficRisk] = {}
-        self._cars: dict[str, _Car] = {}
+        self.cars: dict[str, _Car] = {}  #: by id
         self._watches: dict[str, BrakeWatch] = {}
         self.leaders = _leaders_of(guard)  #: how hard they were seen to brake
         if guard is not None:
@@ -216,12 +213,6 @@ class Guarding:
         self.decisions = 0
         #: Steps in which a car drove slower than its driver wanted; in shadow, would have.
         self.revised = 0
-
-    def __len__(self) -> int:
-        return len(self._cars)
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._cars)
 
     def begin_anew(self) -> None:
         """Another simulation, or another moment of it, begins."""
@@ -237,26 +228,18 @@ class Guarding:
         high = self._vehicle.getAccel(car)
         guard = self._guard_for(car, high)
         # What a guard cannot allow either way it does not forbid.
-        self._cars[car] = _Car(car, guard, min(high, guard.actions.high))
+        self.cars[car] = _Car(car, guard, min(high, guard.actions.high))
 
     def remove(self, car: str) -> None:
         """Guard it no longer: it is handed back."""
-        one = self._cars.get(car)
-        if one is not None:
-            self._hand_back(one)
-        self.leave(car)
+        self._hand_back(self.cars.pop(car))
 
-    def leave(self, car: str) -> None:
-        """It has left the simulation."""
-        self._cars.pop(car, None)
-
-    def step(self, time: float) -> int:
-        """Say what came of the step that is over, and decide on the next; returns how often."""
+    def step(self, time: float) -> None:
+        """Say what came of the step that is over, and decide on the next."""
         decides = self._steps % self._every == 0
         self._steps += 1
         seen_leaders: dict[str, float] = {}
-        before = self.decisions
-        for one in self._cars.values():
+        for one in self.cars.values():
             speed = self._vehicle.getSpeed(one.id)
             if one.seen is not None:
                 self._look_back(one, speed)
@@ -271,7 +254,6 @@ class Guarding:
                 self._act(one, speed)
         if decides and self._learn:
             self._watch(seen_leaders)
-        return self.decisions - before
 
     # -- A step ---------------------------------------------------------------------------------
 
@@ -348,31 +330,24 @@ class Guarding:
 
     def _watch(self, speeds: dict[str, float]) -> None:
         """Learn how hard leaders brake, each by itself, whoever follows it."""
+        ended = []
         for leader, speed in speeds.items():
-            watch = self._watches.get(leader)
-            if watch is None:
-                watch = self._watches[leader] = BrakeWatch(self.interval)
-            self._remember(watch.see(0.0, speed, speed))
+            if leader not in self._watches:
+                self._watches[leader] = BrakeWatch(self.interval)
+            ended.append(self._watches[leader].see(0.0, speed, speed))
         for leader in sorted(self._watches.keys() - speeds.keys()):
-            self._remember(self._watches.pop(leader).end())
-
-    def _remember(self, decel: float | None) -> None:
-        if decel is not None:
-            self.leaders.remember(decel)
+            ended.append(self._watches.pop(leader).end())
+        self.leaders.remember(*ended)
 
     # -- Guards ---------------------------------------------------------------------------------
 
     def _guard_for(self, car: str, high: float) -> Guard:
         mode = Mode.ACT if self._acts else Mode.SHADOW
         if self._template is None:
-            vehicle = self._vehicle
-            decel = vehicle.getDecel(car)
-            low = -max(vehicle.getEmergencyDecel(car), decel)
-            judge = self._judge_for(low, high, decel)
-            dt, tolerated = self.interval, self._tolerance
-            return guard_for_traffic(
-                low, high, decel, dt, judge=judge, tolerance=tolerated, mode=mode
-            )
+            decel = self._vehicle.getDecel(car)
+            limits = -max(self._vehicle.getEmergencyDecel(car), decel), high, decel
+            how: dict[str, Any] = {"tolerance": self._tolerance, "mode": mode}
+            return guard_for_traffic(*limits, self.interval, judge=self._judge_for(*limits), **how)
         guard = self._template.copy()
         guard.freeze()
         reviser = guard.reviser

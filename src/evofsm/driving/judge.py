@@ -200,12 +200,12 @@ class LatentRisk:
             self.follow(observation, acceleration)
             return
         estimate = self.perception.see(seen, self._expected, sure=self.brakes.known)
-        self._remember(self._follow(seen, command))
+        self.manoeuvres.remember(self._follow(seen, command))
         self.brakes.see(seen[1], command, estimate.mean[1], watched=watched)
         if watched:
             if not self._watched:
                 self._own_watch.clear()
-            self._remember(None, self._own_watch.see(0.0, seen[1], seen[1], self._of_change(1)))
+            self.brakes.show(self._own_watch.see(0.0, seen[1], seen[1], self._of_change(1)))
         self._watched = watched
 
     def follow(self, observation: ArrayLike, acceleration: float) -> None:
@@ -225,7 +225,8 @@ class LatentRisk:
         """What comes is not a consequence of what was; a manoeuvre under way counts as it is."""
         ended, shown = self._watch.end(), self._own_watch.end()
         if learn:
-            self._remember(ended, shown)
+            self.manoeuvres.remember(ended)
+            self.brakes.show(shown)
         self._watch.clear()
         self._own_watch.clear()
         self.brakes.clear()
@@ -248,13 +249,6 @@ class LatentRisk:
     def _expected(self) -> float:
         """What the latest command brings until the next decision, most likely [m/s²]."""
         return self.brakes.expected(*self._commands)
-
-    def _remember(self, leaders: float | None, own: float | None = None) -> None:
-        """Take in manoeuvres that have ended [m/s²]."""
-        if leaders is not None:
-            self.manoeuvres.remember(leaders)
-        if own is not None:
-            self.brakes.show(own)
 
     # -- Judging --------------------------------------------------------------------------------
 
@@ -329,19 +323,18 @@ class LatentRisk:
         doubt = here.deviation((1.0, -speed / decel, leader_speed / decel))
         return gap - _CAUTION * doubt, speed, leader_speed
 
-    def critical(self, observation: ArrayLike, accelerations: ArrayLike) -> NDArray[np.float64]:
+    def critical(
+        self, observation: ArrayLike, accelerations: ArrayLike, margin: float | None = None
+    ) -> NDArray[np.float64]:
         """(k,) ndarray: hardest braking of the leader, from now on, that is survived [m/s²].
 
-        0 where even a leader who keeps its speed is hit, `rehearsal.HARDEST` where none is.
+        0 where even a leader who keeps its speed is hit, `rehearsal.HARDEST` where none is. Another
+        ``margin`` may be asked for [m].
         """
-        actions = _finite("accelerations", accelerations)
-        return self._critical(_three_finite(observation), actions, self.margin)
-
-    def _critical(
-        self, observation: Three, actions: NDArray[np.float64], margin: float
-    ) -> NDArray[np.float64]:
-        critical, body = np.empty(len(actions)), self.body._replace(margin=margin)
-        critical_decelerations(observation, actions, self._commands[1], body, self.dt, critical)
+        seen, actions = _three_finite(observation), _finite("accelerations", accelerations)
+        body = self.body if margin is None else self.body._replace(margin=margin)
+        critical = np.empty(len(actions))
+        critical_decelerations(seen, actions, self._commands[1], body, self.dt, critical)
         return critical
 
     @property
@@ -358,9 +351,8 @@ class LatentRisk:
         short of the one that leaders exceed with a probability of ``tolerance``. No margin is kept:
         a dead end is a collision, however small the gap that is left.
         """
-        full = np.array([self.lowest])
-        rows = map(_three_finite, np.asarray(observations, dtype=np.float64))
-        critical = [self._critical(row, full, margin=0.0)[0] for row in rows]
+        rows = np.asarray(observations, dtype=np.float64)
+        critical = [self.critical(row, [self.lowest], margin=0.0)[0] for row in rows]
         return self.manoeuvres.exceeded_by(tolerance) - np.array(critical)
 
     # -- Keeping it -----------------------------------------------------------------------------

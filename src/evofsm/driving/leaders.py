@@ -96,9 +96,9 @@ class Manoeuvres:
     def __len__(self) -> int:
         return len(self.decels)
 
-    def remember(self, *decels: float) -> None:
-        """Take in manoeuvres [m/s²], the oldest first."""
-        seen = [min(positive("decel", decel), HARDEST) for decel in decels]
+    def remember(self, *decels: float | None) -> None:
+        """Take in manoeuvres [m/s²], the oldest first; None for none."""
+        seen = [min(positive("decel", one), HARDEST) for one in decels if one is not None]
         hard = [decel for decel in seen if decel >= self.hard]
         self.gentle += len(seen) - len(hard)
         if hard:
@@ -148,11 +148,6 @@ class BrakeWatch:
         self._shortest = max(self._recently + 1, round(_SHORTEST / dt))
         self._window = max(self._shortest, round(_WINDOW / dt))
         self.clear()
-
-    @property
-    def braking(self) -> bool:
-        """Whether the leader brakes now."""
-        return bool(self._braking)
 
     def clear(self) -> None:
         """Forget the leader: another comes, or an episode begins."""

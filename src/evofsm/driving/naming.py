@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from operator import attrgetter
+import math
+from collections.abc import Callable, Mapping, Sequence
+from operator import attrgetter, itemgetter
+from typing import Any
 
 from numpy.typing import ArrayLike
 
@@ -16,10 +18,9 @@ from evofsm.guard.record import RECORD, Column
 VARIABLES, UNITS = ("gap", "v_follower", "v_leader"), ("m", "m/s", "m/s")
 
 # Up to these a gap [m] and a speed [m/s] are called so.
-_GAPS = ((2.0, "nearly touching"), (15.0, "close"), (40.0, "at a distance"))
-_FAR = "far"
-_SPEEDS = ((0.5, "standing"), (8.0, "slow"), (20.0, "at medium speed"))
-_FAST = "fast"
+Bands = Sequence[tuple[float, str]]
+_GAPS = ((2.0, "nearly touching"), (15.0, "close"), (40.0, "at a distance"), (math.inf, "far"))
+_SPEEDS = ((0.5, "standing"), (8.0, "slow"), (20.0, "at medium speed"), (math.inf, "fast"))
 # Speeds that differ by less are called equal [m/s].
 _EQUAL = 0.5
 
@@ -38,27 +39,18 @@ def name_state(center: ArrayLike, decimals: int = 0) -> str:
     if len(where) != 3:
         raise ValueError(f"center has {len(where)} variables; a name needs gap and both speeds")
     gap, speed, leader = where.tolist()
-    parts = [
-        f"{_word(gap, _GAPS, _FAR)} ({_plain(gap, decimals)} m)",
-        f"{_word(speed, _SPEEDS, _FAST)} ({_plain(speed, decimals)} m/s)",
-        _change(speed - leader, decimals),
-    ]
-    return ", ".join(parts)
-
-
-def _word(value: float, bands: Sequence[tuple[float, str]], beyond: str) -> str:
-    return next((word for most, word in bands if value <= most), beyond)
-
-
-def _plain(value: float, decimals: int) -> str:
-    """Rounded, without a minus before a zero."""
-    return f"{round(value, decimals) + 0.0:.{decimals}f}"
-
-
-def _change(closing: float, decimals: int) -> str:
+    closing = speed - leader
+    change = f"{'closing' if closing > 0.0 else 'opening'} at {abs(closing):.{decimals}f} m/s"
     if abs(closing) < _EQUAL and decimals == 0:
-        return "at equal speeds"
-    return f"{'closing' if closing > 0.0 else 'opening'} at {abs(closing):.{decimals}f} m/s"
+        change = "at equal speeds"
+    places = _placed(gap, _GAPS, decimals, "m"), _placed(speed, _SPEEDS, decimals, "m/s")
+    return ", ".join([*places, change])
+
+
+def _placed(value: float, bands: Bands, decimals: int, unit: str) -> str:
+    word = next((word for most, word in bands if value <= most), bands[-1][1])
+    # Adding 0 takes the minus from a zero.
+    return f"{word} ({round(value, decimals) + 0.0:.{decimals}f} {unit})"
 
 
 #: How places and actions of car following are worded: an entry point of ``evofsm.words``.
@@ -66,36 +58,23 @@ WORDS = Words(name_state, "m/s²")
 #: Of car following.
 LABELS = Labels(names=VARIABLES, units=UNITS)
 
+
+def _observed(about: str, of: Callable[[Any], Any], *, in_table: bool = True) -> Column:
+    return Column(float, about, lambda one: float(of(one.situation.observation)), in_table)
+
+
 #: By name, in the order of ``decisions.parquet``, which has those that are `Column.in_table`: what
 #: was observed, the numbers of every decision, what came of it, and texts.
 DECISION_COLUMNS: Mapping[str, Column] = {
     "time": RECORD["time"],
-    "gap": Column(
-        float,
-        "from bumper to bumper, as observed [m]; left out where missing",
-        lambda one: float(one.situation.observation[0]),
+    "gap": _observed("gap from bumper to bumper [m]; left out where missing", itemgetter(0)),
+    "v_follower": _observed("speed of the follower [m/s]; left out where missing", itemgetter(1)),
+    "v_leader": _observed("speed of the leader [m/s]; left out where missing", itemgetter(2)),
+    "time_to_collision": _observed(
+        "[s]; left out where the gap does not close", time_to_collision, in_table=False
     ),
-    "v_follower": Column(
-        float,
-        "speed of the follower [m/s]; left out where missing",
-        lambda one: float(one.situation.observation[1]),
-    ),
-    "v_leader": Column(
-        float,
-        "speed of the leader [m/s]; left out where missing",
-        lambda one: float(one.situation.observation[2]),
-    ),
-    "time_to_collision": Column(
-        float,
-        "[s]; left out where the gap does not close",
-        lambda one: float(time_to_collision(one.situation.observation)),
-        in_table=False,
-    ),
-    "time_headway": Column(
-        float,
-        "[s]; left out where the follower stands",
-        lambda one: float(time_headway(one.situation.observation)),
-        in_table=False,
+    "time_headway": _observed(
+        "[s]; left out where the follower stands", time_headway, in_table=False
     ),
     **{name: column for name, column in RECORD.items() if column.kind is not str},
     "realised": Column(
