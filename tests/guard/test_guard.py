@@ -13,7 +13,7 @@ from evofsm import EvolvingFSM, Guard, Labels, store
 from evofsm.driving.cars import guard_for_cars
 from evofsm.driving.judge import LatentRisk
 from evofsm.guard.actions import BoxActions, Choices, put_into, same_action
-from evofsm.guard.api import Fallback, Judgement, Proposal, Search
+from evofsm.guard.api import ActionJudge, Fallback, Judgement, Proposal, Search
 from evofsm.guard.guard import KIND
 from evofsm.guard.learnt.judge import LearntRisk
 from evofsm.guard.reviser import Mode
@@ -22,7 +22,7 @@ DT = 0.1
 PUSHES = (-4.0, -1.0, 0.0, 1.0, 4.0)
 
 
-class Balance:
+class Balance(ActionJudge):
     """A judge of an inverted pendulum, no car: it fails where it cannot be brought back any more.
 
     It learns one number, the hardest gust so far, by which it is careful; `index` says that
@@ -35,8 +35,11 @@ class Balance:
         self.dt = dt
         self.index = index
         self.gust = gust
-        self.fallback = Fallback(2.0 if index else 0.0, "doing nothing")
         self._before = None
+
+    @property
+    def fallback(self):
+        return Fallback(2.0 if self.index else 0.0, "doing nothing")
 
     def _push(self, actions):
         return np.take(PUSHES, np.asarray(actions, int)) if self.index else np.asarray(actions)
@@ -50,12 +53,6 @@ class Balance:
 
     def why(self, judged):
         return "it would fall"
-
-    def trial(self):
-        return None
-
-    def effective(self, situation, actions):
-        return actions
 
     def refuse_unfit(self, low, high):
         if self.index and high != len(PUSHES) - 1:

@@ -17,6 +17,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv  # noqa: E402
 from evofsm.driving import CarFollowing, guard_for_cars  # noqa: E402
 from evofsm.fsm import Labels  # noqa: E402
 from evofsm.guard import (  # noqa: E402
+    ActionJudge,
     Fallback,
     Guard,
     Judgement,
@@ -63,7 +64,7 @@ class Script(gymnasium.Env):
         return self.seen[self.row], 1.5, last and self.terminates, False, info
 
 
-class Spy:
+class Spy(ActionJudge):
     """A judge of any system: some actions are dangerous, and what it is told it remembers."""
 
     labels, fallback, dt = Labels(), Fallback(0.0, "nothing"), 0.1
@@ -78,15 +79,6 @@ class Spy:
 
     def why(self, judged):
         return "dangerous"
-
-    def trial(self):
-        return None
-
-    def effective(self, situation, actions):
-        return actions
-
-    def refuse_unfit(self, low, high):
-        pass
 
     def learn(self, observation, action, belief):
         action = np.atleast_1d(np.float32(action))  # as an environment takes it
@@ -191,31 +183,12 @@ def test_a_proposal_that_is_kept_is_passed_on_untouched():
     assert info["reviser/proposed_action"] == info["reviser/executed_action"] == [1.0]
 
 
-def test_all_else_is_forwarded():
-    inner = gymnasium.make("evofsm.driving.env:evofsm/CarFollowing-v0")
-    env = of_cars(inner)
-    assert env.spec.id == inner.spec.id
-    for name in ("unwrapped", "action_space", "observation_space", "metadata"):
-        assert getattr(env, name) == getattr(inner, name)
-    options = {"index": 4, "split": "test"}
-    assert np.array_equal(env.reset(seed=3, options=options)[0], inner.reset(options=options)[0])
-    env.close()
-
-
 @pytest.mark.filterwarnings("ignore:.*symmetric and normalized space:UserWarning")
 @pytest.mark.filterwarnings("ignore:.*different from the unwrapped version:UserWarning")
 def test_gymnasium_finds_nothing_to_complain_of():
     env = of_cars(CarFollowing())
     env.guard.freeze()
     check_env(env, skip_render_check=True)
-
-
-def test_a_failure_is_learnt_and_the_end_of_time_is_none():
-    for failed in (True, False):
-        env = of_cars(Script(FAR, NEAR, HIT, failed=failed))
-        drive(env, full_throttle)
-        assert env.guard.machine.endings.sum() == failed
-        assert env.guard.machine.model().uses.sum() == 2  # the last transition is learnt as well
 
 
 def test_a_failure_ends_the_episode_where_the_environment_goes_on():

@@ -9,7 +9,7 @@ import pytest
 from evofsm.driving.drivers import IDM
 from evofsm.driving.episodes import drive
 from evofsm.driving.judge import LatentRisk
-from evofsm.driving.revisers import AlwaysBrake, Unrevised
+from evofsm.driving.revisers import Unrevised
 from evofsm.driving.scenarios import Body, Leader, Scenario, Sensors
 from evofsm.driving.world import COMMANDED, SPEED
 from evofsm.fsm.actions import IntervalActions
@@ -38,20 +38,6 @@ def script(*lines):
         return line
 
     return propose
-
-
-class Listening(LatentRisk):
-    """Remembers what it was told."""
-
-    told = ()
-
-    def learn(self, observation, acceleration, belief=(1.0,)):
-        self.told += (("learn", observation.tolist(), acceleration),)
-        super().learn(observation, acceleration, belief)
-
-    def follow(self, observation, acceleration):
-        self.told += (("follow", observation.tolist(), acceleration),)
-        super().follow(observation, acceleration)
 
 
 def driven(controller=HASTY, reviser=None, *, on=None, **others):
@@ -115,27 +101,6 @@ def test_a_function_is_a_controller_and_cannot_change_what_was_observed():
     told = driven(meddle, on=scenario(1.0))
     assert told.decisions[0].situation.observation[0] == 8.0
     assert (told.executed == 0.5).all()
-
-
-@pytest.mark.parametrize("learn", [True, False])
-def test_machine_and_risk_are_told_what_was_executed(learn, monkeypatch):
-    machine = EvolvingFSM(ACTIONS.n_actions, radius=1.0)
-    machine.learn_many([[8.0, 0.0, 0.0]], [0])
-    acted = []
-    act = EvolvingFSM.act
-
-    def listen(machine, i):
-        acted.append(i)
-        act(machine, i)
-
-    monkeypatch.setattr(EvolvingFSM, "act", listen)
-    risk = Listening(lowest=-2.5)
-    told = driven(script(1.0), AlwaysBrake(ACTIONS), machine=machine, judge=risk, learn=learn)
-    seen = [d.situation.observation.tolist() for d in told.decisions]
-    how = "learn" if learn else "follow"
-    assert list(risk.told) == [(how, *one) for one in zip(seen, told.executed, strict=True)]
-    assert acted == ([0] * len(told.decisions) if learn else [])
-    assert (told.executed == -2.5).all()
 
 
 def ordinary_driving(seed, minutes=2.0):
@@ -208,27 +173,6 @@ def test_a_driver_who_brakes_hard_shows_what_the_brakes_can_do(tmp_path):
     assert LatentRisk.load(tmp_path / "risk.evofsm").brakes.decel == pytest.approx(6.0)
     reviser.mode = Mode.ACT
     assert braked(7.0) == pytest.approx(6.0)  # its own braking is told from what it commands
-
-
-def test_learning_goes_on_from_episode_to_episode_until_it_is_frozen(snapshot):
-    risk, machine = LatentRisk(lowest=-2.5), EvolvingFSM(ACTIONS.n_actions, radius=1.0)
-    guard = make_guard(ActionReviser(risk, ACTIONS), machine=machine)
-    for episode in range(2):
-        assert not drive(guard, scenario(14.0), controller=HASTY).collided
-        assert len(risk.manoeuvres) == 1 + episode
-    assert machine.n_states > 1
-    assert risk.brakes.decel == pytest.approx(2.5)
-    before = snapshot(machine), snapshot(risk)
-    guard.learn = False
-    told = [drive(guard, scenario(14.0), controller=HASTY) for _ in range(2)]
-    assert (snapshot(machine), snapshot(risk)) == before
-    np.testing.assert_array_equal(told[0].executed, told[1].executed)
-    assert told[0].decisions[20].situation.state is not None
-    assert told[0].decisions[20].situation.belief.sum() == pytest.approx(1.0)
-    guard.learn = True
-    drive(guard, scenario(14.0), controller=HASTY)
-    assert snapshot(risk) != before[1]
-    assert snapshot(machine) != before[0]
 
 
 def test_an_interval_that_is_no_multiple_of_the_steps_is_refused():

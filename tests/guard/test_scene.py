@@ -135,7 +135,7 @@ def test_an_object_that_was_taken_for_another_one_is_no_forecast(taught):
     assert (now >= 0).all()
     assert abs(np.diff(past.away[now, 0])) > 10.0
     links[:2] = now[::-1]
-    again = Memory(memory.n_actions, 2, 1)
+    again = Memory(memory.n_actions, 1)
     again.restore(past._replace(links=links), memory.failures, memory.fitted)
     assert len(again._paths) == len(memory._paths) - 2
     assert np.abs(again._paths[:, 0, 0]).max() < 8.5
@@ -259,16 +259,16 @@ def test_the_shape_of_what_is_too_close_is_learnt():
 
 
 def test_risk_is_of_those_who_failed_there_or_farther_and_survived_there_or_closer():
-    survived, failed = np.array([[0.5], [2.0]]), np.array([[1.0]])
-    contact = Contact.learn((survived, survived), [(failed, failed)], np.ones(1))
-    assert contact.closeness.tolist() == [0.0, 0.5, 1.0, 2.0]
+    survived, failed = np.array([[0.5, 0.5], [2.0, 2.0]]), np.array([[1.0, 1.0]])
+    contact = Contact.learn((survived, survived), [(failed, failed)], np.ones(2))
+    assert contact.closeness / contact.closeness[-1] == pytest.approx([0.0, 0.25, 0.5, 1.0])
     assert contact.risk == pytest.approx([1.0, 2 / 3, 2 / 3, 1 / 3])  # with one that might fail
 
 
 @pytest.mark.parametrize(
     ("make", "why"),
     [
-        (lambda: SceneRisk(1.0, 3, columns=4, place=(0, 1)), "place"),
+        (lambda: SceneRisk(1.0, 3, columns=3), "columns is 3"),
         (lambda: SceneRisk(0.0, 3), "dt"),
         (lambda: Rain().guard().decide(np.ones(7), STAY), "7 numbers are no rows of 4"),
         (lambda: Guard(n_actions=4, interval=1.0, judge=SceneRisk(1.0, 3)), "3 choices"),

@@ -11,9 +11,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 if TYPE_CHECKING:  # whoever asks for a number here waits for no compiler
-    from evofsm.fsm.machine import EvolvingFSM
     from evofsm.fsm.naming import Labels
-    from evofsm.guard.actions import Action, ActionSet
+    from evofsm.guard.actions import Action
     from evofsm.store import Place
 
 #: The highest risk, a probability of failure, that a reviser lets pass.
@@ -221,15 +220,6 @@ class LearningJudge(ActionJudge, Protocol):
     @classmethod
     def load(cls, path: Place) -> Self:
         """Read what was learnt, between two episodes."""
-
-
-class Participants(NamedTuple):
-    """Everything that a decision depends on but the observation and the proposal."""
-
-    actions: ActionSet
-    reviser: Reviser
-    machine: EvolvingFSM | None
-    risk: LearningJudge | None
 
 
 class RiskMeasure(Protocol):

@@ -358,7 +358,7 @@ class AuditLog:
         self._busy = True
         self._flush()  # of an episode that was broken off
         self._seen = []
-        who = (*guard.participants, guard.failed)
+        who = (guard.actions, guard.reviser, guard.machine, guard.judge, guard.failed)
         if list(map(id, who)) != list(map(id, self._who)) or self._learnt != sums_of(guard):
             self._write("start", cut_off=self.cut_off, **_start(guard))
         self._guard, self._who, self._learnt = guard, who, None
@@ -525,7 +525,7 @@ def made_by() -> dict[str, str]:
 def _start(guard: Guard) -> dict[str, Any]:
     """Who decides, as it is before the episode."""
     file = BytesIO()
-    if known := can_be_made_again(guard.participants):
+    if known := can_be_made_again(guard):
         guard.save(file)
     return {
         "about": _ABOUT,

@@ -33,7 +33,6 @@ from evofsm.guard.api import (
     Fallback,
     Intake,
     LearningJudge,
-    Participants,
     Proposal,
     Reviser,
     Revision,
@@ -593,11 +592,6 @@ class Guard:
 
     # -- Keeping it -----------------------------------------------------------------------------
 
-    @property
-    def participants(self) -> Participants:
-        """All that its decisions depend on but observations and proposals."""
-        return Participants(self.actions, self.reviser, self.machine, self.judge)
-
     def copy(self, *, states: bool = True) -> Self:
         """A twin that learns for itself, as between two episodes; without the audit log.
 
@@ -635,7 +629,7 @@ class Guard:
         ValueError
             If the reviser is of someone's own class, so that no file can say what it is.
         """
-        described = outline(self.participants)
+        described = outline(self)
         if described["reviser"] is None:
             raise ValueError(f"a {type(self.reviser).__name__} is no reviser that a file can hold")
         kept = {
@@ -692,12 +686,8 @@ class Guard:
             if kept["failed"] and failed is None:
                 raise ValueError("this guard knew failures by a function; give it again: failed=")
             given = None if isinstance(judge, type) else judge
-            parts = rebuild(kept, *_loaded(kept, files, judge), given)
             return cls.of(
-                parts.reviser,
-                actions=parts.actions,
-                machine=parts.machine,
-                judge=parts.risk,
+                **rebuild(kept, *_loaded(kept, files, judge), given),
                 failed=failed,
                 audit=audit,
                 missing=Missing(kept["missing"]),

@@ -15,8 +15,11 @@ from typing import Any
 from evofsm.fsm.actions import IntervalActions
 from evofsm.fsm.machine import EvolvingFSM
 from evofsm.guard.actions import ActionSet, BoxActions, Choices
-from evofsm.guard.api import ActionJudge, LearningJudge, Participants, Reviser
+from evofsm.guard.api import ActionJudge, LearningJudge, Reviser
 from evofsm.guard.reviser import ActionReviser, Mode
+
+# Guards import this module, so that it cannot import them.
+_Guard = Any
 
 
 @cache
@@ -37,44 +40,44 @@ def part_name(one: object) -> str | None:
     return name if name in _entry_points() and part_class(name) is type(one) else None
 
 
-def outline(parts: Participants) -> dict[str, Any]:
+def outline(guard: _Guard) -> dict[str, Any]:
     """All of a guard but what machine and judge have learnt; None for what is not known here."""
     return {
-        "actions": asdict(parts.actions),
-        "judge": None if parts.risk is None else part_name(parts.risk),
-        "reviser": _reviser(parts),
+        "actions": asdict(guard.actions),
+        "judge": None if guard.judge is None else part_name(guard.judge),
+        "reviser": _reviser(guard),
     }
 
 
-def can_be_made_again(parts: Participants) -> bool:
+def can_be_made_again(guard: _Guard) -> bool:
     """Whether `rebuild` needs no more than the `outline`."""
-    reviser = _reviser(parts)
-    if reviser is None or (parts.risk is not None and part_name(parts.risk) is None):
+    reviser = _reviser(guard)
+    if reviser is None or (guard.judge is not None and part_name(guard.judge) is None):
         return False
-    if not isinstance(parts.reviser, ActionReviser):
+    if not isinstance(guard.reviser, ActionReviser):
         return True
-    return reviser["judge"] is not None and parts.reviser.actions == parts.actions
+    return reviser["judge"] is not None and guard.reviser.actions == guard.actions
 
 
-def _reviser(parts: Participants) -> dict[str, Any] | None:
-    reviser = parts.reviser
+def _reviser(guard: _Guard) -> dict[str, Any] | None:
+    reviser = guard.reviser
     if type(reviser) is ActionReviser:
-        judge = _judge(reviser.risk, parts)
+        judge = _judge(reviser.risk, guard)
         return {"class": "ActionReviser", "judge": judge, "settings": settings_of(reviser)}
     name = part_name(reviser)
-    told = reviser.described() if name else None  # type: ignore[attr-defined]
+    told = reviser.described() if name else None
     return None if told is None else {"class": name, **told}
 
 
-def _judge(judge: ActionJudge, parts: Participants) -> dict[str, Any] | None:
+def _judge(judge: ActionJudge, guard: _Guard) -> dict[str, Any] | None:
     """Whom the reviser asks, if those who learn are whom it asks."""
     name = part_name(judge)
     if name is None:
         return None
-    if judge is parts.risk:
+    if judge is guard.judge:
         return {"class": name}
     asked = getattr(judge, "risk", None), getattr(judge, "machine", None)
-    known = asked[0] is parts.risk and asked[1] is parts.machine and parts.machine is not None
+    known = asked[0] is guard.judge and asked[1] is guard.machine and guard.machine is not None
     return {"class": name, **judge.described()} if known else None  # type: ignore[attr-defined]
 
 
@@ -83,7 +86,7 @@ def rebuild(
     machine: EvolvingFSM | None,
     risk: LearningJudge | None,
     judge: ActionJudge | None = None,
-) -> Participants:
+) -> dict[str, Any]:
     """The parts of an `outline`, with a machine and a judge that were read from elsewhere.
 
     ``judge`` is asked where the outline knows none, and none that learns was read.
@@ -91,9 +94,9 @@ def rebuild(
     fields, reviser = told["actions"], told["reviser"]
     kind = IntervalActions if "width" in fields else BoxActions if "low" in fields else Choices
     actions: ActionSet = kind(**fields)
+    parts = {"actions": actions, "machine": machine, "judge": risk}
     if reviser["class"] != "ActionReviser":
-        again: Reviser = part_class(reviser["class"]).restored(reviser, actions)
-        return Participants(actions, again, machine, risk)
+        return parts | {"reviser": part_class(reviser["class"]).restored(reviser, actions)}
     named = reviser["judge"]
     asked = judge if risk is None else risk
     if named is not None and part_class(named["class"]) is not type(risk):
@@ -102,7 +105,7 @@ def rebuild(
         raise ValueError("no installed package declares its judge; give the judge as it is")
     again = ActionReviser(asked, actions)
     set_again(again, reviser["settings"])
-    return Participants(actions, again, machine, risk)
+    return parts | {"reviser": again}
 
 
 def settings_of(reviser: Reviser) -> dict[str, Any]:

@@ -35,6 +35,8 @@ from evofsm.store import COUNT, FLAG, FROM_1, MOST_COUNTED, SIZE, Kind, Numbers,
 _Floats = NDArray[np.float64]
 _Ints = NDArray[np.int64]
 
+# Numbers of a place.
+_P = 2
 # Steps that are looked ahead.
 _STEPS = 5
 # Objects that are remembered, at most; the oldest episodes are forgotten.
@@ -100,18 +102,16 @@ class SceneRisk(ActionJudge):
         Time between two decisions [s].
     n_actions : int
     columns : int
-        Numbers in a row of the observation. The first is above 0.5 where the row is in use; the
-        first row is oneself, each other one an object. A row with a NaN is not in use.
-    place : sequence of int
-        Columns that say where something is.
+        Numbers in a row of the observation, at least 4. The first is above 0.5 where the row is in
+        use, two more say where something is. The first row is oneself, each other one an object. A
+        row with a NaN is not in use.
     relative : bool
         Whether rows of objects are relative to oneself in all columns but the first.
 
     Raises
     ------
     ValueError
-        If a number is out of its range, or ``place`` names none or all of the columns after the
-        first.
+        If a number is out of its range.
 
     Notes
     -----
@@ -139,23 +139,19 @@ class SceneRisk(ActionJudge):
         n_actions: int,
         *,
         columns: int = 5,
-        place: Sequence[int] = (1, 2),
         relative: bool = True,
     ) -> None:
         self.dt = positive("dt", dt)
         self.labels = Labels(dt=self.dt)
         self.columns = whole("columns", columns)
-        self.place = [int(column) for column in place]
-        self.relative = relative
-        among = set(range(1, self.columns))
-        if not 0 < len(set(self.place)) == len(self.place) < len(among) or set(self.place) - among:
+        if self.columns < 2 + _P:
             raise ValueError(
-                f"place is {self.place}; it must name some, not all, of the columns from 1 to "
-                f"{self.columns - 1}, each once"
+                f"columns is {columns}; a row holds whether it is in use, two numbers of a place, "
+                "and something else, such as a speed"
             )
-        self._rest = sorted(among - set(self.place))
+        self.relative = relative
         #: What was learnt.
-        self.memory = Memory(operator.index(n_actions), len(self.place), len(self._rest))
+        self.memory = Memory(operator.index(n_actions), self.columns - 1 - _P)
         self._seen, self._actions = [], []
 
     def refuse_unfit(self, low: Action, high: Action) -> None:
@@ -230,14 +226,12 @@ class SceneRisk(ActionJudge):
         if not observation.size or observation.size % self.columns:
             raise ValueError(f"{observation.size} numbers are no rows of {self.columns}")
         rows = observation.reshape(-1, self.columns)
-        own, objects = rows[0], rows[1:]
-        objects = objects[(objects[:, 0] > 0.5) & np.isfinite(objects).all(1)]
-        away, other = objects[:, self.place], objects[:, self._rest]
+        own, objects = rows[0, 1:].copy(), rows[1:]
+        objects = objects[(objects[:, 0] > 0.5) & np.isfinite(objects).all(1), 1:]
+        away, other = objects[:, :_P], objects[:, _P:]
         if self.relative:
-            other = other + own[self._rest]
-        else:
-            away = away - own[self.place]
-        return Seen(np.concatenate([own[self.place], own[self._rest]]), away, other)
+            return Seen(own, away, other + own[_P:])
+        return Seen(own, away - own[:_P], other)
 
     # -- Learning -------------------------------------------------------------------------------
 
@@ -273,8 +267,7 @@ class SceneRisk(ActionJudge):
         """Add what was seen to the memory, if it was more than a moment."""
         if len(self._seen) > 1:
             actions = self._actions[: len(self._seen) - 1]
-            p, q = len(self.place), len(self._rest)
-            self.memory.add(Past.of(self._seen, p, q, actions, failed))
+            self.memory.add(Past.of(self._seen, self.columns - 1 - _P, actions, failed))
         self._seen, self._actions = [], []
 
     def sums(self, n_states: int) -> dict[str, float]:
@@ -291,7 +284,7 @@ class SceneRisk(ActionJudge):
 
     def save(self, path: Place, provenance: Mapping[str, Any] | None = None) -> None:
         """Write what is remembered to a file; all else follows from it."""
-        settings = {name: getattr(self, name) for name in ("dt", "columns", "place", "relative")}
+        settings = {name: getattr(self, name) for name in ("dt", "columns", "relative")}
         counts = {name: getattr(self.memory, name) for name in ("n_actions", "failures", "fitted")}
         arrays = {
             name: array.astype(np.float64) for name, array in self.memory.past._asdict().items()
@@ -340,16 +333,16 @@ class Past(NamedTuple):
 
     @classmethod
     def of(
-        cls, seen: Sequence[Seen], p: int, q: int, actions: Sequence[int] = (), failed: bool = False
+        cls, seen: Sequence[Seen], q: int, actions: Sequence[int] = (), failed: bool = False
     ) -> Past:
         """An episode, from what was seen at each moment; actions are one fewer."""
         lost = np.zeros(len(seen), bool)
         lost[-2:-1] = failed
         # In the order in which a file holds them: sums are then the same to the last bit.
-        own = np.array([one.own for one in seen]).reshape(-1, p + q)
+        own = np.array([one.own for one in seen]).reshape(-1, _P + q)
         away, other = (
             np.ascontiguousarray(np.concatenate([np.zeros((0, width)), *each]))
-            for width, each in ((p, [one.away for one in seen]), (q, [one.other for one in seen]))
+            for width, each in ((_P, [one.away for one in seen]), (q, [one.other for one in seen]))
         )
         acted = np.array([*actions, -1][: len(seen)], np.int64)
         counts = np.array([len(one.away) for one in seen], np.int64)
@@ -432,9 +425,8 @@ class Contact(NamedTuple):
         taken by which the fewest survived steps came closer than the failed ones.
         """
         tried = []
-        for power in _SHAPES if len(spread) == 2 else (0.0,):
-            turned = np.exp(0.5 * power * np.array([1.0, -1.0])) if len(spread) == 2 else 1.0
-            sides = spread * turned
+        for power in _SHAPES:
+            sides = spread * np.exp(0.5 * power * np.array([1.0, -1.0]))
             near = np.sort(_closest(*survived, sides))
             met = np.sort([_closest(*steps, sides).min() for steps in failed])
             tried.append((np.log1p(np.searchsorted(near, met)).sum(), sides, near, met))
@@ -488,10 +480,10 @@ class Foreseen(NamedTuple):
 class Memory:
     """Remembers episodes, and forecasts from them."""
 
-    def __init__(self, n_actions: int, p: int, q: int) -> None:
+    def __init__(self, n_actions: int, q: int) -> None:
         self.n_actions = n_actions
         #: All episodes that are remembered.
-        self.past = Past.of([], p, q)
+        self.past = Past.of([], q)
         #: How close is too close; None before the first failure.
         self.contact: Contact | None = None
         self.failures = 0
@@ -572,14 +564,13 @@ class Memory:
     def _fit_motion(self, past: Past) -> None:
         """How places change, by what oneself and objects were like before and after."""
         rows, moment = np.flatnonzero(past.links >= 0), past.moment
-        p = past.away.shape[1]
         if len(rows) < _ROWS * past.own.shape[1]:
             return
         now, then = moment[rows], past.links[rows]
-        mine = _terms(past.own[now], past.own[now + 1], p)
+        mine = _terms(past.own[now], past.own[now + 1])
         x = np.hstack([mine, past.other[rows], past.other[then], np.ones((len(rows), 1))])
         y = past.away[then] - past.away[rows]
-        prior = _first_motion(x.shape[1], p)
+        prior = _first_motion(x.shape[1])
         weights = np.ones(len(rows))
         spread = np.maximum(x.var(0), _CONSTANT * (x**2).mean(0)) + 1e-12
         ridge = _RIDGE * len(rows) * np.diag(spread)
@@ -593,16 +584,15 @@ class Memory:
 
     def _moved(self, own: _Floats, other: _Floats) -> _Floats:
         """(k, p) expected change of relative places in a step; ``own`` is before and after it."""
-        p = own.shape[1] - other.shape[1]
-        mine = np.repeat(_terms(own[:1], own[1:], p), len(other), axis=0)
+        mine = np.repeat(_terms(own[:1], own[1:]), len(other), axis=0)
         x = np.hstack([mine, other, other, np.ones((len(other), 1))])
-        motion = _first_motion(x.shape[1], p) if self._motion is None else self._motion
+        motion = _first_motion(x.shape[1]) if self._motion is None else self._motion
         return np.asarray(x @ motion)
 
-    def _mine(self, before: _Floats, after: _Floats, p: int) -> _Floats:
+    def _mine(self, before: _Floats, after: _Floats) -> _Floats:
         """(k, p) how oneself moves all relative places in a step."""
         assert self._motion is not None
-        terms = _terms(before, after, p)
+        terms = _terms(before, after)
         return np.asarray(terms @ self._motion[: terms.shape[1]])
 
     def _fit_oneself(self, past: Past) -> None:
@@ -632,10 +622,9 @@ class Memory:
 
     def _fit_objects(self, past: Past) -> None:
         """Where each object went from then on, oneself left out."""
-        p, moment = past.away.shape[1], past.moment
-        rows = np.flatnonzero(past.links >= 0)
+        rows, moment = np.flatnonzero(past.links >= 0), past.moment
         now, then = moment[rows], past.links[rows]
-        mine = self._mine(past.own[now], past.own[now + 1], p)
+        mine = self._mine(past.own[now], past.own[now + 1])
         went = np.full_like(past.away, np.nan)
         went[rows] = past.away[then] - past.away[rows] - mine
         known = np.hstack([past.other, np.ones((len(past.other), 1))])
@@ -649,7 +638,7 @@ class Memory:
                 links[astray], went[astray] = -1, np.nan
                 rows = np.flatnonzero(links >= 0)
         total, at = np.zeros_like(past.away), np.arange(len(past.away))
-        paths = np.empty((len(past.away), _STEPS, p))
+        paths = np.empty((len(past.away), _STEPS, _P))
         for h in range(_STEPS):
             here = np.where((at >= 0)[:, None], went[at], np.nan)
             step = np.where(np.isnan(here), step, here)
@@ -661,10 +650,9 @@ class Memory:
 
     def _features(self, own: _Floats, away: _Floats, other: _Floats) -> _Floats:
         """(k, f) what two objects are compared by."""
-        p = away.shape[1]
         far, rest, mine = self._spreads
         near = _NEAR_TO * away / far, _NEAR_TO * other / rest
-        return np.hstack([*near, (away + own[:, :p]) / far, own[:, p:] / mine[p:]])
+        return np.hstack([*near, (away + own[:, :_P]) / far, own[:, _P:] / mine[_P:]])
 
     # -- Forecasting ----------------------------------------------------------------------------
 
@@ -675,8 +663,8 @@ class Memory:
     def foresee(self, seen: Seen) -> Foreseen:
         """What comes of each action."""
         assert self.contact is not None
-        n, p = self.n_actions, seen.away.shape[1]
-        gone, weights, after = self._own_courses(seen.own, p)
+        n = self.n_actions
+        gone, weights, after = self._own_courses(seen.own)
         safe = np.ones(gone.shape[:3])
         own = np.repeat(seen.own[None], len(seen.away), axis=0)
         analogs = _nearest(self._objects, self._features(own, seen.away, seen.other), _ANALOGS)
@@ -684,12 +672,12 @@ class Memory:
             faster = (seen.other[i] - self._others[like]) @ self._steady
             path = self._paths[like] + faster[:, None] * np.arange(1, _STEPS + 1)[:, None]
             to = seen.away[i] + path + gone[:, :, None]
-            start = np.broadcast_to(seen.away[i], (*to.shape[:3], 1, p))
+            start = np.broadcast_to(seen.away[i], (*to.shape[:3], 1, _P))
             safe *= share @ (1.0 - self.contact.of(np.concatenate([start, to], axis=-2)))
         lost = ((1.0 - safe) * weights[:, :, None]).sum(0).reshape(n, n, _STEPS)
         return Foreseen(lost[:, :, -1], 1.0 - lost.mean(-1), after)
 
-    def _own_courses(self, own: _Floats, p: int) -> tuple[_Floats, _Floats, _Floats]:
+    def _own_courses(self, own: _Floats) -> tuple[_Floats, _Floats, _Floats]:
         """How r courses move relative places, by action and by that which follows for good.
 
         (r, n², H, p) moves, (r, n²) shares, and the (n, p + q) states a step later in the first.
@@ -697,9 +685,9 @@ class Memory:
         n, r = self.n_actions, _OWN_ANALOGS
         first, then = np.repeat(np.arange(n), n), np.tile(np.arange(n), n)
         at = np.broadcast_to(own, (r, n * n, len(own)))
-        gone = np.zeros((r, n * n, _STEPS, p))
+        gone = np.zeros((r, n * n, _STEPS, _P))
         shares = np.full((r, n * n), 1.0 / r)
-        total = np.zeros((r * n * n, p))
+        total = np.zeros((r * n * n, _P))
         course = np.arange(r)[:, None, None]
         for h in range(_STEPS):
             to = at.copy()
@@ -713,23 +701,23 @@ class Memory:
                 to[:, rows] += change[np.take_along_axis(like, which, -1)[..., 0]]
                 if h == 0:
                     shares[:, rows] = np.take_along_axis(share, which, -1)[..., 0]
-            total = total + self._mine(at.reshape(-1, len(own)), to.reshape(-1, len(own)), p)
-            gone[:, :, h] = total.reshape(r, n * n, p)
+            total = total + self._mine(at.reshape(-1, len(own)), to.reshape(-1, len(own)))
+            gone[:, :, h] = total.reshape(r, n * n, _P)
             if h == 0:
                 after = to[0, ::n]
             at = to
         return gone, shares / shares.sum(0), after
 
 
-def _terms(before: _Floats, after: _Floats, p: int) -> _Floats:
+def _terms(before: _Floats, after: _Floats) -> _Floats:
     """(k, p + 2 q) what of oneself moves all relative places in a step."""
-    return np.hstack([after[:, :p] - before[:, :p], before[:, p:], after[:, p:]])
+    return np.hstack([after[:, :_P] - before[:, :_P], before[:, _P:], after[:, _P:]])
 
 
-def _first_motion(terms: int, p: int) -> _Floats:
+def _first_motion(terms: int) -> _Floats:
     """The prior of how places change, without which rare moves of one's own are never learnt."""
-    motion = np.zeros((terms, p))
-    motion[:p] = -np.eye(p)
+    motion = np.zeros((terms, _P))
+    motion[:_P] = -np.eye(_P)
     return motion
 
 
