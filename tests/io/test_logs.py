@@ -408,17 +408,30 @@ def test_rows_without_a_leader_end_an_episode(tmp_path, monkeypatch, nothing, at
     monkeypatch.setattr(tables, "_CSV_BYTES", at_once)
     lines = short([nothing, 1, 2, nothing, nothing, 3], crash=[0] * 6)
     path, noted = write(tmp_path / "a.csv", lines, SHORT), Noted()
-    assert together(path, noted=noted, leader_may_lack=True)[:2] == ([1, 2, 3], [0, 2])
+    assert together(path, noted=noted, no_leader="end")[:2] == ([1, 2, 3], [0, 2])
     assert noted.leaderless == 3
     assert "column 'gap'" in refusal(path)
     lines = [f"p,0,{nothing},10,11,1,1", "p,0.1,2,10,11,,0"]
     path, noted = write(tmp_path / "b.csv", lines[:1], SHORT), Noted()
-    assert "no row has a leader" in refusal(path, leader_may_lack=True)
+    assert "no row has a leader" in refusal(path, no_leader="end")
     path = write(tmp_path / "c.csv", lines, SHORT)
-    assert "line 3, column 'a_follower'" in refusal(path, leader_may_lack=True)
+    assert "line 3, column 'a_follower'" in refusal(path, no_leader="end")
     path = write(tmp_path / "d.csv", [lines[0], lines[1].replace(",,", ",1,")], SHORT)
-    read(path, noted=noted, leader_may_lack=True, failed="crash")
+    read(path, noted=noted, no_leader="end", failed="crash")
     assert "1 failures lie in rows without a leader" in " ".join(noted.warnings())
+
+
+def test_a_number_may_stand_for_no_leader(tmp_path):
+    lines = short([0, 5, 4, 0, 0, 3, 2], crash=[0, 7, 7, 0, 0, 7, 7])  # the column of its id
+    path, noted = write(tmp_path / "a.csv", lines, SHORT), Noted()
+    found = together(path, noted=noted, no_leader="crash==0", failed="gap<=0")
+    assert found[:2] == ([5, 4, 3, 2], [0, 2])
+    assert (noted.leaderless, noted.failed, noted.warnings()) == (3, 0, [])
+    assert "(--no-leader names the right one" in refusal(path, no_leader="lead==0")
+    noted = Noted()
+    read(path, noted=noted, failed="gap<=0")
+    assert "1 of 2 failed episodes fail with their first row, and gap is 0" in noted.warnings()[0]
+    assert "--no-leader 'gap==0'" in noted.warnings()[0]
 
 
 # -- Dates and units -------------------------------------------------------------------------------

@@ -118,7 +118,7 @@ def test_units_offsets_and_places_in_arrays(tmp_path):
     with pytest.raises(ValueError, match="row 1, column 'gap': nan cannot be learnt"):
         read(path, beyond)
     with pytest.raises(ValueError, match="no row has a leader"):
-        read(path, beyond, leader_may_lack=True)
+        read(path, beyond, no_leader="end")
     for way, said in (("/n.layout", "no number in messages"), ("/m.x", "no topic '/m'; it has /n")):
         with pytest.raises(ValueError, match=said):
             read(path, {"variables": {**variables, "gap": way}})

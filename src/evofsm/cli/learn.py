@@ -71,9 +71,13 @@ def learn(
         Path | None, option("TOML: which field of which topic of a bag is which variable.")
     ] = None,
     no_leader: Annotated[
-        Literal["refuse", "end"],
-        option("Where a number is missing: refuse the log, or end the episode."),
-    ] = "refuse",
+        str | None,
+        option(
+            "'end': a row in which a number is missing ends the episode, and is left out. A "
+            "condition, such as 'precedingId==0': so does a row in which it holds. "
+            "[default: a missing number is refused]"
+        ),
+    ] = None,
     vehicle_length: Annotated[
         list[str] | None,
         option("FCD: of vehicles [m], or of a type: truck=12. May be repeated. [default: 5.0]"),
@@ -143,14 +147,14 @@ def learn(
         dt=None if dt is None else positive("--dt", dt),
         failed=failed,
         units=parse_units(unit or ()),
-        leader_may_lack=no_leader == "end",
+        no_leader=no_leader,
     )
     lengths, noted = VehicleLengths.parse(vehicle_length or ()), Noted()
     known = [{"name": file, "bytes": _size(file)} for file in files]
     keeper = None
     if checkpoint is not None:
         _check_apart(checkpoint, out, files)
-        names = ("action", "time", "failed", "dt", "leader_may_lack")
+        names = ("action", "time", "failed", "dt", "no_leader")
         settings = {name: getattr(columns, name) for name in names}
         settings |= {"observe": observe, "episode": columns.episode, "units": unit or []}
         settings |= {"files": known, "actions": action_range, "lengths": vehicle_length or []}

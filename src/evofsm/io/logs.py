@@ -42,6 +42,8 @@ _FIRST_ROWS = 8192
 _SAME_STEP = 0.05
 # Speeds [m/s] and usual steps [s] beyond these are most likely in another unit.
 _FASTEST, _LONGEST_USUAL = 60.0, 10.0
+# Numbers that stand for nobody in many recordings.
+_NOBODY = (0.0, -1.0, 255.0, 999.0, 9999.0, 65535.0)
 _SPEED = re.compile(r"v([_0-9]|$)|.*(speed|velocity)", re.IGNORECASE)
 _MICROSECOND = 1e-6
 
@@ -88,6 +90,10 @@ class Noted:
     unplaced: int = 0  #: failures in rows without a leader, which belong to no episode
     fastest: dict[str, float] = field(default_factory=dict)  #: by variable, beyond belief [m/s]
     longest_step: float = 0.0  #: the usual one, beyond belief [s]
+    failed: int = 0  #: episodes
+    failed_at_once: int = 0  #: of them, those with one row
+    #: What a variable was whenever an episode failed at once, if always the same.
+    at_once: dict[str, float] = field(default_factory=dict)
 
     def see(self, chunk: Chunk, names: Sequence[str]) -> None:
         """Look for speeds and steps that are beyond belief."""
@@ -96,6 +102,12 @@ class Noted:
                 self.fastest[name] = max(fastest, self.fastest.get(name, 0.0))
         if chunk.dt > _LONGEST_USUAL:
             self.longest_step = max(chunk.dt, self.longest_step)
+        if chunk.failures is not None:
+            self.failed += len(chunk.failures)
+            for row in np.intersect1d(chunk.failures, chunk.starts):
+                here = dict(zip(names, chunk.observations[row].tolist(), strict=True))
+                same = self.at_once.items() & here.items() if self.failed_at_once else here
+                self.at_once, self.failed_at_once = dict(same), self.failed_at_once + 1
 
     def warnings(self, time: str = "time") -> list[str]:
         """What is most likely a mistake, and what would mend it."""
@@ -107,6 +119,14 @@ class Noted:
         if (step := self.longest_step) > 0.0:
             cause = f"is the time in ms? --unit {time}=ms converts it"
             found.append(f"there is a row every {step:,.6g} s: {cause}")
+        same = [one for one in self.at_once.items() if one[1] in _NOBODY or self.failed_at_once > 1]
+        if same and self.failed_at_once >= self.failed / 2:
+            name, value = min(same, key=lambda one: one[1] not in _NOBODY)
+            found.append(
+                f"{self.failed_at_once:,} of {self.failed:,} failed episodes fail with their first "
+                f"row, and {name} is {value:g} there each time: does that stand for no leader? "
+                f"--no-leader '{name}=={value:g}' leaves such rows out"
+            )
         if self.unplaced:
             why = "lie in rows without a leader, belong to no episode, and were not counted"
             found.append(f"{self.unplaced:,} failures {why}")
@@ -160,7 +180,7 @@ class Condition(NamedTuple):
     number: float
 
     @classmethod
-    def parse(cls, text: str) -> Condition:
+    def parse(cls, text: str, option: str = "--failed") -> Condition:
         """From ``collided`` or ``gap<=0``."""
         column, sign, number, *_ = *re.split("([<>]=?|[=!]=)", text, maxsplit=1), "", "0"
         try:
@@ -169,7 +189,7 @@ class Condition(NamedTuple):
             condition = cls("", "", np.nan)
         if not (condition.column and np.isfinite(condition.number)):
             raise ValueError(
-                f"--failed is {text!r}; write a column of truth values, such as collided, or "
+                f"{option} is {text!r}; write a column of truth values, such as collided, or "
                 "compare one with a number, such as 'gap<=0'"
             )
         return condition
@@ -185,8 +205,8 @@ class Condition(NamedTuple):
             piece.refuse(
                 int(np.argmin(values)),
                 self.column,
-                "{!r} is no truth value; --failed needs a column of 0 and 1, true and false or yes "
-                f"and no, or a comparison such as '{self.column}>0'",
+                "{!r} is no truth value; here a column of 0 and 1, true and false or yes and no is "
+                f"needed, or a comparison such as '{self.column}>0'",
             )
         return values.astype(np.bool_)
 
@@ -214,9 +234,10 @@ class LogColumns:
         Without it nothing tells of failures.
     units : mapping, optional
         Units by the column, or the beginning of columns, that are not those of the SI: ``"km/h"``.
-    leader_may_lack : bool
-        Whether a row in which an observed number is missing (an empty field, NaN, infinity) ends
-        the episode, and is left out; else it is refused.
+    no_leader : str, optional
+        ``"end"``: a row in which an observed number is missing (an empty field, NaN, infinity) ends
+        the episode, and is left out; else it is refused. A condition, as ``failed`` takes one,
+        such as ``"precedingId==0"``: so does a row in which it holds, whatever stands there.
     """
 
     observe: ObservationEncoder = field(default_factory=lambda: ObservationEncoder(*VARIABLES))
@@ -226,7 +247,7 @@ class LogColumns:
     dt: float | None = None
     failed: str | None = None
     units: Mapping[str, str] = field(default_factory=dict)
-    leader_may_lack: bool = False
+    no_leader: str | None = None
 
 
 # -- Reading --------------------------------------------------------------------------------------
@@ -337,6 +358,42 @@ def episodes_of(chunks: Iterable[Chunk]) -> Iterator[Chunk]:
         yield _joined(parts)
 
 
+class LoggedRow(NamedTuple):
+    """A row of a trace, for whoever decides on each."""
+
+    begins: bool  #: an episode
+    time: float  #: [s]
+    values: dict[str, float]  #: of the variables, by their names
+    action: float  #: taken after it, NaN where none is known
+    failed: bool  #: whether the episode ended with it in failure
+
+
+def rows_of(chunks: Iterable[Chunk], names: Sequence[str] = VARIABLES) -> Iterator[LoggedRow]:
+    """The rows of chunks, one by one.
+
+    Parameters
+    ----------
+    chunks : iterable of Chunk
+        As `read_traces` yields them.
+    names : sequence of str
+        Of the variables: ``columns.observe.names``.
+
+    Examples
+    --------
+    >>> z, u = np.array([[9.0, 20.0, 19.0]]), np.array([-1.0])
+    >>> chunk = Chunk("a.csv", z, u, np.zeros(1), np.zeros(1, np.int64), dt=0.1)
+    >>> next(rows_of([chunk])).values
+    {'gap': 9.0, 'v_follower': 20.0, 'v_leader': 19.0}
+    """
+    for chunk in chunks:
+        begins, fails = np.zeros((2, len(chunk.times)), np.bool_)
+        begins[chunk.starts] = True
+        fails[[] if chunk.failures is None else chunk.failures] = True
+        columns = (begins, chunk.times, chunk.observations, chunk.actions, fails)
+        for first, time, values, *rest in zip(*(each.tolist() for each in columns), strict=True):
+            yield LoggedRow(first, time, dict(zip(names, values, strict=True)), *rest)
+
+
 def _joined(parts: Sequence[Chunk]) -> Chunk:
     observations, actions, times = (
         np.concatenate([getattr(part, name) for part in parts])
@@ -392,6 +449,8 @@ def _columns_of_pairs(path: str, columns: LogColumns) -> LogColumns:
     asked += [f"--action {columns.action}"] if columns.action != ACTION else []
     given = {"--episode": columns.episode, "--dt": columns.dt, "--unit": columns.units or None}
     asked += [option for option, value in given.items() if value is not None]
+    if columns.no_leader not in (None, "end"):  # who has none is no pair
+        asked += [f"--no-leader {columns.no_leader}"]
     failed = None if columns.failed is None else Condition.parse(columns.failed)
     if failed is not None and not (failed.sign and failed.column in (*VARIABLES, ACTION)):
         asked += [f"--failed {columns.failed} (but with 'gap<=0')"]
@@ -401,7 +460,7 @@ def _columns_of_pairs(path: str, columns: LogColumns) -> LogColumns:
             f"their own; it gives {', '.join(VARIABLES)} and the action {ACTION}, and cannot be "
             f"read with {', '.join(asked)}"
         )
-    return replace(columns, time="time", leader_may_lack=False)
+    return replace(columns, time="time", no_leader=None)
 
 
 class _Clock:
@@ -466,6 +525,9 @@ class _Reader:
         usual = [name for name in USUAL_EPISODE if name in table.columns]
         self._episode = usual if columns.episode is None else list(columns.episode)
         self._failed = None if columns.failed is None else Condition.parse(columns.failed)
+        self._nobody = None
+        if columns.no_leader not in (None, "end"):
+            self._nobody = Condition.parse(columns.no_leader, "--no-leader")
         self._before = 0  # rows
         self._first_date = np.nan
         # Episodes that there were, and the latest one.
@@ -478,7 +540,9 @@ class _Reader:
         """The rows that are learnt, piece by piece."""
         columns, clock = self._columns, self._clock
         wanted, factors = self._wanted()
-        only_compared = [x for x in wanted.gaps if x not in (*self._observed, columns.action)]
+        nobody = () if self._nobody is None else (self._nobody.column,)
+        may_lack = (*self._observed, columns.action, *nobody)
+        only_compared = [name for name in wanted.gaps if name not in may_lack]
         for piece in self._table.pieces(wanted):
             for name, factor in factors.items():
                 piece.numbers[name] = piece.numbers[name] * factor
@@ -495,7 +559,7 @@ class _Reader:
             for name in only_compared:
                 if (lacks := kept & np.isnan(piece.numbers[name])).any():
                     piece.refuse(int(np.argmax(lacks)), name)
-            if columns.leader_may_lack:
+            if columns.no_leader:
                 # Where the table knows its episodes, the action may be derived, and NaN.
                 for name in (*self._observed, *([columns.action] if piece.starts is None else [])):
                     piece.refuse_unusable(name, kept)
@@ -516,11 +580,13 @@ class _Reader:
         table, columns, failed = self._table, self._columns, self._failed
         learnt = [*self._observed, columns.action]
         clock = [columns.time] if self._clock.ticks else []
-        compared = [failed.column] if failed is not None and failed.sign else []
-        told = [failed.column] if failed is not None and not failed.sign else []
+        conditions = {"--no-leader": self._nobody, "--failed": failed}
+        there = [one for one in conditions.values() if one is not None]
+        compared = [one.column for one in there if one.sign]
+        told = [one.column for one in there if not one.sign]
         categories = [v.name for v in self._variables if isinstance(v, Category)]
         options = {
-            **dict.fromkeys([*compared, *told], "--failed"),
+            **{one.column: option for option, one in conditions.items() if one is not None},
             **dict.fromkeys([*self._observed, *categories], "--observe"),
             **dict.fromkeys(self._episode, "--episode"),
             **dict.fromkeys(clock, "--time"),
@@ -543,7 +609,7 @@ class _Reader:
             raise ValueError(f"{table.path}: {error}") from None
         self._noted.units |= given
         gaps = [name for name in compared if name not in learnt]
-        gaps += learnt if columns.leader_may_lack else []
+        gaps += learnt if columns.no_leader else []
         wanted = Wanted(numbers, [*self._episode, *categories, *told], gaps, date)
         return wanted, {name: UNITS[unit] for name, unit in given.items()}
 
@@ -594,11 +660,13 @@ class _Reader:
         holds is no second failure, and a hole in time does not make it one.
         """
         lacking, fails = np.zeros((2, piece.rows), np.bool_)
-        for name in self._observed if self._columns.leader_may_lack else ():
+        for name in self._observed if self._columns.no_leader else ():
             lacking |= ~np.isfinite(piece.numbers[name])
+        nobody = False if self._nobody is None else self._nobody.holds(piece)
+        lacking |= nobody
         kept = ~lacking
         if self._failed is not None:
-            holds = self._failed.holds(piece)
+            holds = self._failed.holds(piece) & ~np.asarray(nobody)
             before = np.concatenate([[self._held], holds[:-1]]) & ~anew
             self._held = bool(holds[-1])
             fails, still = holds & ~before, holds & before
