@@ -3,7 +3,7 @@
 Whoever may see and steer a run must know the token in the address. Names other than this
 computer's own are refused (a page elsewhere could have its name point here), and so are pages of
 other origins. Nobody who looks on can hold the run up: what happens is handed over without
-waiting, and whoever reads too slowly loses frames and is later shown all of it at once.
+waiting, and whoever reads too slowly is cut off, comes again, and is shown all of it at once.
 """
 
 from __future__ import annotations
@@ -12,7 +12,6 @@ import asyncio
 import hmac
 import logging
 import secrets
-import socket
 import threading
 from collections import deque
 from http import HTTPStatus
@@ -28,18 +27,16 @@ from evofsm.driving.naming import name_state
 from evofsm.extras import needs
 
 with needs("websockets", "watch", "the live page"):
-    from websockets.asyncio.server import ServerConnection, serve
+    from websockets.asyncio.server import ServerConnection, broadcast, serve
     from websockets.datastructures import Headers
     from websockets.exceptions import ConnectionClosed
     from websockets.http11 import Request, Response
 
 _HOST = "127.0.0.1"
-# Who is more messages behind is shown everything anew; a run keeps so many frames.
-_MOST_WAITING, _MOST_FRAMES, _MOST_CLIENTS = 64, 20_000, 200
-# Under way to a client [bytes].
-_MOST_SENT = 1 << 17
-# A command is short [bytes].
-_LONGEST_COMMAND = 512
+# A run keeps so many frames.
+_MOST_FRAMES, _MOST_CLIENTS = 20_000, 200
+# Who leaves more unread is cut off, all of a run is less; a command is short [bytes].
+_MOST_UNREAD, _LONGEST_COMMAND = 1 << 26, 512
 _WELCOME = {
     "page.html": "text/html",
     "page.css": "text/css",
@@ -102,8 +99,9 @@ class LivePage:
         self.player: Player | None = None  #: does what pages ask for
         self._live = live
         self.port = port  #: where it listens
-        self._shown = _Shown()
-        self._clients: set[_Client] = set()
+        self._latest: dict[str, str] = {}  # messages of the present run, for who comes later
+        self._frames: deque[str] = deque(maxlen=_MOST_FRAMES)
+        self._clients: set[ServerConnection] = set()
         self._start: Start | None = None
         self._ready = threading.Event()
         self._error: Exception | None = None
@@ -137,9 +135,17 @@ class LivePage:
     # -- In the server's own thread ---------------------------------------------------------------
 
     def _publish(self, kind: str, text: str) -> None:
-        self._shown.add(kind, text)
+        if kind == "start":
+            self._frames.clear()
+            self._latest.clear()
+        if kind == "frame":
+            self._frames.append(text)
+        else:
+            self._latest[kind] = text
         for client in self._clients:
-            client.offer(text)
+            if client.transport.get_write_buffer_size() > _MOST_UNREAD:
+                client.transport.abort()
+        broadcast(self._clients, text)
 
     def _serve(self) -> None:
         asyncio.run(self._listen())
@@ -195,22 +201,17 @@ class LivePage:
         if len(self._clients) >= _MOST_CLIENTS:
             await connection.close(_TOO_MANY, "too many look on already")
             return
-        # The system must not take in more than a little for one who does not read.
-        wire = connection.transport.get_extra_info("socket")
-        wire.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _MOST_SENT)
-        client = _Client(connection, self._shown)
-        self._clients.add(client)
+        parts = ",".join([*self._latest.values(), *self._frames])  # the start first
+        broadcast([connection], f'{{"kind":"whole","parts":[{parts}]}}')
+        self._clients.add(connection)
         if self.player is not None:
             self.player.attend()
-        feeding = asyncio.create_task(client.feed())
         try:
             await self._obey_all(connection)
         except ConnectionClosed:
             pass
         finally:
-            self._clients.discard(client)
-            feeding.cancel()
-            await asyncio.gather(feeding, return_exceptions=True)
+            self._clients.discard(connection)
 
     async def _obey_all(self, connection: ServerConnection) -> None:
         async for text in connection:
@@ -248,63 +249,6 @@ class _Command(msgspec.Struct, forbid_unknown_fields=True):
 
     do: str
     value: bool | float | None = None
-
-
-class _Shown:
-    """What was shown of the present run, for who comes later."""
-
-    def __init__(self) -> None:
-        self._latest: dict[str, str] = {}
-        self.frames: deque[str] = deque(maxlen=_MOST_FRAMES)
-
-    def add(self, kind: str, text: str) -> None:
-        if kind == "start":
-            self.frames.clear()
-            self._latest.clear()
-        if kind == "frame":
-            self.frames.append(text)
-        else:
-            self._latest[kind] = text
-
-    def whole(self) -> str:
-        """All of it in one message, the start first."""
-        return f'{{"kind":"whole","parts":[{",".join([*self._latest.values(), *self.frames])}]}}'
-
-
-class _Client:
-    """Someone who looks on, with what is still to be sent."""
-
-    def __init__(self, connection: ServerConnection, shown: _Shown) -> None:
-        self._connection = connection
-        self._shown = shown
-        self._waiting: deque[str] = deque()
-        self._is_behind = True  # of all that happened before
-        self._news = asyncio.Event()
-        self._news.set()
-
-    def offer(self, text: str) -> None:
-        """One more message; who has too many waiting is shown everything anew instead."""
-        if self._is_behind:
-            return
-        self._waiting.append(text)
-        if len(self._waiting) > _MOST_WAITING:
-            self._waiting.clear()
-            self._is_behind = True
-        self._news.set()
-
-    async def feed(self) -> None:
-        """Send what is waiting, as fast as it is read."""
-        try:
-            while True:
-                await self._news.wait()
-                self._news.clear()
-                if self._is_behind:
-                    self._is_behind = False
-                    await self._connection.send(self._shown.whole())
-                while self._waiting:
-                    await self._connection.send(self._waiting.popleft())
-        except ConnectionClosed:
-            pass
 
 
 def _refusal(status: HTTPStatus, text: str) -> Response:
