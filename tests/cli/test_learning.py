@@ -158,8 +158,6 @@ def test_what_cannot_be_learnt_is_refused(trace):
     Z, actions = trace
     with pytest.raises(ValueError, match="no transition could be learnt"):
         learn_traces(chunks(Z, actions, range(200)), machine(), ACTIONS)
-    with pytest.raises(ValueError, match="the machine has 3 actions, but there are 4 intervals"):
-        learn_traces(chunks(Z, actions), EvolvingFSM(3), ACTIONS)
     Z[130, 1] = math.nan
     with pytest.raises(ValueError, match="variable 1: nan"):
         learn_traces(chunks(Z, actions, size=100), machine(), ACTIONS)

@@ -217,7 +217,7 @@ def _shown(episodes: int) -> Iterator[Any]:
 
         def moved(done: int, collisions: int) -> None:
             rate = f" ({collisions} collisions, {collisions / done:.1%})" if done else ""
-            move(done, text=f"Driving{rate}")
+            move(done, description=f"Driving{rate}")
 
         yield moved
 

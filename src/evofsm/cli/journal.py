@@ -18,7 +18,7 @@ import json
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 from zlib import crc32
 
 import msgspec
@@ -33,7 +33,7 @@ Record = Mapping[str, Any]
 
 
 class Journal:
-    """Records in a file that no other process writes. Close it, or use it in ``with``.
+    """Records in a file that no other process writes. Close it after use.
 
     A file that is no journal, or is damaged elsewhere than at its end, is refused.
     """
@@ -84,12 +84,6 @@ class Journal:
     def close(self) -> None:
         """Let others have the file."""
         self._file.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self.close()
 
     def _write(self, data: bytes, *, sync: bool = True) -> None:
         try:

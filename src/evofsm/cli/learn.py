@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -19,7 +20,6 @@ if TYPE_CHECKING:
     from evofsm.fsm.actions import IntervalActions
     from evofsm.fsm.machine import EvolvingFSM
     from evofsm.fsm.observations import ObservationEncoder
-    from evofsm.io import Chunk, VehicleLengths
     from evofsm.io.logs import Noted
 
 
@@ -167,15 +167,15 @@ def learn(
             files, columns, lengths, lambda count: move(advance=count), noted, read_topics
         )
         learning = learn_traces(
-            _noting(chunks, lengths, noted, keeper.notes if keeper else {}),
+            chunks,
             machine,
             actions,
             encoder.names,
             [units.get(name, "") for name in encoder.names],
             keeper,
+            lambda: {"noted": asdict(noted), "lengths": str(lengths) if lengths.seen else ""},
         )
-    noted = Noted(**learning.notes["noted"]) if learning.notes else noted
-    assumed = learning.notes.get("lengths") or (str(lengths) if lengths.seen else None)
+    noted = Noted(**learning.read.notes["noted"])
     provenance = _provenance(learning, known, action, failed, unit)
     warnings = noted.warnings(time)
     for warning in warnings:
@@ -187,7 +187,7 @@ def learn(
         print_json({"files": files, "saved": out, **document, "noted": noted, "warnings": warnings})
         return
     read = [*_read(learning, action), *_read_otherwise(noted, failed, learning)]
-    if assumed:
+    if assumed := learning.read.notes["lengths"]:
         read.append(("vehicle lengths", f"assumed, for FCD has none: {assumed}"))
     show(facts("What was read", read), *tables_of(learning.model))
     if learning.model.n_states > 1 and learning.certainty < _UNCERTAIN:
@@ -320,16 +320,6 @@ def _check_apart(checkpoint: Path, out: Path | None, files: Sequence[str]) -> No
     others = [*files, *([] if out is None else [str(out)])]
     if checkpoint.resolve() in {Path(other).resolve() for other in others}:
         raise ValueError(f"--checkpoint {checkpoint} is named twice; give it a file of its own")
-
-
-def _noting(
-    chunks: Iterator[Chunk], lengths: VehicleLengths, noted: Noted, notes: dict[str, Any]
-) -> Iterator[Chunk]:
-    """The same chunks; at their end, what was assumed and noticed in reading them is noted."""
-    from dataclasses import asdict
-
-    yield from chunks
-    notes |= {"noted": asdict(noted), "lengths": str(lengths) if lengths.seen else None}
 
 
 # -- What came of it ------------------------------------------------------------------------------

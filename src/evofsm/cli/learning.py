@@ -10,9 +10,9 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -69,6 +69,7 @@ class Progress(msgspec.Struct):
     finished: bool = False
     scored: int = 0  #: rows of which forecasts were scored
     certainty: float = 0.0  #: sum over them of the share that the most probable state has
+    notes: dict[str, Any] = msgspec.field(default_factory=dict)  #: of whoever read the rows
     #: number, divergence of persistence, and of forecasts: one step, and `HORIZON`
     one_step: list[float] = msgspec.field(default_factory=lambda: [0.0] * 3)
     ahead: list[float] = msgspec.field(default_factory=lambda: [0.0] * 3)
@@ -84,7 +85,6 @@ class Learning:
     transitions: int
     certainty: float  #: mean share of the belief that the most probable state has
     skills: tuple[Skill, ...]  #: of one step, then of `HORIZON`
-    notes: Mapping[str, Any] = field(default_factory=dict)  #: of whoever read the rows
 
 
 class Checkpoint:
@@ -92,8 +92,6 @@ class Checkpoint:
 
     def __init__(self, path: Path, settings: Mapping[str, Any], every: float = _EVERY) -> None:
         self.path, self.settings, self.every = path, dict(settings), every
-        #: What else is kept, by whoever reads the rows; what was, once it has begun.
-        self.notes: dict[str, Any] = {}
         self._latest = time.monotonic()
 
     def begin(self, machine: EvolvingFSM) -> tuple[EvolvingFSM, Progress]:
@@ -110,7 +108,6 @@ class Checkpoint:
                 f"{self.path} is the checkpoint of other work: {found}; run it with those, name "
                 "another file, or delete this one to begin anew"
             )
-        self.notes.update(kept["notes"])
         return EvolvingFSM.load(self.path), msgspec.convert(kept["read"], Progress)
 
     def offer(self, machine: EvolvingFSM, read: Progress) -> None:
@@ -120,7 +117,7 @@ class Checkpoint:
 
     def save(self, machine: EvolvingFSM, read: Progress, *, first: bool = False) -> None:
         """Replace the file; where that fails, the work goes on, with a warning."""
-        kept = {"settings": self.settings, "notes": self.notes, "read": msgspec.to_builtins(read)}
+        kept = {"settings": self.settings, "read": msgspec.to_builtins(read)}
         try:
             machine.save(self.path, {"learning": kept})
         except OSError as error:
@@ -137,13 +134,9 @@ def learn_traces(
     names: Sequence[str] = (),
     units: Sequence[str] = (),
     checkpoint: Checkpoint | None = None,
+    notes: Callable[[], dict[str, Any]] = dict,
 ) -> Learning:
-    """Learn all chunks in their order, each row once."""
-    if actions.n_actions != machine.n_actions:
-        raise ValueError(
-            f"the machine has {machine.n_actions} actions, but there are {actions.n_actions} "
-            "intervals"
-        )
+    """Learn all chunks in their order, each row once; notes are taken once they are read."""
     machine, read = machine.copy(), Progress()
     if checkpoint is not None:
         machine, read = checkpoint.begin(machine)
@@ -154,7 +147,7 @@ def learn_traces(
             _learn(machine, actions, chunk, read)
             if checkpoint is not None:
                 checkpoint.offer(machine, read)
-        read.finished = True
+        read.finished, read.notes = True, notes()
         if checkpoint is not None:
             checkpoint.save(machine, read)
     model = machine.model(actions=actions, names=names, units=units, dt=read.dt)
@@ -164,8 +157,7 @@ def learn_traces(
             "its episode (is every row an episode? are the rows sorted by episode and time?)"
         )
     certainty = read.certainty / read.scored if read.scored else np.nan
-    notes = {} if checkpoint is None else checkpoint.notes
-    return Learning(machine, model, read, transitions, certainty, tuple(_skills(read)), notes)
+    return Learning(machine, model, read, transitions, certainty, tuple(_skills(read)))
 
 
 def _ahead(chunks: Iterable[Chunk]) -> Iterator[Chunk]:

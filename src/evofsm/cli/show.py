@@ -139,7 +139,7 @@ Advance = Callable[..., None]
 def progress(text: str, total: float | None = None) -> Iterator[Advance]:
     """A bar on standard error, none where nobody watches; yields a function that moves it.
 
-    The function takes ``done``, ``total``, ``advance`` and a ``text`` in place of the first.
+    The function takes how much is done, or `advance`, `total` and `description`.
     """
     from rich.console import Console
     from rich.progress import (
@@ -151,23 +151,17 @@ def progress(text: str, total: float | None = None) -> Iterator[Advance]:
     )
 
     columns = (TextColumn("{task.description}"), BarColumn(20), TaskProgressColumn(show_speed=True))
-    watched = sys.stderr.isatty()
-    console = Console(stderr=True)
     with Progress(
-        *columns, TimeRemainingColumn(), console=console, transient=True, disable=not watched
+        *columns,
+        TimeRemainingColumn(),
+        console=Console(stderr=True),
+        transient=True,
+        disable=not sys.stderr.isatty(),
     ) as bars:
         task = bars.add_task(text, total=total)
-
-        def move(
-            done: float | None = None,
-            total: float | None = None,
-            *,
-            advance: float | None = None,
-            text: str | None = None,
-        ) -> None:
-            bars.update(task, completed=done, total=total, advance=advance, description=text)
-
-        yield move
+        yield lambda done=None, total=None, **more: bars.update(
+            task, completed=done, total=total, **more
+        )
 
 
 def message(error: BaseException) -> str:

@@ -45,7 +45,7 @@ def drive_configuration(
             distance += sum(map(sumo.vehicle.getSpeed, guards.cars))
             drives += len(guards.cars)
             if seconds == int(seconds):
-                move(text=f"Driving ({seconds:,.0f} s, {len(guards.collisions)} collisions)")
+                move(description=f"Driving ({seconds:,.0f} s, {len(guards.collisions)} collisions)")
         seconds = float(sumo.simulation.getTime())
     met, guarded, guarding = guards.collisions, guards.ever, guards.guarding
     assert guarding is not None

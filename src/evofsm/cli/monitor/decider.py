@@ -15,6 +15,7 @@ import msgspec
 import numpy as np
 
 from evofsm.cli.monitor.messages import SCHEMA, End, Form, Message, MessageError, Row
+from evofsm.cli.show import plain
 from evofsm.driving import REAL_DRIVES, LatentRisk, TrafficRisk, guard_for_cars, guard_for_traffic
 from evofsm.fsm.validation import positive
 from evofsm.guard import ActionReviser, BoxActions, Guard, Mode, Revision, SearchingJudge, is_spoken
@@ -47,8 +48,6 @@ class Decider:
         episode: int = EPISODE,
         keep: Callable[[Message], None] = lambda message: None,
     ) -> None:
-        if episode < 1:
-            raise ValueError(f"episode is {episode}; it must have a row at least")
         self.guard = guard
         self.episode = episode
         self.form = Form(guard)
@@ -143,7 +142,7 @@ class Decider:
         self.n += 1
         who = {} if row.ahead is None else {"ahead": row.ahead}
         if row.observation is None:  # nothing is ahead: whatever is wanted is done
-            said = dict.fromkeys(("proposed", "executed", "advised"), _plain(row.proposal))
+            said = dict.fromkeys(("proposed", "executed", "advised"), plain(row.proposal))
             said |= dict.fromkeys(_RISKS) | {"reason": "nothing is ahead in the lane"}
             said |= {"alarm": False, "mode": self.mode.value}
             return self._of("decision", time=row.time, ahead=None, **said, **note)
@@ -157,7 +156,7 @@ class Decider:
             return self.error("guard", f"failed: {type(error).__name__}: {error}", row.time)
         low, high = revision.interval
         known = {**revision._asdict(), "risk_low": low, "risk_high": high}
-        said = {name: _plain(known[name]) for name in ("proposed", "executed", "advised", *_RISKS)}
+        said = {name: plain(known[name]) for name in ("proposed", "executed", "advised", *_RISKS)}
         said |= {"reason": revision.reason, "alarm": self._is_alarm(revision)}
         said |= {"mode": self.mode.value}
         return self._of("decision", time=row.time, **who, **self._worst(row), **said, **note)
@@ -247,15 +246,6 @@ def _numbers(observation: tuple[float | None, ...] | None) -> list[float] | None
     if observation is None:
         return None
     return [math.nan if value is None else value for value in observation]
-
-
-def _plain(value: Any) -> Any:
-    """As JSON has it: None for what is no finite number."""
-    if isinstance(value, np.ndarray | np.generic):
-        value = value.tolist()
-    if isinstance(value, list | tuple):
-        return [_plain(one) for one in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 # -- Where no guard is given ----------------------------------------------------------------------

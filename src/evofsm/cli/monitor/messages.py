@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import re
+from operator import itemgetter
 from typing import Annotated, Any, Literal
 
 import msgspec
@@ -253,15 +254,12 @@ def _nearest_ahead(
     ego: _Vehicle, objects: list[_Vehicle], along: str
 ) -> tuple[float, _Vehicle] | None:
     """The closest object in the own lane whose middle is ahead, after the gap to it [m]."""
-    found: tuple[float, _Vehicle] | None = None
-    for one in objects:
-        away = getattr(one, along) - getattr(ego, along)
-        if away <= 0.0 or not _in_lane(ego, one):
-            continue
-        gap = away - 0.5 * (ego.length + one.length)
-        if found is None or gap < found[0]:
-            found = gap, one
-    return found
+    ahead = [
+        (away - 0.5 * (ego.length + one.length), one)
+        for one in objects
+        if (away := getattr(one, along) - getattr(ego, along)) > 0.0 and _in_lane(ego, one)
+    ]
+    return min(ahead, key=itemgetter(0), default=None)
 
 
 def _in_lane(ego: Any, one: Any) -> bool:

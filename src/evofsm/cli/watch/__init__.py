@@ -49,7 +49,6 @@ def watch(
     ] = "paper",
     case: Annotated[int, option("Which of its cases, draws or episodes.", min=1)] = 1,
     world: InWorld = "kinematic",
-    off: Annotated[bool, option("Begin with the reviser off.", "--off")] = False,
     judge: ByJudge = "kinematic",
     tolerance: Tolerance = 0.02,
     switches: Switches = "",
@@ -57,7 +56,6 @@ def watch(
     learn_first: Annotated[int, option("Episodes to learn from before.", min=0)] = 60,
     learn: Annotated[Path | None, option("Begin with what a folder of drive --out holds.")] = None,
     topics: Annotated[Path | None, option("Of a bag: which field is which variable.")] = None,
-    paused: Annotated[bool, option("Show the first frame, and wait.", "--paused")] = False,
     port: Annotated[int, option("Of the page; 0 for any that is free.", min=0, max=65535)] = 0,
     no_browser: Annotated[bool, option("Print the address alone.", "--no-browser")] = False,
 ) -> None:
@@ -82,23 +80,19 @@ def watch(
     else:
         family = family_of(what, switches)
         guard, learnt = _guard(family, judge, tolerance, seed, learn_first, learn)
-        opened = _driven(family, guard, world, case, seed, learnt, off=off)
+        opened = _driven(family, guard, world, case, seed, learnt)
     with (
         LivePage(port, live=not is_recorded) as page,
-        # Whoever comes to a run that waits finds its first frame.
-        Player(opened, page, paused=paused, awaits=not paused) as player,
-    ):
-        page.player = player
-        if paused:
-            player.step()
-        with suppress(KeyboardInterrupt):  # as soon as the address is read
-            say("Watch it here (Ctrl-C ends it); whoever has this address may steer the run:")
-            print(f"  {page.address}", flush=True)
-            if not no_browser:
-                webbrowser.open(page.address)
-            never = threading.Event()
-            while not never.wait(0.5):  # a thread of polars may take the signal: look now and then
-                pass
+        Player(opened, page, awaits=True) as page.player,
+        suppress(KeyboardInterrupt),
+    ):  # as soon as the address is read
+        say("Watch it here (Ctrl-C ends it); whoever has this address may steer the run:")
+        print(f"  {page.address}", flush=True)
+        if not no_browser:
+            webbrowser.open(page.address)
+        never = threading.Event()
+        while not never.wait(0.5):  # a thread of polars may take the signal: look now and then
+            pass
     say("\nThe page is closed.")
 
 
@@ -162,7 +156,7 @@ def _guard(
 
 
 def _driven(
-    family: Family, guard: Guard, world: World, case: int, seed: int, learnt: int, *, off: bool
+    family: Family, guard: Guard, world: World, case: int, seed: int, learnt: int
 ) -> Opening:
     """A session in a world of its own."""
     from evofsm.cli.watch.session import Session, cases_of
@@ -175,9 +169,7 @@ def _driven(
     def session() -> Iterator[Session]:
         with (
             open_world(world) as place,
-            Session(
-                family, guard, place, case=case - 1, seed=seed, on=not off, learnt=learnt
-            ) as opened,
+            Session(family, guard, place, case=case - 1, seed=seed, learnt=learnt) as opened,
         ):
             yield opened
 
