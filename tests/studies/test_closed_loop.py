@@ -21,7 +21,6 @@ TINY = ClosedLoop(
     machine_check=4,
     machine_train=10,
 )
-SMALLEST = replace(TINY, seeds=1, rule_seeds=0, test=3, train=2, machine_train=0, side_test=4)
 
 
 @pytest.fixture(scope="module")
@@ -70,13 +69,6 @@ def test_the_page_names_every_policy_and_where_ours_loses(found, tmp_path, read_
     lost = page.losses[0].frame
     assert "rss-matched" in set(lost["policy"])  # it changes fewer decisions
     assert not {"oracle", "evofsm-told"} & set(lost["policy"])  # which are our own reviser
-
-
-@pytest.mark.slow
-def test_the_result_does_not_depend_on_the_number_of_workers():
-    alone, together = SMALLEST.run(workers=1), SMALLEST.run(workers=2)
-    assert MACHINE not in set(alone["rows"]["policy"])  # without training it has no row
-    assert all(alone[name].equals(together[name]) for name in alone)
 
 
 @pytest.mark.slow

