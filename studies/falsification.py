@@ -253,7 +253,7 @@ class Cars:
             return drive(_guard(self), draw)
         limits = draw.controller.parameters[:, 7:9]
         if limits.min() >= family.actions.low and limits.max() <= family.actions.high:
-            # Exactly what the framework makes of it, without leaving compiled code.
+            # Exactly what the framework makes of it, without its decisions.
             return KinematicWorld().run(draw.scenario, draw.controller, family.interval)
         return drive(unrevised_guard(family), draw)
 

@@ -16,10 +16,8 @@ from evofsm.driving.measures import (
     TimeToCollision,
     critical_fuzzy,
     deceleration_to_avoid_collision,
-    distance_to_avoid,
     is_dead_end,
     modified_time_to_collision,
-    picud,
     proactive_fuzzy,
     safe_distance,
     time_headway,
@@ -167,7 +165,6 @@ def test_headway_is_gap_over_own_speed():
 
 def test_picud_is_the_gap_at_standstill():
     # 30 m + 10²/6 m of the leader - 20 m of reaction - 20²/6 m of the follower.
-    assert picud(np.array([30.0, 20.0, 10.0]), 3.0, 1.0) == pytest.approx(-40.0)
     assert Picud(3.0, 1.0).score(np.array([[30.0, 20.0, 10.0]]), DT) == pytest.approx(40.0)
 
 
@@ -187,7 +184,6 @@ def test_constants_of_the_regulation():
 
 def test_performance_models_score_in_metres_and_see_no_danger_in_opening_gaps():
     rows = np.array([[17.0, 30.0, 18.0], [17.0, 18.0, 30.0]])
-    assert distance_to_avoid(rows, 0.5, 6.0).tolist() == [18.0, 0.0]
     assert PerformanceModel(0.5, 6.0).score(rows, DT).tolist() == [1.0, -17.0]
 
 

@@ -7,25 +7,14 @@ vehicle can really do is part of the question here, so the bounds are arguments.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, fields
 from functools import cached_property
-from typing import TypeAlias
 
 import numpy as np
-from numba import types
 from numpy.typing import NDArray
 
 from evofsm.fsm.kernels import compiled
 from evofsm.guard import Proposal
-
-#: ``kernel(parameters, time, gap, speed, leader_speed) -> acceleration``: a driver that has one,
-#: and the table of its ``parameters``, is driven in closed form without leaving compiled code.
-Kernel: TypeAlias = Callable[[NDArray[np.float64], float, float, float, float], float]
-#: Its signature is fixed, so that it can be passed as a value.
-DRIVER_KERNEL = types.float64(
-    types.float64[:, ::1], types.float64, types.float64, types.float64, types.float64
-)
 
 
 def refuse_others(one: object, whose: str, positive: str, not_negative: str = "") -> None:
@@ -37,7 +26,8 @@ def refuse_others(one: object, whose: str, positive: str, not_negative: str = ""
             raise ValueError(f"{whose} {name} is {value}; it must be {must}")
 
 
-def _idm(
+@compiled
+def idm_kernel(
     phases: NDArray[np.float64], time: float, gap: float, speed: float, leader_speed: float
 ) -> float:
     """The paper's IDM equations, by the last phase that has begun."""
@@ -58,11 +48,25 @@ def _idm(
     return float(min(max(acceleration, phases[now, 7]), phases[now, 8]))
 
 
-idm_kernel: Kernel = compiled(_idm, [DRIVER_KERNEL])
+class _Driver:
+    @cached_property
+    def parameters(self) -> NDArray[np.float64]:
+        """(k, 9) ndarray: of each phase its begin [s], then the arguments of `IDM` in order."""
+        phases: tuple[tuple[float, _Driver], ...] = ((0.0, self),)
+        if isinstance(self, ChangingIDM):
+            phases = ((0.0, self.first), *self.changes)
+        # As astuple does, which copies each number: made for every draw, that takes long.
+        return np.array(
+            [[at, *(getattr(driver, name) for name in _NAMES)] for at, driver in phases]
+        )
+
+    def propose(self, observation: NDArray[np.float64], time: float = 0.0) -> Proposal:
+        """Acceleration [m/s²] for ``[gap, v_follower, v_leader]`` at ``time`` [s]."""
+        return Proposal(idm_kernel(self.parameters, float(time), *map(float, observation)))
 
 
 @dataclass(frozen=True)
-class IDM:
+class IDM(_Driver):
     """A car follower by the Intelligent Driver Model (Treiber, Hennecke, Helbing 2000).
 
     Examples
@@ -82,25 +86,14 @@ class IDM:
     lowest: float = -math.inf  #: bounds of the acceleration that comes out [m/s²]
     highest: float = math.inf
 
-    kernel = staticmethod(idm_kernel)
-
     def __post_init__(self) -> None:
         refuse_others(self, "IDM", "accel desired_speed decel exponent", "min_gap time_headway")
         if not self.lowest < self.highest:
             raise ValueError(f"IDM bounds are [{self.lowest}, {self.highest}]; lowest comes first")
 
-    @cached_property
-    def parameters(self) -> NDArray[np.float64]:
-        """(1, 9) ndarray: begin of the phase [s], then the arguments in order."""
-        return np.array([[0.0, *_numbers(self)]])
-
-    def propose(self, observation: NDArray[np.float64], time: float = 0.0) -> Proposal:
-        """Acceleration [m/s²] for ``[gap, v_follower, v_leader]``."""
-        return Proposal(self.kernel(self.parameters, time, *observation))
-
 
 @dataclass(frozen=True)
-class ChangingIDM:
+class ChangingIDM(_Driver):
     """One driver who drives by one IDM and, from given times on, by others.
 
     Examples
@@ -115,27 +108,10 @@ class ChangingIDM:
     first: IDM
     changes: tuple[tuple[float, IDM], ...]  #: when [s], and how from then on, in order of time
 
-    kernel = staticmethod(idm_kernel)
-
     def __post_init__(self) -> None:
         times = [at for at, _ in self.changes]
         if not all(at >= 0.0 for at in times) or times != sorted(times):
             raise ValueError(f"the driver changes at {times} s; it must be 0 or later, in order")
 
-    @cached_property
-    def parameters(self) -> NDArray[np.float64]:
-        """(1 + changes, 9) ndarray: a row for each phase, as `IDM.parameters`."""
-        phases = ((0.0, self.first), *self.changes)
-        return np.array([[at, *_numbers(driver)] for at, driver in phases])
 
-    def propose(self, observation: NDArray[np.float64], time: float = 0.0) -> Proposal:
-        """Acceleration [m/s²] for ``[gap, v_follower, v_leader]`` at ``time`` [s]."""
-        return Proposal(self.kernel(self.parameters, time, *observation))
-
-
-# As astuple does, which copies each of them: made for every draw, that is what takes long.
 _NAMES = tuple(one.name for one in fields(IDM))
-
-
-def _numbers(driver: IDM) -> tuple[float, ...]:
-    return tuple(getattr(driver, name) for name in _NAMES)

@@ -123,10 +123,7 @@ def modified_time_to_collision(observations: Floats, dt: float) -> Floats:
 
 @dataclass(frozen=True)
 class ModifiedTimeToCollision(_ShortTime):
-    """Danger where the modified time to collision is below a ``threshold`` [s].
-
-    By default it is that of `TimeToCollision`: the two differ in nothing but the accelerations.
-    """
+    """Danger where the modified time to collision is below a ``threshold`` [s]."""
 
     threshold: float = 1.5
 
@@ -189,22 +186,17 @@ class DecelerationToAvoidCollision(_Measure):
         return deceleration_to_avoid_collision(observations) - self.threshold
 
 
-def picud(observations: Floats, decel: float, reaction: float) -> Floats:
-    """Gap that is left when both cars have braked to standstill [m]; below 0 they collide.
-
-    gap + v_leader² / (2·decel) − v·reaction − v² / (2·decel), where both brake by ``decel`` [m/s²],
-    the follower after a ``reaction`` [s].
-    """
-    gap, speed, leader_speed = _columns(observations)
-    braked = (leader_speed**2 - speed**2) / (2.0 * decel)
-    return np.asarray(gap + braked - speed * reaction)
-
-
 @dataclass(frozen=True)
 class Picud(_Measure):
     """PICUD (Uno et al. 2002): danger where urgent braking of both would end in a collision.
 
-    Both brake by ``decel`` [m/s²], the follower after a ``reaction`` [s], which may be 0.
+    Both brake by ``decel`` [m/s²], the follower after a ``reaction`` [s], which may be 0. The gap
+    left at standstill is gap + v_leader² / (2·decel) − v·reaction − v² / (2·decel).
+
+    Examples
+    --------
+    >>> Picud(decel=3.0).score(np.array([[30.0, 20.0, 10.0]]), dt=0.1)
+    array([40.])
     """
 
     decel: float = 3.3
@@ -214,8 +206,9 @@ class Picud(_Measure):
 
     def score(self, observations: Floats, dt: float) -> Floats:
         """Minus the gap left [m]; infinite where the cars have met."""
-        left = picud(observations, self.decel, self.reaction)
-        return _unsafe_once_met(_columns(observations)[0], -left)
+        gap, speed, leader_speed = _columns(observations)
+        braked = (leader_speed**2 - speed**2) / (2.0 * self.decel)
+        return _unsafe_once_met(gap, -(gap + braked - speed * self.reaction))
 
 
 # -- Safe distances -------------------------------------------------------------------------------
@@ -280,24 +273,14 @@ class ResponsibilitySensitiveSafety(_Measure):
         return _unsafe_once_met(gap, safe - gap)
 
 
-def distance_to_avoid(observations: Floats, reaction: float, decel: float) -> Floats:
-    """Gap from which the follower can still avoid a leader that keeps its speed [m].
-
-    closing² / (2·decel) + closing·reaction, the time to collision of the regulation times the
-    closing speed; 0 where the follower is not the faster one.
-    """
-    _, speed, leader_speed = _columns(observations)
-    closing = np.maximum(speed - leader_speed, 0.0)
-    return np.asarray(closing**2 / (2.0 * decel) + closing * reaction)
-
-
 @dataclass(frozen=True)
 class PerformanceModel(_Measure):
     """Danger where a driver of UN Regulation No. 157 could not avoid the collision any more.
 
-    It brakes by ``decel`` [m/s²] after a ``reaction`` [s], which may be 0. The regulation (5.2.5.2
-    and Annex 4, Appendix 3) compares times to collision; here they are multiplied by the closing
-    speed, so that the score is a distance and defined at any speeds. Its sign stays the same.
+    It brakes by ``decel`` [m/s²] after a ``reaction`` [s], which may be 0, behind a leader that
+    keeps its speed, for which it needs closing² / (2·decel) + closing·reaction. The regulation
+    (5.2.5.2 and Annex 4, Appendix 3) compares times to collision; here they are multiplied by the
+    closing speed, so that the score is a distance and defined at any speeds.
 
     Examples
     --------
@@ -325,9 +308,10 @@ class PerformanceModel(_Measure):
         return cls(reaction=0.75, decel=0.774 * _GRAVITY)
 
     def score(self, observations: Floats, dt: float) -> Floats:
-        """Distance to avoid − gap [m]; infinite where the cars have met."""
-        gap = _columns(observations)[0]
-        needed = distance_to_avoid(observations, self.reaction, self.decel)
+        """Distance to avoid the collision − gap [m]; infinite where the cars have met."""
+        gap, speed, leader_speed = _columns(observations)
+        closing = np.maximum(speed - leader_speed, 0.0)
+        needed = closing**2 / (2.0 * self.decel) + closing * self.reaction
         return _unsafe_once_met(gap, needed - gap)
 
 

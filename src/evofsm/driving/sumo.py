@@ -25,13 +25,10 @@ from evofsm.driving.world import (
     REALISED,
     SPEED,
     SPEED_BEHIND,
-    Drives,
-    Episode,
     KinematicWorld,
     Road,
     World,
     decide,
-    drive_alone,
 )
 from evofsm.extras import needs
 
@@ -65,7 +62,7 @@ _ROUTES = f"""<routes>
 """
 
 
-class SumoWorld:
+class SumoWorld(World):
     """The world that is SUMO itself. Close it after use, or use it in a ``with`` statement.
 
     Parameters
@@ -96,11 +93,6 @@ class SumoWorld:
             self._start(scenario.dt)
         self._runs += 1
         return _Road(self._sumo, self._runs, scenario)
-
-    def run(self, scenario: Scenario, controller: Drives) -> Episode:
-        """Drive the scenario with ``controller`` in the follower, asked at every step."""
-        with self.open(scenario) as road:
-            return drive_alone(road, controller)
 
     def close(self) -> None:
         """End the simulation."""

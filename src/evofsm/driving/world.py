@@ -12,13 +12,12 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
-from numba import types
 from numpy.typing import NDArray
 
-from evofsm.driving.drivers import DRIVER_KERNEL, Kernel, idm_kernel
+from evofsm.driving.drivers import idm_kernel
 from evofsm.driving.scenarios import Scenario
 from evofsm.fsm.kernels import compiled
 from evofsm.guard import Controller, Decision, Proposal
@@ -131,12 +130,6 @@ class Plan(NamedTuple):
             ),
             scenario.behind.driver.parameters if scenario.behind else np.empty((0, 9)),
         )
-
-
-_TABLE, _SERIES = types.float64[:, ::1], types.float64[::1]
-_PLAN = types.NamedTuple(
-    [_SERIES, types.float64, _TABLE, _TABLE, _SERIES, _SERIES, _SERIES, _TABLE], Plan
-)
 
 
 @compiled
@@ -254,7 +247,7 @@ class Road(ABC):
     @property
     def observation(self) -> NDArray[np.float64]:
         """(3,) ndarray: gap [m], v_follower [m/s], v_leader [m/s], as the follower sees them."""
-        seen = self._record[max(0, self.row - self._delay), [GAP, SPEED, LEADER_SPEED]]
+        seen = self._record[max(0, self.row - self._delay), GAP : LEADER_SPEED + 1].copy()
         if self._noise is not None:
             seen = seen + self._noise[self.row]
             seen[1:] = np.maximum(seen[1:], 0.0)
@@ -316,35 +309,33 @@ class OnRoad:
         return road.observation, 0.0, terminated, road.over and not terminated, came
 
 
-class World(Protocol):
+class World(ABC):
     """A place to drive in."""
 
+    @abstractmethod
     def open(self, scenario: Scenario) -> AbstractContextManager[Road]:
         """Put the cars on a road, for use in a ``with`` statement."""
-        ...
 
-    def run(self, scenario: Scenario, controller: Controller) -> Episode:
-        """Drive the scenario with ``controller`` in the follower, asked at every step."""
-        ...
+    def run(self, scenario: Scenario, controller: Drives, interval: float | None = None) -> Episode:
+        """Drive the scenario with ``controller`` in the follower.
 
-
-def drive_alone(road: Road, controller: Drives, steps: int = 1) -> Episode:
-    """Ask the controller every so many steps, until time is up or the cars collide."""
-    propose = getattr(controller, "propose", None) or (lambda seen, time: controller(seen))  # type: ignore[operator]
-    over = False
-    while not over:
-        over = road.over
-        observation, time = road.observation, road.time
-        wanted = propose(observation, time)
-        acceleration = float(wanted.action if isinstance(wanted, Proposal) else wanted)
-        _refuse_non_number(acceleration, time, observation[0])
-        road.advance(acceleration, steps)
-    return road.episode()
-
-
-def _refuse_non_number(acceleration: float, time: float, gap: float) -> None:
-    if not math.isfinite(acceleration):
-        raise ValueError(f"controller proposed {acceleration} at {time:g} s, gap {gap:g} m")
+        It is asked every ``interval`` [s], a multiple of the scenario's step, or at every step. A
+        proposal that is no finite number raises a ValueError.
+        """
+        steps = 1 if interval is None else scenario.steps_between(interval)
+        propose = getattr(controller, "propose", None) or (lambda seen, time: controller(seen))  # type: ignore[operator]
+        over = False
+        with self.open(scenario) as road:
+            while not over:
+                over, time, seen = road.over, road.time, road.observation
+                wanted = propose(seen, time)
+                asked = float(wanted.action if isinstance(wanted, Proposal) else wanted)
+                if not math.isfinite(asked):
+                    raise ValueError(
+                        f"controller proposed {asked} at {time:g} s, gap {seen[0]:g} m"
+                    )
+                road.advance(asked, steps)
+            return road.episode()
 
 
 def _noise(scenario: Scenario, rows: int) -> NDArray[np.float64] | None:
@@ -359,11 +350,8 @@ def _noise(scenario: Scenario, rows: int) -> NDArray[np.float64] | None:
 # -- In closed form -------------------------------------------------------------------------------
 
 
-class KinematicWorld:
+class KinematicWorld(World):
     """The closed-form world: points on a line, by SUMO's ballistic update.
-
-    A controller with a kernel, such as `IDM`, is driven without leaving compiled code; any other is
-    asked once a step, with the same result.
 
     Examples
     --------
@@ -379,18 +367,6 @@ class KinematicWorld:
         """Put the cars on a road, for use in a ``with`` statement."""
         return nullcontext(_Road(scenario))
 
-    def run(self, scenario: Scenario, controller: Drives, interval: float | None = None) -> Episode:
-        """Drive the scenario with ``controller`` in the follower.
-
-        It is asked every ``interval`` [s], a multiple of the scenario's step, or at every step. A
-        proposal that is no finite number raises a ValueError.
-        """
-        road = _Road(scenario)
-        steps = 1 if interval is None else scenario.steps_between(interval)
-        if hasattr(controller, "kernel") and road._noise is None and road._delay == 0:
-            return road.run(controller, steps)
-        return drive_alone(road, controller, steps)
-
 
 class _Road(Road):
     """The road in closed form."""
@@ -402,39 +378,3 @@ class _Road(Road):
 
     def advance(self, command: float, steps: int = 1) -> None:
         self.row = advance(self._plan, self._record, self._positions, self.row, command, steps)
-
-    def run(self, driver: Any, steps: int) -> Episode:
-        """As `drive_alone`, without leaving compiled code."""
-        self.row = _drive_kernel(
-            driver.kernel, driver.parameters, self._plan, self._record, self._positions, steps
-        )
-        episode = self.episode()
-        # It is what ended the run.
-        _refuse_non_number(episode.accelerations[-1], self.time, episode.record[-1, GAP])
-        return episode
-
-
-def _drive(
-    driver: Kernel,
-    parameters: NDArray[np.float64],
-    plan: Plan,
-    record: NDArray[np.float64],
-    positions: NDArray[np.float64],
-    steps: int,
-) -> int:
-    """Ask a compiled driver every so many steps; returns the row in which it ended."""
-    row = 0
-    while True:
-        now = record[row]
-        command = driver(parameters, plan.times[row], now[GAP], now[SPEED], now[LEADER_SPEED])
-        if is_over(record, row) or not np.isfinite(command):
-            decide(plan, record, row, command)
-            return row
-        row = advance(plan, record, positions, row, command, steps)
-
-
-# With its signature stated it is compiled once for all drivers.
-_drive_kernel = compiled(
-    _drive,
-    types.int64(types.FunctionType(DRIVER_KERNEL), _TABLE, _PLAN, _TABLE, _SERIES, types.int64),
-)
