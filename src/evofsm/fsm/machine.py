@@ -44,7 +44,6 @@ from evofsm.fsm.explanation import Explanation, Nearest, explain
 from evofsm.fsm.kernels import LINE
 from evofsm.fsm.model import Counts, FSMModel, Policy, believed, check_forecast
 from evofsm.fsm.naming import Labels
-from evofsm.fsm.notebook import machine_html
 from evofsm.fsm.observations import Missing
 from evofsm.fsm.rules import StateRule
 from evofsm.fsm.step import EVENTS, PREDICTED, Event, Limit, Step, Trace, blank_trace
@@ -572,10 +571,6 @@ class EvolvingFSM(Counts if TYPE_CHECKING else object):  # type: ignore[misc] # 
         shown = self.settings | ({} if self._rule == rules.Paper() else {"rule": self._rule})
         settings = ", ".join(f"{name}={value}" for name, value in shown.items())
         return f"{type(self).__name__}({settings})"
-
-    @_alone
-    def _repr_html_(self) -> str:
-        return machine_html(self)
 
     # -- Inside ---------------------------------------------------------------------------------
 

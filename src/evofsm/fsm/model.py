@@ -16,7 +16,6 @@ from evofsm.fsm.clusters import recognise_rows
 from evofsm.fsm.explanation import Explanation, Nearest, explain
 from evofsm.fsm.kernels import lanes
 from evofsm.fsm.naming import Labels
-from evofsm.fsm.notebook import model_html
 from evofsm.fsm.rules import Paper, StateRule, describe_rule, reach, restore_rule, weights_of
 from evofsm.fsm.validation import (
     Floats,
@@ -276,9 +275,6 @@ class FSMModel(Counts):
             f"{type(self).__name__}({self.n_states} states of {variables}, "
             f"{self.n_actions} actions, {self.visits.sum():.0f} observations, {self.rule})"
         )
-
-    def _repr_html_(self) -> str:
-        return model_html(self)
 
     def __deepcopy__(self, memo: Any) -> Self:
         """Itself: nothing in it ever changes."""

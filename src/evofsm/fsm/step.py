@@ -18,7 +18,6 @@ from evofsm.fsm.clusters import CREATED, MOVED, UNCHANGED, determine, recognise,
 from evofsm.fsm.divergence import jensen_shannon_kernel
 from evofsm.fsm.kernels import inner_kernel, kernel, lanes, rare_kernel, spliced_kernel
 from evofsm.fsm.limit import MERGED, merge_closest
-from evofsm.fsm.notebook import step_html
 from evofsm.fsm.transitions import expand, forecast_and_identify, place_of, room_for
 from evofsm.fsm.validation import Floats
 
@@ -262,9 +261,6 @@ class Step(NamedTuple):
             f"{len(self.belief)} states, event={self.event.name}, surprise={self.surprise:.3g}"
             f"{missing})"
         )
-
-    def _repr_html_(self) -> str:
-        return step_html(self)
 
 
 class Trace(NamedTuple):
