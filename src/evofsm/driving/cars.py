@@ -45,6 +45,7 @@ def guard_for_cars(
     rule: StateRule | None = SAFETY_RULE,
     machine: EvolvingFSM | None = None,
     judge: LearningJudge | str = "kinematic",
+    seed: int = 0,
     **settings: Any,
 ) -> Guard:
     """A guard for a car that follows another.
@@ -72,8 +73,10 @@ def guard_for_cars(
         One that has learnt, or which to make: a `LatentRisk`, which is told how cars follow each
         other, or a `LearntRisk`, which is told nothing but which episodes failed, and prevents
         nothing before the first of them.
+    seed : int
+        Of the judge that is made, where that is a `LearntRisk`.
     **settings
-        As in `Guard.of`: ``failed``, ``seed``, ``learn``, ``audit``, ``explaining``, ``missing``.
+        As in `Guard.of`: ``failed``, ``learn``, ``audit``, ``explaining``, ``missing``.
 
     Examples
     --------
@@ -86,7 +89,7 @@ def guard_for_cars(
     """
     actions = IntervalActions(low, high, width, outside="clip")
     if isinstance(judge, str):
-        judge = _judge(judge, actions, interval, settings.get("seed", 0))
+        judge = _judge(judge, actions, interval, seed)
     machine = machine or EvolvingFSM(
         actions.n_actions,
         rule=rule,

@@ -104,7 +104,7 @@ class DecisionLogger(Protocol):
 
 
 # Settings that stand in a file as they are.
-_PLAIN = ("explaining", "interval", "learn", "seed")
+_PLAIN = ("explaining", "interval", "learn")
 # What a judge has that learns.
 _LEARNS = ("dt", "learn", "watch", "follow", "start_episode", "end", "sums", "save", "load")
 # The files of the machine and of the judge, as bytes.
@@ -144,7 +144,7 @@ class Guard:
     mode : Mode
         Whether what it decides is executed, or only recorded.
     seed : int
-        For a judge that draws random numbers.
+        Of the judge that is made where none is given.
     machine : EvolvingFSM, optional
         Recognises and learns; without it one with recommended settings is made.
     width : float, optional
@@ -217,7 +217,6 @@ class Guard:
             interval=interval,
             machine=machine,
             failed=failed,
-            seed=seed,
             audit=audit,
             explaining=explaining,
             missing=missing,
@@ -242,7 +241,7 @@ class Guard:
             Learns from what happens; without it the reviser's own, if it has one that learns.
         learn : bool
             Whether machine and judge learn.
-        failed, seed, audit, explaining, missing
+        failed, audit, explaining, missing
             As in `Guard`.
 
         Examples
@@ -268,7 +267,6 @@ class Guard:
         judge: LearningJudge | None = None,
         learn: bool = True,
         failed: Callable[[NDArray[np.float64]], bool] | None = None,
-        seed: int = 0,
         audit: DecisionLogger | None = None,
         explaining: bool = False,
         missing: Missing = Missing.PARTIAL,
@@ -308,7 +306,6 @@ class Guard:
         #: Learns from what happens; None where nothing but the machine does.
         self.judge = judge
         self.failed = failed
-        self.seed = seed
         self.audit: DecisionLogger | None = audit
         self.explaining = explaining
         self.missing = missing
@@ -606,7 +603,7 @@ class Guard:
             (self.reviser, self.judge),
             {} if self.machine is None else {id(self.machine): machine},
         )
-        names = ("actions", "interval", "learn", "failed", "seed", "explaining", "missing")
+        names = ("actions", "interval", "learn", "failed", "explaining", "missing")
         settings = {name: getattr(self, name) for name in names}
         return type(self).of(reviser, judge=judge, machine=machine if states else None, **settings)
 
