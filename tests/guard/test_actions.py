@@ -31,18 +31,12 @@ def boxes(draw):
 
 @pytest.mark.parametrize(
     ("dimensions", "levels"),
-    [(1, (17,)), (2, (9, 9)), (3, (4,) * 3), (4, (3,) * 4), (5, (2,) * 5), (6, (2,) * 6)],
+    [(1, (17,)), (2, (9, 9)), (3, (4,) * 3), (4, (3,) * 4), (5, (2,) * 5), (8, (2,) * 6 + (1, 1))],
 )
 def test_a_grid_has_as_many_levels_as_make_81_cells_at_most(dimensions, levels):
     box = BoxActions((0.0,) * dimensions, (1.0,) * dimensions)
     assert box.levels == levels
     assert box.n_actions == math.prod(levels) <= 81
-
-
-def test_of_many_dimensions_only_six_are_divided():
-    box = BoxActions((0.0,) * 17, (1.0,) * 17)
-    assert box.n_actions == 64
-    assert box.encode(np.ones(17)) == 63
 
 
 @given(boxes(), st.data())

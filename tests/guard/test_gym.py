@@ -496,15 +496,6 @@ def test_a_frozen_guard_learns_from_none_of_them():
     assert guard.machine.n_states == 0
 
 
-def test_environments_that_are_a_vector_by_themselves_are_driven_too():
-    envs = gymnasium.make_vec("CartPole-v1", num_envs=3, vectorization_mode="vector_entry_point")
-    guard = guard_for(envs.single_action_space)
-    ended = [over.copy() for over, _ in drive_all(RevisedVectorActions(envs, guard), 60)]
-    assert len(guard.judge.episodes) == np.sum(ended)
-    assert all(abs(last[0]) > 2.4 or abs(last[2]) > 0.2 for _, last, _ in guard.judge.episodes)
-    envs.close()
-
-
 def test_a_guard_with_an_audit_log_is_not_shared():
     guard = guard_for(ONE, audit=object())
     with pytest.raises(ValueError, match="one episode at a time"):

@@ -16,7 +16,7 @@ from evofsm.fsm.actions import IntervalActions
 from evofsm.fsm.machine import EvolvingFSM
 from evofsm.guard.api import Proposal
 from evofsm.guard.guard import Guard
-from evofsm.guard.reviser import ActionReviser, Mode, is_spoken
+from evofsm.guard.reviser import ActionReviser, Mode
 
 ACTIONS = IntervalActions(low=-2.5, high=2.5, width=0.3, outside="clip")
 LEADER = Leader(IDM(1.2, 25.0, 1.0, 1.0, 2.5), brake_decel=4.0, brake_time=6.0)
@@ -101,56 +101,6 @@ def test_a_function_is_a_controller_and_cannot_change_what_was_observed():
     told = driven(meddle, on=scenario(1.0))
     assert told.decisions[0].situation.observation[0] == 8.0
     assert (told.executed == 0.5).all()
-
-
-def ordinary_driving(seed, minutes=2.0):
-    """A log at 10 Hz: a driver close behind a leader who brakes gently now and then.
-
-    Gap and speeds as recorded, and the driver's own acceleration, which a recorder smooths over
-    the latest second.
-    """
-    rng = np.random.default_rng(seed)
-    rows = round(600 * minutes)
-    braking = rng.uniform(0.0, rows, size=6)
-    leader, speed, gap, log = 15.0, 15.0, 13.0, []
-    for k in range(rows):
-        log.append((gap, speed, leader))
-        brakes = any(start <= k < start + 30 for start in braking)
-        push = -2.0 if brakes else 0.5 * (15.0 - leader)
-        wish = 0.3 * (gap - 4.0 - 0.6 * speed) + 0.8 * (leader - speed)
-        before = leader, speed
-        leader = max(leader + 0.1 * push, 0.0)
-        speed = max(speed + 0.1 * min(max(wish, -3.0), 1.5), 0.0)
-        gap += 0.05 * (leader + before[0] - speed - before[1])
-    seen = np.array(log)
-    did = np.diff(seen[:, 1], append=seen[-1, 1]) / 0.1
-    return seen, np.convolve(did, np.ones(10) / 10.0)[: len(did)]
-
-
-def shadowed(risk, mode=Mode.SHADOW, drives=2):
-    """What a reviser says beside it, of every row."""
-    reviser = ActionReviser(risk, IntervalActions(-8.0, 8.0, 0.5, outside="clip"), mode=mode)
-    said = []
-    for seed in range(drives):
-        guard = Guard.of(reviser, judge=risk, interval=0.1)
-        for k, (row, did) in enumerate(zip(*ordinary_driving(seed), strict=True)):
-            situation = guard.recognise(row, 0.1 * k)
-            said.append(guard.revise(situation, Proposal(float(did))))
-        guard.end(failed=False)
-    return reviser, said
-
-
-def test_ordinary_driving_raises_few_alarms_and_none_that_speaks_of_braking_not_done():
-    told = LatentRisk.given(-8.0, decel=7.0, leader_decel=8.0, dt=0.1)
-    unlearnt = LatentRisk(-8.0, dt=0.1)
-    for risk, least, most in ((told, 0.0, 0.05), (unlearnt, 0.05, 1.0)):
-        reviser, said = shadowed(risk)
-        alarms = [revision for revision in said if is_spoken(reviser, revision)]
-        assert least * len(said) <= len(alarms) <= most * len(said)
-        assert not [revision.reason for revision in alarms if "in full" in revision.reason]
-    assert unlearnt.brakes.decel == pytest.approx(0.6 * 8.0)  # no harder braking was shown
-    assert told.brakes.known
-    assert told.brakes.decel == pytest.approx(7.0)
 
 
 def test_a_driver_who_brakes_hard_shows_what_the_brakes_can_do(tmp_path):

@@ -207,19 +207,6 @@ def test_what_cannot_be_executed_is_made_usable_and_judged_as_such(wanted, execu
     assert revision.executed <= -2.0
 
 
-@given(st.floats(0.1, 80.0), st.floats(0.0, 35.0), st.floats(0.0, 35.0), PROPOSALS)
-def test_it_never_adds_risk(gap, speed, leader_speed, wanted):
-    risk = LatentRisk(lowest=LOW)
-    risk.brakes.trust(2.4)
-    risk.manoeuvres.remember(*np.linspace(2.5, 4.5, 150))
-    there = Situation(np.array([gap, speed, leader_speed]), np.ones(1), 0, 0.0, 0.0)
-    revision = ActionReviser(risk, ACTIONS).revise(there, Proposal(wanted))
-    assert revision.risk_executed <= revision.risk_proposed
-    assert revision.executed <= wanted
-    low, high = revision.interval
-    assert low <= revision.risk_executed <= high
-
-
 def test_what_was_never_seen_is_said_to_be_so_and_what_is_known_is_not():
     risk = LatentRisk(lowest=LOW)
     reviser = ActionReviser(risk, ACTIONS)

@@ -258,26 +258,18 @@ def _go_on(guard: Guard, judge: Any, episodes: range, *, ask: bool = False) -> N
         rows, failed = _drive(seed=episode), episode % 2 == 0
         for k, row in enumerate(rows):
             if ask:
-                judge.why(judge.judge(_seen(guard, row), _ACTIONS))
+                judge.why(judge.judge(_situation(row, 0), _ACTIONS))
             guard.decide(row, float(_ACTIONS[k % len(_ACTIONS)]), k * _DT)
         guard.end(failed, np.array([-0.1, *rows[-1, 1:]]) if failed else rows[-1])
 
 
-def _seen(guard: Guard, row: NDArray[np.float64]) -> Situation:
-    machine = guard.machine
-    if machine is None or machine.n_states == 0:
-        return _situation(row, 0)
-    belief = np.asarray(machine.model().recognise(row))
-    return _situation(row, 0)._replace(belief=belief, state=int(belief.argmax()))
-
-
-def _asked(guard: Guard, judge: Any) -> list[Judgement]:
-    return [judge.judge(_seen(guard, row), _ACTIONS.copy()) for row in _drive(8, seed=99)]
+def _asked(judge: Any) -> list[Judgement]:
+    return [judge.judge(_situation(row, 0), _ACTIONS.copy()) for row in _drive(8, seed=99)]
 
 
 def judges_each_action(make: Make) -> None:
     """It returns a probability for each action, within its interval, or NaN where it knows none."""
-    for judged in _asked(*_taught(make)):
+    for judged in _asked(_taught(make)[1]):
         shapes = {np.shape(getattr(judged, name)) for name in ("risk", "low", "high")}
         _insist(shapes == {_ACTIONS.shape}, f"of {len(_ACTIONS)} actions it returns {shapes}")
         known = ~np.isnan(judged.risk)
@@ -290,14 +282,12 @@ def judges_each_action(make: Make) -> None:
 def learns_only_from_what_happens(make: Make) -> None:
     """Neither questions nor, once it is frozen, episodes change what it has learnt."""
     guard, judge = _taught(make)
-    before = _asked(guard, judge)
-    text = (
-        "it learns otherwise where somebody else asks it too (does judge note what it was asked?)"
-    )
-    _insist(_same(before, _asked(*_taught(make, ask=True))), text)
+    before = _asked(judge)
+    text = "it learns otherwise where somebody else asks it too (does judge note what it is asked?)"
+    _insist(_same(before, _asked(_taught(make, ask=True)[1])), text)
     guard.freeze()
     _go_on(guard, judge, range(10, 12))
-    _insist(_same(before, _asked(guard, judge)), "a frozen guard's judge went on learning")
+    _insist(_same(before, _asked(judge)), "a frozen guard's judge went on learning")
 
 
 def a_file_keeps_it(make: Make) -> None:
@@ -308,7 +298,7 @@ def a_file_keeps_it(make: Make) -> None:
     with tempfile.TemporaryDirectory() as folder:
         guard.save(Path(folder) / "guard")
         again = Guard.load(Path(folder) / "guard", judge=type(judge))
-    same = _same(_asked(guard, judge), _asked(again, again.judge))
+    same = _same(_asked(judge), _asked(again.judge))
     _insist(same, "one that was saved and loaded judges otherwise (is all that it learns saved?)")
 
 
