@@ -72,7 +72,7 @@ class Point:
         """A guard that learnt from so many episodes; each seed has its own."""
         guard = self.guard(**others)
         for episode in range(count):
-            self.play(guard, 1000 * guard.seed + episode)
+            self.play(guard, 1000 * guard.judge.seed + episode)
         return guard
 
 
