@@ -113,6 +113,7 @@ def test_a_judge_that_is_given_nothing_but_failures_is_driven_saved_and_gone_on_
         (("emergency", "--tolerance", "2"), "tolerance"),
         (("emergency", "--learn", "a", "--workers", "2"), "one after the other"),
         (("emergency", "--mcap", "a", "--workers", "2"), "workers send no decisions"),
+        (("emergency", "--foxglove", "0", "--audit", "log"), "exclude each other"),
         (("emergency", "--cluster", "tcp://127.0.0.1:1"), "no Dask scheduler answers"),
     ],
 )
@@ -344,31 +345,11 @@ def test_episodes_that_kill_every_worker_are_named(monkeypatch):
         list(_in_processes(fatal, [[3, 4]], 1))
 
 
-# -- In Foxglove ----------------------------------------------------------------------------------
-
-
-@pytest.mark.slow
-def test_a_run_waits_for_whoever_looks_on_in_foxglove(evofsm):
-    pytest.importorskip("foxglove")
-    connect = pytest.importorskip("websockets.sync.client").connect
-    failure(evofsm("drive", "emergency", "--foxglove", 0, "--audit", "log"), "exclude each other")
-    words = ("emergency", "--episodes", "1", "--foxglove", "0", "--json")
-    process = subprocess.Popen(
-        command(*words), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    )
-    line = ""
-    while "open ws://" not in line:  # it may say first that it compiles
-        line = process.stderr.readline()
-    address = line.partition("open ")[2].split()[0]
-    with connect(address, subprotocols=["foxglove.sdk.v1"], proxy=None) as client:
-        topics = {}
-        while "/risk" not in topics:
-            told = json.loads(client.recv(timeout=60))
-            topics |= {one["topic"]: one["id"] for one in told.get("channels", [])}
-        asked = {"op": "subscribe", "subscriptions": [{"id": 1, "channelId": topics["/risk"]}]}
-        client.send(json.dumps(asked))
-        while not isinstance(data := client.recv(timeout=60), bytes):
-            pass
-    process.terminate()
-    process.communicate(timeout=60)
-    assert "proposed" in json.loads(data[13:])
+def test_in_foxglove_a_run_waits_for_whoever_looks_on(evofsm, monkeypatch):
+    foxglove = pytest.importorskip("evofsm.io.foxglove")
+    looks = iter([False, True])
+    monkeypatch.setattr(foxglove.FoxgloveSink, "await_someone", lambda sink, _: next(looks))
+    told = evofsm("drive", "emergency", "--episodes", 1, "--foxglove", 0)
+    assert told.exit_code == 0
+    assert "open ws://" in told.stderr
+    assert list(looks) == []

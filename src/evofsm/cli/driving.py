@@ -18,7 +18,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import BrokenExecutor, ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass
 from functools import partial
-from multiprocessing import get_context
+from multiprocessing import get_context, parent_process
 from pathlib import Path
 from threading import Thread
 from typing import Any, NamedTuple
@@ -336,7 +336,7 @@ def _in_processes(drive: Drive, batches: list[list[int]], workers: int) -> Itera
     while batches:
         before = len(batches)
         # Forking a process that has started threads may hang; a fresh one costs a second.
-        pool = ProcessPoolExecutor(workers, get_context("spawn"), _begin_work, (os.getpid(),))
+        pool = ProcessPoolExecutor(workers, get_context("spawn"), _begin_work)
         try:
             futures = {pool.submit(drive, batch): batch for batch in batches}
             for future in as_completed(futures):
@@ -355,13 +355,14 @@ def _in_processes(drive: Drive, batches: list[list[int]], workers: int) -> Itera
             pool.shutdown(wait=False, cancel_futures=True)
 
 
-def _begin_work(parent: int) -> None:
+def _begin_work() -> None:
     """In a worker: Ctrl-C is left to the parent, and no worker outlives it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    parent = parent_process()
+    assert parent is not None
 
     def end_with_parent() -> None:
-        while os.getppid() == parent:
-            time.sleep(0.2)
+        parent.join()
         os._exit(1)
 
     Thread(target=end_with_parent, daemon=True).start()

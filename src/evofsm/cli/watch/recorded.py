@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Iterable, Iterator
 from os import PathLike
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -92,12 +92,6 @@ class Recording:
         """The states as they were after the last episode."""
         model = self._run.model
         return Graph(self._number) if model is None else graph_of(model, None, self._number)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        """Nothing is open."""
 
     def _begun(self, case: int) -> Start:
         about, columns = self._run.about, self._episode.columns

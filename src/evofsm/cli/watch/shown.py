@@ -38,7 +38,6 @@ class Danger(NamedTuple):
     stepped_in: Frame | None = None  #: in which the reviser first changed something
     revised: int = 0  #: decisions that the reviser changed
     change: float = 0.0  #: by how much, all of them together [m/s²]
-    off: float = math.nan  #: time of the latest decision with the reviser off [s]
     decisions: int = 0
     hardest: float = math.inf  #: lowest acceleration that the reviser put through [m/s²]
     dead_end: float = math.nan  #: since when full braking was too late as well [s]
@@ -242,7 +241,6 @@ def _went_on(danger: Danger, frame: Frame, is_tolerable: bool) -> Danger:
         dead_end = frame.time if math.isnan(danger.dead_end) else danger.dead_end
     return danger._replace(
         last=danger.last if is_tolerable else frame.time,
-        off=danger.off if frame.revising else frame.time,
         decisions=danger.decisions + 1,
         dead_end=dead_end,
     )

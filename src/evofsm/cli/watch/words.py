@@ -96,10 +96,7 @@ def _quiet(story: Story, knows_leaders: bool) -> str:
 
 
 def _when(story: Story, danger: Danger, knows_leaders: bool) -> str:
-    since = danger.began.time
-    text = f"Danger began at {_seconds(since)}"
-    if since > story.first:
-        text += f" (and before, at {_seconds(story.first)})"
+    text = f"Danger began at {_seconds(danger.began.time)}"
     if not story.in_danger:
         return f"{text}; it was over at {_seconds(danger.last)}."
     if math.isnan(danger.dead_end):
@@ -143,16 +140,13 @@ def _done(danger: Danger, frame: Frame) -> str:
         return f"Nothing: the reviser is off. It would have begun at once, {instead}."
     if not frame.revising:
         return f"The reviser changed {share}, but now it is off."
-    hardest, elsewhere = "", ""
+    hardest = ""
     if danger.hardest < -_HARDLY:
         hardest = f"; at its hardest it braked by {-danger.hardest:.1f} m/s²"
-    if others := frame.story.revised - danger.revised:
-        elsewhere = f" It changed {others} more outside of this danger."
-    when = _seconds(first.time) + ", as it was switched on" * (danger.off < first.time)
     return (
-        f"The reviser stepped in at {when}, at first {_instead(first.executed, first.proposed)}. "
-        f"It changed {share}, by {danger.change / danger.revised:.1f} m/s² on average{hardest}."
-        f"{elsewhere}"
+        f"The reviser stepped in at {_seconds(first.time)}, at first "
+        f"{_instead(first.executed, first.proposed)}. It changed {share}, by "
+        f"{danger.change / danger.revised:.1f} m/s² on average{hardest}."
     )
 
 
