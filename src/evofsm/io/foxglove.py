@@ -40,14 +40,14 @@ from evofsm.io.runs import (
 
 with needs("foxglove-sdk", "mcap", "writing MCAP, and a live view in Foxglove"):
     import foxglove
+    from foxglove.channels import LogChannel
     from foxglove.mcap import MCAPWriteOptions
+    from foxglove.messages import Log, LogLevel, Timestamp
     from foxglove.websocket import ServerListener
 
 #: A layout of cars, to be imported: *Layouts, Import from file*.
 FOXGLOVE_LAYOUT = Path(__file__).with_name("foxglove_layout.json")
 
-# Levels of foxglove.Log.
-_INFO, _WARNING, _ERROR = 2, 3, 4
 _SECOND = 1_000_000_000  # [ns]
 _PAUSE = _SECOND  # from the end of an episode to the start of the next
 
@@ -68,6 +68,7 @@ class _Channels:
             topic: foxglove.Channel(topic, schema=schema, context=self.context)
             for topic, schema in schemas_of(names, units).items()
         }
+        self._log = LogChannel("/log", context=self.context)
 
     def event(self, kind: str, at: float, observation: NDArray[np.float64]) -> None:
         """Something happened, so long after the episode began [s]."""
@@ -93,14 +94,14 @@ class _Channels:
             )
             unit = " m/s²" if self.is_of_cars else ""
             text = f"proposed {_shown(revision.proposed)}, {done} {_shown(instead)}{unit}"
-            level = _WARNING if changed else _INFO
+            level = LogLevel.Warning if changed else LogLevel.Info
             self.note(level, situation.time, f"{text}: {revision.reason}")
 
-    def note(self, level: int, at: float, text: str) -> None:
+    def note(self, level: LogLevel, at: float, text: str) -> None:
         """A line for the log panel."""
-        sec, nsec = divmod(self.begin + round(at * _SECOND), _SECOND)
-        about = {"timestamp": {"sec": sec, "nsec": nsec}, "level": level, "message": text}
-        self._send("/log", at, {**about, "name": "evofsm", "file": "", "line": 0})
+        now = self.begin + round(at * _SECOND)
+        stamp = Timestamp(*divmod(now, _SECOND))
+        self._log.log(Log(timestamp=stamp, level=level, message=text, name="evofsm"), log_time=now)
 
     def next_episode(self, after: float) -> None:
         """The present one was so long [s]."""
@@ -153,13 +154,8 @@ class _File:
             self.error = error
             raise
 
-    def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
-        """Go to a place."""
-        return self._file.seek(offset, whence)
-
-    def flush(self) -> None:
-        """Hand on what waits."""
-        self._file.flush()
+    def __getattr__(self, name: str) -> Any:  # seek, flush
+        return getattr(self._file, name)
 
     def close(self) -> None:
         """Write the index, which ends the log."""
@@ -236,7 +232,7 @@ class RunWriter:
         happened = {"collision": episode.collided, "rear-end collision": episode.rear_ended}
         for kind in (kind for kind, it_did in happened.items() if it_did):
             channels.event(kind, end, last)
-            channels.note(_ERROR, end, kind)
+            channels.note(LogLevel.Error, end, kind)
         channels.event("episode ended", end, last)
         channels.next_episode(end)
 
@@ -398,7 +394,7 @@ class FoxgloveSink:
         if failed:
             kind = "collision" if self._channels.is_of_cars else "failure"
             self._channels.event(kind, self._time, self._observation)
-            self._channels.note(_ERROR, self._time, kind)
+            self._channels.note(LogLevel.Error, self._time, kind)
         self._channels.event("episode ended", self._time, self._observation)
 
     def _keep_pace(self) -> None:

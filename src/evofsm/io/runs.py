@@ -2,7 +2,7 @@
 
 What was seen (``/observation``), where that is (``/belief``), how dangerous (``/risk``), and what
 was done about it (``/decision``); ``/event``, and ``/log`` for Foxglove's log panel. The messages
-are JSON with schemas that name every unit. What is not known is left out of a message: JSON has no
+are JSON with schemas that name every unit, those of ``/log`` Foxglove's own. What is not known is left out of a message: JSON has no
 NaN, and the schemas that Foxglove takes have one type for each field, so no null.
 """
 
@@ -95,27 +95,9 @@ def schemas_of(
         "time": _of("number", "since the start of the episode [s]"),
         **{name: _schema(columns[name]) for name in names},
     }
-    second = {"sec": {"type": "integer"}, "nsec": {"type": "integer"}}
-    levels = enumerate(("UNKNOWN", "DEBUG", "INFO", "WARNING", "ERROR", "FATAL"))
-    fields["/log"] = {
-        "timestamp": {**_of("object", "when"), "properties": second},
-        "level": {
-            "description": "how grave",
-            "oneOf": [{"title": name, "const": level} for level, name in levels],
-        },
-        "message": _of("string", "what happened"),
-        "name": _of("string", "who says so"),
-        "file": _of("string", "empty"),
-        "line": _of("integer", "0"),
-    }
-    titles = {"/log": "foxglove.Log"}  # Foxglove knows it by its name
     return {
-        topic: {
-            "title": titles.get(topic, f"evofsm.{topic[1:].capitalize()}"),
-            "type": "object",
-            "properties": properties,
-        }
-        for topic, properties in fields.items()
+        topic: {"title": f"evofsm.{topic[1:].capitalize()}", "type": "object", "properties": of_it}
+        for topic, of_it in fields.items()
     }
 
 

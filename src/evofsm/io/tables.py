@@ -66,7 +66,6 @@ UNITS: Mapping[str, float] = {
 # What stands in a field where there is no number.
 _NOTHING = ("", "na", "n/a", "null", "none")
 _DATE = re.compile(r"\s*\d{4}-?\d\d-?\d\d[Tt ]")
-_ZONE = r"([zZ]|[+-]\d\d:?\d\d)$"
 
 
 def silent(count: int) -> None:
@@ -497,18 +496,11 @@ def _microseconds(piece: Piece, name: str, dates: polars.Series) -> NDArray[np.f
     import polars
 
     if dates.dtype == polars.String:
-        dates = dates.str.strip_chars().str.replace("[t ]", "T")
-        zoned = dates.str.contains(_ZONE)
-        if zoned.any() and not zoned.all():
-            row = int((zoned if not zoned[0] else ~zoned).arg_max() or 0)
-            piece.refuse(row, name, "{!r}: some have a zone and others have none")
-        layout = "%Y-%m-%dT%H:%M:%S%.f" + "%#z" * bool(zoned.any())
-        dates = dates.str.replace("[zZ]$", "+00:00").str.to_datetime(layout, strict=False)
+        dates = dates.str.strip_chars().str.to_datetime(strict=False)
     if dates.null_count():
-        piece.refuse(
-            int(dates.is_null().arg_max() or 0),
-            name,
-            "{!r} is no date; the first row has one, so all must have one in ISO 8601, such as "
-            "2026-03-14T09:26:53.5+01:00",
+        why = (
+            "{!r} is no date as the first row has one; all must be in ISO 8601, such as "
+            "2026-03-14T09:26:53.5+01:00, and have a zone, or none"
         )
+        piece.refuse(int(dates.is_null().arg_max() or 0), name, why)
     return dates.dt.epoch("us").cast(polars.Float64).to_numpy()
