@@ -2,8 +2,8 @@
 
 What was seen (``/observation``), where that is (``/belief``), how dangerous (``/risk``), and what
 was done about it (``/decision``); ``/event``, and ``/log`` for Foxglove's log panel. The messages
-are JSON with schemas that name every unit, those of ``/log`` Foxglove's own. What is not known is left out of a message: JSON has no
-NaN, and the schemas that Foxglove takes have one type for each field, so no null.
+are JSON with schemas that name every unit, those of ``/log`` Foxglove's own type. What is not
+known is left out of a message: JSON has no NaN, and the schemas have one type for each field.
 """
 
 from __future__ import annotations
