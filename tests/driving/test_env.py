@@ -1,6 +1,4 @@
 import importlib
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -45,15 +43,6 @@ def test_gymnasium_finds_nothing_to_complain_of(family):
     assert env.spec.id == ID
     assert env.unwrapped.collision_cost == 5.0
     check_env(env.unwrapped)
-
-
-def test_the_same_seed_drives_the_same_episodes():
-    first, again, other = CarFollowing(), CarFollowing(), CarFollowing()
-    for seed in (3, None, None):  # the seed rules the episodes after it as well
-        one, two = (drive(env, own_driver(env), seed=seed) for env in (first, again))
-        assert np.array_equal(observations(one), observations(two))
-        assert one[-1][-1] == two[-1][-1]
-    assert other.reset(seed=4)[1]["index"] != first.reset(seed=3)[1]["index"]
 
 
 def test_an_episode_is_chosen_exactly():
@@ -160,28 +149,6 @@ def test_noise_and_delay_are_in_what_is_seen_and_not_in_what_is_told():
     observation, info = env.reset(options={"index": 0})
     assert observation[0] != info["gap"] == env.draw.scenario.initial_gap
     assert observation in env.observation_space
-
-
-def test_sumo_drives_the_same():
-    pytest.importorskip("libsumo")
-    in_closed_form, in_sumo = CarFollowing(), CarFollowing(world="sumo")
-    try:
-        for index in range(2):
-            one, two = (
-                drive(env, own_driver(env), options={"index": index})
-                for env in (in_closed_form, in_sumo)
-            )
-            assert np.abs(observations(one) - observations(two)).max() < 1e-9
-            assert one[-1][2:4] == two[-1][2:4]
-    finally:
-        in_sumo.close()
-
-
-@pytest.mark.slow
-def test_without_gymnasium_the_extra_is_named():
-    program = "import sys; sys.modules['gymnasium'] = None; import evofsm.driving.env"
-    finished = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
-    assert finished.stderr.rstrip().endswith("pip install '.[gym]' in a clone of evofsm")
 
 
 def test_in_a_platoon_the_example_prevents_collisions(monkeypatch):

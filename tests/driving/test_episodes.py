@@ -5,13 +5,7 @@ import pytest
 
 pytest.importorskip("scipy")
 
-from evofsm.driving.cars import (
-    TOLD,
-    guard_for_cars,
-    guard_for_family,
-    learners_of,
-    name_judge,
-)
+from evofsm.driving.cars import TOLD, guard_for_cars, guard_for_family, learners_of, name_judge
 from evofsm.driving.drivers import IDM
 from evofsm.driving.episodes import (
     Trial,

@@ -135,11 +135,6 @@ def test_at_equal_speed_some_are_blind_and_others_see():
         assert sees == (type(measure) not in blind | {PerformanceModel})
 
 
-def test_ttc_scores_by_its_inverse():
-    rows = np.array([[10.0, 25.0, 20.0], [10.0, 20.0, 20.0], [0.0, 20.0, 20.0]])
-    assert TimeToCollision(threshold=4.0).score(rows, DT).tolist() == [0.25, -0.25, np.inf]
-
-
 def test_mttc_solves_for_the_first_meeting():
     # Opening at 1 m/s, but 2 m/s² faster and faster: t² - t = 6.
     rows = np.array([[6.0, 10.0, 13.0], [6.0, 10.0, 11.0]])
@@ -174,14 +169,6 @@ def test_the_safe_distance_of_rss_by_hand():
     assert safe_distance(np.array([9.0, 5.0, 40.0]), 0.5, 2.0, 5.0, 8.0) == 0.0
 
 
-def test_constants_of_the_regulation():
-    assert ResponsibilitySensitiveSafety.r157() == ResponsibilitySensitiveSafety(0.75, 3, 6, 6)
-    matched = ResponsibilitySensitiveSafety(0.25, 2.5, 2.5, 4.5)
-    assert ResponsibilitySensitiveSafety.matched(2.5, 4.5) == matched
-    assert PerformanceModel.regulation() == PerformanceModel(0.35, 6.0)
-    assert PerformanceModel.careful_human() == PerformanceModel(0.75, 0.774 * 9.81)
-
-
 def test_performance_models_score_in_metres_and_see_no_danger_in_opening_gaps():
     rows = np.array([[17.0, 30.0, 18.0], [17.0, 18.0, 30.0]])
     assert PerformanceModel(0.5, 6.0).score(rows, DT).tolist() == [1.0, -17.0]
@@ -209,14 +196,6 @@ def test_cfs_trusts_braking_that_is_under_way_up_to_the_comfortable():
     # Braking by 8 m/s², taken for 4 m/s²: from 10 to 6 m/s in 8 m, then 36/10 or 36/8 m.
     rows = np.array([[99.0, 28.0, 10.0], [12.05, 20.0, 10.0]])
     assert critical_fuzzy(rows, 1.0, 1.0, 4.0, 5.0)[1] == pytest.approx(0.45 / 0.9)
-
-
-def test_fuzzy_safety_takes_the_more_dangerous_of_the_two():
-    rows = np.array([[60.0, 30.0, 20.0], [30.0, 15.0, 0.0], [4.5, 0.0, 0.0]])
-    model = FuzzySafety(threshold=0.25)
-    pfs = proactive_fuzzy(rows, 0.75, 4.0, 6.0, 7.0, 2.0)
-    cfs = critical_fuzzy(rows, DT, 0.75, 4.0, 6.0)
-    assert model.score(rows, DT).tolist() == (np.maximum(pfs, cfs) - 0.25).tolist()
 
 
 # -- Dead ends --------------------------------------------------------------------------------

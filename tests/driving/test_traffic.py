@@ -38,11 +38,6 @@ def test_whom_one_may_meet_is_a_pair(other, pair):
     assert found == ([] if pair is None else [pair])
 
 
-def test_one_may_move_over_oneself():
-    (pair,) = Scene(ME._replace(vy=1.0), [Object("car", x=115.0, y=3.5, vx=20.0)]).pairs()
-    assert pair.role is Role.CUTTING_IN
-
-
 def test_rows_hold_the_closest_and_zeros_where_there_is_none():
     far, near = Object("far", 180.0, 0.0, 20.0), Object("near", 120.0, 0.0, 20.0)
     assert [pair.gap for pair in Scene(ME, [far, near]).pairs()] == [15.0, 75.0]
@@ -157,19 +152,6 @@ def test_where_who_is_behind_cannot_be_spared_one_brakes_as_softly_as_one_can():
     assert "the softest for ahead" in revision.reason
     softer = judge().ahead.judge(at([27.0, 15.0, 0.0]), [revision.executed + 0.25])
     assert softer.risk[0] > 0.02
-
-
-def test_hard_braking_of_the_driver_is_softened_for_who_is_behind():
-    revision = decide(scene(behind(12.0, 15)), -9.0)
-    assert -9.0 < revision.executed < 0.0
-    assert "object 1, behind" in revision.reason
-
-
-def test_what_was_taught_of_leaders_is_used():
-    one, near = judge(), at(scene(ahead(9.0, 15)))
-    assert one.judge(near, [0.0]).risk[0] == 1.0
-    one.ahead.manoeuvres.remember(*[3.0] * 200)
-    assert one.judge(near, [0.0]).risk[0] < 0.02
 
 
 @pytest.mark.parametrize(

@@ -6,11 +6,10 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from evofsm.driving.drivers import IDM
+from evofsm.driving.drivers import IDM, ChangingIDM
 from evofsm.driving.scenarios import Behind, Body, CutIn, Leader, Scenario, Sensors
 from evofsm.driving.sumo import SumoWorld
 from evofsm.driving.world import REALISED, KinematicWorld
-from evofsm.guard.api import Proposal
 from evofsm.paper.runs import CASES, Settings
 
 pytest.importorskip("libsumo")
@@ -30,13 +29,6 @@ def in_both():
             )
             for case in CASES
         }
-
-
-class Plain:
-    """A controller without a kernel."""
-
-    def __init__(self, propose):
-        self.propose = propose
 
 
 @pytest.mark.parametrize("case", CASES)
@@ -82,19 +74,10 @@ def test_a_world_changes_its_step_between_runs():
             assert np.abs(episode.observations - closed_form.observations).max() < 1e-9
 
 
-def test_the_leader_brakes_once_in_full_from_the_time_it_is_told():
-    leader = Leader(IDM(1.2, 25.0, 1.0, 1.0, 2.5), brake_decel=9.0, brake_time=0.07)
-    episode = KinematicWorld().run(Scenario(leader, initial_gap=50.0), SETTINGS.drivers[2])
-    braking = episode.leader_accelerations == -9.0
-    assert np.array_equal(braking, np.arange(len(braking)) >= 7)
-    assert (np.diff(episode.observations[8:, 2]) <= 0.0).all()
-    assert episode.observations[-1, 2] == 0.0
-
-
 @pytest.mark.parametrize("wrong", [math.nan, math.inf])
 def test_a_controller_that_proposes_no_number_is_named(wrong):
     with pytest.raises(ValueError, match="controller proposed"):
-        KinematicWorld().run(SETTINGS.scenario, Plain(lambda z, time: Proposal(wrong)))
+        KinematicWorld().run(SETTINGS.scenario, lambda z: wrong)
 
 
 @pytest.mark.parametrize(
@@ -147,11 +130,11 @@ def test_a_start_that_fails_leaves_no_simulation_behind():
 
 
 def test_a_controller_cannot_write_into_the_record():
-    def meddle(observation, time):
+    def meddle(observation):
         observation[:] = 99.0
-        return Proposal(1.0)
+        return 1.0
 
-    episode = KinematicWorld().run(replace(SETTINGS.scenario, duration=0.5), Plain(meddle))
+    episode = KinematicWorld().run(replace(SETTINGS.scenario, duration=0.5), meddle)
     assert episode.observations[0].tolist() == [5.0, 0.0, 0.0]
 
 
@@ -185,7 +168,7 @@ def test_both_worlds_agree_with_everything_switched_on():
 
 
 def test_a_cut_in_replaces_the_leader_at_its_time():
-    episode = KinematicWorld().run(FULL, Plain(lambda z, time: Proposal(-1.0)))
+    episode = KinematicWorld().run(FULL, lambda z: -1.0)
     assert episode.observations[500, 0] == pytest.approx(9.0)
     assert episode.observations[500, 2] == 11.0
     assert episode.observations[499, 2] != pytest.approx(11.0, abs=0.5)
@@ -201,7 +184,7 @@ def test_waves_then_the_brake_move_the_leader():
 
 def test_a_body_is_late_limited_and_smooth():
     scenario = replace(FULL, sensors=Sensors(), behind=None)
-    episode = KinematicWorld().run(scenario, Plain(lambda z, time: Proposal(-9.0)))
+    episode = KinematicWorld().run(scenario, lambda z: -9.0)
     realised = episode.record[:, REALISED]
     assert (realised[:20] == 0.0).all()
     assert np.diff(realised[:100]).min() == pytest.approx(-0.15)
@@ -210,21 +193,16 @@ def test_a_body_is_late_limited_and_smooth():
 
 def test_sensors_see_late_and_with_the_noise_of_their_seed():
     seen = []
-    look = Plain(lambda z, time: seen.append(z) or Proposal(0.0))
-    episode = KinematicWorld().run(replace(FULL, duration=5.0), look)
+    episode = KinematicWorld().run(replace(FULL, duration=5.0), lambda z: seen.append(z) or 0.0)
     late = np.array(seen)[20:] - episode.observations[:-20]
     assert late[:, 0].std() == pytest.approx(0.5, rel=0.2)
     assert late[:, 1].std() == pytest.approx(0.3, rel=0.2)
-    first = seen.copy()
-    seen.clear()
-    KinematicWorld().run(replace(FULL, duration=5.0), look)
-    assert np.array_equal(first, seen)
 
 
 def test_a_car_behind_may_run_into_a_follower_who_brakes():
     sleepy = IDM(1.25, 25.0, 2.0, 0.1, 2.0, lowest=-1.0)
     scenario = replace(FULL, behind=Behind(sleepy, gap=4.0), sensors=Sensors())
-    episode = KinematicWorld().run(scenario, Plain(lambda z, time: Proposal(-6.0)))
+    episode = KinematicWorld().run(scenario, lambda z: -6.0)
     assert episode.rear_ended
     assert not episode.collided
 
@@ -243,8 +221,50 @@ def test_who_is_asked_at_an_interval_keeps_its_command_between():
     seldom = KinematicWorld().run(FULL, SETTINGS.drivers[1], 0.25)
     commands = seldom.accelerations[:100].reshape(4, 25)
     assert (commands == commands[:, :1]).all()
-    driver = replace(FULL, sensors=Sensors()), SETTINGS.drivers[1]
-    asked = KinematicWorld().run(driver[0], Plain(driver[1].propose), 0.25)
-    assert np.array_equal(asked.record, KinematicWorld().run(*driver, 0.25).record)
     with pytest.raises(ValueError, match="no multiple of the simulation's step"):
-        KinematicWorld().run(*driver, 0.123456)
+        KinematicWorld().run(FULL, SETTINGS.drivers[1], 0.123456)
+
+
+# -- Who drives: the Intelligent Driver Model ------------------------------------------------------
+
+NORMAL = IDM(1.25, 25.0, 2.0, 1.5, 2.0)
+HASTY = IDM(2.25, 28.0, 0.8, 0.3, 2.0, lowest=-4.0, highest=2.5)
+
+
+def test_acceleration_follows_the_papers_equations():
+    gap, speed, leader_speed = 30.0, 20.0, 15.0
+    desired = 2.0 + 20.0 * 1.5 + 20.0 * 5.0 / (2.0 * math.sqrt(1.25 * 2.0))
+    expected = 1.25 * (1.0 - (20.0 / 25.0) ** 4 - (desired / 30.0) ** 2)
+    assert NORMAL.propose(np.array([gap, speed, leader_speed])).action == pytest.approx(expected)
+
+
+@pytest.mark.parametrize("gap", [0.5, 0.0, -3.0])
+def test_bounds_hold_also_at_and_after_a_collision(gap):
+    assert HASTY.propose(np.array([gap, 20.0, 0.0])).action == -4.0
+
+
+def test_free_road_gives_the_full_acceleration_at_rest_and_none_at_the_desired_speed():
+    assert NORMAL.propose(np.array([math.inf, 0.0, 0.0])).action == 1.25
+    assert NORMAL.propose(np.array([math.inf, 25.0, 0.0])).action == 0.0
+
+
+@pytest.mark.parametrize(
+    ("change", "word"),
+    [
+        ({"accel": 0.0}, "accel"),
+        ({"decel": -2.0}, "decel"),
+        ({"min_gap": -1.0}, "min_gap"),
+        ({"desired_speed": math.nan}, "desired_speed"),
+        ({"lowest": 3.0, "highest": 2.5}, "bounds"),
+    ],
+)
+def test_impossible_parameters_are_refused_by_name(change, word):
+    values = {"accel": 1.0, "desired_speed": 25.0, "min_gap": 2.0, "time_headway": 1.0}
+    with pytest.raises(ValueError, match=word):
+        IDM(**{**values, "decel": 2.0, **change})
+
+
+@pytest.mark.parametrize("at", [math.nan, -1.0])
+def test_a_driver_changes_at_a_time(at):
+    with pytest.raises(ValueError, match="changes at"):
+        ChangingIDM(NORMAL, ((at, HASTY),))
