@@ -46,7 +46,13 @@ def drive_configuration(
             drives += len(guards.cars)
             if seconds == int(seconds):
                 move(description=f"Driving ({seconds:,.0f} s, {len(guards.collisions)} collisions)")
-        seconds = float(sumo.simulation.getTime())
+        seconds, kinds = float(sumo.simulation.getTime()), sumo.vehicletype.getIDList()
+    if not guards.ever:
+        own = ", ".join(kind for kind in kinds if not kind.startswith("DEFAULT_"))
+        raise ValueError(
+            f"--vehicles {vehicles}: in {seconds:,.0f} s there was no such car, so nothing was "
+            f"guarded; types are {own or 'those of SUMO alone'}"
+        )
     met, guarded, guarding = guards.collisions, guards.ever, guards.guarding
     assert guarding is not None
     return {
@@ -102,13 +108,10 @@ def _facts(came: dict[str, Any]) -> Iterator[tuple[str, str]]:
     acts = came["mode"] == "act"
     yield "simulation", f"{came['configuration']}, {came['seconds']:,.0f} s"
     yield "guarded", f"{came['guarded']:,} cars ({came['vehicles']}), {came['mode']}"
-    if not came["guarded"]:
-        yield "note", f"no car was {came['vehicles']}: is it the name of a type or car?"
     by, into = f"{came['of_guarded']:,} by guarded cars", f"{came['into_guarded']:,} by others"
     yield "collisions", f"{came['collisions']:,}: {by}, {into} into them"
     yield "mean speed", f"{came['speed']:.2f} m/s of guarded cars"
     share = came["revised"] / max(1, came["decisions"])
     what = "held back" if acts else "would have held back"
     yield "guards", f"{what} {share:.1%} of {came['decisions']:,} decisions"
-    if came["guarded"]:
-        yield "overhead", f"{came['microseconds']:.0f} µs a decision"
+    yield "overhead", f"{came['microseconds']:.0f} µs a decision"
