@@ -283,18 +283,26 @@ class _Child:
 
 @dataclass(frozen=True)
 class Sample:
-    """A file, and what is in it once it was loaded and saved again."""
+    """A file, how it is loaded, and what is done with it then."""
 
     name: str
     data: bytes
-    load: Callable[[Path], bytes]
+    load: Callable[[Path], Any]
+    use: Callable[[Any], object]
+
+    def try_it(self, path: Path) -> bytes:
+        """What is in a file once it was loaded and saved again, if it can be used, too."""
+        loaded = self.load(path)
+        came = _saved(loaded)
+        self.use(loaded)
+        return came
 
 
-_LOADS: dict[str, Callable[[Path], bytes]] = {
-    "machine": lambda path: _saved(EvolvingFSM.load(path)),
-    "model": lambda path: _saved(FSMModel.load(path)),
-    "risk": lambda path: _saved(LatentRisk.load(path)),
-    "guard": lambda path: _saved(Guard.load(path)),
+_LOADS: dict[str, tuple[Callable[[Path], Any], Callable[[Any], object]]] = {
+    "machine": (EvolvingFSM.load, lambda machine: machine.learn_one([0.0, 1.0], 0)),
+    "model": (FSMModel.load, lambda model: model.explain(0)),
+    "risk": (LatentRisk.load, lambda risk: risk.score([[30.0, 20.0, 18.0]])),
+    "guard": (Guard.load, lambda guard: guard.decide([30.0, 20.0, 18.0], 0.5)),
 }
 
 
@@ -314,15 +322,31 @@ def samples(folder: Path) -> list[Sample]:
         guard.decide([30.0 - k, 20.0, 18.0], 0.5)
     guard.save(folder / "new.guard")
     paths = {kind: folder / f"new.{kind}" for kind in _LOADS}
-    return [Sample(path.name, path.read_bytes(), _LOADS[kind]) for kind, path in paths.items()]
+    return [Sample(path.name, path.read_bytes(), *_LOADS[kind]) for kind, path in paths.items()]
 
 
-def damaged(sample: Sample, random: np.random.Generator) -> bytes:
-    """The file with one thing wrong."""
+def damaged(sample: Sample, random: np.random.Generator) -> tuple[bytes, bool]:
+    """The file with one thing wrong, and whether its checksum is right."""
     ways: list[Way] = [*_ROUGH, *_FINE]
-    while (data := ways[random.integers(len(ways))](sample.data, random)) == sample.data:
-        pass
-    return data
+    data = sample.data
+    while data == sample.data:
+        way = ways[random.integers(len(ways))]
+        data = way(sample.data, random)
+    return data, way in _FINE
+
+
+def _is_legal(came: bytes, expected: bytes) -> bool:
+    """Whether no more differs than settings, each of its type still: no file can tell those."""
+    (header, *numbers), (whole, *whole_numbers) = _unpacked(came), _unpacked(expected)
+    told, expected_told = (one.pop("__metadata__")["evofsm"] for one in (header, whole))
+    settings, expected_settings = told.pop("settings"), expected_told.pop("settings")
+    pairs = [(settings[name], value) for name, value in expected_settings.items()]
+    is_typed = all(None in pair or _type(pair[0]) is _type(pair[1]) for pair in pairs)
+    return is_typed and (header, numbers, told) == (whole, whole_numbers, expected_told)
+
+
+def _type(value: object) -> type:
+    return float if type(value) is int else type(value)
 
 
 def _flip(data: bytes, random: np.random.Generator) -> bytes:
@@ -444,7 +468,10 @@ _FINE = (_lose_array, _rename_array, _claim, _change_setting)
 
 
 def damage(times: int, folder: Path, random: np.random.Generator) -> Counter[str]:
-    """Load damaged files; each must be refused by name, or hold what the whole one does."""
+    """Load damaged files; each must be refused by name, or hold what the whole one does.
+
+    One that was forged, so that its checksum is right, may hold other legal settings.
+    """
     found: Counter[str] = Counter()
     kinds = samples(folder)
     path = folder / "damaged"
@@ -452,16 +479,17 @@ def damage(times: int, folder: Path, random: np.random.Generator) -> Counter[str
     whole = []
     for sample in kinds:
         path.write_bytes(sample.data)
-        sample.load(path)  # once before, so that nothing is counted that is made only once
+        sample.try_it(path)  # once before, so that nothing is counted that is made only once
         before = _in_use()
-        whole.append((sample, sample.load(path), _peak() - before))
+        whole.append((sample, sample.try_it(path), _peak() - before))
     for turn in range(times):
         sample, expected, needed = whole[turn % len(whole)]
-        path.write_bytes(damaged(sample, random))
+        data, is_forged = damaged(sample, random)
+        path.write_bytes(data)
         found["damaged files"] += 1
         before = _in_use()
         try:
-            came = sample.load(path)
+            came = sample.try_it(path)
         except ValueError as error:
             found["refused"] += 1
             found["crashes"] += str(path) not in str(error)
@@ -469,8 +497,10 @@ def damage(times: int, folder: Path, random: np.random.Generator) -> Counter[str
             print(f"{sample.name}: {error!r}", file=sys.stderr)
             found["crashes"] += 1
         else:
+            is_legal = is_forged and came != expected and _is_legal(came, expected)
             found["the same"] += came == expected
-            found["loaded silently"] += came != expected
+            found["legal settings"] += is_legal
+            found["loaded silently"] += came != expected and not is_legal
         found["over-allocations"] += _peak() - before > _MORE * needed + _SPARE
     tracemalloc.stop()
     return found

@@ -29,9 +29,12 @@ DRAWS = Kind(
         "scale": SIZE._replace(optional=True),
         "ends": Numbers(("m",), optional=True),
         "rule": {"width": SIZE._replace(optional=True)},
+        "told": bool,
+        "name": str | None,
     },
 )
-SETTINGS = {"n_kinds": 2, "scale": 0.5, "ends": [0.0, 1.0], "rule": {"width": 3}, "name": "0" * 64}
+SETTINGS = {"n_kinds": 2, "scale": 0.5, "ends": [0.0, 1.0], "rule": {"width": 3}}
+SETTINGS |= {"told": True, "name": "0" * 64}
 
 
 def arrays(n=5):
@@ -185,6 +188,9 @@ HARMFUL = {
     "an empty list": (settings_with(n_kinds=[]), r"n_kinds has shape \(0,\)"),
     "negative": (settings_with(n_kinds=-1), "n_kinds of -1 cannot be right"),
     "a fraction": (settings_with(n_kinds=2.5), "n_kinds holds a fraction"),
+    "a float": (settings_with(n_kinds=2.0), "n_kinds holds a fraction; it must be an integer"),
+    "another type": (settings_with(told=1), "told is 1; it must be of type bool"),
+    "none of two types": (settings_with(name=[]), r"name is \[\]; it must be of type str | None"),
     "huge": (settings_with(n_kinds=10**400), "n_kinds is 1000"),
     "text": (settings_with(scale="wide"), "scale is 'wide'; it must be a number"),
     "NaN": (settings_with(scale=float("nan")), "scale of nan"),

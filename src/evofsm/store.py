@@ -89,7 +89,7 @@ class Numbers(NamedTuple):
                     f"{name} of {number:g} cannot be right: it must lie between {self.least:g} and "
                     f"{self.most:g}"
                 )
-        if self.whole and numbers.dtype.kind == "f" and (numbers != np.rint(numbers)).any():
+        if self.whole and (isinstance(given, float) or (numbers != np.rint(numbers)).any()):
             raise ValueError(f"{name} holds a fraction; it must be an integer")
 
     def refuse_shape(self, name: str, shape: tuple[int, ...], sizes: dict[int | str, int]) -> None:
@@ -112,13 +112,14 @@ SIZE = Numbers(least=SMALLEST, most=LARGEST_OBSERVATION)
 class Kind(NamedTuple):
     """What files of one kind hold.
 
-    Settings that are not declared may be there, and have to be checked by whoever uses them. A
-    setting that is one integer may be a size in the shapes of arrays, as ``"settings.NAME"``.
+    A setting is declared as `Numbers`, as a type that `isinstance` takes (`str | None`), as
+    ``list[str]``, or as a mapping of such settings. One that is not declared has to be checked by
+    whoever uses it. One integer may be a size in the shapes of arrays, as ``"settings.NAME"``.
     """
 
     name: str
-    arrays: Mapping[str, Numbers] | None  #: None: whatever its work needs
-    settings: Mapping[str, Any] = {}  #: `Numbers`, or such a mapping for settings in a setting
+    arrays: Mapping[str, Numbers]
+    settings: Mapping[str, Any] = {}
 
     def refuse_others(self, settings: Mapping[str, Any]) -> None:
         """Raise a ValueError for settings that no file of this kind may hold, naming one."""
@@ -408,8 +409,6 @@ def _refuse_unfit(
     """
     sizes: dict[int | str, int] = {}
     _refuse_settings(settings, kind.settings, sizes)
-    if kind.arrays is None:
-        return sizes
     if lacking := set(kind.arrays) - set(entries):
         raise ValueError(f"it lacks {', '.join(sorted(lacking))}")
     if unknown := set(entries) - set(kind.arrays):
@@ -425,7 +424,7 @@ def _refuse_unfit(
 def _refuse_numbers(
     kind: Kind, arrays: Mapping[str, NDArray[Any]], sizes: dict[int | str, int]
 ) -> None:
-    for name, numbers in (kind.arrays or {}).items():
+    for name, numbers in kind.arrays.items():
         numbers.refuse_others(name, arrays[name], sizes)
 
 
@@ -435,18 +434,28 @@ def _refuse_settings(
     sizes: dict[int | str, int],
     within: str = "",
 ) -> None:
-    for name, numbers in declared.items():
+    for name, wanted in declared.items():
         value, full_name = settings.get(name), f"{within}{name}"
-        if not isinstance(numbers, Numbers):
+        if isinstance(wanted, Mapping):
             if not isinstance(value, Mapping | None):
                 raise ValueError(f"{full_name} is {value!r}; it must be a mapping")
-            _refuse_settings(value or {}, numbers, sizes, f"{full_name}.")
+            _refuse_settings(value or {}, wanted, sizes, f"{full_name}.")
+        elif not isinstance(wanted, Numbers):
+            if not _is(value, wanted):
+                kind = wanted.__name__ if isinstance(wanted, type) else wanted
+                raise ValueError(f"{full_name} is {value!r}; it must be of type {kind}")
         elif value is not None:
-            numbers.refuse_others(full_name, value, sizes)
-            if numbers.whole and numbers.shape == ():
+            wanted.refuse_others(full_name, value, sizes)
+            if wanted.whole and wanted.shape == ():
                 sizes[f"settings.{full_name}"] = int(value)
-        elif not numbers.optional:
+        elif not wanted.optional:
             raise ValueError(f"it lacks {full_name}")
+
+
+def _is(value: Any, kind: Any) -> bool:
+    if kind == list[str]:
+        return isinstance(value, list) and all(isinstance(one, str) for one in value)
+    return isinstance(value, kind)
 
 
 # -- Errors ---------------------------------------------------------------------------------------

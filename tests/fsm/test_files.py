@@ -135,6 +135,9 @@ MODELS = [
     ("settings", {"failure_horizon": 0.5}, "settings.failure_horizon of 0.5"),
     ("actions", {"low": -1e308, "high": 0.0, "width": 1e308}, "actions.low of -1e"),
     ("actions", {"low": -0.5, "high": 1.0, "width": 1e-12}, "more than 3 intervals"),
+    ("failures_told", {}, "failures_told is {}; it must be of type bool"),
+    ("names", {}, r"names is {}; it must be of type list\[str\]"),
+    ("units", ["m", 1], r"units is \['m', 1\]"),
     ("names", ["gap"], r"names are \('gap',\), but there are 2 variables"),
 ]
 

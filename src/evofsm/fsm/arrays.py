@@ -247,6 +247,8 @@ MODEL = Kind(
     OF_MODEL,
     {
         "width": Numbers(least=0.0),
+        "failures_told": bool,
+        **dict.fromkeys(("names", "units"), list[str]),
         **_optional({"dt": SIZE}),
         "rule": _RULE,
         "settings": _optional(_SETTINGS),

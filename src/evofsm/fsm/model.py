@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field
 from typing import Any, Literal, Self, SupportsIndex, get_args
 
 import numpy as np
@@ -298,23 +298,20 @@ class FSMModel(Counts):
         """Read it from a file, as `EvolvingFSM.load` does."""
         content, arrays = store.read(path, MODEL)
         with store.explained(path):
-            if (actions := content["actions"]) is not None:
+            if (actions := content.get("actions")) is not None:
                 q = len(arrays["uses"])  # as many as there are matrices
                 if (actions["high"] - actions["low"]) > (q + 1) * actions["width"]:
                     raise ValueError(f"actions has more than {q} intervals, for {q} matrices")
                 content["actions"] = IntervalActions(**actions)
             content |= {name: tuple(content[name]) for name in ("names", "units")}
             content["rule"] = restore_rule(content["rule"])
-            if lacking := {entry.name for entry in fields(cls)} - set(content) - set(arrays):
-                raise ValueError(f"it lacks {', '.join(sorted(lacking))}")
-            parts: dict[str, Any] = {**content, **arrays}
-            return cls(**parts)
+            return cls(**content | arrays)
 
     @property
     def _content(self) -> dict[str, Any]:
         """All but the arrays, for JSON."""
-        told = ("width", "names", "units", "dt", "failures_told")
-        return {name: getattr(self, name) for name in told} | {
+        return {name: getattr(self, name) for name in ("width", "dt", "failures_told")} | {
+            **{name: list(getattr(self, name)) for name in ("names", "units")},
             "actions": None if self.actions is None else asdict(self.actions),
             "rule": describe_rule(self.rule),
             "settings": dict(self.settings),

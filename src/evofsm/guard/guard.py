@@ -42,7 +42,7 @@ from evofsm.guard.learnt.judge import LearntRisk
 from evofsm.guard.parts import outline, part_class, rebuild
 from evofsm.guard.reviser import NOTHING, ActionReviser, Mode, is_spoken
 from evofsm.guard.warming import warm_judge, warm_machine
-from evofsm.store import Kind, Numbers, Place
+from evofsm.store import COUNT, SIZE, Kind, Numbers, Place
 
 # Intervals that a range of actions is divided into for the machine, unless a width is given.
 _INTERVALS = 17
@@ -108,7 +108,17 @@ _PLAIN = ("explaining", "interval", "learn")
 # What a judge has that learns.
 _LEARNS = ("dt", "learn", "watch", "follow", "start_episode", "end", "sums", "save", "load")
 # The files of the machine and of the judge, as bytes.
-KIND = Kind("guard", {name: Numbers((name,), dtype=np.uint8) for name in ("machine", "judge")})
+KIND = Kind(
+    "guard",
+    {name: Numbers((name,), dtype=np.uint8) for name in ("machine", "judge")},
+    {
+        **dict.fromkeys(("explaining", "failed", "learn"), bool),
+        "interval": SIZE._replace(optional=True),
+        "seed": COUNT,
+        "missing": str,
+        "judge": str | None,
+    },
+)
 
 
 class Guard:
@@ -677,9 +687,6 @@ class Guard:
         """
         kept, files = store.read(path, KIND)
         with store.explained(path):
-            for name in ("explaining", "failed", "learn"):
-                if not isinstance(kept[name], bool):
-                    raise ValueError(f"{name} is {kept[name]!r}; it must be true or false")
             if kept["failed"] and failed is None:
                 raise ValueError("this guard knew failures by a function; give it again: failed=")
             given = None if isinstance(judge, type) else judge

@@ -85,6 +85,7 @@ _KIND = Kind(
         "columns": FROM_1,
         "failures": COUNT,
         "fitted": COUNT,
+        "relative": bool,
     },
 )
 

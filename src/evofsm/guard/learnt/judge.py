@@ -695,6 +695,7 @@ KIND = Kind(
         **dict.fromkeys(_TIMES, _TIME),
         **dict.fromkeys(("seed", *_COUNTS, "n_constant"), COUNT),
         "horizon": FROM_1,
+        **dict.fromkeys(("names", "units", "without"), list[str]),
         "violations": {
             "share": SHARE,
             "doubt": _TIME,
