@@ -30,6 +30,25 @@ def spiral():
 
 
 @pytest.fixture(scope="session")
+def sumo_road():
+    """Writes a straight road of one lane, at 20 m/s, for SUMO."""
+
+    def write(folder, length):
+        (folder / "road.net.xml").write_text(
+            f"""<net version="1.20">
+  <edge id="road" from="begin" to="end" priority="1">
+    <lane id="road_0" index="0" speed="20" length="{length}" shape="0,0 {length},0"/>
+  </edge>
+  <junction id="begin" type="dead_end" x="0" y="0" incLanes="" intLanes="" shape="0,0 0,3.2"/>
+  <junction id="end" type="dead_end" x="{length}" y="0" incLanes="road_0" intLanes=""
+            shape="{length},0 {length},3.2"/>
+</net>"""
+        )
+
+    return write
+
+
+@pytest.fixture(scope="session")
 def compiled():
     """All that a watched run needs is compiled, for tests that wait for some seconds only."""
     from evofsm.cli.watch.session import Session, learn_first, watched_guard

@@ -11,16 +11,6 @@ from evofsm.cli.sumocfg import trace_configuration
 from evofsm.cli.watch import _is_log
 from evofsm.cli.watch.recorded import Recording, record_log
 
-NET = """<net version="1.20">
-    <location netOffset="0,0" convBoundary="0,0,1500,0" origBoundary="0,0,1500,0"
-              projParameter="!"/>
-    <edge id="road" from="begin" to="end" priority="1">
-        <lane id="road_0" index="0" speed="20" length="1500" shape="0,0 1500,0"/>
-    </edge>
-    <junction id="begin" type="dead_end" x="0" y="0" incLanes="" intLanes="" shape="0,0 0,3.2"/>
-    <junction id="end" type="dead_end" x="1500" y="0" incLanes="road_0" intLanes=""
-              shape="1500,0 1500,3.2"/>
-</net>"""
 CARS = """<routes>
     <vType id="calm" sigma="0" speedFactor="0.4" speedDev="0"/>
     <vType id="hasty" tau="0.2" minGap="0.5" accel="3.5" sigma="0" speedDev="0"
@@ -40,8 +30,8 @@ CONFIGURATION = """<configuration>
 
 
 @pytest.fixture
-def configuration(tmp_path):
-    (tmp_path / "road.net.xml").write_text(NET)
+def configuration(tmp_path, sumo_road):
+    sumo_road(tmp_path, 1500)
     (tmp_path / "cars.rou.xml").write_text(CARS)
     (tmp_path / "my.sumocfg").write_text(CONFIGURATION)
     return tmp_path / "my.sumocfg"

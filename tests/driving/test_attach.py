@@ -17,16 +17,6 @@ libsumo = pytest.importorskip("libsumo")
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "your-own-sumo"
 NO_GAP = ("--collision.mingap-factor", "0")
-NET = """<net version="1.20">
-    <location netOffset="0,0" convBoundary="0,0,3000,0" origBoundary="0,0,3000,0"
-              projParameter="!"/>
-    <edge id="road" from="begin" to="end" priority="1">
-        <lane id="road_0" index="0" speed="20" length="3000" shape="0,0 3000,0"/>
-    </edge>
-    <junction id="begin" type="dead_end" x="0" y="0" incLanes="" intLanes="" shape="0,0 0,3.2"/>
-    <junction id="end" type="dead_end" x="3000" y="0" incLanes="road_0" intLanes=""
-              shape="3000,0 3000,3.2"/>
-</net>"""
 CARS = """<routes>
     <vType id="calm" sigma="0" speedFactor="0.7" speedDev="0"/>
     <vType id="hasty" tau="0.2" minGap="0.5" accel="3.5" sigma="0" speedDev="0"
@@ -41,13 +31,13 @@ CARS = """<routes>
 
 
 @pytest.fixture
-def road(tmp_path):
+def road(tmp_path, sumo_road):
     """Starts the simulation anew; returns libsumo."""
 
     def start(*options, others="", ssm=""):
         if libsumo.simulation.isLoaded():
             libsumo.close()
-        (tmp_path / "road.net.xml").write_text(NET)
+        sumo_road(tmp_path, 3000)
         (tmp_path / "cars.rou.xml").write_text(CARS.format(others=others, ssm=ssm))
         files = ["-n", str(tmp_path / "road.net.xml"), "-r", str(tmp_path / "cars.rou.xml")]
         quiet = ["--no-step-log", "--no-warnings", "--collision.action", "warn"]

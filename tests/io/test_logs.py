@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 
 from evofsm.fsm.observations import Category, ObservationEncoder
 from evofsm.io import tables
-from evofsm.io.logs import LogColumns, Noted, episodes_of, parse_units, read_traces
-from evofsm.io.tables import CsvTable, Wanted, file_kind
+from evofsm.io.logs import LogColumns, Noted, episodes_of, parse_units, read_traces, rows_of
+from evofsm.io.tables import CsvTable, Wanted
 
 polars = pytest.importorskip("polars")
 
@@ -47,15 +47,11 @@ def read(*paths, noted=None, **columns):
 
 
 def together(*paths, noted=None, **columns):
-    """All chunks as one: gaps, starts, failures."""
-    chunks = read(*paths, noted=noted, **columns)
-    before = np.cumsum([0, *(len(chunk.times) for chunk in chunks)]).tolist()
-    gaps = np.concatenate([chunk.observations[:, 0] for chunk in chunks]).tolist()
-    starts = [b + k for b, chunk in zip(before, chunks, strict=False) for k in chunk.starts]
-    if chunks[0].failures is None:
-        return gaps, starts, None
-    fails = [b + k for b, chunk in zip(before, chunks, strict=False) for k in chunk.failures]
-    return gaps, starts, fails
+    """Of all chunks as one: gaps, starts, failures."""
+    rows = list(rows_of(read(*paths, noted=noted, **columns)))
+    starts = [k for k, row in enumerate(rows) if row.begins]
+    fails = [k for k, row in enumerate(rows) if row.failed]
+    return [row.values["gap"] for row in rows], starts, fails
 
 
 def refusal(*paths, **columns):
@@ -131,15 +127,6 @@ def test_any_table_is_read_as_python_s_own_reader_reads_it(
     assert [t for piece in pieces for t in piece.texts["a text"]] == [row[1] for row in wanted]
 
 
-def test_columns_may_have_other_names_and_an_order_and_a_step_in_place_of_a_clock(tmp_path):
-    path = write(tmp_path / "a.csv", ["1,0.0,7", "2,0.5,8"], "u,t,x")
-    (chunk,) = read(path, observe=ObservationEncoder("x", "u"), action="u", time="t")
-    assert chunk.observations.tolist() == [[7.0, 1.0], [8.0, 2.0]]
-    assert (chunk.actions.tolist(), chunk.dt) == ([1.0, 2.0], 0.5)
-    (chunk,) = read(path, observe=ObservationEncoder("x"), action="u", dt=0.25)
-    assert (chunk.times.tolist(), chunk.dt) == ([0.0, 0.25], 0.25)
-
-
 def test_a_discrete_column_gets_a_coordinate_for_each_value(tmp_path):
     path = write(tmp_path / "a.csv", ["0,5,red,1", "1,6,green,1"], "time,gap,light,a")
     encoder = ObservationEncoder("gap", Category("light", ("red", "green"), distance=2.0))
@@ -171,7 +158,7 @@ def test_chunks_go_on_where_the_one_before_ended(tmp_path, monkeypatch):
     monkeypatch.setattr(tables, "_CSV_BYTES", 1 << 14)
     monkeypatch.delattr(CsvTable, "_odd")  # which is slower: plain files do without it
     assert len(read(path)) > 2
-    assert together(path) == (whole.observations[:, 0].tolist(), [0, 900, 1700], None)
+    assert together(path) == (whole.observations[:, 0].tolist(), [0, 900, 1700], [])
     lengths = [len(episode.times) for episode in episodes_of(read(path))]
     assert lengths == [900, 800, 700]
 
@@ -199,28 +186,6 @@ def test_memory_does_not_grow_with_the_file(tmp_path, monkeypatch):
 
     peak(20_000)  # what is only done once
     assert peak(100_000) < 1.1 * peak(20_000)
-
-
-@pytest.mark.parametrize(
-    ("name", "content", "kind"),
-    [
-        ("a.txt", b"time,gap\n", "csv"),
-        ("a.csv", b"PAR1", "parquet"),
-        ("a", b"\xef\xbb\xbf <fcd-export>", "xml"),
-        ("a.gz", gzip.compress(b"<fcd-export>", mtime=0), "xml"),
-        ("a.db3", b"SQLite format 3\0", "bag"),
-        ("a.csv", b"\x89MCAP0\r\n\x01" + bytes(8) + b"\4\0\0\0ros2", "bag"),
-        ("a.mcap", b"\x89MCAP0\r\n\x01" + bytes(8) + b"\6\0\0\0evofsm", "run"),
-        ("a.mcap", b"\x89MCAP0\r\n\x01" + bytes(12) + b"\x0b\0\0\0another one", "mcap"),
-        ("a.mcap", b"\x89MCAP0\r\n", "mcap"),
-        ("a.osi.gz", b"anything", "osi"),
-        ("bag/metadata.yaml", b"", "bag"),
-    ],
-)
-def test_a_file_is_known_by_how_it_begins(tmp_path, name, content, kind):
-    (tmp_path / name).parent.mkdir(exist_ok=True)
-    (tmp_path / name).write_bytes(content)
-    assert file_kind(str(tmp_path / name.removesuffix("/metadata.yaml"))) == kind
 
 
 # -- What is refused ------------------------------------------------------------------------------
@@ -303,6 +268,8 @@ def test_time_runs_forward_at_the_step_of_the_first_file(tmp_path, monkeypatch):
         (gzip.compress(b"", mtime=0), "is empty"),
         (HEADER.encode(), "has a header but no rows"),
         (b"0,1\n1,2\n", "no header"),
+        (b"\x89MCAP0\r\n\x01" + bytes(8) + b"\6\0\0\0evofsm", "is a run that evofsm drove"),
+        (b"\x89MCAP0\r\n\x01" + bytes(8) + b"\4\0\0\0ros2", "is a bag of ROS 2; --topics"),
         (b"\x00\x01\x02\xff\xfe" * 50, "not text in UTF-8"),
         (b"\xfd7zXZ\0" + bytes(50), "compressed by xz; unpack it"),
         (b"#ROSBAG V2.0\n", "a bag of ROS 1; convert it"),
@@ -390,7 +357,7 @@ def test_the_first_row_in_which_it_holds_ends_the_episode(
     assert starts == [0, 3, 5, 6, 7, 8, 9]
     assert failures == [2, 4, 6, 10]
     assert noted.after_failure == 3
-    assert together(path)[2] is None  # nothing tells of failures
+    assert read(path)[0].failures is None  # nothing tells of them
 
 
 def test_what_only_tells_of_failures_may_be_infinite_but_must_be_there(tmp_path):

@@ -188,25 +188,17 @@ def test_what_is_wrong_in_a_table_is_named(tmp_path, text, message):
     assert message in refusal(write(tmp_path / "a.csv", text))
 
 
-NET = """<net version="1.20">
-  <location netOffset="0,0" convBoundary="0,0,2000,0" origBoundary="0,0,2000,0" projParameter="!"/>
-  <edge id="e" from="a" to="b" priority="1">
-    <lane id="e_0" index="0" speed="30" length="2000" shape="0,-1.6 2000,-1.6"/>
-  </edge>
-  <junction id="a" type="dead_end" x="0" y="0" incLanes="" intLanes="" shape="0,0 0,-3.2"/>
-  <junction id="b" type="dead_end" x="2000" y="0" incLanes="e_0" intLanes="" shape="0,0 0,1"/>
-</net>"""
 ROUTES = """<routes>
   <vType id="car" length="5" sigma="0.5"/>
   <vType id="truck" length="12" maxSpeed="20"/>
-  <route id="r" edges="e"/>
+  <route id="r" edges="road"/>
   <vehicle id="a" type="car" route="r" depart="1"/>
   <vehicle id="b" type="truck" route="r" depart="3"/>
   <vehicle id="c" type="car" route="r" depart="6"/>
 </routes>"""
 DRIVE = """
 import json, sys, libsumo
-libsumo.start(["sumo", "-n", "net.xml", "-r", "routes.xml", "--step-length", "0.1",
+libsumo.start(["sumo", "-n", "road.net.xml", "-r", "routes.xml", "--step-length", "0.1",
                "--no-step-log", "--fcd-output", sys.argv[1], *sys.argv[2:]])
 seen, car = [], libsumo.vehicle
 while libsumo.simulation.getTime() < 20:
@@ -220,12 +212,12 @@ json.dump(seen, open("truth.json", "w"))
 
 
 @pytest.fixture(scope="module")
-def sumo(tmp_path_factory):
+def sumo(tmp_path_factory, sumo_road):
     """Writes FCD with SUMO, in a process of its own as libsumo needs."""
     if find_spec("libsumo") is None:
         pytest.skip("libsumo is not installed")
     folder = tmp_path_factory.mktemp("sumo")
-    (folder / "net.xml").write_text(NET)
+    sumo_road(folder, 2000)
     (folder / "routes.xml").write_text(ROUTES)
 
     def drive(name, *options):
