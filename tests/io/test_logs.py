@@ -342,7 +342,7 @@ def test_the_first_row_in_which_it_holds_ends_the_episode(
     tmp_path, monkeypatch, condition, ending, at_once
 ):
     hole = [f"s,{t},{gap},1,1,0,{hit}" for t, gap, hit in ((0, 1, 0), (0.1, 0, 1), (9, 0, 1))]
-    lines = [*short([3, 1, 0, -1, -1, 2, 0, 5]), *short([-1, 4], "q"), "r,0,5,1,1,0,0", *hole]
+    lines = [*short([3, 1, 0, -1, -1, 2, 0]), *short([-1, 4], "q"), "r,0,5,1,1,0,0", *hole]
     path = write(tmp_path / "a.csv", lines, SHORT)
     if ending == "parquet":
         kind = polars.Boolean if condition == "crash" else polars.Int8
@@ -353,9 +353,9 @@ def test_the_first_row_in_which_it_holds_ends_the_episode(
     monkeypatch.setattr(tables, "_PARQUET_ROWS", at_once)
     noted = Noted()
     gaps, starts, failures = together(path, noted=noted, failed=condition)
-    assert gaps == [3, 1, 0, 2, 0, 5, -1, 4, 5, 1, 0]
-    assert starts == [0, 3, 5, 6, 7, 8, 9]
-    assert failures == [2, 4, 6, 10]
+    assert gaps == [3, 1, 0, 2, 0, -1, 4, 5, 1, 0]
+    assert starts == [0, 3, 5, 6, 7, 8]
+    assert failures == [2, 4, 5, 9]
     assert noted.after_failure == 3
     assert read(path)[0].failures is None  # nothing tells of them
 
