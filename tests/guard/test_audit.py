@@ -221,8 +221,6 @@ def test_one_writes_at_a_time_and_between_episodes_of_a_guard_only(tmp_path):
         guard.audit = log
         with pytest.raises(ValueError, match="within an episode"):
             guard.decide([50.0, 9.0, 9.0], 0.0)
-    with pytest.raises(ValueError, match="sync is 'never'"):
-        AuditLog(tmp_path / "log", sync="never")
 
 
 # -- What is written ------------------------------------------------------------------------------
@@ -471,7 +469,7 @@ REPLAYED = {
     "mode": ("begin", 0, of_reviser),  # shows where it first matters
 }
 MISFITS = {
-    **{f"version {one!r}": ("start", other("version", one)) for one in (0, -7, 0.5, True, "1")},
+    **{f"version {one!r}": ("start", other("version", one)) for one in (0, 99, 1.0, True, "1")},
     "no version": ("start", lambda content: content.pop("version")),
     "another kind": ("end", other("kind", "nonsense")),
     "no explanation": ("decision", lambda content: content.pop("explanation")),
@@ -534,16 +532,13 @@ def test_a_decision_that_was_hidden_or_invented_is_found_by_replaying(driven, tm
     assert "nothing to speak of" in difference.explanation
 
 
-def test_what_differs_is_named_and_a_newer_version_refused(driven, tmp_path):
+def test_what_differs_is_named(driven, tmp_path):
     forge(driven, tmp_path / "forged", "decision", 3, other("executed", 1.25))
     (field,) = audit(tmp_path / "forged").difference.fields
     assert (field.name, field.recorded) == ("executed", "1.25")
     forge(driven, tmp_path / "forged", "start", 0, lambda one: one["made_by"].update(numpy="1.0"))
     (other_maker,) = audit(tmp_path / "forged").other_makers
     assert (other_maker.name, other_maker.recorded) == ("numpy", "1.0")
-    forge(driven, tmp_path / "newer", "start", 0, other("version", 99))
-    with pytest.raises(ValueError, match="newer"):
-        audit(tmp_path / "newer")
 
 
 # -- When things go wrong -------------------------------------------------------------------------

@@ -21,7 +21,6 @@ from evofsm.guard import (  # noqa: E402
     Fallback,
     Guard,
     Judgement,
-    Proposal,
     RevisedActions,
     RevisedVectorActions,
     Search,
@@ -500,8 +499,6 @@ def test_a_guard_with_an_audit_log_is_not_shared():
     guard = guard_for(ONE, audit=object())
     with pytest.raises(ValueError, match="one episode at a time"):
         RevisedVectorActions(SyncVectorEnv([lambda: Script(FAR)]), guard)
-    with pytest.raises(ValueError, match="call revise"):
-        guard.take_in(None, Proposal(0), 0)
 
 
 # -- PettingZoo --------------------------------------------------------------------------------

@@ -173,9 +173,3 @@ class ConformalAlarm:
         if above < 1:
             return math.inf
         return -math.inf if above > n else self._ordered[n - above]
-
-    def __repr__(self) -> str:
-        return (
-            f"{type(self).__name__}(rate={self.rate:g}, of={self.of!r}, {self.errors} errors of "
-            f"{self.counted:,})"
-        )

@@ -511,8 +511,8 @@ class Guard:
     def take_in(self, situation: Situation, proposal: Proposal, executed: Action) -> None:
         """Instead of `revise`, where it was decided elsewhere: learn from what was executed.
 
-        The reviser is asked all the same, as a judge may learn from that too. Refused with an audit
-        log, which could not be replayed then.
+        The reviser is asked all the same, as a judge may learn from that too. Not for a guard with
+        an audit log, which could not be replayed then.
 
         Parameters
         ----------
@@ -521,8 +521,6 @@ class Guard:
         executed : float or (d,) array_like
             An action of the set.
         """
-        if self.audit is not None:
-            raise ValueError("with an audit log a guard decides itself: call revise")
         self.reviser.revise(situation, proposal)
         self._take_in(situation, fixed(executed))
 

@@ -117,6 +117,5 @@ def settings_of(reviser: Reviser) -> dict[str, Any]:
 
 def set_again(reviser: Reviser, settings: Mapping[str, Any]) -> None:
     """Give a reviser the `settings_of` another time."""
-    if not isinstance(reviser, ActionReviser):
-        return
-    reviser.mode, reviser.tolerance = Mode(settings["mode"]), float(settings["tolerance"])
+    if isinstance(reviser, ActionReviser):
+        reviser.mode, reviser.tolerance = Mode(settings["mode"]), float(settings["tolerance"])

@@ -107,7 +107,7 @@ def audit(
     OSError
         If there is no such file, or it may not be read.
     ValueError
-        If it is no audit log, or one of a newer version.
+        If it is no audit log.
 
     Examples
     --------
@@ -128,7 +128,7 @@ fields=())
     chain, counts, player = Chain(path, kept), Counter[str](), _Player(failed)
     finding = difference = None
     for record in chain.records():
-        finding = _misfit(path, record, started=counts["start"] > 0)
+        finding = _misfit(record, started=counts["start"] > 0)
         if finding is not None:
             break
         counts[record.content["kind"]] += 1
@@ -154,20 +154,15 @@ fields=())
     )
 
 
-def _misfit(path: Path, record: Record, *, started: bool) -> Finding | None:
+def _misfit(record: Record, *, started: bool) -> Finding | None:
     """What no log holds: a chain says nothing about it, nor does replaying."""
     content = record.content
     kind, version = content.get("kind"), content.get("version", LOG_VERSION)
     why = ""
     if not isinstance(kind, str) or kind not in FIELDS:
         why = f"there is no kind {str(kind)[:40]!r}"
-    elif type(version) is int and version > LOG_VERSION:
-        raise ValueError(
-            f"{path}: its version {version} is newer than this library's {LOG_VERSION}; "
-            "a newer evofsm reads it"
-        )
     elif type(version) is not int or version != LOG_VERSION:
-        why = f"there is no version {version!r}"
+        why = f"its version is {version!r}, not {LOG_VERSION} (did a newer evofsm write it?)"
     elif kind != "start" and not started:
         why = "it comes before the guard that decides"
     elif differing := sorted((FIELDS[kind] | {"kind", "clock"}) ^ content.keys()):

@@ -306,9 +306,6 @@ class SceneRisk(ActionJudge):
             judge.memory.restore(past, **counted)
         return judge
 
-    def __repr__(self) -> str:
-        return f"{type(self).__name__}(dt={self.dt:g}, n_actions={self.memory.n_actions})"
-
 
 # -- What is remembered -------------------------------------------------------------------------
 
