@@ -18,7 +18,7 @@ def log(tmp_path):
     """A log of ten records, seven of them decisions; and its head."""
     risk = LatentRisk(ACTIONS.low)
     with AuditLog(tmp_path / "log.jsonl") as written:
-        guard = Guard.of(ActionReviser(risk, ACTIONS), judge=risk, audit=written)
+        guard = Guard.of(ActionReviser(risk, ACTIONS), judge=risk, interval=0.25, audit=written)
         for step in range(7):
             seen = np.array([20.0 - step, 15.0 - 0.6 * step, 11.0])
             guard.revise(guard.recognise(seen, 0.25 * step), Proposal(1.0))

@@ -244,7 +244,7 @@ def test_decisions_that_changed_something_are_written_and_others_are_held_back(t
 def test_a_controller_that_fails_and_one_out_of_range_are_written(tmp_path):
     path = tmp_path / "log"
     with AuditLog(path) as log:
-        guard = Guard.of(Unrevised(ACTIONS), audit=log)
+        guard = Guard.of(Unrevised(ACTIONS), interval=0.25, audit=log)
         for step, proposed in enumerate([1.0, math.nan, 99.0, math.inf]):
             guard.decide([50.0, 9.0, 9.0], proposed, step * 0.25)
     decisions = [record for record in contents(path) if record["kind"] == "decision"]
@@ -554,7 +554,7 @@ def test_a_process_that_was_killed_while_writing_loses_the_half_record(driven, t
     with AuditLog(path) as log:
         assert log.head.number == finished
         assert log.cut_off == left - (whole.rfind(b"\n", 0, left) + 1)
-        Guard.of(Unrevised(ACTIONS), audit=log).end(failed=False)
+        Guard.of(Unrevised(ACTIONS), interval=0.25, audit=log).end(failed=False)
     assert audit(path, log.head, replay=False).is_good
     again = contents(path)[finished]
     assert (again["kind"], again["cut_off"]) == ("start", log.cut_off)

@@ -318,7 +318,7 @@ def test_what_a_file_cannot_hold_has_to_be_given_again(tmp_path):
         Guard.load(path, failed=lambda z: False)
     assert Guard.load(path, judge=Balance, failed=lambda z: z[0] > 1.0).failed is not None
     with pytest.raises(ValueError, match="no reviser that a file can hold"):
-        Guard.of(SimpleNamespace(actions=Choices(2))).save(path)
+        Guard.of(SimpleNamespace(actions=Choices(2)), interval=DT).save(path)
     with pytest.raises(ValueError, match="holds a guard, not a machine"):
         EvolvingFSM.load(path)
 

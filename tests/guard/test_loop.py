@@ -108,7 +108,7 @@ def test_a_driver_who_brakes_hard_shows_what_the_brakes_can_do(tmp_path):
     reviser = ActionReviser(risk, IntervalActions(-8.0, 2.0, 0.5), mode=Mode.SHADOW)
 
     def braked(*decels):
-        guard, speed, time = Guard.of(reviser, judge=risk), 25.0, 0.0
+        guard, speed, time = Guard.of(reviser, judge=risk, interval=0.1), 25.0, 0.0
         for decel in np.repeat((0.0, *decels, 0.0), 20):
             situation = guard.recognise(np.array([60.0, speed, speed]), time)
             guard.revise(situation, Proposal(-decel))

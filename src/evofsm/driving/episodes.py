@@ -61,8 +61,8 @@ def drive(
     Raises
     ------
     ValueError
-        If nobody drives, the guard has no interval or its actions are vectors, or the interval is
-        no multiple of the scenario's step.
+        If nobody drives, the guard's actions are vectors, or its interval is no multiple of the
+        scenario's step.
 
     Examples
     --------
@@ -82,8 +82,6 @@ def drive(
         controller = what.controller
     if controller is None:
         raise ValueError("nobody drives: a Scenario has no controller of its own, so give one")
-    if guard.interval is None:
-        raise ValueError("the guard was made without an interval, the time between decisions")
     if isinstance(guard.actions, BoxActions):
         raise ValueError("the guard's actions are vectors, but a car is driven by one number")
     steps = scenario.steps_between(guard.interval)

@@ -90,7 +90,7 @@ def run_episode(
     guard.begin()
     held, count, over, failed = _whole(observation, None), 0, False, False
     while not over:
-        time = info.get("time", math.nan if guard.interval is None else count * guard.interval)
+        time = info.get("time", count * guard.interval)
         proposal = _asked(propose, held, time)
         begin = perf_counter()
         revision = guard.decide(np.ravel(observation), proposal, time)

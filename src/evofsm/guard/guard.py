@@ -58,10 +58,10 @@ _LARGEST = 1e30
 class InputMonitor:
     """Tells what is wrong with observations: late, twice, after a gap in time, or incomplete.
 
-    Without an ``interval`` [s] no gap in time is told.
+    They are due every ``interval`` [s].
     """
 
-    def __init__(self, missing: Missing = Missing.PARTIAL, interval: float | None = None) -> None:
+    def __init__(self, missing: Missing, interval: float) -> None:
         self.missing = missing
         self.interval = interval
         #: The latest value of each variable; NaN of one that was never seen.
@@ -81,7 +81,7 @@ class InputMonitor:
             if len(self.held) == len(observation):  # what was seen of them before is still held
                 held = np.where(absent, self.held, observation)
             found = _LACKING[self.missing]
-        if self.interval is not None and time - self._time > _GAP * self.interval:
+        if time - self._time > _GAP * self.interval:
             found |= Intake.GAP
         self.held, self._time = held.copy(), time
         return found
@@ -233,18 +233,18 @@ class Guard:
         )
 
     @classmethod
-    def of(cls, reviser: Reviser, **settings: Any) -> Self:
+    def of(cls, reviser: Reviser, *, interval: float, **settings: Any) -> Self:
         """A guard of parts that were made before; nothing is added to them.
 
         Parameters
         ----------
         reviser : Reviser
             Any; what it returns is executed.
+        interval : float
+            Time between decisions [s]; an observation that comes later than 1.5 of them begins an
+            episode anew.
         actions : IntervalActions, Choices or BoxActions, optional
             The set of actions; without it the reviser's own.
-        interval : float, optional
-            Time between decisions [s]; an observation that comes later than 1.5 of them begins an
-            episode anew. Without it no such gap is seen, and times must be given to `decide`.
         machine : EvolvingFSM, optional
             Without one nothing is recognised.
         judge : LearningJudge, optional
@@ -264,15 +264,15 @@ class Guard:
         2.5
         """
         guard = cls.__new__(cls)
-        guard._set_up(reviser, **settings)
+        guard._set_up(reviser, interval=interval, **settings)
         return guard
 
     def _set_up(
         self,
         reviser: Reviser,
         *,
+        interval: float,
         actions: ActionSet | None = None,
-        interval: float | None = None,
         machine: EvolvingFSM | None = None,
         judge: LearningJudge | None = None,
         learn: bool = True,
@@ -282,7 +282,7 @@ class Guard:
         missing: Missing = Missing.PARTIAL,
     ) -> None:
         self.actions: ActionSet = actions or reviser.actions  # type: ignore[attr-defined]
-        self.interval = None if interval is None else positive("interval", interval)
+        self.interval = positive("interval", interval)
         asked = reviser.risk if isinstance(reviser, ActionReviser) else judge
         if judge is None and isinstance(asked, LearningJudge):
             judge = asked
@@ -291,7 +291,7 @@ class Guard:
             raise ValueError(
                 f"the judge has a method learn, but not all of a LearningJudge: it lacks {lacks}"
             )
-        if judge and self.interval and not math.isclose(judge.dt, self.interval):
+        if judge and not math.isclose(judge.dt, self.interval):
             raise ValueError(
                 f"interval is {interval} s, but the judge was made for decisions every {judge.dt} s"
             )
@@ -412,8 +412,7 @@ class Guard:
         wanted = proposal.action if isinstance(proposal, Proposal) else proposal
         wanted = no_action(self.actions) if wanted is None else self._proposed(wanted)
         if time is None:
-            count = self._decisions if self._under_way else 0
-            time = math.nan if self.interval is None else count * self.interval
+            time = self._decisions * self.interval if self._under_way else 0.0
         return self.revise(self.recognise(observation, time), Proposal(wanted))
 
     def _proposed(self, action: ArrayLike) -> Action:
@@ -486,7 +485,7 @@ class Guard:
             began = self._observing.observe(z)
             if began and machine is not None:
                 machine.onset()
-        if machine is not None and state is not None and self.interval is not None:
+        if machine is not None and state is not None:
             seen = float(machine.visits[state]) * self.interval
         return Situation(z, belief, state, surprise, time, intake, seen)
 

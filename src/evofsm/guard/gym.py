@@ -325,8 +325,8 @@ class Lane:
         if self._shared:
             guard.begin()
             for step, (seen, proposal, executed) in enumerate(past):
-                time = math.nan if guard.interval is None else step * guard.interval
-                guard.take_in(guard.recognise(seen, time), proposal, executed)
+                situation = guard.recognise(seen, step * guard.interval)
+                guard.take_in(situation, proposal, executed)
         guard.end(failed, self._seen)
 
 

@@ -182,8 +182,6 @@ class Decider:
         if row.ahead != latest.ahead:
             self.end()
             return ["another one is ahead: a new episode"] if row.observation else []
-        if interval is None:
-            return []
         if step > _HOLE * interval:
             return [f"{step:.3g} s without a row: nothing is learnt or carried across"]
         if step < _OFTEN * interval and not self._said_often:
