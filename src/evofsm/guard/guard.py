@@ -42,7 +42,7 @@ from evofsm.guard.learnt.judge import LearntRisk
 from evofsm.guard.parts import outline, part_class, rebuild
 from evofsm.guard.reviser import NOTHING, ActionReviser, Mode, is_spoken
 from evofsm.guard.warming import warm_judge, warm_machine
-from evofsm.store import COUNT, SIZE, Kind, Numbers, Place
+from evofsm.store import SIZE, Kind, Numbers, Place
 
 # Intervals that a range of actions is divided into for the machine, unless a width is given.
 _INTERVALS = 17
@@ -113,8 +113,7 @@ KIND = Kind(
     {name: Numbers((name,), dtype=np.uint8) for name in ("machine", "judge")},
     {
         **dict.fromkeys(("explaining", "failed", "learn"), bool),
-        "interval": SIZE._replace(optional=True),
-        "seed": COUNT,
+        "interval": SIZE,
         "missing": str,
         "judge": str | None,
     },
