@@ -64,6 +64,19 @@ def _inside(function: Function, **options: Any) -> Function:
     return cast(Function, njit(**_OPTIONS, **options)(function))
 
 
+def entry(kernel: Any) -> Callable[..., Any]:
+    """The quick way into a kernel: the types of the first call are those of all that follow."""
+    found: Callable[..., Any] | None = None
+
+    def enter(*given: Any) -> Any:
+        nonlocal found
+        if found is None:
+            found = kernel.compile(tuple(map(numba.typeof, given)))
+        return found(*given)
+
+    return enter
+
+
 #: Numbers in a cache line.
 LINE = 8
 

@@ -19,7 +19,6 @@ from threading import RLock
 from typing import TYPE_CHECKING, Any, Self, SupportsIndex, TypeVar, cast
 from weakref import WeakSet
 
-import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -41,12 +40,12 @@ from evofsm.fsm.arrays import (
 from evofsm.fsm.clusters import PAPER, width_of
 from evofsm.fsm.divergence import jensen_shannon
 from evofsm.fsm.explanation import Explanation, Nearest, explain
-from evofsm.fsm.kernels import LINE
+from evofsm.fsm.kernels import LINE, entry
 from evofsm.fsm.model import Counts, FSMModel, Policy, believed, check_forecast
 from evofsm.fsm.naming import Labels
 from evofsm.fsm.observations import Missing
 from evofsm.fsm.rules import StateRule
-from evofsm.fsm.step import EVENTS, PREDICTED, Event, Limit, Step, Trace, blank_trace
+from evofsm.fsm.step import EVENTS, PREDICTED, Event, Step, Trace, blank_trace
 from evofsm.fsm.transitions import room_for
 from evofsm.fsm.validation import Floats, positive, whole
 from evofsm.store import LARGEST_OBSERVATION, Place
@@ -60,8 +59,8 @@ _SETTINGS = ("n_actions", "radius", "distance_weight", "learning_rate", "prior_f
 # Arrays of a snapshot that a machine answers with.
 _ASKED = {*arrays.OF_MODEL, "joint_frequency", "marginal_matrix"} - {"centers", "visits"}
 _FLOAT64 = np.dtype(np.float64)
-# Compiled code of a step, without and with a limit to the states.
-_ENTRIES: dict[bool, Callable[..., int]] = {}
+# Compiled code of a step, with and without a limit to the states.
+_LIMITED, _UNLIMITED = entry(stepping.learn_rows), entry(stepping.learn_rows)
 # Every machine there is, for a process that is forked.
 _MACHINES: WeakSet[EvolvingFSM] = WeakSet()
 
@@ -593,7 +592,8 @@ class EvolvingFSM(Counts if TYPE_CHECKING else object):  # type: ignore[misc] # 
         actions[0], failures[0] = action, bool(failed)
         scratch = np.empty((3, len(self._learnt.belief)))
         given = self._settings, self._limit, row, actions, starts, failures, failed is not None
-        while not _row_kernel(self._learnt, *given, scratch, 0, trace, none):
+        learn_row = _UNLIMITED if self._limit is None else _LIMITED
+        while not learn_row(self._learnt, *given, scratch, 0, trace, none):
             self._make_room()
             scratch = np.empty((3, len(self._learnt.belief)))
         n, surprise = trace.n_states.item(), trace.surprise.item()
@@ -679,15 +679,6 @@ class EvolvingFSM(Counts if TYPE_CHECKING else object):  # type: ignore[misc] # 
             return None
         distance = float(np.sqrt(learnt.squared_distances[state]))
         return Nearest(state, distance, rules.reach(self._rule, self.width))
-
-
-def _row_kernel(learnt: Learnt, settings: Settings, limit: Limit, *given: Any) -> int:
-    """`learn_rows`, by the quick way in: its types are looked up once, and not in each call."""
-    entry = _ENTRIES.get(limit is None)
-    if entry is None:
-        types = tuple(numba.typeof(one) for one in (learnt, settings, limit, *given))
-        entry = _ENTRIES[limit is None] = cast(Any, stepping.learn_rows).compile(types)
-    return cast(int, entry(learnt, settings, limit, *given))
 
 
 def opened(machine: EvolvingFSM) -> tuple[Learnt, Settings]:

@@ -10,7 +10,6 @@ from evofsm.guard.learnt.replay import (
     KEPT,
     NOTHING_PASSES,
     Disturbances,
-    Ends,
     Model,
     features,
     limited,
@@ -114,16 +113,14 @@ def test_the_kernel_replays_as_a_plain_loop_does(choices, planned):
     disturbances.landing[2, 1] = -0.2, 0.4
     situations = 0.3 * draw.normal(size=(4, 2 * m + a))
     plan, policy = draw.uniform(-1.0, 1.0, (planned, a)), draw.normal(size=(a, 1 + m))
-    ends, found = Ends.of(4 * K), []
-    lost, left = replay(model, situations, plan, policy, disturbances, 1.3, 0.2, 4 * K, ends)
+    ends, found = replay(model, situations, plan, policy, disturbances, 1.3, 0.2), []
     for s in range(4):
         for k in range(K):
             found.append(plainly(model, situations[s], plan, policy, disturbances, k, 1.3, 0.2))
     survived, least = np.array(found).T
     fails = survived < STEPS
     np.testing.assert_allclose(ends.value, np.where(fails, survived - STEPS - 1.0, least))
-    assert left == pytest.approx(least[~fails].min(initial=np.inf))
-    assert lost == (survived < STEPS).sum() > 0
+    assert fails.any()
     move = np.array([[5.0, 5.0, 5.0], [-5.0, -5.0, -5.0], [0.1, 0.1, 0.1]])
     expected = [[0.3, 0.9, 0.3], [-0.2, -0.6, -0.2], [0.1, 0.1, 0.1]]
     np.testing.assert_allclose(limited(model, move), expected)
@@ -147,13 +144,12 @@ def search_for(model, proposal, policies, margin=0.0, place=0.0, disturbances=No
     disturbances = Disturbances.none(1, STEPS, 1) if disturbances is None else disturbances
     here = np.concatenate([[place, 0.0], np.zeros(a)])
     ranks = np.arange(len(policies))
-    world = here[None], policies, ranks, disturbances, 1.0, np.array([proposal]), margin, allowed
-    action = np.empty((1, a))
-    how, backup, left = search(model, *world, action)
+    world = here, policies, ranks, disturbances, 1.0, np.array(proposal), margin, allowed
+    how, action, backup, left = search(model, *world)
     if how == NOTHING_PASSES:
         return Found(None, backup, -np.inf, left < 0.02)
-    assert (how == KEPT) == (action[0] == proposal).all()
-    return Found(action[0], backup, left, False)
+    assert (how == KEPT) == (action == proposal).all()
+    return Found(action, backup, left, False)
 
 
 def test_where_full_action_only_just_holds_nothing_passes():

@@ -18,7 +18,6 @@ from evofsm.guard.learnt.replay import (
     MOVING,
     ONSET,
     Disturbances,
-    Ends,
     Floats,
     Ints,
     Model,
@@ -504,9 +503,8 @@ class Dynamics:
 
     def fails_after(self, situation: Floats, plan: Floats, disturbances: Disturbances) -> Floats:
         """(K,) steps after which a plan (T, a) fails amid each disturbance; infinite: it lasts."""
-        count = disturbances.residuals.shape[2]
-        ends, policy = Ends.of(count), np.zeros((plan.shape[1], 1 + self.n_variables))
-        replay(self.model, situation[None], plan, policy, disturbances, 1.0, 0.0, count, ends)
+        policy = np.zeros((plan.shape[1], 1 + self.n_variables))
+        ends = replay(self.model, situation[None], plan, policy, disturbances)
         return np.where(ends.value >= 0.0, np.inf, ends.value + len(plan) + 2.0)
 
     def _find_jump(self, found: Disturbances, k: int, j: int, z: Floats) -> None:

@@ -270,17 +270,16 @@ class LearntRisk:
         model, proposal, scale = dynamics.model, dynamics.encode(wanted), self.disturbance_scale
         remembered, ranks = self.remembered, self._ranks[:_ASKED]
         allowed = self._allowed(tolerance, remembered)
-        asked = model, here[None], backups.policies, ranks, disturbances, scale
-        found, tried = np.empty((1, dynamics.size)), None
-        how, which, left = search(*asked, proposal[None], self.margin, allowed, found)
-        action = found[0]
+        asked = model, here, backups.policies, ranks, disturbances, scale
+        how, action, which, left = search(*asked, proposal, self.margin, allowed)
+        tried = None
         if which != ranks[0]:  # what passed now is asked first the next time
             self._ranks = np.append(which, self._ranks[self._ranks != which])
         passes, self._refused = how != NOTHING_PASSES, how != KEPT
         self._holds = passes
         if not passes:
             if self._certified:
-                again = search(*asked, found, 0.0, allowed, np.empty_like(found))
+                again = search(*asked, action, 0.0, allowed)
                 self._holds = again[0] != NOTHING_PASSES
             tried = self._untried(action) if self.learning and left < _ALIKE else None
             action = action if tried is None else tried

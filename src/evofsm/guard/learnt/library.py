@@ -29,7 +29,7 @@ from typing import NamedTuple, Self
 import numpy as np
 
 from evofsm.guard.learnt.dynamics import Dynamics, Episode
-from evofsm.guard.learnt.replay import Disturbances, Ends, Floats, Ints, Model, replay
+from evofsm.guard.learnt.replay import Disturbances, Floats, Ints, Model, replay
 
 # Situations that are kept, and those on which the starts of an episode are tried.
 KEPT, _TRIED = 32, 8
@@ -73,11 +73,10 @@ def harm(
     executed first.
     """
     each = disturbances.residuals.shape[2]
-    count = len(situations) * each
     plan = np.empty((0, policies.shape[1])) if plan is None else plan
-    found, ends = np.full(count, -np.inf), Ends.of(count)
+    found = np.full(len(situations) * each, -np.inf)
     for policy in policies:
-        replay(model, situations, plan, policy, disturbances, scale, 0.0, count, ends)
+        ends = replay(model, situations, plan, policy, disturbances, scale)
         np.maximum(found, ends.value, out=found)
         if enough < math.inf and found.min() >= enough:
             break
@@ -281,12 +280,10 @@ class Backups:
         policies, ranks = self.policies.copy(), self.ranks
         linear = np.arange(self.n_constant, len(policies))
         each, nothing = disturbances.residuals.shape[2], np.empty((0, policies.shape[1]))
-        count = len(situations) * each
-        ends = Ends.of(count)
 
         def worth(policy: Floats) -> Floats:
             """(S,) how well it ends in each situation, in the mean of all disturbances."""
-            replay(model, situations, nothing, policy, disturbances, scale, 0.0, count, ends)
+            ends = replay(model, situations, nothing, policy, disturbances, scale)
             return np.asarray(ends.worth.reshape(-1, each).mean(1))
 
         shape, columns = policies.shape[1:], np.append(0, 1 + self.variables)

@@ -21,7 +21,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from evofsm.fsm.kernels import Function, compiled
+from evofsm.fsm.kernels import Function, compiled, entry
 
 inner_kernel = numba.njit(inline="always", error_model="numpy")
 
@@ -114,11 +114,6 @@ class Ends(NamedTuple):
     #: least one and, where all is survived, that at the end as well, as who comes back does better
     #: than who hovers beside failure
     worth: Floats
-
-    @classmethod
-    def of(cls, count: int) -> Ends:
-        """Room for so many replays."""
-        return cls(np.empty(count), np.empty(count))
 
 
 # -- What is expected -----------------------------------------------------------------------------
@@ -398,7 +393,7 @@ def _follow_policy(model: Model, policy: Floats, z: Floats, end: float, action: 
 
 
 @kernel
-def replay(
+def _replay(
     model: Model,
     situations: Floats,
     plan: Floats,
@@ -409,16 +404,10 @@ def replay(
     allowed: int,
     ends: Ends,
 ) -> tuple[int, float]:
-    """Replay each of K disturbances in each of S situations, into ``ends``.
+    """`replay` into ``ends``; how many are not survived, and the least distance of the others.
 
-    Returns how many are not survived, and the least distance to failure of the others.
-
-    A situation is an observation, its change, and the action before (2m + a). First the actions of
-    the ``plan`` (T, a) are taken, if it has any, then what the ``policy`` (a, 1 + m) says. A replay
-    ends where the distance to failure falls below ``enough``, and the larger that is, the more of
-    the range of actions the policy leaves unused: where full action just holds, no distance says
-    how near the point of no return is. All end as soon as more than ``allowed`` did, or number 0
-    did, that is no disturbance at all; if all are allowed, each goes on as far as it can.
+    All end as soon as more than ``allowed`` did, or number 0 did, that is no disturbance at all; if
+    all are allowed, each goes on as far as it can.
 
     Replays lie side by side, so that loops over them (``l``) are vector instructions. No slice is
     assigned: that takes a second of compiling each.
@@ -527,21 +516,38 @@ def replay(
     return lost, left
 
 
+_enter = entry(_replay)
+
+
+def replay(
+    model: Model,
+    situations: Floats,
+    plan: Floats,
+    policy: Floats,
+    disturbances: Disturbances,
+    harder: float = 1.0,
+    enough: float = 0.0,
+) -> Ends:
+    """Replay each of K disturbances in each of S situations.
+
+    A situation is an observation, its change, and the action before (2m + a). First the actions of
+    the ``plan`` (T, a) are taken, if it has any, then what the ``policy`` (a, 1 + m) says. A replay
+    ends where the distance to failure falls below ``enough``, and the larger that is, the more of
+    the range of actions the policy leaves unused: where full action just holds, no distance says
+    how near the point of no return is.
+    """
+    count = len(situations) * disturbances.residuals.shape[2]
+    ends = Ends(np.empty(count), np.empty(count))
+    _enter(model, situations, plan, policy, disturbances, harder, enough, count, ends)
+    return ends
+
+
 # -- What decides ---------------------------------------------------------------------------------
 
 #: What a search finds: the proposal passes, another action passes, or none does.
 KEPT, CHANGED, NOTHING_PASSES = 0, 1, 2
 
 
-@inner_kernel
-def _between(one: Floats, other: Floats, share: float, action: Floats) -> None:
-    """An action (1, a) so much of the way from one to another; at the end of it the other."""
-    for i in range(action.shape[1]):
-        between = one[0, i] + share * (other[0, i] - one[0, i])
-        action[0, i] = other[0, i] if share == 1.0 else between
-
-
-@kernel
 def search(
     model: Model,
     situation: Floats,
@@ -552,58 +558,65 @@ def search(
     proposal: Floats,
     margin: float,
     allowed: int,
-    action: Floats,
-) -> tuple[int, int, float]:
-    """Find the ``action`` closest to a proposal after which a backup survives by the margin.
+) -> tuple[int, Floats, int, float]:
+    """Find the action closest to a proposal after which a backup survives by the margin.
 
     The proposal itself if one does; else what the first of ``ranks`` does that survives, and from
     there as near to the proposal as halvings come. All disturbances have to be survived but
     ``allowed``, and that none begins. Where no action passes it is that of the backup that lasts
-    longest. ``situation`` is (1, 2m + a), proposal and action are (1, a).
+    longest. ``situation`` is (2m + a,), proposal and action are (a,).
 
-    Returns what was found, after which backup it passes, and the least distance to failure that is
-    then left; where nothing passes, how far apart backups are, near 0 if all last as long.
+    Returns what was found, the action, after which backup it passes, and the least distance to
+    failure that is then left; where nothing passes, how far apart backups are, near 0 if all last
+    as long.
     """
-    a, count = proposal.shape[1], disturbances.residuals.shape[2]
-    ends, own, nothing = Ends(np.empty(count), np.empty(count)), np.empty((1, a)), np.empty((0, a))
-    halvings, middle = _HALVINGS if model.choices == 0 else 0, np.empty((1, a))
-    _between(proposal, proposal, 1.0, action)
+    m, a, choices = len(model.origin), len(proposal), model.choices
+    count, plan, here = disturbances.residuals.shape[2], np.empty((1, a)), situation[None]
+    ends = Ends(np.empty(count), np.empty(count))
+    given = disturbances, scale, margin, allowed, ends
+
+    def survives(action: Floats, backup: int) -> tuple[bool, float]:
+        """Whether the backup survives after the action, and by how much."""
+        plan[0] = action
+        lost, left = _enter(model, here, plan, policies[backup], *given)
+        return lost <= allowed and left >= margin, left
+
     for q in ranks:
-        lost, left = replay(
-            model, situation, proposal, policies[q], disturbances, scale, margin, allowed, ends
-        )
-        if lost <= allowed and left >= margin:
-            return KEPT, q, left
+        passes, left = survives(proposal, q)
+        if passes:
+            return KEPT, proposal, q, left
     for q in ranks:
-        _follow_policy(model, policies[q], situation.T, 1.0, own.T)
-        refused, share, distance, passes = 0.0, 1.0, 0.0, False
-        for i in range(a):
-            distance += abs(own[0, i] - proposal[0, i])
-        if model.choices > 0 and distance == 0.0:
+        own = _action_of(model, policies[q], situation[:m])
+        if choices and (own == proposal).all():
             continue  # it was refused
-        for halving in range(1 + halvings):  # the backup's own action, then closer ones
-            half = 0.5 * (refused + share) if halving else 1.0
-            _between(proposal, own, half, middle)
-            lost, closer = replay(
-                model, situation, middle, policies[q], disturbances, scale, margin, allowed, ends
-            )
-            if lost <= allowed and closer >= margin:
-                share, left, passes = half, closer, True
-                _between(middle, middle, 1.0, action)
-            elif not passes:
-                break
+        passes, left = survives(own, q)
+        if not passes:
+            continue
+        action, off, refused, share = own, own - proposal, 0.0, 1.0
+        for _ in range(0 if choices else _HALVINGS):
+            half = 0.5 * (refused + share)
+            closer = proposal + half * off
+            passes, distance = survives(closer, q)
+            if passes:
+                action, share, left = closer, half, distance
             else:
                 refused = half
-        if passes:
-            return CHANGED, q, left
-    which, longest, shortest = ranks[0], -np.inf, np.inf
+        return CHANGED, action, q, left
+    which, longest, shortest, nothing = ranks[0], -np.inf, np.inf, np.empty((0, a))
     for q in ranks:
-        replay(model, situation, nothing, policies[q], disturbances, scale, 0.0, count, ends)
-        lasts = 0.0
-        for l in range(count):
-            lasts += ends.worth[l] / count
+        lasts = float(replay(model, here, nothing, policies[q], disturbances, scale).worth.mean())
         shortest = min(shortest, lasts)
         if lasts > longest + _EQUAL:
             which, longest = q, lasts
-    _follow_policy(model, policies[which], situation.T, 1.0, action.T)
-    return NOTHING_PASSES, which, (longest - shortest) / (abs(longest) + 1e-12)
+    apart = (longest - shortest) / (abs(longest) + 1e-12)
+    return NOTHING_PASSES, _action_of(model, policies[which], situation[:m]), which, apart
+
+
+def _action_of(model: Model, policy: Floats, z: Floats) -> Floats:
+    """(a,) what a linear policy (a, 1 + m) does at an observation."""
+    action, off = policy[:, 0], (z - model.mean).tolist()
+    for slope, distance, inverse in zip(policy.T[1:], off, model.inverse.tolist(), strict=True):
+        action = action + slope * distance * inverse
+    if model.choices:
+        return np.asarray(np.eye(len(action))[action.argmax()])
+    return np.minimum(np.maximum(action, -1.0), 1.0)
