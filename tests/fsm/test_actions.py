@@ -11,14 +11,9 @@ PAPER_EDGES = [-2.5, -2.2, -1.9, -1.6, -1.3, -1.0, -0.7, -0.4, -0.1]
 PAPER_EDGES += [0.2, 0.5, 0.8, 1.1, 1.4, 1.7, 2.0, 2.3, 2.5]
 
 
-def test_the_papers_experiment_has_17_actions():
-    actions = IntervalActions(**PAPER)
-    assert actions.n_actions == 17
-    assert actions.edges.tolist() == PAPER_EDGES
-
-
 def test_an_inner_edge_belongs_to_the_interval_that_it_begins():
     actions = IntervalActions(**PAPER)
+    assert (actions.n_actions, actions.edges.tolist()) == (17, PAPER_EDGES)
     for k, edge in enumerate(PAPER_EDGES[1:-1]):
         assert actions.encode(edge) == actions.encode([edge])[0] == k + 1
         assert actions.encode(math.nextafter(edge, -math.inf)) == k
@@ -50,13 +45,6 @@ def test_intervals_meet_and_their_centers_are_encoded_as_themselves():
     assert [actions.encode(actions.center(i)) for i in range(17)] == list(range(17))
 
 
-def test_values_beyond_the_range_are_refused_by_default():
-    actions = IntervalActions(**PAPER)
-    for value in (2.6, -math.inf, [0.0, math.nextafter(2.5, 3)]):
-        with pytest.raises(ValueError, match=r"outside \[-2.5, 2.5\].*clip"):
-            actions.encode(value)
-
-
 def test_values_beyond_the_range_fall_into_the_end_intervals_when_clipped():
     actions = IntervalActions(**PAPER, outside="clip")
     assert actions.encode([-math.inf, -9.0, -2.6, 2.6, 9.0, math.inf]).tolist() == [
@@ -64,12 +52,17 @@ def test_values_beyond_the_range_fall_into_the_end_intervals_when_clipped():
     ]
 
 
-@pytest.mark.parametrize("outside", ["error", "clip"])
-def test_nan_is_refused_even_when_clipped(outside):
-    actions = IntervalActions(**PAPER, outside=outside)
-    for value in (math.nan, [0.0, math.nan]):
-        with pytest.raises(ValueError, match="NaN"):
-            actions.encode(value)
+@pytest.mark.parametrize(
+    ("outside", "value", "words"),
+    [
+        *(("error", value, r"outside \[-2.5, 2.5\].*clip") for value in (2.6, -math.inf)),
+        ("error", [0.0, math.nextafter(2.5, 3)], r"outside \[-2.5, 2.5\].*clip"),
+        *((outside, [0.0, math.nan], "NaN") for outside in ("error", "clip")),
+    ],
+)
+def test_values_beyond_the_range_are_refused_and_nan_always(outside, value, words):
+    with pytest.raises(ValueError, match=words):
+        IntervalActions(**PAPER, outside=outside).encode(value)
 
 
 @pytest.mark.parametrize("i", [-1, 17])
@@ -108,16 +101,12 @@ def test_an_action_that_is_no_number_is_named(value, words):
         ({"low": 2.5}, "low must be below high"),
         ({"low": 3.0}, "low must be below high"),
         ({"outside": "ignore"}, "outside is 'ignore'"),
+        ({"low": 0.0, "high": 1e-10, "width": 1e-11}, "larger unit"),
     ],
 )
 def test_settings_that_make_no_sense_are_refused(change, words):
     with pytest.raises(ValueError, match=words):
         IntervalActions(**{**PAPER, **change})
-
-
-def test_intervals_too_narrow_for_their_edges_to_be_told_apart_are_refused():
-    with pytest.raises(ValueError, match="larger unit"):
-        IntervalActions(0.0, 1e-10, 1e-11)
 
 
 def test_labels_show_which_edges_belong_to_the_interval():

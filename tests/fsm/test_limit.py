@@ -73,21 +73,6 @@ def test_a_newcomer_close_to_a_state_is_left_to_it():
     assert machine.centers.ravel().tolist() == [0.0, 9.0]
 
 
-@pytest.mark.parametrize(
-    ("settings", "words"),
-    [
-        ({"max_states": 0}, "max_states is 0; it must be a positive integer"),
-        ({"max_states": 2.5}, "max_states is 2.5"),
-        ({"belief_tolerance": 1.0}, "belief_tolerance is 1.0; it must lie below 1"),
-        ({"belief_tolerance": -1e-6}, "belief_tolerance is -1e-06"),
-        ({"belief_tolerance": np.nan}, "belief_tolerance is nan"),
-    ],
-)
-def test_settings_that_cannot_be_are_refused(settings, words):
-    with pytest.raises(ValueError, match=words):
-        EvolvingFSM(n_actions=2, **settings)
-
-
 def wander(rows, seed=0):
     rng = np.random.default_rng(seed)
     Z = np.abs(np.cumsum(rng.normal(scale=0.5, size=(rows, 2)), axis=0)) % 12.0

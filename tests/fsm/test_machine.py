@@ -23,46 +23,13 @@ LEARNT = (
 )
 
 
-def new_machine():
-    return EvolvingFSM(n_actions=3, radius=0.01)
+# -- Batches -----------------------------------------------------------------------------------
 
 
-def learn_in_a_loop(machine, Z, I, starts=()):
-    """What `learn_many` does, with `observe` and `act`."""
-    for row, (z, i) in enumerate(zip(Z, I, strict=True)):
-        if row in starts:
-            machine.start_episode()
-        machine.observe(z)
-        if i >= 0:
-            machine.act(i)
-
-
-@pytest.fixture(scope="module")
-def stream(spiral):
-    """120 rows that found more than 32 states, in three episodes, some rows without action."""
-    rng = np.random.default_rng(1)
-    return spiral(120), rng.integers(-1, 3, 120), [0, 41, 90]
-
-
-# -- A batch and a loop ------------------------------------------------------------------------
-
-
-def test_a_batch_learns_bit_for_bit_what_the_loop_learns(stream, snapshot):
-    loop, batch = new_machine(), new_machine()
-    learn_in_a_loop(loop, *stream)
-    batch.learn_many(*stream)
-    assert loop.n_states > 32
-    assert snapshot(batch) == snapshot(loop)
-
-
-def test_without_row_0_among_the_starts_the_present_episode_goes_on(stream):
-    Z, I, _ = stream
-    machine = new_machine()
-    machine.learn_many(Z[:20], np.zeros(20, int))
-    going_on = machine.copy().learn_many(Z[20:], I[20:])
-    beginning = machine.copy().learn_many(Z[20:], I[20:], [0])
-    assert not np.isnan(going_on.surprise[0])
-    assert np.isnan(beginning.surprise[0])
+def test_without_row_0_among_the_starts_the_present_episode_goes_on(grown):
+    rows = [[0.3, 0.1], [0.0, 0.2]], [0, 1]
+    assert not np.isnan(grown.copy().learn_many(*rows).surprise[0])
+    assert np.isnan(grown.learn_many(*rows, [0]).surprise[0])
 
 
 def test_a_batch_of_no_rows_changes_nothing(grown, snapshot):

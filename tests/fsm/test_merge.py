@@ -1,7 +1,6 @@
 """Machines that learnt apart become one: states matched, evidence added up, order of no matter."""
 
 import functools
-import io
 
 import numpy as np
 import pytest
@@ -58,22 +57,16 @@ def assert_alike(one, other, atol):
     assert (model.uses == expected.uses).all()
 
 
-def saved(machine):
-    file = io.BytesIO()
-    machine.save(file)
-    return file.getvalue()
-
-
 seeds = st.lists(st.integers(0, 10_000), min_size=2, max_size=4, unique=True)
 
 
 @settings(max_examples=30)
 @given(st.sampled_from(RULES), seeds, st.randoms(use_true_random=False))
-def test_order_of_the_parts_does_not_matter(rule, seeds, random):
+def test_order_of_the_parts_does_not_matter(snapshot, rule, seeds, random):
     parts = [taught(rule, seed, rows=20 + seed % 150) for seed in seeds]
     shuffled = random.sample(parts, len(parts))
     one, other = merge(parts), merge(shuffled)
-    assert saved(one) == saved(other)
+    assert snapshot(one) == snapshot(other)
 
 
 @settings(max_examples=30)
@@ -99,12 +92,12 @@ def test_evidence_adds_up_and_rows_remain_distributions(rule, seeds):
 
 @given(st.sampled_from(RULES), st.integers(0, 10_000))
 @settings(max_examples=10)
-def test_what_has_observed_nothing_contributes_nothing(rule, seed):
+def test_what_has_observed_nothing_contributes_nothing(snapshot, rule, seed):
     part, nothing = taught(rule, seed), EvolvingFSM(3, rule=rule)
     before = part.copy()
     merged = merge([nothing, part, nothing])
     before.start_episode()
-    assert saved(merged) == saved(before)
+    assert snapshot(merged) == snapshot(before)
     assert merge([nothing, nothing]).n_states == 0
 
 
@@ -161,7 +154,7 @@ def test_the_strongest_centre_leads_and_centres_stay_apart():
 
 
 @pytest.mark.parametrize("rule", RULES)
-def test_it_is_saved_and_loaded_and_goes_on_learning(rule, tmp_path):
+def test_it_is_saved_and_loaded_and_goes_on_learning(snapshot, rule, tmp_path):
     merged = merge([taught(rule, seed) for seed in range(3)])
     merged.save(tmp_path / "merged.evofsm")
     again = EvolvingFSM.load(tmp_path / "merged.evofsm")
@@ -172,7 +165,7 @@ def test_it_is_saved_and_loaded_and_goes_on_learning(rule, tmp_path):
         np.testing.assert_allclose(machine.transition_matrices.sum(axis=-1), 1.0, atol=1e-9)
         assert np.isnan(trace.surprise[0])  # a new episode
         assert not np.isnan(trace.surprise[1:]).any()
-    assert saved(merged) == saved(again)
+    assert snapshot(merged) == snapshot(again)
 
 
 @pytest.mark.parametrize(

@@ -37,18 +37,6 @@ STAY = [[1.0, 0.0], [0.0, 1.0]]
 # -- A snapshot --------------------------------------------------------------------------------
 
 
-def test_a_snapshot_holds_what_the_machine_knew(grown):
-    model = grown.model(names=("x", "y"), units=("m", "m/s"), dt=0.01)
-    for name in (
-        *("centers", "potentials", "transition_matrices", "origin_frequency"),
-        *("decisions", "failures", "endings"),
-    ):
-        np.testing.assert_array_equal(getattr(model, name), getattr(grown, name))
-    assert (model.n_states, model.n_variables, model.n_actions) == (grown.n_states, 2, 3)
-    assert (model.names, model.units, model.dt) == (("x", "y"), ("m", "m/s"), 0.01)
-    np.testing.assert_array_equal(model.marginal_matrix, grown.marginal_matrix)
-
-
 def test_it_counts_founding_visits_and_uses(spiral):
     machine = EvolvingFSM(n_actions=2, radius=0.01)
     trace = machine.learn_many(spiral(120), [1] * 30 + [0] * 20 + [-1] * 10 + [0] * 60)
@@ -135,13 +123,6 @@ def test_a_model_of_a_machine_that_saw_nothing_says_so():
 
 
 # -- Forecasts ---------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("policy", ["marginal", "hold", "observed"])
-@pytest.mark.parametrize("horizon", [1, 4])
-def test_the_snapshot_forecasts_as_the_machine_does(grown, policy, horizon):
-    forecast = grown.model().propagate(grown.belief, 1, horizon, policy)
-    np.testing.assert_array_equal(forecast, grown.predict(1, horizon, policy))
 
 
 def test_without_an_action_the_policy_rules_from_the_first_step_on():

@@ -6,30 +6,39 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from evofsm.fsm.machine import EvolvingFSM
+from evofsm.fsm.rules import Edges, Novelty
+from evofsm.fsm.step import Event
 
 
-def machines(n_actions):
-    return st.builds(
-        EvolvingFSM,
-        n_actions=st.just(n_actions),
-        radius=st.sampled_from([0.05, 0.3, 2.0]),
-        distance_weight=st.sampled_from([0.3, 0.85, 1.5]),
-        learning_rate=st.sampled_from([0.01, 0.3, 0.9]),
-        prior_frequency=st.sampled_from([1e-6, 1e-3, 1.0]),
-        spread=st.sampled_from([0.05, 1.0, 3.0]),
+@st.composite
+def machines(draw, m, n_actions):
+    told = {
+        "distance_weight": draw(st.sampled_from([0.3, 0.85, 1.5])),
+        "learning_rate": draw(st.sampled_from([0.01, 0.3, 0.9])),
+        "prior_frequency": draw(st.sampled_from([1e-6, 1e-3, 1.0])),
+    }
+    radius, spread = (
+        draw(st.sampled_from([0.05, 0.3, 2.0])),
+        draw(st.sampled_from([0.05, 1.0, 3.0])),
     )
+    if draw(st.booleans()):
+        scales = draw(st.sampled_from([(), (0.5, 3.0, 1.0)[:m]]))
+        return EvolvingFSM(n_actions, rule=Novelty(radius, scales, spread), **told)
+    rule = draw(st.sampled_from([None, Edges()]))
+    return EvolvingFSM(n_actions, radius, spread=spread, rule=rule, **told)
 
 
 @st.composite
 def streams(draw, numbers=None):
-    """A machine, observations on a coarse grid (so that many are equal), actions and starts."""
+    """A machine, observations on a coarse grid (so that many are equal), actions and episodes."""
     m, q = draw(st.integers(1, 3)), draw(st.integers(1, 4))
     if numbers is None:
         numbers = st.integers(-32, 32).map(lambda k: k / 8)
-    rows = draw(st.lists(st.tuples(*[numbers] * m), min_size=1, max_size=60))
+    rows = draw(st.lists(st.tuples(*[numbers] * m), min_size=1, max_size=50))
     I = draw(st.lists(st.integers(-1, q - 1), min_size=len(rows), max_size=len(rows)))
-    starts = draw(st.lists(st.integers(0, len(rows) - 1), max_size=3))
-    return draw(machines(q)), np.array(rows, dtype=float), np.array(I), sorted(set(starts))
+    starts, failures = (draw(st.sets(st.integers(0, len(rows) - 1), max_size=5)) for _ in range(2))
+    machine = draw(machines(m, q))
+    return machine, np.array(rows, dtype=float), np.array(I), sorted(starts), sorted(failures)
 
 
 def assert_distribution(rows):
@@ -37,37 +46,69 @@ def assert_distribution(rows):
     np.testing.assert_allclose(rows.sum(axis=-1), 1.0, rtol=0, atol=1e-9)
 
 
+@pytest.fixture(scope="session")
+def learn(snapshot):
+    """Learn a batch: a loop learns the same bit for bit, and what is learnt is sound."""
+
+    def learn(machine, Z, I, starts=(), failures=()):
+        loop, steps = machine.copy(), []
+        trace = machine.learn_many(Z, I, starts, failures, belief=True)
+        for row, (z, i) in enumerate(zip(Z, I, strict=True)):
+            if row in starts:
+                loop.start_episode()
+            steps.append(loop.observe(z, failed=row in failures))
+            if i >= 0 and row not in failures:
+                loop.act(i)
+        assert snapshot(machine) == snapshot(loop)
+        assert trace.state.tolist() == [step.state for step in steps]
+        assert trace.event.tolist() == [step.event for step in steps]
+        assert trace.surprise.tobytes() == np.array([step.surprise for step in steps]).tobytes()
+        assert_sound(machine, trace)
+        assert machine.endings.sum() == len(failures)
+
+    return learn
+
+
 def assert_sound(machine, trace):
-    assert_distribution(machine.transition_matrices)
-    assert_distribution(machine.marginal_matrix)
-    assert_distribution(machine.belief)
-    assert_distribution(trace.belief)
+    model = machine.model()
+    for rows in (model.transition_matrices, model.marginal_matrix, machine.belief, trace.belief):
+        assert_distribution(rows)
     for i in range(machine.n_actions):
         assert_distribution(machine.predict(i, 3, "observed"))
-    assert (np.diff(trace.n_states) >= 0).all()
-    assert (np.diff(trace.n_states, prepend=0) == (trace.event == 2)).all()
-    assert (machine.origin_frequency >= 0.0).all()
-    assert ((machine.potentials > 0.0) & (machine.potentials <= 1.0)).all()
+    assert (np.diff(trace.n_states, prepend=0) == (trace.event == Event.CREATED)).all()
+    assert (model.origin_frequency >= 0.0).all()
+    assert ((model.potentials > 0.0) & (model.potentials <= 1.0)).all()
+    assert (model.failures <= model.decisions).all()
     surprise = trace.surprise[~np.isnan(trace.surprise)]
     assert ((surprise >= 0.0) & (surprise <= 1.0)).all()
+    assert model.decisions.sum() == pytest.approx(len(surprise))
+
+
+@given(streams())
+def test_a_batch_and_a_loop_are_the_same_and_what_is_learnt_is_sound(learn, stream):
+    learn(*stream)
 
 
 @given(streams(numbers=st.floats(-1e100, 1e100)))
-def test_that_holds_for_numbers_of_every_size(stream):
-    machine, Z, I, starts = stream
-    assert_sound(machine, machine.learn_many(Z, I, starts, belief=True))
+def test_that_holds_for_numbers_of_every_size(learn, stream):
+    learn(*stream)
 
 
 @pytest.mark.parametrize("scale", [1e-300, 1e-160, 1e-150, 1e-9, 1e9, 1e99])
-def test_that_holds_in_every_unit(scale):
+def test_that_holds_in_every_unit(learn, scale):
     Z = np.random.default_rng(3).normal(size=(200, 2)) * scale
-    machine = EvolvingFSM(n_actions=2, radius=0.3 * scale)
-    assert_sound(machine, machine.learn_many(Z, np.arange(200) % 2, belief=True))
+    learn(EvolvingFSM(n_actions=2, radius=0.3 * scale), Z, np.arange(200) % 2)
+
+
+def test_that_holds_while_many_states_are_created(learn, spiral):
+    machine = EvolvingFSM(n_actions=3, radius=0.01)
+    learn(machine, spiral(120), np.arange(120) % 4 - 1, [0, 41, 90])
+    assert machine.n_states > 32
 
 
 @given(streams(), st.sampled_from([1.0, -64.0, 2.0**20, -(2.0**40)]))
 def test_shifting_all_observations_changes_no_belief(stream, offset):
-    machine, Z, I, starts = stream
+    machine, Z, I, starts, _ = stream
     shifted = machine.copy()
     expected = machine.learn_many(Z, I, starts, belief=True)
     trace = shifted.learn_many(Z + offset, I, starts, belief=True)  # exact: a coarse grid

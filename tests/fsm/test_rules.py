@@ -47,68 +47,6 @@ def walk():
 # -- All rules -------------------------------------------------------------------------------------
 
 
-LEARNT = (
-    *("centers", "potentials", "transition_matrices", "origin_frequency", "belief"),
-    *("decisions", "failures", "endings"),
-)
-
-
-def learn_in_a_loop(machine, Z, I, starts, failures):
-    steps = []
-    for row, (z, i) in enumerate(zip(Z, I, strict=True)):
-        if row in starts:
-            machine.start_episode()
-        steps.append(machine.observe(z, failed=row in failures))
-        if i >= 0 and row not in failures:
-            machine.act(i)
-    return steps
-
-
-def assert_same_trace(trace, steps):
-    assert trace.state.tolist() == [s.state for s in steps]
-    assert trace.n_states.tolist() == [len(s.belief) for s in steps]
-    assert trace.event.tolist() == [s.event for s in steps]
-    assert trace.surprise.tobytes() == np.array([s.surprise for s in steps]).tobytes()
-
-
-rules = st.one_of(
-    st.just(Paper()),
-    st.just(Edges()),
-    st.builds(
-        Novelty,
-        radius=st.sampled_from([0.3, 1.0, 3.0]),
-        scales=st.sampled_from([(), (1.0, 1.0), (0.5, 3.0)]),
-        spread=st.sampled_from([0.1, 1.0]),
-    ),
-)
-
-
-@st.composite
-def streams(draw):
-    """Observations on a coarse grid (so that many are equal), actions, starts and failures."""
-    number = st.integers(-32, 32).map(lambda k: k / 8)
-    rows = draw(st.lists(st.tuples(number, number), min_size=1, max_size=50))
-    I = draw(st.lists(st.integers(-1, 2), min_size=len(rows), max_size=len(rows)))
-    some = st.lists(st.integers(0, len(rows) - 1), max_size=5)
-    return np.array(rows), np.array(I), draw(some), draw(some)
-
-
-@given(rules, streams())
-def test_that_holds_for_every_stream_and_what_is_learnt_is_sound(rule, stream):
-    batch, loop = EvolvingFSM(3, rule=rule), EvolvingFSM(3, rule=rule)
-    trace = batch.learn_many(*stream, belief=True)
-    assert_same_trace(trace, learn_in_a_loop(loop, *stream))
-    for name in LEARNT:
-        assert getattr(batch, name).tobytes() == getattr(loop, name).tobytes()
-    assert (np.diff(trace.n_states, prepend=0) == (trace.event == Event.CREATED)).all()
-    for rows in (batch.transition_matrices, batch.belief, trace.belief):
-        np.testing.assert_allclose(rows.sum(axis=-1), 1.0, rtol=0, atol=1e-9)
-    assert ((batch.potentials > 0.0) & (batch.potentials <= 1.0)).all()
-    assert batch.decisions.sum() == pytest.approx((~np.isnan(trace.surprise)).sum())
-    assert (batch.failures <= batch.decisions).all()
-    assert batch.endings.sum() == len(set(stream[3]))
-
-
 def test_a_model_keeps_the_rule_and_recognises_by_it(rule, walk, tmp_path):
     machine = EvolvingFSM(3, rule=rule)
     Z, I, starts, failures = walk(300)
@@ -204,19 +142,6 @@ def test_belief_falls_with_scaled_distance_however_much_was_seen():
         squared = (((machine.centers - z) / [10.0, 1.0]) ** 2).sum(axis=1)
         similarity = np.exp(-squared / (0.5 * 2.0**2))
         np.testing.assert_allclose(belief, similarity / similarity.sum(), rtol=1e-10, atol=1e-300)
-
-
-def test_scales_do_as_if_the_observations_had_been_divided():
-    Z = np.random.default_rng(1).normal(size=(300, 2)) * [4.0, 1.0]
-    I = np.arange(300) % 2
-    scaled = EvolvingFSM(n_actions=2, rule=Novelty(1.0, scales=(4.0, 0.5)))
-    divided = EvolvingFSM(n_actions=2, rule=Novelty(1.0))
-    a = scaled.learn_many(Z, I, belief=True)
-    b = divided.learn_many(Z / [4.0, 0.5], I, belief=True)
-    for one, other in zip(a, b, strict=True):
-        np.testing.assert_allclose(one, other, rtol=1e-12, atol=0.0)  # powers of 2: exact
-    np.testing.assert_array_equal(scaled.centers, divided.centers * [4.0, 0.5])
-    np.testing.assert_allclose(scaled.potentials, divided.potentials, rtol=1e-12)
 
 
 @pytest.mark.parametrize("name", ["radius", "spread"])
