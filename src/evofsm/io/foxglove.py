@@ -103,9 +103,13 @@ class _Channels:
         stamp = Timestamp(*divmod(now, _SECOND))
         self._log.log(Log(timestamp=stamp, level=level, message=text, name="evofsm"), log_time=now)
 
-    def next_episode(self, after: float) -> None:
-        """The present one was so long [s]."""
-        self.begin += round(after * _SECOND) + _PAUSE
+    def end(self, at: float, observation: NDArray[np.float64], happened: Sequence[str]) -> None:
+        """The episode ended, so long after it began [s], with what happened then."""
+        for kind in happened:
+            self.event(kind, at, observation)
+            self.note(LogLevel.Error, at, kind)
+        self.event("episode ended", at, observation)
+        self.begin += round(at * _SECOND) + _PAUSE
         self.episode += 1
 
     def _send(self, topic: str, at: float, message: Mapping[str, Any]) -> None:
@@ -224,17 +228,13 @@ class RunWriter:
 
     def add(self, episode: Episode) -> None:
         """Write the next episode, with its decisions."""
-        channels = self._channels
-        end, last = float(episode.time[-1]), episode.observations[-1]
-        channels.event("episode started", float(episode.time[0]), episode.observations[0])
+        channels, seen = self._channels, episode.observations
+        channels.event("episode started", float(episode.time[0]), seen[0])
         for decision in episode.decisions:
             channels.decision(decision)
-        happened = {"collision": episode.collided, "rear-end collision": episode.rear_ended}
-        for kind in (kind for kind, it_did in happened.items() if it_did):
-            channels.event(kind, end, last)
-            channels.note(LogLevel.Error, end, kind)
-        channels.event("episode ended", end, last)
-        channels.next_episode(end)
+        told = {"collision": episode.collided, "rear-end collision": episode.rear_ended}
+        happened = [kind for kind, it_did in told.items() if it_did]
+        channels.end(float(episode.time[-1]), seen[-1], happened)
 
     def attach(self, model: FSMModel) -> None:
         """Attach what was learnt."""
@@ -347,7 +347,6 @@ class FoxgloveSink:
             self._open.callback(server.stop)
             self.address = f"ws://{host}:{server.port}"
             self._channels.begin = time.time_ns()  # live, a message is now; in a file time is 0
-        self._episodes = 0
         self._time = 0.0  # of the latest decision, in its episode [s]
         self._observation: NDArray[np.float64] = np.full(len(names), math.nan)
         self._due = math.nan  # when time 0 of the episode was, on the clock of this computer [s]
@@ -370,9 +369,6 @@ class FoxgloveSink:
 
     def begin(self, guard: Guard) -> None:
         """An episode begins."""
-        if self._episodes:
-            self._channels.next_episode(self._time)
-        self._episodes += 1
         self._time, self._due = 0.0, math.nan
 
     def seen(self, observation: NDArray[np.float64], time: float) -> None:
@@ -391,11 +387,8 @@ class FoxgloveSink:
         """The episode ended."""
         if observation is not None:
             self._observation = observation
-        if failed:
-            kind = "collision" if self._channels.is_of_cars else "failure"
-            self._channels.event(kind, self._time, self._observation)
-            self._channels.note(LogLevel.Error, self._time, kind)
-        self._channels.event("episode ended", self._time, self._observation)
+        kind = "collision" if self._channels.is_of_cars else "failure"
+        self._channels.end(self._time, self._observation, [kind] if failed else [])
 
     def _keep_pace(self) -> None:
         """Wait for what is to be shown now."""
