@@ -42,8 +42,8 @@ class Taught(NamedTuple):
 def taught(short: bool) -> Taught:
     """Both, frozen; the episodes are those that the learnt one comes to."""
     family = load_family(FAMILY)
-    low, high, width = family.actions.low, family.actions.high, family.actions.width
-    learnt, kinematic = Guard(low, high, width=width, interval=family.interval), many_states()
+    low, high = family.actions.low, family.actions.high
+    learnt, kinematic = Guard(low, high, interval=family.interval), many_states()
     for guard in (learnt, kinematic):
         for episode in range(_SHORT if short else _LEARNT):
             drive(guard, family.draw(0, episode))

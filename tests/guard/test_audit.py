@@ -43,7 +43,7 @@ ACTIONS = IntervalActions(low=-2.5, high=2.5, width=0.3, outside="clip")
 def cars(log=None, **changed):
     """A guard of cars; ``reviser`` is made of its judge and its machine."""
     guard = guard_for_cars(-2.5, 2.5, width=0.3)
-    parts = {"actions": ACTIONS, "interval": 0.25, "machine": guard.machine, "judge": guard.judge}
+    parts = {"interval": 0.25, "machine": guard.machine, "judge": guard.judge}
     reviser = changed.pop("reviser", lambda judge, machine: ActionReviser(judge, ACTIONS))
     made = reviser(parts["judge"], parts["machine"])
     return Guard.of(made, audit=log, **(parts | changed))

@@ -459,7 +459,6 @@ def test_a_judge_is_told_all_that_happens_and_the_machine_counts_what_began():
     [
         ({}, "give low and high of the action, or n_actions"),
         ({"low": -1.0, "high": 1.0, "n_actions": 3}, "not both"),
-        ({"low": [-1.0], "high": [1.0], "width": 0.1}, "width is of"),
         ({"low": [-1.0], "high": [1.0], "judge": LatentRisk(-1.0, DT)}, "a vector of 1"),
         ({"low": 1.0, "high": -1.0}, "low must be below high"),
         ({"n_actions": 4, "judge": Balance(index=True)}, "5 pushes"),

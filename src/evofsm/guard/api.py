@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 if TYPE_CHECKING:  # whoever asks for a number here waits for no compiler
     from evofsm.fsm.naming import Labels
-    from evofsm.guard.actions import Action
+    from evofsm.guard.actions import Action, ActionSet
     from evofsm.store import Place
 
 #: The highest risk, a probability of failure, that a reviser lets pass.
@@ -90,6 +90,10 @@ class Controller(Protocol):
 
 class Reviser(Protocol):
     """Anything that keeps a proposal or replaces it by a better action."""
+
+    @property
+    def actions(self) -> ActionSet:
+        """What it executes is one of them."""
 
     def start_episode(self) -> None:
         """Forget what was under way."""

@@ -348,7 +348,7 @@ class AuditLog:
         self._busy = True
         self._flush()  # of an episode that was broken off
         self._seen = []
-        who = (guard.actions, guard.reviser, guard.machine, guard.judge, guard.failed)
+        who = (guard.reviser, guard.machine, guard.judge, guard.failed)
         if list(map(id, who)) != list(map(id, self._who)) or self._learnt != sums_of(guard):
             self._write("start", cut_off=self.cut_off, **_start(guard))
         self._guard, self._who, self._learnt = guard, who, None

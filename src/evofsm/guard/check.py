@@ -207,7 +207,6 @@ def _revisions(reviser: Any, rows: Rows) -> Answers:
 def revises_what_is_proposed(make: Make) -> None:
     """It executes a finite number within its actions, even where no number was proposed."""
     reviser = make()
-    actions = getattr(reviser, "actions", None)
     wanted = (*_ACTIONS.tolist(), 5.0, -9.0, math.nan, math.inf, -math.inf, 1e9)
     for k, row in enumerate(_drive(40)):
         proposed = wanted[k % len(wanted)]
@@ -220,7 +219,7 @@ def revises_what_is_proposed(make: Make) -> None:
         _insist(isinstance(one, Revision), f"revise returns {one!r}, not a Revision")
         is_number = isinstance(one.executed, float) and math.isfinite(one.executed)
         _insist(is_number, f"{of} it executes {one.executed!r}; it must be a finite float")
-        within = actions is None or actions.low <= one.executed <= actions.high
+        within = reviser.actions.low <= one.executed <= reviser.actions.high
         _insist(within, f"{of} it executes {one.executed}, outside its set of actions")
         _insist(_same(one.proposed, proposed), f"{of} it reports {one.proposed} as proposed")
         _insist(one.reason, "it gives no reason, and a driver would not learn why")

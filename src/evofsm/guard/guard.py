@@ -44,7 +44,7 @@ from evofsm.guard.reviser import NOTHING, ActionReviser, Mode, is_spoken
 from evofsm.guard.warming import warm_judge, warm_machine
 from evofsm.store import SIZE, Kind, Numbers, Place
 
-# Intervals that a range of actions is divided into for the machine, unless a width is given.
+# Intervals that a range of actions is divided into for the machine.
 _INTERVALS = 17
 # States of the machine that is made where none is given.
 _MOST_STATES = 200
@@ -156,9 +156,6 @@ class Guard:
         Of the judge that is made where none is given.
     machine : EvolvingFSM, optional
         Recognises and learns; without it one with recommended settings is made.
-    width : float, optional
-        Width of an interval of actions, for the machine; without it a 17th of the range. Vectors
-        lie in the cells of a grid instead (`BoxActions`).
     audit : DecisionLogger, optional
         Records what is decided: an `AuditLog`, or `evofsm.io.FoxgloveSink`, which shows it.
     explaining : bool
@@ -204,12 +201,11 @@ class Guard:
         mode: Mode = Mode.ACT,
         seed: int = 0,
         machine: EvolvingFSM | None = None,
-        width: float | None = None,
         audit: DecisionLogger | None = None,
         explaining: bool = False,
         missing: Missing = Missing.PARTIAL,
     ) -> None:
-        actions = _actions(low, high, n_actions, width)
+        actions = _actions(low, high, n_actions)
         interval = positive("interval", interval)
         soon = None if horizon is None else max(1, round(positive("horizon", horizon) / interval))
         if judge is None:
@@ -242,8 +238,6 @@ class Guard:
         interval : float
             Time between decisions [s]; an observation that comes later than 1.5 of them begins an
             episode anew.
-        actions : IntervalActions, Choices or BoxActions, optional
-            The set of actions; without it the reviser's own.
         machine : EvolvingFSM, optional
             Without one nothing is recognised.
         judge : LearningJudge, optional
@@ -271,7 +265,6 @@ class Guard:
         reviser: Reviser,
         *,
         interval: float,
-        actions: ActionSet | None = None,
         machine: EvolvingFSM | None = None,
         judge: LearningJudge | None = None,
         learn: bool = True,
@@ -280,7 +273,7 @@ class Guard:
         explaining: bool = False,
         missing: Missing = Missing.PARTIAL,
     ) -> None:
-        self.actions: ActionSet = actions or reviser.actions  # type: ignore[attr-defined]
+        self.actions = reviser.actions
         self.interval = positive("interval", interval)
         asked = reviser.risk if isinstance(reviser, ActionReviser) else judge
         if judge is None and isinstance(asked, LearningJudge):
@@ -609,7 +602,7 @@ class Guard:
             (self.reviser, self.judge),
             {} if self.machine is None else {id(self.machine): machine},
         )
-        names = ("actions", "interval", "learn", "failed", "explaining", "missing")
+        names = ("interval", "learn", "failed", "explaining", "missing")
         settings = {name: getattr(self, name) for name in names}
         return type(self).of(reviser, judge=judge, machine=machine if states else None, **settings)
 
@@ -695,25 +688,21 @@ class Guard:
             )
 
 
-def _actions(
-    low: ArrayLike | None, high: ArrayLike | None, n_actions: int | None, width: float | None
-) -> ActionSet:
+def _actions(low: ArrayLike | None, high: ArrayLike | None, n_actions: int | None) -> ActionSet:
     if n_actions is not None:
-        if (low, high, width) != (None, None, None):
+        if (low, high) != (None, None):
             raise ValueError("give low and high, or n_actions, not both")
         return Choices(n_actions)
     if low is None or high is None:
         raise ValueError("give low and high of the action, or n_actions")
     if np.ndim(low) or np.ndim(high):
-        if width is not None:
-            raise ValueError("width is of an action that is one number; leave it out")
         if not (np.ndim(low) and np.ndim(high)):  # a number is the end of each component
             low, high = np.broadcast_arrays(low, high)
         ends: Any = low, high
         return BoxActions(*ends)
     least, most = np.asarray(low, np.float64).item(), np.asarray(high, np.float64).item()
-    width = (most - least) / _INTERVALS if width is None and least < most else width
-    return IntervalActions(least, most, width or 1.0, outside="clip")
+    width = (most - least) / _INTERVALS if least < most else 1.0
+    return IntervalActions(least, most, width, outside="clip")
 
 
 def _loaded(

@@ -54,9 +54,7 @@ def can_be_made_again(guard: _Guard) -> bool:
     reviser = _reviser(guard)
     if reviser is None or (guard.judge is not None and part_name(guard.judge) is None):
         return False
-    if not isinstance(guard.reviser, ActionReviser):
-        return True
-    return reviser["judge"] is not None and guard.reviser.actions == guard.actions
+    return not isinstance(guard.reviser, ActionReviser) or reviser["judge"] is not None
 
 
 def _reviser(guard: _Guard) -> dict[str, Any] | None:
@@ -94,7 +92,7 @@ def rebuild(
     fields, reviser = told["actions"], told["reviser"]
     kind = IntervalActions if "width" in fields else BoxActions if "low" in fields else Choices
     actions: ActionSet = kind(**fields)
-    parts = {"actions": actions, "machine": machine, "judge": risk}
+    parts = {"machine": machine, "judge": risk}
     if reviser["class"] != "ActionReviser":
         return parts | {"reviser": part_class(reviser["class"]).restored(reviser, actions)}
     named = reviser["judge"]
