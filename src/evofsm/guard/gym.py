@@ -289,7 +289,7 @@ class Lane:
 
     def decide(self, action: Any) -> Decided:
         """What to execute; the action itself where there is nothing to judge, or to decide."""
-        terms, proposal = self.terms, self.terms.proposal(action)
+        terms, proposal = self.terms, Proposal(self.terms.to_guard(action))
         if not self.is_open:
             unjudged = terms.decided(action, terms.unjudged(proposal))
             return unjudged._replace(executed=action, cost=0.0)
@@ -347,14 +347,7 @@ class Terms:
         self.guard = guard
         self.penalty = penalty
         self._observe, self._failed = observe or _flat(observations), failed
-        self._to_guard, self._to_env = _conversions(actions, guard.actions)
-
-    def proposal(self, action: Any) -> Proposal:
-        """A proposed action, as the guard takes it."""
-        wanted = self._to_guard(action)
-        if isinstance(self.guard.actions, BoxActions):
-            return Proposal(self.guard.actions.checked("proposal", wanted))
-        return Proposal(float(wanted))
+        self.to_guard, self._to_env = _conversions(actions, guard.actions)
 
     def unjudged(self, proposal: Proposal) -> Revision:
         """The proposal, made usable, where there is nothing to judge."""
@@ -426,8 +419,9 @@ def _conversions(space: Space[Any], actions: ActionSet) -> tuple[_Convert, _Conv
             "environment first (RescaleAction, TransformAction of gymnasium.wrappers)"
         )
 
-    def to_guard(action: Any) -> NDArray[np.float64]:
-        return np.asarray(action, dtype=np.float64).reshape(shape)
+    def to_guard(action: Any) -> Action:
+        wanted = np.array(action, dtype=np.float64).reshape(shape)
+        return wanted if shape else float(wanted)
 
     def to_env(action: Action) -> NDArray[Any]:
         again = np.asarray(action).reshape(space.shape).astype(space.dtype)
