@@ -144,13 +144,6 @@ def test_there_is_no_step_without_an_episode():
         env.step([0.0])
 
 
-def test_noise_and_delay_are_in_what_is_seen_and_not_in_what_is_told():
-    env = CarFollowing(load_family("emergency").with_switches(["noise"]))
-    observation, info = env.reset(options={"index": 0})
-    assert observation[0] != info["gap"] == env.draw.scenario.initial_gap
-    assert observation in env.observation_space
-
-
 def test_in_a_platoon_the_example_prevents_collisions(monkeypatch):
     pytest.importorskip("pettingzoo")
     monkeypatch.syspath_prepend(Path(__file__).parents[2] / "examples")

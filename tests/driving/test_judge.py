@@ -225,19 +225,18 @@ def test_bad_input_is_named_and_changes_nothing(taught, snapshot, observation, a
 
 
 @pytest.mark.parametrize(
-    "settings_",
+    ("name", "wrong"),
     [
-        {"lowest": 0.0},
-        {"lowest": math.nan},
-        {"lowest": -2.5, "dt": 0.0},
-        {"lowest": -2.5, "own_brakes": -1.0},
-        {"lowest": -2.5, "leader_decel": math.nan},
-        {"lowest": -2.5, "margin": math.inf},
+        ("lowest", 0.0),
+        ("lowest", math.nan),
+        ("dt", 0.0),
+        ("own_brakes", -1.0),
+        ("margin", math.inf),
     ],
 )
-def test_settings_that_cannot_be_right_are_refused(settings_):
+def test_settings_that_cannot_be_right_are_refused(name, wrong):
     with pytest.raises(ValueError, match="must be"):
-        LatentRisk(**settings_)
+        LatentRisk(**{"lowest": -2.5, name: wrong})
 
 
 # -- In files ----------------------------------------------------------------------------------
@@ -308,17 +307,14 @@ def test_states_are_judged_at_their_centres_weighed_by_the_belief():
 # -- Sharing, and a table to begin with -------------------------------------------------------
 
 
-# Survived only up to some 9 m/s² of the leader.
-HERE = Situation(np.array([10.0, 20.0, 20.0]), np.ones(1), 0, np.nan, 0.0)
-
-
 def test_with_a_table_of_real_drives_a_tolerance_can_be_met_at_once():
     cautious, begun = (
         LatentRisk.given(-8.0, decel=7.0, leader_decel=10.0, leaders=leaders)
         for leaders in (None, REAL_DRIVES)
     )
-    assert cautious.judge(HERE, [0.0]).risk[0] == 1.0
-    judged = begun.judge(HERE, [0.0])
+    here = situation(10.0, 20.0, 20.0)  # survived only up to some 9 m/s² of the leader
+    assert cautious.judge(here, [0.0]).risk[0] == 1.0
+    judged = begun.judge(here, [0.0])
     assert 0.0 < judged.risk[0] <= 0.02
     assert judged.high[0] > 0.02  # it is not sure
     assert judged.evidence == sum(REAL_DRIVES.counts)
@@ -327,5 +323,3 @@ def test_with_a_table_of_real_drives_a_tolerance_can_be_met_at_once():
 def test_a_table_that_lacks_what_is_hard_here_is_refused():
     with pytest.raises(ValueError, match=r"from 2\.5 m/s² on, but hard is 2"):
         LatentRisk(-8.0, hard=2.0, leaders=REAL_DRIVES)
-    higher = LatentRisk(-8.0, hard=3.5, leaders=REAL_DRIVES).manoeuvres
-    assert len(higher) + higher.gentle == sum(REAL_DRIVES.counts) + REAL_DRIVES.gentle

@@ -20,7 +20,6 @@ from evofsm.driving.measures import (
     modified_time_to_collision,
     proactive_fuzzy,
     safe_distance,
-    time_headway,
     time_to_collision,
 )
 
@@ -150,17 +149,6 @@ def test_drac_is_what_stops_the_closing_within_the_gap():
     rows = np.array([[10.0, 30.0, 20.0], [10.0, 20.0, 30.0], [0.0, 20.0, 30.0]])
     assert deceleration_to_avoid_collision(rows).tolist() == [5.0, 0.0, np.inf]
     assert DecelerationToAvoidCollision(5.0).score(rows, DT).tolist() == [0.0, -5.0, np.inf]
-
-
-def test_headway_is_gap_over_own_speed():
-    rows = np.array([[30.0, 20.0, 0.0], [30.0, 0.0, 20.0], [-1.0, 0.0, 0.0]])
-    assert time_headway(rows).tolist() == [1.5, np.inf, 0.0]
-    assert TimeHeadway(2.0).score(rows, DT).tolist() == pytest.approx([1 / 6, -0.5, np.inf])
-
-
-def test_picud_is_the_gap_at_standstill():
-    # 30 m + 10²/6 m of the leader - 20 m of reaction - 20²/6 m of the follower.
-    assert Picud(3.0, 1.0).score(np.array([[30.0, 20.0, 10.0]]), DT) == pytest.approx(40.0)
 
 
 def test_the_safe_distance_of_rss_by_hand():

@@ -243,11 +243,6 @@ def test_bounds_hold_also_at_and_after_a_collision(gap):
     assert HASTY.propose(np.array([gap, 20.0, 0.0])).action == -4.0
 
 
-def test_free_road_gives_the_full_acceleration_at_rest_and_none_at_the_desired_speed():
-    assert NORMAL.propose(np.array([math.inf, 0.0, 0.0])).action == 1.25
-    assert NORMAL.propose(np.array([math.inf, 25.0, 0.0])).action == 0.0
-
-
 @pytest.mark.parametrize(
     ("change", "word"),
     [
