@@ -8,8 +8,6 @@ import pytest
 pytestmark = pytest.mark.slow
 
 pytest.importorskip("typer")
-pytest.importorskip("matplotlib")
-pytest.importorskip("polars")
 
 
 def evofsm(*arguments, folder):
@@ -25,7 +23,6 @@ def reproduced(tmp_path_factory):
     return evofsm("paper", "--out", "out", folder=folder), folder / "out"
 
 
-@pytest.mark.slow
 def test_all_claims_hold_and_the_page_is_named(reproduced):
     run, _ = reproduced
     assert run.returncode == 0, run.stderr
@@ -34,7 +31,6 @@ def test_all_claims_hold_and_the_page_is_named(reproduced):
     assert "\x1b" not in run.stdout, "colours in a pipe"
 
 
-@pytest.mark.slow
 def test_a_claim_that_fails_is_shown_and_ends_with_1(tmp_path):
     settings = tmp_path / "coarse.toml"
     settings.write_text("[machine]\nradius = 30.0\n")
@@ -48,21 +44,13 @@ def test_a_claim_that_fails_is_shown_and_ends_with_1(tmp_path):
     assert "states_final" in failing
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (("--settings", "missing.toml"), "missing.toml: no such file"),
-        (("--settings", "wrong.toml"), "there is no 'radios'"),
-        (("--out", "file"), "file"),
-        (("--rounds", "0"), "--rounds"),
-        (("--world", "mars"), "mars"),
-    ],
+    ("option", "value", "message"),
+    [("--settings", "missing.toml", "missing.toml: no such file"), ("--out", "file", "file")],
 )
-def test_what_cannot_be_done_is_said_in_a_line_and_ends_with_2(tmp_path, arguments, message):
-    (tmp_path / "wrong.toml").write_text("[machine]\nradios = 1\n")
+def test_what_cannot_be_done_is_said_in_a_line_and_ends_with_2(tmp_path, option, value, message):
     (tmp_path / "file").write_text("in the way")
-    run = evofsm("paper", "--world", "kinematic", *arguments, folder=tmp_path)
+    run = evofsm("paper", "--world", "kinematic", option, value, folder=tmp_path)
     assert run.returncode == 2
     assert message in run.stderr
     assert "Traceback" not in run.stderr

@@ -96,12 +96,15 @@ def test_the_terminal_says_the_same_and_cuts_no_number(width, monkeypatch, capsy
     from rich.console import Console
 
     wide = pl.DataFrame({"name": ["[bold]row"], **{f"column {k}": [12345.25] for k in range(20)}})
-    page = replace(PAGE, parts=[Table("Wide", wide)], targets=TARGETS.with_columns(met=False))
+    empty = Table("Empty", AREAS[:0], {"who": "{who}", "x": "{area:.1f}"})
+    parts = [Table("Wide", wide), empty]
+    page = replace(PAGE, parts=parts, targets=TARGETS.with_columns(met=False))
     print_page(page, out=Console(width=width, markup=False, highlight=False))
     said = capsys.readouterr().out
     assert said.count("12345.2") == 20
     assert "[bold]row" in said
     assert "! a" in said
+    assert "Empty" in said
     assert "Where it loses" in said
 
 
@@ -109,20 +112,13 @@ def test_the_terminal_says_the_same_and_cuts_no_number(width, monkeypatch, capsy
     ("template", "row", "text"),
     [
         ("{x:%}", {"x": 0.0001}, "0.01 %"),
-        ("{x:%}", {"x": 0.0}, "0.0 %"),
         ("{x} of {n}", {"x": 3, "n": 1200}, "3 of 1,200"),
         ("{x:.2f} ({l}–{h})", {"x": None, "l": None, "h": float("nan")}, "–"),
         ("{x}", {"x": True}, "yes"),
         ("{x}", {"x": [1, 2]}, "1, 2"),
         ("{x}", {"x": float("inf")}, "∞"),
         ("{x:.1e}", {"x": -4e-3}, "-4.0e-03"),
-        ("{x}", {"x": "rss-r157"}, "rss-r157"),
     ],
 )
 def test_cells_are_written_as_people_read_them(template, row, text):
     assert cell(template, row) == text
-
-
-def test_a_table_without_rows_can_be_shown(written):
-    empty = Table("Empty", AREAS[:0], {"who": "{who}", "x": "{area:.1f}"})
-    assert "Empty" in written(replace(PAGE, parts=[empty])).text
