@@ -317,18 +317,3 @@ def test_an_episode_begins_afresh_but_knows_its_sensors_and_keeps_more_distance(
     np.testing.assert_array_equal(
         sharp.judge(situation(row), ACTIONS).critical, sharp.critical(row, ACTIONS)
     )
-
-
-def test_asked_twice_it_answers_the_same_and_asked_otherwise_it_does_not():
-    risk, row = taught()
-    perception, row, off = risk.perception, tuple(row), tuple(row + 0.1)
-    first = perception.estimate(row, 0.5)
-    assert perception.estimate(row, 0.5) == first
-    for other in (
-        perception.estimate(off, 0.5),
-        perception.estimate(row, 0.0),
-        perception.estimate(row, 0.5, sure=False),
-    ):
-        assert other != first
-    perception.see(row, 0.5)
-    assert perception.estimate(row, 0.5) != first

@@ -14,12 +14,9 @@ from evofsm.driving.measures import (
     ResponsibilitySensitiveSafety,
     TimeHeadway,
     TimeToCollision,
-    critical_fuzzy,
     deceleration_to_avoid_collision,
     is_dead_end,
     modified_time_to_collision,
-    proactive_fuzzy,
-    safe_distance,
     time_to_collision,
 )
 
@@ -153,8 +150,9 @@ def test_drac_is_what_stops_the_closing_within_the_gap():
 
 def test_the_safe_distance_of_rss_by_hand():
     # 10 m and 0.25 m until it responds, 21²/10 m of braking, less 20²/16 m of the leader.
-    assert safe_distance(np.array([9.0, 20.0, 20.0]), 0.5, 2.0, 5.0, 8.0) == pytest.approx(29.35)
-    assert safe_distance(np.array([9.0, 5.0, 40.0]), 0.5, 2.0, 5.0, 8.0) == 0.0
+    rows = np.array([[9.0, 20.0, 20.0], [9.0, 5.0, 40.0]])
+    safe = ResponsibilitySensitiveSafety(0.5, 2.0, 5.0, 8.0).safe_distance(rows)
+    assert safe == pytest.approx([29.35, 0.0])
 
 
 def test_performance_models_score_in_metres_and_see_no_danger_in_opening_gaps():
@@ -166,7 +164,7 @@ def test_pfs_falls_from_the_unsafe_to_the_safe_distance():
     # Unsafe below 20 m and safe from 32 m on, behind a margin of 2 m.
     gaps = np.array([21.0, 22.0, 28.0, 33.9, 34.0, 40.0, 0.0, -1.0])
     rows = np.column_stack([gaps, np.full(8, 20.0), np.full(8, 20.0)])
-    pfs = proactive_fuzzy(rows, 1.0, 4.0, 5.0, 5.0, margin=2.0)
+    pfs = FuzzySafety(1.0, 4.0, 5.0, 5.0, margin=2.0).proactive(rows)
     assert pfs == pytest.approx([1.0, 1.0, 0.5, 0.1 / 12.0, 0.0, 0.0, 1.0, 1.0])
 
 
@@ -174,16 +172,16 @@ def test_cfs_falls_from_what_hard_to_what_comfortable_braking_needs():
     # 10 m of reaction, then 10 m or 12.5 m of braking.
     gaps = np.array([19.0, 20.0, 21.0, 22.5, 30.0])
     rows = np.column_stack([gaps, np.full(5, 20.0), np.full(5, 10.0)])
-    assert critical_fuzzy(rows, DT, 1.0, 4.0, 5.0).tolist() == [1.0, 1.0, 0.6, 0.0, 0.0]
+    assert FuzzySafety(1.0, 4.0, 5.0).critical(rows, DT).tolist() == [1.0, 1.0, 0.6, 0.0, 0.0]
 
 
 def test_cfs_trusts_braking_that_is_under_way_up_to_the_comfortable():
     # Braking by 3 m/s², 2 m/s too fast: 2²/6 m are needed.
     rows = np.array([[9.0, 13.0, 8.0], [0.7, 10.0, 8.0], [0.6, 7.0, 5.0]])
-    assert critical_fuzzy(rows, 1.0, 1.0, 4.0, 5.0)[1:].tolist() == [0.0, 1.0]
+    assert FuzzySafety(1.0, 4.0, 5.0).critical(rows, 1.0)[1:].tolist() == [0.0, 1.0]
     # Braking by 8 m/s², taken for 4 m/s²: from 10 to 6 m/s in 8 m, then 36/10 or 36/8 m.
     rows = np.array([[99.0, 28.0, 10.0], [12.05, 20.0, 10.0]])
-    assert critical_fuzzy(rows, 1.0, 1.0, 4.0, 5.0)[1] == pytest.approx(0.45 / 0.9)
+    assert FuzzySafety(1.0, 4.0, 5.0).critical(rows, 1.0)[1] == pytest.approx(0.45 / 0.9)
 
 
 # -- Dead ends --------------------------------------------------------------------------------

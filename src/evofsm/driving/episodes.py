@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from evofsm.driving.family import Draw, Family
 from evofsm.driving.revisers import Unrevised
-from evofsm.driving.scenarios import Scenario
+from evofsm.driving.scenarios import Scenario, steps_between
 from evofsm.driving.sumo import open_world
 from evofsm.driving.world import (
     COMMANDED,
@@ -84,7 +84,7 @@ def drive(
         raise ValueError("nobody drives: a Scenario has no controller of its own, so give one")
     if isinstance(guard.actions, BoxActions):
         raise ValueError("the guard's actions are vectors, but a car is driven by one number")
-    steps = scenario.steps_between(guard.interval)
+    steps = steps_between(guard.interval, scenario.dt)
     with (world or KinematicWorld()).open(scenario) as road:
         decisions = tuple(run_episode(OnRoad(road, steps), guard, controller))
         return replace(road.episode(), decisions=decisions)

@@ -285,24 +285,12 @@ def held_out(family: Family, seed: int, episodes: int) -> list[Draw]:
 # The sizes are our own: what a production radar and brake system roughly show.
 
 
-def _noise(scenario: Scenario, numbers: Numbers) -> Scenario:
-    """White noise on gap [m] and both speeds [m/s], new at every step."""
-    return replace(scenario, sensors=replace(scenario.sensors, gap_noise=0.5, speed_noise=0.3))
+def _with(part: str, **values: float) -> Callable[[Scenario, Numbers], Scenario]:
+    def switch(scenario: Scenario, numbers: Numbers) -> Scenario:
+        changed = replace(getattr(scenario, part), **values)
+        return replace(scenario, **{part: changed})
 
-
-def _delay(scenario: Scenario, numbers: Numbers) -> Scenario:
-    """What is seen is 0.2 s old."""
-    return replace(scenario, sensors=replace(scenario.sensors, delay=0.2))
-
-
-def _actuator(scenario: Scenario, numbers: Numbers) -> Scenario:
-    """From a command to its effect it takes 0.2 s."""
-    return replace(scenario, body=replace(scenario.body, delay=0.2))
-
-
-def _jerk(scenario: Scenario, numbers: Numbers) -> Scenario:
-    """The realised acceleration changes by at most 15 m/s³."""
-    return replace(scenario, body=replace(scenario.body, jerk=15.0))
+    return switch
 
 
 def _third_car(scenario: Scenario, numbers: Numbers) -> Scenario:
@@ -314,9 +302,9 @@ def _third_car(scenario: Scenario, numbers: Numbers) -> Scenario:
 
 #: What can be switched on in any family, by name.
 SWITCHES: Mapping[str, Callable[[Scenario, Numbers], Scenario]] = {
-    "noise": _noise,
-    "delay": _delay,
-    "actuator": _actuator,
-    "jerk": _jerk,
+    "noise": _with("sensors", gap_noise=0.5, speed_noise=0.3),  # white, on all, at every step
+    "delay": _with("sensors", delay=0.2),  # of what is seen
+    "actuator": _with("body", delay=0.2),  # from a command to its effect
+    "jerk": _with("body", jerk=15.0),
     "third_car": _third_car,
 }

@@ -214,27 +214,13 @@ class Picud(_Measure):
 # -- Safe distances -------------------------------------------------------------------------------
 
 
-def safe_distance(
-    observations: Floats, response: float, accel: float, decel: float, leader_decel: float
-) -> Floats:
-    """Gap from which the follower can still stop behind a leader that brakes in full [m].
-
-    v·ρ + a·ρ²/2 + (v + ρ·a)² / (2·decel) − v_leader² / (2·leader_decel), or 0 if that is negative,
-    where v is the follower's speed, ρ the ``response`` [s], a ``accel`` [m/s²], ``decel`` the
-    braking that it is sure to reach and ``leader_decel`` the hardest of the leader [m/s²].
-    """
-    _, speed, leader_speed = _columns(observations)
-    fastest = speed + response * accel
-    travelled = (speed + fastest) / 2.0 * response
-    stopping = travelled + fastest**2 / (2.0 * decel)
-    return np.asarray(np.maximum(stopping - leader_speed**2 / (2.0 * leader_decel), 0.0))
-
-
 @dataclass(frozen=True)
 class ResponsibilitySensitiveSafety(_Measure):
     """RSS (Shalev-Shwartz et al. 2017, arXiv:1708.06374), its longitudinal part.
 
-    Danger where the gap is shorter than the safe distance. ``response`` and ``accel`` may be 0.
+    Danger where the gap is shorter than the safe distance: the follower accelerates by ``accel`` at
+    most for a ``response`` [s], both of which may be 0, and is sure to brake by ``decel`` then, the
+    leader by ``leader_decel`` at most [m/s²].
 
     Examples
     --------
@@ -269,8 +255,20 @@ class ResponsibilitySensitiveSafety(_Measure):
     def score(self, observations: Floats, dt: float) -> Floats:
         """Safe distance − gap [m]; infinite where the cars have met."""
         gap = _columns(observations)[0]
-        safe = safe_distance(observations, self.response, self.accel, self.decel, self.leader_decel)
-        return _unsafe_once_met(gap, safe - gap)
+        return _unsafe_once_met(gap, self.safe_distance(observations) - gap)
+
+    def safe_distance(self, observations: Floats) -> Floats:
+        """Gap from which the follower can still stop behind a leader that brakes in full [m].
+
+        v·ρ + a·ρ²/2 + (v + ρ·a)² / (2·decel) − v_leader² / (2·leader_decel), or 0 if that is
+        negative, where v is the follower's speed, ρ the ``response`` and a ``accel``.
+        """
+        _, speed, leader_speed = _columns(observations)
+        fastest = speed + self.response * self.accel
+        travelled = (speed + fastest) / 2.0 * self.response
+        stopping = travelled + fastest**2 / (2.0 * self.decel)
+        left = stopping - leader_speed**2 / (2.0 * self.leader_decel)
+        return np.asarray(np.maximum(left, 0.0))
 
 
 @dataclass(frozen=True)
@@ -316,55 +314,6 @@ class PerformanceModel(_Measure):
 
 
 # -- Fuzzy safety ---------------------------------------------------------------------------------
-
-
-def proactive_fuzzy(
-    observations: Floats,
-    reaction: float,
-    comfortable_decel: float,
-    decel: float,
-    leader_decel: float,
-    margin: float,
-) -> Floats:
-    """PFS, how unsafe the gap is should the leader brake in full (Mattas et al. 2020).
-
-    With the distance s(b) = v·reaction + v² / (2·b) − v_leader² / (2·leader_decel), it is 1,
-    unsafe, for gap − margin below s(decel) and where the cars have met, 0 above
-    s(comfortable_decel) + margin, and linear in between. The parameters are those of `FuzzySafety`.
-    """
-    gap, speed, leader_speed = _columns(observations)
-    shared = speed * reaction - leader_speed**2 / (2.0 * leader_decel)
-    unsafe = shared + speed**2 / (2.0 * decel)
-    safe = shared + speed**2 / (2.0 * comfortable_decel) + margin
-    return np.where(gap <= 0.0, 1.0, _membership(gap - margin, unsafe, safe))
-
-
-def critical_fuzzy(
-    observations: Floats, dt: float, reaction: float, comfortable_decel: float, decel: float
-) -> Floats:
-    """CFS, how unsafe the gap is while the follower closes in on a leader that keeps its speed.
-
-    Until it reacts, the follower keeps its acceleration (since the row before, ``dt`` [s] ago), or
-    brakes by ``comfortable_decel`` where it brakes harder than that. If it is then still the faster
-    one, CFS is 1, unsafe, for gaps from which ``decel`` would not do, 0 for gaps from which
-    ``comfortable_decel`` does, and linear in between. If not, it is 1 for gaps from which the
-    present braking does not do, and 0 else; 1 where the cars have met.
-    """
-    gap, speed, leader_speed = _columns(observations)
-    closing = speed - leader_speed
-    accel = _acceleration(speed, dt)
-    change = np.maximum(accel, -comfortable_decel) * reaction
-    later = closing + change
-    travelled = (closing + later) / 2.0 * reaction
-    approaches = closing > 0.0
-    slows = approaches & (later < 0.0)
-    # What the present braking needs until the speeds are equal.
-    present = np.zeros_like(gap)
-    np.divide(closing**2, -2.0 * accel, out=present, where=slows)
-    unsafe = np.where(slows, present, travelled + later**2 / (2.0 * decel))
-    safe = np.where(slows, present, travelled + later**2 / (2.0 * comfortable_decel))
-    critical = np.where(approaches, _membership(gap, unsafe, safe), 0.0)
-    return np.where(gap <= 0.0, 1.0, critical)
 
 
 def _membership(gap: Floats, unsafe: Floats, safe: Floats) -> Floats:
@@ -413,9 +362,46 @@ class FuzzySafety(_Measure):
 
     def score(self, observations: Floats, dt: float) -> Floats:
         """The larger one of PFS and CFS − threshold; 1 − threshold where the cars have met."""
-        own = self.reaction, self.comfortable_decel, self.decel
-        proactive = proactive_fuzzy(observations, *own, self.leader_decel, self.margin)
-        return np.maximum(proactive, critical_fuzzy(observations, dt, *own)) - self.threshold
+        return np.maximum(self.proactive(observations), self.critical(observations, dt)) - (
+            self.threshold
+        )
+
+    def proactive(self, observations: Floats) -> Floats:
+        """PFS, how unsafe the gap is should the leader brake in full (Mattas et al. 2020).
+
+        With the distance s(b) = v·reaction + v² / (2·b) − v_leader² / (2·leader_decel), it is 1,
+        unsafe, for gap − margin below s(decel) and where the cars have met, 0 above
+        s(comfortable_decel) + margin, and linear in between.
+        """
+        gap, speed, leader_speed = _columns(observations)
+        shared = speed * self.reaction - leader_speed**2 / (2.0 * self.leader_decel)
+        unsafe = shared + speed**2 / (2.0 * self.decel)
+        safe = shared + speed**2 / (2.0 * self.comfortable_decel) + self.margin
+        return np.where(gap <= 0.0, 1.0, _membership(gap - self.margin, unsafe, safe))
+
+    def critical(self, observations: Floats, dt: float) -> Floats:
+        """CFS, how unsafe the gap is while the follower closes in on a leader that keeps its speed.
+
+        Until it reacts, the follower keeps its acceleration (since the row before, ``dt`` [s] ago),
+        or brakes comfortably where it brakes harder than that. If it is then still the faster one,
+        CFS is 1, unsafe, for gaps from which ``decel`` would not do, 0 for gaps from which
+        ``comfortable_decel`` does, and linear in between. If not, it is 1 for gaps from which the
+        present braking does not do, and 0 else; 1 where the cars have met.
+        """
+        gap, speed, leader_speed = _columns(observations)
+        closing, comfortable = speed - leader_speed, self.comfortable_decel
+        accel = _acceleration(speed, dt)
+        later = closing + np.maximum(accel, -comfortable) * self.reaction
+        travelled = (closing + later) / 2.0 * self.reaction
+        approaches = closing > 0.0
+        slows = approaches & (later < 0.0)
+        # What the present braking needs until the speeds are equal.
+        present = np.zeros_like(gap)
+        np.divide(closing**2, -2.0 * accel, out=present, where=slows)
+        unsafe = np.where(slows, present, travelled + later**2 / (2.0 * self.decel))
+        safe = np.where(slows, present, travelled + later**2 / (2.0 * comfortable))
+        critical = np.where(approaches, _membership(gap, unsafe, safe), 0.0)
+        return np.where(gap <= 0.0, 1.0, critical)
 
 
 #: Measures with the constants of their sources, by the names of their revisers.

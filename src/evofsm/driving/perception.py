@@ -70,7 +70,6 @@ class Perception:
     def clear(self) -> None:
         """An episode begins: nothing is known of where one is; the noise is that of before."""
         self._latest: Estimate | None = None
-        self._asked: tuple[Three, float, bool] | None = None
         self._seen: Three | None = None
         self._changes = nan, nan  # of both speeds, beyond what was expected
 
@@ -89,7 +88,6 @@ class Perception:
             if learn and self._seen is not None:
                 self._learn(self._seen, now, realised)
             self._seen = now
-        self._asked = None
         if is_whole(estimate.mean):
             self._latest = estimate
         return estimate
@@ -100,11 +98,8 @@ class Perception:
             return Estimate(now, _EXACT)
         if self._latest is None:
             return Estimate(now, _diagonal(self.noise))
-        if self._asked != (now, realised, sure):  # whoever judges and then learns asks twice
-            doubt = _OWN if sure else _OWN_UNKNOWN
-            filtered = _filtered(*self._latest, now, self.noise, realised, doubt, self.dt)
-            self._asked, self._answer = (now, realised, sure), Estimate(*filtered)
-        return self._answer
+        doubt = _OWN if sure else _OWN_UNKNOWN
+        return Estimate(*_filtered(*self._latest, now, self.noise, realised, doubt, self.dt))
 
     def _learn(self, before: Three, now: Three, realised: float) -> None:
         """Take in what kinematics do not explain; of who may stand nothing."""
@@ -129,7 +124,7 @@ class Perception:
         """Take over what `learnt` returned."""
         gap, own, leader = (_Sizes(np.asarray(latest[name]).tolist()) for name in _NAMES)
         self._sizes = gap, own, leader
-        self.noise, self._asked = _noise(self._sizes, self.dt), None
+        self.noise = _noise(self._sizes, self.dt)
 
 
 def is_whole(observation: Three) -> bool:

@@ -141,10 +141,6 @@ class Scenario:
         """How many steps that is, rounded."""
         return round(seconds / self.dt)
 
-    def steps_between(self, interval: float) -> int:
-        """How many steps lie between two decisions; a ValueError where they are no multiple."""
-        return steps_between(interval, self.dt)
-
 
 def steps_between(interval: float, dt: float) -> int:
     """How many steps lie between two decisions; a ValueError where they are no multiple."""

@@ -288,13 +288,9 @@ class TrafficRisk(ActionJudge):
 
 def _worse(one: Judgement, other: Judgement) -> Judgement:
     """The higher risk of each action."""
-    return Judgement(
-        np.maximum(one.risk, other.risk),
-        np.maximum(one.low, other.low),
-        np.maximum(one.high, other.high),
-        np.minimum(one.critical, other.critical),
-        max(one.evidence, other.evidence),
-    )
+    risks = map(np.maximum, one[:3], other[:3])
+    critical = np.minimum(one.critical, other.critical)
+    return Judgement(*risks, critical, max(one.evidence, other.evidence))
 
 
 def _best(

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evofsm.driving.drivers import idm_kernel
-from evofsm.driving.scenarios import Scenario
+from evofsm.driving.scenarios import Scenario, steps_between
 from evofsm.fsm.kernels import compiled
 from evofsm.guard import Controller, Decision, Proposal
 
@@ -216,8 +216,8 @@ def advance(
 # -- A run under way ------------------------------------------------------------------------------
 
 
-class Road(ABC):
-    """Cars under way in one run of a scenario.
+class Road:
+    """Cars under way in one run of a scenario, in closed form.
 
     Whoever drives asks `observation`, then tells `advance` what to do. The run is `over` with the
     row in which two cars met, or with the last; `advance` then only records what was commanded.
@@ -234,10 +234,11 @@ class Road(ABC):
         start[GAP], start[GAP_BEHIND] = scenario.initial_gap, behind.gap if behind else math.inf
         start[SPEED] = start[SPEED_BEHIND] = scenario.initial_speed
         start[LEADER_SPEED] = scenario.leader.initial_speed
+        self._positions = np.array([0.0, start[GAP], -start[GAP_BEHIND]])
 
-    @abstractmethod
     def advance(self, command: float, steps: int = 1) -> None:
         """Drive some steps with this acceleration commanded to the follower [m/s²]."""
+        self.row = advance(self._plan, self._record, self._positions, self.row, command, steps)
 
     @property
     def time(self) -> float:
@@ -322,7 +323,7 @@ class World(ABC):
         It is asked every ``interval`` [s], a multiple of the scenario's step, or at every step. A
         proposal that is no finite number raises a ValueError.
         """
-        steps = 1 if interval is None else scenario.steps_between(interval)
+        steps = 1 if interval is None else steps_between(interval, scenario.dt)
         propose = getattr(controller, "propose", None) or (lambda seen, time: controller(seen))  # type: ignore[operator]
         over = False
         with self.open(scenario) as road:
@@ -365,16 +366,4 @@ class KinematicWorld(World):
 
     def open(self, scenario: Scenario) -> AbstractContextManager[Road]:
         """Put the cars on a road, for use in a ``with`` statement."""
-        return nullcontext(_Road(scenario))
-
-
-class _Road(Road):
-    """The road in closed form."""
-
-    def __init__(self, scenario: Scenario) -> None:
-        super().__init__(scenario)
-        behind = scenario.behind.gap if scenario.behind else math.inf
-        self._positions = np.array([0.0, scenario.initial_gap, -behind])
-
-    def advance(self, command: float, steps: int = 1) -> None:
-        self.row = advance(self._plan, self._record, self._positions, self.row, command, steps)
+        return nullcontext(Road(scenario))
