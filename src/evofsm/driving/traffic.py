@@ -288,9 +288,9 @@ class TrafficRisk(ActionJudge):
 
 def _worse(one: Judgement, other: Judgement) -> Judgement:
     """The higher risk of each action."""
-    risks = map(np.maximum, one[:3], other[:3])
+    risk, low, high = map(np.maximum, one[:3], other[:3])
     critical = np.minimum(one.critical, other.critical)
-    return Judgement(*risks, critical, max(one.evidence, other.evidence))
+    return Judgement(risk, low, high, critical, max(one.evidence, other.evidence))
 
 
 def _best(
