@@ -107,7 +107,7 @@ def drive(
     require_world(world, **({"polars": "tables"} if out is not None and not at_once else {}))
     require(**({} if mcap is None else {"mcap": "mcap"}))
     require(**({} if foxglove is None else {"foxglove": "foxglove"}))
-    from evofsm.cli.driving import GUARD, Results, Setup, load_guard, make_guard
+    from evofsm.cli.driving import GUARD, Results, Setup, drive_at_once, load_guard, make_guard
     from evofsm.guard import Mode
 
     setup = Setup(
@@ -131,7 +131,9 @@ def drive(
             raise ValueError(f"--mcap holds what one run drives, but {found}")
         try:
             if at_once:
-                driving = _drive_at_once(results, episodes, workers, cluster)
+                count = workers or (1 if cluster else os.cpu_count() or 1)
+                with _shown(episodes) as move:
+                    driving = drive_at_once(results, episodes, count, cluster, move)
             else:
                 driving = _drive_in_turn(results, episodes, audit, mcap, foxglove)
         except KeyboardInterrupt:
@@ -198,16 +200,6 @@ def _drive_in_turn(
     if log is not None:
         warn(f"head of {audit}, to be kept elsewhere: {log.head}")
     return driving
-
-
-def _drive_at_once(
-    results: Results, episodes: int, workers: int | None, cluster: str | None
-) -> Driving:
-    from evofsm.cli.driving import drive_at_once
-
-    count = workers or (1 if cluster else os.cpu_count() or 1)
-    with _shown(episodes) as move:
-        return drive_at_once(results, episodes, count, cluster, move)
 
 
 @contextmanager

@@ -18,6 +18,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import BrokenExecutor, ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass
 from functools import partial
+from itertools import chain
 from multiprocessing import get_context, parent_process
 from pathlib import Path
 from threading import Thread
@@ -312,11 +313,11 @@ def drive_at_once(
     size = max(1, min(_BATCH, len(missing) // (8 * workers)))
     batches = [missing[place : place + size] for place in range(0, len(missing), size)]
     drive = partial(_drive_batch, trial)
-    driven = _in_processes(drive, batches, workers)
-    if cluster is not None:
+    if cluster is None:
+        driven = _in_processes(drive, batches, workers)
+    else:
         driven = _on_cluster(drive, batches, cluster, workers)
-    show(len(results.rows), sum(row["collided"] for row in results.rows.values()))
-    for rows in driven:
+    for rows in chain([[]], driven):  # first what was driven before
         for row in rows:
             results.add(row)
         show(len(results.rows), sum(row["collided"] for row in results.rows.values()))

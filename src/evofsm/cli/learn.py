@@ -354,23 +354,19 @@ def _save(
 
 def _document(learning: Learning, provenance: Mapping[str, Any]) -> dict[str, Any]:
     """All that is printed, for JSON; states and actions from 0."""
-    read = learning.read
-    names = ("rows", "episodes", "seconds", "clipped_below", "clipped_above", "jumps")
-    known = read.failures if learning.model.failures_told else None
-    return {
-        **{name: getattr(read, name) for name in names},
-        "transitions": learning.transitions,
-        "failures": known,
-        "certainty": learning.certainty,
-        "skills": learning.skills,
-        "model": {**model_document(learning.model), "provenance": provenance},
-    }
+    names = ("rows", "episodes", "seconds", "clipped_below", "clipped_above", "jumps", "failures")
+    found = {name: getattr(learning.read, name) for name in names}
+    if not learning.model.failures_told:
+        found["failures"] = None
+    found |= {"transitions": learning.transitions, "certainty": learning.certainty}
+    model = {**model_document(learning.model), "provenance": provenance}
+    return {**found, "skills": learning.skills, "model": model}
 
 
 def _read(learning: Learning, action: str) -> Iterator[tuple[str, str]]:
     read, actions = learning.read, learning.model.actions
     yield "rows", f"{read.rows:,}, one every {learning.model.dt:g} s"
-    yield "episodes", f"{read.episodes:,}, together {_duration(read.seconds)}"
+    yield "episodes", f"{read.episodes:,}, together {read.seconds:,.1f} s"
     yield "transitions", f"{learning.transitions:,}"
     if read.jumps:
         yield "time jumps", f"{read.jumps:,}; each begins an episode"
@@ -399,23 +395,12 @@ def _read_otherwise(
         yield "converted", f"{', '.join(given)} to units of the SI"
 
 
-def _duration(seconds: float) -> str:
-    if seconds < 120.0:
-        return f"{seconds:.1f} s"
-    minutes = seconds / 60.0
-    return f"{minutes:.1f} min" if minutes < 120.0 else f"{minutes / 60.0:.1f} h"
-
-
 def _skills(skills: Sequence[Skill]) -> Iterator[RenderableType]:
-    rows = [
-        (
-            f"{one.seconds:g} s",
-            f"{one.divergence:.2g}",
-            f"{one.persistence:.2g}",
-            _skill_text(one.skill),
-        )
-        for one in skills
-    ]
+    rows = []
+    for one in skills:
+        skill = "none" if math.isnan(one.skill) else f"{one.skill:+,.2f}"
+        divergences = f"{one.divergence:.2g}", f"{one.persistence:.2g}"
+        rows.append((f"{one.seconds:g} s", *divergences, skill))
     header = ("ahead", "forecast [bit]", "persistence [bit]", "skill")
     yield table("Forecasts compared with persistence", header, rows)
     yield (
@@ -426,9 +411,3 @@ def _skills(skills: Sequence[Skill]) -> Iterator[RenderableType]:
     )
     if len(skills) == 1:
         yield "The step is too long for a separate forecast of 1 s ahead."
-
-
-def _skill_text(skill: float) -> str:
-    if math.isnan(skill):
-        return "none"
-    return f"{skill:+.2f}" if abs(skill) < 10.0 else f"{skill:+,.0f}"

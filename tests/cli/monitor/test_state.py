@@ -1,9 +1,8 @@
-import numpy as np
 import pytest
 
 from evofsm.cli.monitor.decider import Decider, guard_of_monitor
 from evofsm.cli.monitor.state import State
-from evofsm.guard import Guard, Mode
+from evofsm.guard import Mode
 from evofsm.store import read_header
 from monitor_rows import JUNK, line, scenes, traffic
 
@@ -52,38 +51,6 @@ def test_it_goes_on_bit_for_bit_wherever_it_is_killed(tmp_path, learn, mode):
         if k % 50 == 0:
             assert decider.answer(JUNK[k // 50 % len(JUNK)])["kind"] == "error"
         assert decider.answer(line(row)) == plain.answer(line(row)), k
-    state.close()
-
-
-@pytest.mark.slow
-def test_a_learnt_judge_goes_on_bit_for_bit(tmp_path):
-    """One that is told nothing but failures, and draws random numbers as it learns."""
-
-    def fresh():
-        return Guard(low=-1.0, high=1.0, interval=0.1)
-
-    def messages():
-        rng = np.random.default_rng(0)
-        for k in range(8):
-            x = v = 0.0
-            for j in range(60):
-                push = float(rng.uniform(-1.0, 1.0))
-                seen = {"observation": [x, v], "proposal": push}
-                yield line({"time": 100.0 * k + 0.1 * j, **seen})
-                v += 0.1 * (push + 2.0 * x)
-                x += 0.1 * v
-                if abs(x) > 1.0:
-                    break
-            yield line({"end": True, "failed": abs(x) > 1.0, "observation": [x, v]})
-
-    plain = Decider(fresh())
-    decider, state = opened(tmp_path / "state.evofsm", fresh=fresh)
-    for k, message in enumerate(messages()):
-        if k % 37 == 20:
-            abandoned(state)
-            decider, state = opened(tmp_path / "state.evofsm", fresh=fresh)
-        assert decider.answer(message) == plain.answer(message), k
-    assert decider.n > 200
     state.close()
 
 

@@ -1,7 +1,7 @@
 """The messages of a monitor: what a line may hold, checked before anything is done with it.
 
 A message is a JSON object on a line of its own; ``docs/monitor.md`` describes each key. `msgspec`
-checks types and ranges; the sentences that say what was wrong are made here.
+checks types and ranges; here the key and the value are added to what it says.
 """
 
 from __future__ import annotations
@@ -35,21 +35,6 @@ _WIDTH = 1.8
 _Number = Annotated[float, Meta(ge=-LARGEST_OBSERVATION, le=LARGEST_OBSERVATION)]
 _Seen = _Number | None
 _Name = Annotated[str, Meta(max_length=_SHOWN)] | Annotated[int, Meta(ge=-(2**63), le=2**63 - 1)]
-
-_NUMBER = "a finite number"
-_NAMED = f"an int, or a text of at most {_SHOWN} letters"
-# What a value must be, by how msgspec begins to say what it expected.
-_RULES = {
-    "`float | null`": f"{_NUMBER}, or null if not seen",
-    "`float`": _NUMBER,
-    "`int | str`": _NAMED,
-    "`int | float | str`": _NAMED,
-    "`str`": _NAMED,
-    "`int`": "an int",
-    "`bool`": "true or false",
-    "`object`": "a JSON object",
-    "`array": "a list",
-}
 
 
 class MessageError(ValueError):
@@ -169,7 +154,7 @@ class Form:
             where = f"objects[{k}]"
             _refuse_nowhere(one, where, along)
             if one.id is UNSET:
-                raise MessageError(f"{where}.id", f"is missing; it must be {_NAMED}")
+                raise MessageError(f"{where}.id", "is missing; it must be an int or a text")
             in_lanes = one.lane is not UNSET and ego.lane is not UNSET
             if not in_lanes and (one.y is UNSET or ego.y is UNSET):
                 what = "is given for it or for ego, but not for both; nor is y"
@@ -191,7 +176,7 @@ class Form:
         text, _, place = error.partition(" - at `$")
         place = place.removesuffix("`").removeprefix(".")
         if text == "Number out of range":
-            return MessageError(place or "line", f"is too large; it must be {_NUMBER}")
+            return MessageError(place or "line", "is too large")
         told = _parsed(line)
         time = _time(told)
         if found := re.fullmatch(r"Object (missing|contains).* field `(.*)`", text):
@@ -205,7 +190,8 @@ class Form:
         if place == "schema":
             what = f"is {value}; this monitor knows version {SCHEMA} alone"
         else:
-            what = f"is {value}; it must be {_rule(text, place)}"
+            expected = re.sub("^Expected |, got .*|`", "", text).replace(" | ", " or ")
+            what = f"is {value}; it must be {expected}"
         return MessageError(place or "line", what, time)
 
 
@@ -304,20 +290,6 @@ def _at(told: Any, place: str) -> Any:
     for part in re.findall(r"[^.\[\]]+", place):
         told = told[int(part)] if isinstance(told, list) else told.get(part)
     return told
-
-
-def _rule(text: str, place: str) -> str:
-    """What a value must be, from what msgspec expected of it."""
-    expected = re.sub(r"^Expected |, got .*", "", text)
-    if found := re.fullmatch(r"`array` of length [<>]= (\d+)", expected):
-        return f"a list of {found[1]} numbers"
-    if found := re.fullmatch(r"`int` [<>]= (\d+)", expected):
-        return f"an int of at {'most' if '<' in expected else 'least'} {found[1]}"
-    is_action = place == "proposal"
-    if is_action:
-        expected = expected.replace(" | null", "")
-    rule = next((rule for begin, rule in _RULES.items() if expected.startswith(begin)), _NUMBER)
-    return f"{rule}, or null if there is none" if is_action else rule
 
 
 def _missing(about: str) -> str:
