@@ -222,8 +222,7 @@ def _recording(
         return nullcontext()
     from evofsm.io.foxglove import recording
 
-    told = setup.settings | {"family": setup.family.name, "first": setup.first}
-    return recording(mcap, told | {"episodes": episodes})
+    return recording(mcap, setup.settings | {"first": setup.first, "episodes": episodes})
 
 
 @contextmanager

@@ -90,14 +90,12 @@ class Setup:
     @property
     def settings(self) -> dict[str, Any]:
         """All that an episode depends on, for JSON."""
-        of_family = {
-            "name": self.family.name,
-            "switches": list(self.family.switches),
-            "file": self.family.source and Path(self.family.source).read_text("utf-8"),
-        }
-        names = ("reviser", "judge", "tolerance", "seed", "world", "learn", "learnt", "digest")
-        own = {name: getattr(self, name) for name in names}
-        return {"family": of_family, **own, "mode": self.mode.value}
+        names = ("reviser", "judge", "tolerance", "seed", "world")
+        own = {name: getattr(self, name) for name in (*names, "learn", "learnt", "digest")}
+        own |= {"family": self.family.name, "switches": self.family.switches}
+        own |= {"mode": self.mode.value}
+        source = self.family.source
+        return {**own, "file": source and Path(source).read_text("utf-8")}
 
     def trial(self, guard: Guard, world: World | str) -> Trial:
         """Its episodes, by their number: training draws while it learns, held-out ones else."""

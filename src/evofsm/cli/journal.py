@@ -149,25 +149,14 @@ def _record(line: bytes) -> dict[str, Any] | None:
 
 def differences(before: Record, now: Record) -> str:
     """In which settings two pieces of work differ, in words; empty where in none."""
-    flat_before, flat_now = _flat(before), _flat(now)
+    now = json.loads(msgspec.json.encode(now))  # as the other was read
     found = [
-        f"{name} was {_shown(flat_before.get(name))} and is now {_shown(flat_now.get(name))}"
-        for name in flat_before | flat_now
-        if flat_before.get(name) != flat_now.get(name)
+        f"{name} was {_shown(before.get(name))} and is now {_shown(now.get(name))}"
+        for name in {**before, **now}
+        if before.get(name) != now.get(name)
     ]
     more = f" and {len(found) - _NAMED} more" if len(found) > _NAMED else ""
     return ", ".join(found[:_NAMED]) + more
-
-
-def _flat(value: Any, name: str = "") -> dict[str, Any]:
-    """Settings within settings, by names with dots, as JSON has them."""
-    if not isinstance(value, dict | list | tuple):
-        return {name: json.loads(msgspec.json.encode(value))}
-    items = value.items() if isinstance(value, dict) else enumerate(value)
-    found: dict[str, Any] = {}
-    for inner, one in items:
-        found |= _flat(one, f"{name}.{inner}" if name else str(inner))
-    return found
 
 
 def _shown(value: Any) -> str:

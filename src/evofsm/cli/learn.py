@@ -157,7 +157,8 @@ def learn(
         names = ("action", "time", "failed", "dt", "no_leader")
         settings = {name: getattr(columns, name) for name in names}
         settings |= {"observe": observe, "episode": columns.episode, "units": unit or []}
-        settings |= {"files": known, "actions": action_range, "lengths": vehicle_length or []}
+        settings |= {f"bytes of {file['name']}": file["bytes"] for file in known}
+        settings |= {"actions": action_range, "lengths": vehicle_length or []}
         settings |= {"machine": repr(machine), "topics": topics and topics.read_text("utf-8")}
         keeper = Checkpoint(checkpoint, settings)
     read_topics = None if topics is None else Topics.load(topics)

@@ -76,8 +76,6 @@ class Recording:
     def step(self) -> Frame:
         """The next frame."""
         number, decisions = self._number, len(self._episode.columns["time"])
-        if number > decisions:
-            raise RuntimeError("the episode is over; restart it")
         frame = self._moved(number)
         if number < decisions:
             frame = frame._replace(**_decided(self._episode.columns, number))

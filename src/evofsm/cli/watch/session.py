@@ -119,14 +119,11 @@ class Session:
         self._number, self._row, self._position, self._stood = 0, 0, 0.0, 0.0
         self._state: int | None = None
         self._held = np.full(3, np.nan)
-        self._over = False
         self.start = self._begun()
         return self.start
 
     def step(self) -> Frame:
         """One decision, and what came of the one before."""
-        if self._over:
-            raise RuntimeError("the run is over; restart it")
         ends = self._road.over or self._stood >= _STANDING
         frame = self._end() if ends else self._decide()
         frame = frame._replace(story=self._chronicle.tell(frame))
@@ -189,7 +186,6 @@ class Session:
         )
 
     def _end(self) -> Frame:
-        self._over = True
         self._guard.end(self._road.collided, self._road.observation)
         self.learnt += 1
         return self._seen()._replace(
