@@ -3,7 +3,7 @@
 import math
 import re
 import time
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 
 import pytest
 
@@ -12,8 +12,6 @@ pytest.importorskip("playwright.sync_api")
 
 from playwright import sync_api as playwright
 
-from evofsm.cli.watch.player import Player
-from evofsm.cli.watch.server import LivePage
 from evofsm.cli.watch.session import Session, learn_first, watched_guard
 from evofsm.driving import KinematicWorld, load_family
 
@@ -23,9 +21,9 @@ pytestmark = pytest.mark.usefixtures("compiled")
 
 
 @pytest.fixture
-def seen(browser):
+def seen(browser, shown):
     """Opens the page on a run; it must not complain, nor ask anyone else for anything."""
-    contexts, wrong = [], []
+    wrong = []
 
     @contextmanager
     def session():
@@ -34,16 +32,19 @@ def seen(browser):
         with Session(PAPER, guard, KinematicWorld()) as opened:
             yield opened
 
-    with LivePage() as live:
-        players = []
+    with ExitStack() as stack:
 
         def see(width=1280, height=800, **settings):
-            player = Player(session, live, **settings)
-            players.append(player.__enter__())
-            live.player = player
-            contexts.append(browser.new_context(viewport={"width": width, "height": height}))
-            page = contexts[-1].new_page()
+            live = stack.enter_context(shown(session, **settings))
+            context = browser.new_context(viewport={"width": width, "height": height})
+            stack.callback(context.close)
+            page = context.new_page()
             page.set_default_timeout(60_000)
+
+            def asked(url):
+                if live.token not in url and not url.startswith("data:"):
+                    wrong.append(url)
+
             page.on("console", lambda message: wrong.append(message.text))
             page.on("pageerror", lambda error: wrong.append(str(error)))
             page.on("request", lambda request: asked(request.url))
@@ -51,15 +52,7 @@ def seen(browser):
             page.goto(live.address)
             return page
 
-        def asked(url):
-            if live.token not in url and not url.startswith("data:"):
-                wrong.append(url)
-
         yield see
-        for context in contexts:
-            context.close()
-        for player in players:
-            player.__exit__()
     assert wrong == []
 
 

@@ -15,8 +15,6 @@ pytest.importorskip("websockets")
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
-from evofsm.cli.watch.player import Player
-from evofsm.cli.watch.server import LivePage
 from evofsm.cli.watch.session import Session, watched_guard
 from evofsm.driving import KinematicWorld, load_family
 
@@ -25,18 +23,17 @@ pytestmark = pytest.mark.usefixtures("compiled")
 PAPER = load_family("paper")
 
 
+@pytest.fixture
+def page(shown):
+    """A page that shows a run, which waits."""
+    with shown(session, paused=True) as page:
+        yield page
+
+
 @contextmanager
 def session():
     with Session(PAPER, watched_guard(PAPER), KinematicWorld()) as opened:
         yield opened
-
-
-@pytest.fixture
-def page():
-    """A page that shows a run, which waits."""
-    with LivePage() as page, Player(session, page, paused=True) as player:
-        page.player = player
-        yield page
 
 
 def get(page, path, host=None, **headers):
@@ -121,14 +118,14 @@ def test_a_socket_needs_the_token_and_an_origin(page):
         connect(f"ws://127.0.0.1:{page.port}/{page.token}/socket", proxy=None)
 
 
-def test_it_listens_on_this_computer_only_and_a_port_that_is_taken_is_said(page):
+def test_it_listens_on_this_computer_only_and_a_port_that_is_taken_is_said(page, shown):
     own = {info[4][0] for info in socket.getaddrinfo(socket.gethostname(), None, socket.AF_INET)}
     for address in {*own, "127.0.0.2"} - {"127.0.0.1", "127.0.1.1"}:
         with pytest.raises(ConnectionRefusedError):
             socket.create_connection((address, page.port), timeout=5).close()
-    with pytest.raises(OSError, match="address already in use"), LivePage(page.port):
+    with pytest.raises(OSError, match="address already in use"), shown(session, port=page.port):
         pass
-    with LivePage() as other:
+    with shown(session) as other:
         assert page.token != other.token
         assert len(page.token) >= 32
 
@@ -136,8 +133,8 @@ def test_it_listens_on_this_computer_only_and_a_port_that_is_taken_is_said(page)
 # -- What is shown, and done ----------------------------------------------------------------------
 
 
-def test_who_connects_and_says_nothing_does_not_hold_up_the_end():
-    with LivePage() as page:
+def test_who_connects_and_says_nothing_does_not_hold_up_the_end(shown):
+    with shown(session) as page:
         silent = socket.create_connection(("127.0.0.1", page.port), timeout=5)
         time.sleep(0.1)
         began = time.monotonic()
@@ -148,7 +145,7 @@ def test_who_connects_and_says_nothing_does_not_hold_up_the_end():
 def test_who_comes_late_is_shown_all_of_it(page):
     with looking_on(page) as first:
         for number in range(3):
-            page.player.step()
+            first.send('{"do": "step"}')
             assert told(first, "frame")["number"] == number
     with looking_on(page) as later:
         whole = json.loads(later.recv(timeout=60))
@@ -172,12 +169,8 @@ def test_pages_act_on_the_run(page):
         assert told(client, "start")["case"] == 3
 
 
-def test_a_run_waits_for_the_first_who_looks_on():
-    with (
-        LivePage() as page,
-        Player(session, page, speed=math.inf, awaits=True) as player,
-    ):
-        page.player = player
+def test_a_run_waits_for_the_first_who_looks_on(shown):
+    with shown(session, speed=math.inf, awaits=True) as page:
         assert get(page, f"/{page.token}/")[0] == 200  # who loads the page only sees nothing yet
         assert not page._frames
         with looking_on(page) as client:
@@ -253,22 +246,23 @@ def test_junk_on_the_wire_is_survived(page):
             wire.settimeout(0.05)
             wire.recv(100)
     with looking_on(page) as client:
-        page.player.step()
+        client.send('{"do": "step"}')
         assert told(client, "frame")["number"] == 0
 
 
 @pytest.mark.slow
-def test_who_does_not_read_does_not_hold_the_run_up_and_is_later_shown_all_of_it(monkeypatch):
+def test_who_does_not_read_does_not_hold_the_run_up_and_is_later_shown_all_of_it(
+    shown, monkeypatch
+):
     monkeypatch.setattr("evofsm.cli.watch.server._MOST_UNREAD", 1 << 14)
     narrow = socket.socket()
     narrow.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
-    with LivePage() as page:
+    with shown(session, awaits=True, speed=math.inf) as page:
         narrow.connect(("127.0.0.1", page.port))
-        with Player(session, page, awaits=True, speed=math.inf) as page.player:
-            with looking_on(page, sock=narrow), looking_on(page) as client:
-                while len(page._clients) == 2:  # the buffers on the way hold some runs
-                    while not told(client, "frame")["over"]:
-                        pass
-                    page.player.restart()
-            with looking_on(page) as again:
-                assert json.loads(again.recv(timeout=60))["parts"][0]["kind"] == "start"
+        with looking_on(page, sock=narrow), looking_on(page) as client:
+            while len(page._clients) == 2:  # the buffers on the way hold some runs
+                while not told(client, "frame")["over"]:
+                    pass
+                client.send('{"do": "restart"}')
+        with looking_on(page) as again:
+            assert json.loads(again.recv(timeout=60))["parts"][0]["kind"] == "start"

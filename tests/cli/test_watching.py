@@ -1,8 +1,7 @@
 """A run that is watched: what is shown of it, its story, and the clock it is played by."""
 
+import asyncio
 import math
-import threading
-from contextlib import contextmanager
 
 import pytest
 
@@ -36,18 +35,6 @@ def drive(session):
     while not frames[-1].over:
         frames.append(session.step())
     return frames
-
-
-@pytest.mark.slow
-def test_the_reviser_prevents_the_collision_that_happens_without_it():
-    session = opened()
-    revised = drive(session)[-1]
-    session.restart()
-    session.revising = False
-    alone = drive(session)[-1]
-    assert not revised.collided
-    assert alone.collided
-    assert alone.time == alone.story.collision == revised.story.alone
 
 
 def test_danger_shows_long_before_time_to_collision_notices_and_is_told_from_when_it_began():
@@ -178,82 +165,42 @@ def test_a_guard_decides_on_each_row_of_a_log_and_changes_nothing(tmp_path):
 # -- The clock ------------------------------------------------------------------------------------
 
 
-class Told:
-    """An audience that writes down what it is told, and can be waited for."""
-
-    def __init__(self):
-        self.events = []
-        self.news = threading.Condition()
-
-    def __call__(self, kind, what):
-        with self.news:
-            self.events.append((kind, what))
-            self.news.notify_all()
-
-    def of(self, kind):
-        with self.news:
-            return [what for one, what in self.events if one == kind]
-
-    def wait(self, holds):
-        with self.news:
-            assert self.news.wait_for(lambda: holds(self), timeout=60.0), self.events[-3:]
-
-
-def ends(told):
-    return sum(frame.over for frame in told.of("frame"))
-
-
-def played(told, **settings):
-    guard = learnt()
-
-    @contextmanager
-    def session():
-        with opened(guard=guard) as one:
-            yield one
-
-    return Player(session, told, **settings)
-
-
 def test_it_waits_steps_and_goes_on():
-    told = Told()
-    with played(told, paused=True, speed=math.inf) as player:
-        told.wait(lambda told: told.of("start"))
-        for number in range(3):
-            player.step()
-            told.wait(lambda told, n=number: len(told.of("frame")) > n)
-        assert len(told.of("frame")) == 3
-        assert told.of("clock")[-1].paused
-        player.pause(False)
-        told.wait(lambda told: told.of("clock")[-1].over)
-    assert told.of("frame")[-1].over
+    async def play():
+        told = []
+        player = Player(opened(), lambda *what: told.append(what), paused=True, speed=math.inf)
+        playing = asyncio.create_task(player.play())
+        for number in range(4):
+            await asyncio.sleep(0.05)
+            assert [what.number for kind, what in told if kind == "frame"] == [*range(number)]
+            player.step() if number < 3 else player.pause(False)
+        while not (told[-1][0] == "clock" and told[-1][1].over):
+            await asyncio.sleep(0.01)
+        playing.cancel()
+        return told
+
+    told = asyncio.run(asyncio.wait_for(play(), 60.0))
+    assert [what.over for kind, what in told if kind == "frame"][-1]
 
 
 def test_speed_is_kept():
-    told = Told()
-    with played(told, speed=8.0):
-        told.wait(lambda told: len(told.of("frame")) >= 20)
-    assert len(told.of("frame")) < 60  # and not as fast as it goes
+    async def play():
+        told = []
+        player = Player(opened(), lambda kind, what: told.append(kind), speed=8.0)
+        playing = asyncio.create_task(player.play())
+        await asyncio.sleep(1.0)
+        playing.cancel()
+        return told.count("frame")
+
+    assert 10 < asyncio.run(play()) <= 34
 
 
-def test_what_cannot_be_opened_raises_and_a_run_that_breaks_off_says_why():
-    @contextmanager
-    def no_road():
-        raise ValueError("no road")
-        yield
-
-    with pytest.raises(ValueError, match="no road"), Player(no_road, Told()):
-        pass
-
-    @contextmanager
-    def short_road():
-        with opened() as session:
-            session.step = lambda: 1 / 0
-            yield session
-
-    told = Told()
-    with Player(short_road, told, speed=math.inf):
-        told.wait(lambda told: told.of("failed"))
-    assert told.of("failed") == ["ZeroDivisionError: division by zero"]
+def test_a_run_that_breaks_off_says_why():
+    session, told = opened(), []
+    session.step = lambda: 1 / 0
+    player = Player(session, lambda *what: told.append(what), speed=math.inf)
+    asyncio.run(asyncio.wait_for(player.play(), 60.0))
+    assert told[-1] == ("failed", "ZeroDivisionError: division by zero")
 
 
 # -- A judge that was told nothing but which episodes failed --------------------------------------

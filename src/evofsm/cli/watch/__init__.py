@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import threading
+import asyncio
 import webbrowser
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -33,8 +33,6 @@ if TYPE_CHECKING:
 
 # Of a simulation of somebody else's that are watched [s].
 _SECONDS = 600.0
-
-Opening = Callable[[], "AbstractContextManager[Watched]"]
 
 
 def watch(
@@ -72,28 +70,31 @@ def watch(
         require(scipy="study", mcap="mcap")
     else:
         require_world(world)
-    from evofsm.cli.watch.player import Player
-    from evofsm.cli.watch.server import LivePage
-
+    opened: AbstractContextManager[Watched]
     if is_recorded:
         opened = _recorded(what, case, topics, judge, tolerance, is_log=is_log)
     else:
         family = family_of(what, switches)
         guard, learnt = _guard(family, judge, tolerance, seed, learn_first, learn)
         opened = _driven(family, guard, world, case, seed, learnt)
-    with (
-        LivePage(port, live=not is_recorded) as page,
-        Player(opened, page, awaits=True) as page.player,
-        suppress(KeyboardInterrupt),
-    ):  # as soon as the address is read
+    with suppress(KeyboardInterrupt), opened as watched:
+        asyncio.run(_serve(watched, port, live=not is_recorded, browse=not no_browser))
+    say("\nThe page is closed.")
+
+
+async def _serve(watched: Watched, port: int, *, live: bool, browse: bool) -> None:
+    """Play to whoever opens the page."""
+    from evofsm.cli.watch.player import Player
+    from evofsm.cli.watch.server import LivePage
+
+    async with LivePage(port, live=live) as page:
+        page.player = Player(watched, page, awaits=True)
         say("Watch it here (Ctrl-C ends it); whoever has this address may steer the run:")
         print(f"  {page.address}", flush=True)
-        if not no_browser:
+        if browse:
             webbrowser.open(page.address)
-        never = threading.Event()
-        while not never.wait(0.5):  # a thread of polars may take the signal: look now and then
-            pass
-    say("\nThe page is closed.")
+        await page.player.play()
+        await asyncio.Event().wait()  # it broke off; the page says why
 
 
 def _is_log(what: str) -> bool:
@@ -112,7 +113,7 @@ def _is_log(what: str) -> bool:
 
 def _recorded(
     what: str, case: int, topics: Path | None, judge: Judge, tolerance: float, *, is_log: bool
-) -> Opening:
+) -> AbstractContextManager[Watched]:
     """A run that was recorded, or a log with what a guard would have said; read beforehand."""
     from tempfile import TemporaryDirectory
 
@@ -133,7 +134,7 @@ def _recorded(
                 warn(f"watched are the first {MOST_ROWS:,} rows; there are more")
             recording = Recording(run)
     recording.restart(case - 1)
-    return lambda: nullcontext(recording)
+    return nullcontext(recording)
 
 
 def _guard(
@@ -155,19 +156,16 @@ def _guard(
     return guard, episodes
 
 
+@contextmanager
 def _driven(
     family: Family, guard: Guard, world: World, case: int, seed: int, learnt: int
-) -> Opening:
+) -> Iterator[Session]:
     """A session in a world of its own."""
     from evofsm.cli.watch.session import Session
     from evofsm.driving.sumo import open_world
 
-    @contextmanager
-    def session() -> Iterator[Session]:
-        with (
-            open_world(world) as place,
-            Session(family, guard, place, case=case - 1, seed=seed, learnt=learnt) as opened,
-        ):
-            yield opened
-
-    return session
+    with (
+        open_world(world) as place,
+        Session(family, guard, place, case=case - 1, seed=seed, learnt=learnt) as opened,
+    ):
+        yield opened

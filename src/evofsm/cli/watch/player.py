@@ -1,13 +1,13 @@
-"""The clock of a run that is watched: pause, step, speed, restart; in a thread of its own."""
+"""The clock of a run that is watched: pause, step, speed, restart; in the page's own loop."""
 
 from __future__ import annotations
 
+import asyncio
 import math
-import threading
 import time
 from collections.abc import Callable
-from contextlib import AbstractContextManager
-from typing import Any, NamedTuple, Protocol, Self
+from contextlib import suppress
+from typing import Any, NamedTuple, Protocol
 
 from evofsm.cli.watch.shown import Frame, Graph, Start
 
@@ -46,155 +46,113 @@ class Clock(NamedTuple):
 
 
 class Player:
-    """Plays what is watched at a pace, and does as it is told while it plays.
+    """Plays what is watched at a pace, and does as it is told before the next decision.
 
-    What it is told is carried out before the next decision; telling never waits. What cannot be
-    opened raises its error where the player is entered. ``audience``, which must not wait, is told
-    what happens: "start" with a `Start`, "frame" with a `Frame`, "graph" with a `Graph`, "clock"
-    with a `Clock`, and "failed" with why it broke off.
+    ``audience`` is told what happens: "start" with a `Start`, "frame" with a `Frame`, "graph" with
+    a `Graph`, "clock" with a `Clock`, and "failed" with why it broke off. With ``awaits`` it waits
+    until someone attends.
     """
 
     def __init__(
         self,
-        watched: Callable[[], AbstractContextManager[Watched]],
+        watched: Watched,
         audience: Callable[[str, Any], object],
         *,
         paused: bool = False,
         speed: float = 1.0,
         awaits: bool = False,
     ) -> None:
-        self._watched = watched
-        self._audience = audience
-        self._awaits = awaits
-        self._paused = paused
-        self._speed = speed
-        self._over = False
-        self._steps: float = 0  # to be taken although paused
+        self._watched, self._audience, self._awaits = watched, audience, awaits
+        self._paused, self._speed, self._over = paused, speed, False
+        self._steps = False  # once, although it is paused
         self._due = 0.0  # when the next frame is [s]
         self._since = 0  # frames since the latest graph
-        self._told = threading.Condition()
-        self._orders: dict[str, Callable[[Watched], object]] = {}  # the latest of each kind
-        self._closed = False
-        self._opened = threading.Event()
-        self._refused: Exception | None = None  # why it could not be opened
-        self._thread = threading.Thread(target=self._play, name="evofsm-player", daemon=True)
-
-    # -- Told from any thread ---------------------------------------------------------------------
+        self._order: Callable[[], object] | None = None  # of what may take time, the latest
+        self._news = asyncio.Event()
 
     def attend(self) -> None:
         """Someone looks on: play, if that was waited for."""
         if self._awaits:
-            self._tell("attend", lambda watched: self._set(awaits=False))
+            self._set(awaits=False)
 
     def pause(self, paused: bool) -> None:
         """Wait, or go on."""
-        self._tell("pause", lambda watched: self._set(paused=paused))
+        self._set(paused=paused)
 
     def step(self) -> None:
         """One decision, then wait."""
-        self._tell("step", lambda watched: self._set(paused=True, steps=1))
+        self._set(paused=True, steps=True)
 
     def speed(self, speed: float) -> None:
         """Play so many times as fast as real time."""
-        self._tell("speed", lambda watched: self._set(speed=speed))
+        self._set(speed=speed)
 
     def revise(self, on: bool) -> None:
         """Switch the reviser on or off."""
-        self._tell("revise", lambda watched: setattr(watched, "revising", on))
+        self._watched.revising = on
+        self._set()
 
     def restart(self, case: int | None = None) -> None:
         """Begin anew, or another case; and go on if it waited."""
-
-        def order(watched: Watched) -> None:
-            watched.restart(case)
-            self._paused = False
-            self._begin(watched)
-
-        self._tell("restart", order)
+        self._order = lambda: self._watched.restart(case)
+        self._news.set()
 
     def _set(self, **changes: bool | float) -> None:
         for name, value in changes.items():
             setattr(self, f"_{name}", value)
         self._due = time.monotonic()
+        self._audience("clock", self._clock())
+        self._news.set()
 
-    def _tell(self, kind: str, order: Callable[[Watched], object]) -> None:
-        with self._told:
-            self._orders.pop(kind, None)  # what was told last comes last
-            self._orders[kind] = order
-            self._told.notify()
-
-    # -- In its own thread ------------------------------------------------------------------------
-
-    def __enter__(self) -> Self:
-        self._thread.start()
-        self._opened.wait()
-        if self._refused is not None:
-            self._thread.join()
-            raise self._refused
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        with self._told:
-            self._closed = True
-            self._told.notify()
-        self._thread.join()
-
-    def _play(self) -> None:
+    async def play(self) -> None:
+        """Play until it is cancelled, or breaks off."""
         try:
-            with self._watched() as watched:
-                self._begin(watched)
-                self._opened.set()
-                while self._is_due(watched):
-                    self._show(watched, watched.step())
+            self._begin()
+            while True:
+                await self._wait()
+                if self._order is not None:
+                    order, self._order = self._order, None
+                    order()
+                    self._paused = False
+                    self._begin()
+                elif self._patience() <= 0.0:
+                    self._steps = False
+                    interval = self._watched.start.interval / self._speed
+                    # What came late is not made up for.
+                    self._due = max(self._due, time.monotonic() - _LATE) + interval
+                    self._show(self._watched.step())
         except Exception as error:
-            if not self._opened.is_set():
-                self._refused = error
-                self._opened.set()
             # Whoever looks on must learn why nothing moves any more.
             self._audience("failed", f"{type(error).__name__}: {error}")
 
-    def _begin(self, watched: Watched) -> None:
-        self._over, self._due = False, time.monotonic()
-        self._audience("start", watched.start)
-        self._audience("clock", self._clock(watched))
-        self._audience("graph", watched.graph())
+    async def _wait(self) -> None:
+        """Until the next frame, or until something was told; others have their turn."""
+        wait = max(0.0, self._patience())
+        with suppress(TimeoutError):
+            await asyncio.wait_for(self._news.wait(), None if math.isinf(wait) else wait)
+        self._news.clear()
 
-    def _is_due(self, watched: Watched) -> bool:
-        """Wait for the next frame, and do meanwhile what was told; False once closed."""
-        while True:
-            with self._told:
-                while not (self._orders or self._closed or (wait := self._wait()) <= 0.0):
-                    self._told.wait(None if math.isinf(wait) else wait)
-                if self._closed:
-                    return False
-                orders, self._orders = self._orders, {}
-            if not orders:
-                break
-            for order in orders.values():
-                order(watched)
-            self._audience("clock", self._clock(watched))
-        self._steps = 0
-        # What came late is not made up for.
-        self._due = max(self._due, time.monotonic() - _LATE) + watched.start.interval / self._speed
-        return True
-
-    def _wait(self) -> float:
+    def _patience(self) -> float:
         """Time until the next frame [s]; infinite where none comes by itself."""
-        if self._over or self._awaits:
+        if self._over or self._awaits or (self._paused and not self._steps):
             return math.inf
-        if self._paused:
-            return 0.0 if self._steps else math.inf
-        return self._due - time.monotonic()
+        return 0.0 if self._paused else self._due - time.monotonic()
 
-    def _show(self, watched: Watched, frame: Frame) -> None:
+    def _begin(self) -> None:
+        self._over, self._due = False, time.monotonic()
+        self._audience("start", self._watched.start)
+        self._audience("clock", self._clock())
+        self._audience("graph", self._watched.graph())
+
+    def _show(self, frame: Frame) -> None:
         self._audience("frame", frame)
         self._since += 1
         if frame.event == "created" or frame.over or self._since >= _GRAPH_EVERY:
-            self._audience("graph", watched.graph())
+            self._audience("graph", self._watched.graph())
             self._since = 0
         if frame.over:
             self._over = True
-            self._audience("clock", self._clock(watched))
+            self._audience("clock", self._clock())
 
-    def _clock(self, watched: Watched) -> Clock:
-        return Clock(self._paused, self._speed, watched.revising, self._over)
+    def _clock(self) -> Clock:
+        return Clock(self._paused, self._speed, self._watched.revising, self._over)

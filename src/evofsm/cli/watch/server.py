@@ -2,17 +2,15 @@
 
 Whoever may see and steer a run must know the token in the address. Names other than this
 computer's own are refused (a page elsewhere could have its name point here), and so are pages of
-other origins. Nobody who looks on can hold the run up: what happens is handed over without
-waiting, and whoever reads too slowly is cut off, comes again, and is shown all of it at once.
+other origins. Nobody who looks on can hold the run up: nobody is waited for, and whoever reads too
+slowly is cut off, comes again, and is shown all of it at once.
 """
 
 from __future__ import annotations
 
-import asyncio
 import hmac
 import logging
 import secrets
-import threading
 from collections import deque
 from http import HTTPStatus
 from importlib.resources import files
@@ -89,7 +87,7 @@ def _rounded(value: Any) -> Any:
 
 
 class LivePage:
-    """Serves a run to browsers on this computer; the audience of a `Player`.
+    """Serves a run to browsers on this computer, in ``async with``; the audience of a `Player`.
 
     ``port`` may be 0, for any that is free; ``live`` says whether the run can be acted on.
     """
@@ -97,15 +95,12 @@ class LivePage:
     def __init__(self, port: int = 0, *, live: bool = True) -> None:
         self.token = secrets.token_urlsafe(24)
         self.player: Player | None = None  #: does what pages ask for
-        self._live = live
         self.port = port  #: where it listens
+        self._live = live
         self._latest: dict[str, str] = {}  # messages of the present run, for who comes later
         self._frames: deque[str] = deque(maxlen=_MOST_FRAMES)
         self._clients: set[ServerConnection] = set()
         self._start: Start | None = None
-        self._ready = threading.Event()
-        self._error: Exception | None = None
-        self._thread = threading.Thread(target=self._serve, name="evofsm-live-page", daemon=True)
         self._files = {name: (files(__package__) / "live" / name).read_bytes() for name in _WELCOME}
 
     @property
@@ -113,31 +108,35 @@ class LivePage:
         """To be opened in a browser; who has it may steer the run."""
         return f"http://{_HOST}:{self.port}/{self.token}/"
 
-    def __enter__(self) -> Self:
-        self._thread.start()
-        self._ready.wait()
-        if self._error is not None:
-            self._thread.join()
-            raise self._error
+    async def __aenter__(self) -> Self:
+        self._server = await serve(
+            self._attend,
+            _HOST,
+            self.port,
+            process_request=self._answer,
+            compression=None,
+            max_size=_LONGEST_COMMAND,
+            max_queue=4,
+            open_timeout=2,
+            close_timeout=1,
+            server_header=None,
+            logger=_log,
+        )
+        (listening,) = self._server.sockets
+        self.port = int(listening.getsockname()[1])
         return self
 
-    def __exit__(self, *error: object) -> None:
-        self._loop.call_soon_threadsafe(self._stop.set)
-        self._thread.join()
+    async def __aexit__(self, *error: object) -> None:
+        self._server.close()
+        await self._server.wait_closed()
 
     def __call__(self, kind: str, what: Any) -> None:
-        """What the player tells; it never waits."""
+        """What the player tells."""
         if isinstance(what, Start):
             self._start = what
-        text = message(kind, what, self._start, live=self._live)
-        self._loop.call_soon_threadsafe(self._publish, kind, text)
-
-    # -- In the server's own thread ---------------------------------------------------------------
-
-    def _publish(self, kind: str, text: str) -> None:
-        if kind == "start":
             self._frames.clear()
             self._latest.clear()
+        text = message(kind, what, self._start, live=self._live)
         if kind == "frame":
             self._frames.append(text)
         else:
@@ -146,35 +145,6 @@ class LivePage:
             if client.transport.get_write_buffer_size() > _MOST_UNREAD:
                 client.transport.abort()
         broadcast(self._clients, text)
-
-    def _serve(self) -> None:
-        asyncio.run(self._listen())
-
-    async def _listen(self) -> None:
-        self._loop, self._stop = asyncio.get_running_loop(), asyncio.Event()
-        try:
-            server = await serve(
-                self._attend,
-                _HOST,
-                self.port,
-                process_request=self._answer,
-                compression=None,
-                max_size=_LONGEST_COMMAND,
-                max_queue=4,
-                open_timeout=2,
-                close_timeout=1,
-                server_header=None,
-                logger=_log,
-            )
-        except Exception as error:  # a port that is taken, or none at all
-            self._error = error
-            self._ready.set()
-            return
-        async with server:
-            (listening,) = server.sockets
-            self.port = int(listening.getsockname()[1])
-            self._ready.set()
-            await self._stop.wait()
 
     def _answer(self, connection: ServerConnection, request: Request) -> Response | None:
         """The files of the page; None lets a socket be opened."""
