@@ -20,6 +20,20 @@ def evofsm():
     return lambda *words: CliRunner().invoke(application(), [*map(str, words)])
 
 
+@pytest.fixture(scope="session")
+def refused(evofsm):
+    """The one line in which a command refuses."""
+
+    def refuse(*words):
+        result = evofsm(*words)
+        assert (result.exit_code, result.stdout) == (2, "")
+        (line,) = result.stderr.splitlines()
+        assert line.startswith("evofsm: ")
+        return line
+
+    return refuse
+
+
 @pytest.fixture
 def shown():
     """Serve a page in a thread, and play on it; settings are those of `Player`."""

@@ -49,12 +49,6 @@ def at_once(folder=None, episodes=6, workers=2, **options):
         return drive_at_once(results, episodes, workers)
 
 
-def failure(result, says):
-    assert result.exit_code == 2
-    assert says in result.stderr
-    assert result.stderr.count("\n") == 1
-
-
 # -- In turn --------------------------------------------------------------------------------------
 
 
@@ -84,7 +78,7 @@ def test_it_learns_saves_and_drives_frozen(evofsm, tmp_path):
 
 @pytest.mark.slow
 def test_a_judge_that_is_given_nothing_but_failures_is_driven_saved_and_gone_on_with(
-    evofsm, tmp_path
+    evofsm, refused, tmp_path
 ):
     drive, out = ("drive", "emergency", "--judge", "learnt"), tmp_path / "learnt"
     first = evofsm(*drive, "--episodes", 6, "--out", out, "--audit", tmp_path / "log")
@@ -98,8 +92,8 @@ def test_a_judge_that_is_given_nothing_but_failures_is_driven_saved_and_gone_on_
     assert again == whole
     frozen = evofsm(*drive, "--episodes", 3, "--frozen", out)
     assert "held-out episodes" in frozen.stdout, frozen.stderr
-    wrong = evofsm("drive", "emergency", "--episodes", 3, "--frozen", out)
-    failure(wrong, "of the judge 'learnt', not of 'kinematic'")
+    wrong = refused("drive", "emergency", "--episodes", 3, "--frozen", out)
+    assert "of the judge 'learnt', not of 'kinematic'" in wrong
 
 
 @pytest.mark.parametrize(
@@ -117,9 +111,9 @@ def test_a_judge_that_is_given_nothing_but_failures_is_driven_saved_and_gone_on_
         (("emergency", "--cluster", "tcp://127.0.0.1:1"), "no Dask scheduler answers"),
     ],
 )
-def test_what_cannot_be_driven_is_refused_in_one_line(evofsm, words, says, monkeypatch):
+def test_what_cannot_be_driven_is_refused_in_one_line(refused, words, says, monkeypatch):
     monkeypatch.setattr("evofsm.cli.driving._PATIENCE", 0.5)
-    failure(evofsm("drive", *words, "--episodes", 1), says)
+    assert says in refused("drive", *words, "--episodes", 1)
 
 
 # -- Whatever stops it ----------------------------------------------------------------------------
@@ -177,12 +171,12 @@ def test_a_folder_of_other_settings_is_refused(tmp_path, changes, says):
     assert "or name another folder" in str(caught.value)
 
 
-def test_what_was_learnt_is_one_of_the_settings(evofsm, tmp_path):
+def test_what_was_learnt_is_one_of_the_settings(evofsm, refused, tmp_path):
     for name in ("a", "b"):
         in_turn(tmp_path / name, 1, seed=ord(name))
     out = ("--episodes", 1, "--out", tmp_path / "out")
     assert evofsm("drive", "emergency", "--frozen", tmp_path / "a", *out).exit_code == 0
-    failure(evofsm("drive", "emergency", "--frozen", tmp_path / "b", *out), "digest was")
+    assert "digest was" in refused("drive", "emergency", "--frozen", tmp_path / "b", *out)
 
 
 def test_two_at_once_are_refused(tmp_path):

@@ -34,15 +34,6 @@ def _in_80_columns(monkeypatch):
     monkeypatch.setenv("COLUMNS", "80")
 
 
-def failure(result):
-    """The one line of an error."""
-    assert result.exit_code == 2
-    assert result.stdout == ""
-    (line,) = result.stderr.splitlines()
-    assert line.startswith("evofsm: ")
-    return line
-
-
 # -- Learn ----------------------------------------------------------------------------------------
 
 
@@ -126,29 +117,29 @@ def test_fcd_says_which_lengths_it_assumed(evofsm, tmp_path):
 # -- What goes wrong ------------------------------------------------------------------------------
 
 
-def test_files_that_are_none_end_with_one_line(evofsm, log, tmp_path):
-    assert failure(evofsm("learn", "nosuch.csv")) == "evofsm: nosuch.csv: no such file or directory"
-    assert failure(evofsm("inspect", "nosuch")) == "evofsm: nosuch: no such file or directory"
-    assert "is a folder" in failure(evofsm("learn", tmp_path))
-    assert "another program" in failure(evofsm("inspect", log))
+def test_files_that_are_none_end_with_one_line(evofsm, refused, log, tmp_path):
+    assert refused("learn", "nosuch.csv") == "evofsm: nosuch.csv: no such file or directory"
+    assert refused("inspect", "nosuch") == "evofsm: nosuch: no such file or directory"
+    assert "is a folder" in refused("learn", tmp_path)
+    assert "another program" in refused("inspect", log)
 
 
-def test_a_bad_row_late_in_the_file_leaves_the_model_of_before(evofsm, log, tmp_path):
+def test_a_bad_row_late_in_the_file_leaves_the_model_of_before(evofsm, refused, log, tmp_path):
     path = tmp_path / "model.evofsm"
     assert evofsm("learn", log, "--out", path).exit_code == 0
     before = path.read_bytes()
     bad = tmp_path / "bad.csv"
     bad.write_text(log.read_text() + "r,v9,0,0.0,nan,1,1,1\n")
-    assert "bad.csv, line 702, column 'gap'" in failure(evofsm("learn", log, bad, "--out", path))
+    assert "bad.csv, line 702, column 'gap'" in refused("learn", log, bad, "--out", path)
     assert path.read_bytes() == before
     new = tmp_path / "new.evofsm"
-    failure(evofsm("learn", bad, "--out", new))
+    refused("learn", bad, "--out", new)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["bad.csv", "log.csv", "model.evofsm"]
 
 
-def test_out_never_overwrites_a_file_of_another_kind(evofsm, log):
+def test_out_never_overwrites_a_file_of_another_kind(evofsm, refused, log):
     before = log.read_bytes()
-    assert "is no file of evofsm; it was left alone" in failure(evofsm("learn", log, "--out", log))
+    assert "is no file of evofsm; it was left alone" in refused("learn", log, "--out", log)
     assert log.read_bytes() == before
 
 
@@ -217,12 +208,12 @@ def test_a_log_that_tells_nothing_of_failures_is_said_to(evofsm, crashes, tmp_pa
     assert "0 of 3 (at most 48 %) failed later on" in text
 
 
-def test_units_and_missing_leaders_are_said_in_the_summary(evofsm, tmp_path):
+def test_units_and_missing_leaders_are_said_in_the_summary(evofsm, refused, tmp_path):
     path = tmp_path / "log.csv"
     rows = [f"p,{100 * k},{'' if k == 9 else 20},54,54,0.1" for k in range(30)]
     header = "pair,time,gap,v_follower,v_leader,a_follower"
     path.write_text("\n".join([header, *rows, ""]))
-    assert "no leader? --no-leader end" in failure(evofsm("learn", path))
+    assert "no leader? --no-leader end" in refused("learn", path)
     told = evofsm(
         *("learn", path, "--no-leader", "end", "--unit", "v=km/h", "--unit", "time=ms"),
         *("--out", tmp_path / "model"),
@@ -278,5 +269,5 @@ def test_another_rule_is_told_by_its_name(evofsm, crashes, tmp_path, options, ru
         (["--max-states", "0"], "max_states is 0"),
     ],
 )
-def test_wrong_options_end_with_one_line(evofsm, crashes, options, message):
-    assert message in failure(evofsm("learn", crashes, *options))
+def test_wrong_options_end_with_one_line(evofsm, refused, crashes, options, message):
+    assert message in refused("learn", crashes, *options)

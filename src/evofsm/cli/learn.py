@@ -251,16 +251,11 @@ def _machine(
     if scale and rule != "novelty":
         raise ValueError(f"--scale is for --rule novelty, not {rule}")
     if rule == "novelty":
-        one = 1.0 if radius is None else radius
-        novelty = Novelty(one, _scales(scale, encoder), 1.0 if spread is None else spread)
+        width = {} if spread is None else {"spread": spread}
+        novelty = Novelty(1.0 if radius is None else radius, _scales(scale, encoder), **width)
         return EvolvingFSM(n_actions, rule=novelty, max_states=max_states)
-    return EvolvingFSM(
-        n_actions,
-        radius=0.3 if radius is None else radius,
-        spread=3.0 if spread is None else spread,
-        max_states=max_states,
-        rule=Edges() if rule == "edges" else None,
-    )
+    edges = Edges() if rule == "edges" else None
+    return EvolvingFSM(n_actions, radius, spread=spread, max_states=max_states, rule=edges)
 
 
 def _scales(scale: list[str] | None, encoder: ObservationEncoder) -> list[float]:

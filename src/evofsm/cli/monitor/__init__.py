@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import sys
 from contextlib import ExitStack
+from hashlib import sha256
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -80,7 +81,8 @@ def monitor(
     with ExitStack() as stack:
         saved = None
         if state is not None:
-            given = None if guard is None or guard.resolve() == state.resolve() else _digest(guard)
+            is_other = guard is not None and guard.resolve() != state.resolve()
+            given = sha256(guard.read_bytes()).hexdigest() if guard and is_other else None
             made = {"interval": interval, "brakes": brakes} if guard is None else {}
             told = {"mode": mode, "learn": learn, "episode": episode}
             saved = State(state, {"guard": given, **made, **told})
@@ -107,13 +109,6 @@ def monitor(
             if saved is None and decider.rows:
                 decider.end()
     return None
-
-
-def _digest(file: Path) -> str:
-    """What tells a saved guard from another one."""
-    from hashlib import sha256
-
-    return sha256(file.read_bytes()).hexdigest()
 
 
 def _prepare(
