@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import Any
 
 from evofsm.fsm.arrays import EPISODES, VISITS, Learnt, Settings
-from evofsm.fsm.kernels import rare_kernel
+from evofsm.fsm.kernels import rare_kernel, spliced_kernel
 from evofsm.fsm.transitions import merge_states
 from evofsm.fsm.validation import Floats
 
@@ -81,7 +81,7 @@ def _merge(learnt: Learnt, weights: Floats, kept: int, given: int, n: int) -> No
         learnt.squared_distances[i] = squared_distance
 
 
-@rare_kernel
+@spliced_kernel
 def _forget(learnt: Learnt, given: int, n: int) -> None:
     """Make an index as good as new."""
     learnt.states[given].joined = learnt.states[given].latest_visit = 0.0

@@ -8,7 +8,7 @@ episode may end, is no state of the machine: it is counted.
 from __future__ import annotations
 
 from enum import IntFlag
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -130,14 +130,12 @@ def fail(learnt: Learnt, settings: Settings) -> None:
     _end(learnt, settings)
 
 
-@kernel
 def believe(learnt: Learnt, belief: Floats) -> None:
     """Go on in the episode with a belief over all states, from which nothing else is learnt."""
-    now = learnt.now[0]
-    _tick(now)
-    for i in range(len(belief)):
-        learnt.belief[i] = belief[i]
-    now.state, now.action, now.chained = np.argmax(belief), NO_ACTION, 1
+    now: Any = learnt.now.view(np.recarray)[0]
+    cast(Any, _tick).py_func(now)
+    learnt.belief[: len(belief)] = belief
+    now.state, now.action, now.chained = belief.argmax(), NO_ACTION, 1
 
 
 @rare_kernel

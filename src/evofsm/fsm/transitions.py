@@ -13,7 +13,7 @@ other way round, with the same meaning of rows.)
 from __future__ import annotations
 
 from evofsm.fsm.arrays import NO_ACTION, NOT_OPEN, Learnt, Settings
-from evofsm.fsm.kernels import inner_kernel, kernel, lanes, rare_kernel
+from evofsm.fsm.kernels import inner_kernel, kernel, lanes, spliced_kernel
 from evofsm.fsm.validation import Floats
 
 # A weight below this is taken as 0: smaller numbers turn denormal and slow every step.
@@ -74,7 +74,7 @@ def forecast_and_identify(
                 matrix[i, j] = (1.0 - rate) * probability + rate * reached[j]
 
 
-@rare_kernel
+@spliced_kernel
 def forget_row(learnt: Learnt, place: int, i: int, n: int, prior_frequency: float) -> None:
     """Give a row of a matrix of ``n`` states the prior frequencies, which are all alike."""
     for j in range(n):
@@ -82,7 +82,7 @@ def forget_row(learnt: Learnt, place: int, i: int, n: int, prior_frequency: floa
     learnt.origin_frequency[place, i] = n * prior_frequency
 
 
-@rare_kernel
+@spliced_kernel
 def expand(learnt: Learnt, new: int, n: int, prior_frequency: float) -> None:
     """Add a state to all matrices, ``n`` with it: its row and column of F are the prior frequency.
 
@@ -99,7 +99,7 @@ def expand(learnt: Learnt, new: int, n: int, prior_frequency: float) -> None:
         forget_row(learnt, place, new, n, prior_frequency)
 
 
-@rare_kernel
+@spliced_kernel
 def merge_states(learnt: Learnt, kept: int, given: int, n: int) -> None:
     """Add the frequencies of transitions from and to a state to those of another one."""
     for place in range(learnt.now[0].n_places):

@@ -297,7 +297,7 @@ def learn_transition(
     was not expected.
     """
     (p, m), a, n, first = model.weights.shape, u.shape[1], sums.counts[1], i == 0
-    at, change, move = np.empty((m, 2)), np.empty((m, 2)), np.zeros((m, 2))
+    at, change, move = np.empty((m, 2)), np.empty((m, 2)), np.empty((m, 2))
     action, latest, found = np.empty((a, 2)), np.empty((a, 2)), np.empty((p, 2))
     for t in range(i, i + 2):
         for j in range(m):
@@ -308,8 +308,9 @@ def learn_transition(
         at, change, latest, action, model.origin, model.reach, 1.0, model.choices == 0, found
     )
     for r in range(2):
-        for k in range(p):
-            for j in range(m):
+        for j in range(m):
+            move[j, r] = 0.0
+            for k in range(p):
                 move[j, r] += found[k, r] * model.weights[k, j]
     known, jump, moved, surprised = sums.scale[0] > 0.0, False, False, False
     for j in range(m):
@@ -418,7 +419,7 @@ def _replay(
     n = (count + _LINE - 1) // _LINE * _LINE
     z, change, move, after = np.empty((m, n)), np.empty((m, n)), np.empty((m, n)), np.empty((m, n))
     before, action, found = np.empty((a, n)), np.empty((a, n)), np.empty((p, n))
-    which, survived, near = np.zeros(n, np.int64), np.empty(n, np.int64), np.empty(n)
+    which, survived, near = np.empty(n, np.int64), np.empty(n, np.int64), np.empty(n)
     jumps = False
     for l in range(n):
         start = l // each if l < count else 0
@@ -427,10 +428,9 @@ def _replay(
         for i in range(a):
             before[i, l] = situations[start, 2 * m + i]
         near[l], survived[l] = np.inf, steps if l < count else -1
-        if l < count:
-            which[l] = l % each
-            for j in range(m):
-                jumps |= disturbances.jump_at[which[l], j] >= 0.0
+        which[l] = l % each if l < count else 0
+        for j in range(m):
+            jumps |= disturbances.jump_at[which[l], j] >= 0.0
     lost, end = 0, 1.0 - _RESERVE * enough
     for t in range(steps):
         if t < len(plan):
