@@ -7,8 +7,6 @@ from pathlib import Path
 
 import pytest
 
-import evofsm
-
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "src" / "evofsm"
 FACES = sorted(PACKAGE.rglob("__init__.pyi"))
@@ -33,14 +31,3 @@ def test_a_face_offers_each_name_once_in_order_and_no_module_hides_it(face):
     offered = {line.rpartition(" as ")[2] for line in lines if not line.startswith("from . ")}
     assert not offered & modules
     assert room.__all__ == sorted(names)
-
-
-def test_the_top_offers_nothing_that_a_room_does_not():
-    for name in evofsm.__all__:
-        home = getattr(evofsm, name).__module__
-        assert home.startswith("evofsm."), name
-
-
-def test_every_folder_with_modules_says_what_it_is_for():
-    for folder in {path.parent for path in PACKAGE.rglob("*.py")}:
-        assert (folder / "__init__.py").read_text("utf-8").startswith('"""'), folder

@@ -57,12 +57,6 @@ def test_importing_the_package_costs_little_more_than_importing_numpy():
     assert min(seconds["evofsm"]) <= 1.5 * min(seconds["numpy"])
 
 
-def test_every_public_name_can_be_had_and_is_listed():
-    for name in evofsm.__all__:
-        assert getattr(evofsm, name).__name__ == name
-    assert set(evofsm.__all__) <= set(dir(evofsm))
-
-
 def test_the_version_is_that_of_the_distribution():
     assert evofsm.__version__ == distribution("evofsm").version
 

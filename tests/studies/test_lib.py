@@ -167,16 +167,3 @@ def test_episodes_are_resampled_as_a_whole():
     low, high = lib.Ranked(score, truth, episode).interval()[0]
     alone = lib.Ranked(score, truth).interval()[0]
     assert high - low > 3.0 * (alone.high - alone.low)
-
-
-def test_calibrated_probabilities_never_fall_and_come_true():
-    rng = np.random.default_rng(1)
-    score = rng.normal(size=2000)
-    truth = rng.uniform(size=2000) < 1.0 / (1.0 + np.exp(-2.0 * score))
-    calibrate = lib.isotonic(score, truth)
-    probability = calibrate(np.sort(score))
-    assert (np.diff(probability) >= 0.0).all()
-    assert lib.isotonic([1.0, 2.0], [False, True])([1.0, 2.0]).tolist() == [0.0, 1.0]
-    assert lib.brier(calibrate(score), truth) < lib.brier(np.full(2000, truth.mean()), truth)
-    with pytest.raises(ValueError, match="one score or more"):
-        lib.isotonic([], [])

@@ -22,7 +22,7 @@ from studies.sensitivity import (
 )
 
 from evofsm.driving import KinematicWorld
-from evofsm.paper import Settings, check_claims, run_paper
+from evofsm.paper import check_claims, run_paper
 
 
 @pytest.mark.slow
@@ -40,13 +40,6 @@ def test_the_fast_way_has_the_verdicts_of_the_papers_study(changes):
     verdicts = {claim.id: claim.holds for claim in check_claims(slow)}
     assert verdicts == {claim: row[claim] for claim in verdicts}
     assert row["n_states"] == slow.model.n_states
-
-
-def test_a_setting_says_what_the_paper_study_is_told():
-    settings = replace(recovered(), brake_speed=23.0, bound=3.0).paper_settings()
-    assert settings.scenario.leader.brake_speed == 23.0
-    assert [settings.drivers[case].lowest for case in (1, 2)] == [-3.0, -3.0]
-    assert recovered().paper_settings() == Settings.load()
 
 
 def test_noise_is_seen_by_the_machine_alone_and_differs_from_run_to_run():
