@@ -14,7 +14,7 @@ import pytest
 
 from evofsm.fsm.observations import ObservationEncoder
 from evofsm.io import vehicles
-from evofsm.io.logs import LogColumns, read_traces
+from evofsm.io.logs import LogColumns, episodes_of, read_traces
 from evofsm.io.vehicles import VehicleLengths
 
 polars = pytest.importorskip("polars")
@@ -29,13 +29,8 @@ def write(path, text):
 
 def episodes(path, lengths=None, **columns):
     """Every episode as (observations, actions, times)."""
-    found = []
-    for chunk in read_traces([str(path)], LogColumns(**columns), lengths):
-        ends = [*chunk.starts[1:], len(chunk.times)]
-        for start, end in zip(chunk.starts, ends, strict=True):
-            part = slice(start, end)
-            found.append((chunk.observations[part], chunk.actions[part], chunk.times[part]))
-    return found
+    chunks = read_traces([str(path)], LogColumns(**columns), lengths)
+    return [(one.observations, one.actions, one.times) for one in episodes_of(chunks)]
 
 
 def refusal(path, **columns):
